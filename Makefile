@@ -1,0 +1,75 @@
+# Everything starts here, on a machine with nothing but Python 3 and make:
+#   make train        a robot learns from pictures; the preset follows the hardware
+# uv is fetched into .uv/ where it is missing, and everything else goes into .venv/.
+
+SHELL := /bin/bash
+.SHELLFLAGS := -eu -o pipefail -c
+.DELETE_ON_ERROR:
+
+SEED ?= 0
+PRESET ?= auto
+RUN_DIR ?= runs/seed$(SEED)-$(shell date +%Y%m%d-%H%M%S)
+ARGS ?=
+WORKERS ?= 2
+PYTHON ?= >=3.11,<3.14
+
+# Evaluated once: `:=` would run them for `make help` too, so each sits in the recipe that needs it.
+UV = $$(uv --version >/dev/null 2>&1 && echo uv || echo .uv/bin/uv)
+PINS = $(UV) pip compile --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-emit-find-links \
+	--quiet --custom-compile-command "make pins"
+BIN := .venv/bin
+STAMPS := .venv/stamps
+ACCELERATOR := $(shell nvidia-smi -L >/dev/null 2>&1 && echo gpu || echo base)
+
+.PHONY: help train test lint format bench-cpu pins clean
+.DEFAULT_GOAL := help
+
+help: ## Show this list
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' Makefile
+	@echo
+	@echo "  variables: SEED=$(SEED) PRESET=$(PRESET) (auto: cpu or fast by the hardware) RUN_DIR=... ARGS='--any-option 1' WORKERS=$(WORKERS)"
+
+train: $(STAMPS)/$(ACCELERATOR) ## Train on VisualFetchReach; curve.png and video.gif land in RUN_DIR
+	@$(BIN)/jaxrl-vis train --preset $(PRESET) --seed $(SEED) --run-dir "$(RUN_DIR)" $(ARGS)
+
+test: $(STAMPS)/dev ## Run the tests
+	@$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal $(ARGS)
+
+lint: $(STAMPS)/dev ## Check style, format and types
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/pyright
+
+format: $(STAMPS)/dev ## Mend style and format
+	@$(BIN)/ruff check --fix .
+	@$(BIN)/ruff format .
+
+bench-cpu: $(STAMPS)/base ## Run the five benchmarks at CPU sizes; records land in benchmarks/results
+	@for benchmark in render physics env update train; do JAX_PLATFORMS=cpu $(BIN)/jaxrl-vis bench $$benchmark $(ARGS); done
+
+pins: .venv/bin/python ## Write requirements/*.txt anew
+	@$(PINS) $(PINS_ARGS) pyproject.toml -o requirements/base.txt
+	@$(PINS) $(PINS_ARGS) pyproject.toml --group dev -c requirements/base.txt -o requirements/dev.txt
+	@$(PINS) $(PINS_ARGS) pyproject.toml --extra cuda12 -c requirements/base.txt -o requirements/gpu.txt
+	@if grep -E -n '://|--(extra-)?(index-url|find-links)' requirements/*.txt; then echo "pins must carry no address" >&2; exit 1; fi
+
+clean: ## Remove what make built (not runs/)
+	rm -rf .venv .uv build dist .pytest_cache .ruff_cache
+
+# A private environment works where pip refuses to touch the system's ("externally managed"); --target works where the
+# system's Python has pip but no venv.
+.uv/bin/uv:
+	@echo "uv is missing: installing it into .uv/"
+	@if ! python3 -m venv .uv 2>/dev/null || ! .uv/bin/python -m pip install --quiet uv; then \
+		rm -rf .uv; python3 -m pip install --quiet --target .uv uv; fi
+
+.venv/bin/python:
+	@uv --version >/dev/null 2>&1 || $(MAKE) --no-print-directory .uv/bin/uv
+	@$(UV) venv --quiet --python "$(PYTHON)" .venv
+
+# dev holds all of base, at the same versions.
+$(STAMPS)/%: requirements/%.txt pyproject.toml | .venv/bin/python
+	@echo "installing requirements/$*.txt into .venv/"
+	@$(UV) pip install --quiet --python .venv --require-hashes -r requirements/$*.txt
+	@$(UV) pip install --quiet --python .venv --no-deps -e .
+	@mkdir -p $(STAMPS) && touch $@

@@ -1,0 +1,37 @@
+"""The worlds: physics, cameras and goals, as traceable JAX functions.
+
+    env = jaxrl_vis_envs.make("VisualFetchReach", image_size=64)
+    state = env.reset(jax.random.key(0))
+
+Importing this package loads neither MuJoCo nor JAX: the learner's leaves import `jaxrl_vis_envs.goals` alone. The names below
+are looked up when they are first used.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from jaxrl_vis_envs.base import GoalEnv, State
+    from jaxrl_vis_envs.registry import UnknownEnvironmentError, UnknownOverrideError, list_envs, make, register
+
+_HOME = {
+    "GoalEnv": "base",
+    "State": "base",
+    "UnknownEnvironmentError": "registry",
+    "UnknownOverrideError": "registry",
+    "list_envs": "registry",
+    "make": "registry",
+    "register": "registry",
+}
+
+__all__ = ["GoalEnv", "State", "UnknownEnvironmentError", "UnknownOverrideError", "list_envs", "make", "register"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,125 @@
+"""What every goal-reaching world has in common: its state, and the four functions that move it.
+
+    state = env.reset(key)              one environment; vmap it for a batch
+    state = env.advance(state, action)  physics, reward, success; no pixels
+    frame = env.observe(state)          what the agent sees
+    state = env.step(state, action)     advance, then observe, with ``state.obs`` filled in
+
+An environment object holds only constants (model, camera, configuration); a `State` holds everything that changes, so every
+method is a pure function that can be jitted, vmapped, scanned and differentiated through. Episodes have a fixed length
+(`GoalEnv.horizon`), ``done`` is always 0, and nothing resets by itself: no final observation is ever lost.
+"""
+
+import abc
+import dataclasses
+import functools
+from typing import Any, Self
+
+import jax
+import jax.numpy as jnp
+
+from jaxrl_vis_envs import goals
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class State:
+    """Everything that changes in one environment.
+
+    Attributes:
+        data: The physics state (`mujoco.mjx.Data` for the MuJoCo tasks).
+        achieved_state: [G] float32, the true quantity that the goal is about (metres or radians; each task says which).
+        goal_state: [G] float32, the value of that quantity that the goal picture shows. Neither is shown to the agent.
+        reward: [] float32, `goals.oracle_reward` of the two.
+        done: [] float32, always 0: episodes have one length, and ending one is a truncation.
+        metrics: ``success`` ([] float32, 0 or 1) and ``goal_distance`` ([] float32, unit of the state).
+        obs: ``observation``, ``achieved_goal`` and ``desired_goal``, each as `GoalEnv.observe` makes them; None where the
+            caller asked for no pictures (`GoalEnv.advance` passes it through untouched).
+    """
+
+    data: Any
+    achieved_state: jax.Array
+    goal_state: jax.Array
+    reward: jax.Array
+    done: jax.Array
+    metrics: dict[str, jax.Array]
+    obs: dict[str, jax.Array] | None = None
+
+    def replace(self, **changes: Any) -> Self:
+        """A copy with some fields changed."""
+        return dataclasses.replace(self, **changes)
+
+
+class GoalEnv(abc.ABC):
+    """A world with a goal. Subclasses say how it starts, moves and looks; success and reward are the same for all."""
+
+    # Set by each task.
+    name: str
+    horizon: int  # control steps in an episode
+    action_size: int  # A
+    threshold: float  # an episode succeeds where goal_distance <= threshold, in `distance_unit`
+    distance_unit: str = "m"
+    control_period: float  # simulated seconds of one control step
+
+    @abc.abstractmethod
+    def reset(self, key: jax.Array) -> State:
+        """Starts an episode: samples a start and a goal, and fills in `State.obs`.
+
+        Args:
+            key: [] a typed JAX key.
+        """
+
+    @abc.abstractmethod
+    def advance(self, state: State, action: jax.Array) -> State:
+        """Moves the physics by one control step, without making a picture.
+
+        Args:
+            state: The state to start from.
+            action: [A] float32 in [-1, 1]; values outside are clipped, and a NaN counts as 0.
+        """
+
+    @abc.abstractmethod
+    def observe(self, state: State) -> jax.Array:
+        """What the agent sees of ``state``: planar [C, H, W] uint8, or [S] float32 for the state variants."""
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """`advance`, then `observe`: the one to use where every step's picture is wanted."""
+        state = self.advance(state, action)
+        frame = self.observe(state)
+        desired_goal = frame if state.obs is None else state.obs["desired_goal"]
+        return state.replace(obs={"observation": frame, "achieved_goal": frame, "desired_goal": desired_goal})
+
+    @functools.cached_property
+    def _reset_shape(self) -> State:
+        return jax.eval_shape(self.reset, jax.random.key(0))
+
+    @property
+    def observation_spec(self) -> jax.ShapeDtypeStruct:
+        """Shape and dtype of `observe`, derived by tracing `reset`, so it cannot go stale."""
+        obs = self._reset_shape.obs
+        assert obs is not None
+        return jax.ShapeDtypeStruct(obs["observation"].shape, obs["observation"].dtype)
+
+    @property
+    def goal_state_size(self) -> int:
+        """G, the length of `State.achieved_state`."""
+        return self._reset_shape.goal_state.shape[0]
+
+    def _measure(self, data: Any, achieved_state: jax.Array, goal_state: jax.Array, obs: dict | None) -> State:
+        """A State with its reward and metrics filled in from the truth."""
+        distance = goals.goal_distance(achieved_state, goal_state)
+        return State(
+            data=data,
+            achieved_state=achieved_state,
+            goal_state=goal_state,
+            reward=goals.oracle_reward(achieved_state, goal_state, self.threshold),
+            done=jnp.zeros((), jnp.float32),
+            metrics={"success": goals.success(achieved_state, goal_state, self.threshold), "goal_distance": distance},
+            obs=obs,
+        )
+
+
+def sanitize_action(action: jax.Array) -> jax.Array:
+    """[A] -> [A] float32 in [-1, 1], with NaN read as 0: a broken policy must not poison the physics."""
+    action = jnp.asarray(action, jnp.float32)
+    return jnp.clip(jnp.where(jnp.isnan(action), 0.0, action), -1.0, 1.0)

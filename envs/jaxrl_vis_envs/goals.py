@@ -1,0 +1,39 @@
+"""Rewards and success: the one place. Environments score with these, and the learner relabels with the same functions.
+
+Two rewards exist. The *oracle* compares true states within a threshold (thesis, equation 5.6). The *indicator* is positive only
+where the observed picture equals the goal picture in every byte (thesis, equation 5.4), so it needs no state estimate and has
+no false positives. Arrays may carry any leading batch axes; only the goal's own axes are reduced.
+"""
+
+import jax
+import jax.numpy as jnp
+
+
+def goal_distance(achieved_state: jax.Array, goal_state: jax.Array) -> jax.Array:
+    """Euclidean distance of [..., G] float32 states, in their unit: [...] float32."""
+    return jnp.sqrt(jnp.sum(jnp.square(achieved_state - goal_state), axis=-1))
+
+
+def success(achieved_state: jax.Array, goal_state: jax.Array, threshold: float) -> jax.Array:
+    """1 where [..., G] states lie within ``threshold`` of each other, else 0 (NaN is a failure): [...] float32."""
+    return (goal_distance(achieved_state, goal_state) <= threshold).astype(jnp.float32)
+
+
+def oracle_reward(
+    achieved_state: jax.Array,
+    goal_state: jax.Array,
+    threshold: float,
+    positive: float = 0.0,
+    negative: float = -1.0,
+) -> jax.Array:
+    """Ground-truth reward of [..., G] float32 states (thesis, equation 5.6): [...] float32.
+
+    The defaults are those of Gymnasium's Fetch tasks: 0 at the goal, -1 elsewhere.
+    """
+    return jnp.where(goal_distance(achieved_state, goal_state) <= threshold, positive, negative).astype(jnp.float32)
+
+
+def indicator_reward(picture: jax.Array, goal_picture: jax.Array, positive: float = 1.0, negative: float = -1.0) -> jax.Array:
+    """Indicator reward of [..., C, H, W] pictures (thesis, equation 5.4): ``positive`` where all bytes agree: [...] float32."""
+    equal = jnp.all(picture == goal_picture, axis=(-3, -2, -1))
+    return jnp.where(equal, positive, negative).astype(jnp.float32)

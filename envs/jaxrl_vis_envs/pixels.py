@@ -1,0 +1,72 @@
+"""What the agent sees: which channels, in which order, at which size, and how a depth becomes a byte.
+
+A picture is planar, [C, H, W] uint8, with the channels R, G, B, D (as many of them as ``pixels`` asks for). Depth is planar (along
+the camera's axis) and metric: 0 is the near end of the task's depth range, 255 the far end, linear between, clipped outside.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import mujoco
+
+from jaxrl_vis_envs.render import Scene, quantize, render_planes
+
+CHANNELS = {"rgbd": 4, "rgb": 3, "depth": 1}
+
+
+@dataclasses.dataclass(frozen=True)
+class PixelsConfig:
+    """Settings of the pictures."""
+
+    image_size: int = 64
+    """Height and width, in pixels."""
+    pixels: Literal["rgbd", "rgb", "depth"] = "rgbd"
+    """Channels."""
+    depth_range: tuple[float, float] = (0.1, 10.0)
+    """Depths that bytes 0 and 255 stand for, m. Tasks choose it as tight as what moves allows."""
+
+    def __post_init__(self) -> None:
+        if self.image_size < 1:
+            raise ValueError(f"image_size must be at least 1, got {self.image_size}")
+        if self.pixels not in CHANNELS:
+            raise ValueError(f"pixels must be one of {', '.join(CHANNELS)}, got {self.pixels!r}")
+        near, far = self.depth_range
+        if not 0.0 <= near < far:
+            raise ValueError(f"depth_range must be (near, far) with 0 <= near < far, got {self.depth_range}")
+
+
+def picture_observer(mj_model: mujoco.MjModel, camera: str, config: PixelsConfig) -> Callable[[Any], jax.Array]:
+    """A function from the poses of one environment (`mjx.Data`) to its picture [C, H, W] uint8.
+
+    Raises:
+        ValueError: There is no such camera, or something in its view cannot be drawn.
+    """
+    scene = Scene.from_mjmodel(mj_model, camera=camera, height=config.image_size, width=config.image_size)
+    wants_colour, wants_depth = config.pixels != "depth", config.pixels != "rgb"
+
+    def observe(data: Any) -> jax.Array:
+        planes = render_planes(scene, data, rgb=wants_colour, depth=wants_depth)
+        channels = []
+        if planes.rgb is not None:
+            channels.append(quantize(planes.rgb))
+        if planes.depth is not None:
+            channels.append(encode_depth(planes.depth, config.depth_range)[None])
+        return jnp.concatenate(channels)
+
+    return observe
+
+
+def encode_depth(depth: jax.Array, depth_range: tuple[float, float]) -> jax.Array:
+    """Bytes of depths ``[...]`` (m): 0 at the near end of ``depth_range`` (m) or before, 255 at the far end or beyond."""
+    near, far = depth_range
+    share = jnp.clip((depth - near) / (far - near), 0.0, 1.0)
+    return jnp.round(255.0 * share).astype(jnp.uint8)
+
+
+def decode_depth(encoded: jax.Array, depth_range: tuple[float, float]) -> jax.Array:
+    """Depths (m, float32) that bytes ``[...]`` of `encode_depth` stand for; exact to half a step of (far - near) / 255."""
+    near, far = depth_range
+    return near + encoded.astype(jnp.float32) * ((far - near) / 255.0)

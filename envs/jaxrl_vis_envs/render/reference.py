@@ -1,0 +1,67 @@
+"""MuJoCo's own OpenGL renderer behind the same `Frame`: the truth for tests, and the better picture for videos.
+
+It needs a GL library (``MUJOCO_GL=egl`` or ``osmesa`` without a display), one MuJoCo call per picture, and NumPy only. GL is
+touched when a `ReferenceRenderer` is made, not when this module is imported.
+"""
+
+from typing import Any, Self
+
+import mujoco
+import numpy as np
+
+from jaxrl_vis_envs.render.pictures import Frame
+
+
+class ReferenceRenderer:
+    """Draws `mujoco.MjData` with `mujoco.Renderer`. Close it, or use it in a ``with`` statement.
+
+    Args:
+        mj_model: The model. Its ``vis.global_.offwidth`` and ``offheight`` bound the picture's size.
+        height: H, pixels.
+        width: W, pixels.
+        effects: Whether to draw shadows, reflections and haze, which `render` does not.
+        site_groups: Site groups that are drawn.
+
+    Raises:
+        ValueError: The picture is larger than the model's offscreen buffer.
+        RuntimeError: There is no usable GL library.
+    """
+
+    def __init__(
+        self, mj_model: mujoco.MjModel, height: int, width: int, effects: bool = False, site_groups: tuple[int, ...] = ()
+    ):
+        self._model = mj_model
+        try:
+            self._renderer = mujoco.Renderer(mj_model, height, width)
+        except (ImportError, AttributeError, mujoco.FatalError) as error:
+            raise RuntimeError(f"no usable GL library (set MUJOCO_GL to egl or osmesa): {error}") from error
+        self._options = mujoco.MjvOption()
+        self._options.sitegroup[:] = [group in site_groups for group in range(len(self._options.sitegroup))]
+        if not effects:
+            flags = mujoco.mjtRndFlag
+            for flag in (flags.mjRND_SHADOW, flags.mjRND_REFLECTION, flags.mjRND_HAZE):
+                self._renderer.scene.flags[flag] = False
+
+    def __call__(self, mj_data: mujoco.MjData, camera: str | int) -> Frame:
+        """The picture as NumPy arrays: a `Frame` of rgb [H, W, 3] uint8, depth [H, W] float32 and segmentation [H, W] int32."""
+        self._renderer.update_scene(mj_data, camera, self._options)
+        colour = self._renderer.render().copy()
+        self._renderer.enable_depth_rendering()
+        depth = self._renderer.render().astype(np.float32)
+        self._renderer.disable_depth_rendering()
+        self._renderer.enable_segmentation_rendering()
+        ids, kinds = np.moveaxis(self._renderer.render(), -1, 0)
+        self._renderer.disable_segmentation_rendering()
+        labels = np.where(kinds == mujoco.mjtObj.mjOBJ_GEOM, ids, -1)
+        labels = np.where(kinds == mujoco.mjtObj.mjOBJ_SITE, ids + self._model.ngeom, labels)
+        return Frame(colour, depth, labels.astype(np.int32))
+
+    def close(self) -> None:
+        """Frees the GL context."""
+        self._renderer.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *details: Any) -> None:
+        self.close()

@@ -1,0 +1,138 @@
+"""Reacher: bring the fingertip of a two-link arm to where the goal picture shows it.
+
+As the authors of "Reinforcement Learning without Ground-Truth State" used it: the joint velocities are overwritten at the start of
+a control step and then decay, and the goal is the fingertip of a random configuration. ``control="torque"`` gives the motors of
+Gym's Reacher instead.
+
+    VisualReacher   sees RGB-D from above
+    Reacher         sees joint angles, fingertip and joint velocities
+
+State: fingertip position in the plane of the table, m. Action: one component for each joint.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import mujoco
+from mujoco import mjx
+
+from jaxrl_vis_envs.base import GoalEnv, State, sanitize_action
+from jaxrl_vis_envs.pixels import PixelsConfig, picture_observer
+from jaxrl_vis_envs.registry import register
+from jaxrl_vis_envs.tasks import mjx_model
+
+_DEFAULT_SUBSTEPS = {"velocity": 10, "torque": 2}
+
+
+@dataclasses.dataclass(frozen=True)
+class ReacherConfig:
+    """Settings of the task. Lengths in m, angles in rad."""
+
+    horizon: int = 50
+    """Control steps in an episode."""
+    threshold: float = 0.01
+    """An episode succeeds where the fingertip is within this distance of the goal, m."""
+    start_range: float = 0.1
+    """Both joints start uniform within this angle of 0, rad."""
+    control: Literal["velocity", "torque"] = "velocity"
+    """What an action sets: the velocity that the joints start the control step with, or the torque during it."""
+    velocity_scale: float = 10.0
+    """Joint velocity of an action of 1 under velocity control, rad/s (it turns the joint by .95 rad)."""
+    substeps: int | None = None
+    """Physics steps of 10 ms in a control step. None: 10 under velocity control, 2 under torque control."""
+
+    def __post_init__(self) -> None:
+        if self.control not in _DEFAULT_SUBSTEPS:
+            raise ValueError(f"control must be 'velocity' or 'torque', got {self.control!r}")
+        if self.horizon < 1 or (self.substeps is not None and self.substeps < 1):
+            raise ValueError(f"horizon and substeps must be at least 1, got {self.horizon} and {self.substeps}")
+
+
+@dataclasses.dataclass(frozen=True)
+class VisualReacherConfig(PixelsConfig, ReacherConfig):
+    """Settings of the task and its pictures."""
+
+    depth_range: tuple[float, float] = (0.8, 1.1)
+    """Depths that bytes 0 and 255 stand for, m: 1.2 mm a step; the arm lies between .82 and 1.04 m."""
+
+    def __post_init__(self) -> None:
+        ReacherConfig.__post_init__(self)
+        PixelsConfig.__post_init__(self)
+
+
+class Reacher(GoalEnv):
+    """The task; what the agent sees of it is up to ``observer``."""
+
+    action_size = 2
+    camera = "above"
+    distance_unit = "m"
+
+    def __init__(
+        self, config: ReacherConfig, observer: Callable[[mujoco.MjModel], Callable[[mjx.Data], jax.Array]] | None = None
+    ):
+        """Builds the model.
+
+        Args:
+            config: The settings.
+            observer: Given the model, returns the function from a physics state to an observation. Default: `observe_arm`.
+        """
+        self.config = config
+        self.horizon = config.horizon
+        self.threshold = config.threshold
+        self.mj_model = mjx_model.load_model("reacher.xml")
+        self._substeps = config.substeps or _DEFAULT_SUBSTEPS[config.control]
+        self.control_period = self._substeps * float(self.mj_model.opt.timestep)
+        self._fingertip = self.mj_model.site("fingertip").id
+        self._model = mjx.put_model(self.mj_model)
+        mj_data = mujoco.MjData(self.mj_model)
+        mujoco.mj_forward(self.mj_model, mj_data)
+        self._start = mjx_model.start_data(self.mj_model, mj_data)
+        self._observer = observer(self.mj_model) if observer is not None else self.observe_arm
+
+    def reset(self, key: jax.Array) -> State:
+        start_range = self.config.start_range
+        start_key, _ = jax.random.split(key)
+        data = self.configuration(jax.random.uniform(start_key, (2,), jnp.float32, -start_range, start_range))
+        goal_data = self.sample_goal(key)
+        frame = self._observer(data)
+        obs = {"observation": frame, "achieved_goal": frame, "desired_goal": self._observer(goal_data)}
+        return self._measure(data, self._position(data), self._position(goal_data), obs)
+
+    def advance(self, state: State, action: jax.Array) -> State:
+        action = sanitize_action(action)
+        if self.config.control == "velocity":
+            data = state.data.replace(qvel=self.config.velocity_scale * action)
+        else:
+            data = state.data.replace(ctrl=action)
+        data = mjx_model.simulate(self._model, data, self._substeps)
+        return self._measure(data, self._position(data), state.goal_state, state.obs)
+
+    def observe(self, state: State) -> jax.Array:
+        return self._observer(state.data)
+
+    def observe_arm(self, data: mjx.Data) -> jax.Array:
+        """Cosines and sines of both joint angles, fingertip x and y (m), joint velocities (rad/s): [8] float32."""
+        return jnp.concatenate([jnp.cos(data.qpos), jnp.sin(data.qpos), self._position(data), data.qvel])
+
+    def sample_goal(self, key: jax.Array) -> mjx.Data:
+        """The configuration that the goal picture of ``reset(key)`` shows."""
+        _, goal_key = jax.random.split(key)
+        return self.configuration(jax.random.uniform(goal_key, (2,), jnp.float32, -2 * jnp.pi, 2 * jnp.pi))
+
+    def configuration(self, joint_angles: jax.Array) -> mjx.Data:
+        """The arm at rest with ``joint_angles`` [2] float32, rad."""
+        return mjx.kinematics(self._model, self._start.replace(qpos=joint_angles))
+
+    def _position(self, data: mjx.Data) -> jax.Array:
+        return data.site_xpos[self._fingertip, :2]
+
+
+def _visual(config: VisualReacherConfig) -> Reacher:
+    return Reacher(config, lambda mj_model: picture_observer(mj_model, Reacher.camera, config))
+
+
+register("Reacher", Reacher, ReacherConfig)
+register("VisualReacher", _visual, VisualReacherConfig)

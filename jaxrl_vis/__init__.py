@@ -1,0 +1,38 @@
+"""Trains robots to reach goals that are given as pictures.
+
+    config = jaxrl_vis.preset("fast", env="VisualFetchReach")
+    trainer = jaxrl_vis.make_trainer(config)
+    for report in trainer.run(): ...
+
+Importing the package imports no JAX; asking for the trainer does.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+# Public name -> the module that holds it, imported at first use.
+_HOMES = {
+    "Config": "jaxrl_vis.config",
+    "RequestError": "jaxrl_vis.config",
+    "preset": "jaxrl_vis.config",
+    "Trainer": "jaxrl_vis.trainer",
+    "make_trainer": "jaxrl_vis.trainer",
+}
+
+if TYPE_CHECKING:
+    from jaxrl_vis.config import Config, RequestError, preset
+    from jaxrl_vis.trainer import Trainer, make_trainer
+
+__all__ = ["Config", "RequestError", "Trainer", "__version__", "make_trainer", "preset"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,39 @@
+"""Measures one machine and keeps a record, so that a change can be told from noise and from another machine.
+
+Every benchmark varies the state of each environment, asserts that the results differ, warms up, waits for the device, repeats,
+and reports the median; compilation is timed apart. `record` keeps the figures and prints each change.
+"""
+
+import importlib
+from pathlib import Path
+from typing import Any
+
+from jaxrl_vis.bench.record import Measurement, compare_and_keep, write_json
+from jaxrl_vis.bench.settings import Settings
+
+BENCHMARKS = ("render", "physics", "env", "update", "train")
+
+
+def run(benchmark: str, results: Path | None = None, json: Path | None = None, **settings: Any) -> list[Measurement]:
+    """Runs one benchmark, prints and keeps its records.
+
+    Args:
+        benchmark: One of `BENCHMARKS`.
+        results: Folder of kept records; None for the checkout's own, or benchmarks/results under the current folder.
+        json: Also write this run's records here.
+        **settings: Fields of `Settings`.
+
+    Raises:
+        RequestError: A setting cannot be met.
+    """
+    measure = importlib.import_module(f"jaxrl_vis.bench.{benchmark}").measure
+    measurements = []
+    for measurement in measure(Settings(**settings).for_this_device()):
+        measurements.append(measurement)
+        compare_and_keep(benchmark, measurement, results)
+    if json is not None:
+        write_json(json, measurements)
+    return measurements
+
+
+__all__ = ["BENCHMARKS", "Measurement", "Settings", "run"]

@@ -1,0 +1,48 @@
+"""Whole episodes: reset with its goal picture, then physics and a picture at every step, under random actions."""
+
+from collections.abc import Iterator
+
+import jax
+
+from jaxrl_vis.bench.record import Measurement
+from jaxrl_vis.bench.settings import Settings
+from jaxrl_vis.bench.timing import assert_varied, compile_timed
+from jaxrl_vis.bench.timing import measure as measure_time
+from jaxrl_vis_envs.compilation import world_jit
+
+CPU_COUNTS = (16, 256)
+ACCELERATOR_COUNTS = (256, 1024, 4096, 8192)
+
+
+def measure(settings: Settings) -> Iterator[Measurement]:
+    """Environment steps per second, resets and goal pictures amortised over the horizon."""
+    env = settings.make_env()
+
+    def episode(key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        reset_key, action_key = jax.random.split(key)
+        state = env.reset(reset_key)
+        goal = state.obs["desired_goal"]  # type: ignore[index] - reset fills it in
+
+        def step(state, step_key):
+            action = jax.random.uniform(step_key, (env.action_size,), minval=-1.0, maxval=1.0)
+            state = env.advance(state, action)
+            return state, env.observe(state)
+
+        # Every frame is returned, so none can be left out of the program.
+        return jax.lax.scan(step, state.replace(obs=None), jax.random.split(action_key, env.horizon))[1], goal
+
+    for count in settings.counts(CPU_COUNTS, ACCELERATOR_COUNTS):
+        keys = jax.random.split(jax.random.key(3), count)
+        compiled, compile_s = compile_timed(world_jit(jax.vmap(episode, out_axes=(1, 0))), keys)
+        frames, goals = compiled(keys)
+        assert_varied(frames[-1], "last frames")
+        assert_varied(goals, "goals")
+        del frames, goals
+        timing = measure_time(lambda: compiled(keys), settings.repeats)  # noqa: B023 - called at once
+        yield Measurement(
+            name="env/steps",
+            value=count * env.horizon / timing.median_s,
+            unit="env-steps/s",
+            config={**settings.picture_config(), "envs": count},
+            details=timing.details(compile_s),
+        )

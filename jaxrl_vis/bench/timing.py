@@ -1,0 +1,67 @@
+"""Timing that means something: compiled ahead, warmed up, waited for, repeated."""
+
+import dataclasses
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+
+@dataclasses.dataclass(frozen=True)
+class Timing:
+    """Seconds of one call.
+
+    Attributes:
+        median_s: Of the repeats.
+        spread: (slowest - fastest) / median.
+        repeats: How many there were.
+    """
+
+    median_s: float
+    spread: float
+    repeats: int
+
+    def details(self, compile_s: float, **more: Any) -> dict[str, Any]:
+        """What a record keeps beside the figure."""
+        timing = {"repeats": self.repeats, "spread": round(self.spread, 4), "compile_s": round(compile_s, 2)}
+        return {**timing, **more}
+
+
+def compile_timed(jitted: Any, *arguments: Any) -> tuple[Any, float]:
+    """Compiles ahead of time: the program, and the seconds of tracing and compiling (few where a cache had it)."""
+    start = time.perf_counter()
+    compiled = jitted.lower(*arguments).compile()
+    return compiled, time.perf_counter() - start
+
+
+def measure(call: Callable[[], Any], repeats: int = 5, budget_s: float = 30.0) -> Timing:
+    """Times ``call`` after one untimed call, until its result is there.
+
+    Args:
+        call: The work; returns arrays.
+        repeats: Calls at most. At least three are made, or ``repeats`` if that is less.
+        budget_s: No further repeat starts after this many seconds.
+    """
+    jax.block_until_ready(call())
+    seconds: list[float] = []
+    while len(seconds) < repeats and (len(seconds) < 3 or sum(seconds) < budget_s):
+        start = time.perf_counter()
+        jax.block_until_ready(call())
+        seconds.append(time.perf_counter() - start)
+    median = statistics.median(seconds)
+    return Timing(median, (max(seconds) - min(seconds)) / median, len(seconds))
+
+
+def assert_varied(rows: Any, what: str) -> None:
+    """Asserts that [N, ...] ``rows`` are not copies of each other: more than half are unlike all others.
+
+    A benchmark whose environments all do the same measures one environment and a broadcast.
+    """
+    rows = np.asarray(rows)
+    count = rows.shape[0]
+    distinct = len({row.tobytes() for row in rows})
+    if count > 1 and distinct <= count // 2:
+        raise AssertionError(f"only {distinct} of {count} {what} differ: this would measure a broadcast")

@@ -1,0 +1,103 @@
+"""Gradient steps alone, sampling and relabelling from the replay included."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxrl_vis.bench import roofline
+from jaxrl_vis.bench.record import Measurement
+from jaxrl_vis.bench.settings import Settings
+from jaxrl_vis.bench.timing import Timing, assert_varied, compile_timed
+from jaxrl_vis.bench.timing import measure as measure_time
+from jaxrl_vis.config import Config, preset
+from jaxrl_vis.train_step import TrainStep, make_train_step
+from jaxrl_vis.types import LoopState, ReplayState
+
+
+def training_config(settings: Settings, **overrides: Any) -> Config:
+    """The preset of this device, with the benchmark's task, pictures and sizes."""
+    if settings.env.startswith("Visual"):
+        overrides |= {"image_size": settings.image_size, "pixels": settings.pixels}
+    if settings.batch_size is not None:
+        overrides["batch_size"] = settings.batch_size
+    return preset("fast" if settings.on_accelerator else "cpu", env=settings.env, **overrides)
+
+
+def fill_replay(replay: ReplayState, key: jax.Array) -> ReplayState:
+    """A replay full of noise: no two frames are equal, and every part of the memory is read.
+
+    Filled one episode at a time: random words for a whole replay of pictures would take several times its memory.
+    """
+
+    def noise(leaf: jax.Array, leaf_key: jax.Array) -> jax.Array:
+        def episode(_: None, episode_key: jax.Array) -> tuple[None, jax.Array]:
+            if leaf.dtype == jnp.uint8:
+                return None, jax.random.bits(episode_key, leaf.shape[1:], jnp.uint8)
+            return None, jax.random.uniform(episode_key, leaf.shape[1:], leaf.dtype, -1.0, 1.0)
+
+        return jax.lax.scan(episode, None, jax.random.split(leaf_key, leaf.shape[0]))[1]
+
+    leaves, structure = jax.tree.flatten(replay.episodes)
+    filled = [noise(leaf, leaf_key) for leaf, leaf_key in zip(leaves, jax.random.split(key, len(leaves)), strict=True)]
+    episodes = jax.tree.unflatten(structure, filled)
+    return replay.replace(episodes=episodes, size=jnp.full_like(replay.size, leaves[0].shape[0]))
+
+
+def start(program: TrainStep) -> LoopState:
+    """A fresh learner with a full replay: one seed."""
+    loop = program.init(jax.random.split(jax.random.key(0), 1))
+    fill = jax.jit(jax.vmap(fill_replay), donate_argnums=0)
+    return loop.replace(replay=fill(loop.replay, jax.random.split(jax.random.key(1), 1)))
+
+
+def time_updates(program: TrainStep, settings: Settings) -> tuple[Timing, float]:
+    """Seconds of one call of ``update_many``, and those of its compilation."""
+    loop = start(program)
+    keys = jax.random.split(jax.random.key(2), 1)
+    compiled, compile_s = compile_timed(program.update_many, loop.train, loop.replay, keys, loop.iteration)
+    assert_varied(loop.replay.episodes.frames[0, :64, 0], "frames of the replay")
+    train = loop.train
+    before = jax.device_get(train.actor)
+
+    def call() -> Any:
+        nonlocal train
+        train, metrics = compiled(train, loop.replay, keys, loop.iteration)
+        return train, metrics
+
+    timing = measure_time(call, settings.repeats)
+    after = jax.device_get(train.actor)
+    if all((old == new).all() for old, new in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True)):
+        raise AssertionError("the parameters did not move: no gradient step was taken")
+    return timing, compile_s
+
+
+def measure(settings: Settings) -> Iterator[Measurement]:
+    """Gradient steps per second, with the roofline beside."""
+    updates = 200 if settings.on_accelerator else 20
+    config = training_config(settings, updates_per_iteration=updates)
+    env = settings.make_env()
+    program = make_train_step(env, config)
+    timing, compile_s = time_updates(program, settings)
+    seconds = timing.median_s / updates
+
+    # One gradient step on its own, compiled for its cost alone.
+    single = make_train_step(env, config.replace(updates_per_iteration=1))
+    loop = jax.eval_shape(single.init, jax.random.split(jax.random.key(0), 1))
+    keys = jax.random.split(jax.random.key(2), 1)
+    counted = roofline.compiler_cost(single.update_many.lower(loop.train, loop.replay, keys, loop.iteration).compile())
+    params = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), (loop.train.actor, loop.train.critic))
+    least = roofline.least_cost(program.networks, params, config.batch_size)
+
+    dtype, device = str(program.networks.dtype), jax.devices()[0].device_kind
+    costs = {"roofline": roofline.describe(least, seconds, dtype, device)}
+    if counted is not None:
+        costs["compiler"] = roofline.describe(counted, seconds, dtype, device)
+    yield Measurement(
+        name="update/gradient_steps",
+        value=1.0 / seconds,
+        unit="updates/s",
+        config={**settings.picture_config(), "method": config.method, "batch_size": config.batch_size, "dtype": dtype},
+        details=timing.details(compile_s, replay_mb=round(program.replay_bytes / 1e6, 1), **costs),
+    )

@@ -1,0 +1,294 @@
+"""Checkpoints in two tiers, over orbax: a light one often, a full one rarely.
+
+    checkpoints/light/<iteration>/   train         networks, targets, optimisers, statistics: enough for eval and play
+    checkpoints/full/<iteration>/    train, rest   and the replay, keys and iteration: a resumed run repeats itself exactly
+
+Each also holds a manifest: names, shapes and types of all arrays, their checksums, and what the host has to remember. orbax
+makes a folder appear under its final name only when it is complete; the checksums find what went wrong later: without them, a
+flipped byte in a data file would be restored without a word. The newest two of each tier are kept.
+"""
+
+import contextlib
+import dataclasses
+import gc
+import logging
+import shutil
+import sys
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import orbax.checkpoint as ocp
+from orbax.checkpoint.checkpoint_managers import LatestN
+
+from jaxrl_vis.config import RequestError
+from jaxrl_vis.types import LoopState, TrainState
+
+LIGHT, FULL = "light", "full"
+SCHEMA = 1
+_KEPT = 2
+
+Arrays = dict[str, np.ndarray]
+
+
+class _Damaged(Exception):
+    """This checkpoint cannot be trusted. The message says why, in a few words."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Restored:
+    """What a checkpoint held.
+
+    Attributes:
+        tier: `LIGHT` or `FULL`.
+        iteration: Iterations that the run had done.
+        train: The learner, [S, ...].
+        loop: Everything; None from the light tier.
+        memo: What the caller gave to `Checkpoints.save` to remember.
+    """
+
+    tier: str
+    iteration: int
+    train: TrainState
+    loop: LoopState | None
+    memo: dict[str, Any]
+
+
+def named_leaves(tree: Any) -> dict[str, Any]:
+    """The leaves of a pytree by name, such as ``actor.params.Dense_0.kernel``."""
+    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in jax.tree.leaves_with_path(tree)}
+
+
+def to_host(tree: Any, copy: bool) -> Arrays:
+    """The leaves of a pytree as numpy arrays by name; typed keys as their words.
+
+    Args:
+        tree: Arrays on a device.
+        copy: False: on a CPU, look at the device's memory itself. Only until the arrays are donated, and whoever keeps such a
+            view makes the next donation a copy.
+    """
+
+    def convert(leaf: jax.Array) -> np.ndarray:
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            leaf = jax.random.key_data(leaf)
+        if copy or jax.default_backend() != "cpu":
+            return np.array(leaf)
+        try:
+            return np.from_dlpack(leaf)
+        except (BufferError, RuntimeError, TypeError):  # a type that numpy lacks, or several devices
+            return np.array(leaf)
+
+    return {name: convert(leaf) for name, leaf in named_leaves(tree).items()}
+
+
+def _checksum(array: np.ndarray) -> int:
+    return zlib.crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8))
+
+
+def _describe(arrays: Arrays) -> dict[str, list]:
+    return {name: [list(array.shape), str(array.dtype), _checksum(array)] for name, array in arrays.items()}
+
+
+def _rest(loop: LoopState) -> dict[str, Any]:
+    return {"replay": loop.replay, "key": loop.key, "iteration": loop.iteration}
+
+
+@contextlib.contextmanager
+def _hushed() -> Iterator[None]:
+    """Keeps orbax from printing pages about a checkpoint that we are about to describe in one line."""
+    absl, before = logging.getLogger("absl"), sys.unraisablehook
+    disabled = absl.disabled
+    absl.disabled, sys.unraisablehook = True, lambda _: None
+    try:
+        yield
+    finally:
+        gc.collect()  # abandoned coroutines complain when they are collected
+        absl.disabled, sys.unraisablehook = disabled, before
+
+
+class Checkpoints:
+    """The checkpoints of one run.
+
+    Args:
+        folder: Where both tiers lie; made when something is saved.
+        say: Called with one line about each checkpoint that cannot be used.
+        read_only: Promise to save nothing: nothing is created or cleaned up.
+    """
+
+    def __init__(self, folder: Path, say: Callable[[str], None] = print, read_only: bool = False):
+        self._folder = folder.resolve()  # orbax refuses relative names
+        self._say = say
+        self._read_only = read_only
+        self._managers: dict[str, ocp.CheckpointManager] = {}
+
+    def _manager(self, tier: str) -> ocp.CheckpointManager:
+        if tier not in self._managers:
+            options = ocp.CheckpointManagerOptions(
+                preservation_policy=None if self._read_only else LatestN(_KEPT),
+                cleanup_tmp_directories=not self._read_only,
+                read_only=self._read_only,
+                create=not self._read_only,
+            )
+            self._managers[tier] = ocp.CheckpointManager(self._folder / tier, options=options)
+        return self._managers[tier]
+
+    def iterations(self, tier: str) -> list[int]:
+        """Iterations of which ``tier`` has a checkpoint, ascending; damaged ones included."""
+        folder = self._folder / tier
+        if not folder.is_dir():
+            return []
+        return sorted(int(entry.name) for entry in folder.iterdir() if entry.is_dir() and entry.name.isdigit())
+
+    def newest(self) -> int | None:
+        """The newest iteration of either tier; None where there is no checkpoint."""
+        return max([*self.iterations(LIGHT), *self.iterations(FULL)], default=None)
+
+    def save_light(self, iteration: int, train: TrainState, memo: dict[str, Any]) -> None:
+        """Copies the learner to the host and writes it in the background; ``train`` may be donated as soon as this returns.
+
+        Args:
+            iteration: Iterations done.
+            train: The learner, [S, ...].
+            memo: Anything that JSON can hold.
+        """
+        self._save(LIGHT, iteration, {"train": to_host(train, copy=True)}, memo)
+
+    def save_full(self, iteration: int, loop: LoopState, memo: dict[str, Any]) -> None:
+        """Writes everything, and returns when it is on the disk: a second copy of the replay would need memory for two."""
+        items = {"train": to_host(loop.train, copy=False), "rest": to_host(_rest(loop), copy=False)}
+        self._save(FULL, iteration, items, memo)
+        self.wait()
+
+    def _save(self, tier: str, iteration: int, items: dict[str, Arrays], memo: dict[str, Any]) -> None:
+        manager = self._manager(tier)
+        manager.wait_until_finished()
+        if iteration in self.iterations(tier):  # orbax would quietly keep the old one
+            manager.delete(iteration)
+        described = {name: _describe(arrays) for name, arrays in items.items()}
+        manifest = {"schema": SCHEMA, "iteration": iteration, "items": described, "memo": memo}
+        arguments = {name: ocp.args.StandardSave(arrays) for name, arrays in items.items()}
+        arguments["manifest"] = ocp.args.JsonSave(manifest)
+        if not manager.save(iteration, args=ocp.args.Composite(**arguments), force=True):
+            raise RuntimeError(f"checkpoint {tier}/{iteration} was not written")
+
+    def wait(self) -> None:
+        """Returns when everything is on the disk."""
+        for manager in self._managers.values():
+            manager.wait_until_finished()
+
+    def close(self) -> None:
+        """`wait`, then lets go of orbax's threads."""
+        for manager in self._managers.values():
+            manager.close()
+        self._managers.clear()
+
+    def discard_after(self, iteration: int) -> None:
+        """Deletes the checkpoints after ``iteration``, which a resumed run writes again, and damaged ones among them."""
+        for tier in (LIGHT, FULL):
+            for later in self.iterations(tier):
+                if later > iteration:
+                    shutil.rmtree(self._folder / tier / str(later), ignore_errors=True)
+            if tier in self._managers:
+                self._managers.pop(tier).close()  # it remembers what it has seen
+
+    def restore_for_resume(self, template: LoopState) -> Restored | None:
+        """The newest good full checkpoint, or, where there is none, the newest good light one; None where there is neither.
+
+        Args:
+            template: Shapes and types of the loop state, as `jax.eval_shape` makes them.
+
+        Raises:
+            RequestError: A checkpoint has another structure.
+        """
+        return self._newest_good([(FULL, step) for step in _descending(self.iterations(FULL))], template, with_rest=True) or (
+            self._newest_good([(LIGHT, step) for step in _descending(self.iterations(LIGHT))], template, with_rest=False)
+        )
+
+    def restore_train(self, template: LoopState) -> Restored | None:
+        """The learner of the newest good checkpoint of either tier; None where there is none. See `restore_for_resume`."""
+        found = [(step, tier) for tier in (FULL, LIGHT) for step in self.iterations(tier)]
+        return self._newest_good([(tier, step) for step, tier in sorted(found, reverse=True)], template, with_rest=False)
+
+    def _newest_good(self, candidates: list[tuple[str, int]], template: LoopState, with_rest: bool) -> Restored | None:
+        for tier, iteration in candidates:
+            try:
+                return self._restore(tier, iteration, template, with_rest)
+            except _Damaged as damage:
+                self._say(f"checkpoint {tier}/{iteration} is damaged ({damage}); trying the one before")
+        return None
+
+    def _restore(self, tier: str, iteration: int, template: LoopState, with_rest: bool) -> Restored:
+        manifest = self._read(tier, iteration, {"manifest": ocp.args.JsonRestore()})["manifest"]
+        if not isinstance(manifest, dict) or not {"schema", "items", "memo"} <= set(manifest):
+            raise _Damaged("its manifest is incomplete")
+        templates = {"train": template.train} | ({"rest": _rest(template)} if with_rest else {})
+        specs = {name: _host_specs(tree) for name, tree in templates.items()}
+        where = self._folder / tier / str(iteration)
+        if manifest["schema"] != SCHEMA:
+            raise RequestError(f"{where} is of schema {manifest['schema']}, not {SCHEMA}: use the version that wrote it")
+        for name, spec in specs.items():
+            _check_structure(where, manifest["items"].get(name, {}), spec)
+        read = self._read(tier, iteration, {name: ocp.args.StandardRestore(spec) for name, spec in specs.items()})
+        trees = {}
+        for name, tree in templates.items():
+            for leaf_name, array in to_host(read[name], copy=False).items():
+                if _checksum(array) != manifest["items"][name][leaf_name][2]:
+                    raise _Damaged(f"wrong checksum of {leaf_name}")
+            trees[name] = _rebuild(tree, read[name])
+        loop = LoopState(train=trees["train"], **trees["rest"]) if with_rest else None
+        return Restored(tier, iteration, trees["train"], loop, manifest["memo"])
+
+    def _read(self, tier: str, iteration: int, arguments: dict[str, Any]) -> Any:
+        with _hushed():
+            try:
+                return self._manager(tier).restore(iteration, args=ocp.args.Composite(**arguments))
+            # orbax and tensorstore report damage as whatever exception they run into, plain Exception included.
+            except Exception as error:
+                text = " ".join(str(error).split())[:80]
+                raise _Damaged(f"{type(error).__name__}: {text}") from None
+
+
+def _descending(steps: list[int]) -> list[int]:
+    return sorted(steps, reverse=True)
+
+
+def _host_specs(tree: Any) -> dict[str, jax.ShapeDtypeStruct]:
+    """What `to_host` makes of a tree with these shapes, placed on the first device."""
+    device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+
+    def convert(leaf: Any) -> jax.ShapeDtypeStruct:
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            leaf = jax.eval_shape(jax.random.key_data, leaf)
+        return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=device)
+
+    return {name: convert(leaf) for name, leaf in named_leaves(tree).items()}
+
+
+def _rebuild(template: Any, arrays: dict[str, jax.Array]) -> Any:
+    """The inverse of `to_host`: a tree like ``template``."""
+
+    def convert(path: Any, leaf: Any) -> jax.Array:
+        array = arrays[jax.tree_util.keystr(path, simple=True, separator=".")]
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            # The default kind, as `Trainer.run_keys` makes them; another one has another number of words, noticed before this.
+            return jax.random.wrap_key_data(array)
+        return array
+
+    return jax.tree.map_with_path(convert, template)
+
+
+def _check_structure(where: Path, saved: dict[str, list], expected: dict[str, jax.ShapeDtypeStruct]) -> None:
+    """Raises RequestError, naming the first differences, where a checkpoint has other arrays than this program."""
+    differences = []
+    for name in sorted(set(saved) | set(expected)):
+        there = f"{saved[name][1]}{saved[name][0]}" if name in saved else "nothing"
+        here = f"{expected[name].dtype}{list(expected[name].shape)}" if name in expected else "nothing"
+        if there != here:
+            differences.append(f"{name} is {there} there and {here} here")
+    if differences:
+        shown = "; ".join(differences[:3]) + (f"; and {len(differences) - 3} more" if len(differences) > 3 else "")
+        raise RequestError(f"{where} has another structure, so another version wrote it: {shown}; use that, or --overwrite")

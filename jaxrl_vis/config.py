@@ -1,0 +1,292 @@
+"""What a training run is made of: one frozen record, four presets, and checks that say what is wrong in one line.
+
+Imports no JAX, so that the command line can print its help at once.
+"""
+
+import dataclasses
+import difflib
+import math
+from typing import Any, Literal, Self
+
+Method = Literal["oracle", "indicator", "indicator_balance_filter"]
+METHODS: tuple[str, ...] = ("oracle", "indicator", "indicator_balance_filter")
+PIXELS: tuple[str, ...] = ("rgbd", "rgb", "depth")
+DTYPES: tuple[str, ...] = ("auto", "float32", "bfloat16")
+
+
+class RequestError(ValueError):
+    """The request was wrong. The message is one line: what is wrong, and how to mend it. The command line exits with 2."""
+
+
+def nearest(word: str, choices: list[str] | tuple[str, ...]) -> str:
+    """'; did you mean X or Y?' for a misspelt ``word``, or a list of all ``choices`` when none is near."""
+    lowered = {choice.lower(): choice for choice in choices}
+    found = [lowered[match] for match in difflib.get_close_matches(word.lower(), list(lowered), n=3, cutoff=0.5)]
+    return f"; did you mean {' or '.join(found)}?" if found else f"; choose one of {', '.join(choices)}"
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """One training run. Counts are per seed; lengths of time are in control steps unless a unit is given."""
+
+    env: str = "VisualFetchReach"
+    """The task; `jaxrl-vis envs` lists them."""
+    preset: str = "fast"
+    """The preset that this configuration started from; kept for the record."""
+    method: Method = "oracle"
+    """Where rewards come from: the true state (oracle), or equality of pictures, without or with balancing and filtering."""
+    seed: int = 0
+    """First seed."""
+    seeds: int = 1
+    """How many seeds to train side by side in one program: seed, seed + 1, ..."""
+
+    # -- The world
+    pixels: Literal["rgbd", "rgb", "depth"] = "rgbd"
+    """Channels of the picture."""
+    image_size: int = 64
+    """Height and width of the picture, in pixels."""
+    num_envs: int = 80
+    """Environments in a rollout; each plays one episode per iteration."""
+
+    # -- How long, and how often to learn
+    env_steps: int = 200_000
+    """Environment steps to train for; rounded up to whole iterations of num_envs * horizon."""
+    updates_per_iteration: int = 40
+    """Gradient steps after each rollout."""
+    batch_size: int = 512
+    """Transitions in a gradient step."""
+    replay_transitions: int = 200_000
+    """Replay capacity; rounded up to whole rollouts."""
+
+    # -- Goal relabelling and reward (thesis, section 5.1.4)
+    relabel_probability: float = 0.9
+    """p1: share of samples whose goal is replaced by an observation of the same episode."""
+    balance_probability: float | None = None
+    """p2: share of those that take the very next observation, a sure positive. None: 0.5 for balancing methods, else 0."""
+    filter_threshold: float | None = None
+    """q0: negatives with Q above it are taken as false and dropped. None: the middle of its band for filtering methods."""
+    reward_positive: float | None = None
+    """R+. None: 0 for the oracle, 1 for indicator methods."""
+    reward_negative: float | None = None
+    """R-. None: -1."""
+
+    # -- DDPG
+    discount: float | None = None
+    """gamma. None: 1 - 1/horizon."""
+    actor_learning_rate: float = 1e-3
+    """Adam step size of the actor."""
+    critic_learning_rate: float = 1e-3
+    """Adam step size of the critic."""
+    target_decay: float = 0.98
+    """Share of a target network that stays at each target update."""
+    target_update_interval: int = 40
+    """Gradient steps between target updates."""
+    action_penalty: float = 1.0
+    """Weight of the mean squared action in the actor's loss."""
+    clip_targets_above: bool = True
+    """Clip critic targets at R+/(1-gamma) too (they are always clipped at R-/(1-gamma) below)."""
+    random_action_probability: float = 0.3
+    """Exploration: share of actions drawn uniformly."""
+    action_noise: float = 0.2
+    """Exploration: standard deviation of the Gaussian noise on the other actions."""
+
+    # -- Networks
+    encoder_filters: tuple[int, ...] = (16, 32, 64, 64)
+    """Output channels of the 2x2 stride-2 convolutions."""
+    latent_size: int = 512
+    """Size of an encoded picture."""
+    hidden_sizes: tuple[int, ...] = (256, 256, 256)
+    """Hidden layers of the actor's and the critic's heads."""
+    compute_dtype: Literal["auto", "float32", "bfloat16"] = "auto"
+    """Arithmetic of the networks; parameters and losses are float32. auto: bfloat16 on accelerators."""
+    normalizer_floor: float = 0.01
+    """Smallest standard deviation that an observation is divided by, in its own unit (grey levels for pictures)."""
+    normalizer_clip: float = 5.0
+    """Normalised observations are clipped to plus and minus this."""
+
+    # -- Looking and saving
+    eval_interval: int = 5
+    """Iterations between evaluations; one more comes at the end."""
+    eval_episodes: int = 1000
+    """Episodes of an evaluation, on keys of their own."""
+    checkpoint_interval: int = 5
+    """Iterations between light checkpoints (networks and optimisers; enough for eval and play)."""
+    full_checkpoint_interval: int = 0
+    """Iterations between full checkpoints (with the replay; resume is exact). 0: only at the end of an interrupted run."""
+
+    def replace(self, **changes: Any) -> Self:
+        """A copy with some fields changed.
+
+        Raises:
+            RequestError: A name is not a field.
+        """
+        names = [field.name for field in dataclasses.fields(self)]
+        for name in changes:
+            if name not in names:
+                raise RequestError(f"unknown option {name!r}{nearest(name, names)}")
+        return dataclasses.replace(self, **changes)
+
+
+@dataclasses.dataclass(frozen=True)
+class Resolved:
+    """What follows from a `Config` and the task's horizon: no None left.
+
+    Attributes:
+        horizon: T, control steps in an episode.
+        discount: gamma.
+        reward_positive, reward_negative: R+ and R-.
+        balance_probability: p2.
+        filter_threshold: q0; infinity where the method does not filter.
+        critic_output_bias: What the critic says before it has learned anything.
+        target_minimum, target_maximum: Bounds of the critic's targets.
+    """
+
+    horizon: int
+    discount: float
+    reward_positive: float
+    reward_negative: float
+    balance_probability: float
+    filter_threshold: float
+    critic_output_bias: float
+    target_minimum: float
+    target_maximum: float
+
+
+def resolve(config: Config, horizon: int) -> Resolved:
+    """Fills in the defaults that depend on the method and the horizon.
+
+    The filter's band is R- + gamma R+/(1-gamma) < q0 < R+/(1-gamma) (thesis, section 5.1.4); its middle is the default. A critic
+    that starts at or above q0 would drop every negative before it has learned from one, and so never come down. With rewards
+    0/-1 a fresh critic (Q near 0) does: there it starts at R-/(1-gamma), the least value any state can have.
+
+    Raises:
+        RequestError: The discount or the filter threshold lies outside its range.
+    """
+    indicator, filtering = config.method.startswith("indicator"), config.method == "indicator_balance_filter"
+    discount = 1.0 - 1.0 / horizon if config.discount is None else config.discount
+    if not 0.0 <= discount < 1.0:
+        raise RequestError(f"discount must lie in [0, 1), not {discount}; leave it out for 1 - 1/horizon")
+    positive = (1.0 if indicator else 0.0) if config.reward_positive is None else config.reward_positive
+    negative = -1.0 if config.reward_negative is None else config.reward_negative
+    if positive <= negative:
+        raise RequestError(f"reward_positive ({positive}) must be larger than reward_negative ({negative})")
+    best, worst = positive / (1.0 - discount), negative / (1.0 - discount)
+    low = negative + discount * best
+    threshold = math.inf
+    if filtering:
+        threshold = (low + best) / 2 if config.filter_threshold is None else config.filter_threshold
+    if config.filter_threshold is not None:
+        if not filtering:
+            raise RequestError("filter_threshold needs --method indicator_balance_filter")
+        if not low < threshold < best:
+            raise RequestError(f"filter_threshold {threshold} lies outside its band ({low:g}, {best:g})")
+    balance = 0.5 if filtering else 0.0
+    return Resolved(
+        horizon=horizon,
+        discount=discount,
+        reward_positive=positive,
+        reward_negative=negative,
+        balance_probability=balance if config.balance_probability is None else config.balance_probability,
+        filter_threshold=threshold,
+        critic_output_bias=worst if threshold <= 0.0 else 0.0,
+        target_minimum=worst,
+        target_maximum=best if config.clip_targets_above else math.inf,
+    )
+
+
+_PAPER = Config(
+    preset="paper",
+    image_size=100,
+    num_envs=80,
+    env_steps=800_000,
+    updates_per_iteration=40,
+    batch_size=512,
+    replay_transitions=40_000,
+    target_decay=0.98,
+    target_update_interval=40,
+    clip_targets_above=False,
+    eval_interval=5,
+)
+
+_FAST = Config(
+    preset="fast",
+    num_envs=100,
+    env_steps=200_000,
+    updates_per_iteration=200,
+    batch_size=512,
+    replay_transitions=200_000,
+    target_decay=0.99,
+    target_update_interval=1,
+    eval_interval=2,
+)
+
+_CPU = _FAST.replace(
+    preset="cpu",
+    pixels="depth",
+    image_size=32,
+    num_envs=64,
+    env_steps=64_000,
+    updates_per_iteration=200,
+    batch_size=128,
+    replay_transitions=64_000,
+    latent_size=128,
+    hidden_sizes=(256, 256),
+    eval_interval=5,
+    eval_episodes=256,
+)
+
+_DEBUG = _CPU.replace(
+    preset="debug",
+    image_size=16,
+    num_envs=4,
+    env_steps=800,
+    updates_per_iteration=4,
+    batch_size=16,
+    replay_transitions=800,
+    encoder_filters=(8, 8),
+    latent_size=16,
+    hidden_sizes=(32,),
+    eval_interval=2,
+    eval_episodes=8,
+    checkpoint_interval=2,
+)
+
+PRESETS: dict[str, Config] = {config.preset: config for config in (_PAPER, _FAST, _CPU, _DEBUG)}
+"""``paper``: the authors' release. ``fast``: ours. ``cpu``: what two cores can do in minutes. ``debug``: seconds, learns nothing."""
+
+
+def preset(name: str, **overrides: Any) -> Config:
+    """A named configuration with some fields changed.
+
+    Raises:
+        RequestError: There is no such preset, or no such field.
+    """
+    if name not in PRESETS:
+        raise RequestError(f"unknown preset {name!r}{nearest(name, list(PRESETS))}")
+    return PRESETS[name].replace(**overrides)
+
+
+def validate(config: Config) -> Config:
+    """Returns ``config`` if it makes sense in itself; what depends on the task is checked where the task is known.
+
+    Raises:
+        RequestError: A field is out of range. The message names the field and its value.
+    """
+    for name, choices in (("method", METHODS), ("pixels", PIXELS), ("compute_dtype", DTYPES)):
+        value = getattr(config, name)
+        if value not in choices:
+            raise RequestError(f"unknown {name} {value!r}{nearest(str(value), choices)}")
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if field.type is int and field.name not in ("seed", "full_checkpoint_interval") and value < 1:
+            raise RequestError(f"{field.name} must be at least 1, not {value}")
+    for name in ("relabel_probability", "balance_probability", "random_action_probability", "target_decay"):
+        value = getattr(config, name)
+        if value is not None and not 0.0 <= value <= 1.0:
+            raise RequestError(f"{name} is a share and must lie in [0, 1], not {value}")
+    for name in ("actor_learning_rate", "critic_learning_rate", "normalizer_floor", "normalizer_clip"):
+        if not getattr(config, name) > 0.0:
+            raise RequestError(f"{name} must be positive, not {getattr(config, name)}")
+    if config.seed < 0 or config.full_checkpoint_interval < 0:
+        raise RequestError(f"seed ({config.seed}) and full_checkpoint_interval ({config.full_checkpoint_interval}) must be >= 0")
+    return config

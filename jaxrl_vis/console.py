@@ -1,0 +1,97 @@
+"""What a run says while it runs: a progress bar on a terminal, plain lines everywhere else."""
+
+import statistics
+import sys
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+
+def show_shares(values: Sequence[float]) -> str:
+    """``0.93`` for one seed; for several their median, then each: ``0.93 (0.91 0.93 0.96)``."""
+    median = f"{statistics.median(values):.2f}"
+    return median if len(values) == 1 else f"{median} ({' '.join(f'{value:.2f}' for value in values)})"
+
+
+def show_seconds(seconds: float) -> str:
+    """``42 s``, ``3 min 5 s`` or ``2 h 10 min``."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{seconds:.1f} s" if seconds < 10 else f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60} s"
+    return f"{whole // 3600} h {whole % 3600 // 60} min"
+
+
+class RunConsole:
+    """Shows a run's progress. A bar appears only where stdout is a terminal; lines are printed above it.
+
+    Args:
+        total: Iterations of the whole run.
+        done: Iterations that an earlier part of the run has done.
+        quiet: Say nothing at all.
+    """
+
+    def __init__(self, quiet: bool = False):
+        self._quiet = quiet
+        self._bar: Progress | None = None
+        self._task = None
+
+    @property
+    def has_bar(self) -> bool:
+        """Whether a progress bar is on the screen."""
+        return self._bar is not None
+
+    def say(self, line: str) -> None:
+        """Prints one line."""
+        if self._quiet:
+            return
+        if self._bar is not None:
+            self._bar.console.print(line, markup=False, highlight=False, soft_wrap=True)
+        else:
+            print(line, flush=True)
+
+    def start(self, total: int, done: int) -> None:
+        """Shows the bar, on a terminal."""
+        if self._quiet or not sys.stdout.isatty():
+            return
+        columns = (
+            TextColumn("[bold]training"),
+            BarColumn(bar_width=None),
+            MofNCompleteColumn(),
+            TextColumn("success [bold green]{task.fields[success]}"),
+            TextColumn("distance {task.fields[distance]}"),
+            TextColumn("{task.fields[speed]} steps/s"),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+        )
+        self._bar = Progress(*columns, console=Console(), refresh_per_second=4)
+        self._bar.start()
+        self._task = self._bar.add_task("training", total=total, completed=done, success="-", distance="-", speed="-")
+
+    def advance(self, done: int, steps_per_second: float) -> None:
+        """Moves the bar."""
+        if self._bar is not None and self._task is not None:
+            self._bar.update(self._task, completed=done, speed=f"{steps_per_second:,.0f}")
+
+    def evaluated(self, success: Sequence[float], distance: Sequence[float], unit: str) -> None:
+        """Shows the latest evaluation beside the bar."""
+        if self._bar is not None and self._task is not None:
+            shown = f"{statistics.median(distance):.3f} {unit}"
+            self._bar.update(self._task, success=f"{statistics.median(success):.2f}", distance=shown)
+
+    def stop(self) -> None:
+        """Takes the bar away."""
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+        self.stop()

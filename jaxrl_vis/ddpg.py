@@ -1,0 +1,128 @@
+"""Deep deterministic policy gradient with goals (Lillicrap et al., 2016), one gradient step as one pure function.
+
+Four networks read three pictures (observation, goal, next observation). Each picture is normalised and ordered once, and each
+network encodes what it needs in one pass:
+
+    critic, actor (online, with gradient)   observation, goal
+    their targets                           goal, next observation
+
+The actor's loss values its actions with the critic's latents from the critic's own forward pass: the actor cannot change them.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from jaxrl_vis import losses, normalizer
+from jaxrl_vis.config import Config, Resolved
+from jaxrl_vis.networks import Networks
+from jaxrl_vis.types import Batch, Metrics, Params, TrainState
+
+
+class Algorithm(NamedTuple):
+    """A learner. Pure; `TrainState` is a pytree.
+
+    Attributes:
+        init: key -> TrainState.
+        update: (TrainState, Batch, reward [B] float32) -> (TrainState, metrics of [] float32).
+        act: (TrainState, observation latent inputs...) see `Policy`.
+    """
+
+    init: Callable[[jax.Array], TrainState]
+    update: Callable[[TrainState, Batch, jax.Array], tuple[TrainState, Metrics]]
+
+
+def make_ddpg(networks: Networks, config: Config, resolved: Resolved) -> Algorithm:
+    """DDPG for these networks.
+
+    Args:
+        networks: What the parameters mean.
+        config: Learning rates, target decay, action penalty.
+        resolved: Discount, bounds of the targets, filter threshold.
+    """
+    actor_optimizer = optax.adam(config.actor_learning_rate)
+    critic_optimizer = optax.adam(config.critic_learning_rate)
+
+    def init(key: jax.Array) -> TrainState:
+        actor_key, critic_key = jax.random.split(key)
+        actor, critic = networks.init_actor(actor_key), networks.init_critic(critic_key)
+        return TrainState(
+            actor=actor,
+            critic=critic,
+            # Copies: a donated buffer must not appear twice.
+            target_actor=jax.tree.map(jnp.copy, actor),
+            target_critic=jax.tree.map(jnp.copy, critic),
+            actor_optimizer=actor_optimizer.init(actor),
+            critic_optimizer=critic_optimizer.init(critic),
+            normalizer=normalizer.init(networks.observation_spec),
+            updates=jnp.zeros((), jnp.int32),
+        )
+
+    def encode_pair(params: Params, inputs: jax.Array) -> tuple[jax.Array, jax.Array]:
+        first, second = jnp.split(networks.encode(params, inputs), 2)
+        return first, second
+
+    def critic_loss(critic: Params, inputs: jax.Array, action: jax.Array, reward: jax.Array, target: jax.Array):
+        observation, goal = encode_pair(critic, inputs)
+        value = networks.value(critic, observation, goal, action)
+        keep = losses.keep_mask(reward, value, resolved.reward_negative, resolved.filter_threshold)
+        loss = losses.critic_loss(value, target, keep)
+        return loss, (observation, goal, value, keep)
+
+    def actor_loss(actor: Params, critic: Params, inputs: jax.Array, critic_latents: tuple[jax.Array, jax.Array]):
+        action = networks.act(actor, *encode_pair(actor, inputs))
+        value = networks.value(critic, *critic_latents, action)
+        return losses.actor_loss(value, action, config.action_penalty), action
+
+    def update(state: TrainState, batch: Batch, reward: jax.Array) -> tuple[TrainState, Metrics]:
+        size = reward.shape[0]
+        frames = jnp.concatenate([batch.observation_t, batch.goal, batch.observation_tp1])
+        inputs = networks.prepare(state.normalizer, frames)
+        now, after = inputs[: 2 * size], inputs[size:]  # (observation, goal) and (goal, next observation)
+
+        target_goal, target_observation = encode_pair(state.target_actor, after)
+        action_tp1 = networks.act(state.target_actor, target_observation, target_goal)
+        target_goal, target_observation = encode_pair(state.target_critic, after)
+        value_tp1 = networks.value(state.target_critic, target_observation, target_goal, action_tp1)
+        target = losses.td_target(
+            reward, value_tp1, resolved.discount, resolved.target_minimum, resolved.target_maximum
+        )
+
+        (critic_error, (observation, goal, value, keep)), critic_gradient = jax.value_and_grad(critic_loss, has_aux=True)(
+            state.critic, now, batch.action, reward, target
+        )
+        (policy_loss, action), actor_gradient = jax.value_and_grad(actor_loss, has_aux=True)(
+            state.actor, state.critic, now, (observation, goal)
+        )
+
+        critic_change, critic_moments = critic_optimizer.update(critic_gradient, state.critic_optimizer)
+        actor_change, actor_moments = actor_optimizer.update(actor_gradient, state.actor_optimizer)
+        actor = optax.apply_updates(state.actor, actor_change)
+        critic = optax.apply_updates(state.critic, critic_change)
+        updates = state.updates + 1
+        follow = jnp.where(updates % config.target_update_interval == 0, 1.0 - config.target_decay, 0.0)
+        state = state.replace(
+            actor=actor,
+            critic=critic,
+            target_actor=optax.incremental_update(actor, state.target_actor, follow),
+            target_critic=optax.incremental_update(critic, state.target_critic, follow),
+            actor_optimizer=actor_moments,
+            critic_optimizer=critic_moments,
+            updates=updates,
+        )
+        positive = reward == resolved.reward_positive
+        metrics = {
+            "train/critic_loss": critic_error,
+            "train/actor_loss": policy_loss,
+            "train/value": jnp.mean(value),
+            "train/action_size": jnp.sqrt(jnp.mean(jnp.square(action))),
+            "train/positive_share": jnp.mean(positive.astype(jnp.float32)),
+            # Of the negatives, since only those can be dropped.
+            "train/filtered_share": jnp.sum(1.0 - keep) / jnp.maximum(jnp.sum(1.0 - positive), 1.0),
+        }
+        return state, metrics
+
+    return Algorithm(init=init, update=update)

@@ -1,0 +1,117 @@
+"""Says whether this installation works: one line a check, and the mend where one fails."""
+
+import contextlib
+import importlib
+import importlib.metadata
+import io
+import os
+import platform
+import time
+from collections.abc import Callable
+
+PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy")
+
+
+def versions() -> str:
+    """Versions of Python and of the packages that matter."""
+    found = [f"Python {platform.python_version()}"]
+    return ", ".join(found + [f"{name} {importlib.metadata.version(name)}" for name in PACKAGES])
+
+
+def devices() -> str:
+    """What JAX runs on."""
+    import jax
+
+    kinds: dict[str, int] = {}
+    for device in jax.devices():
+        kinds[device.device_kind] = kinds.get(device.device_kind, 0) + 1
+    return f"{jax.default_backend()}: " + ", ".join(f"{count} x {kind}" for kind, count in kinds.items())
+
+
+def memory() -> str:
+    """Bytes of the host and of the first device."""
+    import jax
+
+    host = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 0
+    text = f"host {host / 2**30:.1f} GiB" if host else "host unknown"
+    limit = (jax.devices()[0].memory_stats() or {}).get("bytes_limit")
+    return text + (f", device {limit / 2**30:.1f} GiB usable" if limit else "")
+
+
+def compilation_cache() -> str:
+    """The folder where compiled programs are kept, and whether it can be written."""
+    import jax
+
+    from jaxrl_vis import trainer
+
+    trainer.enable_compilation_cache()
+    folder = jax.config.jax_compilation_cache_dir
+    if not folder:
+        return "off: every start compiles anew"
+    os.makedirs(folder, exist_ok=True)
+    if not os.access(folder, os.W_OK):
+        raise PermissionError(f"{folder} cannot be written; set JAX_COMPILATION_CACHE_DIR to a folder that can")
+    return folder
+
+
+def physics() -> str:
+    """Compiles and takes one control step."""
+    import jax
+    import jax.numpy as jnp
+
+    import jaxrl_vis_envs
+    from jaxrl_vis_envs.compilation import world_jit
+
+    with contextlib.redirect_stdout(io.StringIO()):  # it tells stdout that Warp is missing, which nothing here uses
+        importlib.import_module("mujoco.mjx")
+    env = jaxrl_vis_envs.make("FetchReach")
+    start = time.perf_counter()
+    state = world_jit(env.reset)(jax.random.key(0))
+    state = world_jit(env.advance)(state, jnp.full((env.action_size,), 0.5, jnp.float32))
+    if not bool(jnp.isfinite(state.achieved_state).all()):
+        raise FloatingPointError("one physics step gave a number that is not finite")
+    return f"one step of {env.name} in {time.perf_counter() - start:.1f} s, compilation included"
+
+
+def camera() -> str:
+    """Compiles and draws one picture, and checks that it shows something."""
+    import jax
+
+    import jaxrl_vis_envs
+    from jaxrl_vis_envs.compilation import world_jit
+
+    env = jaxrl_vis_envs.make("VisualFetchReach", image_size=32)
+    start = time.perf_counter()
+    obs = world_jit(lambda key: env.reset(key).obs)(jax.random.key(0))
+    frame, goal = obs["observation"], obs["desired_goal"]
+    if int(frame.max()) == int(frame.min()):
+        raise ValueError("the picture is empty")
+    if bool((frame == goal).all()):
+        raise ValueError("the start's picture equals the goal's")
+    return (
+        f"{'x'.join(map(str, frame.shape))} picture of {env.name} in {time.perf_counter() - start:.1f} s, compilation included"
+    )
+
+
+CHECKS: tuple[tuple[str, Callable[[], str]], ...] = (
+    ("versions", versions),
+    ("devices", devices),
+    ("memory", memory),
+    ("compile cache", compilation_cache),
+    ("physics", physics),
+    ("camera", camera),
+)
+
+
+def main() -> int:
+    """Runs every check, whatever the earlier ones said; 1 where one fails."""
+    failures = 0
+    for name, check in CHECKS:
+        try:
+            verdict, text = "ok  ", check()
+        except Exception as error:  # noqa: BLE001 - a doctor reports whatever is wrong
+            failures += 1
+            verdict, text = "FAIL", f"{type(error).__name__}: {' '.join(str(error).split())}"
+        print(f"{verdict}  {name:14} {text}", flush=True)
+    print("all is well" if not failures else f"{failures} of {len(CHECKS)} checks failed")
+    return 1 if failures else 0

@@ -1,0 +1,40 @@
+"""The losses of DDPG with goals, as pure functions of arrays (Lillicrap et al., 2016; thesis, section 5.1).
+
+Subscripts are time: ``value_t`` belongs to the state before the action, ``value_tp1`` to the one after it.
+"""
+
+import jax
+import jax.numpy as jnp
+
+
+def td_target(
+    reward_t: jax.Array, value_tp1: jax.Array, discount: float, minimum: float = -jnp.inf, maximum: float = jnp.inf
+) -> jax.Array:
+    """r + gamma Q'(s', pi'(s')) clipped to what a sum of rewards can be: [B] float32, without gradient.
+
+    Episodes end by running out of time, never by a terminal state, so the discount is never zeroed.
+    """
+    return jax.lax.stop_gradient(jnp.clip(reward_t + discount * value_tp1, minimum, maximum))
+
+
+def keep_mask(reward_t: jax.Array, value_t: jax.Array, reward_negative: float, threshold: float) -> jax.Array:
+    """1 for transitions to learn from, 0 for negatives whose value says that they are false (thesis, section 5.1.4): [B] float32.
+
+    Args:
+        reward_t: [B] rewards.
+        value_t: [B] the online critic's values of the same transitions.
+        reward_negative: R-.
+        threshold: q0; infinity keeps everything.
+    """
+    false_negative = (reward_t == reward_negative) & (value_t > threshold)
+    return jax.lax.stop_gradient(1.0 - false_negative.astype(jnp.float32))
+
+
+def critic_loss(value_t: jax.Array, target: jax.Array, keep: jax.Array) -> jax.Array:
+    """Mean squared temporal-difference error over the transitions with ``keep`` 1: [] float32; 0 where there are none."""
+    return jnp.sum(keep * jnp.square(value_t - target)) / jnp.maximum(jnp.sum(keep), 1.0)
+
+
+def actor_loss(value_t: jax.Array, action: jax.Array, action_penalty: float) -> jax.Array:
+    """Minus the mean value of the policy's own actions [B, A], plus their weighted mean square: [] float32."""
+    return -jnp.mean(value_t) + action_penalty * jnp.mean(jnp.square(action))

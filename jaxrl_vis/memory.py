@@ -1,0 +1,133 @@
+"""Will the run fit? Asked before anything is allocated, because running out of memory an hour later is no answer."""
+
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from jaxrl_vis.config import Config, RequestError
+
+# What stays unclaimed: XLA's workspaces and the allocator's gaps on an accelerator, the program and its libraries on a host.
+_SLACK_BYTES = 256 * 2**20
+
+# Copies of one rollout that live beside the replay: the scan's frames in time-major order, then in the replay's order, and the
+# floats of a part of them on the way through the networks.
+_ROLLOUT_COPIES = 3
+
+# Copies of the parameters and optimiser states: gradients, updates, and what XLA does not write in place.
+_TRAIN_COPIES = 2
+
+
+def tree_bytes(shapes: Any) -> int:
+    """Bytes of all arrays (or their shapes) in a pytree; typed keys count as their words."""
+
+    def size(leaf: Any) -> int:
+        item = 8 if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf.dtype.itemsize
+        return math.prod(leaf.shape) * item
+
+    return sum(size(leaf) for leaf in jax.tree.leaves(shapes))
+
+
+def available_bytes() -> int | None:
+    """Bytes that the first device can still give, or, for a CPU, that the host can; None where nobody says."""
+    device = jax.devices()[0]
+    if device.platform != "cpu":
+        statistics = device.memory_stats() or {}
+        if "bytes_limit" not in statistics:
+            return None
+        return int(statistics["bytes_limit"] - statistics.get("bytes_in_use", 0))
+    try:
+        for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
+            if line.startswith("MemAvailable:"):
+                return min(int(line.split()[1]) * 1024, _container_bytes())
+    except (OSError, ValueError, IndexError):
+        pass
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, OSError, ValueError):
+        return None
+
+
+def _container_bytes() -> int:
+    """What a container's limit (cgroup version 2) leaves; a very large number where there is none."""
+    group = Path("/sys/fs/cgroup")
+    try:
+        limit = (group / "memory.max").read_text(encoding="ascii").strip()
+        used = int((group / "memory.current").read_text(encoding="ascii"))
+        # Cached files count as used, but give way.
+        statistics = dict(line.split() for line in (group / "memory.stat").read_text(encoding="ascii").splitlines())
+        return int(limit) - used + int(statistics.get("inactive_file", 0))
+    except (OSError, ValueError):
+        return 2**62
+
+
+def show_bytes(count: float) -> str:
+    """``1.5 GiB`` and the like."""
+    return f"{count / 2**30:.1f} GiB" if count >= 2**30 / 10 else f"{count / 2**20:.1f} MiB"
+
+
+def check_memory(config: Config, loop_shapes: Any, replay_bytes: int, steps_per_iteration: int) -> str:
+    """Compares what a run needs with what there is.
+
+    Args:
+        config: The run.
+        loop_shapes: The loop state's shapes, all seeds.
+        replay_bytes: Of one seed's replay.
+        steps_per_iteration: Environment steps of one seed in an iteration; the replay's capacity is a multiple of it.
+
+    Returns:
+        A line for the reader, such as ``replay 0.3 GiB of 22.0 GiB``.
+
+    Raises:
+        RequestError: It does not fit. Says what would.
+    """
+    capacity = math.ceil(config.replay_transitions / steps_per_iteration) * steps_per_iteration
+    replay = replay_bytes * config.seeds
+    bytes_per_rollout = replay * steps_per_iteration / capacity
+    train = max(0, tree_bytes(loop_shapes) - replay)
+    beside = train * (1 + _TRAIN_COPIES) + bytes_per_rollout * _ROLLOUT_COPIES + _SLACK_BYTES
+    there = available_bytes()
+    if there is None:
+        return f"replay {show_bytes(replay)}"
+    if replay + beside > there:
+        fitting = int((there - beside) // bytes_per_rollout) * steps_per_iteration
+        if fitting > 0:
+            mend = f"--replay-transitions {fitting} fits"
+        else:
+            mend = "not even one rollout fits: lower --num-envs, --image-size or --seeds"
+        seeds = "1 seed" if config.seeds == 1 else f"{config.seeds} seeds"
+        raise RequestError(
+            f"a replay of {config.replay_transitions} transitions for {seeds} needs "
+            f"{replay} bytes ({show_bytes(replay)}), and networks and rollouts {show_bytes(beside)} more; "
+            f"there are {there} bytes ({show_bytes(there)}): {mend}"
+        )
+    return f"replay {show_bytes(replay)} of {show_bytes(there)}"
+
+
+def check_compiled(programs: dict[str, Any], already_there: bool) -> None:
+    """The same question with the compiler's own figures, on devices that cannot swap. Still nothing is allocated.
+
+    Args:
+        programs: Compiled programs by name; ``train_iteration`` among them.
+        already_there: The loop state is on the device already.
+
+    Raises:
+        RequestError: A program's scratch memory does not fit beside the state.
+    """
+    there = available_bytes()
+    if there is None or jax.devices()[0].platform == "cpu":
+        return
+    analyses = {name: program.memory_analysis() for name, program in programs.items()}
+    state = analyses["train_iteration"].argument_size_in_bytes if analyses.get("train_iteration") else 0
+    for name, analysis in analyses.items():
+        if analysis is None or name == "init":
+            continue
+        scratch = analysis.temp_size_in_bytes + analysis.output_size_in_bytes - analysis.alias_size_in_bytes
+        needed = scratch + (0 if already_there else state)
+        if needed > there:
+            raise RequestError(
+                f"{name} needs {show_bytes(scratch)} of scratch memory beside a state of {show_bytes(state)}; there are "
+                f"{show_bytes(there)}: lower --num-envs, --eval-episodes, --batch-size or --replay-transitions"
+            )

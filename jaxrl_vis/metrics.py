@@ -1,0 +1,76 @@
+"""metrics.jsonl, and the numbers that go into it. No JAX here: everything is plain Python by now.
+
+One line per seed and evaluation: seed, iteration, updates, env_steps (counts per seed, since the beginning), eval/*, the means
+of train/* since the last evaluation, and time/wall_s (the run so far, with evaluation, compilation and what came before a
+resumption), time/compile_s (of that, compilation), time/env_steps_per_s (all seeds together, since the last evaluation).
+"""
+
+import json
+import math
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from jaxrl_vis.run_folder import write_atomically
+
+PerSeed = dict[str, list[float]]
+"""Name -> one number per seed."""
+
+
+def mean_of(history: Sequence[Mapping[str, Sequence[float]]]) -> PerSeed:
+    """The mean of each metric over the iterations in ``history``, seed by seed.
+
+    The order of additions is fixed, so a resumed run writes the same digits as a straight one.
+    """
+    if not history:
+        return {}
+    return {
+        name: [
+            _nine_digits(math.fsum(values) / len(history)) for values in zip(*(entry[name] for entry in history), strict=True)
+        ]
+        for name in history[0]
+    }
+
+
+def _nine_digits(value: float) -> float:
+    # As many as a float32 has, so that the file stays readable.
+    return float(f"{value:.9g}")
+
+
+def make_rows(seeds: Iterable[int], counts: Mapping[str, int], values: Mapping[str, Sequence[float]]) -> list[dict[str, Any]]:
+    """One row per seed: its number, then ``counts``, then its share of ``values``. A NaN or an infinity becomes None."""
+    return [
+        {"seed": seed, **counts, **{name: row[i] if math.isfinite(row[i]) else None for name, row in values.items()}}
+        for i, seed in enumerate(seeds)
+    ]
+
+
+def append_rows(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
+    """Writes rows at the end of the file and sees to it that they are on the disk."""
+    with path.open("a", encoding="utf-8") as file:
+        file.writelines(json.dumps(row) + "\n" for row in rows)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def read_rows(path: Path) -> list[dict[str, Any]]:
+    """All rows of a metrics file, or none where there is no file. A line that was cut off in the middle is left out."""
+    if not path.exists():
+        return []
+    rows = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        try:
+            row = json.loads(line)
+        except ValueError:
+            continue
+        if isinstance(row, dict) and "iteration" in row and "seed" in row:
+            rows.append(row)
+    return rows
+
+
+def cut_back(path: Path, iteration: int) -> None:
+    """Takes out every row after ``iteration``: a resumed run writes those again."""
+    if path.exists():
+        kept = [row for row in read_rows(path) if row["iteration"] <= iteration]
+        write_atomically(path, "".join(json.dumps(row) + "\n" for row in kept))

@@ -1,0 +1,186 @@
+"""Encoder, actor and critic (OL-AUX, appendix; hyper-parameters in `Config`). The only file that knows flax.
+
+The encoder is a stack of 2x2 convolutions with stride 2. Such windows never overlap, so each layer IS a matrix product of
+[pixels, 4 * channels in] with [4 * channels in, channels out]. If the pixels are put into nested 2x2 blocks once,
+
+    [B, C, H, W]  ->  [B, H/16, W/16, 2*2, 2*2, 2*2, 2*2 * C]      (four layers; the finest block last)
+
+every layer is one reshape and one matrix product over the last axis, with no copy between layers. The order is made on the
+uint8 picture, where it is cheapest. Borders that do not fill a block are cropped, as a convolution without padding does.
+
+Observation and goal go through the same encoder; actor and critic have one each.
+"""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from jaxrl_vis import normalizer
+from jaxrl_vis.config import Config, RequestError
+from jaxrl_vis.types import NormalizerState, Params
+
+_glorot = nn.initializers.glorot_uniform()
+
+
+def to_blocks(frames: jax.Array, levels: int) -> jax.Array:
+    """Planar pictures in nested 2x2 blocks: [..., C, H, W] -> [..., (H / 2^levels) * (W / 2^levels), 4^levels * C], same dtype.
+
+    The last axis runs over (coarsest block, ..., finest block, channel).
+    """
+    *batch, channels, height, width = frames.shape
+    rows, columns = height >> levels, width >> levels
+    frames = frames[..., : rows << levels, : columns << levels]
+    twos = (2,) * levels
+    frames = frames.reshape(*batch, channels, rows, *twos, columns, *twos)
+    first = len(batch)
+    row_axis, column_axis = first + 1, first + 2 + levels
+    pairs = [axis for level in range(1, levels + 1) for axis in (row_axis + level, column_axis + level)]
+    frames = frames.transpose(*range(first), row_axis, column_axis, *pairs, first)
+    return frames.reshape(*batch, rows * columns, 4**levels * channels)
+
+
+class _Encoder(nn.Module):
+    """[B, blocks, 4^levels * C] -> [B, latent]."""
+
+    filters: Sequence[int]
+    latent_size: int
+    dtype: Any
+
+    @nn.compact
+    def __call__(self, blocks: jax.Array) -> jax.Array:
+        values = blocks.astype(self.dtype)
+        batch, count, size = values.shape
+        channels = size // 4 ** len(self.filters)
+        for level, filters in enumerate(self.filters):
+            # Initialised as the convolution that it is: fan-out counts the window too.
+            kernel = self.param(
+                f"kernel_{level}", lambda key, shape: _glorot(key, (2, 2, shape[0] // 4, shape[1])).reshape(shape), (4 * channels, filters)
+            )
+            bias = self.param(f"bias_{level}", nn.initializers.zeros, (filters,))
+            values = values.reshape(-1, 4 * channels) @ kernel.astype(self.dtype)
+            values = nn.relu(values + bias.astype(self.dtype))
+            channels = filters
+        values = values.reshape(batch, count * channels)
+        return nn.Dense(self.latent_size, dtype=self.dtype, kernel_init=_glorot, name="latent")(values)
+
+
+class _Head(nn.Module):
+    """[B, inputs] -> [B, outputs] float32."""
+
+    hidden_sizes: Sequence[int]
+    outputs: int
+    output_bias: float
+    dtype: Any
+
+    @nn.compact
+    def __call__(self, inputs: jax.Array) -> jax.Array:
+        values = inputs.astype(self.dtype)
+        for size in self.hidden_sizes:
+            values = nn.relu(nn.Dense(size, dtype=self.dtype, kernel_init=_glorot)(values))
+        # The last layer stays in float32: near Q = -50 neighbouring bfloat16 numbers lie 0.25 apart.
+        bias = nn.initializers.constant(self.output_bias)
+        return nn.Dense(self.outputs, dtype=jnp.float32, kernel_init=_glorot, bias_init=bias)(values)
+
+
+@dataclasses.dataclass(frozen=True)
+class Networks:
+    """Pure functions of parameters, for one task and one configuration.
+
+    Attributes:
+        init_actor, init_critic: key -> {"encoder": ..., "head": ...}.
+        prepare: (normalizer, frames [B, ...]) -> inputs: what every encoder reads; made once, shared by all four networks.
+        encode: (actor or critic parameters, inputs [B, ...]) -> latent [B, latent].
+        act: (actor, observation latent, goal latent) -> [B, A] float32 in (-1, 1).
+        value: (critic, observation latent, goal latent, action [B, A]) -> [B] float32.
+    """
+
+    config: Config
+    observation_spec: jax.ShapeDtypeStruct
+    action_size: int
+    critic_output_bias: float
+
+    def __post_init__(self) -> None:
+        """Checks the picture's size.
+
+        Raises:
+            RequestError: The picture is smaller than one block of the encoder.
+        """
+        if self.sees_pictures:
+            *_, height, width = self.observation_spec.shape
+            least = 2**self._levels
+            if min(height, width) < least:
+                raise RequestError(
+                    f"image_size {min(height, width)} is too small for {self._levels} encoder layers, which need at least "
+                    f"{least}: raise --image-size or shorten --encoder-filters"
+                )
+
+    @property
+    def sees_pictures(self) -> bool:
+        """Whether observations are planar pictures rather than state vectors."""
+        return len(self.observation_spec.shape) == 3
+
+    @property
+    def _levels(self) -> int:
+        return len(self.config.encoder_filters)
+
+    @property
+    def dtype(self) -> Any:
+        """The dtype that the networks compute in."""
+        chosen = self.config.compute_dtype
+        if chosen == "auto":
+            chosen = "float32" if jax.default_backend() == "cpu" else "bfloat16"
+        return jnp.dtype(chosen)
+
+    @property
+    def _encoder(self) -> _Encoder:
+        return _Encoder(self.config.encoder_filters, self.config.latent_size, self.dtype)
+
+    def _head(self, outputs: int, output_bias: float) -> _Head:
+        return _Head(self.config.hidden_sizes, outputs, output_bias, self.dtype)
+
+    @property
+    def _latent_size(self) -> int:
+        return self.config.latent_size if self.sees_pictures else math.prod(self.observation_spec.shape)
+
+    def _init(self, key: jax.Array, head: _Head, head_inputs: int) -> Params:
+        encoder_key, head_key = jax.random.split(key)
+        params = {"head": head.init(head_key, jnp.zeros((1, head_inputs)))["params"]}
+        if self.sees_pictures:
+            blocks = to_blocks(jnp.zeros((1, *self.observation_spec.shape)), self._levels)
+            params["encoder"] = self._encoder.init(encoder_key, blocks)["params"]
+        return params
+
+    def init_actor(self, key: jax.Array) -> Params:
+        """Fresh actor parameters."""
+        return self._init(key, self._head(self.action_size, 0.0), 2 * self._latent_size)
+
+    def init_critic(self, key: jax.Array) -> Params:
+        """Fresh critic parameters."""
+        return self._init(key, self._head(1, self.critic_output_bias), 2 * self._latent_size + self.action_size)
+
+    def prepare(self, statistics: NormalizerState, frames: jax.Array) -> jax.Array:
+        """Normalises and orders [B, ...] observations for the encoders: [B, blocks, block size], or [B, S] for states."""
+        mean, scale = statistics.mean, normalizer.scale(statistics, self.config.normalizer_floor)
+        if self.sees_pictures:
+            frames, mean, scale = (to_blocks(array, self._levels) for array in (frames, mean, scale))
+        limit = self.config.normalizer_clip
+        return jnp.clip((frames.astype(jnp.float32) - mean) * scale, -limit, limit).astype(self.dtype)
+
+    def encode(self, params: Params, inputs: jax.Array) -> jax.Array:
+        """Latents [B, latent] of prepared observations; a state vector is its own latent."""
+        return self._encoder.apply({"params": params["encoder"]}, inputs) if self.sees_pictures else inputs
+
+    def act(self, actor: Params, observation: jax.Array, goal: jax.Array) -> jax.Array:
+        """Actions [B, A] float32 in (-1, 1) for latents [B, latent]."""
+        inputs = jnp.concatenate([observation, goal], axis=-1)
+        return jnp.tanh(self._head(self.action_size, 0.0).apply({"params": actor["head"]}, inputs))
+
+    def value(self, critic: Params, observation: jax.Array, goal: jax.Array, action: jax.Array) -> jax.Array:
+        """Values [B] float32 of actions [B, A] for latents [B, latent]."""
+        inputs = jnp.concatenate([observation, goal, action.astype(observation.dtype)], axis=-1)
+        return self._head(1, self.critic_output_bias).apply({"params": critic["head"]}, inputs)[..., 0]

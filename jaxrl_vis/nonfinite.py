@@ -1,0 +1,52 @@
+"""A number that is not finite: how the host notices it, and what is kept for whoever looks for its cause."""
+
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxrl_vis.checkpoint import named_leaves, to_host
+from jaxrl_vis.metrics import PerSeed
+from jaxrl_vis.types import LoopState
+
+_MAX_EPISODES = 64
+
+
+class NonFiniteError(FloatingPointError):
+    """A loss, a state or a parameter is not finite any more. One line: what, where the state was dumped, what is still good."""
+
+
+def nonfinite_leaves(tree: Any) -> list[str]:
+    """Names of the floating-point leaves that hold a NaN or an infinity."""
+    return [
+        name
+        for name, leaf in named_leaves(tree).items()
+        if jnp.issubdtype(leaf.dtype, jnp.floating) and not bool(jnp.isfinite(leaf).all())
+    ]
+
+
+def dump(file: Path, loop: LoopState, values: PerSeed, leaves: list[str]) -> None:
+    """Writes an .npz that shows where a non-finite number came from.
+
+    ``train.*``: the learner. ``episodes.*``: states and actions of up to 64 replay episodes with a bad number in them, with
+    their seed_index and slot. ``metrics.*``: losses and the like, [S]. ``key`` (words) and ``iteration``: what the next
+    iteration would draw from. ``nonfinite_leaves``: the names in ``leaves``.
+
+    Args:
+        file: Where to; its folder is made.
+        loop: The state: of the iteration that went wrong, or of the one that was dispatched before the host knew.
+        values: Metrics of the iteration that went wrong.
+        leaves: Names of the learner's leaves that are not finite.
+    """
+    found = {f"train.{name}": array for name, array in to_host(loop.train, copy=True).items()}
+    episodes = loop.replay.episodes
+    bad = ~(jnp.isfinite(episodes.states).all((-2, -1)) & jnp.isfinite(episodes.actions).all((-2, -1)))
+    seeds, slots = (index[:_MAX_EPISODES] for index in np.nonzero(np.asarray(bad)))
+    found |= {"episodes.seed_index": seeds, "episodes.slot": slots}
+    found |= {f"episodes.{name}": np.asarray(getattr(episodes, name)[seeds, slots]) for name in ("states", "actions")}
+    found |= {f"metrics.{name}": np.asarray(row) for name, row in values.items()}
+    found |= to_host({"key": loop.key, "iteration": loop.iteration}, copy=True)
+    found["nonfinite_leaves"] = np.asarray(leaves, dtype=np.str_)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(file, **found)

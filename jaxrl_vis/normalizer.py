@@ -1,0 +1,44 @@
+"""Running mean and deviation of observations, per pixel and channel, merged batch by batch (Chan et al., 1979).
+
+A camera that stands still sees mostly things that never change: subtracting the mean picture leaves what moves.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from jaxrl_vis.types import NormalizerState
+
+
+def init(observation_spec: jax.ShapeDtypeStruct) -> NormalizerState:
+    """Statistics of no observations of this shape."""
+    zeros = jnp.zeros(observation_spec.shape, jnp.float32)
+    return NormalizerState(count=jnp.zeros((), jnp.float32), mean=zeros, sum_of_squares=zeros)
+
+
+def update(state: NormalizerState, frames: jax.Array, axes: tuple[int, ...] = (0, 1)) -> NormalizerState:
+    """Merges the statistics of ``frames`` [E, T+2, ...] into the running ones.
+
+    Args:
+        state: Statistics so far.
+        frames: Observations in their own dtype, with leading axes to reduce.
+        axes: The leading axes.
+    """
+    count = jnp.float32(1.0)
+    for axis in axes:
+        count = count * frames.shape[axis]
+    # Deviations are taken from the running mean, not from zero: close to it they are small, and squares keep their digits.
+    centred = frames.astype(jnp.float32) - state.mean
+    shift = jnp.mean(centred, axis=axes)
+    batch_squares = jnp.sum(jnp.square(centred), axis=axes) - count * jnp.square(shift)
+    total = state.count + count
+    return NormalizerState(
+        count=total,
+        mean=state.mean + shift * (count / total),
+        sum_of_squares=state.sum_of_squares + jnp.maximum(batch_squares, 0.0) + jnp.square(shift) * state.count * count / total,
+    )
+
+
+def scale(state: NormalizerState, floor: float) -> jax.Array:
+    """1 / standard deviation [...] float32, the deviation being at least ``floor``."""
+    variance = state.sum_of_squares / jnp.maximum(state.count, 1.0)
+    return 1.0 / jnp.maximum(jnp.sqrt(variance), floor)

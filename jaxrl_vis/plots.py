@@ -1,0 +1,146 @@
+"""curve.png: how often the robot reaches its goal, and how near it gets, against environment steps."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg", force=False)  # no display is needed to write a file
+
+import matplotlib.pyplot as plt  # noqa: E402
+import numpy as np  # noqa: E402
+from matplotlib.axes import Axes  # noqa: E402
+from matplotlib.figure import Figure  # noqa: E402
+from matplotlib.ticker import FuncFormatter, MaxNLocator, PercentFormatter  # noqa: E402
+
+_INK, _FAINT = "#22252a", "#8b919a"
+_SUCCESS, _DISTANCE = "#0f7b6c", "#b4531f"
+
+
+def gather(rows: Sequence[Mapping[str, Any]], name: str) -> tuple[np.ndarray, np.ndarray]:
+    """One metric as a table.
+
+    Args:
+        rows: Of metrics.jsonl, any order.
+        name: Such as ``eval/success``.
+
+    Returns:
+        env_steps [P], ascending, and values [S, P] float64; NaN where a seed has no number there.
+    """
+    steps = sorted({row["env_steps"] for row in rows})
+    seeds = sorted({row["seed"] for row in rows})
+    values = np.full((len(seeds), len(steps)), np.nan)
+    for row in rows:
+        value = row.get(name)
+        values[seeds.index(row["seed"]), steps.index(row["env_steps"])] = np.nan if value is None else value
+    return np.asarray(steps, np.int64), values
+
+
+def _show_steps(count: float, _: int | None = None) -> str:
+    if count >= 1e6:
+        return f"{count / 1e6:g} M"
+    return f"{count / 1e3:g} k" if count >= 1e3 else f"{count:g}"
+
+
+def draw_curves(axes: Axes, steps: np.ndarray, values: np.ndarray, colour: str) -> float:
+    """Each seed as a thin line, the median as a thick one, the middle half of the seeds as a band.
+
+    Args:
+        axes: Where to draw.
+        steps: [P] env_steps.
+        values: [S, P], NaN for gaps.
+        colour: Of all of it.
+
+    Returns:
+        The last median; NaN where there is no number at all.
+    """
+    measured = ~np.isnan(values).all(axis=0)
+    steps, values = steps[measured], values[:, measured]
+    if not steps.size:
+        return float("nan")
+    low, median, high = np.nanpercentile(values, [25, 50, 75], axis=0)
+    marker = "o" if steps.size == 1 else None
+    if values.shape[0] > 1:
+        axes.fill_between(steps, low, high, color=colour, alpha=0.16, linewidth=0)
+        for seed_values in values:
+            axes.plot(steps, seed_values, color=colour, alpha=0.4, linewidth=0.9)
+    axes.plot(steps, median, color=colour, linewidth=2.6, solid_capstyle="round", marker=marker)
+    axes.plot(steps[-1], median[-1], "o", color=colour, markersize=6.5, markeredgecolor="white", markeredgewidth=1.2)
+    return float(median[-1])
+
+
+def _style(axes: Axes, title: str) -> None:
+    axes.set_title(title, loc="left", fontsize=11, color=_INK, pad=8)
+    axes.grid(axis="y", color="#e6e8eb", linewidth=0.8)
+    axes.set_axisbelow(True)
+    for side in ("top", "right", "left"):
+        axes.spines[side].set_visible(False)
+    axes.spines["bottom"].set_color("#c9cdd3")
+    axes.tick_params(colors=_FAINT, labelcolor=_INK, length=0, labelsize=9.5)
+    axes.xaxis.set_major_formatter(FuncFormatter(_show_steps))
+    axes.xaxis.set_major_locator(MaxNLocator(6))
+    axes.yaxis.set_major_locator(MaxNLocator(6))
+
+
+def _label_end(axes: Axes, steps: np.ndarray, value: float, text: str, colour: str) -> None:
+    place = {"xytext": (9, 0), "textcoords": "offset points", "va": "center"}
+    axes.annotate(text, (steps[-1], value), color=colour, fontsize=11, weight="bold", **place)
+
+
+def plot_run(
+    rows: Sequence[Mapping[str, Any]],
+    path: Path,
+    title: str,
+    subtitle: str = "",
+    unit: str = "m",
+    threshold: float | None = None,
+) -> bool:
+    """Writes the curve of a run.
+
+    Args:
+        rows: Of metrics.jsonl.
+        path: A .png, or any other name that matplotlib knows how to write.
+        title: First line, bold.
+        subtitle: Second line.
+        unit: Of eval/goal_distance.
+        threshold: Distance below which an episode is a success; drawn as a dashed line.
+
+    Returns:
+        False where there are no rows, and nothing was written.
+    """
+    if not rows:
+        return False
+    figure = Figure(figsize=(10.5, 4.4), dpi=150, facecolor="white")
+    success_axes, distance_axes = figure.subplots(1, 2)
+    steps, success = gather(rows, "eval/success")
+    _, distance = gather(rows, "eval/goal_distance")
+
+    last = draw_curves(success_axes, steps, success, _SUCCESS)
+    _style(success_axes, "Goals reached at the end of an episode")
+    success_axes.set_ylim(-0.02, 1.03)
+    success_axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+    if np.isfinite(last):
+        _label_end(success_axes, steps, last, f"{last:.0%}", _SUCCESS)
+
+    last = draw_curves(distance_axes, steps, distance, _DISTANCE)
+    _style(distance_axes, f"Distance to the goal at the end ({unit})")
+    finite = distance[np.isfinite(distance)]
+    distance_axes.set_ylim(0.0, 1.08 * max(finite.max(initial=0.0), threshold or 0.0) or 1.0)
+    if np.isfinite(last):
+        _label_end(distance_axes, steps, last, f"{last:.3f}", _DISTANCE)
+    if threshold is not None:
+        distance_axes.axhline(threshold, color=_FAINT, linewidth=1.1, linestyle=(0, (5, 4)))
+        distance_axes.annotate(
+            f"reached: {threshold:g} {unit}", (0, threshold), xycoords=("axes fraction", "data"), xytext=(2, 4),
+            textcoords="offset points", color=_FAINT, fontsize=9,
+        )  # fmt: skip
+    for axes in (success_axes, distance_axes):
+        axes.set_xlim(0, steps[-1] * 1.02 if steps[-1] > 0 else 1)
+        axes.set_xlabel("environment steps per seed", fontsize=9.5, color=_INK)
+    figure.text(0.035, 0.945, title, fontsize=14, weight="bold", color=_INK, va="center")
+    figure.text(0.035, 0.885, subtitle, fontsize=10, color=_FAINT, va="center")
+    figure.subplots_adjust(left=0.065, right=0.945, bottom=0.135, top=0.755, wspace=0.27)
+    figure.savefig(path)
+    plt.close("all")
+    return True

@@ -1,0 +1,108 @@
+"""A ring of whole episodes, in the dtype that they came in, each frame once.
+
+    frames  [N, T+2, C, H, W] uint8     slots 0 ... T: the episode;  slot T+1: its goal
+             |
+             +-- rollouts of E episodes, one after the other; N is a multiple of E
+
+A rollout is written as one contiguous slice. The place follows from the iteration, which all seeds share, so that under `vmap`
+over seeds it stays a slice and does not become a scatter. Samples are drawn from the newest ``size`` episodes.
+"""
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxrl_vis.types import Batch, Episodes, ReplayState
+
+
+class Indices(NamedTuple):
+    """Where B transitions lie: [B] int32 each.
+
+    Attributes:
+        episode: In [0, N).
+        time: t in [0, T).
+    """
+
+    episode: jax.Array
+    time: jax.Array
+
+
+class Replay(NamedTuple):
+    """A replay's fixed sizes. All its functions are pure.
+
+    Attributes:
+        num_rollouts: Rollouts that the ring holds.
+        num_envs: E, episodes in a rollout.
+        horizon: T.
+    """
+
+    num_rollouts: int
+    num_envs: int
+    horizon: int
+
+    @property
+    def num_episodes(self) -> int:
+        """N, episodes that the ring holds."""
+        return self.num_rollouts * self.num_envs
+
+    def spec(self, observation: jax.ShapeDtypeStruct, goal_state_size: int, action_size: int) -> ReplayState:
+        """Shapes and dtypes of the storage, without allocating it."""
+        episodes, horizon = self.num_episodes, self.horizon
+        return ReplayState(
+            episodes=Episodes(
+                frames=jax.ShapeDtypeStruct((episodes, horizon + 2, *observation.shape), observation.dtype),
+                states=jax.ShapeDtypeStruct((episodes, horizon + 2, goal_state_size), jnp.float32),
+                actions=jax.ShapeDtypeStruct((episodes, horizon, action_size), jnp.float32),
+            ),
+            size=jax.ShapeDtypeStruct((), jnp.int32),
+        )
+
+    def init(self, observation: jax.ShapeDtypeStruct, goal_state_size: int, action_size: int) -> ReplayState:
+        """An empty replay."""
+        return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), self.spec(observation, goal_state_size, action_size))
+
+    def insert(self, state: ReplayState, rollout: Episodes, iteration: jax.Array) -> ReplayState:
+        """Writes the E episodes of ``iteration`` ([] int32), over the oldest ones once the ring is full."""
+        start = (iteration % self.num_rollouts) * self.num_envs
+        episodes = jax.tree.map(
+            lambda storage, new: jax.lax.dynamic_update_slice_in_dim(storage, new, start, axis=0), state.episodes, rollout
+        )
+        return ReplayState(episodes=episodes, size=jnp.minimum(state.size + self.num_envs, self.num_episodes))
+
+    def sample_indices(self, state: ReplayState, key: jax.Array, iteration: jax.Array, batch_size: int) -> Indices:
+        """B transitions, evenly over the stored ones, after the rollout of ``iteration`` was inserted."""
+        episode_key, time_key = jax.random.split(key)
+        end = (iteration % self.num_rollouts + 1) * self.num_envs
+        age = jax.random.randint(episode_key, (batch_size,), 1, jnp.maximum(state.size, 1) + 1)
+        return Indices(
+            episode=(end - age) % self.num_episodes,
+            time=jax.random.randint(time_key, (batch_size,), 0, self.horizon),
+        )
+
+    def gather(self, state: ReplayState, indices: Indices, goal_slot: jax.Array) -> Batch:
+        """Reads transitions with the goal in ``goal_slot`` ([B] int32 in [1, T+1])."""
+        frames, states, actions = state.episodes.frames, state.episodes.states, state.episodes.actions
+        episode, time = indices
+        # One gather for all three pictures; the learner reads them side by side again, which then costs nothing.
+        slots = jnp.concatenate([time, goal_slot, time + 1])
+        observation_t, goal, observation_tp1 = jnp.split(frames[jnp.tile(episode, 3), slots], 3)
+        return Batch(
+            observation_t=observation_t,
+            observation_tp1=observation_tp1,
+            goal=goal,
+            action=actions[episode, time],
+            state_tp1=states[episode, time + 1],
+            goal_state=states[episode, goal_slot],
+        )
+
+
+def make_replay(transitions: int, num_envs: int, horizon: int) -> Replay:
+    """A replay of at least ``transitions`` transitions, rounded up to whole rollouts of ``num_envs`` episodes."""
+    return Replay(num_rollouts=max(1, math.ceil(transitions / (num_envs * horizon))), num_envs=num_envs, horizon=horizon)
+
+
+def num_bytes(spec: ReplayState) -> int:
+    """Bytes that a replay of this spec takes."""
+    return sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(spec))

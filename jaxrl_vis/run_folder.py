@@ -1,0 +1,228 @@
+"""The folder of a run: where its files lie, which configuration they belong to, and who may write there.
+
+The files:
+
+    config.json     schema, versions, device, git revision, configuration      metrics.jsonl   see `metrics`
+    checkpoints/    see `checkpoint`      nonfinite/   what a run that went wrong held      curve.png   video.gif
+"""
+
+import dataclasses
+import importlib.metadata
+import json
+import os
+import platform
+import shutil
+import subprocess
+import typing
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from jaxrl_vis.config import Config, RequestError
+
+SCHEMA = 1
+
+MAY_CHANGE = ("preset", "env_steps", "eval_interval", "eval_episodes", "checkpoint_interval", "full_checkpoint_interval")
+"""Fields that a resumed run may set anew: how long to train, how often to look and save. All others shape what is learned."""
+
+_PACKAGES = ("jaxrl-vis", "jax", "jaxlib", "numpy", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint")
+
+
+def default_folder(config: Config) -> Path:
+    """``runs/<env>-<method>-<preset>-seed<first>`` or ``...-seeds<first>to<last>``, below the working directory."""
+    last = config.seed + config.seeds - 1
+    seeds = f"seed{config.seed}" if config.seeds == 1 else f"seeds{config.seed}to{last}"
+    return Path("runs") / f"{config.env}-{config.method}-{config.preset}-{seeds}"
+
+
+@dataclasses.dataclass(frozen=True)
+class RunFolder:
+    """Names of the files of a run; see the module's picture.
+
+    Attributes:
+        path: The folder itself.
+    """
+
+    path: Path
+
+    @property
+    def config(self) -> Path:
+        """What was asked for, by which versions and on what device."""
+        return self.path / "config.json"
+
+    @property
+    def metrics(self) -> Path:
+        """One line per seed and evaluation."""
+        return self.path / "metrics.jsonl"
+
+    @property
+    def checkpoints(self) -> Path:
+        """The two tiers of checkpoints."""
+        return self.path / "checkpoints"
+
+    @property
+    def nonfinite(self) -> Path:
+        """States with a NaN or an infinity in them."""
+        return self.path / "nonfinite"
+
+    @property
+    def curve(self) -> Path:
+        """Success and distance against environment steps."""
+        return self.path / "curve.png"
+
+    @property
+    def video(self) -> Path:
+        """A few episodes of the trained policy."""
+        return self.path / "video.gif"
+
+    def check(self, config: Config, resume: bool = False, overwrite: bool = False) -> bool:
+        """Whether this folder may be used for ``config``. Changes nothing.
+
+        Returns:
+            True where an earlier run goes on, False where a run starts at the beginning.
+
+        Raises:
+            RequestError: The folder holds something that the caller did not say what to do with, or a run that contradicts.
+        """
+        if resume and overwrite:
+            raise RequestError("--resume and --overwrite contradict each other: give one of them")
+        if self.path.exists() and not self.path.is_dir():
+            raise RequestError(f"{self.path} is a file: choose another --run-dir")
+        if not self.path.exists() or not any(self.path.iterdir()):
+            return False
+        if not (resume or overwrite):
+            raise RequestError(f"run folder {self.path} exists: --resume goes on with it, --overwrite starts again")
+        if not self.config.exists():
+            raise RequestError(f"{self.path} holds files but no config.json, so it is not a run: choose another --run-dir")
+        if overwrite:
+            return False
+        _check_same(self.path, read_record(self.path).get("config", {}), config)
+        return True
+
+    def open(self, config: Config, resume: bool = False, overwrite: bool = False) -> bool:
+        """`check`, then makes the folder ready: with ``overwrite``, an earlier run's files are deleted, and nothing else.
+
+        Returns:
+            True where an earlier run goes on.
+
+        Raises:
+            RequestError: See `check`; or the folder cannot be written to.
+        """
+        goes_on = self.check(config, resume, overwrite)
+        try:
+            if overwrite:
+                for folder in (self.checkpoints, self.nonfinite):
+                    shutil.rmtree(folder, ignore_errors=True)
+                for file in (self.metrics, self.curve, self.video):
+                    file.unlink(missing_ok=True)
+            self.path.mkdir(parents=True, exist_ok=True)
+            write_atomically(self.config, json.dumps(_record(config), indent=2) + "\n")
+        except OSError as error:
+            raise RequestError(f"cannot write to {self.path} ({error.strerror}): choose another --run-dir") from error
+        return goes_on
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Replaces a file's contents in one step: a reader, or a power cut, sees the old contents or the new ones."""
+    temporary = path.with_name(path.name + ".tmp")
+    with temporary.open("w", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.replace(path)
+
+
+def git_revision() -> str | None:
+    """Revision of the checkout that this file belongs to, with ``-dirty`` for changes; None outside a checkout."""
+    here = Path(__file__).resolve()
+
+    def git(*words: str) -> str | None:
+        try:
+            done = subprocess.run(("git", "-C", str(here.parent), *words), capture_output=True, text=True, timeout=10)
+        except (OSError, subprocess.TimeoutExpired):
+            return None
+        return done.stdout.strip() if done.returncode == 0 else None
+
+    # An installed copy may lie inside somebody else's checkout, whose revision says nothing about this code.
+    if git("ls-files", "--error-unmatch", here.name) is None:
+        return None
+    return git("describe", "--always", "--dirty", "--abbrev=40", "--exclude", "*")
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the libraries that a result depends on."""
+    found = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            found[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            found[package] = "not installed"
+    return found
+
+
+def device_record() -> dict[str, Any]:
+    """The devices that JAX runs on."""
+    device = jax.devices()[0]
+    return {"platform": device.platform, "kind": device.device_kind, "count": jax.device_count(), "cpu_count": os.cpu_count()}
+
+
+def _record(config: Config) -> dict[str, Any]:
+    return {
+        "schema": SCHEMA,
+        "preset": config.preset,
+        "git_revision": git_revision(),
+        "versions": versions(),
+        "device": device_record(),
+        "config": dataclasses.asdict(config),
+    }
+
+
+def read_record(path: Path) -> dict[str, Any]:
+    """The contents of a run's config.json.
+
+    Raises:
+        RequestError: There is no run in ``path``, or its config.json cannot be read.
+    """
+    file = RunFolder(path).config
+    try:
+        record = json.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise RequestError(f"no run in {path}: there is no config.json") from error
+    except (OSError, ValueError) as error:
+        raise RequestError(f"{file} cannot be read ({type(error).__name__}): --overwrite starts again") from error
+    if not isinstance(record, dict) or record.get("schema") != SCHEMA:
+        raise RequestError(f"{file} is not of schema {SCHEMA}: it was written by another version; use that, or --overwrite")
+    return record
+
+
+def read_config(path: Path) -> Config:
+    """The configuration of the run in ``path``.
+
+    Raises:
+        RequestError: There is no run, or another version wrote it.
+    """
+    saved = read_record(path).get("config", {})
+    hints = typing.get_type_hints(Config)
+    unknown = sorted(set(saved) - set(hints))
+    if unknown:
+        raise RequestError(f"the run in {path} has options that this version does not know: {', '.join(unknown)}")
+    # JSON has no tuples.
+    return Config(**{name: tuple(value) if isinstance(value, list) else value for name, value in saved.items()})
+
+
+def _check_same(path: Path, saved: dict[str, Any], config: Config) -> None:
+    """Raises RequestError, naming the fields, where ``config`` would not learn what ``saved`` learned."""
+    asked = json.loads(json.dumps(dataclasses.asdict(config)))  # tuples as lists, like the saved ones
+    # An option that is newer than the saved run had its default value then.
+    saved = json.loads(json.dumps(dataclasses.asdict(Config()))) | saved
+    contradictions = [
+        f"{name} (saved {saved[name]}, asked {asked.get(name, 'nothing: no such option now')})"
+        for name in sorted(saved)
+        if name not in MAY_CHANGE and saved[name] != asked.get(name)
+    ]
+    if contradictions:
+        raise RequestError(
+            f"cannot resume {path}, its configuration is another one: {'; '.join(contradictions)}; "
+            "ask for the saved values, or take another --run-dir"
+        )

@@ -1,0 +1,195 @@
+"""One training iteration, for one or several seeds, as one compiled program.
+
+    key = fold_in(seed's key, iteration)
+    rollout     reset, then scan over T: act, advance, observe            -> E episodes
+    insert      one contiguous slice of the replay; observation statistics
+    updates     scan over U: sample, relabel, reward, gradient step, target networks
+    metrics     fixed-shape means
+
+`vmap` over the seeds' axis makes it train several learners at once. The loop state is donated, so the replay is written where it
+lies.
+"""
+
+import dataclasses
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+import jaxrl_vis_envs
+from jaxrl_vis import normalizer
+from jaxrl_vis.config import Config, RequestError, Resolved, resolve, validate
+from jaxrl_vis.ddpg import Algorithm, make_ddpg
+from jaxrl_vis.networks import Networks
+from jaxrl_vis.relabel import choose_goal_slots
+from jaxrl_vis.replay import Replay, make_replay, num_bytes
+from jaxrl_vis.rollout import play
+from jaxrl_vis.types import Batch, LoopState, Metrics, ReplayState, TrainState
+from jaxrl_vis_envs import goals
+from jaxrl_vis_envs.base import GoalEnv
+from jaxrl_vis_envs.compilation import world_jit
+
+# A leading seed axis on everything but the iteration, which all seeds share (see `replay`).
+_SEED_AXES = LoopState(train=0, replay=0, key=0, iteration=None)  # type: ignore[arg-type]
+
+# Evaluation draws from keys of its own, the same at every evaluation and for every seed.
+_EVALUATION_SEED = 2**31 - 1
+
+
+def make_env(config: Config) -> GoalEnv:
+    """The task that a configuration asks for.
+
+    Raises:
+        RequestError: There is no such task, or it cannot be made like that.
+    """
+    pictures = {"image_size": config.image_size, "pixels": config.pixels} if config.env.startswith("Visual") else {}
+    try:
+        return jaxrl_vis_envs.make(config.env, **pictures)
+    except ValueError as error:
+        raise RequestError(str(error)) from error
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainStep:
+    """The compiled program of a run and what belongs to it; see `make_train_step`.
+
+    Attributes:
+        env, config, resolved, networks, replay: What it was made of.
+        init: keys [S] -> LoopState.
+        train_iteration: LoopState (donated) -> (LoopState, metrics of [S] float32).
+        evaluate: TrainState [S, ...] -> metrics of [S] float32, without noise, on fixed keys.
+        record: (TrainState [S, ...], key) -> a few episodes of the first seed, for videos.
+        update_many: (TrainState, ReplayState, key, iteration) of one seed -> the same after ``updates_per_iteration`` steps.
+    """
+
+    env: GoalEnv
+    config: Config
+    resolved: Resolved
+    networks: Networks
+    replay: Replay
+    init: Any
+    train_iteration: Any
+    evaluate: Any
+    record: Any
+    update_many: Any
+
+    @property
+    def steps_per_iteration(self) -> int:
+        """Environment steps of one seed in an iteration."""
+        return self.config.num_envs * self.env.horizon
+
+    @property
+    def updates_per_iteration(self) -> int:
+        """Gradient steps of one seed in an iteration."""
+        return self.config.updates_per_iteration
+
+    @property
+    def num_iterations(self) -> int:
+        """Iterations that `Config.env_steps` takes."""
+        return math.ceil(self.config.env_steps / self.steps_per_iteration)
+
+    @property
+    def replay_spec(self) -> ReplayState:
+        """Shapes of one seed's replay, without allocating it."""
+        return self.replay.spec(self.env.observation_spec, self.env.goal_state_size, self.env.action_size)
+
+    @property
+    def replay_bytes(self) -> int:
+        """Bytes of one seed's replay."""
+        return num_bytes(self.replay_spec)
+
+
+def reward_of(config: Config, resolved: Resolved, threshold: float, batch: Batch) -> jax.Array:
+    """Rewards [B] float32 of relabelled transitions, by the same functions that score the environments."""
+    values = {"positive": resolved.reward_positive, "negative": resolved.reward_negative}
+    if config.method == "oracle":
+        return goals.oracle_reward(batch.state_tp1, batch.goal_state, threshold, **values)
+    return goals.indicator_reward(batch.observation_tp1, batch.goal, **values)
+
+
+def _make_update_many(config: Config, resolved: Resolved, env: GoalEnv, replay: Replay, algorithm: Algorithm):
+    def update_many(train: TrainState, memory: ReplayState, key: jax.Array, iteration: jax.Array) -> tuple[TrainState, Metrics]:
+        def one_update(train: TrainState, update_key: jax.Array) -> tuple[TrainState, Metrics]:
+            sample_key, goal_key = jax.random.split(update_key)
+            indices = replay.sample_indices(memory, sample_key, iteration, config.batch_size)
+            goal_slots = choose_goal_slots(
+                goal_key, indices.time, env.horizon, config.relabel_probability, resolved.balance_probability
+            )
+            batch = replay.gather(memory, indices, goal_slots)
+            return algorithm.update(train, batch, reward_of(config, resolved, env.threshold, batch))
+
+        train, metrics = jax.lax.scan(one_update, train, jax.random.split(key, config.updates_per_iteration))
+        return train, jax.tree.map(jnp.mean, metrics)
+
+    return update_many
+
+
+def _count_nonfinite(tree: Any) -> jax.Array:
+    floats = [leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    return sum((jnp.sum(~jnp.isfinite(leaf)) for leaf in floats), jnp.zeros((), jnp.int32)).astype(jnp.float32)
+
+
+def make_train_step(env: GoalEnv, config: Config) -> TrainStep:
+    """Builds the program of a run. Nothing is compiled or allocated yet.
+
+    Raises:
+        RequestError: The configuration asks for something that cannot be.
+    """
+    resolved = resolve(validate(config), env.horizon)
+    networks = Networks(config, env.observation_spec, env.action_size, resolved.critic_output_bias)
+    if config.method != "oracle" and not networks.sees_pictures:
+        raise RequestError(f"method {config.method} compares pictures: use --env Visual{config.env}, or --method oracle")
+    algorithm = make_ddpg(networks, config, resolved)
+    replay = make_replay(config.replay_transitions, config.num_envs, env.horizon)
+    update_many = _make_update_many(config, resolved, env, replay, algorithm)
+
+    def init(key: jax.Array) -> LoopState:
+        return LoopState(
+            train=algorithm.init(key),
+            replay=replay.init(env.observation_spec, env.goal_state_size, env.action_size),
+            key=key,
+            iteration=jnp.zeros((), jnp.int32),
+        )
+
+    def train_iteration(loop: LoopState) -> tuple[LoopState, Metrics]:
+        rollout_key, update_key = jax.random.split(jax.random.fold_in(loop.key, loop.iteration))
+        exploration = {"random_action_probability": config.random_action_probability, "action_noise": config.action_noise}
+        episodes, outcome = play(env, networks, loop.train, rollout_key, config.num_envs, **exploration)
+        memory = replay.insert(loop.replay, episodes, loop.iteration)
+        train = loop.train.replace(normalizer=normalizer.update(loop.train.normalizer, episodes.frames))
+        train, metrics = update_many(train, memory, update_key, loop.iteration)
+        metrics |= {f"train/{name}": jnp.mean(values) for name, values in outcome.items()}
+        metrics["guard/nonfinite"] = _count_nonfinite((metrics, episodes.states, episodes.actions))
+        return LoopState(train=train, replay=memory, key=loop.key, iteration=loop.iteration + 1), metrics
+
+    def evaluate(train: TrainState) -> Metrics:
+        key = jax.random.key(_EVALUATION_SEED)
+        _, outcome = play(env, networks, train, key, config.eval_episodes, keep_frames=False)
+        return {
+            "eval/success": jnp.mean(outcome["success"]),
+            "eval/goal_distance": jnp.mean(outcome["goal_distance"]),
+            "eval/goal_distance_median": jnp.median(outcome["goal_distance"]),
+        }
+
+    def record(train: TrainState, key: jax.Array) -> dict[str, jax.Array]:
+        first_seed = jax.tree.map(lambda leaf: leaf[0], train)
+        episodes, outcome = play(env, networks, first_seed, key, num_envs=8)
+        horizon = env.horizon
+        return {"frames": episodes.frames[:, : horizon + 1], "goals": episodes.frames[:, horizon + 1], **outcome}
+
+    def per_seed(function, in_axes=0, out_axes=0):
+        return jax.vmap(function, in_axes=in_axes, out_axes=out_axes)
+
+    return TrainStep(
+        env=env,
+        config=config,
+        resolved=resolved,
+        networks=networks,
+        replay=replay,
+        init=world_jit(per_seed(init, out_axes=_SEED_AXES)),
+        train_iteration=world_jit(per_seed(train_iteration, (_SEED_AXES,), (_SEED_AXES, 0)), donate_argnums=0),
+        evaluate=world_jit(per_seed(evaluate)),
+        record=world_jit(record),
+        update_many=world_jit(per_seed(update_many, (0, 0, 0, None)), donate_argnums=0),
+    )

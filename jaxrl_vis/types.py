@@ -1,0 +1,135 @@
+"""Arrays and records that the learner's modules pass to each other, and the letters that name their axes.
+
+    E  environments in a rollout          B  transitions in a batch       C, H, W  channels, height, width of a picture
+    N  episodes that the replay holds     A  action components            G        components of the true goal state
+    T  control steps of an episode        S  seeds trained side by side
+
+An observation is a planar picture [C, H, W] uint8 or a state vector [S] float32; "..." stands for its own axes.
+"""
+
+import dataclasses
+from typing import Any, Self
+
+import jax
+
+Params = Any  # a nested dict of arrays, as flax.linen makes it
+Metrics = dict[str, jax.Array]
+
+
+class Replaceable:
+    """Gives a frozen dataclass a ``replace`` method."""
+
+    def replace(self, **changes: Any) -> Self:
+        """A copy with some fields changed."""
+        return dataclasses.replace(self, **changes)  # type: ignore[type-var]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Episodes(Replaceable):
+    """E whole episodes, episode-major, each frame once. Slot T+1 of frames and states holds the goal.
+
+    One array for an episode's frames *and* its goal makes relabelling the choice of a slot: t+1 to T is a frame of the same
+    episode, T+1 the goal that the episode was started with.
+
+    Attributes:
+        frames: [E, T+2, ...] observations after 0, 1, ... T steps, then the goal's.
+        states: [E, T+2, G] float32, the true goal-space states of the same instants.
+        actions: [E, T, A] float32, as executed (with exploration noise).
+    """
+
+    frames: jax.Array
+    states: jax.Array
+    actions: jax.Array
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class ReplayState(Replaceable):
+    """A ring of N episodes. Same arrays as `Episodes` with E = N.
+
+    Attributes:
+        episodes: [N, ...] storage; the part that was never written is zero.
+        size: [] int32, episodes stored.
+    """
+
+    episodes: Episodes
+    size: jax.Array
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Batch(Replaceable):
+    """B transitions with a goal each, as sampled and relabelled; rewards come from these.
+
+    Attributes:
+        observation_t, observation_tp1: [B, ...] before and after the action.
+        goal: [B, ...] the goal's observation, relabelled or original.
+        action: [B, A] float32.
+        state_tp1: [B, G] float32, the true state after the action.
+        goal_state: [B, G] float32, the true state that `goal` shows.
+    """
+
+    observation_t: jax.Array
+    observation_tp1: jax.Array
+    goal: jax.Array
+    action: jax.Array
+    state_tp1: jax.Array
+    goal_state: jax.Array
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class NormalizerState(Replaceable):
+    """Running mean and variance of observations, per pixel and channel.
+
+    Attributes:
+        count: [] float32, frames seen.
+        mean: [...] float32, in the observation's own unit (0 to 255 for pictures).
+        sum_of_squares: [...] float32, of deviations from the mean.
+    """
+
+    count: jax.Array
+    mean: jax.Array
+    sum_of_squares: jax.Array
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class TrainState(Replaceable):
+    """The learner: networks, their targets, optimisers, observation statistics.
+
+    Attributes:
+        actor, critic: Online parameters.
+        target_actor, target_critic: Slowly following copies.
+        actor_optimizer, critic_optimizer: optax states.
+        normalizer: Observation statistics.
+        updates: [] int32, gradient steps taken (fewer than 2^31 in any run that ends).
+    """
+
+    actor: Params
+    critic: Params
+    target_actor: Params
+    target_critic: Params
+    actor_optimizer: Any
+    critic_optimizer: Any
+    normalizer: NormalizerState
+    updates: jax.Array
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class LoopState(Replaceable):
+    """All that one training iteration carries to the next, with a leading seed axis S on every leaf but ``iteration``.
+
+    Attributes:
+        train: The learner, [S, ...].
+        replay: The episodes, [S, N, ...].
+        key: [S] typed keys, never changed: iteration k draws from ``fold_in(key, k)``, so a resumed run repeats itself exactly.
+        iteration: [] int32, iterations done; shared by all seeds, so that the replay is written with one contiguous slice.
+    """
+
+    train: TrainState
+    replay: ReplayState
+    key: jax.Array
+    iteration: jax.Array

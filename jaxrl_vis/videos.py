@@ -1,0 +1,235 @@
+"""video.gif: what the robot saw, beside the picture of the goal that it was given.
+
+Pictures come in planar, [C, H, W] uint8, and are shown in rows: colour, then depth, whichever there are.
+"""
+
+import base64
+import dataclasses
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from jaxrl_vis.config import RequestError
+
+SUFFIXES = (".gif", ".mp4", ".html", ".png")
+
+_PICTURE_SIZE = 256  # px, about; pictures are enlarged by a whole factor
+_GAP, _BORDER, _HEADER, _FOOTER = 14, 5, 30, 40
+_BACKGROUND, _TEXT, _FAINT = (24, 26, 31), (232, 234, 237), (139, 145, 154)
+_REACHED, _MISSED, _PLAIN = (62, 207, 142), (226, 109, 92), (52, 56, 64)
+_HOLD = 1.0  # s, how long the last frame of an episode stays
+
+
+@dataclasses.dataclass(frozen=True)
+class Recording:
+    """Some episodes.
+
+    Attributes:
+        frames: [K, T+1, C, H, W] uint8, what the robot saw.
+        goals: [K, C, H, W] uint8, what it was asked for.
+        success: [K] bool, at the last step; or [K, T+1] at every step.
+    """
+
+    frames: np.ndarray
+    goals: np.ndarray
+    success: np.ndarray
+
+
+def shows_pictures(shape: Sequence[int]) -> bool:
+    """Whether frames of this shape, episodes by steps by observation, are pictures that can be shown."""
+    return len(shape) == 5 and shape[2] in (1, 3, 4)
+
+
+def _depth_picture(depth: np.ndarray, near: float, far: float) -> np.ndarray:
+    """Depth [H, W] in grey levels -> [H, W, 3] uint8: near is bright, the steps look equally large."""
+    scaled = np.clip((depth.astype(np.float32) - near) / max(far - near, 1.0), 0.0, 1.0)
+    return (matplotlib.colormaps["magma"](0.97 - 0.92 * scaled)[..., :3] * 255).round().astype(np.uint8)
+
+
+def _depth_range(recording: Recording) -> tuple[float, float]:
+    """Grey levels between which this recording's depth lies, a few outliers aside; the same for all its pictures."""
+    depth = np.concatenate([recording.frames[:, ::5, -1].ravel(), recording.goals[:, -1].ravel()])
+    near, far = np.percentile(depth, [0.5, 99.5])
+    return float(near), float(far)
+
+
+def _rows_of(picture: np.ndarray, depth_range: tuple[float, float]) -> list[tuple[str, np.ndarray]]:
+    """[C, H, W] -> captions and pictures [H, W, 3] uint8."""
+    rows = []
+    if picture.shape[0] >= 3:
+        rows.append(("colour", np.moveaxis(picture[:3], 0, -1)))
+    if picture.shape[0] in (1, 4):
+        rows.append(("depth", _depth_picture(picture[-1], *depth_range)))
+    return rows
+
+
+def _enlarge(picture: np.ndarray) -> Image.Image:
+    factor = max(1, round(_PICTURE_SIZE / picture.shape[0]))
+    size = (picture.shape[1] * factor, picture.shape[0] * factor)
+    return Image.fromarray(picture).resize(size, Image.Resampling.NEAREST)
+
+
+def _compose(
+    observation: np.ndarray,
+    goal: np.ndarray,
+    depth_range: tuple[float, float],
+    footer: tuple[str, str],
+    share: float,
+    colour: tuple[int, int, int],
+) -> Image.Image:
+    """One frame of the video.
+
+    Args:
+        observation: [C, H, W] uint8.
+        goal: [C, H, W] uint8.
+        depth_range: See `_depth_range`.
+        footer: Texts at the left and at the right.
+        share: Of the episode that is over, 0 to 1.
+        colour: Of the border.
+    """
+    left, right = (_rows_of(picture, depth_range) for picture in (observation, goal))
+    pictures = [(_enlarge(seen), _enlarge(wanted)) for (_, seen), (_, wanted) in zip(left, right, strict=True)]
+    width, height = pictures[0][0].size
+    cell = height + 2 * _BORDER + _GAP
+    size = (2 * (width + 2 * _BORDER) + 3 * _GAP, _HEADER + _GAP // 2 + cell * len(pictures) + _FOOTER)
+    canvas = Image.new("RGB", size, _BACKGROUND)
+    draw = ImageDraw.Draw(canvas)
+    font, small = ImageFont.load_default(size=17), ImageFont.load_default(size=14)
+    columns = (_GAP, 2 * _GAP + width + 2 * _BORDER)
+    for x, text in zip(columns, ("what the robot sees", "what it is asked for"), strict=True):
+        draw.text((x + 2, _HEADER // 2 + 4), text, font=font, fill=_TEXT, anchor="lm")
+    for row, pair in enumerate(pictures):
+        y = _HEADER + _GAP // 2 + row * cell
+        for x, picture, border in zip(columns, pair, (colour, _PLAIN), strict=True):
+            draw.rectangle((x, y, x + width + 2 * _BORDER - 1, y + height + 2 * _BORDER - 1), fill=border)
+            canvas.paste(picture, (x + _BORDER, y + _BORDER))
+    y = size[1] - _FOOTER
+    draw.rectangle((_GAP, y, size[0] - _GAP, y + 3), fill=_PLAIN)
+    draw.rectangle((_GAP, y, _GAP + (size[0] - 2 * _GAP) * share, y + 3), fill=colour if colour != _PLAIN else _FAINT)
+    draw.text((_GAP + 2, y + 20), footer[0], font=small, fill=_FAINT, anchor="lm")
+    draw.text((size[0] - _GAP - 2, y + 20), footer[1], font=font, fill=colour if colour != _PLAIN else _FAINT, anchor="rm")
+    return canvas
+
+
+def draw_frames(recording: Recording, frame_seconds: float, max_episodes: int) -> tuple[list[Image.Image], list[float]]:
+    """All frames of a video, and how long each is shown, in seconds.
+
+    Borders turn green where the goal is reached; at the end of an episode that missed, red.
+    """
+    episodes, num_frames = recording.frames.shape[:2]
+    episodes = min(episodes, max_episodes)
+    depth_range = _depth_range(recording)
+    images, seconds = [], []
+    for episode in range(episodes):
+        success = np.asarray(recording.success[episode], bool)
+        for t in range(num_frames):
+            is_last = t == num_frames - 1
+            reached = bool(success[t]) if success.ndim else is_last and bool(success)
+            colour = _REACHED if reached else _MISSED if is_last else _PLAIN
+            verdict = "goal reached" if reached else "missed" if is_last else ""
+            footer = (f"episode {episode + 1} of {episodes}   step {t} of {num_frames - 1}", verdict)
+            share = t / max(1, num_frames - 1)
+            frame, goal = recording.frames[episode, t], recording.goals[episode]
+            images.append(_compose(frame, goal, depth_range, footer, share, colour))
+            seconds.append(_HOLD if is_last else frame_seconds)
+    return images, seconds
+
+
+def _gif_bytes(images: list[Image.Image], seconds: list[float]) -> bytes:
+    """An endless GIF. One palette for all frames, without dithering: nothing flickers, and equal frames pack well."""
+    samples = images[:: max(1, len(images) // 16)] + images[-1:]
+    montage = Image.new("RGB", (samples[0].width, samples[0].height * len(samples)))
+    for i, sample in enumerate(samples):
+        montage.paste(sample, (0, i * sample.height))
+    palette = montage.quantize(255, method=Image.Quantize.MEDIANCUT)
+    frames = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+    # GIF counts in hundredths of a second, and players slow down anything below two.
+    durations = [max(2, round(value * 100)) * 10 for value in seconds]
+    file = io.BytesIO()
+    frames[0].save(file, "GIF", save_all=True, append_images=frames[1:], duration=durations, loop=0, optimize=False, disposal=1)
+    return file.getvalue()
+
+
+def _strip(recording: Recording) -> Image.Image:
+    """Six instants of up to four episodes, one below the other, each with its goal at the right."""
+    num_frames = recording.frames.shape[1]
+    depth_range = _depth_range(recording)
+    instants = sorted({round(share * (num_frames - 1)) for share in (0, 0.1, 0.2, 0.35, 0.6, 1)})
+    rows = []
+    for episode in range(min(4, recording.frames.shape[0])):
+        success = np.asarray(recording.success[episode], bool)
+        border = _REACHED if bool(success if success.ndim == 0 else success[-1]) else _MISSED
+        shown = [(recording.frames[episode, t], border if t == num_frames - 1 else _PLAIN) for t in instants]
+        shown.append((recording.goals[episode], _PLAIN))
+        views = [([_enlarge(view).resize((128, 128)) for _, view in _rows_of(each, depth_range)], edge) for each, edge in shown]
+        rows += [[(pictures[row], edge) for pictures, edge in views] for row in range(len(views[0][0]))]
+    cell = 128 + 2 * 3 + 8
+    canvas = Image.new("RGB", (cell * len(rows[0]) + 24, cell * len(rows) + 34), _BACKGROUND)
+    draw = ImageDraw.Draw(canvas)
+    font = ImageFont.load_default(size=15)
+    for column in range(len(rows[0])):
+        is_goal = column == len(instants)
+        x = 8 + column * cell + (12 if is_goal else 0)
+        draw.text((x + 3, 17), "goal" if is_goal else f"step {instants[column]}", font=font, fill=_TEXT, anchor="lm")
+        for line, row in enumerate(rows):
+            picture, edge = row[column]
+            y = 30 + line * cell
+            draw.rectangle((x, y, x + 133, y + 133), fill=edge)
+            canvas.paste(picture, (x + 3, y + 3))
+    return canvas
+
+
+def check_output(path: Path) -> None:
+    """Whether a video can be written under this name. Ask before spending a minute on playing episodes.
+
+    Raises:
+        RequestError: The suffix is not one of `SUFFIXES`, or it needs a package that is not installed.
+    """
+    if path.suffix.lower() not in SUFFIXES:
+        raise RequestError(f"cannot write {path}: the name must end in one of {', '.join(SUFFIXES)}")
+    if path.suffix.lower() == ".mp4":
+        try:
+            import imageio_ffmpeg  # noqa: F401
+        except ImportError as error:
+            raise RequestError(f"writing {path} needs imageio-ffmpeg: install it, or ask for a .gif") from error
+
+
+def write_video(recording: Recording, path: Path, frame_seconds: float = 0.04, max_episodes: int = 6) -> None:
+    """Writes episodes as a .gif, an .mp4, an .html page with the gif in it, or a .png with some frames side by side.
+
+    Args:
+        recording: The episodes.
+        path: The suffix decides the format.
+        frame_seconds: How long a frame is shown, s.
+        max_episodes: How many of them to show; a .png shows at most four.
+
+    Raises:
+        RequestError: See `check_output`; or the frames are no pictures.
+    """
+    check_output(path)
+    if not shows_pictures(recording.frames.shape):
+        raise RequestError(f"nothing to see: observations are vectors of {recording.frames.shape[-1]} numbers, not pictures")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    suffix = path.suffix.lower()
+    if suffix == ".png":
+        _strip(recording).save(path)
+        return
+    images, seconds = draw_frames(recording, frame_seconds, max_episodes)
+    if suffix == ".gif":
+        path.write_bytes(_gif_bytes(images, seconds))
+    elif suffix == ".html":
+        encoded = base64.b64encode(_gif_bytes(images, seconds)).decode("ascii")
+        page = f'<!doctype html><title>{path.stem}</title><body style="margin:0;background:#181a1f;text-align:center">'
+        path.write_text(f'{page}<img alt="episodes" src="data:image/gif;base64,{encoded}"></body>\n', encoding="utf-8")
+    else:
+        import imageio.v2 as imageio
+
+        rate = max(1, round(1 / frame_seconds))
+        with imageio.get_writer(path, fps=rate, macro_block_size=2, quality=8) as writer:
+            for image, duration in zip(images, seconds, strict=True):
+                for _ in range(max(1, round(duration * rate))):
+                    writer.append_data(np.asarray(image))

@@ -1,0 +1,137 @@
+"""A program with the interface of `train_step.TrainStep` that compiles in a moment: it draws random numbers and "learns" them.
+
+As a script (`python fake_program.py RUN_DIR KIND`), it trains until somebody stops it; the tests send it signals.
+"""
+
+import math
+import sys
+import time
+import types
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxrl_vis.config import Config
+from jaxrl_vis.trainer import Trainer
+from jaxrl_vis.types import Episodes, LoopState, NormalizerState, ReplayState, TrainState
+
+HORIZON, SIZE = 5, 16
+_SEED_AXES = LoopState(train=0, replay=0, key=0, iteration=None)
+
+
+def small_config(**changes) -> Config:
+    config = Config(preset="debug", num_envs=2, env_steps=80, replay_transitions=30, image_size=SIZE, pixels="depth", seeds=2)
+    looking = {"eval_interval": 2, "eval_episodes": 4, "checkpoint_interval": 2, "full_checkpoint_interval": 2}
+    return config.replace(**(looking | changes))
+
+
+class FakeProgram:
+    """See the module."""
+
+    def __init__(self, config: Config, nan_at: int | None = None, break_state: bool = False, filtered_share: float = 0.1):
+        self.config, self.traces = config, 0
+        self.env = types.SimpleNamespace(distance_unit="m", threshold=0.05, control_period=0.04, horizon=HORIZON)
+        self.steps_per_iteration = config.num_envs * HORIZON
+        self.updates_per_iteration = 3
+        self.num_iterations = math.ceil(config.env_steps / self.steps_per_iteration)
+        episodes = math.ceil(config.replay_transitions / self.steps_per_iteration) * config.num_envs
+        size = config.image_size
+        self.replay_bytes = episodes * ((HORIZON + 2) * (size * size + 3 * 4) + HORIZON * 4 * 4) + 4
+
+        def init_one(key):
+            parameters = {"layer": {"kernel": jax.random.uniform(key, (4, 3)) - 0.5, "bias": jnp.zeros(3)}}
+            train = TrainState(
+                actor=parameters,
+                critic=parameters,
+                target_actor=parameters,
+                target_critic=parameters,
+                actor_optimizer=(jnp.zeros((), jnp.int32), parameters),
+                critic_optimizer=(),
+                normalizer=NormalizerState(jnp.zeros(()), jnp.zeros((1, size, size)), jnp.ones((1, size, size))),
+                updates=jnp.zeros((), jnp.int32),
+            )
+            replay = Episodes(
+                frames=jnp.zeros((episodes, HORIZON + 2, 1, size, size), jnp.uint8),
+                states=jnp.zeros((episodes, HORIZON + 2, 3)),
+                actions=jnp.zeros((episodes, HORIZON, 4)),
+            )
+            return LoopState(train, ReplayState(replay, jnp.zeros((), jnp.int32)), key, jnp.zeros((), jnp.int32))
+
+        def iterate_one(loop):
+            self.traces += 1
+            # One draw, spread out by arithmetic that compiles faster than many draws.
+            noise = jax.random.uniform(jax.random.fold_in(loop.key, loop.iteration), ())
+            old = loop.replay.episodes
+
+            def spread(like):
+                count = jnp.arange(config.num_envs * math.prod(like.shape[1:]), dtype=jnp.uint32)
+                words = (count * jnp.uint32(2654435761)) ^ (noise * 2.0**24).astype(jnp.uint32)
+                values = ((words ^ (words >> 15)) >> 8).reshape((config.num_envs, *like.shape[1:]))
+                return values.astype(jnp.uint8) if like.dtype == jnp.uint8 else values.astype(jnp.float32) / 2.0**24 - 0.5
+
+            new = jax.tree.map(spread, old)
+            start = (loop.iteration * config.num_envs) % episodes
+            bad = loop.iteration == (-1 if nan_at is None else nan_at)
+            if break_state:
+                new = new.replace(states=jnp.where(bad, jnp.nan, new.states))
+            replay = jax.tree.map(lambda whole, part: jax.lax.dynamic_update_slice_in_dim(whole, part, start, 0), old, new)
+            step = 0.1 * (noise - 0.5) + 1e-3 * replay.states.mean() + 1e-4 * replay.frames.mean()
+            actor = {"layer": {"kernel": loop.train.actor["layer"]["kernel"] + step, "bias": loop.train.actor["layer"]["bias"]}}
+            loss = jnp.where(bad, jnp.nan, step**2)
+            critic = jax.tree.map(lambda leaf: leaf + 0.0 * loss, loop.train.critic)
+            train = loop.train.replace(actor=actor, critic=critic, updates=loop.train.updates + 3)
+            memory = ReplayState(replay, jnp.minimum(loop.replay.size + config.num_envs, episodes))
+            metrics = {
+                "train/critic_loss": loss,
+                "train/success": jax.nn.sigmoid(loop.iteration / 3.0 - 1.0),
+                "train/goal_distance": 0.2 / (1.0 + loop.iteration),
+                "train/filtered_share": jnp.float32(filtered_share),
+                "guard/nonfinite": jnp.sum(~jnp.isfinite(loss)).astype(jnp.float32),
+            }
+            return LoopState(train, memory, loop.key, loop.iteration + 1), metrics
+
+        def evaluate_one(train):
+            score = jax.nn.sigmoid(train.updates / 9.0 - 1.0 + 0.1 * train.actor["layer"]["kernel"].sum())
+            return {"eval/success": score, "eval/goal_distance": 0.2 * (1.0 - score)}
+
+        def record(train, key):
+            y, x = jnp.mgrid[0:size, 0:size]
+            t = jnp.arange(HORIZON + 1)[:, None, None]
+            ball = ((y - 3 - t) ** 2 + (x - 4 - t) ** 2 < 9) * 120
+            frames = jnp.broadcast_to((200 - ball).astype(jnp.uint8)[None, :, None], (3, HORIZON + 1, 1, size, size))
+            return {"frames": frames, "goals": frames[:, -1], "success": jnp.array([1.0, 0.0, 1.0])}
+
+        self.init = jax.jit(jax.vmap(init_one, out_axes=_SEED_AXES))
+        self.train_iteration = jax.jit(jax.vmap(iterate_one, in_axes=(_SEED_AXES,), out_axes=(_SEED_AXES, 0)), donate_argnums=0)
+        self.evaluate = jax.jit(jax.vmap(evaluate_one))
+        self.record = jax.jit(record)
+
+
+def make_fake_trainer(config: Config, run_dir: Path, resume: bool = False, overwrite: bool = False, **program) -> Trainer:
+    return Trainer(config, FakeProgram(config, **program), run_dir, resume=resume, overwrite=overwrite)
+
+
+def as_plain(tree) -> list[np.ndarray]:
+    """All leaves as numpy arrays, keys as their words."""
+
+    def plain(leaf):
+        return np.array(jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf)
+
+    return [plain(leaf) for leaf in jax.tree.leaves(tree)]
+
+
+def main() -> None:
+    run_dir, kind = Path(sys.argv[1]), sys.argv[2]
+    # "signal": small and slow, saved only when interrupted. "kill": saves a large replay at every iteration.
+    config = small_config(env_steps=100_000, full_checkpoint_interval=0, checkpoint_interval=1000, eval_interval=50)
+    if kind == "kill":
+        config = config.replace(replay_transitions=50_000, num_envs=1000, env_steps=10**7, full_checkpoint_interval=1)
+    for report in make_fake_trainer(config, run_dir, resume=run_dir.exists()).run():
+        print(f"report {report.iteration}", flush=True)
+        time.sleep(0.05 if kind == "signal" else 0.0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,162 @@
+import json
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxrl_vis.bench import record, roofline, timing
+from jaxrl_vis.bench.record import Measurement
+from jaxrl_vis.bench.settings import Settings
+from jaxrl_vis.config import RequestError, preset
+
+
+def measurement(value: float, envs: int = 4, unit: str = "images/s") -> Measurement:
+    return Measurement(
+        "render/images", value, unit, {"env": "VisualReacher", "envs": envs, "sizes": (1, 2)}, {"compile_s": 1.5}
+    )
+
+
+def test_record_round_trip_and_change(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for value in (100.0, 110.0):
+        record.compare_and_keep("render", measurement(value), tmp_path)
+    record.compare_and_keep("render", measurement(50.0, envs=8), tmp_path)
+    lines = capsys.readouterr().out.splitlines()
+    assert "(first record)" in lines[0]
+    assert "+10.0 %" in lines[2]
+    assert "(first record)" in lines[4]
+    path = record.results_path("render", tmp_path)
+    assert [path] == list(tmp_path.iterdir())
+    kept = {entry["config"]["envs"]: entry for entry in record.load(path)}
+    assert {envs: entry["value"] for envs, entry in kept.items()} == {4: 110.0, 8: 50.0}
+    assert kept[4]["config"]["sizes"] == [1, 2]
+    expected = {"schema", "name", "value", "unit", "config", "details", "device", "versions", "revision", "date"}
+    assert set(kept[4]) == expected
+    assert kept[4]["versions"]["jax"] == jax.__version__
+
+
+def test_records_of_another_device_do_not_compare(tmp_path: Path) -> None:
+    path = tmp_path / "render.json"
+    first = record.to_record(measurement(100.0))
+    assert record.keep(path, first) is None
+    assert record.keep(path, {**first, "device": "another"}) is None
+    assert record.keep(path, {**first, "value": 90.0})["value"] == 100.0
+    assert len(record.load(path)) == 2
+
+
+def test_a_file_of_something_else_is_not_overwritten(tmp_path: Path) -> None:
+    path = tmp_path / "render.json"
+    path.write_text('[{"schema": 99}]')
+    with pytest.raises(ValueError, match="schema"):
+        record.keep(path, record.to_record(measurement(1.0)))
+    assert path.read_text() == '[{"schema": 99}]'
+
+
+def test_json_holds_this_run_s_records(tmp_path: Path) -> None:
+    record.write_json(tmp_path / "deep" / "out.json", [measurement(1.0), measurement(2.0, envs=8)])
+    assert [entry["value"] for entry in json.loads((tmp_path / "deep" / "out.json").read_text())] == [1.0, 2.0]
+
+
+def test_revision_of_no_checkout(tmp_path: Path) -> None:
+    assert record.git_revision(tmp_path) == "unknown"
+
+
+def test_copies_are_refused() -> None:
+    timing.assert_varied(np.arange(8).reshape(4, 2), "rows")
+    with pytest.raises(AssertionError, match="only 1 of 4 rows differ"):
+        timing.assert_varied(np.ones((4, 2)), "rows")
+    timing.assert_varied(np.ones((1, 2)), "rows")
+
+
+def test_timing_counts_calls_and_keeps_its_budget() -> None:
+    calls = []
+    slow = timing.measure(lambda: (calls.append(1), time.sleep(0.01)), repeats=50, budget_s=0.05)
+    assert 3 <= slow.repeats < 50
+    assert len(calls) == slow.repeats + 1
+    assert 0.01 <= slow.median_s < 1.0
+    assert timing.measure(lambda: None, repeats=1).repeats == 1
+
+
+def test_least_cost_agrees_with_the_compiler_for_dense_layers() -> None:
+    sizes = (24, 32, 16, 3)
+    kernels = [jnp.ones((first, second)) for first, second in zip(sizes, sizes[1:], strict=False)]
+
+    def forward(rows):
+        for kernel in kernels:
+            rows = rows @ kernel
+        return rows
+
+    counted = roofline.compiler_cost(jax.jit(forward).lower(jnp.ones((8, 24))).compile())
+    assert counted is not None
+    assert counted.flops == pytest.approx(2 * 8 * roofline.head_products(sizes), rel=0.02)
+
+
+def test_encoder_products_count_every_layer() -> None:
+    from jaxrl_vis.networks import Networks
+
+    config = preset("debug", encoder_filters=(8, 16), latent_size=32)
+    networks = Networks(config, jax.ShapeDtypeStruct((3, 16, 16), jnp.uint8), 4, 0.0)
+    first = 8 * 8 * (4 * 3) * 8
+    assert roofline.encoder_products(networks) == (first + 4 * 4 * (4 * 8) * 16 + 4 * 4 * 16 * 32, first)
+
+
+def test_peaks_take_the_longest_name() -> None:
+    assert roofline.peak_of("NVIDIA H100 80GB HBM3") is roofline.PEAKS["NVIDIA H100 80GB HBM3"]
+    assert roofline.peak_of("cpu") is None
+    shares = roofline.describe(roofline.Cost(989e9, 3.35e9), 0.01, "bfloat16", "NVIDIA H100 80GB HBM3")
+    assert shares["share_of_peak_flops"] == pytest.approx(0.1)
+    assert shares["share_of_peak_bandwidth"] == pytest.approx(0.1)
+    assert shares["updates_per_s_at_the_roof"] == 1000
+
+
+def test_noise_fills_the_whole_replay() -> None:
+    from jaxrl_vis.bench.update import fill_replay
+    from jaxrl_vis.replay import make_replay
+
+    replay = make_replay(transitions=40, num_envs=2, horizon=5)
+    empty = replay.init(jax.ShapeDtypeStruct((1, 4, 4), jnp.uint8), goal_state_size=3, action_size=2)
+    full = fill_replay(empty, jax.random.key(0))
+    assert jax.tree.map(jax.typeof, full) == jax.tree.map(jax.typeof, empty)
+    assert int(full.size) == replay.num_episodes
+    frames = np.asarray(full.episodes.frames).reshape(replay.num_episodes * 7, -1)
+    assert len({frame.tobytes() for frame in frames}) == len(frames)
+
+
+@pytest.mark.parametrize("benchmark", ["update", "train"])
+def test_learner_benchmarks_keep_records(benchmark: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from jaxrl_vis import bench
+    from jaxrl_vis.bench import train, update
+
+    def tiny(settings: Settings, **overrides: int):
+        return preset("debug", env=settings.env, **overrides)
+
+    for module in (train, update):
+        monkeypatch.setattr(module, "training_config", tiny)
+    found = bench.run(benchmark, env="FetchReach", repeats=1, results=tmp_path, json=tmp_path / "out.json")
+    assert found and all(entry.value > 0.0 for entry in found)
+    assert len(json.loads((tmp_path / "out.json").read_text())) == len(found)
+    assert record.results_path(benchmark, tmp_path).exists()
+
+
+@pytest.mark.parametrize("benchmark", ["render", "physics", "env"])
+def test_world_benchmarks_keep_records(benchmark: str, tmp_path: Path) -> None:
+    from jaxrl_vis import bench
+
+    found = bench.run(benchmark, env="VisualReacher", envs=(3,), image_size=16, pixels="depth", repeats=1, results=tmp_path)
+    assert found and all(entry.value > 0.0 for entry in found)
+
+
+def test_a_missing_opengl_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    import mujoco
+
+    from jaxrl_vis.bench import mujoco_renderer
+
+    def no_renderer(*_, **__):
+        raise RuntimeError("cannot\nconnect")
+
+    monkeypatch.setattr(mujoco, "Renderer", no_renderer, raising=False)
+    with pytest.raises(RequestError, match="needs OpenGL.*MUJOCO_GL") as caught:
+        mujoco_renderer.check()
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,169 @@
+"""Checkpoints: round trips, damage, kills while writing."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from fake_program import FakeProgram, as_plain, make_fake_trainer, small_config
+
+from jaxrl_vis.checkpoint import FULL, LIGHT, Checkpoints
+from jaxrl_vis.config import RequestError
+
+FAKE = Path(__file__).with_name("fake_program.py")
+
+
+@pytest.fixture(scope="module")
+def states():
+    """Loop states after 1, 2 and 3 iterations of the fake program, and its shapes."""
+    trainer = make_fake_trainer(small_config(), None)
+    loop, found = trainer.init(jax.random.key(7)), []
+    for _ in range(3):
+        loop, _ = trainer.train_iteration(loop)
+        found.append(jax.tree.map(jnp.copy, loop))
+    return found, trainer.shapes
+
+
+@pytest.fixture
+def saved(states, tmp_path):
+    """A folder with full checkpoints of iterations 1 to 3, of which orbax keeps 2 and 3, and light ones likewise."""
+    checkpoints = Checkpoints(tmp_path / "checkpoints")
+    for iteration, loop in enumerate(states[0], start=1):
+        checkpoints.save_light(iteration, loop.train, {"wall_s": 1.5 * iteration})
+        checkpoints.save_full(iteration, loop, {"wall_s": 1.5 * iteration})
+    checkpoints.close()
+    return tmp_path / "checkpoints"
+
+
+def test_everything_comes_back_bit_for_bit(states, saved):
+    loops, shapes = states
+    lines = []
+    checkpoints = Checkpoints(saved, lines.append)
+    assert checkpoints.iterations(FULL) == checkpoints.iterations(LIGHT) == [2, 3]
+    restored = checkpoints.restore_for_resume(shapes)
+    assert (restored.tier, restored.iteration, restored.memo) == (FULL, 3, {"wall_s": 4.5}) and not lines
+    assert jax.tree.structure(restored.loop) == jax.tree.structure(loops[2])
+    for new, old in zip(jax.tree.leaves(restored.loop), jax.tree.leaves(loops[2]), strict=True):
+        assert new.dtype == old.dtype and new.shape == old.shape
+    assert all(map(np.array_equal, as_plain(restored.loop), as_plain(loops[2])))
+    light = Checkpoints(saved, lines.append, read_only=True).restore_train(shapes)
+    assert light.loop is None or light.tier == FULL
+    assert all(map(np.array_equal, as_plain(light.train), as_plain(loops[2].train)))
+
+
+def test_a_light_save_survives_donation(tmp_path):
+    trainer = make_fake_trainer(small_config(), None)
+    loop, _ = trainer.train_iteration(trainer.init(jax.random.key(0)))
+    expected = as_plain(loop.train)
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save_light(1, loop.train, {})
+    for _ in range(5):
+        loop, _ = trainer.train_iteration(loop)
+    checkpoints.wait()
+    assert all(map(np.array_equal, as_plain(checkpoints.restore_train(trainer.shapes).train), expected))
+    checkpoints.close()
+
+
+def test_a_full_save_does_not_keep_the_replay(tmp_path):
+    """After saving, the replay can be donated again: otherwise the next iteration would hold it twice."""
+    trainer = make_fake_trainer(small_config(), None)
+    loop, _ = trainer.train_iteration(trainer.init(jax.random.key(0)))
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save_full(1, loop, {})
+    trainer.train_iteration(loop)
+    assert loop.replay.episodes.frames.is_deleted()
+    checkpoints.close()
+
+
+def damage(folder: Path, how: str) -> None:
+    files = sorted((file for file in folder.rglob("*") if file.is_file()), key=lambda file: file.stat().st_size)
+    if how == "delete data":
+        for file in folder.rglob("d/*"):
+            file.unlink()
+    elif how == "delete manifest":
+        for file in (folder / "manifest").iterdir():
+            file.unlink()
+    elif how == "truncate all":
+        for file in files:
+            file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    else:
+        contents = bytearray(files[-1].read_bytes())
+        contents[len(contents) // 2] ^= 0xFF
+        files[-1].write_bytes(bytes(contents))
+
+
+@pytest.mark.parametrize("how", ["delete data", "delete manifest", "truncate all", "flip a byte"])
+def test_a_damaged_checkpoint_is_skipped_with_one_line(states, saved, how, capfd):
+    loops, shapes = states
+    damage(saved / FULL / "3", how)
+    lines = []
+    restored = Checkpoints(saved, lines.append).restore_for_resume(shapes)
+    assert (restored.tier, restored.iteration) == (FULL, 2)
+    assert all(map(np.array_equal, as_plain(restored.loop), as_plain(loops[1])))
+    assert len(lines) == 1 and "full/3 is damaged" in lines[0] and "\n" not in lines[0]
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_only_light_left(states, saved):
+    for iteration in "23":
+        damage(saved / FULL / iteration, "delete data")
+    lines = []
+    restored = Checkpoints(saved, lines.append).restore_for_resume(states[1])
+    assert (restored.tier, restored.iteration, restored.loop, len(lines)) == (LIGHT, 3, None, 2)
+
+
+def test_later_checkpoints_are_discarded_and_written_again(states, saved):
+    checkpoints = Checkpoints(saved)
+    checkpoints.discard_after(2)
+    assert checkpoints.iterations(FULL) == checkpoints.iterations(LIGHT) == [2]
+    checkpoints.save_full(2, states[0][0], {"again": True})  # the same iteration once more replaces it
+    assert checkpoints.restore_for_resume(states[1]).memo == {"again": True}
+    checkpoints.save_full(3, states[0][2], {})
+    assert checkpoints.iterations(FULL) == [2, 3]
+    checkpoints.close()
+
+
+def test_another_structure_is_named(saved):
+    other = FakeProgram(small_config(image_size=8))
+    shapes = jax.eval_shape(other.init, jax.random.split(jax.random.key(0), 2))
+    with pytest.raises(RequestError, match=r"normalizer\.mean is float32\[2, 1, 16, 16\] there and float32\[2, 1, 8, 8\] here"):
+        Checkpoints(saved).restore_for_resume(shapes)
+
+
+def test_nothing_saved_yet(states, tmp_path):
+    checkpoints = Checkpoints(tmp_path / "none", read_only=True)
+    assert checkpoints.newest() is None and checkpoints.restore_train(states[1]) is None
+    assert not (tmp_path / "none").exists()
+
+
+def test_kill_while_saving_keeps_the_checkpoint_before(tmp_path, clean_environment):
+    run_dir = tmp_path / "run"
+    command = [sys.executable, str(FAKE), str(run_dir), "kill"]
+    process = subprocess.Popen(command, env=clean_environment, stdout=subprocess.DEVNULL, start_new_session=True)
+    full = run_dir / "checkpoints" / FULL
+    try:
+        deadline, caught = time.monotonic() + 60, False
+        while time.monotonic() < deadline and not caught and process.poll() is None:
+            names = os.listdir(full) if full.exists() else []
+            done = [name for name in names if name.isdigit()]
+            caught = bool(done) and any("tmp" in name for name in names)
+    finally:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+    assert caught and process.returncode == -signal.SIGKILL
+    newest = max(int(name) for name in done)
+    config = small_config(env_steps=10**7, replay_transitions=50_000, num_envs=1000, full_checkpoint_interval=1)
+    lines = []
+    trainer = make_fake_trainer(config, None)
+    checkpoints = Checkpoints(run_dir / "checkpoints", lines.append)
+    restored = checkpoints.restore_for_resume(trainer.shapes)
+    checkpoints.close()
+    assert restored.tier == FULL and restored.iteration >= newest and not lines
+    assert int(restored.loop.iteration) == restored.iteration
+    assert not [name for name in os.listdir(full) if "tmp" in name]  # and the half-written one is gone

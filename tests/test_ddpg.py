@@ -1,0 +1,167 @@
+"""The learner on worlds with known answers, and the mechanisms of the thesis on batches with known shares."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probe_environments as probes
+import pytest
+from jaxrl_vis.config import preset
+from jaxrl_vis.train_step import make_train_step
+
+DISCOUNT = 0.75  # 1 - 1/horizon of the probes
+
+
+def trained(env, iterations=12, **overrides):
+    settings = {
+        "num_envs": 16,
+        "updates_per_iteration": 50,
+        "batch_size": 64,
+        "hidden_sizes": (64, 64),
+        "replay_transitions": 4000,
+        "target_decay": 0.95,
+        "action_penalty": 0.0,
+        "normalizer_floor": 0.1,
+        "eval_episodes": 64,
+        "relabel_probability": 0.0,
+    }
+    program = make_train_step(env, preset("debug", **{**settings, **overrides}))
+    loop = program.init(jax.random.key(7)[None])
+    for _ in range(iterations):
+        loop, metrics = program.train_iteration(loop)
+    return program, jax.tree.map(lambda leaf: leaf[0], loop.train), metrics
+
+
+def values(program, train, observations, goals, action=0.0):
+    """The critic's values of [B] points and goals."""
+    networks = program.networks
+    points = networks.prepare(train.normalizer, jnp.asarray(observations, jnp.float32)[:, None])
+    goals = networks.prepare(train.normalizer, jnp.asarray(goals, jnp.float32)[:, None])
+    actions = jnp.full((points.shape[0], 1), action)
+    return np.asarray(networks.value(train.critic, points, goals, actions))
+
+
+def test_value_of_a_place_that_is_always_the_goal():
+    program, train, _ = trained(probes.AlwaysThere(), reward_positive=1.0, reward_negative=0.0, iterations=25)
+    np.testing.assert_allclose(values(program, train, [0.0], [0.0]), [1.0 / (1.0 - DISCOUNT)], atol=0.1)
+
+
+def test_values_are_discounted():
+    program, train, _ = trained(probes.ThreeStepsAway())
+    expected = [-1.0 - DISCOUNT, -1.0, 0.0]
+    np.testing.assert_allclose(values(program, train, [-3.0, -2.0, -1.0], [0.0] * 3), expected, atol=0.15)
+
+
+def test_value_depends_on_the_observation():
+    program, train, _ = trained(probes.TwoPlaces(), iterations=25)
+    np.testing.assert_allclose(values(program, train, [0.0, 1.0], [0.0, 0.0]), [0.0, -1.0 / (1.0 - DISCOUNT)], atol=0.3)
+
+
+def test_value_depends_on_the_goal():
+    program, train, _ = trained(probes.TwoGoals(), iterations=25)
+    np.testing.assert_allclose(values(program, train, [0.0, 0.0], [0.0, 1.0]), [0.0, -1.0 / (1.0 - DISCOUNT)], atol=0.3)
+
+
+def test_policy_goes_where_the_goal_is():
+    program, train, _ = trained(probes.GoWhereTold(), relabel_probability=0.9, iterations=25)
+    outcome = program.evaluate(jax.tree.map(lambda leaf: leaf[None], train))
+    assert outcome["eval/success"][0] >= 0.95
+
+
+def test_policy_depends_on_the_observation():
+    program, train, _ = trained(probes.GoAgainstTheSign())
+    outcome = program.evaluate(jax.tree.map(lambda leaf: leaf[None], train))
+    assert outcome["eval/success"][0] >= 0.95
+
+
+def test_seeds_side_by_side_learn_what_they_learn_alone():
+    """Three seeds in one program give each seed's own run (to rounding: batched products sum in another order)."""
+    config = preset("debug", num_envs=4, updates_per_iteration=3, batch_size=8)
+    program = make_train_step(probes.GoWhereTold(), config)
+    keys = jax.random.split(jax.random.key(1), 3)
+    together = program.init(keys)
+    for _ in range(2):
+        together, _ = program.train_iteration(together)
+    for seed in range(3):
+        alone = program.init(keys[seed][None])
+        for _ in range(2):
+            alone, _ = program.train_iteration(alone)
+        for left, right in zip(jax.tree.leaves(alone.train), jax.tree.leaves(together.train), strict=True):
+            np.testing.assert_allclose(left[0], right[seed], rtol=1e-4, atol=1e-5)
+
+
+def test_one_trace_and_a_new_episode_every_time():
+    traces = 0
+
+    class Counting(probes.GoWhereTold):
+        def advance(self, state, action):
+            nonlocal traces
+            traces += 1
+            return super().advance(state, action)
+
+    program = make_train_step(Counting(), preset("debug"))
+    loop = program.init(jax.random.key(0)[None])
+    goals = []
+    for _ in range(3):
+        loop, _ = program.train_iteration(loop)
+        written = (int(loop.iteration) - 1) % program.replay.num_rollouts * program.config.num_envs
+        goals.append(np.asarray(loop.replay.episodes.states)[0, written, -1, 0])
+    assert traces == 1
+    assert len(set(goals)) == 3
+
+
+@pytest.mark.parametrize("rewards", [(None, None), (0.0, -1.0)])
+def test_a_fresh_filter_drops_nothing(rewards):
+    """At initialisation no negative is dropped, under +1/-1 and under 0/-1 (there the critic must start below the band)."""
+    program = make_train_step(
+        probes.PointPicture(),
+        preset(
+            "debug",
+            method="indicator_balance_filter",
+            reward_positive=rewards[0],
+            reward_negative=rewards[1],
+            updates_per_iteration=1,
+            batch_size=256,
+            num_envs=32,
+        ),
+    )
+    _, metrics = program.train_iteration(program.init(jax.random.key(0)[None]))
+    assert metrics["train/filtered_share"][0] == 0.0
+    assert metrics["train/positive_share"][0] > 0.3
+
+
+def test_the_filter_drops_negatives_that_the_critic_values_like_positives():
+    """Place 0 is its own goal, seen with noise in one byte, so most of its indicator rewards are false negatives."""
+    program = make_train_step(
+        probes.PointPicture(), preset("debug", method="indicator_balance_filter", num_envs=32, updates_per_iteration=1, batch_size=256)
+    )
+    loop = program.init(jax.random.key(0)[None])
+    head = loop.train.critic["head"]
+    last = sorted(head)[-1]
+    confident = {**head, last: {**head[last], "bias": head[last]["bias"] + 1e3}}
+    loop = loop.replace(train=loop.train.replace(critic={**loop.train.critic, "head": confident}))
+    _, metrics = program.train_iteration(loop)
+    assert metrics["train/filtered_share"][0] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("method", "expected"),
+    # T = 4. Future relabelling hits slot t+1 with probability mean(1/(T-t)) = H_T/T = 0.5208; every other slot differs.
+    [("indicator", 0.9 * 25 / 48), ("indicator_balance_filter", 0.45 + 0.45 * 25 / 48)],
+)
+def test_share_of_positives_is_the_one_derived(method, expected):
+    program = make_train_step(
+        probes.PointPicture(), preset("debug", method=method, num_envs=256, updates_per_iteration=40, batch_size=512)
+    )
+    _, metrics = program.train_iteration(program.init(jax.random.key(3)[None]))
+    assert abs(float(metrics["train/positive_share"][0]) - expected) < 0.012
+
+
+def test_replay_is_written_in_place():
+    """The compiled iteration holds no second copy of the replay: it is aliased, and temporaries stay far below it."""
+    program = make_train_step(probes.PointPicture(), preset("debug", replay_transitions=200_000))
+    loop = jax.eval_shape(program.init, jax.random.split(jax.random.key(0), 2))
+    memory = program.train_iteration.lower(loop).compile().memory_analysis()
+    replay = 2 * program.replay_bytes
+    assert replay > 10e6
+    assert memory.alias_size_in_bytes >= replay
+    assert memory.temp_size_in_bytes < 0.2 * replay

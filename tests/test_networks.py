@@ -1,0 +1,72 @@
+"""The encoder is the convolution stack that it says it is; statistics are those of the whole data."""
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxrl_vis import losses, normalizer
+from jaxrl_vis.config import RequestError, preset
+from jaxrl_vis.networks import Networks, to_blocks
+
+
+def make_networks(size, filters=(4, 8, 16), **overrides):
+    config = preset("debug", encoder_filters=filters, latent_size=5, **overrides)
+    return Networks(config, jax.ShapeDtypeStruct((3, size, size), jnp.uint8), 2, 0.0)
+
+
+@pytest.mark.parametrize("size", [8, 16, 21, 30])
+def test_the_encoder_is_a_stack_of_strided_convolutions(size):
+    networks = make_networks(size)
+    params = networks.init_critic(jax.random.key(0))
+    frames = jax.random.randint(jax.random.key(1), (2, 3, size, size), 0, 256).astype(jnp.uint8)
+    statistics = normalizer.update(normalizer.init(networks.observation_spec), frames[:, None])
+    latent = networks.encode(params, networks.prepare(statistics, frames))
+
+    scale = normalizer.scale(statistics, networks.config.normalizer_floor)
+    values = jnp.clip((frames - statistics.mean) * scale, -5, 5).transpose(0, 2, 3, 1)
+    for level, filters in enumerate((4, 8, 16)):
+        kernel = params["encoder"][f"kernel_{level}"].reshape(2, 2, -1, filters)
+        values = jax.lax.conv_general_dilated(values, kernel, (2, 2), "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC"))
+        values = nn.relu(values + params["encoder"][f"bias_{level}"])
+    dense = params["encoder"]["latent"]
+    expected = values.reshape(2, -1) @ dense["kernel"] + dense["bias"]
+    np.testing.assert_allclose(latent, expected, rtol=1e-4, atol=1e-4)
+
+
+def test_blocks_hold_every_pixel_once():
+    frames = jnp.arange(2 * 3 * 8 * 8).reshape(2, 3, 8, 8)
+    blocks = to_blocks(frames, 2)
+    assert blocks.shape == (2, 4, 48)
+    np.testing.assert_array_equal(np.sort(np.asarray(blocks).ravel()), np.arange(blocks.size))
+    np.testing.assert_array_equal(np.sort(np.asarray(blocks[0, 0])), np.sort(np.asarray(frames[0, :, :4, :4]).ravel()))
+
+
+def test_a_picture_smaller_than_a_block_is_refused():
+    with pytest.raises(RequestError, match="image_size 7 is too small for 3 encoder layers, which need at least 8"):
+        make_networks(7)
+
+
+def test_statistics_are_those_of_all_frames():
+    batches = 255 * jax.random.beta(jax.random.key(0), 2.0, 5.0, (4, 6, 5, 3, 2, 2))
+    state = normalizer.init(jax.ShapeDtypeStruct((3, 2, 2), jnp.float32))
+    for batch in batches:
+        state = normalizer.update(state, batch)
+    frames = np.asarray(batches, np.float64).reshape(-1, 3, 2, 2)
+    np.testing.assert_allclose(state.mean, frames.mean(0), rtol=1e-5)
+    np.testing.assert_allclose(normalizer.scale(state, 1e-6), 1 / frames.std(0), rtol=1e-4)
+
+
+def test_a_pixel_that_never_changes_is_divided_by_the_floor():
+    state = normalizer.update(normalizer.init(jax.ShapeDtypeStruct((1,), jnp.uint8)), jnp.full((3, 4, 1), 200, jnp.uint8))
+    np.testing.assert_allclose(normalizer.scale(state, 0.01), [100.0])
+
+
+def test_losses_by_hand():
+    target = losses.td_target(jnp.array([0.0, -1.0, -1.0]), jnp.array([-2.0, -1.0, -99.0]), 0.5, minimum=-2.0)
+    np.testing.assert_allclose(target, [-1.0, -1.5, -2.0])
+    keep = losses.keep_mask(jnp.array([1.0, -1.0, -1.0]), jnp.array([50.0, 49.5, 48.0]), -1.0, 49.0)
+    np.testing.assert_allclose(keep, [1.0, 0.0, 1.0])
+    np.testing.assert_allclose(losses.critic_loss(jnp.array([1.0, 5.0, 3.0]), jnp.array([0.0, 0.0, 0.0]), keep), 5.0)
+    assert losses.critic_loss(jnp.ones(3), jnp.zeros(3), jnp.zeros(3)) == 0.0
+    np.testing.assert_allclose(losses.actor_loss(jnp.array([2.0, 4.0]), jnp.array([[1.0], [0.0]]), 0.5), -3.0 + 0.25)

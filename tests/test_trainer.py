@@ -1,0 +1,365 @@
+"""The training run: exact resumption, signals, bad input, memory, non-finite numbers."""
+
+import dataclasses
+import itertools
+import json
+import runpy
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from fake_program import FakeProgram, as_plain, make_fake_trainer, small_config
+
+from jaxrl_vis import memory, metrics, run_loop, train_step, trainer
+from jaxrl_vis.checkpoint import FULL, LIGHT, Checkpoints
+from jaxrl_vis.config import Config, RequestError, preset
+from jaxrl_vis.run_folder import RunFolder, default_folder, read_config
+from jaxrl_vis_envs.compilation import world_jit
+
+FAKE = Path(__file__).with_name("fake_program.py")
+
+
+def rows_without_time(path: Path) -> list[dict]:
+    return [
+        {name: row[name] for name in row if not name.startswith("time/")} for row in metrics.read_rows(path / "metrics.jsonl")
+    ]
+
+
+def final_state(path: Path, shapes) -> list[np.ndarray]:
+    checkpoints = Checkpoints(path / "checkpoints", read_only=True)
+    return as_plain(checkpoints.restore_for_resume(shapes).loop)
+
+
+@pytest.fixture(scope="module")
+def straight(tmp_path_factory):
+    """A run of eight iterations without interruption: its folder, its trainer, its reports."""
+    path = tmp_path_factory.mktemp("runs") / "straight"
+    straight_trainer = make_fake_trainer(small_config(), path)
+    return path, straight_trainer, list(straight_trainer.run())
+
+
+def test_a_run_reports_logs_and_draws(straight, capsys):
+    path, straight_trainer, reports = straight
+    assert [report.iteration for report in reports] == list(range(1, 9))
+    assert reports[-1].env_steps == 80 and reports[-1].updates == 24
+    assert [i for i, report in enumerate(reports, 1) if "eval/success" in report.metrics] == [2, 4, 6, 8]
+    rows = metrics.read_rows(path / "metrics.jsonl")
+    assert [(row["iteration"], row["seed"]) for row in rows] == list(itertools.product((2, 4, 6, 8), (0, 1)))
+    for row in rows:
+        assert row["env_steps"] == 10 * row["iteration"] and row["updates"] == 3 * row["iteration"]
+        assert 0 < row["eval/success"] < 1 and row["time/wall_s"] >= row["time/compile_s"] > 0
+    means = np.mean([report.metrics["train/critic_loss"][1] for report in reports[2:4]])
+    assert rows[3]["train/critic_loss"] == pytest.approx(means, rel=1e-6)
+    assert (path / "curve.png").stat().st_size > 10_000 and (path / "video.gif").stat().st_size > 3_000
+    record = json.loads((path / "config.json").read_text())
+    assert record["schema"] == 1 and record["config"]["num_envs"] == 2 and record["versions"]["jax"] == jax.__version__
+    assert {"git_revision", "preset", "device"} <= set(record)
+    assert read_config(path) == small_config()
+
+
+def test_train_iteration_is_traced_once(straight):
+    assert straight[1].program.traces == 1
+
+
+@pytest.mark.parametrize("cut", [2, 4])
+def test_resumed_equals_straight_bit_for_bit(straight, tmp_path, cut, capsys):
+    straight_path, straight_trainer, reports = straight
+    path = tmp_path / "run"
+    list(make_fake_trainer(small_config(env_steps=10 * cut), path).run())
+    resumed_reports = list(make_fake_trainer(small_config(), path, resume=True).run())
+    assert "exactly" in capsys.readouterr().out
+    assert [report.iteration for report in resumed_reports] == list(range(cut + 1, 9))
+    assert all(a == b for a, b in zip(resumed_reports, reports[cut:], strict=True))
+    assert rows_without_time(path) == rows_without_time(straight_path)
+    wall = [row["time/wall_s"] for row in metrics.read_rows(path / "metrics.jsonl")]
+    assert wall == sorted(wall)
+    shapes = straight_trainer.shapes
+    assert all(map(np.array_equal, final_state(path, shapes), final_state(straight_path, shapes)))
+
+
+def test_resume_between_evaluations_goes_on_with_the_means(straight, tmp_path):
+    """Abandoned after iteration 5, saved at 3: rows after 3 are written again, with means over iterations 3 and 4."""
+    path = tmp_path / "run"
+    config = small_config(full_checkpoint_interval=3, checkpoint_interval=1)
+    for report in make_fake_trainer(config, path).run():
+        if report.iteration == 5:
+            break
+    list(make_fake_trainer(config, path, resume=True).run())
+    assert rows_without_time(path) == rows_without_time(straight[0])
+
+
+def test_damaged_newest_checkpoint_on_resume(straight, tmp_path, capsys):
+    path = tmp_path / "run"
+    list(make_fake_trainer(small_config(env_steps=60), path).run())
+    for file in (path / "checkpoints" / FULL / "6").rglob("d/*"):
+        file.unlink()
+    list(make_fake_trainer(small_config(), path, resume=True).run())
+    out = capsys.readouterr().out
+    assert "full/6 is damaged" in out and "resumed at iteration 4 of 8, exactly" in out
+    assert rows_without_time(path) == rows_without_time(straight[0])
+
+
+def test_resume_from_light_says_what_it_is(tmp_path, capsys):
+    path = tmp_path / "run"
+    config = small_config(full_checkpoint_interval=0)
+    list(make_fake_trainer(config.replace(env_steps=40), path).run())
+    assert not Checkpoints(path / "checkpoints").iterations(FULL)
+    reports = list(make_fake_trainer(config, path, resume=True).run())
+    assert "not an exact continuation" in capsys.readouterr().out
+    assert [report.iteration for report in reports] == [5, 6, 7, 8] and reports[-1].updates == 24
+
+
+def test_finished_run_says_so(straight, capsys):
+    assert list(make_fake_trainer(small_config(), straight[0], resume=True).run()) == []
+    assert "finished already" in capsys.readouterr().out
+
+
+def test_resume_of_nothing_starts(tmp_path, capsys):
+    reports = make_fake_trainer(small_config(env_steps=20), tmp_path / "run", resume=True).run()
+    assert [report.iteration for report in reports] == [1, 2]
+    assert "nothing to resume" in capsys.readouterr().out
+
+
+def start(run_dir: Path, environment: dict[str, str]) -> subprocess.Popen:
+    command = [sys.executable, str(FAKE), str(run_dir), "signal"]
+    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, -signal.SIGINT)])
+def test_a_signal_saves_and_loses_at_most_one_iteration(tmp_path, clean_environment, number, status):
+    run_dir = tmp_path / "run"
+    process = start(run_dir, clean_environment)
+    seen = 0
+    for line in process.stdout:
+        if line.startswith("report"):
+            seen = int(line.split()[1])
+        if seen == 7:
+            process.send_signal(number)
+            break
+    rest, errors = process.communicate(timeout=60)
+    assert process.returncode == status, errors
+    assert "--resume" in rest
+    seen = max([seen, *(int(line.split()[1]) for line in rest.splitlines() if line.startswith("report"))])
+    shapes = make_fake_trainer(small_config(), None).shapes
+    checkpoints = Checkpoints(run_dir / "checkpoints")
+    restored = checkpoints.restore_for_resume(shapes)
+    assert restored.tier == FULL and restored.iteration >= seen - 1 and not checkpoints.iterations(LIGHT)
+    config = read_config(run_dir).replace(env_steps=10 * (restored.iteration + 2), eval_interval=1)
+    reports = list(make_fake_trainer(config, run_dir, resume=True).run())
+    assert [report.iteration for report in reports] == [restored.iteration + 1, restored.iteration + 2]
+
+
+def test_an_evaluation_that_a_signal_prevented_is_made_up_for(straight, tmp_path):
+    path = tmp_path / "run"
+    reports = make_fake_trainer(small_config(), path).run()
+    with pytest.raises(trainer.Terminated) as stopped:
+        for report in reports:
+            if report.iteration == 3:  # iteration 4, which ends with an evaluation, comes next
+                signal.raise_signal(signal.SIGTERM)
+    assert stopped.value.code == 143
+    assert len(rows_without_time(path)) == 2
+    list(make_fake_trainer(small_config(), path, resume=True).run())
+    assert rows_without_time(path) == rows_without_time(straight[0])
+
+
+def test_handlers_are_put_back(tmp_path):
+    before = signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)
+    reports = make_fake_trainer(small_config(), tmp_path / "run").run()
+    next(reports)
+    assert signal.getsignal(signal.SIGTERM) != before[0]
+    reports.close()
+    assert (signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)) == before
+
+
+def test_a_second_signal_does_not_wait(tmp_path):
+    reports = make_fake_trainer(small_config(), tmp_path / "run").run()
+    next(reports)
+    signal.raise_signal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
+    reports.close()
+
+
+def test_an_existing_folder_is_refused(straight, tmp_path):
+    with pytest.raises(RequestError, match="--resume goes on with it, --overwrite starts again"):
+        make_fake_trainer(small_config(), straight[0])
+    with pytest.raises(RequestError, match="contradict each other"):
+        make_fake_trainer(small_config(), straight[0], resume=True, overwrite=True)
+    (tmp_path / "thesis.txt").write_text("precious")
+    with pytest.raises(RequestError, match="not a run"):
+        make_fake_trainer(small_config(), tmp_path, overwrite=True)
+    assert (tmp_path / "thesis.txt").read_text() == "precious"
+    with pytest.raises(RequestError, match="is a file"):
+        make_fake_trainer(small_config(), tmp_path / "thesis.txt")
+
+
+def test_overwrite_deletes_the_run_and_nothing_else(tmp_path):
+    path = tmp_path / "run"
+    list(make_fake_trainer(small_config(env_steps=20), path).run())
+    (path / "notes.txt").write_text("mine")
+    assert len(list(make_fake_trainer(small_config(seed=5, env_steps=20), path, overwrite=True).run())) == 2
+    assert (path / "notes.txt").exists() and {row["seed"] for row in rows_without_time(path)} == {5, 6}
+
+
+def test_a_contradicting_config_is_named(straight):
+    with pytest.raises(RequestError) as refused:
+        make_fake_trainer(small_config(num_envs=3, discount=0.5, eval_interval=1), straight[0], resume=True)
+    text = str(refused.value)
+    assert "num_envs (saved 2, asked 3)" in text and "discount (saved None, asked 0.5)" in text
+    assert "eval_interval" not in text and "\n" not in text
+
+
+def test_a_broken_config_file_is_one_line(straight, tmp_path):
+    with pytest.raises(RequestError, match="no run in"):
+        read_config(tmp_path)
+    (tmp_path / "config.json").write_text("{")
+    with pytest.raises(RequestError, match="cannot be read"):
+        make_fake_trainer(small_config(), tmp_path, resume=True)
+    record = json.loads((straight[0] / "config.json").read_text())
+    record["config"]["old_option"] = 1
+    (tmp_path / "config.json").write_text(json.dumps(record))
+    with pytest.raises(RequestError, match="old_option"):
+        make_fake_trainer(small_config(), tmp_path, resume=True)
+
+
+def test_a_replay_that_cannot_fit_is_refused_before_allocation(tmp_path, monkeypatch):
+    config = small_config(replay_transitions=10**12, seeds=1)
+    with pytest.raises(RequestError, match="bytes") as refused:
+        list(make_fake_trainer(config, tmp_path / "run").run())
+    text = str(refused.value)
+    fitting = int(text.split("--replay-transitions ")[1].split()[0])
+    assert 0 < fitting < 10**12 and fitting % 10 == 0 and "\n" not in text
+    there = memory.available_bytes()
+    monkeypatch.setattr(memory, "available_bytes", lambda: there)
+    fits = make_fake_trainer(config.replace(replay_transitions=fitting), tmp_path / "other")
+    line = memory.check_memory(fits.config, fits.shapes, fits.program.replay_bytes, 10)
+    assert line.startswith("replay ") and " of " in line
+    monkeypatch.setattr(memory, "available_bytes", lambda: 1000)
+    with pytest.raises(RequestError, match="not even one rollout fits"):
+        memory.check_memory(fits.config, fits.shapes, fits.program.replay_bytes, 10)
+
+
+@pytest.mark.parametrize("break_state", [False, True])
+def test_a_non_finite_number_stops_the_run(tmp_path, break_state, capsys):
+    path = tmp_path / "run"
+    with pytest.raises(trainer.NonFiniteError) as stopped:
+        list(make_fake_trainer(small_config(), path, nan_at=4, break_state=break_state).run())
+    text = str(stopped.value)
+    assert "in iteration 5" in text and "train/critic_loss" in text and "iteration 4" in text and "\n" not in text
+    (file,) = (path / "nonfinite").iterdir()
+    assert str(file) in text
+    dumped = np.load(file)
+    assert "critic.layer.kernel" in dumped["nonfinite_leaves"] and np.isnan(dumped["metrics.train/critic_loss"]).all()
+    assert np.isnan(dumped["train.critic.layer.bias"]).all() and dumped["key"].shape[0] == 2
+    assert dumped["episodes.states"].shape[0] == (4 if break_state else 0)
+    shapes = make_fake_trainer(small_config(), None).shapes
+    restored = Checkpoints(path / "checkpoints", read_only=True).restore_for_resume(shapes)
+    assert restored.iteration == 4 and all(np.isfinite(leaf).all() for leaf in as_plain(restored.train))
+
+
+def test_a_filter_that_takes_everything_is_reported(tmp_path, capsys):
+    list(make_fake_trainer(small_config(), tmp_path / "run", filtered_share=0.95).run())
+    assert capsys.readouterr().out.count("warning: more than 90%") == 1
+
+
+def test_init_takes_one_key_or_one_per_seed():
+    one = make_fake_trainer(small_config(seeds=1), None)
+    assert all(map(np.array_equal, as_plain(one.init(jax.random.key(0))), as_plain(one.init(one.run_keys))))
+    two = make_fake_trainer(small_config(), None)
+    assert two.init(jax.random.key(3)).key.shape == (2,)
+    # A seed learns the same beside another one as alone.
+    alone, together = one.init(one.run_keys), two.init(two.run_keys)
+    alone, alone_metrics = one.train_iteration(alone)
+    together, metrics_of_both = two.train_iteration(together)
+    assert float(alone_metrics["train/critic_loss"][0]) == pytest.approx(
+        float(metrics_of_both["train/critic_loss"][0]), rel=1e-5
+    )
+
+
+def test_names_of_default_folders():
+    assert default_folder(Config()) == Path("runs/VisualFetchReach-oracle-fast-seed0")
+    assert default_folder(Config(seeds=5)).name == "VisualFetchReach-oracle-fast-seeds0to4"
+
+
+def test_metrics_file_survives_a_torn_line(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    rows = [{"seed": 0, "iteration": i, "x": float(i)} for i in range(4)]
+    metrics.append_rows(path, rows)
+    with path.open("a") as file:
+        file.write('{"seed": 0, "iter')
+    assert metrics.read_rows(path) == rows
+    metrics.cut_back(path, 1)
+    assert path.read_text().count("\n") == 2 and metrics.read_rows(path) == rows[:2]
+    assert metrics.make_rows([3], {"iteration": 1}, {"a": [float("nan")]}) == [{"seed": 3, "iteration": 1, "a": None}]
+
+
+def test_evaluate_and_play_a_run(straight, tmp_path, monkeypatch):
+    path, _, reports = straight
+
+    def fake_make_trainer(config, *arguments, **options):
+        return trainer.Trainer(config, FakeProgram(config), *arguments, **options)
+
+    monkeypatch.setattr(trainer, "make_trainer", fake_make_trainer)
+    found = trainer.evaluate_run(path, episodes=7)
+    assert found["eval/success"] == pytest.approx(reports[-1].metrics["eval/success"], rel=1e-5)
+    assert [type(value) for value in found["eval/success"]] == [float, float]
+    for suffix in (".gif", ".png", ".html"):
+        trainer.play_run(path, tmp_path / f"out{suffix}", episodes=4)
+        assert (tmp_path / f"out{suffix}").stat().st_size > 1000
+    with pytest.raises(RequestError, match="must end in"):
+        trainer.play_run(path, tmp_path / "out.avi")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(RequestError, match="no run in"):
+        trainer.evaluate_run(tmp_path / "empty")
+    RunFolder(tmp_path / "new").open(small_config())
+    with pytest.raises(RequestError, match="no usable checkpoint"):
+        trainer.evaluate_run(tmp_path / "new")
+
+
+@pytest.mark.slow
+def test_the_real_program_resumes_bit_for_bit(tmp_path, capsys):
+    """The same as above with physics, cameras and networks. Traced once: the three runs share the program."""
+    config = preset("debug", env="VisualReacher", full_checkpoint_interval=2)
+    program = train_step.make_train_step(train_step.make_env(config), config)
+    traced, calls = program.train_iteration, []
+    program = dataclasses.replace(
+        program, train_iteration=world_jit(lambda loop: (calls.append(0), traced(loop))[1], donate_argnums=0)
+    )
+
+    def run(path, resume=False, **changes):
+        asked = config.replace(**changes)
+        mine = trainer.Trainer(asked, dataclasses.replace(program, config=asked), path, resume=resume)
+        return mine, list(mine.run())
+
+    mine, reports = run(tmp_path / "straight")
+    assert [report.iteration for report in reports] == [1, 2, 3, 4] and len(calls) == 1
+    run(tmp_path / "cut", env_steps=400)
+    run(tmp_path / "cut", resume=True)
+    assert rows_without_time(tmp_path / "cut") == rows_without_time(tmp_path / "straight")
+    both = final_state(tmp_path / "cut", mine.shapes), final_state(tmp_path / "straight", mine.shapes)
+    assert all(map(np.array_equal, *both)) and any(leaf.any() for leaf in both[0])
+    assert (tmp_path / "cut" / "video.gif").stat().st_size > 10_000
+    line = memory.check_memory(config, mine.shapes, program.replay_bytes, program.steps_per_iteration)
+    assert line.startswith("replay ")
+
+
+@pytest.mark.slow
+def test_the_script_runs(tmp_path, checkout, capsys):
+    script = runpy.run_path(str(checkout / "notebooks" / "train.py"))
+    assert len((checkout / "notebooks" / "train.py").read_text().splitlines()) < 40
+    script["main"]("debug", "VisualReacher", str(tmp_path / "run"))
+    assert "best evaluation" in capsys.readouterr().out
+    figures = trainer.evaluate_run(tmp_path / "run")
+    assert len(figures["eval/success"]) == 1
+    trainer.play_run(tmp_path / "run", tmp_path / "strip.png")
+    assert (tmp_path / "strip.png").exists()
+
+
+def test_a_report_cannot_be_changed(straight):
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        straight[2][0].iteration = 3
+    assert run_loop.Report is trainer.Report
