@@ -78,7 +78,7 @@ def to_host(tree: Any, copy: bool) -> Arrays:
         if copy or jax.default_backend() != "cpu":
             return np.array(leaf)
         try:
-            return np.from_dlpack(leaf)
+            return np.from_dlpack(leaf)  # pyright: ignore[reportArgumentType]
         except (BufferError, RuntimeError, TypeError):  # a type that numpy lacks, or several devices
             return np.array(leaf)
 
@@ -86,7 +86,7 @@ def to_host(tree: Any, copy: bool) -> Arrays:
 
 
 def _checksum(array: np.ndarray) -> int:
-    return zlib.crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8))
+    return zlib.crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
 
 
 def _describe(arrays: Arrays) -> dict[str, list]:
@@ -170,7 +170,7 @@ class Checkpoints:
             manager.delete(iteration)
         described = {name: _describe(arrays) for name, arrays in items.items()}
         manifest = {"schema": SCHEMA, "iteration": iteration, "items": described, "memo": memo}
-        arguments = {name: ocp.args.StandardSave(arrays) for name, arrays in items.items()}
+        arguments: dict[str, Any] = {name: ocp.args.StandardSave(arrays) for name, arrays in items.items()}
         arguments["manifest"] = ocp.args.JsonSave(manifest)
         if not manager.save(iteration, args=ocp.args.Composite(**arguments), force=True):
             raise RuntimeError(f"checkpoint {tier}/{iteration} was not written")

@@ -155,9 +155,9 @@ class Resolved:
 def resolve(config: Config, horizon: int) -> Resolved:
     """Fills in the defaults that depend on the method and the horizon.
 
-    The filter's band is R- + gamma R+/(1-gamma) < q0 < R+/(1-gamma) (thesis, section 5.1.4); its middle is the default. A critic
-    that starts at or above q0 would drop every negative before it has learned from one, and so never come down. With rewards
-    0/-1 a fresh critic (Q near 0) does: there it starts at R-/(1-gamma), the least value any state can have.
+    The filter's band is R- + gamma R+/(1-gamma) < q0 < R+/(1-gamma) (thesis, section 5.1.4); its middle is the default. A
+    critic that starts at or above q0 would drop every negative before it has learned from one, and so never come down. With
+    rewards 0/-1 a fresh critic (Q near 0) does: there it starts at R-/(1-gamma), the least value any state can have.
 
     Raises:
         RequestError: The discount or the filter threshold lies outside its range.
@@ -252,7 +252,7 @@ _DEBUG = _CPU.replace(
 )
 
 PRESETS: dict[str, Config] = {config.preset: config for config in (_PAPER, _FAST, _CPU, _DEBUG)}
-"""``paper``: the authors' release. ``fast``: ours. ``cpu``: what two cores can do in minutes. ``debug``: seconds, learns nothing."""
+"""``paper``: the authors' release. ``fast``: ours. ``cpu``: what two cores do in minutes. ``debug``: seconds, no learning."""
 
 
 def preset(name: str, **overrides: Any) -> Config:
@@ -288,5 +288,7 @@ def validate(config: Config) -> Config:
         if not getattr(config, name) > 0.0:
             raise RequestError(f"{name} must be positive, not {getattr(config, name)}")
     if config.seed < 0 or config.full_checkpoint_interval < 0:
-        raise RequestError(f"seed ({config.seed}) and full_checkpoint_interval ({config.full_checkpoint_interval}) must be >= 0")
+        raise RequestError(
+            f"seed ({config.seed}) and full_checkpoint_interval ({config.full_checkpoint_interval}) must be >= 0"
+        )
     return config

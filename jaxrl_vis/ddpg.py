@@ -87,9 +87,7 @@ def make_ddpg(networks: Networks, config: Config, resolved: Resolved) -> Algorit
         action_tp1 = networks.act(state.target_actor, target_observation, target_goal)
         target_goal, target_observation = encode_pair(state.target_critic, after)
         value_tp1 = networks.value(state.target_critic, target_observation, target_goal, action_tp1)
-        target = losses.td_target(
-            reward, value_tp1, resolved.discount, resolved.target_minimum, resolved.target_maximum
-        )
+        target = losses.td_target(reward, value_tp1, resolved.discount, resolved.target_minimum, resolved.target_maximum)
 
         (critic_error, (observation, goal, value, keep)), critic_gradient = jax.value_and_grad(critic_loss, has_aux=True)(
             state.critic, now, batch.action, reward, target

@@ -36,10 +36,7 @@ def print_table() -> None:
 
 def draw(path: Path, image_size: int = 128) -> None:
     """Writes one row of pictures a task: start and goal as colours, start and goal as depth."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    from matplotlib.figure import Figure  # not pyplot, which would change a notebook's backend
 
     rows = []
     for name in jaxrl_vis_envs.list_envs():
@@ -49,7 +46,8 @@ def draw(path: Path, image_size: int = 128) -> None:
         obs = world_jit(lambda key, env=env: env.reset(key).obs)(jax.random.key(0))
         start, goal = (np.moveaxis(np.asarray(obs[part]), 0, -1) for part in ("observation", "desired_goal"))
         rows.append((name, [start[..., :3], goal[..., :3], start[..., 3], goal[..., 3]]))
-    figure, axes = plt.subplots(len(rows), 4, figsize=(10, 2.7 * len(rows)), squeeze=False)
+    figure = Figure(figsize=(10, 2.7 * len(rows)))
+    axes = figure.subplots(len(rows), 4, squeeze=False)
     for (name, pictures), line in zip(rows, axes, strict=True):
         for picture, title, axis in zip(pictures, ("start", "goal", "start, depth", "goal, depth"), line, strict=True):
             axis.imshow(picture, cmap="magma", interpolation="nearest", vmin=0, vmax=255)
@@ -57,4 +55,3 @@ def draw(path: Path, image_size: int = 128) -> None:
             axis.axis("off")
     figure.tight_layout()
     figure.savefig(path, dpi=max(72, math.ceil(4 * image_size / 10)))
-    plt.close(figure)

@@ -18,7 +18,7 @@ def td_target(
 
 
 def keep_mask(reward_t: jax.Array, value_t: jax.Array, reward_negative: float, threshold: float) -> jax.Array:
-    """1 for transitions to learn from, 0 for negatives whose value says that they are false (thesis, section 5.1.4): [B] float32.
+    """1 for transitions to learn from, 0 for negatives whose value says that they are false (thesis, 5.1.4): [B] float32.
 
     Args:
         reward_t: [B] rewards.

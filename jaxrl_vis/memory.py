@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from jaxrl_vis.config import Config, RequestError
 
@@ -24,7 +25,7 @@ def tree_bytes(shapes: Any) -> int:
     """Bytes of all arrays (or their shapes) in a pytree; typed keys count as their words."""
 
     def size(leaf: Any) -> int:
-        item = 8 if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf.dtype.itemsize
+        item = 8 if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf.dtype.itemsize
         return math.prod(leaf.shape) * item
 
     return sum(size(leaf) for leaf in jax.tree.leaves(shapes))

@@ -59,7 +59,9 @@ class _Encoder(nn.Module):
         for level, filters in enumerate(self.filters):
             # Initialised as the convolution that it is: fan-out counts the window too.
             kernel = self.param(
-                f"kernel_{level}", lambda key, shape: _glorot(key, (2, 2, shape[0] // 4, shape[1])).reshape(shape), (4 * channels, filters)
+                f"kernel_{level}",
+                lambda key, shape: _glorot(key, (2, 2, shape[0] // 4, shape[1])).reshape(shape),
+                (4 * channels, filters),
             )
             bias = self.param(f"bias_{level}", nn.initializers.zeros, (filters,))
             values = values.reshape(-1, 4 * channels) @ kernel.astype(self.dtype)
@@ -137,10 +139,10 @@ class Networks:
         return jnp.dtype(chosen)
 
     @property
-    def _encoder(self) -> _Encoder:
+    def _encoder(self) -> Any:
         return _Encoder(self.config.encoder_filters, self.config.latent_size, self.dtype)
 
-    def _head(self, outputs: int, output_bias: float) -> _Head:
+    def _head(self, outputs: int, output_bias: float) -> Any:
         return _Head(self.config.hidden_sizes, outputs, output_bias, self.dtype)
 
     @property

@@ -49,4 +49,4 @@ def dump(file: Path, loop: LoopState, values: PerSeed, leaves: list[str]) -> Non
     found |= to_host({"key": loop.key, "iteration": loop.iteration}, copy=True)
     found["nonfinite_leaves"] = np.asarray(leaves, dtype=np.str_)
     file.parent.mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(file, **found)
+    np.savez_compressed(file, **found)  # pyright: ignore[reportArgumentType]

@@ -4,15 +4,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg", force=False)  # no display is needed to write a file
-
-import matplotlib.pyplot as plt  # noqa: E402
-import numpy as np  # noqa: E402
-from matplotlib.axes import Axes  # noqa: E402
-from matplotlib.figure import Figure  # noqa: E402
-from matplotlib.ticker import FuncFormatter, MaxNLocator, PercentFormatter  # noqa: E402
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, MaxNLocator, PercentFormatter
 
 _INK, _FAINT = "#22252a", "#8b919a"
 _SUCCESS, _DISTANCE = "#0f7b6c", "#b4531f"
@@ -142,5 +137,4 @@ def plot_run(
     figure.text(0.035, 0.885, subtitle, fontsize=10, color=_FAINT, va="center")
     figure.subplots_adjust(left=0.065, right=0.945, bottom=0.135, top=0.755, wspace=0.27)
     figure.savefig(path)
-    plt.close("all")
     return True

@@ -47,21 +47,21 @@ class Replay(NamedTuple):
         """N, episodes that the ring holds."""
         return self.num_rollouts * self.num_envs
 
-    def spec(self, observation: jax.ShapeDtypeStruct, goal_state_size: int, action_size: int) -> ReplayState:
-        """Shapes and dtypes of the storage, without allocating it."""
+    def init(self, observation: jax.ShapeDtypeStruct, goal_state_size: int, action_size: int) -> ReplayState:
+        """An empty replay."""
         episodes, horizon = self.num_episodes, self.horizon
         return ReplayState(
             episodes=Episodes(
-                frames=jax.ShapeDtypeStruct((episodes, horizon + 2, *observation.shape), observation.dtype),
-                states=jax.ShapeDtypeStruct((episodes, horizon + 2, goal_state_size), jnp.float32),
-                actions=jax.ShapeDtypeStruct((episodes, horizon, action_size), jnp.float32),
+                frames=jnp.zeros((episodes, horizon + 2, *observation.shape), observation.dtype),
+                states=jnp.zeros((episodes, horizon + 2, goal_state_size), jnp.float32),
+                actions=jnp.zeros((episodes, horizon, action_size), jnp.float32),
             ),
-            size=jax.ShapeDtypeStruct((), jnp.int32),
+            size=jnp.zeros((), jnp.int32),
         )
 
-    def init(self, observation: jax.ShapeDtypeStruct, goal_state_size: int, action_size: int) -> ReplayState:
-        """An empty replay."""
-        return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), self.spec(observation, goal_state_size, action_size))
+    def spec(self, observation: jax.ShapeDtypeStruct, goal_state_size: int, action_size: int) -> ReplayState:
+        """Shapes and dtypes of the storage, without allocating it."""
+        return jax.eval_shape(lambda: self.init(observation, goal_state_size, action_size))
 
     def insert(self, state: ReplayState, rollout: Episodes, iteration: jax.Array) -> ReplayState:
         """Writes the E episodes of ``iteration`` ([] int32), over the oldest ones once the ring is full."""

@@ -208,7 +208,8 @@ def read_config(path: Path) -> Config:
     if unknown:
         raise RequestError(f"the run in {path} has options that this version does not know: {', '.join(unknown)}")
     # JSON has no tuples.
-    return Config(**{name: tuple(value) if isinstance(value, list) else value for name, value in saved.items()})
+    fields: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in saved.items()}
+    return Config(**fields)
 
 
 def _check_same(path: Path, saved: dict[str, Any], config: Config) -> None:

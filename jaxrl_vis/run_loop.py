@@ -98,6 +98,7 @@ class RunLoop:
         self._memo = Memo()
         self._done = 0
         self._loop: LoopState | None = None
+        self._pictures: dict[str, jax.Array] = {}
         self._started = self._mark = time.monotonic()
         self._begun, self._begun_at = 0, self._mark
         self._marked_iteration = 0
@@ -242,7 +243,8 @@ class RunLoop:
         """Evaluates the learner, writes a line per seed, and adds the figures to the report."""
         assert self._loop is not None
         speed = self._speed(self._done)
-        values = {name: self._per_seed(value) for name, value in jax.device_get(self._trainer.evaluate(self._loop)).items()}
+        outcome, self._pictures = self._trainer.watch(self._loop)
+        values = {name: self._per_seed(value) for name, value in jax.device_get(outcome).items()}
         if not all(np.isfinite(row).all() for row in values.values()):
             self._stop_nonfinite(f"the evaluation after iteration {self._done}", values)
         self._memo.evaluation_due = False
@@ -353,7 +355,7 @@ class RunLoop:
         if not interruption:
             self._draw_curve()
         if not interruption and self._trainer.shows_pictures:
-            videos.write_video(self._trainer.record(self._loop), self._folder.video, self._trainer.frame_seconds)
+            videos.write_video(videos.first_seed(self._pictures), self._folder.video, self._trainer.frame_seconds)
         if interruption:
             interruption.end()
         wall = self._memo.wall_s + time.monotonic() - self._started

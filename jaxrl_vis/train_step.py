@@ -6,8 +6,8 @@
     updates     scan over U: sample, relabel, reward, gradient step, target networks
     metrics     fixed-shape means
 
-`vmap` over the seeds' axis makes it train several learners at once. The loop state is donated, so the replay is written where it
-lies.
+`vmap` over the seeds' axis makes it train several learners at once. The loop state is donated, so the replay is written where
+it lies.
 """
 
 import dataclasses
@@ -24,7 +24,7 @@ from jaxrl_vis.ddpg import Algorithm, make_ddpg
 from jaxrl_vis.networks import Networks
 from jaxrl_vis.relabel import choose_goal_slots
 from jaxrl_vis.replay import Replay, make_replay, num_bytes
-from jaxrl_vis.rollout import play
+from jaxrl_vis.rollout import Exploration, play
 from jaxrl_vis.types import Batch, LoopState, Metrics, ReplayState, TrainState
 from jaxrl_vis_envs import goals
 from jaxrl_vis_envs.base import GoalEnv
@@ -33,8 +33,8 @@ from jaxrl_vis_envs.compilation import world_jit
 # A leading seed axis on everything but the iteration, which all seeds share (see `replay`).
 _SEED_AXES = LoopState(train=0, replay=0, key=0, iteration=None)  # type: ignore[arg-type]
 
-# Evaluation draws from keys of its own, the same at every evaluation and for every seed.
-_EVALUATION_SEED = 2**31 - 1
+# Episodes of an evaluation whose pictures are handed back, for videos.
+_NUM_RECORDED = 8
 
 
 def make_env(config: Config) -> GoalEnv:
@@ -58,8 +58,8 @@ class TrainStep:
         env, config, resolved, networks, replay: What it was made of.
         init: keys [S] -> LoopState.
         train_iteration: LoopState (donated) -> (LoopState, metrics of [S] float32).
-        evaluate: TrainState [S, ...] -> metrics of [S] float32, without noise, on fixed keys.
-        record: (TrainState [S, ...], key) -> a few episodes of the first seed, for videos.
+        evaluate: (TrainState [S, ...], key) -> (metrics of [S] float32, recording [S, K, ...]), without noise. All seeds play
+            the same episodes, and of the first K each frame is handed back, so that no video needs a program of its own.
         update_many: (TrainState, ReplayState, key, iteration) of one seed -> the same after ``updates_per_iteration`` steps.
     """
 
@@ -71,7 +71,6 @@ class TrainStep:
     init: Any
     train_iteration: Any
     evaluate: Any
-    record: Any
     update_many: Any
 
     @property
@@ -154,8 +153,8 @@ def make_train_step(env: GoalEnv, config: Config) -> TrainStep:
 
     def train_iteration(loop: LoopState) -> tuple[LoopState, Metrics]:
         rollout_key, update_key = jax.random.split(jax.random.fold_in(loop.key, loop.iteration))
-        exploration = {"random_action_probability": config.random_action_probability, "action_noise": config.action_noise}
-        episodes, outcome = play(env, networks, loop.train, rollout_key, config.num_envs, **exploration)
+        exploration = Exploration(config.random_action_probability, config.action_noise)
+        episodes, outcome = play(env, networks, loop.train, rollout_key, config.num_envs, exploration)
         memory = replay.insert(loop.replay, episodes, loop.iteration)
         train = loop.train.replace(normalizer=normalizer.update(loop.train.normalizer, episodes.frames))
         train, metrics = update_many(train, memory, update_key, loop.iteration)
@@ -163,22 +162,18 @@ def make_train_step(env: GoalEnv, config: Config) -> TrainStep:
         metrics["guard/nonfinite"] = _count_nonfinite((metrics, episodes.states, episodes.actions))
         return LoopState(train=train, replay=memory, key=loop.key, iteration=loop.iteration + 1), metrics
 
-    def evaluate(train: TrainState) -> Metrics:
-        key = jax.random.key(_EVALUATION_SEED)
-        _, outcome = play(env, networks, train, key, config.eval_episodes, keep_frames=False)
-        return {
+    def evaluate(train: TrainState, key: jax.Array) -> tuple[Metrics, dict[str, jax.Array]]:
+        num_recorded = min(_NUM_RECORDED, config.eval_episodes)
+        episodes, outcome = play(env, networks, train, key, config.eval_episodes, num_kept=num_recorded)
+        frames, goals = episodes.frames[:, :-1], episodes.frames[:, -1]
+        metrics = {
             "eval/success": jnp.mean(outcome["success"]),
             "eval/goal_distance": jnp.mean(outcome["goal_distance"]),
             "eval/goal_distance_median": jnp.median(outcome["goal_distance"]),
         }
+        return metrics, {"frames": frames, "goals": goals, "success": outcome["success"][:num_recorded]}
 
-    def record(train: TrainState, key: jax.Array) -> dict[str, jax.Array]:
-        first_seed = jax.tree.map(lambda leaf: leaf[0], train)
-        episodes, outcome = play(env, networks, first_seed, key, num_envs=8)
-        horizon = env.horizon
-        return {"frames": episodes.frames[:, : horizon + 1], "goals": episodes.frames[:, horizon + 1], **outcome}
-
-    def per_seed(function, in_axes=0, out_axes=0):
+    def per_seed(function, in_axes: Any = 0, out_axes: Any = 0):
         return jax.vmap(function, in_axes=in_axes, out_axes=out_axes)
 
     return TrainStep(
@@ -189,7 +184,6 @@ def make_train_step(env: GoalEnv, config: Config) -> TrainStep:
         replay=replay,
         init=world_jit(per_seed(init, out_axes=_SEED_AXES)),
         train_iteration=world_jit(per_seed(train_iteration, (_SEED_AXES,), (_SEED_AXES, 0)), donate_argnums=0),
-        evaluate=world_jit(per_seed(evaluate)),
-        record=world_jit(record),
+        evaluate=world_jit(per_seed(evaluate, (0, None))),
         update_many=world_jit(per_seed(update_many, (0, 0, 0, None)), donate_argnums=0),
     )

@@ -39,8 +39,8 @@ __all__ = [
     "play_run",
 ]
 
-# Episodes for the video are drawn from a key of their own.
-_VIDEO_SEED = 2**31 - 2
+# Evaluation draws from a key of its own, the same at every evaluation and for every seed.
+_EVALUATION_SEED = 2**31 - 1
 
 
 def enable_compilation_cache() -> str:
@@ -128,7 +128,7 @@ class Trainer:
             The compiled programs by name.
         """
         enable_compilation_cache()
-        names = ["init", "train_iteration", "evaluate", *(["record"] if self.shows_pictures else [])]
+        names = ["init", "train_iteration", "evaluate"]
         # Tracing is Python and goes one by one; XLA compiles without the interpreter's lock.
         lowered = {name: self._lower(name) for name in names if name not in self._compiled}
         with concurrent.futures.ThreadPoolExecutor() as pool:
@@ -140,8 +140,7 @@ class Trainer:
         arguments: dict[str, tuple] = {
             "init": (self.run_keys,),
             "train_iteration": (self.shapes,),
-            "evaluate": (self.shapes.train,),
-            "record": (self.shapes.train, jax.random.key(0)),
+            "evaluate": (self.shapes.train, jax.random.key(0)),
         }
         return getattr(self.program, name).lower(*arguments[name])
 
@@ -170,20 +169,19 @@ class Trainer:
         """
         return self._call("train_iteration", loop)
 
-    def evaluate(self, loop: LoopState | TrainState) -> Metrics:
-        """``eval/success`` and ``eval/goal_distance``, [S] float32, of the policy without noise on fixed keys."""
-        return self._call("evaluate", loop.train if isinstance(loop, LoopState) else loop)
-
-    def record(self, loop: LoopState | TrainState, key: jax.Array | None = None) -> videos.Recording:
-        """A few episodes of the first seed, on the host.
+    def evaluate(self, loop: LoopState | TrainState, key: jax.Array | None = None) -> Metrics:
+        """``eval/success``, ``eval/goal_distance`` and its median, [S] float32, of the policy without noise.
 
         Args:
             loop: What was trained.
             key: Draws the episodes; None: always the same ones.
         """
-        key = jax.random.key(_VIDEO_SEED) if key is None else key
-        recorded = jax.device_get(self._call("record", loop.train if isinstance(loop, LoopState) else loop, key))
-        return videos.Recording(recorded["frames"], recorded["goals"], recorded["success"])
+        return self.watch(loop, key)[0]
+
+    def watch(self, loop: LoopState | TrainState, key: jax.Array | None = None) -> tuple[Metrics, dict[str, jax.Array]]:
+        """As `evaluate`, and with it the pictures of the first few episodes of every seed: for `videos.first_seed`."""
+        key = jax.random.key(_EVALUATION_SEED) if key is None else key
+        return self._call("evaluate", loop.train if isinstance(loop, LoopState) else loop, key)
 
     def run(self) -> Iterator[Report]:
         """Trains to the end and yields a `Report` per iteration, one iteration late.
@@ -277,13 +275,14 @@ def play_run(run_dir: Path | str, out: Path | str, episodes: int = 6) -> None:
     """
     out = Path(out)
     videos.check_output(out)
-    trainer = _open_run(run_dir)
+    trainer = _open_run(run_dir, eval_episodes=max(1, episodes))
     if not trainer.shows_pictures:
         raise RequestError(f"{trainer.config.env} shows the robot no pictures: play a run on a Visual task")
     restored = _load(trainer)
-    key, parts, count = jax.random.key(_VIDEO_SEED), [], 0
+    key, parts, count = jax.random.key(_EVALUATION_SEED), [], 0
     while count < episodes:
-        parts.append(trainer.record(restored.train, jax.random.fold_in(key, count) if parts else None))
+        _, pictures = trainer.watch(restored.train, jax.random.fold_in(key, count) if parts else None)
+        parts.append(videos.first_seed(pictures))
         count += len(parts[-1].success)
     joined = videos.Recording(
         *(np.concatenate([getattr(part, name) for part in parts])[:episodes] for name in ("frames", "goals", "success"))

@@ -8,6 +8,7 @@ import dataclasses
 import io
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -48,6 +49,12 @@ def _depth_picture(depth: np.ndarray, near: float, far: float) -> np.ndarray:
     """Depth [H, W] in grey levels -> [H, W, 3] uint8: near is bright, the steps look equally large."""
     scaled = np.clip((depth.astype(np.float32) - near) / max(far - near, 1.0), 0.0, 1.0)
     return (matplotlib.colormaps["magma"](0.97 - 0.92 * scaled)[..., :3] * 255).round().astype(np.uint8)
+
+
+def first_seed(pictures: dict[str, Any]) -> Recording:
+    """What `Trainer.watch` saw of the first seed ([S, K, ...] arrays, on any device), on the host."""
+    first = {name: np.asarray(values[0]) for name, values in pictures.items()}
+    return Recording(first["frames"], first["goals"], first["success"])
 
 
 def _depth_range(recording: Recording) -> tuple[float, float]:
@@ -193,7 +200,7 @@ def check_output(path: Path) -> None:
         raise RequestError(f"cannot write {path}: the name must end in one of {', '.join(SUFFIXES)}")
     if path.suffix.lower() == ".mp4":
         try:
-            import imageio_ffmpeg  # noqa: F401
+            import imageio_ffmpeg  # noqa: F401  # pyright: ignore[reportMissingImports]
         except ImportError as error:
             raise RequestError(f"writing {path} needs imageio-ffmpeg: install it, or ask for a .gif") from error
 

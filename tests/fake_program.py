@@ -92,21 +92,18 @@ class FakeProgram:
             }
             return LoopState(train, memory, loop.key, loop.iteration + 1), metrics
 
-        def evaluate_one(train):
+        def evaluate_one(train, key):
             score = jax.nn.sigmoid(train.updates / 9.0 - 1.0 + 0.1 * train.actor["layer"]["kernel"].sum())
-            return {"eval/success": score, "eval/goal_distance": 0.2 * (1.0 - score)}
-
-        def record(train, key):
             y, x = jnp.mgrid[0:size, 0:size]
             t = jnp.arange(HORIZON + 1)[:, None, None]
             ball = ((y - 3 - t) ** 2 + (x - 4 - t) ** 2 < 9) * 120
             frames = jnp.broadcast_to((200 - ball).astype(jnp.uint8)[None, :, None], (3, HORIZON + 1, 1, size, size))
-            return {"frames": frames, "goals": frames[:, -1], "success": jnp.array([1.0, 0.0, 1.0])}
+            pictures = {"frames": frames, "goals": frames[:, -1], "success": jnp.array([1.0, 0.0, 1.0])}
+            return {"eval/success": score, "eval/goal_distance": 0.2 * (1.0 - score)}, pictures
 
         self.init = jax.jit(jax.vmap(init_one, out_axes=_SEED_AXES))
         self.train_iteration = jax.jit(jax.vmap(iterate_one, in_axes=(_SEED_AXES,), out_axes=(_SEED_AXES, 0)), donate_argnums=0)
-        self.evaluate = jax.jit(jax.vmap(evaluate_one))
-        self.record = jax.jit(record)
+        self.evaluate = jax.jit(jax.vmap(evaluate_one, in_axes=(0, None)))
 
 
 def make_fake_trainer(config: Config, run_dir: Path, resume: bool = False, overwrite: bool = False, **program) -> Trainer:

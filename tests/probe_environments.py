@@ -5,6 +5,7 @@ They are pure arithmetic: no MuJoCo, no pictures, a few steps.
 
 import jax
 import jax.numpy as jnp
+
 from jaxrl_vis_envs.base import GoalEnv, State, sanitize_action
 
 

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import probe_environments as probes
 import pytest
+
 from jaxrl_vis.config import preset
 from jaxrl_vis.train_step import make_train_step
 
@@ -63,13 +64,13 @@ def test_value_depends_on_the_goal():
 
 def test_policy_goes_where_the_goal_is():
     program, train, _ = trained(probes.GoWhereTold(), relabel_probability=0.9, iterations=25)
-    outcome = program.evaluate(jax.tree.map(lambda leaf: leaf[None], train))
+    outcome, _ = program.evaluate(jax.tree.map(lambda leaf: leaf[None], train), jax.random.key(11))
     assert outcome["eval/success"][0] >= 0.95
 
 
 def test_policy_depends_on_the_observation():
     program, train, _ = trained(probes.GoAgainstTheSign())
-    outcome = program.evaluate(jax.tree.map(lambda leaf: leaf[None], train))
+    outcome, _ = program.evaluate(jax.tree.map(lambda leaf: leaf[None], train), jax.random.key(11))
     assert outcome["eval/success"][0] >= 0.95
 
 
@@ -132,7 +133,8 @@ def test_a_fresh_filter_drops_nothing(rewards):
 def test_the_filter_drops_negatives_that_the_critic_values_like_positives():
     """Place 0 is its own goal, seen with noise in one byte, so most of its indicator rewards are false negatives."""
     program = make_train_step(
-        probes.PointPicture(), preset("debug", method="indicator_balance_filter", num_envs=32, updates_per_iteration=1, batch_size=256)
+        probes.PointPicture(),
+        preset("debug", method="indicator_balance_filter", num_envs=32, updates_per_iteration=1, batch_size=256),
     )
     loop = program.init(jax.random.key(0)[None])
     head = loop.train.critic["head"]

@@ -169,7 +169,9 @@ def test_the_goal_picture_is_the_picture_of_the_goal(name):
     np.testing.assert_array_equal(pictures, played.start.obs["desired_goal"])
     differs = np.asarray(played.start.obs["desired_goal"] != played.start.obs["observation"]).any(axis=(1, 2, 3))
     assert differs.mean() > 0.95
-    assert (np.asarray(played.steps.obs["observation"][-1] != played.start.obs["observation"])).any(axis=(1, 2, 3)).mean() > 0.95
+    assert (np.asarray(played.steps.obs["observation"][-1] != played.start.obs["observation"])).any(
+        axis=(1, 2, 3)
+    ).mean() > 0.95
 
 
 @pytest.mark.parametrize("name", ["FetchReach", "Reacher"])
@@ -259,12 +261,13 @@ def test_goals_need_no_mujoco():
     assert subprocess.run([sys.executable, "-c", code], check=False, env=SUBPROCESS_ENVIRONMENT).returncode == 0
 
 
-def test_world_jit_switches_off_fusion_emitters_on_a_cpu(monkeypatch):
+def test_world_jit_switches_off_fusion_emitters_on_a_cpu_where_jax_can(monkeypatch):
     options = {}
     monkeypatch.setattr(jax, "jit", lambda function, **given: options.update(given))
     compilation.world_jit(lambda: None, donate_argnums=0)
     assert options["donate_argnums"] == 0
-    expected = {"xla_cpu_use_fusion_emitters": False} if jax.default_backend() == "cpu" else {}
+    takes_it = jax.default_backend() == "cpu" and jax.__version_info__ < (0, 11)
+    expected = {"xla_cpu_use_fusion_emitters": False} if takes_it else {}
     assert options["compiler_options"] == expected
     assert compilation.compiler_options("gpu") == {}
 

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+
 from jaxrl_vis import losses, normalizer
 from jaxrl_vis.config import RequestError, preset
 from jaxrl_vis.networks import Networks, to_blocks

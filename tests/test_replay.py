@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+
 from jaxrl_vis.relabel import choose_goal_slots
 from jaxrl_vis.replay import make_replay, num_bytes
 from jaxrl_vis.types import Episodes

@@ -3,6 +3,9 @@
 XLA's CPU fusion emitters recompute a deep kinematic chain once for every use, which makes MuJoCo's forward kinematics hundreds
 of times slower on a CPU. They are switched off per function here, and never by environment variable: a notebook has started JAX
 long before this package is imported.
+
+JAX 0.11 has no such option per function any more (it refuses the name). Its emitters do not explode, but leave physics on a CPU
+about half as fast (FetchReach, 64 environments, two cores: 1,100 environment steps a second against 2,350).
 """
 
 from collections.abc import Callable
@@ -13,7 +16,7 @@ import jax
 
 def compiler_options(backend: str | None = None) -> dict[str, Any]:
     """Compiler options for programs that contain physics or rendering, for ``backend`` (default: the one JAX runs on)."""
-    if (backend or jax.default_backend()) == "cpu":
+    if (backend or jax.default_backend()) == "cpu" and jax.__version_info__ < (0, 11):
         return {"xla_cpu_use_fusion_emitters": False}
     return {}
 

@@ -1,7 +1,8 @@
 """What the agent sees: which channels, in which order, at which size, and how a depth becomes a byte.
 
-A picture is planar, [C, H, W] uint8, with the channels R, G, B, D (as many of them as ``pixels`` asks for). Depth is planar (along
-the camera's axis) and metric: 0 is the near end of the task's depth range, 255 the far end, linear between, clipped outside.
+A picture is planar, [C, H, W] uint8, with the channels R, G, B, D, as many of them as ``pixels`` asks for. Depth is
+planar (along the camera's axis) and metric: 0 is the near end of the task's depth range, 255 the far end, linear between,
+clipped outside.
 """
 
 import dataclasses

@@ -1,6 +1,7 @@
 """MuJoCo's own renderer on the same poses, for comparison. Needs OpenGL, which nothing else here does."""
 
 import time
+import warnings
 from typing import Any
 
 import mujoco
@@ -19,8 +20,9 @@ def check() -> None:
         RequestError: There is no OpenGL.
     """
     try:
-        renderer = mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), height=8, width=8)
-        renderer.close()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what is missing is said once, below
+            mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), height=8, width=8).close()
     except Exception as error:  # every OpenGL binding fails in its own way
         raise RequestError(
             "--peer mujoco needs OpenGL: install EGL or OSMesa (Debian: libegl1 or libosmesa6) and set MUJOCO_GL=egl or "

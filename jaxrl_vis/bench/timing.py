@@ -9,6 +9,8 @@ from typing import Any
 import jax
 import numpy as np
 
+_LEAST_SECONDS = 0.2
+
 
 @dataclasses.dataclass(frozen=True)
 class Timing:
@@ -42,15 +44,22 @@ def measure(call: Callable[[], Any], repeats: int = 5, budget_s: float = 30.0) -
 
     Args:
         call: The work; returns arrays.
-        repeats: Calls at most. At least three are made, or ``repeats`` if that is less.
+        repeats: Timed repeats at most. At least three are made, or ``repeats`` if that is less.
         budget_s: No further repeat starts after this many seconds.
     """
-    jax.block_until_ready(call())
-    seconds: list[float] = []
-    while len(seconds) < repeats and (len(seconds) < 3 or sum(seconds) < budget_s):
+
+    def seconds_of(calls: int) -> float:
         start = time.perf_counter()
-        jax.block_until_ready(call())
-        seconds.append(time.perf_counter() - start)
+        for _ in range(calls):
+            jax.block_until_ready(call())
+        return (time.perf_counter() - start) / calls
+
+    jax.block_until_ready(call())
+    # A call of a few milliseconds is repeated until a clock and a scheduler can tell it from noise.
+    calls = max(1, min(1000, round(_LEAST_SECONDS / max(seconds_of(1), 1e-6))))
+    seconds: list[float] = []
+    while len(seconds) < repeats and (len(seconds) < 3 or sum(seconds) * calls < budget_s):
+        seconds.append(seconds_of(calls))
     median = statistics.median(seconds)
     return Timing(median, (max(seconds) - min(seconds)) / median, len(seconds))
 

@@ -125,6 +125,7 @@ def render(scene: Scene, data: Any) -> Frame:
         The frame.
     """
     planes = render_planes(scene, data, rgb=True, depth=True, segmentation=True)
+    assert planes.rgb is not None and planes.depth is not None and planes.segmentation is not None
     return Frame(quantize(jnp.moveaxis(planes.rgb, 0, -1)), planes.depth, planes.segmentation)
 
 

@@ -54,7 +54,7 @@ class ReferenceRenderer:
         self._renderer.disable_segmentation_rendering()
         labels = np.where(kinds == mujoco.mjtObj.mjOBJ_GEOM, ids, -1)
         labels = np.where(kinds == mujoco.mjtObj.mjOBJ_SITE, ids + self._model.ngeom, labels)
-        return Frame(colour, depth, labels.astype(np.int32))
+        return Frame(colour, depth, labels.astype(np.int32))  # pyright: ignore[reportArgumentType]
 
     def close(self) -> None:
         """Frees the GL context."""

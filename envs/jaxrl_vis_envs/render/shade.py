@@ -21,7 +21,7 @@ _SPOT = int(mujoco.mjtLightType.mjLIGHT_SPOT)
 # What MuJoCo lights a scene with that has no light at all.
 _AMBIENT_WITHOUT_LIGHTS = 0.3
 
-Vector = tuple[jax.Array, jax.Array, jax.Array]
+Vector = tuple[jax.Array, ...]  # three of them
 
 
 class Light(NamedTuple):
@@ -199,6 +199,7 @@ def _light_factors(light: Light, point: Vector, normal: Vector, to_camera: Vecto
         to_light = tuple(-light.direction[axis] for axis in range(3))
         fade = 1.0
     else:
+        assert light.position is not None and light.attenuation is not None
         offset = tuple(light.position[axis] - point[axis] for axis in range(3))
         distance_square = _dot(offset, offset)
         inverse_distance = jax.lax.rsqrt(distance_square + 1e-20)
@@ -207,6 +208,7 @@ def _light_factors(light: Light, point: Vector, normal: Vector, to_camera: Vecto
         constant, linear, quadratic = (light.attenuation[index] for index in range(3))
         fade = 1.0 / (constant + linear * distance + quadratic * distance_square)
         if light.cosine_cutoff is not None:
+            assert light.exponent is not None
             along = -_dot(to_light, tuple(light.direction[axis] for axis in range(3)))
             fade = jnp.where(along >= light.cosine_cutoff, fade * _power(along, light.exponent), 0.0)
     facing = jnp.maximum(_dot(normal, to_light), 0.0)

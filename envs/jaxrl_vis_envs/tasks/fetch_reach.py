@@ -18,12 +18,12 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mujoco import mjx
 
 from jaxrl_vis_envs.base import GoalEnv, State, sanitize_action
 from jaxrl_vis_envs.pixels import PixelsConfig, picture_observer
 from jaxrl_vis_envs.registry import register
 from jaxrl_vis_envs.tasks import mjx_model
+from jaxrl_vis_envs.tasks.mjx_model import mjx
 
 # The gripper points down. Added to the link's own unit quaternion, as the original does, it turns the target about 60 % of the
 # way back to this orientation in each control step.

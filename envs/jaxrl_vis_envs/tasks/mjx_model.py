@@ -1,12 +1,16 @@
 """What every MJX task needs: loading its model, and states without weak types."""
 
+import contextlib
+import io
 import pathlib
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
-from mujoco import mjx
+
+with contextlib.redirect_stdout(io.StringIO()):  # it prints, twice, that Warp is missing, which nothing here needs
+    from mujoco import mjx
 
 _ASSETS = pathlib.Path(__file__).parent / "assets"
 
@@ -34,8 +38,10 @@ def simulate(model: mjx.Model, data: mjx.Data, substeps: int) -> mjx.Data:
     def substep(data: mjx.Data, _: Any) -> tuple[mjx.Data, None]:
         return mjx.step(model, data), None
 
-    data, _ = jax.lax.scan(substep, data, length=substeps)
-    return mjx.kinematics(model, data)
+    # Accelerators multiply float32 matrices with ten bits of mantissa unless they are told not to.
+    with jax.default_matmul_precision("highest"):
+        data, _ = jax.lax.scan(substep, data, length=substeps)
+        return mjx.kinematics(model, data)
 
 
 def point_velocity(data: mjx.Data, point: jax.Array) -> jax.Array:

@@ -1,8 +1,8 @@
 """Reacher: bring the fingertip of a two-link arm to where the goal picture shows it.
 
-As the authors of "Reinforcement Learning without Ground-Truth State" used it: the joint velocities are overwritten at the start of
-a control step and then decay, and the goal is the fingertip of a random configuration. ``control="torque"`` gives the motors of
-Gym's Reacher instead.
+As the authors of "Reinforcement Learning without Ground-Truth State" used it: the joint velocities are overwritten at the
+start of a control step and then decay, and the goal is the fingertip of a random configuration. ``control="torque"`` gives the
+motors of Gym's Reacher instead.
 
     VisualReacher   sees RGB-D from above
     Reacher         sees joint angles, fingertip and joint velocities
@@ -17,12 +17,12 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 import mujoco
-from mujoco import mjx
 
 from jaxrl_vis_envs.base import GoalEnv, State, sanitize_action
 from jaxrl_vis_envs.pixels import PixelsConfig, picture_observer
 from jaxrl_vis_envs.registry import register
 from jaxrl_vis_envs.tasks import mjx_model
+from jaxrl_vis_envs.tasks.mjx_model import mjx
 
 _DEFAULT_SUBSTEPS = {"velocity": 10, "torque": 2}
 
