@@ -327,7 +327,7 @@ def test_the_real_program_resumes_bit_for_bit(tmp_path, capsys):
     program = train_step.make_train_step(train_step.make_env(config), config)
     traced, calls = program.train_iteration, []
     program = dataclasses.replace(
-        program, train_iteration=world_jit(lambda loop: (calls.append(0), traced(loop))[1], donate_argnums=0)
+        program, train_iteration=world_jit(lambda loop: (calls.append(0), traced.__wrapped__(loop))[1], donate_argnums=0)
     )
 
     def run(path, resume=False, **changes):
