@@ -231,7 +231,7 @@ _CPU = _FAST.replace(
     replay_transitions=64_000,
     latent_size=128,
     hidden_sizes=(256, 256),
-    eval_interval=5,
+    eval_interval=2,
     eval_episodes=256,
 )
 

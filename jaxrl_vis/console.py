@@ -30,8 +30,6 @@ class RunConsole:
     """Shows a run's progress. A bar appears only where stdout is a terminal; lines are printed above it.
 
     Args:
-        total: Iterations of the whole run.
-        done: Iterations that an earlier part of the run has done.
         quiet: Say nothing at all.
     """
 
@@ -39,11 +37,6 @@ class RunConsole:
         self._quiet = quiet
         self._bar: Progress | None = None
         self._task = None
-
-    @property
-    def has_bar(self) -> bool:
-        """Whether a progress bar is on the screen."""
-        return self._bar is not None
 
     def say(self, line: str) -> None:
         """Prints one line."""
@@ -55,7 +48,12 @@ class RunConsole:
             print(line, flush=True)
 
     def start(self, total: int, done: int) -> None:
-        """Shows the bar, on a terminal."""
+        """Shows the bar, on a terminal.
+
+        Args:
+            total: Iterations of the whole run.
+            done: Iterations that an earlier part of the run has done.
+        """
         if self._quiet or not sys.stdout.isatty():
             return
         columns = (

@@ -102,7 +102,6 @@ class RunLoop:
         self._started = self._mark = time.monotonic()
         self._begun, self._begun_at = 0, self._mark
         self._marked_iteration = 0
-        self._last_rows: list[dict[str, Any]] = []
 
     def reports(self, resume: bool, overwrite: bool) -> Iterator[Report]:
         """The whole run; see `Trainer.run`."""
@@ -258,7 +257,6 @@ class RunLoop:
         counts = {"iteration": self._done, "updates": report.updates, "env_steps": report.env_steps}
         rows = metrics.make_rows(self._trainer.seeds, counts, values | means | rounded)
         metrics.append_rows(self._folder.metrics, rows)
-        self._last_rows = rows
         self._warn_if_filtered(means)
         # The last evaluation may come between two scheduled ones; a longer run, resumed from here, goes on with the means.
         if self._is_due(self._config.eval_interval):
@@ -355,11 +353,14 @@ class RunLoop:
         if not interruption:
             self._draw_curve()
         if not interruption and self._trainer.shows_pictures:
+            if not self._pictures:  # killed after the last evaluation, before this: resumed with nothing left to evaluate
+                _, self._pictures = self._trainer.watch(self._loop)
             videos.write_video(videos.first_seed(self._pictures), self._folder.video, self._trainer.frame_seconds)
         if interruption:
             interruption.end()
         wall = self._memo.wall_s + time.monotonic() - self._started
-        success = ", ".join(f"seed {row['seed']}: {row['eval/success']:.3f}" for row in self._last_rows)
+        rows = [row for row in metrics.read_rows(self._folder.metrics) if row["iteration"] == self._done]
+        success = ", ".join(f"seed {row['seed']}: {row['eval/success']:.3f}" for row in rows)
         written = [file.name for file in (self._folder.curve, self._folder.video) if file.exists()]
         compiling = show_seconds(self._memo.compile_s)
         self._say(f"success at the end: {success}; {show_seconds(wall)}, of which {compiling} compiling")

@@ -149,9 +149,15 @@ def draw_frames(recording: Recording, frame_seconds: float, max_episodes: int) -
 def _gif_bytes(images: list[Image.Image], seconds: list[float]) -> bytes:
     """An endless GIF. One palette for all frames, without dithering: nothing flickers, and equal frames pack well."""
     samples = images[:: max(1, len(images) // 16)] + images[-1:]
-    montage = Image.new("RGB", (samples[0].width, samples[0].height * len(samples)))
+    # Swatches give the colours of borders and texts a place in the palette, however colourful the pictures are.
+    swatches = (_REACHED, _MISSED, _PLAIN, _BACKGROUND, _TEXT, _FAINT)
+    height = samples[0].height
+    montage = Image.new("RGB", (samples[0].width, height * len(samples) + 48 * len(swatches)))
     for i, sample in enumerate(samples):
-        montage.paste(sample, (0, i * sample.height))
+        montage.paste(sample, (0, i * height))
+    for i, colour in enumerate(swatches):
+        top = height * len(samples) + 48 * i
+        montage.paste(colour, (0, top, montage.width, top + 48))
     palette = montage.quantize(255, method=Image.Quantize.MEDIANCUT)
     frames = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     # GIF counts in hundredths of a second, and players slow down anything below two.

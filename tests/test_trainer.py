@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import json
 import runpy
+import shutil
 import signal
 import subprocess
 import sys
@@ -101,6 +102,16 @@ def test_damaged_newest_checkpoint_on_resume(straight, tmp_path, capsys):
     out = capsys.readouterr().out
     assert "full/6 is damaged" in out and "resumed at iteration 4 of 8, exactly" in out
     assert rows_without_time(path) == rows_without_time(straight[0])
+
+
+def test_killed_between_the_last_evaluation_and_the_end(straight, tmp_path, capsys):
+    path = tmp_path / "run"
+    list(make_fake_trainer(small_config(), path).run())
+    shutil.rmtree(path / "checkpoints" / LIGHT)
+    (path / "video.gif").unlink()
+    assert list(make_fake_trainer(small_config(), path, resume=True).run()) == []
+    assert rows_without_time(path) == rows_without_time(straight[0]) and (path / "video.gif").exists()
+    assert capsys.readouterr().out.count("success at the end: seed 0") == 2
 
 
 def test_resume_from_light_says_what_it_is(tmp_path, capsys):
@@ -355,7 +366,7 @@ def test_the_script_runs(tmp_path, checkout, capsys):
     assert "best evaluation" in capsys.readouterr().out
     figures = trainer.evaluate_run(tmp_path / "run")
     assert len(figures["eval/success"]) == 1
-    trainer.play_run(tmp_path / "run", tmp_path / "strip.png")
+    trainer.play_run(tmp_path / "run", tmp_path / "strip.png", episodes=8)  # as many as an evaluation: compiled already
     assert (tmp_path / "strip.png").exists()
 
 

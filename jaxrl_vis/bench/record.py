@@ -60,7 +60,12 @@ def library_versions() -> dict[str, str]:
 
 
 def git_revision(folder: Path = _CHECKOUT) -> str:
-    """The checkout's revision, with ``-dirty`` where code differs from it (kept records do not count); or ``unknown``."""
+    """The checkout's revision, with ``-dirty`` where code differs from it (kept records do not count); or ``unknown``.
+
+    JAXRL_VIS_REVISION, where it is set, goes first: for a copy that travelled without its history.
+    """
+    if os.environ.get("JAXRL_VIS_REVISION"):
+        return os.environ["JAXRL_VIS_REVISION"]
 
     def git(*arguments: str) -> str:
         return subprocess.run(["git", "-C", folder, *arguments], capture_output=True, text=True, check=True).stdout.strip()
