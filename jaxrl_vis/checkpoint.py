@@ -59,7 +59,7 @@ class Restored:
 
 
 def named_leaves(tree: Any) -> dict[str, Any]:
-    """The leaves of a pytree by name, such as ``actor.params.Dense_0.kernel``."""
+    """The leaves of a pytree by name, such as ``actor.head.output.kernel``."""
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in jax.tree.leaves_with_path(tree)}
 
 

@@ -22,17 +22,27 @@ from jaxrl_vis.networks import Networks
 from jaxrl_vis.types import Batch, Metrics, Params, TrainState
 
 
+class Working(NamedTuple):
+    """Networks of a `TrainState` in the dtype that they are computed with (`Networks.working_copy`)."""
+
+    actor: Params
+    critic: Params
+    target_actor: Params
+    target_critic: Params
+
+
 class Algorithm(NamedTuple):
-    """A learner. Pure; `TrainState` is a pytree.
+    """A learner. Pure; `TrainState` and `Working` are pytrees.
 
     Attributes:
         init: key -> TrainState.
-        update: (TrainState, Batch, reward [B] float32) -> (TrainState, metrics of [] float32).
-        act: (TrainState, observation latent inputs...) see `Policy`.
+        working: TrainState -> Working, made anew from it before the first of several updates.
+        update: (TrainState, its Working, Batch, reward [B] float32) -> (TrainState, Working, metrics of [] float32).
     """
 
     init: Callable[[jax.Array], TrainState]
-    update: Callable[[TrainState, Batch, jax.Array], tuple[TrainState, Metrics]]
+    working: Callable[[TrainState], Working]
+    update: Callable[[TrainState, Working, Batch, jax.Array], tuple[TrainState, Working, Metrics]]
 
 
 def make_ddpg(networks: Networks, config: Config, resolved: Resolved) -> Algorithm:
@@ -61,41 +71,47 @@ def make_ddpg(networks: Networks, config: Config, resolved: Resolved) -> Algorit
             updates=jnp.zeros((), jnp.int32),
         )
 
-    def encode_pair(params: Params, inputs: jax.Array) -> tuple[jax.Array, jax.Array]:
-        first, second = jnp.split(networks.encode(params, inputs), 2)
-        return first, second
+    def networks_of(state: TrainState) -> tuple[Params, ...]:
+        return state.actor, state.critic, state.target_actor, state.target_critic
+
+    def working(state: TrainState) -> Working:
+        return Working(*map(networks.working_copy, networks_of(state)))
+
+    def encode_pair(params: Params, inputs: jax.Array, first: int) -> jax.Array:
+        """Latents [2, B, latent] of pictures ``first`` and ``first`` + 1 of the three."""
+        size = inputs.shape[0] // 3
+        return networks.encode(params, inputs, slice(first * size, (first + 2) * size)).reshape(2, size, -1)
 
     def critic_loss(critic: Params, inputs: jax.Array, action: jax.Array, reward: jax.Array, target: jax.Array):
-        observation, goal = encode_pair(critic, inputs)
-        value = networks.value(critic, observation, goal, action)
+        latents = encode_pair(critic, inputs, 0)
+        value = networks.value(critic, latents, action)
         keep = losses.keep_mask(reward, value, resolved.reward_negative, resolved.filter_threshold)
         loss = losses.critic_loss(value, target, keep)
-        return loss, (observation, goal, value, keep)
+        return loss, (latents, value, keep)
 
-    def actor_loss(actor: Params, critic: Params, inputs: jax.Array, critic_latents: tuple[jax.Array, jax.Array]):
-        action = networks.act(actor, *encode_pair(actor, inputs))
-        value = networks.value(critic, *critic_latents, action)
+    def actor_loss(actor: Params, critic: Params, inputs: jax.Array, critic_latents: jax.Array):
+        action = networks.act(actor, encode_pair(actor, inputs, 0))
+        value = networks.value(critic, critic_latents, action)
         return losses.actor_loss(value, action, config.action_penalty), action
 
-    def update(state: TrainState, batch: Batch, reward: jax.Array) -> tuple[TrainState, Metrics]:
-        size = reward.shape[0]
-        frames = jnp.concatenate([batch.observation_t, batch.goal, batch.observation_tp1])
-        inputs = networks.prepare(state.normalizer, frames)
-        now, after = inputs[: 2 * size], inputs[size:]  # (observation, goal) and (goal, next observation)
+    def update(state: TrainState, copies: Working, batch: Batch, reward: jax.Array) -> tuple[TrainState, Working, Metrics]:
+        now = Working(*map(networks.with_working_copy, networks_of(state), copies))
+        # Observation, goal, next observation: the online networks read the first two, their targets the last two.
+        inputs = networks.prepare(state.normalizer, batch.frames.reshape(-1, *batch.frames.shape[2:]))
 
-        target_goal, target_observation = encode_pair(state.target_actor, after)
-        action_tp1 = networks.act(state.target_actor, target_observation, target_goal)
-        target_goal, target_observation = encode_pair(state.target_critic, after)
-        value_tp1 = networks.value(state.target_critic, target_observation, target_goal, action_tp1)
+        # Turned round: their pictures come as (goal, observation).
+        action_tp1 = networks.act(now.target_actor, encode_pair(now.target_actor, inputs, 1)[::-1])
+        value_tp1 = networks.value(now.target_critic, encode_pair(now.target_critic, inputs, 1)[::-1], action_tp1)
         target = losses.td_target(reward, value_tp1, resolved.discount, resolved.target_minimum, resolved.target_maximum)
 
-        (critic_error, (observation, goal, value, keep)), critic_gradient = jax.value_and_grad(critic_loss, has_aux=True)(
-            state.critic, now, batch.action, reward, target
+        (critic_error, (latents, value, keep)), critic_gradient = jax.value_and_grad(critic_loss, has_aux=True)(
+            now.critic, inputs, batch.action, reward, target
         )
         (policy_loss, action), actor_gradient = jax.value_and_grad(actor_loss, has_aux=True)(
-            state.actor, state.critic, now, (observation, goal)
+            now.actor, now.critic, inputs, latents
         )
 
+        critic_gradient, actor_gradient = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), (critic_gradient, actor_gradient))
         critic_change, critic_moments = critic_optimizer.update(critic_gradient, state.critic_optimizer)
         actor_change, actor_moments = actor_optimizer.update(actor_gradient, state.actor_optimizer)
         actor = optax.apply_updates(state.actor, actor_change)
@@ -121,6 +137,6 @@ def make_ddpg(networks: Networks, config: Config, resolved: Resolved) -> Algorit
             # Of the negatives, since only those can be dropped.
             "train/filtered_share": jnp.sum(1.0 - keep) / jnp.maximum(jnp.sum(1.0 - positive), 1.0),
         }
-        return state, metrics
+        return state, working(state), metrics
 
-    return Algorithm(init=init, update=update)
+    return Algorithm(init=init, working=working, update=update)

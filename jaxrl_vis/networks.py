@@ -20,11 +20,32 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from jaxrl_vis import normalizer
+from jaxrl_vis import encoder_kernel, normalizer
 from jaxrl_vis.config import Config, RequestError
 from jaxrl_vis.types import NormalizerState, Params
 
 _glorot = nn.initializers.glorot_uniform()
+
+# Inputs at most this wide are multiplied element by element: a GPU's matrix units would pad them.
+_NARROW = 16
+
+
+@jax.custom_vjp
+def _product(values: jax.Array, kernel: jax.Array) -> jax.Array:
+    """``values @ kernel``, [..., M, K] and [..., K, N]."""
+    return values @ kernel
+
+
+def _product_backward(residuals: tuple[jax.Array, jax.Array], gradient: jax.Array) -> tuple[jax.Array, jax.Array]:
+    values, kernel = residuals
+    # JAX's own rule makes the kernel's gradient transposed, and the optimiser then reads it against the grain.
+    batch = tuple(range(values.ndim - 2))
+    rows, columns = len(batch), len(batch) + 1
+    kernel_gradient = jax.lax.dot_general(values, gradient, (((rows,), (rows,)), (batch, batch)))
+    return jax.lax.dot_general(gradient, kernel, (((columns,), (columns,)), (batch, batch))), kernel_gradient
+
+
+_product.defvjp(lambda values, kernel: (values @ kernel, (values, kernel)), _product_backward)
 
 
 def to_blocks(frames: jax.Array, levels: int) -> jax.Array:
@@ -52,11 +73,11 @@ class _Encoder(nn.Module):
     dtype: Any
 
     @nn.compact
-    def __call__(self, blocks: jax.Array) -> jax.Array:
+    def __call__(self, blocks: jax.Array, first_layer: int = 0) -> jax.Array:
         values = blocks.astype(self.dtype)
         batch, count, size = values.shape
-        channels = size // 4 ** len(self.filters)
-        for level, filters in enumerate(self.filters):
+        channels = size // 4 ** (len(self.filters) - first_layer)
+        for level, filters in list(enumerate(self.filters))[first_layer:]:
             # Initialised as the convolution that it is: fan-out counts the window too.
             kernel = self.param(
                 f"kernel_{level}",
@@ -64,15 +85,42 @@ class _Encoder(nn.Module):
                 (4 * channels, filters),
             )
             bias = self.param(f"bias_{level}", nn.initializers.zeros, (filters,))
-            values = values.reshape(-1, 4 * channels) @ kernel.astype(self.dtype)
+            values = _product(values.reshape(-1, 4 * channels), kernel.astype(self.dtype))
             values = nn.relu(values + bias.astype(self.dtype))
             channels = filters
-        values = values.reshape(batch, count * channels)
-        return nn.Dense(self.latent_size, dtype=self.dtype, kernel_init=_glorot, name="latent")(values)
+        return _Dense(self.latent_size, self.dtype, name="latent")(values.reshape(batch, count * channels))
+
+
+class _Dense(nn.Module):
+    """[B, inputs] -> [B, size], as `flax.linen.Dense`.
+
+    Inputs may come in parts that belong side by side, as arrays [B, part] or [parts, B, part]: nothing is put together first.
+    """
+
+    size: int
+    dtype: Any
+    bias_init: nn.initializers.Initializer = nn.initializers.zeros
+
+    @nn.compact
+    def __call__(self, *inputs: jax.Array) -> jax.Array:
+        inputs = tuple(values if values.ndim == 3 else values[None] for values in inputs)
+        width = sum(values.shape[0] * values.shape[-1] for values in inputs)
+        kernel = self.param("kernel", _glorot, (width, self.size)).astype(self.dtype)
+        total, first = self.param("bias", self.bias_init, (self.size,)).astype(self.dtype), 0
+        for values in inputs:
+            parts, _, part = values.shape
+            rows = kernel[first : first + parts * part].reshape(parts, part, self.size)
+            values = values.astype(self.dtype)
+            if part <= _NARROW:
+                total = total + jnp.sum(values[..., None] * rows[:, None], axis=(0, 2))
+            else:
+                total = total + jnp.sum(_product(values, rows), axis=0)
+            first += parts * part
+        return total
 
 
 class _Head(nn.Module):
-    """[B, inputs] -> [B, outputs] float32."""
+    """Inputs as of `_Dense` -> [B, outputs] float32."""
 
     hidden_sizes: Sequence[int]
     outputs: int
@@ -80,13 +128,12 @@ class _Head(nn.Module):
     dtype: Any
 
     @nn.compact
-    def __call__(self, inputs: jax.Array) -> jax.Array:
-        values = inputs.astype(self.dtype)
-        for size in self.hidden_sizes:
-            values = nn.relu(nn.Dense(size, dtype=self.dtype, kernel_init=_glorot)(values))
+    def __call__(self, *inputs: jax.Array) -> jax.Array:
+        for layer, size in enumerate(self.hidden_sizes):
+            inputs = (nn.relu(_Dense(size, self.dtype, name=f"hidden_{layer}")(*inputs)),)
         # The last layer stays in float32: near Q = -50 neighbouring bfloat16 numbers lie 0.25 apart.
         bias = nn.initializers.constant(self.output_bias)
-        return nn.Dense(self.outputs, dtype=jnp.float32, kernel_init=_glorot, bias_init=bias)(values)
+        return _Dense(self.outputs, jnp.float32, bias, name="output")(*inputs)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,8 +144,8 @@ class Networks:
         init_actor, init_critic: key -> {"encoder": ..., "head": ...}.
         prepare: (normalizer, frames [B, ...]) -> inputs: what every encoder reads; made once, shared by all four networks.
         encode: (actor or critic parameters, inputs [B, ...]) -> latent [B, latent].
-        act: (actor, observation latent, goal latent) -> [B, A] float32 in (-1, 1).
-        value: (critic, observation latent, goal latent, action [B, A]) -> [B] float32.
+        act: (actor, latents [2, B, latent] of observations and goals) -> [B, A] float32 in (-1, 1).
+        value: (critic, latents [2, B, latent], action [B, A]) -> [B] float32.
     """
 
     config: Config
@@ -125,6 +172,16 @@ class Networks:
     def sees_pictures(self) -> bool:
         """Whether observations are planar pictures rather than state vectors."""
         return len(self.observation_spec.shape) == 3
+
+    @property
+    def uses_kernel(self) -> bool:
+        """Whether the first layers run as one GPU kernel (`encoder_kernel`) instead of one product each."""
+        return (
+            self.sees_pictures
+            and jax.default_backend() == "gpu"
+            and self.dtype == jnp.bfloat16
+            and encoder_kernel.supports(self.config.encoder_filters, self.observation_spec.shape)
+        )
 
     @property
     def _levels(self) -> int:
@@ -165,24 +222,55 @@ class Networks:
         """Fresh critic parameters."""
         return self._init(key, self._head(1, self.critic_output_bias), 2 * self._latent_size + self.action_size)
 
+    def working_copy(self, params: Params) -> Params:
+        """The large kernels in the dtype that the networks compute in; None for all parameters that stay as they are.
+
+        With `with_working_copy`, a learner that makes this copy where it changes the parameters saves the networks a conversion
+        at every use.
+        """
+
+        def copy(path: Any, leaf: jax.Array) -> jax.Array | None:
+            stays = leaf.ndim < 2 or leaf.dtype == self.dtype or any(entry.key == "output" for entry in path)
+            return None if stays else leaf.astype(self.dtype)
+
+        return jax.tree_util.tree_map_with_path(copy, params)
+
+    def with_working_copy(self, params: Params, copy: Params) -> Params:
+        """Parameters that are computed with: the copy where there is one. Every function here takes them like the originals."""
+        return jax.tree.map(
+            lambda converted, leaf: leaf if converted is None else converted, copy, params, is_leaf=lambda leaf: leaf is None
+        )
+
     def prepare(self, statistics: NormalizerState, frames: jax.Array) -> jax.Array:
         """Normalises and orders [B, ...] observations for the encoders: [B, blocks, block size], or [B, S] for states."""
         mean, scale = statistics.mean, normalizer.scale(statistics, self.config.normalizer_floor)
+        if self.uses_kernel:
+            return encoder_kernel.prepare(frames, mean, scale, self._levels, self.config.normalizer_clip, self.dtype)
         if self.sees_pictures:
             frames, mean, scale = (to_blocks(array, self._levels) for array in (frames, mean, scale))
         limit = self.config.normalizer_clip
         return jnp.clip((frames.astype(jnp.float32) - mean) * scale, -limit, limit).astype(self.dtype)
 
-    def encode(self, params: Params, inputs: jax.Array) -> jax.Array:
-        """Latents [B, latent] of prepared observations; a state vector is its own latent."""
-        return self._encoder.apply({"params": params["encoder"]}, inputs) if self.sees_pictures else inputs
+    def encode(self, params: Params, inputs: jax.Array, which: slice = slice(None)) -> jax.Array:
+        """Latents of ``which`` of the prepared observations, [B, latent]; a state vector is its own latent."""
+        if not self.sees_pictures:
+            return inputs[which]
+        first_layer = 0
+        if self.uses_kernel:
+            weights = encoder_kernel.make_weights(params["encoder"], self.observation_spec.shape[0])
+            first_layer = encoder_kernel.LEVELS
+            inputs = encoder_kernel.encode(inputs, weights, which)
+            batch, patches, size = inputs.shape
+            finer = 4 ** (self._levels - first_layer)
+            inputs = inputs.reshape(batch, patches // finer, finer * size)
+        else:
+            inputs = inputs[which]
+        return self._encoder.apply({"params": params["encoder"]}, inputs, first_layer)
 
-    def act(self, actor: Params, observation: jax.Array, goal: jax.Array) -> jax.Array:
-        """Actions [B, A] float32 in (-1, 1) for latents [B, latent]."""
-        inputs = jnp.concatenate([observation, goal], axis=-1)
-        return jnp.tanh(self._head(self.action_size, 0.0).apply({"params": actor["head"]}, inputs))
+    def act(self, actor: Params, latents: jax.Array) -> jax.Array:
+        """Actions [B, A] float32 in (-1, 1) for latents [2, B, latent] of observations and goals."""
+        return jnp.tanh(self._head(self.action_size, 0.0).apply({"params": actor["head"]}, latents))
 
-    def value(self, critic: Params, observation: jax.Array, goal: jax.Array, action: jax.Array) -> jax.Array:
-        """Values [B] float32 of actions [B, A] for latents [B, latent]."""
-        inputs = jnp.concatenate([observation, goal, action.astype(observation.dtype)], axis=-1)
-        return self._head(1, self.critic_output_bias).apply({"params": critic["head"]}, inputs)[..., 0]
+    def value(self, critic: Params, latents: jax.Array, action: jax.Array) -> jax.Array:
+        """Values [B] float32 of actions [B, A] for latents [2, B, latent] of observations and goals."""
+        return self._head(1, self.critic_output_bias).apply({"params": critic["head"]}, latents, action)[..., 0]

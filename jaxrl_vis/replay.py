@@ -1,20 +1,44 @@
-"""A ring of whole episodes, in the dtype that they came in, each frame once.
+"""A ring of whole episodes, byte for byte as they came in, each frame once.
 
-    frames  [N, T+2, C, H, W] uint8     slots 0 ... T: the episode;  slot T+1: its goal
-             |
+    frames  [N, T+2, C, H, W/4] uint32     slots 0 ... T: the episode;  slot T+1: its goal
+             |                |
+             |                +-- four pixels (uint8) a word: XLA copies element by element, and words cost no more than bytes
              +-- rollouts of E episodes, one after the other; N is a multiple of E
+
+Pictures whose width four does not divide, and state vectors, are kept as they are.
 
 A rollout is written as one contiguous slice. The place follows from the iteration, which all seeds share, so that under `vmap`
 over seeds it stays a slice and does not become a scatter. Samples are drawn from the newest ``size`` episodes.
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from jaxrl_vis.types import Batch, Episodes, ReplayState
+
+_WORD = 4  # bytes
+
+
+def _packs(dtype: Any, width: int) -> bool:
+    return dtype == jnp.uint8 and width % _WORD == 0
+
+
+def pack(frames: jax.Array) -> jax.Array:
+    """Observations as they are stored: [..., W] uint8 -> [..., W/4] uint32 where four divides W, else unchanged."""
+    *shape, width = frames.shape
+    if not _packs(frames.dtype, width):
+        return frames
+    return jax.lax.bitcast_convert_type(frames.reshape(*shape, width // _WORD, _WORD), jnp.uint32)
+
+
+def unpack(frames: jax.Array) -> jax.Array:
+    """Undoes `pack`."""
+    if frames.dtype != jnp.uint32:
+        return frames
+    return jax.lax.bitcast_convert_type(frames, jnp.uint8).reshape(*frames.shape[:-1], frames.shape[-1] * _WORD)
 
 
 class Indices(NamedTuple):
@@ -52,7 +76,7 @@ class Replay(NamedTuple):
         episodes, horizon = self.num_episodes, self.horizon
         return ReplayState(
             episodes=Episodes(
-                frames=jnp.zeros((episodes, horizon + 2, *observation.shape), observation.dtype),
+                frames=pack(jnp.zeros((episodes, horizon + 2, *observation.shape), observation.dtype)),
                 states=jnp.zeros((episodes, horizon + 2, goal_state_size), jnp.float32),
                 actions=jnp.zeros((episodes, horizon, action_size), jnp.float32),
             ),
@@ -66,6 +90,7 @@ class Replay(NamedTuple):
     def insert(self, state: ReplayState, rollout: Episodes, iteration: jax.Array) -> ReplayState:
         """Writes the E episodes of ``iteration`` ([] int32), over the oldest ones once the ring is full."""
         start = (iteration % self.num_rollouts) * self.num_envs
+        rollout = rollout.replace(frames=pack(rollout.frames))
         episodes = jax.tree.map(
             lambda storage, new: jax.lax.dynamic_update_slice_in_dim(storage, new, start, axis=0), state.episodes, rollout
         )
@@ -85,13 +110,9 @@ class Replay(NamedTuple):
         """Reads transitions with the goal in ``goal_slot`` ([B] int32 in [1, T+1])."""
         frames, states, actions = state.episodes.frames, state.episodes.states, state.episodes.actions
         episode, time = indices
-        # One gather for all three pictures; the learner reads them side by side again, which then costs nothing.
-        slots = jnp.concatenate([time, goal_slot, time + 1])
-        observation_t, goal, observation_tp1 = jnp.split(frames[jnp.tile(episode, 3), slots], 3)
+        slots = jnp.stack([time, goal_slot, time + 1])
         return Batch(
-            observation_t=observation_t,
-            observation_tp1=observation_tp1,
-            goal=goal,
+            frames=unpack(frames[jnp.broadcast_to(episode, slots.shape), slots]),
             action=actions[episode, time],
             state_tp1=states[episode, time + 1],
             goal_state=states[episode, goal_slot],

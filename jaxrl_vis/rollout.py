@@ -49,7 +49,7 @@ def make_policy(networks: Networks, train: TrainState, goals: jax.Array, explora
     goal_latents = encode(goals)
 
     def policy(key: jax.Array, frames: jax.Array) -> jax.Array:
-        action = networks.act(train.actor, encode(frames), goal_latents)
+        action = networks.act(train.actor, jnp.stack([encode(frames), goal_latents]))
         if exploration == NO_EXPLORATION:
             return action
         noise_key, choice_key, random_key = jax.random.split(key, 3)

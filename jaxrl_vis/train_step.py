@@ -20,10 +20,10 @@ import jax.numpy as jnp
 import jaxrl_vis_envs
 from jaxrl_vis import normalizer
 from jaxrl_vis.config import Config, RequestError, Resolved, resolve, validate
-from jaxrl_vis.ddpg import Algorithm, make_ddpg
+from jaxrl_vis.ddpg import Algorithm, Working, make_ddpg
 from jaxrl_vis.networks import Networks
 from jaxrl_vis.relabel import choose_goal_slots
-from jaxrl_vis.replay import Replay, make_replay, num_bytes
+from jaxrl_vis.replay import Indices, Replay, make_replay, num_bytes
 from jaxrl_vis.rollout import Exploration, play
 from jaxrl_vis.types import Batch, LoopState, Metrics, ReplayState, TrainState
 from jaxrl_vis_envs import goals
@@ -109,16 +109,20 @@ def reward_of(config: Config, resolved: Resolved, threshold: float, batch: Batch
 
 def _make_update_many(config: Config, resolved: Resolved, env: GoalEnv, replay: Replay, algorithm: Algorithm):
     def update_many(train: TrainState, memory: ReplayState, key: jax.Array, iteration: jax.Array) -> tuple[TrainState, Metrics]:
-        def one_update(train: TrainState, update_key: jax.Array) -> tuple[TrainState, Metrics]:
+        def choose(update_key: jax.Array) -> tuple[Indices, jax.Array]:
             sample_key, goal_key = jax.random.split(update_key)
             indices = replay.sample_indices(memory, sample_key, iteration, config.batch_size)
-            goal_slots = choose_goal_slots(
-                goal_key, indices.time, env.horizon, config.relabel_probability, resolved.balance_probability
-            )
-            batch = replay.gather(memory, indices, goal_slots)
-            return algorithm.update(train, batch, reward_of(config, resolved, env.threshold, batch))
+            relabel, balance = config.relabel_probability, resolved.balance_probability
+            return indices, choose_goal_slots(goal_key, indices.time, env.horizon, relabel, balance)
 
-        train, metrics = jax.lax.scan(one_update, train, jax.random.split(key, config.updates_per_iteration))
+        def one_update(carry: tuple[TrainState, Working], chosen: tuple[Indices, jax.Array]) -> tuple[Any, Metrics]:
+            batch = replay.gather(memory, *chosen)
+            train, working, metrics = algorithm.update(*carry, batch, reward_of(config, resolved, env.threshold, batch))
+            return (train, working), metrics
+
+        # What all updates learn from is chosen at once: in the loop, drawing numbers would be a dozen tiny kernels an update.
+        chosen = jax.vmap(choose)(jax.random.split(key, config.updates_per_iteration))
+        (train, _), metrics = jax.lax.scan(one_update, (train, algorithm.working(train)), chosen)
         return train, jax.tree.map(jnp.mean, metrics)
 
     return update_many

@@ -46,7 +46,7 @@ class Episodes(Replaceable):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class ReplayState(Replaceable):
-    """A ring of N episodes. Same arrays as `Episodes` with E = N.
+    """A ring of N episodes. Same arrays as `Episodes` with E = N, but for the packing of pictures (`replay`).
 
     Attributes:
         episodes: [N, ...] storage; the part that was never written is zero.
@@ -63,19 +63,32 @@ class Batch(Replaceable):
     """B transitions with a goal each, as sampled and relabelled; rewards come from these.
 
     Attributes:
-        observation_t, observation_tp1: [B, ...] before and after the action.
-        goal: [B, ...] the goal's observation, relabelled or original.
+        frames: [3, B, ...] observations before the action, of the goal (relabelled or original), and after the action: side by
+            side, as they are read and as the networks take them, so that nothing is copied in between.
         action: [B, A] float32.
         state_tp1: [B, G] float32, the true state after the action.
-        goal_state: [B, G] float32, the true state that `goal` shows.
+        goal_state: [B, G] float32, the true state that the goal shows.
     """
 
-    observation_t: jax.Array
-    observation_tp1: jax.Array
-    goal: jax.Array
+    frames: jax.Array
     action: jax.Array
     state_tp1: jax.Array
     goal_state: jax.Array
+
+    @property
+    def observation_t(self) -> jax.Array:
+        """[B, ...] before the action."""
+        return self.frames[0]
+
+    @property
+    def goal(self) -> jax.Array:
+        """[B, ...] the goal's observation."""
+        return self.frames[1]
+
+    @property
+    def observation_tp1(self) -> jax.Array:
+        """[B, ...] after the action."""
+        return self.frames[2]
 
 
 @jax.tree_util.register_dataclass

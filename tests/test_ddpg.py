@@ -38,7 +38,7 @@ def values(program, train, observations, goals, action=0.0):
     points = networks.prepare(train.normalizer, jnp.asarray(observations, jnp.float32)[:, None])
     goals = networks.prepare(train.normalizer, jnp.asarray(goals, jnp.float32)[:, None])
     actions = jnp.full((points.shape[0], 1), action)
-    return np.asarray(networks.value(train.critic, points, goals, actions))
+    return np.asarray(networks.value(train.critic, jnp.stack([points, goals]), actions))
 
 
 def test_value_of_a_place_that_is_always_the_goal():

@@ -1,12 +1,14 @@
 """The encoder is the convolution stack that it says it is; statistics are those of the whole data."""
 
+import functools
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxrl_vis import losses, normalizer
+from jaxrl_vis import encoder_kernel, losses, normalizer
 from jaxrl_vis.config import RequestError, preset
 from jaxrl_vis.networks import Networks, to_blocks
 
@@ -33,6 +35,49 @@ def test_the_encoder_is_a_stack_of_strided_convolutions(size):
     dense = params["encoder"]["latent"]
     expected = values.reshape(2, -1) @ dense["kernel"] + dense["bias"]
     np.testing.assert_allclose(latent, expected, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("shape", "batch", "which"),
+    [
+        ((4, 64, 64), 3, slice(1, 3)),
+        ((1, 32, 32), 3, slice(None)),  # too few patches for a tile
+        ((3, 40, 36), 6, slice(2, 6)),  # borders to crop, a channel to pad
+    ],
+)
+def test_the_gpu_kernel_computes_and_differentiates_the_same_function(shape, batch, which, monkeypatch):
+    config = preset("fast", latent_size=16, compute_dtype="float32")
+    networks = Networks(config, jax.ShapeDtypeStruct(shape, jnp.uint8), 2, 0.0)
+    assert not networks.uses_kernel
+    keys = jax.random.split(jax.random.key(0), 4)
+    params = networks.init_actor(keys[0])["encoder"]
+    # Biases that matter.
+    params = jax.tree.map(lambda leaf: leaf + 0.05 * jax.random.normal(keys[1], leaf.shape), params)
+    frames = jax.random.bits(keys[2], (batch, *shape), jnp.uint8)
+    statistics = normalizer.update(normalizer.init(networks.observation_spec), frames[:, None])
+
+    def latents(params, probe):
+        latent = networks.encode({"encoder": params}, networks.prepare(statistics, frames), which)
+        return jnp.sum(latent * probe), latent
+
+    probe = jax.random.normal(keys[3], (len(range(batch)[which]), 16))
+    evaluate = jax.value_and_grad(latents, has_aux=True)
+    (_, expected), expected_gradient = evaluate(params, probe)
+    monkeypatch.setattr(Networks, "uses_kernel", True)
+    for name in ("prepare", "encode"):
+        monkeypatch.setattr(encoder_kernel, name, functools.partial(getattr(encoder_kernel, name), interpret=True))
+    (_, latent), gradient = evaluate(params, probe)
+
+    np.testing.assert_allclose(latent, expected, rtol=1e-4, atol=1e-4)
+    for (path, ours), theirs in zip(jax.tree.leaves_with_path(gradient), jax.tree.leaves(expected_gradient), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-3, atol=1e-4 * np.abs(theirs).max(), err_msg=str(path))
+
+
+@pytest.mark.parametrize(
+    ("filters", "shape"), [((16, 32), (4, 64, 64)), ((16, 24, 64, 64), (4, 64, 64)), ((16, 32, 64), (4, 64, 66))]
+)
+def test_what_the_gpu_kernel_cannot_take_goes_the_other_way(filters, shape):
+    assert not encoder_kernel.supports(filters, shape)
 
 
 def test_blocks_hold_every_pixel_once():

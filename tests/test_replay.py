@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxrl_vis.relabel import choose_goal_slots
-from jaxrl_vis.replay import make_replay, num_bytes
+from jaxrl_vis.replay import make_replay, num_bytes, pack, unpack
 from jaxrl_vis.types import Episodes
 
 HORIZON, ENVS = 5, 3
@@ -19,6 +19,15 @@ def encoded_rollout(first_episode: int) -> Episodes:
     both = jnp.stack(jnp.broadcast_arrays(episode[:, None], slots[None]), axis=-1)  # [E, T+2, 2]
     frames = jnp.broadcast_to(both[..., None, None], (ENVS, HORIZON + 2, 2, 4, 4)).astype(jnp.uint8)
     return Episodes(frames=frames, states=both.astype(jnp.float32), actions=both[:, :HORIZON].astype(jnp.float32))
+
+
+@pytest.mark.parametrize("width", [8, 6])
+def test_pictures_come_back_byte_for_byte(width):
+    frames = jax.random.bits(jax.random.key(0), (2, HORIZON + 2, 3, 5, width), jnp.uint8)
+    packed = pack(frames)
+    assert packed.nbytes == frames.nbytes
+    assert packed.dtype == (jnp.uint32 if width % 4 == 0 else jnp.uint8)
+    np.testing.assert_array_equal(unpack(packed), frames)
 
 
 def filled(rollouts: int, capacity: int = 3):

@@ -33,8 +33,8 @@ def fill_replay(replay: ReplayState, key: jax.Array) -> ReplayState:
 
     def noise(leaf: jax.Array, leaf_key: jax.Array) -> jax.Array:
         def episode(_: None, episode_key: jax.Array) -> tuple[None, jax.Array]:
-            if leaf.dtype == jnp.uint8:
-                return None, jax.random.bits(episode_key, leaf.shape[1:], jnp.uint8)
+            if jnp.issubdtype(leaf.dtype, jnp.unsignedinteger):
+                return None, jax.random.bits(episode_key, leaf.shape[1:], leaf.dtype)
             return None, jax.random.uniform(episode_key, leaf.shape[1:], leaf.dtype, -1.0, 1.0)
 
         return jax.lax.scan(episode, None, jax.random.split(leaf_key, leaf.shape[0]))[1]

@@ -1,0 +1,338 @@
+"""The encoder's first three layers as one GPU kernel each way (Pallas, by Triton), and pictures in the order that it reads.
+
+Windows of 2x2 pixels with stride 2 never overlap, so three layers see a *patch* of 8x8 pixels at a time and nothing else. A
+tile of R patches passes through all three without leaving the chip:
+
+    4 R quarters of 4x4 pixels  [4 R, 16 C]   @ [16 C, 4 F1]   layer 1, its four windows at once: block-diagonal
+                                [4 R, 4 F1]   @ [4 F1, F2]     layer 2
+    R patches                   [R, 4 F2]     @ [4 F2, F3]     layer 3
+
+Layer 1 multiplies three zeros for every number, because products 16 wide leave a GPU's matrix units idle anyway. As separate
+products, the layers would spend nine tenths of their time on writing and reading each other's activations. The backward kernel
+computes layers 1 and 2 again, keeps the gradients of the weights in registers over several tiles, and writes a partial sum
+for each program; those are added up in a fixed order, so a resumed run repeats itself exactly.
+
+`networks` has the same function as plain matrix products: that is the reference, and what every other backend runs.
+"""
+
+import functools
+import itertools
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.experimental import pallas as pl
+from jax.experimental.pallas import triton as plgpu
+
+LEVELS = 3
+"""Layers in the kernel."""
+WORD = 4
+"""Pixels that are read at a time: four neighbours in a row, one byte each."""
+_MOST_CHANNELS = 4  # beyond, the weights' gradients no longer fit into registers
+_LEAST_ROWS = 16  # of a product
+# Measured on an H200: patches in a tile, tiles that one program works through, and how they are run.
+_FORWARD_PATCHES, _FORWARD_TILES, _FORWARD = 16, 8, plgpu.CompilerParams(num_warps=4, num_stages=3)
+_BACKWARD_PATCHES, _BACKWARD_TILES, _BACKWARD = 16, 16, plgpu.CompilerParams(num_warps=4, num_stages=1)
+_PREPARE_PATCHES, _PREPARE_PICTURES, _PREPARE = 16, 16, plgpu.CompilerParams(num_warps=8, num_stages=2)
+
+
+class Weights(NamedTuple):
+    """Three layers as the kernel multiplies them, float32.
+
+    Attributes:
+        kernel_1: [16 C', 4 F1] for a quarter; C' is C padded to a power of two.
+        bias_1: [4 F1].
+        kernel_2: [4 F1, F2].
+        bias_2: [F2].
+        kernel_3: [4 F2, F3].
+        bias_3: [F3].
+    """
+
+    kernel_1: jax.Array
+    bias_1: jax.Array
+    kernel_2: jax.Array
+    bias_2: jax.Array
+    kernel_3: jax.Array
+    bias_3: jax.Array
+
+
+def supports(filters: tuple[int, ...], shape: tuple[int, ...]) -> bool:
+    """Whether the kernel can take encoders with these output channels, and pictures [C, H, W] of this shape."""
+    channels, _, width = shape
+    powers = all(16 <= size <= 64 and size & (size - 1) == 0 for size in filters[:LEVELS])
+    return len(filters) >= LEVELS and powers and channels <= _MOST_CHANNELS and width % WORD == 0
+
+
+def _padded(channels: int) -> int:
+    return pl.next_power_of_2(channels)
+
+
+def _divisor(number: int, limit: int) -> int:
+    """The largest power of two that divides ``number``, at most ``limit``."""
+    return math.gcd(number, limit)
+
+
+def make_weights(params: dict[str, Any], channels: int) -> Weights:
+    """The first three layers of an encoder (`networks`) for pictures of ``channels`` channels."""
+    window = params["kernel_0"].reshape(2, 2, channels, -1)  # row, column, channel, filter
+    window = jnp.pad(window, [(0, 0), (0, 0), (0, _padded(channels) - channels), (0, 0)])
+    # From (channel, window's row, row, window's column, column) to (window's row, window's column, filter), where a window only
+    # sees itself. Written as a product by zeros and ones, which XLA makes one pass of.
+    same = jnp.eye(2, dtype=window.dtype)
+    same = same[:, None, None, None, :, None, None] * same[:, None, None, :, None]
+    quarter = window.transpose(2, 0, 1, 3)[:, None, :, None, :, None, None, :] * same
+    return Weights(
+        kernel_1=quarter.reshape(16 * _padded(channels), -1),
+        bias_1=jnp.tile(params["bias_0"], 4),
+        kernel_2=params["kernel_1"],
+        bias_2=params["bias_1"],
+        kernel_3=params["kernel_2"],
+        bias_3=params["bias_2"],
+    )
+
+
+# -- Pictures
+
+
+def _word_offsets(first_patch: Any, patches: int, shape: tuple[int, int, int], levels: int) -> tuple[jax.Array, jax.Array]:
+    """Where the words of some patches lie in a planar picture, and whether they are there: [patches, 16 C'] int32 and bool.
+
+    Patches run over the 2^levels blocks of the picture, row by row, and within a block over its halves of halves (as
+    `networks.to_blocks`), so that the next layers find their windows side by side. Words of a patch run over (quarter's row,
+    quarter's column, channel, row).
+    """
+    channels, height, width = shape
+    columns, padded = width >> levels, _padded(channels)
+    size = (patches, 16 * padded)
+    # Non-negative throughout: lax.div and lax.rem, unlike // and %, then compile to shifts and masks.
+    div, rem = lambda a, b: jax.lax.div(a, jnp.int32(b)), lambda a, b: jax.lax.rem(a, jnp.int32(b))
+    patch = first_patch + jax.lax.broadcasted_iota(jnp.int32, size, 0)
+    word = jax.lax.broadcasted_iota(jnp.int32, size, 1)
+
+    finer = levels - LEVELS
+    block = div(patch, 4**finer)
+    row, column = div(block, columns), rem(block, columns)
+    for level in reversed(range(finer)):
+        quarter = rem(div(patch, 4**level), 4)
+        row, column = 2 * row + div(quarter, 2), 2 * column + rem(quarter, 2)
+
+    row = 8 * row + 4 * div(word, 8 * padded) + rem(word, 4)
+    column = 2 * column + rem(div(word, 4 * padded), 2)
+    channel = rem(div(word, 4), padded)
+    return channel * (height * width // WORD) + row * (width // WORD) + column, channel < channels
+
+
+def _prepare_kernel(words_ref, mean_ref, scale_ref, out_ref, *, shape, levels, limit):
+    pictures, patches, size = out_ref.shape
+    offsets, there = _word_offsets(pl.program_id(0) * patches, patches, shape, levels)
+    pixels = (patches, size // WORD, WORD)
+    byte = jax.lax.broadcasted_iota(jnp.int32, pixels, 2)
+    inside = jnp.broadcast_to(there[:, :, None], pixels)
+    places = offsets[:, :, None] * WORD + byte
+    # The same pixels of every picture: their statistics stay in registers.
+    mean = plgpu.load(mean_ref.at[places], mask=inside, other=0.0)
+    scale = plgpu.load(scale_ref.at[places], mask=inside, other=0.0)
+    shift = (8 * byte).astype(jnp.uint32)
+
+    def one_picture(picture, _):
+        words = plgpu.load(words_ref.at[picture, offsets], mask=there, other=0)
+        values = (jax.lax.shift_right_logical(jnp.broadcast_to(words[:, :, None], pixels), shift) & 255).astype(jnp.float32)
+        values = jnp.clip((values - mean) * scale, -limit, limit)
+        out_ref[picture] = values.astype(out_ref.dtype).reshape(patches, size)
+
+    jax.lax.fori_loop(0, pictures, one_picture, None)
+
+
+def prepare(
+    frames: jax.Array, mean: jax.Array, scale: jax.Array, levels: int, limit: float, dtype: Any, interpret: bool = False
+) -> jax.Array:
+    """Normalises pictures and puts them into patches: [B, C, H, W] uint8 -> [B, patches, 64 C'] of ``dtype``.
+
+    Args:
+        frames: Planar pictures, their width a multiple of `WORD`.
+        mean, scale: [C, H, W] float32.
+        levels: All the encoder's layers; borders that do not fill a block of 2^levels pixels are cropped.
+        limit: Normalised values are clipped to plus and minus this.
+        dtype: Of the result.
+        interpret: Run without a GPU, slowly.
+    """
+    batch, *shape = frames.shape
+    channels, height, width = shape
+    patches = (height >> levels) * (width >> levels) * 4 ** (levels - LEVELS)
+    size = 64 * _padded(channels)
+    tile, pictures = _divisor(patches, _PREPARE_PATCHES), _divisor(batch, _PREPARE_PICTURES)
+    pixels = math.prod(shape)
+    words = jax.lax.bitcast_convert_type(frames.reshape(batch, pixels // WORD, WORD), jnp.uint32)
+    whole = pl.BlockSpec((pixels,), lambda patch, picture: (0,))
+    return pl.pallas_call(
+        functools.partial(_prepare_kernel, shape=tuple(shape), levels=levels, limit=limit),
+        out_shape=jax.ShapeDtypeStruct((batch, patches, size), dtype),
+        grid=(patches // tile, batch // pictures),
+        in_specs=[pl.BlockSpec((pictures, pixels // WORD), lambda patch, picture: (picture, 0)), whole, whole],
+        out_specs=pl.BlockSpec((pictures, tile, size), lambda patch, picture: (picture, patch, 0)),
+        compiler_params=_PREPARE,
+        interpret=interpret,
+        name="prepare_patches",
+    )(words, mean.reshape(pixels), scale.reshape(pixels))
+
+
+# -- Layers
+
+
+def _dot(left: jax.Array, right: jax.Array, contract: tuple[int, int] = (1, 0)) -> jax.Array:
+    """A product in float32, over axis ``contract[0]`` of the left side and ``contract[1]`` of the right one."""
+    dimensions = (((contract[0],), (contract[1],)), ((), ()))
+    return jax.lax.dot_general(left, right, dimensions, preferred_element_type=jnp.float32)
+
+
+def _layer(values: jax.Array, kernel: jax.Array, bias: jax.Array) -> jax.Array:
+    """A product with bias and rectifier, in the dtype of ``values``."""
+    return jnp.maximum(_dot(values, kernel) + bias[None, :], 0.0).astype(values.dtype)
+
+
+def _before(after: jax.Array, gradient: jax.Array) -> jax.Array:
+    """The gradient before a rectifier whose output is ``after``, in its dtype."""
+    return jnp.where(after > 0.0, gradient, 0.0).astype(after.dtype)
+
+
+def _forward_kernel(x_ref, *refs, patches):
+    weights, out_ref = Weights(*(ref[...] for ref in refs[:-1])), refs[-1]
+
+    def one_tile(tile, _):
+        x = x_ref[pl.ds(tile * 4 * patches, 4 * patches), :]
+        hidden = _layer(x, weights.kernel_1, weights.bias_1)
+        hidden = _layer(hidden, weights.kernel_2, weights.bias_2).reshape(patches, -1)
+        out_ref[pl.ds(tile * patches, patches), :] = _layer(hidden, weights.kernel_3, weights.bias_3)
+
+    jax.lax.fori_loop(0, out_ref.shape[0] // patches, one_tile, None)
+
+
+def _backward_kernel(x_ref, out_ref, gradient_ref, *refs, patches):
+    weights, sums_ref = Weights(*(ref[...] for ref in refs[:-1])), refs[-1]
+
+    def add_rows(values):
+        """The sum over rows, in each of the result's rows: as a product, it costs half of what a reduction does."""
+        return _dot(jnp.ones((_LEAST_ROWS, values.shape[0]), values.dtype), values)
+
+    def one_tile(tile, sums):
+        x = x_ref[pl.ds(tile * 4 * patches, 4 * patches), :]
+        here = pl.ds(tile * patches, patches)
+        hidden_1 = _layer(x, weights.kernel_1, weights.bias_1)
+        hidden_2 = _layer(hidden_1, weights.kernel_2, weights.bias_2)
+        before_3 = _before(out_ref[here, :], gradient_ref[here, :])
+        gradient_2 = _dot(before_3, weights.kernel_3, (1, 1)).reshape(hidden_2.shape)
+        before_2 = _before(hidden_2, gradient_2)
+        before_1 = _before(hidden_1, _dot(before_2, weights.kernel_2, (1, 1)))
+        return Weights(
+            sums.kernel_1 + _dot(x, before_1, (0, 0)),
+            sums.bias_1 + add_rows(before_1),
+            sums.kernel_2 + _dot(hidden_1, before_2, (0, 0)),
+            sums.bias_2 + add_rows(before_2),
+            sums.kernel_3 + _dot(hidden_2.reshape(patches, -1), before_3, (0, 0)),
+            sums.bias_3 + add_rows(before_3),
+        )
+
+    zeros = [jnp.zeros(value.shape if value.ndim > 1 else (_LEAST_ROWS, value.shape[0]), jnp.float32) for value in weights]
+    sums = jax.lax.fori_loop(0, out_ref.shape[0] // patches, one_tile, Weights(*zeros))
+    first = 0
+    for like, value in zip(weights, sums, strict=True):
+        if like.ndim == 1:  # sixteen times the same sum
+            value = jnp.sum(value, axis=0) * (1.0 / _LEAST_ROWS)
+        sums_ref[pl.ds(first, like.size)] = value.reshape(-1)
+        first += like.size
+
+
+def _whole(array: jax.Array) -> pl.BlockSpec:
+    return pl.BlockSpec(array.shape, lambda program: (0,) * array.ndim)
+
+
+def _rows(count: int, columns: int, skipped: int = 0) -> pl.BlockSpec:
+    """``count`` rows of a matrix for each program, after the first ``skipped`` blocks of as many rows."""
+    return pl.BlockSpec((count, columns), lambda program: (program + skipped, 0))
+
+
+def _cast(weights: Weights, dtype: Any) -> Weights:
+    """Kernels in the dtype of the products; biases are added in float32."""
+    return weights._replace(**{name: getattr(weights, name).astype(dtype) for name in ("kernel_1", "kernel_2", "kernel_3")})
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(2, 3, 4))
+def apply(patches: jax.Array, weights: Weights, first: int, count: int, interpret: bool = False) -> jax.Array:
+    """Three layers of 2x2 stride-2 convolutions with rectifiers, for some patches: [M, 64 C'] -> [count, F3], same dtype.
+
+    Differentiable with respect to the weights only: patches are data.
+
+    Args:
+        patches: [M, 64 C'] from `prepare`.
+        weights: From `make_weights`.
+        first, count: Which rows; both multiples of 16.
+        interpret: Run without a GPU, slowly.
+    """
+    size, outputs = patches.shape[1], weights.bias_3.shape[0]
+    tile = _divisor(math.gcd(first, count), _FORWARD_PATCHES)
+    block = tile * _divisor(math.gcd(first, count) // tile, _FORWARD_TILES)
+    cast = _cast(weights, patches.dtype)
+    return pl.pallas_call(
+        functools.partial(_forward_kernel, patches=tile),
+        out_shape=jax.ShapeDtypeStruct((count, outputs), patches.dtype),
+        grid=(count // block,),
+        in_specs=[_rows(4 * block, size // 4, first // block), *map(_whole, cast)],
+        out_specs=_rows(block, outputs),
+        compiler_params=_FORWARD,
+        interpret=interpret,
+        name="encode_patches",
+    )(patches.reshape(-1, size // 4), *cast)
+
+
+def _apply_forward(patches: jax.Array, weights: Weights, first: int, count: int, interpret: bool):
+    out = apply(patches, weights, first, count, interpret)
+    return out, (patches, weights, out)
+
+
+def _apply_backward(first: int, count: int, interpret: bool, residuals: Any, gradient: jax.Array):
+    patches, weights, out = residuals
+    size, outputs = patches.shape[1], out.shape[1]
+    tile = _divisor(math.gcd(first, count), _BACKWARD_PATCHES)
+    block = tile * _divisor(math.gcd(first, count) // tile, _BACKWARD_TILES)
+    programs = count // block
+    cast = _cast(weights, patches.dtype)
+    total = sum(array.size for array in weights)
+    partial_sums = pl.pallas_call(
+        functools.partial(_backward_kernel, patches=tile),
+        # All weights in one row, so that one reduction adds up the programs.
+        out_shape=jax.ShapeDtypeStruct((programs, total), jnp.float32),
+        grid=(programs,),
+        in_specs=[
+            _rows(4 * block, size // 4, first // block),
+            _rows(block, outputs),
+            _rows(block, outputs),
+            *map(_whole, cast),
+        ],
+        out_specs=pl.BlockSpec((None, total), lambda program: (program, 0)),
+        compiler_params=_BACKWARD,
+        interpret=interpret,
+        name="encode_patches_backward",
+    )(patches.reshape(-1, size // 4), out, gradient, *cast)
+    sums = jnp.split(jnp.sum(partial_sums, axis=0), list(itertools.accumulate(array.size for array in weights))[:-1])
+    gradients = (part.reshape(like.shape).astype(like.dtype) for part, like in zip(sums, weights, strict=True))
+    return jnp.zeros_like(patches), Weights(*gradients)
+
+
+apply.defvjp(_apply_forward, _apply_backward)
+
+
+def encode(patches: jax.Array, weights: Weights, which: slice = slice(None), interpret: bool = False) -> jax.Array:
+    """`apply` to ``which`` of the pictures: [B, patches, 64 C'] -> [pictures, patches, F3], same dtype.
+
+    Pictures are chosen here rather than by slicing before, because a slice that a kernel reads is a copy.
+    """
+    batch, per_picture, size = patches.shape
+    pictures = range(batch)[which]
+    first, count = pictures.start * per_picture, len(pictures) * per_picture
+    rows = count
+    if math.gcd(first, count) % _LEAST_ROWS:  # a few small pictures
+        patches = jnp.pad(patches[which], ((0, -len(pictures) % _LEAST_ROWS), (0, 0), (0, 0)))
+        first, rows = 0, patches.shape[0] * per_picture
+    out: jax.Array = apply(patches.reshape(-1, size), weights, first, rows, interpret)  # type: ignore[assignment]
+    return out[:count].reshape(-1, per_picture, out.shape[-1])
