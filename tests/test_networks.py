@@ -41,7 +41,7 @@ def test_the_encoder_is_a_stack_of_strided_convolutions(size):
     ("shape", "batch", "which"),
     [
         ((4, 64, 64), 3, slice(1, 3)),
-        ((1, 32, 32), 3, slice(None)),  # too few patches for a tile
+        ((1, 16, 16), 3, slice(1, 3)),  # too few patches for a tile
         ((3, 40, 36), 6, slice(2, 6)),  # borders to crop, a channel to pad
     ],
 )
