@@ -12,6 +12,7 @@ import json
 import os
 import pathlib
 import sys
+import textwrap
 import time
 from types import SimpleNamespace
 from typing import Any
@@ -56,7 +57,7 @@ def compare(name: str, poses: int, size: int) -> dict[str, Any]:
         return {**row, "refused": " ".join(str(error).split()), "failures": ["refused"]}
     draw = world_jit(jax.vmap(lambda poses: render(scene, SimpleNamespace(**poses))))
     mj_data, tally, ours_s = mujoco.MjData(mj_model), Tally(looks(mj_model)), 0.0
-    with ReferenceRenderer(mj_model, size, size, site_groups=entry.site_groups) as reference:
+    with ReferenceRenderer(render_models.build(name, truth=True)[0], size, size, site_groups=entry.site_groups) as reference:
         for first in range(0, poses, BATCH):
             theirs, inputs = [], []
             # The last batch is filled up, so that there is one compiled program; what is too much is dropped.

@@ -46,7 +46,7 @@ def panel(name: str) -> tuple[str, Image.Image]:
     mj_model, camera = render_models.build(name)
     mj_data = mujoco.MjData(mj_model)
     render_models.set_pose(mj_model, mj_data, 0)
-    with ReferenceRenderer(mj_model, SIZE, SIZE, site_groups=entry.site_groups) as reference:
+    with ReferenceRenderer(render_models.build(name, truth=True)[0], SIZE, SIZE, site_groups=entry.site_groups) as reference:
         theirs = np.asarray(reference(mj_data, camera).rgb)
     row = np.full((SIZE, 3 * SIZE + 2 * GAP, 3), 255, np.uint8)
     row[:, SIZE + GAP : 2 * SIZE + GAP] = theirs

@@ -27,9 +27,10 @@ POSES, HEIGHT, WIDTH = 4, 72, 96
 def draw(name: str) -> render_references.References:
     """Draws one model in its first poses."""
     mj_model, camera = render_models.build(name)
+    truth, _ = render_models.build(name, truth=True)
     mj_data = mujoco.MjData(mj_model)
     columns: dict[str, list] = {field: [] for field in render_references.References._fields}
-    with ReferenceRenderer(mj_model, HEIGHT, WIDTH, site_groups=render_models.MODELS[name].site_groups) as reference:
+    with ReferenceRenderer(truth, HEIGHT, WIDTH, site_groups=render_models.MODELS[name].site_groups) as reference:
         for number in range(POSES):
             render_models.set_pose(mj_model, mj_data, number)
             for field in ("qpos", "mocap_pos", "mocap_quat"):

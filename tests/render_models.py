@@ -11,10 +11,11 @@ import pathlib
 import warnings
 import zlib
 from collections.abc import Callable
+from typing import Any
 
 import mujoco
 import numpy as np
-from render_features import FEATURES, scene_xml
+from render_features import FEATURES, scene_spec, truth_of
 
 import jaxrl_vis_envs
 
@@ -22,6 +23,7 @@ SEED = 0
 # OpenGL draws polygons where a ray caster draws balls, and lights their corners: with fine ones the two mean the same.
 SLICES, STACKS, QUADS = 128, 64, 16
 CAMERA = "parity"
+_VIEW = (120.0, -25.0, 1.5)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,13 +37,15 @@ class RenderModel:
         view: For an added camera: azimuth and elevation in degrees as MuJoCo's free camera counts them, and the distance in
             multiples of the model's extent.
         site_groups: Groups of sites that are drawn.
+        finish: Changes the compiled model in place.
     """
 
     source: str
     load: Callable[[], mujoco.MjSpec]
     camera: str | int | None = None
-    view: tuple[float, float, float] = (120.0, -25.0, 1.5)
+    view: tuple[float, ...] = _VIEW
     site_groups: tuple[int, ...] = ()
+    finish: Callable[[mujoco.MjModel], None] | None = None
 
 
 def package_folder(name: str) -> pathlib.Path:
@@ -56,30 +60,68 @@ def _from_package(package: str, path: str) -> Callable[[], mujoco.MjSpec]:
     return lambda: mujoco.MjSpec.from_file(str(package_folder(package).joinpath(*path.split("/"))))
 
 
-def _suite(domain: str) -> Callable[[], mujoco.MjSpec]:
-    return _from_package("dm_control", f"suite/{domain}.xml")
+def _suite(domain: str, camera: str | int | None = 0, **more: Any) -> RenderModel:
+    """A domain of the dm_control suite, as its file has it; seen by its first camera unless another is named."""
+    return RenderModel("dm-control", _from_package("dm_control", f"suite/{domain}.xml"), camera, **more)
 
 
-def _ours(task: str) -> Callable[[], mujoco.MjSpec]:
+def _mjx(path: str, camera: int | None = None, **more: Any) -> RenderModel:
+    """A test model of mujoco-mjx."""
+    return RenderModel("mujoco-mjx", _from_package("mujoco", f"mjx/test_data/{path}.xml"), camera, **more)
+
+
+def _ours(task: str) -> RenderModel:
     folder = pathlib.Path(jaxrl_vis_envs.__file__).parent / "tasks" / "assets"
-    return lambda: mujoco.MjSpec.from_file(str(folder / f"{task}.xml"))
+    return RenderModel("ours", lambda: mujoco.MjSpec.from_file(str(folder / f"{task}.xml")), 0)
 
 
-def _feature(name: str) -> Callable[[], mujoco.MjSpec]:
-    return lambda: mujoco.MjSpec.from_string(scene_xml(FEATURES[name]))
+def _feature(name: str) -> RenderModel:
+    return RenderModel("feature", lambda: scene_spec(FEATURES[name]), "eye", site_groups=(0,))
 
+
+def _raise_terrain(mj_model: mujoco.MjModel) -> None:
+    """Gives the quadruped's flat terrain the bowl with bumps that its escape task starts from (the formula is ours)."""
+    rows, columns = np.mgrid[-1.0 : 1.0 : mj_model.hfield_nrow[0] * 1j, -1.0 : 1.0 : mj_model.hfield_ncol[0] * 1j]
+    bowl = np.clip(2.5 * np.hypot(rows, columns) ** 2, 0.0, 1.0)
+    mj_model.hfield_data[:] = (bowl * (0.7 + 0.3 * np.sin(40.0 * rows) * np.cos(35.0 * columns))).reshape(-1)
+
+
+def _lower_ground(mj_model: mujoco.MjModel) -> None:
+    """Puts the ground 0.4 m lower, because the robot starts inside it."""
+    mj_model.geom_pos[mj_model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD, 2] -= 0.4
+
+
+_SUITE = ("acrobot", "ball_in_cup", "cartpole", "cheetah", "finger", "fish", "hopper", "humanoid", "humanoid_CMU", "lqr")
+_SUITE += ("manipulator", "pendulum", "point_mass", "reacher", "stacker", "swimmer", "walker")
 
 MODELS: dict[str, RenderModel] = {
-    "fetch_reach": RenderModel("ours", _ours("fetch_reach"), 0),
-    "dm_finger": RenderModel("dm_control", _suite("finger"), "cam0"),
-    **{name: RenderModel("feature", _feature(name), "eye", site_groups=(0,)) for name in FEATURES},
+    "fetch_reach": _ours("fetch_reach"),
+    "reacher": _ours("reacher"),
+    **{f"dm_{domain.lower()}": _suite(domain) for domain in _SUITE},
+    "dm_dog": _suite("dog", None, view=(60.0, -15.0, 1.0)),
+    "dm_quadruped": _suite("quadruped", "x", finish=_raise_terrain),
+    "dm_quadruped_far": _suite("quadruped", None, view=(60.0, -20.0, 0.8), finish=_raise_terrain),
+    "mjx_convex": _mjx("convex", 0),
+    "mjx_humanoid": _mjx("humanoid/humanoid"),
+    "mjx_pendula": _mjx("pendula"),
+    "mjx_ray": _mjx("ray"),
+    "mjx_tendon": _mjx("tendon/pulley_fixed_site_wrap"),
+    "mjx_wrap": _mjx("tendon/wrap_sidesite"),
+    "mjx_shadow_hand": _mjx("shadow_hand/scene_right"),
+    "mjx_barkour": _mjx("barkour_v0/assets/barkour_v0_mjx", 0, finish=_lower_ground),
+    "mujoco_model": RenderModel("mujoco", _from_package("mujoco", "testdata/model.xml")),
+    **{name: _feature(name) for name in FEATURES},
 }
 
 
-def build(name: str) -> tuple[mujoco.MjModel, int]:
-    """The model, ready to be drawn by both renderers, and the index of the camera that looks.
+def build(name: str, truth: bool = False) -> tuple[mujoco.MjModel, int]:
+    """The model, ready to be drawn, and the index of the camera that looks.
 
     Multisampling is off and surfaces are finely divided; nothing else of the model's look is changed.
+
+    Args:
+        name: One of `MODELS`.
+        truth: Whether it is for MuJoCo's own renderer, which a few features need a stand-in for.
 
     Raises:
         KeyError: There is no such model in `MODELS`.
@@ -88,10 +130,12 @@ def build(name: str) -> tuple[mujoco.MjModel, int]:
     entry = MODELS[name]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # deprecated attributes in other people's models
-        spec = entry.load()
+        spec = scene_spec(truth_of(FEATURES[name])) if truth and name in FEATURES else entry.load()
         if entry.camera is None:
             _add_camera(spec, entry.view)
         mj_model = spec.compile()
+    if entry.finish is not None:
+        entry.finish(mj_model)
     quality = mj_model.vis.quality
     quality.offsamples, quality.numslices, quality.numstacks, quality.numquads = 0, SLICES, STACKS, QUADS
     if entry.camera is None:
@@ -99,7 +143,7 @@ def build(name: str) -> tuple[mujoco.MjModel, int]:
     return mj_model, entry.camera if isinstance(entry.camera, int) else mj_model.camera(entry.camera).id
 
 
-def _add_camera(spec: mujoco.MjSpec, view: tuple[float, float, float]) -> None:
+def _add_camera(spec: mujoco.MjSpec, view: tuple[float, ...]) -> None:
     """Adds a fixed camera that looks at the model's middle as MuJoCo's free camera would."""
     mj_model = spec.compile()
     azimuth, elevation = np.deg2rad(view[:2])
@@ -108,21 +152,21 @@ def _add_camera(spec: mujoco.MjSpec, view: tuple[float, float, float]) -> None:
     camera = spec.worldbody.add_camera()
     camera.name = CAMERA
     camera.pos = mj_model.stat.center - view[2] * mj_model.stat.extent * ahead
-    camera.alt.xyaxes = [*right, *np.cross(right, ahead)]
+    mujoco.mju_mat2Quat(camera.quat, np.stack([right, np.cross(right, ahead), -ahead], axis=1).reshape(-1))
 
 
 def set_pose(mj_model: mujoco.MjModel, mj_data: mujoco.MjData, number: int) -> None:
     """Puts the joints into random pose ``number``, and the mocap bodies of the feature scenes too; runs the kinematics.
 
     Hinges and slides are uniform within their limits (hinges without: any angle; slides without: 0.3 m each way), balls turn by
-    up to a radian, free bodies move by a tenth of the model's extent and turn by up to half a radian.
+    up to a radian, free bodies move by a tenth of the model's extent (0.2 m at most) and turn by up to half a radian.
     """
     rng = np.random.default_rng([SEED, number])
     mujoco.mj_resetData(mj_model, mj_data)
     for joint in range(mj_model.njnt):
         start, kind = mj_model.jnt_qposadr[joint], mj_model.jnt_type[joint]
         if kind == mujoco.mjtJoint.mjJNT_FREE:
-            mj_data.qpos[start : start + 3] += 0.1 * mj_model.stat.extent * rng.uniform(-1.0, 1.0, 3)
+            mj_data.qpos[start : start + 3] += min(0.1 * mj_model.stat.extent, 0.2) * rng.uniform(-1.0, 1.0, 3)
             _turn(mj_data.qpos[start + 3 : start + 7], 0.5, rng)
         elif kind == mujoco.mjtJoint.mjJNT_BALL:
             _turn(mj_data.qpos[start : start + 4], 1.0, rng)
