@@ -18,6 +18,7 @@ import numpy as np
 from render_features import FEATURES, scene_spec, truth_of
 
 import jaxrl_vis_envs
+from jaxrl_vis.bench.render_scenes import forward, scatter_joints
 
 SEED = 0
 # OpenGL draws polygons where a ray caster draws balls, and lights their corners: with fine ones the two mean the same.
@@ -156,24 +157,9 @@ def _add_camera(spec: mujoco.MjSpec, view: tuple[float, ...]) -> None:
 
 
 def set_pose(mj_model: mujoco.MjModel, mj_data: mujoco.MjData, number: int) -> None:
-    """Puts the joints into random pose ``number``, and the mocap bodies of the feature scenes too; runs the kinematics.
-
-    Hinges and slides are uniform within their limits (hinges without: any angle; slides without: 0.3 m each way), balls turn by
-    up to a radian, free bodies move by a tenth of the model's extent (0.2 m at most) and turn by up to half a radian.
-    """
+    """Puts the joints into random pose ``number``, and the mocap bodies of the feature scenes too; runs the kinematics."""
     rng = np.random.default_rng([SEED, number])
-    mujoco.mj_resetData(mj_model, mj_data)
-    for joint in range(mj_model.njnt):
-        start, kind = mj_model.jnt_qposadr[joint], mj_model.jnt_type[joint]
-        if kind == mujoco.mjtJoint.mjJNT_FREE:
-            mj_data.qpos[start : start + 3] += min(0.1 * mj_model.stat.extent, 0.2) * rng.uniform(-1.0, 1.0, 3)
-            _turn(mj_data.qpos[start + 3 : start + 7], 0.5, rng)
-        elif kind == mujoco.mjtJoint.mjJNT_BALL:
-            _turn(mj_data.qpos[start : start + 4], 1.0, rng)
-        else:
-            reach = np.pi if kind == mujoco.mjtJoint.mjJNT_HINGE else 0.3
-            low, high = mj_model.jnt_range[joint] if mj_model.jnt_limited[joint] else (-reach, reach)
-            mj_data.qpos[start] = rng.uniform(low, high)
+    scatter_joints(mj_model, mj_data, rng)
     for body in np.flatnonzero(mj_model.body_mocapid >= 0):
         name, mocap = mj_model.body(body).name, mj_model.body_mocapid[body]
         if name.startswith("thing"):
@@ -183,20 +169,6 @@ def set_pose(mj_model: mujoco.MjModel, mj_data: mujoco.MjData, number: int) -> N
         elif name == "eye":
             _orbit(mj_data.mocap_pos[mocap], mj_data.mocap_quat[mocap], rng)
     forward(mj_model, mj_data)
-
-
-def forward(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> None:
-    """Runs what a picture needs: the poses of bodies, geoms, sites, cameras and lights."""
-    mujoco.mj_kinematics(mj_model, mj_data)
-    mujoco.mj_comPos(mj_model, mj_data)
-    mujoco.mj_camlight(mj_model, mj_data)
-
-
-def _turn(quaternion: np.ndarray, most: float, rng: np.random.Generator) -> None:
-    """Turns a quaternion in place, by up to ``most`` radians about a random axis."""
-    axis, turned = rng.normal(size=3), np.empty(4)
-    mujoco.mju_axisAngle2Quat(turned, axis / np.linalg.norm(axis), rng.uniform(0.0, most))
-    mujoco.mju_mulQuat(quaternion, quaternion.copy(), turned)
 
 
 def _orbit(position: np.ndarray, quaternion: np.ndarray, rng: np.random.Generator) -> None:

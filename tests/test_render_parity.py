@@ -14,6 +14,7 @@ import render_models
 import render_references
 from render_comparison import BARE, BOUNDS, PLANE, SKY, TEXTURED, Tally, looks
 
+from jaxrl_vis.bench.render_scenes import forward
 from jaxrl_vis_envs.compilation import world_jit
 from jaxrl_vis_envs.render import Frame, Scene, render
 
@@ -31,7 +32,7 @@ def test_pictures_agree_with_mujoco(name: str) -> None:
     poses = []
     for qpos, position, quaternion in zip(stored.qpos, stored.mocap_pos, stored.mocap_quat, strict=True):
         mj_data.qpos, mj_data.mocap_pos, mj_data.mocap_quat = qpos, position, quaternion
-        render_models.forward(mj_model, mj_data)
+        forward(mj_model, mj_data)
         poses.append(render_models.poses_of(mj_data))
     draw = world_jit(jax.vmap(lambda poses: render(scene, SimpleNamespace(**poses))))
     drawn = jax.tree.map(np.asarray, draw(jax.tree.map(lambda *rows: np.stack(rows), *poses)))
