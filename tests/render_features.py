@@ -148,8 +148,9 @@ def _lights() -> dict[str, Feature]:
             _coloured(_BODIES),
             _SKY + shiny,
             lights,
-            'type="plane" size="2 2 .1" material="wall"',
+            'type="plane" size="2 2 .02" material="wall"',
             visual=visual,
+            **more,
         )
 
     common = 'diffuse=".9 .8 .7" specular=".4 .4 .4"'
