@@ -1,7 +1,7 @@
 """In which order pixels are worked on: blocks of them, one after the other.
 
-On a CPU, because XLA drops optimization barriers before it fuses for a CPU, and then computes the nearest hit anew for every use
-of it (60 times slower with colour). The boundary of a loop is the one that it respects, so there are at least two blocks
+On a CPU, because XLA drops optimization barriers before it fuses for a CPU, and then computes the nearest hit anew for every
+use of it (60 times slower with colour). The boundary of a loop is the one that it respects, so there are at least two blocks
 wherever the number of pixels can be divided; what lies between two operations then also stays in the cache.
 
 Anywhere, in scenes with much in them: a block is then a tile, and most things are not in it.

@@ -102,7 +102,7 @@ def ray_parts(scene: Scene, u: jax.Array, v: jax.Array) -> tuple[tuple, tuple, j
 
 
 def mapped(matrix: jax.Array, vector: tuple) -> tuple:
-    """``matrix @ vector`` for a [3, 3] matrix (or nine values in rows) and three values, leaving out products with plain zeros."""
+    """``matrix @ vector`` for a [3, 3] matrix (or rows of values) and three values, without the products with plain zeros."""
     rows = [[matrix[row, column] for column in range(3)] for row in range(3)] if hasattr(matrix, "shape") else matrix
     result = []
     for row in rows:

@@ -15,7 +15,8 @@ CLUSTER = 8
 MAP = slice(0, 12)  # three rows of four: first and second barycentric coordinate, height
 NORMALS = slice(12, 21)  # of the three corners
 COORDINATES = slice(21, 27)  # of the texture, at the three corners
-COLUMNS = 27
+CORNERS = slice(27, 36)  # metres
+COLUMNS = 36
 
 _HFIELD, _MESH = int(mujoco.mjtGeom.mjGEOM_HFIELD), int(mujoco.mjtGeom.mjGEOM_MESH)
 # MuJoCo smooths a corner only where the smooth normal is within this cosine of the triangle's own.
@@ -26,7 +27,7 @@ def build_triangles(mj_model: mujoco.MjModel, ids: np.ndarray) -> dict[str, np.n
     """Triangles of all meshes and height fields among the objects ``ids``. Keys as in `Scene`.
 
     Returns:
-        ``triangles`` [R, 27] float32, metres, in the frame of their geom, `CLUSTER` rows to a cluster; ``clusters`` [K, 4]
+        ``triangles`` [R, 36] float32, metres, in the frame of their geom, `CLUSTER` rows to a cluster; ``clusters`` [K, 4]
         float32, middle and radius (m) of the ball around each drawn cluster, in the same frame; ``cluster_places`` [K, 2]
         int32, the index into ``ids`` of the object, and the first row of its triangles. A mesh that several geoms show has its
         triangles once, and its clusters once per geom.
@@ -116,7 +117,8 @@ def _clustered(corners: np.ndarray, normals: np.ndarray, coordinates: np.ndarray
     offset = -np.einsum("tij,tj->ti", inverse, corners[:, 0])
     maps = np.concatenate([inverse, offset[:, :, None]], axis=2)
     count = len(corners)
-    table = np.concatenate([maps.reshape(count, 12), normals.reshape(count, 9), coordinates.reshape(count, 6)], axis=1)
+    parts = (maps.reshape(count, 12), normals.reshape(count, 9), coordinates.reshape(count, 6), corners.reshape(count, 9))
+    table = np.concatenate(parts, axis=1)
     groups = _grouped(corners.mean(1), np.arange(count))
     # No ray meets a triangle whose height is 1 everywhere.
     rows = np.zeros((len(groups) * CLUSTER, COLUMNS))
@@ -131,7 +133,7 @@ def _clustered(corners: np.ndarray, normals: np.ndarray, coordinates: np.ndarray
 
 
 def _grouped(middles: np.ndarray, members: np.ndarray) -> list[np.ndarray]:
-    """Halves the members along their longest axis until at most `CLUSTER` are left; all groups but one in each half are full."""
+    """Halves the members along their longest axis until at most `CLUSTER` are left; nearly all groups are full."""
     if len(members) <= CLUSTER:
         return [members] if len(members) else []
     points = middles[members]

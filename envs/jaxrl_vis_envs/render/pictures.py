@@ -1,8 +1,8 @@
 """Pictures of one environment: `render` for people and files, `render_planes` for the hot path. `jax.vmap` them for a batch.
 
 Three steps: once per environment, everything linear (`shapes`, `lights`); per pixel, which object is nearest (`raycast`,
-`triangles`), which gives integers and is never differentiated; per pixel, once, depth, normal and colour of that object from the
-row of a table (`surface`, `shade`).
+`triangles`), which gives integers and is never differentiated; per pixel, once, depth, normal and colour of that object from
+the row of a table (`surface`, `shade`).
 """
 
 from typing import Any, NamedTuple
@@ -11,10 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis_envs.render import blocks, camera, raycast, shade, shapes, surface
+from jaxrl_vis_envs.render import blocks, camera, raycast, shade, shapes, surface, transparent
 from jaxrl_vis_envs.render.lights import Light, camera_lights
 from jaxrl_vis_envs.render.scene import Scene
-from jaxrl_vis_envs.render.transparent import blend, nearest_transparent
 
 
 class Frame(NamedTuple):
@@ -22,8 +21,7 @@ class Frame(NamedTuple):
 
     Attributes:
         rgb: [H, W, 3] uint8.
-        depth: [H, W] float32, planar metres (distance along the camera's axis), the scene's ``zfar`` for the sky. What is
-            transparent has no depth, as with MuJoCo.
+        depth: [H, W] float32, planar metres (distance along the camera's axis), the scene's ``zfar`` for the sky.
         segmentation: [H, W] int32: geom id, ngeom + site id for a site, -1 for the sky.
         normals: [H, W, 3] float32, unit, in the camera's frame (x right, y up, z towards the viewer), 0 for the sky; or None.
         distance: [H, W] float32, metres along the ray, ``zfar`` for the sky; or None.
@@ -96,7 +94,7 @@ def render_planes(
     unit = shapes.unit_shapes(scene, data, position, rotation, finite)
     # A barrier, because XLA would otherwise redo the work per object in every pixel.
     unit = jax.lax.optimization_barrier(unit)
-    if not (rgb or segmentation or normals or blocks.tiled(scene)):
+    if not (rgb or segmentation or normals or blocks.tiled(scene) or any(scene.transparent)):
         drawn = blocks.scan(lambda u, v: (raycast.nearest_distance(scene, unit, u, v),), u, v)
         far = drawn[0]
         length = far * _ray_length(scene, u, v) if distance else None
@@ -121,26 +119,28 @@ def _finish(scene: Scene, view: _View, wanted: tuple, u: Any, v: Any, key: Any, 
     near, index = raycast.decode(scene, key)
     sees = index >= 0
     planes: list[jax.Array] = []
-    far = near
-    if rgb or depth or normals or distance:
+    far, normal = near, (0.0, 0.0, 0.0)
+    if rgb or depth or normals or distance or any(scene.transparent):
         row = surface.fetch(view.table, index)
         hit = surface.meet(scene, row, surface.fetch_triangle(scene, triangle), u, v, near)
         far = jnp.where(sees, hit.depth, scene.zfar)
+        normal = tuple(jnp.where(sees, component, 0.0) for component in hit.normal)
+        sheets = transparent.sheets(scene, view.unit, view.table, u, v, far)
         if rgb:
             colour = shade.shade(scene, view.unit, view.lights, row, hit, u, v)
             background = shade.sky(scene, view.rotation, u, v)
             colour = tuple(jnp.where(sees, front, back) for front, back in zip(colour, background, strict=True))
             if scene.haze[0] >= 0:
                 colour = shade.haze(scene, view.unit, u, v, far, colour)
-            planes.extend(blend(scene, view.unit, view.table, view.lights, u, v, far, colour))
-        if depth:
-            planes.append(far)
-        if normals:
-            planes.extend(jnp.where(sees, component, 0.0) for component in hit.normal)
-        if distance:
-            planes.append(jnp.where(sees, far * _ray_length(scene, u, v), scene.zfar))
+            planes.extend(transparent.blend(scene, view.unit, view.lights, sheets, u, v, colour))
+        far, index, normal = transparent.nearest(sheets, far, index, normal)
+    if depth:
+        planes.append(far)
+    if normals:
+        planes.extend(normal)
+    if distance:
+        planes.append(jnp.where(index >= 0, far * _ray_length(scene, u, v), scene.zfar))
     if segmentation:
-        index = nearest_transparent(scene, view.unit, u, v, jax.lax.stop_gradient(far), index)
         # One entry more than there are drawn objects, so that -1 finds the sky's label at the end.
         planes.append(jnp.asarray(np.array([*scene.object_ids, -1], np.int32))[index])
     return tuple(planes)

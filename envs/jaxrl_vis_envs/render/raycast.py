@@ -37,9 +37,8 @@ def primitive_rows(scene: Scene, transparent: bool) -> list[int]:
     ]
 
 
-def behind(scene: Scene, unit: shapes.UnitShapes, row: int) -> jax.Array:
+def behind(unit: shapes.UnitShapes, row: int) -> jax.Array:
     """Whether the camera is behind the plane of a row, [] bool."""
-    del scene
     return unit.origin[row, 2] < 0.0
 
 
@@ -48,7 +47,7 @@ def _solid_entry(scene: Scene, unit: shapes.UnitShapes, row: int, u: jax.Array, 
     t, meets = row_entry(scene, unit, row, u, v)
     meets = meets & (t > scene.znear)
     if scene.transparent[row] == CLEAR_FROM_BEHIND:
-        meets = meets & ~behind(scene, unit, row)
+        meets = meets & ~behind(unit, row)
     return t, meets
 
 
@@ -73,7 +72,7 @@ def row_entry(scene: Scene, unit: shapes.UnitShapes, row: int, u: jax.Array, v: 
 
 
 def _row_values(unit: shapes.UnitShapes, row: int, scene: Scene) -> tuple:
-    """Origin (3), axes (3 x 3), extra and extra_square of one object, as lists of scalars; the axes of a plain ball are None."""
+    """Origin (3), axes (3 x 3), extra and extra_square of one object, in scalars; the axes of a plain ball are None."""
     origin = [unit.origin[row, axis] for axis in range(3)]
     round_ = scene.object_types[row] == shapes.SPHERE and scene.atlas.mappings[row] == 0
     axes = None if round_ else [[unit.axes[row, i, j] for j in range(3)] for i in range(3)]

@@ -65,7 +65,7 @@ class Scene:
         sky_bottom: [3] float32 in [0, 1], colour of a plain sky straight down.
         haze_colour: [3] float32 in [0, 1].
         texels: [T, 4] uint32, all textures at all resolutions, see `textures.Atlas`.
-        triangles: [R, 27] float32, the triangles of all meshes and height fields, see `meshes.build_triangles`.
+        triangles: [R, 36] float32, the triangles of all meshes and height fields, see `meshes.build_triangles`.
         clusters: [K, 4] float32, metres: balls around the clusters of triangles that are drawn.
         cluster_places: [K, 2] int32: which of the G objects each cluster belongs to, and the first row of its triangles.
         object_ids: G indices of the drawn objects, the last of the model first (of two at the same depth MuJoCo shows the

@@ -1,9 +1,10 @@
 """The colour of what each pixel sees: MuJoCo's fixed-function lighting, evaluated once per pixel after the nearest hit.
 
 Per light, as OpenGL has it: attenuation x spot x (ambient x colour + diffuse x colour x N.L + specular x (N.H)^(128 x
-shininess)), the highlight only where N.L > 0, all lights summed with the emission, clipped to [0, 1] and then multiplied with the
-texture. Colours are computed per pixel, where OpenGL interpolates between the corners of polygons, so a highlight on a coarse
-mesh may differ; there are no reflections. A point light shines from its position (MuJoCo's renderer does not know them).
+shininess)), the highlight only where N.L > 0, all lights summed with the emission, clipped to [0, 1] and then multiplied with
+the texture. The corners of a mesh's triangles are lit and their colours mixed, as by OpenGL; primitives, which OpenGL cuts into
+polygons and lights likewise, are lit at every pixel. There are no reflections. A point light shines from its position (MuJoCo's
+renderer does not know them).
 """
 
 from typing import Any
@@ -12,8 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis_envs.render import lights as lighting
 from jaxrl_vis_envs.render import camera, charts, shapes, surface, textures
+from jaxrl_vis_envs.render import lights as lighting
 from jaxrl_vis_envs.render.raycast import entry
 from jaxrl_vis_envs.render.scene import Scene
 from jaxrl_vis_envs.render.surface import Hit, Row, Vector
@@ -41,10 +42,26 @@ def shade(
     Returns:
         Red, green and blue, each [P] float32 in [0, 1].
     """
-    if scene.projection == "orthographic":
-        to_camera = surface.normalized(tuple(-p for p in hit.point))  # OpenGL's viewer is a point all the same
+    if hit.triangle is None:
+        if scene.projection == "orthographic":
+            to_camera = surface.normalized(tuple(-p for p in hit.point))  # OpenGL's viewer is a point all the same
+        else:
+            to_camera = surface.normalized((-u, -v, jnp.ones_like(u)))
+        colour = _lighted(scene, unit, lights, row, hit, to_camera)
     else:
-        to_camera = surface.normalized((-u, -v, jnp.ones_like(u)))
+        colour = (0.0, 0.0, 0.0)
+        for share, corner in surface.corners(row, hit):
+            to_camera = surface.normalized(tuple(-p for p in corner.point))
+            lighted = _lighted(scene, unit, lights, row, corner, to_camera)
+            colour = tuple(total + share * own for total, own in zip(colour, lighted, strict=True))
+    texture = surface.texture_colour(scene, row, hit)
+    return colour if texture is None else tuple(value * texel for value, texel in zip(colour, texture, strict=True))
+
+
+def _lighted(
+    scene: Scene, unit: shapes.UnitShapes, lights: list[lighting.Light], row: Row, hit: Hit, to_camera: Vector
+) -> Vector:
+    """Colour of points of surfaces without a texture, each [P] float32 in [0, 1]."""
     coloured: list[Any] = [row.emission if lights else row.emission + _AMBIENT_WITHOUT_LIGHTS] * 3
     highlight: list[Any] = [0.0] * 3
     for light in lights:
@@ -54,12 +71,10 @@ def shade(
             coloured[channel] += factors[0] * light.ambient[channel] + factors[1] * light.diffuse[channel]
             if light.highlights:
                 highlight[channel] += factors[2] * light.specular[channel]
-    colour = tuple(
+    return tuple(
         jnp.clip(light * base + row.specular * shine, 0.0, 1.0)
         for light, base, shine in zip(coloured, row.colour, highlight, strict=True)
     )
-    texture = surface.texture_colour(scene, row, hit)
-    return colour if texture is None else tuple(value * texel for value, texel in zip(colour, texture, strict=True))
 
 
 def _lit(scene: Scene, unit: shapes.UnitShapes, light: lighting.Light, hit: Hit) -> jax.Array:

@@ -1,8 +1,8 @@
 """What a pixel sees of the object it sees: exact depth, normal, and the colour of the texture, once per pixel.
 
 All is computed from one row of a table that is fetched for the pixel. The depth that comes in only says where to start: one
-Newton step along the ray brings it onto the surface. As a function of poses, sizes and the camera that step has the derivative of
-the depth, so nothing that searches for the nearest object has to be differentiated.
+Newton step along the ray brings it onto the surface. As a function of poses, sizes and the camera that step has the derivative
+of the depth, so nothing that searches for the nearest object has to be differentiated.
 """
 
 from typing import NamedTuple
@@ -81,8 +81,8 @@ def object_table(scene: Scene, unit: shapes.UnitShapes) -> jax.Array:
 def _texture_scales(scene: Scene, ids: np.ndarray) -> list[jax.Array]:
     """How the coordinates of a point become those of the texture: five [G].
 
-    For a flat one, coordinates across and up (see `charts`) are multiplied with the first two and the last two added; for a cube,
-    the coordinates in the unit shape's frame are multiplied with the first three.
+    For a flat one, coordinates across and up (see `charts`) are multiplied with the first two and the last two added; for a
+    cube, the coordinates in the unit shape's frame are multiplied with the first three.
     """
     kinds, mappings = np.array(scene.object_types), np.array(scene.atlas.mappings)
     size = _visual_size(kinds, scene.size[ids])
@@ -187,6 +187,29 @@ def _shares(columns: list, local: Vector, moved: float) -> list:
 def _mix(corners: list, shares: list, base: float = 1.0) -> jax.Array:
     """A value between those at the three corners; with ``base`` 0 its change."""
     return base * corners[0] + shares[0] * (corners[1] - corners[0]) + shares[1] * (corners[2] - corners[0])
+
+
+def corners(row: Row, hit: Hit) -> list[tuple[jax.Array, Hit]]:
+    """What OpenGL lights instead of a triangle's points: its corners, each with its share of the point, [P].
+
+    Where no mesh is seen, each corner is the point itself. (The triangles of a height field are many and flat.)
+    """
+    assert hit.triangle is not None
+    seen, columns = hit.triangle
+    seen = seen & (row.kind == shapes.MESH)
+    second, third = _shares(columns, hit.local, 1.0)
+    found = []
+    for number, share in enumerate((1.0 - second - third, second, third)):
+        local = tuple(columns[27 + 3 * number + axis] - row.origin[axis] for axis in range(3))
+        facing = columns[12 + 3 * number : 15 + 3 * number]
+        # The axes of a mesh are a rotation: its transpose leads back to the camera's frame.
+        point, normal = (
+            tuple(sum(row.axes[i][j] * vector[i] for i in range(3)) for j in range(3)) for vector in (local, facing)
+        )
+        own = tuple(jnp.where(seen, new, old) for new, old in zip(point, hit.point, strict=True))
+        turned = tuple(jnp.where(seen, new, old) for new, old in zip(normal, hit.normal, strict=True))
+        found.append((jnp.where(seen, share, 1.0 if number == 0 else 0.0), hit._replace(point=own, normal=turned)))
+    return found
 
 
 def _gradient(scene: Scene, row: Row, local: Vector) -> Vector:

@@ -1,5 +1,6 @@
-"""Textures as MuJoCo's renderer samples them: all images at all resolutions in one array, bilinear within a resolution and linear
-between two (OpenGL's trilinear filter).
+"""Textures as MuJoCo's renderer samples them: bilinear within a resolution and linear between two (OpenGL's trilinear filter).
+
+All images at all resolutions are in one array.
 
 A row of the array holds a texel and its neighbours to the right, below, and both, each as red + 256 green + 65536 blue: one
 lookup gives all that a bilinear mean needs.

@@ -1,7 +1,7 @@
 """The nearest triangle of meshes and height fields along rays.
 
-Clusters of triangles whose ball does not touch the pyramid of a block of pixels are left out: the others are counted through, and
-a loop runs up to that count. Under `jax.vmap` it runs up to the greatest count in the batch.
+Clusters of triangles whose ball does not touch the pyramid of a block of pixels are left out: the others are counted through,
+and a loop runs up to that count. Under `jax.vmap` it runs up to the greatest count in the batch.
 """
 
 import jax
