@@ -19,8 +19,8 @@ from jaxrl_vis_envs.render.scene import Scene
 
 # Pixels of one environment that a CPU works on at a time.
 _CPU_BLOCK = 512
-# Height and width of a tile, if the picture can be cut so.
-_TILE = 16
+# Height and width of a tile, if the picture can be cut so. Small ones see fewer objects, but each costs a round of a loop.
+_CPU_TILE, _TILE = 8, 16
 
 
 class Layout(NamedTuple):
@@ -50,7 +50,7 @@ def layout(scene: Scene) -> Layout:
 
 
 def restore(scene: Scene, layout: Layout, plane: jax.Array) -> jax.Array:
-    """[blocks, P] in a layout -> [H, W]."""
+    """Blocks of pixels in a layout (joined or not) -> [H, W]."""
     if layout.tile is None:
         return plane.reshape(scene.height, scene.width)
     high, wide = layout.tile
@@ -60,9 +60,10 @@ def restore(scene: Scene, layout: Layout, plane: jax.Array) -> jax.Array:
 
 
 def _tile_length(pixels: int) -> int:
-    """Near `_TILE`, and a divisor of ``pixels`` if there is one that is near enough."""
-    lengths = [length for length in range(_TILE // 2 + 2, 2 * _TILE - 4) if pixels % length == 0]
-    return min(lengths, key=lambda length: abs(length - _TILE), default=min(_TILE, pixels))
+    """Near the wished length of a tile, and a divisor of ``pixels`` if there is one that is near enough."""
+    wish = _CPU_TILE if jax.default_backend() == "cpu" else _TILE
+    lengths = [length for length in range(wish // 2 + 2, 2 * wish - 4) if pixels % length == 0]
+    return min(lengths, key=lambda length: abs(length - wish), default=min(wish, pixels))
 
 
 def _block_count(pixels: int) -> int:
@@ -81,9 +82,16 @@ def scan(function: Callable, *pixels: Any) -> Any:
     return jax.lax.scan(lambda carry, block: (carry, function(*block)), None, pixels)[1]
 
 
+def joined(planes: tuple) -> tuple:
+    """Arrays [blocks, P] (or None) in fewer and longer blocks, for what does not depend on which pixels are in a block."""
+    pixels = planes[0].size
+    count = _block_count(pixels)
+    return tuple(None if plane is None else plane.reshape(count, -1) for plane in planes)
+
+
 def tiled(scene: Scene) -> bool:
     """Whether there is so much in the scene that it pays to look at what each tile shows."""
-    return scene.clusters.shape[-2] > 0
+    return scene.clusters.shape[-2] > 0 or len(raycast.primitive_rows(scene, transparent=False)) > raycast.UNROLLED
 
 
 def nearest(scene: Scene, unit: shapes.UnitShapes, u: jax.Array, v: jax.Array) -> tuple[jax.Array, jax.Array | None]:

@@ -101,6 +101,34 @@ def ray_parts(scene: Scene, u: jax.Array, v: jax.Array) -> tuple[tuple, tuple, j
     return (0.0, 0.0, 0.0), (u, v, -1.0), 1.0 / (u * u + v * v + 1.0)
 
 
+def in_view(
+    scene: Scene, middle: jax.Array, radius: jax.Array, u: jax.Array, v: jax.Array, depth: jax.Array | None
+) -> jax.Array:
+    """Which balls the rays through a block of pixels may meet.
+
+    Args:
+        scene: The scene.
+        middle: [K, 3] float32, metres, camera's frame.
+        radius: [K] float32, metres.
+        u: [P] float32, see `camera.pixel_rays`.
+        v: [P] float32.
+        depth: [P] float32, metres, beyond which nothing counts; None for no such depth.
+
+    Returns:
+        [K] bool; false for what is not finite.
+    """
+    ahead = -middle[:, 2]
+    touching = (ahead + radius > scene.znear) & (ahead - radius < (scene.zfar if depth is None else jnp.max(depth)))
+    for axis, coordinate in enumerate((u, v)):
+        low, high = jnp.min(coordinate), jnp.max(coordinate)
+        if scene.projection == "orthographic":
+            touching &= (middle[:, axis] - high <= radius) & (low - middle[:, axis] <= radius)
+        else:
+            touching &= middle[:, axis] - high * ahead <= radius * jnp.sqrt(1.0 + high * high)
+            touching &= low * ahead - middle[:, axis] <= radius * jnp.sqrt(1.0 + low * low)
+    return touching
+
+
 def mapped(matrix: jax.Array, vector: tuple) -> tuple:
     """``matrix @ vector`` for a [3, 3] matrix (or rows of values) and three values, without the products with plain zeros."""
     rows = [[matrix[row, column] for column in range(3)] for row in range(3)] if hasattr(matrix, "shape") else matrix

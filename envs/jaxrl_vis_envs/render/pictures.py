@@ -107,7 +107,8 @@ def render_planes(
     lights = camera_lights(scene, data, position, rotation) if rgb else []
     view = _View(rotation, unit, surface.object_table(scene, unit), lights)
     wanted = (rgb, depth, segmentation, normals, distance)
-    planes = blocks.scan(lambda *pixels: _finish(scene, view, wanted, *pixels), u, v, key, triangle)
+    pixels = blocks.joined((u, v, key, triangle))
+    planes = blocks.scan(lambda *block: _finish(scene, view, wanted, *block), *pixels)
     planes = jax.lax.optimization_barrier(planes)
     planes = [blocks.restore(scene, layout, plane) for plane in planes]
     return _collect(wanted, planes)

@@ -10,12 +10,17 @@ loop anew for each of its outputs, computes it once. `surface` makes the depth e
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxrl_vis_envs.render import camera, shapes
 from jaxrl_vis_envs.render.scene import Scene
 
 # Keeps a division by a ray component that is exactly 0 finite; far too small to change any other number.
 _TINY = 1e-20
+
+# So many primitives are unrolled in any case, and of more, those of a type of which there are at most so many.
+UNROLLED = 48
+_FEW = 3
 
 # Values of `Scene.transparent`.
 OPAQUE, CLEAR, CLEAR_FROM_BEHIND = range(3)
@@ -68,14 +73,14 @@ def row_entry(scene: Scene, unit: shapes.UnitShapes, row: int, u: jax.Array, v: 
     """Where the ray of each pixel enters the object of one row (t, metres of planar depth), and whether it does; [P] each."""
     start, direction, inverse_square = camera.ray_parts(scene, u, v)
     kind = scene.object_types[row]
-    return entry(kind, _row_values(unit, row, scene), start, direction, inverse_square)
+    bare_ball = kind == shapes.SPHERE and scene.atlas.mappings[row] == 0
+    return entry(kind, _row_values(unit, row, bare_ball), start, direction, inverse_square)
 
 
-def _row_values(unit: shapes.UnitShapes, row: int, scene: Scene) -> tuple:
+def _row_values(unit: shapes.UnitShapes, row: int | jax.Array, bare_ball: bool) -> tuple:
     """Origin (3), axes (3 x 3), extra and extra_square of one object, in scalars; the axes of a plain ball are None."""
     origin = [unit.origin[row, axis] for axis in range(3)]
-    round_ = scene.object_types[row] == shapes.SPHERE and scene.atlas.mappings[row] == 0
-    axes = None if round_ else [[unit.axes[row, i, j] for j in range(3)] for i in range(3)]
+    axes = None if bare_ball else [[unit.axes[row, i, j] for j in range(3)] for i in range(3)]
     return origin, axes, unit.extra[row], unit.extra_square[row]
 
 
@@ -104,15 +109,61 @@ def entry(kind: int, values: tuple, start: tuple, direction: tuple, inverse_squa
 
 
 def nearest_key(scene: Scene, unit: shapes.UnitShapes, u: jax.Array, v: jax.Array) -> jax.Array:
-    """The key of the nearest opaque primitive along every ray, [P] int32. The objects are unrolled into one pass."""
+    """The key of the nearest opaque primitive along every ray, [P] int32.
+
+    Few objects are unrolled into one pass. Of many, those of a type whose balls touch the pyramid of the rays are counted
+    through, and a loop runs up to their count; the rays should then lie close together.
+    """
     mask = code_mask(scene)
     unit, u, v = jax.lax.stop_gradient((unit, u, v))
     best = jnp.broadcast_to(sky_key(scene), u.shape)
-    for row in primitive_rows(scene, transparent=False):
-        t, meets = _solid_entry(scene, unit, row, u, v)
-        key = (jax.lax.bitcast_convert_type(t, jnp.int32) & ~mask) | row
-        best = jnp.minimum(best, jnp.where(meets, key, best))
+    rows = primitive_rows(scene, transparent=False)
+    listed = {} if len(rows) <= UNROLLED else _rows_by_type(scene, rows)
+    for row in rows:
+        if scene.object_types[row] not in listed:
+            t, meets = _solid_entry(scene, unit, row, u, v)
+            key = (jax.lax.bitcast_convert_type(t, jnp.int32) & ~mask) | row
+            best = jnp.minimum(best, jnp.where(meets, key, best))
+    for kind, rows in listed.items():
+        best = _nearest_listed(scene, unit, kind, rows, u, v, best)
     return best
+
+
+def _rows_by_type(scene: Scene, rows: list[int]) -> dict[int, np.ndarray]:
+    """The rows of each type that has enough of them for a loop. Planes fill the picture: a loop would save nothing."""
+    kinds = np.array(scene.object_types)[rows]
+    counted = {int(kind): np.array(rows)[kinds == kind] for kind in np.unique(kinds) if kind != shapes.PLANE}
+    return {kind: found for kind, found in counted.items() if len(found) > _FEW}
+
+
+def _nearest_listed(
+    scene: Scene, unit: shapes.UnitShapes, kind: int, rows: np.ndarray, u: jax.Array, v: jax.Array, best: jax.Array
+) -> jax.Array:
+    """The least of ``best`` [P] and the keys of those objects among ``rows``, all of one type, that the rays may meet."""
+    mask = code_mask(scene)
+    ball = unit.ball[rows]
+    start, direction, inverse_square = camera.ray_parts(scene, u, v)
+    bare_ball = kind == shapes.SPHERE and not any(scene.atlas.mappings[row] for row in rows)
+    # The k-th object that touches is the number of these counts that are at most k. All of them are brought to the front of a
+    # table at once: whatever is done in the loop, but for the pixels, costs more than it does.
+    counts = jnp.cumsum(camera.in_view(scene, ball[:, :3], ball[:, 3], u, v, None).astype(jnp.int32))
+    total = counts[-1]
+    order = jnp.sum(counts[None, :] <= np.arange(len(rows))[:, None], axis=1)
+    columns = [unit.origin[rows], unit.axes[rows].reshape(-1, 9), unit.extra[rows, None], unit.extra_square[rows, None]]
+    table = jnp.concatenate([*columns, jnp.asarray(rows, jnp.float32)[:, None]], axis=1)
+    table = table.at[jnp.minimum(order, len(rows) - 1)].get(mode="promise_in_bounds")
+
+    def advance(state: tuple) -> tuple:
+        step, best = state
+        values = jax.lax.dynamic_slice(table, (step, 0), (1, table.shape[1]))[0]
+        origin, axes = [values[i] for i in range(3)], [[values[3 + 3 * i + j] for j in range(3)] for i in range(3)]
+        form = (origin, None if bare_ball else axes, values[12], values[13])
+        t, meets = entry(kind, form, start, direction, inverse_square)
+        key = (jax.lax.bitcast_convert_type(t, jnp.int32) & ~mask) | values[14].astype(jnp.int32)
+        meets = meets & (t > scene.znear) & (step < total)
+        return step + 1, jnp.minimum(best, jnp.where(meets, key, best))
+
+    return jax.lax.while_loop(lambda state: state[0] < total, advance, (jnp.zeros((), jnp.int32), best))[1]
 
 
 def nearest_distance(scene: Scene, unit: shapes.UnitShapes, u: jax.Array, v: jax.Array) -> jax.Array:

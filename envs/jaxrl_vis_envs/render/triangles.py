@@ -65,39 +65,11 @@ def _touching(
     axes, origin = unit.axes[owner], unit.origin[owner]
     offset = scene.clusters[:, :3] - origin
     middle = jnp.sum(axes * offset[:, :, None], axis=1)  # back to the camera's frame: the axes of a mesh are a rotation
-    touching = in_view(scene, middle, scene.clusters[:, 3], u, v, depth)
+    touching = camera.in_view(scene, middle, scene.clusters[:, 3], u, v, depth)
     if only is not None:
         return touching & (owner == only)
     opaque = np.array(scene.transparent) == raycast.OPAQUE
     return touching & jnp.asarray(opaque)[owner]
-
-
-def in_view(
-    scene: Scene, middle: jax.Array, radius: jax.Array, u: jax.Array, v: jax.Array, depth: jax.Array | None
-) -> jax.Array:
-    """Which balls the rays through a block of pixels may meet.
-
-    Args:
-        scene: The scene.
-        middle: [K, 3] float32, metres, camera's frame.
-        radius: [K] float32, metres.
-        u: [P] float32, see `camera.pixel_rays`.
-        v: [P] float32.
-        depth: [P] float32, metres, beyond which nothing counts; None for no such depth.
-
-    Returns:
-        [K] bool; false for what is not finite.
-    """
-    ahead = -middle[:, 2]
-    touching = (ahead + radius > scene.znear) & (ahead - radius < (scene.zfar if depth is None else jnp.max(depth)))
-    for axis, coordinate in enumerate((u, v)):
-        low, high = jnp.min(coordinate), jnp.max(coordinate)
-        if scene.projection == "orthographic":
-            touching &= (middle[:, axis] - high <= radius) & (low - middle[:, axis] <= radius)
-        else:
-            touching &= middle[:, axis] - high * ahead <= radius * jnp.sqrt(1.0 + high * high)
-            touching &= low * ahead - middle[:, axis] <= radius * jnp.sqrt(1.0 + low * low)
-    return touching
 
 
 def _meet_cluster(scene: Scene, unit: shapes.UnitShapes, cluster: jax.Array, u: jax.Array, v: jax.Array) -> jax.Array:
