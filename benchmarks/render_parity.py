@@ -12,23 +12,18 @@ import json
 import os
 import pathlib
 import sys
-import textwrap
 import time
-from types import SimpleNamespace
 from typing import Any
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "envs"), str(ROOT / "tests")]
 os.environ.setdefault("JAX_PLATFORMS", "cpu")  # the pictures are few, and MuJoCo's renderer is what takes the time
 
-import jax  # noqa: E402
 import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 import render_models  # noqa: E402
 from render_comparison import BOUNDS, Tally, looks  # noqa: E402
 
-from jaxrl_vis_envs.compilation import world_jit  # noqa: E402
-from jaxrl_vis_envs.render import Scene, render  # noqa: E402
 from jaxrl_vis_envs.render.reference import ReferenceRenderer  # noqa: E402
 
 TARGET = ROOT / "benchmarks" / "results" / "render_parity.json"
@@ -52,10 +47,9 @@ def compare(name: str, poses: int, size: int) -> dict[str, Any]:
     start = time.perf_counter()
     try:
         mj_model, camera = render_models.build(name)
-        scene = Scene.from_mjmodel(mj_model, camera, size, size, site_groups=entry.site_groups)
+        scene = render_models.make_scene(name, mj_model, camera, size, size)
     except (ValueError, ModuleNotFoundError) as error:
         return {**row, "refused": " ".join(str(error).split()), "failures": ["refused"]}
-    draw = world_jit(jax.vmap(lambda poses: render(scene, SimpleNamespace(**poses))))
     mj_data, tally, ours_s = mujoco.MjData(mj_model), Tally(looks(mj_model)), 0.0
     with ReferenceRenderer(render_models.build(name, truth=True)[0], size, size, site_groups=entry.site_groups) as reference:
         for first in range(0, poses, BATCH):
@@ -67,10 +61,10 @@ def compare(name: str, poses: int, size: int) -> dict[str, Any]:
                 if number < poses:
                     theirs.append(reference(mj_data, camera))
             mark = time.perf_counter()
-            ours = jax.tree.map(np.asarray, draw(jax.tree.map(lambda *rows: np.stack(rows), *inputs)))
+            ours = render_models.draw(scene, inputs)
             ours_s += time.perf_counter() - mark
-            for index, frame in enumerate(theirs):
-                tally.add(jax.tree.map(lambda rows, index=index: rows[index], ours), frame)
+            for our, their in zip(ours, theirs, strict=False):
+                tally.add(our, their)
     worst = tally.worst[1]
     name_of = mj_model.geom(worst).name if 0 <= worst < mj_model.ngeom else ""
     return {

@@ -9,7 +9,6 @@ import argparse
 import os
 import pathlib
 import sys
-from types import SimpleNamespace
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "envs"), str(ROOT / "tests")]
@@ -21,8 +20,6 @@ import render_models  # noqa: E402
 from PIL import Image, ImageDraw, ImageFont  # noqa: E402
 from render_features import FEATURES  # noqa: E402
 
-from jaxrl_vis_envs.compilation import world_jit  # noqa: E402
-from jaxrl_vis_envs.render import Scene, render  # noqa: E402
 from jaxrl_vis_envs.render.reference import ReferenceRenderer  # noqa: E402
 
 FOLDER = ROOT / "docs" / "renderer"
@@ -52,12 +49,11 @@ def panel(name: str) -> tuple[str, Image.Image]:
     row[:, SIZE + GAP : 2 * SIZE + GAP] = theirs
     title = FEATURES[name].title if name in FEATURES else name
     try:
-        scene = Scene.from_mjmodel(mj_model, camera, SIZE, SIZE, site_groups=entry.site_groups)
+        scene = render_models.make_scene(name, mj_model, camera, SIZE, SIZE)
     except ValueError:
         row[:, :SIZE] = row[:, 2 * (SIZE + GAP) :] = MISSING
         return f"{title} (refused)", Image.fromarray(row)
-    draw = world_jit(lambda poses: render(scene, SimpleNamespace(**poses)))
-    ours = np.asarray(draw(render_models.poses_of(mj_data)).rgb)
+    ours = np.asarray(render_models.draw(scene, [render_models.poses_of(mj_data)])[0].rgb)
     row[:, :SIZE] = ours
     difference = GAIN * np.abs(ours.astype(int) - theirs)
     row[:, 2 * (SIZE + GAP) :] = np.minimum(difference, 255)

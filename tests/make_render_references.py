@@ -35,8 +35,9 @@ def draw(name: str) -> render_references.References:
             render_models.set_pose(mj_model, mj_data, number)
             for field in ("qpos", "mocap_pos", "mocap_quat"):
                 columns[field].append(getattr(mj_data, field).copy())
-            for field, plane in reference(mj_data, camera)._asdict().items():
-                columns[field].append(plane)
+            frame = reference(mj_data, camera)
+            for field in ("rgb", "depth", "segmentation"):
+                columns[field].append(getattr(frame, field))
     near, far = (mj_model.stat.extent * plane for plane in (mj_model.vis.map.znear, mj_model.vis.map.zfar))
     arrays = {field: np.stack(rows) for field, rows in columns.items() if rows}
     return render_references.References(fingerprint=render_models.fingerprint(mj_model), near=near, far=far, **arrays)

@@ -85,8 +85,7 @@ class Tally:
     )
 
     def add(self, ours: Any, theirs: Any) -> None:
-        """Adds one picture: two `Frame` of arrays; ``theirs`` is the truth."""
-        ours, theirs = (type(frame)(*map(np.asarray, frame)) for frame in (ours, theirs))
+        """Adds one picture: two `Frame` of NumPy arrays; ``theirs`` is the truth."""
         kept = ~(near_edges(ours.segmentation) | near_edges(theirs.segmentation))
         solid = kept & ((ours.segmentation >= 0) | (theirs.segmentation >= 0))
         self.kept += int(kept.sum())

@@ -11,14 +11,18 @@ import pathlib
 import warnings
 import zlib
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
+import jax
 import mujoco
 import numpy as np
 from render_features import FEATURES, scene_spec, truth_of
 
 import jaxrl_vis_envs
 from jaxrl_vis.bench.render_scenes import forward, scatter_joints
+from jaxrl_vis_envs.compilation import world_jit
+from jaxrl_vis_envs.render import Frame, Scene, render
 
 SEED = 0
 # OpenGL draws polygons where a ray caster draws balls, and lights their corners: with fine ones the two mean the same.
@@ -38,6 +42,7 @@ class RenderModel:
         view: For an added camera: azimuth and elevation in degrees as MuJoCo's free camera counts them, and the distance in
             multiples of the model's extent.
         site_groups: Groups of sites that are drawn.
+        leave_out: What is not drawn, as `Scene.from_mjmodel` takes it.
         finish: Changes the compiled model in place.
     """
 
@@ -46,6 +51,7 @@ class RenderModel:
     camera: str | int | None = None
     view: tuple[float, ...] = _VIEW
     site_groups: tuple[int, ...] = ()
+    leave_out: tuple[str, ...] = ()
     finish: Callable[[mujoco.MjModel], None] | None = None
 
 
@@ -99,7 +105,7 @@ MODELS: dict[str, RenderModel] = {
     "fetch_reach": _ours("fetch_reach"),
     "reacher": _ours("reacher"),
     **{f"dm_{domain.lower()}": _suite(domain) for domain in _SUITE},
-    "dm_dog": _suite("dog", None, view=(60.0, -15.0, 1.0)),
+    "dm_dog": _suite("dog", None, view=(60.0, -15.0, 1.0), leave_out=("skin",)),
     "dm_quadruped": _suite("quadruped", "x", finish=_raise_terrain),
     "dm_quadruped_far": _suite("quadruped", None, view=(60.0, -20.0, 0.8), finish=_raise_terrain),
     "mjx_convex": _mjx("convex", 0),
@@ -142,6 +148,16 @@ def build(name: str, truth: bool = False) -> tuple[mujoco.MjModel, int]:
     if entry.camera is None:
         return mj_model, mj_model.camera(CAMERA).id
     return mj_model, entry.camera if isinstance(entry.camera, int) else mj_model.camera(entry.camera).id
+
+
+def make_scene(name: str, mj_model: mujoco.MjModel, camera: int, height: int, width: int) -> Scene:
+    """Our scene of a model that `build` made.
+
+    Raises:
+        ValueError: Our renderer cannot draw it.
+    """
+    entry = MODELS[name]
+    return Scene.from_mjmodel(mj_model, camera, height, width, site_groups=entry.site_groups, leave_out=entry.leave_out)
 
 
 def _add_camera(spec: mujoco.MjSpec, view: tuple[float, ...]) -> None:
@@ -187,14 +203,29 @@ def poses_of(mj_data: mujoco.MjData) -> dict[str, np.ndarray]:
     return {name: np.array(getattr(mj_data, name), np.float32) for name in names}
 
 
+def draw(scene: Scene, poses: list[dict[str, np.ndarray]]) -> list[Frame]:
+    """Our pictures of several poses, each from `poses_of`: frames of NumPy arrays.
+
+    The scene is an argument of the compiled program: scenes that are alike in all but numbers share it.
+    """
+    frames = jax.tree.map(np.asarray, _draw_all(scene, jax.tree.map(lambda *rows: np.stack(rows), *poses)))
+    return [jax.tree.map(lambda planes, index=index: planes[index], frames) for index in range(len(poses))]
+
+
+_draw_all = world_jit(jax.vmap(lambda scene, poses: render(scene, SimpleNamespace(**poses)), in_axes=(None, 0)))
+
+
 def fingerprint(mj_model: mujoco.MjModel) -> int:
     """A number that changes when what the model looks like does: another version of the package that it comes from."""
-    arrays = (
+    numbers = (
         mj_model.geom_type, mj_model.geom_size, mj_model.geom_pos, mj_model.geom_rgba, mj_model.body_pos, mj_model.light_pos,
-        mj_model.cam_pos, mj_model.mat_rgba, mj_model.tex_data, mj_model.mesh_vert, mj_model.hfield_data,
+        mj_model.cam_pos, mj_model.mat_rgba, mj_model.mesh_vert, mj_model.hfield_data,
     )  # fmt: skip
     # Rounded, so that another processor's last bit is not another model.
-    return zlib.crc32(b"".join(np.round(np.asarray(array, np.float64), 4).tobytes() for array in arrays))
+    found = zlib.crc32(mj_model.tex_data.tobytes())
+    for array in numbers:
+        found = zlib.crc32(np.round(np.asarray(array, np.float64), 4).tobytes(), found)
+    return found
 
 
 def versions() -> dict[str, str]:

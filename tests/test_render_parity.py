@@ -4,9 +4,6 @@ The bounds are those of the live comparison (benchmarks/render_parity.py), on fe
 stored pictures fails, and so does one whose package has changed since they were made.
 """
 
-from types import SimpleNamespace
-
-import jax
 import mujoco
 import numpy as np
 import pytest
@@ -15,8 +12,7 @@ import render_references
 from render_comparison import BARE, BOUNDS, PLANE, SKY, TEXTURED, Tally, looks
 
 from jaxrl_vis.bench.render_scenes import forward
-from jaxrl_vis_envs.compilation import world_jit
-from jaxrl_vis_envs.render import Frame, Scene, render
+from jaxrl_vis_envs.render import Frame
 
 
 @pytest.mark.parametrize("name", render_models.MODELS)
@@ -27,21 +23,17 @@ def test_pictures_agree_with_mujoco(name: str) -> None:
         f"{name} is not what was drawn: its package has changed, so run tests/make_render_references.py {name}"
     )
     height, width = stored.depth.shape[1:]
-    scene = Scene.from_mjmodel(mj_model, camera, height, width, site_groups=render_models.MODELS[name].site_groups)
+    scene = render_models.make_scene(name, mj_model, camera, height, width)
     mj_data = mujoco.MjData(mj_model)
     poses = []
     for qpos, position, quaternion in zip(stored.qpos, stored.mocap_pos, stored.mocap_quat, strict=True):
         mj_data.qpos, mj_data.mocap_pos, mj_data.mocap_quat = qpos, position, quaternion
         forward(mj_model, mj_data)
         poses.append(render_models.poses_of(mj_data))
-    draw = world_jit(jax.vmap(lambda poses: render(scene, SimpleNamespace(**poses))))
-    drawn = jax.tree.map(np.asarray, draw(jax.tree.map(lambda *rows: np.stack(rows), *poses)))
     tally = Tally(looks(mj_model))
-    for index in range(len(poses)):
-        tally.add(
-            Frame(*(plane[index] for plane in drawn)),
-            Frame(stored.rgb[index], stored.depth[index], stored.segmentation[index]),
-        )
+    for index, ours in enumerate(render_models.draw(scene, poses)):
+        theirs = Frame(stored.rgb[index], stored.depth[index], stored.segmentation[index])  # pyright: ignore[reportArgumentType]
+        tally.add(ours, theirs)
     assert len({row.tobytes() for row in stored.rgb}) == len(poses), "the stored pictures are copies of each other"
     assert tally.solid > 0, "nothing was compared"
     assert not tally.failures(), {measure: tally.measures()[measure] for measure in tally.failures()}
