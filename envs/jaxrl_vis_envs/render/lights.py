@@ -15,7 +15,7 @@ _SPOT = int(mujoco.mjtLightType.mjLIGHT_SPOT)
 
 
 class Light(NamedTuple):
-    """One light in the camera's frame; the numbers are scalars or [3] arrays."""
+    """One light in the camera's frame; the numbers are scalars, and [3] arrays or three scalars."""
 
     directional: bool
     highlights: bool
@@ -88,6 +88,51 @@ def camera_lights(scene: Scene, data: Any, camera_position: jax.Array, camera_ro
         attenuation = scene.light_attenuation[index]
         lights.append(Light(*facts, positions[index], directions[index], *colours, attenuation, cosine, exponent))
     return lights
+
+
+class LightFacts(NamedTuple):
+    """What of a light is settled when the scene is made."""
+
+    directional: bool
+    highlights: bool
+    shadows: bool
+    cone: bool
+
+
+def facts(scene: Scene) -> list[LightFacts]:
+    """Of the lights that `camera_lights` gives, in its order."""
+    own = zip(scene.light_types, scene.light_highlights, scene.light_shadows, strict=False)
+    found = [LightFacts(kind == _DIRECTIONAL, highlights, shadows, kind == _SPOT) for kind, highlights, shadows in own]
+    return [LightFacts(True, scene.light_highlights[-1], False, False)] * scene.headlight + found
+
+
+def pack(lights: list[Light]) -> jax.Array:
+    """All numbers of the lights as one table: [L, 20] float32."""
+    rows = []
+    for light in lights:
+        zeros, zero = jnp.zeros(3), jnp.zeros(())
+        vectors = (light.position, light.direction, light.ambient, light.diffuse, light.specular, light.attenuation)
+        numbers = (light.cosine_cutoff, light.exponent)
+        rows.append(
+            jnp.concatenate(
+                [zeros if vector is None else vector for vector in vectors]
+                + [(zero if number is None else number)[None] for number in numbers]
+            )
+        )
+    return jnp.stack(rows) if rows else jnp.zeros((0, 20))
+
+
+def unpack(scene: Scene, table: Any) -> list[Light]:
+    """Undoes `pack`; vectors come as three scalars. The table may be an array or, in a kernel, a block of memory."""
+    found = []
+    for index, fact in enumerate(facts(scene)):
+        values = [table[index, column] for column in range(20)]
+        vectors: list[Any] = [tuple(values[first : first + 3]) for first in range(0, 18, 3)]
+        if fact.directional:
+            vectors[0] = vectors[5] = None
+        cone = values[18:] if fact.cone else (None, None)
+        found.append(Light(*fact[:3], *vectors, *cone))
+    return found
 
 
 def _power(base: jax.Array, exponent: jax.Array) -> jax.Array:

@@ -2,17 +2,17 @@
 
 Three steps: once per environment, everything linear (`shapes`, `lights`); per pixel, which object is nearest (`raycast`,
 `triangles`), which gives integers and is never differentiated; per pixel, once, depth, normal and colour of that object from
-the row of a table (`surface`, `shade`).
+the row of a table (`surface`, `shade`). On a GPU the last two are one kernel for most scenes (`gpu_kernel`).
 """
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis_envs.render import blocks, camera, raycast, shade, shapes, surface, transparent
-from jaxrl_vis_envs.render.lights import Light, camera_lights
+from jaxrl_vis_envs.render import blocks, camera, gpu_kernel, lights, raycast, shade, shapes, surface, transparent
 from jaxrl_vis_envs.render.scene import Scene
 
 
@@ -38,7 +38,7 @@ class Planes(NamedTuple):
     """A picture as the hot path wants it: planes, not quantised, and only those that were asked for.
 
     Attributes:
-        rgb: [3, H, W] float32 in [0, 1], or None.
+        rgb: [3, H, W] float32 in [0, 1], or uint8 where that was asked for; or None.
         depth: [H, W] float32 as in `Frame`, or None.
         segmentation: [H, W] int32 as in `Frame`, or None.
         normals: [3, H, W] float32 as in `Frame`, or None.
@@ -58,7 +58,7 @@ class _View(NamedTuple):
     rotation: jax.Array
     unit: shapes.UnitShapes
     table: jax.Array
-    lights: list[Light]
+    lights: list[lights.Light]
 
 
 def render_planes(
@@ -69,6 +69,7 @@ def render_planes(
     segmentation: bool = False,
     normals: bool = False,
     distance: bool = False,
+    quantized: bool = False,
 ) -> Planes:
     """Draws one environment, as planes. What is not asked for is not computed.
 
@@ -82,16 +83,54 @@ def render_planes(
         segmentation: Whether to say which object each pixel sees.
         normals: Whether to return the normals of the surfaces.
         distance: Whether to return the depth along the rays.
+        quantized: Whether to return the colours as `quantize` makes them, [3, H, W] uint8: less to write.
 
     Returns:
         The planes that were asked for.
     """
+    wanted = (rgb, depth, segmentation, normals, distance)
     if not scene.object_ids:
-        return _draw_nothing(scene, data, (rgb, depth, segmentation, normals, distance))
+        planes = _draw_nothing(scene, data, wanted)
+    else:
+        position, rotation, finite = camera.camera_pose(scene, data)
+        unit = shapes.unit_shapes(scene, data, position, rotation, finite)
+        table = lights.pack(lights.camera_lights(scene, data, position, rotation) if rgb else [])
+        draw = _draw_by_kernel if gpu_kernel.takes(scene) else _draw
+        planes = draw((wanted, quantized), scene, rotation, unit, table)
+    if quantized and planes.rgb is not None and planes.rgb.dtype != jnp.uint8:
+        planes = planes._replace(rgb=quantize(planes.rgb))
+    return planes
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _draw_by_kernel(
+    outputs: tuple, scene: Scene, rotation: jax.Array, unit: shapes.UnitShapes, light_table: jax.Array
+) -> Planes:
+    """`_draw` as one GPU kernel, with the derivatives of `_draw`."""
+    (rgb, depth, segmentation, normals, distance), quantized = outputs
+    planes = gpu_kernel.draw((rgb, depth, normals, distance, segmentation), quantized, scene, rotation, unit, light_table)
+    colour, near, normal, length, labels = planes
+    return Planes(colour, near, labels, normal, length)
+
+
+@_draw_by_kernel.defjvp
+def _differentiate(outputs: tuple, primals: tuple, tangents: tuple) -> tuple[Planes, Planes]:
+    return jax.jvp(functools.partial(_draw, outputs), primals, tangents)
+
+
+def _draw(outputs: tuple, scene: Scene, rotation: jax.Array, unit: shapes.UnitShapes, light_table: jax.Array) -> Planes:
+    """The wanted planes of a scene with objects.
+
+    Args:
+        outputs: Which planes, as `render_planes` takes them, and whether colours are bytes.
+        scene: The scene.
+        rotation: [3, 3] float32, see `camera.camera_pose`.
+        unit: The drawn objects.
+        light_table: From `lights.pack`.
+    """
+    (rgb, depth, segmentation, normals, distance), quantized = outputs
     layout = blocks.layout(scene)
     u, v = camera.pixel_rays(scene, layout.rows, layout.columns)
-    position, rotation, finite = camera.camera_pose(scene, data)
-    unit = shapes.unit_shapes(scene, data, position, rotation, finite)
     # A barrier, because XLA would otherwise redo the work per object in every pixel.
     unit = jax.lax.optimization_barrier(unit)
     if not (rgb or segmentation or normals or blocks.tiled(scene) or any(scene.transparent)):
@@ -104,14 +143,12 @@ def render_planes(
     key, triangle = blocks.nearest(scene, unit, u, v)
     # Barriers here too: each output would otherwise look for the nearest object again.
     key, triangle = jax.lax.optimization_barrier((key, triangle))
-    lights = camera_lights(scene, data, position, rotation) if rgb else []
-    view = _View(rotation, unit, surface.object_table(scene, unit), lights)
-    wanted = (rgb, depth, segmentation, normals, distance)
+    view = _View(rotation, unit, surface.object_table(scene, unit), lights.unpack(scene, light_table) if rgb else [])
     pixels = blocks.joined((u, v, key, triangle))
-    planes = blocks.scan(lambda *block: _finish(scene, view, wanted, *block), *pixels)
+    planes = blocks.scan(lambda *block: _finish(scene, view, outputs[0], *block), *pixels)
     planes = jax.lax.optimization_barrier(planes)
-    planes = [blocks.restore(scene, layout, plane) for plane in planes]
-    return _collect(wanted, planes)
+    planes = _collect(outputs[0], [blocks.restore(scene, layout, plane) for plane in planes])
+    return planes._replace(rgb=quantize(planes.rgb)) if quantized and planes.rgb is not None else planes
 
 
 def _finish(scene: Scene, view: _View, wanted: tuple, u: Any, v: Any, key: Any, triangle: Any) -> tuple:
