@@ -21,7 +21,7 @@ from render_features import FEATURES, scene_spec, truth_of
 
 import jaxrl_vis_envs
 from jaxrl_vis.bench.render_scenes import forward, scatter_joints
-from jaxrl_vis_envs.compilation import world_jit
+from jaxrl_vis_envs.compilation import compiler_options, world_jit
 from jaxrl_vis_envs.render import Frame, Scene, render
 
 SEED = 0
@@ -43,6 +43,7 @@ class RenderModel:
             multiples of the model's extent.
         site_groups: Groups of sites that are drawn.
         leave_out: What is not drawn, as `Scene.from_mjmodel` takes it.
+        plane_backs: Whether planes are seen from behind, where MuJoCo draws them half transparent.
         finish: Changes the compiled model in place.
     """
 
@@ -52,6 +53,7 @@ class RenderModel:
     view: tuple[float, ...] = _VIEW
     site_groups: tuple[int, ...] = ()
     leave_out: tuple[str, ...] = ()
+    plane_backs: bool = False
     finish: Callable[[mujoco.MjModel], None] | None = None
 
 
@@ -83,7 +85,9 @@ def _ours(task: str) -> RenderModel:
 
 
 def _feature(name: str) -> RenderModel:
-    return RenderModel("feature", lambda: scene_spec(FEATURES[name]), "eye", site_groups=(0,))
+    feature = FEATURES[name]
+    boards = any('type="plane"' in thing for thing in feature.things)
+    return RenderModel("feature", lambda: scene_spec(feature), "eye", site_groups=(0,), plane_backs=boards)
 
 
 def _raise_terrain(mj_model: mujoco.MjModel) -> None:
@@ -157,7 +161,15 @@ def make_scene(name: str, mj_model: mujoco.MjModel, camera: int, height: int, wi
         ValueError: Our renderer cannot draw it.
     """
     entry = MODELS[name]
-    return Scene.from_mjmodel(mj_model, camera, height, width, site_groups=entry.site_groups, leave_out=entry.leave_out)
+    return Scene.from_mjmodel(
+        mj_model,
+        camera,
+        height,
+        width,
+        site_groups=entry.site_groups,
+        leave_out=entry.leave_out,
+        plane_backs=entry.plane_backs,
+    )
 
 
 def _add_camera(spec: mujoco.MjSpec, view: tuple[float, ...]) -> None:
@@ -203,16 +215,27 @@ def poses_of(mj_data: mujoco.MjData) -> dict[str, np.ndarray]:
     return {name: np.array(getattr(mj_data, name), np.float32) for name in names}
 
 
-def draw(scene: Scene, poses: list[dict[str, np.ndarray]]) -> list[Frame]:
+def draw(scene: Scene, poses: list[dict[str, np.ndarray]], quick: bool = False) -> list[Frame]:
     """Our pictures of several poses, each from `poses_of`: frames of NumPy arrays.
 
     The scene is an argument of the compiled program: scenes that are alike in all but numbers share it.
+
+    Args:
+        scene: From `make_scene`.
+        poses: The poses.
+        quick: Whether the compiler may spend less on making the program fast, which pays for a handful of small pictures.
     """
-    frames = jax.tree.map(np.asarray, _draw_all(scene, jax.tree.map(lambda *rows: np.stack(rows), *poses)))
+    drawer = _draw_quick if quick else _draw_all
+    frames = jax.tree.map(np.asarray, drawer(scene, jax.tree.map(lambda *rows: np.stack(rows), *poses)))
     return [jax.tree.map(lambda planes, index=index: planes[index], frames) for index in range(len(poses))]
 
 
-_draw_all = world_jit(jax.vmap(lambda scene, poses: render(scene, SimpleNamespace(**poses)), in_axes=(None, 0)))
+def _render_all(scene: Scene, poses: dict[str, jax.Array]) -> Frame:
+    return jax.vmap(lambda pose: render(scene, SimpleNamespace(**pose)))(poses)
+
+
+_draw_all = world_jit(_render_all)
+_draw_quick = jax.jit(_render_all, compiler_options={**compiler_options(), "xla_backend_optimization_level": 0})
 
 
 def fingerprint(mj_model: mujoco.MjModel) -> int:

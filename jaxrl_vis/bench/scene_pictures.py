@@ -78,11 +78,11 @@ def _measure_size(settings: Settings, config: dict[str, Any], mj_model: mujoco.M
 
 def _picture(scene: Scene, poses: dict[str, jax.Array], output: str) -> Any:
     """One picture as planes: rgbd (uint8 and float32 metres), rgbd8 (all uint8) or depth (float32 metres)."""
-    planes = render_planes(scene, SimpleNamespace(**poses), rgb=output != "depth")
+    planes = render_planes(scene, SimpleNamespace(**poses), rgb=output != "depth", quantized=True)
     assert planes.depth is not None
     if planes.rgb is None:
         return planes.depth
-    return quantize(planes.rgb), planes.depth if output == "rgbd" else quantize(planes.depth / _DEPTH_RANGE)
+    return planes.rgb, planes.depth if output == "rgbd" else quantize(planes.depth / _DEPTH_RANGE)
 
 
 def _measure_ours(settings: Settings, config: dict[str, Any], mj_model: mujoco.MjModel, batches: list) -> Measurement:
