@@ -96,7 +96,8 @@ def test_gradients_are_those_of_finite_differences(thing):
     scene, poses, inside = setting(thing)
 
     def measured(change):
-        planes = render_planes(*(lambda s, p: (s, SimpleNamespace(**p)))(*moved(scene, poses, change)))
+        changed, placed = moved(scene, poses, change)
+        planes = render_planes(changed, SimpleNamespace(**placed))
         weights = jnp.where(inside, 1.0, 0.0) / inside.sum()
         return jnp.stack([jnp.sum(weights * planes.depth), jnp.sum(weights * planes.rgb), jnp.sum(weights * planes.rgb[0])])
 

@@ -129,7 +129,7 @@ def in_view(
     return touching
 
 
-def mapped(matrix: jax.Array, vector: tuple) -> tuple:
+def mapped(matrix: Any, vector: tuple) -> tuple:
     """``matrix @ vector`` for a [3, 3] matrix (or rows of values) and three values, without the products with plain zeros."""
     rows = [[matrix[row, column] for column in range(3)] for row in range(3)] if hasattr(matrix, "shape") else matrix
     result = []

@@ -86,7 +86,7 @@ def refuse_unsupported(
     """Raises a ValueError of one line that names everything that would be seen and cannot be drawn, and what to do."""
     refused = []
     for index in np.flatnonzero(drawn & ~np.isin(types, SUPPORTED_TYPES)):
-        refused.append(f"{object_name(mj_model, index)} ({_type_name(types[index])})")
+        refused.append(f"{object_name(mj_model, int(index))} ({_type_name(types[index])})")
     if refused:
         raise ValueError(
             f"cannot draw {', '.join(refused)}: use a mesh or primitives, a group that is not drawn, alpha 0, or leave_out"
@@ -103,7 +103,7 @@ def refuse_unsupported(
         raise ValueError(f"cannot light with images ({names}): make it inactive, or a directional, point or spot light")
     if shadows:
         fine = np.isin(types, (mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_HFIELD))
-        casting = [object_name(mj_model, index) for index in np.flatnonzero(drawn & fine)]
+        casting = [object_name(mj_model, int(index)) for index in np.flatnonzero(drawn & fine)]
         if casting:
             raise ValueError(f"cannot draw shadows of {', '.join(casting)} (triangles): use shadows=False, or leave_out")
 

@@ -134,12 +134,14 @@ def _draw(outputs: tuple, scene: Scene, rotation: jax.Array, unit: shapes.UnitSh
     # A barrier, because XLA would otherwise redo the work per object in every pixel.
     unit = jax.lax.optimization_barrier(unit)
     if not (rgb or segmentation or normals or blocks.tiled(scene) or any(scene.transparent)):
-        drawn = blocks.scan(lambda u, v: (raycast.nearest_distance(scene, unit, u, v),), u, v)
-        far = drawn[0]
-        length = far * _ray_length(scene, u, v) if distance else None
-        length = None if length is None else jnp.where(far < scene.zfar, length, scene.zfar)
-        return Planes(None, *(blocks.restore(scene, layout, plane) if want else None
-                              for plane, want in ((far, depth), (None, False), (None, False), (length, distance))))  # fmt: skip
+        far = blocks.scan(lambda u, v: raycast.nearest_distance(scene, unit, u, v), u, v)
+        near = length = None
+        if depth:
+            near = blocks.restore(scene, layout, far)
+        if distance:
+            along = jnp.where(far < scene.zfar, far * _ray_length(scene, u, v), scene.zfar)
+            length = blocks.restore(scene, layout, along)
+        return Planes(None, near, None, None, length)
     key, triangle = blocks.nearest(scene, unit, u, v)
     # Barriers here too: each output would otherwise look for the nearest object again.
     key, triangle = jax.lax.optimization_barrier((key, triangle))
@@ -157,7 +159,8 @@ def _finish(scene: Scene, view: _View, wanted: tuple, u: Any, v: Any, key: Any, 
     near, index = raycast.decode(scene, key)
     sees = index >= 0
     planes: list[jax.Array] = []
-    far, normal = near, (0.0, 0.0, 0.0)
+    far = near
+    normal: tuple = ()
     if rgb or depth or normals or distance or any(scene.transparent):
         row = surface.fetch(view.table, index)
         hit = surface.meet(scene, row, surface.fetch_triangle(scene, triangle), u, v, near)

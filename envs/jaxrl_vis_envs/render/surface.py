@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis_envs.render import camera, charts, meshes, model_reading, shapes, textures
+from jaxrl_vis_envs.render import camera, charts, model_reading, shapes, textures
 from jaxrl_vis_envs.render.scene import Scene
 
 Vector = tuple  # of three
@@ -115,27 +115,33 @@ def _visual_size(kinds: np.ndarray, size: jax.Array) -> jax.Array:
 
 def read_row(values: jax.Array) -> Row:
     """Sorts the columns of `object_table` (its last axis) into a `Row`."""
-    v = [values[..., column] for column in range(values.shape[-1])]
+    return _sorted([values[..., column] for column in range(values.shape[-1])])
+
+
+def _sorted(v: list) -> Row:
     axes = tuple(tuple(v[3 * row : 3 * row + 3]) for row in range(3))
     return Row(axes, tuple(v[9:12]), v[12], v[13], tuple(v[14:17]), v[17], v[18], v[19], tuple(v[20:]))
 
 
 def fetch(table: jax.Array, row: jax.Array) -> Row:
     """The row of every pixel: table [G, columns] and [P] int32 (below 0: the first row)."""
-    index = jnp.maximum(row, 0)
-    if jax.default_backend() == "cpu":
-        # One row per pixel is kept and read by all that follows; a column at a time is looked up anew for every use.
-        return read_row(table.at[index].get(mode="promise_in_bounds"))
-    columns = [table[:, column].at[index].get(mode="promise_in_bounds") for column in range(table.shape[1])]
-    return read_row(jnp.stack(columns, axis=-1))
+    return _sorted(_look_up(table, row))
 
 
 def fetch_triangle(scene: Scene, triangle: jax.Array | None) -> tuple | None:
     """What `meet` needs of the triangles of pixels: rows of `Scene.triangles` [P] int32, below 0 for none."""
-    if triangle is None:
-        return None
-    values = scene.triangles.at[jnp.maximum(triangle, 0)].get(mode="promise_in_bounds")
-    return triangle >= 0, [values[..., column] for column in range(meshes.COLUMNS)]
+    return None if triangle is None else (triangle >= 0, _look_up(scene.triangles, triangle))
+
+
+def _look_up(table: jax.Array, row: jax.Array) -> list[jax.Array]:
+    """The columns [P] of the rows [P] of a table."""
+    index = jnp.maximum(row, 0)
+    if jax.default_backend() == "cpu":
+        # One row per pixel is kept and read by all that follows; a column at a time is looked up anew for every use.
+        values = table.at[index].get(mode="promise_in_bounds")
+        return [values[..., column] for column in range(table.shape[1])]
+    # Elsewhere that is what keeps the rows of all pixels out of the memory.
+    return [table[:, column].at[index].get(mode="promise_in_bounds") for column in range(table.shape[1])]
 
 
 def meet(scene: Scene, row: Row, triangle: tuple | None, u: jax.Array, v: jax.Array, start: jax.Array) -> Hit:
