@@ -27,7 +27,7 @@ from jaxrl_vis_envs.render import Frame, Scene, render
 SEED = 0
 # OpenGL draws polygons where a ray caster draws balls, and lights their corners: with fine ones the two mean the same.
 SLICES, STACKS, QUADS = 128, 64, 16
-CAMERA = "parity"
+CAMERA, SWING = "parity", "parity_swing"
 _VIEW = (120.0, -25.0, 1.5)
 
 
@@ -102,13 +102,14 @@ def _lower_ground(mj_model: mujoco.MjModel) -> None:
     mj_model.geom_pos[mj_model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD, 2] -= 0.4
 
 
-_SUITE = ("acrobot", "ball_in_cup", "cartpole", "cheetah", "finger", "fish", "hopper", "humanoid", "humanoid_CMU", "lqr")
+_SUITE = ("acrobot", "ball_in_cup", "cartpole", "cheetah", "finger", "fish", "hopper", "humanoid", "humanoid_CMU")
 _SUITE += ("manipulator", "pendulum", "point_mass", "reacher", "stacker", "swimmer", "walker")
 
 MODELS: dict[str, RenderModel] = {
     "fetch_reach": _ours("fetch_reach"),
     "reacher": _ours("reacher"),
     **{f"dm_{domain.lower()}": _suite(domain) for domain in _SUITE},
+    "dm_lqr": _suite("lqr", None),
     "dm_dog": _suite("dog", None, view=(60.0, -15.0, 1.0), leave_out=("skin",)),
     "dm_quadruped": _suite("quadruped", "x", finish=_raise_terrain),
     "dm_quadruped_far": _suite("quadruped", None, view=(60.0, -20.0, 0.8), finish=_raise_terrain),
@@ -178,9 +179,12 @@ def _add_camera(spec: mujoco.MjSpec, view: tuple[float, ...]) -> None:
     azimuth, elevation = np.deg2rad(view[:2])
     ahead = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
     right = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
-    camera = spec.worldbody.add_camera()
+    # Where nothing can move, the camera swings around the middle.
+    swing = mj_model.nq == 0
+    holder = spec.worldbody.add_body(name=SWING, mocap=True, pos=mj_model.stat.center) if swing else spec.worldbody
+    camera = holder.add_camera()
     camera.name = CAMERA
-    camera.pos = mj_model.stat.center - view[2] * mj_model.stat.extent * ahead
+    camera.pos = (0.0 if swing else mj_model.stat.center) - view[2] * mj_model.stat.extent * ahead
     mujoco.mju_mat2Quat(camera.quat, np.stack([right, np.cross(right, ahead), -ahead], axis=1).reshape(-1))
 
 
@@ -194,6 +198,8 @@ def set_pose(mj_model: mujoco.MjModel, mj_data: mujoco.MjData, number: int) -> N
             quaternion = rng.normal(size=4)
             mj_data.mocap_pos[mocap] += rng.uniform(-0.08, 0.08, 3)
             mj_data.mocap_quat[mocap] = quaternion / np.linalg.norm(quaternion)
+        elif name == SWING:
+            mujoco.mju_axisAngle2Quat(mj_data.mocap_quat[mocap], [0.0, 0.0, 1.0], rng.uniform(-np.pi, np.pi))
         elif name == "eye":
             _orbit(mj_data.mocap_pos[mocap], mj_data.mocap_quat[mocap], rng)
     forward(mj_model, mj_data)
