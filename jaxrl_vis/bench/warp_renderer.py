@@ -64,14 +64,17 @@ def measure(
     compile_s = time.perf_counter() - start
     size = config["image_size"]
 
+    import warp as wp  # pyright: ignore[reportMissingImports]
+
     def pictures(draw: Callable[[], None]) -> tuple[np.ndarray, np.ndarray]:
         draw()
+        wp.synchronize_device()
         return context.rgb_data.numpy(), context.depth_data.numpy()
 
     assert_new_pictures(pictures, draws)
     seen = pictures(draws[0])[1].reshape(-1, size, size)[: len(depth)]
     share = agreement(depth[: len(seen)], np.where(seen > 0.0, seen, np.inf))  # its sky has depth 0
-    timing = measure_time(alternate(lambda draw: draw(), draws), repeats)
+    timing = measure_time(alternate(lambda draw: draw(), draws), repeats, wait=lambda _: wp.synchronize_device())
     value = config["images"] / timing.median_s
     return Measurement(
         name="render/peer_warp",
@@ -83,13 +86,13 @@ def measure(
             depth_agreement=round(share, 4),
             ours_over_peer=round(ours / value, 2),
             mujoco_warp=importlib.metadata.version("mujoco-warp"),
-            warp=importlib.metadata.version("warp-lang"),
+            warp=wp.config.version,
         ),
     )
 
 
 def prepare(config: dict[str, Any], mj_model: mujoco.MjModel, batches: list) -> tuple[Any, list[Callable[[], None]]]:
-    """Builds the render context, and for each batch a call that draws it and waits until it is drawn.
+    """Builds the render context, and for each batch a call that has it drawn.
 
     Args:
         config: Has ``images``, ``image_size`` and ``textures``.
@@ -131,18 +134,15 @@ def prepare(config: dict[str, Any], mj_model: mujoco.MjModel, batches: list) -> 
     if not wp.get_device().is_cuda:
         return context, [lambda data=data: launch(data) for data in datas]
 
-    def replay(graph: Any) -> Callable[[], None]:
-        def draw() -> None:
-            wp.capture_launch(graph)
-            wp.synchronize_device()
-
-        return draw
+    def replay(graph: Any, *_kept: Any) -> Callable[[], None]:
+        # A graph does not keep alive what it reads and writes.
+        return lambda: wp.capture_launch(graph) if _kept else None
 
     draws = []
     for data in datas:
         with wp.ScopedCapture() as capture:
             launch(data)
-        draws.append(replay(capture.graph))
+        draws.append(replay(capture.graph, model, data))
     return context, draws
 
 
