@@ -1,6 +1,6 @@
 """Compares our renderer with MuJoCo's own on many models, live, and prints a table. Needs a GL library.
 
-    MUJOCO_GL=egl python benchmarks/render_parity.py [MODEL ...] [--poses N] [--size PIXELS] [--out FILE]
+    MUJOCO_GL=egl python benchmarks/render_parity.py [MODEL ...] [--poses N] [--size PIXELS] [--out FILE] [--print]
 
 Every model of tests/render_models.py is drawn in N seeded random poses by both, with shadows, reflections and multisampling
 off. What is measured, and the bounds, are in tests/render_comparison.py. The exit status is 1 where a bound does not hold. A
@@ -89,13 +89,13 @@ def table_row(row: dict[str, Any]) -> str:
         text = "" if value is None else f"{scale * value:.{digits}f}"
         cells.append(f"**{text}**" if name in row["failures"] else text)
     verdict = "pass" if not row["failures"] else "**fail**: " + ", ".join(row["failures"])
-    return f"| {row['model']} | {row['source']} | {row['geoms']} | {' | '.join(cells)} | {verdict} |"
+    return f"| {row['model']} | {row['source']} | {row['geoms']} | {row['poses']} | {' | '.join(cells)} | {verdict} |"
 
 
 def table_head() -> str:
     """Names and bounds of the columns, Markdown."""
-    names = ["model", "from", "drawn", *(title for title, _, _ in COLUMNS.values()), "verdict"]
-    bounds = ["bound", "", ""]
+    names = ["model", "from", "drawn", "poses", *(title for title, _, _ in COLUMNS.values()), "verdict"]
+    bounds = ["bound", "", "", ""]
     for name, (_, scale, _) in COLUMNS.items():
         bound = BOUNDS.get(name)
         bounds.append(f"{'≥' if bound.at_least else '≤'} {scale * bound.limit:g}" if bound else "")
@@ -109,6 +109,7 @@ def main() -> int:
     parser.add_argument("--poses", type=int, default=200)
     parser.add_argument("--size", type=int, default=128, help="height and width in pixels")
     parser.add_argument("--out", type=pathlib.Path, default=TARGET, help="rows of other models that this file holds are kept")
+    parser.add_argument("--print", action="store_true", help="only print the rows that --out holds")
     options = parser.parse_args()
     unknown = set(options.models) - set(render_models.MODELS)
     if unknown:
@@ -117,6 +118,9 @@ def main() -> int:
     rows = {row["model"]: row for row in kept["rows"] if row["model"] in render_models.MODELS}
     failed = 0
     print(table_head())
+    if options.print:
+        print("\n".join(table_row(row) for row in rows.values()))
+        return int(any(row["failures"] for row in rows.values()))
     for name in options.models or render_models.MODELS:
         rows[name] = compare(name, options.poses, options.size)
         failed += bool(rows[name]["failures"])
