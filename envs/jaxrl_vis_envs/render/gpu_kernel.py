@@ -22,18 +22,20 @@ from jaxrl_vis_envs.render.scene import Scene
 _PIXELS = 128
 _COMPILER = plgpu.CompilerParams(num_warps=4, num_stages=1)
 _ENDLESS = 1e9
+_TYPES = {shapes.PLANE, shapes.SPHERE, shapes.CAPSULE, shapes.ELLIPSOID, shapes.CYLINDER, shapes.BOX}
 
 
 def takes(scene: Scene) -> bool:
-    """Whether there is a GPU, and the kernel can draw this scene: opaque primitives without textures, shadows or haze."""
+    """Whether there is a GPU, and the kernel can draw this scene: opaque primitives without shadows or haze."""
     return jax.default_backend() == "gpu" and supports(scene)
 
 
 def supports(scene: Scene) -> bool:
     """Whether the kernel can draw this scene, if there is a GPU."""
-    plain = not scene.atlas.used and scene.sky == "plain" and scene.haze[0] < 0
-    opaque = not any(scene.transparent) and not any(scene.light_shadows)
-    return plain and opaque and all(kind in raycast._INTERSECTIONS for kind in scene.object_types)
+    plain = not any(scene.transparent) and not any(scene.light_shadows) and scene.haze[0] < 0
+    textured = scene.atlas.used or scene.atlas.sky is not None
+    # How far a texture is spread over a pixel is found out in the kernel, which does not know lenses with a sensor.
+    return plain and not (textured and scene.projection == "intrinsic") and set(scene.object_types) <= _TYPES
 
 
 def tile_shape(height: int, width: int) -> tuple[int, int]:
@@ -111,6 +113,8 @@ class _Refs(NamedTuple):
     extra: Any
     extra_square: Any
     looks: Any
+    texels: Any
+    levels: Any
     lights: Any
     view: Any
     ids: Any
@@ -121,6 +125,9 @@ def _nearest(scene: Scene, refs: _Refs, place: Any, u: jax.Array, v: jax.Array, 
     mask = raycast.code_mask(scene)
     start, direction, inverse_square = camera.ray_parts(scene, u, v)
     kinds = sorted(scene.object_types)
+    bare_balls = not any(
+        textured for kind, textured in zip(scene.object_types, scene.atlas.mappings, strict=True) if kind == shapes.SPHERE
+    )
 
     for word in range(refs.words.shape[1]):
         bits = refs.words[place, word]
@@ -133,7 +140,11 @@ def _nearest(scene: Scene, refs: _Refs, place: Any, u: jax.Array, v: jax.Array, 
                 left, best = carry
                 bit = 31 - jax.lax.clz(left & -left)
                 index = refs.order[32 * word + bit]
-                axes = None if kind == shapes.SPHERE else [[refs.axes[index, i, j] for j in range(3)] for i in range(3)]
+                axes = (
+                    None
+                    if kind == shapes.SPHERE and bare_balls
+                    else [[refs.axes[index, i, j] for j in range(3)] for i in range(3)]
+                )
                 values = ([refs.origin[index, i] for i in range(3)], axes, refs.extra[index], refs.extra_square[index])
                 t, meets = raycast.entry(kind, values, start, direction, inverse_square)
                 key = (jax.lax.bitcast_convert_type(t, jnp.int32) & ~mask) | index
@@ -172,14 +183,15 @@ def _kernel(*refs, scene, wanted, quantized, tile):
         plgpu.store(ref, value.astype(out[0].dtype), mask=inside)
 
     top_colour, bottom_colour = ([refs.view[first + i] for i in range(3)] for first in (15, 18))
-    inner = scene.replace(sky_top=top_colour, sky_bottom=bottom_colour, zfar=zfar)
+    texels = _Rows(refs.texels, levels=_Rows(refs.levels))
+    inner = scene.replace(sky_top=top_colour, sky_bottom=bottom_colour, zfar=zfar, fovy=refs.view[21], texels=texels)
     zero = jnp.zeros((_PIXELS,))
     far, normal, colour = zero, (zero,) * 3, (zero,) * 3
     if rgb or depth or normals or distance:
 
         def surfaces():
             cell = _fetch(refs, jnp.where(sees, index, 0))
-            hit = surface.meet(scene, cell, None, u, v, near)
+            hit = surface.meet(inner, cell, None, u, v, near)
             colour = shade.shade(inner, None, lights.unpack(scene, refs.lights), cell, hit, u, v) if rgb else (zero,) * 3
             return hit.depth, tuple(hit.normal), tuple(colour)
 
@@ -220,10 +232,33 @@ def _fetch(refs: _Refs, index: jax.Array) -> surface.Row:
     def column(ref, *place):
         return plgpu.load(ref.at[(index, *(jnp.full(index.shape, number, jnp.int32) for number in place))])
 
-    axes = tuple(tuple(column(refs.axes, i, j) for j in range(3)) for i in range(3))
-    origin = tuple(column(refs.origin, i) for i in range(3))
-    kind, red, green, blue, emission, specular, exponent = (column(refs.looks, number) for number in range(7))
-    return surface.Row(axes, origin, column(refs.extra), kind, (red, green, blue), emission, specular, exponent, ())
+    columns = [column(refs.axes, i, j) for i in range(3) for j in range(3)] + [column(refs.origin, i) for i in range(3)]
+    return surface.row_of(
+        [*columns, column(refs.extra), *(column(refs.looks, number) for number in range(refs.looks.shape[1]))]
+    )
+
+
+class _Rows:
+    """A block of memory whose rows are looked up as those of an array; only the columns that are asked for are read."""
+
+    def __init__(self, ref: Any, row: Any = None, levels: Any = None):
+        self.ref, self.row, self.levels = ref, row, levels
+
+    def __len__(self) -> int:
+        return self.ref.shape[0]
+
+    @property
+    def at(self) -> Any:
+        return self
+
+    def get(self, mode: str) -> Any:
+        del mode
+        return self
+
+    def __getitem__(self, place: Any) -> Any:
+        if self.row is None:
+            return _Rows(self.ref, place)
+        return plgpu.load(self.ref.at[self.row, jnp.full(self.row.shape, place[-1], jnp.int32)])
 
 
 class _Matrix:
@@ -262,7 +297,6 @@ def draw(
     tile = tile_shape(scene.height, scene.width)
     words, order = tile_words(scene, rectangles(scene, unit), tile)
     ids = np.array(scene.object_ids, np.int32)
-    looks = (jnp.asarray(scene.object_types, jnp.float32), *(scene.rgba[ids, i] for i in range(3)), scene.emission[ids])
     lens, sky = jnp.stack(camera.lens(scene)), (scene.sky_top, scene.sky_bottom)
     inputs = _Refs(
         words=words,
@@ -271,9 +305,11 @@ def draw(
         origin=unit.origin,
         extra=unit.extra,
         extra_square=unit.extra_square,
-        looks=jnp.stack([*looks, scene.specular[ids], 128.0 * scene.shininess[ids]], axis=1),
+        looks=jnp.stack(surface.look_columns(scene), axis=1),
+        texels=scene.texels if len(scene.texels) else jnp.zeros((1, 4), jnp.uint32),
+        levels=jnp.asarray(scene.atlas.levels or [(0, 1, 1)], jnp.int32),
         lights=light_table if len(light_table) else jnp.zeros((1, 1)),
-        view=jnp.concatenate([lens, jnp.stack([scene.znear, scene.zfar]), rotation.reshape(9), *sky]),
+        view=jnp.concatenate([lens, jnp.stack([scene.znear, scene.zfar]), rotation.reshape(9), *sky, scene.fovy[None]]),
         ids=jnp.asarray(ids),
     )
     pixels = scene.height * scene.width

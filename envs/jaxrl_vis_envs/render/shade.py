@@ -26,13 +26,13 @@ _SKY_DISTANCE = 0.7
 
 
 def shade(
-    scene: Scene, unit: shapes.UnitShapes, lights: list[lighting.Light], row: Row, hit: Hit, u: jax.Array, v: jax.Array
+    scene: Scene, unit: shapes.UnitShapes | None, lights: list[lighting.Light], row: Row, hit: Hit, u: jax.Array, v: jax.Array
 ) -> Vector:
     """Colour of surfaces.
 
     Args:
         scene: The scene.
-        unit: The drawn objects (for shadows).
+        unit: The drawn objects (for shadows; None where no light casts any).
         lights: The lights in the camera's frame.
         row: The object of each pixel.
         hit: Where it is met.
@@ -59,7 +59,7 @@ def shade(
 
 
 def _lighted(
-    scene: Scene, unit: shapes.UnitShapes, lights: list[lighting.Light], row: Row, hit: Hit, to_camera: Vector
+    scene: Scene, unit: shapes.UnitShapes | None, lights: list[lighting.Light], row: Row, hit: Hit, to_camera: Vector
 ) -> Vector:
     """Colour of points of surfaces without a texture, each [P] float32 in [0, 1]."""
     coloured: list[Any] = [row.emission if lights else row.emission + _AMBIENT_WITHOUT_LIGHTS] * 3
@@ -77,8 +77,9 @@ def _lighted(
     )
 
 
-def _lit(scene: Scene, unit: shapes.UnitShapes, light: lighting.Light, hit: Hit) -> jax.Array:
+def _lit(scene: Scene, unit: shapes.UnitShapes | None, light: lighting.Light, hit: Hit) -> jax.Array:
     """[P] float32: 1 where no geom is between the point and the light, otherwise 0. Sites cast no shadow."""
+    assert unit is not None
     to_light, distance, _ = lighting.towards(light, hit.point)
     start = tuple(jax.lax.stop_gradient(p) for p in hit.point)
     to_light = tuple(jax.lax.stop_gradient(component) for component in to_light)
@@ -95,7 +96,7 @@ def _lit(scene: Scene, unit: shapes.UnitShapes, light: lighting.Light, hit: Hit)
     return 1.0 - shadowed.astype(jnp.float32)
 
 
-def sky(scene: Scene, camera_rotation: jax.Array, u: jax.Array, v: jax.Array) -> Vector:
+def sky(scene: Scene, camera_rotation: Any, u: jax.Array, v: jax.Array) -> Vector:
     """Colour of the sky along every ray.
 
     Returns:

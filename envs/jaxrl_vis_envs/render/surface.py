@@ -58,14 +58,19 @@ class Hit(NamedTuple):
 
 def object_table(scene: Scene, unit: shapes.UnitShapes) -> jax.Array:
     """[G, columns] float32: everything about each drawn object that a pixel which sees it needs, in the order of `Row`."""
-    ids = np.array(scene.object_ids)
-    kinds = jnp.asarray(scene.object_types, jnp.float32)
     columns = [
         *(unit.axes[:, row, column] for row in range(3) for column in range(3)),
         *(unit.origin[:, axis] for axis in range(3)),
-        unit.extra, kinds, scene.rgba[ids, 0], scene.rgba[ids, 1], scene.rgba[ids, 2],
-        scene.emission[ids], scene.specular[ids], 128.0 * scene.shininess[ids],
-    ]  # fmt: skip
+        unit.extra,
+    ]
+    return jnp.stack(columns + look_columns(scene), axis=-1)
+
+
+def look_columns(scene: Scene) -> list[jax.Array]:
+    """The columns of `object_table` that do not depend on poses, from the kind on; [G] float32 each."""
+    ids = np.array(scene.object_ids)
+    columns = [jnp.asarray(scene.object_types, jnp.float32), *(scene.rgba[ids, channel] for channel in range(3))]
+    columns += [scene.emission[ids], scene.specular[ids], 128.0 * scene.shininess[ids]]
     if scene.atlas.used:
         images = [image or textures.Image(0, 1, 1) for image in scene.atlas.images]
         columns.append(jnp.asarray(scene.atlas.mappings, jnp.float32))
@@ -75,7 +80,7 @@ def object_table(scene: Scene, unit: shapes.UnitShapes) -> jax.Array:
         columns.append(jnp.asarray([image.faces == 6 for image in images], jnp.float32))
         sizes = np.array([scene.atlas.levels[image.first_level][1:] for image in images], np.float32)
         columns.extend(jnp.asarray(sizes[:, axis]) for axis in range(2))
-    return jnp.stack(columns, axis=-1)
+    return columns
 
 
 def _texture_scales(scene: Scene, ids: np.ndarray) -> list[jax.Array]:
@@ -115,17 +120,18 @@ def _visual_size(kinds: np.ndarray, size: jax.Array) -> jax.Array:
 
 def read_row(values: jax.Array) -> Row:
     """Sorts the columns of `object_table` (its last axis) into a `Row`."""
-    return _sorted([values[..., column] for column in range(values.shape[-1])])
+    return row_of([values[..., column] for column in range(values.shape[-1])])
 
 
-def _sorted(v: list) -> Row:
+def row_of(v: list) -> Row:
+    """A `Row` of the columns of `object_table`."""
     axes = tuple(tuple(v[3 * row : 3 * row + 3]) for row in range(3))
     return Row(axes, tuple(v[9:12]), v[12], v[13], tuple(v[14:17]), v[17], v[18], v[19], tuple(v[20:]))
 
 
 def fetch(table: jax.Array, row: jax.Array) -> Row:
     """The row of every pixel: table [G, columns] and [P] int32 (below 0: the first row)."""
-    return _sorted(_look_up(table, row))
+    return row_of(_look_up(table, row))
 
 
 def fetch_triangle(scene: Scene, triangle: jax.Array | None) -> tuple | None:

@@ -179,7 +179,7 @@ def sample(
     """Colours of textures at many places.
 
     Args:
-        texels: [T, 4] uint32.
+        texels: [T, 4] uint32, or in a kernel a block of memory that is looked up like it and brings the table of levels along.
         levels: As in `Atlas`.
         first_level: [P] int32 or a number: which texture.
         level_count: [P] int32 or a number.
@@ -196,7 +196,7 @@ def sample(
     weight = level - fine
     fine = fine.astype(jnp.int32)
     coarse = jnp.minimum(fine + 1, level_count - 1)
-    table = jnp.asarray(levels, jnp.int32)
+    table = jnp.asarray(levels, jnp.int32) if isinstance(texels, jax.Array) else texels.levels
     near = _bilinear(texels, table, first_level + fine, face, place, repeats)
     far = _bilinear(texels, table, first_level + coarse, face, place, repeats)
     return tuple(a + weight * (b - a) for a, b in zip(near, far, strict=True))
