@@ -99,8 +99,10 @@ class Bench:
     """Transitions in a gradient step (update)."""
     repeats: int = 5
     """Timed repeats; the median counts."""
-    peer: Literal["mujoco"] | None = None
-    """Measure a peer side by side, on the same poses (render)."""
+    peer: Literal["mujoco", "warp"] | None = None
+    """Measure another renderer side by side, on the same poses (render)."""
+    scene: str | None = None
+    """finger, fetch_reach, primitives or the path of an MJCF file: draw this, without a task; all three for a peer (render)."""
     json: Path | None = None
     """Also write this run's records here."""
     results: Path | None = None
@@ -326,8 +328,9 @@ def run_doctor(_: Doctor, __: Sequence[str]) -> int:
 
 def run_bench(options: Bench, _: Sequence[str]) -> int:
     """Runs one benchmark."""
-    if options.peer is not None and options.benchmark != "render":
-        raise RequestError("--peer mujoco goes with `bench render` only")
+    for option in ("peer", "scene"):
+        if getattr(options, option) is not None and options.benchmark != "render":
+            raise RequestError(f"--{option} {getattr(options, option)} goes with `bench render` only")
     if any(count < 1 for count in options.envs) or options.repeats < 1:
         raise RequestError("--envs and --repeats must be at least 1")
     check_env(options.env)

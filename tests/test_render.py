@@ -227,12 +227,14 @@ def test_an_empty_scene_is_sky(ball):
     assert np.all(np.asarray(frame.segmentation) == -1)
 
 
-def test_a_visible_mesh_is_refused_by_name():
+def test_what_cannot_be_drawn_is_refused_by_name():
     xml = """<mujoco><asset><mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset><worldbody>
-      <geom name="statue" type="mesh" mesh="m" group="{group}"/><camera name="front"/></worldbody></mujoco>"""
-    with pytest.raises(ValueError, match="statue.*mesh") as refusal:
-        Scene.from_mjmodel(mujoco.MjModel.from_xml_string(xml.format(group=0)), "front")
+      <geom name="statue" type="sdf" mesh="m" group="{group}"/><camera name="front"/></worldbody></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(xml.format(group=0))
+    with pytest.raises(ValueError, match="statue.*sdf") as refusal:
+        Scene.from_mjmodel(model, "front")
     assert "\n" not in str(refusal.value)
+    assert Scene.from_mjmodel(model, "front", leave_out=("statue",)).object_ids == ()
     hidden = Scene.from_mjmodel(mujoco.MjModel.from_xml_string(xml.format(group=3)), "front")
     assert hidden.object_ids == ()
 

@@ -8,9 +8,11 @@ import mujoco
 import numpy as np
 
 from jaxrl_vis.bench.record import Measurement
-from jaxrl_vis.bench.settings import Settings
+from jaxrl_vis.bench.render_scenes import set_poses
 from jaxrl_vis.bench.timing import Timing, assert_varied
 from jaxrl_vis.config import RequestError
+
+POSES = 64
 
 
 def check() -> None:
@@ -30,36 +32,58 @@ def check() -> None:
         ) from error
 
 
-def measure(settings: Settings, states: Any, size: int, count: int) -> Measurement:
-    """Images per second, colours and depth, one pose after the other: that is how this renderer works."""
-    mj_model = settings.make_env().mj_model
-    positions, mocap = np.asarray(states.data.qpos[:count]), np.asarray(states.data.mocap_pos[:count])
-    colours, seconds = [], []
-    mj_data = mujoco.MjData(mj_model)
+def measure(
+    config: dict[str, Any], mj_model: mujoco.MjModel, batches: list, repeats: int, depth: np.ndarray, ours: float
+) -> Measurement:
+    """Images per second, colours and depth, one pose after the other: that is how this renderer works.
+
+    Shadows, reflections and haze are off; multisampling is as the model has it (`render_scenes.load` switches it off).
+
+    Args:
+        config: What the record says was drawn.
+        mj_model: The model; its first camera looks.
+        batches: Poses, see `render_scenes.random_poses`. The first counts.
+        repeats: Unused; every picture is timed.
+        depth: [K, H, W] of ours in the first poses, metres, inf for the sky.
+        ours: Our images per second.
+    """
+    from jaxrl_vis.bench.scene_pictures import agreement
+
+    size, poses = config["image_size"], batches[0]
+    count = min(POSES, len(poses["geom_xpos"]))
+    colours, depths, seconds = [], [], []
+    mj_data, flags = mujoco.MjData(mj_model), mujoco.mjtRndFlag
     with mujoco.Renderer(mj_model, height=size, width=size) as renderer:
+        for flag in (flags.mjRND_SHADOW, flags.mjRND_REFLECTION, flags.mjRND_HAZE):
+            renderer.scene.flags[flag] = False
+        options = mujoco.MjvOption()
+        options.sitegroup[:] = 0
 
-        def draw() -> np.ndarray:
-            renderer.update_scene(mj_data, camera=0)
-            picture = renderer.render().copy()
+        def draw() -> tuple[np.ndarray, np.ndarray]:
+            renderer.update_scene(mj_data, 0, options)
+            colour = renderer.render().copy()
             renderer.enable_depth_rendering()
-            renderer.render()
+            metres = renderer.render().copy()
             renderer.disable_depth_rendering()
-            return picture
+            return colour, metres
 
-        draw()
-        for position, marker in zip(positions, mocap, strict=True):
-            mj_data.qpos[:], mj_data.mocap_pos[:] = position, marker
-            mujoco.mj_forward(mj_model, mj_data)  # the pose is given: not part of the figure
+        for index in [0, *range(count)]:  # the first twice: once to warm up
+            set_poses(mj_data, poses, index)  # the pose is given: not part of the figure
             start = time.perf_counter()
-            colours.append(draw())
+            colour, metres = draw()
             seconds.append(time.perf_counter() - start)
-    assert_varied(np.stack(colours), "pictures of mujoco.Renderer")
-    median = float(np.median(seconds))
-    timing = Timing(median, (max(seconds) - min(seconds)) / median, count)
+            colours.append(colour)
+            depths.append(metres)
+    assert_varied(np.stack(colours[1:]), "pictures of mujoco.Renderer")
+    median = float(np.median(seconds[1:]))
+    timing = Timing(median, (max(seconds[1:]) - min(seconds[1:])) / median, count)
+    far = 0.999 * mj_model.vis.map.zfar * mj_model.stat.extent
+    theirs = np.stack(depths[1:])[: len(depth)]
+    share = agreement(depth[: len(theirs)], np.where(theirs < far, theirs, np.inf))
     return Measurement(
         name="render/peer_mujoco",
         value=1.0 / median,
         unit="images/s",
-        config={"env": settings.env, "image_size": size, "pixels": "rgbd"},
-        details=timing.details(0.0),
+        config={**config, "images": count},
+        details=timing.details(0.0, depth_agreement=round(share, 4), ours_over_peer=round(ours * median, 1)),
     )

@@ -1,9 +1,15 @@
-"""Pictures alone: what the agent sees of a batch of different poses, without physics."""
+"""Pictures alone, without physics: what an agent sees of its task, or a scene beside other renderers.
 
-from collections.abc import Iterator
+Every batch is drawn from poses that all differ, and every other call draws another batch, so nothing can be kept from picture
+to picture; that both differ is asserted.
+"""
+
+import itertools
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
+import numpy as np
 
 from jaxrl_vis.bench.physics import start_states
 from jaxrl_vis.bench.record import Measurement
@@ -17,11 +23,46 @@ CPU_COUNTS = (64,)
 ACCELERATOR_COUNTS = (256, 1024, 4096)
 CPU_SIZES = (32, 64)
 ACCELERATOR_SIZES = (64, 100)
-PEER_POSES = 64
 _STEPS = 5  # random control steps from the common start, after which no two robots stand alike
 
 
-def poses(settings: Settings, count: int) -> Any:
+def measure(settings: Settings) -> Iterator[Measurement]:
+    """Images per second for each picture size, output and batch: of the task, or of scenes where one or a peer is asked for."""
+    if settings.scene is not None or settings.peer is not None:
+        from jaxrl_vis.bench import scene_pictures
+
+        yield from scene_pictures.measure(settings, picture_sizes(settings))
+        return
+    if not settings.env.startswith("Visual"):
+        raise RequestError(f"bench render needs a task with pictures: --env Visual{settings.env}")
+    counts = settings.counts(CPU_COUNTS, ACCELERATOR_COUNTS)
+    batches = [poses(settings, max(counts), seed) for seed in (4, 5)]
+    for size in picture_sizes(settings):
+        for output in ("depth", "rgb", "rgbd") if settings.on_accelerator else ("depth", "rgbd"):
+            env = settings.make_env(image_size=size, pixels=output)
+            for count in counts:
+                some = [jax.tree.map(lambda leaf, count=count: leaf[:count], states) for states in batches]
+                compiled, compile_s = compile_timed(world_jit(jax.vmap(env.observe)), some[0])
+                assert_new_pictures(compiled, some)
+                timing = measure_time(alternate(compiled, some), settings.repeats)
+                yield Measurement(
+                    name="render/images",
+                    value=count / timing.median_s,
+                    unit="images/s",
+                    config={"env": settings.env, "image_size": size, "pixels": output, "envs": count},
+                    details=timing.details(compile_s),
+                )
+
+
+def picture_sizes(settings: Settings) -> tuple[int, ...]:
+    """Heights and widths to measure: the device's own, or the one that was asked for where it is another."""
+    sizes = ACCELERATOR_SIZES if settings.on_accelerator else CPU_SIZES
+    if settings.image_size is not None and settings.image_size not in sizes:
+        return (settings.image_size,)
+    return sizes
+
+
+def poses(settings: Settings, count: int, seed: int = 4) -> Any:
     """``count`` environments in different poses."""
     env = settings.make_env()
 
@@ -32,36 +73,34 @@ def poses(settings: Settings, count: int) -> Any:
 
         return jax.lax.scan(step, state, jax.random.split(key, _STEPS))[0]
 
-    return world_jit(jax.vmap(scatter))(start_states(env, count), jax.random.split(jax.random.key(4), count))
+    return world_jit(jax.vmap(scatter))(start_states(env, count), jax.random.split(jax.random.key(seed), count))
 
 
-def measure(settings: Settings) -> Iterator[Measurement]:
-    """Images per second for each picture size, output and batch."""
-    if not settings.env.startswith("Visual"):
-        raise RequestError(f"bench render needs a task with pictures: --env Visual{settings.env}")
-    if settings.peer is not None:  # Checked first: it is the part that may be missing.
-        from jaxrl_vis.bench import mujoco_renderer
+def alternate(draw: Callable[[Any], Any], batches: list[Any]) -> Callable[[], Any]:
+    """A call without arguments that draws the next of the batches, round and round."""
+    turns = itertools.cycle(batches)
+    return lambda: draw(next(turns))
 
-        mujoco_renderer.check()
-    counts = settings.counts(CPU_COUNTS, ACCELERATOR_COUNTS)
-    states = poses(settings, max(*counts, PEER_POSES if settings.peer else 1))
-    sizes = ACCELERATOR_SIZES if settings.on_accelerator else CPU_SIZES
-    if settings.image_size is not None and settings.image_size not in sizes:
-        sizes = (settings.image_size,)
-    for size in sizes:
-        for output in ("depth", "rgb", "rgbd") if settings.on_accelerator else ("depth", "rgbd"):
-            env = settings.make_env(image_size=size, pixels=output)
-            for count in counts:
-                some = jax.tree.map(lambda leaf, count=count: leaf[:count], states)
-                compiled, compile_s = compile_timed(world_jit(jax.vmap(env.observe)), some)
-                assert_varied(compiled(some), "pictures")
-                timing = measure_time(lambda: compiled(some), settings.repeats)  # noqa: B023 - called at once
-                yield Measurement(
-                    name="render/images",
-                    value=count / timing.median_s,
-                    unit="images/s",
-                    config={"env": settings.env, "image_size": size, "pixels": output, "envs": count},
-                    details=timing.details(compile_s),
-                )
-        if settings.peer is not None:
-            yield mujoco_renderer.measure(settings, states, size, PEER_POSES)
+
+def assert_new_pictures(draw: Callable[[Any], Any], batches: list[Any]) -> None:
+    """Asserts that pictures differ within a batch and between batches.
+
+    Args:
+        draw: Gives arrays [N, ...], or a tree of them.
+        batches: Two or more.
+    """
+    drawn = [rows_of(draw(batch)) for batch in batches]
+    for rows in drawn:
+        assert_varied(rows, "pictures")
+    for first, second in itertools.pairwise(drawn):
+        same = int(np.sum(np.all(first == second, axis=1)))
+        if len(first) > 1 and same >= len(first) / 2:
+            raise AssertionError(
+                f"{same} of {len(first)} pictures stay the same in the next batch: this would measure a broadcast"
+            )
+
+
+def rows_of(pictures: Any) -> np.ndarray:
+    """[N, bytes] of a tree of arrays [N, ...]."""
+    planes = [np.ascontiguousarray(plane) for plane in jax.tree.leaves(jax.device_get(pictures))]
+    return np.concatenate([plane.reshape(len(plane), -1).view(np.uint8) for plane in planes], axis=1)

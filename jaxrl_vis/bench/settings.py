@@ -16,6 +16,7 @@ class Settings:
         batch_size: Transitions in a gradient step.
         repeats: Timed repeats at most; see `timing.measure`.
         peer: Another renderer to measure side by side.
+        scene: A scene of `render_scenes`, or the path of an MJCF file, to be drawn in the place of a task.
         on_accelerator: Whether JAX runs on one; filled in by `for_this_device`.
     """
 
@@ -26,6 +27,7 @@ class Settings:
     batch_size: int | None = None
     repeats: int = 5
     peer: str | None = None
+    scene: str | None = None
     on_accelerator: bool = False
 
     def for_this_device(self) -> Self:

@@ -39,22 +39,33 @@ def compile_timed(jitted: Any, *arguments: Any) -> tuple[Any, float]:
     return compiled, time.perf_counter() - start
 
 
-def measure(call: Callable[[], Any], repeats: int = 5, budget_s: float = 30.0) -> Timing:
+def measure(
+    call: Callable[[], Any],
+    repeats: int = 5,
+    budget_s: float = 30.0,
+    wait: Callable[[Any], Any] = jax.block_until_ready,
+) -> Timing:
     """Times ``call`` after one untimed call, until its result is there.
+
+    Short calls are made one after the other and waited for together, as in a loop that does something with the results on the
+    device: a wait after each would time how fast the host gives orders.
 
     Args:
         call: The work; returns arrays.
         repeats: Timed repeats at most. At least three are made, or ``repeats`` if that is less.
         budget_s: No further repeat starts after this many seconds.
+        wait: Waits for all calls whose last result it is given.
     """
 
     def seconds_of(calls: int) -> float:
         start = time.perf_counter()
+        result = None
         for _ in range(calls):
-            jax.block_until_ready(call())
+            result = call()
+        wait(result)
         return (time.perf_counter() - start) / calls
 
-    jax.block_until_ready(call())
+    wait(call())
     # A call of a few milliseconds is repeated until a clock and a scheduler can tell it from noise.
     calls = max(1, min(1000, round(_LEAST_SECONDS / max(seconds_of(1), 1e-6))))
     seconds: list[float] = []

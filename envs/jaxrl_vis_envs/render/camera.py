@@ -1,7 +1,9 @@
 """Where the camera stands, and the ray of every pixel.
 
-Everything is drawn in the camera's frame (OpenGL's: x right, y up, looking along -z). A ray is ``t * (u, v, -1)``, so the ray
-parameter t is the planar depth in metres, and nothing has to be converted afterwards.
+Everything is drawn in the camera's frame (OpenGL's: x right, y up, looking along -z). A ray is ``start + t * direction`` with a
+direction whose z is -1, so the ray parameter t is the planar depth in metres, and nothing has to be converted afterwards. With
+perspective the start is 0 and the direction (u, v, -1); an orthographic camera has the start (u, v, 0) and the direction
+(0, 0, -1).
 """
 
 from typing import Any
@@ -11,6 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxrl_vis_envs.render.scene import Scene
+
+_DEGREES = np.pi / 180.0
 
 
 def camera_pose(scene: Scene, data: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -26,22 +30,114 @@ def camera_pose(scene: Scene, data: Any) -> tuple[jax.Array, jax.Array, jax.Arra
     """
     position = jnp.asarray(data.cam_xpos, jnp.float32)[scene.camera_id]
     rotation = jnp.asarray(data.cam_xmat, jnp.float32).reshape(-1, 3, 3)[scene.camera_id]
+    # Written out rather than as matrix products, which accelerators would do at low precision.
+    position = position + jnp.sum(rotation * scene.camera_shift, axis=1)
+    rotation = jnp.sum(rotation[:, :, None] * _rotation(scene.camera_turn)[None], axis=1)
     finite = jnp.all(jnp.isfinite(position)) & jnp.all(jnp.isfinite(rotation))
     position = jnp.where(finite, position, 0.0)
     rotation = jnp.where(finite, rotation, jnp.eye(3, dtype=jnp.float32))
     return position, rotation, finite
 
 
-def pixel_rays(scene: Scene) -> tuple[jax.Array, jax.Array]:
-    """The u and v of every pixel's ray ``(u, v, -1)`` in the camera's frame, through the middle of the pixel.
+def _rotation(vector: jax.Array) -> jax.Array:
+    """[3] radians -> [3, 3], the identity at 0 with the right gradient there."""
+    square = jnp.sum(vector * vector)
+    small = square < 1e-8
+    angle = jnp.sqrt(jnp.where(small, 1.0, square))
+    sine = jnp.where(small, 1.0 - square / 6.0, jnp.sin(angle) / angle)
+    cosine = jnp.where(small, 0.5, (1.0 - jnp.cos(angle)) / (angle * angle))
+    x, y, z = vector[0], vector[1], vector[2]
+    zero = jnp.zeros_like(x)
+    cross = jnp.stack([jnp.stack([zero, -z, y]), jnp.stack([z, zero, -x]), jnp.stack([-y, x, zero])])
+    return jnp.eye(3) + sine * cross + cosine * (vector[:, None] * vector[None, :] - square * jnp.eye(3))
+
+
+def lens(scene: Scene) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """Where the picture lies on the plane at depth 1 m (or at any depth, if orthographic).
 
     Returns:
-        u and v, each [H * W] float32 without unit, row by row from the top left. Flat, because XLA makes one loop over the
-        last axis, and a long one vectorises better than a short one.
+        Middle across and up, half the width and half the height, each [] float32 (m).
     """
-    columns = (2.0 * np.arange(scene.width) + 1.0 - scene.width) / scene.height
-    rows = (scene.height - 1.0 - 2.0 * np.arange(scene.height)) / scene.height
-    unit_u = np.broadcast_to(columns[None, :], (scene.height, scene.width)).reshape(-1)
-    unit_v = np.broadcast_to(rows[:, None], (scene.height, scene.width)).reshape(-1)
-    half_height = jnp.tan(scene.fovy * (np.pi / 360.0))
-    return jnp.asarray(unit_u, jnp.float32) * half_height, jnp.asarray(unit_v, jnp.float32) * half_height
+    zero = jnp.zeros(())
+    if scene.projection == "intrinsic":
+        middle = scene.principal / scene.focal
+        half = 0.5 * scene.sensor / scene.focal
+        return middle[0], -middle[1], half[0], half[1]
+    half_height = 0.5 * scene.fovy if scene.projection == "orthographic" else jnp.tan(scene.fovy * (0.5 * _DEGREES))
+    return zero, zero, half_height * (scene.width / scene.height), half_height
+
+
+def pixel_rays(scene: Scene, rows: np.ndarray, columns: np.ndarray) -> tuple[jax.Array, jax.Array]:
+    """The u and v of the rays through the middles of pixels.
+
+    Args:
+        scene: The scene.
+        rows: Rows of the pixels, from the top; any shape.
+        columns: Columns, the same shape.
+
+    Returns:
+        u and v, float32, the shape of ``rows``.
+    """
+    middle_u, middle_v, half_u, half_v = lens(scene)
+    unit_u = (2.0 * columns + 1.0 - scene.width) / scene.width
+    unit_v = (scene.height - 1.0 - 2.0 * rows) / scene.height
+    return middle_u + jnp.asarray(unit_u, jnp.float32) * half_u, middle_v + jnp.asarray(unit_v, jnp.float32) * half_v
+
+
+def pixel_pitch(scene: Scene) -> tuple[jax.Array, jax.Array]:
+    """How much u and v change from one pixel to the next, [] float32 each."""
+    _, _, half_u, half_v = lens(scene)
+    return half_u * (2.0 / scene.width), half_v * (2.0 / scene.height)
+
+
+def ray_parts(scene: Scene, u: jax.Array, v: jax.Array) -> tuple[tuple, tuple, jax.Array | float]:
+    """Start and direction of rays in the camera's frame, and the inverse square of the direction's length.
+
+    Returns:
+        Three [P] arrays or numbers, three more, and [P] or a number. Numbers are what is the same for every ray.
+    """
+    if scene.projection == "orthographic":
+        return (u, v, 0.0), (0.0, 0.0, -1.0), 1.0
+    return (0.0, 0.0, 0.0), (u, v, -1.0), 1.0 / (u * u + v * v + 1.0)
+
+
+def in_view(
+    scene: Scene, middle: jax.Array, radius: jax.Array, u: jax.Array, v: jax.Array, depth: jax.Array | None
+) -> jax.Array:
+    """Which balls the rays through a block of pixels may meet.
+
+    Args:
+        scene: The scene.
+        middle: [K, 3] float32, metres, camera's frame.
+        radius: [K] float32, metres.
+        u: [P] float32, see `camera.pixel_rays`.
+        v: [P] float32.
+        depth: [P] float32, metres, beyond which nothing counts; None for no such depth.
+
+    Returns:
+        [K] bool; false for what is not finite.
+    """
+    ahead = -middle[:, 2]
+    touching = (ahead + radius > scene.znear) & (ahead - radius < (scene.zfar if depth is None else jnp.max(depth)))
+    for axis, coordinate in enumerate((u, v)):
+        low, high = jnp.min(coordinate), jnp.max(coordinate)
+        if scene.projection == "orthographic":
+            touching &= (middle[:, axis] - high <= radius) & (low - middle[:, axis] <= radius)
+        else:
+            touching &= middle[:, axis] - high * ahead <= radius * jnp.sqrt(1.0 + high * high)
+            touching &= low * ahead - middle[:, axis] <= radius * jnp.sqrt(1.0 + low * low)
+    return touching
+
+
+def mapped(matrix: Any, vector: tuple) -> tuple:
+    """``matrix @ vector`` for a [3, 3] matrix (or rows of values) and three values, without the products with plain zeros."""
+    rows = [[matrix[row, column] for column in range(3)] for row in range(3)] if hasattr(matrix, "shape") else matrix
+    result = []
+    for row in rows:
+        terms = [
+            -entry if isinstance(value, float) and value == -1.0 else entry * value
+            for entry, value in zip(row, vector, strict=True)
+            if not (isinstance(value, float) and value == 0.0)
+        ]
+        result.append(sum(terms[1:], terms[0]) if terms else 0.0)
+    return tuple(result)

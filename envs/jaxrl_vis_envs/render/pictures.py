@@ -1,13 +1,18 @@
-"""Pictures of one environment: `render` for people and files, `render_planes` for the hot path. `jax.vmap` them for a batch."""
+"""Pictures of one environment: `render` for people and files, `render_planes` for the hot path. `jax.vmap` them for a batch.
 
-from collections.abc import Callable
+Three steps: once per environment, everything linear (`shapes`, `lights`); per pixel, which object is nearest (`raycast`,
+`triangles`), which gives integers and is never differentiated; per pixel, once, depth, normal and colour of that object from
+the row of a table (`surface`, `shade`). On a GPU the last two are one kernel for most scenes (`gpu_kernel`).
+"""
+
+import functools
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis_envs.render import camera, raycast, shade
+from jaxrl_vis_envs.render import blocks, camera, gpu_kernel, lights, raycast, shade, shapes, surface, transparent
 from jaxrl_vis_envs.render.scene import Scene
 
 
@@ -18,28 +23,54 @@ class Frame(NamedTuple):
         rgb: [H, W, 3] uint8.
         depth: [H, W] float32, planar metres (distance along the camera's axis), the scene's ``zfar`` for the sky.
         segmentation: [H, W] int32: geom id, ngeom + site id for a site, -1 for the sky.
+        normals: [H, W, 3] float32, unit, in the camera's frame (x right, y up, z towards the viewer), 0 for the sky; or None.
+        distance: [H, W] float32, metres along the ray, ``zfar`` for the sky; or None.
     """
 
     rgb: jax.Array
     depth: jax.Array
     segmentation: jax.Array
+    normals: jax.Array | None = None
+    distance: jax.Array | None = None
 
 
 class Planes(NamedTuple):
     """A picture as the hot path wants it: planes, not quantised, and only those that were asked for.
 
     Attributes:
-        rgb: [3, H, W] float32 in [0, 1], or None.
-        depth: [H, W] float32, planar metres, the scene's ``zfar`` for the sky; or None.
+        rgb: [3, H, W] float32 in [0, 1], or uint8 where that was asked for; or None.
+        depth: [H, W] float32 as in `Frame`, or None.
         segmentation: [H, W] int32 as in `Frame`, or None.
+        normals: [3, H, W] float32 as in `Frame`, or None.
+        distance: [H, W] float32 as in `Frame`, or None.
     """
 
     rgb: jax.Array | None
     depth: jax.Array | None
     segmentation: jax.Array | None
+    normals: jax.Array | None = None
+    distance: jax.Array | None = None
 
 
-def render_planes(scene: Scene, data: Any, rgb: bool = True, depth: bool = True, segmentation: bool = False) -> Planes:
+class _View(NamedTuple):
+    """What is prepared once per environment."""
+
+    rotation: jax.Array
+    unit: shapes.UnitShapes
+    table: jax.Array
+    lights: list[lights.Light]
+
+
+def render_planes(
+    scene: Scene,
+    data: Any,
+    rgb: bool = True,
+    depth: bool = True,
+    segmentation: bool = False,
+    normals: bool = False,
+    distance: bool = False,
+    quantized: bool = False,
+) -> Planes:
     """Draws one environment, as planes. What is not asked for is not computed.
 
     Args:
@@ -48,85 +79,169 @@ def render_planes(scene: Scene, data: Any, rgb: bool = True, depth: bool = True,
             [ngeom, 3], ``geom_xmat`` [ngeom, 3, 3] or [ngeom, 9], and likewise ``cam_xpos``, ``cam_xmat`` and, for the lights,
             ``xpos``, ``xmat``. A geom whose pose is not finite is not drawn.
         rgb: Whether to shade.
-        depth: Whether to return the depth.
+        depth: Whether to return the planar depth.
         segmentation: Whether to say which object each pixel sees.
+        normals: Whether to return the normals of the surfaces.
+        distance: Whether to return the depth along the rays.
+        quantized: Whether to return the colours as `quantize` makes them, [3, H, W] uint8: less to write.
 
     Returns:
         The planes that were asked for.
     """
-    u, v = camera.pixel_rays(scene)
-    position, rotation, finite = camera.camera_pose(scene, data)
-    blocks = _block_count(u.shape[0])
-    u, v = u.reshape(blocks, -1), v.reshape(blocks, -1)
-    if scene.object_ids:
-        shapes = raycast.unit_shapes(scene, data, position, rotation, finite)
-        # A barrier, because XLA would otherwise redo the work per object in every pixel.
-        shapes = jax.lax.optimization_barrier(shapes)
-        want_winner = rgb or segmentation
-        distance, winner = _by_blocks(lambda u, v: raycast.nearest_hit(scene, shapes, u, v, want_winner), u, v)
+    wanted = (rgb, depth, segmentation, normals, distance)
+    if not scene.object_ids:
+        planes = _draw_nothing(scene, data, wanted)
     else:
-        shapes, distance, winner = None, jnp.broadcast_to(scene.zfar, u.shape), jnp.full(u.shape, -1, jnp.int32)
-    shape = (scene.height, scene.width)
-    colours = labels = None
-    if rgb:
-        lights = shade.camera_lights(scene, data, position, rotation)
-        # Barriers here too: each of the three colours would otherwise look for the nearest object again, and a stack of them
-        # would shade three times.
-        distance, winner = jax.lax.optimization_barrier((distance, winner))
-        colours = _by_blocks(lambda *pixels: _colour(scene, shapes, lights, rotation, *pixels), u, v, distance, winner)
-        colours = jnp.stack(jax.lax.optimization_barrier(colours)).reshape(3, *shape)
+        position, rotation, finite = camera.camera_pose(scene, data)
+        unit = shapes.unit_shapes(scene, data, position, rotation, finite)
+        table = lights.pack(lights.camera_lights(scene, data, position, rotation) if rgb else [])
+        draw = _draw_by_kernel if gpu_kernel.takes(scene) else _draw
+        planes = draw((wanted, quantized), scene, rotation, unit, table)
+    if quantized and planes.rgb is not None and planes.rgb.dtype != jnp.uint8:
+        planes = planes._replace(rgb=quantize(planes.rgb))
+    return planes
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _draw_by_kernel(
+    outputs: tuple, scene: Scene, rotation: jax.Array, unit: shapes.UnitShapes, light_table: jax.Array
+) -> Planes:
+    """`_draw` as one GPU kernel, with the derivatives of `_draw`."""
+    (rgb, depth, segmentation, normals, distance), quantized = outputs
+    planes = gpu_kernel.draw((rgb, depth, normals, distance, segmentation), quantized, scene, rotation, unit, light_table)
+    colour, near, normal, length, labels = planes
+    return Planes(colour, near, labels, normal, length)
+
+
+@_draw_by_kernel.defjvp
+def _differentiate(outputs: tuple, primals: tuple, tangents: tuple) -> tuple[Planes, Planes]:
+    return jax.jvp(functools.partial(_draw, outputs), primals, tangents)
+
+
+def _draw(outputs: tuple, scene: Scene, rotation: jax.Array, unit: shapes.UnitShapes, light_table: jax.Array) -> Planes:
+    """The wanted planes of a scene with objects.
+
+    Args:
+        outputs: Which planes, as `render_planes` takes them, and whether colours are bytes.
+        scene: The scene.
+        rotation: [3, 3] float32, see `camera.camera_pose`.
+        unit: The drawn objects.
+        light_table: From `lights.pack`.
+    """
+    (rgb, depth, segmentation, normals, distance), quantized = outputs
+    layout = blocks.layout(scene)
+    u, v = camera.pixel_rays(scene, layout.rows, layout.columns)
+    # A barrier, because XLA would otherwise redo the work per object in every pixel.
+    unit = jax.lax.optimization_barrier(unit)
+    if not (rgb or segmentation or normals or blocks.tiled(scene) or any(scene.transparent)):
+        far = blocks.scan(lambda u, v: raycast.nearest_distance(scene, unit, u, v), u, v)
+        near = length = None
+        if depth:
+            near = blocks.restore(scene, layout, far)
+        if distance:
+            along = jnp.where(far < scene.zfar, far * _ray_length(scene, u, v), scene.zfar)
+            length = blocks.restore(scene, layout, along)
+        return Planes(None, near, None, None, length)
+    key, triangle = blocks.nearest(scene, unit, u, v)
+    # Barriers here too: each output would otherwise look for the nearest object again.
+    key, triangle = jax.lax.optimization_barrier((key, triangle))
+    view = _View(rotation, unit, surface.object_table(scene, unit), lights.unpack(scene, light_table) if rgb else [])
+    pixels = blocks.joined((u, v, key, triangle))
+    planes = blocks.scan(lambda *block: _finish(scene, view, outputs[0], *block), *pixels)
+    planes = jax.lax.optimization_barrier(planes)
+    planes = _collect(outputs[0], [blocks.restore(scene, layout, plane) for plane in planes])
+    return planes._replace(rgb=quantize(planes.rgb)) if quantized and planes.rgb is not None else planes
+
+
+def _finish(scene: Scene, view: _View, wanted: tuple, u: Any, v: Any, key: Any, triangle: Any) -> tuple:
+    """Everything about a block of pixels whose nearest objects are known: the wanted planes, [P] each, one after the other."""
+    rgb, depth, segmentation, normals, distance = wanted
+    near, index = raycast.decode(scene, key)
+    sees = index >= 0
+    planes: list[jax.Array] = []
+    far = near
+    normal: tuple = ()
+    if rgb or depth or normals or distance or any(scene.transparent):
+        row = surface.fetch(view.table, index)
+        hit = surface.meet(scene, row, surface.fetch_triangle(scene, triangle), u, v, near)
+        far = jnp.where(sees, hit.depth, scene.zfar)
+        normal = tuple(jnp.where(sees, component, 0.0) for component in hit.normal)
+        sheets = transparent.sheets(scene, view.unit, view.table, u, v, far)
+        if rgb:
+            colour = shade.shade(scene, view.unit, view.lights, row, hit, u, v)
+            background = shade.sky(scene, view.rotation, u, v)
+            colour = tuple(jnp.where(sees, front, back) for front, back in zip(colour, background, strict=True))
+            if scene.haze[0] >= 0:
+                colour = shade.haze(scene, view.unit, u, v, far, colour)
+            planes.extend(transparent.blend(scene, view.unit, view.lights, sheets, u, v, colour))
+        far, index, normal = transparent.nearest(sheets, far, index, normal)
+    if depth:
+        planes.append(far)
+    if normals:
+        planes.extend(normal)
+    if distance:
+        planes.append(jnp.where(index >= 0, far * _ray_length(scene, u, v), scene.zfar))
     if segmentation:
         # One entry more than there are drawn objects, so that -1 finds the sky's label at the end.
-        labels = jnp.asarray(np.array([*scene.object_ids, -1], np.int32))[winner].reshape(shape)
-    return Planes(colours, distance.reshape(shape) if depth else None, labels)
+        planes.append(jnp.asarray(np.array([*scene.object_ids, -1], np.int32))[index])
+    return tuple(planes)
 
 
-def _colour(scene: Scene, shapes: Any, lights: list, rotation: jax.Array, u: Any, v: Any, distance: Any, winner: Any) -> tuple:
-    """Colour of every pixel, sky included: three arrays [P] in [0, 1]."""
-    background = shade.sky(scene, rotation, u, v)
-    if shapes is None:
-        return background
-    surface = shade.shade(scene, shapes, lights, u, v, distance, winner)
-    return tuple(jnp.where(winner >= 0, near, far) for near, far in zip(surface, background, strict=True))
+def _collect(wanted: tuple, planes: list[jax.Array]) -> Planes:
+    """Sorts the planes of `_finish`, [H, W] each, into `Planes`."""
+    rgb, depth, segmentation, normals, distance = wanted
+    left = list(planes)
+
+    def take(want: bool, count: int = 1) -> jax.Array | None:
+        if not want:
+            return None
+        taken = [left.pop(0) for _ in range(count)]
+        return jnp.stack(taken) if count > 1 else taken[0]
+
+    colour, near, normal, length = take(rgb, 3), take(depth), take(normals, 3), take(distance)
+    return Planes(colour, near, take(segmentation), normal, length)
 
 
-# Pixels of one environment that a CPU works on at a time: what lies between two operations then stays in its cache.
-_CPU_BLOCK = 512
+def _draw_nothing(scene: Scene, data: Any, wanted: tuple) -> Planes:
+    """A scene without objects: sky."""
+    rgb, depth, segmentation, normals, distance = wanted
+    shape = (scene.height, scene.width)
+    colour = None
+    if rgb:
+        rows, columns = np.indices(shape)
+        u, v = camera.pixel_rays(scene, rows, columns)
+        colour = jnp.stack(shade.sky(scene, camera.camera_pose(scene, data)[1], u, v))
+    far = jnp.broadcast_to(scene.zfar, shape)
+    return Planes(
+        colour,
+        far if depth else None,
+        jnp.full(shape, -1, jnp.int32) if segmentation else None,
+        jnp.zeros((3, *shape)) if normals else None,
+        far if distance else None,
+    )
 
 
-def _block_count(pixels: int) -> int:
-    """Into how many equal blocks the pixels are cut: 1 on an accelerator, on a CPU so that a block is about `_CPU_BLOCK`.
-
-    XLA drops optimization barriers before it fuses for a CPU, and then computes the nearest hit anew for every use of it (60
-    times slower with colour). The boundary of a loop is the one that it respects, so on a CPU there are at least two blocks
-    wherever the number of pixels can be divided.
-    """
-    if jax.default_backend() != "cpu":
-        return 1
-    counts = [count for count in range(2, max(3, pixels // 64)) if pixels % count == 0]
-    return min(counts, key=lambda count: abs(np.log(pixels / count / _CPU_BLOCK)), default=1)
+def _ray_length(scene: Scene, u: jax.Array, v: jax.Array) -> jax.Array | float:
+    """Metres along the ray for each metre of depth."""
+    return 1.0 if scene.projection == "orthographic" else jnp.sqrt(u * u + v * v + 1.0)
 
 
-def _by_blocks(function: Callable, *pixels: jax.Array) -> Any:
-    """Applies ``function``, which takes and gives arrays [P], to arrays [blocks, P], block by block."""
-    if pixels[0].shape[0] == 1:
-        return jax.tree.map(lambda plane: plane[None], function(*(plane[0] for plane in pixels)))
-    return jax.lax.scan(lambda carry, block: (carry, function(*block)), None, pixels)[1]
-
-
-def render(scene: Scene, data: Any) -> Frame:
+def render(scene: Scene, data: Any, normals: bool = False, distance: bool = False) -> Frame:
     """Draws one environment: colour, depth and segmentation. `jax.vmap` it for a batch.
 
     Args:
         scene: What is drawn, and from which camera.
         data: Poses of one environment, as in `render_planes`.
+        normals: Whether to return the normals of the surfaces too.
+        distance: Whether to return the depth along the rays too.
 
     Returns:
         The frame.
     """
-    planes = render_planes(scene, data, rgb=True, depth=True, segmentation=True)
+    planes = render_planes(scene, data, rgb=True, depth=True, segmentation=True, normals=normals, distance=distance)
     assert planes.rgb is not None and planes.depth is not None and planes.segmentation is not None
-    return Frame(quantize(jnp.moveaxis(planes.rgb, 0, -1)), planes.depth, planes.segmentation)
+    upright = None if planes.normals is None else jnp.moveaxis(planes.normals, 0, -1)
+    return Frame(quantize(jnp.moveaxis(planes.rgb, 0, -1)), planes.depth, planes.segmentation, upright, planes.distance)
 
 
 def quantize(colour: jax.Array) -> jax.Array:

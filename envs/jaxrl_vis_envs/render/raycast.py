@@ -1,137 +1,181 @@
-"""Which object each pixel sees, and how far away: analytic intersections of rays with unit shapes.
-
-Every object is brought to a unit shape (ball, cylinder, cube, square) by a linear map of the camera's frame, once per object.
-What is left per pixel and object is a ray that is linear in the pixel's (u, v), and a handful of operations. The objects are
-unrolled and everything is elementwise over pixels, so that XLA makes one pass of it without anything in memory between.
+"""Which object each pixel sees: analytic intersections of rays with unit shapes.
 
 An object counts where a ray enters it in front of the near plane: from inside an object one looks through it, as with OpenGL's
 culled back faces. A plane is seen from both sides.
-"""
 
-from typing import Any, NamedTuple
+The answer is one integer per pixel, a key: the bits of the depth (which order as the depths do), with the lowest bits replaced
+by the row of the object. The nearest object is then the least key, one operation per object, and XLA on a CPU, which computes a
+loop anew for each of its outputs, computes it once. `surface` makes the depth exact again, and differentiable.
+"""
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
+from jaxrl_vis_envs.render import camera, shapes
 from jaxrl_vis_envs.render.scene import Scene
-
-_PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
-_SPHERE = int(mujoco.mjtGeom.mjGEOM_SPHERE)
-_CAPSULE = int(mujoco.mjtGeom.mjGEOM_CAPSULE)
-_ELLIPSOID = int(mujoco.mjtGeom.mjGEOM_ELLIPSOID)
-_CYLINDER = int(mujoco.mjtGeom.mjGEOM_CYLINDER)
-_BOX = int(mujoco.mjtGeom.mjGEOM_BOX)
 
 # Keeps a division by a ray component that is exactly 0 finite; far too small to change any other number.
 _TINY = 1e-20
-# Objects with a pose that is not finite go this far behind the camera, in metres: no ray meets them, and no NaN is left.
-_BEHIND = 1e6
+
+# So many primitives are unrolled in any case, and of more, those of a type of which there are at most so many.
+UNROLLED = 48
+_FEW = 3
+
+# Values of `Scene.transparent`.
+OPAQUE, CLEAR, CLEAR_FROM_BEHIND = range(3)
 
 
-class UnitShapes(NamedTuple):
-    """The drawn objects as unit shapes: a point p of the camera's frame is ``origin + axes @ p`` in the shape's frame.
-
-    Attributes:
-        origin: [G, 3] float32, the camera in the shape's frame.
-        axes: [G, 3, 3] float32, 1/metres (rotation from the camera's frame, then division by the half-sizes).
-        extra: [G] float32. Sphere: radius in metres. Capsule: half-length over radius. Otherwise unused.
-        extra_square: [G] float32. Sphere and capsule: squared radius in square metres. Otherwise unused.
-    """
-
-    origin: jax.Array
-    axes: jax.Array
-    extra: jax.Array
-    extra_square: jax.Array
+def code_mask(scene: Scene) -> int:
+    """The lowest bits of a key, that hold the row of the object; all ones is the sky."""
+    return (1 << int(len(scene.object_ids)).bit_length()) - 1
 
 
-def unit_shapes(
-    scene: Scene, data: Any, camera_position: jax.Array, camera_rotation: jax.Array, camera_finite: jax.Array
-) -> UnitShapes:
-    """Brings every drawn object to a unit shape in the camera's frame.
-
-    Args:
-        scene: The scene.
-        data: Has ``geom_xpos`` [ngeom, 3] and ``geom_xmat`` [ngeom, 3, 3] or [ngeom, 9], and the same of sites that are drawn.
-        camera_position: [3] float32, metres, world.
-        camera_rotation: [3, 3] float32, columns are the camera's axes in the world.
-        camera_finite: [] bool; where false, nothing is seen.
-    """
-    position, rotation = _object_poses(scene, data)
-    finite = camera_finite & jnp.all(jnp.isfinite(position), -1) & jnp.all(jnp.isfinite(rotation), (-2, -1))
-    position = jnp.where(finite[:, None], position, 0.0)
-    rotation = jnp.where(finite[:, None, None], rotation, 0.0)
-    # Written out rather than as matrix products, which accelerators would do at low precision.
-    offset = jnp.sum((position - camera_position)[:, :, None] * camera_rotation, axis=1)  # [G, 3] in the camera's frame
-    relative = jnp.sum(rotation[:, :, :, None] * camera_rotation[None, :, None, :], axis=1)  # [G, shape axis, camera axis]
-    offset = jnp.where(finite[:, None], offset, jnp.array([0.0, 0.0, _BEHIND]))
-    relative = jnp.where(finite[:, None, None], relative, jnp.eye(3))
-
-    size = scene.size[np.array(scene.object_ids)]
-    kinds = np.array(scene.object_types)[:, None]
-    radius = size[:, :1]
-    ones = jnp.ones_like(radius)
-    half = jnp.where(kinds == _PLANE, jnp.concatenate([size[:, :2], ones], 1), size)
-    half = jnp.where((kinds == _SPHERE) | (kinds == _CAPSULE), jnp.broadcast_to(radius, size.shape), half)
-    half = jnp.where(kinds == _CYLINDER, jnp.concatenate([radius, radius, size[:, 1:2]], 1), half)
-    # A ball looks the same from everywhere: leaving its rotation out saves operations in every pixel.
-    relative = jnp.where((kinds == _SPHERE)[:, :, None], jnp.eye(3), relative)
-    axes = relative / half[:, :, None]
-    origin = -jnp.sum(axes * offset[:, None, :], axis=-1)
-    extra = jnp.where(kinds[:, 0] == _CAPSULE, size[:, 1] / size[:, 0], size[:, 0])
-    return UnitShapes(origin, axes, extra, jnp.square(size[:, 0]))
+def primitive_rows(scene: Scene, transparent: bool) -> list[int]:
+    """Rows of the drawn objects that are primitives, and transparent or not."""
+    fine = (shapes.MESH, shapes.HFIELD)
+    wanted = (CLEAR, CLEAR_FROM_BEHIND) if transparent else (OPAQUE, CLEAR_FROM_BEHIND)
+    return [
+        row
+        for row, (kind, clear) in enumerate(zip(scene.object_types, scene.transparent, strict=True))
+        if kind not in fine and clear in wanted
+    ]
 
 
-def _object_poses(scene: Scene, data: Any) -> tuple[jax.Array, jax.Array]:
-    """Positions [G, 3] and rotations [G, 3, 3] of the drawn objects in the world, float32."""
-    position = jnp.asarray(data.geom_xpos, jnp.float32)
-    rotation = jnp.asarray(data.geom_xmat, jnp.float32).reshape(-1, 3, 3)
-    if any(index >= scene.geom_count for index in scene.object_ids):
-        position = jnp.concatenate([position, jnp.asarray(data.site_xpos, jnp.float32)])
-        rotation = jnp.concatenate([rotation, jnp.asarray(data.site_xmat, jnp.float32).reshape(-1, 3, 3)])
-    ids = np.array(scene.object_ids)
-    return position[ids], rotation[ids]
+def behind(unit: shapes.UnitShapes, row: int) -> jax.Array:
+    """Whether the camera is behind the plane of a row, [] bool."""
+    return unit.origin[row, 2] < 0.0
 
 
-def nearest_hit(
-    scene: Scene, shapes: UnitShapes, u: jax.Array, v: jax.Array, want_winner: bool
-) -> tuple[jax.Array, jax.Array | None]:
-    """The nearest object along every ray.
+def _solid_entry(scene: Scene, unit: shapes.UnitShapes, row: int, u: jax.Array, v: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """`row_entry` for objects that are opaque from this side, and not before the near plane."""
+    t, meets = row_entry(scene, unit, row, u, v)
+    meets = meets & (t > scene.znear)
+    if scene.transparent[row] == CLEAR_FROM_BEHIND:
+        meets = meets & ~behind(unit, row)
+    return t, meets
+
+
+def sky_key(scene: Scene) -> jax.Array:
+    """The key of a pixel that sees nothing, [] int32."""
+    mask = code_mask(scene)
+    return (jax.lax.bitcast_convert_type(scene.zfar, jnp.int32) & ~mask) | mask
+
+
+def decode(scene: Scene, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Depth (m, float32, a few millionths too small, not differentiable) and row (-1 for the sky, int32) of keys."""
+    mask = code_mask(scene)
+    row = key & mask
+    return jax.lax.bitcast_convert_type(key & ~mask, jnp.float32), jnp.where(row == mask, -1, row)
+
+
+def row_entry(scene: Scene, unit: shapes.UnitShapes, row: int, u: jax.Array, v: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Where the ray of each pixel enters the object of one row (t, metres of planar depth), and whether it does; [P] each."""
+    start, direction, inverse_square = camera.ray_parts(scene, u, v)
+    kind = scene.object_types[row]
+    bare_ball = kind == shapes.SPHERE and scene.atlas.mappings[row] == 0
+    return entry(kind, _row_values(unit, row, bare_ball), start, direction, inverse_square)
+
+
+def _row_values(unit: shapes.UnitShapes, row: int | jax.Array, bare_ball: bool) -> tuple:
+    """Origin (3), axes (3 x 3), extra and extra_square of one object, in scalars; the axes of a plain ball are None."""
+    origin = [unit.origin[row, axis] for axis in range(3)]
+    axes = None if bare_ball else [[unit.axes[row, i, j] for j in range(3)] for i in range(3)]
+    return origin, axes, unit.extra[row], unit.extra_square[row]
+
+
+def entry(kind: int, values: tuple, start: tuple, direction: tuple, inverse_square) -> tuple[jax.Array, jax.Array]:
+    """Where rays enter a shape, and whether they do.
 
     Args:
-        scene: The scene.
-        shapes: The drawn objects.
-        u: [P] float32, see `camera.pixel_rays`.
-        v: [P] float32.
-        want_winner: Whether to say which object it is; the depth alone is cheaper.
+        kind: The type, a `mujoco.mjtGeom`.
+        values: Origin (3), axes (3 x 3, None for a ball that is not turned), extra and extra_square, as in `UnitShapes`.
+        start: Three values, metres, camera's frame.
+        direction: Three values, in the camera's frame.
+        inverse_square: The inverse square of the direction's length.
 
     Returns:
-        Depth [P] float32, planar metres, ``scene.zfar`` where nothing is hit; and the winner [P] int32, an index into the drawn
-        objects, -1 where nothing is hit (None if not wanted).
+        t [P] float32 (the ray parameter, finite everywhere, smooth wherever the ray does enter) and [P] bool.
     """
-    ray_square = u * u + v * v + 1.0
-    inverse_ray_square = 1.0 / ray_square
+    origin, axes, extra, extra_square = values
+    if axes is None:
+        inverse = 1.0 / extra
+        ray = direction
+        begin = tuple(o if isinstance(s, float) else o + s * inverse for o, s in zip(origin, start, strict=True))
+        return _sphere(begin, ray, extra, inverse_square)
+    ray = camera.mapped(axes, direction)
+    begin = tuple(o + s for o, s in zip(origin, camera.mapped(axes, start), strict=True))
+    return _INTERSECTIONS[kind](begin, ray, extra, inverse_square * extra_square)
+
+
+def nearest_key(scene: Scene, unit: shapes.UnitShapes, u: jax.Array, v: jax.Array) -> jax.Array:
+    """The key of the nearest opaque primitive along every ray, [P] int32.
+
+    Few objects are unrolled into one pass. Of many, those of a type whose balls touch the pyramid of the rays are counted
+    through, and a loop runs up to their count; the rays should then lie close together.
+    """
+    mask = code_mask(scene)
+    unit, u, v = jax.lax.stop_gradient((unit, u, v))
+    best = jnp.broadcast_to(sky_key(scene), u.shape)
+    rows = primitive_rows(scene, transparent=False)
+    listed = {} if len(rows) <= UNROLLED else _rows_by_type(scene, rows)
+    for row in rows:
+        if scene.object_types[row] not in listed:
+            t, meets = _solid_entry(scene, unit, row, u, v)
+            key = (jax.lax.bitcast_convert_type(t, jnp.int32) & ~mask) | row
+            best = jnp.minimum(best, jnp.where(meets, key, best))
+    for kind, rows in listed.items():
+        best = _nearest_listed(scene, unit, kind, rows, u, v, best)
+    return best
+
+
+def _rows_by_type(scene: Scene, rows: list[int]) -> dict[int, np.ndarray]:
+    """The rows of each type that has enough of them for a loop. Planes fill the picture: a loop would save nothing."""
+    kinds = np.array(scene.object_types)[rows]
+    counted = {int(kind): np.array(rows)[kinds == kind] for kind in np.unique(kinds) if kind != shapes.PLANE}
+    return {kind: found for kind, found in counted.items() if len(found) > _FEW}
+
+
+def _nearest_listed(
+    scene: Scene, unit: shapes.UnitShapes, kind: int, rows: np.ndarray, u: jax.Array, v: jax.Array, best: jax.Array
+) -> jax.Array:
+    """The least of ``best`` [P] and the keys of those objects among ``rows``, all of one type, that the rays may meet."""
+    mask = code_mask(scene)
+    ball = unit.ball[rows]
+    start, direction, inverse_square = camera.ray_parts(scene, u, v)
+    bare_ball = kind == shapes.SPHERE and not any(scene.atlas.mappings[row] for row in rows)
+    # The k-th object that touches is the number of these counts that are at most k. All of them are brought to the front of a
+    # table at once: whatever is done in the loop, but for the pixels, costs more than it does.
+    counts = jnp.cumsum(camera.in_view(scene, ball[:, :3], ball[:, 3], u, v, None).astype(jnp.int32))
+    total = counts[-1]
+    order = jnp.sum(counts[None, :] <= np.arange(len(rows))[:, None], axis=1)
+    columns = [unit.origin[rows], unit.axes[rows].reshape(-1, 9), unit.extra[rows, None], unit.extra_square[rows, None]]
+    table = jnp.concatenate([*columns, jnp.asarray(rows, jnp.float32)[:, None]], axis=1)
+    table = table.at[jnp.minimum(order, len(rows) - 1)].get(mode="promise_in_bounds")
+
+    def advance(state: tuple) -> tuple:
+        step, best = state
+        values = jax.lax.dynamic_slice(table, (step, 0), (1, table.shape[1]))[0]
+        origin, axes = [values[i] for i in range(3)], [[values[3 + 3 * i + j] for j in range(3)] for i in range(3)]
+        form = (origin, None if bare_ball else axes, values[12], values[13])
+        t, meets = entry(kind, form, start, direction, inverse_square)
+        key = (jax.lax.bitcast_convert_type(t, jnp.int32) & ~mask) | values[14].astype(jnp.int32)
+        meets = meets & (t > scene.znear) & (step < total)
+        return step + 1, jnp.minimum(best, jnp.where(meets, key, best))
+
+    return jax.lax.while_loop(lambda state: state[0] < total, advance, (jnp.zeros((), jnp.int32), best))[1]
+
+
+def nearest_distance(scene: Scene, unit: shapes.UnitShapes, u: jax.Array, v: jax.Array) -> jax.Array:
+    """The depth alone, [P] float32 (m), differentiable as it is: cheaper where nothing else is asked for."""
     depth = jnp.broadcast_to(scene.zfar, u.shape)
-    winner = jnp.full(u.shape, -1, jnp.int32)
-    for index, kind in enumerate(scene.object_types):
-        origin = [shapes.origin[index, axis] for axis in range(3)]
-        extra = (shapes.extra[index], shapes.extra_square[index])
-        if kind == _SPHERE:
-            t, meets = _sphere(origin, (u, v), extra[0], inverse_ray_square)
-        else:
-            axes = shapes.axes[index]
-            ray = [axes[axis, 0] * u + axes[axis, 1] * v - axes[axis, 2] for axis in range(3)]
-            t, meets = _INTERSECTIONS[kind](origin, ray, extra, inverse_ray_square)
-        nearer = meets & (t > scene.znear) & (t < depth)
-        depth = jnp.where(nearer, t, depth)
-        if want_winner:
-            winner = jnp.where(nearer, index, winner)
-    return depth, winner if want_winner else None
+    for row in primitive_rows(scene, transparent=False):
+        t, meets = _solid_entry(scene, unit, row, u, v)
+        depth = jnp.where(meets & (t < depth), t, depth)
+    return depth
 
 
-# Each intersection takes the ray's origin and direction in the unit shape's frame, and returns where the ray enters (t, in
-# metres of planar depth) and whether it does. t is finite everywhere, and smooth wherever the ray does enter.
+# Each intersection takes the ray's start and direction in the unit shape's frame.
 
 
 def _safe_root(square: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -140,21 +184,20 @@ def _safe_root(square: jax.Array) -> tuple[jax.Array, jax.Array]:
     return jnp.sqrt(jnp.where(positive, square, 1.0)), positive
 
 
-def _sphere(origin: list, uv: tuple, radius: Any, inverse_ray_square: jax.Array) -> tuple:
-    """The unit ball, not rotated: the ray's direction is (u, v, -1) over the radius.
+def _sphere(origin: tuple, ray: tuple, radius: jax.Array, inverse_square) -> tuple:
+    """The unit ball, not rotated: the ray's direction is still in metres, so t comes out in radii.
 
     The ray is followed to its point nearest to the centre first. Subtracting there, and not between the large terms of the
     usual quadratic formula, keeps a small ball that is far away sharp in float32.
     """
-    u, v = uv
-    middle = (origin[2] - origin[0] * u - origin[1] * v) * inverse_ray_square  # in radii
-    x, y, z = origin[0] + middle * u, origin[1] + middle * v, origin[2] - middle
-    root, meets = _safe_root((1.0 - (x * x + y * y + z * z)) * inverse_ray_square)
+    middle = -(origin[0] * ray[0] + origin[1] * ray[1] + origin[2] * ray[2]) * inverse_square
+    x, y, z = (origin[axis] + middle * ray[axis] for axis in range(3))
+    root, meets = _safe_root((1.0 - (x * x + y * y + z * z)) * inverse_square)
     return (middle - root) * radius, meets
 
 
-def _ellipsoid(origin: list, ray: list, extra: tuple, inverse_ray_square: jax.Array) -> tuple:
-    del extra, inverse_ray_square
+def _ellipsoid(origin: tuple, ray: tuple, extra: jax.Array, scaled_inverse) -> tuple:
+    del extra, scaled_inverse
     inverse = 1.0 / (ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2])
     middle = -(origin[0] * ray[0] + origin[1] * ray[1] + origin[2] * ray[2]) * inverse
     x, y, z = (origin[axis] + middle * ray[axis] for axis in range(3))
@@ -162,7 +205,7 @@ def _ellipsoid(origin: list, ray: list, extra: tuple, inverse_ray_square: jax.Ar
     return middle - root, meets
 
 
-def _tube(origin: list, ray: list) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _tube(origin: tuple, ray: tuple) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The endless cylinder of radius 1 around z: middle of the chord, half its length, and whether there is one."""
     inverse = 1.0 / (ray[0] * ray[0] + ray[1] * ray[1] + _TINY)
     middle = -(origin[0] * ray[0] + origin[1] * ray[1]) * inverse
@@ -171,15 +214,13 @@ def _tube(origin: list, ray: list) -> tuple[jax.Array, jax.Array, jax.Array]:
     return middle, root, meets
 
 
-def _capsule(origin: list, ray: list, extra: tuple, inverse_ray_square: jax.Array) -> tuple:
+def _capsule(origin: tuple, ray: tuple, half_length: jax.Array, inverse) -> tuple:
     """A tube with a ball at each end: where the ray enters the tube beyond an end, that end's ball decides."""
-    half_length, radius_square = extra
     middle, root, meets = _tube(origin, ray)
     side = middle - root
     height = origin[2] + side * ray[2]
     centre = jnp.clip(height, -half_length, half_length)
     on_side = meets & (height == centre)
-    inverse = inverse_ray_square * radius_square
     below = origin[2] - jnp.where(height > 0.0, half_length, -half_length)
     nearest = -(origin[0] * ray[0] + origin[1] * ray[1] + below * ray[2]) * inverse
     x, y, z = origin[0] + nearest * ray[0], origin[1] + nearest * ray[1], below + nearest * ray[2]
@@ -187,9 +228,9 @@ def _capsule(origin: list, ray: list, extra: tuple, inverse_ray_square: jax.Arra
     return jnp.where(on_side, side, nearest - ball_root), meets & (on_side | meets_ball)
 
 
-def _cylinder(origin: list, ray: list, extra: tuple, inverse_ray_square: jax.Array) -> tuple:
+def _cylinder(origin: tuple, ray: tuple, extra: jax.Array, scaled_inverse) -> tuple:
     """The tube and the slab |z| <= 1: inside both from the later entry to the earlier exit."""
-    del extra, inverse_ray_square
+    del extra, scaled_inverse
     middle, root, meets = _tube(origin, ray)
     inverse = 1.0 / (ray[2] + _TINY)
     slab_middle, slab_half = -origin[2] * inverse, jnp.abs(inverse)
@@ -198,9 +239,9 @@ def _cylinder(origin: list, ray: list, extra: tuple, inverse_ray_square: jax.Arr
     return enter, meets & (enter < leave)
 
 
-def _box(origin: list, ray: list, extra: tuple, inverse_ray_square: jax.Array) -> tuple:
+def _box(origin: tuple, ray: tuple, extra: jax.Array, scaled_inverse) -> tuple:
     """Three slabs: inside all of them from the latest entry to the earliest exit."""
-    del extra, inverse_ray_square
+    del extra, scaled_inverse
     enters, leaves = [], []
     for axis in range(3):
         inverse = 1.0 / (ray[axis] + _TINY)
@@ -212,12 +253,24 @@ def _box(origin: list, ray: list, extra: tuple, inverse_ray_square: jax.Array) -
     return enter, enter < leave
 
 
-def _plane(origin: list, ray: list, extra: tuple, inverse_ray_square: jax.Array) -> tuple:
+def _plane(origin: tuple, ray: tuple, extra: jax.Array, scaled_inverse) -> tuple:
     """The square |x|, |y| <= 1 at z = 0, seen from both sides."""
-    del extra, inverse_ray_square
+    del extra, scaled_inverse
     t = -origin[2] / (ray[2] + _TINY)
     x, y = origin[0] + t * ray[0], origin[1] + t * ray[1]
     return t, jnp.maximum(jnp.abs(x), jnp.abs(y)) <= 1.0
 
 
-_INTERSECTIONS = {_PLANE: _plane, _CAPSULE: _capsule, _ELLIPSOID: _ellipsoid, _CYLINDER: _cylinder, _BOX: _box}
+def _ball(origin: tuple, ray: tuple, extra: jax.Array, scaled_inverse) -> tuple:
+    """A ball that is turned, for its texture."""
+    return _ellipsoid(origin, ray, extra, scaled_inverse)
+
+
+_INTERSECTIONS = {
+    shapes.PLANE: _plane,
+    shapes.SPHERE: _ball,
+    shapes.CAPSULE: _capsule,
+    shapes.ELLIPSOID: _ellipsoid,
+    shapes.CYLINDER: _cylinder,
+    shapes.BOX: _box,
+}

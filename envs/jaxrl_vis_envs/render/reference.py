@@ -19,7 +19,7 @@ class ReferenceRenderer:
         mj_model: The model. Its ``vis.global_.offwidth`` and ``offheight`` bound the picture's size.
         height: H, pixels.
         width: W, pixels.
-        effects: Whether to draw shadows, reflections and haze, which `render` does not.
+        effects: Whether to draw what `render` does not: shadows, reflections, haze, tendons, skins, flexes and rangefinders.
         site_groups: Site groups that are drawn.
 
     Raises:
@@ -37,6 +37,10 @@ class ReferenceRenderer:
             raise RuntimeError(f"no usable GL library (set MUJOCO_GL to egl or osmesa): {error}") from error
         self._options = mujoco.MjvOption()
         self._options.sitegroup[:] = [group in site_groups for group in range(len(self._options.sitegroup))]
+        # What is not a geom or a site has no label in a segmentation, and `render` does not draw it.
+        marks = mujoco.mjtVisFlag
+        for mark in (marks.mjVIS_TENDON, marks.mjVIS_RANGEFINDER, marks.mjVIS_SKIN, marks.mjVIS_FLEXEDGE, marks.mjVIS_FLEXSKIN):
+            self._options.flags[mark] = effects
         if not effects:
             flags = mujoco.mjtRndFlag
             for flag in (flags.mjRND_SHADOW, flags.mjRND_REFLECTION, flags.mjRND_HAZE):

@@ -1,0 +1,135 @@
+"""Compares our renderer with MuJoCo's own on many models, live, and prints a table. Needs a GL library.
+
+    MUJOCO_GL=egl python benchmarks/render_parity.py [MODEL ...] [--poses N] [--size PIXELS] [--out FILE] [--print]
+
+Every model of tests/render_models.py is drawn in N seeded random poses by both, with shadows, reflections and multisampling
+off. What is measured, and the bounds, are in tests/render_comparison.py. The exit status is 1 where a bound does not hold. A
+model that our renderer refuses is a row of the table like any other, with the reason.
+"""
+
+import argparse
+import json
+import os
+import pathlib
+import sys
+import time
+from typing import Any
+
+ROOT = pathlib.Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "envs"), str(ROOT / "tests")]
+os.environ.setdefault("JAX_PLATFORMS", "cpu")  # the pictures are few, and MuJoCo's renderer is what takes the time
+
+import mujoco  # noqa: E402
+import numpy as np  # noqa: E402
+import render_models  # noqa: E402
+from render_comparison import BOUNDS, Tally, looks  # noqa: E402
+
+from jaxrl_vis_envs.render.reference import ReferenceRenderer  # noqa: E402
+
+TARGET = ROOT / "benchmarks" / "results" / "render_parity.json"
+BATCH = 10  # poses that we draw at a time
+COLUMNS = {
+    "segmentation": ("segm %", 100.0, 3),
+    "iou": ("min IoU", 1.0, 3),
+    "depth": ("depth %", 100.0, 3),
+    "bare_mean": ("rgb mean", 1.0, 2),
+    "bare_p99": ("rgb p99", 1.0, 0),
+    "textured_mean": ("textured mean", 1.0, 2),
+    "plane_mean": ("plane mean", 1.0, 2),
+    "sky_mean": ("sky mean", 1.0, 2),
+}
+
+
+def compare(name: str, poses: int, size: int) -> dict[str, Any]:
+    """Draws one model with both renderers and measures: the model's row."""
+    entry = render_models.MODELS[name]
+    row: dict[str, Any] = {"model": name, "source": entry.source, "poses": poses, "size": size}
+    start = time.perf_counter()
+    try:
+        mj_model, camera = render_models.build(name)
+        scene = render_models.make_scene(name, mj_model, camera, size, size)
+    except (ValueError, ModuleNotFoundError) as error:
+        return {**row, "refused": " ".join(str(error).split()), "failures": ["refused"]}
+    mj_data, tally, ours_s = mujoco.MjData(mj_model), Tally(looks(mj_model)), 0.0
+    with ReferenceRenderer(render_models.build(name, truth=True)[0], size, size, site_groups=entry.site_groups) as reference:
+        for first in range(0, poses, BATCH):
+            theirs, inputs = [], []
+            # The last batch is filled up, so that there is one compiled program; what is too much is dropped.
+            for number in range(first, first + BATCH):
+                render_models.set_pose(mj_model, mj_data, number)
+                inputs.append(render_models.poses_of(mj_data))
+                if number < poses:
+                    theirs.append(reference(mj_data, camera))
+            mark = time.perf_counter()
+            ours = render_models.draw(scene, inputs)
+            ours_s += time.perf_counter() - mark
+            for our, their in zip(ours, theirs, strict=False):
+                tally.add(our, their)
+    worst = tally.worst[1]
+    name_of = mj_model.geom(worst).name if 0 <= worst < mj_model.ngeom else ""
+    return {
+        **row,
+        "geoms": len(scene.object_ids),
+        "measures": {name: None if np.isnan(value) else round(value, 5) for name, value in tally.measures().items()},
+        "worst_iou": {"object": worst, "name": name_of, "pose": tally.worst[2]},
+        "failures": tally.failures(),
+        "seconds": {"ours": round(ours_s, 1), "all": round(time.perf_counter() - start, 1)},
+    }
+
+
+def table_row(row: dict[str, Any]) -> str:
+    """One line of the table, Markdown. A figure that is out of its bound is bold."""
+    if "refused" in row:
+        return (
+            f"| {row['model']} | {row['source']} | | " + " | ".join("" for _ in COLUMNS) + f" | **refused**: {row['refused']} |"
+        )
+    cells = []
+    for name, (_, scale, digits) in COLUMNS.items():
+        value = row["measures"][name]
+        text = "" if value is None else f"{scale * value:.{digits}f}"
+        cells.append(f"**{text}**" if name in row["failures"] else text)
+    verdict = "pass" if not row["failures"] else "**fail**: " + ", ".join(row["failures"])
+    return f"| {row['model']} | {row['source']} | {row['geoms']} | {row['poses']} | {' | '.join(cells)} | {verdict} |"
+
+
+def table_head() -> str:
+    """Names and bounds of the columns, Markdown."""
+    names = ["model", "from", "drawn", "poses", *(title for title, _, _ in COLUMNS.values()), "verdict"]
+    bounds = ["bound", "", "", ""]
+    for name, (_, scale, _) in COLUMNS.items():
+        bound = BOUNDS.get(name)
+        bounds.append(f"{'≥' if bound.at_least else '≤'} {scale * bound.limit:g}" if bound else "")
+    return "\n".join("| " + " | ".join(line) + " |" for line in (names, ["---"] * len(names), [*bounds, ""]))
+
+
+def main() -> int:
+    """Compares the models that were named, or all."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("models", nargs="*", metavar="MODEL", help="all if none is named")
+    parser.add_argument("--poses", type=int, default=200)
+    parser.add_argument("--size", type=int, default=128, help="height and width in pixels")
+    parser.add_argument("--out", type=pathlib.Path, default=TARGET, help="rows of other models that this file holds are kept")
+    parser.add_argument("--print", action="store_true", help="only print the rows that --out holds")
+    options = parser.parse_args()
+    unknown = set(options.models) - set(render_models.MODELS)
+    if unknown:
+        parser.error(f"no model {', '.join(sorted(unknown))}; there are {', '.join(render_models.MODELS)}")
+    kept = json.loads(options.out.read_text()) if options.out.exists() else {"rows": []}
+    rows = {row["model"]: row for row in kept["rows"] if row["model"] in render_models.MODELS}
+    failed = 0
+    print(table_head())
+    if options.print:
+        print("\n".join(table_row(row) for row in rows.values()))
+        return int(any(row["failures"] for row in rows.values()))
+    for name in options.models or render_models.MODELS:
+        rows[name] = compare(name, options.poses, options.size)
+        failed += bool(rows[name]["failures"])
+        print(table_row(rows[name]), flush=True)
+        ordered = [rows[model] for model in render_models.MODELS if model in rows]
+        options.out.parent.mkdir(parents=True, exist_ok=True)
+        options.out.write_text(json.dumps({"versions": render_models.versions(), "rows": ordered}, indent=1) + "\n")
+    return int(failed > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,114 @@
+"""In which order pixels are worked on: blocks of them, one after the other.
+
+On a CPU, because XLA drops optimization barriers before it fuses for a CPU, and then computes the nearest hit anew for every
+use of it (60 times slower with colour). The boundary of a loop is the one that it respects, so there are at least two blocks
+wherever the number of pixels can be divided; what lies between two operations then also stays in the cache.
+
+Anywhere, in scenes with much in them: a block is then a tile, and most things are not in it.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxrl_vis_envs.render import raycast, shapes, triangles
+from jaxrl_vis_envs.render.scene import Scene
+
+# Pixels of one environment that a CPU works on at a time.
+_CPU_BLOCK = 512
+# Height and width of a tile, if the picture can be cut so. Small ones see fewer objects, but each costs a round of a loop.
+_CPU_TILE, _TILE = 8, 16
+
+
+class Layout(NamedTuple):
+    """The pixels in blocks: rows and columns [blocks, P], NumPy; and the height and width of a tile, None for strips.
+
+    The tiles of a picture that cannot be cut evenly hang over its right and lower border.
+    """
+
+    rows: np.ndarray
+    columns: np.ndarray
+    tile: tuple[int, int] | None
+
+
+def layout(scene: Scene) -> Layout:
+    """Cuts the picture of a scene into blocks."""
+    if not tiled(scene):
+        pixels = np.arange(scene.height * scene.width).reshape(_block_count(scene.height * scene.width), -1)
+        return Layout(pixels // scene.width, pixels % scene.width, None)
+    high, wide = _tile_length(scene.height), _tile_length(scene.width)
+    down, across = -(-scene.height // high), -(-scene.width // wide)
+    rows, columns = np.indices((down * high, across * wide))
+
+    def cut(grid: np.ndarray) -> np.ndarray:
+        return grid.reshape(down, high, across, wide).swapaxes(1, 2).reshape(down * across, high * wide)
+
+    return Layout(cut(rows), cut(columns), (high, wide))
+
+
+def restore(scene: Scene, layout: Layout, plane: jax.Array) -> jax.Array:
+    """Blocks of pixels in a layout (joined or not) -> [H, W]."""
+    if layout.tile is None:
+        return plane.reshape(scene.height, scene.width)
+    high, wide = layout.tile
+    down, across = -(-scene.height // high), -(-scene.width // wide)
+    whole = plane.reshape(down, across, high, wide).swapaxes(1, 2).reshape(down * high, across * wide)
+    return whole[: scene.height, : scene.width]
+
+
+def _tile_length(pixels: int) -> int:
+    """Near the wished length of a tile, and a divisor of ``pixels`` if there is one that is near enough."""
+    wish = _CPU_TILE if jax.default_backend() == "cpu" else _TILE
+    lengths = [length for length in range(wish // 2 + 2, 2 * wish - 4) if pixels % length == 0]
+    return min(lengths, key=lambda length: abs(length - wish), default=min(wish, pixels))
+
+
+def _block_count(pixels: int) -> int:
+    """Into how many equal blocks the pixels are cut: 1 on an accelerator, on a CPU so that a block is about `_CPU_BLOCK`."""
+    if jax.default_backend() != "cpu":
+        return 1
+    counts = [count for count in range(2, max(3, pixels // 64)) if pixels % count == 0]
+    return min(counts, key=lambda count: abs(np.log(pixels / count / _CPU_BLOCK)), default=1)
+
+
+def scan(function: Callable, *pixels: Any) -> Any:
+    """Applies ``function``, which takes and gives arrays [P], to arrays [blocks, P], block by block."""
+    if pixels[0].shape[0] == 1:
+        first = jax.tree.map(lambda plane: plane[0], pixels)
+        return jax.tree.map(lambda plane: plane[None], function(*first))
+    return jax.lax.scan(lambda carry, block: (carry, function(*block)), None, pixels)[1]
+
+
+def joined(planes: tuple) -> tuple:
+    """Arrays [blocks, P] (or None) in fewer and longer blocks, for what does not depend on which pixels are in a block."""
+    pixels = planes[0].size
+    count = _block_count(pixels)
+    return tuple(None if plane is None else plane.reshape(count, -1) for plane in planes)
+
+
+def tiled(scene: Scene) -> bool:
+    """Whether there is so much in the scene that it pays to look at what each tile shows."""
+    return scene.clusters.shape[-2] > 0 or len(raycast.primitive_rows(scene, transparent=False)) > raycast.UNROLLED
+
+
+def nearest(scene: Scene, unit: shapes.UnitShapes, u: jax.Array, v: jax.Array) -> tuple[jax.Array, jax.Array | None]:
+    """Keys of the nearest opaque objects [blocks, P] int32, and rows of their triangles [blocks, P] int32 (-1: a primitive).
+
+    The triangles are None in a scene without any.
+    """
+    key = scan(lambda u, v: raycast.nearest_key(scene, unit, u, v), u, v)
+    if not scene.clusters.shape[-2]:
+        return key, None
+
+    def add_triangles(u: jax.Array, v: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        depth, row, owner = triangles.nearest_triangle(scene, unit, u, v, raycast.decode(scene, key)[0])
+        mask = raycast.code_mask(scene)
+        met = (jax.lax.bitcast_convert_type(depth, jnp.int32) & ~mask) | owner
+        return jnp.where(row >= 0, met, key), row
+
+    # Nothing here is differentiated: `surface.meet` is.
+    unit = jax.lax.stop_gradient(unit)
+    return scan(add_triangles, u, v, key)

@@ -1,0 +1,184 @@
+"""The lights in the camera's frame, once per environment, and what each gives to a point of a surface."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from jaxrl_vis_envs.render.scene import Scene
+from jaxrl_vis_envs.render.surface import Vector, dot, normalized
+
+_DIRECTIONAL = int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
+_SPOT = int(mujoco.mjtLightType.mjLIGHT_SPOT)
+
+
+class Light(NamedTuple):
+    """One light in the camera's frame; the numbers are scalars, and [3] arrays or three scalars."""
+
+    directional: bool
+    highlights: bool
+    shadows: bool
+    position: jax.Array | None
+    direction: jax.Array
+    ambient: jax.Array
+    diffuse: jax.Array
+    specular: jax.Array
+    attenuation: jax.Array | None
+    cosine_cutoff: jax.Array | None
+    exponent: jax.Array | None
+
+
+def light_poses(scene: Scene, data: Any) -> tuple[jax.Array, jax.Array]:
+    """World poses of the scene's lights, from body poses, because `mjx.Data` carries none.
+
+    Args:
+        scene: The scene.
+        data: Has ``xpos`` [nbody, 3] and ``xmat`` [nbody, 3, 3] or [nbody, 9], and ``subtree_com`` [nbody, 3] where a light
+            follows a centre of mass.
+
+    Returns:
+        Positions [L, 3] in metres and unit directions [L, 3], float32.
+    """
+    modes = mujoco.mjtCamLight
+    body_position = jnp.asarray(data.xpos, jnp.float32)
+    body_rotation = jnp.asarray(data.xmat, jnp.float32).reshape(-1, 3, 3)
+    positions, directions = [], []
+    for index, (mode, body, target) in enumerate(zip(scene.light_modes, scene.light_bodies, scene.light_targets, strict=True)):
+        position, direction = scene.light_position[index], scene.light_direction[index]
+        if mode == modes.mjCAMLIGHT_TRACK:
+            position = body_position[body] + position
+        elif mode == modes.mjCAMLIGHT_TRACKCOM:
+            position = jnp.asarray(data.subtree_com, jnp.float32)[body] + position
+        else:
+            position = body_position[body] + jnp.sum(body_rotation[body] * position, -1)
+            direction = jnp.sum(body_rotation[body] * direction, -1)
+        if target >= 0 and mode in (modes.mjCAMLIGHT_TARGETBODY, modes.mjCAMLIGHT_TARGETBODYCOM):
+            by_body = mode == modes.mjCAMLIGHT_TARGETBODY
+            aim = body_position[target] if by_body else jnp.asarray(data.subtree_com, jnp.float32)[target]
+            direction = aim - position
+        positions.append(position)
+        directions.append(direction * jax.lax.rsqrt(jnp.sum(jnp.square(direction)) + 1e-20))
+    return jnp.stack(positions), jnp.stack(directions)
+
+
+def camera_lights(scene: Scene, data: Any, camera_position: jax.Array, camera_rotation: jax.Array) -> list[Light]:
+    """The headlight, if it is on, and the model's lights, in the camera's frame."""
+    lights = []
+    if scene.headlight:
+        ahead = jnp.array([0.0, 0.0, -1.0], jnp.float32)
+        head = (scene.headlight_ambient, scene.headlight_diffuse, scene.headlight_specular)
+        lights.append(Light(True, scene.light_highlights[-1], False, None, ahead, *head, None, None, None))
+    if not scene.light_types:
+        return lights
+    positions, directions = light_poses(scene, data)
+    positions = jnp.sum((positions - camera_position)[:, :, None] * camera_rotation, axis=1)
+    directions = jnp.sum(directions[:, :, None] * camera_rotation, axis=1)
+    for index, kind in enumerate(scene.light_types):
+        colours = (scene.light_ambient[index], scene.light_diffuse[index], scene.light_specular[index])
+        facts = (kind == _DIRECTIONAL, scene.light_highlights[index], scene.light_shadows[index])
+        if kind == _DIRECTIONAL:
+            lights.append(Light(*facts, None, directions[index], *colours, None, None, None))
+            continue
+        cutoff = scene.light_cutoff[index]
+        # OpenGL takes cones of up to 90 degrees; a light with a wider one shines everywhere.
+        cosine = jnp.where(cutoff > 90.0, -2.0, jnp.cos(cutoff * (np.pi / 180.0))) if kind == _SPOT else None
+        exponent = jnp.where(cutoff > 90.0, 0.0, scene.light_exponent[index]) if kind == _SPOT else None
+        attenuation = scene.light_attenuation[index]
+        lights.append(Light(*facts, positions[index], directions[index], *colours, attenuation, cosine, exponent))
+    return lights
+
+
+class LightFacts(NamedTuple):
+    """What of a light is settled when the scene is made."""
+
+    directional: bool
+    highlights: bool
+    shadows: bool
+    cone: bool
+
+
+def facts(scene: Scene) -> list[LightFacts]:
+    """Of the lights that `camera_lights` gives, in its order."""
+    own = zip(scene.light_types, scene.light_highlights, scene.light_shadows, strict=False)
+    found = [LightFacts(kind == _DIRECTIONAL, highlights, shadows, kind == _SPOT) for kind, highlights, shadows in own]
+    return [LightFacts(True, scene.light_highlights[-1], False, False)] * scene.headlight + found
+
+
+def pack(lights: list[Light]) -> jax.Array:
+    """All numbers of the lights as one table: [L, 20] float32."""
+    rows = []
+    for light in lights:
+        zeros, zero = jnp.zeros(3), jnp.zeros(())
+        vectors = (light.position, light.direction, light.ambient, light.diffuse, light.specular, light.attenuation)
+        numbers = (light.cosine_cutoff, light.exponent)
+        rows.append(
+            jnp.concatenate(
+                [zeros if vector is None else vector for vector in vectors]
+                + [(zero if number is None else number)[None] for number in numbers]
+            )
+        )
+    return jnp.stack(rows) if rows else jnp.zeros((0, 20))
+
+
+def unpack(scene: Scene, table: Any) -> list[Light]:
+    """Undoes `pack`; vectors come as three scalars. The table may be an array or, in a kernel, a block of memory."""
+    found = []
+    for index, fact in enumerate(facts(scene)):
+        values = [table[index, column] for column in range(20)]
+        vectors: list[Any] = [tuple(values[first : first + 3]) for first in range(0, 18, 3)]
+        if fact.directional:
+            vectors[0] = vectors[5] = None
+        cone = values[18:] if fact.cone else (None, None)
+        found.append(Light(*fact[:3], *vectors, *cone))
+    return found
+
+
+def _power(base: jax.Array, exponent: jax.Array) -> jax.Array:
+    """``base ** exponent`` for a base in [0, 1], with finite gradients at 0 and vectorised everywhere."""
+    return jnp.exp(exponent * jnp.log(jnp.maximum(base, 1e-6)))
+
+
+def towards(light: Light, point: Vector) -> tuple[Vector, jax.Array | None, jax.Array | None]:
+    """From points to the light: unit vector, distance and its inverse (m, 1/m, [P]; None for a directional light)."""
+    if light.directional:
+        return tuple(-light.direction[axis] for axis in range(3)), None, None
+    assert light.position is not None
+    offset = tuple(light.position[axis] - point[axis] for axis in range(3))
+    distance_square = dot(offset, offset)
+    inverse = jax.lax.rsqrt(distance_square + 1e-20)
+    return tuple(component * inverse for component in offset), distance_square * inverse, inverse
+
+
+def light_factors(
+    light: Light, point: Vector, normal: Vector, to_camera: Vector, exponent: jax.Array, lit: jax.Array | None
+) -> tuple:
+    """What the ambient, diffuse and specular colour of one light are multiplied with, each [P] or a number.
+
+    Args:
+        light: The light.
+        point: Where, in the camera's frame.
+        normal: Unit, outward.
+        to_camera: Unit.
+        exponent: Of the highlight.
+        lit: [P], 1 where the light is seen from the point, 0 in a shadow; None for no shadows.
+    """
+    to_light, distance, _ = towards(light, point)
+    fade: Any = 1.0
+    if distance is not None:
+        assert light.attenuation is not None
+        constant, linear, quadratic = (light.attenuation[index] for index in range(3))
+        fade = 1.0 / (constant + distance * (linear + quadratic * distance))
+        if light.cosine_cutoff is not None:
+            assert light.exponent is not None
+            along = -dot(to_light, tuple(light.direction[axis] for axis in range(3)))
+            fade = jnp.where(along >= light.cosine_cutoff, fade * _power(along, light.exponent), 0.0)
+    if lit is not None:
+        fade = fade * lit
+    facing = jnp.maximum(dot(normal, to_light), 0.0)
+    shine: Any = 0.0
+    if light.highlights:
+        halfway = normalized(tuple(to_light[axis] + to_camera[axis] for axis in range(3)))
+        shine = fade * jnp.where(facing > 0.0, _power(dot(normal, halfway), exponent), 0.0)
+    return fade, fade * facing, shine

@@ -1,0 +1,142 @@
+"""Meshes and height fields as small clusters of triangles, made once with the scene. NumPy only.
+
+A triangle is kept as the affine map that brings it to the unit triangle: rows that give its two barycentric coordinates and the
+height above its plane, so that a ray meets it where the height is 0, and both coordinates and their sum are within [0, 1]. The
+triangles are grouped, eight that are near each other at a time, with a ball around each group.
+"""
+
+import mujoco
+import numpy as np
+
+CLUSTER = 8
+"""Triangles in a cluster; the last of a mesh's are filled up with ones that no ray meets."""
+
+# Columns of `Scene.triangles`.
+MAP = slice(0, 12)  # three rows of four: first and second barycentric coordinate, height
+NORMALS = slice(12, 21)  # of the three corners
+COORDINATES = slice(21, 27)  # of the texture, at the three corners
+CORNERS = slice(27, 36)  # metres
+COLUMNS = 36
+
+_HFIELD, _MESH = int(mujoco.mjtGeom.mjGEOM_HFIELD), int(mujoco.mjtGeom.mjGEOM_MESH)
+# MuJoCo smooths a corner only where the smooth normal is within this cosine of the triangle's own.
+_SMOOTH = 0.8
+
+
+def build_triangles(mj_model: mujoco.MjModel, ids: np.ndarray) -> dict[str, np.ndarray]:
+    """Triangles of all meshes and height fields among the objects ``ids``. Keys as in `Scene`.
+
+    Returns:
+        ``triangles`` [R, 36] float32, metres, in the frame of their geom, `CLUSTER` rows to a cluster; ``clusters`` [K, 4]
+        float32, middle and radius (m) of the ball around each drawn cluster, in the same frame; ``cluster_places`` [K, 2]
+        int32, the index into ``ids`` of the object, and the first row of its triangles. A mesh that several geoms show has its
+        triangles once, and its clusters once per geom.
+    """
+    rows: list[np.ndarray] = []
+    found: dict[tuple[int, int], tuple[int, np.ndarray]] = {}
+    clusters, places = [np.zeros((0, 4))], [np.zeros((0, 2), np.int64)]
+    for row, index in enumerate(ids):
+        if index >= mj_model.ngeom or mj_model.geom_type[index] not in (_HFIELD, _MESH):
+            continue
+        key = (int(mj_model.geom_type[index]), int(mj_model.geom_dataid[index]))
+        if key not in found:
+            triangles = _hfield(mj_model, key[1]) if key[0] == _HFIELD else _mesh(mj_model, key[1])
+            first = sum(map(len, rows))
+            table, balls = _clustered(*triangles)
+            rows.append(table)
+            found[key] = first, balls
+        first, balls = found[key]
+        clusters.append(balls)
+        places.append(np.stack([np.full(len(balls), row), first + CLUSTER * np.arange(len(balls))], axis=1))
+    return dict(
+        triangles=np.concatenate([*rows, np.zeros((0, COLUMNS))]).astype(np.float32),
+        clusters=np.concatenate(clusters).astype(np.float32),
+        cluster_places=np.concatenate(places).astype(np.int32),
+    )
+
+
+def _mesh(mj_model: mujoco.MjModel, mesh: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Corners [T, 3, 3], normals [T, 3, 3] and texture coordinates [T, 3, 2] of a mesh."""
+    faces = slice(mj_model.mesh_faceadr[mesh], mj_model.mesh_faceadr[mesh] + mj_model.mesh_facenum[mesh])
+    corners = mj_model.mesh_vert[mj_model.mesh_vertadr[mesh] + mj_model.mesh_face[faces]].astype(np.float64)
+    normals = mj_model.mesh_normal[mj_model.mesh_normaladr[mesh] + mj_model.mesh_facenormal[faces]].astype(np.float64)
+    if mj_model.mesh_texcoordadr[mesh] >= 0:
+        where = mj_model.mesh_texcoordadr[mesh] + mj_model.mesh_facetexcoord[faces]
+        return corners, normals, mj_model.mesh_texcoord[where].astype(np.float64)
+    flat = _flat_normals(corners)[:, None]
+    normals = np.where(np.sum(normals * flat, -1, keepdims=True) < _SMOOTH, flat, normals)
+    return corners, normals, np.zeros((len(corners), 3, 2))
+
+
+def _hfield(mj_model: mujoco.MjModel, hfield: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The same of a height field: its surface, its four sides and its bottom. All flat."""
+    rows, columns = int(mj_model.hfield_nrow[hfield]), int(mj_model.hfield_ncol[hfield])
+    start = mj_model.hfield_adr[hfield]
+    heights = mj_model.hfield_data[start : start + rows * columns].reshape(rows, columns).astype(np.float64)
+    half_x, half_y, top, base = mj_model.hfield_size[hfield]
+    x, y = np.linspace(-half_x, half_x, columns), np.linspace(-half_y, half_y, rows)
+    surface = np.stack([*np.meshgrid(x, y), heights * top], axis=-1)
+    floor = surface * [1.0, 1.0, 0.0] - [0.0, 0.0, base]
+    quads = [_strip_quads(surface[:-1], surface[1:])]
+    # Each side from its lower edge to its upper one, seen from outside from left to right.
+    for lower, upper in (
+        (floor[0], surface[0]),
+        (floor[-1][::-1], surface[-1][::-1]),
+        (floor[::-1, 0], surface[::-1, 0]),
+        (floor[:, -1], surface[:, -1]),
+    ):
+        quads.append(_strip_quads(lower[None], upper[None]))
+    ends = floor[[0, 0, -1, -1], [0, -1, 0, -1]].reshape(2, 2, 3)
+    quads.append(_strip_quads(ends[1:], ends[:1]))
+    quads_ = np.concatenate(quads)
+    # MuJoCo cuts every cell from its first corner to the one opposite.
+    corners = np.concatenate([quads_[:, [2, 0, 3]], quads_[:, [0, 1, 3]]])
+    normals = np.broadcast_to(_flat_normals(corners)[:, None], corners.shape)
+    return corners, normals, np.zeros((len(corners), 3, 2))
+
+
+def _strip_quads(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """[n, m, 3] and [n, m, 3] -> [n * (m - 1), 4, 3]: lower left, lower right, upper left, upper right."""
+    return np.stack([lower[:, :-1], lower[:, 1:], upper[:, :-1], upper[:, 1:]], axis=2).reshape(-1, 4, 3)
+
+
+def _flat_normals(corners: np.ndarray) -> np.ndarray:
+    """[T, 3] unit normals; of a triangle without area, anything."""
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+
+
+def _clustered(corners: np.ndarray, normals: np.ndarray, coordinates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows [K * CLUSTER, COLUMNS] of the triangles, cluster by cluster, and the balls [K, 4]. Without area: left out."""
+    flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    kept = np.linalg.norm(flat, axis=1) > 1e-14
+    corners, normals, coordinates = corners[kept], normals[kept], coordinates[kept]
+    unit = _flat_normals(corners)
+    basis = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], unit], axis=2)
+    inverse = np.linalg.inv(basis)
+    offset = -np.einsum("tij,tj->ti", inverse, corners[:, 0])
+    maps = np.concatenate([inverse, offset[:, :, None]], axis=2)
+    count = len(corners)
+    parts = (maps.reshape(count, 12), normals.reshape(count, 9), coordinates.reshape(count, 6), corners.reshape(count, 9))
+    table = np.concatenate(parts, axis=1)
+    groups = _grouped(corners.mean(1), np.arange(count))
+    # No ray meets a triangle whose height is 1 everywhere.
+    rows = np.zeros((len(groups) * CLUSTER, COLUMNS))
+    rows[:, 11] = 1.0
+    balls = np.zeros((len(groups), 4))
+    for number, group in enumerate(groups):
+        rows[number * CLUSTER : number * CLUSTER + len(group)] = table[group]
+        points = corners[group].reshape(-1, 3)
+        middle = 0.5 * (points.min(0) + points.max(0))
+        balls[number] = *middle, np.linalg.norm(points - middle, axis=1).max()
+    return rows, balls
+
+
+def _grouped(middles: np.ndarray, members: np.ndarray) -> list[np.ndarray]:
+    """Halves the members along their longest axis until at most `CLUSTER` are left; nearly all groups are full."""
+    if len(members) <= CLUSTER:
+        return [members] if len(members) else []
+    points = middles[members]
+    order = members[np.argsort(points[:, np.argmax(np.ptp(points, axis=0))], kind="stable")]
+    half = CLUSTER * max(1, round(len(members) / (2 * CLUSTER)))
+    return _grouped(middles, order[:half]) + _grouped(middles, order[half:])

@@ -1,0 +1,239 @@
+"""What MuJoCo's visualiser makes of a model: colours, lights, the camera's lens, and what cannot be drawn. NumPy only."""
+
+from typing import Any
+
+import mujoco
+import numpy as np
+
+SUPPORTED_TYPES = (
+    mujoco.mjtGeom.mjGEOM_PLANE,
+    mujoco.mjtGeom.mjGEOM_HFIELD,
+    mujoco.mjtGeom.mjGEOM_SPHERE,
+    mujoco.mjtGeom.mjGEOM_CAPSULE,
+    mujoco.mjtGeom.mjGEOM_ELLIPSOID,
+    mujoco.mjtGeom.mjGEOM_CYLINDER,
+    mujoco.mjtGeom.mjGEOM_BOX,
+    mujoco.mjtGeom.mjGEOM_MESH,
+)
+
+# MuJoCo's half-size 0 of a plane means "without end" along that axis; this is far beyond any clip distance.
+ENDLESS = 1e10
+# MuJoCo draws what has less alpha than this as transparent.
+OPAQUE = 0.995
+# OpenGL has eight lights; MuJoCo's renderer takes the headlight and then the model's in their order.
+MOST_LIGHTS = 8
+
+
+def find_camera(mj_model: mujoco.MjModel, camera: str | int) -> int:
+    """The camera's index, or a ValueError that names the cameras there are."""
+    if isinstance(camera, str):
+        camera_id = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
+    else:
+        camera_id = int(camera)
+    if not 0 <= camera_id < mj_model.ncam:
+        names = ", ".join(repr(mj_model.camera(index).name) for index in range(mj_model.ncam)) or "none"
+        raise ValueError(f"there is no camera {camera!r} in the model; its cameras are: {names}")
+    return camera_id
+
+
+def projection(mj_model: mujoco.MjModel, camera_id: int) -> str:
+    """How the camera maps space to the picture, as in `Scene`."""
+    if mj_model.cam_projection[camera_id] == mujoco.mjtProjection.mjPROJ_ORTHOGRAPHIC:
+        return "orthographic"
+    return "intrinsic" if np.all(mj_model.cam_sensorsize[camera_id] > 0) else "perspective"
+
+
+def camera_parameters(mj_model: mujoco.MjModel, camera_id: int) -> dict[str, Any]:
+    """Leaves of the camera. Keys as in `Scene`."""
+    intrinsic = mj_model.cam_intrinsic[camera_id]
+    return dict(
+        fovy=mj_model.cam_fovy[camera_id],
+        focal=intrinsic[:2],
+        principal=intrinsic[2:],
+        sensor=mj_model.cam_sensorsize[camera_id],
+        camera_shift=np.zeros(3),
+        camera_turn=np.zeros(3),
+        znear=mj_model.vis.map.znear * mj_model.stat.extent,
+        zfar=mj_model.vis.map.zfar * mj_model.stat.extent,
+    )
+
+
+def drawn_objects(
+    mj_model: mujoco.MjModel,
+    rgba: np.ndarray,
+    groups: tuple[int, ...],
+    site_groups: tuple[int, ...],
+    leave_out: tuple[str, ...],
+) -> np.ndarray:
+    """[ngeom + nsite] bool: in a group that is drawn, not invisible, not left out."""
+    # MuJoCo counts groups beyond the last as the last one, and likewise below.
+    most = mujoco.mjNGROUP - 1
+    geoms = np.isin(np.clip(mj_model.geom_group, 0, most), groups)
+    sites = np.isin(np.clip(mj_model.site_group, 0, most), site_groups)
+    left_out = [mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_GEOM, name) for name in leave_out]
+    geoms[[index for index in left_out if index >= 0]] = False
+    return np.concatenate([geoms, sites]) & (rgba[:, 3] > 0)
+
+
+def refuse_unsupported(
+    mj_model: mujoco.MjModel,
+    types: np.ndarray,
+    drawn: np.ndarray,
+    groups: tuple[int, ...],
+    leave_out: tuple[str, ...],
+    shadows: bool,
+) -> None:
+    """Raises a ValueError of one line that names everything that would be seen and cannot be drawn, and what to do."""
+    refused = []
+    for index in np.flatnonzero(drawn & ~np.isin(types, SUPPORTED_TYPES)):
+        refused.append(f"{object_name(mj_model, int(index))} ({_type_name(types[index])})")
+    if refused:
+        raise ValueError(
+            f"cannot draw {', '.join(refused)}: use a mesh or primitives, a group that is not drawn, alpha 0, or leave_out"
+        )
+    for kind, count, group in (("skin", mj_model.nskin, "skin_group"), ("flex", mj_model.nflex, "flex_group")):
+        seen = [i for i in range(count) if getattr(mj_model, group)[i] in groups and kind not in leave_out]
+        if seen:
+            accessor = mujoco.mjtObj.mjOBJ_SKIN if kind == "skin" else mujoco.mjtObj.mjOBJ_FLEX
+            names = ", ".join(f"{kind} {mujoco.mj_id2name(mj_model, accessor, i) or f'number {i}'}" for i in seen)
+            raise ValueError(f"cannot draw {names}: use a group that is not drawn, or leave_out=({kind!r},)")
+    images = np.flatnonzero((mj_model.light_type == mujoco.mjtLightType.mjLIGHT_IMAGE) & mj_model.light_active.astype(bool))
+    if len(images):
+        names = ", ".join(f"light {mj_model.light(i).name or f'number {i}'}" for i in images)
+        raise ValueError(f"cannot light with images ({names}): make it inactive, or a directional, point or spot light")
+    if shadows:
+        fine = np.isin(types, (mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_HFIELD))
+        casting = [object_name(mj_model, int(index)) for index in np.flatnonzero(drawn & fine)]
+        if casting:
+            raise ValueError(f"cannot draw shadows of {', '.join(casting)} (triangles): use shadows=False, or leave_out")
+
+
+def object_name(mj_model: mujoco.MjModel, index: int) -> str:
+    """What a message calls object ``index`` (a geom, or ngeom + a site)."""
+    is_geom = index < mj_model.ngeom
+    number = int(index if is_geom else index - mj_model.ngeom)
+    name = (mj_model.geom(number) if is_geom else mj_model.site(number)).name or f"number {number}"
+    return f"{'geom' if is_geom else 'site'} {name}"
+
+
+def _type_name(kind: int) -> str:
+    return mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower()
+
+
+def object_materials(mj_model: mujoco.MjModel) -> np.ndarray:
+    """[N] material of every geom, then of every site; -1 for none."""
+    return np.concatenate([mj_model.geom_matid, mj_model.site_matid])
+
+
+def object_textures(mj_model: mujoco.MjModel) -> np.ndarray:
+    """[N] texture that colours every geom, then every site; -1 for none."""
+    material = object_materials(mj_model)
+    if not mj_model.nmat:
+        return np.full(len(material), -1)
+    return np.where(material >= 0, mj_model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB], -1)
+
+
+def object_looks(mj_model: mujoco.MjModel) -> dict[str, np.ndarray]:
+    """Size, colour and material of every geom, then of every site. Keys as in `Scene`."""
+    size = np.concatenate([mj_model.geom_size, mj_model.site_size]).reshape(-1, 3)
+    rgba = np.concatenate([mj_model.geom_rgba, mj_model.site_rgba]).reshape(-1, 4).astype(np.float64)
+    material = object_materials(mj_model)
+    count = len(size)
+    # What MuJoCo's visualiser gives to an object without a material.
+    emission, specular, shininess = np.zeros(count), np.full(count, 0.5), np.full(count, 0.5)
+    repeat = np.ones((count, 2))
+    for index in np.flatnonzero(material >= 0):
+        number = material[index]
+        emission[index] = mj_model.mat_emission[number]
+        specular[index] = mj_model.mat_specular[number]
+        shininess[index] = mj_model.mat_shininess[number]
+        repeat[index] = mj_model.mat_texrepeat[number]
+        # The default grey means "not set", and then the material's colour counts.
+        if np.array_equal(rgba[index], [0.5, 0.5, 0.5, 1.0]):
+            rgba[index] = mj_model.mat_rgba[number]
+    planes = np.concatenate([mj_model.geom_type, mj_model.site_type]) == mujoco.mjtGeom.mjGEOM_PLANE
+    size = np.where(planes[:, None] & (size <= 0), ENDLESS, size)
+    return dict(size=size, rgba=rgba, emission=emission, specular=specular, shininess=shininess, texture_repeat=repeat)
+
+
+def texture_pixels(mj_model: mujoco.MjModel, texture: int) -> np.ndarray:
+    """[rows, columns, channels] uint8."""
+    height, width = int(mj_model.tex_height[texture]), int(mj_model.tex_width[texture])
+    channels = int(mj_model.tex_nchannel[texture])
+    start = int(mj_model.tex_adr[texture])
+    return mj_model.tex_data[start : start + height * width * channels].reshape(height, width, channels)
+
+
+def mean_texture_colours(mj_model: mujoco.MjModel) -> np.ndarray:
+    """[N, 3] in [0, 1], of every geom and site; ones where there is no texture."""
+    means = np.ones((mj_model.ntex + 1, 3))  # the last row is for no texture
+    for texture in range(mj_model.ntex):
+        pixels = texture_pixels(mj_model, texture)
+        colour = pixels.reshape(-1, pixels.shape[-1]).mean(0) / 255.0
+        means[texture] = colour[:3] if len(colour) >= 3 else colour[0]
+    return means[object_textures(mj_model)]
+
+
+def skybox(mj_model: mujoco.MjModel) -> int:
+    """The texture of the sky, -1 for none."""
+    found = np.flatnonzero(mj_model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
+    return int(found[0]) if len(found) else -1
+
+
+def sky_colours(mj_model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    """Colours straight up and straight down of the sky, black without one. [3] each, in [0, 1]."""
+    texture = skybox(mj_model)
+    if texture < 0:
+        return np.zeros(3), np.zeros(3)
+    pixels = texture_pixels(mj_model, texture)
+    # Six square faces above each other, in OpenGL's order: right, left, up, down, front, back.
+    edge = pixels.shape[1]
+    middle = edge // 2
+    faces = pixels.reshape(-1, edge, edge, pixels.shape[-1])
+    up, down = (faces[2], faces[3]) if len(faces) == 6 else (faces[0], faces[0])
+    return up[middle, middle, :3] / 255.0, down[middle, middle, :3] / 255.0
+
+
+def haze_plane(mj_model: mujoco.MjModel, drawn: np.ndarray) -> tuple[int, float]:
+    """The first endless plane that is drawn (-1 for none, or where there is no sky), and the width of the haze."""
+    endless = (mj_model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) & np.all(mj_model.geom_size[:, :2] == 0, axis=1)
+    found = np.flatnonzero(endless & drawn[: mj_model.ngeom])
+    if not len(found) or skybox(mj_model) < 0:
+        return -1, 0.0
+    return int(found[0]), float(mj_model.vis.map.haze)
+
+
+def lights(mj_model: mujoco.MjModel, material_specular: np.ndarray, shadows: bool) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Leaves of the lights that are drawn with, and the static facts about them. Keys as in `Scene`."""
+    head = mj_model.vis.headlight
+    active = np.flatnonzero(mj_model.light_active)[: MOST_LIGHTS - bool(head.active)]
+    modes = mj_model.light_mode[active][:, None]
+    # A tracking light keeps its orientation and its offset of the initial pose; the others are given in their body's frame.
+    track, track_com = mujoco.mjtCamLight.mjCAMLIGHT_TRACK, mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM
+    position = np.where(modes == track, mj_model.light_pos0[active], mj_model.light_pos[active])
+    position = np.where(modes == track_com, mj_model.light_poscom0[active], position)
+    direction = np.where((modes == track) | (modes == track_com), mj_model.light_dir0[active], mj_model.light_dir[active])
+    leaves = dict(
+        light_position=position,
+        light_direction=direction,
+        light_ambient=mj_model.light_ambient[active],
+        light_diffuse=mj_model.light_diffuse[active],
+        light_specular=mj_model.light_specular[active],
+        light_attenuation=mj_model.light_attenuation[active],
+        light_cutoff=mj_model.light_cutoff[active],
+        light_exponent=mj_model.light_exponent[active],
+        headlight_ambient=head.ambient,
+        headlight_diffuse=head.diffuse,
+        headlight_specular=head.specular,
+    )
+    shiny = bool(np.any(material_specular > 0))
+    highlights = [shiny and bool(np.any(colour > 0)) for colour in (*mj_model.light_specular[active], head.specular)]
+    facts = dict(
+        light_types=tuple(mj_model.light_type[active].tolist()),
+        light_modes=tuple(mj_model.light_mode[active].tolist()),
+        light_bodies=tuple(mj_model.light_bodyid[active].tolist()),
+        light_targets=tuple(mj_model.light_targetbodyid[active].tolist()),
+        light_highlights=tuple(highlights),
+        light_shadows=tuple((mj_model.light_castshadow[active].astype(bool) & shadows).tolist()),
+    )
+    return leaves, facts

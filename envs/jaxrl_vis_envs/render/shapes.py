@@ -1,0 +1,113 @@
+"""Once per environment: every drawn object as a unit shape in the camera's frame.
+
+An object is brought to a unit shape (ball, cylinder, cube, square; a mesh keeps its metres) by an affine map of the camera's
+frame. What is left per pixel and object is a ray that is linear in the pixel's (u, v), and a handful of operations. All of it
+is in a few small tables whose rows are the drawn objects, which is what any other way to find the nearest hit needs too.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from jaxrl_vis_envs.render.scene import Scene
+
+PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
+HFIELD = int(mujoco.mjtGeom.mjGEOM_HFIELD)
+SPHERE = int(mujoco.mjtGeom.mjGEOM_SPHERE)
+CAPSULE = int(mujoco.mjtGeom.mjGEOM_CAPSULE)
+ELLIPSOID = int(mujoco.mjtGeom.mjGEOM_ELLIPSOID)
+CYLINDER = int(mujoco.mjtGeom.mjGEOM_CYLINDER)
+BOX = int(mujoco.mjtGeom.mjGEOM_BOX)
+MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
+
+# Objects with a pose that is not finite go this far behind the camera, in metres: no ray meets them, and no NaN is left.
+_BEHIND = 1e6
+
+
+class UnitShapes(NamedTuple):
+    """The drawn objects as unit shapes: a point p of the camera's frame is ``origin + axes @ p`` in the shape's frame.
+
+    Attributes:
+        origin: [G, 3] float32, the camera in the shape's frame.
+        axes: [G, 3, 3] float32, 1/metres (rotation from the camera's frame, then division by the half-sizes).
+        extra: [G] float32. Sphere: radius in metres. Capsule: half-length over radius. Otherwise unused.
+        extra_square: [G] float32. Sphere and capsule: squared radius in square metres. Otherwise unused.
+        ball: [G, 4] float32, metres: a ball around the object, middle in the camera's frame and radius. A mesh's is not used.
+    """
+
+    origin: jax.Array
+    axes: jax.Array
+    extra: jax.Array
+    extra_square: jax.Array
+    ball: jax.Array
+
+
+def unit_shapes(
+    scene: Scene, data: Any, camera_position: jax.Array, camera_rotation: jax.Array, camera_finite: jax.Array
+) -> UnitShapes:
+    """Brings every drawn object to a unit shape in the camera's frame.
+
+    Args:
+        scene: The scene.
+        data: Has ``geom_xpos`` [ngeom, 3] and ``geom_xmat`` [ngeom, 3, 3] or [ngeom, 9], and the same of sites that are drawn.
+        camera_position: [3] float32, metres, world.
+        camera_rotation: [3, 3] float32, columns are the camera's axes in the world.
+        camera_finite: [] bool; where false, nothing is seen.
+    """
+    position, rotation = _object_poses(scene, data)
+    size = scene.size[np.array(scene.object_ids)]
+    finite = camera_finite & jnp.all(jnp.isfinite(position), -1) & jnp.all(jnp.isfinite(rotation), (-2, -1))
+    position = jnp.where(finite[:, None], position, 0.0)
+    rotation = jnp.where(finite[:, None, None], rotation, 0.0)
+    # Written out rather than as matrix products, which accelerators would do at low precision.
+    offset = jnp.sum((position - camera_position)[:, :, None] * camera_rotation, axis=1)  # [G, 3] in the camera's frame
+    relative = jnp.sum(rotation[:, :, :, None] * camera_rotation[None, :, None, :], axis=1)  # [G, shape axis, camera axis]
+    offset = jnp.where(finite[:, None], offset, jnp.array([0.0, 0.0, _BEHIND]))
+    relative = jnp.where(finite[:, None, None], relative, jnp.eye(3))
+
+    kinds = np.array(scene.object_types)[:, None]
+    half = _half_sizes(kinds, size)
+    # A ball looks the same from everywhere: leaving its rotation out saves operations in every pixel, unless it has a texture.
+    bare = np.array(scene.atlas.mappings)[:, None] == 0
+    relative = jnp.where(((kinds == SPHERE) & bare)[:, :, None], jnp.eye(3), relative)
+    axes = relative / half[:, :, None]
+    origin = -jnp.sum(axes * offset[:, None, :], axis=-1)
+    capsules = kinds[:, 0] == CAPSULE
+    # Where: a size that means nothing for a type may be 0.
+    extra = jnp.where(capsules, size[:, 1] / jnp.where(capsules, size[:, 0], 1.0), size[:, 0])
+    ball = jnp.concatenate([offset, _radii(kinds[:, 0], size)[:, None]], axis=1)
+    return UnitShapes(origin, axes, extra, jnp.square(size[:, 0]), ball)
+
+
+def _half_sizes(kinds: np.ndarray, size: jax.Array) -> jax.Array:
+    """[G, 3] metres that become 1 in the unit shape's frame."""
+    ones = jnp.ones_like(size[:, :1])
+    radius = size[:, :1]
+    half = jnp.where(kinds == PLANE, jnp.concatenate([size[:, :2], ones], 1), size)
+    half = jnp.where((kinds == SPHERE) | (kinds == CAPSULE), jnp.broadcast_to(radius, size.shape), half)
+    half = jnp.where(kinds == CYLINDER, jnp.concatenate([radius, radius, size[:, 1:2]], 1), half)
+    return jnp.where((kinds == MESH) | (kinds == HFIELD), 1.0, half)
+
+
+def _radii(kinds: np.ndarray, size: jax.Array) -> jax.Array:
+    """[G] metres, of a ball around each shape (planes: around the part that is drawn)."""
+    a, b, c = size[:, 0], size[:, 1], size[:, 2]
+    radius = jnp.sqrt(a * a + b * b + c * c)
+    radius = jnp.where(kinds == SPHERE, a, radius)
+    radius = jnp.where(kinds == CAPSULE, a + b, radius)
+    radius = jnp.where(kinds == ELLIPSOID, jnp.maximum(jnp.maximum(a, b), c), radius)
+    return jnp.where((kinds == CYLINDER) | (kinds == PLANE), jnp.sqrt(a * a + b * b), radius)
+
+
+def _object_poses(scene: Scene, data: Any) -> tuple[jax.Array, jax.Array]:
+    """Positions [G, 3] and rotations [G, 3, 3] of the drawn objects in the world, float32."""
+    position = jnp.asarray(data.geom_xpos, jnp.float32)
+    rotation = jnp.asarray(data.geom_xmat, jnp.float32).reshape(-1, 3, 3)
+    if any(index >= scene.geom_count for index in scene.object_ids):
+        position = jnp.concatenate([position, jnp.asarray(data.site_xpos, jnp.float32)])
+        rotation = jnp.concatenate([rotation, jnp.asarray(data.site_xmat, jnp.float32).reshape(-1, 3, 3)])
+    ids = np.array(scene.object_ids)
+    return position[ids], rotation[ids]

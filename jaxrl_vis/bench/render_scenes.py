@@ -1,0 +1,190 @@
+"""Scenes that renderers are compared on, and batches of poses to draw them in: world poses, so that no kinematics is timed."""
+
+import importlib.util
+import itertools
+import warnings
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from jaxrl_vis.config import RequestError
+
+SCENES = ("finger", "fetch_reach", "primitives")
+POSES = ("geom_xpos", "geom_xmat", "site_xpos", "site_xmat", "cam_xpos", "cam_xmat", "light_xpos", "light_xdir")
+POSES += ("xpos", "xmat", "subtree_com")
+FREE_METRES, FREE_RADIANS, BALL_RADIANS, SLIDE_METRES = 0.2, 0.5, 1.0, 0.3
+
+
+def load(scene: str, textures: bool = True) -> mujoco.MjModel:
+    """The model of a scene; its first camera looks. Multisampling and shadows are off.
+
+    Args:
+        scene: ``finger`` (that of the dm_control suite), ``fetch_reach`` (ours), ``primitives`` (127 mixed primitives on and
+            over a table), or the path of an MJCF file with a camera.
+        textures: Whether materials keep their textures, and the sky its own.
+
+    Raises:
+        RequestError: The scene is unknown, its package is missing, or it has no camera.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what MuJoCo says about other people's models
+        if scene == "primitives":
+            mj_model = mujoco.MjModel.from_xml_string(primitives_xml())
+        else:
+            path = _path_of(scene)
+            try:
+                mj_model = mujoco.MjModel.from_xml_path(str(path))
+            except ValueError as error:
+                raise RequestError(f"{path} is no MuJoCo model: {' '.join(str(error).split())}") from error
+    if not mj_model.ncam:
+        raise RequestError(f"scene {scene} has no camera: give it one in its <worldbody>")
+    mj_model.vis.quality.offsamples = mj_model.vis.quality.shadowsize = 0
+    mj_model.light_castshadow[:] = 0
+    if not textures:
+        mj_model.mat_texid[:] = -1
+        # A sky is found by its type.
+        mj_model.tex_type[mj_model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX] = mujoco.mjtTexture.mjTEXTURE_CUBE
+    return mj_model
+
+
+def _path_of(scene: str) -> Path:
+    if scene == "finger":
+        package = importlib.util.find_spec("dm_control")
+        if package is None or not package.submodule_search_locations:
+            raise RequestError("scene finger is that of dm_control, which is missing: pip install dm_control")
+        return Path(package.submodule_search_locations[0]) / "suite" / "finger.xml"
+    if scene == "fetch_reach":
+        import jaxrl_vis_envs
+
+        return Path(jaxrl_vis_envs.__file__).parent / "tasks" / "assets" / "fetch_reach.xml"
+    if not Path(scene).is_file():
+        raise RequestError(f"no scene {scene!r}: choose {', '.join(SCENES)} or the path of an MJCF file")
+    return Path(scene)
+
+
+def primitives_xml() -> str:
+    """127 geoms: a floor, a table top, and 25 each of sphere, capsule, ellipsoid, cylinder and box, all free bodies.
+
+    Kinds, sizes, places, camera and lights are those of MuJoCo Warp's own benchmark of that name, so that figures compare.
+    """
+    kinds = (
+        ("sphere", ".05", "1 0 0 1", 0.8),
+        ("capsule", ".04 .05", "0 1 0 1", 0.95),
+        ("ellipsoid", ".05 .04 .03", "0 0 1 1", 1.1),
+        ("cylinder", ".04 .04", "1 1 0 1", 1.2),
+        ("box", ".03 .03 .03", "0 1 1 1", 1.4),
+    )
+    bodies = "\n".join(
+        f'<body pos="{0.6 + 0.1 * column:g} {-0.4 + 0.2 * row:g} {height}"><freejoint/>'
+        f'<geom type="{kind}" size="{size}" rgba="{rgba}"/></body>'
+        for (kind, size, rgba, height), row, column in itertools.product(kinds, range(5), range(5))
+    )
+    return f"""
+<mujoco model="primitives">
+  <visual>
+    <map znear=".01" zfar="200"/>
+    <headlight ambient=".2 .2 .2" diffuse=".8 .8 .8" specular="1 1 1"/>
+  </visual>
+  <asset>
+    <texture type="skybox" builtin="gradient" rgb1="1 1 1" rgb2="1 1 1" width="64" height="384"/>
+    <texture name="grid" type="2d" builtin="checker" rgb1=".1 .2 .3" rgb2=".2 .3 .4" width="512" height="512"/>
+    <material name="grid" texture="grid" texrepeat="1 1" texuniform="true"/>
+  </asset>
+  <worldbody>
+    <light directional="true" pos="0 0 3" dir="0 0 -1"/>
+    <camera pos="3 0 2" xyaxes="0 1 0 -.6 0 1"/>
+    <geom type="plane" size="0 0 .05" material="grid"/>
+    <geom type="box" pos=".8 0 .5" size=".5 1 .01"/>
+    {bodies}
+  </worldbody>
+</mujoco>
+"""
+
+
+def scatter_joints(mj_model: mujoco.MjModel, mj_data: mujoco.MjData, rng: np.random.Generator) -> None:
+    """Puts every joint into a random position, in place; does not run the kinematics.
+
+    Hinges and slides are uniform within their limits (hinges without: any angle; slides without: 0.3 m each way), balls turn by
+    up to a radian, free bodies move by a tenth of the model's extent (0.2 m at most) and turn by up to half a radian.
+    """
+    mujoco.mj_resetData(mj_model, mj_data)
+    joints = mujoco.mjtJoint
+    kinds, starts = mj_model.jnt_type, mj_model.jnt_qposadr
+    reach = np.where(kinds == joints.mjJNT_HINGE, np.pi, SLIDE_METRES)[:, None] * np.array([-1.0, 1.0])
+    low, high = np.where(mj_model.jnt_limited[:, None], mj_model.jnt_range, reach).T
+    angles = rng.uniform(low, high)
+    simple = (kinds == joints.mjJNT_HINGE) | (kinds == joints.mjJNT_SLIDE)
+    mj_data.qpos[starts[simple]] = angles[simple]
+    free = starts[kinds == joints.mjJNT_FREE][:, None]
+    most = min(0.1 * mj_model.stat.extent, FREE_METRES)
+    mj_data.qpos[free + np.arange(3)] += most * rng.uniform(-1.0, 1.0, (len(free), 3))
+    balls = starts[kinds == joints.mjJNT_BALL][:, None]
+    for places, radians in ((free + 3 + np.arange(4), FREE_RADIANS), (balls + np.arange(4), BALL_RADIANS)):
+        mj_data.qpos[places] = _turned(mj_data.qpos[places], radians, rng)
+
+
+def _turned(quaternions: np.ndarray, most: float, rng: np.random.Generator) -> np.ndarray:
+    """[N, 4] quaternions, each turned by up to ``most`` radians about a random axis."""
+    axes = rng.normal(size=(len(quaternions), 3))
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    half = rng.uniform(0.0, most, (len(quaternions), 1)) / 2
+    real, vector = quaternions[:, :1], quaternions[:, 1:]
+    turn_real, turn = np.cos(half), np.sin(half) * axes
+    product = real * turn + turn_real * vector + np.cross(vector, turn)
+    return np.concatenate([real * turn_real - np.sum(vector * turn, 1, keepdims=True), product], axis=1)
+
+
+def forward(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> None:
+    """Runs what a picture needs: the poses of bodies, geoms, sites, cameras and lights."""
+    mujoco.mj_kinematics(mj_model, mj_data)
+    mujoco.mj_comPos(mj_model, mj_data)
+    mujoco.mj_camlight(mj_model, mj_data)
+
+
+def random_poses(mj_model: mujoco.MjModel, count: int, seed: int) -> dict[str, np.ndarray]:
+    """World poses of ``count`` random positions of the joints: each of `POSES`, [count, ...] float32 as MjData has it."""
+    rng, mj_data = np.random.default_rng(seed), mujoco.MjData(mj_model)
+    poses = {name: np.empty((count, *getattr(mj_data, name).shape), np.float32) for name in POSES}
+    for index in range(count):
+        scatter_joints(mj_model, mj_data, rng)
+        forward(mj_model, mj_data)
+        for name, rows in poses.items():
+            rows[index] = getattr(mj_data, name)
+    return poses
+
+
+def set_poses(mj_data: mujoco.MjData, poses: dict[str, np.ndarray], index: int) -> None:
+    """Puts one row of `random_poses` into MjData, so that it can be drawn."""
+    for name in POSES:
+        getattr(mj_data, name)[:] = poses[name][index]
+
+
+def needed_tests(mj_model: mujoco.MjModel, poses: dict[str, np.ndarray], size: int) -> float:
+    """Ray-geom tests a pixel that perfect culling by bounding sphere would leave, in the mean over ``poses``.
+
+    A geom needs a test in every pixel that the projection of its bounding sphere covers; a plane in every one. Geoms that are
+    not drawn (their group, or alpha 0) need none.
+
+    Args:
+        mj_model: The model; its first camera looks.
+        poses: From `random_poses`.
+        size: Height and width of the picture in pixels.
+    """
+    drawn = np.isin(mj_model.geom_group, (0, 1, 2)) & (mj_model.geom_rgba[:, 3] > 0)
+    endless = drawn & (mj_model.geom_rbound <= 0)
+    round_ = np.flatnonzero(drawn & ~endless)
+    axes = poses["cam_xmat"][:, 0].reshape(-1, 3, 3)
+    offset = poses["geom_xpos"][:, round_] - poses["cam_xpos"][:, :1]
+    x, y, away = np.moveaxis(np.einsum("ngi,nij->ngj", offset, axes), -1, 0) * np.array([1.0, 1.0, -1.0])[:, None, None]
+    radius = mj_model.geom_rbound[round_]
+    reach = np.tan(np.deg2rad(mj_model.cam_fovy[0]) / 2)
+    middles = (2.0 * np.arange(size) + 1.0 - size) / size * reach
+    tests = 0.0
+    for u, v in itertools.product(middles, middles):
+        # The sphere's centre against the line of the ray (u, v, -1): nearer than the radius, and not wholly behind.
+        length = u * u + v * v + 1.0
+        along = (x * u + y * v + away) / length
+        apart = x * x + y * y + away * away - along * along * length
+        tests += np.count_nonzero((apart <= radius * radius) & (away + radius > 0.0))
+    return float(tests / (len(x) * size * size) + np.count_nonzero(endless))

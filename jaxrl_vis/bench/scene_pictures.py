@@ -1,0 +1,138 @@
+"""Our renderer on the scenes of `render_scenes`, and other renderers beside it in the same run, on the same poses.
+
+All are given world poses, and write 8-bit colours and float32 depth in metres, without shadows. What a renderer does to find
+its way in a new pose (culling, refitting of bounding volumes) is part of its figure.
+"""
+
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from jaxrl_vis.bench import render_scenes, roofline
+from jaxrl_vis.bench.record import Measurement
+from jaxrl_vis.bench.render import alternate, assert_new_pictures
+from jaxrl_vis.bench.settings import Settings
+from jaxrl_vis.bench.timing import compile_timed
+from jaxrl_vis.bench.timing import measure as measure_time
+from jaxrl_vis_envs.compilation import world_jit
+from jaxrl_vis_envs.render import Scene, quantize, render_planes
+
+CPU_COUNTS = (64,)
+ACCELERATOR_COUNTS = (4096,)
+ACCELERATOR_COUNTS_OF = {"primitives": (8192,)}
+CPU_SCENES = ("finger", "fetch_reach")
+PEER_POSES = 64  # pictures that mujoco.Renderer draws, one after the other
+COMPARED = 32  # pictures that are compared with the peer's
+_SAMPLE = 32  # poses that the needed tests are counted in
+_DEPTH_RANGE = 10.0  # metres that an 8-bit depth spans
+# Single-precision operations per second outside the matrix units, from data sheets.
+_VECTOR_PEAKS = {"NVIDIA H100 80GB HBM3": 67e12, "NVIDIA H100 PCIe": 51e12, "NVIDIA H200": 67e12, "NVIDIA A100": 19.5e12}
+
+
+def measure(settings: Settings, sizes: tuple[int, ...]) -> Iterator[Measurement]:
+    """Images per second of every scene and size: each output of ours, then the peer.
+
+    Args:
+        settings: ``scene`` and ``peer`` count, and what `Settings` says of all benchmarks.
+        sizes: Heights and widths.
+    """
+    if settings.peer is not None:
+        _peer(settings.peer).check()  # First: it is the part that may be missing.
+    scenes = render_scenes.SCENES if settings.on_accelerator else CPU_SCENES
+    for scene in (settings.scene,) if settings.scene else scenes:
+        # Without textures first: that is what MuJoCo Warp is fastest at.
+        for textures in (False, True):
+            mj_model = render_scenes.load(scene, textures)
+            for count in settings.counts(CPU_COUNTS, ACCELERATOR_COUNTS_OF.get(scene, ACCELERATOR_COUNTS)):
+                batches = [render_scenes.random_poses(mj_model, max(count, PEER_POSES), seed) for seed in (1, 2)]
+                for size in sizes:
+                    config = {"scene": scene, "textures": textures, "image_size": size, "images": count}
+                    yield from _measure_size(settings, config, mj_model, batches)
+
+
+def _peer(name: str) -> Any:
+    from jaxrl_vis.bench import mujoco_renderer, warp_renderer
+
+    return {"mujoco": mujoco_renderer, "warp": warp_renderer}[name]
+
+
+def _measure_size(settings: Settings, config: dict[str, Any], mj_model: mujoco.MjModel, batches: list) -> Iterator[Measurement]:
+    """All outputs of ours for one scene, size and batch, and the peer, which has one output."""
+    ours: Measurement | None = None
+    for output in ("rgbd", "rgbd8", "depth"):
+        found = _measure_ours(settings, {**config, "pixels": output}, mj_model, batches)
+        yield found
+        ours = ours or found
+    if settings.peer is not None and ours is not None:
+        some = {name: jnp.asarray(rows[:COMPARED]) for name, rows in batches[0].items()}
+        scene = Scene.from_mjmodel(mj_model, 0, config["image_size"], config["image_size"])
+        depth = np.asarray(world_jit(jax.vmap(lambda poses: _picture(scene, poses, "depth")))(some))
+        depth = np.where(depth < float(scene.zfar), depth, np.inf)
+        yield _peer(settings.peer).measure({**config, "pixels": "rgbd"}, mj_model, batches, settings.repeats, depth, ours.value)
+
+
+def _picture(scene: Scene, poses: dict[str, jax.Array], output: str) -> Any:
+    """One picture as planes: rgbd (uint8 and float32 metres), rgbd8 (all uint8) or depth (float32 metres)."""
+    planes = render_planes(scene, SimpleNamespace(**poses), rgb=output != "depth", quantized=True)
+    assert planes.depth is not None
+    if planes.rgb is None:
+        return planes.depth
+    return planes.rgb, planes.depth if output == "rgbd" else quantize(planes.depth / _DEPTH_RANGE)
+
+
+def _measure_ours(settings: Settings, config: dict[str, Any], mj_model: mujoco.MjModel, batches: list) -> Measurement:
+    count, size, output = config["images"], config["image_size"], config["pixels"]
+    scene = Scene.from_mjmodel(mj_model, 0, size, size)
+    some = [{name: jnp.asarray(rows[:count]) for name, rows in batch.items()} for batch in batches]
+    draw = world_jit(jax.vmap(lambda poses: _picture(scene, poses, output)))
+    compiled, compile_s = compile_timed(draw, some[0])
+    assert_new_pictures(compiled, some)
+    timing = measure_time(alternate(compiled, some), settings.repeats)
+    sample = {name: rows[:_SAMPLE] for name, rows in batches[0].items()}
+    needed = render_scenes.needed_tests(mj_model, sample, size)
+    details = _effort(compiled, count * size * size, timing.median_s, needed, len(scene.object_ids))
+    return Measurement("render/scene", count / timing.median_s, "images/s", config, timing.details(compile_s, **details))
+
+
+def _effort(compiled: Any, pixels: int, seconds: float, needed: float, drawn: int) -> dict[str, Any]:
+    """What the figure cost: ray-geom tests, memory, and operations where the compiler counts all of them.
+
+    Args:
+        compiled: The program.
+        pixels: Of all pictures together.
+        seconds: Of one call.
+        needed: Tests a pixel that perfect culling would leave.
+        drawn: Objects, which is the tests a pixel without culling.
+    """
+    effort: dict[str, Any] = {
+        "drawn": drawn,
+        "needed_tests_per_pixel": round(needed, 2),
+        "needed_gtests_per_s": round(1e-9 * needed * pixels / seconds, 2),
+    }
+    memory = compiled.memory_analysis()
+    if memory is not None and memory.output_size_in_bytes:
+        effort["temporaries_over_output"] = round(memory.temp_size_in_bytes / memory.output_size_in_bytes, 3)
+    cost = roofline.compiler_cost(compiled)
+    # On a CPU the pictures are drawn block by block, and the body of a loop is counted once.
+    if cost is not None and jax.default_backend() != "cpu":
+        effort["tflop_per_s"] = round(1e-12 * cost.flops / seconds, 3)
+        peak = next((peak for name, peak in _VECTOR_PEAKS.items() if jax.devices()[0].device_kind.startswith(name)), None)
+        if peak is not None:
+            effort["share_of_peak_flops"] = round(cost.flops / seconds / peak, 4)
+    return effort
+
+
+def agreement(ours: np.ndarray, theirs: np.ndarray) -> float:
+    """Share of pixels where two depths [N, H, W] in metres, inf for the sky, are within a centimetre or a hundredth.
+
+    Silhouettes count too: two renderers that draw the same scene agree on most pixels, not on all.
+    """
+    sky = np.isinf(ours) & np.isinf(theirs)
+    with np.errstate(invalid="ignore"):
+        close = np.abs(ours - theirs) <= np.maximum(1e-2, 1e-2 * np.abs(theirs))
+    return float(np.mean(sky | (close & np.isfinite(ours) & np.isfinite(theirs))))

@@ -1,0 +1,138 @@
+"""How far our pictures are from MuJoCo's own, in the measures that the project has set itself bounds for.
+
+A pixel within one pixel of an edge of the segmentation, in either picture, is left out of everything: there OpenGL and a ray
+caster may choose differently. All other pixels count, whether or not the two agree on what they show.
+"""
+
+import dataclasses
+from typing import Any
+
+import mujoco
+import numpy as np
+
+VISIBLE_PIXELS = 30  # a geom with fewer in a picture (edges counted) has no IoU there
+DEPTH_METRES, DEPTH_SHARE = 1e-3, 1e-3  # whichever is more
+
+PLANE, SKY, BARE, TEXTURED = "plane", "sky", "bare", "textured"
+
+
+@dataclasses.dataclass(frozen=True)
+class Bound:
+    """What a measure must keep to: ``at_least`` or ``at_most``."""
+
+    limit: float
+    at_least: bool
+
+    def holds(self, value: float) -> bool:
+        """Whether the value keeps to it. A measure of nothing (NaN: no such pixels) does."""
+        return bool(np.isnan(value) or (value >= self.limit if self.at_least else value <= self.limit))
+
+
+# Shares of pixels, and differences of colours in 1/255.
+BOUNDS = {
+    "segmentation": Bound(0.997, True),
+    "iou": Bound(0.95, True),
+    "depth": Bound(0.999, True),
+    "bare_mean": Bound(4.0, False),
+    "bare_p99": Bound(12.0, False),
+    "textured_mean": Bound(8.0, False),
+}
+
+
+def looks(mj_model: mujoco.MjModel) -> np.ndarray:
+    """[ngeom + nsite] of PLANE, BARE or TEXTURED, indexed as the segmentation is."""
+    kinds = []
+    for types, materials in ((mj_model.geom_type, mj_model.geom_matid), (mj_model.site_type, mj_model.site_matid)):
+        for kind, material in zip(types, materials, strict=True):
+            textured = material >= 0 and mj_model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB] >= 0
+            is_plane = kind == mujoco.mjtGeom.mjGEOM_PLANE
+            kinds.append(PLANE if is_plane else TEXTURED if textured else BARE)
+    return np.array(kinds, dtype="<U8")
+
+
+def near_edges(labels: np.ndarray) -> np.ndarray:
+    """Where one of the eight neighbours of a pixel shows something else. [..., H, W] -> bool."""
+    *batch, height, width = labels.shape
+    padded = np.pad(labels, [(0, 0)] * len(batch) + [(1, 1), (1, 1)], mode="edge")
+    shifted = (padded[..., row : row + height, column : column + width] for row in range(3) for column in range(3))
+    return np.any([neighbour != labels for neighbour in shifted], axis=0)
+
+
+@dataclasses.dataclass
+class Tally:
+    """Sums over the pictures of one model. Feed it with `add`; read `measures`.
+
+    Attributes:
+        kinds: What `looks` gives for the model.
+        pictures: How many were added.
+        kept: Pixels away from edges.
+        agreeing: Of these, where the segmentations agree.
+        solid: Kept pixels that show an object in either picture.
+        close: Of these, where the depths agree.
+        worst: The least IoU, with the object and the picture that it was found in.
+        colours: For each kind of surface, counts [256] of absolute differences of colour values, in 1/255.
+    """
+
+    kinds: np.ndarray
+    pictures: int = 0
+    kept: int = 0
+    agreeing: int = 0
+    solid: int = 0
+    close: int = 0
+    worst: tuple[float, int, int] = (np.nan, -1, -1)
+    colours: dict[str, np.ndarray] = dataclasses.field(
+        default_factory=lambda: {kind: np.zeros(256, np.int64) for kind in (BARE, TEXTURED, PLANE, SKY)}
+    )
+
+    def add(self, ours: Any, theirs: Any) -> None:
+        """Adds one picture: two `Frame` of NumPy arrays; ``theirs`` is the truth."""
+        kept = ~(near_edges(ours.segmentation) | near_edges(theirs.segmentation))
+        solid = kept & ((ours.segmentation >= 0) | (theirs.segmentation >= 0))
+        self.kept += int(kept.sum())
+        self.agreeing += int((kept & (ours.segmentation == theirs.segmentation)).sum())
+        self.solid += int(solid.sum())
+        allowed = np.maximum(DEPTH_METRES, DEPTH_SHARE * theirs.depth)
+        self.close += int((solid & (np.abs(ours.depth - theirs.depth) <= allowed)).sum())
+        labels, visible = np.unique(theirs.segmentation, return_counts=True)
+        for label in labels[(labels >= 0) & (visible >= VISIBLE_PIXELS)]:
+            both, either = (
+                int((kept & rule(ours.segmentation == label, theirs.segmentation == label)).sum())
+                for rule in (np.logical_and, np.logical_or)
+            )
+            # Not `<`, which NaN (none yet) would never pass.
+            if either and not both / either >= self.worst[0]:
+                self.worst = (both / either, int(label), self.pictures)
+        difference = np.abs(ours.rgb.astype(np.int16) - theirs.rgb)
+        surface = np.append(self.kinds, SKY)[theirs.segmentation]  # -1 finds the sky at the end
+        for kind, counts in self.colours.items():
+            counts += np.bincount(difference[kept & (surface == kind)].reshape(-1), minlength=256)
+        self.pictures += 1
+
+    def measures(self) -> dict[str, float]:
+        """The figures by name: those of `BOUNDS`, and ``plane_mean``, ``plane_p99``, ``sky_mean``, ``kept`` (a share).
+
+        NaN where there was nothing to measure.
+        """
+        found = {
+            "segmentation": _share(self.agreeing, self.kept),
+            "iou": self.worst[0],
+            "depth": _share(self.close, self.solid),
+        }
+        for kind, counts in self.colours.items():
+            found[f"{kind}_mean"] = _share(float(counts @ np.arange(256)), int(counts.sum()))
+            found[f"{kind}_p99"] = _percentile(counts, 0.99)
+        return found
+
+    def failures(self) -> list[str]:
+        """Names of the bounds that do not hold."""
+        measures = self.measures()
+        return [name for name, bound in BOUNDS.items() if not bound.holds(measures[name])]
+
+
+def _share(part: float, whole: int) -> float:
+    return part / whole if whole else float("nan")
+
+
+def _percentile(counts: np.ndarray, share: float) -> float:
+    """The least difference that ``share`` of the counted values do not pass."""
+    return float(np.searchsorted(np.cumsum(counts), share * counts.sum())) if counts.sum() else float("nan")

@@ -1,0 +1,163 @@
+"""Scenes, poses and peers of `bench render`, without GL and without a GPU."""
+
+import sys
+from pathlib import Path
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from jaxrl_vis import bench
+from jaxrl_vis.bench import record, render, render_scenes, scene_pictures, warp_renderer
+from jaxrl_vis.config import RequestError
+
+BALL = """
+<mujoco>
+  <statistic extent="1"/>
+  <worldbody>
+    <body pos="0 2 0"><freejoint/><geom type="sphere" size=".2"/></body>
+    <geom type="plane" size="3 3 .1" pos="0 0 -1"/>
+    <camera xyaxes="1 0 0 0 0 1" fovy="60"/>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.fixture
+def ball(tmp_path: Path) -> str:
+    path = tmp_path / "ball.xml"
+    path.write_text(BALL)
+    return str(path)
+
+
+@pytest.mark.parametrize(("scene", "geoms"), [("finger", 8), ("fetch_reach", 18), ("primitives", 127)])
+def test_scenes_load_ready_for_a_fair_comparison(scene: str, geoms: int) -> None:
+    mj_model = render_scenes.load(scene)
+    assert mj_model.ngeom == geoms
+    assert mj_model.ncam >= 1
+    assert mj_model.vis.quality.offsamples == 0
+    assert not mj_model.light_castshadow.any()
+
+
+def test_primitives_are_mixed() -> None:
+    types = render_scenes.load("primitives").geom_type
+    assert sorted(np.unique(types, return_counts=True)[1].tolist()) == [1, 25, 25, 25, 25, 26]
+
+
+def test_textures_can_be_left_out() -> None:
+    with_them, without = render_scenes.load("finger"), render_scenes.load("finger", textures=False)
+    assert (with_them.mat_texid >= 0).any() and not (without.mat_texid >= 0).any()
+    skybox = mujoco.mjtTexture.mjTEXTURE_SKYBOX
+    assert (with_them.tex_type == skybox).any() and not (without.tex_type == skybox).any()
+
+
+@pytest.mark.parametrize(
+    ("content", "complaint"),
+    [(None, "no scene .*finger, fetch_reach, primitives"), ("<mujoco/>", "no camera"), ("<robot", "no MuJoCo model")],
+)
+def test_what_is_no_scene_is_refused_in_one_line(content: str | None, complaint: str, tmp_path: Path) -> None:
+    path = tmp_path / "scene.xml"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(RequestError, match=complaint) as caught:
+        render_scenes.load(str(path))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_suite_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(render_scenes.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(RequestError, match="pip install dm_control"):
+        render_scenes.load("finger")
+
+
+def test_poses_are_random_repeatable_and_within_limits() -> None:
+    mj_model = render_scenes.load("finger")
+    first, again, other = (render_scenes.random_poses(mj_model, 6, seed) for seed in (1, 1, 2))
+    assert len({row.tobytes() for row in np.concatenate([first["geom_xpos"], other["geom_xpos"]])}) == 12
+    for name, rows in first.items():
+        np.testing.assert_array_equal(rows, again[name])
+        assert np.all(np.isfinite(rows))
+    mj_data, rng = mujoco.MjData(mj_model), np.random.default_rng(0)
+    limited = mj_model.jnt_limited.astype(bool)
+    for _ in range(20):
+        render_scenes.scatter_joints(mj_model, mj_data, rng)
+        assert np.all(mj_data.qpos[limited] >= mj_model.jnt_range[limited, 0])
+        assert np.all(mj_data.qpos[limited] <= mj_model.jnt_range[limited, 1])
+
+
+def test_free_bodies_stay_near_their_start_with_unit_quaternions(ball: str) -> None:
+    mj_model = render_scenes.load(ball)
+    mj_data, rng = mujoco.MjData(mj_model), np.random.default_rng(0)
+    turns = []
+    for _ in range(50):
+        render_scenes.scatter_joints(mj_model, mj_data, rng)
+        assert np.all(np.abs(mj_data.qpos[:3] - [0.0, 2.0, 0.0]) <= 0.1)
+        assert np.linalg.norm(mj_data.qpos[3:]) == pytest.approx(1.0)
+        turns.append(2.0 * np.arccos(np.clip(mj_data.qpos[3], -1.0, 1.0)))
+    assert max(turns) <= 0.5 + 1e-6 and max(turns) > 0.3
+
+
+def test_needed_tests_count_the_pixels_of_a_ball_and_every_plane(ball: str) -> None:
+    mj_model = render_scenes.load(ball)
+    mj_data = mujoco.MjData(mj_model)
+    render_scenes.forward(mj_model, mj_data)
+    poses = {name: np.asarray(getattr(mj_data, name), np.float32)[None] for name in render_scenes.POSES}
+    # The ball's edge lies at tan(asin(.2 / 2)) of a picture that reaches to tan(30 degrees).
+    disc = np.pi * (np.tan(np.arcsin(0.1)) / np.tan(np.pi / 6)) ** 2 / 4
+    assert render_scenes.needed_tests(mj_model, poses, 128) == pytest.approx(1.0 + disc, abs=2e-3)
+    poses["geom_xpos"][:, 1] = [0.0, -2.0, 0.0]  # behind the camera
+    assert render_scenes.needed_tests(mj_model, poses, 128) == 1.0
+
+
+def test_pictures_that_do_not_change_are_refused() -> None:
+    rows = np.arange(8, dtype=np.float32)[:, None]
+    with pytest.raises(AssertionError, match="8 of 8 pictures stay the same"):
+        render.assert_new_pictures(lambda batch: (jnp.asarray(batch), None), [rows, rows])
+    with pytest.raises(AssertionError, match="only 1 of 8 pictures differ"):
+        render.assert_new_pictures(lambda batch: 0 * batch, [rows, rows + 8])
+    render.assert_new_pictures(lambda batch: batch, [rows, rows + 8])
+
+
+def test_calls_alternate_between_batches() -> None:
+    draw = render.alternate(lambda batch: batch, [1, 2])
+    assert [draw() for _ in range(5)] == [1, 2, 1, 2, 1]
+
+
+def test_a_scene_keeps_a_record_for_each_output(ball: str, tmp_path: Path) -> None:
+    found = bench.run("render", scene=ball, envs=(3,), image_size=8, repeats=1, results=tmp_path)
+    assert [(entry.config["textures"], entry.config["pixels"]) for entry in found] == [
+        (textures, output) for textures in (False, True) for output in ("rgbd", "rgbd8", "depth")
+    ]
+    assert all(entry.value > 0.0 and entry.config["scene"] == ball for entry in found)
+    assert all(entry.details["drawn"] == 2 and entry.details["needed_tests_per_pixel"] >= 1.0 for entry in found)
+    assert len(record.load(record.results_path("render", tmp_path))) == len(found)
+
+
+def test_a_scene_that_stands_still_is_not_measured(tmp_path: Path) -> None:
+    path = tmp_path / "still.xml"
+    path.write_text(BALL.replace("<freejoint/>", ""))
+    with pytest.raises(AssertionError, match="broadcast"):
+        bench.run("render", scene=str(path), envs=(3,), image_size=8, repeats=1, results=tmp_path)
+
+
+def test_agreement_counts_sky_and_closeness() -> None:
+    ours = np.array([[[np.inf, 2.0, 2.0, np.inf]]])
+    theirs = np.array([[[np.inf, 2.01, 2.2, 1.0]]])
+    assert scene_pictures.agreement(ours, theirs) == 0.5
+
+
+def test_a_missing_warp_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "path", [])
+    monkeypatch.setitem(sys.modules, "mujoco_warp", None)
+    with pytest.raises(RequestError, match="pip install mujoco-warp==4.0.0") as caught:
+        warp_renderer.check()
+    assert "\n" not in str(caught.value)
+
+
+def test_another_warp_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(warp_renderer.importlib.metadata, "version", lambda name: "5.0.0")
+    for name in ("mujoco_warp", "warp"):
+        monkeypatch.setitem(sys.modules, name, type(sys)(name))
+    with pytest.raises(RequestError, match=r"4\.0\.0, not 5\.0\.0"):
+        warp_renderer.check()

@@ -1,0 +1,28 @@
+"""The page about the renderer: its examples run, its pictures are there."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture
+def page(checkout: Path) -> str:
+    return (checkout / "docs" / "renderer.md").read_text()
+
+
+def test_examples_run_and_print_what_they_say(page: str, capsys: pytest.CaptureFixture[str]) -> None:
+    examples = "\n".join(re.findall(r"```python\n(.*?)```", page, re.DOTALL))
+    exec(compile(examples, "docs/renderer.md", "exec"), {})
+    said = re.findall(r"print\(.*\)  # (\([^a-z]*\))$", examples, re.MULTILINE)
+    assert len(said) == 3
+    printed = capsys.readouterr().out.splitlines()
+    assert [line for line in printed if line.startswith("(")] == said
+    assert 0.5 < float(printed[-1]) < 1.5
+
+
+def test_pictures_are_there(page: str, checkout: Path) -> None:
+    pictures = re.findall(r"!\[.*?\]\((.*?)\)", page)
+    assert len(pictures) == 5
+    for picture in pictures:
+        assert (checkout / "docs" / picture).read_bytes().startswith(b"\x89PNG")

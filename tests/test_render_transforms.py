@@ -1,0 +1,121 @@
+"""The renderer inside what JAX makes of functions: vmap of scan, scan of vmap, donation, several devices; and its memory."""
+
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from jaxrl_vis_envs.compilation import world_jit
+from jaxrl_vis_envs.render import Scene, quantize, render_planes
+
+POSES = ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat", "xpos", "xmat")
+XML = """
+<mujoco>
+  <statistic extent="1"/>
+  <asset><mesh name="m" vertex="-.2 -.2 0 .2 -.2 0 .2 .2 0 -.2 .2 0 0 0 .3"/></asset>
+  <worldbody>
+    <light directional="true" dir=".3 .3 -1"/>
+    <geom type="plane" size="1 1 .1"/>
+    <geom type="sphere" size=".15" pos=".2 0 .4"/>
+    <geom type="{kind}" size=".15 .1 .1" {mesh} pos="-.2 0 .3" rgba=".8 .3 .2 {alpha}"/>
+    <camera name="eye" pos="0 -1.2 1" xyaxes="1 0 0 0 .6 .8"/>
+  </worldbody>
+</mujoco>
+"""
+SIZE = 16
+
+
+def setting(kind: str, alpha: float = 1.0, size: int = SIZE) -> tuple[Scene, dict]:
+    mesh = 'mesh="m"' if kind == "mesh" else ""
+    mj_model = mujoco.MjModel.from_xml_string(XML.format(kind=kind, mesh=mesh, alpha=alpha))
+    mj_data = mujoco.MjData(mj_model)
+    mujoco.mj_forward(mj_model, mj_data)
+    return Scene.from_mjmodel(mj_model, "eye", size, size), {name: jnp.asarray(getattr(mj_data, name)) for name in POSES}
+
+
+def picture(scene: Scene, poses: dict, height):
+    """RGB-D of the scene with everything ``height`` higher, [4, H, W]."""
+    lifted = poses | {"geom_xpos": poses["geom_xpos"].at[1:, 2].add(height)}
+    planes = render_planes(scene, SimpleNamespace(**lifted))
+    return jnp.concatenate([planes.rgb, planes.depth[None]])
+
+
+@pytest.mark.parametrize(("kind", "alpha"), [("capsule", 1.0), ("capsule", 0.4), ("mesh", 1.0)])
+def test_vmap_of_scan_is_scan_of_vmap(kind, alpha):
+    scene, poses = setting(kind, alpha)
+    heights = jnp.array([[0.0, 0.05], [0.1, 0.15], [0.2, jnp.nan]])
+
+    @world_jit
+    def vmap_of_scan(heights):
+        return jax.vmap(lambda row: jax.lax.scan(lambda carry, h: (carry, picture(scene, poses, h)), None, row)[1])(heights)
+
+    @world_jit
+    def scan_of_vmap(heights):
+        return jax.lax.scan(lambda carry, h: (carry, jax.vmap(lambda one: picture(scene, poses, one))(h)), None, heights.T)[1]
+
+    left, right = vmap_of_scan(heights), jnp.moveaxis(scan_of_vmap(heights), 0, 1)
+    assert np.all(np.isfinite(left))
+    assert np.mean(np.abs(left - right) < 1e-4) > 0.998
+    pictures = np.asarray(left).reshape(6, -1)
+    assert len(np.unique(pictures, axis=0)) == 6
+
+
+def test_a_donated_state_is_drawn_into():
+    scene, poses = setting("mesh")
+
+    def step(state):
+        height, frames = state
+        frame = quantize(picture(scene, poses, height)[:3])
+        return height + 0.1, jax.lax.dynamic_update_index_in_dim(frames, frame, jnp.int32(height * 10 + 0.5), 0)
+
+    donating = world_jit(step, donate_argnums=0)
+    state = (jnp.float32(0.0), jnp.zeros((3, 3, SIZE, SIZE), jnp.uint8))
+    before = state[1]
+    for _ in range(3):
+        state = donating(state)
+    assert before.is_deleted()
+    assert len(np.unique(np.asarray(state[1]).reshape(3, -1), axis=0)) == 3
+
+
+SHARDED = f"""
+import sys
+sys.path.insert(0, {__file__.rsplit("/", 1)[0]!r})
+import jax, numpy as np
+from test_render_transforms import picture, setting, world_jit
+from jax.sharding import PartitionSpec
+assert len(jax.devices()) == 2
+scene, poses = setting("mesh")
+heights = np.linspace(0.0, 0.3, 4, dtype=np.float32)
+drawn = jax.vmap(lambda height: picture(scene, poses, height))
+mesh = jax.sharding.Mesh(np.array(jax.devices()), ("envs",))
+spec = PartitionSpec("envs")
+sharded = world_jit(jax.shard_map(drawn, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False))(heights)
+assert len(sharded.sharding.device_set) == 2
+np.testing.assert_allclose(sharded, world_jit(drawn)(heights), atol=1e-4)
+print("same")
+"""
+
+
+def test_shard_map_over_two_devices(clean_environment):
+    environment = {**clean_environment, "XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
+    done = subprocess.run([sys.executable, "-c", SHARDED], env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stdout.strip() == "same"
+
+
+@pytest.mark.parametrize("kind", ["capsule", "mesh"])
+def test_no_temporary_is_much_larger_than_the_picture(kind):
+    scene, poses = setting(kind, size=64)
+    count = 32
+
+    def draw(height):
+        return picture(scene, poses, height)
+
+    memory = world_jit(jax.vmap(draw)).lower(jnp.zeros(count)).compile().memory_analysis()
+    # All temporaries together: keys, triangles, and the planes before they are put together.
+    assert memory.temp_size_in_bytes <= 4 * memory.output_size_in_bytes
