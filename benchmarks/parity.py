@@ -5,16 +5,17 @@
 A recording holds N sequences of T actions in [-1, 1], and the states at their T + 1 instants:
 
     FetchReach   actions [N, T, 4], grip_pos_m [N, T + 1, 3]; Gymnasium-Robotics
+    FingerTurn   actions [N, T, 2], qpos_rad_nsubK and qvel_rad_s_nsubK [N, T + 1, 3] for K = 21, 2 or both; dm_control
     Reacher      actions [N, T, 2], qpos_rad and qvel_rad_s [N, T + 1, 2], fingertip_pos_m [N, T + 1, 3]; Gymnasium (torque)
 
-Prints one line for each error; its bound, where it has one, stands beside it. Exit status: 0 all within their bounds; 1 a bound is
-broken; 2 there is nothing to compare (no such task or file, or a key is missing).
+Prints one line for each error; its bound, where it has one, stands beside it. Exit status: 0 all within their bounds; 1 a
+bound is broken; 2 there is nothing to compare (no such task or file, or a key is missing).
 """
 
 import argparse
 import sys
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -48,13 +49,6 @@ class NothingToCompareError(ValueError):
     """The recording lacks something, or no recording is known for the task."""
 
 
-def state_at(env: GoalEnv, data: jax.Array) -> State:
-    """A state with the physics at ``data``; goal and reward are nonsense."""
-    zero = jnp.zeros((), jnp.float32)
-    nowhere = jnp.zeros(env.goal_state_size, jnp.float32)
-    return State(data, nowhere, nowhere, zero, zero, {"success": zero, "goal_distance": zero})
-
-
 def play(
     env: GoalEnv, start: Callable[..., State], starts: tuple[np.ndarray, ...], actions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -76,6 +70,11 @@ def play(
     rows = [jnp.asarray(leaf, jnp.float32) for leaf in (actions, *starts)]
     qpos, achieved = world_jit(jax.vmap(play_one))(*rows)
     return np.asarray(qpos), np.asarray(achieved)
+
+
+def start_at(env: Any) -> Callable[[jax.Array, jax.Array], State]:
+    """A function from joint angles and velocities to the state that starts there; its goal is nonsense."""
+    return lambda qpos, qvel: env.state_at(env.configuration(qpos).replace(qvel=qvel), jnp.zeros(env.goal_state_size))
 
 
 def distance_figures(name: str, error: np.ndarray, median: float | None, high: float | None, percentile: int) -> list[Figure]:
@@ -102,14 +101,35 @@ def fetch_reach(recording: Recording) -> list[Figure]:
     ]
 
 
+def finger_turn(recording: Recording) -> list[Figure]:
+    """Joint angles with K physics steps in a control step, for each K that was recorded. Only 21 is bounded: the task's own."""
+    figures = []
+    for substeps in (21, 2):
+        keys = (f"qpos_rad_nsub{substeps}", f"qvel_rad_s_nsub{substeps}")
+        if substeps == 2 and not any(key in recording for key in keys):
+            continue
+        env = jaxrl_vis_envs.make("FingerTurn", substeps=substeps)
+        actions, qpos, qvel = _take(recording, "actions", *keys)
+        ours, _ = play(env, start_at(env), (qpos[:, 0], qvel[:, 0]), actions)
+        error = np.abs(ours - qpos)[:, -1].max(axis=-1)
+        name = f"{substeps} substeps, joint and spinner angles at the end: "
+        figures += [
+            Figure(name + "greatest error", float(error.max()), "rad", 0.01 if substeps == 21 else None),
+            Figure(name + "median error", float(np.median(error)), "rad"),
+            Figure(f"{substeps} substeps, sequences that move the spinner > 0.3 rad", _share_moving(qpos), ""),
+        ]
+    return figures
+
+
+def _share_moving(qpos: np.ndarray) -> float:
+    """Share of the sequences in which the spinner moves so far that contact matters: below a half the recording says little."""
+    return float((np.ptp(qpos[:, :, 2], axis=1) > 0.3).mean())
+
+
 def reacher(recording: Recording) -> list[Figure]:
     env = jaxrl_vis_envs.make("Reacher", control="torque")
     actions, qpos, qvel, fingertip = _take(recording, "actions", "qpos_rad", "qvel_rad_s", "fingertip_pos_m")
-
-    def start(qpos: jax.Array, qvel: jax.Array) -> State:
-        return state_at(env, env.configuration(qpos).replace(qvel=qvel))
-
-    our_qpos, our_fingertip = play(env, start, (qpos[:, 0], qvel[:, 0]), actions)
+    our_qpos, our_fingertip = play(env, start_at(env), (qpos[:, 0], qvel[:, 0]), actions)
     error = np.abs(our_qpos - qpos)[:, 1:]
     tip_error = np.linalg.norm(our_fingertip - fingertip[..., :2], axis=-1)[:, 1:]
     return [
@@ -121,6 +141,7 @@ def reacher(recording: Recording) -> list[Figure]:
 
 COMPARISONS: dict[str, Callable[[Recording], list[Figure]]] = {
     "FetchReach": fetch_reach,
+    "FingerTurn": finger_turn,
     "Reacher": reacher,
 }
 

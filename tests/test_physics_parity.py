@@ -8,7 +8,7 @@ import pytest
 from benchmarks import parity
 
 DATA = pathlib.Path(__file__).parent / "data"
-RECORDINGS = {"FetchReach": "fetch_reach.npz", "Reacher": "reacher.npz"}
+RECORDINGS = {"FetchReach": "fetch_reach.npz", "FingerTurn": "finger.npz", "Reacher": "reacher.npz"}
 
 
 def test_every_comparison_has_a_recording():

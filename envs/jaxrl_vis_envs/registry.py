@@ -13,8 +13,10 @@ from jaxrl_vis_envs.base import GoalEnv
 
 _BUILT_IN = {
     "FetchReach": "jaxrl_vis_envs.tasks.fetch_reach",
+    "FingerTurn": "jaxrl_vis_envs.tasks.finger_turn",
     "Reacher": "jaxrl_vis_envs.tasks.reacher",
     "VisualFetchReach": "jaxrl_vis_envs.tasks.fetch_reach",
+    "VisualFingerTurn": "jaxrl_vis_envs.tasks.finger_turn",
     "VisualReacher": "jaxrl_vis_envs.tasks.reacher",
 }
 
