@@ -6,6 +6,7 @@ A recording holds N sequences of T actions in [-1, 1], and the states at their T
 
     FetchReach   actions [N, T, 4], grip_pos_m [N, T + 1, 3]; Gymnasium-Robotics
     FingerTurn   actions [N, T, 2], qpos_rad_nsubK and qvel_rad_s_nsubK [N, T + 1, 3] for K = 21, 2 or both; dm_control
+    HandReach    actions [N, T, 20], qpos [N, T + 1, 24] (rad), tip_pos_m [N, T + 1, 15]; Gymnasium-Robotics
     Reacher      actions [N, T, 2], qpos_rad and qvel_rad_s [N, T + 1, 2], fingertip_pos_m [N, T + 1, 3]; Gymnasium (torque)
 
 Prints one line for each error; its bound, where it has one, stands beside it. Exit status: 0 all within their bounds; 1 a
@@ -126,6 +127,21 @@ def _share_moving(qpos: np.ndarray) -> float:
     return float((np.ptp(qpos[:, :, 2], axis=1) > 0.3).mean())
 
 
+def hand_reach(recording: Recording) -> list[Figure]:
+    """Fingertips, with contacts and, to show that the bounds would tell, without."""
+    actions, qpos, tips = _take(recording, "actions", "qpos", "tip_pos_m")
+    figures = []
+    for contacts in (True, False):
+        env = jaxrl_vis_envs.make("HandReach", contacts=contacts)
+        _, ours = play(env, start_at(env), (qpos[:, 0], np.zeros_like(qpos[:, 0])), actions)
+        error = np.linalg.norm((ours - tips).reshape(*tips.shape[:2], 5, 3), axis=-1)[:, 1:]
+        for number, finger in enumerate(("first finger", "middle finger", "ring finger", "little finger", "thumb")):
+            name = finger if contacts else f"without contacts, {finger}"
+            bounds = (0.002, 0.008) if contacts else (None, None)
+            figures += distance_figures(name, error[..., number], *bounds, 95)
+    return figures
+
+
 def reacher(recording: Recording) -> list[Figure]:
     env = jaxrl_vis_envs.make("Reacher", control="torque")
     actions, qpos, qvel, fingertip = _take(recording, "actions", "qpos_rad", "qvel_rad_s", "fingertip_pos_m")
@@ -142,6 +158,7 @@ def reacher(recording: Recording) -> list[Figure]:
 COMPARISONS: dict[str, Callable[[Recording], list[Figure]]] = {
     "FetchReach": fetch_reach,
     "FingerTurn": finger_turn,
+    "HandReach": hand_reach,
     "Reacher": reacher,
 }
 

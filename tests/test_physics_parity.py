@@ -8,7 +8,7 @@ import pytest
 from benchmarks import parity
 
 DATA = pathlib.Path(__file__).parent / "data"
-RECORDINGS = {"FetchReach": "fetch_reach.npz", "FingerTurn": "finger.npz", "Reacher": "reacher.npz"}
+RECORDINGS = {"FetchReach": "fetch_reach.npz", "FingerTurn": "finger.npz", "HandReach": "hand_reach.npz", "Reacher": "reacher.npz"}
 
 
 def test_every_comparison_has_a_recording():
@@ -27,6 +27,13 @@ def test_tasks_follow_the_recordings_of_their_originals(name):
 def test_most_of_the_fetch_recording_counts():
     figures = {figure.name: figure.value for figure in parity.compare("FetchReach", np.load(DATA / "fetch_reach.npz"))}
     assert figures["share of the recording that counts (near the start)"] > 0.5
+
+
+def test_contacts_matter_to_the_hand():
+    figures = {figure.name: figure.value for figure in parity.compare("HandReach", np.load(DATA / "hand_reach.npz"))}
+    for finger in ("ring finger", "little finger"):
+        name = f"{finger}: 95th percentile of the error"
+        assert figures[f"without contacts, {name}"] > max(3 * figures[name], 0.008)
 
 
 def test_a_drifting_task_is_found_out(tmp_path, capsys):

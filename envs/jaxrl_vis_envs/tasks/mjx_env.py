@@ -1,4 +1,4 @@
-"""What the MJX tasks share: a task says how it starts, what its goals are, what an action does and what is true; the rest is here.
+"""What the MJX tasks share. A task says how it starts, what its goals are, what an action does and what is true.
 
 A task is a subclass of `MjxGoalEnv` with five methods, and a frozen config with ``horizon`` and ``threshold``. Seen through
 a `pixels.Observer` it is the visual task, without one the state task.

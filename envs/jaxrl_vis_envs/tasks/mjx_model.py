@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 
 with contextlib.redirect_stdout(io.StringIO()):  # it prints, twice, that Warp is missing, which nothing here needs
     from mujoco import mjx
@@ -29,9 +30,11 @@ def start_data(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> mjx.Data:
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), mjx.put_data(mj_model, mj_data))
 
 
-def still_data(mj_model: mujoco.MjModel) -> mjx.Data:
-    """`start_data` of the model's own initial configuration, at rest."""
+def still_data(mj_model: mujoco.MjModel, keyframe: str | None = None) -> mjx.Data:
+    """`start_data` of a keyframe of the model, or of its own initial configuration, at rest."""
     mj_data = mujoco.MjData(mj_model)
+    if keyframe is not None:
+        mujoco.mj_resetDataKeyframe(mj_model, mj_data, mj_model.key(keyframe).id)
     mujoco.mj_forward(mj_model, mj_data)
     return start_data(mj_model, mj_data)
 
@@ -53,15 +56,18 @@ def simulate(model: mjx.Model, data: mjx.Data, substeps: int) -> mjx.Data:
 
 
 def step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """`mjx.step` for models with the Euler integrator, with forces as exact as float32 allows. Sensors stay as they are.
+    """`mjx.step`, with contacts and forces as exact as float32 allows under the Euler integrator. Sensors stay as they are.
 
     Two things are better than in MJX. Its contacts between capsules lie up to .1 mm off along short capsules (it adds 1e-6 to
-    a squared length). And its solver accepts a step only where it lowers the cost, and in float32 the cost cannot tell forces apart that differ by
-    less than the square root of the rounding error, some 3e-4. Where large forces balance, at a joint's limit say, that is the
-    velocity's first digit. One more Newton step, judged by the gradient instead, leaves only the rounding error itself.
+    a squared length). And its solver accepts a step only where it lowers the cost, and in float32 the cost cannot tell forces
+    apart that differ by less than the square root of the rounding error, some 3e-4. Where large forces balance, at a joint's
+    limit say, that is the velocity's first digit. One more Newton step, judged by the gradient, leaves the rounding error.
     """
+    if model.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER:
+        return mjx.step(model, data)
     data = mjx.fwd_position(model, data)
-    if data._impl.ncon > 0:
+    pairs = np.stack([model.pair_geom1, model.pair_geom2])
+    if np.any(np.all(model.geom_type[pairs] == mujoco.mjtGeom.mjGEOM_CAPSULE, axis=0)):
         # What fwd_position made of the contacts before is never used, so that XLA drops it.
         data = mjx.make_constraint(model, _place_capsule_contacts(model, data))
     data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, mjx.fwd_velocity(model, data)))
@@ -101,7 +107,7 @@ def _place_capsule_contacts(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         pos=jnp.where(is_of_capsules[:, None], position, contact.pos),
         frame=jnp.where(is_of_capsules[:, None, None], frame, contact.frame),
     )
-    return data.tree_replace({"_impl.contact": contact})
+    return data.tree_replace({"_impl.contact": contact})  # type: ignore[dict-item] - a Contact is a tree of arrays
 
 
 def _polish(model: mjx.Model, data: mjx.Data) -> mjx.Data:
@@ -114,6 +120,19 @@ def _polish(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         qacc=jnp.where(is_better, new.qacc, data.qacc),
         qfrc_constraint=jnp.where(is_better, new.qfrc_constraint, data.qfrc_constraint),
     )
+
+
+def tip_jacobian(mj_model: mujoco.MjModel, data: mjx.Data, sites: np.ndarray) -> jax.Array:
+    """Change of the positions of ``sites`` [S] (m, world) per radian of each hinge of a tree: [nv, S, 3] float32, m/rad."""
+    moves = np.zeros((mj_model.nv, len(sites)), np.float32)
+    for column, site in enumerate(sites):
+        body = mj_model.site_bodyid[site]
+        while body > 0:
+            first, count = mj_model.body_jntadr[body], mj_model.body_jntnum[body]
+            moves[first : first + count, column] = 1.0
+            body = mj_model.body_parentid[body]
+    arms = data.site_xpos[sites][None] - data.xanchor[:, None]
+    return moves[..., None] * jnp.cross(data.xaxis[:, None], arms)
 
 
 def point_velocity(data: mjx.Data, point: jax.Array) -> jax.Array:
