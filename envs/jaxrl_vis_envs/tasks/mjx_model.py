@@ -45,14 +45,24 @@ def simulate(model: mjx.Model, data: mjx.Data, substeps: int) -> mjx.Data:
     `mjx.step` leaves the poses of the state *before* its last integration, so one more `mjx.kinematics` is needed for the
     picture, the true state and ``qpos`` to agree.
     """
+    data = take_steps(model, data, substeps)
+    with _full_precision():
+        return mjx.kinematics(model, data)
+
+
+def take_steps(model: mjx.Model, data: mjx.Data, count: int) -> mjx.Data:
+    """``count`` physics steps; poses and true states are then one step old."""
 
     def substep(data: mjx.Data, _: Any) -> tuple[mjx.Data, None]:
         return step(model, data), None
 
-    # Accelerators multiply float32 matrices with ten bits of mantissa unless they are told not to.
-    with jax.default_matmul_precision("highest"):
-        data, _ = jax.lax.scan(substep, data, length=substeps)
-        return mjx.kinematics(model, data)
+    with _full_precision():
+        return jax.lax.scan(substep, data, length=count)[0]
+
+
+def _full_precision() -> Any:
+    """Accelerators multiply float32 matrices with ten bits of mantissa unless they are told not to."""
+    return jax.default_matmul_precision("highest")
 
 
 def step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
