@@ -20,10 +20,10 @@ from jaxrl_vis_envs.base import GoalEnv, sanitize_action
 BATCH, STEPS = 64, 8
 SOURCES = pathlib.Path(__file__).resolve().parents[1] / "envs"
 SUBPROCESS_ENVIRONMENT = {**os.environ, "PYTHONPATH": str(SOURCES)}
-TASKS = ["FetchReach", "FingerTurn", "Reacher"]
+TASKS = ["FetchReach", "FingerTurn", "HandReach", "Reacher", "SawyerReach"]
 VISUAL_TASKS = [f"Visual{task}" for task in TASKS]
-NAMES = TASKS + VISUAL_TASKS
-HORIZONS = {"FetchReach": 50, "FingerTurn": 50, "Reacher": 50}
+NAMES = sorted(TASKS + VISUAL_TASKS)
+HORIZONS = {"FetchReach": 50, "FingerTurn": 50, "HandReach": 50, "Reacher": 50, "SawyerReach": 25}
 
 
 class Episode(NamedTuple):

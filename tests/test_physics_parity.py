@@ -2,13 +2,21 @@
 
 import pathlib
 
+import jax
 import numpy as np
+import one_step
 import pytest
 
+import jaxrl_vis_envs
 from benchmarks import parity
 
 DATA = pathlib.Path(__file__).parent / "data"
-RECORDINGS = {"FetchReach": "fetch_reach.npz", "FingerTurn": "finger.npz", "HandReach": "hand_reach.npz", "Reacher": "reacher.npz"}
+RECORDINGS = {
+    "FetchReach": "fetch_reach.npz",
+    "FingerTurn": "finger.npz",
+    "HandReach": "hand_reach.npz",
+    "Reacher": "reacher.npz",
+}
 
 
 def test_every_comparison_has_a_recording():
@@ -34,6 +42,18 @@ def test_contacts_matter_to_the_hand():
     for finger in ("ring finger", "little finger"):
         name = f"{finger}: 95th percentile of the error"
         assert figures[f"without contacts, {name}"] > max(3 * figures[name], 0.008)
+
+
+def test_mjx_steps_the_fetch_robot_as_mujoco_does():
+    env = jaxrl_vis_envs.make("FetchReach")
+    start = env.sample_start(jax.random.key(0))
+    rng = np.random.default_rng(0)
+    targets = np.asarray(start.xpos[env._gripper]) + rng.uniform(-0.15, 0.15, (12, 10, 3)) - [0.0, 0.0, 0.06]
+    starts = np.tile(np.asarray(start.qpos, np.float64), (12, 1))
+    states = one_step.visited_states(env.mj_model, starts, np.zeros((12, 10, 0)), every=13, mocap=targets)
+    excess, contacts = one_step.velocity_difference(env.mj_model, states)
+    assert (contacts > 0).sum() > 5
+    assert excess.max() <= 1.0, f"{np.sort(excess)[-10:]}"
 
 
 def test_a_drifting_task_is_found_out(tmp_path, capsys):

@@ -41,7 +41,9 @@ def reach(
 
     def improve(data: mjx.Data, share: jax.Array) -> tuple[mjx.Data, None]:
         target = start.xpos[body] + share * (position - start.xpos[body])
-        return mjx.kinematics(model, data.replace(qpos=data.qpos + _step(mj_model, data, body, target, rotation, damping))), None
+        return mjx.kinematics(
+            model, data.replace(qpos=data.qpos + _step(mj_model, data, body, target, rotation, damping))
+        ), None
 
     # The target moves to the goal first, then the last steps settle there.
     shares = jnp.minimum(jnp.arange(1, steps + 1) / (steps - _SETTLING_STEPS), 1.0).astype(jnp.float32)
