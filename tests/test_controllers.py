@@ -1,4 +1,4 @@
-"""Goals are attainable: a scripted controller that sees the true state reaches them (the full figure: benchmarks/controllers.py)."""
+"""Goals are attainable: a controller on the true state reaches them (the full figure: benchmarks/controllers.py)."""
 
 import pytest
 

@@ -48,7 +48,7 @@ def test_mjx_steps_the_fetch_robot_as_mujoco_does():
     env = jaxrl_vis_envs.make("FetchReach")
     start = env.sample_start(jax.random.key(0))
     rng = np.random.default_rng(0)
-    targets = np.asarray(start.xpos[env._gripper]) + rng.uniform(-0.15, 0.15, (12, 10, 3)) - [0.0, 0.0, 0.06]
+    targets = np.asarray(start.xpos[env._gripper]) + rng.uniform(-0.15, 0.15, (12, 10, 3)) - [0.0, 0.0, 0.12]
     starts = np.tile(np.asarray(start.qpos, np.float64), (12, 1))
     states = one_step.visited_states(env.mj_model, starts, np.zeros((12, 10, 0)), every=13, mocap=targets)
     excess, contacts = one_step.velocity_difference(env.mj_model, states)

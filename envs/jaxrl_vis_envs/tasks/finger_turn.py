@@ -109,7 +109,7 @@ class FingerTurn(MjxGoalEnv):
         return (data.site_xpos[self._tip] - data.xpos[self._hinge])[jnp.array([0, 2])]
 
     def observe_state(self, data: mjx.Data) -> jax.Array:
-        """Angles of the finger joints (rad), x and z of the tip (m), joint velocities (rad/s): [7] float32, as in dm_control."""
+        """Angles of the finger joints (rad), x and z of the tip (m), joint velocities (rad/s): [7] float32, as dm_control."""
         return jnp.concatenate([data.qpos[:2], self.achieved(data), data.qvel])
 
     def configuration(self, joint_angles: jax.Array) -> mjx.Data:

@@ -1,8 +1,8 @@
 """Hand reach: bring the five fingertips of a Shadow hand to where the goal picture shows them.
 
-HandReach of Gym's robotics environments with the goals of the OL-AUX release: where the fingertips are after 20 random actions from
-the start, which all but open or close each joint. ``goal_rule="meet"`` is Gym's own: the thumb meets a finger over the
-palm, or, one time in ten, everything returns to the start; its threshold in Gym is .01 m.
+HandReach of Gym's robotics environments with the goals of the OL-AUX release: where the fingertips are after 20 random actions
+from the start, most of which fully open or close each joint. ``goal_rule="meet"`` is Gym's own: the thumb meets a finger over
+the palm, or, one time in ten, everything returns to the start; its threshold in Gym is .01 m.
 
     VisualHandReach   sees RGB-D from in front of the fingertips, each of which has its own colour
     HandReach         sees joint angles and velocities, and the fingertips
@@ -137,7 +137,7 @@ class HandReach(MjxGoalEnv):
         return mjx.kinematics(self._model, self._start.replace(qpos=joint_angles))
 
     def configuration_at(self, tips: jax.Array) -> mjx.Data:
-        """The hand at rest with its tips as near to ``tips`` [5, 3] (m, world) as its joints let it, by damped least squares."""
+        """The hand at rest with its tips as near to ``tips`` [5, 3] (m, world) as its joints let it (damped least squares)."""
         low, high = jnp.asarray(self.mj_model.jnt_range.T, jnp.float32)
         coupling = jnp.asarray(_joints_by_actuator(self.mj_model), jnp.float32)
 

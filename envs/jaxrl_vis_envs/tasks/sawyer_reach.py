@@ -8,7 +8,7 @@ reached. An episode starts at its centre. A hand that stays there succeeds in 1.
     VisualSawyerReach   sees RGB-D from above the far edge of the table
     SawyerReach         sees the hand's position and velocity
 
-State: position of the grip between the fingers in the world, m. Action: displacement of the position that the hand is pulled to.
+State: position of the grip between the fingers in the world, m. Action: displacement of where the hand is pulled to.
 """
 
 import dataclasses
