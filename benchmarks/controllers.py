@@ -140,7 +140,7 @@ def _plan(
     states, _ = mujoco.rollout.rollout(
         mj_model, mujoco.MjData(mj_model), initial[None].repeat(_PLANS, 0), np.repeat(plans, substeps, axis=1)
     )
-    ends = states[:, -1, 1:4]
+    ends = np.asarray(states)[:, -1, 1:4]
     # The spinner's axis points to -y: a positive angle turns its tip from +z towards -x.
     error = np.abs((-ends[:, 2] - goal_angle + np.pi) % (2 * np.pi) - np.pi)
     if error[0] < _NEAR_ENOUGH:

@@ -63,7 +63,7 @@ def picture_observer(mj_model: mujoco.MjModel, camera: str, config: PixelsConfig
     """
     scene = Scene.from_mjmodel(mj_model, camera=camera, height=config.image_size, width=config.image_size)
     wants_colour, wants_depth = config.pixels != "depth", config.pixels != "rgb"
-    model = mjx.put_model(mj_model) if config.frames > 1 else None
+    model = mjx.put_model(mj_model)
 
     def observe_one(data: mjx.Data) -> jax.Array:
         planes = render_planes(scene, data, rgb=wants_colour, depth=wants_depth)

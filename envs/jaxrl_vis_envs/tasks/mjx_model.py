@@ -142,7 +142,7 @@ def tip_jacobian(mj_model: mujoco.MjModel, data: mjx.Data, sites: np.ndarray) ->
             moves[first : first + count, column] = 1.0
             body = mj_model.body_parentid[body]
     arms = data.site_xpos[sites][None] - data.xanchor[:, None]
-    return moves[..., None] * jnp.cross(data.xaxis[:, None], arms)
+    return jnp.asarray(moves)[..., None] * jnp.cross(data.xaxis[:, None], arms)
 
 
 def point_velocity(data: mjx.Data, point: jax.Array) -> jax.Array:
