@@ -20,7 +20,10 @@ from jaxrl_vis_envs.base import GoalEnv, sanitize_action
 BATCH, STEPS = 64, 8
 SOURCES = pathlib.Path(__file__).resolve().parents[1] / "envs"
 SUBPROCESS_ENVIRONMENT = {**os.environ, "PYTHONPATH": str(SOURCES)}
-NAMES = ["FetchReach", "Reacher", "VisualFetchReach", "VisualReacher"]
+TASKS = ["FetchReach", "FingerTurn", "HandReach", "Reacher", "SawyerReach"]
+VISUAL_TASKS = [f"Visual{task}" for task in TASKS]
+NAMES = sorted(TASKS + VISUAL_TASKS)
+HORIZONS = {"FetchReach": 50, "FingerTurn": 50, "HandReach": 50, "Reacher": 50, "SawyerReach": 25}
 
 
 class Episode(NamedTuple):
@@ -123,7 +126,7 @@ def test_reset_and_step(name):
     np.testing.assert_array_equal(played.steps.obs["desired_goal"][-1], played.start.obs["desired_goal"])
     np.testing.assert_array_equal(played.steps.goal_state[-1], played.start.goal_state)
     assert (np.abs(played.steps_qpos[-1] - played.start_qpos).max(axis=-1) > 1e-3).all()
-    assert env.name == name and env.horizon == 50 and env.control_period > 0
+    assert env.name == name and env.horizon == HORIZONS[name.removeprefix("Visual")] and env.control_period > 0
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -157,21 +160,53 @@ def test_sanitize_action():
     np.testing.assert_array_equal(action, [0.0, 1.0, -1.0, 0.5])
 
 
-@pytest.mark.parametrize("name", ["VisualFetchReach", "VisualReacher"])
+@pytest.mark.parametrize("name", VISUAL_TASKS)
 def test_the_goal_picture_is_the_picture_of_the_goal(name):
     env, played = make(name), episode(name)
     keys = jax.random.split(jax.random.key(0), BATCH)
 
-    def observe_goal(key: jax.Array, state: Any) -> jax.Array:
-        return env.observe(state.replace(data=env.sample_goal(key)))
+    def observe_goal(key: jax.Array) -> jax.Array:
+        return env.observe(env.state_at(env.sample_goal(key), jnp.zeros(env.goal_state_size)))
 
-    pictures = compilation.world_jit(jax.vmap(observe_goal))(keys, played.start)
+    pictures = compilation.world_jit(jax.vmap(observe_goal))(keys)
     np.testing.assert_array_equal(pictures, played.start.obs["desired_goal"])
     differs = np.asarray(played.start.obs["desired_goal"] != played.start.obs["observation"]).any(axis=(1, 2, 3))
     assert differs.mean() > 0.95
     assert (np.asarray(played.steps.obs["observation"][-1] != played.start.obs["observation"])).any(
         axis=(1, 2, 3)
     ).mean() > 0.95
+
+
+def test_pictures_stack_newest_first():
+    """Against an environment that shows one picture, from the same key, under the same actions."""
+    actions = jax.random.uniform(jax.random.key(1), (3, 1, 2), minval=-1.0)
+    keys = jax.random.split(jax.random.key(0), 1)
+
+    def pictures(**overrides: Any) -> tuple[GoalEnv, Any, Any]:
+        env = jaxrl_vis_envs.make("VisualReacher", image_size=16, **overrides)
+
+        def play(keys: jax.Array, actions: jax.Array) -> tuple[Any, Any]:
+            start = jax.vmap(env.reset)(keys)
+
+            def step(state: Any, action: jax.Array) -> tuple[Any, Any]:
+                state = jax.vmap(env.step)(state, action)
+                return state, state.obs
+
+            return start.obs, jax.lax.scan(step, start, actions)[1]
+
+        return env, *compilation.world_jit(play)(keys, actions)
+
+    env, start, steps = pictures(frames=3)
+    _, start_1, steps_1 = pictures()
+    one = [start_1["observation"][0], *steps_1["observation"][:, 0]]
+    assert env.frames == 3 and env.observation_spec.shape == (12, 16, 16)
+    np.testing.assert_array_equal(start["observation"][0], np.concatenate([one[0], one[0], one[0]]))
+    np.testing.assert_array_equal(steps["observation"][0, 0], np.concatenate([one[1], one[0], one[0]]))
+    np.testing.assert_array_equal(steps["observation"][2, 0], np.concatenate([one[3], one[2], one[1]]))
+    # A goal stands still: the desired one, and what was achieved on the way.
+    np.testing.assert_array_equal(start["desired_goal"][0], np.tile(start_1["desired_goal"][0], (3, 1, 1)))
+    np.testing.assert_array_equal(steps["achieved_goal"][2, 0], np.tile(one[3], (3, 1, 1)))
+    np.testing.assert_array_equal(env.as_goal(steps["observation"][2, 0]), steps["achieved_goal"][2, 0])
 
 
 @pytest.mark.parametrize("name", ["FetchReach", "Reacher"])
@@ -237,6 +272,8 @@ def test_names_that_do_not_exist():
     for name, bad in (
         ("VisualReacher", {"pixels": "hsv"}),
         ("VisualReacher", {"image_size": 0}),
+        ("VisualReacher", {"frames": 0}),
+        ("FingerTurn", {"substeps": 0}),
         ("VisualFetchReach", {"depth_range": (2.0, 1.0)}),
         ("Reacher", {"control": "telepathy"}),
         ("FetchReach", {"substeps": 1}),

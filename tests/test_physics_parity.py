@@ -1,64 +1,82 @@
-"""Recordings of the original environments, played through ours.
-
-tests/data/fetch_reach.npz: six sequences of 50 actions and grip positions of Gymnasium-Robotics' FetchReach.
-tests/data/reacher.npz: six sequences of 50 actions and joint angles of Gymnasium's Reacher (torque control).
-"""
+"""Recordings of the original environments (tests/data), played through ours by benchmarks/parity.py."""
 
 import pathlib
 
 import jax
-import jax.numpy as jnp
 import numpy as np
+import one_step
+import pytest
 
 import jaxrl_vis_envs
-from jaxrl_vis_envs.compilation import world_jit
+from benchmarks import parity
 
 DATA = pathlib.Path(__file__).parent / "data"
+RECORDINGS = {
+    "FetchReach": "fetch_reach.npz",
+    "FingerTurn": "finger.npz",
+    "HandReach": "hand_reach.npz",
+    "Reacher": "reacher.npz",
+}
 
 
-def test_fetch_reach_follows_the_recording():
-    recording = np.load(DATA / "fetch_reach.npz")
+def test_every_comparison_has_a_recording():
+    assert sorted(parity.COMPARISONS) == sorted(RECORDINGS)
+
+
+@pytest.mark.parametrize("name", RECORDINGS)
+def test_tasks_follow_the_recordings_of_their_originals(name):
+    figures = parity.compare(name, np.load(DATA / RECORDINGS[name]))
+    for figure in figures:
+        print(figure)
+    assert any(figure.bound is not None for figure in figures)
+    assert not [figure for figure in figures if figure.is_broken]
+
+
+def test_most_of_the_fetch_recording_counts():
+    figures = {figure.name: figure.value for figure in parity.compare("FetchReach", np.load(DATA / "fetch_reach.npz"))}
+    assert figures["share of the recording that counts (near the start)"] > 0.5
+
+
+def test_contacts_matter_to_the_hand():
+    figures = {figure.name: figure.value for figure in parity.compare("HandReach", np.load(DATA / "hand_reach.npz"))}
+    for finger in ("ring finger", "little finger"):
+        name = f"{finger}: 95th percentile of the error"
+        assert figures[f"without contacts, {name}"] > max(3 * figures[name], 0.008)
+
+
+def test_mjx_steps_the_fetch_robot_as_mujoco_does():
+    """In the air. On the table they differ: of a box on a plane the two engines keep different corners."""
     env = jaxrl_vis_envs.make("FetchReach")
-
-    def play(actions):
-        def step(state, action):
-            state = env.advance(state, action)
-            return state, state.achieved_state
-
-        start = env.reset(jax.random.key(0))
-        return start.achieved_state, jax.lax.scan(step, start, actions)[1]
-
-    start, positions = world_jit(jax.vmap(play))(jnp.asarray(recording["actions"]))
-    positions = np.concatenate([np.asarray(start)[:, None], positions], axis=1)
-    recorded = recording["grip_pos_m"]
-    # Only while the grip has not yet left the box around its start (goals lie within .15 m): farther out the arm stretches,
-    # swings through the table's edge or its own base, and tells little about the task.
-    is_outside = (np.abs(recorded - recorded[:, :1]) > 0.25).any(axis=-1)
-    is_inside = np.cumsum(is_outside, axis=1) == 0
-    error = np.linalg.norm(positions - recorded, axis=-1)[is_inside]
-    assert is_inside.sum() > 150
-    assert np.median(error) < 0.005
-    assert np.percentile(error, 99) < 0.015
+    start = env.sample_start(jax.random.key(0))
+    rng = np.random.default_rng(0)
+    targets = np.asarray(start.xpos[env._gripper]) + rng.uniform(-0.15, 0.15, (12, 10, 3))
+    starts = np.tile(np.asarray(start.qpos, np.float64), (12, 1))
+    states = one_step.visited_states(env.mj_model, starts, np.zeros((12, 10, 0)), every=13, mocap=targets)
+    excess, contacts = one_step.velocity_difference(env.mj_model, states)
+    assert (contacts == 0).sum() > 100
+    assert excess[contacts == 0].max() <= 1.0, f"{np.sort(excess)[-10:]}"
 
 
-def test_reacher_torque_follows_the_recording():
-    recording = np.load(DATA / "reacher.npz")
-    env = jaxrl_vis_envs.make("Reacher", control="torque")
+def test_a_drifting_task_is_found_out(tmp_path, capsys):
+    recording = dict(np.load(DATA / "reacher.npz"))
+    recording["qpos_rad"] = recording["qpos_rad"] + 0.011 * (np.arange(51) > 0)[:, None]
+    np.savez(tmp_path / "drifting.npz", **recording)
+    assert parity.main(["VisualReacher", str(tmp_path / "drifting.npz")]) == 1
+    assert capsys.readouterr().out.count("BROKEN") == 1
 
-    def play(qpos, qvel, actions):
-        start = env.reset(jax.random.key(0))
-        start = start.replace(data=env.configuration(qpos).replace(qvel=qvel))
 
-        def step(state, action):
-            state = env.advance(state, action)
-            return state, (state.data.qpos, state.achieved_state)
+def test_a_recording_that_is_not_a_number_breaks_its_bounds():
+    assert parity.Figure("error", float("nan"), "m", 1.0).is_broken
 
-        return jax.lax.scan(step, start, actions)[1]
 
-    start = (jnp.asarray(recording["qpos_rad"][:, 0]), jnp.asarray(recording["qvel_rad_s"][:, 0]))
-    qpos, fingertip = world_jit(jax.vmap(play))(*start, jnp.asarray(recording["actions"]))
-    error = np.abs(np.asarray(qpos) - recording["qpos_rad"][:, 1:])
-    print("median, 99th percentile and greatest error in rad:", np.median(error), np.percentile(error, 99), error.max())
-    assert np.median(error) < 0.01
-    tip_error = np.linalg.norm(np.asarray(fingertip) - recording["fingertip_pos_m"][:, 1:, :2], axis=-1)
-    assert np.median(tip_error) < 0.001
+def test_nothing_to_compare(tmp_path, capsys):
+    np.savez(tmp_path / "empty.npz", actions=np.zeros((1, 2, 4)))
+    np.savez(tmp_path / "short.npz", actions=np.zeros((1, 2, 4)), grip_pos_m=np.zeros((1, 2, 3)))
+    for arguments, complaint in (
+        (["FetchReach", str(tmp_path / "empty.npz")], "lacks grip_pos_m"),
+        (["FetchReach", str(tmp_path / "short.npz")], "must begin with the shape"),
+        (["Swimmer", str(tmp_path / "empty.npz")], "choose one of"),
+        (["FetchReach", str(tmp_path / "missing.npz")], "No such file"),
+    ):
+        assert parity.main(arguments) == 2
+        assert complaint in capsys.readouterr().err

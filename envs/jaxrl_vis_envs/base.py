@@ -33,8 +33,10 @@ class State:
         reward: [] float32, `goals.oracle_reward` of the two.
         done: [] float32, always 0: episodes have one length, and ending one is a truncation.
         metrics: ``success`` ([] float32, 0 or 1) and ``goal_distance`` ([] float32, unit of the state).
-        obs: ``observation``, ``achieved_goal`` and ``desired_goal``, each as `GoalEnv.observe` makes them; None where the
-            caller asked for no pictures (`GoalEnv.advance` passes it through untouched).
+        obs: ``observation``, as `GoalEnv.observe` makes it, ``achieved_goal`` and ``desired_goal``, as `GoalEnv.as_goal` does;
+            None where the caller asked for no pictures (`GoalEnv.advance` passes it through untouched).
+        history: [F - 1, nq] float32, the joint positions one, two, ... control steps ago, where an observation stacks F > 1
+            pictures; else None. Before the first step everything stood still.
     """
 
     data: Any
@@ -44,6 +46,7 @@ class State:
     done: jax.Array
     metrics: dict[str, jax.Array]
     obs: dict[str, jax.Array] | None = None
+    history: jax.Array | None = None
 
     def replace(self, **changes: Any) -> Self:
         """A copy with some fields changed."""
@@ -60,6 +63,7 @@ class GoalEnv(abc.ABC):
     threshold: float  # an episode succeeds where goal_distance <= threshold, in `distance_unit`
     distance_unit: str = "m"
     control_period: float  # simulated seconds of one control step
+    frames: int = 1  # F, pictures of the latest control steps that an observation stacks
 
     @abc.abstractmethod
     def reset(self, key: jax.Array) -> State:
@@ -80,14 +84,27 @@ class GoalEnv(abc.ABC):
 
     @abc.abstractmethod
     def observe(self, state: State) -> jax.Array:
-        """What the agent sees of ``state``: planar [C, H, W] uint8, or [S] float32 for the state variants."""
+        """What the agent sees of ``state``: planar [C, H, W] uint8, or [S] float32 for the state variants.
+
+        Where pictures are stacked, C is F times the channels of one, and the newest comes first.
+        """
+
+    def as_goal(self, frame: jax.Array) -> jax.Array:
+        """The goal that says "be where ``frame`` was", in the shape of ``frame``: its newest picture, F times.
+
+        A goal stands still; whoever relabels with something observed on the way has to say so in the same way.
+        """
+        if self.frames == 1:
+            return frame
+        return jnp.tile(frame[: frame.shape[0] // self.frames], (self.frames, 1, 1))
 
     def step(self, state: State, action: jax.Array) -> State:
         """`advance`, then `observe`: the one to use where every step's picture is wanted."""
         state = self.advance(state, action)
         frame = self.observe(state)
-        desired_goal = frame if state.obs is None else state.obs["desired_goal"]
-        return state.replace(obs={"observation": frame, "achieved_goal": frame, "desired_goal": desired_goal})
+        achieved_goal = self.as_goal(frame)
+        desired_goal = achieved_goal if state.obs is None else state.obs["desired_goal"]
+        return state.replace(obs={"observation": frame, "achieved_goal": achieved_goal, "desired_goal": desired_goal})
 
     @functools.cached_property
     def _reset_shape(self) -> State:
@@ -105,7 +122,14 @@ class GoalEnv(abc.ABC):
         """G, the length of `State.achieved_state`."""
         return self._reset_shape.goal_state.shape[0]
 
-    def _measure(self, data: Any, achieved_state: jax.Array, goal_state: jax.Array, obs: dict | None) -> State:
+    def _measure(
+        self,
+        data: Any,
+        achieved_state: jax.Array,
+        goal_state: jax.Array,
+        obs: dict | None,
+        history: jax.Array | None = None,
+    ) -> State:
         """A State with its reward and metrics filled in from the truth."""
         distance = goals.goal_distance(achieved_state, goal_state)
         return State(
@@ -116,7 +140,18 @@ class GoalEnv(abc.ABC):
             done=jnp.zeros((), jnp.float32),
             metrics={"success": goals.success(achieved_state, goal_state, self.threshold), "goal_distance": distance},
             obs=obs,
+            history=history,
         )
+
+
+def start_history(qpos: jax.Array, frames: int) -> jax.Array | None:
+    """`State.history` at the start of an episode, where ``qpos`` [nq] has stood still: [frames - 1, nq], None for one frame."""
+    return None if frames == 1 else jnp.tile(qpos, (frames - 1, 1))
+
+
+def push_history(history: jax.Array | None, qpos: jax.Array) -> jax.Array | None:
+    """``history`` after one more control step, which began at ``qpos`` [nq]; the oldest is forgotten."""
+    return None if history is None else jnp.concatenate([qpos[None], history[:-1]])
 
 
 def sanitize_action(action: jax.Array) -> jax.Array:

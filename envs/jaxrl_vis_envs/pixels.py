@@ -3,17 +3,22 @@
 A picture is planar, [C, H, W] uint8, with the channels R, G, B, D, as many of them as ``pixels`` asks for. Depth is
 planar (along the camera's axis) and metric: 0 is the near end of the task's depth range, 255 the far end, linear between,
 clipped outside.
+
+``frames`` pictures, of this control step and those before it, may be stacked along the channels, the newest first. What came
+before is kept as joint positions (`State.history`), a few numbers, and drawn again: a picture costs less than the physics
+that leads to it, and no picture has to travel with the state.
 """
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import mujoco
 
 from jaxrl_vis_envs.render import Scene, quantize, render_planes
+from jaxrl_vis_envs.tasks.mjx_model import mjx
 
 CHANNELS = {"rgbd": 4, "rgb": 3, "depth": 1}
 
@@ -28,8 +33,12 @@ class PixelsConfig:
     """Channels."""
     depth_range: tuple[float, float] = (0.1, 10.0)
     """Depths that bytes 0 and 255 stand for, m. Tasks choose it as tight as what moves allows."""
+    frames: int = 1
+    """Pictures of the latest control steps that an observation stacks. With one, velocities are hidden."""
 
     def __post_init__(self) -> None:
+        if self.frames < 1:
+            raise ValueError(f"frames must be at least 1, got {self.frames}")
         if self.image_size < 1:
             raise ValueError(f"image_size must be at least 1, got {self.image_size}")
         if self.pixels not in CHANNELS:
@@ -39,16 +48,24 @@ class PixelsConfig:
             raise ValueError(f"depth_range must be (near, far) with 0 <= near < far, got {self.depth_range}")
 
 
-def picture_observer(mj_model: mujoco.MjModel, camera: str, config: PixelsConfig) -> Callable[[Any], jax.Array]:
-    """A function from the poses of one environment (`mjx.Data`) to its picture [C, H, W] uint8.
+Observer = Callable[..., jax.Array]
+"""observer(data, history=None): an observation of the poses in ``data``, after those in ``history`` (see `State`)."""
+
+
+def picture_observer(mj_model: mujoco.MjModel, camera: str, config: PixelsConfig) -> Observer:
+    """A function from the poses of one environment to its pictures [frames * channels, H, W] uint8.
+
+    It takes ``data`` (`mjx.Data`, whose poses are up to date) and ``history`` ([frames - 1, nq] float32, joint positions one,
+    two, ... control steps ago). Without ``history`` the world has stood still, and one picture is repeated.
 
     Raises:
         ValueError: There is no such camera, or something in its view cannot be drawn.
     """
     scene = Scene.from_mjmodel(mj_model, camera=camera, height=config.image_size, width=config.image_size)
     wants_colour, wants_depth = config.pixels != "depth", config.pixels != "rgb"
+    model = mjx.put_model(mj_model)
 
-    def observe(data: Any) -> jax.Array:
+    def observe_one(data: mjx.Data) -> jax.Array:
         planes = render_planes(scene, data, rgb=wants_colour, depth=wants_depth)
         channels = []
         if planes.rgb is not None:
@@ -56,6 +73,17 @@ def picture_observer(mj_model: mujoco.MjModel, camera: str, config: PixelsConfig
         if planes.depth is not None:
             channels.append(encode_depth(planes.depth, config.depth_range)[None])
         return jnp.concatenate(channels)
+
+    def observe(data: mjx.Data, history: jax.Array | None = None) -> jax.Array:
+        if config.frames == 1 or history is None:
+            return jnp.tile(observe_one(data), (config.frames, 1, 1))
+
+        def observe_at(qpos: jax.Array) -> jax.Array:
+            with jax.default_matmul_precision("highest"):
+                return observe_one(mjx.kinematics(model, data.replace(qpos=qpos)))
+
+        pictures = jax.vmap(observe_at)(jnp.concatenate([data.qpos[None], history]))
+        return pictures.reshape(-1, *pictures.shape[2:])
 
     return observe
 

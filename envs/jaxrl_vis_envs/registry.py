@@ -13,9 +13,15 @@ from jaxrl_vis_envs.base import GoalEnv
 
 _BUILT_IN = {
     "FetchReach": "jaxrl_vis_envs.tasks.fetch_reach",
+    "FingerTurn": "jaxrl_vis_envs.tasks.finger_turn",
+    "HandReach": "jaxrl_vis_envs.tasks.hand_reach",
     "Reacher": "jaxrl_vis_envs.tasks.reacher",
+    "SawyerReach": "jaxrl_vis_envs.tasks.sawyer_reach",
     "VisualFetchReach": "jaxrl_vis_envs.tasks.fetch_reach",
+    "VisualFingerTurn": "jaxrl_vis_envs.tasks.finger_turn",
+    "VisualHandReach": "jaxrl_vis_envs.tasks.hand_reach",
     "VisualReacher": "jaxrl_vis_envs.tasks.reacher",
+    "VisualSawyerReach": "jaxrl_vis_envs.tasks.sawyer_reach",
 }
 
 

@@ -19,10 +19,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from jaxrl_vis_envs.base import GoalEnv, State, sanitize_action
-from jaxrl_vis_envs.pixels import PixelsConfig, picture_observer
+from jaxrl_vis_envs.pixels import Observer, PixelsConfig, picture_observer
 from jaxrl_vis_envs.registry import register
-from jaxrl_vis_envs.tasks import mjx_model
+from jaxrl_vis_envs.tasks import inverse_kinematics, mjx_model
+from jaxrl_vis_envs.tasks.mjx_env import MjxGoalEnv
 from jaxrl_vis_envs.tasks.mjx_model import mjx
 
 # The gripper points down. Added to the link's own unit quaternion, as the original does, it turns the target about 60 % of the
@@ -34,10 +34,6 @@ _SETTLING_SUBSTEPS = 200
 _DOWN_ROTATION = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])  # of the gripper while it points down
 _TABLE_TOP = 0.4  # m
 _CONTROL_PERIOD = 0.04  # s
-_IK_STEPS = 10
-# Of the three directions (m^2) and the three turns (rad^2). Near a singular pose the real arm gives up orientation before
-# position, and so does this.
-_IK_DAMPING = (3e-3, 3e-3, 3e-3, 3e-2, 3e-2, 3e-2)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,108 +75,63 @@ class VisualFetchReachConfig(PixelsConfig, FetchReachConfig):
         PixelsConfig.__post_init__(self)
 
 
-class FetchReach(GoalEnv):
+class FetchReach(MjxGoalEnv):
     """The task; what the agent sees of it is up to ``observer``."""
 
     action_size = 4
     camera = "front"
     distance_unit = "m"
 
-    def __init__(
-        self, config: FetchReachConfig, observer: Callable[[mujoco.MjModel], Callable[[mjx.Data], jax.Array]] | None = None
-    ):
+    def __init__(self, config: FetchReachConfig, observer: Callable[[mujoco.MjModel], Observer] | None = None):
         """Builds the model and finds the start.
 
         Args:
             config: The settings.
-            observer: Given the model, returns the function from a physics state to an observation. Default: `observe_grip`.
+            observer: Given the model, returns the function from poses to pictures. Default: `observe_state`.
         """
-        self.config = config
-        self.horizon = config.horizon
-        self.threshold = config.threshold
-        self.mj_model = mjx_model.load_model("fetch_reach.xml")
-        self.mj_model.opt.iterations = config.solver_iterations
-        self.mj_model.opt.ls_iterations = config.line_search_iterations
+        mj_model = mjx_model.load_model("fetch_reach.xml")
+        mj_model.opt.iterations = config.solver_iterations
+        mj_model.opt.ls_iterations = config.line_search_iterations
         self.control_period = _CONTROL_PERIOD
-        self._gripper = self.mj_model.body("gripper").id
-        self._grip = self.mj_model.site("grip").id
+        self._gripper = mj_model.body("gripper").id
+        self._grip = mj_model.site("grip").id
         # The start is found with the timestep of the model file, so that it does not depend on `substeps`.
-        self._start = mjx_model.start_data(self.mj_model, _settle_at_start(self.mj_model))
-        self.mj_model.opt.timestep = _CONTROL_PERIOD / config.substeps
-        self._model = mjx.put_model(self.mj_model)
-        self._observer = observer(self.mj_model) if observer is not None else self.observe_grip
+        self._start = mjx_model.start_data(mj_model, _settle_at_start(mj_model))
+        mj_model.opt.timestep = _CONTROL_PERIOD / config.substeps
+        super().__init__(config, mj_model, observer)
 
-    def reset(self, key: jax.Array) -> State:
-        data, goal_data = self._start, self.sample_goal(key)
-        frame = self._observer(data)
-        obs = {"observation": frame, "achieved_goal": frame, "desired_goal": self._observer(goal_data)}
-        return self._measure(data, data.site_xpos[self._grip], goal_data.site_xpos[self._grip], obs)
+    def sample_start(self, key: jax.Array) -> mjx.Data:
+        return self._start
 
-    def advance(self, state: State, action: jax.Array) -> State:
-        action = sanitize_action(action)
+    def sample_goal(self, key: jax.Array) -> mjx.Data:
+        offset = jax.random.uniform(key, (3,), jnp.float32, -self.config.goal_range, self.config.goal_range)
+        return self.goal_configuration(self._start.site_xpos[self._grip] + offset)
+
+    def act(self, data: mjx.Data, action: jax.Array) -> mjx.Data:
         # The target starts from where the gripper is, not from the last target, so that what was not reached is forgotten.
-        position = state.data.xpos[self._gripper] + self.config.action_scale * action[:3]
-        quaternion = state.data.xquat[self._gripper] + jnp.asarray(_DOWN, jnp.float32)
-        data = state.data.replace(mocap_pos=position[None], mocap_quat=quaternion[None])
-        data = mjx_model.simulate(self._model, data, self.config.substeps)
-        return self._measure(data, data.site_xpos[self._grip], state.goal_state, state.obs)
+        position = data.xpos[self._gripper] + self.config.action_scale * action[:3]
+        quaternion = data.xquat[self._gripper] + jnp.asarray(_DOWN, jnp.float32)
+        data = data.replace(mocap_pos=position[None], mocap_quat=quaternion[None])
+        return mjx_model.simulate(self._model, data, self.config.substeps)
 
-    def observe(self, state: State) -> jax.Array:
-        return self._observer(state.data)
+    def achieved(self, data: mjx.Data) -> jax.Array:
+        return data.site_xpos[self._grip]
 
-    def observe_grip(self, data: mjx.Data) -> jax.Array:
+    def observe_state(self, data: mjx.Data) -> jax.Array:
         """Position of the grip (m) and its displacement in a control step at its present speed (m): [6] float32, as in Gym."""
         position = data.site_xpos[self._grip]
         return jnp.concatenate([position, self.control_period * mjx_model.point_velocity(data, position)])
 
-    def sample_goal(self, key: jax.Array) -> mjx.Data:
-        """The configuration that the goal picture of ``reset(key)`` shows."""
-        offset = jax.random.uniform(key, (3,), jnp.float32, -self.config.goal_range, self.config.goal_range)
-        return self.goal_configuration(self._start.site_xpos[self._grip] + offset)
-
     def goal_configuration(self, goal: jax.Array) -> mjx.Data:
         """The robot at rest with its grip as near to ``goal`` [3] (m, world) as joints and table let it, the gripper down.
 
-        Damped least squares from the start, weighted by the joints' mobilities (1/damping), which is the way that the physics
-        takes: the joint angles agree with those after driving the arm there for 200 substeps within .002 rad in the median
-        and .04 rad at the 99th percentile of 300 goals, and a reset costs a hundredth.
+        The joint angles agree with those after driving the arm there for 200 substeps within .002 rad in the median and .04
+        rad at the 99th percentile of 300 goals, and a reset costs a hundredth.
         """
         lowest = _TABLE_TOP + float(self.mj_model.geom_size[self.mj_model.geom("fingers_contact").id, 0])
         goal_link = goal - jnp.asarray(_DOWN_ROTATION @ self.mj_model.site_pos[self._grip], jnp.float32)
         goal_link = goal_link.at[2].max(lowest)
-        start_link = self._start.xpos[self._gripper]
-
-        def improve(data: mjx.Data, share: jax.Array) -> tuple[mjx.Data, None]:
-            qpos = data.qpos + self._inverse_kinematics_step(data, start_link + share * (goal_link - start_link))
-            return mjx.kinematics(self._model, data.replace(qpos=qpos)), None
-
-        # The target moves to the goal first, then the last steps settle there.
-        shares = jnp.minimum(jnp.arange(1, _IK_STEPS + 1) / (_IK_STEPS - 3), 1.0).astype(jnp.float32)
-        return jax.lax.scan(improve, self._start, shares)[0]
-
-    def _inverse_kinematics_step(self, data: mjx.Data, link: jax.Array) -> jax.Array:
-        """Change of joint angles [nv] (rad) that brings the gripper nearer to ``link`` [3] (m, world), pointing down."""
-        position = data.xpos[self._gripper]
-        jacobian = jnp.concatenate([mjx_model.hinge_jacobian(data, position), data.xaxis], axis=1)  # [nv, 6]
-        # Half the sum of cross products is the rotation vector to first order; its exact length does not matter here.
-        turn = 0.5 * jnp.sum(jnp.cross(data.xmat[self._gripper].T, jnp.asarray(_DOWN_ROTATION.T, jnp.float32)), axis=0)
-        error = jnp.concatenate([link - position, turn])
-        mobility = jnp.asarray(self.mj_model.dof_damping.max() / self.mj_model.dof_damping, jnp.float32)
-        damping = jnp.diag(jnp.asarray(_IK_DAMPING, jnp.float32))
-
-        def solve(error: jax.Array, mobility: jax.Array) -> jax.Array:
-            weighted = mobility[:, None] * jacobian
-            return weighted @ jnp.linalg.solve(jacobian.T @ weighted + damping, error)
-
-        # A joint at its limit stays there, and the others take over what it leaves.
-        limited = self.mj_model.jnt_limited.astype(bool)
-        low = jnp.asarray(np.where(limited, self.mj_model.jnt_range[:, 0], -np.inf), jnp.float32) - data.qpos
-        high = jnp.asarray(np.where(limited, self.mj_model.jnt_range[:, 1], np.inf), jnp.float32) - data.qpos
-        change = solve(error, mobility)
-        is_stopped = (change < low) | (change > high)
-        stopped = jnp.where(is_stopped, jnp.clip(change, low, high), 0.0)
-        rest = solve(error - stopped @ jacobian, jnp.where(is_stopped, 0.0, mobility))
-        return jnp.clip(stopped + rest, low, high)
+        return inverse_kinematics.reach(self.mj_model, self._model, self._start, self._gripper, goal_link, _DOWN_ROTATION)
 
 
 def _settle_at_start(mj_model: mujoco.MjModel) -> mujoco.MjData:

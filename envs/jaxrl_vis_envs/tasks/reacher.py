@@ -18,10 +18,10 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
-from jaxrl_vis_envs.base import GoalEnv, State, sanitize_action
-from jaxrl_vis_envs.pixels import PixelsConfig, picture_observer
+from jaxrl_vis_envs.pixels import Observer, PixelsConfig, picture_observer
 from jaxrl_vis_envs.registry import register
 from jaxrl_vis_envs.tasks import mjx_model
+from jaxrl_vis_envs.tasks.mjx_env import MjxGoalEnv
 from jaxrl_vis_envs.tasks.mjx_model import mjx
 
 _DEFAULT_SUBSTEPS = {"velocity": 10, "torque": 2}
@@ -63,71 +63,54 @@ class VisualReacherConfig(PixelsConfig, ReacherConfig):
         PixelsConfig.__post_init__(self)
 
 
-class Reacher(GoalEnv):
+class Reacher(MjxGoalEnv):
     """The task; what the agent sees of it is up to ``observer``."""
 
     action_size = 2
     camera = "above"
     distance_unit = "m"
 
-    def __init__(
-        self, config: ReacherConfig, observer: Callable[[mujoco.MjModel], Callable[[mjx.Data], jax.Array]] | None = None
-    ):
+    def __init__(self, config: ReacherConfig, observer: Callable[[mujoco.MjModel], Observer] | None = None):
         """Builds the model.
 
         Args:
             config: The settings.
-            observer: Given the model, returns the function from a physics state to an observation. Default: `observe_arm`.
+            observer: Given the model, returns the function from poses to pictures. Default: `observe_state`.
         """
-        self.config = config
-        self.horizon = config.horizon
-        self.threshold = config.threshold
-        self.mj_model = mjx_model.load_model("reacher.xml")
+        mj_model = mjx_model.load_model("reacher.xml")
         self._substeps = config.substeps or _DEFAULT_SUBSTEPS[config.control]
-        self.control_period = self._substeps * float(self.mj_model.opt.timestep)
-        self._fingertip = self.mj_model.site("fingertip").id
-        self._model = mjx.put_model(self.mj_model)
-        mj_data = mujoco.MjData(self.mj_model)
-        mujoco.mj_forward(self.mj_model, mj_data)
-        self._start = mjx_model.start_data(self.mj_model, mj_data)
-        self._observer = observer(self.mj_model) if observer is not None else self.observe_arm
+        self.control_period = self._substeps * float(mj_model.opt.timestep)
+        self._fingertip = mj_model.site("fingertip").id
+        self._still = mjx_model.still_data(mj_model)
+        super().__init__(config, mj_model, observer)
 
-    def reset(self, key: jax.Array) -> State:
-        start_range = self.config.start_range
+    def sample_start(self, key: jax.Array) -> mjx.Data:
         start_key, _ = jax.random.split(key)
-        data = self.configuration(jax.random.uniform(start_key, (2,), jnp.float32, -start_range, start_range))
-        goal_data = self.sample_goal(key)
-        frame = self._observer(data)
-        obs = {"observation": frame, "achieved_goal": frame, "desired_goal": self._observer(goal_data)}
-        return self._measure(data, self._position(data), self._position(goal_data), obs)
-
-    def advance(self, state: State, action: jax.Array) -> State:
-        action = sanitize_action(action)
-        if self.config.control == "velocity":
-            data = state.data.replace(qvel=self.config.velocity_scale * action)
-        else:
-            data = state.data.replace(ctrl=action)
-        data = mjx_model.simulate(self._model, data, self._substeps)
-        return self._measure(data, self._position(data), state.goal_state, state.obs)
-
-    def observe(self, state: State) -> jax.Array:
-        return self._observer(state.data)
-
-    def observe_arm(self, data: mjx.Data) -> jax.Array:
-        """Cosines and sines of both joint angles, fingertip x and y (m), joint velocities (rad/s): [8] float32."""
-        return jnp.concatenate([jnp.cos(data.qpos), jnp.sin(data.qpos), self._position(data), data.qvel])
+        return self.configuration(
+            jax.random.uniform(start_key, (2,), jnp.float32, -self.config.start_range, self.config.start_range)
+        )
 
     def sample_goal(self, key: jax.Array) -> mjx.Data:
-        """The configuration that the goal picture of ``reset(key)`` shows."""
         _, goal_key = jax.random.split(key)
         return self.configuration(jax.random.uniform(goal_key, (2,), jnp.float32, -2 * jnp.pi, 2 * jnp.pi))
 
+    def act(self, data: mjx.Data, action: jax.Array) -> mjx.Data:
+        if self.config.control == "velocity":
+            data = data.replace(qvel=self.config.velocity_scale * action)
+        else:
+            data = data.replace(ctrl=action)
+        return mjx_model.simulate(self._model, data, self._substeps)
+
+    def achieved(self, data: mjx.Data) -> jax.Array:
+        return data.site_xpos[self._fingertip, :2]
+
+    def observe_state(self, data: mjx.Data) -> jax.Array:
+        """Cosines and sines of both joint angles, fingertip x and y (m), joint velocities (rad/s): [8] float32."""
+        return jnp.concatenate([jnp.cos(data.qpos), jnp.sin(data.qpos), self.achieved(data), data.qvel])
+
     def configuration(self, joint_angles: jax.Array) -> mjx.Data:
         """The arm at rest with ``joint_angles`` [2] float32, rad."""
-        return mjx.kinematics(self._model, self._start.replace(qpos=joint_angles))
-
-    def _position(self, data: mjx.Data) -> jax.Array:
-        return data.site_xpos[self._fingertip, :2]
+        return mjx.kinematics(self._model, self._still.replace(qpos=joint_angles))
 
 
 def _visual(config: VisualReacherConfig) -> Reacher:

@@ -1,0 +1,170 @@
+"""Scripted controllers that see the true state: every goal can be reached, or else the task is wrong.
+
+    python benchmarks/controllers.py [ENV ...] [--episodes 1000]
+
+Prints the share of episodes that end within the threshold, at the last step. Exit status: 0 all at least .95, else 1.
+"""
+
+import argparse
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import mujoco.rollout
+import numpy as np
+
+import jaxrl_vis_envs
+from jaxrl_vis_envs.compilation import world_jit
+
+LEAST_SUCCESS = 0.95
+Policy = Callable[[Any, Any, Any], tuple[jax.Array, Any]]
+"""(state, configuration of the goal, memory) -> (action [A], memory)."""
+
+
+def fetch_reach(env: Any) -> tuple[Policy, Any]:
+    """Proportional."""
+
+    def act(state: Any, goal: Any, memory: Any) -> tuple[jax.Array, Any]:
+        return jnp.append(20.0 * (state.goal_state - state.achieved_state), 0.0), memory
+
+    return act, None
+
+
+def sawyer_reach(env: Any) -> tuple[Policy, Any]:
+    """Straight to the goal, as fast as it goes."""
+
+    def act(state: Any, goal: Any, memory: Any) -> tuple[jax.Array, Any]:
+        return (state.goal_state - state.data.mocap_pos[0]) / env.config.action_scale, memory
+
+    return act, None
+
+
+def reacher(env: Any) -> tuple[Policy, Any]:
+    """Velocity control: each joint straight to its angle at the goal, the elbow bent to the left."""
+    upper, fore = 0.1, 0.11  # m
+    unit_turn = 0.95  # rad that an action of 1 turns a joint by
+
+    def act(state: Any, goal: Any, memory: Any) -> tuple[jax.Array, Any]:
+        x, y = state.goal_state
+        cosine = (x * x + y * y - upper**2 - fore**2) / (2 * upper * fore)
+        elbow = jnp.minimum(jnp.arccos(jnp.clip(cosine, -1.0, 1.0)), 2.99)
+        shoulder = jnp.arctan2(y, x) - jnp.arctan2(fore * jnp.sin(elbow), upper + fore * jnp.cos(elbow))
+        change = jnp.array([shoulder, elbow]) - state.data.qpos
+        change = change.at[0].set((change[0] + jnp.pi) % (2 * jnp.pi) - jnp.pi)
+        return change / unit_turn, memory
+
+    return act, None
+
+
+def hand_reach(env: Any) -> tuple[Policy, Any]:
+    """Integral control of the actuated joints towards their angles at the goal."""
+    joints = env.mj_model.actuator_trnid[:, 0]
+    low, high = env.mj_model.actuator_ctrlrange.T
+    centre, half_range = 0.5 * (low + high), 0.5 * (high - low)
+
+    def act(state: Any, goal: Any, integral: jax.Array) -> tuple[jax.Array, jax.Array]:
+        integral = jnp.clip(integral + 0.3 * (goal.qpos - state.data.qpos)[joints], -0.5, 0.5)
+        return (goal.qpos[joints] + integral - centre) / half_range, integral
+
+    return act, jnp.zeros(len(joints))
+
+
+POLICIES: dict[str, Callable[[Any], tuple[Policy, Any]]] = {
+    "FetchReach": fetch_reach,
+    "HandReach": hand_reach,
+    "Reacher": reacher,
+    "SawyerReach": sawyer_reach,
+}
+
+
+def success_rate(name: str, episodes: int, seed: int = 0, **overrides: Any) -> float:
+    """Share of the episodes of the task ``name`` (with ``overrides`` of its settings) that its controller ends in success."""
+    env = jaxrl_vis_envs.make(name, **overrides)
+    keys = jax.random.split(jax.random.key(seed), episodes)
+    if name == "FingerTurn":
+        return turn_the_finger(env, keys, np.random.default_rng(seed))
+    policy, memory = POLICIES[name](env)
+
+    def play(key: jax.Array) -> jax.Array:
+        goal = env.sample_goal(key)
+
+        def step(carry: Any, _: Any) -> tuple[Any, None]:
+            state, memory = carry
+            action, memory = policy(state, goal, memory)
+            return (env.advance(state, action), memory), None
+
+        start = env.state_at(env.sample_start(key), env.achieved(goal))
+        (state, _), _ = jax.lax.scan(step, (start, memory), length=env.horizon)
+        return state.metrics["success"]
+
+    return float(np.mean(world_jit(jax.vmap(play))(keys)))
+
+
+def turn_the_finger(env: Any, keys: jax.Array, generator: np.random.Generator) -> float:
+    """FingerTurn by random shooting: of many short plans, tried in C MuJoCo, the first action of the best."""
+    reset, advance = world_jit(jax.vmap(env.reset)), world_jit(jax.vmap(env.advance))
+    state = reset(keys)
+    plans = np.zeros((len(keys), _PLAN_STEPS, 2))
+    for _ in range(env.horizon):
+        qpos, qvel, goals = np.asarray(state.data.qpos), np.asarray(state.data.qvel), np.asarray(state.goal_state)
+        for row, goal in enumerate(goals):
+            angle = np.arctan2(goal[0], goal[1])
+            plans[row] = _plan(env.mj_model, qpos[row], qvel[row], angle, plans[row], env.config.substeps, generator)
+        state = advance(state, jnp.asarray(plans[:, 0], jnp.float32))
+        plans = np.concatenate([plans[:, 1:], np.zeros_like(plans[:, :1])], axis=1)
+    return float(np.mean(state.metrics["success"]))
+
+
+_PLAN_STEPS = 3  # control steps
+_PLANS = 64
+_NEAR_ENOUGH = 0.3  # rad; the threshold is .54
+
+
+def _plan(
+    mj_model: mujoco.MjModel,
+    qpos: np.ndarray,
+    qvel: np.ndarray,
+    goal_angle: float,
+    last_plan: np.ndarray,
+    substeps: int,
+    generator: np.random.Generator,
+) -> np.ndarray:
+    """Actions [_PLAN_STEPS, 2] that bring the spinner nearest to ``goal_angle`` (rad), or rest where it is near enough."""
+    plans = generator.uniform(-1.0, 1.0, (_PLANS, _PLAN_STEPS, 2))
+    plans[: _PLANS // 2] = plans[: _PLANS // 2, :1]  # half of them hold one action
+    plans[0], plans[1] = 0.0, last_plan
+    initial = np.concatenate([[0.0], qpos, qvel])  # mjSTATE_FULLPHYSICS: time, positions, velocities
+    states, _ = mujoco.rollout.rollout(
+        mj_model, mujoco.MjData(mj_model), initial[None].repeat(_PLANS, 0), np.repeat(plans, substeps, axis=1)
+    )
+    ends = np.asarray(states)[:, -1, 1:4]
+    # The spinner's axis points to -y: a positive angle turns its tip from +z towards -x.
+    error = np.abs((-ends[:, 2] - goal_angle + np.pi) % (2 * np.pi) - np.pi)
+    if error[0] < _NEAR_ENOUGH:
+        return plans[0]
+    # Far from the spinner nothing happens, so a plan is also better the nearer it ends to it.
+    upper, fore = ends[:, 0], ends[:, 0] + ends[:, 1]
+    x, z = 0.18 * np.cos(upper) + 0.16 * np.cos(fore), 0.18 * np.sin(upper) + 0.16 * np.sin(fore)
+    distance = np.hypot(x - 0.4, z)  # m, from fingertip to the spinner's hinge
+    return plans[np.argmin(error + 0.5 * np.maximum(distance - 0.1, 0.0))]
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description="Success of scripted controllers that see the true state.")
+    names = sorted([*POLICIES, "FingerTurn"])
+    parser.add_argument("env", nargs="*", default=names, help=f"any of {', '.join(names)}; default: all")
+    parser.add_argument("--episodes", type=int, default=1000)
+    options = parser.parse_args(arguments)
+    status = 0
+    for name in options.env:
+        rate = success_rate(name, options.episodes)
+        print(f"{name:<12} {rate:.4f} of {options.episodes} episodes", flush=True)
+        status |= rate < LEAST_SUCCESS
+    return int(status)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,208 @@
+"""Drives our tasks with recordings of the originals, and says how far they drift apart.
+
+    python benchmarks/parity.py ENV FILE.npz        e.g. FetchReach tests/data/fetch_reach.npz
+
+A recording holds N sequences of T actions in [-1, 1], and the states at their T + 1 instants:
+
+    FetchReach   actions [N, T, 4], grip_pos_m [N, T + 1, 3]; Gymnasium-Robotics
+    FingerTurn   actions [N, T, 2], qpos_rad_nsubK and qvel_rad_s_nsubK [N, T + 1, 3] for K = 21, 2 or both; dm_control
+    HandReach    actions [N, T, 20], qpos [N, T + 1, 24] (rad), tip_pos_m [N, T + 1, 15]; Gymnasium-Robotics
+    Reacher      actions [N, T, 2], qpos_rad and qvel_rad_s [N, T + 1, 2], fingertip_pos_m [N, T + 1, 3]; Gymnasium (torque)
+
+Prints one line for each error; its bound, where it has one, stands beside it. Exit status: 0 all within their bounds; 1 a
+bound is broken; 2 there is nothing to compare (no such task or file, or a key is missing).
+"""
+
+import argparse
+import sys
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxrl_vis_envs
+from jaxrl_vis_envs.base import GoalEnv, State
+from jaxrl_vis_envs.compilation import world_jit
+
+Recording = Mapping[str, np.ndarray]
+
+
+class Figure(NamedTuple):
+    """One error of ours against the recording, in ``unit``; ``bound`` is the most it may be, None for mere information."""
+
+    name: str
+    value: float
+    unit: str
+    bound: float | None = None
+
+    @property
+    def is_broken(self) -> bool:
+        return self.bound is not None and not self.value <= self.bound
+
+    def __str__(self) -> str:
+        bound = "" if self.bound is None else f"   bound {self.bound:g}   {'BROKEN' if self.is_broken else 'kept'}"
+        return f"{self.name:<60} {self.value:10.5f} {self.unit:<3}{bound}"
+
+
+class NothingToCompareError(ValueError):
+    """The recording lacks something, or no recording is known for the task."""
+
+
+def play(
+    env: GoalEnv, start: Callable[..., State], starts: tuple[np.ndarray, ...], actions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Plays N sequences from ``start(*one row of each of starts)``.
+
+    Returns:
+        qpos [N, T + 1, nq] and the achieved states [N, T + 1, G], the start among them.
+    """
+
+    def play_one(actions: jax.Array, *row: jax.Array) -> tuple[jax.Array, jax.Array]:
+        def step(state: State, action: jax.Array) -> tuple[State, tuple[jax.Array, jax.Array]]:
+            state = env.advance(state, action)
+            return state, (state.data.qpos, state.achieved_state)
+
+        state = start(*row)
+        _, (qpos, achieved) = jax.lax.scan(step, state, actions)
+        return jnp.concatenate([state.data.qpos[None], qpos]), jnp.concatenate([state.achieved_state[None], achieved])
+
+    rows = [jnp.asarray(leaf, jnp.float32) for leaf in (actions, *starts)]
+    qpos, achieved = world_jit(jax.vmap(play_one))(*rows)
+    return np.asarray(qpos), np.asarray(achieved)
+
+
+def start_at(env: Any) -> Callable[[jax.Array, jax.Array], State]:
+    """A function from joint angles and velocities to the state that starts there; its goal is nonsense."""
+    return lambda qpos, qvel: env.state_at(env.configuration(qpos).replace(qvel=qvel), jnp.zeros(env.goal_state_size))
+
+
+def distance_figures(name: str, error: np.ndarray, median: float | None, high: float | None, percentile: int) -> list[Figure]:
+    """Median and a high percentile of ``error`` [...] (m) against their bounds (m)."""
+    return [
+        Figure(f"{name}: median error", float(np.median(error)), "m", median),
+        Figure(f"{name}: {percentile}th percentile of the error", float(np.percentile(error, percentile)), "m", high),
+    ]
+
+
+def fetch_reach(recording: Recording) -> list[Figure]:
+    env = jaxrl_vis_envs.make("FetchReach")
+    actions, recorded = _take(recording, "actions", "grip_pos_m")
+    start = env.reset(jax.random.key(0))
+    _, grip = play(env, lambda: start, (), actions)
+    # Only while the grip has not yet left the box around its start (goals lie within .15 m): farther out the arm stretches,
+    # swings through the table's edge or its own base, and tells little about the task.
+    is_outside = (np.abs(recorded - recorded[:, :1]) > 0.25).any(axis=-1)
+    is_inside = np.cumsum(is_outside, axis=1) == 0
+    error = np.linalg.norm(grip - recorded, axis=-1)[is_inside]
+    return [
+        Figure("share of the recording that counts (near the start)", float(is_inside.mean()), ""),
+        *distance_figures("grip", error, 0.005, 0.015, 99),
+    ]
+
+
+def finger_turn(recording: Recording) -> list[Figure]:
+    """Joint angles with K physics steps in a control step, for each K that was recorded. Only 21 is bounded: the task's own."""
+    figures = []
+    for substeps in (21, 2):
+        keys = (f"qpos_rad_nsub{substeps}", f"qvel_rad_s_nsub{substeps}")
+        if substeps == 2 and not any(key in recording for key in keys):
+            continue
+        env = jaxrl_vis_envs.make("FingerTurn", substeps=substeps)
+        actions, qpos, qvel = _take(recording, "actions", *keys)
+        ours, _ = play(env, start_at(env), (qpos[:, 0], qvel[:, 0]), actions)
+        error = np.abs(ours - qpos)[:, -1].max(axis=-1)
+        name = f"{substeps} substeps, joint and spinner angles at the end: "
+        figures += [
+            Figure(name + "greatest error", float(error.max()), "rad", 0.01 if substeps == 21 else None),
+            Figure(name + "median error", float(np.median(error)), "rad"),
+            Figure(f"{substeps} substeps, sequences that move the spinner > 0.3 rad", _share_moving(qpos), ""),
+        ]
+    return figures
+
+
+def _share_moving(qpos: np.ndarray) -> float:
+    """Share of the sequences in which the spinner moves so far that contact matters: below a half the recording says little."""
+    return float((np.ptp(qpos[:, :, 2], axis=1) > 0.3).mean())
+
+
+def hand_reach(recording: Recording) -> list[Figure]:
+    """Fingertips, with contacts and, to show that the bounds would tell, without."""
+    actions, qpos, tips = _take(recording, "actions", "qpos", "tip_pos_m")
+    figures = []
+    for contacts in (True, False):
+        env = jaxrl_vis_envs.make("HandReach", contacts=contacts)
+        _, ours = play(env, start_at(env), (qpos[:, 0], np.zeros_like(qpos[:, 0])), actions)
+        error = np.linalg.norm((ours - tips).reshape(*tips.shape[:2], 5, 3), axis=-1)[:, 1:]
+        for number, finger in enumerate(("first finger", "middle finger", "ring finger", "little finger", "thumb")):
+            name = finger if contacts else f"without contacts, {finger}"
+            bounds = (0.002, 0.008) if contacts else (None, None)
+            figures += distance_figures(name, error[..., number], *bounds, 95)
+    return figures
+
+
+def reacher(recording: Recording) -> list[Figure]:
+    env = jaxrl_vis_envs.make("Reacher", control="torque")
+    actions, qpos, qvel, fingertip = _take(recording, "actions", "qpos_rad", "qvel_rad_s", "fingertip_pos_m")
+    our_qpos, our_fingertip = play(env, start_at(env), (qpos[:, 0], qvel[:, 0]), actions)
+    error = np.abs(our_qpos - qpos)[:, 1:]
+    tip_error = np.linalg.norm(our_fingertip - fingertip[..., :2], axis=-1)[:, 1:]
+    return [
+        Figure("joint angles: median error", float(np.median(error)), "rad", 0.01),
+        Figure("joint angles: 99th percentile of the error", float(np.percentile(error, 99)), "rad"),
+        *distance_figures("fingertip", tip_error, 0.001, None, 99),
+    ]
+
+
+COMPARISONS: dict[str, Callable[[Recording], list[Figure]]] = {
+    "FetchReach": fetch_reach,
+    "FingerTurn": finger_turn,
+    "HandReach": hand_reach,
+    "Reacher": reacher,
+}
+
+
+def compare(name: str, recording: Recording) -> list[Figure]:
+    """Errors of the task ``name`` (with or without "Visual" before it: the physics is the same) against a recording.
+
+    Raises:
+        NothingToCompareError: Recordings of that task are unknown, or this one lacks a key or holds a wrong shape.
+    """
+    name = name.removeprefix("Visual")
+    if name not in COMPARISONS:
+        raise NothingToCompareError(f"no recordings of {name!r} are known; choose one of {', '.join(COMPARISONS)}")
+    return COMPARISONS[name](recording)
+
+
+def _take(recording: Recording, *keys: str) -> list[np.ndarray]:
+    """The arrays under ``keys``, actions first, whose number and length of sequences agree."""
+    missing = [key for key in keys if key not in recording]
+    if missing:
+        raise NothingToCompareError(f"the recording lacks {', '.join(missing)}; it holds {', '.join(recording)}")
+    arrays = [np.asarray(recording[key]) for key in keys]
+    count, length = arrays[0].shape[:2]
+    for key, array in zip(keys[1:], arrays[1:]):
+        if array.shape[:2] != (count, length + 1):
+            raise NothingToCompareError(f"{key} must begin with the shape {(count, length + 1)}, and has {array.shape}")
+    return arrays
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description="Compares a task with a recording of its original.")
+    parser.add_argument("env", help=f"one of {', '.join(COMPARISONS)}")
+    parser.add_argument("file", help="the recording, .npz")
+    options = parser.parse_args(arguments)
+    try:
+        with np.load(options.file) as recording:
+            figures = compare(options.env, recording)
+    except (OSError, NothingToCompareError) as error:
+        print(f"parity: {error}", file=sys.stderr)
+        return 2
+    for figure in figures:
+        print(figure)
+    return 1 if any(figure.is_broken for figure in figures) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

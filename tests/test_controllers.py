@@ -1,0 +1,17 @@
+"""Goals are attainable: a controller on the true state reaches them (the full figure: benchmarks/controllers.py)."""
+
+import pytest
+
+from benchmarks import controllers
+
+EPISODES = {"FetchReach": 24, "FingerTurn": 6, "HandReach": 16, "Reacher": 64, "SawyerReach": 64}
+
+
+def test_every_task_has_a_controller():
+    assert sorted([*controllers.POLICIES, "FingerTurn"]) == sorted(EPISODES)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", EPISODES)
+def test_a_controller_on_the_true_state_succeeds(name):
+    assert controllers.success_rate(name, EPISODES[name], seed=1) >= controllers.LEAST_SUCCESS
