@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
-from jaxrl_vis_envs.render import Scene, quantize, render_planes
+from jaxrl_vis_envs.render import Scene, render_planes
 from jaxrl_vis_envs.tasks.mjx_model import mjx
 
 CHANNELS = {"rgbd": 4, "rgb": 3, "depth": 1}
@@ -66,10 +66,10 @@ def picture_observer(mj_model: mujoco.MjModel, camera: str, config: PixelsConfig
     model = mjx.put_model(mj_model)
 
     def observe_one(data: mjx.Data) -> jax.Array:
-        planes = render_planes(scene, data, rgb=wants_colour, depth=wants_depth)
+        planes = render_planes(scene, data, rgb=wants_colour, depth=wants_depth, quantized=True)
         channels = []
         if planes.rgb is not None:
-            channels.append(quantize(planes.rgb))
+            channels.append(planes.rgb)
         if planes.depth is not None:
             channels.append(encode_depth(planes.depth, config.depth_range)[None])
         return jnp.concatenate(channels)
