@@ -23,6 +23,7 @@ import jax.numpy as jnp
 from jaxrl_vis import encoder_kernel, normalizer
 from jaxrl_vis.config import Config, RequestError
 from jaxrl_vis.types import NormalizerState, Params
+from jaxrl_vis_envs.compilation import runs_gpu_kernels
 
 _glorot = nn.initializers.glorot_uniform()
 
@@ -178,7 +179,7 @@ class Networks:
         """Whether the first layers run as one GPU kernel (`encoder_kernel`) instead of one product each."""
         return (
             self.sees_pictures
-            and jax.default_backend() == "gpu"
+            and runs_gpu_kernels()
             and self.dtype == jnp.bfloat16
             and encoder_kernel.supports(self.config.encoder_filters, self.observation_spec.shape)
         )

@@ -87,7 +87,9 @@ def test_the_kernel_draws_the_same_picture(lens, textured, many, with_kernel):
     with_kernel()
     # A batch whose second picture is another one: a geom without a finite pose is not drawn.
     places = jnp.stack([poses.geom_xpos, poses.geom_xpos.at[2].set(jnp.nan)])
-    drawn = jax.vmap(lambda geom_xpos: draw(SimpleNamespace(**{**vars(poses), "geom_xpos": geom_xpos})))(places)
+    # Two axes, as in training: seeds and environments.
+    draw_all = jax.vmap(jax.vmap(lambda geom_xpos: draw(SimpleNamespace(**{**vars(poses), "geom_xpos": geom_xpos}))))
+    drawn = jax.tree.map(lambda plane: plane[0], draw_all(places[None]))
     assert len(np.unique(np.asarray(expected.segmentation))) > 7
     for name, plane in expected._asdict().items():
         ours = np.asarray(getattr(drawn, name)[0], np.float64)

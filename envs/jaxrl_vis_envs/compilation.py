@@ -24,3 +24,16 @@ def compiler_options(backend: str | None = None) -> dict[str, Any]:
 def world_jit(function: Callable, **jit_options: Any) -> Any:
     """`jax.jit` with the options of `compiler_options`; every jit of a function that moves or draws a world goes through it."""
     return jax.jit(function, compiler_options=compiler_options(), **jit_options)
+
+
+def runs_gpu_kernels() -> bool:
+    """Whether hand-written kernels (Pallas, by Triton) run here: on NVIDIA GPUs of compute capability 8.0 or more.
+
+    Everything that has a kernel has the same function in plain JAX, for all other devices.
+    """
+    if jax.default_backend() != "gpu":
+        return False
+    try:
+        return float(jax.devices()[0].compute_capability) >= 8.0
+    except (AttributeError, TypeError, ValueError):  # another maker's
+        return False

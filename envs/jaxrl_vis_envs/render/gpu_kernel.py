@@ -15,6 +15,7 @@ import numpy as np
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
 
+from jaxrl_vis_envs.compilation import runs_gpu_kernels
 from jaxrl_vis_envs.render import camera, lights, raycast, shade, shapes, surface
 from jaxrl_vis_envs.render.scene import Scene
 
@@ -26,12 +27,12 @@ _TYPES = {shapes.PLANE, shapes.SPHERE, shapes.CAPSULE, shapes.ELLIPSOID, shapes.
 
 
 def takes(scene: Scene) -> bool:
-    """Whether there is a GPU, and the kernel can draw this scene: opaque primitives without shadows or haze."""
-    return jax.default_backend() == "gpu" and supports(scene)
+    """Whether the kernel draws this scene here: opaque primitives without shadows or haze, on a GPU that runs kernels."""
+    return runs_gpu_kernels() and supports(scene)
 
 
 def supports(scene: Scene) -> bool:
-    """Whether the kernel can draw this scene, if there is a GPU."""
+    """Whether the kernel can draw this scene, wherever it runs."""
     plain = not any(scene.transparent) and not any(scene.light_shadows) and scene.haze[0] < 0
     textured = scene.atlas.used or scene.atlas.sky is not None
     # How far a texture is spread over a pixel is found out in the kernel, which does not know lenses with a sensor.
