@@ -103,7 +103,7 @@ class FingerTurn(MjxGoalEnv):
         return self.configuration(self._still.qpos.at[2].set(angle))
 
     def act(self, data: mjx.Data, action: jax.Array) -> mjx.Data:
-        return mjx_model.simulate(self._model, data.replace(ctrl=action), self.config.substeps)
+        return mjx_model.simulate(self._model, data.replace(ctrl=action), self.config.substeps, exact=True)
 
     def achieved(self, data: mjx.Data) -> jax.Array:
         return (data.site_xpos[self._tip] - data.xpos[self._hinge])[jnp.array([0, 2])]

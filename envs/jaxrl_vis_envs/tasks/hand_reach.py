@@ -123,7 +123,7 @@ class HandReach(MjxGoalEnv):
         return self._after_random_actions(key)
 
     def act(self, data: mjx.Data, action: jax.Array) -> mjx.Data:
-        return mjx_model.simulate(self._model, data.replace(ctrl=self._targets(action)), self.config.substeps)
+        return mjx_model.simulate(self._model, data.replace(ctrl=self._targets(action)), self.config.substeps, exact=True)
 
     def achieved(self, data: mjx.Data) -> jax.Array:
         return data.site_xpos[self._tips].reshape(-1)

@@ -39,22 +39,22 @@ def still_data(mj_model: mujoco.MjModel, keyframe: str | None = None) -> mjx.Dat
     return start_data(mj_model, mj_data)
 
 
-def simulate(model: mjx.Model, data: mjx.Data, substeps: int) -> mjx.Data:
-    """``substeps`` physics steps, after which every pose belongs to the final ``qpos``.
+def simulate(model: mjx.Model, data: mjx.Data, substeps: int, exact: bool = False) -> mjx.Data:
+    """``substeps`` physics steps (`step`), after which every pose belongs to the final ``qpos``.
 
     `mjx.step` leaves the poses of the state *before* its last integration, so one more `mjx.kinematics` is needed for the
     picture, the true state and ``qpos`` to agree.
     """
-    data = take_steps(model, data, substeps)
+    data = take_steps(model, data, substeps, exact)
     with _full_precision():
         return mjx.kinematics(model, data)
 
 
-def take_steps(model: mjx.Model, data: mjx.Data, count: int) -> mjx.Data:
-    """``count`` physics steps; poses and true states are then one step old."""
+def take_steps(model: mjx.Model, data: mjx.Data, count: int, exact: bool = False) -> mjx.Data:
+    """``count`` physics steps (`step`); poses and true states are then one step old."""
 
     def substep(data: mjx.Data, _: Any) -> tuple[mjx.Data, None]:
-        return step(model, data), None
+        return step(model, data, exact), None
 
     with _full_precision():
         return jax.lax.scan(substep, data, length=count)[0]
@@ -65,15 +65,17 @@ def _full_precision() -> Any:
     return jax.default_matmul_precision("highest")
 
 
-def step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """`mjx.step`, with contacts and forces as exact as float32 allows under the Euler integrator. Sensors stay as they are.
+def step(model: mjx.Model, data: mjx.Data, exact: bool = True) -> mjx.Data:
+    """`mjx.step`; if ``exact``, with contacts and forces as exact as float32 allows under the Euler integrator.
+
+    That costs nearly as much again, so tasks ask for it where contacts decide. Sensors are then left as they are.
 
     Two things are better than in MJX. Its contacts between capsules lie up to .1 mm off along short capsules (it adds 1e-6 to
     a squared length). And its solver accepts a step only where it lowers the cost, and in float32 the cost cannot tell forces
     apart that differ by less than the square root of the rounding error, some 3e-4. Where large forces balance, at a joint's
     limit say, that is the velocity's first digit. One more Newton step, judged by the gradient, leaves the rounding error.
     """
-    if model.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER:
+    if not exact or model.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER:
         return mjx.step(model, data)
     data = mjx.fwd_position(model, data)
     pairs = np.stack([model.pair_geom1, model.pair_geom2])
