@@ -87,6 +87,7 @@ def distance_figures(name: str, error: np.ndarray, median: float | None, high: f
 
 
 def fetch_reach(recording: Recording) -> list[Figure]:
+    """Grip position, up to where the recorded one leaves its neighbourhood."""
     env = jaxrl_vis_envs.make("FetchReach")
     actions, recorded = _take(recording, "actions", "grip_pos_m")
     start = env.reset(jax.random.key(0))
@@ -143,6 +144,7 @@ def hand_reach(recording: Recording) -> list[Figure]:
 
 
 def reacher(recording: Recording) -> list[Figure]:
+    """Joint angles and fingertip under torque control."""
     env = jaxrl_vis_envs.make("Reacher", control="torque")
     actions, qpos, qvel, fingertip = _take(recording, "actions", "qpos_rad", "qvel_rad_s", "fingertip_pos_m")
     our_qpos, our_fingertip = play(env, start_at(env), (qpos[:, 0], qvel[:, 0]), actions)
@@ -189,6 +191,7 @@ def _take(recording: Recording, *keys: str) -> list[np.ndarray]:
 
 
 def main(arguments: list[str] | None = None) -> int:
+    """Prints the errors: 0 within all bounds, 1 where one is broken, 2 where the request was wrong."""
     parser = argparse.ArgumentParser(description="Compares a task with a recording of its original.")
     parser.add_argument("env", help=f"one of {', '.join(COMPARISONS)}")
     parser.add_argument("file", help="the recording, .npz")

@@ -45,6 +45,20 @@ class Algorithm(NamedTuple):
     update: Callable[[TrainState, Working, Batch, jax.Array], tuple[TrainState, Working, Metrics]]
 
 
+def _networks_of(state: TrainState) -> tuple[Params, ...]:
+    """The four networks' parameters, in the order of `Working`."""
+    return state.actor, state.critic, state.target_actor, state.target_critic
+
+
+def _shares(reward: jax.Array, keep: jax.Array, positive_reward: float) -> Metrics:
+    """Shares of the batch that are positives, and of its negatives (only those can be dropped) that are filtered."""
+    positive = (reward == positive_reward).astype(jnp.float32)
+    return {
+        "train/positive_share": jnp.mean(positive),
+        "train/filtered_share": jnp.sum(1.0 - keep) / jnp.maximum(jnp.sum(1.0 - positive), 1.0),
+    }
+
+
 def make_ddpg(networks: Networks, config: Config, resolved: Resolved) -> Algorithm:
     """DDPG for these networks.
 
@@ -71,11 +85,8 @@ def make_ddpg(networks: Networks, config: Config, resolved: Resolved) -> Algorit
             updates=jnp.zeros((), jnp.int32),
         )
 
-    def networks_of(state: TrainState) -> tuple[Params, ...]:
-        return state.actor, state.critic, state.target_actor, state.target_critic
-
     def working(state: TrainState) -> Working:
-        return Working(*map(networks.working_copy, networks_of(state)))
+        return Working(*map(networks.working_copy, _networks_of(state)))
 
     def encode_pair(params: Params, inputs: jax.Array, first: int) -> jax.Array:
         """Latents [2, B, latent] of pictures ``first`` and ``first`` + 1 of the three."""
@@ -95,7 +106,7 @@ def make_ddpg(networks: Networks, config: Config, resolved: Resolved) -> Algorit
         return losses.actor_loss(value, action, config.action_penalty), action
 
     def update(state: TrainState, copies: Working, batch: Batch, reward: jax.Array) -> tuple[TrainState, Working, Metrics]:
-        now = Working(*map(networks.with_working_copy, networks_of(state), copies))
+        now = Working(*map(networks.with_working_copy, _networks_of(state), copies))
         # Observation, goal, next observation: the online networks read the first two, their targets the last two.
         inputs = networks.prepare(state.normalizer, batch.frames.reshape(-1, *batch.frames.shape[2:]))
 
@@ -127,15 +138,12 @@ def make_ddpg(networks: Networks, config: Config, resolved: Resolved) -> Algorit
             critic_optimizer=critic_moments,
             updates=updates,
         )
-        positive = reward == resolved.reward_positive
         metrics = {
             "train/critic_loss": critic_error,
             "train/actor_loss": policy_loss,
             "train/value": jnp.mean(value),
             "train/action_size": jnp.sqrt(jnp.mean(jnp.square(action))),
-            "train/positive_share": jnp.mean(positive.astype(jnp.float32)),
-            # Of the negatives, since only those can be dropped.
-            "train/filtered_share": jnp.sum(1.0 - keep) / jnp.maximum(jnp.sum(1.0 - positive), 1.0),
+            **_shares(reward, keep, resolved.reward_positive),
         }
         return state, working(state), metrics
 
