@@ -16,7 +16,7 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 
-import jaxrl_vis_envs
+from benchmarks import worlds
 from jaxrl_vis_envs.compilation import world_jit
 
 LEAST_SUCCESS = 0.95
@@ -82,38 +82,28 @@ POLICIES: dict[str, Callable[[Any], tuple[Policy, Any]]] = {
 
 def success_rate(name: str, episodes: int, seed: int = 0, **overrides: Any) -> float:
     """Share of the episodes of the task ``name`` (with ``overrides`` of its settings) that its controller ends in success."""
-    env = jaxrl_vis_envs.make(name, **overrides)
-    keys = jax.random.split(jax.random.key(seed), episodes)
+    env = worlds.make(name, **overrides)
+    state, goals = worlds.reset(env, jax.random.split(jax.random.key(seed), episodes))
     if name == "FingerTurn":
-        return turn_the_finger(env, keys, np.random.default_rng(seed))
+        return turn_the_finger(env, state, np.random.default_rng(seed))
     policy, memory = POLICIES[name](env)
-
-    def play(key: jax.Array) -> jax.Array:
-        goal = env.sample_goal(key)
-
-        def step(carry: Any, _: Any) -> tuple[Any, None]:
-            state, memory = carry
-            action, memory = policy(state, goal, memory)
-            return (env.advance(state, action), memory), None
-
-        start = env.state_at(env.sample_start(key), env.achieved(goal))
-        (state, _), _ = jax.lax.scan(step, (start, memory), length=env.horizon)
-        return state.metrics["success"]
-
-    return float(np.mean(world_jit(jax.vmap(play))(keys)))
+    act = world_jit(jax.vmap(policy))
+    memory = jax.tree.map(lambda leaf: jnp.tile(leaf, (episodes, 1)), memory)
+    for _ in range(env.horizon):
+        action, memory = act(state, goals, memory)
+        state = worlds.advance(env, state, action)
+    return float(np.mean(state.metrics["success"]))
 
 
-def turn_the_finger(env: Any, keys: jax.Array, generator: np.random.Generator) -> float:
+def turn_the_finger(env: Any, state: Any, generator: np.random.Generator) -> float:
     """FingerTurn by random shooting: of many short plans, tried in C MuJoCo, the first action of the best."""
-    reset, advance = world_jit(jax.vmap(env.reset)), world_jit(jax.vmap(env.advance))
-    state = reset(keys)
-    plans = np.zeros((len(keys), _PLAN_STEPS, 2))
+    plans = np.zeros((len(state.reward), _PLAN_STEPS, 2))
     for _ in range(env.horizon):
         qpos, qvel, goals = np.asarray(state.data.qpos), np.asarray(state.data.qvel), np.asarray(state.goal_state)
         for row, goal in enumerate(goals):
             angle = np.arctan2(goal[0], goal[1])
             plans[row] = _plan(env.mj_model, qpos[row], qvel[row], angle, plans[row], env.config.substeps, generator)
-        state = advance(state, jnp.asarray(plans[:, 0], jnp.float32))
+        state = worlds.advance(env, state, plans[:, 0])
         plans = np.concatenate([plans[:, 1:], np.zeros_like(plans[:, :1])], axis=1)
     return float(np.mean(state.metrics["success"]))
 

@@ -19,12 +19,10 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-import jaxrl_vis_envs
-from jaxrl_vis_envs.base import GoalEnv, State
-from jaxrl_vis_envs.compilation import world_jit
+from benchmarks import worlds
+from jaxrl_vis_envs.base import State
 
 Recording = Mapping[str, np.ndarray]
 
@@ -50,32 +48,18 @@ class NothingToCompareError(ValueError):
     """The recording lacks something, or no recording is known for the task."""
 
 
-def play(
-    env: GoalEnv, start: Callable[..., State], starts: tuple[np.ndarray, ...], actions: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Plays N sequences from ``start(*one row of each of starts)``.
+def play(env: Any, state: State, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Plays N sequences of T actions.
 
     Returns:
-        qpos [N, T + 1, nq] and the achieved states [N, T + 1, G], the start among them.
+        qpos [N, T, nq] and the achieved states [N, T, G] after each action.
     """
-
-    def play_one(actions: jax.Array, *row: jax.Array) -> tuple[jax.Array, jax.Array]:
-        def step(state: State, action: jax.Array) -> tuple[State, tuple[jax.Array, jax.Array]]:
-            state = env.advance(state, action)
-            return state, (state.data.qpos, state.achieved_state)
-
-        state = start(*row)
-        _, (qpos, achieved) = jax.lax.scan(step, state, actions)
-        return jnp.concatenate([state.data.qpos[None], qpos]), jnp.concatenate([state.achieved_state[None], achieved])
-
-    rows = [jnp.asarray(leaf, jnp.float32) for leaf in (actions, *starts)]
-    qpos, achieved = world_jit(jax.vmap(play_one))(*rows)
-    return np.asarray(qpos), np.asarray(achieved)
-
-
-def start_at(env: Any) -> Callable[[jax.Array, jax.Array], State]:
-    """A function from joint angles and velocities to the state that starts there; its goal is nonsense."""
-    return lambda qpos, qvel: env.state_at(env.configuration(qpos).replace(qvel=qvel), jnp.zeros(env.goal_state_size))
+    qpos, achieved = [], []
+    for time in range(actions.shape[1]):
+        state = worlds.advance(env, state, actions[:, time])
+        qpos.append(state.data.qpos)
+        achieved.append(state.achieved_state)
+    return np.stack(qpos, axis=1), np.stack(achieved, axis=1)
 
 
 def distance_figures(name: str, error: np.ndarray, median: float | None, high: float | None, percentile: int) -> list[Figure]:
@@ -88,15 +72,15 @@ def distance_figures(name: str, error: np.ndarray, median: float | None, high: f
 
 def fetch_reach(recording: Recording) -> list[Figure]:
     """Grip position, up to where the recorded one leaves its neighbourhood."""
-    env = jaxrl_vis_envs.make("FetchReach")
+    env = worlds.make("FetchReach")
     actions, recorded = _take(recording, "actions", "grip_pos_m")
-    start = env.reset(jax.random.key(0))
-    _, grip = play(env, lambda: start, (), actions)
+    start, _ = worlds.reset(env, jax.random.split(jax.random.key(0), len(actions)))
+    _, grip = play(env, start, actions)
     # Only while the grip has not yet left the box around its start (goals lie within .15 m): farther out the arm stretches,
     # swings through the table's edge or its own base, and tells little about the task.
     is_outside = (np.abs(recorded - recorded[:, :1]) > 0.25).any(axis=-1)
     is_inside = np.cumsum(is_outside, axis=1) == 0
-    error = np.linalg.norm(grip - recorded, axis=-1)[is_inside]
+    error = np.linalg.norm(grip - recorded[:, 1:], axis=-1)[is_inside[:, 1:]]
     return [
         Figure("share of the recording that counts (near the start)", float(is_inside.mean()), ""),
         *distance_figures("grip", error, 0.005, 0.015, 99),
@@ -110,10 +94,10 @@ def finger_turn(recording: Recording) -> list[Figure]:
         keys = (f"qpos_rad_nsub{substeps}", f"qvel_rad_s_nsub{substeps}")
         if substeps == 2 and not any(key in recording for key in keys):
             continue
-        env = jaxrl_vis_envs.make("FingerTurn", substeps=substeps)
+        env = worlds.make("FingerTurn", substeps=substeps)
         actions, qpos, qvel = _take(recording, "actions", *keys)
-        ours, _ = play(env, start_at(env), (qpos[:, 0], qvel[:, 0]), actions)
-        error = np.abs(ours - qpos)[:, -1].max(axis=-1)
+        ours, _ = play(env, worlds.start_at(env, qpos[:, 0], qvel[:, 0]), actions)
+        error = np.abs(ours[:, -1] - qpos[:, -1]).max(axis=-1)
         name = f"{substeps} substeps, joint and spinner angles at the end: "
         figures += [
             Figure(name + "greatest error", float(error.max()), "rad", 0.01 if substeps == 21 else None),
@@ -133,9 +117,9 @@ def hand_reach(recording: Recording) -> list[Figure]:
     actions, qpos, tips = _take(recording, "actions", "qpos", "tip_pos_m")
     figures = []
     for contacts in (True, False):
-        env = jaxrl_vis_envs.make("HandReach", contacts=contacts)
-        _, ours = play(env, start_at(env), (qpos[:, 0], np.zeros_like(qpos[:, 0])), actions)
-        error = np.linalg.norm((ours - tips).reshape(*tips.shape[:2], 5, 3), axis=-1)[:, 1:]
+        env = worlds.make("HandReach", contacts=contacts)
+        _, ours = play(env, worlds.start_at(env, qpos[:, 0], np.zeros_like(qpos[:, 0])), actions)
+        error = np.linalg.norm((ours - tips[:, 1:]).reshape(*ours.shape[:2], 5, 3), axis=-1)
         for number, finger in enumerate(("first finger", "middle finger", "ring finger", "little finger", "thumb")):
             name = finger if contacts else f"without contacts, {finger}"
             bounds = (0.002, 0.008) if contacts else (None, None)
@@ -145,11 +129,11 @@ def hand_reach(recording: Recording) -> list[Figure]:
 
 def reacher(recording: Recording) -> list[Figure]:
     """Joint angles and fingertip under torque control."""
-    env = jaxrl_vis_envs.make("Reacher", control="torque")
+    env = worlds.make("Reacher", control="torque")
     actions, qpos, qvel, fingertip = _take(recording, "actions", "qpos_rad", "qvel_rad_s", "fingertip_pos_m")
-    our_qpos, our_fingertip = play(env, start_at(env), (qpos[:, 0], qvel[:, 0]), actions)
-    error = np.abs(our_qpos - qpos)[:, 1:]
-    tip_error = np.linalg.norm(our_fingertip - fingertip[..., :2], axis=-1)[:, 1:]
+    our_qpos, our_fingertip = play(env, worlds.start_at(env, qpos[:, 0], qvel[:, 0]), actions)
+    error = np.abs(our_qpos - qpos[:, 1:])
+    tip_error = np.linalg.norm(our_fingertip - fingertip[:, 1:, :2], axis=-1)
     return [
         Figure("joint angles: median error", float(np.median(error)), "rad", 0.01),
         Figure("joint angles: 99th percentile of the error", float(np.percentile(error, 99)), "rad"),

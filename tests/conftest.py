@@ -33,3 +33,20 @@ def checkout() -> Path:
 def clean_environment(checkout: Path) -> dict[str, str]:
     """Environment variables for a subprocess that imports the checkout."""
     return {**os.environ, "PYTHONPATH": os.pathsep.join((str(checkout), str(checkout / "envs")))}
+
+
+# What takes longest, first: at the end of a run no worker should wait for the other.
+LONGEST = ("HandReach", "SawyerReach", "FetchReach", "FingerTurn", "Reacher")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests that share compiled programs run in one process: those of one group, or else of one file."""
+
+    def group(item: pytest.Item) -> str:
+        mark = item.get_closest_marker("xdist_group")
+        return mark.args[0] if mark else item.path.stem
+
+    for item in items:
+        item.add_marker(pytest.mark.xdist_group(group(item)))
+    items.sort(key=lambda item: LONGEST.index(group(item)) if group(item) in LONGEST else len(LONGEST))

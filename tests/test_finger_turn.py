@@ -9,20 +9,24 @@ import one_step
 import pytest
 
 import jaxrl_vis_envs
-from jaxrl_vis_envs.compilation import world_jit
+from benchmarks import worlds
 
+pytestmark = pytest.mark.xdist_group("FingerTurn")
 COUNT = 512
 
 
-@functools.cache
 def make():
-    return jaxrl_vis_envs.make("FingerTurn")
+    return worlds.make("FingerTurn")
 
 
 @functools.cache
+def starts_and_goals():
+    """COUNT episodes at their start, and the configurations that their goals show."""
+    return worlds.reset(make(), jax.random.split(jax.random.key(3), COUNT))
+
+
 def starts():
-    """State of COUNT episodes at their start."""
-    return world_jit(jax.vmap(make().reset))(jax.random.split(jax.random.key(3), COUNT))
+    return starts_and_goals()[0]
 
 
 def test_nothing_touches_at_the_start():
@@ -54,9 +58,8 @@ def test_goals_are_tips_at_uniform_angles():
 
 
 def test_the_finger_hangs_away_from_the_spinner_in_the_goal():
-    env = make()
-    qpos = np.asarray(world_jit(jax.vmap(env.sample_goal))(jax.random.split(jax.random.key(3), 8)).qpos)
-    np.testing.assert_allclose(qpos[:, :2], np.tile([-np.pi / 2, 0.0], (8, 1)), atol=1e-6)
+    qpos = np.asarray(starts_and_goals()[1].qpos)
+    np.testing.assert_allclose(qpos[:, :2], np.tile([-np.pi / 2, 0.0], (COUNT, 1)), atol=1e-6)
 
 
 def test_three_pictures_by_default_and_one_by_choice():

@@ -9,8 +9,10 @@ import one_step
 import pytest
 
 import jaxrl_vis_envs
+from benchmarks import worlds
 from jaxrl_vis_envs.compilation import world_jit
 
+pytestmark = pytest.mark.xdist_group("HandReach")
 COUNT = 128
 START_TIPS = [
     (0.9917, 0.7975, 0.1522),
@@ -21,15 +23,14 @@ START_TIPS = [
 ]
 
 
-@functools.cache
 def make(**overrides):
-    return jaxrl_vis_envs.make("HandReach", **overrides)
+    return worlds.make("HandReach", **overrides)
 
 
 @functools.cache
 def goals():
     """Configurations of COUNT goals."""
-    return world_jit(jax.vmap(make().sample_goal))(jax.random.split(jax.random.key(3), COUNT))
+    return worlds.reset(make(), jax.random.split(jax.random.key(3), COUNT))[1]
 
 
 def tips(data):

@@ -7,8 +7,7 @@ import numpy as np
 import one_step
 import pytest
 
-import jaxrl_vis_envs
-from benchmarks import parity
+from benchmarks import parity, worlds
 
 DATA = pathlib.Path(__file__).parent / "data"
 RECORDINGS = {
@@ -23,7 +22,7 @@ def test_every_comparison_has_a_recording():
     assert sorted(parity.COMPARISONS) == sorted(RECORDINGS)
 
 
-@pytest.mark.parametrize("name", RECORDINGS)
+@pytest.mark.parametrize("name", [pytest.param(task, marks=pytest.mark.xdist_group(task)) for task in RECORDINGS])
 def test_tasks_follow_the_recordings_of_their_originals(name):
     figures = parity.compare(name, np.load(DATA / RECORDINGS[name]))
     for figure in figures:
@@ -32,11 +31,13 @@ def test_tasks_follow_the_recordings_of_their_originals(name):
     assert not [figure for figure in figures if figure.is_broken]
 
 
+@pytest.mark.xdist_group("FetchReach")
 def test_most_of_the_fetch_recording_counts():
     figures = {figure.name: figure.value for figure in parity.compare("FetchReach", np.load(DATA / "fetch_reach.npz"))}
     assert figures["share of the recording that counts (near the start)"] > 0.5
 
 
+@pytest.mark.xdist_group("HandReach")
 def test_contacts_matter_to_the_hand():
     figures = {figure.name: figure.value for figure in parity.compare("HandReach", np.load(DATA / "hand_reach.npz"))}
     for finger in ("ring finger", "little finger"):
@@ -44,9 +45,10 @@ def test_contacts_matter_to_the_hand():
         assert figures[f"without contacts, {name}"] > max(3 * figures[name], 0.008)
 
 
+@pytest.mark.xdist_group("FetchReach")
 def test_mjx_steps_the_fetch_robot_as_mujoco_does():
     """In the air. On the table they differ: of a box on a plane the two engines keep different corners."""
-    env = jaxrl_vis_envs.make("FetchReach")
+    env = worlds.make("FetchReach")
     start = env.sample_start(jax.random.key(0))
     rng = np.random.default_rng(0)
     targets = np.asarray(start.xpos[env._gripper]) + rng.uniform(-0.15, 0.15, (12, 10, 3))

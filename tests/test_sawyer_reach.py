@@ -6,27 +6,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import one_step
+import pytest
 
-import jaxrl_vis_envs
-from jaxrl_vis_envs.compilation import world_jit
+from benchmarks import worlds
 
+pytestmark = pytest.mark.xdist_group("SawyerReach")
 COUNT = 512
 
 
-@functools.cache
 def make():
-    return jaxrl_vis_envs.make("SawyerReach")
+    return worlds.make("SawyerReach")
 
 
 @functools.cache
 def starts():
     """State of COUNT episodes at their start."""
-    return world_jit(jax.vmap(make().reset))(jax.random.split(jax.random.key(3), COUNT))
-
-
-@functools.cache
-def advance():
-    return world_jit(jax.vmap(make().advance))
+    return worlds.reset(make(), jax.random.split(jax.random.key(3), COUNT))[0]
 
 
 def test_the_numbers_of_the_thesis():
@@ -54,16 +49,16 @@ def test_chance_is_the_share_of_the_box_within_the_threshold():
 def test_a_unit_of_action_is_five_centimetres():
     state = jax.tree.map(lambda leaf: leaf[:2], starts())
     action = jnp.array([[1.0, -1.0, 0.5], [0.0, 0.0, 0.0]])
-    moved = advance()(state, action)
+    moved = worlds.advance(make(), state, action)
     for _ in range(3):
-        moved = advance()(moved, jnp.zeros((2, 3)))
+        moved = worlds.advance(make(), moved, jnp.zeros((2, 3)))
     np.testing.assert_allclose(moved.achieved_state - state.achieved_state, 0.05 * action, atol=2e-3)
 
 
 def test_the_hand_stays_over_the_table():
     state = jax.tree.map(lambda leaf: leaf[:2], starts())
     for _ in range(12):
-        state = advance()(state, jnp.tile(jnp.array([0.0, 0.0, -1.0]), (2, 1)))
+        state = worlds.advance(make(), state, jnp.tile(jnp.array([0.0, 0.0, -1.0]), (2, 1)))
     assert np.asarray(state.achieved_state)[:, 2].min() > 0.69
 
 

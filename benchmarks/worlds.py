@@ -1,0 +1,68 @@
+"""Tasks played from the host, by two compiled programs each that serve any number of episodes.
+
+The physics of a task takes much longer to compile than to play for a few episodes. Whoever plays it in one way and then in
+another (a controller, a recording, a test) shares these programs: they take `LANES` episodes at a time, and the last few are
+filled up with copies.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+import jaxrl_vis_envs
+from jaxrl_vis_envs.base import State
+from jaxrl_vis_envs.compilation import world_jit
+from jaxrl_vis_envs.tasks import mjx_model
+
+LANES = 64
+
+
+@functools.cache
+def make(name: str, **overrides: Any) -> Any:
+    """`jaxrl_vis_envs.make`, but the same environment every time, so that its programs are compiled once."""
+    return jaxrl_vis_envs.make(name, **overrides)
+
+
+def reset(env: Any, keys: jax.Array) -> tuple[State, Any]:
+    """Episodes at their start, and the configurations (`mjx.Data`) that their goals show; keys [N]."""
+    return _in_lanes(_reset_program(env), keys)
+
+
+def advance(env: Any, state: State, actions: Any) -> State:
+    """N episodes one control step later; actions [N, A]."""
+    return _in_lanes(_advance_program(env), state, jnp.asarray(actions, jnp.float32))
+
+
+def start_at(env: Any, qpos: Any, qvel: Any) -> State:
+    """Episodes that start with joint positions [N, nq] and velocities [N, nv]; their goals are nonsense.
+
+    Poses, and what is derived from them, are right from the first `advance` on.
+    """
+    still = jax.tree.map(lambda leaf: jnp.tile(leaf, (len(qpos), *(1,) * leaf.ndim)), mjx_model.still_data(env.mj_model))
+    data = still.replace(qpos=jnp.asarray(qpos, jnp.float32), qvel=jnp.asarray(qvel, jnp.float32))
+    return jax.vmap(lambda data: env.state_at(data, jnp.zeros_like(env.achieved(data))))(data)
+
+
+@functools.cache
+def _reset_program(env: Any) -> Callable:
+    # A goal is sampled twice by this text, and once by the compiled program.
+    return world_jit(jax.vmap(lambda key: (env.reset(key), env.sample_goal(key))))
+
+
+@functools.cache
+def _advance_program(env: Any) -> Callable:
+    return world_jit(jax.vmap(env.advance))
+
+
+def _in_lanes(program: Callable, *trees: Any) -> Any:
+    """``program`` on [N, ...] leaves, LANES rows at a time."""
+    count = len(jax.tree.leaves(trees)[0])
+    parts = []
+    for first in range(0, count, LANES):
+        rows = jnp.minimum(jnp.arange(first, first + LANES), count - 1)
+        part = program(*jax.tree.map(lambda leaf, rows=rows: leaf[rows], trees))
+        parts.append(part)
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:count], *parts)
