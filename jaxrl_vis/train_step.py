@@ -186,7 +186,7 @@ def make_train_step(env: GoalEnv, config: Config) -> TrainStep:
         resolved=resolved,
         networks=networks,
         replay=replay,
-        init=world_jit(per_seed(init, out_axes=_SEED_AXES)),
+        init=world_jit(per_seed(init, out_axes=_SEED_AXES), runs_once=True),
         train_iteration=world_jit(per_seed(train_iteration, (_SEED_AXES,), (_SEED_AXES, 0)), donate_argnums=0),
         evaluate=world_jit(per_seed(evaluate, (0, None))),
         update_many=world_jit(per_seed(update_many, (0, 0, 0, None)), donate_argnums=0),

@@ -306,7 +306,8 @@ def test_world_jit_switches_off_fusion_emitters_on_a_cpu_where_jax_can(monkeypat
     takes_it = jax.default_backend() == "cpu" and jax.__version_info__ < (0, 11)
     expected = {"xla_cpu_use_fusion_emitters": False} if takes_it else {}
     assert options["compiler_options"] == expected
-    assert compilation.compiler_options("gpu") == {}
+    assert compilation.compiler_options("gpu") == compilation.compiler_options("gpu", runs_once=True) == {}
+    assert compilation.compiler_options("cpu", runs_once=True) == {**expected, "xla_backend_optimization_level": 1}
 
 
 @FETCH

@@ -1,6 +1,9 @@
 """Gradients of pictures against finite differences, away from silhouettes, and what must not spoil them."""
 
+import functools
+from collections.abc import Callable
 from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,9 +27,9 @@ XML = """
   </asset>
   <worldbody>
     <light pos=".5 -1 2" dir="-.3 .5 -1" cutoff="80" diffuse=".6 .5 .4" attenuation="1 .1 .1"/>
-    <geom name="thing" {thing}/>
-    <geom name="floor" type="plane" size="2 2 .1" pos="0 0 -.5"/>
+    <geom name="floor" type="plane" size="9 9 .1" pos="0 0 -.5"/>
     <camera name="eye" pos=".2 -1.2 .5" xyaxes="1 .1 0 -.05 .4 1" fovy="45"/>
+    {things}
   </worldbody>
 </mujoco>
 """
@@ -38,49 +41,17 @@ THINGS = {
     "cylinder": f'type="cylinder" size=".2 .2" rgba=".7 .5 .3 1" {QUAT}',
     "box": f'type="box" size=".2 .15 .2" rgba=".7 .5 .3 1" {QUAT}',
     "plane": f'type="plane" size=".3 .3 .1" rgba=".7 .5 .3 1" {QUAT}',
-    "mesh": f'type="mesh" mesh="wedge" rgba=".7 .5 .3 1" {QUAT}',
     "textured": f'type="ellipsoid" size=".2 .15 .3" material="soft" {QUAT}',
+    "mesh": f'type="mesh" mesh="wedge" rgba=".7 .5 .3 1" {QUAT}',
     "transparent": f'type="ellipsoid" size=".2 .15 .3" rgba=".7 .5 .3 .4" {QUAT}',
 }
-
-
-def setting(thing: str):
-    """(scene, poses, mask of pixels well inside the thing)."""
-    mj_model = mujoco.MjModel.from_xml_string(XML.format(thing=THINGS[thing]))
-    mj_data = mujoco.MjData(mj_model)
-    mujoco.mj_forward(mj_model, mj_data)
-    poses = {name: jnp.asarray(getattr(mj_data, name), jnp.float32) for name in POSES}
-    scene = Scene.from_mjmodel(mj_model, "eye", SIZE, SIZE)
-    planes = render_planes(scene, SimpleNamespace(**poses), rgb=False, segmentation=True, normals=True)
-    labels, normals = np.asarray(planes.segmentation), np.asarray(planes.normals)
-    # Away from silhouettes, and from the edges between the faces of one thing.
-    inside = np.zeros((SIZE, SIZE), bool)
-    for row in range(2, SIZE - 2):
-        for column in range(2, SIZE - 2):
-            block = (slice(row - 2, row + 3), slice(column - 2, column + 3))
-            facing = normals[(slice(None), *block)].reshape(3, -1)
-            inside[row, column] = np.all(labels[block] == 0) and np.min(normals[:, row, column] @ facing) > 0.6
-    assert inside.sum() >= 4, thing
-    return scene, poses, jnp.asarray(inside)
-
-
-def moved(scene: Scene, poses: dict, change: dict) -> tuple[Scene, dict]:
-    """The scene and the poses with small changes: of the thing's position and orientation, the camera, sizes, looks."""
-    x, y, z = change["turn"]
-    cross = jnp.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    turned = poses["geom_xmat"].reshape(-1, 3, 3)
-    turned = turned.at[0].set(turned[0] + jnp.sum(cross[:, :, None] * turned[0][None], axis=1))
-    poses = poses | {"geom_xpos": poses["geom_xpos"].at[0].add(change["shift"]), "geom_xmat": turned}
-    scene = scene.replace(
-        camera_shift=change["camera_shift"],
-        camera_turn=change["camera_turn"],
-        fovy=scene.fovy + change["fovy"],
-        size=scene.size.at[0].add(change["size"]),
-        rgba=scene.rgba.at[0, :3].add(change["colour"]),
-        light_diffuse=scene.light_diffuse + change["light"],
-        light_position=scene.light_position + change["light_position"],
-    )
-    return scene, poses
+# What is drawn together: a program's compilation takes far longer than its run.
+SCENES = {
+    "primitives": ("sphere", "capsule", "ellipsoid", "cylinder", "box", "plane", "textured"),
+    "mesh": ("mesh",),
+    "transparent": ("transparent",),
+}
+SCENE_OF = {thing: scene for scene, things in SCENES.items() for thing in things}
 
 
 def no_change() -> dict:
@@ -88,70 +59,137 @@ def no_change() -> dict:
     return {name: jnp.zeros(3) for name in threes} | {"fovy": jnp.zeros(())}
 
 
+def moved(scene: Scene, poses: dict, thing: jax.Array, change: dict) -> tuple[Scene, dict]:
+    """The scene and the poses with small changes: of a thing's position and orientation, the camera, sizes, looks."""
+    x, y, z = change["turn"]
+    cross = jnp.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    turned = poses["geom_xmat"].reshape(-1, 3, 3)
+    turned = turned.at[thing].set(turned[thing] + jnp.sum(cross[:, :, None] * turned[thing][None], axis=1))
+    poses = poses | {"geom_xpos": poses["geom_xpos"].at[thing].add(change["shift"]), "geom_xmat": turned}
+    scene = scene.replace(
+        camera_shift=change["camera_shift"],
+        camera_turn=change["camera_turn"],
+        fovy=scene.fovy + change["fovy"],
+        size=scene.size.at[thing].add(change["size"]),
+        rgba=scene.rgba.at[thing, :3].add(change["colour"]),
+        light_diffuse=scene.light_diffuse + change["light"],
+        light_position=scene.light_position + change["light_position"],
+    )
+    return scene, poses
+
+
+class Setting(NamedTuple):
+    """A scene, its poses, and one compiled program.
+
+    ``measure(poses, thing, change, mask)`` gives the planes, the means over ``mask`` of depth, of all colours and of red,
+    and the slopes of these three with respect to ``change``.
+    """
+
+    scene: Scene
+    poses: dict
+    measure: Callable[..., tuple[Any, jax.Array, dict]]
+
+
+@functools.cache
+def setting(name: str) -> Setting:
+    things = (
+        f'<body pos="{0.9 * place} 0 0"><geom name="{thing}" {THINGS[thing]}/></body>'
+        for place, thing in enumerate(SCENES[name])
+    )
+    mj_model = mujoco.MjModel.from_xml_string(XML.format(things="".join(things)))
+    mj_data = mujoco.MjData(mj_model)
+    mujoco.mj_forward(mj_model, mj_data)
+    poses = {pose: jnp.asarray(getattr(mj_data, pose), jnp.float32) for pose in POSES}
+    scene = Scene.from_mjmodel(mj_model, "eye", SIZE, SIZE)
+
+    def values(change, poses, thing, mask):
+        # The camera goes along, so that every thing is in the middle of the picture.
+        place = jnp.zeros(3).at[0].set(0.9 * (thing - 1))
+        changed, placed = moved(scene, poses, thing, change)
+        changed = changed.replace(camera_shift=changed.camera_shift + place, light_position=changed.light_position + place)
+        planes = render_planes(changed, SimpleNamespace(**placed), segmentation=True, normals=True)
+        weights = jnp.where(mask, 1.0, 0.0) / jnp.maximum(mask.sum(), 1)
+        means = jnp.stack([jnp.sum(weights * plane) for plane in (planes.depth, planes.rgb, planes.rgb[0])])
+        return means, (planes, means)
+
+    def measure(poses, thing, change, mask):
+        slopes, (planes, means) = jax.jacrev(values, has_aux=True)(change, poses, thing, mask)
+        return planes, means, slopes
+
+    return Setting(scene, poses, world_jit(measure))
+
+
+def well_inside(planes: Any, thing: int) -> jax.Array:
+    """[SIZE, SIZE] bool: away from silhouettes, and from the edges between the faces of one thing."""
+    labels, normals = np.asarray(planes.segmentation), np.asarray(planes.normals)
+    inside = np.zeros((SIZE, SIZE), bool)
+    for row in range(2, SIZE - 2):
+        for column in range(2, SIZE - 2):
+            block = (slice(row - 2, row + 3), slice(column - 2, column + 3))
+            facing = normals[(slice(None), *block)].reshape(3, -1)
+            inside[row, column] = np.all(labels[block] == thing) and np.min(normals[:, row, column] @ facing) > 0.6
+    assert inside.sum() >= 4
+    return jnp.asarray(inside)
+
+
 STEPS = {"fovy": 0.05, "turn": 2e-3, "camera_turn": 2e-3, "light_position": 1e-2, "colour": 1e-2, "light": 1e-2}
+NOWHERE = jnp.zeros((SIZE, SIZE), bool)
 
 
-@pytest.mark.parametrize("thing", THINGS)
-def test_gradients_are_those_of_finite_differences(thing):
-    scene, poses, inside = setting(thing)
-
-    def measured(change):
-        changed, placed = moved(scene, poses, change)
-        planes = render_planes(changed, SimpleNamespace(**placed))
-        weights = jnp.where(inside, 1.0, 0.0) / inside.sum()
-        return jnp.stack([jnp.sum(weights * planes.depth), jnp.sum(weights * planes.rgb), jnp.sum(weights * planes.rgb[0])])
-
-    compiled = world_jit(measured)
-    slopes = world_jit(jax.jacrev(measured))(no_change())
-    for name, slope in slopes.items():
-        if name == "size" and thing == "mesh":
+@pytest.mark.parametrize("name", THINGS)
+def test_gradients_are_those_of_finite_differences(name):
+    scene = SCENE_OF[name]
+    _, poses, measure = setting(scene)
+    thing = 1 + SCENES[scene].index(name)  # after the floor
+    inside = well_inside(measure(poses, thing, no_change(), NOWHERE)[0], thing)
+    _, _, slopes = measure(poses, thing, no_change(), inside)
+    for quantity, slope in slopes.items():
+        if quantity == "size" and name == "mesh":
             continue  # a mesh has none
-        step = STEPS.get(name, 1e-3)
+        step = STEPS.get(quantity, 1e-3)
         directions = np.eye(3) if slope.ndim == 2 else np.ones(1)
         for axis, direction in enumerate(directions):
             up, down = (
-                compiled(no_change() | {name: jnp.asarray(sign * step * direction, jnp.float32)}) for sign in (1.0, -1.0)
+                measure(poses, thing, no_change() | {quantity: jnp.asarray(sign * step * direction, jnp.float32)}, inside)[1]
+                for sign in (1.0, -1.0)
             )
-            expected = (up - down) / (2.0 * step)
             found = slope[:, axis] if slope.ndim == 2 else slope
-            np.testing.assert_allclose(found, expected, rtol=0.03, atol=0.02, err_msg=f"{thing} {name} {axis}")
+            expected = (up - down) / (2.0 * step)
+            np.testing.assert_allclose(found, expected, rtol=0.03, atol=0.02, err_msg=f"{name} {quantity} {axis}")
     assert np.abs(slopes["shift"][0]).max() > 0.1
     assert np.abs(slopes["colour"][1]).max() > 0.1
 
 
-@pytest.mark.parametrize("thing", ["capsule", "mesh", "transparent"])
-def test_a_nan_pose_leaves_no_nan_in_other_gradients(thing):
-    scene, poses, _ = setting(thing)
-    poses = poses | {"geom_xpos": poses["geom_xpos"].at[0].set(jnp.nan)}
-
-    def brightness(shift, colour):
-        shifted = poses | {"geom_xpos": poses["geom_xpos"].at[1].add(shift)}
-        looks = scene.replace(rgba=scene.rgba.at[1, :3].add(colour))
-        planes = render_planes(looks, SimpleNamespace(**shifted), normals=True)
-        return planes.rgb.sum() + planes.depth.sum() + planes.normals.sum()
-
-    shift, colour = world_jit(jax.grad(brightness, argnums=(0, 1)))(jnp.zeros(3), jnp.zeros(3))
-    assert np.all(np.isfinite(shift)) and np.all(np.isfinite(colour))
-    assert np.any(np.asarray(colour) > 0)
+@pytest.mark.parametrize("name", SCENES)
+def test_a_nan_pose_leaves_no_nan_in_other_gradients(name):
+    """The last thing has no pose; gradients of the whole picture with respect to the floor, the camera and the lights."""
+    _, poses, measure = setting(name)
+    poses = poses | {"geom_xpos": poses["geom_xpos"].at[-1].set(jnp.nan)}
+    planes, means, slopes = measure(poses, 0, no_change(), ~NOWHERE)
+    assert np.all(np.isfinite(means)) and len(SCENES[name]) not in np.asarray(planes.segmentation)
+    for quantity, slope in slopes.items():
+        assert np.all(np.isfinite(slope)), quantity
+    assert np.any(np.asarray(slopes["colour"][1]) > 0)
 
 
 def test_a_pose_is_found_by_descent():
-    scene, poses, _ = setting("ellipsoid")
-
-    def depth(shift):
-        return render_planes(scene, SimpleNamespace(**moved(scene, poses, no_change() | {"shift": shift})[1]), rgb=False).depth
-
-    truth = jnp.array([0.03, -0.04, 0.02])
-    target = depth(truth)
+    """Of a ball, from a depth picture alone."""
+    scene, poses, _ = setting("primitives")
+    thing = 1 + SCENES["primitives"].index("sphere")
 
     @world_jit
-    def descend(shift):
+    def descend(shift, target):
         def error(shift):
-            return jnp.mean(jnp.clip(jnp.abs(depth(shift) - target), 0.0, 0.2))
+            change = no_change() | {"shift": shift}
+            planes = render_planes(scene, SimpleNamespace(**moved(scene, poses, thing, change)[1]), rgb=False)
+            return jnp.mean(jnp.clip(jnp.abs(planes.depth - target), 0.0, 0.2)), planes.depth
 
-        return shift - 0.05 * jax.grad(error)(shift)
+        slope, depth = jax.grad(error, has_aux=True)(shift)
+        return shift - 0.05 * slope, depth
 
+    truth = jnp.array([0.03, -0.04, 0.02])
+    target = descend(truth, jnp.zeros((SIZE, SIZE)))[1]
     shift = jnp.zeros(3)
     for _ in range(60):
-        shift = descend(shift)
+        shift, _ = descend(shift, target)
     assert np.linalg.norm(shift - truth) < 0.5 * np.linalg.norm(truth)

@@ -14,16 +14,23 @@ from typing import Any
 import jax
 
 
-def compiler_options(backend: str | None = None) -> dict[str, Any]:
-    """Compiler options for programs that contain physics or rendering, for ``backend`` (default: the one JAX runs on)."""
-    if (backend or jax.default_backend()) == "cpu" and jax.__version_info__ < (0, 11):
-        return {"xla_cpu_use_fusion_emitters": False}
-    return {}
+def compiler_options(backend: str | None = None, *, runs_once: bool = False) -> dict[str, Any]:
+    """Compiler options for programs that contain physics or rendering, for ``backend`` (default: the one JAX runs on).
+
+    ``runs_once`` is for a program that takes longer to compile than to run: a CPU's machine code is then hardly optimised
+    (drawing the first parameters of all networks: 2 s to compile in place of 19).
+    """
+    if (backend or jax.default_backend()) != "cpu":
+        return {}
+    options: dict[str, Any] = {"xla_backend_optimization_level": 1} if runs_once else {}
+    if jax.__version_info__ < (0, 11):
+        options["xla_cpu_use_fusion_emitters"] = False
+    return options
 
 
-def world_jit(function: Callable, **jit_options: Any) -> Any:
+def world_jit(function: Callable, *, runs_once: bool = False, **jit_options: Any) -> Any:
     """`jax.jit` with the options of `compiler_options`; every jit of a function that moves or draws a world goes through it."""
-    return jax.jit(function, compiler_options=compiler_options(), **jit_options)
+    return jax.jit(function, compiler_options=compiler_options(runs_once=runs_once), **jit_options)
 
 
 def runs_gpu_kernels() -> bool:
