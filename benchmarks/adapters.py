@@ -1,0 +1,110 @@
+"""Trains other libraries' agents through the adapters, and keeps a record of how well they do before and after.
+
+    python benchmarks/adapters.py sb3 [--env FetchReach] [--steps 20000]      Stable-Baselines3: DDPG with HER, sparse reward
+    python benchmarks/adapters.py brax [--env Reacher] [--steps 1000000]      brax: PPO, dense reward
+
+Needs ``pip install 'jaxrl-vis[gymnasium]' stable-baselines3``, or ``pip install 'jaxrl-vis[brax]'``. Success is the share of 256
+episodes that lie within the threshold at their last step, without exploration. Exit status: 0 it learned; 1 it did not.
+"""
+
+import argparse
+import importlib.metadata
+import os
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+# brax compiles by itself, without what `compilation.world_jit` would have asked for. Read by JAX at its first import; a script may
+# do that, a library may not.
+if "fusion_emitters" not in os.environ.get("XLA_FLAGS", ""):
+    os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_use_fusion_emitters=false"
+
+import numpy as np
+
+from jaxrl_vis.bench.record import Measurement, compare_and_keep
+
+EVALUATION_EPISODES = 256
+EVALUATION_SEED = 10_000
+
+
+def evaluate(env: str, act: Callable[[dict[str, np.ndarray]], np.ndarray]) -> dict[str, float]:
+    """Success and distance (unit of the task) at the last step, of a policy from observations [N, ...] to actions [N, A]."""
+    from jaxrl_vis_envs.adapters.gymnasium import GymnasiumVectorEnv
+
+    envs = GymnasiumVectorEnv(env, EVALUATION_EPISODES)
+    observations, _ = envs.reset(seed=EVALUATION_SEED)
+    truncated = np.zeros(EVALUATION_EPISODES, bool)
+    infos: dict[str, Any] = {}
+    while not truncated.all():
+        observations, _, _, truncated, infos = envs.step(act(observations))
+    return {"success": float(infos["is_success"].mean()), "goal_distance": float(infos["goal_distance"].mean())}
+
+
+def train_sb3(env: str, steps: int, seed: int) -> Measurement:
+    """DDPG with hindsight goals, on one environment, with the hyper-parameters of SB3's zoo for Fetch but for the network."""
+    import stable_baselines3
+    import torch
+    from stable_baselines3.common.noise import NormalActionNoise
+
+    from jaxrl_vis_envs.adapters.gymnasium import GymnasiumEnv
+
+    torch.set_num_threads(1)
+    gym_env = GymnasiumEnv(env)
+    size = gym_env.goal_env.action_size
+    settings: dict[str, Any] = {"gamma": 0.95, "learning_rate": 1e-3, "batch_size": 256, "learning_starts": 1000}
+    model = stable_baselines3.DDPG(
+        "MultiInputPolicy",
+        gym_env,
+        replay_buffer_class=stable_baselines3.HerReplayBuffer,
+        replay_buffer_kwargs={"n_sampled_goal": 4, "goal_selection_strategy": "future"},
+        buffer_size=steps,
+        action_noise=NormalActionNoise(np.zeros(size), 0.2 * np.ones(size)),
+        policy_kwargs={"net_arch": [256, 256]},
+        seed=seed,
+        **settings,
+    )
+
+    def act(observations: dict[str, np.ndarray]) -> np.ndarray:
+        return model.predict(observations, deterministic=True)[0]
+
+    before, started = evaluate(env, act), time.perf_counter()
+    model.learn(steps, log_interval=40)
+    seconds = time.perf_counter() - started
+    versions = {"stable_baselines3": stable_baselines3.__version__, "torch": torch.__version__}
+    config = {"agent": "stable_baselines3 DDPG + HER", "env": env, "steps": steps, "seed": seed, **settings}
+    return learning(config, before, evaluate(env, act), seconds, versions)
+
+
+def learning(
+    config: dict[str, Any], before: dict[str, float], after: dict[str, float], seconds: float, details: dict[str, Any]
+) -> Measurement:
+    """The record of a training run, from figures of `evaluate`."""
+    versions = {name: importlib.metadata.version(name) for name in ("gymnasium",)}
+    figures = {
+        f"{name}_{when}": round(value, 4) for when, at in (("before", before), ("after", after)) for name, value in at.items()
+    }
+    return Measurement(
+        "adapters/success", after["success"], "share", config, {**figures, "train_s": round(seconds, 1), **versions, **details}
+    )
+
+
+TRAINERS = {"sb3": (train_sb3, "FetchReach", 20_000)}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Trains, prints and keeps the record; 1 where success did not rise."""
+    parser = argparse.ArgumentParser(description="Trains other libraries' agents through the adapters.")
+    parser.add_argument("agent", choices=sorted(TRAINERS))
+    parser.add_argument("--env", help="a state task; default: one that the agent is known to learn")
+    parser.add_argument("--steps", type=int, help="environment steps")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args(arguments)
+    train, env, steps = TRAINERS[options.agent]
+    measurement = train(options.env or env, options.steps or steps, options.seed)
+    compare_and_keep("adapters", measurement)
+    return 0 if measurement.details["success_after"] > measurement.details["success_before"] else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
