@@ -3,8 +3,8 @@
     python benchmarks/adapters.py sb3 [--env FetchReach] [--steps 20000]      Stable-Baselines3: DDPG with HER, sparse reward
     python benchmarks/adapters.py brax [--env Reacher] [--steps 1000000]      brax: PPO, dense reward
 
-Needs ``pip install 'jaxrl-vis[gymnasium]' stable-baselines3``, or ``pip install 'jaxrl-vis[brax]'``. Success is the share of 256
-episodes that lie within the threshold at their last step, without exploration. Exit status: 0 it learned; 1 it did not.
+Needs ``pip install 'jaxrl-vis[gymnasium]' stable-baselines3``, or ``pip install 'jaxrl-vis[brax]'``. Success is the share of
+256 episodes that lie within the threshold at their last step, without exploration. Exit status: 0 it learned; 1 it did not.
 """
 
 import argparse
@@ -15,8 +15,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-# brax compiles by itself, without what `compilation.world_jit` would have asked for. Read by JAX at its first import; a script may
-# do that, a library may not.
+# brax compiles by itself, without what `compilation.world_jit` would have asked for. Read by JAX at its first import: a script
+# may do that, a library may not.
 if "fusion_emitters" not in os.environ.get("XLA_FLAGS", ""):
     os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_use_fusion_emitters=false"
 
@@ -80,10 +80,9 @@ def learning(
     config: dict[str, Any], before: dict[str, float], after: dict[str, float], seconds: float, details: dict[str, Any]
 ) -> Measurement:
     """The record of a training run, from figures of `evaluate`."""
-    versions = {name: importlib.metadata.version(name) for name in ("gymnasium",)}
-    figures = {
-        f"{name}_{when}": round(value, 4) for when, at in (("before", before), ("after", after)) for name, value in at.items()
-    }
+    figures = {f"{name}_before": round(value, 4) for name, value in before.items()}
+    figures |= {f"{name}_after": round(value, 4) for name, value in after.items()}
+    versions = {"gymnasium": importlib.metadata.version("gymnasium")}
     return Measurement(
         "adapters/success", after["success"], "share", config, {**figures, "train_s": round(seconds, 1), **versions, **details}
     )

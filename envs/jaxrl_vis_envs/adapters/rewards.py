@@ -14,8 +14,8 @@ def reward_function(reward: Reward, threshold: float) -> RewardFunction:
     """The function that scores states.
 
     Args:
-        reward: ``oracle`` pays 0 within ``threshold`` of the goal and -1 elsewhere (`goals.oracle_reward`); ``dense`` pays minus
-            the distance, in the unit of the states.
+        reward: ``oracle`` pays 0 within ``threshold`` of the goal and -1 elsewhere (`goals.oracle_reward`); ``dense`` pays
+            minus the distance, in the unit of the states.
         threshold: Distance within which an episode succeeds, in the unit of the states.
 
     Raises:
