@@ -1,14 +1,13 @@
 """Trains other libraries' agents through the adapters, and keeps a record of how well they do before and after.
 
     python benchmarks/adapters.py sb3 [--env FetchReach] [--steps 20000]      Stable-Baselines3: DDPG with HER, sparse reward
-    python benchmarks/adapters.py brax [--env Reacher] [--steps 1000000]      brax: PPO, dense reward
+    python benchmarks/adapters.py brax [--env FetchReach] [--steps 300000]    brax: PPO, dense reward
 
 Needs ``pip install 'jaxrl-vis[gymnasium]' stable-baselines3``, or ``pip install 'jaxrl-vis[brax]'``. Success is the share of
 256 episodes that lie within the threshold at their last step, without exploration. Exit status: 0 it learned; 1 it did not.
 """
 
 import argparse
-import importlib.metadata
 import os
 import sys
 import time
@@ -43,6 +42,7 @@ def evaluate(env: str, act: Callable[[dict[str, np.ndarray]], np.ndarray]) -> di
 
 def train_sb3(env: str, steps: int, seed: int) -> Measurement:
     """DDPG with hindsight goals, on one environment, with the hyper-parameters of SB3's zoo for Fetch but for the network."""
+    import gymnasium
     import stable_baselines3
     import torch
     from stable_baselines3.common.noise import NormalActionNoise
@@ -69,11 +69,81 @@ def train_sb3(env: str, steps: int, seed: int) -> Measurement:
         return model.predict(observations, deterministic=True)[0]
 
     before, started = evaluate(env, act), time.perf_counter()
+    print(before, flush=True)
     model.learn(steps, log_interval=40)
     seconds = time.perf_counter() - started
-    versions = {"stable_baselines3": stable_baselines3.__version__, "torch": torch.__version__}
+    versions = {
+        "gymnasium": gymnasium.__version__,
+        "stable_baselines3": stable_baselines3.__version__,
+        "torch": torch.__version__,
+    }
     config = {"agent": "stable_baselines3 DDPG + HER", "env": env, "steps": steps, "seed": seed, **settings}
     return learning(config, before, evaluate(env, act), seconds, versions)
+
+
+def train_brax(env: str, steps: int, seed: int) -> Measurement:
+    """PPO on observation and goal as one vector, with minus the distance as the reward."""
+    import functools
+
+    import brax
+    import jax
+    from brax.training.agents.ppo import networks
+    from brax.training.agents.ppo import train as ppo
+
+    from jaxrl_vis_envs.adapters.brax import BraxEnv, lend_jax
+
+    brax_env = BraxEnv(env, reward="dense")
+    reset, step = jax.vmap(brax_env.reset), jax.vmap(brax_env.step)
+    keys = jax.random.split(jax.random.PRNGKey(EVALUATION_SEED), EVALUATION_EPISODES)
+
+    @functools.cache
+    def evaluation(make_policy: Any) -> Any:
+        def play(params: Any) -> dict[str, jax.Array]:
+            policy = make_policy(params, deterministic=True)
+            play_step = lambda state, _: (step(state, policy(state.obs, jax.random.PRNGKey(0))[0]), None)  # noqa: E731
+            return jax.lax.scan(play_step, reset(keys), length=brax_env.episode_length)[0].metrics
+
+        return jax.jit(play)
+
+    curve: list[tuple[int, dict[str, float]]] = []
+
+    def watch(env_steps: int, make_policy: Any, params: Any) -> None:
+        curve.append((env_steps, {name: float(values.mean()) for name, values in evaluation(make_policy)(params).items()}))
+        print(curve[-1], flush=True)
+
+    settings: dict[str, Any] = {
+        "num_envs": 128,
+        "unroll_length": 10,
+        "batch_size": 128,
+        "num_minibatches": 8,
+        "num_updates_per_batch": 8,
+        "num_resets_per_eval": 3,
+        "learning_rate": 1e-3,
+        "discounting": 0.95,
+        "reward_scaling": 10.0,
+        "entropy_cost": 1e-3,
+    }
+    network_factory = functools.partial(
+        networks.make_ppo_networks, policy_hidden_layer_sizes=(128, 128), value_hidden_layer_sizes=(128, 128)
+    )
+    started = time.perf_counter()
+    with lend_jax():
+        ppo.train(
+            brax_env,
+            num_timesteps=steps,
+            episode_length=brax_env.episode_length,
+            normalize_observations=True,
+            network_factory=network_factory,
+            num_evals=6,
+            run_evals=False,
+            policy_params_fn=watch,
+            seed=seed,
+            **settings,
+        )
+    seconds = time.perf_counter() - started
+    config = {"agent": "brax PPO", "env": env, "reward": "dense", "steps": curve[-1][0], "seed": seed, **settings}
+    versions = {"brax": brax.__version__, "curve": [[at, round(figures["success"], 3)] for at, figures in curve]}
+    return learning(config, curve[0][1], curve[-1][1], seconds, versions)
 
 
 def learning(
@@ -82,13 +152,12 @@ def learning(
     """The record of a training run, from figures of `evaluate`."""
     figures = {f"{name}_before": round(value, 4) for name, value in before.items()}
     figures |= {f"{name}_after": round(value, 4) for name, value in after.items()}
-    versions = {"gymnasium": importlib.metadata.version("gymnasium")}
     return Measurement(
-        "adapters/success", after["success"], "share", config, {**figures, "train_s": round(seconds, 1), **versions, **details}
+        "adapters/success", after["success"], "share", config, {**figures, "train_s": round(seconds, 1), **details}
     )
 
 
-TRAINERS = {"sb3": (train_sb3, "FetchReach", 20_000)}
+TRAINERS = {"brax": (train_brax, "FetchReach", 300_000), "sb3": (train_sb3, "FetchReach", 20_000)}
 
 
 def main(arguments: list[str] | None = None) -> int:
