@@ -72,11 +72,7 @@ def train_sb3(env: str, steps: int, seed: int) -> Measurement:
     print(before, flush=True)
     model.learn(steps, log_interval=40)
     seconds = time.perf_counter() - started
-    versions = {
-        "gymnasium": gymnasium.__version__,
-        "stable_baselines3": stable_baselines3.__version__,
-        "torch": torch.__version__,
-    }
+    versions = {module.__name__: module.__version__ for module in (gymnasium, stable_baselines3, torch)}
     config = {"agent": "stable_baselines3 DDPG + HER", "env": env, "steps": steps, "seed": seed, **settings}
     return learning(config, before, evaluate(env, act), seconds, versions)
 

@@ -7,11 +7,12 @@
     with lend_jax():
         make_policy, params, metrics = ppo.train(env, episode_length=env.episode_length, num_envs=256, ...)
 
-`BraxEnv` never says ``done``: brax's EpisodeWrapper, told the ``episode_length``, ends episodes and marks the end as a truncation.
+`BraxEnv` never says ``done``: brax's EpisodeWrapper, told the ``episode_length``, ends episodes and marks that as truncation.
 
-Two peculiarities of brax matter here. Its AutoResetWrapper starts every episode of an environment like that environment's first
-one, with the same goal: use many environments, or ask for ``num_resets_per_eval``. And it compiles by itself, without the option
-that physics needs on a CPU (see `compilation`): there, set ``XLA_FLAGS=--xla_cpu_use_fusion_emitters=false`` before JAX starts.
+Two peculiarities of brax matter here. Its AutoResetWrapper starts every episode of an environment like that environment's
+first one, with the same goal: use many environments, or ask for ``num_resets_per_eval``. And it compiles by itself, without
+the option that physics needs on a CPU (see `compilation`): there, set ``XLA_FLAGS=--xla_cpu_use_fusion_emitters=false``
+before JAX starts.
 """
 
 import contextlib
@@ -69,7 +70,7 @@ class BraxEnv(Env):
     def step(self, state: BraxState, action: jax.Array) -> BraxState:
         """Moves by ``action`` [A] in [-1, 1]. ``done`` stays 0, ``info`` is passed on, ``metrics`` are those of the world.
 
-        ``metrics``: ``success`` (0 or 1) and ``goal_distance`` (unit of the task), which brax's evaluation sums over an episode.
+        Those are ``success`` (0 or 1) and ``goal_distance`` (unit of the task). Brax's evaluation sums them over an episode.
         """
         world: Any = state.pipeline_state
         world = self.goal_env.step(world, action)
