@@ -64,8 +64,9 @@ class BraxEnv(Env):
         Brax's wrappers read the batch's shape from such an untyped key, so what they wrap needs untyped ones.
         """
         is_typed = jnp.issubdtype(rng.dtype, jax.dtypes.prng_key)
-        state = self.goal_env.reset(rng if is_typed else jax.random.wrap_key_data(rng))
-        return BraxState(state, self._observe(state), self._reward(state), jnp.zeros(()), dict(state.metrics))
+        world = self.goal_env.reset(rng if is_typed else jax.random.wrap_key_data(rng))
+        physics: Any = world  # brax says that it must be a state of its own physics, and never looks
+        return BraxState(physics, self._observe(world), self._reward(world), jnp.zeros(()), dict(world.metrics))
 
     def step(self, state: BraxState, action: jax.Array) -> BraxState:
         """Moves by ``action`` [A] in [-1, 1]. ``done`` stays 0, ``info`` is passed on, ``metrics`` are those of the world.

@@ -69,6 +69,7 @@ def _programs(env: GoalEnv) -> _Programs:
 
     def reset(seeds: jax.Array) -> tuple[State, dict[str, jax.Array]]:
         state = jax.vmap(lambda seed: env.reset(jax.random.key(seed)))(seeds)
+        assert state.obs is not None
         goals = {"goal_pixels": _to_public(state.obs["desired_goal"])} if sees_pictures else {}
         # Pictures are handed out, not carried.
         state = state.replace(obs=None)
