@@ -41,7 +41,7 @@ def evaluate(env: str, act: Callable[[dict[str, np.ndarray]], np.ndarray]) -> di
 
 
 def train_sb3(env: str, steps: int, seed: int) -> Measurement:
-    """DDPG with hindsight goals, on one environment, with the hyper-parameters of SB3's zoo for Fetch but for the network."""
+    """DDPG with hindsight goals and the sparse reward, on one environment."""
     import gymnasium
     import stable_baselines3
     import torch

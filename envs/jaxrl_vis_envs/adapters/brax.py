@@ -23,15 +23,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxrl_vis_envs.adapters.rewards import Reward, reward_function
+from jaxrl_vis_envs.base import GoalEnv, State
+from jaxrl_vis_envs.registry import make
+from jaxrl_vis_envs.tasks import mjx_model  # noqa: F401 - before brax, for it imports MJX without MJX's remarks on stdout
+
 try:
     from brax.envs.base import Env
     from brax.envs.base import State as BraxState
 except ImportError as error:
     raise ImportError("this adapter needs brax: pip install 'jaxrl-vis[brax]'") from error
-
-from jaxrl_vis_envs.adapters.rewards import Reward, reward_function
-from jaxrl_vis_envs.base import GoalEnv, State
-from jaxrl_vis_envs.registry import make
 
 
 class BraxEnv(Env):
