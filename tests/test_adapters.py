@@ -417,7 +417,7 @@ def test_the_page_holds_the_robot_its_goal_and_their_motion():
     for t, state in enumerate(system["states"]["x"]):
         for name, poses in (("arm", robot), ("goal of arm", goal)):
             index = system["geoms"][name][0]["link_idx"]
-            np.testing.assert_allclose(state["pos"][index], scale * poses.positions[t, 1], atol=1e-3)
+            np.testing.assert_allclose(state["pos"][index], scale * (poses.positions[t, 1] - mj_model.stat.center), atol=1e-3)
             np.testing.assert_allclose(state["rot"][index], poses.rotations[t, 1], atol=1e-3)
 
 
@@ -440,7 +440,7 @@ def test_the_page_shows_the_episodes_that_the_video_shows(tmp_path):
     shown = np.array([state["pos"][system["geoms"]["world"][0]["link_idx"]][0] for state in system["states"]["x"]])
     # The last instant of an episode is held for .6 s, which is one instant of this world.
     expected = [[*states[:-1, 0], states[-2, 0]] for states in np.asarray(episodes.states)]
-    np.testing.assert_allclose(shown, scale * np.ravel(expected), atol=1e-3)
+    np.testing.assert_allclose(shown, scale * (np.ravel(expected) - env.mj_model.stat.center[0]), atol=1e-3)
 
 
 def test_play_html_says_what_it_cannot_do(tmp_path, monkeypatch, capsys):

@@ -48,7 +48,7 @@ class Poses(NamedTuple):
 def viewer_page(mj_model: mujoco.MjModel, poses: Poses, goals: Poses, seconds: float) -> str:
     """HTML that plays T instants of a robot, and of its goal, a slimmer robot in green.
 
-    Lengths are scaled to fit the viewer's camera: numbers that the page shows are not metres.
+    The scene is moved and scaled to fit the viewer's camera: numbers that the page shows are not metres.
 
     Args:
         mj_model: The bodies; B of them.
@@ -63,9 +63,9 @@ def viewer_page(mj_model: mujoco.MjModel, poses: Poses, goals: Poses, seconds: f
     def add_link(name: str, geoms: list[dict[str, Any]], positions: np.ndarray, rotations: np.ndarray) -> None:
         if geoms:
             links[name] = [{**geom, "link_idx": len(tracks)} for geom in geoms]
-            tracks.append((scale * positions, rotations))
+            tracks.append((scale * (positions - mj_model.stat.center), rotations))
 
-    # The camera looks at the first link.
+    # The camera starts near the origin, and turns to the first link.
     count = len(poses.positions)
     centre, upright = np.tile(mj_model.stat.center, (count, 1)), np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
     point = {"name": "Sphere", "pos": [0, 0, 0], "rot": [1, 0, 0, 0], "rgba": [0, 0, 0, 1], "size": [1e-4, 0, 0]}
