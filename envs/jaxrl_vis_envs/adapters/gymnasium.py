@@ -174,7 +174,8 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
         """Starts all episodes. Environment i is seeded with ``seed + i`` or ``seed[i]``; ``options`` has no meaning here."""
-        if isinstance(seed, int) or seed is None:
+        if seed is None or isinstance(seed, int | np.integer):
+            seed = None if seed is None else int(seed)
             super().reset(seed=seed)
             seeds = [None if seed is None else seed + i for i in range(self.num_envs)]
         else:
