@@ -63,7 +63,9 @@ class Play:
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """The run folder."""
     out: Path | None = None
-    """A .gif, .mp4 or .html file; play.gif in the run folder if not given."""
+    """A .gif, .mp4 or .html file; play.gif (play.html with --html) in the run folder if not given."""
+    html: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Show the robot and its goal in three dimensions: a page with brax's viewer (needs brax, and the network when opened)."""
     episodes: int = 6
     """Episodes to show."""
 
@@ -296,13 +298,13 @@ def run_eval(options: Eval, _: Sequence[str]) -> int:
 def run_play(options: Play, _: Sequence[str]) -> int:
     """Draws a run's episodes."""
     _check_run(options.run)
-    out = options.out or options.run / "play.gif"
+    out = options.out or options.run / ("play.html" if options.html else "play.gif")
     if options.episodes < 1:
         raise RequestError(f"--episodes must be at least 1, not {options.episodes}")
     load_simulator()
     from jaxrl_vis.trainer import play_run
 
-    play_run(options.run, out, episodes=options.episodes)
+    play_run(options.run, out, episodes=options.episodes, three_dimensional=options.html)
     print(out)
     return 0
 

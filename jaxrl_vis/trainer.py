@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental.compilation_cache import compilation_cache
 
-from jaxrl_vis import videos
+from jaxrl_vis import videos, viewer
 from jaxrl_vis.checkpoint import Checkpoints, Restored
 from jaxrl_vis.config import Config, RequestError
 from jaxrl_vis.interruption import Terminated
@@ -262,24 +262,29 @@ def evaluate_run(run_dir: Path | str, episodes: int | None = None) -> dict[str, 
     return {name: [float(number) for number in value] for name, value in values.items()}
 
 
-def play_run(run_dir: Path | str, out: Path | str, episodes: int = 6) -> None:
+def play_run(run_dir: Path | str, out: Path | str, episodes: int = 6, three_dimensional: bool = False) -> None:
     """Plays episodes with the first seed of the newest good checkpoint of a run, and writes them as a video.
 
     Args:
         run_dir: The run folder.
         out: .gif, .mp4 (needs imageio-ffmpeg), .html or .png.
         episodes: How many to show.
+        three_dimensional: Write an .html page for brax's viewer (needs brax) instead of the robot's pictures; for state tasks,
+            too.
 
     Raises:
         RequestError: There is no run, nothing usable in it, no picture to show, or no way to write ``out``.
     """
     out = Path(out)
-    videos.check_output(out)
+    (viewer.check_page if three_dimensional else videos.check_output)(out)
     trainer = _open_run(run_dir, eval_episodes=max(1, episodes))
-    if not trainer.shows_pictures:
-        raise RequestError(f"{trainer.config.env} shows the robot no pictures: play a run on a Visual task")
+    if not (trainer.shows_pictures or three_dimensional):
+        raise RequestError(f"{trainer.config.env} shows the robot no pictures: play a run on a Visual task, or with --html")
     restored = _load(trainer)
     key, parts, count = jax.random.key(_EVALUATION_SEED), [], 0
+    if three_dimensional:
+        viewer.write_page(trainer.program, restored.train, key, max(1, episodes), out)
+        return
     while count < episodes:
         _, pictures = trainer.watch(restored.train, jax.random.fold_in(key, count) if parts else None)
         parts.append(videos.first_seed(pictures))

@@ -2,16 +2,26 @@
 
 Two rewards exist. The *oracle* compares true states within a threshold (thesis, equation 5.6). The *indicator* is positive only
 where the observed picture equals the goal picture in every byte (thesis, equation 5.4), so it needs no state estimate and has
-no false positives. Arrays may carry any leading batch axes; only the goal's own axes are reduced.
+no false positives. Arrays may carry any leading batch axes; only the goal's own axes are reduced. NumPy arrays are scored by
+NumPy, so that a learner on the host (see `adapters`) pays for no transfer and no compilation.
 """
+
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+
+
+def _namespace(*arrays: Any) -> Any:
+    """NumPy where all of ``arrays`` are NumPy's, else jax.numpy."""
+    return np if all(isinstance(array, np.ndarray) for array in arrays) else jnp
 
 
 def goal_distance(achieved_state: jax.Array, goal_state: jax.Array) -> jax.Array:
     """Euclidean distance of [..., G] float32 states, in their unit: [...] float32."""
-    return jnp.sqrt(jnp.sum(jnp.square(achieved_state - goal_state), axis=-1))
+    numpy = _namespace(achieved_state, goal_state)
+    return numpy.sqrt(numpy.sum(numpy.square(achieved_state - goal_state), axis=-1))
 
 
 def success(achieved_state: jax.Array, goal_state: jax.Array, threshold: float) -> jax.Array:
@@ -30,7 +40,8 @@ def oracle_reward(
 
     The defaults are those of Gymnasium's Fetch tasks: 0 at the goal, -1 elsewhere.
     """
-    return jnp.where(goal_distance(achieved_state, goal_state) <= threshold, positive, negative).astype(jnp.float32)
+    is_reached = goal_distance(achieved_state, goal_state) <= threshold
+    return _namespace(achieved_state, goal_state).where(is_reached, positive, negative).astype(jnp.float32)
 
 
 def indicator_reward(picture: jax.Array, goal_picture: jax.Array, positive: float = 1.0, negative: float = -1.0) -> jax.Array:

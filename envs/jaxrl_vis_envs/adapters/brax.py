@@ -1,0 +1,148 @@
+"""The worlds as brax environments, for brax's own agents.
+
+    from brax.training.agents.ppo import train as ppo
+    from jaxrl_vis_envs.adapters.brax import BraxEnv, lend_jax
+
+    env = BraxEnv("FetchReach", reward="dense")
+    with lend_jax():
+        make_policy, params, metrics = ppo.train(env, episode_length=env.episode_length, num_envs=256, ...)
+
+`BraxEnv` never says ``done``: brax's EpisodeWrapper, told the ``episode_length``, ends episodes and marks that as truncation.
+
+Two peculiarities of brax matter here. Its AutoResetWrapper starts every episode of an environment like that environment's
+first one, with the same goal: use many environments, or ask for ``num_resets_per_eval``. And it compiles by itself, without
+the option that physics needs on a CPU (see `compilation`): there, set ``XLA_FLAGS=--xla_cpu_use_fusion_emitters=false``
+before JAX starts.
+"""
+
+import contextlib
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxrl_vis_envs.adapters.rewards import Reward, reward_function
+from jaxrl_vis_envs.base import GoalEnv, State
+from jaxrl_vis_envs.registry import make
+from jaxrl_vis_envs.tasks import mjx_model  # noqa: F401 - before brax, for it imports MJX without MJX's remarks on stdout
+
+try:
+    from brax.envs.base import Env
+    from brax.envs.base import State as BraxState
+except ImportError as error:
+    raise ImportError("this adapter needs brax: pip install 'jaxrl-vis[brax]'") from error
+
+
+class BraxEnv(Env):
+    """A world with brax's interface.
+
+    What brax's agents see is, for a state task, one vector [2 S] float32: observation, then goal. For a picture task it is a
+    dictionary of ``pixels/observation`` and ``pixels/goal``, [H, W, C] float32 from 0 to 1, as brax's PPO for pictures takes it
+    (its SAC takes vectors only).
+
+    Args:
+        env: The name of a world, or one that is made already.
+        reward: ``oracle`` (0 at the goal, -1 elsewhere) or ``dense`` (minus the distance to the goal). Without relabelling of
+            goals, which brax's agents do not do, little is learned from ``oracle`` alone.
+        **overrides: Fields of the world's configuration to change, as in `jaxrl_vis_envs.make`.
+
+    Raises:
+        ValueError: There is no such world, option or reward.
+    """
+
+    def __init__(self, env: str | GoalEnv, reward: Reward = "oracle", **overrides: Any) -> None:
+        if overrides and not isinstance(env, str):
+            raise ValueError(f"{', '.join(overrides)}: options go with the name of a world, not with one that is made already")
+        self.goal_env = make(env, **overrides) if isinstance(env, str) else env
+        self._score = reward_function(reward, self.goal_env.threshold)
+        self._sees_pictures = len(self.goal_env.observation_spec.shape) == 3
+
+    def reset(self, rng: jax.Array) -> BraxState:
+        """Starts an episode from a key, [2] uint32 as brax's are, or typed.
+
+        Brax's wrappers read the batch's shape from such an untyped key, so what they wrap needs untyped ones.
+        """
+        is_typed = jnp.issubdtype(rng.dtype, jax.dtypes.prng_key)
+        world = self.goal_env.reset(rng if is_typed else jax.random.wrap_key_data(rng))
+        physics: Any = world  # brax says that it must be a state of its own physics, and never looks
+        return BraxState(physics, self._observe(world), self._reward(world), jnp.zeros(()), dict(world.metrics))
+
+    def step(self, state: BraxState, action: jax.Array) -> BraxState:
+        """Moves by ``action`` [A] in [-1, 1]. ``done`` stays 0, ``info`` is passed on, ``metrics`` are those of the world.
+
+        Those are ``success`` (0 or 1) and ``goal_distance`` (unit of the task). Brax's evaluation sums them over an episode.
+        """
+        world: Any = state.pipeline_state
+        world = self.goal_env.step(world, action)
+        return state.replace(  # type: ignore[attr-defined] - flax gives it
+            pipeline_state=world,
+            obs=self._observe(world),
+            reward=self._reward(world),
+            done=jnp.zeros(()),
+            metrics={**state.metrics, **world.metrics},
+        )
+
+    @property
+    def episode_length(self) -> int:
+        """Control steps in an episode, for brax's argument of that name."""
+        return self.goal_env.horizon
+
+    @property
+    def observation_size(self) -> Any:
+        """2 S, or for pictures the shape of each key."""
+        shape = self.goal_env.observation_spec.shape
+        if not self._sees_pictures:
+            return 2 * shape[0]
+        height_width_channels = (*shape[1:], shape[0])
+        return {"pixels/observation": height_width_channels, "pixels/goal": height_width_channels}
+
+    @property
+    def action_size(self) -> int:
+        """A."""
+        return self.goal_env.action_size
+
+    @property
+    def dt(self) -> float:
+        """Simulated seconds of one control step."""
+        return self.goal_env.control_period
+
+    @property
+    def backend(self) -> str:
+        """The physics: ``mjx``."""
+        return "mjx"
+
+    def _observe(self, state: State) -> Any:
+        assert state.obs is not None
+        observation, goal = state.obs["observation"], state.obs["desired_goal"]
+        if not self._sees_pictures:
+            return jnp.concatenate([observation, goal])
+        pictures = {"pixels/observation": observation, "pixels/goal": goal}
+        return {name: jnp.moveaxis(picture, 0, -1).astype(jnp.float32) / 255.0 for name, picture in pictures.items()}
+
+    def _reward(self, state: State) -> jax.Array:
+        return self._score(state.achieved_state, state.goal_state)
+
+
+@contextlib.contextmanager
+def lend_jax() -> Iterator[None]:
+    """Lends JAX, for as long as it is open, a function that brax's agents call and JAX 0.10 has no more.
+
+    It is ``jax.device_put_replicated``; where JAX still has it, nothing happens. Up to brax 0.14.2, PPO and SAC need it.
+    """
+    if hasattr(jax, "device_put_replicated"):
+        yield
+        return
+    jax.device_put_replicated = _device_put_replicated
+    try:
+        yield
+    finally:
+        del jax.device_put_replicated
+
+
+def _device_put_replicated(tree: Any, devices: list[Any]) -> Any:
+    """``tree`` with a new first axis along which each of ``devices`` holds a copy."""
+    mesh = jax.sharding.Mesh(np.array(devices), ("devices",))
+    sharding = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("devices"))
+    return jax.tree.map(lambda leaf: jax.device_put(jnp.stack([jnp.asarray(leaf)] * len(devices)), sharding), tree)

@@ -1,0 +1,249 @@
+"""The worlds as Gymnasium environments, single and vector, with the goal dictionaries of Gymnasium-Robotics.
+
+    import gymnasium
+    import jaxrl_vis_envs.adapters.gymnasium  # registers the names
+
+    env = gymnasium.make("jaxrl_vis/VisualFetchReach-v0", image_size=64)
+    envs = gymnasium.make_vec("jaxrl_vis/FetchReach-v0", num_envs=16)  # one compiled step moves all of them
+
+Observations are dictionaries:
+
+    observation     [S] float32, what the state variant of the task sees
+    achieved_goal   [G] float32, the true state that goals are about
+    desired_goal    [G] float32, the state that is asked for
+    pixels          [H, W, C] uint8, what the robot sees (picture tasks only)
+    goal_pixels     [H, W, C] uint8, the picture of the goal (picture tasks only)
+
+Goals are states, not pictures, so that ``compute_reward`` is vectorised and right for goals that a learner puts in later
+(hindsight relabelling). An agent that shall see pictures only is given those two keys, and none of the others, with
+`gymnasium.wrappers.FilterObservation`.
+
+Episodes have one length and end in truncation, never in termination.
+"""
+
+from typing import Any
+
+import numpy as np
+
+try:
+    import gymnasium
+    from gymnasium.utils import seeding
+    from gymnasium.vector import AutoresetMode
+    from gymnasium.vector.utils import batch_space
+except ImportError as error:
+    raise ImportError("this adapter needs Gymnasium: pip install 'jaxrl-vis[gymnasium]'") from error
+
+from jaxrl_vis_envs.adapters.gymnasium_worlds import Observations, Worlds
+from jaxrl_vis_envs.adapters.rewards import Reward
+from jaxrl_vis_envs.base import GoalEnv
+from jaxrl_vis_envs.registry import list_envs
+
+NAMESPACE = "jaxrl_vis"
+
+
+class GymnasiumEnv(gymnasium.Env):
+    """One environment.
+
+    Args:
+        env: The name of a world, or one that is made already.
+        reward: ``oracle`` (0 at the goal, -1 elsewhere) or ``dense`` (minus the distance to the goal).
+        render_mode: None, or ``rgb_array`` for pictures from the camera of the task, which state tasks have as well.
+        render_size: Height and width of what `render` returns, px; it has nothing to do with ``pixels``.
+        **overrides: Fields of the world's configuration to change, as in `jaxrl_vis_envs.make`.
+
+    Raises:
+        ValueError: There is no such world, option, reward or render mode.
+    """
+
+    metadata = {"render_modes": ["rgb_array"]}
+
+    def __init__(
+        self,
+        env: str | GoalEnv,
+        reward: Reward = "oracle",
+        render_mode: str | None = None,
+        render_size: int = 256,
+        **overrides: Any,
+    ) -> None:
+        self._worlds = Worlds(env, reward, render_mode, render_size, overrides)
+        self.metadata = self._worlds.metadata
+        self.render_mode = render_mode
+        self.observation_space = self._worlds.programs.space
+        self.action_space = self._worlds.action_space
+
+    @property
+    def goal_env(self) -> GoalEnv:
+        """The world behind it."""
+        return self._worlds.env
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observations, dict[str, Any]]:
+        """Starts an episode; a ``seed`` settles it and all that follow. ``options`` has no meaning here."""
+        super().reset(seed=seed)
+        observations = self._worlds.reset(np.array([_draw_seed(self.np_random)]))
+        return _first(observations), self._info(observations)
+
+    def step(self, action: np.ndarray) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
+        """Moves by ``action`` [A]: clipped to [-1, 1], and a NaN counts as 0.
+
+        Returns:
+            observation, reward, False, whether the episode has had all its steps, and ``is_success`` and ``goal_distance``.
+
+        Raises:
+            gymnasium.error.ResetNeeded: There was no `reset`.
+            ValueError: ``action`` has another shape.
+        """
+        observations, reward = self._worlds.step(np.asarray(action)[None])
+        return _first(observations), float(reward[0]), False, self._worlds.is_over, self._info(observations)
+
+    def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any = None) -> np.ndarray:
+        """Rewards of states [..., G] for goals [..., G]: [...] float32. ``info`` is not read."""
+        return self._worlds.score(np.asarray(achieved_goal), np.asarray(desired_goal))
+
+    def compute_terminated(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any = None) -> np.ndarray:
+        """Whether states [..., G] end an episode with goals [..., G]: never, [...] bool."""
+        return np.zeros(np.broadcast_shapes(np.shape(achieved_goal), np.shape(desired_goal))[:-1], bool)
+
+    def compute_truncated(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any = None) -> np.ndarray:
+        """Whether states cut an episode short: never, [...] bool. Only its length does, which a state does not tell."""
+        return self.compute_terminated(achieved_goal, desired_goal, info)
+
+    def render(self) -> Any:
+        """A picture [size, size, 3] uint8, or None where no render mode was asked for."""
+        pictures = self._worlds.render()
+        return None if pictures is None else pictures[0]
+
+    def _info(self, observations: Observations) -> dict[str, Any]:
+        return {name: values[0].item() for name, values in self._worlds.info(observations).items()}
+
+
+def _first(observations: Observations) -> Observations:
+    return {name: values[0] for name, values in observations.items()}
+
+
+class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
+    """N environments, moved by one compiled program. It does what a `gymnasium.vector.SyncVectorEnv` of `GymnasiumEnv` does.
+
+    All episodes have one length, so all end at once.
+
+    Args:
+        env: The name of a world, or one that is made already.
+        num_envs: N.
+        reward: See `GymnasiumEnv`.
+        autoreset_mode: ``NextStep`` (the step after the last one starts new episodes, whatever the action) or ``SameStep`` (the
+            last step does, and hands out the last observations as ``final_obs``).
+        render_mode: See `GymnasiumEnv`.
+        render_size: See `GymnasiumEnv`.
+        **overrides: See `GymnasiumEnv`.
+
+    Raises:
+        ValueError: There is no such world, option, reward or mode.
+    """
+
+    def __init__(
+        self,
+        env: str | GoalEnv,
+        num_envs: int = 1,
+        reward: Reward = "oracle",
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        render_mode: str | None = None,
+        render_size: int = 256,
+        **overrides: Any,
+    ) -> None:
+        if num_envs < 1:
+            raise ValueError(f"num_envs must be at least 1, got {num_envs}")
+        mode = AutoresetMode(autoreset_mode)
+        if mode == AutoresetMode.DISABLED:
+            raise ValueError("autoreset_mode must be NextStep or SameStep")
+        self._worlds = Worlds(env, reward, render_mode, render_size, overrides)
+        self.num_envs = num_envs
+        self.metadata = {**self._worlds.metadata, "autoreset_mode": mode}
+        self.render_mode = render_mode
+        self.single_observation_space = self._worlds.programs.space
+        self.single_action_space = self._worlds.action_space
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._resets_in_step = mode == AutoresetMode.SAME_STEP
+        self._generators: list[np.random.Generator] = []
+
+    @property
+    def goal_env(self) -> GoalEnv:
+        """The world behind it."""
+        return self._worlds.env
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observations, dict[str, Any]]:
+        """Starts all episodes. Environment i is seeded with ``seed + i`` or ``seed[i]``; ``options`` has no meaning here."""
+        if seed is None or isinstance(seed, int | np.integer):
+            seed = None if seed is None else int(seed)
+            super().reset(seed=seed)
+            seeds = [None if seed is None else seed + i for i in range(self.num_envs)]
+        else:
+            seeds = list(seed)
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"seed must hold one number for each of {self.num_envs} environments, got {len(seeds)}")
+        if not self._generators:
+            self._generators = [seeding.np_random(given)[0] for given in seeds]
+        else:
+            pairs = zip(self._generators, seeds)
+            self._generators = [old if given is None else seeding.np_random(given)[0] for old, given in pairs]
+        return self._restart()
+
+    def step(self, actions: np.ndarray) -> tuple[Observations, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Moves by ``actions`` [N, A]: clipped to [-1, 1], and a NaN counts as 0.
+
+        Returns:
+            observations, rewards [N] float64, terminations and truncations [N] bool, and the infos of `GymnasiumEnv` as arrays.
+
+        Raises:
+            gymnasium.error.ResetNeeded: There was no `reset`.
+            ValueError: ``actions`` has another shape.
+        """
+        never, all_over = np.zeros(self.num_envs, bool), np.ones(self.num_envs, bool)
+        if self._worlds.is_over and not self._resets_in_step:
+            observations, infos = self._restart()
+            return observations, np.zeros(self.num_envs), never, never.copy(), infos
+        observations, reward = self._worlds.step(actions)
+        infos, reward = self._infos(observations), reward.astype(np.float64)
+        if not self._worlds.is_over:
+            return observations, reward, never, never.copy(), infos
+        if self._resets_in_step:
+            final = np.empty(self.num_envs, object)
+            final[:] = [{name: values[i] for name, values in observations.items()} for i in range(self.num_envs)]
+            last_infos = {"final_obs": final, "final_info": infos, "_final_obs": all_over, "_final_info": all_over.copy()}
+            observations, infos = self._restart()
+            infos |= last_infos
+        return observations, reward, never, all_over.copy(), infos
+
+    def render(self) -> tuple[Any, ...] | None:
+        """Pictures [size, size, 3] uint8, one for each environment, or None where no render mode was asked for."""
+        pictures = self._worlds.render()
+        return None if pictures is None else tuple(pictures)
+
+    def _restart(self) -> tuple[Observations, dict[str, Any]]:
+        observations = self._worlds.reset(np.array([_draw_seed(generator) for generator in self._generators]))
+        return observations, self._infos(observations)
+
+    def _infos(self, observations: Observations) -> dict[str, Any]:
+        """Infos as arrays, each with a mask of the environments that have it: all."""
+        infos = self._worlds.info(observations)
+        return infos | {f"_{name}": np.ones(self.num_envs, bool) for name in infos}
+
+
+def _draw_seed(generator: np.random.Generator) -> np.uint32:
+    return generator.integers(2**32, dtype=np.uint32)
+
+
+def register_all() -> None:
+    """Registers every world as ``jaxrl_vis/<name>-v0``. Importing this module does it; call it for worlds added since then."""
+    for name in list_envs():
+        if f"{NAMESPACE}/{name}-v0" not in gymnasium.registry:
+            gymnasium.register(
+                id=f"{NAMESPACE}/{name}-v0",
+                entry_point=f"{__name__}:GymnasiumEnv",
+                vector_entry_point=f"{__name__}:GymnasiumVectorEnv",
+                kwargs={"env": name},
+            )
+
+
+register_all()

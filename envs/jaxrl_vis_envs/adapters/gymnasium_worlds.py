@@ -1,0 +1,189 @@
+"""N environments in step behind Gymnasium's interfaces: what the single and the vector environment are made of."""
+
+import functools
+from typing import Any, NamedTuple
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnasium import spaces
+
+from jaxrl_vis_envs import render
+from jaxrl_vis_envs.adapters.rewards import Reward, reward_function
+from jaxrl_vis_envs.base import GoalEnv, State
+from jaxrl_vis_envs.compilation import world_jit
+from jaxrl_vis_envs.registry import make
+
+Observations = dict[str, np.ndarray]
+
+
+class _Programs(NamedTuple):
+    """The compiled half of a world, for any number N of environments; shared by all environments with the same settings.
+
+    Attributes:
+        env: The world.
+        space: The observation space of one environment.
+        reset: seeds [N] uint32 -> (State, observations).
+        step: (State, donated; actions [N, A] float32) -> (State, observations but for ``goal_pixels``, which stay).
+    """
+
+    env: GoalEnv
+    space: spaces.Dict
+    reset: Any
+    step: Any
+
+
+@functools.cache
+def _make_cached(name: str, overrides: tuple[tuple[str, Any], ...]) -> GoalEnv:
+    return make(name, **dict(overrides))
+
+
+def _world(env: str | GoalEnv, overrides: dict[str, Any]) -> GoalEnv:
+    """The world of that name and those settings, made once.
+
+    Raises:
+        ValueError: As `jaxrl_vis_envs.make`; or there are overrides for a world that exists already.
+    """
+    if isinstance(env, str):
+        settings = ((key, tuple(value) if isinstance(value, list) else value) for key, value in sorted(overrides.items()))
+        return _make_cached(env, tuple(settings))
+    if overrides:
+        raise ValueError(f"{', '.join(overrides)}: options go with the name of a world, not with one that is made already")
+    return env
+
+
+@functools.cache
+def _programs(env: GoalEnv) -> _Programs:
+    spec = env.observation_spec
+    sees_pictures = len(spec.shape) == 3
+    observe_state = getattr(env, "observe_state", None)
+
+    def observe(state: State) -> dict[str, jax.Array]:
+        observation = {"achieved_goal": state.achieved_state, "desired_goal": state.goal_state}
+        if not sees_pictures:
+            return {"observation": env.observe(state), **observation}
+        # A world of somebody else's making may have nothing but pictures.
+        vector = state.achieved_state if observe_state is None else observe_state(state.data)
+        return {"observation": vector, **observation, "pixels": _to_public(env.observe(state))}
+
+    def reset(seeds: jax.Array) -> tuple[State, dict[str, jax.Array]]:
+        state = jax.vmap(lambda seed: env.reset(jax.random.key(seed)))(seeds)
+        assert state.obs is not None
+        goals = {"goal_pixels": _to_public(state.obs["desired_goal"])} if sees_pictures else {}
+        # Pictures are handed out, not carried.
+        state = state.replace(obs=None)
+        return state, {**jax.vmap(observe)(state), **goals}
+
+    def step(state: State, actions: jax.Array) -> tuple[State, dict[str, jax.Array]]:
+        state = jax.vmap(env.advance)(state, actions)
+        return state, jax.vmap(observe)(state)
+
+    _, shapes = jax.eval_shape(reset, jax.ShapeDtypeStruct((1,), jnp.uint32))
+    return _Programs(env, _space(shapes), world_jit(reset), world_jit(step, donate_argnums=0))
+
+
+def _to_public(picture: jax.Array) -> jax.Array:
+    """[..., C, H, W] -> [..., H, W, C]."""
+    return jnp.moveaxis(picture, -3, -1)
+
+
+def _space(shapes: dict[str, jax.ShapeDtypeStruct]) -> spaces.Dict:
+    """The space of one environment's observations, whose batches of one have ``shapes``."""
+
+    def box(shape: jax.ShapeDtypeStruct) -> spaces.Box:
+        low, high = (0, 255) if shape.dtype == jnp.uint8 else (-np.inf, np.inf)
+        return spaces.Box(low, high, shape.shape[1:], shape.dtype.type)
+
+    return spaces.Dict({name: box(shape) for name, shape in shapes.items()})
+
+
+@functools.cache
+def _camera(env: GoalEnv, size: int) -> Any:
+    """A compiled function from the physics of N environments to their pictures [N, size, size, 3] uint8."""
+    mj_model, camera = getattr(env, "mj_model", None), getattr(env, "camera", None)
+    if mj_model is None or camera is None:
+        raise ValueError(f"{env.name} has no MuJoCo model with a camera to render through")
+    scene = render.Scene.from_mjmodel(mj_model, camera=camera, height=size, width=size)
+    return world_jit(jax.vmap(lambda data: render.render(scene, data).rgb))
+
+
+class Worlds:
+    """N environments in step, on the device. The arguments are those of `gymnasium.GymnasiumEnv`.
+
+    Attributes:
+        env: The world.
+        programs: Its compiled half.
+        score: Rewards of states [..., G] for goals [..., G]: [...] float32.
+        metadata: As Gymnasium wants it.
+        action_space: Of one environment.
+        steps: Since `reset`.
+    """
+
+    def __init__(
+        self, env: str | GoalEnv, reward: Reward, render_mode: str | None, render_size: int, overrides: dict[str, Any]
+    ) -> None:
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
+        self.env = _world(env, overrides)
+        self.programs = _programs(self.env)
+        self.score = reward_function(reward, self.env.threshold)
+        self.metadata = {"render_modes": ["rgb_array"], "render_fps": max(1, round(1 / self.env.control_period))}
+        self.action_space = spaces.Box(-1.0, 1.0, (self.env.action_size,), np.float32)
+        self.steps = 0
+        self._camera = None if render_mode is None else _camera(self.env, render_size)
+        self._state: State | None = None
+        self._goal_pixels: Observations = {}
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the episodes have had all their steps."""
+        return self.steps >= self.env.horizon
+
+    def reset(self, seeds: np.ndarray) -> Observations:
+        """Starts the episodes of ``seeds`` [N] uint32."""
+        self._state, observations = self.programs.reset(seeds)
+        self.steps = 0
+        observations = _to_host(observations)
+        self._goal_pixels = {name: observations[name].copy() for name in observations if name == "goal_pixels"}
+        return observations
+
+    def step(self, actions: Any) -> tuple[Observations, np.ndarray]:
+        """Moves by ``actions`` [N, A]; returns observations and rewards [N] float32.
+
+        Raises:
+            gymnasium.error.ResetNeeded: There was no `reset`.
+            ValueError: ``actions`` has another shape.
+        """
+        if self._state is None:
+            raise gymnasium.error.ResetNeeded("call reset() before step()")
+        actions, expected = np.asarray(actions, np.float32), (*self._state.done.shape, self.env.action_size)
+        if actions.shape != expected:
+            raise ValueError(f"actions must have the shape {expected}, got {actions.shape}")
+        self._state, observations = self.programs.step(self._state, actions)
+        self.steps += 1
+        observations = _to_host(observations) | {name: pictures.copy() for name, pictures in self._goal_pixels.items()}
+        # Scored here, and not by the compiled step, so that it is `compute_reward` of what was handed out to the last bit.
+        return observations, self.score(observations["achieved_goal"], observations["desired_goal"])
+
+    def info(self, observations: Observations) -> dict[str, np.ndarray]:
+        """``is_success`` [N] bool and ``goal_distance`` [N] float32."""
+        distance = -reward_function("dense", self.env.threshold)(observations["achieved_goal"], observations["desired_goal"])
+        return {"is_success": distance <= self.env.threshold, "goal_distance": distance}
+
+    def render(self) -> np.ndarray | None:
+        """Pictures [N, size, size, 3] uint8, or None where no render mode was asked for.
+
+        Raises:
+            gymnasium.error.ResetNeeded: There was no `reset`.
+        """
+        if self._camera is None:
+            return None
+        if self._state is None:
+            raise gymnasium.error.ResetNeeded("call reset() before render()")
+        return np.array(self._camera(self._state.data))
+
+
+def _to_host(observations: dict[str, jax.Array]) -> Observations:
+    """Copies: what JAX hands out on a CPU is a view of memory that the next step is given back."""
+    return {name: np.array(values) for name, values in observations.items()}

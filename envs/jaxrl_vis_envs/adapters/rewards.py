@@ -1,0 +1,28 @@
+"""Which reward an adapter pays. The libraries it serves choose it once, when an environment is made."""
+
+from collections.abc import Callable
+from typing import Any, Literal, get_args
+
+from jaxrl_vis_envs import goals
+
+Reward = Literal["oracle", "dense"]
+RewardFunction = Callable[[Any, Any], Any]
+"""(achieved states [..., G], goal states [..., G]) -> rewards [...] float32; NumPy in, NumPy out, and so for JAX."""
+
+
+def reward_function(reward: Reward, threshold: float) -> RewardFunction:
+    """The function that scores states.
+
+    Args:
+        reward: ``oracle`` pays 0 within ``threshold`` of the goal and -1 elsewhere (`goals.oracle_reward`); ``dense`` pays
+            minus the distance, in the unit of the states.
+        threshold: Distance within which an episode succeeds, in the unit of the states.
+
+    Raises:
+        ValueError: There is no such reward.
+    """
+    if reward not in get_args(Reward):
+        raise ValueError(f"reward must be one of {', '.join(get_args(Reward))}, got {reward!r}")
+    if reward == "dense":
+        return lambda achieved_state, goal_state: -goals.goal_distance(achieved_state, goal_state)
+    return lambda achieved_state, goal_state: goals.oracle_reward(achieved_state, goal_state, threshold)

@@ -1,0 +1,338 @@
+"""The worlds behind other libraries' interfaces: each library's own checker, and what goes wrong where adapters are wrong."""
+
+import dataclasses
+import functools
+import importlib
+import re
+import sys
+import warnings
+from typing import Any
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probe_environments as probes
+import pytest
+from brax.envs.wrappers import training
+from brax.training.agents.ppo import networks as ppo_networks
+from brax.training.agents.ppo import train as ppo
+from brax.training.agents.sac import networks as sac_networks
+from brax.training.agents.sac import train as sac
+from gymnasium.utils.env_checker import check_env
+
+from jaxrl_vis_envs import goals, registry
+from jaxrl_vis_envs.adapters.brax import BraxEnv, lend_jax
+from jaxrl_vis_envs.adapters.gymnasium import GymnasiumEnv, GymnasiumVectorEnv, register_all
+from jaxrl_vis_envs.pixels import picture_observer
+from jaxrl_vis_envs.tasks import reacher
+
+HORIZON = probes.Probe.horizon
+
+
+class Wide(probes.PointPicture):
+    """Pictures of different height, width and channels."""
+
+    def see(self, position):
+        return super().see(position)[:, :2].repeat(3, axis=0)
+
+
+@functools.cache
+def told() -> probes.Probe:
+    return probes.GoWhereTold()
+
+
+@functools.cache
+def wide() -> probes.Probe:
+    return Wide()
+
+
+def actions_of(env: Any, steps: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(-1, 1, (steps, *env.action_space.shape)).astype(np.float32)
+
+
+class ReacherWithoutPhysics(reacher.Reacher):
+    """The arm turns by its action: everything but the physics, which takes longest to compile, is real."""
+
+    def act(self, data, action):
+        return self.configuration(data.qpos + action)
+
+
+@pytest.fixture
+def registered(monkeypatch):
+    """What `registry.register` and Gymnasium learn in a test, they forget after it."""
+    monkeypatch.setattr(registry, "_ENTRIES", dict(registry._ENTRIES))
+    monkeypatch.setattr(gymnasium.envs.registration, "registry", dict(gymnasium.registry))
+    monkeypatch.setattr(gymnasium, "registry", gymnasium.envs.registration.registry)
+
+
+def test_gymnasium_checks_a_world_that_it_made_by_name(registered):
+    def build(config: Any) -> Any:
+        return ReacherWithoutPhysics(config, lambda model: picture_observer(model, "above", config))
+
+    registry.register("TurnedReacher", build, registry.config_class("VisualReacher"))
+    register_all()
+    name, settings = "jaxrl_vis/TurnedReacher-v0", {"image_size": 16, "pixels": "depth", "render_size": 24}
+    env = gymnasium.make(name, render_mode="rgb_array", **settings)
+    with warnings.catch_warnings():
+        # All that it may say: a position has no bounds.
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message=".*observation space (minimum|maximum) value is -?infinity.*")
+        check_env(env.unwrapped)
+    observation, _ = env.reset(seed=3)
+    assert {name: (value.shape, value.dtype.name) for name, value in observation.items()} == {
+        "observation": ((8,), "float32"),
+        "achieved_goal": ((2,), "float32"),
+        "desired_goal": ((2,), "float32"),
+        "pixels": ((16, 16, 1), "uint8"),
+        "goal_pixels": ((16, 16, 1), "uint8"),
+    }
+    np.testing.assert_array_equal(observation["observation"][4:6], observation["achieved_goal"])
+    picture = env.render()
+    assert picture.shape == (24, 24, 3) and picture.dtype == np.uint8 and np.ptp(picture) > 50
+
+
+def test_gymnasium_checks_state_and_picture_probes():
+    for env in (told(), wide()):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            check_env(GymnasiumEnv(env))
+
+
+def test_a_reward_is_what_compute_reward_says_of_the_observation():
+    for reward in ("oracle", "dense"):
+        env = GymnasiumEnv(told(), reward=reward)
+        rewards, achieved, desired = [], [], []
+        for seed in range(20):
+            observation, _ = env.reset(seed=seed)
+            step = env.step(observation["desired_goal"] + (0.05 if seed % 2 else 0.3))
+            rewards.append(step[1])
+            achieved.append(step[0]["achieved_goal"])
+            desired.append(step[0]["desired_goal"])
+            assert step[4]["is_success"] == bool(seed % 2)
+        achieved, desired = np.array(achieved), np.array(desired)
+        np.testing.assert_array_equal(env.compute_reward(achieved, desired, {}), np.float32(rewards))
+        assert len(set(rewards)) > 1
+        # Goals that a learner puts in later: any batch axes, and the same numbers as the one place that knows rewards.
+        others = np.roll(desired, 1, axis=0)
+        relabelled = env.compute_reward(achieved.reshape(4, 5, 1), others.reshape(4, 5, 1), {})
+        assert relabelled.shape == (4, 5) and relabelled.dtype == np.float32
+        expected = -np.abs(achieved - others)[:, 0]
+        if reward == "oracle":
+            expected = goals.oracle_reward(jnp.asarray(achieved), jnp.asarray(others), told().threshold)
+        np.testing.assert_allclose(relabelled.ravel(), expected, atol=1e-6)
+        np.testing.assert_array_equal(env.compute_reward(achieved, achieved, {}), 0.0)
+        assert not env.compute_terminated(achieved, desired, {}).any()
+
+
+def test_episodes_end_in_truncation_at_the_horizon():
+    env = GymnasiumEnv(told())
+    env.reset(seed=0)
+    for _ in range(2):
+        ends = [env.step(env.action_space.sample())[2:4] for _ in range(HORIZON)]
+        assert ends == [(False, False)] * (HORIZON - 1) + [(False, True)]
+        env.reset()
+
+
+def test_a_seed_settles_this_episode_and_the_next():
+    def goals_of(env: GymnasiumEnv, seed: int) -> list[float]:
+        return [env.reset(seed=seed)[0]["desired_goal"][0], env.reset()[0]["desired_goal"][0]]
+
+    env = GymnasiumEnv(told())
+    first = goals_of(env, 5)
+    assert first == goals_of(GymnasiumEnv(told()), 5) == goals_of(env, 5)
+    assert len({*first, *goals_of(env, 6)}) == 4
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_the_vector_environment_does_what_separate_environments_do(mode):
+    ours = GymnasiumVectorEnv(told(), 3, autoreset_mode=mode)
+    theirs = gymnasium.vector.SyncVectorEnv([lambda: GymnasiumEnv(told())] * 3, autoreset_mode=mode)
+    assert ours.metadata["autoreset_mode"] == theirs.metadata["autoreset_mode"]
+    assert (ours.observation_space, ours.action_space) == (theirs.observation_space, theirs.action_space)
+
+    def assert_same(a: Any, b: Any) -> None:
+        if isinstance(a, dict):
+            assert set(a) == set(b)
+            for name in a:
+                assert_same(a[name], b[name])
+        elif isinstance(a, np.ndarray) and a.dtype == object:
+            for x, y in zip(a, b, strict=True):
+                assert_same(x, y)
+        else:
+            np.testing.assert_allclose(a, b, atol=1e-6)
+
+    for x, y in zip(ours.reset(seed=11), theirs.reset(seed=11), strict=True):
+        assert_same(x, y)
+    truncated = []
+    for actions in actions_of(ours, 2 * HORIZON + 3):
+        step, expected = ours.step(actions), theirs.step(actions)
+        for x, y in zip(step, expected, strict=True):
+            assert_same(x, y)
+        truncated.append(bool(step[3].all()))
+    assert sum(truncated) == 2
+    for x, y in zip(ours.reset(), theirs.reset(), strict=True):
+        assert_same(x, y)
+    for x, y in zip(ours.reset(seed=[4, None, 4]), theirs.reset(seed=[4, None, 4]), strict=True):
+        assert_same(x, y)
+
+
+def test_pictures_are_height_width_channels_and_goals_stay():
+    env = GymnasiumVectorEnv(wide(), 2)
+    first, _ = env.reset(seed=0)
+    assert first["pixels"].shape == (2, 2, 4, 3)
+    expected = np.broadcast_to(np.float32(first["achieved_goal"]).view(np.uint8)[:, None, :, None], (2, 2, 4, 3))
+    np.testing.assert_array_equal(first["pixels"], expected)
+    goal = first["goal_pixels"].copy()
+    for values in first.values():
+        values[:] = 0  # what was handed out belongs to the caller
+    then, *_ = env.step(actions_of(env, 1)[0])
+    np.testing.assert_array_equal(then["goal_pixels"], goal)
+    assert then["pixels"].any() and (then["achieved_goal"] > 0.5).all()
+
+
+def test_environments_with_the_same_settings_are_compiled_once(registered):
+    traces = []
+
+    class Counted(probes.GoWhereTold):
+        def advance(self, state, action):
+            traces.append(1)
+            return super().advance(state, action)
+
+    @dataclasses.dataclass(frozen=True)
+    class Settings:
+        size: tuple[int, ...] = (1,)
+
+    registry.register("Counted", lambda config: Counted(), Settings)
+    for size in ([1], (1,)):  # as JSON has it, and as we do
+        env = GymnasiumEnv("Counted", size=size)
+        env.reset(seed=0)
+        env.step(np.zeros(1))
+    assert len(traces) == 1
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: GymnasiumEnv("Reachr"), "did you mean Reacher"),
+        (lambda: GymnasiumEnv("Reacher", horizn=3), "did you mean horizon"),
+        (lambda: GymnasiumEnv(told(), horizon=3), "horizon: options go with the name"),
+        (lambda: GymnasiumEnv(told(), reward="sparse"), "reward must be one of oracle, dense, got 'sparse'"),
+        (lambda: GymnasiumEnv(told(), render_mode="human"), "rgb_array"),
+        (lambda: GymnasiumEnv(told(), render_mode="rgb_array"), "no MuJoCo model"),
+        (lambda: GymnasiumVectorEnv(told(), 0), "num_envs"),
+        (lambda: GymnasiumVectorEnv(told(), 2, autoreset_mode="Disabled"), "NextStep or SameStep"),
+        (lambda: GymnasiumVectorEnv(told(), 2).reset(seed=[1]), "each of 2"),
+        (lambda: BraxEnv(told(), reward="sparse"), "oracle, dense"),
+        (lambda: BraxEnv(told(), horizon=3), "horizon: options go with the name"),
+    ],
+)
+def test_bad_settings_are_refused_in_one_line(make, message):
+    with pytest.raises(ValueError, match=re.escape(message)) as caught:
+        make()
+    assert "\n" not in str(caught.value)
+
+
+def test_misuse_is_refused_in_one_line():
+    env = GymnasiumEnv(told())
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(np.zeros(1))
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=re.escape("must have the shape (1, 1), got (1, 2)")):
+        env.step(np.zeros(2))
+
+
+@pytest.mark.parametrize(("adapter", "library"), [("brax", "brax"), ("brax_viewer", "brax"), ("gymnasium", "gymnasium")])
+def test_a_missing_library_is_named_with_its_extra(monkeypatch, adapter, library):
+    for name in [name for name in sys.modules if name.split(".")[0] == library]:
+        monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.setitem(sys.modules, library, None)
+    monkeypatch.delitem(sys.modules, f"jaxrl_vis_envs.adapters.{adapter}", raising=False)
+    with pytest.raises(ImportError, match=re.escape(f"pip install 'jaxrl-vis[{library}]'")):
+        importlib.import_module(f"jaxrl_vis_envs.adapters.{adapter}")
+
+
+def test_brax_wrappers_truncate_at_the_horizon_and_start_again():
+    env = BraxEnv(told(), reward="dense")
+    wrapped = training.EvalWrapper(training.wrap(env, episode_length=env.episode_length))
+    state = jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(0), 3))
+    first = np.asarray(state.obs)
+    assert first.shape == (3, env.observation_size) and len(np.unique(first[:, 1])) == 3
+    step = jax.jit(wrapped.step)
+    ends, episode_reward = [], 0.0
+    for t in range(1, 2 * HORIZON + 1):
+        goal = np.asarray(state.obs)[:, 1:]
+        state = step(state, goal + 0.25)
+        np.testing.assert_allclose(state.reward, -0.25, atol=1e-6)
+        np.testing.assert_allclose(state.metrics["goal_distance"], 0.25, atol=1e-6)
+        ends.append((float(state.done[0]), float(state.info["truncation"][0])))
+        episode_reward += float(state.reward[0]) * (t <= HORIZON)
+        expected = first if t % HORIZON == 0 else np.concatenate([goal + 0.25, goal], axis=1)
+        np.testing.assert_allclose(state.obs, expected, atol=1e-6)
+    assert ends == ([(0.0, 0.0)] * (HORIZON - 1) + [(1.0, 1.0)]) * 2
+    summed = state.info["eval_metrics"].episode_metrics
+    np.testing.assert_allclose(summed["reward"], episode_reward, atol=1e-5)
+    np.testing.assert_allclose(summed["goal_distance"], 0.25 * HORIZON, atol=1e-5)
+
+
+def test_brax_shows_pictures_as_its_vision_agents_take_them():
+    env = BraxEnv(wide())
+    state = env.step(env.reset(jax.random.PRNGKey(0)), jnp.zeros(1))
+    assert env.observation_size == {"pixels/observation": (2, 4, 3), "pixels/goal": (2, 4, 3)}
+    assert {name: picture.shape for name, picture in state.obs.items()} == env.observation_size
+    bytes_shown = np.asarray(state.pipeline_state.achieved_state).view(np.uint8)
+    np.testing.assert_allclose(255 * state.obs["pixels/observation"][0, :, 0], bytes_shown, atol=1e-3)
+    assert float(state.reward) == -1.0
+
+
+def test_brax_keys_of_either_kind_start_the_same_episode():
+    env = BraxEnv(told())
+    np.testing.assert_array_equal(env.reset(jax.random.PRNGKey(7)).obs, env.reset(jax.random.key(7)).obs)
+
+
+def test_brax_ppo_learns_where_to_go():
+    env = BraxEnv(told(), reward="dense")
+    sizes = {"policy_hidden_layer_sizes": (16,), "value_hidden_layer_sizes": (16,)}
+    with lend_jax():
+        make_policy, params, _ = ppo.train(
+            env,
+            num_timesteps=15_000,
+            episode_length=env.episode_length,
+            num_envs=64,
+            unroll_length=4,
+            batch_size=64,
+            num_minibatches=2,
+            num_updates_per_batch=4,
+            learning_rate=5e-3,
+            discounting=0.5,
+            run_evals=False,
+            network_factory=functools.partial(ppo_networks.make_ppo_networks, **sizes),
+        )
+    assert not hasattr(jax, "device_put_replicated")
+    goal = jnp.linspace(-0.7, 0.7, 29)[:, None]
+    action, _ = make_policy(params, deterministic=True)(jnp.concatenate([jnp.zeros_like(goal), goal], axis=1), None)
+    assert float(jnp.abs(action - goal).mean()) < 0.12  # .36 for staying where it is
+
+
+@pytest.mark.slow
+def test_brax_sac_trains():
+    env, rewards = BraxEnv(told(), reward="dense"), []
+    with lend_jax():
+        sac.train(
+            env,
+            num_timesteps=2_000,
+            episode_length=env.episode_length,
+            num_envs=16,
+            num_eval_envs=64,
+            batch_size=64,
+            grad_updates_per_step=4,
+            min_replay_size=256,
+            max_replay_size=2048,
+            learning_rate=5e-3,
+            discounting=0.5,
+            reward_scaling=30.0,
+            deterministic_eval=True,
+            network_factory=functools.partial(sac_networks.make_sac_networks, hidden_layer_sizes=(16,)),
+            progress_fn=lambda _, metrics: rewards.append(metrics["eval/episode_reward"]),
+        )
+    assert rewards[-1] > -0.6, rewards  # staying in the middle, or anywhere at random, costs 1.6 or more
