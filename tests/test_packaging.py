@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[1]
 # A module imports from earlier layers only.
 LAYERS: tuple[tuple[str, ...], ...] = (
     ("config", "types"),
-    ("normalizer", "losses"),
+    ("normalizer", "losses", "encoder_kernel"),
     ("networks",),
     ("replay", "relabel", "ddpg", "rollout"),
     ("train_step",),
