@@ -29,6 +29,8 @@ from jaxrl_vis.types import Batch, LoopState, Metrics, ReplayState, TrainState
 from jaxrl_vis_envs import goals
 from jaxrl_vis_envs.base import GoalEnv
 from jaxrl_vis_envs.compilation import world_jit
+from jaxrl_vis_envs.randomization import typical
+from jaxrl_vis_envs.registry import config_class
 
 # A leading seed axis on everything but the iteration, which all seeds share (see `replay`).
 _SEED_AXES = LoopState(train=0, replay=0, key=0, iteration=None)  # type: ignore[arg-type]
@@ -43,9 +45,15 @@ def make_env(config: Config) -> GoalEnv:
     Raises:
         RequestError: There is no such task, or it cannot be made like that.
     """
-    pictures = {"image_size": config.image_size, "pixels": config.pixels} if config.env.startswith("Visual") else {}
+    validate(config)
     try:
-        return jaxrl_vis_envs.make(config.env, **pictures)
+        fields = {field.name for field in dataclasses.fields(config_class(config.env))}
+        settings: dict[str, Any] = {name: getattr(config, name) for name in ("image_size", "pixels") if name in fields}
+        if config.frames is not None:
+            settings["frames"] = config.frames
+        if config.randomize:
+            settings["randomization"] = typical(*config.randomize, strength=config.randomize_strength)
+        return jaxrl_vis_envs.make(config.env, **settings)
     except ValueError as error:
         raise RequestError(str(error)) from error
 

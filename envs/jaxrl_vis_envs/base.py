@@ -37,6 +37,7 @@ class State:
             None where the caller asked for no pictures (`GoalEnv.advance` passes it through untouched).
         history: [F - 1, nq] float32, the joint positions one, two, ... control steps ago, where an observation stacks F > 1
             pictures; else None. Before the first step everything stood still.
+        domain: What domain randomisation drew for this episode (see `randomization`); None where it is off.
     """
 
     data: Any
@@ -47,6 +48,7 @@ class State:
     metrics: dict[str, jax.Array]
     obs: dict[str, jax.Array] | None = None
     history: jax.Array | None = None
+    domain: dict[str, jax.Array] | None = None
 
     def replace(self, **changes: Any) -> Self:
         """A copy with some fields changed."""
@@ -129,6 +131,7 @@ class GoalEnv(abc.ABC):
         goal_state: jax.Array,
         obs: dict | None,
         history: jax.Array | None = None,
+        domain: dict[str, jax.Array] | None = None,
     ) -> State:
         """A State with its reward and metrics filled in from the truth."""
         distance = goals.goal_distance(achieved_state, goal_state)
@@ -141,6 +144,7 @@ class GoalEnv(abc.ABC):
             metrics={"success": goals.success(achieved_state, goal_state, self.threshold), "goal_distance": distance},
             obs=obs,
             history=history,
+            domain=domain,
         )
 
 
