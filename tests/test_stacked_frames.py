@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from point_mass import PointMass, PointMassConfig
+from probe_environments import Probe
 
 import jaxrl_vis_envs
 from jaxrl_vis import train_step
@@ -16,7 +16,7 @@ from jaxrl_vis.relabel import stand_still
 from jaxrl_vis.replay import Indices, make_replay
 from jaxrl_vis.trainer import Trainer
 from jaxrl_vis.types import Episodes
-from jaxrl_vis_envs.randomization import KINDS, typical
+from jaxrl_vis_envs.base import push_history, start_history
 
 ENVS, SETTINGS = 2, {"batch_size": 64, "updates_per_iteration": 1, "replay_transitions": 10, "image_size": 8, "num_envs": 2}
 
@@ -50,19 +50,35 @@ def test_relabelled_goals_are_what_was_reached_standing_still():
         assert not np.array_equal(still.goal[row], still.observation_tp1[row])
 
 
+class Walker(Probe):
+    """A point that walks; a picture is as bright as the point is far, on six grey levels, so that goals can be met."""
+
+    def __init__(self, frames: int):
+        self.frames = frames
+
+    def picture(self, position):
+        return jnp.full((3, 8, 8), jnp.clip(jnp.round(position[0]) % 6, 0, 5), jnp.uint8)
+
+    def reset(self, key):
+        position, goal = jax.random.uniform(key, (2, 1), maxval=6.0)
+        still, wanted = (jnp.tile(self.picture(place), (self.frames, 1, 1)) for place in (position, goal))
+        obs = {"observation": still, "achieved_goal": still, "desired_goal": wanted}
+        return self._measure(position, position, goal, obs, start_history(position, self.frames))
+
+    def advance(self, state, action):
+        position, history = state.data + 1.5 + 0.5 * action, push_history(state.history, state.data)
+        return self._measure(position, position, state.goal_state, state.obs, history)
+
+    def observe(self, state):
+        positions = [state.data] if state.history is None else [state.data, *state.history]
+        return jnp.concatenate([self.picture(position) for position in positions])
+
+
 @functools.cache
 def program(frames: int = 2):
-    """A training program whose gradient step only looks at its batch; all of it varies as well."""
-    config = preset(
-        "debug",
-        pixels="rgb",
-        method="indicator_balance_filter",
-        relabel_probability=1.0,
-        balance_probability=0.5,
-        filter_threshold=None,
-        **SETTINGS,
-    )
-    env = PointMass(PointMassConfig(pixels="rgb", frames=frames, randomization=typical(*KINDS)))
+    """A training program whose gradient step only looks at its batch."""
+    config = preset("debug", method="indicator_balance_filter", relabel_probability=1.0, **SETTINGS)
+    env = Walker(frames)
 
     def look(state, working, batch, reward):
         goal, after = (frame.reshape(len(reward), frames, -1) for frame in (batch.goal, batch.observation_tp1))
@@ -82,16 +98,13 @@ def program(frames: int = 2):
 
 def test_training_samples_goals_that_stand_still():
     made = program()
-    loop, metrics = made.train_iteration(made.init(jax.random.key(0)[None]))
+    _, metrics = made.train_iteration(made.init(jax.random.key(0)[None]))
     seen = {name: float(value[0]) for name, value in metrics.items()}
     assert seen["goals_that_stand_still"] == 1.0
     assert seen["observations_that_move"] > 0.5
     # Half of the goals are the next picture for certain, some others by chance.
     assert 0.4 < seen["rewarded"] < 0.95
     assert seen["rewarded_as_arrived"] == 1.0
-    # Randomisation: both episodes start at the same place, and look different.
-    frames = np.asarray(loop.replay.episodes.frames[0])
-    assert (frames[0, 0] != frames[1, 0]).mean() > 0.3
     assert seen["guard/nonfinite"] == 0.0
 
 
