@@ -116,40 +116,40 @@ def draw(path: Path, names: Sequence[str] | None = None, image_size: int = 128, 
     rows = []
     for name in names:
         env: Any = jaxrl_vis_envs.make(name)
-        rows.append(_row(name, frames_of(env, jax.random.key(1), goals, image_size), env.mj_model.ngeom))
+        rows.append(_row(env, frames_of(env, jax.random.key(1), goals, image_size)))
     Image.fromarray(np.concatenate(rows)).save(path)
 
 
-def _row(name: str, frames: Frame, geoms: int) -> np.ndarray:
+def _row(env: Any, frames: Frame) -> np.ndarray:
     """One task's strip: [H, W, 3] uint8."""
     from PIL import Image, ImageDraw, ImageFont
 
-    depths = [_depth_picture(frames.depth, index) for index in (0, 1)]
-    labels = [_label_picture(frames.segmentation[index], geoms) for index in (0, 1)]
-    groups = [
-        [(f"{name}: start", frames.rgb[0]), ("depth", depths[0]), ("geoms", labels[0])],
-        [("goal", frames.rgb[1]), ("depth", depths[1]), ("geoms", labels[1])],
-        [("another goal" if index == 2 else "", frames.rgb[index]) for index in range(2, len(frames.rgb))],
-    ]
-    size = frames.rgb.shape[1]
-    count = sum(map(len, groups))
-    strip = Image.new("RGB", (count * (size + _GAP) + 3 * _GROUP_GAP, size + _TITLE + _GAP), _SKY)
-    pencil, font, left = ImageDraw.Draw(strip), ImageFont.load_default(size=11), _GROUP_GAP // 2
+    geoms, groups = env.mj_model.ngeom, []
+    for index, title in ((0, "start"), (1, "goal")):
+        depth = _depth_picture(np.asarray(frames.depth[index]), env.config.depth_range)
+        labels = _label_picture(np.asarray(frames.segmentation[index]), geoms)
+        groups.append([(title, frames.rgb[index]), ("depth", depth), ("geoms", labels)])
+    groups.append([("other goals" if index == 2 else "", frames.rgb[index]) for index in range(2, len(frames.rgb))])
+    size, count = frames.rgb.shape[1], sum(map(len, groups))
+    strip = Image.new("RGB", (count * (size + _GAP) + 3 * _GROUP_GAP, size + 2 * _TITLE + _GAP), _SKY)
+    pencil, left = ImageDraw.Draw(strip), _GROUP_GAP // 2
+    pencil.text((left, 2), env.name, fill=(0, 0, 0), font=ImageFont.load_default(size=13))
+    font = ImageFont.load_default(size=11)
     for group in groups:
         for title, picture in group:
-            pencil.text((left, 2), title, fill=(30, 30, 30), font=font)
-            strip.paste(Image.fromarray(np.asarray(picture)), (left, _TITLE))
+            pencil.text((left, _TITLE + 2), title, fill=(90, 90, 90), font=font)
+            strip.paste(Image.fromarray(np.asarray(picture)), (left, 2 * _TITLE))
             left += size + _GAP
         left += _GROUP_GAP
     return np.asarray(strip)
 
 
-def _depth_picture(depth: np.ndarray, index: int) -> np.ndarray:
-    """One of the depths [K, H, W] (m) in colours, near is bright; one scale for all, outliers such as the sky aside."""
+def _depth_picture(depth: np.ndarray, depth_range: tuple[float, float]) -> np.ndarray:
+    """Depth [H, W] (m) in colours, over the range (m) that the agent's bytes span; near is bright."""
     import matplotlib
 
-    near, far = np.percentile(depth, [0.5, 85])
-    share = np.clip((depth[index] - near) / max(far - near, 1e-6), 0.0, 1.0)
+    near, far = depth_range
+    share = np.clip((depth - near) / (far - near), 0.0, 1.0)
     return (matplotlib.colormaps["magma"](0.97 - 0.92 * share)[..., :3] * 255).round().astype(np.uint8)
 
 
