@@ -18,7 +18,8 @@ XML = """
   <visual><headlight ambient=".3 .3 .3" diffuse=".4 .4 .4" specular="0 0 0"/></visual>
   <worldbody>
     <camera name="above" pos="0 -.3 1" xyaxes="1 0 0 0 1 .3" fovy="50"/>
-    <light directional="true" dir=".2 .3 -.9" diffuse=".4 .4 .4" specular="0 0 0"/>
+    <light directional="true" dir=".2 .3 -.9" diffuse=".3 .3 .3" specular="0 0 0"/>
+    <light pos="-.5 0 .7" dir="0 0 -1" cutoff="100" diffuse=".2 .2 .2" specular="0 0 0"/>
     <geom name="ground" type="plane" size="1 1 .1" rgba=".3 .5 .6 1"/>
     <body name="ball" pos="0 0 .1">
       <joint name="x" type="slide" axis="1 0 0" damping="1"/>

@@ -134,8 +134,10 @@ def draw_shape() -> Any:
         ("camera_orientation", [0.0, 0.1, 0.0], True, True),
         ("camera_fovy", 0.2, True, True),
         ("light_direction", [[0.5, 0.0, 0.0]], False, True),
-        ("light_diffuse", [[0.5, 0.0, 0.0], [0.0, 0.0, 0.0]], False, True),
-        ("light_ambient", [[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]], False, True),
+        ("light_position", [[0.0, 0.0, 0.0], [0.3, 0.0, 0.0]], False, True),
+        ("light_position", [[0.3, 0.3, 0.3], [0.0, 0.0, 0.0]], False, False),  # the first is directional
+        ("light_diffuse", [[0.5, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]], False, True),
+        ("light_ambient", [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.5, 0.0, 0.0]], False, True),
         ("colour", "first", False, True),
     ],
 )
