@@ -72,6 +72,7 @@ class FingerTurn(MjxGoalEnv):
     action_size = 2
     camera = "side"
     distance_unit = "m"
+    chance, difficulty = 0.16, 2.4  # benchmarks/task_difficulty.py FingerTurn --episodes 1000
 
     def __init__(self, config: FingerTurnConfig, observer: Callable[[mujoco.MjModel], Observer] | None = None):
         """Builds the model.

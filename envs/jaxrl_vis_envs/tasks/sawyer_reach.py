@@ -89,6 +89,7 @@ class SawyerReach(MjxGoalEnv):
     action_size = 3
     camera = "above"
     distance_unit = "m"
+    chance, difficulty = 0.010, 3.5  # benchmarks/task_difficulty.py SawyerReach --episodes 1000
 
     def __init__(self, config: SawyerReachConfig, observer: Callable[[mujoco.MjModel], Observer] | None = None):
         """Builds the model and finds the start.
