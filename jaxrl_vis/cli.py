@@ -72,10 +72,20 @@ class Play:
 
 @dataclasses.dataclass(frozen=True)
 class Envs:
-    """List the tasks."""
+    """List the tasks.
 
+    chance is the share of episodes that random actions end in success, difficulty the mean distance from start to goal in
+    thresholds.
+    """
+
+    env: tuple[str, ...] = ()
+    """Only these tasks; all if not given."""
     gallery: Path | None = None
-    """Also draw each picture task here: start and goal, as colours and as depth."""
+    """Also draw the picture tasks here: start and goals as colours, depth and geoms."""
+    image_size: int = 128
+    """Height and width of a picture of the gallery, in pixels."""
+    goals: int = 4
+    """Goals that the gallery shows of each task."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -311,12 +321,17 @@ def run_play(options: Play, _: Sequence[str]) -> int:
 
 def run_envs(options: Envs, _: Sequence[str]) -> int:
     """Prints the table of tasks, and draws the gallery."""
+    for name in options.env:
+        check_env(name)
+    if options.goals < 1 or options.image_size < 1:
+        raise RequestError("--goals and --image-size must be at least 1")
     load_simulator()
     from jaxrl_vis import gallery
 
-    gallery.print_table()
+    names = options.env or None
+    gallery.print_table(names)
     if options.gallery is not None:
-        gallery.draw(options.gallery)
+        gallery.draw(options.gallery, names, options.image_size, options.goals)
         print(options.gallery)
     return 0
 

@@ -11,6 +11,8 @@ from typing import Any, Literal, Self
 Method = Literal["oracle", "indicator", "indicator_balance_filter"]
 METHODS: tuple[str, ...] = ("oracle", "indicator", "indicator_balance_filter")
 PIXELS: tuple[str, ...] = ("rgbd", "rgb", "depth")
+Kind = Literal["camera", "lights", "colours", "dynamics"]
+RANDOMIZED: tuple[str, ...] = ("camera", "lights", "colours", "dynamics")
 DTYPES: tuple[str, ...] = ("auto", "float32", "bfloat16")
 
 
@@ -45,6 +47,12 @@ class Config:
     """Channels of the picture."""
     image_size: int = 64
     """Height and width of the picture, in pixels."""
+    frames: int | None = None
+    """Pictures of the latest control steps that an observation stacks. None: as many as the task does."""
+    randomize: tuple[Kind, ...] = ()
+    """What varies between episodes, in training and evaluation: any of camera, lights, colours, dynamics."""
+    randomize_strength: float = 1.0
+    """How far it varies: 1 is typical (`jaxrl_vis_envs.randomization.KINDS`), 2 twice as far."""
     num_envs: int = 80
     """Environments in a rollout; each plays one episode per iteration."""
 
@@ -276,6 +284,11 @@ def validate(config: Config) -> Config:
         value = getattr(config, name)
         if value not in choices:
             raise RequestError(f"unknown {name} {value!r}{nearest(str(value), choices)}")
+    for kind in config.randomize:
+        if kind not in RANDOMIZED:
+            raise RequestError(f"cannot randomize {kind!r}{nearest(str(kind), RANDOMIZED)}")
+    if config.frames is not None and config.frames < 1:
+        raise RequestError(f"frames must be at least 1, not {config.frames}")
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
         if field.type is int and field.name not in ("seed", "full_checkpoint_interval") and value < 1:
@@ -284,7 +297,7 @@ def validate(config: Config) -> Config:
         value = getattr(config, name)
         if value is not None and not 0.0 <= value <= 1.0:
             raise RequestError(f"{name} is a share and must lie in [0, 1], not {value}")
-    for name in ("actor_learning_rate", "critic_learning_rate", "normalizer_floor", "normalizer_clip"):
+    for name in ("actor_learning_rate", "critic_learning_rate", "normalizer_floor", "normalizer_clip", "randomize_strength"):
         if not getattr(config, name) > 0.0:
             raise RequestError(f"{name} must be positive, not {getattr(config, name)}")
     if config.seed < 0 or config.full_checkpoint_interval < 0:

@@ -1,57 +1,164 @@
-"""What `jaxrl-vis envs` shows: a table of the tasks, and a sheet with a start and a goal of each."""
+"""What `jaxrl-vis envs` shows: a table of the tasks, and a sheet of pictures, one row a task.
 
-import math
+    start: colours, depth, geoms | a goal: colours, depth, geoms | more goals: colours
+
+The table compiles nothing. A row of the sheet takes two programs: one samples poses, one draws them all.
+"""
+
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
 import jaxrl_vis_envs
+from jaxrl_vis.config import RequestError
 from jaxrl_vis_envs.compilation import world_jit
+from jaxrl_vis_envs.render import Frame, Scene, render
+
+_COLUMNS = ("name", "actions", "observation", "goal state", "horizon", "threshold", "control period", "chance", "difficulty")
+_LEGEND = (
+    "chance: share of episodes that random actions end in success. difficulty: mean distance of start and goal in thresholds.\n"
+    "Both are measured by benchmarks/task_difficulty.py."
+)
+_GAP, _TITLE, _GROUP_GAP = 3, 17, 12  # px
+_SKY = (255, 255, 255)
 
 
-def print_table() -> None:
-    """One row a task: shapes, horizon, threshold and control period."""
-    table = Table(title="Tasks")
-    for column in ("name", "observation", "actions", "goal state", "horizon", "threshold", "control period"):
+def print_table(names: Sequence[str] | None = None) -> None:
+    """One row for each of the tasks ``names`` (default: all), from their definitions; nothing is compiled."""
+    table = Table(title="Tasks", caption=_LEGEND, caption_justify="left")
+    for column in _COLUMNS:
         table.add_column(column, no_wrap=True)
-    for name in jaxrl_vis_envs.list_envs():
+    for name in jaxrl_vis_envs.list_envs() if names is None else names:
         env = jaxrl_vis_envs.make(name)
         spec = env.observation_spec
         table.add_row(
             name,
-            f"{'x'.join(map(str, spec.shape))} {spec.dtype}",
             str(env.action_size),
+            f"{'x'.join(map(str, spec.shape))} {spec.dtype}",
             str(env.goal_state_size),
             str(env.horizon),
             f"{env.threshold:g} {env.distance_unit}",
             f"{1000 * env.control_period:g} ms",
+            "-" if env.chance is None else f"{100 * env.chance:.1f} %",
+            "-" if env.difficulty is None else f"{env.difficulty:.1f}",
         )
     console = Console()
     # A pipe gets whole lines; a terminal gets the width that it has.
     (console if console.is_terminal else Console(width=160)).print(table)
 
 
-def draw(path: Path, image_size: int = 128) -> None:
-    """Writes one row of pictures a task: start and goal as colours, start and goal as depth."""
-    from matplotlib.figure import Figure  # not pyplot, which would change a notebook's backend
+class _Poses(NamedTuple):
+    """What the renderer reads of `mjx.Data`, [K, ...]."""
 
+    geom_xpos: jax.Array
+    geom_xmat: jax.Array
+    site_xpos: jax.Array
+    site_xmat: jax.Array
+    cam_xpos: jax.Array
+    cam_xmat: jax.Array
+    xpos: jax.Array
+    xmat: jax.Array
+    subtree_com: jax.Array
+
+
+def picture_tasks() -> list[str]:
+    """Names of the tasks that show the agent pictures."""
+    return [name for name in jaxrl_vis_envs.list_envs() if len(jaxrl_vis_envs.make(name).observation_spec.shape) == 3]
+
+
+def frames_of(env: Any, key: jax.Array, goals: int, size: int) -> Frame:
+    """The start of an episode and ``goals`` goals as the task's camera sees them: [1 + goals, ...] NumPy arrays.
+
+    Args:
+        env: A task with a camera (`MjxGoalEnv`).
+        key: [] a typed key.
+        goals: How many.
+        size: Height and width, pixels.
+    """
+    keys = jax.random.split(key, goals)
+
+    def sample(keys: jax.Array) -> _Poses:
+        both = (jax.vmap(env.sample_start)(keys[:1]), jax.vmap(env.sample_goal)(keys))
+        return _Poses(*(jnp.concatenate([getattr(data, name) for data in both]) for name in _Poses._fields))
+
+    scene = Scene.from_mjmodel(env.mj_model, env.camera, size, size)
+    # A loop over one picture compiles sooner than a batch, and a few pictures take no time.
+    draw = world_jit(lambda poses: jax.lax.map(lambda one: render(scene, one), poses))
+    return jax.tree.map(np.asarray, draw(world_jit(sample)(keys)))
+
+
+def draw(path: Path, names: Sequence[str] | None = None, image_size: int = 128, goals: int = 4) -> None:
+    """Writes the sheet.
+
+    Args:
+        path: The file, whose ending names the format.
+        names: Tasks that show pictures; default: all.
+        image_size: Height and width of a picture, pixels.
+        goals: Goals of each task.
+
+    Raises:
+        RequestError: A task shows no pictures, or the file's ending names no format.
+    """
+    from PIL import Image
+
+    if path.suffix.lower() not in Image.registered_extensions():
+        raise RequestError(f"cannot write {path}: end its name in .png or .jpg")
+    names = picture_tasks() if names is None else names
+    for name in names:
+        if name not in picture_tasks():
+            raise RequestError(f"{name} shows no pictures; its visual twin is Visual{name}")
     rows = []
-    for name in jaxrl_vis_envs.list_envs():
-        if len(jaxrl_vis_envs.make(name).observation_spec.shape) != 3:
-            continue
-        env = jaxrl_vis_envs.make(name, image_size=image_size, pixels="rgbd")
-        obs = world_jit(lambda key, env=env: env.reset(key).obs)(jax.random.key(0))
-        start, goal = (np.moveaxis(np.asarray(obs[part]), 0, -1) for part in ("observation", "desired_goal"))
-        rows.append((name, [start[..., :3], goal[..., :3], start[..., 3], goal[..., 3]]))
-    figure = Figure(figsize=(10, 2.7 * len(rows)))
-    axes = figure.subplots(len(rows), 4, squeeze=False)
-    for (name, pictures), line in zip(rows, axes, strict=True):
-        for picture, title, axis in zip(pictures, ("start", "goal", "start, depth", "goal, depth"), line, strict=True):
-            axis.imshow(picture, cmap="magma", interpolation="nearest", vmin=0, vmax=255)
-            axis.set_title(f"{name}: {title}" if title == "start" else title, fontsize=9)
-            axis.axis("off")
-    figure.tight_layout()
-    figure.savefig(path, dpi=max(72, math.ceil(4 * image_size / 10)))
+    for name in names:
+        env: Any = jaxrl_vis_envs.make(name)
+        rows.append(_row(env, frames_of(env, jax.random.key(1), goals, image_size)))
+    Image.fromarray(np.concatenate(rows)).save(path)
+
+
+def _row(env: Any, frames: Frame) -> np.ndarray:
+    """One task's strip: [H, W, 3] uint8."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    geoms, groups = env.mj_model.ngeom, []
+    for index, title in ((0, "start"), (1, "goal")):
+        depth = _depth_picture(np.asarray(frames.depth[index]), env.config.depth_range)
+        labels = _label_picture(np.asarray(frames.segmentation[index]), geoms)
+        groups.append([(title, frames.rgb[index]), ("depth", depth), ("geoms", labels)])
+    groups.append([("other goals" if index == 2 else "", frames.rgb[index]) for index in range(2, len(frames.rgb))])
+    size, count = frames.rgb.shape[1], sum(map(len, groups))
+    strip = Image.new("RGB", (count * (size + _GAP) + 3 * _GROUP_GAP, size + 2 * _TITLE + _GAP), _SKY)
+    pencil, left = ImageDraw.Draw(strip), _GROUP_GAP // 2
+    pencil.text((left, 2), env.name, fill=(0, 0, 0), font=ImageFont.load_default(size=13))
+    font = ImageFont.load_default(size=11)
+    for group in groups:
+        for title, picture in group:
+            pencil.text((left, _TITLE + 2), title, fill=(90, 90, 90), font=font)
+            strip.paste(Image.fromarray(np.asarray(picture)), (left, 2 * _TITLE))
+            left += size + _GAP
+        left += _GROUP_GAP
+    return np.asarray(strip)
+
+
+def _depth_picture(depth: np.ndarray, depth_range: tuple[float, float]) -> np.ndarray:
+    """Depth [H, W] (m) in colours, over the range (m) that the agent's bytes span; near is bright."""
+    import matplotlib
+
+    near, far = depth_range
+    share = np.clip((depth - near) / (far - near), 0.0, 1.0)
+    return (matplotlib.colormaps["magma"](0.97 - 0.92 * share)[..., :3] * 255).round().astype(np.uint8)
+
+
+def _label_picture(labels: np.ndarray, geoms: int) -> np.ndarray:
+    """Geom ids [H, W] in colours that differ between neighbours: steps of the golden ratio round the hues; the sky is white."""
+    import matplotlib
+
+    hues = (np.arange(geoms) * 0.61803399) % 1.0
+    values = np.where(np.arange(geoms) % 2 == 0, 0.95, 0.65)
+    palette = matplotlib.colors.hsv_to_rgb(np.stack([hues, np.full(geoms, 0.65), values], axis=-1))
+    palette = np.concatenate([(palette * 255).round(), [_SKY]]).astype(np.uint8)
+    return palette[np.where((labels >= 0) & (labels < geoms), labels, geoms)]

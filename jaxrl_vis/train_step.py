@@ -22,13 +22,15 @@ from jaxrl_vis import normalizer
 from jaxrl_vis.config import Config, RequestError, Resolved, resolve, validate
 from jaxrl_vis.ddpg import Algorithm, Working, make_ddpg
 from jaxrl_vis.networks import Networks
-from jaxrl_vis.relabel import choose_goal_slots
+from jaxrl_vis.relabel import choose_goal_slots, stand_still
 from jaxrl_vis.replay import Indices, Replay, make_replay, num_bytes
 from jaxrl_vis.rollout import Exploration, play
 from jaxrl_vis.types import Batch, LoopState, Metrics, ReplayState, TrainState
 from jaxrl_vis_envs import goals
 from jaxrl_vis_envs.base import GoalEnv
 from jaxrl_vis_envs.compilation import world_jit
+from jaxrl_vis_envs.randomization import typical
+from jaxrl_vis_envs.registry import config_class
 
 # A leading seed axis on everything but the iteration, which all seeds share (see `replay`).
 _SEED_AXES = LoopState(train=0, replay=0, key=0, iteration=None)  # type: ignore[arg-type]
@@ -43,9 +45,15 @@ def make_env(config: Config) -> GoalEnv:
     Raises:
         RequestError: There is no such task, or it cannot be made like that.
     """
-    pictures = {"image_size": config.image_size, "pixels": config.pixels} if config.env.startswith("Visual") else {}
+    validate(config)
     try:
-        return jaxrl_vis_envs.make(config.env, **pictures)
+        fields = {field.name for field in dataclasses.fields(config_class(config.env))}
+        settings: dict[str, Any] = {name: getattr(config, name) for name in ("image_size", "pixels") if name in fields}
+        if config.frames is not None:
+            settings["frames"] = config.frames
+        if config.randomize:
+            settings["randomization"] = typical(*config.randomize, strength=config.randomize_strength)
+        return jaxrl_vis_envs.make(config.env, **settings)
     except ValueError as error:
         raise RequestError(str(error)) from error
 
@@ -99,12 +107,22 @@ class TrainStep:
         return num_bytes(self.replay_spec)
 
 
-def reward_of(config: Config, resolved: Resolved, threshold: float, batch: Batch) -> jax.Array:
-    """Rewards [B] float32 of relabelled transitions, by the same functions that score the environments."""
+def reward_of(
+    config: Config, resolved: Resolved, threshold: float, batch: Batch, reached: jax.Array | None = None
+) -> jax.Array:
+    """Rewards [B] float32 of relabelled transitions, by the same functions that score the environments.
+
+    Args:
+        config: Which reward.
+        resolved: Its two values.
+        threshold: Of the oracle's reward, in the unit of the true states.
+        batch: The transitions.
+        reached: [B, ...] what they have reached, as a goal would show it; None: as it was observed.
+    """
     values = {"positive": resolved.reward_positive, "negative": resolved.reward_negative}
     if config.method == "oracle":
         return goals.oracle_reward(batch.state_tp1, batch.goal_state, threshold, **values)
-    return goals.indicator_reward(batch.observation_tp1, batch.goal, **values)
+    return goals.indicator_reward(batch.observation_tp1 if reached is None else reached, batch.goal, **values)
 
 
 def _make_update_many(config: Config, resolved: Resolved, env: GoalEnv, replay: Replay, algorithm: Algorithm):
@@ -116,8 +134,11 @@ def _make_update_many(config: Config, resolved: Resolved, env: GoalEnv, replay: 
             return indices, choose_goal_slots(goal_key, indices.time, env.horizon, relabel, balance)
 
         def one_update(carry: tuple[TrainState, Working], chosen: tuple[Indices, jax.Array]) -> tuple[Any, Metrics]:
-            batch = replay.gather(memory, *chosen)
-            train, working, metrics = algorithm.update(*carry, batch, reward_of(config, resolved, env.threshold, batch))
+            batch, reached = replay.gather(memory, *chosen), None
+            if env.frames > 1:
+                batch, reached = stand_still(batch, env.as_goal)
+            reward = reward_of(config, resolved, env.threshold, batch, reached)
+            train, working, metrics = algorithm.update(*carry, batch, reward)
             return (train, working), metrics
 
         # What all updates learn from is chosen at once: in the loop, drawing numbers would be a dozen tiny kernels an update.
@@ -169,7 +190,11 @@ def make_train_step(env: GoalEnv, config: Config) -> TrainStep:
     def evaluate(train: TrainState, key: jax.Array) -> tuple[Metrics, dict[str, jax.Array]]:
         num_recorded = min(_NUM_RECORDED, config.eval_episodes)
         episodes, outcome = play(env, networks, train, key, config.eval_episodes, num_kept=num_recorded)
-        frames, goals = episodes.frames[:, :-1], episodes.frames[:, -1]
+        # For people, the newest of stacked pictures, which come first.
+        newest = episodes.frames
+        if env.frames > 1:
+            newest = newest[:, :, : newest.shape[2] // env.frames]
+        frames, goals = newest[:, :-1], newest[:, -1]
         metrics = {
             "eval/success": jnp.mean(outcome["success"]),
             "eval/goal_distance": jnp.mean(outcome["goal_distance"]),

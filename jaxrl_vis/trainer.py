@@ -112,7 +112,10 @@ class Trainer:
     @functools.cached_property
     def shows_pictures(self) -> bool:
         """Whether what the robot sees can be shown in a video."""
-        return videos.shows_pictures(self.shapes.replay.episodes.frames.shape[1:])
+        seeds, episodes, slots, *picture = self.shapes.replay.episodes.frames.shape
+        if len(picture) == 3:  # of stacked pictures the newest is shown
+            picture[0] //= getattr(self.env, "frames", 1)
+        return videos.shows_pictures((episodes, slots, *picture))
 
     @property
     def frame_seconds(self) -> float:

@@ -37,6 +37,7 @@ class State:
             None where the caller asked for no pictures (`GoalEnv.advance` passes it through untouched).
         history: [F - 1, nq] float32, the joint positions one, two, ... control steps ago, where an observation stacks F > 1
             pictures; else None. Before the first step everything stood still.
+        domain: What domain randomisation drew for this episode (see `randomization`); None where it is off.
     """
 
     data: Any
@@ -47,6 +48,7 @@ class State:
     metrics: dict[str, jax.Array]
     obs: dict[str, jax.Array] | None = None
     history: jax.Array | None = None
+    domain: dict[str, jax.Array] | None = None
 
     def replace(self, **changes: Any) -> Self:
         """A copy with some fields changed."""
@@ -63,6 +65,9 @@ class GoalEnv(abc.ABC):
     threshold: float  # an episode succeeds where goal_distance <= threshold, in `distance_unit`
     distance_unit: str = "m"
     control_period: float  # simulated seconds of one control step
+    # How hard the task is before anything is learned, as measured by benchmarks/task_difficulty.py; None: not measured.
+    chance: float | None = None  # share of episodes that uniformly random actions end in success
+    difficulty: float | None = None  # mean distance from start to goal, in thresholds
     frames: int = 1  # F, pictures of the latest control steps that an observation stacks
 
     @abc.abstractmethod
@@ -129,6 +134,7 @@ class GoalEnv(abc.ABC):
         goal_state: jax.Array,
         obs: dict | None,
         history: jax.Array | None = None,
+        domain: dict[str, jax.Array] | None = None,
     ) -> State:
         """A State with its reward and metrics filled in from the truth."""
         distance = goals.goal_distance(achieved_state, goal_state)
@@ -141,6 +147,7 @@ class GoalEnv(abc.ABC):
             metrics={"success": goals.success(achieved_state, goal_state, self.threshold), "goal_distance": distance},
             obs=obs,
             history=history,
+            domain=domain,
         )
 
 

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
+from jaxrl_vis_envs.randomization import Domain, varied_scene
 from jaxrl_vis_envs.render import Scene, render_planes
 from jaxrl_vis_envs.tasks.mjx_model import mjx
 
@@ -49,43 +50,65 @@ class PixelsConfig:
 
 
 Observer = Callable[..., jax.Array]
-"""observer(data, history=None): an observation of the poses in ``data``, after those in ``history`` (see `State`)."""
+"""observer(data, history=None, domain=None): an observation of the poses in ``data``, after those in ``history``, under the
+look in ``domain`` (see `State`)."""
 
 
-def picture_observer(mj_model: mujoco.MjModel, camera: str, config: PixelsConfig) -> Observer:
+class PictureObserver:
     """A function from the poses of one environment to its pictures [frames * channels, H, W] uint8.
 
-    It takes ``data`` (`mjx.Data`, whose poses are up to date) and ``history`` ([frames - 1, nq] float32, joint positions one,
-    two, ... control steps ago). Without ``history`` the world has stood still, and one picture is repeated.
-
-    Raises:
-        ValueError: There is no such camera, or something in its view cannot be drawn.
+    Attributes:
+        scene: What is drawn, before randomisation.
+        spec: Shape and dtype of what it returns.
     """
-    scene = Scene.from_mjmodel(mj_model, camera=camera, height=config.image_size, width=config.image_size)
-    wants_colour, wants_depth = config.pixels != "depth", config.pixels != "rgb"
-    model = mjx.put_model(mj_model)
 
-    def observe_one(data: mjx.Data) -> jax.Array:
+    def __init__(self, mj_model: mujoco.MjModel, camera: str, config: PixelsConfig) -> None:
+        """Reads the scene; see `picture_observer`."""
+        size = config.image_size
+        self.scene = Scene.from_mjmodel(mj_model, camera=camera, height=size, width=size)
+        self.spec = jax.ShapeDtypeStruct((config.frames * CHANNELS[config.pixels], size, size), jnp.uint8)
+        self._config = config
+        self._model = mjx.put_model(mj_model)
+
+    def __call__(self, data: mjx.Data, history: jax.Array | None = None, domain: Domain | None = None) -> jax.Array:
+        """Draws.
+
+        Args:
+            data: Poses, up to date.
+            history: [frames - 1, nq] float32, joint positions one, two, ... control steps ago. Without, the world has stood
+                still, and one picture is repeated.
+            domain: The look of the episode (`randomization`), which holds for all pictures.
+        """
+        scene = varied_scene(self.scene, domain)
+        if self._config.frames == 1 or history is None:
+            return jnp.tile(self._draw(scene, data), (self._config.frames, 1, 1))
+
+        def draw_at(qpos: jax.Array) -> jax.Array:
+            with jax.default_matmul_precision("highest"):
+                return self._draw(scene, mjx.kinematics(self._model, data.replace(qpos=qpos)))
+
+        pictures = jax.vmap(draw_at)(jnp.concatenate([data.qpos[None], history]))
+        return pictures.reshape(-1, *pictures.shape[2:])
+
+    def _draw(self, scene: Scene, data: mjx.Data) -> jax.Array:
+        """One picture [channels, H, W]."""
+        wants_colour, wants_depth = self._config.pixels != "depth", self._config.pixels != "rgb"
         planes = render_planes(scene, data, rgb=wants_colour, depth=wants_depth, quantized=True)
         channels = []
         if planes.rgb is not None:
             channels.append(planes.rgb)
         if planes.depth is not None:
-            channels.append(encode_depth(planes.depth, config.depth_range)[None])
+            channels.append(encode_depth(planes.depth, self._config.depth_range)[None])
         return jnp.concatenate(channels)
 
-    def observe(data: mjx.Data, history: jax.Array | None = None) -> jax.Array:
-        if config.frames == 1 or history is None:
-            return jnp.tile(observe_one(data), (config.frames, 1, 1))
 
-        def observe_at(qpos: jax.Array) -> jax.Array:
-            with jax.default_matmul_precision("highest"):
-                return observe_one(mjx.kinematics(model, data.replace(qpos=qpos)))
+def picture_observer(mj_model: mujoco.MjModel, camera: str, config: PixelsConfig) -> PictureObserver:
+    """What a picture task sees with, for `MjxGoalEnv`.
 
-        pictures = jax.vmap(observe_at)(jnp.concatenate([data.qpos[None], history]))
-        return pictures.reshape(-1, *pictures.shape[2:])
-
-    return observe
+    Raises:
+        ValueError: There is no such camera, or something in its view cannot be drawn.
+    """
+    return PictureObserver(mj_model, camera, config)
 
 
 def encode_depth(depth: jax.Array, depth_range: tuple[float, float]) -> jax.Array:

@@ -20,6 +20,7 @@ import mujoco
 import numpy as np
 
 from jaxrl_vis_envs.pixels import Observer, PixelsConfig, picture_observer
+from jaxrl_vis_envs.randomization import OFF, Randomization
 from jaxrl_vis_envs.registry import register
 from jaxrl_vis_envs.tasks import inverse_kinematics, mjx_model
 from jaxrl_vis_envs.tasks.mjx_env import MjxGoalEnv
@@ -54,6 +55,8 @@ class FetchReachConfig:
     """Newton iterations in a physics step. One is enough in the air, but not where the fingers rub on the table."""
     line_search_iterations: int = 4
     """Line search iterations in a Newton iteration."""
+    randomization: Randomization = OFF
+    """What varies between episodes, and how far."""
 
     def __post_init__(self) -> None:
         for field in ("horizon", "solver_iterations", "line_search_iterations"):
@@ -81,6 +84,7 @@ class FetchReach(MjxGoalEnv):
     action_size = 4
     camera = "front"
     distance_unit = "m"
+    chance, difficulty = 0.009, 2.8  # benchmarks/task_difficulty.py FetchReach --episodes 1000
 
     def __init__(self, config: FetchReachConfig, observer: Callable[[mujoco.MjModel], Observer] | None = None):
         """Builds the model and finds the start.

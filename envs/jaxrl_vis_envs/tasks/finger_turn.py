@@ -19,6 +19,7 @@ import mujoco
 import numpy as np
 
 from jaxrl_vis_envs.pixels import Observer, PixelsConfig, picture_observer
+from jaxrl_vis_envs.randomization import OFF, Randomization
 from jaxrl_vis_envs.registry import register
 from jaxrl_vis_envs.tasks import mjx_model
 from jaxrl_vis_envs.tasks.mjx_env import MjxGoalEnv
@@ -42,6 +43,8 @@ class FingerTurnConfig:
     """Newton iterations in a physics step."""
     line_search_iterations: int = 8
     """Line search iterations in a Newton iteration."""
+    randomization: Randomization = OFF
+    """What varies between episodes, and how far."""
 
     def __post_init__(self) -> None:
         for field in ("horizon", "substeps", "solver_iterations", "line_search_iterations"):
@@ -69,6 +72,7 @@ class FingerTurn(MjxGoalEnv):
     action_size = 2
     camera = "side"
     distance_unit = "m"
+    chance, difficulty = 0.16, 2.4  # benchmarks/task_difficulty.py FingerTurn --episodes 1000
 
     def __init__(self, config: FingerTurnConfig, observer: Callable[[mujoco.MjModel], Observer] | None = None):
         """Builds the model.

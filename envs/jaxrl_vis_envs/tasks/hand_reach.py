@@ -22,6 +22,7 @@ import mujoco
 import numpy as np
 
 from jaxrl_vis_envs.pixels import Observer, PixelsConfig, picture_observer
+from jaxrl_vis_envs.randomization import OFF, Randomization
 from jaxrl_vis_envs.registry import register
 from jaxrl_vis_envs.tasks import mjx_model
 from jaxrl_vis_envs.tasks.mjx_env import MjxGoalEnv
@@ -64,6 +65,8 @@ class HandReachConfig:
     """Newton iterations in a physics step."""
     line_search_iterations: int = 4
     """Line search iterations in a Newton iteration."""
+    randomization: Randomization = OFF
+    """What varies between episodes, and how far."""
 
     def __post_init__(self) -> None:
         for field in ("horizon", "goal_actions", "substeps", "goal_substeps", "solver_iterations", "line_search_iterations"):

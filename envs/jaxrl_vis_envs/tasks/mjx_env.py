@@ -5,15 +5,18 @@ a `pixels.Observer` it is the visual task, without one the state task.
 """
 
 import abc
+import copy
+import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
 import mujoco
 
+from jaxrl_vis_envs import randomization
 from jaxrl_vis_envs.base import GoalEnv, State, push_history, sanitize_action, start_history
-from jaxrl_vis_envs.pixels import Observer
+from jaxrl_vis_envs.pixels import Observer, PictureObserver
 from jaxrl_vis_envs.tasks.mjx_model import mjx
 
 
@@ -29,6 +32,9 @@ class MjxGoalEnv(GoalEnv):
             config: The settings of the task.
             mj_model: The model; changes to it after this have no effect.
             observer: Given the model, returns the function from poses to pictures. None: `observe_state` is what is seen.
+
+        Raises:
+            ValueError: The look shall vary (``config.randomization``), but there are no pictures of a scene.
         """
         self.config = config
         self.horizon = config.horizon
@@ -37,6 +43,10 @@ class MjxGoalEnv(GoalEnv):
         self.mj_model = mj_model
         self._model = mjx.put_model(mj_model)
         self._draw = observer(mj_model) if observer is not None else None
+        self._randomization: randomization.Randomization = getattr(config, "randomization", randomization.OFF)
+        self._scene = getattr(self._draw, "scene", None)
+        if self._randomization.varies_look and self._scene is None:
+            raise ValueError("camera, lights and colours can only be randomized in a task that draws pictures")
 
     @abc.abstractmethod
     def sample_start(self, key: jax.Array) -> mjx.Data:
@@ -48,7 +58,10 @@ class MjxGoalEnv(GoalEnv):
 
     @abc.abstractmethod
     def act(self, data: mjx.Data, action: jax.Array) -> mjx.Data:
-        """The physics of one control step. ``action`` is [A] float32, all finite and within [-1, 1]."""
+        """The physics of one control step, of ``self._model``, whose numbers may vary (see `randomization`).
+
+        ``action`` is [A] float32, all finite and within [-1, 1], or in a somewhat other range where its scale varies.
+        """
 
     @abc.abstractmethod
     def achieved(self, data: mjx.Data) -> jax.Array:
@@ -60,23 +73,52 @@ class MjxGoalEnv(GoalEnv):
 
     def reset(self, key: jax.Array) -> State:
         data, goal_data = self.sample_start(key), self.sample_goal(key)
-        state = self.state_at(data, self.achieved(goal_data))
+        domain = randomization.sample(key, self._randomization, self._model, self.action_size, self._scene)
+        state = self.state_at(data, self.achieved(goal_data), domain)
         # One program draws both: that halves what there is to compile.
         both = jax.tree.map(lambda *leaves: jnp.stack(leaves), data, goal_data)
-        frame, goal = jax.vmap(lambda data: self._observe(data, None))(both)
+        frame, goal = jax.vmap(lambda data: self._observe(data, None, domain))(both)
         return state.replace(obs={"observation": frame, "achieved_goal": frame, "desired_goal": goal})
 
     def advance(self, state: State, action: jax.Array) -> State:
-        data = self.act(state.data, sanitize_action(action))
+        action = randomization.varied_action(sanitize_action(action), state.domain)
+        data = self._under(state.domain).act(state.data, action)
         history = push_history(state.history, state.data.qpos)
-        return self._measure(data, self.achieved(data), state.goal_state, state.obs, history)
+        return self._measure(data, self.achieved(data), state.goal_state, state.obs, history, state.domain)
 
     def observe(self, state: State) -> jax.Array:
-        return self._observe(state.data, state.history)
+        return self._observe(state.data, state.history, state.domain)
 
-    def state_at(self, data: mjx.Data, goal_state: jax.Array) -> State:
-        """An episode that starts at ``data``, with a goal state [G] and no pictures."""
-        return self._measure(data, self.achieved(data), goal_state, None, start_history(data.qpos, self.frames))
+    def state_at(self, data: mjx.Data, goal_state: jax.Array, domain: randomization.Domain | None = None) -> State:
+        """An episode that starts at ``data``, with a goal state [G] and no pictures, where nothing but ``domain`` varies."""
+        history = start_history(data.qpos, self.frames)
+        return self._measure(data, self.achieved(data), goal_state, None, history, domain)
 
-    def _observe(self, data: mjx.Data, history: jax.Array | None) -> jax.Array:
-        return self.observe_state(data) if self._draw is None else self._draw(data, history)
+    @property
+    def observation_spec(self) -> jax.ShapeDtypeStruct:
+        """Shape and dtype of `observe`, without tracing physics or renderer."""
+        if isinstance(self._draw, PictureObserver):
+            return self._draw.spec
+        shape = jax.eval_shape(lambda data: self._observe(data, start_history(data.qpos, self.frames), None), self._data_shape)
+        return jax.ShapeDtypeStruct(shape.shape, shape.dtype)
+
+    @property
+    def goal_state_size(self) -> int:
+        return jax.eval_shape(self.achieved, self._data_shape).shape[0]
+
+    @functools.cached_property
+    def _data_shape(self) -> mjx.Data:
+        return jax.eval_shape(lambda: mjx.make_data(self.mj_model))
+
+    def _under(self, domain: randomization.Domain | None) -> Self:
+        """This task with the dynamics of an episode: a copy, so that what `act` does stays a function of its arguments."""
+        if not self._randomization.varies_model or domain is None:
+            return self
+        varied = copy.copy(self)
+        varied._model = randomization.varied_model(self._model, domain)
+        return varied
+
+    def _observe(self, data: mjx.Data, history: jax.Array | None, domain: randomization.Domain | None) -> jax.Array:
+        if self._draw is None:
+            return self.observe_state(data)
+        return self._draw(data, history) if self._scene is None else self._draw(data, history, domain)

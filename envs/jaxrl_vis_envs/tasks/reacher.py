@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import mujoco
 
 from jaxrl_vis_envs.pixels import Observer, PixelsConfig, picture_observer
+from jaxrl_vis_envs.randomization import OFF, Randomization
 from jaxrl_vis_envs.registry import register
 from jaxrl_vis_envs.tasks import mjx_model
 from jaxrl_vis_envs.tasks.mjx_env import MjxGoalEnv
@@ -43,6 +44,8 @@ class ReacherConfig:
     """Joint velocity of an action of 1 under velocity control, rad/s (it turns the joint by .95 rad)."""
     substeps: int | None = None
     """Physics steps of 10 ms in a control step. None: 10 under velocity control, 2 under torque control."""
+    randomization: Randomization = OFF
+    """What varies between episodes, and how far."""
 
     def __post_init__(self) -> None:
         if self.control not in _DEFAULT_SUBSTEPS:
@@ -69,6 +72,7 @@ class Reacher(MjxGoalEnv):
     action_size = 2
     camera = "above"
     distance_unit = "m"
+    chance, difficulty = 0.004, 23.7  # benchmarks/task_difficulty.py Reacher --episodes 20000
 
     def __init__(self, config: ReacherConfig, observer: Callable[[mujoco.MjModel], Observer] | None = None):
         """Builds the model.

@@ -20,6 +20,7 @@ import mujoco
 import numpy as np
 
 from jaxrl_vis_envs.pixels import Observer, PixelsConfig, picture_observer
+from jaxrl_vis_envs.randomization import OFF, Randomization
 from jaxrl_vis_envs.registry import register
 from jaxrl_vis_envs.tasks import inverse_kinematics, mjx_model
 from jaxrl_vis_envs.tasks.mjx_env import MjxGoalEnv
@@ -55,6 +56,8 @@ class SawyerReachConfig:
     """Newton iterations in a physics step."""
     line_search_iterations: int = 4
     """Line search iterations in a Newton iteration."""
+    randomization: Randomization = OFF
+    """What varies between episodes, and how far."""
 
     def __post_init__(self) -> None:
         for field in ("horizon", "solver_iterations", "line_search_iterations"):
@@ -86,6 +89,7 @@ class SawyerReach(MjxGoalEnv):
     action_size = 3
     camera = "above"
     distance_unit = "m"
+    chance, difficulty = 0.010, 3.5  # benchmarks/task_difficulty.py SawyerReach --episodes 1000
 
     def __init__(self, config: SawyerReachConfig, observer: Callable[[mujoco.MjModel], Observer] | None = None):
         """Builds the model and finds the start.

@@ -1,0 +1,61 @@
+"""How hard the tasks are before anything is learned: the figures of `jaxrl-vis envs`.
+
+    python benchmarks/task_difficulty.py [ENV ...] [--episodes 1000]
+
+Chance: share of episodes that end within the threshold under actions that are drawn uniformly at every step.
+Difficulty: mean distance of start and goal, in thresholds.
+"""
+
+import argparse
+import os
+import pathlib
+import sys
+from typing import Any
+
+ROOT = pathlib.Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "envs")]
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+import jax  # noqa: E402
+import numpy as np  # noqa: E402
+
+import jaxrl_vis_envs  # noqa: E402
+from jaxrl_vis_envs.compilation import world_jit  # noqa: E402
+
+_BATCH = 200  # episodes side by side; larger batches of the hand have hung on a CPU
+NAMES = ["FetchReach", "FingerTurn", "HandReach", "Reacher", "SawyerReach"]
+
+
+def measure(name: str, episodes: int, seed: int = 0, **overrides: Any) -> tuple[float, float]:
+    """Chance and difficulty of a task, over ``episodes`` episodes."""
+    env: Any = jaxrl_vis_envs.make(name, **overrides)
+
+    def play(key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        world_key, action_key = jax.random.split(key)
+        goal_state = env.achieved(env.sample_goal(world_key))
+        start = env.state_at(env.sample_start(world_key), goal_state)
+        actions = jax.random.uniform(action_key, (env.horizon, env.action_size), minval=-1.0)
+        end, _ = jax.lax.scan(lambda state, action: (env.advance(state, action), None), start, actions)
+        return end.metrics["success"], start.metrics["goal_distance"]
+
+    program, keys = world_jit(jax.vmap(play)), jax.random.split(jax.random.key(seed), episodes)
+    outcomes = [jax.device_get(program(keys[first : first + _BATCH])) for first in range(0, episodes, _BATCH)]
+    success, distance = (np.concatenate(parts) for parts in zip(*outcomes, strict=True))
+    return float(np.mean(success)), float(np.mean(distance)) / env.threshold
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Prints one line a task."""
+    parser = argparse.ArgumentParser(description="Chance level and difficulty of tasks.")
+    parser.add_argument("env", nargs="*", default=NAMES, help=f"any of {', '.join(NAMES)}; default: all")
+    parser.add_argument("--episodes", type=int, default=1000)
+    options = parser.parse_args(arguments)
+    for name in options.env:
+        chance, difficulty = measure(name, options.episodes)
+        error = (chance * (1 - chance) / options.episodes) ** 0.5
+        print(f"{name:<12} chance {chance:.4f} +- {error:.4f}   difficulty {difficulty:.2f} thresholds", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

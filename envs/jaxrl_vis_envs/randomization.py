@@ -1,0 +1,214 @@
+"""Domain randomisation: another camera, other lights, colours and dynamics in every episode. Off by default.
+
+    env = make("VisualFetchReach", randomization=Randomization(camera_position=0.02, colour=0.1, mass=0.2))
+    env = make("VisualFetchReach", randomization=typical("camera", "lights", "colours", "dynamics"))
+
+    reset     draws what is on, from a key of its own, into `State.domain`      starts and goals stay what they are without
+    observe   draws through a scene with those leaves changed                   the goal picture has the look of its episode
+    advance   steps a model with those leaves changed
+
+Only numbers vary, so one compiled program serves all values, and under `jax.vmap` each environment has its own. The GPU kernel
+of the renderer takes every one of these leaves as an input, so it draws varied scenes too. What is off is not drawn from the
+key, not stored and not computed: the program is the one without randomisation.
+"""
+
+import dataclasses
+import math
+from typing import Any, Self
+
+import jax
+import jax.numpy as jnp
+
+from jaxrl_vis_envs.render import Scene
+
+Domain = dict[str, jax.Array]
+"""What was drawn for one episode, float32: deviations by the name of their range in `Randomization`, for those that are on."""
+
+# Folded into an episode's key. Large, because small numbers give the keys that `jax.random.split` hands out.
+_TAG = 0x646F6D61
+
+_ABSOLUTE = ("camera_position", "camera_orientation", "light_position", "light_direction", "colour")
+_DYNAMICS = ("mass", "damping", "friction", "actuator_gain", "action_scale")
+
+
+@dataclasses.dataclass(frozen=True)
+class Randomization:
+    """How far things vary between episodes. A deviation is uniform between plus and minus its range; 0 is off.
+
+    Ranges that are shares multiply by 1 plus the deviation, and must be less than 1.
+
+    Raises:
+        ValueError: A range is negative or not finite, or a share is 1 or more.
+    """
+
+    camera_position: float = 0.0
+    """Shift of the camera along each axis of its own frame, m."""
+    camera_orientation: float = 0.0
+    """Turn of the camera about each axis of its own frame, rad."""
+    camera_fovy: float = 0.0
+    """Field of view, share."""
+    light_position: float = 0.0
+    """Shift of each light along each axis, m; nothing for directional lights."""
+    light_direction: float = 0.0
+    """Change of each light's unit direction along each axis: about its tilt in rad. Nothing for the headlight."""
+    light_diffuse: float = 0.0
+    """Diffuse and specular strength of each light in each colour channel, share. The headlight is one of the lights."""
+    light_ambient: float = 0.0
+    """Ambient strength of each light in each colour channel, share."""
+    colour: float = 0.0
+    """Red, green and blue of each geom, of 1; clipped to what a colour can be."""
+    mass: float = 0.0
+    """Mass of each body, and its inertia with it, share."""
+    damping: float = 0.0
+    """Damping of each joint, share."""
+    friction: float = 0.0
+    """Friction of all contacts and all dry friction in joints together, share."""
+    actuator_gain: float = 0.0
+    """Strength of each actuator (of a position servo: its stiffness), share."""
+    action_scale: float = 0.0
+    """What each component of an action is multiplied with, share; for tasks without actuators too."""
+
+    def __post_init__(self) -> None:
+        for name, value in dataclasses.asdict(self).items():
+            if not (math.isfinite(value) and value >= 0.0):
+                raise ValueError(f"{name} of the randomization must be a finite range of at least 0, got {value}")
+            if name not in _ABSOLUTE and value >= 1.0:
+                raise ValueError(f"{name} of the randomization is a share and must be less than 1, got {value}")
+
+    @property
+    def active(self) -> dict[str, float]:
+        """The ranges that are on."""
+        return {name: value for name, value in dataclasses.asdict(self).items() if value > 0.0}
+
+    @property
+    def varies_look(self) -> bool:
+        """Whether pictures of the same poses differ between episodes."""
+        return any(name not in _DYNAMICS for name in self.active)
+
+    @property
+    def varies_model(self) -> bool:
+        """Whether the model of the physics differs between episodes."""
+        return any(name in _MODEL_LEAVES for name in self.active)
+
+    def scaled(self, strength: float) -> Self:
+        """The same with every range ``strength`` times as wide."""
+        return type(self)(**{name: strength * value for name, value in dataclasses.asdict(self).items()})
+
+
+OFF = Randomization()
+
+KINDS: dict[str, dict[str, float]] = {
+    "camera": dict(camera_position=0.02, camera_orientation=0.02, camera_fovy=0.03),
+    "lights": dict(light_position=0.3, light_direction=0.3, light_diffuse=0.3, light_ambient=0.3),
+    "colours": dict(colour=0.1),
+    "dynamics": dict(mass=0.2, damping=0.2, friction=0.3, actuator_gain=0.1, action_scale=0.1),
+}
+"""Typical ranges: what a careful person fails to measure about a real cell."""
+
+
+def typical(*kinds: str, strength: float = 1.0) -> Randomization:
+    """The typical ranges of these `KINDS`, ``strength`` times as wide.
+
+    Raises:
+        ValueError: There is no such kind, or a range leaves its bounds.
+    """
+    for kind in kinds:
+        if kind not in KINDS:
+            raise ValueError(f"there is no randomization of {kind!r}; choose among {', '.join(KINDS)}")
+    ranges: dict[str, float] = {}
+    for kind in kinds:
+        ranges |= KINDS[kind]
+    return Randomization(**ranges).scaled(strength)
+
+
+def sample(key: jax.Array, ranges: Randomization, model: Any, action_size: int, scene: Scene | None) -> Domain | None:
+    """Draws the deviations of one episode.
+
+    Args:
+        key: [] the typed key of the episode; what else is drawn from it is independent of this.
+        ranges: What varies how far.
+        model: The `mjx.Model`.
+        action_size: A.
+        scene: What pictures are drawn of; None for a task without pictures, whose ``ranges`` must leave the look alone.
+
+    Returns:
+        The deviations of what is on, or None where all is off. Each has a key of its own, so that it does not depend on what
+        else is on.
+    """
+    active = ranges.active
+    if not active:
+        return None
+    lights = 1 if scene is None else 1 + len(scene.light_types)  # the last is the headlight
+    shapes = {
+        "camera_position": (3,),
+        "camera_orientation": (3,),
+        "camera_fovy": (),
+        "light_position": (lights - 1, 3),
+        "light_direction": (lights - 1, 3),
+        "light_diffuse": (lights, 3),
+        "light_ambient": (lights, 3),
+        "colour": (0 if scene is None else len(scene.rgba), 3),
+        "mass": (model.nbody,),
+        "damping": (model.nv,),
+        "friction": (),
+        "actuator_gain": (model.nu,),
+        "action_scale": (action_size,),
+    }
+    key = jax.random.fold_in(key, _TAG)
+    keys = {name: jax.random.fold_in(key, place) for place, name in enumerate(shapes)}
+    return {name: jax.random.uniform(keys[name], shapes[name], jnp.float32, -limit, limit) for name, limit in active.items()}
+
+
+def varied_scene(scene: Scene, domain: Domain | None) -> Scene:
+    """``scene`` with the camera, lights and colours of an episode; itself where none of them varies."""
+    if domain is None:
+        return scene
+    changes: dict[str, jax.Array] = {}
+    if "camera_position" in domain:
+        changes["camera_shift"] = scene.camera_shift + domain["camera_position"]
+    if "camera_orientation" in domain:
+        changes["camera_turn"] = scene.camera_turn + domain["camera_orientation"]
+    if "camera_fovy" in domain:
+        # A lens is wider by its angle, or, for a camera with a sensor, by the sensor's size.
+        factor = 1.0 + domain["camera_fovy"]
+        changes |= {"fovy": scene.fovy * factor, "sensor": scene.sensor * factor}
+    if "light_position" in domain:
+        changes["light_position"] = scene.light_position + domain["light_position"]
+    if "light_direction" in domain:
+        changes["light_direction"] = scene.light_direction + domain["light_direction"]  # made unit where it is used
+    for name, leaves in (("light_diffuse", ("diffuse", "specular")), ("light_ambient", ("ambient",))):
+        if name in domain:
+            factor = 1.0 + domain[name]
+            for leaf in leaves:
+                changes[f"light_{leaf}"] = getattr(scene, f"light_{leaf}") * factor[:-1]
+                changes[f"headlight_{leaf}"] = getattr(scene, f"headlight_{leaf}") * factor[-1]
+    if "colour" in domain:
+        changes["rgba"] = scene.rgba.at[:, :3].set(jnp.clip(scene.rgba[:, :3] + domain["colour"], 0.0, 1.0))
+    return scene.replace(**changes) if changes else scene
+
+
+# Leaves of mjx.Model that each range multiplies along their first axis. How soft constraints are (invweight0) stays as it is.
+_MODEL_LEAVES = {
+    "mass": ("body_mass", "body_inertia"),
+    "damping": ("dof_damping",),
+    "friction": ("geom_friction", "pair_friction", "dof_frictionloss", "tendon_frictionloss"),
+    "actuator_gain": ("actuator_gainprm", "actuator_biasprm"),
+}
+
+
+def varied_model(model: Any, domain: Domain | None) -> Any:
+    """``model`` (`mjx.Model`) with the dynamics of an episode; itself where none of them varies."""
+    changes = {}
+    for name, leaves in _MODEL_LEAVES.items():
+        if domain is None or name not in domain:
+            continue
+        factor = 1.0 + domain[name]
+        for leaf in leaves:
+            value = jnp.asarray(getattr(model, leaf))
+            changes[leaf] = value * factor.reshape(*factor.shape, *(1,) * (value.ndim - factor.ndim))
+    return model.replace(**changes) if changes else model
+
+
+def varied_action(action: jax.Array, domain: Domain | None) -> jax.Array:
+    """What an action [A] amounts to in an episode: [A] float32, in [-2, 2]."""
+    return action if domain is None or "action_scale" not in domain else action * (1.0 + domain["action_scale"])

@@ -1,0 +1,69 @@
+"""A world that compiles in a moment, made as a user would make one: a ball on two rails, a motor for each."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+
+from jaxrl_vis_envs.pixels import PixelsConfig, picture_observer
+from jaxrl_vis_envs.randomization import OFF, Randomization
+from jaxrl_vis_envs.tasks import mjx_model
+from jaxrl_vis_envs.tasks.mjx_env import MjxGoalEnv
+
+XML = """
+<mujoco>
+  <option timestep=".05"><flag contact="disable" constraint="disable"/></option>
+  <visual><headlight ambient=".3 .3 .3" diffuse=".4 .4 .4" specular="0 0 0"/></visual>
+  <worldbody>
+    <camera name="above" pos="0 -.3 1" xyaxes="1 0 0 0 1 .3" fovy="50"/>
+    <light directional="true" dir=".2 .3 -.9" diffuse=".3 .3 .3" specular="0 0 0"/>
+    <light pos="-.5 0 .7" dir="0 0 -1" cutoff="100" diffuse=".2 .2 .2" specular="0 0 0"/>
+    <geom name="ground" type="plane" size="1 1 .1" rgba=".3 .5 .6 1"/>
+    <body name="ball" pos="0 0 .1">
+      <joint name="x" type="slide" axis="1 0 0" damping="1"/>
+      <joint name="y" type="slide" axis="0 1 0" damping="1"/>
+      <geom name="ball" type="sphere" size=".1" mass="1" rgba=".8 .3 .2 1"/>
+    </body>
+  </worldbody>
+  <actuator><motor joint="x" gear="10"/><motor joint="y" gear="10"/></actuator>
+</mujoco>
+"""
+
+
+@dataclasses.dataclass(frozen=True)
+class PointMassConfig(PixelsConfig):
+    horizon: int = 5
+    threshold: float = 0.1
+    image_size: int = 8
+    depth_range: tuple[float, float] = (0.5, 1.5)
+    randomization: Randomization = OFF
+
+
+class PointMass(MjxGoalEnv):
+    action_size, camera, control_period = 2, "above", 0.05
+
+    def __init__(self, config: PointMassConfig):
+        self._still = mjx_model.still_data(mujoco.MjModel.from_xml_string(XML))
+        super().__init__(
+            config, mujoco.MjModel.from_xml_string(XML), lambda model: picture_observer(model, self.camera, config)
+        )
+
+    def sample_start(self, key: jax.Array) -> Any:
+        return self.configuration(jnp.zeros(2))
+
+    def sample_goal(self, key: jax.Array) -> Any:
+        return self.configuration(jax.random.uniform(key, (2,), minval=-0.3, maxval=0.3))
+
+    def act(self, data: Any, action: jax.Array) -> Any:
+        return mjx_model.simulate(self._model, data.replace(ctrl=action), 1)
+
+    def achieved(self, data: Any) -> jax.Array:
+        return data.qpos
+
+    def observe_state(self, data: Any) -> jax.Array:
+        return data.qpos
+
+    def configuration(self, qpos: jax.Array) -> Any:
+        return mjx_model.mjx.kinematics(self._model, self._still.replace(qpos=qpos))

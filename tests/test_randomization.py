@@ -1,0 +1,276 @@
+"""Domain randomisation: what is on changes what it should and nothing else, and off is as if there were none."""
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import point_mass
+import pytest
+from point_mass import PointMass, PointMassConfig
+
+import jaxrl_vis_envs
+from jaxrl_vis import config as config_file
+from jaxrl_vis.config import RequestError, preset
+from jaxrl_vis.train_step import make_env
+from jaxrl_vis_envs import pixels, randomization
+from jaxrl_vis_envs.compilation import world_jit
+from jaxrl_vis_envs.randomization import KINDS, OFF, Randomization, typical
+from jaxrl_vis_envs.render import Scene, gpu_kernel, pictures, render_planes
+
+SIZE, COUNT, STEPS = 16, 3, 2
+TASKS = ["FetchReach", "FingerTurn", "HandReach", "Reacher", "SawyerReach"]
+
+
+def keys(first: int = 0) -> jax.Array:
+    return jax.random.split(jax.random.key(first), COUNT)
+
+
+def make(ranges: Randomization) -> PointMass:
+    return PointMass(PointMassConfig(image_size=SIZE, randomization=ranges))
+
+
+@functools.cache
+def episodes(ranges: Randomization = OFF) -> tuple[Any, Any]:
+    """Starts of COUNT episodes, and their state after STEPS full actions."""
+    env = make(ranges)
+
+    def play(keys: jax.Array) -> tuple[Any, Any]:
+        start = jax.vmap(env.reset)(keys)
+        action = jnp.ones((COUNT, env.action_size))
+        end, _ = jax.lax.scan(lambda state, _: (jax.vmap(env.step)(state, action), None), start, length=STEPS)
+        return start, end
+
+    return world_jit(play)(keys())
+
+
+ALL = typical(*KINDS)
+LOOKS = typical("camera", "lights", "colours")
+
+
+def without_domain(state: Any) -> list[np.ndarray]:
+    return [np.asarray(leaf) for leaf in jax.tree.leaves(state.replace(domain=None))]
+
+
+def test_off_adds_nothing() -> None:
+    env = make(OFF)
+    start = jax.eval_shape(env.reset, jax.random.key(0))
+    assert start.domain is None
+    with_all = jax.eval_shape(make(ALL).reset, jax.random.key(0))
+    assert len(jax.tree.leaves(with_all)) == len(jax.tree.leaves(start)) + len(ALL.active)
+    assert sum(leaf.size for leaf in jax.tree.leaves(with_all.domain)) < 200
+
+    # Nor to the program: it is that of an environment which knows of no randomisation.
+    class Plain(PointMass):
+        def reset(self, key: jax.Array) -> Any:
+            data, goal = self.sample_start(key), self.sample_goal(key)
+            state = self.state_at(data, self.achieved(goal))
+            both = jax.tree.map(lambda *leaves: jnp.stack(leaves), data, goal)
+            frame, goal_frame = jax.vmap(lambda data: self._draw(data, None))(both)
+            return state.replace(obs={"observation": frame, "achieved_goal": frame, "desired_goal": goal_frame})
+
+    plain = Plain(env.config)
+    assert str(jax.make_jaxpr(plain.reset)(jax.random.key(0))) == str(jax.make_jaxpr(env.reset)(jax.random.key(0)))
+
+
+def test_starts_and_goals_are_those_without_randomisation() -> None:
+    plain, varied = episodes()[0], episodes(ALL)[0]
+    np.testing.assert_array_equal(varied.achieved_state, plain.achieved_state)
+    np.testing.assert_array_equal(varied.goal_state, plain.goal_state)
+    np.testing.assert_array_equal(varied.data.qpos, plain.data.qpos)
+
+
+def test_a_look_changes_pictures_and_not_the_physics() -> None:
+    (plain_start, plain_end), (start, end) = episodes(), episodes(LOOKS)
+    for before, after in ((plain_start, start), (plain_end, end)):
+        for name in ("observation", "desired_goal"):
+            assert (np.asarray(before.obs[name]) != np.asarray(after.obs[name])).any(axis=(1, 2, 3)).all()
+        for one, other in zip(without_domain(before.replace(obs=None)), without_domain(after.replace(obs=None)), strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+def test_dynamics_change_the_motion_and_not_the_look() -> None:
+    (plain_start, plain_end), (start, end) = episodes(), episodes(typical("dynamics"))
+    for one, other in zip(without_domain(plain_start), without_domain(start), strict=True):
+        np.testing.assert_array_equal(one, other)
+    moved = np.abs(np.asarray(plain_end.data.qvel - end.data.qvel))
+    assert (moved.max(axis=1) > 1e-3 * np.abs(np.asarray(plain_end.data.qvel)).max()).all()
+
+
+def test_environments_of_a_batch_differ_and_keys_repeat() -> None:
+    start = episodes(ALL)[0]
+    assert set(start.domain) == set(ALL.active)
+    for name, values in start.domain.items():
+        values = np.asarray(values).reshape(COUNT, -1)
+        assert (np.abs(values) <= ALL.active[name]).all()
+        if values.size:
+            assert (values[0] != values[1]).all(), name
+    # The same key draws the same, whatever else is on.
+    alone = episodes(LOOKS)[0]
+    for name, values in alone.domain.items():
+        np.testing.assert_array_equal(values, start.domain[name])
+
+
+@functools.cache
+def draw_shape() -> Any:
+    """The task's scene, and draw(domain) -> (planes [4, H, W], geoms [H, W]) of its first start."""
+    env = make(OFF)
+    data = jax.tree.map(lambda leaf: leaf[0], episodes()[0].data)
+    scene = Scene.from_mjmodel(env.mj_model, env.camera, SIZE, SIZE)
+
+    def draw(scene: Scene) -> tuple[jax.Array, jax.Array]:
+        planes = render_planes(scene, data, segmentation=True)
+        return jnp.concatenate([planes.rgb, planes.depth[None]]), planes.segmentation
+
+    return scene, world_jit(draw)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "geometry", "colours"),
+    [
+        ("camera_position", [0.1, 0.0, 0.0], True, True),
+        ("camera_orientation", [0.0, 0.1, 0.0], True, True),
+        ("camera_fovy", 0.2, True, True),
+        ("light_direction", [[0.5, 0.0, 0.0]], False, True),
+        ("light_position", [[0.0, 0.0, 0.0], [0.3, 0.0, 0.0]], False, True),
+        ("light_position", [[0.3, 0.3, 0.3], [0.0, 0.0, 0.0]], False, False),  # the first is directional
+        ("light_diffuse", [[0.5, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]], False, True),
+        ("light_ambient", [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.5, 0.0, 0.0]], False, True),
+        ("colour", "first", False, True),
+    ],
+)
+def test_each_look(name: str, value: Any, geometry: bool, colours: bool) -> None:
+    scene, draw = draw_shape()
+    if value == "first":
+        value = np.zeros((len(scene.rgba), 3))
+        value[0, 2] = -0.3  # the ground, blue
+    domain = {name: jnp.asarray(value, jnp.float32)}
+    (before, labels), (after, new_labels) = draw(scene), draw(randomization.varied_scene(scene, domain))
+    before, after = np.asarray(before), np.asarray(after)
+    assert ((before[3] != after[3]).any() or (np.asarray(labels) != np.asarray(new_labels)).any()) == geometry
+    assert (before[:3] != after[:3]).any() == colours
+    if name == "colour":  # nothing but the ground, and nothing of it but its blue
+        np.testing.assert_array_equal(before[:2], after[:2])
+        np.testing.assert_array_equal((before[2] != after[2]), np.asarray(labels) == 0)
+    if name in ("light_diffuse", "light_ambient"):  # redder, no less green or blue
+        np.testing.assert_array_equal(before[1:3], after[1:3])
+        assert (after[0] >= before[0]).all()
+
+
+def test_a_camera_is_shifted_in_its_own_frame() -> None:
+    scene, draw = draw_shape()
+    near = randomization.varied_scene(scene, {"camera_position": jnp.array([0.0, 0.0, 0.1])})
+    # 10 cm back: everything in the middle of the picture is 10 cm further.
+    middle = (3, SIZE // 2, SIZE // 2)
+    assert float(draw(near)[0][middle] - draw(scene)[0][middle]) == pytest.approx(0.1, abs=0.02)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_each_range_of_the_dynamics_scales_its_leaves(task: str) -> None:
+    env = jaxrl_vis_envs.make(task, randomization=typical("dynamics"))
+    domain = randomization.sample(jax.random.key(3), env.config.randomization, env._model, env.action_size, None)
+    expected = {
+        "mass": {"body_mass", "body_inertia"},
+        "damping": {"dof_damping"},
+        "friction": {"geom_friction", "pair_friction", "dof_frictionloss", "tendon_frictionloss"},
+        "actuator_gain": {"actuator_gainprm", "actuator_biasprm"},
+    }
+    for name, leaves in expected.items():
+        varied = randomization.varied_model(env._model, {name: domain[name]})
+        for field in env._model.__dataclass_fields__:
+            before, after = getattr(env._model, field), getattr(varied, field)
+            if field not in leaves:
+                assert after is before, field
+                continue
+            before, after, factor = np.asarray(before), np.asarray(after), 1.0 + np.asarray(domain[name])
+            assert before.shape == after.shape
+            scaled = before.T * factor.T if factor.ndim else before * factor
+            np.testing.assert_allclose(after, scaled.T if factor.ndim else scaled, rtol=1e-6)
+    np.testing.assert_allclose(
+        randomization.varied_action(jnp.ones(env.action_size), domain), 1.0 + np.asarray(domain["action_scale"])
+    )
+
+
+def test_mjx_steps_a_varied_model_as_mujoco_does() -> None:
+    """The leaves that are changed are those that MuJoCo's own model has: C MuJoCo with the same numbers moves the same."""
+    end = jax.tree.map(lambda leaf: np.asarray(leaf[0], np.float64), episodes(ALL)[1])
+    start = episodes(ALL)[0]
+    model = mujoco.MjModel.from_xml_string(point_mass.XML)
+    domain = {name: np.asarray(values) for name, values in end.domain.items()}
+    model.body_mass *= 1 + domain["mass"]
+    model.body_inertia *= 1 + domain["mass"][:, None]
+    model.dof_damping *= 1 + domain["damping"]
+    model.actuator_gainprm[:, 0] *= 1 + domain["actuator_gain"]
+    data = mujoco.MjData(model)
+    mujoco.mj_setConst(model, data)
+    data.qpos[:] = np.asarray(start.data.qpos[0])
+    data.ctrl[:] = 1 + domain["action_scale"]
+    for _ in range(STEPS):
+        mujoco.mj_step(model, data)
+    np.testing.assert_allclose(end.data.qvel, data.qvel, rtol=1e-4)
+
+
+def test_the_gpu_kernel_draws_varied_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By Pallas's interpreter: the scene's leaves differ between the environments of a batch, and both ways draw the same."""
+    scene, _ = draw_shape()
+    start = episodes(ALL)[0]
+    assert gpu_kernel.supports(scene)
+
+    def draw(data: Any, domain: Any) -> jax.Array:
+        planes = render_planes(randomization.varied_scene(scene, domain), data)
+        return jnp.concatenate([planes.rgb, planes.depth[None]])
+
+    plain = np.asarray(world_jit(jax.vmap(draw))(start.data, start.domain))
+    monkeypatch.setattr(gpu_kernel, "takes", gpu_kernel.supports)
+    monkeypatch.setattr(pictures.gpu_kernel, "draw", functools.partial(gpu_kernel.draw, interpret=True))
+    by_kernel = np.asarray(jax.vmap(draw)(start.data, start.domain))
+    assert (np.abs(plain - by_kernel).max(axis=1) < 1e-3).mean() > 0.98  # but for pixels on an edge
+    assert len({picture.tobytes() for picture in by_kernel}) == COUNT
+
+
+def test_typical_ranges_and_bad_ones() -> None:
+    assert typical() == OFF and not OFF.active
+    assert typical("dynamics", strength=0.5).mass == 0.5 * KINDS["dynamics"]["mass"]
+    assert set(KINDS) == set(config_file.RANDOMIZED)
+    assert {name for kind in KINDS.values() for name in kind} == set(Randomization.__dataclass_fields__)
+    for bad in (lambda: Randomization(mass=-0.1), lambda: Randomization(colour=float("nan")), lambda: Randomization(mass=1.0)):
+        with pytest.raises(ValueError, match="of the randomization"):
+            bad()
+    with pytest.raises(ValueError, match="camera, lights"):
+        typical("weather")
+    with pytest.raises(ValueError, match="draws pictures"):
+        jaxrl_vis_envs.make("Reacher", randomization=LOOKS)
+
+
+def test_every_picture_task_takes_every_kind() -> None:
+    for task in TASKS:
+        env = jaxrl_vis_envs.make(f"Visual{task}", image_size=8, randomization=ALL)
+        domain = jax.eval_shape(
+            lambda key, env=env: randomization.sample(key, env.config.randomization, env._model, env.action_size, env._scene),
+            jax.random.key(0),
+        )
+        assert set(domain) == set(ALL.active)
+        scene = jax.eval_shape(lambda domain, env=env: randomization.varied_scene(env._scene, domain), domain)
+        same = jax.tree.map(lambda one, other: (one.shape, one.dtype) == (other.shape, other.dtype), scene, env._scene)
+        assert all(jax.tree.leaves(same))
+        assert isinstance(env._draw, pixels.PictureObserver)
+
+
+def test_the_learner_asks_for_it() -> None:
+    """`jaxrl-vis train --randomize camera dynamics --randomize-strength 2`."""
+    settings = {"randomize": ("camera", "dynamics"), "randomize_strength": 2.0}
+    env = make_env(preset("debug", env="VisualReacher", **settings))
+    assert env.config.randomization == typical("camera", "dynamics", strength=2.0)
+    assert make_env(preset("debug", env="VisualReacher")).config.randomization == OFF
+    for wrong, words in (
+        ({"randomize": ("camra",)}, "did you mean camera"),
+        ({"randomize": ("dynamics",), "randomize_strength": 10.0}, "mass"),
+        ({"randomize_strength": 0.0}, "randomize_strength"),
+        ({"env": "Reacher", "randomize": ("colours",)}, "draws pictures"),
+        ({"env": "Reacher", "frames": 2}, "frames"),
+        ({"frames": 0}, "frames"),
+    ):
+        with pytest.raises(RequestError, match=words):
+            make_env(preset("debug", **({"env": "VisualReacher"} | wrong)))

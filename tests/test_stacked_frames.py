@@ -1,0 +1,125 @@
+"""A learner that sees stacked pictures: its goals stand still, whether they were given or made by relabelling."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from probe_environments import Probe
+
+import jaxrl_vis_envs
+from jaxrl_vis import train_step
+from jaxrl_vis.config import preset
+from jaxrl_vis.ddpg import make_ddpg
+from jaxrl_vis.relabel import stand_still
+from jaxrl_vis.replay import Indices, make_replay
+from jaxrl_vis.trainer import Trainer
+from jaxrl_vis.types import Episodes
+from jaxrl_vis_envs.base import push_history, start_history
+
+ENVS, SETTINGS = 2, {"batch_size": 64, "updates_per_iteration": 1, "replay_transitions": 10, "image_size": 8, "num_envs": 2}
+
+
+def test_relabelled_goals_are_what_was_reached_standing_still():
+    """VisualReacher's own rule, on episodes whose pictures hold their number and their slot, newest first."""
+    env = jaxrl_vis_envs.make("VisualReacher", frames=2, image_size=4, pixels="depth")
+    horizon = 5
+    slots = np.arange(horizon + 2)
+    newest = 10 * np.arange(ENVS)[:, None] + slots
+    before = 10 * np.arange(ENVS)[:, None] + np.maximum(slots - 1, 0)
+    before[:, -1] = newest[:, -1]  # the goal that was given stands still
+    frames = np.broadcast_to(np.stack([newest, before], axis=2)[..., None, None], (ENVS, horizon + 2, 2, 4, 4))
+    replay = make_replay(ENVS * horizon, ENVS, horizon)
+    rollout = Episodes(
+        jnp.asarray(frames, jnp.uint8), jnp.zeros((ENVS, horizon + 2, 2)), jnp.zeros((ENVS, horizon, env.action_size))
+    )
+    state = replay.insert(replay.init(env.observation_spec, 2, env.action_size), rollout, jnp.int32(0))
+    episode, time, goal_slot = (jnp.array(values) for values in ([0, 1, 0, 1], [0, 1, 2, 4], [1, 4, 6, 5]))
+    batch = replay.gather(state, Indices(episode, time), goal_slot)
+    still, reached = stand_still(batch, env.as_goal)
+    np.testing.assert_array_equal(still.observation_t, batch.observation_t)
+    np.testing.assert_array_equal(still.observation_tp1, batch.observation_tp1)
+    for row in range(len(time)):
+        e, t, g = int(episode[row]), int(time[row]), int(goal_slot[row])
+        np.testing.assert_array_equal(still.goal[row], env.as_goal(frames[e, g].astype(np.uint8)))
+        assert set(np.unique(still.goal[row])) == {newest[e, g]}
+        assert set(np.unique(reached[row])) == {newest[e, t + 1]}
+        # Reached where the goal is the very next picture, though what was observed there shows that it moved.
+        assert np.array_equal(still.goal[row], reached[row]) == (g == t + 1)
+        assert not np.array_equal(still.goal[row], still.observation_tp1[row])
+
+
+class Walker(Probe):
+    """A point that walks; a picture is as bright as the point is far, on six grey levels, so that goals can be met."""
+
+    def __init__(self, frames: int):
+        self.frames = frames
+
+    def picture(self, position):
+        return jnp.full((3, 8, 8), jnp.clip(jnp.round(position[0]) % 6, 0, 5), jnp.uint8)
+
+    def reset(self, key):
+        position, goal = jax.random.uniform(key, (2, 1), maxval=6.0)
+        still, wanted = (jnp.tile(self.picture(place), (self.frames, 1, 1)) for place in (position, goal))
+        obs = {"observation": still, "achieved_goal": still, "desired_goal": wanted}
+        return self._measure(position, position, goal, obs, start_history(position, self.frames))
+
+    def advance(self, state, action):
+        position, history = state.data + 1.5 + 0.5 * action, push_history(state.history, state.data)
+        return self._measure(position, position, state.goal_state, state.obs, history)
+
+    def observe(self, state):
+        positions = [state.data] if state.history is None else [state.data, *state.history]
+        return jnp.concatenate([self.picture(position) for position in positions])
+
+
+@functools.cache
+def program(frames: int = 2):
+    """A training program whose gradient step only looks at its batch."""
+    config = preset("debug", method="indicator_balance_filter", relabel_probability=1.0, **SETTINGS)
+    env = Walker(frames)
+
+    def look(state, working, batch, reward):
+        goal, after = (frame.reshape(len(reward), frames, -1) for frame in (batch.goal, batch.observation_tp1))
+        arrived = jnp.all(goal[:, 0] == after[:, 0], axis=-1)
+        return state, working, {
+            "goals_that_stand_still": jnp.mean(jnp.all(goal == goal[:, :1], axis=(1, 2))),
+            "observations_that_move": jnp.mean(jnp.any(after != after[:, :1], axis=(1, 2))),
+            "arrived": jnp.mean(arrived),
+            "rewarded": jnp.mean(reward > 0),
+            "rewarded_as_arrived": jnp.mean((reward > 0) == arrived),
+        }  # fmt: skip
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(train_step, "make_ddpg", lambda *args: make_ddpg(*args)._replace(update=look))
+        return train_step.make_train_step(env, config)
+
+
+def test_training_samples_goals_that_stand_still():
+    made = program()
+    _, metrics = made.train_iteration(made.init(jax.random.key(0)[None]))
+    seen = {name: float(value[0]) for name, value in metrics.items()}
+    assert seen["goals_that_stand_still"] == 1.0
+    assert seen["observations_that_move"] > 0.5
+    # Half of the goals are the next picture for certain, some others by chance.
+    assert 0.4 < seen["rewarded"] < 0.95
+    assert seen["rewarded_as_arrived"] == 1.0
+    assert seen["guard/nonfinite"] == 0.0
+
+
+def test_people_are_shown_the_newest_picture():
+    made = program()
+    trainer = Trainer(made.config, made)
+    assert trainer.shows_pictures
+    _, pictures = jax.eval_shape(made.evaluate, trainer.shapes.train, jax.random.key(0))
+    horizon = made.env.horizon
+    assert pictures["frames"].shape == (1, 8, horizon + 1, 3, 8, 8)
+    assert pictures["goals"].shape == (1, 8, 3, 8, 8)
+
+
+def test_a_single_frame_is_left_alone(monkeypatch):
+    """With one picture there is nothing to do, and nothing is done."""
+    monkeypatch.setattr(train_step, "stand_still", None)  # calling it would fail
+    made = program(1)
+    jax.eval_shape(made.train_iteration, jax.eval_shape(made.init, jax.random.key(0)[None]))
