@@ -8,6 +8,7 @@ import os
 import platform
 import time
 from collections.abc import Callable
+from typing import Any
 
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy")
 
@@ -67,7 +68,7 @@ def physics_and_camera() -> str:
     env = jaxrl_vis_envs.make("VisualReacher", image_size=32)
     start = time.perf_counter()
 
-    def step_once(key: jax.Array) -> tuple[jax.Array, dict]:
+    def step_once(key: jax.Array) -> tuple[jax.Array, Any]:
         state = env.step(env.reset(key), jnp.full((env.action_size,), 0.5, jnp.float32))
         return state.achieved_state, state.obs
 
