@@ -94,6 +94,7 @@ class HandReach(MjxGoalEnv):
     action_size = 20
     camera = "front"
     distance_unit = "m"
+    chance, difficulty = 0.0, 4.3  # benchmarks/task_difficulty.py HandReach --episodes 1000
 
     def __init__(self, config: HandReachConfig, observer: Callable[[mujoco.MjModel], Observer] | None = None):
         """Builds the model.
