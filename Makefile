@@ -33,7 +33,7 @@ train: $(STAMPS)/$(ACCELERATOR) ## Train on VisualFetchReach; curve.png and vide
 	@$(BIN)/jaxrl-vis train --preset $(PRESET) --seed $(SEED) --run-dir "$(RUN_DIR)" $(ARGS)
 
 test: $(STAMPS)/dev ## Run the tests
-	@$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup --no-loadscope-reorder $(ARGS)
+	@$(BIN)/python -m pytest -n $(WORKERS) $(ARGS)
 
 lint: $(STAMPS)/dev ## Check style, format and types
 	@$(BIN)/ruff check .

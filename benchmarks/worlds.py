@@ -17,7 +17,7 @@ from jaxrl_vis_envs.base import State
 from jaxrl_vis_envs.compilation import world_jit
 from jaxrl_vis_envs.tasks import mjx_model
 
-LANES = 64
+LANES = 16
 
 
 @functools.cache

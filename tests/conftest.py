@@ -5,6 +5,7 @@ import os
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 # Read by JAX at its first import, so set before any test module is imported.
 os.environ["JAX_PLATFORMS"] = "cpu"
@@ -37,18 +38,42 @@ def clean_environment(checkout: Path) -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": os.pathsep.join((str(checkout), str(checkout / "envs")))}
 
 
-# What takes longest, first: at the end of a run no worker should wait for the other.
-LONGEST = ("HandReach", "SawyerReach", "FetchReach", "FingerTurn", "Reacher")
+# Files whose tests play a task, and the tasks, by the word that names of files and tests have in common; the one that takes
+# longest to compile first, since at the end of a run no worker should wait for the other.
+WORLD_TESTS = ("controllers", "envs", "finger_turn", "hand_reach", "physics_parity", "sawyer_reach")
+    "test_controllers",
+    "test_envs",
+    "test_finger_turn",
+    "test_hand_reach",
+    "test_physics_parity",
+    "test_sawyer_reach",
+)
+WORLDS = ("hand", "sawyer", "fetch", "finger", "reacher")
 
 
-@pytest.hookimpl(tryfirst=True)
+def group_of(nodeid: str) -> str:
+    """What shares compiled programs with other tests: those of one world, or else of one file."""
+    file = Path(nodeid.partition("::")[0]).stem
+    names = [world for world in WORLDS if world in nodeid.lower()] if file.removeprefix("test_") in WORLD_TESTS else []
+    return names[0] if names else file
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests that share compiled programs run in one process: those of one group, or else of one file."""
+    def rank(item: pytest.Item) -> int:
+        group = group_of(item.nodeid)
+        return WORLDS.index(group) if group in WORLDS else len(WORLDS)
 
-    def group(item: pytest.Item) -> str:
-        mark = item.get_closest_marker("xdist_group")
-        return mark.args[0] if mark else item.path.stem
+    items.sort(key=rank)
 
-    for item in items:
-        item.add_marker(pytest.mark.xdist_group(group(item)))
-    items.sort(key=lambda item: LONGEST.index(group(item)) if group(item) in LONGEST else len(LONGEST))
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Each group runs in one process."""
+    from xdist.scheduler import LoadScopeScheduling
+
+    class OneProcessPerGroup(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            return group_of(nodeid)
+
+    config.option.loadscopereorder = False  # or else it would start with the group of most tests
+    return OneProcessPerGroup(config, log)

@@ -11,6 +11,6 @@ def test_every_task_has_a_controller():
     assert sorted([*controllers.POLICIES, "FingerTurn"]) == sorted(EPISODES)
 
 
-@pytest.mark.parametrize("name", [pytest.param(task, marks=pytest.mark.xdist_group(task)) for task in EPISODES])
+@pytest.mark.parametrize("name", EPISODES)
 def test_a_controller_on_the_true_state_succeeds(name):
     assert controllers.success_rate(name, EPISODES[name], seed=1) >= controllers.LEAST_SUCCESS

@@ -19,15 +19,14 @@ from jaxrl_vis_envs import compilation, goals, pixels, registry
 from jaxrl_vis_envs.base import GoalEnv, State, sanitize_action
 from jaxrl_vis_envs.compilation import world_jit
 
-BATCH, STEPS = 64, 8
+BATCH, STEPS = 32, 8
 SOURCES = pathlib.Path(__file__).resolve().parents[1] / "envs"
 SUBPROCESS_ENVIRONMENT = {**os.environ, "PYTHONPATH": str(SOURCES)}
 TASKS = ["FetchReach", "FingerTurn", "HandReach", "Reacher", "SawyerReach"]
 HORIZONS = {"FetchReach": 50, "FingerTurn": 50, "HandReach": 50, "Reacher": 50, "SawyerReach": 25}
 
 
-# One process plays all tests of a world, so that its physics is compiled once (see conftest.py).
-EACH_TASK = pytest.mark.parametrize("name", [pytest.param(task, marks=pytest.mark.xdist_group(task)) for task in TASKS])
+EACH_TASK = pytest.mark.parametrize("name", TASKS)
 
 
 @functools.cache
@@ -210,10 +209,7 @@ def test_pictures_stack_newest_first():
     np.testing.assert_array_equal(env.as_goal(steps["observation"][2, 0]), steps["achieved_goal"][2, 0])
 
 
-FETCH, REACHER = pytest.mark.xdist_group("FetchReach"), pytest.mark.xdist_group("Reacher")
-
-
-@pytest.mark.parametrize("name", [pytest.param("FetchReach", marks=FETCH), pytest.param("Reacher", marks=REACHER)])
+@pytest.mark.parametrize("name", ["FetchReach", "Reacher"])
 def test_a_goal_vector_is_at_rest_at_the_goal(name: str) -> None:
     start = episode(name).states[0]
     position = slice(0, 3) if name == "FetchReach" else slice(4, 6)
@@ -222,7 +218,6 @@ def test_a_goal_vector_is_at_rest_at_the_goal(name: str) -> None:
     np.testing.assert_array_equal(start.obs["desired_goal"][:, velocity], 0.0)
 
 
-@FETCH
 def test_fetch_reach_start_and_goals():
     env, start = worlds.make("FetchReach"), episode("FetchReach").states[0]
     np.testing.assert_allclose(start.achieved_state, np.tile([1.3418, 0.7491, 0.5347], (BATCH, 1)), atol=2e-3)
@@ -234,7 +229,6 @@ def test_fetch_reach_start_and_goals():
     assert np.asarray(start.goal_state)[:, 2].min() > 0.4
 
 
-@REACHER
 def test_reacher_start_and_goals():
     start = episode("Reacher").states[0]
     assert (np.abs(start.data.qpos) <= 0.1).all()
@@ -242,7 +236,6 @@ def test_reacher_start_and_goals():
     assert (np.linalg.norm(start.goal_state, axis=-1) <= 0.2101).all()
 
 
-@REACHER
 def test_a_unit_of_reacher_action_turns_a_joint_by_nearly_a_radian():
     start = episode("Reacher").states[0]
     moved = worlds.advance(worlds.make("Reacher"), start, np.tile([1.0, 0.0], (BATCH, 1)))
@@ -310,8 +303,7 @@ def test_world_jit_switches_off_fusion_emitters_on_a_cpu_where_jax_can(monkeypat
     assert compilation.compiler_options("cpu", runs_once=True) == {**expected, "xla_backend_optimization_level": 1}
 
 
-@FETCH
-def test_compiling_after_jax_has_started():
+def test_compiling_fetch_reach_after_jax_has_started():
     program = [sys.executable, "-c", textwrap.dedent(_LATE_START)]
     finished = subprocess.run(program, capture_output=True, text=True, check=False, env=SUBPROCESS_ENVIRONMENT)
     assert finished.returncode == 0, finished.stderr

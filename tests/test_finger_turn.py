@@ -11,7 +11,6 @@ import pytest
 import jaxrl_vis_envs
 from benchmarks import worlds
 
-pytestmark = pytest.mark.xdist_group("FingerTurn")
 COUNT = 512
 
 

@@ -12,7 +12,6 @@ import jaxrl_vis_envs
 from benchmarks import worlds
 from jaxrl_vis_envs.compilation import world_jit
 
-pytestmark = pytest.mark.xdist_group("HandReach")
 COUNT = 128
 START_TIPS = [
     (0.9917, 0.7975, 0.1522),

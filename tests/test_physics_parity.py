@@ -1,5 +1,6 @@
 """Recordings of the original environments (tests/data), played through ours by benchmarks/parity.py."""
 
+import functools
 import pathlib
 
 import jax
@@ -22,30 +23,33 @@ def test_every_comparison_has_a_recording():
     assert sorted(parity.COMPARISONS) == sorted(RECORDINGS)
 
 
-@pytest.mark.parametrize("name", [pytest.param(task, marks=pytest.mark.xdist_group(task)) for task in RECORDINGS])
+@functools.cache
+def compared(name: str) -> list[parity.Figure]:
+    with np.load(DATA / RECORDINGS[name]) as recording:
+        return parity.compare(name, recording)
+
+
+@pytest.mark.parametrize("name", RECORDINGS)
 def test_tasks_follow_the_recordings_of_their_originals(name):
-    figures = parity.compare(name, np.load(DATA / RECORDINGS[name]))
+    figures = compared(name)
     for figure in figures:
         print(figure)
     assert any(figure.bound is not None for figure in figures)
     assert not [figure for figure in figures if figure.is_broken]
 
 
-@pytest.mark.xdist_group("FetchReach")
 def test_most_of_the_fetch_recording_counts():
-    figures = {figure.name: figure.value for figure in parity.compare("FetchReach", np.load(DATA / "fetch_reach.npz"))}
+    figures = {figure.name: figure.value for figure in compared("FetchReach")}
     assert figures["share of the recording that counts (near the start)"] > 0.5
 
 
-@pytest.mark.xdist_group("HandReach")
 def test_contacts_matter_to_the_hand():
-    figures = {figure.name: figure.value for figure in parity.compare("HandReach", np.load(DATA / "hand_reach.npz"))}
+    figures = {figure.name: figure.value for figure in compared("HandReach")}
     for finger in ("ring finger", "little finger"):
         name = f"{finger}: 95th percentile of the error"
         assert figures[f"without contacts, {name}"] > max(3 * figures[name], 0.008)
 
 
-@pytest.mark.xdist_group("FetchReach")
 def test_mjx_steps_the_fetch_robot_as_mujoco_does():
     """In the air. On the table they differ: of a box on a plane the two engines keep different corners."""
     env = worlds.make("FetchReach")

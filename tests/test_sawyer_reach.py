@@ -6,11 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import one_step
-import pytest
 
 from benchmarks import worlds
 
-pytestmark = pytest.mark.xdist_group("SawyerReach")
 COUNT = 512
 
 
