@@ -41,13 +41,6 @@ def clean_environment(checkout: Path) -> dict[str, str]:
 # Files whose tests play a task, and the tasks, by the word that names of files and tests have in common; the one that takes
 # longest to compile first, since at the end of a run no worker should wait for the other.
 WORLD_TESTS = ("controllers", "envs", "finger_turn", "hand_reach", "physics_parity", "sawyer_reach")
-    "test_controllers",
-    "test_envs",
-    "test_finger_turn",
-    "test_hand_reach",
-    "test_physics_parity",
-    "test_sawyer_reach",
-)
 WORLDS = ("hand", "sawyer", "fetch", "finger", "reacher")
 
 
