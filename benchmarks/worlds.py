@@ -33,7 +33,9 @@ def reset(env: Any, keys: jax.Array) -> tuple[State, Any]:
 
 def advance(env: Any, state: State, actions: Any) -> State:
     """N episodes one control step later; actions [N, A]."""
-    return _in_lanes(_advance_program(env), state, jnp.asarray(actions, jnp.float32))
+    # Observations are nothing to physics, and with or without them would be two programs.
+    moved = _in_lanes(_advance_program(env), state.replace(obs=None), jnp.asarray(actions, jnp.float32))
+    return moved.replace(obs=state.obs)
 
 
 def start_at(env: Any, qpos: Any, qvel: Any) -> State:

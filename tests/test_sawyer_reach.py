@@ -53,7 +53,7 @@ def test_a_unit_of_action_is_five_centimetres():
     np.testing.assert_allclose(moved.achieved_state - state.achieved_state, 0.05 * action, atol=2e-3)
 
 
-def test_the_hand_stays_over_the_table():
+def test_the_gripper_stays_over_the_table():
     state = jax.tree.map(lambda leaf: leaf[:2], starts())
     for _ in range(12):
         state = worlds.advance(make(), state, jnp.tile(jnp.array([0.0, 0.0, -1.0]), (2, 1)))
