@@ -31,7 +31,7 @@ EACH_TASK = pytest.mark.parametrize("name", TASKS)
 
 @functools.cache
 def make_visual(task: str) -> GoalEnv:
-    return jaxrl_vis_envs.make(f"Visual{task}", image_size=16)
+    return jaxrl_vis_envs.make(f"Visual{task}", image_size=32)
 
 
 class Episode(NamedTuple):

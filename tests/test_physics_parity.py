@@ -26,7 +26,8 @@ def test_every_comparison_has_a_recording():
 @functools.cache
 def compared(name: str) -> list[parity.Figure]:
     with np.load(DATA / RECORDINGS[name]) as recording:
-        return parity.compare(name, recording)
+        # What two substeps do has no bound, but another program to compile.
+        return parity.compare(name, {key: recording[key] for key in recording if not key.endswith("nsub2")})
 
 
 @pytest.mark.parametrize("name", RECORDINGS)
