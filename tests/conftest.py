@@ -39,9 +39,11 @@ def clean_environment(checkout: Path) -> dict[str, str]:
 
 
 # Files whose tests play a task, and the tasks, by the word that names of files and tests have in common; the one that takes
-# longest to compile first, since at the end of a run no worker should wait for the other.
+# longest to compile first.
 WORLD_TESTS = ("controllers", "envs", "finger_turn", "hand_reach", "physics_parity", "sawyer_reach")
 WORLDS = ("hand", "sawyer", "fetch", "finger", "reacher")
+# At the end of a run no worker should wait for the other, so what takes longest comes first.
+FIRST = (*WORLDS, "test_notebooks", "test_trainer", "test_render_parity")
 
 
 def group_of(nodeid: str) -> str:
@@ -54,7 +56,7 @@ def group_of(nodeid: str) -> str:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     def rank(item: pytest.Item) -> int:
         group = group_of(item.nodeid)
-        return WORLDS.index(group) if group in WORLDS else len(WORLDS)
+        return FIRST.index(group) if group in FIRST else len(FIRST)
 
     items.sort(key=rank)
 

@@ -64,7 +64,7 @@ def test_mjx_steps_the_fetch_robot_as_mujoco_does():
     assert excess[contacts == 0].max() <= 1.0, f"{np.sort(excess)[-10:]}"
 
 
-def test_a_drifting_task_is_found_out(tmp_path, capsys):
+def test_a_drifting_reacher_is_found_out(tmp_path, capsys):
     recording = dict(np.load(DATA / "reacher.npz"))
     recording["qpos_rad"] = recording["qpos_rad"] + 0.011 * (np.arange(51) > 0)[:, None]
     np.savez(tmp_path / "drifting.npz", **recording)
