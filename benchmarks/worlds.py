@@ -5,6 +5,7 @@ another (a controller, a recording, a test) shares these programs: they take `LA
 filled up with copies.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -13,6 +14,7 @@ import jax
 import jax.numpy as jnp
 
 import jaxrl_vis_envs
+from jaxrl_vis_envs import registry
 from jaxrl_vis_envs.base import State
 from jaxrl_vis_envs.compilation import world_jit
 from jaxrl_vis_envs.tasks import mjx_model
@@ -20,10 +22,14 @@ from jaxrl_vis_envs.tasks import mjx_model
 LANES = 16
 
 
-@functools.cache
 def make(name: str, **overrides: Any) -> Any:
-    """`jaxrl_vis_envs.make`, but the same environment every time, so that its programs are compiled once."""
-    return jaxrl_vis_envs.make(name, **overrides)
+    """`jaxrl_vis_envs.make`, but the same environment for the same settings, so that its programs are compiled once."""
+    return _make(name, registry.config_class(name)(**overrides))
+
+
+@functools.cache
+def _make(name: str, config: Any) -> Any:
+    return jaxrl_vis_envs.make(name, **{field.name: getattr(config, field.name) for field in dataclasses.fields(config)})
 
 
 def reset(env: Any, keys: jax.Array) -> tuple[State, Any]:
