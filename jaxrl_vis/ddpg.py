@@ -59,6 +59,28 @@ def _shares(reward: jax.Array, keep: jax.Array, positive_reward: float) -> Metri
     }
 
 
+def _start(
+    networks: Networks,
+    actor_optimizer: optax.GradientTransformation,
+    critic_optimizer: optax.GradientTransformation,
+    key: jax.Array,
+) -> TrainState:
+    """A learner that has learned nothing: targets equal the online networks."""
+    actor_key, critic_key = jax.random.split(key)
+    actor, critic = networks.init_actor(actor_key), networks.init_critic(critic_key)
+    return TrainState(
+        actor=actor,
+        critic=critic,
+        # Copies: a donated buffer must not appear twice.
+        target_actor=jax.tree.map(jnp.copy, actor),
+        target_critic=jax.tree.map(jnp.copy, critic),
+        actor_optimizer=actor_optimizer.init(actor),
+        critic_optimizer=critic_optimizer.init(critic),
+        normalizer=normalizer.init(networks.observation_spec),
+        updates=jnp.zeros((), jnp.int32),
+    )
+
+
 def make_ddpg(networks: Networks, config: Config, resolved: Resolved) -> Algorithm:
     """DDPG for these networks.
 
@@ -71,19 +93,7 @@ def make_ddpg(networks: Networks, config: Config, resolved: Resolved) -> Algorit
     critic_optimizer = optax.adam(config.critic_learning_rate)
 
     def init(key: jax.Array) -> TrainState:
-        actor_key, critic_key = jax.random.split(key)
-        actor, critic = networks.init_actor(actor_key), networks.init_critic(critic_key)
-        return TrainState(
-            actor=actor,
-            critic=critic,
-            # Copies: a donated buffer must not appear twice.
-            target_actor=jax.tree.map(jnp.copy, actor),
-            target_critic=jax.tree.map(jnp.copy, critic),
-            actor_optimizer=actor_optimizer.init(actor),
-            critic_optimizer=critic_optimizer.init(critic),
-            normalizer=normalizer.init(networks.observation_spec),
-            updates=jnp.zeros((), jnp.int32),
-        )
+        return _start(networks, actor_optimizer, critic_optimizer, key)
 
     def working(state: TrainState) -> Working:
         return Working(*map(networks.working_copy, _networks_of(state)))

@@ -290,6 +290,9 @@ def test_brax_keys_of_either_kind_start_the_same_episode():
     np.testing.assert_array_equal(env.reset(jax.random.PRNGKey(7)).obs, env.reset(jax.random.key(7)).obs)
 
 
+BRAX_LEARNING = {"batch_size": 64, "learning_rate": 5e-3, "discounting": 0.5}
+
+
 def test_brax_ppo_learns_where_to_go():
     env = BraxEnv(told(), reward="dense")
     sizes = {"policy_hidden_layer_sizes": (16,), "value_hidden_layer_sizes": (16,)}
@@ -300,12 +303,10 @@ def test_brax_ppo_learns_where_to_go():
             episode_length=env.episode_length,
             num_envs=64,
             unroll_length=4,
-            batch_size=64,
             num_minibatches=2,
             num_updates_per_batch=4,
-            learning_rate=5e-3,
-            discounting=0.5,
             run_evals=False,
+            **BRAX_LEARNING,
             network_factory=functools.partial(ppo_networks.make_ppo_networks, **sizes),
         )
     assert not hasattr(jax, "device_put_replicated")
@@ -324,12 +325,10 @@ def test_brax_sac_trains():
             episode_length=env.episode_length,
             num_envs=16,
             num_eval_envs=64,
-            batch_size=64,
             grad_updates_per_step=4,
             min_replay_size=256,
             max_replay_size=2048,
-            learning_rate=5e-3,
-            discounting=0.5,
+            **BRAX_LEARNING,
             reward_scaling=30.0,
             deterministic_eval=True,
             network_factory=functools.partial(sac_networks.make_sac_networks, hidden_layer_sizes=(16,)),
