@@ -64,6 +64,18 @@ def test_mjx_steps_the_fetch_robot_as_mujoco_does():
     assert excess[contacts == 0].max() <= 1.0, f"{np.sort(excess)[-10:]}"
 
 
+def test_mjx_steps_the_reacher_as_mujoco_does():
+    """Half of the starts are near the limit of the elbow, the only constraint, on either side of it."""
+    env = worlds.make("Reacher")
+    rng = np.random.default_rng(0)
+    near_limit = rng.choice([-1.0, 1.0], 32) * rng.uniform(2.9, 3.1, 32)
+    starts = np.stack([rng.uniform(-6, 6, 64), np.concatenate([rng.uniform(-3, 3, 32), near_limit])], axis=1)
+    states = one_step.visited_states(env.mj_model, starts, rng.uniform(-1, 1, (64, 4, 2)), every=3)
+    assert (np.abs(states.qpos[:, 1]) > 3.0).sum() > 30
+    excess, _ = one_step.velocity_difference(env.mj_model, states)
+    assert excess.max() <= 1.0, f"{np.sort(excess)[-10:]}"
+
+
 def test_a_drifting_reacher_is_found_out(tmp_path, capsys):
     recording = dict(np.load(DATA / "reacher.npz"))
     recording["qpos_rad"] = recording["qpos_rad"] + 0.011 * (np.arange(51) > 0)[:, None]

@@ -19,6 +19,7 @@ import mujoco
 
 from jaxrl_vis_envs.randomization import Domain, varied_scene
 from jaxrl_vis_envs.render import Scene, render_planes
+from jaxrl_vis_envs.tasks import mjx_model
 from jaxrl_vis_envs.tasks.mjx_model import mjx
 
 CHANNELS = {"rgbd": 4, "rgb": 3, "depth": 1}
@@ -85,7 +86,7 @@ class PictureObserver:
 
         def draw_at(qpos: jax.Array) -> jax.Array:
             with jax.default_matmul_precision("highest"):
-                return self._draw(scene, mjx.kinematics(self._model, data.replace(qpos=qpos)))
+                return self._draw(scene, mjx_model.kinematics(self._model, data.replace(qpos=qpos)))
 
         pictures = jax.vmap(draw_at)(jnp.concatenate([data.qpos[None], history]))
         return pictures.reshape(-1, *pictures.shape[2:])

@@ -118,7 +118,7 @@ class FingerTurn(MjxGoalEnv):
 
     def configuration(self, joint_angles: jax.Array) -> mjx.Data:
         """The world at rest with ``joint_angles`` [3] float32: proximal (-pi/2 hangs down), distal, spinner, rad."""
-        return mjx.kinematics(self._model, self._still.replace(qpos=joint_angles))
+        return mjx_model.kinematics(self._model, self._still.replace(qpos=joint_angles))
 
     def _clearance(self, data: mjx.Data) -> jax.Array:
         """The least distance between finger and spinner, m; negative where they overlap."""

@@ -138,7 +138,7 @@ class HandReach(MjxGoalEnv):
 
     def configuration(self, joint_angles: jax.Array) -> mjx.Data:
         """The hand at rest with ``joint_angles`` [24] float32, rad."""
-        return mjx.kinematics(self._model, self._start.replace(qpos=joint_angles))
+        return mjx_model.kinematics(self._model, self._start.replace(qpos=joint_angles))
 
     def configuration_at(self, tips: jax.Array) -> mjx.Data:
         """The hand at rest with its tips as near to ``tips`` [5, 3] (m, world) as its joints let it (damped least squares)."""

@@ -41,7 +41,7 @@ def reach(
 
     def improve(data: mjx.Data, share: jax.Array) -> tuple[mjx.Data, None]:
         target = start.xpos[body] + share * (position - start.xpos[body])
-        return mjx.kinematics(
+        return mjx_model.kinematics(
             model, data.replace(qpos=data.qpos + _step(mj_model, data, body, target, rotation, damping))
         ), None
 

@@ -1,7 +1,5 @@
 """What every MJX task needs: loading its model, and states without weak types."""
 
-import contextlib
-import io
 import pathlib
 from typing import Any
 
@@ -10,9 +8,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-with contextlib.redirect_stdout(io.StringIO()):  # it prints, twice, that Warp is missing, which nothing here needs
-    from mujoco import mjx
-    from mujoco.mjx._src import math, solver  # their pieces are not public
+from jaxrl_vis_envs.tasks.kinematics import kinematics
+from jaxrl_vis_envs.tasks.quiet_mjx import math, mjx, sensor, smooth, solver
+
+__all__ = ["kinematics", "load_model", "mjx", "simulate", "start_data", "step", "still_data", "take_steps", "tip_jacobian"]
 
 _ASSETS = pathlib.Path(__file__).parent / "assets"
 
@@ -42,12 +41,12 @@ def still_data(mj_model: mujoco.MjModel, keyframe: str | None = None) -> mjx.Dat
 def simulate(model: mjx.Model, data: mjx.Data, substeps: int, exact: bool = False) -> mjx.Data:
     """``substeps`` physics steps (`step`), after which every pose belongs to the final ``qpos``.
 
-    `mjx.step` leaves the poses of the state *before* its last integration, so one more `mjx.kinematics` is needed for the
+    `mjx.step` leaves the poses of the state *before* its last integration, so `kinematics` is needed once more for the
     picture, the true state and ``qpos`` to agree.
     """
     data = take_steps(model, data, substeps, exact)
     with _full_precision():
-        return mjx.kinematics(model, data)
+        return kinematics(model, data)
 
 
 def take_steps(model: mjx.Model, data: mjx.Data, count: int, exact: bool = False) -> mjx.Data:
@@ -66,29 +65,65 @@ def _full_precision() -> Any:
 
 
 def step(model: mjx.Model, data: mjx.Data, exact: bool = True) -> mjx.Data:
-    """`mjx.step`; if ``exact``, with contacts and forces as exact as float32 allows under the Euler integrator.
+    """`mjx.step` in fewer operations; if ``exact``, with contacts and forces as exact as float32 allows.
 
-    That costs nearly as much again, so tasks ask for it where contacts decide. Sensors are then left as they are.
-
-    Two things are better than in MJX. Its contacts between capsules lie up to .1 mm off along short capsules (it adds 1e-6 to
-    a squared length). And its solver accepts a step only where it lowers the cost, and in float32 the cost cannot tell forces
-    apart that differ by less than the square root of the rounding error, some 3e-4. Where large forces balance, at a joint's
-    limit say, that is the velocity's first digit. One more Newton step, judged by the gradient, leaves the rounding error.
+    Exactness costs nearly as much again, so tasks ask for it where contacts decide. Two things are then better than in MJX.
+    Its contacts between capsules lie up to .1 mm off along short capsules (it adds 1e-6 to a squared length). And its solver
+    accepts a step only where it lowers the cost, and in float32 the cost cannot tell forces apart that differ by less than the
+    square root of the rounding error, some 3e-4. Where large forces balance, at a joint's limit say, that is the velocity's
+    first digit. One more Newton step, judged by the gradient, leaves the rounding error.
     """
-    if not exact or model.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER:
-        return mjx.step(model, data)
-    data = mjx.fwd_position(model, data)
+    if model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER:
+        return mjx.euler(model, _forward(model, data, exact))
+    if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 and model.na == 0 and model.nq == model.nv:
+        return _runge_kutta_4(model, data, exact)
+    return mjx.step(model, data)
+
+
+def _forward(model: mjx.Model, data: mjx.Data, exact: bool) -> mjx.Data:
+    """`mjx.forward`: accelerations from positions, velocities and controls; for ``exact`` see `step`."""
+    data = smooth.com_pos(model, kinematics(model, data))
+    data = smooth.crb(model, smooth.tendon(model, data))
+    data = smooth.factor_m(model, smooth.tendon_armature(model, data))
+    data = mjx.collision(model, data)
     pairs = np.stack([model.pair_geom1, model.pair_geom2])
-    if np.any(np.all(model.geom_type[pairs] == mujoco.mjtGeom.mjGEOM_CAPSULE, axis=0)):
-        # What fwd_position made of the contacts before is never used, so that XLA drops it.
-        data = mjx.make_constraint(model, _place_capsule_contacts(model, data))
-    data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, mjx.fwd_velocity(model, data)))
+    if exact and np.any(np.all(model.geom_type[pairs] == mujoco.mjtGeom.mjGEOM_CAPSULE, axis=0)):
+        data = _place_capsule_contacts(model, data)
+    data = smooth.transmission(model, mjx.make_constraint(model, data))
+    data = mjx.fwd_velocity(model, sensor.sensor_pos(model, data))
+    data = mjx.fwd_actuation(model, sensor.sensor_vel(model, data))
+    data = mjx.fwd_acceleration(model, data)
     if data._impl.nefc == 0:
-        data = data.replace(qacc=data.qacc_smooth)
-    else:
-        data = mjx.solve(model, data)
-        data = _polish(model, data)
-    return mjx.euler(model, data)
+        return data.replace(qacc=data.qacc_smooth)
+    data = mjx.solve(model, data)
+    return sensor.sensor_acc(model, _polish(model, data) if exact else data)
+
+
+def _runge_kutta_4(model: mjx.Model, data: mjx.Data, exact: bool) -> mjx.Data:
+    """`mjx.step` with the classical Runge-Kutta method, for joints of one degree of freedom and actuators without a state.
+
+    MJX's own puts four copies of the forward dynamics into the program; this one puts one, which compiles in a third of the time.
+    """
+    timestep, start = model.opt.timestep, data
+
+    def stage(carry: tuple[mjx.Data, jax.Array, jax.Array], row: jax.Array) -> tuple[Any, None]:
+        data, mean_velocity, mean_acceleration = carry
+        reach, weight = row  # how far into the step the stage lies, and its share in the mean
+        velocity = start.qvel + reach * timestep * data.qacc
+        position = start.qpos + reach * timestep * data.qvel
+        data = data.replace(qpos=position, qvel=velocity, time=start.time + reach * timestep)
+        data = _forward(model, data, exact)
+        return (data, mean_velocity + weight * velocity, mean_acceleration + weight * data.qacc), None
+
+    tableau = jnp.array([[0.0, 1 / 6], [0.5, 1 / 3], [0.5, 1 / 3], [1.0, 1 / 6]], jnp.float32)
+    nothing = jnp.zeros_like(data.qvel)
+    data, velocity, acceleration = jax.lax.scan(stage, (data, nothing, nothing), tableau)[0]
+    return data.replace(
+        qpos=start.qpos + timestep * velocity,
+        qvel=start.qvel + timestep * acceleration,
+        time=start.time + timestep,
+        qacc_warmstart=data.qacc,
+    )
 
 
 def _place_capsule_contacts(model: mjx.Model, data: mjx.Data) -> mjx.Data:

@@ -114,7 +114,7 @@ class Reacher(MjxGoalEnv):
 
     def configuration(self, joint_angles: jax.Array) -> mjx.Data:
         """The arm at rest with ``joint_angles`` [2] float32, rad."""
-        return mjx.kinematics(self._model, self._still.replace(qpos=joint_angles))
+        return mjx_model.kinematics(self._model, self._still.replace(qpos=joint_angles))
 
 
 def _visual(config: VisualReacherConfig) -> Reacher:
