@@ -12,6 +12,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 import jaxrl_vis_envs
 from jaxrl_vis_envs import registry
@@ -40,7 +41,7 @@ def reset(env: Any, keys: jax.Array) -> tuple[State, Any]:
 def advance(env: Any, state: State, actions: Any) -> State:
     """N episodes one control step later; actions [N, A]."""
     # Observations are nothing to physics, and with or without them would be two programs.
-    moved = _in_lanes(_advance_program(env), state.replace(obs=None), jnp.asarray(actions, jnp.float32))
+    moved = _in_lanes(_advance_program(env), state.replace(obs=None), np.asarray(actions, np.float32))
     return moved.replace(obs=state.obs)
 
 
@@ -66,11 +67,10 @@ def _advance_program(env: Any) -> Callable:
 
 
 def _in_lanes(program: Callable, *trees: Any) -> Any:
-    """``program`` on [N, ...] leaves, LANES rows at a time."""
+    """``program`` on [N, ...] leaves, LANES rows at a time; the results are NumPy arrays, of which rows are taken quickly."""
     count = len(jax.tree.leaves(trees)[0])
     parts = []
     for first in range(0, count, LANES):
-        rows = jnp.minimum(jnp.arange(first, first + LANES), count - 1)
-        part = program(*jax.tree.map(lambda leaf, rows=rows: leaf[rows], trees))
-        parts.append(part)
-    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:count], *parts)
+        rows = np.minimum(np.arange(first, first + LANES), count - 1)
+        parts.append(jax.device_get(program(*jax.tree.map(lambda leaf, rows=rows: leaf[rows], trees))))
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *parts)
