@@ -111,8 +111,8 @@ class Bench:
     """Transitions in a gradient step (update)."""
     repeats: int = 5
     """Timed repeats; the median counts."""
-    peer: Literal["mujoco", "warp"] | None = None
-    """Measure another renderer side by side, on the same poses (render)."""
+    peer: Literal["mujoco", "warp", "playground"] | None = None
+    """Measure another side by side: a renderer on the same poses (render), or MuJoCo Playground's FingerTurn (physics)."""
     scene: str | None = None
     """finger, fetch_reach, primitives or the path of an MJCF file: draw this, without a task; all three for a peer (render)."""
     json: Path | None = None
@@ -345,9 +345,10 @@ def run_doctor(_: Doctor, __: Sequence[str]) -> int:
 
 def run_bench(options: Bench, _: Sequence[str]) -> int:
     """Runs one benchmark."""
-    for option in ("peer", "scene"):
-        if getattr(options, option) is not None and options.benchmark != "render":
-            raise RequestError(f"--{option} {getattr(options, option)} goes with `bench render` only")
+    for option, benchmark in (("scene", "render"), ("peer", "physics" if options.peer == "playground" else "render")):
+        value = getattr(options, option)
+        if value is not None and options.benchmark != benchmark:
+            raise RequestError(f"--{option} {value} goes with `bench {benchmark}` only")
     if any(count < 1 for count in options.envs) or options.repeats < 1:
         raise RequestError("--envs and --repeats must be at least 1")
     check_env(options.env)

@@ -1,14 +1,16 @@
-"""Physics alone: `advance` under random actions, no pictures."""
+"""Physics alone: `advance` under random actions, no pictures; MuJoCo Playground's FingerTurn beside ours where it is asked for."""
 
 from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
 
+from jaxrl_vis.bench import playground
 from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.settings import Settings
 from jaxrl_vis.bench.timing import assert_varied, compile_timed
 from jaxrl_vis.bench.timing import measure as measure_time
+from jaxrl_vis.config import RequestError
 from jaxrl_vis_envs.base import GoalEnv, State
 from jaxrl_vis_envs.compilation import world_jit
 
@@ -24,6 +26,10 @@ def start_states(env: GoalEnv, count: int) -> State:
 
 def measure(settings: Settings) -> Iterator[Measurement]:
     """Environment steps per second."""
+    if settings.peer is not None:
+        if settings.env != "FingerTurn":
+            raise RequestError("bench physics --peer playground needs --env FingerTurn")
+        playground.load()  # first: it is the part that may be missing
     env = settings.make_env()
     steps = env.horizon if settings.on_accelerator else 10
     counts = settings.counts(CPU_COUNTS, ACCELERATOR_COUNTS)
@@ -45,10 +51,13 @@ def measure(settings: Settings) -> Iterator[Measurement]:
         if not bool(jnp.isfinite(final.achieved_state).all()):
             raise FloatingPointError("physics gave numbers that are not finite")
         timing = measure_time(lambda: compiled(*arguments).achieved_state, settings.repeats)  # noqa: B023 - called at once
+        rate = count * steps / timing.median_s
         yield Measurement(
             name="physics/steps",
-            value=count * steps / timing.median_s,
+            value=rate,
             unit="env-steps/s",
             config={"env": settings.env, "envs": count, "steps": steps},
             details=timing.details(compile_s),
         )
+        if settings.peer is not None:
+            yield from playground.measure(settings, count, steps, env.control_period, rate)

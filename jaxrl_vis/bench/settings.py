@@ -15,7 +15,7 @@ class Settings:
         pixels: Channels: rgbd, rgb or depth.
         batch_size: Transitions in a gradient step.
         repeats: Timed repeats at most; see `timing.measure`.
-        peer: Another renderer to measure side by side.
+        peer: Another renderer, or another's physics, to measure side by side.
         scene: A scene of `render_scenes`, or the path of an MJCF file, to be drawn in the place of a task.
         on_accelerator: Whether JAX runs on one; filled in by `for_this_device`.
     """
