@@ -260,6 +260,15 @@ def texture_colour(scene: Scene, row: Row, hit: Hit) -> Vector | None:
     """Red, green and blue that the colour is multiplied with, [P] each in [0, 1]; None in a scene without textures."""
     if not scene.atlas.used:
         return None
+    if isinstance(scene.texels, jax.Array):
+        return _texture_colour(scene, row, hit)
+    # In a kernel, many a tile sees nothing that has a texture.
+    plain = (jnp.ones_like(hit.depth),) * 3
+    return jax.lax.cond(jnp.max(row.texture[0]) > 0.0, lambda: _texture_colour(scene, row, hit), lambda: plain)
+
+
+def _texture_colour(scene: Scene, row: Row, hit: Hit) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """`texture_colour` of a scene that has textures."""
     mapping, *scales, shift_across, shift_down, first_level, levels, six_faces, width, height = row.texture
     changes = _changes(scene, row, hit)
     flat = {kind for kind, how in zip(scene.object_types, scene.atlas.mappings, strict=True) if how == textures.FLAT}
@@ -306,7 +315,8 @@ def texture_colour(scene: Scene, row: Row, hit: Hit) -> Vector | None:
         jnp.maximum(spreads[0], spreads[1]),
         repeats,
     )
-    return tuple(jnp.where(mapping > 0.0, value, 1.0) for value in colour)
+    red, green, blue = (jnp.where(mapping > 0.0, value, 1.0) for value in colour)
+    return red, green, blue
 
 
 def _changes(scene: Scene, row: Row, hit: Hit) -> list[Vector]:
