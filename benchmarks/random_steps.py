@@ -2,8 +2,8 @@
 
     python benchmarks/random_steps.py [TASK ...] [--steps 1000000] [--envs 8192]
 
-Actions are uniform, and one in a hundred is far outside [-1, 1], infinite or not a number, which tasks clip. Exits with 1 where a
-position, a velocity or a distance is not finite. Meant for a GPU.
+Actions are uniform, and one in a hundred is far outside [-1, 1], infinite or not a number, which tasks clip. Exits with 1 where
+a position, a velocity or a distance is not finite. Meant for a GPU.
 """
 
 import argparse

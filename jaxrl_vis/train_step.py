@@ -25,7 +25,7 @@ from jaxrl_vis.networks import Networks
 from jaxrl_vis.relabel import choose_goal_slots, stand_still
 from jaxrl_vis.replay import Indices, Replay, make_replay, num_bytes
 from jaxrl_vis.rollout import Exploration, play
-from jaxrl_vis.types import Batch, LoopState, Metrics, ReplayState, TrainState
+from jaxrl_vis.types import Batch, Episodes, LoopState, Metrics, ReplayState, TrainState
 from jaxrl_vis_envs import goals
 from jaxrl_vis_envs.base import GoalEnv
 from jaxrl_vis_envs.compilation import world_jit
@@ -176,34 +176,38 @@ def make_train_step(env: GoalEnv, config: Config) -> TrainStep:
             iteration=jnp.zeros((), jnp.int32),
         )
 
+    def per_seed(function, in_axes: Any = 0, out_axes: Any = 0):
+        return jax.vmap(function, in_axes=in_axes, out_axes=out_axes)
+
     def train_iteration(loop: LoopState) -> tuple[LoopState, Metrics]:
-        rollout_key, update_key = jax.random.split(jax.random.fold_in(loop.key, loop.iteration))
+        keys = per_seed(lambda key: jax.random.split(jax.random.fold_in(key, loop.iteration)), out_axes=1)(loop.key)
         exploration = Exploration(config.random_action_probability, config.action_noise)
-        episodes, outcome = play(env, networks, loop.train, rollout_key, config.num_envs, exploration)
+        episodes, outcome = play(env, networks, loop.train, keys[0], config.num_envs, exploration)
+        return per_seed(learn, (_SEED_AXES, 0, 0, 0), (_SEED_AXES, 0))(loop, episodes, outcome, keys[1])
+
+    def learn(loop: LoopState, episodes: Episodes, outcome: Metrics, key: jax.Array) -> tuple[LoopState, Metrics]:
         memory = replay.insert(loop.replay, episodes, loop.iteration)
         train = loop.train.replace(normalizer=normalizer.update(loop.train.normalizer, episodes.frames))
-        train, metrics = update_many(train, memory, update_key, loop.iteration)
+        train, metrics = update_many(train, memory, key, loop.iteration)
         metrics |= {f"train/{name}": jnp.mean(values) for name, values in outcome.items()}
         metrics["guard/nonfinite"] = _count_nonfinite((metrics, episodes.states, episodes.actions))
         return LoopState(train=train, replay=memory, key=loop.key, iteration=loop.iteration + 1), metrics
 
     def evaluate(train: TrainState, key: jax.Array) -> tuple[Metrics, dict[str, jax.Array]]:
         num_recorded = min(_NUM_RECORDED, config.eval_episodes)
-        episodes, outcome = play(env, networks, train, key, config.eval_episodes, num_kept=num_recorded)
+        keys = jnp.broadcast_to(key, (jax.tree.leaves(train)[0].shape[0],))
+        episodes, outcome = play(env, networks, train, keys, config.eval_episodes, num_kept=num_recorded)
         # For people, the newest of stacked pictures, which come first.
         newest = episodes.frames
         if env.frames > 1:
-            newest = newest[:, :, : newest.shape[2] // env.frames]
-        frames, goals = newest[:, :-1], newest[:, -1]
+            newest = newest[:, :, :, : newest.shape[3] // env.frames]
+        frames, goals = newest[:, :, :-1], newest[:, :, -1]
         metrics = {
-            "eval/success": jnp.mean(outcome["success"]),
-            "eval/goal_distance": jnp.mean(outcome["goal_distance"]),
-            "eval/goal_distance_median": jnp.median(outcome["goal_distance"]),
+            "eval/success": jnp.mean(outcome["success"], axis=1),
+            "eval/goal_distance": jnp.mean(outcome["goal_distance"], axis=1),
+            "eval/goal_distance_median": jnp.median(outcome["goal_distance"], axis=1),
         }
-        return metrics, {"frames": frames, "goals": goals, "success": outcome["success"][:num_recorded]}
-
-    def per_seed(function, in_axes: Any = 0, out_axes: Any = 0):
-        return jax.vmap(function, in_axes=in_axes, out_axes=out_axes)
+        return metrics, {"frames": frames, "goals": goals, "success": outcome["success"][:, :num_recorded]}
 
     return TrainStep(
         env=env,
@@ -212,7 +216,7 @@ def make_train_step(env: GoalEnv, config: Config) -> TrainStep:
         networks=networks,
         replay=replay,
         init=world_jit(per_seed(init, out_axes=_SEED_AXES), runs_once=True),
-        train_iteration=world_jit(per_seed(train_iteration, (_SEED_AXES,), (_SEED_AXES, 0)), donate_argnums=0),
-        evaluate=world_jit(per_seed(evaluate, (0, None))),
+        train_iteration=world_jit(train_iteration, donate_argnums=0),
+        evaluate=world_jit(evaluate),
         update_many=world_jit(per_seed(update_many, (0, 0, 0, None)), donate_argnums=0),
     )

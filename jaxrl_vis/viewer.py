@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxrl_vis.config import RequestError
 from jaxrl_vis.networks import Networks
-from jaxrl_vis.rollout import NO_EXPLORATION, make_policy
+from jaxrl_vis.rollout import NO_EXPLORATION, choose_actions, encode
 from jaxrl_vis.types import TrainState
 from jaxrl_vis_envs.compilation import world_jit
 
@@ -48,11 +48,11 @@ def play_poses(env: Any, networks: Networks, train: TrainState, key: jax.Array, 
     reset_keys = jax.random.split(reset_key, num_envs)
     first = jax.vmap(env.reset)(reset_keys)
     goal = jax.vmap(env.sample_goal)(reset_keys)
-    policy = make_policy(networks, train, first.obs["desired_goal"], NO_EXPLORATION)
+    goal_latents = encode(networks, train, first.obs["desired_goal"])
 
     def step(carry: Any, _: None) -> Any:
         state, frame = carry
-        state = jax.vmap(env.advance)(state, policy(key, frame))
+        state = jax.vmap(env.advance)(state, choose_actions(networks, train, goal_latents, NO_EXPLORATION, key, frame))
         return (state, jax.vmap(env.observe)(state)), (state.data.xpos, state.data.xquat)
 
     _, poses = jax.lax.scan(step, (first.replace(obs=None), first.obs["observation"]), length=env.horizon)

@@ -237,7 +237,8 @@ def draw(scene: Scene, poses: list[dict[str, np.ndarray]], quick: bool = False) 
 
 
 def _render_all(scene: Scene, poses: dict[str, jax.Array]) -> Frame:
-    return jax.vmap(lambda pose: render(scene, SimpleNamespace(**pose)))(poses)
+    # One after the other: under `jax.vmap` as much again would have to be traced.
+    return jax.lax.map(lambda pose: render(scene, SimpleNamespace(**pose)), poses)
 
 
 _draw_all = world_jit(_render_all)

@@ -87,4 +87,6 @@ def test_balls_and_free_bodies_are_left_to_mjx():
 
 
 def test_a_world_without_joints():
-    assert_poses_agree(mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='.1'/></worldbody></mujoco>"), ("geom_xpos",))
+    assert_poses_agree(
+        mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='.1'/></worldbody></mujoco>"), ("geom_xpos",)
+    )

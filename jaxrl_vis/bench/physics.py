@@ -1,4 +1,4 @@
-"""Physics alone: `advance` under random actions, no pictures; MuJoCo Playground's FingerTurn beside ours where it is asked for."""
+"""Physics alone: `advance` under random actions, no pictures; MuJoCo Playground's FingerTurn beside ours on request."""
 
 from collections.abc import Iterator
 

@@ -25,7 +25,7 @@ def load() -> Any:
         RequestError: It is not installed.
     """
     try:
-        from mujoco_playground._src.dm_control_suite import finger
+        from mujoco_playground._src.dm_control_suite import finger  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise RequestError(f"--peer playground needs MuJoCo Playground: pip install playground ({error})") from error
     return finger

@@ -1,9 +1,9 @@
 """Poses of all bodies at once.
 
-MJX walks down a kinematic tree body by body, which makes up half of the program of a step (and of the time it takes to compile).
-Here every joint is a node with a pose relative to the node before it, and the poses relative to the world come from pointer
-doubling: in each round a node's pose is composed with that of its ancestor, and the ancestor becomes that one's ancestor. A
-chain of N nodes takes log2(N) rounds, each over all nodes side by side.
+MJX walks down a kinematic tree body by body, which makes up half of the program of a step, and of the time to compile it. Here
+every joint is a node with a pose relative to the one before it, and the poses relative to the world come from pointer doubling:
+in each round a node's pose is composed with that of its ancestor, and the ancestor becomes that one's ancestor. A chain of N
+nodes takes log2(N) rounds, each over all nodes side by side.
 """
 
 from typing import NamedTuple
@@ -76,9 +76,7 @@ def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     return _place_cameras(model, data)
 
 
-def _relative_poses(
-    model: mjx.Model, data: mjx.Data, nodes: _Nodes, displacement: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+def _relative_poses(model: mjx.Model, data: mjx.Data, nodes: _Nodes, displacement: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Pose of each node relative to its parent: positions [N, 3] (m) and unit quaternions [N, 4]."""
     body_pos, body_quat = model.body_pos, model.body_quat
     if model.nmocap:
@@ -110,8 +108,13 @@ def _nodes(model: mjx.Model) -> _Nodes:
             if model.body_jntnum[index]:
                 of_joint.append(before)
         of_body.append(before)
-    arrays = (np.array(rows, int) for rows in (body, parent))
-    return _Nodes(*arrays, max(depth), np.array(of_joint, int), np.array(of_body, int))
+    return _Nodes(
+        body=np.array(body, int),
+        parent=np.array(parent, int),
+        depth=max(depth),
+        of_joint=np.array(of_joint, int),
+        of_body=np.array(of_body, int),
+    )
 
 
 def _place_cameras(model: mjx.Model, data: mjx.Data) -> mjx.Data:

@@ -102,7 +102,7 @@ def _forward(model: mjx.Model, data: mjx.Data, exact: bool) -> mjx.Data:
 def _runge_kutta_4(model: mjx.Model, data: mjx.Data, exact: bool) -> mjx.Data:
     """`mjx.step` with the classical Runge-Kutta method, for joints of one degree of freedom and actuators without a state.
 
-    MJX's own puts four copies of the forward dynamics into the program; this one puts one, which compiles in a third of the time.
+    MJX's own puts four copies of the forward dynamics into the program; with one it compiles in a third of the time.
     """
     timestep, start = model.opt.timestep, data
 
