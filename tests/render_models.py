@@ -21,7 +21,7 @@ from render_features import FEATURES, scene_spec, truth_of
 
 import jaxrl_vis_envs
 from jaxrl_vis.bench.render_scenes import forward, scatter_joints
-from jaxrl_vis_envs.compilation import compiler_options, world_jit
+from jaxrl_vis_envs.compilation import compiler_options
 from jaxrl_vis_envs.render import Frame, Scene, render
 
 SEED = 0
@@ -241,8 +241,9 @@ def _render_all(scene: Scene, poses: dict[str, jax.Array]) -> Frame:
     return jax.lax.map(lambda pose: render(scene, SimpleNamespace(**pose)), poses)
 
 
-_draw_all = world_jit(_render_all)
-_draw_quick = jax.jit(_render_all, compiler_options={**compiler_options(), "xla_backend_optimization_level": 0})
+_draw_all, _draw_quick = (
+    jax.jit(_render_all, compiler_options={**compiler_options(), "xla_backend_optimization_level": level}) for level in (2, 0)
+)
 
 
 def fingerprint(mj_model: mujoco.MjModel) -> int:

@@ -209,8 +209,7 @@ def sample(
     return tuple(a + weight * (b - a) for a, b in zip(near, far, strict=True))
 
 
-def _bilinear(texels: jax.Array, table: jax.Array, level: jax.Array, face: jax.Array | int, place: tuple, repeats) -> list:
-    """Red, green and blue, with weights of 1/256 as graphics hardware has them: two channels fit into one integer product."""
+def _bilinear(texels: jax.Array, table: jax.Array, level: jax.Array, face: jax.Array | int, place: tuple, repeats) -> tuple:
     facts = table.at[jnp.clip(level, 0, len(table) - 1)].get(mode="promise_in_bounds")
     first, shape = facts[..., 0], (facts[..., 1], facts[..., 2])
     lows, shares = [], []
@@ -219,21 +218,50 @@ def _bilinear(texels: jax.Array, table: jax.Array, level: jax.Array, face: jax.A
         at = place[axis] * count - 0.5
         at = jnp.where(repeats, at, jnp.clip(at, 0.0, count - 1.0))
         low = jnp.floor(at)
-        shares.append((256.0 * (at - low) + 0.5).astype(jnp.int32))
+        shares.append(at - low)
         lows.append((low - count * jnp.floor(low / count)).astype(jnp.int32))
     index = first + (face * shape[1] + lows[1]) * shape[0] + lows[0]
     # Clipped also against what is not a number.
     quad = texels.at[jnp.clip(index, 0, len(texels) - 1)].get(mode="promise_in_bounds")
-    right, below = shares
+    corners = tuple(quad[..., corner] for corner in range(4))
+    return (_mixed if isinstance(texels, jax.Array) else _mix)(corners, *shares)
+
+
+def _mix(corners: tuple, right: jax.Array, below: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Red, green and blue between four texels, with weights of 1/256 as graphics hardware has them.
+
+    So two channels fit into one product of integers.
+    """
+    right, below = ((256.0 * share + 0.5).astype(jnp.int32) for share in (right, below))
     both = (right * below + 128) >> 8
     weights = (256 - right - below + both, right - both, below - both, both)
     red_blue, green = jnp.uint32(0), jnp.uint32(0)
-    for corner, weight in enumerate(weights):
-        texel, weight = quad[..., corner], weight.astype(jnp.uint32)
+    for texel, weight in zip(corners, weights, strict=True):
+        weight = weight.astype(jnp.uint32)
         red_blue += (texel & 0xFF00FF) * weight
         green += ((texel >> 8) & 0xFF) * weight
-    parts = (red_blue & 0xFFFF, green, red_blue >> 16)
-    return [part.astype(jnp.int32).astype(jnp.float32) * (1.0 / (255.0 * 256.0)) for part in parts]
+    red, green, blue = (
+        part.astype(jnp.int32).astype(jnp.float32) * (1.0 / (255.0 * 256.0))
+        for part in (red_blue & 0xFFFF, green, red_blue >> 16)
+    )
+    return red, green, blue
+
+
+_mixed = jax.custom_jvp(_mix)
+
+
+@_mixed.defjvp
+def _mix_tangents(primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
+    """Integers have no slope; that of the mean that they stand for."""
+    corners, right, below = primals
+    _, right_move, below_move = tangents
+    moves = []
+    for channel in range(3):
+        one, two, three, four = (((c >> (8 * channel)) & 255).astype(jnp.int32).astype(jnp.float32) / 255.0 for c in corners)
+        to_right = (two - one) * (1.0 - below) + (four - three) * below
+        to_below = (three - one) * (1.0 - right) + (four - two) * right
+        moves.append(to_right * right_move + to_below * below_move)
+    return _mix(corners, right, below), tuple(moves)
 
 
 def cube_place(direction: tuple) -> tuple[jax.Array, tuple[jax.Array, jax.Array], tuple]:
