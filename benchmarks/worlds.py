@@ -5,6 +5,7 @@ another (a controller, a recording, a test) shares these programs: they take `LA
 filled up with copies.
 """
 
+import copy
 import dataclasses
 import functools
 from collections.abc import Callable
@@ -57,8 +58,13 @@ def start_at(env: Any, qpos: Any, qvel: Any) -> State:
 
 @functools.cache
 def _reset_program(env: Any) -> Callable:
-    # A goal is sampled twice by this text, and once by the compiled program.
-    return world_jit(jax.vmap(lambda key: (env.reset(key), env.sample_goal(key))))
+    def start(key: jax.Array) -> tuple[State, Any]:
+        goal = env.sample_goal(key)
+        knowing = copy.copy(env)  # what takes long to trace is traced once
+        knowing.sample_goal = lambda _: goal
+        return knowing.reset(key), goal
+
+    return world_jit(jax.vmap(start))
 
 
 @functools.cache

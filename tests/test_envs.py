@@ -75,12 +75,13 @@ _LATE_START = """
     env = worlds.make("FetchReach")
     state, _ = worlds.reset(env, jax.random.split(jax.random.key(0), 16))
     idle = jax.numpy.zeros((16, env.action_size))
-    state = worlds.advance(env, state, idle)
+    advance = worlds._advance_program(env)
+    state = advance(state.replace(obs=None), idle)
     begin = time.time()
     for _ in range(3):
-        state = worlds.advance(env, state, idle)
+        state = advance(state, idle)
     state.reward.block_until_ready()
-    assert worlds._advance_program(env)._cache_size() == 1, "the second step compiled again: something is weakly typed"
+    assert advance._cache_size() == 1, "the second step compiled again: something is weakly typed"
     print((time.time() - begin) / 3)
 """
 
