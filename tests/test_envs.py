@@ -76,7 +76,7 @@ _LATE_START = """
     state, _ = worlds.reset(env, jax.random.split(jax.random.key(0), 16))
     idle = jax.numpy.zeros((16, env.action_size))
     advance = worlds._advance_program(env)
-    state = advance(state.replace(obs=None), idle)
+    state = advance(jax.device_put(state.replace(obs=None)), idle)
     begin = time.time()
     for _ in range(3):
         state = advance(state, idle)
