@@ -132,7 +132,7 @@ def _draw(outputs: tuple, scene: Scene, rotation: jax.Array, unit: shapes.UnitSh
     layout = blocks.layout(scene)
     u, v = camera.pixel_rays(scene, layout.rows, layout.columns)
     # A barrier, because XLA would otherwise redo the work per object in every pixel.
-    unit = jax.lax.optimization_barrier(unit)
+    unit = _barrier(unit)
     if not (rgb or segmentation or normals or blocks.tiled(scene) or any(scene.transparent)):
         far = blocks.scan(lambda u, v: raycast.nearest_distance(scene, unit, u, v), u, v)
         near = length = None
@@ -151,6 +151,17 @@ def _draw(outputs: tuple, scene: Scene, rotation: jax.Array, unit: shapes.UnitSh
     planes = jax.lax.optimization_barrier(planes)
     planes = _collect(outputs[0], [blocks.restore(scene, layout, plane) for plane in planes])
     return planes._replace(rgb=quantize(planes.rgb)) if quantized and planes.rgb is not None else planes
+
+
+@jax.custom_jvp
+def _barrier(tree: Any) -> Any:
+    """What XLA computes once, and not again for every use. JAX 0.11 cannot transpose its own."""
+    return jax.lax.optimization_barrier(tree)
+
+
+@_barrier.defjvp
+def _barrier_tangents(primals: tuple, tangents: tuple) -> tuple:
+    return _barrier(*primals), tangents[0]
 
 
 def _finish(scene: Scene, view: _View, wanted: tuple, u: Any, v: Any, key: Any, triangle: Any) -> tuple:
