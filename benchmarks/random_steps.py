@@ -59,6 +59,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--steps", type=int, default=1_000_000)
     parser.add_argument("--envs", type=int, default=8192)
     options = parser.parse_args(arguments)
+    for name in options.tasks:
+        if name not in TASKS:
+            parser.error(f"unknown task {name!r}: choose {', '.join(TASKS)}")
     failed = False
     for name in options.tasks:
         start = time.perf_counter()

@@ -31,18 +31,13 @@ class _Nodes(NamedTuple):
     of_body: np.ndarray  # [nbody], the last node of the body
 
 
-def supports(model: mjx.Model) -> bool:
-    """Whether all joints of the model are hinges and slides."""
-    return bool(np.isin(model.jnt_type, _ONE_DEGREE_OF_FREEDOM).all())
-
-
 def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """`mjx.kinematics` in a fraction of the operations, and the poses of cameras that ride on bodies.
 
     Bodies that hang on a mocap body move with it, as in MuJoCo (in MJX they stay). Models with ball or free joints are left to
     MJX.
     """
-    if not supports(model):
+    if not np.isin(model.jnt_type, _ONE_DEGREE_OF_FREEDOM).all():
         return _place_cameras(model, mjx.kinematics(model, data))
     nodes = _nodes(model)
     displacement = data.qpos - model.qpos0
@@ -97,6 +92,7 @@ def _relative_poses(model: mjx.Model, data: mjx.Data, nodes: _Nodes, displacemen
 
 
 def _nodes(model: mjx.Model) -> _Nodes:
+    """The tree of a model. Bodies come after their parents in MuJoCo, and joints in the order of their bodies."""
     body, parent, of_joint, of_body, depth = [0], [0], [], [0], [0]
     for index in range(1, model.nbody):
         before = of_body[model.body_parentid[index]]
