@@ -4,7 +4,7 @@ HandReach of Gym's robotics environments with the goals of the OL-AUX release: w
 from the start, most of which fully open or close each joint. ``goal_rule="meet"`` is Gym's own: the thumb meets a finger over
 the palm, or, one time in ten, everything returns to the start; its threshold in Gym is .01 m.
 
-    VisualHandReach   sees RGB-D from in front of the fingertips, each of which has its own colour
+    VisualHandReach   sees RGB-D from above the palm; each fingertip has its own colour
     HandReach         sees joint angles and velocities, and the fingertips
 
 State: positions of the tips of first, middle, ring and little finger and thumb in the world, m; the distance is that of the 15
@@ -80,8 +80,8 @@ class HandReachConfig:
 class VisualHandReachConfig(PixelsConfig, HandReachConfig):
     """Settings of the task and its pictures."""
 
-    depth_range: tuple[float, float] = (0.66, 0.96)
-    """Depths that bytes 0 and 255 stand for, m: 1.2 mm a step, from before the stretched fingers to the wrist."""
+    depth_range: tuple[float, float] = (0.7, 0.96)
+    """Depths that bytes 0 and 255 stand for, m: 1 mm a step, from above fingers that point up to below the lowest knuckle."""
 
     def __post_init__(self) -> None:
         HandReachConfig.__post_init__(self)
