@@ -2,7 +2,8 @@
 
 Three steps: once per environment, everything linear (`shapes`, `lights`); per pixel, which object is nearest (`raycast`,
 `triangles`), which gives integers and is never differentiated; per pixel, once, depth, normal and colour of that object from
-the row of a table (`surface`, `shade`). On a GPU the last two are one kernel for most scenes (`gpu_kernel`).
+the row of a table (`surface`, `shade`). For most scenes the last two are one kernel on a GPU (`gpu_kernel`), and passes that do
+nothing twice on a CPU (`cpu_passes`).
 """
 
 import functools
@@ -12,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis_envs.render import blocks, camera, gpu_kernel, lights, raycast, shade, shapes, surface, transparent
+from jaxrl_vis_envs.render import blocks, camera, cpu_passes, gpu_kernel, lights, raycast, shade, shapes, surface, transparent
 from jaxrl_vis_envs.render.scene import Scene
 
 
@@ -95,25 +96,34 @@ def render_planes(
         position, rotation, finite = camera.camera_pose(scene, data)
         unit = shapes.unit_shapes(scene, data, position, rotation, finite)
         table = lights.pack(lights.camera_lights(scene, data, position, rotation) if rgb else [])
-        draw = _draw_by_kernel if gpu_kernel.takes(scene) else _draw
+        draw = _draw if _fast_way(scene, (wanted, quantized)) is None else _draw_fast
         planes = draw((wanted, quantized), scene, rotation, unit, table)
     if quantized and planes.rgb is not None and planes.rgb.dtype != jnp.uint8:
         planes = planes._replace(rgb=quantize(planes.rgb))
     return planes
 
 
+def _fast_way(scene: Scene, outputs: tuple) -> Any:
+    """The module that draws these outputs of a scene faster than `_draw`, if there is one for this device."""
+    (rgb, _, _, normals, distance), quantized = outputs
+    if gpu_kernel.takes(scene):
+        return gpu_kernel
+    if rgb and quantized and not (normals or distance) and cpu_passes.takes(scene):
+        return cpu_passes
+    return None
+
+
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _draw_by_kernel(
-    outputs: tuple, scene: Scene, rotation: jax.Array, unit: shapes.UnitShapes, light_table: jax.Array
-) -> Planes:
-    """`_draw` as one GPU kernel, with the derivatives of `_draw`."""
+def _draw_fast(outputs: tuple, scene: Scene, rotation: jax.Array, unit: shapes.UnitShapes, light_table: jax.Array) -> Planes:
+    """`_draw` as one GPU kernel, or as passes on a CPU, with the derivatives of `_draw`."""
     (rgb, depth, segmentation, normals, distance), quantized = outputs
-    planes = gpu_kernel.draw((rgb, depth, normals, distance, segmentation), quantized, scene, rotation, unit, light_table)
+    wanted = (rgb, depth, normals, distance, segmentation)
+    planes = _fast_way(scene, outputs).draw(wanted, quantized, scene, rotation, unit, light_table)
     colour, near, normal, length, labels = planes
     return Planes(colour, near, labels, normal, length)
 
 
-@_draw_by_kernel.defjvp
+@_draw_fast.defjvp
 def _differentiate(outputs: tuple, primals: tuple, tangents: tuple) -> tuple[Planes, Planes]:
     return jax.jvp(functools.partial(_draw, outputs), primals, tangents)
 

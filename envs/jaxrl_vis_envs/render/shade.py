@@ -28,7 +28,16 @@ _SKY_DISTANCE = 0.7
 def shade(
     scene: Scene, unit: shapes.UnitShapes | None, lights: list[lighting.Light], row: Row, hit: Hit, u: jax.Array, v: jax.Array
 ) -> Vector:
-    """Colour of surfaces.
+    """Colour of surfaces: `lighted`, with their textures."""
+    colour = lighted(scene, unit, lights, row, hit, u, v)
+    texture = surface.texture_colour(scene, row, hit)
+    return colour if texture is None else tuple(value * texel for value, texel in zip(colour, texture, strict=True))
+
+
+def lighted(
+    scene: Scene, unit: shapes.UnitShapes | None, lights: list[lighting.Light], row: Row, hit: Hit, u: jax.Array, v: jax.Array
+) -> Vector:
+    """Colour of surfaces as if they had no textures.
 
     Args:
         scene: The scene.
@@ -47,15 +56,13 @@ def shade(
             to_camera = surface.normalized(tuple(-p for p in hit.point))  # OpenGL's viewer is a point all the same
         else:
             to_camera = surface.normalized((-u, -v, jnp.ones_like(u)))
-        colour = _lighted(scene, unit, lights, row, hit, to_camera)
-    else:
-        colour = (0.0, 0.0, 0.0)
-        for share, corner in surface.corners(row, hit):
-            to_camera = surface.normalized(tuple(-p for p in corner.point))
-            lighted = _lighted(scene, unit, lights, row, corner, to_camera)
-            colour = tuple(total + share * own for total, own in zip(colour, lighted, strict=True))
-    texture = surface.texture_colour(scene, row, hit)
-    return colour if texture is None else tuple(value * texel for value, texel in zip(colour, texture, strict=True))
+        return _lighted(scene, unit, lights, row, hit, to_camera)
+    colour: Vector = (0.0, 0.0, 0.0)
+    for share, corner in surface.corners(row, hit):
+        to_camera = surface.normalized(tuple(-p for p in corner.point))
+        of_corner = _lighted(scene, unit, lights, row, corner, to_camera)
+        colour = tuple(total + share * own for total, own in zip(colour, of_corner, strict=True))
+    return colour
 
 
 def _lighted(

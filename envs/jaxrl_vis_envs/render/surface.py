@@ -150,7 +150,9 @@ def _look_up(table: jax.Array, row: jax.Array) -> list[jax.Array]:
     return [table[:, column].at[index].get(mode="promise_in_bounds") for column in range(table.shape[1])]
 
 
-def meet(scene: Scene, row: Row, triangle: tuple | None, u: jax.Array, v: jax.Array, start: jax.Array) -> Hit:
+def meet(
+    scene: Scene, row: Row, triangle: tuple | None, u: jax.Array, v: jax.Array, start: jax.Array, refined: bool = True
+) -> Hit:
     """Where the rays meet the objects of ``row``, given a depth nearby.
 
     Args:
@@ -161,6 +163,7 @@ def meet(scene: Scene, row: Row, triangle: tuple | None, u: jax.Array, v: jax.Ar
         u: [P] float32, see `camera.pixel_rays`.
         v: [P] float32.
         start: [P] float32, metres, a depth that is right to a thousandth; not differentiated.
+        refined: Whether to take the step from there onto the surface, which is the only part that has derivatives.
     """
     begin, direction, _ = camera.ray_parts(scene, u, v)
     ray = camera.mapped(row.axes, direction)
@@ -175,9 +178,11 @@ def meet(scene: Scene, row: Row, triangle: tuple | None, u: jax.Array, v: jax.Ar
         height = jnp.where(seen, dot(gradient, near) + columns[11], height)
     slope = dot(gradient, ray)
     slope = jnp.where(jnp.abs(slope) < 1e-12, 1e-12, slope)
-    step = jnp.clip(height / slope, -_START_ERROR * start, _START_ERROR * start)
-    depth = start - step
-    local = tuple(n - step * r for n, r in zip(near, ray, strict=True))
+    depth, local = start, near
+    if refined:
+        step = jnp.clip(height / slope, -_START_ERROR * start, _START_ERROR * start)
+        depth = start - step
+        local = tuple(n - step * r for n, r in zip(near, ray, strict=True))
     facing = gradient = _gradient(scene, row, local)
     if triangle is not None:
         seen, columns = triangle
@@ -185,10 +190,19 @@ def meet(scene: Scene, row: Row, triangle: tuple | None, u: jax.Array, v: jax.Ar
         shares = _shares(columns, local, 1.0)
         mixed = [_mix(columns[12 + k : 19 + k : 3], shares) for k in range(3)]
         facing = tuple(jnp.where(seen, smooth, flat) for smooth, flat in zip(mixed, facing, strict=True))
-    # The normal is a gradient: it goes back to the camera's frame with the transpose of the map.
-    normal = normalized(tuple(sum(row.axes[i][j] * facing[i] for i in range(3)) for j in range(3)))
+    normal = normalized(_to_camera(row, facing))
     point = tuple(b + depth * d for b, d in zip(begin, direction, strict=True))
     return Hit(depth, point, local, gradient, slope, normal, triangle)
+
+
+def _to_camera(row: Row, gradient: Vector) -> Vector:
+    """A gradient in the unit shape's frame goes back to the camera's with the transpose of the map."""
+    return tuple(sum(row.axes[i][j] * gradient[i] for i in range(3)) for j in range(3))
+
+
+def outward(row: Row, hit: Hit) -> Vector:
+    """The normal of a primitive at any length, in the camera's frame."""
+    return _to_camera(row, hit.gradient)
 
 
 def _shares(columns: list, local: Vector, moved: float) -> list:
@@ -215,9 +229,7 @@ def corners(row: Row, hit: Hit) -> list[tuple[jax.Array, Hit]]:
         local = tuple(columns[27 + 3 * number + axis] - row.origin[axis] for axis in range(3))
         facing = columns[12 + 3 * number : 15 + 3 * number]
         # The axes of a mesh are a rotation: its transpose leads back to the camera's frame.
-        point, normal = (
-            tuple(sum(row.axes[i][j] * vector[i] for i in range(3)) for j in range(3)) for vector in (local, facing)
-        )
+        point, normal = _to_camera(row, local), _to_camera(row, facing)
         own = tuple(jnp.where(seen, new, old) for new, old in zip(point, hit.point, strict=True))
         turned = tuple(jnp.where(seen, new, old) for new, old in zip(normal, hit.normal, strict=True))
         found.append((jnp.where(seen, share, 1.0 if number == 0 else 0.0), hit._replace(point=own, normal=turned)))
