@@ -11,6 +11,7 @@ from small_scene import MORE_SPHERES, ORTHOGRAPHIC, small_scene
 
 from jaxrl_vis_envs.render import gpu_kernel, render_planes
 
+
 @pytest.fixture
 def with_kernel(monkeypatch):
     """Makes `render_planes` take the kernel from here on."""

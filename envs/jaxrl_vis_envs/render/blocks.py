@@ -17,7 +17,7 @@ import numpy as np
 from jaxrl_vis_envs.render import raycast, shapes, triangles
 from jaxrl_vis_envs.render.scene import Scene
 
-# Pixels of one environment that a CPU works on at a time.
+# Pixels of one environment that a CPU works on at a time where much is stored for each.
 _CPU_BLOCK = 512
 # Height and width of a tile, if the picture can be cut so. Small ones see fewer objects, but each costs a round of a loop.
 _CPU_TILE, _TILE = 8, 16
@@ -37,7 +37,7 @@ class Layout(NamedTuple):
 def layout(scene: Scene) -> Layout:
     """Cuts the picture of a scene into blocks."""
     if not tiled(scene):
-        pixels = np.arange(scene.height * scene.width).reshape(_block_count(scene.height * scene.width), -1)
+        pixels = np.arange(scene.height * scene.width).reshape(_half_count(scene.height * scene.width), -1)
         return Layout(pixels // scene.width, pixels % scene.width, None)
     high, wide = _tile_length(scene.height), _tile_length(scene.width)
     down, across = -(-scene.height // high), -(-scene.width // wide)
@@ -74,6 +74,11 @@ def _block_count(pixels: int) -> int:
     return min(counts, key=lambda count: abs(np.log(pixels / count / _CPU_BLOCK)), default=1)
 
 
+def _half_count(pixels: int) -> int:
+    """Two blocks on a CPU, if that is possible: the fewest that make a loop."""
+    return 2 if jax.default_backend() == "cpu" and pixels % 2 == 0 else _block_count(pixels)
+
+
 def scan(function: Callable, *pixels: Any) -> Any:
     """Applies ``function``, which takes and gives arrays [P], to arrays [blocks, P], block by block."""
     if pixels[0].shape[0] == 1:
@@ -82,10 +87,28 @@ def scan(function: Callable, *pixels: Any) -> Any:
     return jax.lax.scan(lambda carry, block: (carry, function(*block)), None, pixels)[1]
 
 
-def joined(planes: tuple) -> tuple:
+def scan_one(function: Callable, *pixels: Any) -> jax.Array:
+    """`scan` for a function with one result, on all cores of a CPU.
+
+    What goes straight into the stacked results of a loop, XLA computes on one thread. What is carried, on all of them: so
+    results are carried a round before they are stacked.
+    """
+    count = pixels[0].shape[0]
+    if count == 1 or jax.default_backend() != "cpu":
+        return scan(function, *pixels)
+    like = jax.eval_shape(function, *jax.tree.map(lambda plane: plane[0], pixels))
+    empty = jnp.zeros(like.shape, like.dtype)
+    if count == 2:
+        halves, _ = jax.lax.scan(lambda halves, block: ((halves[1], function(*block)), None), (empty, empty), pixels)
+        return jnp.stack(halves)
+    last, before = jax.lax.scan(lambda done, block: (function(*block), done), empty, pixels)
+    return jnp.concatenate([before[1:], last[None]])
+
+
+def joined(planes: tuple, halves: bool = False) -> tuple:
     """Arrays [blocks, P] (or None) in fewer and longer blocks, for what does not depend on which pixels are in a block."""
     pixels = planes[0].size
-    count = _block_count(pixels)
+    count = _half_count(pixels) if halves else _block_count(pixels)
     return tuple(None if plane is None else plane.reshape(count, -1) for plane in planes)
 
 
@@ -99,7 +122,7 @@ def nearest(scene: Scene, unit: shapes.UnitShapes, u: jax.Array, v: jax.Array) -
 
     The triangles are None in a scene without any.
     """
-    key = scan(lambda u, v: raycast.nearest_key(scene, unit, u, v), u, v)
+    key = scan_one(lambda u, v: raycast.nearest_key(scene, unit, u, v), u, v)
     if not scene.clusters.shape[-2]:
         return key, None
 

@@ -1,12 +1,12 @@
-"""The same picture on a CPU, of 8-bit colours: passes over the pixels that each give one integer of 32 bits per pixel.
+"""The same picture on a CPU, with colours of 8 bits: passes over the pixels that each give one integer of 32 bits per pixel.
 
 XLA computes a loop on a CPU anew for each of its outputs, and with it most of what they share: three channels cost three times
 the shading. So each pass has one output, and what the next one needs of it is packed into its bits: the key of the nearest
-object (`raycast`), its normal (as a point of an octahedron, 16 bits an axis), the colour of its texture (10 bits a channel), and
-the colour that is seen (8 bits a channel). Between the passes are loops over blocks of pixels (`blocks`), because XLA would fuse
-them otherwise.
+object (`raycast`), its normal (as a point of an octahedron, 16 bits an axis), the colour of its texture (10 bits a channel),
+and the colour that is seen (8 bits a channel). Between the passes are loops over blocks of pixels (`blocks`), because XLA
+would fuse them otherwise.
 
-What happens to a pixel is the code of the plain renderer, but for the last bits: depths are those of the keys.
+What happens to a pixel is the code of the plain renderer, but for the last bits: depths beside colours are those of the keys.
 """
 
 import jax
@@ -21,7 +21,6 @@ _FINE = {shapes.MESH, shapes.HFIELD}
 # So many objects at most are chosen from by comparing.
 _CHOSEN = 24
 _NORMAL_STEPS = 32767.0
-_TEXTURE_STEPS = 1023.0
 
 
 def takes(scene: Scene) -> bool:
@@ -41,8 +40,8 @@ def draw(
     """Draws one environment; ``jax.vmap`` it for a batch. Not differentiable.
 
     Args:
-        wanted: Whether to return rgb (must), depth, normals (cannot), distance (cannot) and segmentation.
-        quantized: Whether rgb is uint8 (must).
+        wanted: Whether to return rgb, depth, normals (which must be false), distance (false) and segmentation.
+        quantized: Whether rgb is uint8 (must be true if it is wanted).
         scene: One that the passes take.
         rotation: [3, 3] float32 of the camera, see `camera.camera_pose`.
         unit: The drawn objects.
@@ -51,31 +50,69 @@ def draw(
     Returns:
         Those five planes, [3, H, W] uint8 or [H, W], None where not wanted.
     """
-    assert wanted[0] and quantized and not (wanted[2] or wanted[3])
+    rgb, depth, normals, distance, segmentation = wanted
+    assert not (normals or distance) and (quantized or not rgb)
     layout = blocks.layout(scene)
     u, v = camera.pixel_rays(scene, layout.rows, layout.columns)
+    if not (rgb or segmentation):
+        # Nothing but depths: keys of which no bit is needed for anything else.
+        bits = blocks.scan_one(lambda u, v: raycast.nearest_key(scene, unit, u, v, labelled=False), u, v)
+        return [None, jax.lax.bitcast_convert_type(blocks.restore(scene, layout, bits), jnp.float32), None, None, None]
     key, _ = blocks.nearest(scene, unit, u, v)
-    u, v, key = blocks.joined((u, v, key))
-    table = surface.object_table(scene, unit)
-    shines = lights.unpack(scene, light_table)
-    normal = blocks.scan(lambda u, v, key: _pack_normal(surface.outward(*_met(scene, table, u, v, key))), u, v, key)
-    texture = None
-    if scene.atlas.used or scene.atlas.sky is not None:
-        texture = blocks.scan(lambda u, v, key: _texture(scene, table, rotation, u, v, key), u, v, key)
-
-    def colour(u: jax.Array, v: jax.Array, key: jax.Array, normal: jax.Array, texture: jax.Array | None) -> jax.Array:
-        return _colour(scene, unit, table, shines, rotation, u, v, key, normal, texture)
-
-    packed = blocks.restore(scene, layout, blocks.scan(colour, u, v, key, normal, texture))
-    depth = segmentation = None
-    if wanted[1] or wanted[4]:
-        near, index = raycast.decode(scene, blocks.restore(scene, layout, key))
+    colours = far = labels = None
+    if rgb:
+        packed = _colours(scene, unit, rotation, light_table, *blocks.joined((u, v, key), halves=True))
+        colours = _unpack(blocks.restore(scene, layout, packed))
+    near, index = raycast.decode(scene, blocks.restore(scene, layout, key))
+    if depth:
         # A key's depth has lost its lowest bits: half of them come back.
         centre = jax.lax.bitcast_convert_type(near, jnp.int32) | (raycast.code_mask(scene) >> 1)
-        depth = jnp.where(index >= 0, jax.lax.bitcast_convert_type(centre, jnp.float32), scene.zfar) if wanted[1] else None
-        labels = jnp.asarray(np.array([*scene.object_ids, -1], np.int32))
-        segmentation = labels[index] if wanted[4] else None
-    return [_unpack(packed, 8), depth, None, None, segmentation]
+        far = jnp.where(index >= 0, jax.lax.bitcast_convert_type(centre, jnp.float32), scene.zfar)
+    if segmentation:
+        labels = jnp.asarray(np.array([*scene.object_ids, -1], np.int32))[index]
+    return [colours, far, None, None, labels]
+
+
+def _colours(
+    scene: Scene,
+    unit: shapes.UnitShapes,
+    rotation: jax.Array,
+    light_table: jax.Array,
+    u: jax.Array,
+    v: jax.Array,
+    key: jax.Array,
+) -> jax.Array:
+    """What pixels [blocks, P] see: packed, 8 bits a channel, int32."""
+    table = surface.object_table(scene, unit)
+    shines = lights.unpack(scene, light_table)
+
+    def finish(u: jax.Array, v: jax.Array, key: jax.Array, normal: jax.Array, texture: jax.Array | None) -> jax.Array:
+        row, hit = _met(scene, table, u, v, key)
+        colour = shade.lighted(scene, unit, shines, row, hit._replace(normal=_unpack_normal(normal)), u, v)
+        if texture is None:
+            sky = shade.sky(scene, rotation, u, v)
+        else:
+            sky = tuple(((texture >> shift) & 1023).astype(jnp.float32) / 1023.0 for shift in (0, 10, 20))
+            colour = tuple(value * texel for value, texel in zip(colour, sky, strict=True))
+        return _pack(_in_front(scene, key, colour, sky), 8)
+
+    normal = blocks.scan_one(lambda u, v, key: _pack_normal(surface.outward(*_met(scene, table, u, v, key))), u, v, key)
+    texture = None
+    if scene.atlas.used or scene.atlas.sky is not None:
+        texture = blocks.scan_one(lambda u, v, key: _texture(scene, table, rotation, u, v, key), u, v, key)
+    return blocks.scan_one(finish, u, v, key, normal, texture)
+
+
+def _texture(scene: Scene, table: jax.Array, rotation: jax.Array, u: jax.Array, v: jax.Array, key: jax.Array) -> jax.Array:
+    """What the colours of objects are multiplied with, and the colour of the sky: [P] int32, packed, 10 bits a channel."""
+    picture = surface.texture_colour(scene, *_met(scene, table, u, v, key)) or (jnp.ones_like(u),) * 3
+    return _pack(_in_front(scene, key, picture, shade.sky(scene, rotation, u, v)), 10)
+
+
+def _in_front(scene: Scene, key: jax.Array, colour: Vector, sky: Vector) -> Vector:
+    """The colours of pixels that see an object, the sky's elsewhere."""
+    sees = raycast.decode(scene, key)[1] >= 0
+    return tuple(jnp.where(sees, front, back) for front, back in zip(colour, sky, strict=True))
 
 
 def _met(scene: Scene, table: jax.Array, u: jax.Array, v: jax.Array, key: jax.Array) -> tuple[surface.Row, surface.Hit]:
@@ -96,63 +133,21 @@ def _row(table: jax.Array, index: jax.Array) -> surface.Row:
     return surface.row_of(columns)
 
 
-def _texture(
-    scene: Scene, table: jax.Array, rotation: jax.Array, u: jax.Array, v: jax.Array, key: jax.Array
-) -> jax.Array:
-    """What colours are multiplied with, and the colour of the sky: packed, 10 bits a channel."""
-    ones = (jnp.ones_like(u),) * 3
-    picture = ones
-    if scene.atlas.used:
-        picture = surface.texture_colour(scene, *_met(scene, table, u, v, key)) or ones
-    sky = shade.sky(scene, rotation, u, v)
-    sees = raycast.decode(scene, key)[1] >= 0
-    return _pack([jnp.where(sees, front, back) for front, back in zip(picture, sky, strict=True)], 10)
-
-
-def _colour(
-    scene: Scene,
-    unit: shapes.UnitShapes,
-    table: jax.Array,
-    shines: list[lights.Light],
-    rotation: jax.Array,
-    u: jax.Array,
-    v: jax.Array,
-    key: jax.Array,
-    normal: jax.Array,
-    texture: jax.Array | None,
-) -> jax.Array:
-    """What is seen: packed, 8 bits a channel."""
-    row, hit = _met(scene, table, u, v, key)
-    colour = shade.lighted(scene, unit, shines, row, hit._replace(normal=_unpack_normal(normal)), u, v)
-    if texture is None:
-        sky = shade.sky(scene, rotation, u, v)
-    else:
-        sky = [channel.astype(jnp.float32) / _TEXTURE_STEPS for channel in _channels(texture, 10)]
-        colour = [value * texel for value, texel in zip(colour, sky, strict=True)]
-    sees = raycast.decode(scene, key)[1] >= 0
-    return _pack([jnp.where(sees, front, back) for front, back in zip(colour, sky, strict=True)], 8)
-
-
-def _pack(colour: list[jax.Array], bits: int) -> jax.Array:
+def _pack(colour: Vector, bits: int) -> jax.Array:
     """Three channels [P] in [0, 1], rounded to so many bits each: [P] int32."""
     steps = float(2**bits - 1)
     red, green, blue = (jnp.floor(jnp.clip(channel, 0.0, 1.0) * steps + 0.5).astype(jnp.int32) for channel in colour)
     return red | (green << bits) | (blue << 2 * bits)
 
 
-def _channels(packed: jax.Array, bits: int) -> list[jax.Array]:
-    """The integers that `_pack` packed."""
-    return [(packed >> shift) & (2**bits - 1) for shift in (0, bits, 2 * bits)]
-
-
-def _unpack(packed: jax.Array, bits: int) -> jax.Array:
-    """[H, W] int32 -> [3, H, W] uint8."""
-    return jnp.stack(_channels(packed, bits)).astype(jnp.uint8)
+def _unpack(packed: jax.Array) -> jax.Array:
+    """Colours of 8 bits a channel, [H, W] int32 -> [3, H, W] uint8."""
+    return (packed >> jnp.array([0, 8, 16])[:, None, None]).astype(jnp.uint8)
 
 
 def _pack_normal(normal: Vector) -> jax.Array:
     """A direction of any length -> [P] int32: where it meets an octahedron whose lower half is folded out, 16 bits an axis."""
-    inverse = _reciprocal(sum(jnp.abs(component) for component in normal) + 1e-30)
+    inverse = _reciprocal(jnp.abs(normal[0]) + jnp.abs(normal[1]) + jnp.abs(normal[2]) + 1e-30)
     x, y = normal[0] * inverse, normal[1] * inverse
     below = normal[2] < 0.0
     folded = (1.0 - jnp.abs(y)) * jnp.where(x >= 0.0, 1.0, -1.0), (1.0 - jnp.abs(x)) * jnp.where(y >= 0.0, 1.0, -1.0)

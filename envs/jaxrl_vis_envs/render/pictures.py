@@ -108,7 +108,7 @@ def _fast_way(scene: Scene, outputs: tuple) -> Any:
     (rgb, _, _, normals, distance), quantized = outputs
     if gpu_kernel.takes(scene):
         return gpu_kernel
-    if rgb and quantized and not (normals or distance) and cpu_passes.takes(scene):
+    if (quantized or not rgb) and not (normals or distance) and cpu_passes.takes(scene):
         return cpu_passes
     return None
 

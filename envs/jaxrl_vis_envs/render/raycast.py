@@ -56,12 +56,6 @@ def _solid_entry(scene: Scene, unit: shapes.UnitShapes, row: int, u: jax.Array, 
     return t, meets
 
 
-def sky_key(scene: Scene) -> jax.Array:
-    """The key of a pixel that sees nothing, [] int32."""
-    mask = code_mask(scene)
-    return (jax.lax.bitcast_convert_type(scene.zfar, jnp.int32) & ~mask) | mask
-
-
 def decode(scene: Scene, key: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Depth (m, float32, a few millionths too small, not differentiable) and row (-1 for the sky, int32) of keys."""
     mask = code_mask(scene)
@@ -108,24 +102,24 @@ def entry(kind: int, values: tuple, start: tuple, direction: tuple, inverse_squa
     return _INTERSECTIONS[kind](begin, ray, extra, inverse_square * extra_square)
 
 
-def nearest_key(scene: Scene, unit: shapes.UnitShapes, u: jax.Array, v: jax.Array) -> jax.Array:
-    """The key of the nearest opaque primitive along every ray, [P] int32.
+def nearest_key(scene: Scene, unit: shapes.UnitShapes, u: jax.Array, v: jax.Array, labelled: bool = True) -> jax.Array:
+    """The key of the nearest opaque primitive along every ray, [P] int32; not ``labelled``, only the bits of its depth.
 
     Few objects are unrolled into one pass. Of many, those of a type whose balls touch the pyramid of the rays are counted
     through, and a loop runs up to their count; the rays should then lie close together.
     """
-    mask = code_mask(scene)
+    mask = code_mask(scene) if labelled else 0
     unit, u, v = jax.lax.stop_gradient((unit, u, v))
-    best = jnp.broadcast_to(sky_key(scene), u.shape)
+    best = jnp.broadcast_to((jax.lax.bitcast_convert_type(scene.zfar, jnp.int32) & ~mask) | mask, u.shape)
     rows = primitive_rows(scene, transparent=False)
     listed = {} if len(rows) <= UNROLLED else _rows_by_type(scene, rows)
     for row in rows:
         if scene.object_types[row] not in listed:
             t, meets = _solid_entry(scene, unit, row, u, v)
-            key = (jax.lax.bitcast_convert_type(t, jnp.int32) & ~mask) | row
+            key = (jax.lax.bitcast_convert_type(t, jnp.int32) & ~mask) | (row & mask)
             best = jnp.minimum(best, jnp.where(meets, key, best))
     for kind, rows in listed.items():
-        best = _nearest_listed(scene, unit, kind, rows, u, v, best)
+        best = _nearest_listed(scene, unit, kind, rows, u, v, best, mask)
     return best
 
 
@@ -137,10 +131,9 @@ def _rows_by_type(scene: Scene, rows: list[int]) -> dict[int, np.ndarray]:
 
 
 def _nearest_listed(
-    scene: Scene, unit: shapes.UnitShapes, kind: int, rows: np.ndarray, u: jax.Array, v: jax.Array, best: jax.Array
+    scene: Scene, unit: shapes.UnitShapes, kind: int, rows: np.ndarray, u: jax.Array, v: jax.Array, best: jax.Array, mask: int
 ) -> jax.Array:
     """The least of ``best`` [P] and the keys of those objects among ``rows``, all of one type, that the rays may meet."""
-    mask = code_mask(scene)
     ball = unit.ball[rows]
     start, direction, inverse_square = camera.ray_parts(scene, u, v)
     bare_ball = kind == shapes.SPHERE and not any(scene.atlas.mappings[row] for row in rows)
@@ -159,7 +152,7 @@ def _nearest_listed(
         origin, axes = [values[i] for i in range(3)], [[values[3 + 3 * i + j] for j in range(3)] for i in range(3)]
         form = (origin, None if bare_ball else axes, values[12], values[13])
         t, meets = entry(kind, form, start, direction, inverse_square)
-        key = (jax.lax.bitcast_convert_type(t, jnp.int32) & ~mask) | values[14].astype(jnp.int32)
+        key = (jax.lax.bitcast_convert_type(t, jnp.int32) & ~mask) | (values[14].astype(jnp.int32) & mask)
         meets = meets & (t > scene.znear) & (step < total)
         return step + 1, jnp.minimum(best, jnp.where(meets, key, best))
 
