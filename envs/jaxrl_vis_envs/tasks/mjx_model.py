@@ -74,7 +74,7 @@ def step(model: mjx.Model, data: mjx.Data, exact: bool = True) -> mjx.Data:
     first digit. One more Newton step, judged by the gradient, leaves the rounding error.
     """
     if model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER:
-        return mjx.euler(model, _forward(model, data, exact))
+        return mjx.euler(model, _one_factorization_at_a_time(_forward(model, data, exact)))
     if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 and model.na == 0 and model.nq == model.nv:
         return _runge_kutta_4(model, data, exact)
     return mjx.step(model, data)
@@ -97,6 +97,15 @@ def _forward(model: mjx.Model, data: mjx.Data, exact: bool) -> mjx.Data:
         return data.replace(qacc=data.qacc_smooth)
     data = mjx.solve(model, data)
     return sensor.sensor_acc(model, _polish(model, data) if exact else data)
+
+
+def _one_factorization_at_a_time(data: mjx.Data) -> mjx.Data:
+    """The same, with a mass matrix that depends on the accelerations, as far as XLA can see.
+
+    `mjx.euler` factorizes it once more, with damping, and XLA on a CPU would do so beside the first time. With a batch, each of
+    the two waits in a thread of XLA's pool for work that it has handed to that same pool: on two cores they wait for ever.
+    """
+    return data.tree_replace({"_impl.M": data._impl.M + 0.0 * data.qacc[:, None]})  # type: ignore[dict-item] - a tree of arrays
 
 
 def _runge_kutta_4(model: mjx.Model, data: mjx.Data, exact: bool) -> mjx.Data:
