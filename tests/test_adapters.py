@@ -290,7 +290,7 @@ def test_brax_keys_of_either_kind_start_the_same_episode():
     np.testing.assert_array_equal(env.reset(jax.random.PRNGKey(7)).obs, env.reset(jax.random.key(7)).obs)
 
 
-BRAX_LEARNING = {"batch_size": 64, "learning_rate": 1e-3, "discounting": 0.5}
+BRAX_LEARNING = {"batch_size": 64, "discounting": 0.5}
 
 
 def test_brax_ppo_learns_where_to_go():
@@ -306,6 +306,7 @@ def test_brax_ppo_learns_where_to_go():
             num_minibatches=2,
             num_updates_per_batch=4,
             run_evals=False,
+            learning_rate=1e-3,
             **BRAX_LEARNING,
             network_factory=functools.partial(ppo_networks.make_ppo_networks, **sizes),
         )
@@ -328,6 +329,7 @@ def test_brax_sac_trains():
             grad_updates_per_step=4,
             min_replay_size=256,
             max_replay_size=2048,
+            learning_rate=5e-3,
             **BRAX_LEARNING,
             reward_scaling=30.0,
             deterministic_eval=True,
