@@ -6,6 +6,7 @@ Prints the share of episodes that end within the threshold, at the last step. Ex
 """
 
 import argparse
+import os
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -97,14 +98,19 @@ def success_rate(name: str, episodes: int, seed: int = 0, **overrides: Any) -> f
 
 def turn_the_finger(env: Any, state: Any, generator: np.random.Generator) -> float:
     """FingerTurn by random shooting: of many short plans, tried in C MuJoCo, the first action of the best."""
+    threads = [mujoco.MjData(env.mj_model) for _ in range(os.cpu_count() or 1)]
     plans = np.zeros((len(state.reward), _PLAN_STEPS, 2))
-    for _ in range(env.horizon):
-        qpos, qvel, goals = np.asarray(state.data.qpos), np.asarray(state.data.qvel), np.asarray(state.goal_state)
-        for row, goal in enumerate(goals):
-            angle = np.arctan2(goal[0], goal[1])
-            plans[row] = _plan(env.mj_model, qpos[row], qvel[row], angle, plans[row], env.config.substeps, generator)
-        state = worlds.advance(env, state, plans[:, 0])
-        plans = np.concatenate([plans[:, 1:], np.zeros_like(plans[:, :1])], axis=1)
+    with mujoco.rollout.Rollout(nthread=len(threads)) as pool:
+
+        def try_out(initial: np.ndarray, controls: np.ndarray) -> np.ndarray:
+            return np.asarray(pool.rollout(env.mj_model, threads, initial, controls)[0])[:, -1]
+
+        for _ in range(env.horizon):
+            start = np.concatenate([np.zeros((len(plans), 1)), state.data.qpos, state.data.qvel], axis=1)
+            goals = np.asarray(state.goal_state)
+            plans = _plan(try_out, start, np.arctan2(goals[:, 0], goals[:, 1]), plans, env.config.substeps, generator)
+            state = worlds.advance(env, state, plans[:, 0])
+            plans = np.concatenate([plans[:, 1:], np.zeros_like(plans[:, :1])], axis=1)
     return float(np.mean(state.metrics["success"]))
 
 
@@ -114,32 +120,31 @@ _NEAR_ENOUGH = 0.3  # rad; the threshold is .54
 
 
 def _plan(
-    mj_model: mujoco.MjModel,
-    qpos: np.ndarray,
-    qvel: np.ndarray,
-    goal_angle: float,
-    last_plan: np.ndarray,
+    try_out: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    start: np.ndarray,
+    goal_angle: np.ndarray,
+    last_plans: np.ndarray,
     substeps: int,
     generator: np.random.Generator,
 ) -> np.ndarray:
-    """Actions [_PLAN_STEPS, 2] that bring the spinner nearest to ``goal_angle`` (rad), or rest where it is near enough."""
-    plans = generator.uniform(-1.0, 1.0, (_PLANS, _PLAN_STEPS, 2))
-    plans[: _PLANS // 2] = plans[: _PLANS // 2, :1]  # half of them hold one action
-    plans[0], plans[1] = 0.0, last_plan
-    initial = np.concatenate([[0.0], qpos, qvel])  # mjSTATE_FULLPHYSICS: time, positions, velocities
-    states, _ = mujoco.rollout.rollout(
-        mj_model, mujoco.MjData(mj_model), initial[None].repeat(_PLANS, 0), np.repeat(plans, substeps, axis=1)
-    )
-    ends = np.asarray(states)[:, -1, 1:4]
+    """Actions [E, _PLAN_STEPS, 2] that bring the spinner nearest to ``goal_angle`` [E] (rad), or rest where it is near enough.
+
+    ``start`` is [E, 7]: time, positions, velocities. ``try_out`` gives such rows for the ends of many motions.
+    """
+    episodes = np.arange(len(start))
+    plans = generator.uniform(-1.0, 1.0, (len(start), _PLANS, _PLAN_STEPS, 2))
+    plans[:, : _PLANS // 2] = plans[:, : _PLANS // 2, :1]  # half of them hold one action
+    plans[:, 0], plans[:, 1] = 0.0, last_plans
+    controls = np.repeat(plans.reshape(-1, _PLAN_STEPS, 2), substeps, axis=1)
+    ends = try_out(np.repeat(start, _PLANS, axis=0), controls).reshape(len(start), _PLANS, -1)[:, :, 1:4]
     # The spinner's axis points to -y: a positive angle turns its tip from +z towards -x.
-    error = np.abs((-ends[:, 2] - goal_angle + np.pi) % (2 * np.pi) - np.pi)
-    if error[0] < _NEAR_ENOUGH:
-        return plans[0]
+    error = np.abs((-ends[..., 2] - goal_angle[:, None] + np.pi) % (2 * np.pi) - np.pi)
     # Far from the spinner nothing happens, so a plan is also better the nearer it ends to it.
-    upper, fore = ends[:, 0], ends[:, 0] + ends[:, 1]
+    upper, fore = ends[..., 0], ends[..., 0] + ends[..., 1]
     x, z = 0.18 * np.cos(upper) + 0.16 * np.cos(fore), 0.18 * np.sin(upper) + 0.16 * np.sin(fore)
     distance = np.hypot(x - 0.4, z)  # m, from fingertip to the spinner's hinge
-    return plans[np.argmin(error + 0.5 * np.maximum(distance - 0.1, 0.0))]
+    best = np.argmin(error + 0.5 * np.maximum(distance - 0.1, 0.0), axis=1)
+    return plans[episodes, np.where(error[:, 0] < _NEAR_ENOUGH, 0, best)]
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -19,6 +19,7 @@ ROOT = pathlib.Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "envs"), str(ROOT / "tests")]
 os.environ.setdefault("JAX_PLATFORMS", "cpu")  # the pictures are few, and MuJoCo's renderer is what takes the time
 
+import jax  # noqa: E402
 import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 import render_models  # noqa: E402
@@ -43,7 +44,8 @@ COLUMNS = {
 def compare(name: str, poses: int, size: int) -> dict[str, Any]:
     """Draws one model with both renderers and measures: the model's row."""
     entry = render_models.MODELS[name]
-    row: dict[str, Any] = {"model": name, "source": entry.source, "poses": poses, "size": size}
+    device = jax.devices()[0].device_kind
+    row: dict[str, Any] = {"model": name, "source": entry.source, "poses": poses, "size": size, "device": device}
     start = time.perf_counter()
     try:
         mj_model, camera = render_models.build(name)

@@ -53,7 +53,8 @@ def start_at(env: Any, qpos: Any, qvel: Any) -> State:
     """
     still = jax.tree.map(lambda leaf: jnp.tile(leaf, (len(qpos), *(1,) * leaf.ndim)), mjx_model.still_data(env.mj_model))
     data = still.replace(qpos=jnp.asarray(qpos, jnp.float32), qvel=jnp.asarray(qvel, jnp.float32))
-    return jax.vmap(lambda data: env.state_at(data, jnp.zeros_like(env.achieved(data))))(data)
+    state = jax.vmap(lambda data: env.state_at(data, jnp.zeros_like(env.achieved(data))))(data)
+    return jax.device_get(state)  # as `_in_lanes` gives them: for what lies on a device otherwise, programs are compiled twice
 
 
 @functools.cache

@@ -1,5 +1,6 @@
 """Tests run on the CPU, whatever else there is, and compile each program once for all workers and runs."""
 
+import gc
 import getpass
 import os
 import tempfile
@@ -17,6 +18,9 @@ os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_opti
 
 import jax
 import pytest
+
+# Tracing makes millions of small objects, few of them garbage: looked for as often as by default, it costs a tenth of it all.
+gc.set_threshold(100_000, 20, 20)
 
 
 @pytest.fixture
@@ -43,14 +47,16 @@ def clean_environment(checkout: Path) -> dict[str, str]:
 WORLD_TESTS = ("controllers", "envs", "finger_turn", "hand_reach", "physics_parity", "sawyer_reach")
 WORLDS = ("hand", "sawyer", "fetch", "finger", "reacher")
 # At the end of a run no worker should wait for the other, so what takes longest comes first.
-FIRST = (*WORLDS, "test_notebooks", "test_trainer", "test_render_parity")
+FIRST = (*WORLDS, "test_trainer", "test_render_parity")
+# Files that share the programs of another one: notebooks train with the smallest preset, as tests of the trainer do.
+SHARED = {"test_notebooks": "test_trainer"}
 
 
 def group_of(nodeid: str) -> str:
     """What shares compiled programs with other tests: those of one world, or else of one file."""
     file = Path(nodeid.partition("::")[0]).stem
     names = [world for world in WORLDS if world in nodeid.lower()] if file.removeprefix("test_") in WORLD_TESTS else []
-    return names[0] if names else file
+    return names[0] if names else SHARED.get(file, file)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

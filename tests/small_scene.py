@@ -9,7 +9,7 @@ import mujoco
 from jaxrl_vis_envs.render import Scene
 
 # Every type, every light with a place of its own, a ball behind the camera and one around it; tiles hang over the picture.
-_OBJECTS = """
+_SCENE = """
 <mujoco>
   <asset>
     <texture name="checks" type="2d" builtin="checker" rgb1=".9 .8 .6" rgb2=".2 .3 .5" width="32" height="32"/>
@@ -25,6 +25,12 @@ _OBJECTS = """
     <light type="spot" pos="0 -1 2" dir="0 .5 -1" cutoff="40" exponent="5" attenuation="1 .1 .05"/>
     <light type="point" pos="1 -1 1" specular=".5 .5 .5"/>
     <geom type="plane" size="0 0 1" material="checks"/>
+{objects}
+    {more}
+  </worldbody>
+</mujoco>
+"""
+_ALL = """
     <geom type="plane" size=".4 .3 1" pos="-.6 .6 .8" euler="70 0 20" rgba=".9 .4 .5 1"/>
     <geom type="sphere" size=".2" pos="-.5 -.2 .3" material="faces"/>
     <geom type="sphere" size=".3" pos="0 -4 1" rgba="1 0 0 1"/>
@@ -34,9 +40,11 @@ _OBJECTS = """
     <geom type="cylinder" size=".15 .2" pos=".2 -.5 .25" euler="50 0 0" material="checks"/>
     <geom type="box" size=".1 .15 .2" pos="-.1 .4 .5" euler="20 30 40" material="faces"/>
     <site name="mark" type="box" size=".05 .05 .05" pos="-.3 -.6 .3" rgba="1 0 1 1"/>
-    {more}
-  </worldbody>
-</mujoco>
+"""
+# As much as gradients need: what is textured, what is not, and what hides another.
+_FEW = """
+    <geom type="sphere" size=".2" pos="-.5 -.2 .3" material="faces"/>
+    <geom type="capsule" size=".1 .2" pos="-.4 0 .4" euler="30 20 0" rgba="0 1 0 1"/>
 """
 
 
@@ -49,9 +57,9 @@ MORE_SPHERES = "\n".join(
 
 
 def small_scene(
-    lens: str = "", more: str = "", height: int = 22, width: int = 37, **scene_options: Any
+    lens: str = "", more: str = "", height: int = 22, width: int = 37, few: bool = False, **scene_options: Any
 ) -> tuple[Scene, SimpleNamespace]:
-    mj_model = mujoco.MjModel.from_xml_string(_OBJECTS.format(lens=lens, more=more))
+    mj_model = mujoco.MjModel.from_xml_string(_SCENE.format(lens=lens, objects=_FEW if few else _ALL, more=more))
     mj_data = mujoco.MjData(mj_model)
     mujoco.mj_forward(mj_model, mj_data)
     names = ("geom_xpos", "geom_xmat", "site_xpos", "site_xmat", "cam_xpos", "cam_xmat", "xpos", "xmat", "subtree_com")

@@ -1,6 +1,7 @@
 """Checkpoints: round trips, damage, kills while writing."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -30,15 +31,22 @@ def states():
     return found, trainer.shapes
 
 
-@pytest.fixture
-def saved(states, tmp_path):
+@pytest.fixture(scope="module")
+def saved_once(states, tmp_path_factory):
     """A folder with full checkpoints of iterations 1 to 3, of which orbax keeps 2 and 3, and light ones likewise."""
-    checkpoints = Checkpoints(tmp_path / "checkpoints")
+    folder = tmp_path_factory.mktemp("saved") / "checkpoints"
+    checkpoints = Checkpoints(folder)
     for iteration, loop in enumerate(states[0], start=1):
         checkpoints.save_light(iteration, loop.train, {"wall_s": 1.5 * iteration})
         checkpoints.save_full(iteration, loop, {"wall_s": 1.5 * iteration})
     checkpoints.close()
-    return tmp_path / "checkpoints"
+    return folder
+
+
+@pytest.fixture
+def saved(saved_once, tmp_path):
+    """A copy of that folder, to do with as one likes."""
+    return shutil.copytree(saved_once, tmp_path / "checkpoints")
 
 
 def test_everything_comes_back_bit_for_bit(states, saved):
@@ -153,6 +161,7 @@ def test_kill_while_saving_keeps_the_checkpoint_before(tmp_path, clean_environme
             names = os.listdir(full) if full.exists() else []
             done = [name for name in names if name.isdigit()]
             caught = bool(done) and any("tmp" in name for name in names)
+            time.sleep(0.001)
     finally:
         os.killpg(process.pid, signal.SIGKILL)
         process.wait()

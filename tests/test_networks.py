@@ -23,19 +23,24 @@ def make_networks(size, filters=(4, 8, 16), **overrides):
 @pytest.mark.parametrize("size", [8, 16, 21, 30])
 def test_the_encoder_is_a_stack_of_strided_convolutions(size):
     networks = make_networks(size)
-    params = networks.init_critic(jax.random.key(0))
-    frames = jax.random.randint(jax.random.key(1), (2, 3, size, size), 0, 256).astype(jnp.uint8)
-    statistics = normalizer.update(normalizer.init(networks.observation_spec), frames[:, None])
-    latent = networks.encode(params, networks.prepare(statistics, frames))
 
-    scale = normalizer.scale(statistics, networks.config.normalizer_floor)
-    values = jnp.clip((frames - statistics.mean) * scale, -5, 5).transpose(0, 2, 3, 1)
-    for level, filters in enumerate((4, 8, 16)):
-        kernel = params["encoder"][f"kernel_{level}"].reshape(2, 2, -1, filters)
-        values = jax.lax.conv_general_dilated(values, kernel, (2, 2), "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC"))
-        values = nn.relu(values + params["encoder"][f"bias_{level}"])
-    dense = params["encoder"]["latent"]
-    expected = values.reshape(2, -1) @ dense["kernel"] + dense["bias"]
+    @jax.jit
+    def latents_in_both_ways():
+        params = networks.init_critic(jax.random.key(0))
+        frames = jax.random.randint(jax.random.key(1), (2, 3, size, size), 0, 256).astype(jnp.uint8)
+        statistics = normalizer.update(normalizer.init(networks.observation_spec), frames[:, None])
+        scale = normalizer.scale(statistics, networks.config.normalizer_floor)
+        values = jnp.clip((frames - statistics.mean) * scale, -5, 5).transpose(0, 2, 3, 1)
+        for level, filters in enumerate((4, 8, 16)):
+            kernel = params["encoder"][f"kernel_{level}"].reshape(2, 2, -1, filters)
+            values = jax.lax.conv_general_dilated(values, kernel, (2, 2), "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC"))
+            values = nn.relu(values + params["encoder"][f"bias_{level}"])
+        dense = params["encoder"]["latent"]
+        expected = values.reshape(2, -1) @ dense["kernel"] + dense["bias"]
+        return networks.encode(params, networks.prepare(statistics, frames)), expected
+
+    latent, expected = latents_in_both_ways()
+    assert np.abs(expected).max() > 0.1
     np.testing.assert_allclose(latent, expected, rtol=1e-4, atol=1e-4)
 
 
@@ -51,24 +56,30 @@ def test_the_gpu_kernel_computes_and_differentiates_the_same_function(shape, bat
     config = preset("fast", latent_size=16, compute_dtype="float32")
     networks = Networks(config, jax.ShapeDtypeStruct(shape, jnp.uint8), 2, 0.0)
     assert not networks.uses_kernel
-    keys = jax.random.split(jax.random.key(0), 4)
-    params = networks.init_actor(keys[0])["encoder"]
-    # Biases that matter.
-    params = jax.tree.map(lambda leaf: leaf + 0.05 * jax.random.normal(keys[1], leaf.shape), params)
-    frames = jax.random.bits(keys[2], (batch, *shape), jnp.uint8)
-    statistics = normalizer.update(normalizer.init(networks.observation_spec), frames[:, None])
+
+    @jax.jit
+    def sample(keys):
+        params = networks.init_actor(keys[0])["encoder"]
+        # Biases that matter.
+        params = jax.tree.map(lambda leaf: leaf + 0.05 * jax.random.normal(keys[1], leaf.shape), params)
+        frames = jax.random.bits(keys[2], (batch, *shape), jnp.uint8)
+        statistics = normalizer.update(normalizer.init(networks.observation_spec), frames[:, None])
+        return params, frames, statistics, jax.random.normal(keys[3], (len(range(batch)[which]), 16))
+
+    params, frames, statistics, probe = sample(jax.random.split(jax.random.key(0), 4))
 
     def latents(params, probe):
         latent = networks.encode({"encoder": params}, networks.prepare(statistics, frames), which)
         return jnp.sum(latent * probe), latent
 
-    probe = jax.random.normal(keys[3], (len(range(batch)[which]), 16))
-    evaluate = jax.value_and_grad(latents, has_aux=True)
-    (_, expected), expected_gradient = evaluate(params, probe)
+    def evaluate():  # compiled anew: what is patched differs
+        return jax.jit(jax.value_and_grad(latents, has_aux=True))(params, probe)
+
+    (_, expected), expected_gradient = evaluate()
     monkeypatch.setattr(Networks, "uses_kernel", True)
     for name in ("prepare", "encode"):
         monkeypatch.setattr(encoder_kernel, name, functools.partial(getattr(encoder_kernel, name), interpret=True))
-    (_, latent), gradient = evaluate(params, probe)
+    (_, latent), gradient = evaluate()
 
     np.testing.assert_allclose(latent, expected, rtol=1e-4, atol=1e-4)
     for (path, ours), theirs in zip(jax.tree.leaves_with_path(gradient), jax.tree.leaves(expected_gradient), strict=True):

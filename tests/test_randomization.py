@@ -14,7 +14,7 @@ from point_mass import PointMass, PointMassConfig
 import jaxrl_vis_envs
 from jaxrl_vis import config as config_file
 from jaxrl_vis.config import RequestError, preset
-from jaxrl_vis.train_step import make_env
+from jaxrl_vis.train_step import make_env, make_train_step
 from jaxrl_vis_envs import pixels, randomization
 from jaxrl_vis_envs.compilation import world_jit
 from jaxrl_vis_envs.randomization import KINDS, OFF, Randomization, typical
@@ -274,3 +274,27 @@ def test_the_learner_asks_for_it() -> None:
     ):
         with pytest.raises(RequestError, match=words):
             make_env(preset("debug", **({"env": "VisualReacher"} | wrong)))
+
+
+def test_a_learner_trains_in_worlds_that_vary() -> None:
+    """Every episode starts at the same place and looks different; learning goes on, and repeats itself bit for bit."""
+    settings = {"num_envs": 4, "replay_transitions": 40, "updates_per_iteration": 2, "batch_size": 16, "eval_episodes": 2}
+    program = make_train_step(make(ALL), preset("debug", **settings))
+
+    def train() -> tuple[Any, list[Any]]:
+        loop, rows = program.init(keys()[:1]), []
+        for _ in range(2):
+            loop, metrics = program.train_iteration(loop)
+            rows.append(jax.device_get(metrics))
+        return loop, rows
+
+    (loop, rows), (_, again) = train(), train()
+    starts = np.asarray(loop.replay.episodes.frames[0, :, 0])
+    np.testing.assert_array_equal(loop.replay.episodes.states[0, :, 0], 0.0)
+    assert len({start.tobytes() for start in starts}) == len(starts) == 8
+    assert all(np.isfinite(value).all() and row["guard/nonfinite"] == 0 for row in rows for value in row.values())
+    assert int(loop.train.updates[0]) == 4
+    assert jax.tree.all(jax.tree.map(np.array_equal, rows, again))
+    outcome, recording = program.evaluate(loop.train, jax.random.key(1))
+    assert np.isfinite(outcome["eval/goal_distance"]).all()
+    assert len({frames[0].tobytes() for frames in np.asarray(recording["frames"][0])}) == settings["eval_episodes"]

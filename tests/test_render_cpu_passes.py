@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from small_scene import MORE_SPHERES, ORTHOGRAPHIC, small_scene
 
+from jaxrl_vis_envs.compilation import world_jit
 from jaxrl_vis_envs.render import cpu_passes, render_planes
 
 
@@ -35,7 +36,7 @@ def test_the_passes_draw_the_same_picture(lens, more, options, plainly):
             moved = SimpleNamespace(**{**vars(poses), "geom_xpos": geom_xpos})
             return render_planes(scene, moved, segmentation=True, quantized=True)
 
-        return jax.jit(jax.vmap(draw))(places)
+        return world_jit(jax.vmap(draw))(places)
 
     # A batch whose second picture is another one: a geom without a finite pose is not drawn.
     places = jnp.stack([poses.geom_xpos, poses.geom_xpos.at[2].set(jnp.nan)])
@@ -53,15 +54,15 @@ def test_the_passes_draw_the_same_picture(lens, more, options, plainly):
 
 
 def test_the_passes_have_the_gradients_of_the_plain_renderer(plainly):
-    scene, poses = small_scene(height=12, width=12)
+    scene, poses = small_scene(height=12, width=12, few=True)
 
     def loss(places):
         planes = render_planes(scene, SimpleNamespace(**{**vars(poses), "geom_xpos": places}), quantized=True)
         return jnp.sum(jnp.sin(planes.depth))
 
-    gradient = jax.jit(jax.grad(loss))(poses.geom_xpos)
+    gradient = world_jit(jax.grad(loss))(poses.geom_xpos)
     plainly()
-    expected = jax.jit(jax.grad(loss))(poses.geom_xpos)
+    expected = world_jit(jax.grad(loss))(poses.geom_xpos)
     assert np.abs(expected).max() > 0.1
     np.testing.assert_allclose(gradient, expected, rtol=1e-4, atol=1e-4)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jaxrl_vis_envs.compilation import world_jit
-from jaxrl_vis_envs.render import Scene, raycast, render, render_planes
+from jaxrl_vis_envs.render import Scene, blocks, pictures, raycast, render, render_planes
 
 POSES = ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat", "xpos", "xmat")
 HEAD = '<visual><headlight ambient="{} {} {}" diffuse="0 0 0" specular="0 0 0"/></visual><statistic extent="1"/>'
@@ -216,8 +216,11 @@ def test_many_objects_are_drawn_as_few_are(monkeypatch):
         scene = Scene.from_mjmodel(mj_model, "above", height, width)
         unrolled = shown(scene, mj_data)
         monkeypatch.setattr(raycast, "UNROLLED", 0)
+        assert blocks.tiled(scene)
+        pictures._drawn.clear_cache()
         looped = shown(scene, mj_data)
         monkeypatch.undo()
+        pictures._drawn.clear_cache()
         np.testing.assert_array_equal(unrolled.segmentation, looped.segmentation)
         np.testing.assert_allclose(unrolled.depth, looped.depth, rtol=1e-5)
         assert np.mean(unrolled.rgb == looped.rgb) > 0.999

@@ -88,7 +88,7 @@ def scan(function: Callable, *pixels: Any) -> Any:
 
 
 def scan_one(function: Callable, *pixels: Any) -> jax.Array:
-    """`scan` for a function with one result, on all cores of a CPU.
+    """`scan` for a function with one result, [P] int32, on all cores of a CPU.
 
     What goes straight into the stacked results of a loop, XLA computes on one thread. What is carried, on all of them: so
     results are carried a round before they are stacked.
@@ -96,8 +96,7 @@ def scan_one(function: Callable, *pixels: Any) -> jax.Array:
     count = pixels[0].shape[0]
     if count == 1 or jax.default_backend() != "cpu":
         return scan(function, *pixels)
-    like = jax.eval_shape(function, *jax.tree.map(lambda plane: plane[0], pixels))
-    empty = jnp.zeros(like.shape, like.dtype)
+    empty = jnp.zeros(pixels[0].shape[1:], jnp.int32)
     if count == 2:
         halves, _ = jax.lax.scan(lambda halves, block: ((halves[1], function(*block)), None), (empty, empty), pixels)
         return jnp.stack(halves)

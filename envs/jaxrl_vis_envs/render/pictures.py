@@ -96,8 +96,8 @@ def render_planes(
         position, rotation, finite = camera.camera_pose(scene, data)
         unit = shapes.unit_shapes(scene, data, position, rotation, finite)
         table = lights.pack(lights.camera_lights(scene, data, position, rotation) if rgb else [])
-        draw = _draw if _fast_way(scene, (wanted, quantized)) is None else _draw_fast
-        planes = draw((wanted, quantized), scene, rotation, unit, table)
+        outputs = (wanted, quantized)
+        planes = _drawn(_fast_way(scene, outputs), outputs, scene, rotation, unit, table)
     if quantized and planes.rgb is not None and planes.rgb.dtype != jnp.uint8:
         planes = planes._replace(rgb=quantize(planes.rgb))
     return planes
@@ -113,18 +113,25 @@ def _fast_way(scene: Scene, outputs: tuple) -> Any:
     return None
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _draw_fast(outputs: tuple, scene: Scene, rotation: jax.Array, unit: shapes.UnitShapes, light_table: jax.Array) -> Planes:
-    """`_draw` as one GPU kernel, or as passes on a CPU, with the derivatives of `_draw`."""
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _drawn(way: Any, outputs: tuple, *arguments: Any) -> Planes:
+    """`_draw`, in the faster way that there is, if any. Jitted so that it is traced once, in however many programs it is."""
+    return _draw(outputs, *arguments) if way is None else _draw_fast(way, outputs, *arguments)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def _draw_fast(
+    way: Any, outputs: tuple, scene: Scene, rotation: jax.Array, unit: shapes.UnitShapes, light_table: jax.Array
+) -> Planes:
+    """`_draw` as one GPU kernel, or as passes on a CPU (``way`` is the module), with the derivatives of `_draw`."""
     (rgb, depth, segmentation, normals, distance), quantized = outputs
     wanted = (rgb, depth, normals, distance, segmentation)
-    planes = _fast_way(scene, outputs).draw(wanted, quantized, scene, rotation, unit, light_table)
-    colour, near, normal, length, labels = planes
+    colour, near, normal, length, labels = way.draw(wanted, quantized, scene, rotation, unit, light_table)
     return Planes(colour, near, labels, normal, length)
 
 
 @_draw_fast.defjvp
-def _differentiate(outputs: tuple, primals: tuple, tangents: tuple) -> tuple[Planes, Planes]:
+def _differentiate(way: Any, outputs: tuple, primals: tuple, tangents: tuple) -> tuple[Planes, Planes]:
     return jax.jvp(functools.partial(_draw, outputs), primals, tangents)
 
 

@@ -31,6 +31,7 @@ class _Nodes(NamedTuple):
     of_body: np.ndarray  # [nbody], the last node of the body
 
 
+@jax.jit  # so that it is traced once, in however many programs it is
 def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """`mjx.kinematics` in a fraction of the operations, and the poses of cameras that ride on bodies.
 
