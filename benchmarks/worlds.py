@@ -51,10 +51,11 @@ def start_at(env: Any, qpos: Any, qvel: Any) -> State:
 
     Poses, and what is derived from them, are right from the first `advance` on.
     """
-    still = jax.tree.map(lambda leaf: jnp.tile(leaf, (len(qpos), *(1,) * leaf.ndim)), mjx_model.still_data(env.mj_model))
-    data = still.replace(qpos=jnp.asarray(qpos, jnp.float32), qvel=jnp.asarray(qvel, jnp.float32))
-    state = jax.vmap(lambda data: env.state_at(data, jnp.zeros_like(env.achieved(data))))(data)
-    return jax.device_get(state)  # as `_in_lanes` gives them: for what lies on a device otherwise, programs are compiled twice
+    still = jax.device_get(mjx_model.still_data(env.mj_model))
+    still = jax.tree.map(lambda leaf: np.tile(leaf, (len(qpos), *(1,) * leaf.ndim)), still)
+    data = still.replace(qpos=np.asarray(qpos, np.float32), qvel=np.asarray(qvel, np.float32))
+    begin = world_jit(jax.vmap(lambda data: env.state_at(data, jnp.zeros_like(env.achieved(data)))))
+    return jax.device_get(begin(data))  # as `_in_lanes` gives states: for what lies on a device, programs are compiled twice
 
 
 @functools.cache

@@ -126,9 +126,9 @@ def test_reward_and_success_follow_from_the_true_states(name: str) -> None:
 
 @EACH_TASK
 def test_bad_actions_do_not_poison_the_physics(name: str) -> None:
-    first = jax.tree.map(lambda leaf: jnp.repeat(leaf[:1], BATCH, axis=0), episode(name).states[0])
-    actions = jnp.zeros((STEPS, BATCH, worlds.make(name).action_size))
-    actions = actions.at[:, 0].set(jnp.nan).at[:, 1].set(jnp.inf).at[:, 2].set(-1e30).at[:, 3].set(1.0).at[:, 4].set(-1.0)
+    first = jax.tree.map(lambda leaf: np.repeat(leaf[:1], BATCH, axis=0), jax.device_get(episode(name).states[0]))
+    actions = np.zeros((STEPS, BATCH, worlds.make(name).action_size), np.float32)
+    actions[:, :5] = np.array([np.nan, np.inf, -1e30, 1.0, -1.0])[:, None]
     states = np.stack([state.achieved_state for state in play(name, first, actions)])
     assert np.isfinite(states).all()
     # Rows 0 and 5 (NaN, 0), 1 and 3 (inf, 1), 2 and 4 start from the same state.
@@ -165,10 +165,11 @@ def test_a_visual_task_resets_and_steps_as_its_parts_say() -> None:
     env = PointMass(PointMassConfig(image_size=16))
     keys = jax.random.split(jax.random.key(0), 4)
     start, steps = play_pictures(env, keys, jax.random.uniform(jax.random.key(1), (STEPS, 4, 2), minval=-1.0))
+    start, steps = jax.device_get((start, steps))
     assert start.obs is not None and steps.obs is not None
     nowhere = jnp.zeros(2)
     observe = world_jit(jax.vmap(lambda data: env.observe(env.state_at(data, nowhere))))
-    np.testing.assert_array_equal(start.obs["desired_goal"], observe(jax.vmap(env.sample_goal)(keys)))
+    np.testing.assert_array_equal(start.obs["desired_goal"], observe(world_jit(jax.vmap(env.sample_goal))(keys)))
     np.testing.assert_array_equal(start.obs["observation"], observe(start.data))
     for index in range(STEPS):
         seen = observe(jax.tree.map(lambda leaf, index=index: leaf[index], steps.data))
