@@ -127,8 +127,8 @@ def plot_run(
     if threshold is not None:
         distance_axes.axhline(threshold, color=_FAINT, linewidth=1.1, linestyle=(0, (5, 4)))
         distance_axes.annotate(
-            f"reached: {threshold:g} {unit}", (0, threshold), xycoords=("axes fraction", "data"), xytext=(2, 4),
-            textcoords="offset points", color=_FAINT, fontsize=9,
+            f"reached: {threshold:g} {unit}", (1, threshold), xycoords=("axes fraction", "data"), xytext=(-2, 4),
+            textcoords="offset points", ha="right", color=_FAINT, fontsize=9,  # curves come down from the left
         )  # fmt: skip
     for axes in (success_axes, distance_axes):
         axes.set_xlim(0, steps[-1] * 1.02 if steps[-1] > 0 else 1)
