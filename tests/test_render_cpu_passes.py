@@ -9,7 +9,7 @@ import pytest
 from small_scene import MORE_SPHERES, ORTHOGRAPHIC, small_scene
 
 from jaxrl_vis_envs.compilation import world_jit
-from jaxrl_vis_envs.render import cpu_passes, render_planes
+from jaxrl_vis_envs.render import camera, cpu_passes, cpu_search, render_planes, shapes
 
 
 @pytest.fixture
@@ -19,16 +19,18 @@ def plainly(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("lens", "more", "options"),
+    ("lens", "more", "shape", "options"),
     [
-        ("", MORE_SPHERES, {"textured": True}),
-        ("", "", {"textured": False, "shadows": True}),
-        (ORTHOGRAPHIC, "", {"textured": True}),
+        ("", MORE_SPHERES, (24, 40), {"textured": True}),
+        ("", "", (24, 40), {"textured": False, "shadows": True}),
+        # Large enough for tiles, which hang over the border.
+        (ORTHOGRAPHIC, "", (50, 53), {"textured": True}),
     ],
     ids=["many", "shadows", "orthographic"],
 )
-def test_the_passes_draw_the_same_picture(lens, more, options, plainly):
-    scene, poses = small_scene(lens, more, height=24, width=40, **options)
+def test_the_passes_draw_the_same_picture(lens, more, shape, options, plainly):
+    height, width = shape
+    scene, poses = small_scene(lens, more, height, width, **options)
     assert cpu_passes.takes(scene)
 
     def draw_all(places):
@@ -38,8 +40,10 @@ def test_the_passes_draw_the_same_picture(lens, more, options, plainly):
 
         return world_jit(jax.vmap(draw))(places)
 
-    # A batch whose second picture is another one: a geom without a finite pose is not drawn.
-    places = jnp.stack([poses.geom_xpos, poses.geom_xpos.at[2].set(jnp.nan)])
+    # A batch whose second picture is another one: a geom without a finite pose is not drawn. In the third, the capsule is alone
+    # in its corner.
+    moved = poses.geom_xpos.at[5].set(jnp.array([0.7, 1.0, 0.9]))
+    places = jnp.stack([poses.geom_xpos, poses.geom_xpos.at[2].set(jnp.nan), moved])
     drawn = draw_all(places)
     plainly()
     expected = draw_all(places)
@@ -51,6 +55,37 @@ def test_the_passes_draw_the_same_picture(lens, more, options, plainly):
     assert difference.max() <= 1 and difference.mean() <= 0.125
     assert len(np.unique(np.asarray(drawn.segmentation[0]))) > 7
     assert 2 in np.asarray(drawn.segmentation[0]) and 2 not in np.asarray(drawn.segmentation[1])
+    alone = np.asarray(drawn.segmentation[2]) == 5
+    assert alone.sum() >= 8 and not np.any(np.asarray(drawn.segmentation[:2])[:, alone] == 5)
+
+
+def test_what_is_computed_once_is_computed_for_all_or_none():
+    """A loop of no or one round, in a batch too; and the answer to whether is one for the batch."""
+
+    def double(flags, x):
+        seen = cpu_search._anywhere(flags)
+        return jnp.stack([cpu_search.once(flag, lambda zero: 2 * x + zero, x) for flag in seen])
+
+    flags = jnp.array([[False, True, False], [False, False, True]])
+    np.testing.assert_array_equal(jax.vmap(double)(flags, jnp.array([3, 5])), [[3, 6, 6], [5, 10, 10]])
+    np.testing.assert_array_equal(double(flags[0], jnp.int32(3)), [3, 6, 3])
+    nested = jax.vmap(jax.vmap(double))(flags[None, :, :], jnp.array([[3, 5]]))
+    np.testing.assert_array_equal(nested, [[[3, 6, 6], [5, 10, 10]]])
+
+
+def test_tiles_see_what_is_in_them():
+    scene, poses = small_scene(height=64, width=64)
+    layout = cpu_search.layout(scene)
+    u, v = camera.pixel_rays(scene, layout.rows, layout.columns)
+    position, rotation, finite = camera.camera_pose(scene, poses)
+    unit = shapes.unit_shapes(scene, poses, position, rotation, finite)
+    seen = np.asarray(cpu_search.seen_in_tiles(scene, unit, u, v))
+    labels = np.asarray(render_planes(scene, poses, rgb=False, segmentation=True).segmentation)
+    for tile, (rows, columns) in enumerate(zip(layout.rows, layout.columns, strict=True)):
+        shown = set(labels[rows, columns].tolist()) - {-1}
+        assert shown <= {scene.object_ids[row] for row in np.flatnonzero(seen[tile])}
+    # It is worth it: a tile has less than half of the objects in it.
+    assert seen.mean() < 0.5
 
 
 def test_the_passes_have_the_gradients_of_the_plain_renderer(plainly):

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from jaxrl_vis.bench import render_scenes, roofline
+from jaxrl_vis.bench import program_memory, render_scenes, roofline
 from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.render import alternate, assert_new_pictures
 from jaxrl_vis.bench.settings import Settings
@@ -116,7 +116,9 @@ def _effort(compiled: Any, pixels: int, seconds: float, needed: float, drawn: in
     }
     memory = compiled.memory_analysis()
     if memory is not None and memory.output_size_in_bytes:
-        effort["temporaries_over_output"] = round(memory.temp_size_in_bytes / memory.output_size_in_bytes, 3)
+        output = memory.output_size_in_bytes
+        effort["temporaries_over_output"] = round(memory.temp_size_in_bytes / output, 3)
+        effort["largest_temporary_over_output"] = round(program_memory.largest_temporary(compiled) / output, 3)
     cost = roofline.compiler_cost(compiled)
     # On a CPU the pictures are drawn block by block, and the body of a loop is counted once.
     if cost is not None and jax.default_backend() != "cpu":

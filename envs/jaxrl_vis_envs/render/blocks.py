@@ -35,11 +35,16 @@ class Layout(NamedTuple):
 
 
 def layout(scene: Scene) -> Layout:
-    """Cuts the picture of a scene into blocks."""
+    """Cuts the picture of a scene into blocks: tiles if there is much in it, otherwise strips."""
     if not tiled(scene):
         pixels = np.arange(scene.height * scene.width).reshape(_half_count(scene.height * scene.width), -1)
         return Layout(pixels // scene.width, pixels % scene.width, None)
-    high, wide = _tile_length(scene.height), _tile_length(scene.width)
+    wish = _CPU_TILE if jax.default_backend() == "cpu" else _TILE
+    return tiles(scene, near_divisor(scene.height, wish), near_divisor(scene.width, wish))
+
+
+def tiles(scene: Scene, high: int, wide: int) -> Layout:
+    """Cuts the picture of a scene into tiles of this height and width."""
     down, across = -(-scene.height // high), -(-scene.width // wide)
     rows, columns = np.indices((down * high, across * wide))
 
@@ -59,9 +64,8 @@ def restore(scene: Scene, layout: Layout, plane: jax.Array) -> jax.Array:
     return whole[: scene.height, : scene.width]
 
 
-def _tile_length(pixels: int) -> int:
+def near_divisor(pixels: int, wish: int) -> int:
     """Near the wished length of a tile, and a divisor of ``pixels`` if there is one that is near enough."""
-    wish = _CPU_TILE if jax.default_backend() == "cpu" else _TILE
     lengths = [length for length in range(wish // 2 + 2, 2 * wish - 4) if pixels % length == 0]
     return min(lengths, key=lambda length: abs(length - wish), default=min(wish, pixels))
 
@@ -104,10 +108,9 @@ def scan_one(function: Callable, *pixels: Any) -> jax.Array:
     return jnp.concatenate([before[1:], last[None]])
 
 
-def joined(planes: tuple, halves: bool = False) -> tuple:
+def joined(planes: tuple) -> tuple:
     """Arrays [blocks, P] (or None) in fewer and longer blocks, for what does not depend on which pixels are in a block."""
-    pixels = planes[0].size
-    count = _half_count(pixels) if halves else _block_count(pixels)
+    count = _block_count(planes[0].size)
     return tuple(None if plane is None else plane.reshape(count, -1) for plane in planes)
 
 

@@ -3,17 +3,21 @@
 XLA computes a loop on a CPU anew for each of its outputs, and with it most of what they share: three channels cost three times
 the shading. So each pass has one output, and what the next one needs of it is packed into its bits: the key of the nearest
 object (`raycast`), its normal (as a point of an octahedron, 16 bits an axis), the colour of its texture (10 bits a channel),
-and the colour that is seen (8 bits a channel). Between the passes are loops over blocks of pixels (`blocks`), because XLA
-would fuse them otherwise.
+and the colour that is seen (8 bits a channel). Each pass over a tile is a loop of one round (`cpu_search.once`), because XLA
+would fuse them otherwise; and where only planes are seen in a tile, it is a cheaper one.
 
 What happens to a pixel is the code of the plain renderer, but for the last bits: depths beside colours are those of the keys.
 """
+
+from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis_envs.render import blocks, camera, lights, raycast, shade, shapes, surface
+from jaxrl_vis_envs.render import blocks, camera, cpu_search, lights, raycast, shade, shapes, surface
+from jaxrl_vis_envs.render.pixel_math import clipped, larger, reciprocal
 from jaxrl_vis_envs.render.scene import Scene
 from jaxrl_vis_envs.render.surface import Vector
 
@@ -52,18 +56,17 @@ def draw(
     """
     rgb, depth, normals, distance, segmentation = wanted
     assert not (normals or distance) and (quantized or not rgb)
-    layout = blocks.layout(scene)
+    layout = cpu_search.layout(scene)
     u, v = camera.pixel_rays(scene, layout.rows, layout.columns)
-    if not (rgb or segmentation):
-        # Nothing but depths: keys of which no bit is needed for anything else.
-        bits = blocks.scan_one(lambda u, v: raycast.nearest_key(scene, unit, u, v, labelled=False), u, v)
-        return [None, jax.lax.bitcast_convert_type(blocks.restore(scene, layout, bits), jnp.float32), None, None, None]
-    key, _ = blocks.nearest(scene, unit, u, v)
-    colours = far = labels = None
-    if rgb:
-        packed = _colours(scene, unit, rotation, light_table, *blocks.joined((u, v, key), halves=True))
-        colours = _unpack(blocks.restore(scene, layout, packed))
-    near, index = raycast.decode(scene, blocks.restore(scene, layout, key))
+    # Where nothing but depths is wanted, no bit of the keys is needed for anything else.
+    labelled = rgb or segmentation
+    colouring = _Colouring(scene, unit, rotation, light_table) if rgb else None
+    key, packed = (blocks.restore(scene, layout, plane) for plane in _tiles(scene, unit, colouring, labelled, u, v))
+    colours = _unpack(packed) if rgb else None
+    if not labelled:
+        return [colours, jax.lax.bitcast_convert_type(key, jnp.float32), None, None, None]
+    near, index = raycast.decode(scene, key)
+    far = labels = None
     if depth:
         # A key's depth has lost its lowest bits: half of them come back.
         centre = jax.lax.bitcast_convert_type(near, jnp.int32) | (raycast.code_mask(scene) >> 1)
@@ -73,61 +76,124 @@ def draw(
     return [colours, far, None, None, labels]
 
 
-def _colours(
-    scene: Scene,
-    unit: shapes.UnitShapes,
-    rotation: jax.Array,
-    light_table: jax.Array,
-    u: jax.Array,
-    v: jax.Array,
-    key: jax.Array,
-) -> jax.Array:
-    """What pixels [blocks, P] see: packed, 8 bits a channel, int32."""
-    table = surface.object_table(scene, unit)
-    shines = lights.unpack(scene, light_table)
+class _Tile(NamedTuple):
+    """What is computed of a tile, int32 [P] each: keys, colours, and what leads to them. The next tile's takes its memory."""
 
-    def finish(u: jax.Array, v: jax.Array, key: jax.Array, normal: jax.Array, texture: jax.Array | None) -> jax.Array:
-        row, hit = _met(scene, table, u, v, key)
-        colour = shade.lighted(scene, unit, shines, row, hit._replace(normal=_unpack_normal(normal)), u, v)
+    key: jax.Array
+    colour: jax.Array
+    own_keys: tuple[jax.Array, ...]
+    normal: jax.Array
+    texture: jax.Array
+
+
+def _tiles(
+    scene: Scene, unit: shapes.UnitShapes, colouring: "_Colouring | None", labelled: bool, u: jax.Array, v: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Keys and packed colours of all pixels, [tiles, P] int32 each, one tile after the other."""
+    seen = cpu_search.seen_in_tiles(scene, unit, u, v)
+
+    def draw_tile(carry: tuple, rays: tuple) -> tuple:
+        number, tile, keys, colours = carry
+        # What goes straight into the results of a loop is computed on one core: it is copied there a round later.
+        before = jnp.maximum(number - 1, 0)
+        keys, colours = keys.at[before].set(tile.key), colours.at[before].set(tile.colour)
+        u, v, seen = rays
+        key, own_keys = cpu_search.nearest_key(scene, unit, u, v, seen, tile.own_keys, labelled)
+        tile = tile._replace(key=key, own_keys=own_keys)
+        if colouring is not None:
+            tile = colouring.colour(tile, u, v, jnp.any(seen[np.array(cpu_search.solids(scene), int)]))
+        return (number + 1, tile, keys, colours), None
+
+    count = len(u)
+    empty, results = jnp.zeros(u.shape[1:], jnp.int32), jnp.zeros(u.shape, jnp.int32)
+    first = _Tile(empty, empty, cpu_search.memory(scene, empty), empty, empty)
+    (_, last, keys, colours), _ = jax.lax.scan(draw_tile, (jnp.int32(0), first, results, results), (u, v, seen))
+    return keys.at[count - 1].set(last.key), colours.at[count - 1].set(last.colour)
+
+
+class _Seen(NamedTuple):
+    """What a pass starts from: rows of the objects that may be seen, `surface.object_table`, and rays and keys, [P] each."""
+
+    rows: list[int]
+    table: jax.Array
+    u: jax.Array
+    v: jax.Array
+    key: jax.Array
+
+
+class _Colouring:
+    """Passes over the pixels of a tile whose nearest objects are known."""
+
+    def __init__(self, scene: Scene, unit: shapes.UnitShapes, rotation: jax.Array, light_table: jax.Array) -> None:
+        self.scene, self.unit, self.rotation = scene, unit, rotation
+        self.table = surface.object_table(scene, unit)
+        self.lights = lights.unpack(scene, light_table)
+
+    def colour(self, tile: _Tile, u: jax.Array, v: jax.Array, busy: jax.Array) -> _Tile:
+        """The tile with its colours. In one that is not ``busy`` only planes are seen, and the sky."""
+        every = list(range(len(self.scene.object_types)))
+        planes = [row for row in every if self.scene.object_types[row] == shapes.PLANE]
+
+        def seeing(rows: list[int], what: Callable, *more: jax.Array | None) -> Callable[[jax.Array], jax.Array]:
+            def see(zero: jax.Array) -> jax.Array:
+                # Everything depends on the zero, or XLA would compute and store parts of it for every tile.
+                table, rays, packed = jax.tree.map(
+                    lambda leaf: leaf + zero.astype(leaf.dtype), (self.table, (u, v), (tile.key, *more))
+                )
+                return what(_Seen(rows, table, *rays, packed[0]), *packed[1:])
+
+            return see
+
+        normal = cpu_search.once(busy, seeing(every, self._normal), tile.normal)
+        texture: jax.Array | None = None
+        if self.scene.atlas.used or self.scene.atlas.sky is not None:
+            texture = cpu_search.once(~busy, seeing(planes, self._texture), tile.texture)
+            texture = cpu_search.once(busy, seeing(every, self._texture), texture)
+        colour = cpu_search.once(~busy, seeing(planes, self._finish, None, texture), tile.colour)
+        colour = cpu_search.once(busy, seeing(every, self._finish, normal, texture), colour)
+        return tile._replace(normal=normal, texture=tile.texture if texture is None else texture, colour=colour)
+
+    def _normal(self, seen: _Seen) -> jax.Array:
+        """Packed, for objects whose rows are among these; as all that follow."""
+        return _pack_normal(surface.outward(*self._met(seen)))
+
+    def _texture(self, seen: _Seen) -> jax.Array:
+        """What the colours of objects are multiplied with, and the colour of the sky: packed, 10 bits a channel."""
+        picture = surface.texture_colour(self.scene, *self._met(seen)) or (jnp.ones_like(seen.u),) * 3
+        return _pack(self._in_front(seen, picture, shade.sky(self.scene, self.rotation, seen.u, seen.v)), 10)
+
+    def _finish(self, seen: _Seen, normal: jax.Array | None, texture: jax.Array | None) -> jax.Array:
+        """What is seen: packed, 8 bits a channel. Without a ``normal`` it is that of a plane, which is not much to compute."""
+        row, hit = self._met(seen)
+        if normal is not None:
+            hit = hit._replace(normal=_unpack_normal(normal))
+        colour = shade.lighted(self.scene, self.unit, self.lights, row, hit, seen.u, seen.v)
         if texture is None:
-            sky = shade.sky(scene, rotation, u, v)
+            sky = shade.sky(self.scene, self.rotation, seen.u, seen.v)
         else:
             sky = tuple(((texture >> shift) & 1023).astype(jnp.float32) / 1023.0 for shift in (0, 10, 20))
             colour = tuple(value * texel for value, texel in zip(colour, sky, strict=True))
-        return _pack(_in_front(scene, key, colour, sky), 8)
+        return _pack(self._in_front(seen, colour, sky), 8)
 
-    normal = blocks.scan_one(lambda u, v, key: _pack_normal(surface.outward(*_met(scene, table, u, v, key))), u, v, key)
-    texture = None
-    if scene.atlas.used or scene.atlas.sky is not None:
-        texture = blocks.scan_one(lambda u, v, key: _texture(scene, table, rotation, u, v, key), u, v, key)
-    return blocks.scan_one(finish, u, v, key, normal, texture)
+    def _met(self, seen: _Seen) -> tuple[surface.Row, surface.Hit]:
+        """The object that each pixel sees, and where."""
+        depth, index = raycast.decode(self.scene, seen.key)
+        row = _row(seen.table, seen.rows, index)
+        return row, surface.meet(self.scene, row, None, seen.u, seen.v, depth, refined=False)
 
-
-def _texture(scene: Scene, table: jax.Array, rotation: jax.Array, u: jax.Array, v: jax.Array, key: jax.Array) -> jax.Array:
-    """What the colours of objects are multiplied with, and the colour of the sky: [P] int32, packed, 10 bits a channel."""
-    picture = surface.texture_colour(scene, *_met(scene, table, u, v, key)) or (jnp.ones_like(u),) * 3
-    return _pack(_in_front(scene, key, picture, shade.sky(scene, rotation, u, v)), 10)
-
-
-def _in_front(scene: Scene, key: jax.Array, colour: Vector, sky: Vector) -> Vector:
-    """The colours of pixels that see an object, the sky's elsewhere."""
-    sees = raycast.decode(scene, key)[1] >= 0
-    return tuple(jnp.where(sees, front, back) for front, back in zip(colour, sky, strict=True))
+    def _in_front(self, seen: _Seen, colour: Vector, sky: Vector) -> Vector:
+        """The colours of pixels that see an object, the sky's elsewhere."""
+        sees = raycast.decode(self.scene, seen.key)[1] >= 0
+        return tuple(jnp.where(sees, front, back) for front, back in zip(colour, sky, strict=True))
 
 
-def _met(scene: Scene, table: jax.Array, u: jax.Array, v: jax.Array, key: jax.Array) -> tuple[surface.Row, surface.Hit]:
-    """The object that each pixel sees, and where."""
-    depth, index = raycast.decode(scene, key)
-    row = _row(table, index)
-    return row, surface.meet(scene, row, None, u, v, depth, refined=False)
-
-
-def _row(table: jax.Array, index: jax.Array) -> surface.Row:
+def _row(table: jax.Array, rows: list[int], index: jax.Array) -> surface.Row:
     """The row of every pixel, as `surface.fetch`; few are chosen from, because rows that are looked up would be stored."""
-    if len(table) > _CHOSEN:
+    if len(rows) > _CHOSEN:
         return surface.fetch(table, index)
-    columns = [jnp.broadcast_to(first, index.shape) for first in table[0]]
-    for number in range(1, len(table)):
+    first, *others = rows or [0]
+    columns = [jnp.broadcast_to(value, index.shape) for value in table[first]]
+    for number in others:
         here = index == number
         columns = [jnp.where(here, value, column) for value, column in zip(table[number], columns, strict=True)]
     return surface.row_of(columns)
@@ -136,7 +202,7 @@ def _row(table: jax.Array, index: jax.Array) -> surface.Row:
 def _pack(colour: Vector, bits: int) -> jax.Array:
     """Three channels [P] in [0, 1], rounded to so many bits each: [P] int32."""
     steps = float(2**bits - 1)
-    red, green, blue = (jnp.floor(jnp.clip(channel, 0.0, 1.0) * steps + 0.5).astype(jnp.int32) for channel in colour)
+    red, green, blue = ((clipped(channel) * steps + 0.5).astype(jnp.int32) for channel in colour)
     return red | (green << bits) | (blue << 2 * bits)
 
 
@@ -147,7 +213,7 @@ def _unpack(packed: jax.Array) -> jax.Array:
 
 def _pack_normal(normal: Vector) -> jax.Array:
     """A direction of any length -> [P] int32: where it meets an octahedron whose lower half is folded out, 16 bits an axis."""
-    inverse = _reciprocal(jnp.abs(normal[0]) + jnp.abs(normal[1]) + jnp.abs(normal[2]) + 1e-30)
+    inverse = reciprocal(jnp.abs(normal[0]) + jnp.abs(normal[1]) + jnp.abs(normal[2]) + 1e-30)
     x, y = normal[0] * inverse, normal[1] * inverse
     below = normal[2] < 0.0
     folded = (1.0 - jnp.abs(y)) * jnp.where(x >= 0.0, 1.0, -1.0), (1.0 - jnp.abs(x)) * jnp.where(y >= 0.0, 1.0, -1.0)
@@ -165,16 +231,5 @@ def _unpack_normal(packed: jax.Array) -> Vector:
         for half in (packed & 0xFFFF, jax.lax.shift_right_logical(packed, 16))
     )
     z = 1.0 - jnp.abs(x) - jnp.abs(y)
-    fold = jnp.maximum(-z, 0.0)
+    fold = larger(-z, 0.0)
     return surface.normalized((x - jnp.where(x >= 0.0, fold, -fold), y - jnp.where(y >= 0.0, fold, -fold), z))
-
-
-def _reciprocal(value: jax.Array) -> jax.Array:
-    """1 / value for positive values, right to a few bits, by Newton's method from a guess at the exponent.
-
-    XLA never fuses a division of which the quotient is used twice: it would store it, and compute all else in the loop again.
-    """
-    guess = jax.lax.bitcast_convert_type(0x7EF311C7 - jax.lax.bitcast_convert_type(value, jnp.int32), jnp.float32)
-    for _ in range(3):
-        guess = guess * (2.0 - value * guess)
-    return guess

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from jaxrl_vis_envs.render.pixel_math import larger, power
 from jaxrl_vis_envs.render.scene import Scene
 from jaxrl_vis_envs.render.surface import Vector, dot, normalized
 
@@ -135,11 +136,6 @@ def unpack(scene: Scene, table: Any) -> list[Light]:
     return found
 
 
-def _power(base: jax.Array, exponent: jax.Array) -> jax.Array:
-    """``base ** exponent`` for a base in [0, 1], with finite gradients at 0 and vectorised everywhere."""
-    return jnp.exp(exponent * jnp.log(jnp.maximum(base, 1e-6)))
-
-
 def towards(light: Light, point: Vector) -> tuple[Vector, jax.Array | None, jax.Array | None]:
     """From points to the light: unit vector, distance and its inverse (m, 1/m, [P]; None for a directional light)."""
     if light.directional:
@@ -173,12 +169,12 @@ def light_factors(
         if light.cosine_cutoff is not None:
             assert light.exponent is not None
             along = -dot(to_light, tuple(light.direction[axis] for axis in range(3)))
-            fade = jnp.where(along >= light.cosine_cutoff, fade * _power(along, light.exponent), 0.0)
+            fade = jnp.where(along >= light.cosine_cutoff, fade * power(along, light.exponent), 0.0)
     if lit is not None:
         fade = fade * lit
-    facing = jnp.maximum(dot(normal, to_light), 0.0)
+    facing = larger(dot(normal, to_light), 0.0)
     shine: Any = 0.0
     if light.highlights:
         halfway = normalized(tuple(to_light[axis] + to_camera[axis] for axis in range(3)))
-        shine = fade * jnp.where(facing > 0.0, _power(dot(normal, halfway), exponent), 0.0)
+        shine = fade * jnp.where(facing > 0.0, power(dot(normal, halfway), exponent), 0.0)
     return fade, fade * facing, shine

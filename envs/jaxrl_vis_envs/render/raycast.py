@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxrl_vis_envs.render import camera, shapes
+from jaxrl_vis_envs.render.pixel_math import larger, smaller
 from jaxrl_vis_envs.render.scene import Scene
 
 # Keeps a division by a ray component that is exactly 0 finite; far too small to change any other number.
@@ -102,6 +103,19 @@ def entry(kind: int, values: tuple, start: tuple, direction: tuple, inverse_squa
     return _INTERSECTIONS[kind](begin, ray, extra, inverse_square * extra_square)
 
 
+def sky_key(scene: Scene, mask: int) -> jax.Array:
+    """The key of a ray that meets nothing, [] int32; ``mask`` is `code_mask`, or 0 for depths alone."""
+    return (jax.lax.bitcast_convert_type(scene.zfar, jnp.int32) & ~mask) | mask
+
+
+def object_key(
+    scene: Scene, unit: shapes.UnitShapes, row: int, u: jax.Array, v: jax.Array, missed: jax.Array, mask: int
+) -> jax.Array:
+    """The keys of one opaque object, [P] int32, and ``missed`` where a ray does not meet it; ``mask`` as in `sky_key`."""
+    t, meets = _solid_entry(scene, unit, row, u, v)
+    return jnp.where(meets, (jax.lax.bitcast_convert_type(t, jnp.int32) & ~mask) | (row & mask), missed)
+
+
 def nearest_key(scene: Scene, unit: shapes.UnitShapes, u: jax.Array, v: jax.Array, labelled: bool = True) -> jax.Array:
     """The key of the nearest opaque primitive along every ray, [P] int32; not ``labelled``, only the bits of its depth.
 
@@ -110,14 +124,12 @@ def nearest_key(scene: Scene, unit: shapes.UnitShapes, u: jax.Array, v: jax.Arra
     """
     mask = code_mask(scene) if labelled else 0
     unit, u, v = jax.lax.stop_gradient((unit, u, v))
-    best = jnp.broadcast_to((jax.lax.bitcast_convert_type(scene.zfar, jnp.int32) & ~mask) | mask, u.shape)
+    best = jnp.broadcast_to(sky_key(scene, mask), u.shape)
     rows = primitive_rows(scene, transparent=False)
     listed = {} if len(rows) <= UNROLLED else _rows_by_type(scene, rows)
     for row in rows:
         if scene.object_types[row] not in listed:
-            t, meets = _solid_entry(scene, unit, row, u, v)
-            key = (jax.lax.bitcast_convert_type(t, jnp.int32) & ~mask) | (row & mask)
-            best = jnp.minimum(best, jnp.where(meets, key, best))
+            best = jnp.minimum(best, object_key(scene, unit, row, u, v, best, mask))
     for kind, rows in listed.items():
         best = _nearest_listed(scene, unit, kind, rows, u, v, best, mask)
     return best
@@ -212,7 +224,7 @@ def _capsule(origin: tuple, ray: tuple, half_length: jax.Array, inverse) -> tupl
     middle, root, meets = _tube(origin, ray)
     side = middle - root
     height = origin[2] + side * ray[2]
-    centre = jnp.clip(height, -half_length, half_length)
+    centre = smaller(larger(height, -half_length), half_length)
     on_side = meets & (height == centre)
     below = origin[2] - jnp.where(height > 0.0, half_length, -half_length)
     nearest = -(origin[0] * ray[0] + origin[1] * ray[1] + below * ray[2]) * inverse
@@ -227,8 +239,8 @@ def _cylinder(origin: tuple, ray: tuple, extra: jax.Array, scaled_inverse) -> tu
     middle, root, meets = _tube(origin, ray)
     inverse = 1.0 / (ray[2] + _TINY)
     slab_middle, slab_half = -origin[2] * inverse, jnp.abs(inverse)
-    enter = jnp.maximum(middle - root, slab_middle - slab_half)
-    leave = jnp.minimum(middle + root, slab_middle + slab_half)
+    enter = larger(middle - root, slab_middle - slab_half)
+    leave = smaller(middle + root, slab_middle + slab_half)
     return enter, meets & (enter < leave)
 
 
@@ -241,8 +253,8 @@ def _box(origin: tuple, ray: tuple, extra: jax.Array, scaled_inverse) -> tuple:
         middle, half = -origin[axis] * inverse, jnp.abs(inverse)
         enters.append(middle - half)
         leaves.append(middle + half)
-    enter = jnp.maximum(jnp.maximum(enters[0], enters[1]), enters[2])
-    leave = jnp.minimum(jnp.minimum(leaves[0], leaves[1]), leaves[2])
+    enter = larger(larger(enters[0], enters[1]), enters[2])
+    leave = smaller(smaller(leaves[0], leaves[1]), leaves[2])
     return enter, enter < leave
 
 
@@ -251,7 +263,7 @@ def _plane(origin: tuple, ray: tuple, extra: jax.Array, scaled_inverse) -> tuple
     del extra, scaled_inverse
     t = -origin[2] / (ray[2] + _TINY)
     x, y = origin[0] + t * ray[0], origin[1] + t * ray[1]
-    return t, jnp.maximum(jnp.abs(x), jnp.abs(y)) <= 1.0
+    return t, larger(jnp.abs(x), jnp.abs(y)) <= 1.0
 
 
 def _ball(origin: tuple, ray: tuple, extra: jax.Array, scaled_inverse) -> tuple:

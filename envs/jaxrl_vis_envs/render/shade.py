@@ -15,6 +15,7 @@ import numpy as np
 
 from jaxrl_vis_envs.render import camera, charts, shapes, surface, textures
 from jaxrl_vis_envs.render import lights as lighting
+from jaxrl_vis_envs.render.pixel_math import clipped
 from jaxrl_vis_envs.render.raycast import entry
 from jaxrl_vis_envs.render.scene import Scene
 from jaxrl_vis_envs.render.surface import Hit, Row, Vector
@@ -79,8 +80,7 @@ def _lighted(
             if light.highlights:
                 highlight[channel] += factors[2] * light.specular[channel]
     return tuple(
-        jnp.clip(light * base + row.specular * shine, 0.0, 1.0)
-        for light, base, shine in zip(coloured, row.colour, highlight, strict=True)
+        clipped(light * base + row.specular * shine) for light, base, shine in zip(coloured, row.colour, highlight, strict=True)
     )
 
 

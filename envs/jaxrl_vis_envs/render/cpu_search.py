@@ -1,0 +1,131 @@
+"""The nearest object of every pixel on a CPU, tile by tile, and in a tile only what may be seen there.
+
+A program for a batch cannot leave out of one picture what it does in another. But cameras mostly stand still, and robots stay
+where they are: most tiles show the same few objects in all pictures of a batch. So what depends on a tile is a loop of no or
+one round (`once`), which all pictures of the batch go through or leave out together.
+
+XLA needs to be told so in three ways. A condition that differs between the pictures would become a choice after the work is
+done: it is made one for the batch (`_anywhere`). A branch of ``cond`` runs on one core, the body of a ``while`` on all. And a
+loop that reads what it overwrites is not vectorised, so every object has keys of its own, which are compared afterwards.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxrl_vis_envs.render import blocks, camera, raycast, shapes
+from jaxrl_vis_envs.render.scene import Scene
+
+# A picture has so many tiles across and down; a smaller one than this has two strips, because each tile costs some
+# microseconds for each object.
+_TILES = 4
+_LEAST_PIXELS = 48 * 48
+
+
+def layout(scene: Scene) -> blocks.Layout:
+    """The tiles of the picture."""
+    if blocks.tiled(scene):
+        return blocks.layout(scene)
+    down, across = (_TILES, _TILES) if scene.height * scene.width >= _LEAST_PIXELS else (2, 1)
+    high, wide = (blocks.near_divisor(n, -(-n // parts)) for n, parts in ((scene.height, down), (scene.width, across)))
+    return blocks.tiles(scene, high, wide)
+
+
+def seen_in_tiles(scene: Scene, unit: shapes.UnitShapes, u: jax.Array, v: jax.Array) -> jax.Array:
+    """Which objects may be seen in which tiles, in any picture of the batch.
+
+    Args:
+        scene: The scene.
+        unit: The drawn objects.
+        u: [tiles, P] float32, see `camera.pixel_rays`.
+        v: [tiles, P] float32.
+
+    Returns:
+        [tiles, G] bool, the same for the whole batch; planes are always there.
+    """
+    touching = jax.vmap(lambda u, v: camera.in_view(scene, unit.ball[:, :3], unit.ball[:, 3], u, v, None))(u, v)
+    return _anywhere(touching) | (np.array(scene.object_types) == shapes.PLANE)
+
+
+def solids(scene: Scene) -> list[int]:
+    """Rows of the drawn objects that are no planes."""
+    return [row for row in raycast.primitive_rows(scene, transparent=False) if scene.object_types[row] != shapes.PLANE]
+
+
+def memory(scene: Scene, plane: jax.Array) -> tuple[jax.Array, ...]:
+    """``plane`` [P] int32 for each object whose keys `nearest_key` keeps."""
+    return () if blocks.tiled(scene) else (plane,) * len(solids(scene))
+
+
+def nearest_key(
+    scene: Scene,
+    unit: shapes.UnitShapes,
+    u: jax.Array,
+    v: jax.Array,
+    seen: jax.Array,
+    own: tuple[jax.Array, ...],
+    labelled: bool,
+) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+    """`raycast.nearest_key` of one tile.
+
+    Args:
+        scene: The scene.
+        unit: The drawn objects.
+        u: [P] float32, see `camera.pixel_rays`.
+        v: [P] float32.
+        seen: [G] bool, a row of `seen_in_tiles`.
+        own: From `memory`, whatever is in it now.
+        labelled: Whether the keys say which object it is, or are nothing but the bits of its depth.
+
+    Returns:
+        The keys [P] int32, and the memory for the next tile.
+    """
+    if blocks.tiled(scene):
+        return raycast.nearest_key(scene, unit, u, v, labelled), own
+    mask = raycast.code_mask(scene) if labelled else 0
+    sky = raycast.sky_key(scene, mask)
+    rows = solids(scene)
+
+    def keys_of(row: int) -> Callable[[jax.Array], jax.Array]:
+        def find(nothing: jax.Array) -> jax.Array:
+            moving = jax.tree.map(lambda leaf: leaf + nothing.astype(jnp.float32), unit)
+            return raycast.object_key(scene, moving, row, u, v, sky, mask)
+
+        return find
+
+    own = tuple(once(seen[row], keys_of(row), old) for row, old in zip(rows, own, strict=True))
+    best = jnp.broadcast_to(sky, u.shape)
+    for row in raycast.primitive_rows(scene, transparent=False):
+        if row not in rows:
+            best = jnp.minimum(best, raycast.object_key(scene, unit, row, u, v, sky, mask))
+    for row, key in zip(rows, own, strict=True):
+        best = jnp.minimum(best, jnp.where(seen[row], key, sky))
+    return best, own
+
+
+def once(condition: jax.Array, function: Callable[[jax.Array], jax.Array], otherwise: jax.Array) -> jax.Array:
+    """``function(0)`` where the condition, one for the whole batch, is true; computed once, whatever is done with the result.
+
+    Args:
+        condition: [] bool.
+        function: Takes an int32 that is 0, which XLA does not know: what does not depend on it is computed in any case.
+        otherwise: The result where the condition is false; its memory is used for that of the function.
+    """
+    rounds = jnp.where(condition, 0, 1)
+    return jax.lax.while_loop(
+        lambda state: state[0] < 1, lambda state: (state[0] + 1, function(state[0])), (rounds, otherwise)
+    )[1]
+
+
+@jax.custom_batching.custom_vmap
+def _anywhere(flags: jax.Array) -> jax.Array:
+    """``flags``; in a batch, whether they are true anywhere in it: one answer for all."""
+    return flags
+
+
+@_anywhere.def_vmap
+def _anywhere_in_batch(size: int, batched: list, flags: jax.Array) -> tuple[jax.Array, bool]:
+    del size, batched
+    return _anywhere(jnp.any(flags, axis=0)), False
