@@ -9,7 +9,7 @@ import pytest
 from small_scene import MORE_SPHERES, ORTHOGRAPHIC, small_scene
 
 from jaxrl_vis_envs.compilation import world_jit
-from jaxrl_vis_envs.render import camera, cpu_passes, cpu_search, render_planes, shapes
+from jaxrl_vis_envs.render import camera, cpu_passes, cpu_search, pixel_math, render_planes, shapes
 
 
 @pytest.fixture
@@ -106,3 +106,12 @@ def test_packed_normals_come_back():
     directions = jax.random.normal(jax.random.key(0), (3, 1000)) * jnp.array([[1e-3], [1.0], [30.0]])
     found = jnp.stack(cpu_passes._unpack_normal(cpu_passes._pack_normal(tuple(directions))))
     np.testing.assert_allclose(found, directions / jnp.linalg.norm(directions, axis=0), atol=1e-4)
+
+
+@pytest.mark.parametrize("exponent", [0.0, 0.5, 1.0, 10.0, 64.0, 128.0])
+def test_powers_are_right_to_a_fifth_of_a_grey_level(exponent):
+    base = np.concatenate([np.linspace(0.0, 1.0, 20_001), 1.0 - np.geomspace(1e-7, 1e-2, 1000)]).astype(np.float32)
+    found = jax.jit(pixel_math.power)(base, jnp.float32(exponent))
+    np.testing.assert_allclose(found, np.maximum(base, np.float64(1e-6)) ** exponent, atol=1.0 / 5 / 255)
+    slope = jax.vmap(jax.grad(pixel_math.power), in_axes=(0, None))(base[1:], jnp.float32(exponent))
+    np.testing.assert_allclose(slope, exponent * np.float64(base[1:]) ** (exponent - 1.0), rtol=1e-3, atol=1e-6)

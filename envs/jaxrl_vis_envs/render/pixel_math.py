@@ -1,7 +1,20 @@
 """Arithmetic of single pixels, in as few instructions as the device has for it."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
+import numpy as np
+
+
+def _fitted(values: Callable, degree: int) -> tuple[float, ...]:
+    """The polynomial through a function's values on [0, 1] at the zeros of a Chebyshev polynomial: nearly the best."""
+    nodes = 0.5 + 0.5 * np.cos(np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1))
+    return tuple(np.polyfit(nodes, values(nodes), degree).tolist())
+
+
+_LOG2 = _fitted(lambda x: np.log2(1.0 + x) / x, 5)
+_EXP2 = _fitted(lambda x: 2.0**x, 4)
 
 
 def larger(one: jax.Array, other: jax.Array | float) -> jax.Array:
@@ -21,7 +34,36 @@ def clipped(value: jax.Array) -> jax.Array:
 
 def power(base: jax.Array, exponent: jax.Array) -> jax.Array:
     """``base ** exponent`` [P] for a base in [0, 1], with finite gradients at 0 and vectorised everywhere."""
+    return (_power_of_polynomials if jax.default_backend() == "cpu" else _power)(base, exponent)
+
+
+def _power(base: jax.Array, exponent: jax.Array) -> jax.Array:
     return jnp.exp(exponent * jnp.log(larger(base, 1e-6)))
+
+
+@jax.custom_jvp
+def _power_of_polynomials(base: jax.Array, exponent: jax.Array) -> jax.Array:
+    """`_power` in half the instructions, for exponents up to 128 right to a fifth of a grey level."""
+    bits = jax.lax.bitcast_convert_type(larger(base, 1e-6), jnp.int32)
+    fraction = jax.lax.bitcast_convert_type((bits & 0x7FFFFF) | 0x3F800000, jnp.float32) - 1.0
+    logarithm = ((bits >> 23) - 127).astype(jnp.float32) + fraction * _polynomial(_LOG2, fraction)
+    product = larger(exponent * logarithm, -126.0)
+    whole = jnp.floor(product)
+    scaled = jax.lax.bitcast_convert_type(_polynomial(_EXP2, product - whole), jnp.int32)
+    return jax.lax.bitcast_convert_type(scaled + (whole.astype(jnp.int32) << 23), jnp.float32)
+
+
+@_power_of_polynomials.defjvp
+def _power_slope(primals: tuple, tangents: tuple) -> tuple[jax.Array, jax.Array]:
+    return jax.jvp(_power, primals, tangents)
+
+
+def _polynomial(coefficients: tuple[float, ...], x: jax.Array) -> jax.Array:
+    """The highest power first."""
+    value = jnp.full_like(x, coefficients[0])
+    for coefficient in coefficients[1:]:
+        value = value * x + coefficient
+    return value
 
 
 def reciprocal(value: jax.Array) -> jax.Array:
