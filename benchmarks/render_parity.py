@@ -118,6 +118,7 @@ def main() -> int:
         parser.error(f"no model {', '.join(sorted(unknown))}; there are {', '.join(render_models.MODELS)}")
     kept = json.loads(options.out.read_text()) if options.out.exists() else {"rows": []}
     rows = {row["model"]: row for row in kept["rows"] if row["model"] in render_models.MODELS}
+    versions = render_models.versions()  # first: a package may be missing
     failed = 0
     print(table_head())
     if options.print:
@@ -129,7 +130,7 @@ def main() -> int:
         print(table_row(rows[name]), flush=True)
         ordered = [rows[model] for model in render_models.MODELS if model in rows]
         options.out.parent.mkdir(parents=True, exist_ok=True)
-        options.out.write_text(json.dumps({"versions": render_models.versions(), "rows": ordered}, indent=1) + "\n")
+        options.out.write_text(json.dumps({"versions": versions, "rows": ordered}, indent=1) + "\n")
     return int(failed > 0)
 
 
