@@ -137,10 +137,9 @@ class _Colouring:
         def seeing(rows: list[int], what: Callable, *more: jax.Array | None) -> Callable[[jax.Array], jax.Array]:
             def see(zero: jax.Array) -> jax.Array:
                 # Everything depends on the zero, or XLA would compute and store parts of it for every tile.
-                table, rays, packed = jax.tree.map(
-                    lambda leaf: leaf + zero.astype(leaf.dtype), (self.table, (u, v), (tile.key, *more))
-                )
-                return what(_Seen(rows, table, *rays, packed[0]), *packed[1:])
+                seen, packed = jax.tree.map(lambda leaf: leaf + zero.astype(leaf.dtype), ((self.table, u, v, tile.key), more))
+                table, moved_u, moved_v, key = seen
+                return what(_Seen(rows, table, moved_u, moved_v, key), *packed)
 
             return see
 
