@@ -3,14 +3,16 @@
 import sys
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
 from jaxrl_vis import bench
-from jaxrl_vis.bench import record, render, render_scenes, scene_pictures, warp_renderer
+from jaxrl_vis.bench import record, render, render_operations, render_scenes, scene_pictures, warp_renderer
 from jaxrl_vis.config import RequestError
+from jaxrl_vis_envs.render import Scene
 
 BALL = """
 <mujoco>
@@ -105,9 +107,26 @@ def test_needed_tests_count_the_pixels_of_a_ball_and_every_plane(ball: str) -> N
     poses = {name: np.asarray(getattr(mj_data, name), np.float32)[None] for name in render_scenes.POSES}
     # The ball's edge lies at tan(asin(.2 / 2)) of a picture that reaches to tan(30 degrees).
     disc = np.pi * (np.tan(np.arcsin(0.1)) / np.tan(np.pi / 6)) ** 2 / 4
-    assert render_scenes.needed_tests(mj_model, poses, 128) == pytest.approx(1.0 + disc, abs=2e-3)
+    assert render_scenes.needed_tests(mj_model, poses, 128).tolist() == pytest.approx([1.0, disc], abs=2e-3)
     poses["geom_xpos"][:, 1] = [0.0, -2.0, 0.0]  # behind the camera
-    assert render_scenes.needed_tests(mj_model, poses, 128) == 1.0
+    assert render_scenes.needed_tests(mj_model, poses, 128).tolist() == [1.0, 0.0]
+
+
+def test_operations_are_those_of_the_tests_and_of_one_shading(ball: str) -> None:
+    mj_model = render_scenes.load(ball)
+    scene = Scene.from_mjmodel(mj_model, 0, 8, 8)
+
+    def count(plane: float, ball: float, coloured: bool = True) -> float:
+        found = render_operations.operations_per_pixel(scene, np.array([plane, ball]), coloured)
+        assert found is not None
+        return found
+
+    shading, plane, sphere = count(0, 0), count(1, 0) - count(0, 0), count(0, 1) - count(0, 0)
+    # Of a plane: three products of a ray with an axis, the division, a point, its bounds, and the comparison of keys.
+    assert 20 < plane < 50 < shading
+    assert count(1, 0.5) == pytest.approx(shading + plane + 0.5 * sphere)
+    assert count(1, 0.5) - count(1, 0.5, coloured=False) > 50
+    assert render_operations._count(lambda x, y: jnp.sqrt(x * y + 1.0), *[jax.ShapeDtypeStruct((7919,), jnp.float32)] * 2) == 3
 
 
 def test_pictures_that_do_not_change_are_refused() -> None:

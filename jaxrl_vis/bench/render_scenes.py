@@ -160,8 +160,8 @@ def set_poses(mj_data: mujoco.MjData, poses: dict[str, np.ndarray], index: int) 
         getattr(mj_data, name)[:] = poses[name][index]
 
 
-def needed_tests(mj_model: mujoco.MjModel, poses: dict[str, np.ndarray], size: int) -> float:
-    """Ray-geom tests a pixel that perfect culling by bounding sphere would leave, in the mean over ``poses``.
+def needed_tests(mj_model: mujoco.MjModel, poses: dict[str, np.ndarray], size: int) -> np.ndarray:
+    """Ray-geom tests a pixel that perfect culling by bounding sphere would leave, in the mean over ``poses``; [ngeom] float.
 
     A geom needs a test in every pixel that the projection of its bounding sphere covers; a plane in every one. Geoms that are
     not drawn (their group, or alpha 0) need none.
@@ -180,11 +180,12 @@ def needed_tests(mj_model: mujoco.MjModel, poses: dict[str, np.ndarray], size: i
     radius = mj_model.geom_rbound[round_]
     reach = np.tan(np.deg2rad(mj_model.cam_fovy[0]) / 2)
     middles = (2.0 * np.arange(size) + 1.0 - size) / size * reach
-    tests = 0.0
+    tests = endless.astype(float)
     for u, v in itertools.product(middles, middles):
         # The sphere's centre against the line of the ray (u, v, -1): nearer than the radius, and not wholly behind.
         length = u * u + v * v + 1.0
         along = (x * u + y * v + away) / length
         apart = x * x + y * y + away * away - along * along * length
-        tests += np.count_nonzero((apart <= radius * radius) & (away + radius > 0.0))
-    return float(tests / (len(x) * size * size) + np.count_nonzero(endless))
+        met = (apart <= radius * radius) & (away + radius > 0.0)
+        tests[round_] += np.mean(met, axis=0) / (size * size)
+    return tests

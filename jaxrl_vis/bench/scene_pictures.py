@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from jaxrl_vis.bench import program_memory, render_scenes, roofline
+from jaxrl_vis.bench import program_memory, render_operations, render_scenes
 from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.render import alternate, assert_new_pictures
 from jaxrl_vis.bench.settings import Settings
@@ -95,37 +95,38 @@ def _measure_ours(settings: Settings, config: dict[str, Any], mj_model: mujoco.M
     timing = measure_time(alternate(compiled, some), settings.repeats)
     sample = {name: rows[:_SAMPLE] for name, rows in batches[0].items()}
     needed = render_scenes.needed_tests(mj_model, sample, size)
-    details = _effort(compiled, count * size * size, timing.median_s, needed, len(scene.object_ids))
+    operations = render_operations.operations_per_pixel(scene, needed, coloured=output != "depth")
+    details = _effort(compiled, count * size * size, timing.median_s, float(np.sum(needed)), operations)
+    details["drawn"] = len(scene.object_ids)
     return Measurement("render/scene", count / timing.median_s, "images/s", config, timing.details(compile_s, **details))
 
 
-def _effort(compiled: Any, pixels: int, seconds: float, needed: float, drawn: int) -> dict[str, Any]:
-    """What the figure cost: ray-geom tests, memory, and operations where the compiler counts all of them.
+def _effort(compiled: Any, pixels: int, seconds: float, tests: float, operations: float | None) -> dict[str, Any]:
+    """What the figure cost: ray-geom tests, operations, and memory.
 
     Args:
         compiled: The program.
         pixels: Of all pictures together.
         seconds: Of one call.
-        needed: Tests a pixel that perfect culling would leave.
-        drawn: Objects, which is the tests a pixel without culling.
+        tests: A pixel, which perfect culling would leave.
+        operations: A pixel, which these tests and the shading take (`render_operations`); None where that is not known.
     """
     effort: dict[str, Any] = {
-        "drawn": drawn,
-        "needed_tests_per_pixel": round(needed, 2),
-        "needed_gtests_per_s": round(1e-9 * needed * pixels / seconds, 2),
+        "needed_tests_per_pixel": round(tests, 2),
+        "needed_gtests_per_s": round(1e-9 * tests * pixels / seconds, 2),
     }
+    if operations is not None:
+        effort["needed_operations_per_pixel"] = round(operations)
+        effort["needed_tflop_per_s"] = round(1e-12 * operations * pixels / seconds, 4)
+        kind = jax.devices()[0].device_kind
+        peak = next((peak for name, peak in _VECTOR_PEAKS.items() if kind.startswith(name)), None)
+        if peak is not None:
+            effort["share_of_peak_flops"] = round(operations * pixels / seconds / peak, 4)
     memory = compiled.memory_analysis()
     if memory is not None and memory.output_size_in_bytes:
         output = memory.output_size_in_bytes
         effort["temporaries_over_output"] = round(memory.temp_size_in_bytes / output, 3)
         effort["largest_temporary_over_output"] = round(program_memory.largest_temporary(compiled) / output, 3)
-    cost = roofline.compiler_cost(compiled)
-    # On a CPU the pictures are drawn block by block, and the body of a loop is counted once.
-    if cost is not None and jax.default_backend() != "cpu":
-        effort["tflop_per_s"] = round(1e-12 * cost.flops / seconds, 3)
-        peak = next((peak for name, peak in _VECTOR_PEAKS.items() if jax.devices()[0].device_kind.startswith(name)), None)
-        if peak is not None:
-            effort["share_of_peak_flops"] = round(cost.flops / seconds / peak, 4)
     return effort
 
 

@@ -1,0 +1,74 @@
+"""The least arithmetic that a picture takes: what perfect culling would leave, counted in the renderer's own functions.
+
+A compiler counts what it compiled: tests that a kernel skips, and nothing of the kernel itself. Here every operation on a pixel
+counts as one (so a fused multiply-add as two, and a square root as one), once per pixel and object that has to be tested, and
+once per pixel for what follows: depth, normal, texture and colour. What is done once per environment does not count.
+"""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxrl_vis_envs.render import Scene, camera, lights, raycast, shade, shapes, surface
+
+# So many pixels are traced: a length that nothing else has.
+_PIXELS = 7919
+# Copies, views and choices of memory, which are no arithmetic.
+_MOVES = {"broadcast_in_dim", "squeeze", "reshape", "slice", "dynamic_slice", "concatenate", "gather", "iota", "transpose"}
+
+
+def operations_per_pixel(scene: Scene, tests: np.ndarray, coloured: bool = True) -> float | None:
+    """Operations for one pixel of a picture.
+
+    Args:
+        scene: The scene; what haze, shadows and transparent objects take is left out.
+        tests: [ngeom] float, how often each geom is tested per pixel, see `render_scenes.needed_tests`.
+        coloured: Whether colours are wanted; else depth alone, which the tests themselves give.
+
+    Returns:
+        The operations, or None for a scene with triangles, whose tests are not counted.
+    """
+    if {shapes.MESH, shapes.HFIELD} & set(scene.object_types):
+        return None
+    pixels = jax.ShapeDtypeStruct((_PIXELS,), jnp.float32)
+    count = len(scene.object_ids)
+    unit = shapes.UnitShapes(*(jnp.ones((count, *shape)) for shape in ((3,), (3, 3), (), (), (4,))))
+    total = 0.0
+    for row, geom in enumerate(scene.object_ids):
+
+        def test(u: jax.Array, v: jax.Array, best: jax.Array, row: int = row) -> jax.Array:
+            return jnp.minimum(best, raycast.object_key(scene, unit, row, u, v, best, raycast.code_mask(scene)))
+
+        keys = jax.ShapeDtypeStruct((_PIXELS,), jnp.int32)
+        total += float(tests[geom]) * _count(test, pixels, pixels, keys)
+    total += _count(lambda u, v: camera.ray_parts(scene, u, v)[2], pixels, pixels)
+    if not coloured:
+        return total
+    columns = surface.object_table(scene, unit).shape[1]
+
+    def finish(values: list[jax.Array], table: jax.Array, u: jax.Array, v: jax.Array, depth: jax.Array) -> Any:
+        row = surface.row_of(values)
+        hit = surface.meet(scene, row, None, u, v, depth)
+        return hit.depth, shade.shade(scene, unit, lights.unpack(scene, table), row, hit, u, v)
+
+    table = jax.ShapeDtypeStruct((len(lights.facts(scene)), 20), jnp.float32)
+    return total + _count(finish, [pixels] * columns, table, pixels, pixels, pixels)
+
+
+def _count(function: Callable, *arguments: Any) -> int:
+    """Operations of a function on single pixels."""
+    equations = _equations(jax.make_jaxpr(function)(*arguments).jaxpr)
+    return sum(found.primitive.name not in _MOVES and _PIXELS in found.outvars[0].aval.shape for found in equations)
+
+
+def _equations(jaxpr: Any) -> Iterator[Any]:
+    """Of a jaxpr and of the functions that it calls."""
+    for equation in jaxpr.eqns:
+        inner = [value for value in equation.params.values() if hasattr(value, "jaxpr") or hasattr(value, "eqns")]
+        if not inner:
+            yield equation
+        for value in inner:
+            yield from _equations(getattr(value, "jaxpr", value))
