@@ -105,9 +105,11 @@ def _tiles(
         return (number + 1, tile, keys, colours), None
 
     count = len(u)
-    empty, results = jnp.zeros(u.shape[1:], jnp.int32), jnp.zeros(u.shape, jnp.int32)
+    empty = jnp.zeros(u.shape[1:], jnp.int32)
+    # Zeros that XLA does not know to be the same: it would fill one array on one core, and copy it.
+    results = [jnp.zeros(u.shape, jnp.int32) + (0.0 * unit.origin[0, axis]).astype(jnp.int32) for axis in range(2)]
     first = _Tile(empty, empty, cpu_search.memory(scene, empty), empty, empty)
-    (_, last, keys, colours), _ = jax.lax.scan(draw_tile, (jnp.int32(0), first, results, results), (u, v, seen))
+    (_, last, keys, colours), _ = jax.lax.scan(draw_tile, (jnp.int32(0), first, *results), (u, v, seen))
     return keys.at[count - 1].set(last.key), colours.at[count - 1].set(last.colour)
 
 

@@ -5,6 +5,7 @@ frame. What is left per pixel and object is a ray that is linear in the pixel's 
 is in a few small tables whose rows are the drawn objects, which is what any other way to find the nearest hit needs too.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -62,9 +63,10 @@ def unit_shapes(
     finite = camera_finite & jnp.all(jnp.isfinite(position), -1) & jnp.all(jnp.isfinite(rotation), (-2, -1))
     position = jnp.where(finite[:, None], position, 0.0)
     rotation = jnp.where(finite[:, None, None], rotation, 0.0)
-    # Written out rather than as matrix products, which accelerators would do at low precision.
-    offset = jnp.sum((position - camera_position)[:, :, None] * camera_rotation, axis=1)  # [G, 3] in the camera's frame
-    relative = jnp.sum(rotation[:, :, :, None] * camera_rotation[None, :, None, :], axis=1)  # [G, shape axis, camera axis]
+    # Written out rather than as matrix products, which accelerators would do at low precision, and a CPU on one core.
+    away = position - camera_position
+    offset = _added(lambda k: away[:, k, None] * camera_rotation[k])  # [G, 3] in the camera's frame
+    relative = _added(lambda k: rotation[:, k, :, None] * camera_rotation[k])  # [G, shape axis, camera axis]
     offset = jnp.where(finite[:, None], offset, jnp.array([0.0, 0.0, _BEHIND]))
     relative = jnp.where(finite[:, None, None], relative, jnp.eye(3))
 
@@ -74,12 +76,17 @@ def unit_shapes(
     bare = np.array(scene.atlas.mappings)[:, None] == 0
     relative = jnp.where(((kinds == SPHERE) & bare)[:, :, None], jnp.eye(3), relative)
     axes = relative / half[:, :, None]
-    origin = -jnp.sum(axes * offset[:, None, :], axis=-1)
+    origin = -_added(lambda k: axes[:, :, k] * offset[:, k, None])
     capsules = kinds[:, 0] == CAPSULE
     # Where: a size that means nothing for a type may be 0.
     extra = jnp.where(capsules, size[:, 1] / jnp.where(capsules, size[:, 0], 1.0), size[:, 0])
     ball = jnp.concatenate([offset, _radii(kinds[:, 0], size)[:, None]], axis=1)
     return UnitShapes(origin, axes, extra, jnp.square(size[:, 0]), ball)
+
+
+def _added(term: Callable[[int], jax.Array]) -> jax.Array:
+    """The sum of the terms 0, 1 and 2."""
+    return term(0) + term(1) + term(2)
 
 
 def _half_sizes(kinds: np.ndarray, size: jax.Array) -> jax.Array:
