@@ -278,7 +278,7 @@ def test_the_learner_asks_for_it() -> None:
 
 def test_a_learner_trains_in_worlds_that_vary() -> None:
     """Every episode starts at the same place and looks different; learning goes on, and repeats itself bit for bit."""
-    settings = {"num_envs": 4, "replay_transitions": 40, "updates_per_iteration": 2, "batch_size": 16}
+    settings = {"num_envs": 4, "replay_transitions": 40, "updates_per_iteration": 2, "batch_size": 16, "eval_episodes": 2}
     program = make_train_step(make(ALL), preset("debug", **settings))
 
     def train() -> tuple[Any, list[Any]]:
@@ -295,3 +295,6 @@ def test_a_learner_trains_in_worlds_that_vary() -> None:
     assert all(np.isfinite(value).all() and row["guard/nonfinite"] == 0 for row in rows for value in row.values())
     assert int(loop.train.updates[0]) == 4
     assert jax.tree.all(jax.tree.map(np.array_equal, rows, again))
+    outcome, recording = program.evaluate(loop.train, jax.random.key(1))
+    assert np.isfinite(outcome["eval/goal_distance"]).all()
+    assert len({frames[0].tobytes() for frames in np.asarray(recording["frames"][0])}) == settings["eval_episodes"]

@@ -18,18 +18,21 @@ import numpy as np
 from jaxrl_vis_envs.render import blocks, camera, raycast, shapes
 from jaxrl_vis_envs.render.scene import Scene
 
-# A picture has so many tiles across and down; a smaller one than this has two strips, because each tile costs some
-# microseconds for each object.
+# So many tiles across and down. Each costs some microseconds for each object, and smaller pictures than this would lose by it.
 _TILES = 4
 _LEAST_PIXELS = 48 * 48
 
 
+def _culls(scene: Scene) -> bool:
+    """Whether each object is looked for where it may be seen; otherwise `raycast.nearest_key` finds them all."""
+    return not blocks.tiled(scene) and scene.height * scene.width >= _LEAST_PIXELS
+
+
 def layout(scene: Scene) -> blocks.Layout:
     """The tiles of the picture."""
-    if blocks.tiled(scene):
+    if not _culls(scene):
         return blocks.layout(scene)
-    down, across = (_TILES, _TILES) if scene.height * scene.width >= _LEAST_PIXELS else (2, 1)
-    high, wide = (blocks.near_divisor(n, -(-n // parts)) for n, parts in ((scene.height, down), (scene.width, across)))
+    high, wide = (blocks.near_divisor(pixels, -(-pixels // _TILES)) for pixels in (scene.height, scene.width))
     return blocks.tiles(scene, high, wide)
 
 
@@ -56,7 +59,7 @@ def solids(scene: Scene) -> list[int]:
 
 def memory(scene: Scene, plane: jax.Array) -> tuple[jax.Array, ...]:
     """``plane`` [P] int32 for each object whose keys `nearest_key` keeps."""
-    return () if blocks.tiled(scene) else (plane,) * len(solids(scene))
+    return (plane,) * len(solids(scene)) if _culls(scene) else ()
 
 
 def nearest_key(
@@ -82,7 +85,7 @@ def nearest_key(
     Returns:
         The keys [P] int32, and the memory for the next tile.
     """
-    if blocks.tiled(scene):
+    if not _culls(scene):
         return raycast.nearest_key(scene, unit, u, v, labelled), own
     mask = raycast.code_mask(scene) if labelled else 0
     sky = raycast.sky_key(scene, mask)
