@@ -33,7 +33,7 @@ def ball(tmp_path: Path) -> str:
     return str(path)
 
 
-@pytest.mark.parametrize(("scene", "geoms"), [("finger", 8), ("fetch_reach", 18), ("primitives", 127)])
+@pytest.mark.parametrize(("scene", "geoms"), [("finger", 8), ("fetch_reach", 19), ("primitives", 127)])
 def test_scenes_load_ready_for_a_fair_comparison(scene: str, geoms: int) -> None:
     mj_model = render_scenes.load(scene)
     assert mj_model.ngeom == geoms

@@ -29,7 +29,7 @@ def reach(
     Damped least squares from ``start``, weighted by the joints' mobilities (1/damping), which is the way the physics takes.
 
     Args:
-        mj_model: The model; every joint is a hinge on the way to ``body``.
+        mj_model: The model; the joints on the way to ``body`` are hinges. Others stay as they are.
         model: The same for MJX.
         start: Where the arm comes from.
         body: The last link.
@@ -60,11 +60,12 @@ def _step(
 ) -> jax.Array:
     """Change of joint angles [nv] (rad) that brings ``body`` nearer to ``target`` [3] (m, world) and ``rotation`` [3, 3]."""
     position = data.xpos[body]
-    jacobian = jnp.concatenate([mjx_model.hinge_jacobian(data, position), data.xaxis], axis=1)  # [nv, 6]
+    jacobian = mjx_model.hinge_jacobian(mj_model, data, body, position)
     # Half the sum of cross products is the rotation vector to first order; its exact length does not matter here.
     turn = 0.5 * jnp.sum(jnp.cross(data.xmat[body].T, jnp.asarray(rotation.T, jnp.float32)), axis=0)
     error = jnp.concatenate([target - position, turn])
-    mobility = jnp.asarray(mj_model.dof_damping.max() / mj_model.dof_damping, jnp.float32)
+    carries = mjx_model.carriers(mj_model, body)
+    mobility = jnp.asarray(mj_model.dof_damping[carries].max() / mj_model.dof_damping, jnp.float32)
     regularizer = jnp.diag(jnp.asarray(damping, jnp.float32))
 
     def solve(error: jax.Array, mobility: jax.Array) -> jax.Array:

@@ -45,9 +45,7 @@ def simulate(model: mjx.Model, data: mjx.Data, substeps: int, exact: bool = Fals
     `mjx.step` leaves the poses of the state *before* its last integration, so `kinematics` is needed once more for the
     picture, the true state and ``qpos`` to agree.
     """
-    data = take_steps(model, data, substeps, exact)
-    with _full_precision():
-        return kinematics(model, data)
+    return kinematics(model, take_steps(model, data, substeps, exact))
 
 
 def take_steps(model: mjx.Model, data: mjx.Data, count: int, exact: bool = False) -> mjx.Data:
@@ -182,27 +180,29 @@ def _polish(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     )
 
 
+def carriers(mj_model: mujoco.MjModel, body: int) -> np.ndarray:
+    """Which joints of a tree of joints of one degree of freedom move ``body``: [nv] bool."""
+    moves = np.zeros(mj_model.nv, bool)
+    while body > 0:
+        first, count = mj_model.body_jntadr[body], mj_model.body_jntnum[body]
+        moves[first : first + count] = True
+        body = mj_model.body_parentid[body]
+    return moves
+
+
 def tip_jacobian(mj_model: mujoco.MjModel, data: mjx.Data, sites: np.ndarray) -> jax.Array:
     """Change of the positions of ``sites`` [S] (m, world) per radian of each hinge of a tree: [nv, S, 3] float32, m/rad."""
-    moves = np.zeros((mj_model.nv, len(sites)), np.float32)
-    for column, site in enumerate(sites):
-        body = mj_model.site_bodyid[site]
-        while body > 0:
-            first, count = mj_model.body_jntadr[body], mj_model.body_jntnum[body]
-            moves[first : first + count, column] = 1.0
-            body = mj_model.body_parentid[body]
+    moves = np.stack([carriers(mj_model, mj_model.site_bodyid[site]) for site in sites], axis=1)
     arms = data.site_xpos[sites][None] - data.xanchor[:, None]
-    return jnp.asarray(moves)[..., None] * jnp.cross(data.xaxis[:, None], arms)
+    return jnp.where(moves[..., None], jnp.cross(data.xaxis[:, None], arms), 0.0)
 
 
-def point_velocity(data: mjx.Data, point: jax.Array) -> jax.Array:
-    """Velocity of a ``point`` [3] (m, world) that moves with the last link of a chain of hinges: [3] float32, m/s.
-
-    Valid where every joint of the model is a hinge that carries the point.
-    """
-    return data.qvel @ hinge_jacobian(data, point)
+def point_velocity(mj_model: mujoco.MjModel, data: mjx.Data, body: int, point: jax.Array) -> jax.Array:
+    """Velocity of a ``point`` [3] (m, world) that moves with ``body``, which hinges carry: [3] float32, m/s."""
+    return data.qvel @ hinge_jacobian(mj_model, data, body, point)[:, :3]
 
 
-def hinge_jacobian(data: mjx.Data, point: jax.Array) -> jax.Array:
-    """Change of a ``point`` [3] (m, world) per radian of each hinge: [nv, 3] float32, m/rad; conditions of `point_velocity`."""
-    return jnp.cross(data.xaxis, point - data.xanchor)
+def hinge_jacobian(mj_model: mujoco.MjModel, data: mjx.Data, body: int, point: jax.Array) -> jax.Array:
+    """Change of a ``point`` [3] (m, world) of ``body`` (m/rad), and its turn, per radian of each hinge: [nv, 6] float32."""
+    moves = carriers(mj_model, body)[:, None]
+    return jnp.where(moves, jnp.concatenate([jnp.cross(data.xaxis, point - data.xanchor), data.xaxis], axis=1), 0.0)

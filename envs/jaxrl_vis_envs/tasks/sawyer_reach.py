@@ -129,7 +129,8 @@ class SawyerReach(MjxGoalEnv):
     def observe_state(self, data: mjx.Data) -> jax.Array:
         """Position of the grip (m), its displacement in a control step at its present speed (m): [6] float32."""
         position = data.site_xpos[self._grip]
-        return jnp.concatenate([position, self.control_period * mjx_model.point_velocity(data, position)])
+        velocity = mjx_model.point_velocity(self.mj_model, data, self._hand, position)
+        return jnp.concatenate([position, self.control_period * velocity])
 
     def goal_configuration(self, goal: jax.Array) -> mjx.Data:
         """The arm at rest with its grip at or near ``goal`` [3] (m, world), the hand down."""
