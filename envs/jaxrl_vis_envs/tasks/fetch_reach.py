@@ -136,7 +136,7 @@ class FetchReach(MjxGoalEnv):
     def goal_configuration(self, goal: jax.Array) -> mjx.Data:
         """The robot at rest with its grip as near to ``goal`` [3] (m, world) as joints and table let it, the gripper down.
 
-        The joint angles agree with those after driving the arm there for 200 substeps within .002 rad in the median and .04
+        The joint angles agree with those after driving the arm there for 200 substeps within .002 rad in the median and .02
         rad at the 99th percentile of 300 goals, and a reset costs a hundredth.
         """
         fingertip = self.mj_model.geom("right_fingertip").id
