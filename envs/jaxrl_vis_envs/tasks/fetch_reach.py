@@ -52,14 +52,12 @@ class FetchReachConfig:
     substeps: int = 20
     """Physics steps in a control step of 40 ms (20 is the original's 2 ms; 10 is nearly twice as fast)."""
     solver_iterations: int = 4
-    """Newton iterations in a physics step, at most. One is enough in the air, but not where the fingers rub on the table."""
-    line_search_iterations: int = 6
-    """Line search iterations in a Newton iteration, at most."""
+    """Newton iterations in a physics step. One is enough in the air, but not where the fingers rub on the table."""
     randomization: Randomization = OFF
     """What varies between episodes, and how far."""
 
     def __post_init__(self) -> None:
-        for field in ("horizon", "solver_iterations", "line_search_iterations"):
+        for field in ("horizon", "solver_iterations"):
             if getattr(self, field) < 1:
                 raise ValueError(f"{field} must be at least 1, got {getattr(self, field)}")
         if self.substeps < 4:
@@ -95,7 +93,6 @@ class FetchReach(MjxGoalEnv):
         """
         mj_model = mjx_model.load_model("fetch_reach.xml")
         mj_model.opt.iterations = config.solver_iterations
-        mj_model.opt.ls_iterations = config.line_search_iterations
         self.control_period = _CONTROL_PERIOD
         self._gripper = mj_model.body("gripper").id
         self._grip = mj_model.site("grip").id

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from jaxrl_vis_envs.tasks import newton
 from jaxrl_vis_envs.tasks.kinematics import kinematics
 from jaxrl_vis_envs.tasks.quiet_mjx import math, mjx, sensor, smooth, solver
 
@@ -76,6 +77,8 @@ def step(model: mjx.Model, data: mjx.Data, exact: bool = True) -> mjx.Data:
     first digit. One more Newton step, judged by the gradient, leaves the rounding error.
     """
     if model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER:
+        if newton.fits(model):
+            return newton.euler(model, _forward(model, data, exact))
         return mjx.euler(model, _one_factorization_at_a_time(_forward(model, data, exact)))
     if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 and model.na == 0 and model.nq == model.nv:
         return _runge_kutta_4(model, data, exact)
@@ -86,7 +89,9 @@ def _forward(model: mjx.Model, data: mjx.Data, exact: bool) -> mjx.Data:
     """`mjx.forward`: accelerations from positions, velocities and controls; for ``exact`` see `step`."""
     data = smooth.com_pos(model, kinematics(model, data))
     data = smooth.crb(model, smooth.tendon(model, data))
-    data = smooth.factor_m(model, smooth.tendon_armature(model, data))
+    data = smooth.tendon_armature(model, data)
+    is_small = newton.fits(model)
+    data = data if is_small else smooth.factor_m(model, data)
     data = mjx.collision(model, data)
     pairs = np.stack([model.pair_geom1, model.pair_geom2])
     if exact and np.any(np.all(model.geom_type[pairs] == mujoco.mjtGeom.mjGEOM_CAPSULE, axis=0)):
@@ -94,10 +99,10 @@ def _forward(model: mjx.Model, data: mjx.Data, exact: bool) -> mjx.Data:
     data = smooth.transmission(model, mjx.make_constraint(model, data))
     data = mjx.fwd_velocity(model, sensor.sensor_pos(model, data))
     data = mjx.fwd_actuation(model, sensor.sensor_vel(model, data))
-    data = mjx.fwd_acceleration(model, data)
+    data = newton.accelerate(model, data) if is_small else mjx.fwd_acceleration(model, data)
     if data._impl.nefc == 0:
         return data.replace(qacc=data.qacc_smooth)
-    data = mjx.solve(model, data)
+    data = newton.solve(model, data) if is_small else mjx.solve(model, data)
     return sensor.sensor_acc(model, _polish(model, data) if exact else data)
 
 

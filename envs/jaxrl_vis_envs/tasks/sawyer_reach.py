@@ -54,13 +54,11 @@ class SawyerReachConfig:
     """Physics steps in a control step of 40 ms (20 as in the authors' simulation; 10 is nearly twice as fast)."""
     solver_iterations: int = 1
     """Newton iterations in a physics step."""
-    line_search_iterations: int = 4
-    """Line search iterations in a Newton iteration."""
     randomization: Randomization = OFF
     """What varies between episodes, and how far."""
 
     def __post_init__(self) -> None:
-        for field in ("horizon", "solver_iterations", "line_search_iterations"):
+        for field in ("horizon", "solver_iterations"):
             if getattr(self, field) < 1:
                 raise ValueError(f"{field} must be at least 1, got {getattr(self, field)}")
         if self.substeps < 4:
@@ -100,7 +98,6 @@ class SawyerReach(MjxGoalEnv):
         """
         mj_model = mjx_model.load_model("sawyer_reach.xml")
         mj_model.opt.iterations = config.solver_iterations
-        mj_model.opt.ls_iterations = config.line_search_iterations
         self.control_period = _CONTROL_PERIOD
         self._hand = mj_model.body("hand").id
         self._grip = mj_model.site("grip").id

@@ -1,0 +1,88 @@
+"""The constraint solver for small trees against MJX, NumPy and brute force."""
+
+import copy
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from benchmarks import worlds
+from jaxrl_vis_envs.compilation import world_jit
+from jaxrl_vis_envs.tasks import mjx_model, newton
+from jaxrl_vis_envs.tasks.mjx_model import mjx
+
+
+def test_the_solution_of_small_systems():
+    rng = np.random.default_rng(0)
+    roots = rng.normal(size=(50, 9, 9))
+    matrices = roots @ roots.transpose(0, 2, 1) + 0.1 * np.eye(9)
+    truth = rng.normal(size=(50, 9))
+    right = np.einsum("bij,bj->bi", matrices, truth)
+    solved = jax.jit(jax.vmap(newton.solve_positive))(jnp.asarray(matrices, jnp.float32), jnp.asarray(right, jnp.float32))
+    np.testing.assert_allclose(solved, truth, atol=2e-3)
+
+
+def test_the_line_search_finds_the_least_cost():
+    """Over parabolas of 1 to 12 constraints, some of them equalities, some that the line does not touch."""
+    rng = np.random.default_rng(1)
+    lengths = np.linspace(0, 40, 400_001)
+    for rows in (1, 3, 12) * 8:
+        residual, along = rng.normal(size=(2, rows))
+        along[rng.random(rows) < 0.2] = 0.0
+        stiffness, is_equality = rng.uniform(0.1, 10, rows), rng.random(rows) < 0.3
+        second = rng.uniform(0.1, 1)
+        slope = np.where(is_equality | (residual < 0), stiffness, 0) @ (residual * along)
+        first = -abs(rng.normal()) - max(slope, 0.0)  # downhill at the start, as Newton's direction is
+        found = newton._line_search(*map(jnp.float32, (residual, along, stiffness)), is_equality, first, second)
+        there = residual[:, None] + along[:, None] * lengths
+        acting = np.where(is_equality[:, None] | (there < 0), stiffness[:, None], 0)
+        costs = first * lengths + 0.5 * second * lengths**2 + 0.5 * (acting * there**2).sum(axis=0)
+        assert float(found) == pytest.approx(lengths[costs.argmin()], abs=1e-3)
+
+
+def test_a_step_is_that_of_mjx():
+    """With forces from outside, from configurations beyond the limits of the joints and with the fingers in the table."""
+    env = worlds.make("FetchReach")
+    mj_model = copy.copy(env.mj_model)
+    mj_model.opt.iterations, mj_model.opt.ls_iterations = 20, 20
+    model, start = mjx.put_model(mj_model), env.sample_start(jax.random.key(0))
+    assert newton.fits(model)
+    rng = np.random.default_rng(2)
+    count = 16
+    qpos = np.asarray(start.qpos) + rng.normal(0, 0.2, (count, model.nv)) * (np.arange(model.nv) < 7)
+    qpos[: count // 2, 1] += 0.25  # the shoulder, down
+    numbers = {
+        "qpos": qpos,
+        "qvel": rng.normal(0, 0.5, (count, model.nv)),
+        "qfrc_applied": rng.normal(0, 5, (count, model.nv)),
+        "xfrc_applied": rng.normal(0, 5, (count, model.nbody, 6)),
+    }
+    data = jax.vmap(lambda varied: start.replace(**varied))({name: jnp.float32(value) for name, value in numbers.items()})
+    ours = world_jit(jax.vmap(lambda data: mjx_model.step(model, data, exact=False)))(data)
+    theirs = world_jit(jax.vmap(lambda data: mjx.step(model, data)))(data)
+    forces = np.abs(theirs._impl.efc_force)
+    assert (forces[:, :6] > 0).all()  # the weld
+    assert (forces[:, 6:] > 0).any(axis=0).sum() > 12  # limits and contacts
+    scale = np.abs(theirs.qvel).max(axis=1, keepdims=True)
+    assert (np.abs(theirs.qvel - data.qvel) / scale).max() > 0.1
+    np.testing.assert_allclose(ours.qvel / scale, theirs.qvel / scale, atol=2e-4)
+    np.testing.assert_allclose(ours.qpos, theirs.qpos, atol=1e-5)
+    np.testing.assert_allclose(ours.time, theirs.time)
+
+
+@pytest.mark.parametrize(
+    ("joint", "option", "fits"),
+    [
+        ('<joint type="hinge"/>', "", True),
+        ('<joint type="hinge" frictionloss="1"/>', "", False),
+        ('<joint type="hinge"/>', 'cone="elliptic"', False),
+        ('<joint type="hinge"/>', 'solver="CG"', False),
+        ("<freejoint/>", "", False),
+    ],
+)
+def test_what_is_not_small_and_simple_is_left_to_mjx(joint, option, fits):
+    body = f'<body>{joint}<geom type="sphere" size=".1"/></body>'
+    xml = f"<mujoco><option {option}/><worldbody>{body}</worldbody></mujoco>"
+    assert newton.fits(mjx.put_model(mujoco.MjModel.from_xml_string(xml))) is fits
