@@ -42,6 +42,13 @@ def test_the_line_search_finds_the_least_cost():
         assert float(found) == pytest.approx(lengths[costs.argmin()], abs=1e-3)
 
 
+def test_nothing_moves_where_nothing_pulls():
+    """As where no constraint acts: the direction is 0, and so is the curvature along it."""
+    still = jnp.zeros(2)
+    length = newton._line_search(still, still, jnp.ones(2), np.array([False, True]), jnp.float32(0), jnp.float32(0))
+    assert np.isfinite(length)
+
+
 def test_a_step_is_that_of_mjx():
     """With forces from outside, from configurations beyond the limits of the joints and with the fingers in the table."""
     env = worlds.make("FetchReach")
@@ -51,8 +58,12 @@ def test_a_step_is_that_of_mjx():
     assert newton.fits(model)
     rng = np.random.default_rng(2)
     count = 16
-    qpos = np.asarray(start.qpos) + rng.normal(0, 0.2, (count, model.nv)) * (np.arange(model.nv) < 7)
-    qpos[: count // 2, 1] += 0.25  # the shoulder, down
+    arm, fingers = slice(0, 7), slice(7, 9)
+    qpos = np.tile(np.asarray(start.qpos, np.float64), (count, 1))
+    qpos[:, fingers] += rng.normal(0, 0.002, (count, 2))
+    qpos[::2, arm] += rng.normal(0, 0.03, (count // 2, 7))
+    qpos[::2, 1] += np.linspace(0.1, 0.3, count // 2)  # the shoulder, down
+    qpos[1::2, arm] += rng.normal(0, 1.0, (count // 2, 7))
     numbers = {
         "qpos": qpos,
         "qvel": rng.normal(0, 0.5, (count, model.nv)),
@@ -64,7 +75,8 @@ def test_a_step_is_that_of_mjx():
     theirs = world_jit(jax.vmap(lambda data: mjx.step(model, data)))(data)
     forces = np.abs(theirs._impl.efc_force)
     assert (forces[:, :6] > 0).all()  # the weld
-    assert (forces[:, 6:] > 0).any(axis=0).sum() > 12  # limits and contacts
+    assert (forces[:, 6:12] > 0).any(axis=0).sum() >= 4  # limits, those of the fingers too
+    assert forces[:, 12:18].any() and forces[:, 18:].any()  # contacts of both fingers
     scale = np.abs(theirs.qvel).max(axis=1, keepdims=True)
     assert (np.abs(theirs.qvel - data.qvel) / scale).max() > 0.1
     np.testing.assert_allclose(ours.qvel / scale, theirs.qvel / scale, atol=2e-4)

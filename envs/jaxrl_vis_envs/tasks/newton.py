@@ -94,7 +94,7 @@ def _line_search(
         stiffness: [R].
         is_equality: [R] bool.
         first: The rest of the cost is ``first * length + second * length**2 / 2``.
-        second: Positive.
+        second: Not negative.
     """
 
     def slope_at(length: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -112,7 +112,7 @@ def _line_search(
     after = jnp.min(jnp.where(is_after, corners, jnp.inf))
     middle = jnp.where(jnp.isfinite(after), 0.5 * (before + after), before + 1.0)
     slope, curvature = slope_at(middle)
-    return middle - slope / curvature
+    return middle - slope / jnp.where(curvature > 0, curvature, 1.0)  # 0 where there is no way to go
 
 
 def solve_positive(matrix: jax.Array, right: jax.Array) -> jax.Array:
