@@ -82,7 +82,7 @@ class FetchReach(MjxGoalEnv):
     action_size = 4
     camera = "front"
     distance_unit = "m"
-    chance, difficulty = 0.009, 2.8  # benchmarks/task_difficulty.py FetchReach --episodes 1000
+    chance, difficulty = 0.008, 2.8  # benchmarks/task_difficulty.py FetchReach --episodes 1000
 
     def __init__(self, config: FetchReachConfig, observer: Callable[[mujoco.MjModel], Observer] | None = None):
         """Builds the model and finds the start.
