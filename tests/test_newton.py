@@ -89,12 +89,13 @@ def test_a_step_is_that_of_mjx():
     [
         ('<joint type="hinge"/>', "", True),
         ('<joint type="hinge" frictionloss="1"/>', "", False),
-        ('<joint type="hinge"/>', 'cone="elliptic"', False),
-        ('<joint type="hinge"/>', 'solver="CG"', False),
+        ('<joint type="hinge"/>', '<option cone="elliptic"/>', False),
+        ('<joint type="hinge"/>', '<option solver="CG"/>', False),
         ("<freejoint/>", "", False),
+        ('<joint type="hinge"/>', '<option><flag eulerdamp="disable"/></option>', False),
     ],
 )
 def test_what_is_not_small_and_simple_is_left_to_mjx(joint, option, fits):
     body = f'<body>{joint}<geom type="sphere" size=".1"/></body>'
-    xml = f"<mujoco><option {option}/><worldbody>{body}</worldbody></mujoco>"
+    xml = f"<mujoco>{option}<worldbody>{body}</worldbody></mujoco>"
     assert newton.fits(mjx.put_model(mujoco.MjModel.from_xml_string(xml))) is fits

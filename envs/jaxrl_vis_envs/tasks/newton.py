@@ -22,12 +22,14 @@ _MOST_JOINTS = 12
 def fits(model: mjx.Model) -> bool:
     """Whether the functions here can take the place of MJX's.
 
-    They can for few joints of one degree of freedom, pyramidal cones, no friction in joints or tendons and no activations.
+    They can for few joints of one degree of freedom, pyramidal cones, no friction in joints or tendons, no activations, and
+    with implicit damping and warm starts, as is MuJoCo's default.
     """
+    defaults = mujoco.mjtDisableBit.mjDSBL_EULERDAMP | mujoco.mjtDisableBit.mjDSBL_WARMSTART
     is_newton = model.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON and model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
     is_small = model.nq == model.nv <= _MOST_JOINTS and model.na == 0
     has_friction = np.any(model._impl.dof_hasfrictionloss) or np.any(model._impl.tendon_hasfrictionloss)
-    return bool(is_newton and is_small and not has_friction)
+    return bool(is_newton and is_small and not has_friction and not model.opt.disableflags & defaults)
 
 
 def accelerate(model: mjx.Model, data: mjx.Data) -> mjx.Data:
