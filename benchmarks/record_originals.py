@@ -62,14 +62,18 @@ def gymnasium_task(identifier: str, read: Callable) -> Callable[[np.ndarray], di
 
 
 def fetch_reach() -> Callable[[np.ndarray], dict[str, np.ndarray]]:
+    """A recorder of the grip: [N, T + 1, 3] m."""
     return gymnasium_task("FetchReach-v4", lambda env: {"grip_pos_m": env._get_obs()["achieved_goal"]})
 
 
 def hand_reach() -> Callable[[np.ndarray], dict[str, np.ndarray]]:
+    """A recorder of the fingertips, [N, T + 1, 15] m, and the joints, [N, T + 1, 24] rad."""
     return gymnasium_task("HandReach-v3", lambda env: {"tip_pos_m": env._get_obs()["achieved_goal"], "qpos": env.data.qpos})
 
 
 def reacher() -> Callable[[np.ndarray], dict[str, np.ndarray]]:
+    """A recorder of the two joints, [N, T + 1, 2] rad and rad/s, and the fingertip, [N, T + 1, 3] m."""
+
     def read(env) -> dict[str, np.ndarray]:
         joints = {"qpos_rad": env.data.qpos[:2], "qvel_rad_s": env.data.qvel[:2]}
         return joints | {"fingertip_pos_m": env.get_body_com("fingertip")}

@@ -62,11 +62,11 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     def improve(acceleration: jax.Array, _: None) -> tuple[jax.Array, None]:
         residual = jacobian @ acceleration - target
         acting = pulls(residual)
-        slope = mass @ acceleration - data.qfrc_smooth + (acting * residual) @ jacobian
+        inertial = mass @ acceleration - data.qfrc_smooth
+        slope = inertial + (acting * residual) @ jacobian
         direction = -solve_positive(mass + (jacobian.T * acting) @ jacobian, slope)
         along = jacobian @ direction
-        first = direction @ (mass @ acceleration - data.qfrc_smooth)
-        length = _line_search(residual, along, stiffness, is_equality, first, direction @ (mass @ direction))
+        length = _line_search(residual, along, stiffness, is_equality, direction @ inertial, direction @ (mass @ direction))
         return acceleration + length * direction, None
 
     is_warm = cost(data.qacc_warmstart) < cost(data.qacc_smooth)
