@@ -105,15 +105,19 @@ class RunLoop:
 
     def reports(self, resume: bool, overwrite: bool) -> Iterator[Report]:
         """The whole run; see `Trainer.run`."""
-        goes_on = self._folder.open(self._config, resume, overwrite)
+        goes_on = self._folder.check(self._config, resume, overwrite)
         if resume and not goes_on:
             self._say(f"nothing to resume in {self._folder.path}: starting at the beginning")
         if goes_on and max(self._checkpoints.iterations(LIGHT), default=0) >= self._total:
             self._say(f"{self._folder.path} is finished already ({self._total} iterations): ask for more --env-steps to go on")
             return
+        # Before anything is written or, to start again, deleted.
+        steps = self._program.steps_per_iteration
+        memory = check_memory(self._config, self._trainer.shapes, self._program.replay_bytes, steps)
+        self._folder.open(self._config, resume, overwrite)
         with self._console:
             try:
-                self._prepare(goes_on)
+                self._prepare(goes_on, memory)
                 # Not before: while XLA compiles, no Python runs that could look at a flag, and there is nothing to save.
                 with Interruption() as interruption:
                     yield from self._train(interruption)
@@ -133,15 +137,11 @@ class RunLoop:
 
     # -- Before
 
-    def _prepare(self, goes_on: bool) -> None:
-        trainer, config = self._trainer, self._config
-        shapes = trainer.shapes
-        steps = self._program.steps_per_iteration
-        memory = check_memory(config, shapes, self._program.replay_bytes, steps)
-        device = jax.devices()[0]
-        self._say(f"{config.env}, {self._asked}, on {device.device_kind}; {memory}")
+    def _prepare(self, goes_on: bool, memory: str) -> None:
+        trainer, steps = self._trainer, self._program.steps_per_iteration
+        self._say(f"{self._config.env}, {self._asked}, on {jax.devices()[0].device_kind}; {memory}")
         self._say(f"{self._total} iterations of {steps:,} environment steps per seed; files go to {self._folder.path}")
-        restored = self._checkpoints.restore_for_resume(shapes) if goes_on else None
+        restored = self._checkpoints.restore_for_resume(trainer.shapes) if goes_on else None
         if restored is not None:
             self._take_over(restored)
         elif goes_on:

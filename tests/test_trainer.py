@@ -238,20 +238,29 @@ def test_a_broken_config_file_is_one_line(straight, tmp_path):
 
 
 def test_a_replay_that_cannot_fit_is_refused_before_allocation(tmp_path, monkeypatch):
+    there = memory.available_bytes()  # once: it changes with whatever else runs
+    monkeypatch.setattr(memory, "available_bytes", lambda: there)
     config = small_config(replay_transitions=10**12, seeds=1)
     with pytest.raises(RequestError, match="bytes") as refused:
         list(make_fake_trainer(config, tmp_path / "run").run())
+    assert not (tmp_path / "run").exists()
     text = str(refused.value)
     fitting = int(text.split("--replay-transitions ")[1].split()[0])
     assert 0 < fitting < 10**12 and fitting % 10 == 0 and "\n" not in text
-    there = memory.available_bytes()
-    monkeypatch.setattr(memory, "available_bytes", lambda: there)
     fits = make_fake_trainer(config.replace(replay_transitions=fitting), tmp_path / "other")
     line = memory.check_memory(fits.config, fits.shapes, fits.program.replay_bytes, 10)
     assert line.startswith("replay ") and " of " in line
     monkeypatch.setattr(memory, "available_bytes", lambda: 1000)
     with pytest.raises(RequestError, match="not even one rollout fits"):
         memory.check_memory(fits.config, fits.shapes, fits.program.replay_bytes, 10)
+
+
+def test_an_earlier_run_outlives_a_new_one_that_cannot_be(straight, tmp_path):
+    shutil.copytree(straight[0], tmp_path / "run")
+    before = {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()}
+    with pytest.raises(RequestError, match="bytes"):
+        list(make_fake_trainer(small_config(replay_transitions=10**12, seeds=1), tmp_path / "run", overwrite=True).run())
+    assert before == {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()}
 
 
 @pytest.mark.parametrize("break_state", [False, True])
