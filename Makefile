@@ -1,5 +1,5 @@
 # Everything starts here, on a machine with nothing but Python 3 and make:
-#   make train        a robot learns from pictures; the preset follows the hardware
+#   make train        a robot learns from images; the preset follows the hardware
 # uv is fetched into .uv/ where it is missing, and everything else goes into .venv/.
 
 SHELL := /bin/bash

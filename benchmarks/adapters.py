@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-# brax compiles by itself, without what `compilation.world_jit` would have asked for. Read by JAX at its first import: a script
+# brax compiles by itself, without what `compilation.env_jit` would have asked for. Read by JAX at its first import: a script
 # may do that, a library may not.
 if "fusion_emitters" not in os.environ.get("XLA_FLAGS", ""):
     os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_use_fusion_emitters=false"

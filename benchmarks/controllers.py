@@ -18,7 +18,7 @@ import mujoco.rollout
 import numpy as np
 
 from benchmarks import worlds
-from jaxrl_vis_envs.compilation import world_jit
+from jaxrl_vis_envs.compilation import env_jit
 
 LEAST_SUCCESS = 0.95
 Policy = Callable[[Any, Any, Any], tuple[jax.Array, Any]]
@@ -88,7 +88,7 @@ def success_rate(name: str, episodes: int, seed: int = 0, **overrides: Any) -> f
     if name == "FingerTurn":
         return turn_the_finger(env, state, np.random.default_rng(seed))
     policy, memory = POLICIES[name](env)
-    act = world_jit(jax.vmap(policy))
+    act = env_jit(jax.vmap(policy))
     memory = jax.tree.map(lambda leaf: jnp.tile(leaf, (episodes, 1)), memory)
     for _ in range(env.horizon):
         action, memory = act(state, goals, memory)

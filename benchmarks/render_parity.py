@@ -17,7 +17,7 @@ from typing import Any
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "envs"), str(ROOT / "tests")]
-os.environ.setdefault("JAX_PLATFORMS", "cpu")  # the pictures are few, and MuJoCo's renderer is what takes the time
+os.environ.setdefault("JAX_PLATFORMS", "cpu")  # the images are few, and MuJoCo's renderer is what takes the time
 
 import jax  # noqa: E402
 import mujoco  # noqa: E402

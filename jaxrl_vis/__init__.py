@@ -1,4 +1,4 @@
-"""Trains robots to reach goals that are given as pictures.
+"""Trains robots to reach goals that are given as images.
 
     config = jaxrl_vis.preset("fast", env="VisualFetchReach")
     trainer = jaxrl_vis.make_trainer(config)
@@ -15,15 +15,16 @@ __version__ = "0.1.0"
 # Public name -> the module that holds it, imported at first use.
 _HOMES = {
     "Config": "jaxrl_vis.config",
-    "RequestError": "jaxrl_vis.config",
+    "RequestError": "jaxrl_vis.errors",
     "preset": "jaxrl_vis.config",
-    "Trainer": "jaxrl_vis.trainer",
-    "make_trainer": "jaxrl_vis.trainer",
+    "Trainer": "jaxrl_vis.run.trainer",
+    "make_trainer": "jaxrl_vis.run.trainer",
 }
 
 if TYPE_CHECKING:
-    from jaxrl_vis.config import Config, RequestError, preset
-    from jaxrl_vis.trainer import Trainer, make_trainer
+    from jaxrl_vis.config import Config, preset
+    from jaxrl_vis.errors import RequestError
+    from jaxrl_vis.run.trainer import Trainer, make_trainer
 
 __all__ = ["Config", "RequestError", "Trainer", "__version__", "make_trainer", "preset"]
 

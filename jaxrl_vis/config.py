@@ -4,9 +4,10 @@ Imports no JAX, so that the command line can print its help at once.
 """
 
 import dataclasses
-import difflib
 import math
 from typing import Any, Literal, Self
+
+from jaxrl_vis.errors import RequestError, nearest
 
 Method = Literal["oracle", "indicator", "indicator_balance_filter"]
 METHODS: tuple[str, ...] = ("oracle", "indicator", "indicator_balance_filter")
@@ -14,17 +15,6 @@ PIXELS: tuple[str, ...] = ("rgbd", "rgb", "depth")
 Kind = Literal["camera", "lights", "colours", "dynamics"]
 RANDOMIZED: tuple[str, ...] = ("camera", "lights", "colours", "dynamics")
 DTYPES: tuple[str, ...] = ("auto", "float32", "bfloat16")
-
-
-class RequestError(ValueError):
-    """The request was wrong. The message is one line: what is wrong, and how to mend it. The command line exits with 2."""
-
-
-def nearest(word: str, choices: list[str] | tuple[str, ...]) -> str:
-    """'; did you mean X or Y?' for a misspelt ``word``, or a list of all ``choices`` when none is near."""
-    lowered = {choice.lower(): choice for choice in choices}
-    found = [lowered[match] for match in difflib.get_close_matches(word.lower(), list(lowered), n=3, cutoff=0.5)]
-    return f"; did you mean {' or '.join(found)}?" if found else f"; choose one of {', '.join(choices)}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,7 +26,7 @@ class Config:
     preset: str = "fast"
     """The preset that this configuration started from; kept for the record."""
     method: Method = "oracle"
-    """Where rewards come from: the true state (oracle), or equality of pictures, without or with balancing and filtering."""
+    """Where rewards come from: the true state (oracle), or equality of images, without or with balancing and filtering."""
     seed: int = 0
     """First seed."""
     seeds: int = 1
@@ -44,11 +34,11 @@ class Config:
 
     # -- The world
     pixels: Literal["rgbd", "rgb", "depth"] = "rgbd"
-    """Channels of the picture."""
+    """Channels of the image."""
     image_size: int = 64
-    """Height and width of the picture, in pixels."""
+    """Height and width of the image, in pixels."""
     frames: int | None = None
-    """Pictures of the latest control steps that an observation stacks. None: as many as the task does."""
+    """Images of the latest control steps that an observation stacks. None: as many as the task does."""
     randomize: tuple[Kind, ...] = ()
     """What varies between episodes, in training and evaluation: any of camera, lights, colours, dynamics."""
     randomize_strength: float = 1.0
@@ -102,13 +92,13 @@ class Config:
     encoder_filters: tuple[int, ...] = (16, 32, 64, 64)
     """Output channels of the 2x2 stride-2 convolutions."""
     latent_size: int = 512
-    """Size of an encoded picture."""
+    """Size of an encoded image."""
     hidden_sizes: tuple[int, ...] = (256, 256, 256)
     """Hidden layers of the actor's and the critic's heads."""
     compute_dtype: Literal["auto", "float32", "bfloat16"] = "auto"
     """Arithmetic of the networks; parameters and losses are float32. auto: bfloat16 on accelerators."""
     normalizer_floor: float = 0.01
-    """Smallest standard deviation that an observation is divided by, in its own unit (grey levels for pictures)."""
+    """Smallest standard deviation that an observation is divided by, in its own unit (grey levels for images)."""
     normalizer_clip: float = 5.0
     """Normalised observations are clipped to plus and minus this."""
 

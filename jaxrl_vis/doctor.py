@@ -43,7 +43,7 @@ def compilation_cache() -> str:
     """The folder where compiled programs are kept, and whether it can be written."""
     import jax
 
-    from jaxrl_vis import trainer
+    from jaxrl_vis.run import trainer
 
     trainer.enable_compilation_cache()
     folder = jax.config.jax_compilation_cache_dir
@@ -56,12 +56,12 @@ def compilation_cache() -> str:
 
 
 def physics_and_camera() -> str:
-    """Compiles and takes one control step, draws what it led to, and checks that the picture shows something."""
+    """Compiles and takes one control step, draws what it led to, and checks that the image shows something."""
     import jax
     import jax.numpy as jnp
 
     import jaxrl_vis_envs
-    from jaxrl_vis_envs.compilation import world_jit
+    from jaxrl_vis_envs.compilation import env_jit
 
     with contextlib.redirect_stdout(io.StringIO()):  # it tells stdout that Warp is missing, which nothing here uses
         importlib.import_module("mujoco.mjx")
@@ -72,16 +72,16 @@ def physics_and_camera() -> str:
         state = env.step(env.reset(key), jnp.full((env.action_size,), 0.5, jnp.float32))
         return state.achieved_state, state.obs
 
-    position, obs = world_jit(step_once, runs_once=True)(jax.random.key(0))
+    position, obs = env_jit(step_once, runs_once=True)(jax.random.key(0))
     if not bool(jnp.isfinite(position).all()):
         raise FloatingPointError("one physics step gave a number that is not finite")
     frame, goal = obs["observation"], obs["desired_goal"]
     if int(frame.max()) == int(frame.min()):
-        raise ValueError("the picture is empty")
+        raise ValueError("the image is empty")
     if bool((frame == goal).all()):
-        raise ValueError("the picture equals the goal's")
+        raise ValueError("the image equals the goal's")
     size = "x".join(map(str, frame.shape))
-    return f"one step of {env.name} and its {size} picture in {time.perf_counter() - start:.1f} s, compilation included"
+    return f"one step of {env.name} and its {size} image in {time.perf_counter() - start:.1f} s, compilation included"
 
 
 CHECKS: tuple[tuple[str, Callable[[], str]], ...] = (

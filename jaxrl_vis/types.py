@@ -1,10 +1,10 @@
 """Arrays and records that the learner's modules pass to each other, and the letters that name their axes.
 
-    E  environments in a rollout          B  transitions in a batch       C, H, W  channels, height, width of a picture
+    E  environments in a rollout          B  transitions in a batch       C, H, W  channels, height, width of an image
     N  episodes that the replay holds     A  action components            G        components of the true goal state
     T  control steps of an episode        S  seeds trained side by side
 
-An observation is a planar picture [C, H, W] uint8 or a state vector [S] float32; "..." stands for its own axes.
+An observation is a planar image [C, H, W] uint8 or a state vector [S] float32; "..." stands for its own axes.
 """
 
 import dataclasses
@@ -46,7 +46,7 @@ class Episodes(Replaceable):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class ReplayState(Replaceable):
-    """A ring of N episodes. Same arrays as `Episodes` with E = N, but for the packing of pictures (`replay`).
+    """A ring of N episodes. Same arrays as `Episodes` with E = N, but for the packing of images (`replay`).
 
     Attributes:
         episodes: [N, ...] storage; the part that was never written is zero.
@@ -98,7 +98,7 @@ class NormalizerState(Replaceable):
 
     Attributes:
         count: [] float32, frames seen.
-        mean: [...] float32, in the observation's own unit (0 to 255 for pictures).
+        mean: [...] float32, in the observation's own unit (0 to 255 for images).
         sum_of_squares: [...] float32, of deviations from the mean.
     """
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxrl_vis.config import Config
-from jaxrl_vis.trainer import Trainer
+from jaxrl_vis.run.trainer import Trainer
 from jaxrl_vis.types import Episodes, LoopState, NormalizerState, ReplayState, TrainState
 
 HORIZON, SIZE = 5, 16
@@ -98,8 +98,8 @@ class FakeProgram:
             t = jnp.arange(HORIZON + 1)[:, None, None]
             ball = ((y - 3 - t) ** 2 + (x - 4 - t) ** 2 < 9) * 120
             frames = jnp.broadcast_to((200 - ball).astype(jnp.uint8)[None, :, None], (3, HORIZON + 1, 1, size, size))
-            pictures = {"frames": frames, "goals": frames[:, -1], "success": jnp.array([1.0, 0.0, 1.0])}
-            return {"eval/success": score, "eval/goal_distance": 0.2 * (1.0 - score)}, pictures
+            images = {"frames": frames, "goals": frames[:, -1], "success": jnp.array([1.0, 0.0, 1.0])}
+            return {"eval/success": score, "eval/goal_distance": 0.2 * (1.0 - score)}, images
 
         self.init = jax.jit(jax.vmap(init_one, out_axes=_SEED_AXES))
         self.train_iteration = jax.jit(jax.vmap(iterate_one, in_axes=(_SEED_AXES,), out_axes=(_SEED_AXES, 0)), donate_argnums=0)

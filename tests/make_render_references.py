@@ -1,4 +1,4 @@
-"""Makes the stored pictures of MuJoCo's own renderer that the tests compare ours with. Needs a GL library; the tests do not.
+"""Makes the stored images of MuJoCo's own renderer that the tests compare ours with. Needs a GL library; the tests do not.
 
     MUJOCO_GL=egl python tests/make_render_references.py [MODEL ...]
 

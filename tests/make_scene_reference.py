@@ -4,7 +4,7 @@ Needs a GL library; the test does not. Run from the repository root:
 
     MUJOCO_GL=egl PYTHONPATH=.:envs python tests/make_scene_reference.py
 
-The file holds the model's XML, the poses of every picture and the three reference planes, so it explains itself.
+The file holds the model's XML, the poses of every image and the three reference planes, so it explains itself.
 """
 
 import pathlib
@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxrl_vis_envs.render.reference import ReferenceRenderer
 
-HEIGHT, WIDTH, PICTURES, SEED = 60, 80, 6, 0
+HEIGHT, WIDTH, IMAGES, SEED = 60, 80, 6, 0
 TARGET = pathlib.Path(__file__).parent / "data" / "render_references.npz"
 POSES = ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat", "xpos", "xmat", "site_xpos", "site_xmat")
 
@@ -73,13 +73,13 @@ def random_poses(mj_model: mujoco.MjModel, mj_data: mujoco.MjData, rng: np.rando
 
 
 def main() -> None:
-    """Draws the pictures and writes the file."""
+    """Draws the images and writes the file."""
     mj_model = mujoco.MjModel.from_xml_string(XML)
     mj_data = mujoco.MjData(mj_model)
     rng = np.random.default_rng(SEED)
     columns: dict[str, list] = {name: [] for name in (*POSES, "rgb", "depth", "segmentation")}
     with ReferenceRenderer(mj_model, HEIGHT, WIDTH, site_groups=(0,)) as reference:
-        for _ in range(PICTURES):
+        for _ in range(IMAGES):
             random_poses(mj_model, mj_data, rng)
             for name in POSES:
                 columns[name].append(getattr(mj_data, name).astype(np.float32))

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from jaxrl_vis_envs.compilation import world_jit
-from jaxrl_vis_envs.tasks import mjx_model
-from jaxrl_vis_envs.tasks.mjx_model import mjx
+from jaxrl_vis_envs.compilation import env_jit
+from jaxrl_vis_envs.physics import mjx_model
+from jaxrl_vis_envs.physics.mjx_model import mjx
 
 
 class Visited(NamedTuple):
@@ -63,7 +63,7 @@ def velocity_difference(mj_model: mujoco.MjModel, visited: Visited) -> tuple[np.
         with jax.default_matmul_precision("highest"):
             return mjx_model.step(model, still.replace(**visited._asdict())).qvel
 
-    ours = np.asarray(world_jit(jax.vmap(step))(jax.tree.map(jnp.asarray, visited)))
+    ours = np.asarray(env_jit(jax.vmap(step))(jax.tree.map(jnp.asarray, visited)))
     exact = copy.copy(mj_model)
     exact.opt.iterations, exact.opt.ls_iterations = 100, 50
     excess, contacts = np.empty(len(ours)), np.zeros(len(ours), int)

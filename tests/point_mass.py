@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
-from jaxrl_vis_envs.pixels import PixelsConfig, picture_observer
+from jaxrl_vis_envs.physics import mjx_model
+from jaxrl_vis_envs.pixels import PixelsConfig, image_observer
 from jaxrl_vis_envs.randomization import OFF, Randomization
-from jaxrl_vis_envs.tasks import mjx_model
 from jaxrl_vis_envs.tasks.mjx_env import MjxGoalEnv
 
 XML = """
@@ -46,9 +46,7 @@ class PointMass(MjxGoalEnv):
 
     def __init__(self, config: PointMassConfig):
         self._still = mjx_model.still_data(mujoco.MjModel.from_xml_string(XML))
-        super().__init__(
-            config, mujoco.MjModel.from_xml_string(XML), lambda model: picture_observer(model, self.camera, config)
-        )
+        super().__init__(config, mujoco.MjModel.from_xml_string(XML), lambda model: image_observer(model, self.camera, config))
 
     def sample_start(self, key: jax.Array) -> Any:
         return self.configuration(jnp.zeros(2))

@@ -1,6 +1,6 @@
 """Worlds so small that the right answer is known, each failing for one reason only (after Andy Jones, "Debugging RL").
 
-They are pure arithmetic: no MuJoCo, no pictures, a few steps.
+They are pure arithmetic: no MuJoCo, no images, a few steps.
 """
 
 import jax
@@ -107,8 +107,8 @@ class GoAgainstTheSign(Probe):
         return position
 
 
-class PointPicture(Probe):
-    """A drifting point as a 4x4 picture whose bytes never repeat within an episode: every frame is one of a kind."""
+class PointImage(Probe):
+    """A drifting point as a 4x4 image whose bytes never repeat within an episode: every frame is one of a kind."""
 
     def start(self, key):
         return jax.random.uniform(key, (1,)), jnp.full(1, 100.0)

@@ -1,6 +1,6 @@
-"""How far our pictures are from MuJoCo's own, in the measures that the project has set itself bounds for.
+"""How far our images are from MuJoCo's own, in the measures that the project has set itself bounds for.
 
-A pixel within one pixel of an edge of the segmentation, in either picture, is left out of everything: there OpenGL and a ray
+A pixel within one pixel of an edge of the segmentation, in either image, is left out of everything: there OpenGL and a ray
 caster may choose differently. All other pixels count, whether or not the two agree on what they show.
 """
 
@@ -10,7 +10,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-VISIBLE_PIXELS = 30  # a geom with fewer in a picture (edges counted) has no IoU there
+VISIBLE_PIXELS = 30  # a geom with fewer in an image (edges counted) has no IoU there
 DEPTH_METRES, DEPTH_SHARE = 1e-3, 1e-3  # whichever is more
 
 PLANE, SKY, BARE, TEXTURED = "plane", "sky", "bare", "textured"
@@ -60,21 +60,21 @@ def near_edges(labels: np.ndarray) -> np.ndarray:
 
 @dataclasses.dataclass
 class Tally:
-    """Sums over the pictures of one model. Feed it with `add`; read `measures`.
+    """Sums over the images of one model. Feed it with `add`; read `measures`.
 
     Attributes:
         kinds: What `looks` gives for the model.
-        pictures: How many were added.
+        images: How many were added.
         kept: Pixels away from edges.
         agreeing: Of these, where the segmentations agree.
-        solid: Kept pixels that show an object in either picture.
+        solid: Kept pixels that show an object in either image.
         close: Of these, where the depths agree.
-        worst: The least IoU, with the object and the picture that it was found in.
+        worst: The least IoU, with the object and the image that it was found in.
         colours: For each kind of surface, counts [256] of absolute differences of colour values, in 1/255.
     """
 
     kinds: np.ndarray
-    pictures: int = 0
+    images: int = 0
     kept: int = 0
     agreeing: int = 0
     solid: int = 0
@@ -85,7 +85,7 @@ class Tally:
     )
 
     def add(self, ours: Any, theirs: Any) -> None:
-        """Adds one picture: two `Frame` of NumPy arrays; ``theirs`` is the truth."""
+        """Adds one image: two `Frame` of NumPy arrays; ``theirs`` is the truth."""
         kept = ~(near_edges(ours.segmentation) | near_edges(theirs.segmentation))
         solid = kept & ((ours.segmentation >= 0) | (theirs.segmentation >= 0))
         self.kept += int(kept.sum())
@@ -101,12 +101,12 @@ class Tally:
             )
             # Not `<`, which NaN (none yet) would never pass.
             if either and not both / either >= self.worst[0]:
-                self.worst = (both / either, int(label), self.pictures)
+                self.worst = (both / either, int(label), self.images)
         difference = np.abs(ours.rgb.astype(np.int16) - theirs.rgb)
         surface = np.append(self.kinds, SKY)[theirs.segmentation]  # -1 finds the sky at the end
         for kind, counts in self.colours.items():
             counts += np.bincount(difference[kept & (surface == kind)].reshape(-1), minlength=256)
-        self.pictures += 1
+        self.images += 1
 
     def measures(self) -> dict[str, float]:
         """The figures by name: those of `BOUNDS`, and ``plane_mean``, ``plane_p99``, ``sky_mean``, ``kept`` (a share).

@@ -66,9 +66,9 @@ _MESHES = (
     + '<mesh name="cone" builtin="cone" params="24 .3" scale=".2 .2 .2"/>'
 )
 _HILLS = 'name="hills" nrow="12" ncol="16" size=".45 .35 .16 .05"'
-# A mesh that says where on a picture each of its corners lies.
-_PICTURED = (
-    '<mesh name="pictured" vertex="-.2 -.2 0 .2 -.2 0 .2 .2 0 -.2 .2 0 0 0 .3" texcoord="0 0 1 0 1 1 0 1 .5 .5"'
+# A mesh that says where on an image each of its corners lies.
+_IMAGED = (
+    '<mesh name="imaged" vertex="-.2 -.2 0 .2 -.2 0 .2 .2 0 -.2 .2 0 0 0 .3" texcoord="0 0 1 0 1 1 0 1 .5 .5"'
     ' face="0 2 1 0 3 2 0 1 4 1 2 4 2 3 4 3 0 4"/>'
 )
 
@@ -189,8 +189,8 @@ def _textures() -> dict[str, Feature]:
         '<texture name="look" type="{}" builtin="flat" mark="cross" markrgb="1 1 1" rgb1=".7 .3 .2" rgb2=".2 .3 .7"'
         ' width="65" height="{}"/>'
     )
-    picture = '<texture name="look" type="2d" file="picture.png"/>'
-    die = '<texture name="look" type="cube" file="picture.png" gridsize="1 1"/>'
+    image = '<texture name="look" type="2d" file="image.png"/>'
+    die = '<texture name="look" type="cube" file="image.png" gridsize="1 1"/>'
     plain = '<material name="look" texture="look"/>'
     uniform = '<material name="look" texture="look" texuniform="true" texrepeat="3 2"/>'
     repeated = '<material name="look" texture="look" texrepeat="2 3" rgba=".8 1 .8 1"/>'
@@ -209,27 +209,27 @@ def _textures() -> dict[str, Feature]:
     return {
         "texture_2d_checker": of("2-D checker", flat(checker) + plain),
         "texture_2d_gradient": of("2-D gradient", flat(gradient) + plain),
-        "texture_2d_picture": of("2-D picture", picture + plain),
-        "texture_2d_repeated": of("2-D picture, repeated and tinted", picture + repeated),
-        "texture_2d_uniform": of("2-D picture, repeated by the metre", picture + uniform),
+        "texture_2d_image": of("2-D image", image + plain),
+        "texture_2d_repeated": of("2-D image, repeated and tinted", image + repeated),
+        "texture_2d_uniform": of("2-D image, repeated by the metre", image + uniform),
         "texture_floor": of(
             "2-D checker on a floor without end", flat(checker) + uniform, _BODIES[:2], floor=floor.format("0 0 .1")
         ),
         "texture_floor_finite": of(
-            "2-D picture on a floor with an end", picture + repeated, _BODIES[:2], floor=floor.format("1 .7 .1")
+            "2-D image on a floor with an end", image + repeated, _BODIES[:2], floor=floor.format("1 .7 .1")
         ),
         "texture_cube_checker": of("cube checker", cube(checker) + plain),
         "texture_cube_marked": of("cube with marked edges", cube(marked) + plain, _BODIES),
         "texture_cube_gradient": of("cube gradient", cube(gradient) + plain, _BODIES),
-        "texture_cube_picture": of("cube of one picture", die + plain, _BODIES),
-        "texture_cube_uniform": of("cube picture, by the metre", die + uniform, _BODIES),
+        "texture_cube_image": of("cube of one image", die + plain, _BODIES),
+        "texture_cube_uniform": of("cube image, by the metre", die + uniform, _BODIES),
         "texture_mesh_2d": of(
-            "2-D picture on meshes, one with its own corners",
-            _MESHES + _PICTURED + picture + plain,
-            (*meshes[:2], 'type="mesh" mesh="pictured"'),
+            "2-D image on meshes, one with its own corners",
+            _MESHES + _IMAGED + image + plain,
+            (*meshes[:2], 'type="mesh" mesh="imaged"'),
         ),
-        "texture_mesh_cube": of("cube picture on meshes", _MESHES + die + plain, meshes),
-        "texture_hfield": of("2-D picture on a height field", _HFIELD + picture + plain, ('type="hfield" hfield="hills"',) * 2),
+        "texture_mesh_cube": of("cube image on meshes", _MESHES + die + plain, meshes),
+        "texture_hfield": of("2-D image on a height field", _HFIELD + image + plain, ('type="hfield" hfield="hills"',) * 2),
     }
 
 
@@ -281,10 +281,10 @@ def scene_spec(feature: Feature) -> mujoco.MjSpec:
   </worldbody>
 </mujoco>
 """
-    return mujoco.MjSpec.from_string(xml, assets={"picture.png": _picture()})
+    return mujoco.MjSpec.from_string(xml, assets={"image.png": _image()})
 
 
-def _picture() -> bytes:
+def _image() -> bytes:
     """A PNG that looks different in every corner and from behind: red grows to the right, green downwards, an L in blue."""
     rows, columns = np.mgrid[0:48, 0:48]
     pixels = np.stack([40 + 4 * columns, 40 + 4 * rows, np.full_like(rows, 60)], axis=-1).astype(np.uint8)

@@ -222,14 +222,14 @@ def poses_of(mj_data: mujoco.MjData) -> dict[str, np.ndarray]:
 
 
 def draw(scene: Scene, poses: list[dict[str, np.ndarray]], quick: bool = False) -> list[Frame]:
-    """Our pictures of several poses, each from `poses_of`: frames of NumPy arrays.
+    """Our images of several poses, each from `poses_of`: frames of NumPy arrays.
 
     The scene is an argument of the compiled program: scenes that are alike in all but numbers share it.
 
     Args:
         scene: From `make_scene`.
         poses: The poses.
-        quick: Whether the compiler may spend less on making the program fast, which pays for a handful of small pictures.
+        quick: Whether the compiler may spend less on making the program fast, which pays for a handful of small images.
     """
     drawer = _draw_quick if quick else _draw_all
     frames = jax.tree.map(np.asarray, drawer(scene, jax.tree.map(lambda *rows: np.stack(rows), *poses)))

@@ -1,8 +1,8 @@
-"""Stored pictures of MuJoCo's own renderer: how they are packed, so that many fit into little.
+"""Stored images of MuJoCo's own renderer: how they are packed, so that many fit into little.
 
 One ``.npz`` for each model. Colours are kept exactly. Depth is kept as a 16-bit logarithm between the near and the far plane,
 good to 0.01 %, where the comparison allows 0.1 %. Neighbouring pixels are subtracted from each other, because the compression
-of ``.npz`` knows nothing of pictures.
+of ``.npz`` knows nothing of images.
 """
 
 import pathlib
@@ -15,7 +15,7 @@ _STEPS = 65534  # 65535 is the sky
 
 
 class References(NamedTuple):
-    """Pictures of one model in P poses.
+    """Images of one model in P poses.
 
     Attributes:
         fingerprint: Of the model that was drawn, see `render_models.fingerprint`.
@@ -41,7 +41,7 @@ class References(NamedTuple):
 
 
 def save(name: str, references: References) -> pathlib.Path:
-    """Writes a model's pictures into `FOLDER`."""
+    """Writes a model's images into `FOLDER`."""
     near, far = references.near, references.far
     scaled = np.log(references.depth.astype(np.float64) / near) / np.log(far / near)
     depth = np.where(references.segmentation < 0, _STEPS + 1, np.clip(np.rint(scaled * _STEPS), 0, _STEPS)).astype(np.uint16)
@@ -57,7 +57,7 @@ def save(name: str, references: References) -> pathlib.Path:
 
 
 def load(name: str) -> References:
-    """Reads a model's pictures.
+    """Reads a model's images.
 
     Raises:
         FileNotFoundError: There are none; make_render_references.py makes them.

@@ -8,7 +8,7 @@ import mujoco
 
 from jaxrl_vis_envs.render import Scene
 
-# Every type, every light with a place of its own, a ball behind the camera and one around it; tiles hang over the picture.
+# Every type, every light with a place of its own, a ball behind the camera and one around it; tiles hang over the image.
 _SCENE = """
 <mujoco>
   <asset>

@@ -24,14 +24,14 @@ from gymnasium.utils.env_checker import check_env
 from jaxrl_vis_envs import goals, registry
 from jaxrl_vis_envs.adapters.brax import BraxEnv, lend_jax
 from jaxrl_vis_envs.adapters.gymnasium import GymnasiumEnv, GymnasiumVectorEnv, register_all
-from jaxrl_vis_envs.pixels import picture_observer
+from jaxrl_vis_envs.pixels import image_observer
 from jaxrl_vis_envs.tasks import reacher
 
 HORIZON = probes.Probe.horizon
 
 
-class Wide(probes.PointPicture):
-    """Pictures of different height, width and channels."""
+class Wide(probes.PointImage):
+    """Images of different height, width and channels."""
 
     def see(self, position):
         return super().see(position)[:, :2].repeat(3, axis=0)
@@ -68,7 +68,7 @@ def registered(monkeypatch):
 
 def test_gymnasium_checks_a_world_that_it_made_by_name(registered):
     def build(config: Any) -> Any:
-        return ReacherWithoutPhysics(config, lambda model: picture_observer(model, "above", config))
+        return ReacherWithoutPhysics(config, lambda model: image_observer(model, "above", config))
 
     registry.register("TurnedReacher", build, registry.config_class("VisualReacher"))
     register_all()
@@ -88,11 +88,11 @@ def test_gymnasium_checks_a_world_that_it_made_by_name(registered):
         "goal_pixels": ((16, 16, 1), "uint8"),
     }
     np.testing.assert_array_equal(observation["observation"][4:6], observation["achieved_goal"])
-    picture = env.render()
-    assert picture.shape == (24, 24, 3) and picture.dtype == np.uint8 and np.ptp(picture) > 50
+    image = env.render()
+    assert image.shape == (24, 24, 3) and image.dtype == np.uint8 and np.ptp(image) > 50
 
 
-def test_gymnasium_checks_state_and_picture_probes():
+def test_gymnasium_checks_state_and_image_probes():
     for env in (told(), wide()):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -177,7 +177,7 @@ def test_the_vector_environment_does_what_separate_environments_do(mode):
         assert_same(x, y)
 
 
-def test_pictures_are_height_width_channels_and_goals_stay():
+def test_images_are_height_width_channels_and_goals_stay():
     env = GymnasiumVectorEnv(wide(), 2)
     first, _ = env.reset(seed=0)
     assert first["pixels"].shape == (2, 2, 4, 3)
@@ -275,11 +275,11 @@ def test_brax_wrappers_truncate_at_the_horizon_and_start_again():
     np.testing.assert_allclose(summed["goal_distance"], 0.25 * HORIZON, atol=1e-5)
 
 
-def test_brax_shows_pictures_as_its_vision_agents_take_them():
+def test_brax_shows_images_as_its_vision_agents_take_them():
     env = BraxEnv(wide())
     state = env.step(env.reset(jax.random.PRNGKey(0)), jnp.zeros(1))
     assert env.observation_size == {"pixels/observation": (2, 4, 3), "pixels/goal": (2, 4, 3)}
-    assert {name: picture.shape for name, picture in state.obs.items()} == env.observation_size
+    assert {name: image.shape for name, image in state.obs.items()} == env.observation_size
     bytes_shown = np.asarray(state.pipeline_state.achieved_state).view(np.uint8)
     np.testing.assert_allclose(255 * state.obs["pixels/observation"][0, :, 0], bytes_shown, atol=1e-3)
     assert float(state.reward) == -1.0

@@ -11,7 +11,8 @@ from jaxrl_vis import bench
 from jaxrl_vis.bench import record, roofline, timing, train, update
 from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.settings import Settings
-from jaxrl_vis.config import RequestError, preset
+from jaxrl_vis.config import preset
+from jaxrl_vis.errors import RequestError
 from jaxrl_vis_envs.base import GoalEnv, State
 
 
@@ -98,7 +99,7 @@ def test_least_cost_agrees_with_the_compiler_for_dense_layers() -> None:
 
 
 def test_encoder_products_count_every_layer() -> None:
-    from jaxrl_vis.networks import Networks
+    from jaxrl_vis.learner.networks import Networks
 
     config = preset("debug", encoder_filters=(8, 16), latent_size=32)
     networks = Networks(config, jax.ShapeDtypeStruct((3, 16, 16), jnp.uint8), 4, 0.0)
@@ -117,7 +118,7 @@ def test_peaks_take_the_longest_name() -> None:
 
 def test_noise_fills_the_whole_replay() -> None:
     from jaxrl_vis.bench.update import fill_replay
-    from jaxrl_vis.replay import make_replay
+    from jaxrl_vis.learner.replay import make_replay
 
     replay = make_replay(transitions=40, num_envs=2, horizon=5)
     empty = replay.init(jax.ShapeDtypeStruct((1, 4, 4), jnp.uint8), goal_state_size=3, action_size=2)
@@ -129,7 +130,7 @@ def test_noise_fills_the_whole_replay() -> None:
 
 
 class Dot(GoalEnv):
-    """A bright dot that moves in a dark picture: a world that compiles at once."""
+    """A bright dot that moves in a dark image: a world that compiles at once."""
 
     name, horizon, action_size, threshold, control_period = "VisualDot", 3, 2, 0.1, 0.1
 

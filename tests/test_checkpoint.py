@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from fake_program import FakeProgram, as_plain, make_fake_trainer, small_config
 
-from jaxrl_vis.checkpoint import FULL, LIGHT, Checkpoints
-from jaxrl_vis.config import RequestError
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.run.checkpoint import FULL, LIGHT, Checkpoints
 
 FAKE = Path(__file__).with_name("fake_program.py")
 

@@ -110,7 +110,7 @@ def test_auto_follows_the_hardware() -> None:
 
 
 def test_resume_starts_from_the_saved_configuration(tmp_path: Path) -> None:
-    from jaxrl_vis.run_folder import RunFolder
+    from jaxrl_vis.run.folder import RunFolder
 
     saved = PRESETS["debug"].replace(seed=3, latent_size=24, encoder_filters=(4,))
     RunFolder(tmp_path).open(saved)
@@ -130,7 +130,7 @@ def test_play_refuses_an_unknown_kind_of_file(tmp_path: Path, capsys: pytest.Cap
 
 
 def test_exit_status_of_a_run_that_stops(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    trainer = pytest.importorskip("jaxrl_vis.trainer")
+    trainer = pytest.importorskip("jaxrl_vis.run.trainer")
 
     class Stopping:
         def __init__(self, error: BaseException) -> None:

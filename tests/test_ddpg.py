@@ -7,7 +7,7 @@ import probe_environments as probes
 import pytest
 
 from jaxrl_vis.config import preset
-from jaxrl_vis.train_step import make_train_step
+from jaxrl_vis.learner.train_step import make_train_step
 
 DISCOUNT = 0.75  # 1 - 1/horizon of the probes
 
@@ -114,7 +114,7 @@ def test_one_trace_and_a_new_episode_every_time():
 def test_a_fresh_filter_drops_nothing(rewards):
     """At initialisation no negative is dropped, under +1/-1 and under 0/-1 (there the critic must start below the band)."""
     program = make_train_step(
-        probes.PointPicture(),
+        probes.PointImage(),
         preset(
             "debug",
             method="indicator_balance_filter",
@@ -133,7 +133,7 @@ def test_a_fresh_filter_drops_nothing(rewards):
 def test_the_filter_drops_negatives_that_the_critic_values_like_positives():
     """Place 0 is its own goal, seen with noise in one byte, so most of its indicator rewards are false negatives."""
     program = make_train_step(
-        probes.PointPicture(),
+        probes.PointImage(),
         preset("debug", method="indicator_balance_filter", num_envs=32, updates_per_iteration=1, batch_size=256),
     )
     loop = program.init(jax.random.key(0)[None])
@@ -152,7 +152,7 @@ def test_the_filter_drops_negatives_that_the_critic_values_like_positives():
 )
 def test_share_of_positives_is_the_one_derived(method, expected):
     program = make_train_step(
-        probes.PointPicture(), preset("debug", method=method, num_envs=256, updates_per_iteration=40, batch_size=512)
+        probes.PointImage(), preset("debug", method=method, num_envs=256, updates_per_iteration=40, batch_size=512)
     )
     _, metrics = program.train_iteration(program.init(jax.random.key(3)[None]))
     assert abs(float(metrics["train/positive_share"][0]) - expected) < 0.012
@@ -160,7 +160,7 @@ def test_share_of_positives_is_the_one_derived(method, expected):
 
 def test_replay_is_written_in_place():
     """The compiled iteration holds no second copy of the replay: it is aliased, and temporaries stay far below it."""
-    program = make_train_step(probes.PointPicture(), preset("debug", replay_transitions=200_000))
+    program = make_train_step(probes.PointImage(), preset("debug", replay_transitions=200_000))
     loop = jax.eval_shape(program.init, jax.random.split(jax.random.key(0), 2))
     memory = program.train_iteration.lower(loop).compile().memory_analysis()
     replay = 2 * program.replay_bytes

@@ -18,7 +18,7 @@ import jaxrl_vis_envs
 from benchmarks import worlds
 from jaxrl_vis_envs import compilation, goals, pixels, registry
 from jaxrl_vis_envs.base import GoalEnv, State, sanitize_action
-from jaxrl_vis_envs.compilation import world_jit
+from jaxrl_vis_envs.compilation import env_jit
 
 BATCH, STEPS = 32, 8
 SOURCES = pathlib.Path(__file__).resolve().parents[1] / "envs"
@@ -57,11 +57,11 @@ def play(name: str, state: State, actions: Any) -> list[State]:
 
 
 @functools.cache
-def pictures(task: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def images(task: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """[BATCH, C, H, W]: of the goals, of the starts, and after the last step."""
     env, played = make_visual(task), episode(task)
     nowhere = jnp.zeros(played.states[0].goal_state.shape[1])
-    observe = world_jit(jax.vmap(lambda data: env.observe(env.state_at(data, nowhere))))
+    observe = env_jit(jax.vmap(lambda data: env.observe(env.state_at(data, nowhere))))
     goal, start, end = (np.asarray(observe(data)) for data in (played.goals, played.states[0].data, played.states[-1].data))
     return goal, start, end
 
@@ -137,16 +137,16 @@ def test_bad_actions_do_not_poison_the_physics(name: str) -> None:
 
 
 @EACH_TASK
-def test_pictures_show_goals_and_movement(name: str) -> None:
+def test_images_show_goals_and_movement(name: str) -> None:
     spec = make_visual(name).observation_spec
-    goal, start, end = pictures(name)
-    for picture in (goal, start, end):
-        assert picture.shape == (BATCH, *spec.shape) and picture.dtype == spec.dtype == jnp.uint8
+    goal, start, end = images(name)
+    for image in (goal, start, end):
+        assert image.shape == (BATCH, *spec.shape) and image.dtype == spec.dtype == jnp.uint8
     assert (goal != start).any(axis=(1, 2, 3)).mean() > 0.95
     assert (end != start).any(axis=(1, 2, 3)).mean() > 0.95
 
 
-def play_pictures(env: GoalEnv, keys: jax.Array, actions: jax.Array) -> tuple[State, State]:
+def play_images(env: GoalEnv, keys: jax.Array, actions: jax.Array) -> tuple[State, State]:
     """Episodes at their start [N, ...], and after each action [STEPS, N, ...], played as one program."""
 
     def play(keys: jax.Array, actions: jax.Array) -> tuple[State, State]:
@@ -157,19 +157,19 @@ def play_pictures(env: GoalEnv, keys: jax.Array, actions: jax.Array) -> tuple[St
         start = jax.vmap(env.reset)(keys)
         return start, jax.lax.scan(step, start, actions)[1]
 
-    return world_jit(play)(keys, actions)
+    return env_jit(play)(keys, actions)
 
 
 def test_a_visual_task_resets_and_steps_as_its_parts_say() -> None:
     """`reset` and `step` put together what the other tests see one by one."""
     env = PointMass(PointMassConfig(image_size=16))
     keys = jax.random.split(jax.random.key(0), 4)
-    start, steps = play_pictures(env, keys, jax.random.uniform(jax.random.key(1), (STEPS, 4, 2), minval=-1.0))
+    start, steps = play_images(env, keys, jax.random.uniform(jax.random.key(1), (STEPS, 4, 2), minval=-1.0))
     start, steps = jax.device_get((start, steps))
     assert start.obs is not None and steps.obs is not None
     nowhere = jnp.zeros(2)
-    observe = world_jit(jax.vmap(lambda data: env.observe(env.state_at(data, nowhere))))
-    np.testing.assert_array_equal(start.obs["desired_goal"], observe(world_jit(jax.vmap(env.sample_goal))(keys)))
+    observe = env_jit(jax.vmap(lambda data: env.observe(env.state_at(data, nowhere))))
+    np.testing.assert_array_equal(start.obs["desired_goal"], observe(env_jit(jax.vmap(env.sample_goal))(keys)))
     np.testing.assert_array_equal(start.obs["observation"], observe(start.data))
     for index in range(STEPS):
         seen = observe(jax.tree.map(lambda leaf, index=index: leaf[index], steps.data))
@@ -184,16 +184,16 @@ def test_sanitize_action():
     np.testing.assert_array_equal(action, [0.0, 1.0, -1.0, 0.5])
 
 
-def test_pictures_stack_newest_first():
-    """Against an environment that shows one picture, from the same key, under the same actions."""
+def test_images_stack_newest_first():
+    """Against an environment that shows one image, from the same key, under the same actions."""
     keys = jax.random.split(jax.random.key(0), 1)
     actions = jnp.ones((3, 1, 2)) * jnp.array([1.0, -0.5, 0.8])[:, None, None]
     env, env_1 = (PointMass(PointMassConfig(image_size=16, frames=frames)) for frames in (3, 1))
     (start, steps), (start_1, steps_1) = (
-        tuple(state.obs for state in play_pictures(world, keys, actions)) for world in (env, env_1)
+        tuple(state.obs for state in play_images(world, keys, actions)) for world in (env, env_1)
     )
     one = [start_1["observation"][0], *steps_1["observation"][:, 0]]
-    assert len({np.asarray(picture).tobytes() for picture in one}) == 4
+    assert len({np.asarray(image).tobytes() for image in one}) == 4
     assert env.frames == 3 and env.observation_spec.shape == (12, 16, 16)
     np.testing.assert_array_equal(start["observation"][0], np.concatenate([one[0], one[0], one[0]]))
     np.testing.assert_array_equal(steps["observation"][0, 0], np.concatenate([one[1], one[0], one[0]]))
@@ -220,7 +220,7 @@ def test_fetch_reach_start_and_goals():
     offset = np.asarray(start.goal_state - start.achieved_state)
     assert (np.abs(offset) < env.config.goal_range + 0.02).all()
     assert (np.abs(offset.mean(axis=0)) < 0.04).all() and (np.abs(offset).max(axis=0) > 0.12).all()
-    # The table keeps the fingers, and so the pictured goal, above its top.
+    # The table keeps the fingers, and so the imaged goal, above its top.
     assert np.asarray(start.goal_state)[:, 2].min() > 0.4
 
 
@@ -286,10 +286,10 @@ def test_goals_need_no_mujoco():
     assert subprocess.run([sys.executable, "-c", code], check=False, env=SUBPROCESS_ENVIRONMENT).returncode == 0
 
 
-def test_world_jit_switches_off_fusion_emitters_on_a_cpu_where_jax_can(monkeypatch):
+def test_env_jit_switches_off_fusion_emitters_on_a_cpu_where_jax_can(monkeypatch):
     options = {}
     monkeypatch.setattr(jax, "jit", lambda function, **given: options.update(given))
-    compilation.world_jit(lambda: None, donate_argnums=0)
+    compilation.env_jit(lambda: None, donate_argnums=0)
     assert options["donate_argnums"] == 0
     takes_it = jax.default_backend() == "cpu" and jax.__version_info__ < (0, 11)
     expected = {"xla_cpu_use_fusion_emitters": False} if takes_it else {}

@@ -61,7 +61,7 @@ def test_the_finger_hangs_away_from_the_spinner_in_the_goal():
     np.testing.assert_allclose(qpos[:, :2], np.tile([-np.pi / 2, 0.0], (COUNT, 1)), atol=1e-6)
 
 
-def test_three_pictures_by_default_and_one_by_choice():
+def test_three_images_by_default_and_one_by_choice():
     assert jaxrl_vis_envs.make("VisualFingerTurn", image_size=8).observation_spec.shape == (12, 8, 8)
     assert jaxrl_vis_envs.make("VisualFingerTurn", image_size=8, frames=1).observation_spec.shape == (4, 8, 8)
 

@@ -1,4 +1,4 @@
-"""`jaxrl-vis envs`: the table, at once, and the sheet of pictures."""
+"""`jaxrl-vis envs`: the table, at once, and the sheet of images."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,7 +10,8 @@ from PIL import Image
 from point_mass import PointMass, PointMassConfig
 
 import jaxrl_vis_envs
-from jaxrl_vis import cli, gallery
+from jaxrl_vis import cli
+from jaxrl_vis.report import gallery
 from jaxrl_vis_envs import registry
 
 
@@ -58,11 +59,11 @@ def test_the_gallery_shows_start_and_goals(own_task: str, tmp_path: Path) -> Non
     assert frames.rgb.shape == (1 + goals, size, size, 3)
     for labels in frames.segmentation:
         assert set(np.unique(labels)) == {0, 1}  # ground and ball
-    # The sheet holds those pictures: start and goals are all different, and each is found where it belongs.
-    assert len({picture.tobytes() for picture in frames.rgb}) == 1 + goals
-    for picture in frames.rgb:
-        windows = np.lib.stride_tricks.sliding_window_view(sheet, picture.shape)[:, :, 0]
-        assert (windows == picture).all(axis=(2, 3, 4)).any()
+    # The sheet holds those images: start and goals are all different, and each is found where it belongs.
+    assert len({image.tobytes() for image in frames.rgb}) == 1 + goals
+    for image in frames.rgb:
+        windows = np.lib.stride_tricks.sliding_window_view(sheet, image.shape)[:, :, 0]
+        assert (windows == image).all(axis=(2, 3, 4)).any()
 
 
 def test_what_the_gallery_cannot_draw_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

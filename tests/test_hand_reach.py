@@ -10,7 +10,7 @@ import pytest
 
 import jaxrl_vis_envs
 from benchmarks import worlds
-from jaxrl_vis_envs.compilation import world_jit
+from jaxrl_vis_envs.compilation import env_jit
 
 COUNT = 128
 START_TIPS = [
@@ -75,7 +75,7 @@ def test_gym_rule():
     """Thumb and one finger meet near the palm's front, the others stay; one goal in ten is the start itself."""
     env = make(goal_rule="meet")
     keys = jax.random.split(jax.random.key(4), COUNT)
-    asked, got = world_jit(jax.vmap(lambda key: (env._meeting_tips(key), env.sample_goal(key))))(keys)
+    asked, got = env_jit(jax.vmap(lambda key: (env._meeting_tips(key), env.sample_goal(key))))(keys)
     moved = np.linalg.norm(np.asarray(asked) - np.array(START_TIPS), axis=-1) > 0.005
     returned = ~moved.any(axis=-1)
     assert 0.02 < returned.mean() < 0.2

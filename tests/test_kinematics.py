@@ -6,9 +6,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from jaxrl_vis_envs.compilation import world_jit
-from jaxrl_vis_envs.tasks import mjx_model
-from jaxrl_vis_envs.tasks.mjx_model import mjx
+from jaxrl_vis_envs.compilation import env_jit
+from jaxrl_vis_envs.physics import mjx_model
+from jaxrl_vis_envs.physics.mjx_model import mjx
 
 # Two joints on one body, slides and hinges off the origin, a branch, a body without joints, a carried body with another on it,
 # a camera that rides on a body and one that looks at it, a reference position other than 0.
@@ -51,7 +51,7 @@ def assert_poses_agree(mj_model: mujoco.MjModel, names: tuple[str, ...]) -> None
     mocap_quat = rng.normal(size=(8, mj_model.nmocap, 4)).astype(np.float32)
     model, still = mjx.put_model(mj_model), mjx_model.still_data(mj_model)
 
-    @world_jit
+    @env_jit
     @jax.vmap
     def ours(qpos: jax.Array, mocap_pos: jax.Array, mocap_quat: jax.Array) -> mjx.Data:
         with jax.default_matmul_precision("highest"):

@@ -9,9 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxrl_vis import encoder_kernel, losses, normalizer
-from jaxrl_vis.config import RequestError, preset
-from jaxrl_vis.networks import Networks, to_blocks
+from jaxrl_vis.config import preset
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.learner import encoder_kernel, losses, normalizer
+from jaxrl_vis.learner.networks import Networks, to_blocks
 from jaxrl_vis_envs.compilation import runs_gpu_kernels
 
 
@@ -111,7 +112,7 @@ def test_blocks_hold_every_pixel_once():
     np.testing.assert_array_equal(np.sort(np.asarray(blocks[0, 0])), np.sort(np.asarray(frames[0, :, :4, :4]).ravel()))
 
 
-def test_a_picture_smaller_than_a_block_is_refused():
+def test_a_image_smaller_than_a_block_is_refused():
     with pytest.raises(RequestError, match="image_size 7 is too small for 3 encoder layers, which need at least 8"):
         make_networks(7)
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from benchmarks import worlds
-from jaxrl_vis_envs.compilation import world_jit
-from jaxrl_vis_envs.tasks import mjx_model, newton
-from jaxrl_vis_envs.tasks.mjx_model import mjx
+from jaxrl_vis_envs.compilation import env_jit
+from jaxrl_vis_envs.physics import mjx_model, newton
+from jaxrl_vis_envs.physics.mjx_model import mjx
 
 
 def test_the_solution_of_small_systems():
@@ -71,8 +71,8 @@ def test_a_step_is_that_of_mjx():
         "xfrc_applied": rng.normal(0, 5, (count, model.nbody, 6)),
     }
     data = jax.vmap(lambda varied: start.replace(**varied))({name: jnp.float32(value) for name, value in numbers.items()})
-    ours = world_jit(jax.vmap(lambda data: mjx_model.step(model, data, exact=False)))(data)
-    theirs = world_jit(jax.vmap(lambda data: mjx.step(model, data)))(data)
+    ours = env_jit(jax.vmap(lambda data: mjx_model.step(model, data, exact=False)))(data)
+    theirs = env_jit(jax.vmap(lambda data: mjx.step(model, data)))(data)
     forces = np.abs(theirs._impl.efc_force)
     assert (forces[:, :6] > 0).all()  # the weld
     assert (forces[:, 6:12] > 0).any(axis=0).sum() >= 4  # limits, those of the fingers too

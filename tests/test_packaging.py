@@ -1,6 +1,7 @@
 """Imports run one way, and what is shipped works outside the checkout."""
 
 import ast
+import graphlib
 import os
 import subprocess
 import sys
@@ -11,29 +12,42 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 
-# A module imports from earlier layers only.
+# Folders and single files of jaxrl_vis. A folder imports from earlier rows only; files of one row do not import each other.
 LAYERS: tuple[tuple[str, ...], ...] = (
-    ("config", "types"),
-    ("normalizer", "losses", "encoder_kernel"),
-    ("networks",),
-    ("replay", "relabel", "ddpg", "rollout"),
-    ("train_step",),
-    ("*",),  # the trainer's own files: those that stand nowhere else; they may import each other
-    ("trainer",),
-    ("bench", "doctor", "gallery"),
+    ("errors",),
+    ("config", "types", "provenance"),
+    ("learner",),
+    ("report",),
+    ("run",),
+    ("bench", "doctor"),
     ("cli",),
 )
-LAYER = {name: depth for depth, names in enumerate(LAYERS) for name in names}
+# The same for the environments.
+ENVIRONMENT_LAYERS: tuple[tuple[str, ...], ...] = (
+    ("compilation", "goals"),
+    ("physics", "render"),
+    ("randomization",),
+    ("base",),
+    ("pixels", "registry"),
+    ("tasks",),
+    ("adapters",),
+)
+PACKAGES = {"jaxrl_vis": (ROOT / "jaxrl_vis", LAYERS), "jaxrl_vis_envs": (ROOT / "envs" / "jaxrl_vis_envs", ENVIRONMENT_LAYERS)}
 
 
-def imported(path: Path) -> set[str]:
-    """Every module that a file imports when it runs, by full name; `from a import b` counts as a.b."""
+def imported(path: Path, when_running: bool = True) -> set[str]:
+    """Every module that a file imports, by full name; `from a import b` counts as a.b.
+
+    Args:
+        path: The file.
+        when_running: Leave out what is imported for type checkers only.
+    """
     found = set()
     tree = ast.parse(path.read_text())
     blocks = [node for node in ast.walk(tree) if isinstance(node, ast.If)]
     for_types = [node for block in blocks if "TYPE_CHECKING" in ast.unparse(block.test) for node in ast.walk(block)]
     for node in ast.walk(tree):
-        if node in for_types:
+        if when_running and node in for_types:
             continue
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
@@ -43,26 +57,48 @@ def imported(path: Path) -> set[str]:
     return found
 
 
-def unit_of(module: str) -> str | None:
-    """The file or folder of jaxrl_vis that a full name lies in."""
-    parts = module.split(".")
-    return parts[1] if parts[0] == "jaxrl_vis" and len(parts) > 1 else None
+def modules_of(package: str) -> dict[str, Path]:
+    """Files of a package by the full name of the module, less its own ``__init__``, whose names are looked up when used."""
+    folder, _ = PACKAGES[package]
+    parts = {path: path.relative_to(folder).with_suffix("").parts for path in folder.rglob("*.py")}
+    return {
+        ".".join((package, *(part for part in names if part != "__init__"))): path
+        for path, names in parts.items()
+        if names != ("__init__",)
+    }
 
 
-def test_arrows_run_one_way() -> None:
-    package = ROOT / "jaxrl_vis"
-    units = {path: path.relative_to(package).parts[0].removesuffix(".py") for path in package.rglob("*.py")}
-    assert {name for name in LAYER if name != "*"} <= set(units.values())
-    for path, unit in units.items():
-        if unit == "__init__":
-            continue
-        depth = LAYER.get(unit, LAYER["*"])
-        for name in imported(path):
-            other = unit_of(name)
-            if other not in units.values() or other == unit:
-                continue
-            other_depth = LAYER.get(other, LAYER["*"])
-            assert other_depth < depth or other_depth == depth == LAYER["*"], f"{unit} must not import {other}"
+def imports_within(package: str, when_running: bool) -> dict[str, set[str]]:
+    """Module -> modules of the same package that it imports."""
+    modules = modules_of(package)
+    graph: dict[str, set[str]] = {}
+    for name, path in modules.items():
+        graph[name] = set()
+        for full in imported(path, when_running):
+            # `from a.b import c`: c is a module of a.b, or a name in it.
+            target = full if full in modules else full.rpartition(".")[0]
+            if target in modules and target != name:
+                graph[name].add(target)
+    return graph
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_arrows_run_one_way(package: str) -> None:
+    _, layers = PACKAGES[package]
+    depth_of = {name: depth for depth, names in enumerate(layers) for name in names}
+    for name, targets in imports_within(package, when_running=False).items():
+        unit = name.split(".")[1]
+        assert unit in depth_of, f"{unit} has no layer: give it one"
+        for target in targets:
+            other = target.split(".")[1]
+            assert other == unit or depth_of[other] < depth_of[unit], f"{name} must not import {target}"
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_no_imports_go_in_circles(package: str) -> None:
+    """Also among the files of a folder, and counting what is imported for types only, or inside functions."""
+    sorter = graphlib.TopologicalSorter(imports_within(package, when_running=False))
+    sorter.prepare()  # raises CycleError, which names the circle
 
 
 def test_the_world_knows_nothing_of_the_learner() -> None:
@@ -79,7 +115,8 @@ def test_nothing_imports_the_folder_of_sources() -> None:
 def test_leaves_load_no_mujoco(clean_environment: dict[str, str]) -> None:
     code = """
 import sys
-import jaxrl_vis.replay, jaxrl_vis.relabel, jaxrl_vis.losses, jaxrl_vis.normalizer, jaxrl_vis.networks, jaxrl_vis_envs.goals
+from jaxrl_vis.learner import losses, networks, normalizer, relabel, replay
+from jaxrl_vis_envs import goals
 assert not {"mujoco", "matplotlib", "orbax"} & set(sys.modules)
 """
     subprocess.run([sys.executable, "-c", code], env=clean_environment, check=True)
@@ -123,7 +160,7 @@ def test_wheel_works_outside_the_checkout(wheel: Path, tmp_path: Path) -> None:
     site = tmp_path / "site"
     zipfile.ZipFile(wheel).extractall(site)
     code = f"""
-import jaxrl_vis, jaxrl_vis.cli, jaxrl_vis.train_step, jaxrl_vis_envs
+import jaxrl_vis, jaxrl_vis.cli, jaxrl_vis.learner.train_step, jaxrl_vis_envs
 for package in (jaxrl_vis, jaxrl_vis_envs):
     assert package.__file__.startswith({str(site)!r}), package.__file__
 env = jaxrl_vis_envs.make("FetchReach")

@@ -1,11 +1,11 @@
-"""The pictures that a run leaves behind: the curve and the video."""
+"""The images that a run leaves behind: the curve and the video."""
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from jaxrl_vis import plots, videos
-from jaxrl_vis.config import RequestError
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.report import plots, videos
 
 
 def make_rows(seeds: int, evaluations: int) -> list[dict]:
@@ -25,8 +25,8 @@ def make_recording(channels: int, size: int = 16, per_step: bool = False) -> vid
     return videos.Recording(frames, frames[:, -1], success)
 
 
-def count_colour(picture: Image.Image, colour: tuple[int, int, int]) -> int:
-    near = np.abs(np.asarray(picture.convert("RGB"), int) - colour).max(-1) <= 12
+def count_colour(image: Image.Image, colour: tuple[int, int, int]) -> int:
+    near = np.abs(np.asarray(image.convert("RGB"), int) - colour).max(-1) <= 12
     return int(near.sum())
 
 
@@ -34,9 +34,9 @@ def count_colour(picture: Image.Image, colour: tuple[int, int, int]) -> int:
 def test_the_curve_is_drawn(tmp_path, seeds, evaluations):
     path = tmp_path / "curve.png"
     assert plots.plot_run(make_rows(seeds, evaluations), path, "VisualFetchReach", "oracle", "m", 0.05)
-    picture = Image.open(path)
-    assert picture.width > 1200 and picture.height > 500 and 10_000 < path.stat().st_size < 300_000
-    assert count_colour(picture, (15, 123, 108)) > 20 and count_colour(picture, (180, 83, 31)) > 20
+    image = Image.open(path)
+    assert image.width > 1200 and image.height > 500 and 10_000 < path.stat().st_size < 300_000
+    assert count_colour(image, (15, 123, 108)) > 20 and count_colour(image, (180, 83, 31)) > 20
 
 
 def test_gaps_and_nothing_at_all(tmp_path):
@@ -54,15 +54,15 @@ def test_gaps_and_nothing_at_all(tmp_path):
 def test_a_video_shows_the_observation_beside_the_goal(tmp_path, channels):
     path = tmp_path / "video.gif"
     videos.write_video(make_recording(channels), path, frame_seconds=0.05)
-    picture = Image.open(path)
+    image = Image.open(path)
     rows = 2 if channels == 4 else 1
-    assert picture.n_frames == 18 and picture.info["loop"] == 0
-    assert 520 < picture.width < 640 and 256 * rows < picture.height < 256 * rows + 60 * rows + 80
+    assert image.n_frames == 18 and image.info["loop"] == 0
+    assert 520 < image.width < 640 and 256 * rows < image.height < 256 * rows + 60 * rows + 80
     green, red = [], []
     for t in (0, 5, 11, 17):  # a first frame, and the last of each episode
-        picture.seek(t)
-        green.append(count_colour(picture, (62, 207, 142)) > 2000)
-        red.append(count_colour(picture, (226, 109, 92)) > 2000)
+        image.seek(t)
+        green.append(count_colour(image, (62, 207, 142)) > 2000)
+        red.append(count_colour(image, (226, 109, 92)) > 2000)
     assert green == [False, True, False, True]
     if channels == 3:  # the depth's colours are close to this red
         assert red == [False, False, True, False]
@@ -91,7 +91,7 @@ def test_other_formats(tmp_path):
     with pytest.raises(RequestError, match="must end in one of"):
         videos.write_video(recording, tmp_path / "a.webm")
     vectors = videos.Recording(np.zeros((2, 6, 10), np.float32), np.zeros((2, 10), np.float32), np.zeros(2))
-    with pytest.raises(RequestError, match="not pictures"):
+    with pytest.raises(RequestError, match="not images"):
         videos.write_video(vectors, tmp_path / "b.gif")
 
 

@@ -13,12 +13,13 @@ from point_mass import PointMass, PointMassConfig
 
 import jaxrl_vis_envs
 from jaxrl_vis import config as config_file
-from jaxrl_vis.config import RequestError, preset
-from jaxrl_vis.train_step import make_env, make_train_step
+from jaxrl_vis.config import preset
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.learner.train_step import make_env, make_train_step
 from jaxrl_vis_envs import pixels, randomization
-from jaxrl_vis_envs.compilation import world_jit
+from jaxrl_vis_envs.compilation import env_jit
 from jaxrl_vis_envs.randomization import KINDS, OFF, Randomization, typical
-from jaxrl_vis_envs.render import Scene, gpu_kernel, pictures, render_planes
+from jaxrl_vis_envs.render import Scene, gpu_kernel, images, render_planes
 
 SIZE, COUNT, STEPS = 16, 3, 2
 TASKS = ["FetchReach", "FingerTurn", "HandReach", "Reacher", "SawyerReach"]
@@ -43,7 +44,7 @@ def episodes(ranges: Randomization = OFF) -> tuple[Any, Any]:
         end, _ = jax.lax.scan(lambda state, _: (jax.vmap(env.step)(state, action), None), start, length=STEPS)
         return start, end
 
-    return world_jit(play)(keys())
+    return env_jit(play)(keys())
 
 
 ALL = typical(*KINDS)
@@ -82,7 +83,7 @@ def test_starts_and_goals_are_those_without_randomisation() -> None:
     np.testing.assert_array_equal(varied.data.qpos, plain.data.qpos)
 
 
-def test_a_look_changes_pictures_and_not_the_physics() -> None:
+def test_a_look_changes_images_and_not_the_physics() -> None:
     (plain_start, plain_end), (start, end) = episodes(), episodes(LOOKS)
     for before, after in ((plain_start, start), (plain_end, end)):
         for name in ("observation", "desired_goal"):
@@ -124,7 +125,7 @@ def draw_shape() -> Any:
         planes = render_planes(scene, data, segmentation=True)
         return jnp.concatenate([planes.rgb, planes.depth[None]]), planes.segmentation
 
-    return scene, world_jit(draw)
+    return scene, env_jit(draw)
 
 
 @pytest.mark.parametrize(
@@ -162,7 +163,7 @@ def test_each_look(name: str, value: Any, geometry: bool, colours: bool) -> None
 def test_a_camera_is_shifted_in_its_own_frame() -> None:
     scene, draw = draw_shape()
     near = randomization.varied_scene(scene, {"camera_position": jnp.array([0.0, 0.0, 0.1])})
-    # 10 cm back: everything in the middle of the picture is 10 cm further.
+    # 10 cm back: everything in the middle of the image is 10 cm further.
     middle = (3, SIZE // 2, SIZE // 2)
     assert float(draw(near)[0][middle] - draw(scene)[0][middle]) == pytest.approx(0.1, abs=0.02)
 
@@ -222,12 +223,12 @@ def test_the_gpu_kernel_draws_varied_scenes(monkeypatch: pytest.MonkeyPatch) -> 
         planes = render_planes(randomization.varied_scene(scene, domain), data)
         return jnp.concatenate([planes.rgb, planes.depth[None]])
 
-    plain = np.asarray(world_jit(jax.vmap(draw))(start.data, start.domain))
+    plain = np.asarray(env_jit(jax.vmap(draw))(start.data, start.domain))
     monkeypatch.setattr(gpu_kernel, "takes", gpu_kernel.supports)
-    monkeypatch.setattr(pictures.gpu_kernel, "draw", functools.partial(gpu_kernel.draw, interpret=True))
+    monkeypatch.setattr(images.gpu_kernel, "draw", functools.partial(gpu_kernel.draw, interpret=True))
     by_kernel = np.asarray(jax.vmap(draw)(start.data, start.domain))
     assert (np.abs(plain - by_kernel).max(axis=1) < 1e-3).mean() > 0.98  # but for pixels on an edge
-    assert len({picture.tobytes() for picture in by_kernel}) == COUNT
+    assert len({image.tobytes() for image in by_kernel}) == COUNT
 
 
 def test_typical_ranges_and_bad_ones() -> None:
@@ -240,11 +241,11 @@ def test_typical_ranges_and_bad_ones() -> None:
             bad()
     with pytest.raises(ValueError, match="camera, lights"):
         typical("weather")
-    with pytest.raises(ValueError, match="draws pictures"):
+    with pytest.raises(ValueError, match="draws images"):
         jaxrl_vis_envs.make("Reacher", randomization=LOOKS)
 
 
-def test_every_picture_task_takes_every_kind() -> None:
+def test_every_image_task_takes_every_kind() -> None:
     for task in TASKS:
         env = jaxrl_vis_envs.make(f"Visual{task}", image_size=8, randomization=ALL)
         domain = jax.eval_shape(
@@ -255,7 +256,7 @@ def test_every_picture_task_takes_every_kind() -> None:
         scene = jax.eval_shape(lambda domain, env=env: randomization.varied_scene(env._scene, domain), domain)
         same = jax.tree.map(lambda one, other: (one.shape, one.dtype) == (other.shape, other.dtype), scene, env._scene)
         assert all(jax.tree.leaves(same))
-        assert isinstance(env._draw, pixels.PictureObserver)
+        assert isinstance(env._draw, pixels.ImageObserver)
 
 
 def test_the_learner_asks_for_it() -> None:
@@ -268,7 +269,7 @@ def test_the_learner_asks_for_it() -> None:
         ({"randomize": ("camra",)}, "did you mean camera"),
         ({"randomize": ("dynamics",), "randomize_strength": 10.0}, "mass"),
         ({"randomize_strength": 0.0}, "randomize_strength"),
-        ({"env": "Reacher", "randomize": ("colours",)}, "draws pictures"),
+        ({"env": "Reacher", "randomize": ("colours",)}, "draws images"),
         ({"env": "Reacher", "frames": 2}, "frames"),
         ({"frames": 0}, "frames"),
     ):

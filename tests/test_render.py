@@ -1,4 +1,4 @@
-"""The renderer against MuJoCo's own (stored pictures, so no GL is needed), against geometry, and against itself under vmap."""
+"""The renderer against MuJoCo's own (stored images, so no GL is needed), against geometry, and against itself under vmap."""
 
 import pathlib
 from types import SimpleNamespace
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from mujoco import mjx
 
-from jaxrl_vis_envs.compilation import world_jit
+from jaxrl_vis_envs.compilation import env_jit
 from jaxrl_vis_envs.render import Scene, render, render_planes
 
 REFERENCES = pathlib.Path(__file__).parent / "data" / "render_references.npz"
@@ -56,7 +56,7 @@ def references():
     mj_model = mujoco.MjModel.from_xml_string(str(arrays["xml"]))
     height, width = arrays["depth"].shape[1:]
     scene = Scene.from_mjmodel(mj_model, "eye", height, width, site_groups=(0,))
-    drawn = world_jit(jax.vmap(lambda poses: draw(scene, poses)))({name: arrays[name] for name in POSES})
+    drawn = env_jit(jax.vmap(lambda poses: draw(scene, poses)))({name: arrays[name] for name in POSES})
     return arrays, scene, jax.tree.map(np.asarray, drawn)
 
 
@@ -126,8 +126,8 @@ def test_accepts_mjx_data_and_vmap_equals_a_loop(ball):
         moved = mjx.kinematics(model, data.replace(qpos=data.qpos.at[0].set(shift)))
         return render(scene, mjx.camlight(model, moved))
 
-    batch = world_jit(jax.vmap(drawn))(shifts)
-    one = world_jit(drawn)
+    batch = env_jit(jax.vmap(drawn))(shifts)
+    one = env_jit(drawn)
     for index, shift in enumerate(shifts):
         single = one(shift)
         np.testing.assert_allclose(batch.depth[index], single.depth, atol=1e-5)
@@ -145,7 +145,7 @@ def test_runs_inside_scan(ball):
         moved = poses | {"cam_xpos": poses["cam_xpos"] + jnp.array([0.0, 0.0, 1.0]) * height}
         return height + 0.1, render_planes(scene, SimpleNamespace(**moved), rgb=False).depth
 
-    depths = world_jit(lambda: jax.lax.scan(body, 0.0, None, length=3)[1])()
+    depths = env_jit(lambda: jax.lax.scan(body, 0.0, None, length=3)[1])()
     assert depths.shape == (3, 33, 33)
     assert not np.array_equal(depths[0], depths[2])
 
@@ -198,7 +198,7 @@ def test_gradient_of_depth_with_respect_to_a_pose(ball):
         moved = poses | {"geom_xpos": jnp.asarray(poses["geom_xpos"]) + shift}
         return render_planes(scene, SimpleNamespace(**moved), rgb=False).depth[row, column]
 
-    toward = world_jit(jax.grad(depth), static_argnums=(1, 2))
+    toward = env_jit(jax.grad(depth), static_argnums=(1, 2))
     np.testing.assert_allclose(toward(jnp.zeros(3), 16, 16), [0.0, 1.0, 0.0], atol=1e-5)
     # Also finite where other objects' rays miss, and through the colours.
     assert np.all(np.isfinite(toward(jnp.zeros(3), 3, 3)))
@@ -207,7 +207,7 @@ def test_gradient_of_depth_with_respect_to_a_pose(ball):
         moved = poses | {"geom_xpos": jnp.asarray(poses["geom_xpos"]) + shift}
         return render_planes(scene, SimpleNamespace(**moved)).rgb.sum()
 
-    assert np.all(np.isfinite(world_jit(jax.grad(brightness))(jnp.zeros(3))))
+    assert np.all(np.isfinite(env_jit(jax.grad(brightness))(jnp.zeros(3))))
 
 
 def test_looks_can_differ_within_a_batch(ball):
@@ -215,7 +215,7 @@ def test_looks_can_differ_within_a_batch(ball):
     poses = poses_of(mj_data)
     rgba = jnp.stack([scene.rgba, scene.rgba.at[0, :3].set(jnp.array([1.0, 0.0, 0.0]))])
     size = jnp.stack([scene.size, scene.size.at[0].mul(0.5)])
-    frames = world_jit(jax.vmap(lambda rgba, size: draw(scene.replace(rgba=rgba, size=size), poses)))(rgba, size)
+    frames = env_jit(jax.vmap(lambda rgba, size: draw(scene.replace(rgba=rgba, size=size), poses)))(rgba, size)
     assert frames.rgb[0, 16, 16, 1] > 0 and frames.rgb[1, 16, 16, 1] < frames.rgb[1, 16, 16, 0]
     np.testing.assert_allclose(frames.depth[:, 16, 16], [1.8, 1.9], atol=1e-6)
 
@@ -244,6 +244,6 @@ def test_an_unknown_camera_is_refused_with_the_names_there_are(ball):
         Scene.from_mjmodel(ball[0], "side")
 
 
-def test_an_empty_picture_is_refused(ball):
+def test_an_empty_image_is_refused(ball):
     with pytest.raises(ValueError, match="height=0"):
         Scene.from_mjmodel(ball[0], "front", 0, 4)

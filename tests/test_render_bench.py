@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from jaxrl_vis import bench
-from jaxrl_vis.bench import record, render, render_operations, render_scenes, scene_pictures, warp_renderer
-from jaxrl_vis.config import RequestError
+from jaxrl_vis.bench import record, render, render_operations, render_scenes, scene_images, warp_renderer
+from jaxrl_vis.errors import RequestError
 from jaxrl_vis_envs.render import Scene
 
 BALL = """
@@ -105,7 +105,7 @@ def test_needed_tests_count_the_pixels_of_a_ball_and_every_plane(ball: str) -> N
     mj_data = mujoco.MjData(mj_model)
     render_scenes.forward(mj_model, mj_data)
     poses = {name: np.asarray(getattr(mj_data, name), np.float32)[None] for name in render_scenes.POSES}
-    # The ball's edge lies at tan(asin(.2 / 2)) of a picture that reaches to tan(30 degrees).
+    # The ball's edge lies at tan(asin(.2 / 2)) of an image that reaches to tan(30 degrees).
     disc = np.pi * (np.tan(np.arcsin(0.1)) / np.tan(np.pi / 6)) ** 2 / 4
     assert render_scenes.needed_tests(mj_model, poses, 128).tolist() == pytest.approx([1.0, disc], abs=2e-3)
     poses["geom_xpos"][:, 1] = [0.0, -2.0, 0.0]  # behind the camera
@@ -129,13 +129,13 @@ def test_operations_are_those_of_the_tests_and_of_one_shading(ball: str) -> None
     assert render_operations._count(lambda x, y: jnp.sqrt(x * y + 1.0), *[jax.ShapeDtypeStruct((7919,), jnp.float32)] * 2) == 3
 
 
-def test_pictures_that_do_not_change_are_refused() -> None:
+def test_images_that_do_not_change_are_refused() -> None:
     rows = np.arange(8, dtype=np.float32)[:, None]
-    with pytest.raises(AssertionError, match="8 of 8 pictures stay the same"):
-        render.assert_new_pictures(lambda batch: (jnp.asarray(batch), None), [rows, rows])
-    with pytest.raises(AssertionError, match="only 1 of 8 pictures differ"):
-        render.assert_new_pictures(lambda batch: 0 * batch, [rows, rows + 8])
-    render.assert_new_pictures(lambda batch: batch, [rows, rows + 8])
+    with pytest.raises(AssertionError, match="8 of 8 images stay the same"):
+        render.assert_new_images(lambda batch: (jnp.asarray(batch), None), [rows, rows])
+    with pytest.raises(AssertionError, match="only 1 of 8 images differ"):
+        render.assert_new_images(lambda batch: 0 * batch, [rows, rows + 8])
+    render.assert_new_images(lambda batch: batch, [rows, rows + 8])
 
 
 def test_calls_alternate_between_batches() -> None:
@@ -163,7 +163,7 @@ def test_a_scene_that_stands_still_is_not_measured(tmp_path: Path) -> None:
 def test_agreement_counts_sky_and_closeness() -> None:
     ours = np.array([[[np.inf, 2.0, 2.0, np.inf]]])
     theirs = np.array([[[np.inf, 2.01, 2.2, 1.0]]])
-    assert scene_pictures.agreement(ours, theirs) == 0.5
+    assert scene_images.agreement(ours, theirs) == 0.5
 
 
 def test_a_missing_warp_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:

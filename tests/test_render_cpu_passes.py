@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from small_scene import MORE_SPHERES, ORTHOGRAPHIC, small_scene
 
-from jaxrl_vis_envs.compilation import world_jit
+from jaxrl_vis_envs.compilation import env_jit
 from jaxrl_vis_envs.render import camera, cpu_passes, cpu_search, pixel_math, render_planes, shapes
 
 
@@ -28,7 +28,7 @@ def plainly(monkeypatch):
     ],
     ids=["many", "shadows", "orthographic"],
 )
-def test_the_passes_draw_the_same_picture(lens, more, shape, options, plainly):
+def test_the_passes_draw_the_same_image(lens, more, shape, options, plainly):
     height, width = shape
     scene, poses = small_scene(lens, more, height, width, **options)
     assert cpu_passes.takes(scene)
@@ -38,9 +38,9 @@ def test_the_passes_draw_the_same_picture(lens, more, shape, options, plainly):
             moved = SimpleNamespace(**{**vars(poses), "geom_xpos": geom_xpos})
             return render_planes(scene, moved, segmentation=True, quantized=True)
 
-        return world_jit(jax.vmap(draw))(places)
+        return env_jit(jax.vmap(draw))(places)
 
-    # A batch whose second picture is another one: a geom without a finite pose is not drawn. In the third, the capsule is alone
+    # A batch whose second image is another one: a geom without a finite pose is not drawn. In the third, the capsule is alone
     # in its corner.
     moved = poses.geom_xpos.at[5].set(jnp.array([0.7, 1.0, 0.9]))
     places = jnp.stack([poses.geom_xpos, poses.geom_xpos.at[2].set(jnp.nan), moved])
@@ -95,9 +95,9 @@ def test_the_passes_have_the_gradients_of_the_plain_renderer(plainly):
         planes = render_planes(scene, SimpleNamespace(**{**vars(poses), "geom_xpos": places}), quantized=True)
         return jnp.sum(jnp.sin(planes.depth))
 
-    gradient = world_jit(jax.grad(loss))(poses.geom_xpos)
+    gradient = env_jit(jax.grad(loss))(poses.geom_xpos)
     plainly()
-    expected = world_jit(jax.grad(loss))(poses.geom_xpos)
+    expected = env_jit(jax.grad(loss))(poses.geom_xpos)
     assert np.abs(expected).max() > 0.1
     np.testing.assert_allclose(gradient, expected, rtol=1e-4, atol=1e-4)
 

@@ -1,4 +1,4 @@
-"""The page about the renderer: its examples run, its pictures are there."""
+"""The page about the renderer: its examples run, its images are there."""
 
 import re
 from pathlib import Path
@@ -21,8 +21,8 @@ def test_examples_run_and_print_what_they_say(page: str, capsys: pytest.CaptureF
     assert 0.5 < float(printed[-1]) < 1.5
 
 
-def test_pictures_are_there(page: str, checkout: Path) -> None:
-    pictures = re.findall(r"!\[.*?\]\((.*?)\)", page)
-    assert len(pictures) == 5
-    for picture in pictures:
-        assert (checkout / "docs" / picture).read_bytes().startswith(b"\x89PNG")
+def test_images_are_there(page: str, checkout: Path) -> None:
+    images = re.findall(r"!\[.*?\]\((.*?)\)", page)
+    assert len(images) == 5
+    for image in images:
+        assert (checkout / "docs" / image).read_bytes().startswith(b"\x89PNG")

@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from jaxrl_vis_envs.compilation import world_jit
-from jaxrl_vis_envs.render import Scene, blocks, pictures, raycast, render, render_planes
+from jaxrl_vis_envs.compilation import env_jit
+from jaxrl_vis_envs.render import Scene, blocks, images, raycast, render, render_planes
 
 POSES = ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat", "xpos", "xmat")
 HEAD = '<visual><headlight ambient="{} {} {}" diffuse="0 0 0" specular="0 0 0"/></visual><statistic extent="1"/>'
@@ -36,7 +36,7 @@ def drawn(body: str, camera: str = "above", size: int = 17, header: str = FLAT_L
 def shown(scene: Scene, mj_data):
     """A frame of NumPy arrays, with normals and distance, compiled (what the cache of compiled programs keeps)."""
     poses = {name: np.array(getattr(mj_data, name), np.float32) for name in POSES}
-    drawing = world_jit(lambda scene, poses: render(scene, SimpleNamespace(**poses), normals=True, distance=True))
+    drawing = env_jit(lambda scene, poses: render(scene, SimpleNamespace(**poses), normals=True, distance=True))
     return jax.tree.map(np.asarray, drawing(scene, poses))
 
 
@@ -59,7 +59,7 @@ def test_only_what_is_asked_for_comes_back():
     poses = {name: np.array(getattr(mj_data, name), np.float32) for name in POSES}
 
     def planes(**wanted):
-        return world_jit(lambda poses: render_planes(scene, SimpleNamespace(**poses), **wanted))(poses)
+        return env_jit(lambda poses: render_planes(scene, SimpleNamespace(**poses), **wanted))(poses)
 
     whole = planes(**everything)
     shapes = dict(rgb=(3, 8, 12), depth=(8, 12), segmentation=(8, 12), normals=(3, 8, 12), distance=(8, 12))
@@ -195,7 +195,7 @@ def test_a_texture_repeats_per_object_or_per_metre():
     np.testing.assert_allclose(mean.rgb, 128, atol=1)
 
 
-def test_the_sky_can_be_a_picture():
+def test_the_sky_can_be_a_image():
     sky = '<texture type="skybox" builtin="checker" rgb1="0 0 0" rgb2="1 1 1" width="64" height="64"/>'
     frame = drawn('<geom type="sphere" size=".1"/>' + ABOVE, size=32, assets=sky)
     values = frame.rgb[frame.segmentation < 0][:, 0]
@@ -217,10 +217,10 @@ def test_many_objects_are_drawn_as_few_are(monkeypatch):
         unrolled = shown(scene, mj_data)
         monkeypatch.setattr(raycast, "UNROLLED", 0)
         assert blocks.tiled(scene)
-        pictures._drawn.clear_cache()
+        images._drawn.clear_cache()
         looped = shown(scene, mj_data)
         monkeypatch.undo()
-        pictures._drawn.clear_cache()
+        images._drawn.clear_cache()
         np.testing.assert_array_equal(unrolled.segmentation, looped.segmentation)
         np.testing.assert_allclose(unrolled.depth, looped.depth, rtol=1e-5)
         assert np.mean(unrolled.rgb == looped.rgb) > 0.999
@@ -237,7 +237,7 @@ def test_every_look_can_differ_within_a_batch_without_another_trace():
     ]  # fmt: skip
     traces = []
 
-    @world_jit
+    @env_jit
     def draw(leaves):
         traces.append(1)
         poses = {name: jnp.asarray(getattr(mj_data, name), jnp.float32)

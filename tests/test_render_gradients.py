@@ -1,4 +1,4 @@
-"""Gradients of pictures against finite differences, away from silhouettes, and what must not spoil them."""
+"""Gradients of images against finite differences, away from silhouettes, and what must not spoil them."""
 
 import functools
 from collections.abc import Callable
@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from jaxrl_vis_envs.compilation import world_jit
+from jaxrl_vis_envs.compilation import env_jit
 from jaxrl_vis_envs.render import Scene, render_planes
 
 POSES = ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat", "xpos", "xmat")
@@ -103,7 +103,7 @@ def setting(name: str) -> Setting:
     scene = Scene.from_mjmodel(mj_model, "eye", SIZE, SIZE)
 
     def values(change, poses, thing, mask):
-        # The camera goes along, so that every thing is in the middle of the picture.
+        # The camera goes along, so that every thing is in the middle of the image.
         place = jnp.zeros(3).at[0].set(0.9 * (thing - 1))
         changed, placed = moved(scene, poses, thing, change)
         changed = changed.replace(camera_shift=changed.camera_shift + place, light_position=changed.light_position + place)
@@ -116,7 +116,7 @@ def setting(name: str) -> Setting:
         slopes, (planes, means) = jax.jacrev(values, has_aux=True)(change, poses, thing, mask)
         return planes, means, slopes
 
-    return Setting(scene, poses, world_jit(measure))
+    return Setting(scene, poses, env_jit(measure))
 
 
 def well_inside(planes: Any, thing: int) -> jax.Array:
@@ -162,7 +162,7 @@ def test_gradients_are_those_of_finite_differences(name):
 
 @pytest.mark.parametrize("name", SCENES)
 def test_a_nan_pose_leaves_no_nan_in_other_gradients(name):
-    """The last thing has no pose; gradients of the whole picture with respect to the floor, the camera and the lights."""
+    """The last thing has no pose; gradients of the whole image with respect to the floor, the camera and the lights."""
     _, poses, measure = setting(name)
     poses = poses | {"geom_xpos": poses["geom_xpos"].at[-1].set(jnp.nan)}
     planes, means, slopes = measure(poses, 0, no_change(), ~NOWHERE)
@@ -173,11 +173,11 @@ def test_a_nan_pose_leaves_no_nan_in_other_gradients(name):
 
 
 def test_a_pose_is_found_by_descent():
-    """Of a ball, from a depth picture alone."""
+    """Of a ball, from a depth image alone."""
     scene, poses, _ = setting("primitives")
     thing = 1 + SCENES["primitives"].index("sphere")
 
-    @world_jit
+    @env_jit
     def descend(shift, target):
         def error(shift):
             change = no_change() | {"shift": shift}

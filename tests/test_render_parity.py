@@ -1,7 +1,7 @@
-"""The renderer against MuJoCo's own, model by model, with stored pictures: no GL is needed.
+"""The renderer against MuJoCo's own, model by model, with stored images: no GL is needed.
 
-The bounds are those of the live comparison (benchmarks/render_parity.py), on fewer and smaller pictures. A model without
-stored pictures fails, and so does one whose package has changed since they were made.
+The bounds are those of the live comparison (benchmarks/render_parity.py), on fewer and smaller images. A model without
+stored images fails, and so does one whose package has changed since they were made.
 """
 
 import mujoco
@@ -18,7 +18,7 @@ MANY_TRIANGLES = 5_000  # so many take longer to draw than a fast program takes 
 
 
 @pytest.mark.parametrize("name", render_models.MODELS)
-def test_pictures_agree_with_mujoco(name: str) -> None:
+def test_images_agree_with_mujoco(name: str) -> None:
     stored = render_references.load(name)
     mj_model, camera = render_models.build(name)
     assert render_models.fingerprint(mj_model) == stored.fingerprint, (
@@ -37,13 +37,13 @@ def test_pictures_agree_with_mujoco(name: str) -> None:
     for index, ours in enumerate(render_models.draw(scene, poses, quick)):
         theirs = Frame(stored.rgb[index], stored.depth[index], stored.segmentation[index])  # pyright: ignore[reportArgumentType]
         tally.add(ours, theirs)
-    assert len({row.tobytes() for row in stored.rgb}) == len(poses), "the stored pictures are copies of each other"
+    assert len({row.tobytes() for row in stored.rgb}) == len(poses), "the stored images are copies of each other"
     assert tally.solid > 0, "nothing was compared"
     assert not tally.failures(), {measure: tally.measures()[measure] for measure in tally.failures()}
 
 
 def frame(label: int = 0, depth: float = 2.0, colour: int = 100) -> Frame:
-    """A uniform picture of 16 x 16 pixels, with sky in the right half."""
+    """A uniform image of 16 x 16 pixels, with sky in the right half."""
     labels = np.full((16, 16), label, np.int32)
     labels[:, 8:] = -1
     rgb = np.full((16, 16, 3), colour, np.uint8)
@@ -56,7 +56,7 @@ def tally_of(ours: Frame, theirs: Frame, kind: str = BARE) -> Tally:
     return tally
 
 
-def test_a_picture_agrees_with_itself_away_from_edges() -> None:
+def test_a_image_agrees_with_itself_away_from_edges() -> None:
     tally = tally_of(frame(), frame())
     assert tally.failures() == []
     assert (tally.kept, tally.solid) == (16 * 14, 16 * 7)  # one pixel each side of the edge is left out

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from jaxrl_vis.bench.program_memory import largest_temporary
-from jaxrl_vis_envs.compilation import world_jit
+from jaxrl_vis_envs.compilation import env_jit
 from jaxrl_vis_envs.render import Scene, quantize, render_planes
 
 POSES = ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat", "xpos", "xmat")
@@ -39,7 +39,7 @@ def setting(kind: str, alpha: float = 1.0, size: int = SIZE) -> tuple[Scene, dic
     return Scene.from_mjmodel(mj_model, "eye", size, size), {name: jnp.asarray(getattr(mj_data, name)) for name in POSES}
 
 
-def picture(scene: Scene, poses: dict, height, quantized: bool = False):
+def image(scene: Scene, poses: dict, height, quantized: bool = False):
     """RGB-D of the scene with everything ``height`` higher, [4, H, W]; quantised, the colours are bytes first."""
     lifted = poses | {"geom_xpos": poses["geom_xpos"].at[1:, 2].add(height)}
     planes = render_planes(scene, SimpleNamespace(**lifted), quantized=quantized)
@@ -56,21 +56,21 @@ def test_vmap_of_scan_is_scan_of_vmap(kind, alpha, quantized, size):
     heights = jnp.array([[0.0, 0.05], [0.1, 0.15], [0.2, jnp.nan]])
 
     def draw(height):
-        return picture(scene, poses, height, quantized)
+        return image(scene, poses, height, quantized)
 
-    @world_jit
+    @env_jit
     def vmap_of_scan(heights):
         return jax.vmap(lambda row: jax.lax.scan(lambda carry, h: (carry, draw(h)), None, row)[1])(heights)
 
-    @world_jit
+    @env_jit
     def scan_of_vmap(heights):
         return jax.lax.scan(lambda carry, h: (carry, jax.vmap(draw)(h)), None, heights.T)[1]
 
     left, right = vmap_of_scan(heights), jnp.moveaxis(scan_of_vmap(heights), 0, 1)
     assert np.all(np.isfinite(left))
     assert np.mean(np.abs(left - right) < 1e-4) > 0.998
-    pictures = np.asarray(left).reshape(6, -1)
-    assert len(np.unique(pictures, axis=0)) == 6
+    images = np.asarray(left).reshape(6, -1)
+    assert len(np.unique(images, axis=0)) == 6
 
 
 def test_a_donated_state_is_drawn_into():
@@ -78,10 +78,10 @@ def test_a_donated_state_is_drawn_into():
 
     def step(state):
         height, frames = state
-        frame = quantize(picture(scene, poses, height)[:3])
+        frame = quantize(image(scene, poses, height)[:3])
         return height + 0.1, jax.lax.dynamic_update_index_in_dim(frames, frame, jnp.int32(height * 10 + 0.5), 0)
 
-    donating = world_jit(step, donate_argnums=0)
+    donating = env_jit(step, donate_argnums=0)
     state = (jnp.float32(0.0), jnp.zeros((3, 3, SIZE, SIZE), jnp.uint8))
     before = state[1]
     for _ in range(3):
@@ -94,7 +94,7 @@ SHARDED = f"""
 import sys
 sys.path.insert(0, {__file__.rsplit("/", 1)[0]!r})
 import jax, numpy as np
-from test_render_transforms import picture, setting, world_jit
+from test_render_transforms import image, setting, env_jit
 from jax.sharding import PartitionSpec
 assert len(jax.devices()) == 2
 heights = np.linspace(0.0, 0.3, 4, dtype=np.float32)
@@ -102,10 +102,10 @@ mesh = jax.sharding.Mesh(np.array(jax.devices()), ("envs",))
 spec = PartitionSpec("envs")
 for kind, size, quantized in (("mesh", 16, False), ("capsule", 48, True)):
     scene, poses = setting(kind, size=size)
-    drawn = jax.vmap(lambda height: picture(scene, poses, height, quantized))
-    sharded = world_jit(jax.shard_map(drawn, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False))(heights)
+    drawn = jax.vmap(lambda height: image(scene, poses, height, quantized))
+    sharded = env_jit(jax.shard_map(drawn, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False))(heights)
     assert len(sharded.sharding.device_set) == 2
-    np.testing.assert_allclose(sharded, world_jit(drawn)(heights), atol=1e-4)
+    np.testing.assert_allclose(sharded, env_jit(drawn)(heights), atol=1e-4)
     print(kind, "same")
 """
 
@@ -118,7 +118,7 @@ def test_shard_map_over_two_devices(clean_environment):
 
 
 @pytest.mark.parametrize(("kind", "quantized"), [("capsule", False), ("capsule", True), ("mesh", False)])
-def test_no_temporary_is_larger_than_twice_the_picture(kind, quantized):
+def test_no_temporary_is_larger_than_twice_the_image(kind, quantized):
     scene, poses = setting(kind, size=64)
 
     def draw(height):
@@ -126,7 +126,7 @@ def test_no_temporary_is_larger_than_twice_the_picture(kind, quantized):
         planes = render_planes(scene, SimpleNamespace(**lifted), quantized=quantized)
         return planes.rgb, planes.depth
 
-    compiled = world_jit(jax.vmap(draw)).lower(jax.ShapeDtypeStruct((4096,), jnp.float32)).compile()
+    compiled = env_jit(jax.vmap(draw)).lower(jax.ShapeDtypeStruct((4096,), jnp.float32)).compile()
     output = 4096 * 64 * 64 * (7 if quantized else 16)
     largest = largest_temporary(compiled)
     assert 4096 * 64 * 64 <= largest <= 2 * output

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxrl_vis.relabel import choose_goal_slots
-from jaxrl_vis.replay import make_replay, num_bytes, pack, unpack
+from jaxrl_vis.learner.relabel import choose_goal_slots
+from jaxrl_vis.learner.replay import make_replay, num_bytes, pack, unpack
 from jaxrl_vis.types import Episodes
 
 HORIZON, ENVS = 5, 3
@@ -22,7 +22,7 @@ def encoded_rollout(first_episode: int) -> Episodes:
 
 
 @pytest.mark.parametrize("width", [8, 6])
-def test_pictures_come_back_byte_for_byte(width):
+def test_images_come_back_byte_for_byte(width):
     frames = jax.random.bits(jax.random.key(0), (2, HORIZON + 2, 3, 5, width), jnp.uint8)
     packed = pack(frames)
     assert packed.nbytes == frames.nbytes
@@ -83,8 +83,8 @@ def test_after_an_emptied_ring_only_new_episodes_are_sampled():
 def test_an_episode_takes_one_frame_a_step_and_two_more():
     """At most (T+2)/T frames and 64 bytes a transition."""
     replay = make_replay(1000, 4, 50)
-    picture = jax.ShapeDtypeStruct((4, 64, 64), jnp.uint8)
-    per_transition = num_bytes(replay.spec(picture, 3, 4)) / (replay.num_episodes * 50)
+    image = jax.ShapeDtypeStruct((4, 64, 64), jnp.uint8)
+    per_transition = num_bytes(replay.spec(image, 3, 4)) / (replay.num_episodes * 50)
     assert per_transition <= 64 * 64 * 4 * 52 / 50 + 64
 
 

@@ -1,4 +1,4 @@
-"""A learner that sees stacked pictures: its goals stand still, whether they were given or made by relabelling."""
+"""A learner that sees stacked images: its goals stand still, whether they were given or made by relabelling."""
 
 import functools
 
@@ -9,12 +9,12 @@ import pytest
 from probe_environments import Probe
 
 import jaxrl_vis_envs
-from jaxrl_vis import train_step
 from jaxrl_vis.config import preset
-from jaxrl_vis.ddpg import make_ddpg
-from jaxrl_vis.relabel import stand_still
-from jaxrl_vis.replay import Indices, make_replay
-from jaxrl_vis.trainer import Trainer
+from jaxrl_vis.learner import train_step
+from jaxrl_vis.learner.ddpg import make_ddpg
+from jaxrl_vis.learner.relabel import stand_still
+from jaxrl_vis.learner.replay import Indices, make_replay
+from jaxrl_vis.run.trainer import Trainer
 from jaxrl_vis.types import Episodes
 from jaxrl_vis_envs.base import push_history, start_history
 
@@ -22,7 +22,7 @@ ENVS, SETTINGS = 2, {"batch_size": 64, "updates_per_iteration": 1, "replay_trans
 
 
 def test_relabelled_goals_are_what_was_reached_standing_still():
-    """VisualReacher's own rule, on episodes whose pictures hold their number and their slot, newest first."""
+    """VisualReacher's own rule, on episodes whose images hold their number and their slot, newest first."""
     env = jaxrl_vis_envs.make("VisualReacher", frames=2, image_size=4, pixels="depth")
     horizon = 5
     slots = np.arange(horizon + 2)
@@ -45,23 +45,23 @@ def test_relabelled_goals_are_what_was_reached_standing_still():
         np.testing.assert_array_equal(still.goal[row], env.as_goal(frames[e, g].astype(np.uint8)))
         assert set(np.unique(still.goal[row])) == {newest[e, g]}
         assert set(np.unique(reached[row])) == {newest[e, t + 1]}
-        # Reached where the goal is the very next picture, though what was observed there shows that it moved.
+        # Reached where the goal is the very next image, though what was observed there shows that it moved.
         assert np.array_equal(still.goal[row], reached[row]) == (g == t + 1)
         assert not np.array_equal(still.goal[row], still.observation_tp1[row])
 
 
 class Walker(Probe):
-    """A point that walks; a picture is as bright as the point is far, on six grey levels, so that goals can be met."""
+    """A point that walks; an image is as bright as the point is far, on six grey levels, so that goals can be met."""
 
     def __init__(self, frames: int):
         self.frames = frames
 
-    def picture(self, position):
+    def image(self, position):
         return jnp.full((3, 8, 8), jnp.clip(jnp.round(position[0]) % 6, 0, 5), jnp.uint8)
 
     def reset(self, key):
         position, goal = jax.random.uniform(key, (2, 1), maxval=6.0)
-        still, wanted = (jnp.tile(self.picture(place), (self.frames, 1, 1)) for place in (position, goal))
+        still, wanted = (jnp.tile(self.image(place), (self.frames, 1, 1)) for place in (position, goal))
         obs = {"observation": still, "achieved_goal": still, "desired_goal": wanted}
         return self._measure(position, position, goal, obs, start_history(position, self.frames))
 
@@ -71,7 +71,7 @@ class Walker(Probe):
 
     def observe(self, state):
         positions = [state.data] if state.history is None else [state.data, *state.history]
-        return jnp.concatenate([self.picture(position) for position in positions])
+        return jnp.concatenate([self.image(position) for position in positions])
 
 
 @functools.cache
@@ -102,24 +102,24 @@ def test_training_samples_goals_that_stand_still():
     seen = {name: float(value[0]) for name, value in metrics.items()}
     assert seen["goals_that_stand_still"] == 1.0
     assert seen["observations_that_move"] > 0.5
-    # Half of the goals are the next picture for certain, some others by chance.
+    # Half of the goals are the next image for certain, some others by chance.
     assert 0.4 < seen["rewarded"] < 0.95
     assert seen["rewarded_as_arrived"] == 1.0
     assert seen["guard/nonfinite"] == 0.0
 
 
-def test_people_are_shown_the_newest_picture():
+def test_people_are_shown_the_newest_image():
     made = program()
     trainer = Trainer(made.config, made)
-    assert trainer.shows_pictures
-    _, pictures = jax.eval_shape(made.evaluate, trainer.shapes.train, jax.random.key(0))
+    assert trainer.shows_images
+    _, images = jax.eval_shape(made.evaluate, trainer.shapes.train, jax.random.key(0))
     horizon = made.env.horizon
-    assert pictures["frames"].shape == (1, 8, horizon + 1, 3, 8, 8)
-    assert pictures["goals"].shape == (1, 8, 3, 8, 8)
+    assert images["frames"].shape == (1, 8, horizon + 1, 3, 8, 8)
+    assert images["goals"].shape == (1, 8, 3, 8, 8)
 
 
 def test_a_single_frame_is_left_alone(monkeypatch):
-    """With one picture there is nothing to do, and nothing is done."""
+    """With one image there is nothing to do, and nothing is done."""
     monkeypatch.setattr(train_step, "stand_still", None)  # calling it would fail
     made = program(1)
     jax.eval_shape(made.train_iteration, jax.eval_shape(made.init, jax.random.key(0)[None]))

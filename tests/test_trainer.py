@@ -15,11 +15,14 @@ import numpy as np
 import pytest
 from fake_program import FakeProgram, as_plain, make_fake_trainer, small_config
 
-from jaxrl_vis import memory, metrics, run_loop, train_step, trainer
-from jaxrl_vis.checkpoint import FULL, LIGHT, Checkpoints
-from jaxrl_vis.config import Config, RequestError, preset
-from jaxrl_vis.run_folder import RunFolder, default_folder, read_config
-from jaxrl_vis_envs.compilation import world_jit
+from jaxrl_vis.config import Config, preset
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.learner import train_step
+from jaxrl_vis.run import loop as run_loop
+from jaxrl_vis.run import memory, metrics, trainer
+from jaxrl_vis.run.checkpoint import FULL, LIGHT, Checkpoints
+from jaxrl_vis.run.folder import RunFolder, default_folder, read_config
+from jaxrl_vis_envs.compilation import env_jit
 
 FAKE = Path(__file__).with_name("fake_program.py")
 
@@ -351,7 +354,7 @@ def test_the_real_program_resumes_bit_for_bit(tmp_path, capsys):
         calls.append(0)
         return original(loop)
 
-    program = dataclasses.replace(program, train_iteration=world_jit(train_iteration, donate_argnums=0))
+    program = dataclasses.replace(program, train_iteration=env_jit(train_iteration, donate_argnums=0))
 
     def run(path, resume=False, **changes):
         asked = config.replace(**changes)

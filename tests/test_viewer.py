@@ -13,10 +13,11 @@ import mujoco
 import numpy as np
 import probe_environments as probes
 
-from jaxrl_vis import cli, viewer
+from jaxrl_vis import cli
 from jaxrl_vis.config import preset
-from jaxrl_vis.rollout import play
-from jaxrl_vis.train_step import make_train_step
+from jaxrl_vis.learner.rollout import play
+from jaxrl_vis.learner.train_step import make_train_step
+from jaxrl_vis.report import viewer
 from jaxrl_vis_envs.adapters.brax_viewer import Poses, viewer_page
 
 HORIZON = probes.Probe.horizon

@@ -29,14 +29,14 @@ class State:
     Attributes:
         data: The physics state (`mujoco.mjx.Data` for the MuJoCo tasks).
         achieved_state: [G] float32, the true quantity that the goal is about (metres or radians; each task says which).
-        goal_state: [G] float32, the value of that quantity that the goal picture shows. Neither is shown to the agent.
+        goal_state: [G] float32, the value of that quantity that the goal image shows. Neither is shown to the agent.
         reward: [] float32, `goals.oracle_reward` of the two.
         done: [] float32, always 0: episodes have one length, and ending one is a truncation.
         metrics: ``success`` ([] float32, 0 or 1) and ``goal_distance`` ([] float32, unit of the state).
         obs: ``observation``, as `GoalEnv.observe` makes it, ``achieved_goal`` and ``desired_goal``, as `GoalEnv.as_goal` does;
-            None where the caller asked for no pictures (`GoalEnv.advance` passes it through untouched).
+            None where the caller asked for no images (`GoalEnv.advance` passes it through untouched).
         history: [F - 1, nq] float32, the joint positions one, two, ... control steps ago, where an observation stacks F > 1
-            pictures; else None. Before the first step everything stood still.
+            images; else None. Before the first step everything stood still.
         domain: What domain randomisation drew for this episode (see `randomization`); None where it is off.
     """
 
@@ -68,7 +68,7 @@ class GoalEnv(abc.ABC):
     # How hard the task is before anything is learned, as measured by benchmarks/task_difficulty.py; None: not measured.
     chance: float | None = None  # share of episodes that uniformly random actions end in success
     difficulty: float | None = None  # mean distance from start to goal, in thresholds
-    frames: int = 1  # F, pictures of the latest control steps that an observation stacks
+    frames: int = 1  # F, images of the latest control steps that an observation stacks
 
     @abc.abstractmethod
     def reset(self, key: jax.Array) -> State:
@@ -80,7 +80,7 @@ class GoalEnv(abc.ABC):
 
     @abc.abstractmethod
     def advance(self, state: State, action: jax.Array) -> State:
-        """Moves the physics by one control step, without making a picture.
+        """Moves the physics by one control step, without making an image.
 
         Args:
             state: The state to start from.
@@ -91,11 +91,11 @@ class GoalEnv(abc.ABC):
     def observe(self, state: State) -> jax.Array:
         """What the agent sees of ``state``: planar [C, H, W] uint8, or [S] float32 for the state variants.
 
-        Where pictures are stacked, C is F times the channels of one, and the newest comes first.
+        Where images are stacked, C is F times the channels of one, and the newest comes first.
         """
 
     def as_goal(self, frame: jax.Array) -> jax.Array:
-        """The goal that says "be where ``frame`` was", in the shape of ``frame``: its newest picture, F times.
+        """The goal that says "be where ``frame`` was", in the shape of ``frame``: its newest image, F times.
 
         A goal stands still; whoever relabels with something observed on the way has to say so in the same way.
         """
@@ -104,7 +104,7 @@ class GoalEnv(abc.ABC):
         return jnp.tile(frame[: frame.shape[0] // self.frames], (self.frames, 1, 1))
 
     def step(self, state: State, action: jax.Array) -> State:
-        """`advance`, then `observe`: the one to use where every step's picture is wanted."""
+        """`advance`, then `observe`: the one to use where every step's image is wanted."""
         state = self.advance(state, action)
         frame = self.observe(state)
         achieved_goal = self.as_goal(frame)

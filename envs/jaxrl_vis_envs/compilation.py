@@ -28,7 +28,7 @@ def compiler_options(backend: str | None = None, *, runs_once: bool = False) -> 
     return options
 
 
-def world_jit(function: Callable, *, runs_once: bool = False, **jit_options: Any) -> Any:
+def env_jit(function: Callable, *, runs_once: bool = False, **jit_options: Any) -> Any:
     """`jax.jit` with the options of `compiler_options`; every jit of a function that moves or draws a world goes through it."""
     return jax.jit(function, compiler_options=compiler_options(runs_once=runs_once), **jit_options)
 

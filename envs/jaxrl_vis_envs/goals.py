@@ -1,7 +1,7 @@
 """Rewards and success: the one place. Environments score with these, and the learner relabels with the same functions.
 
 Two rewards exist. The *oracle* compares true states within a threshold (thesis, equation 5.6). The *indicator* is positive only
-where the observed picture equals the goal picture in every byte (thesis, equation 5.4), so it needs no state estimate and has
+where the observed image equals the goal image in every byte (thesis, equation 5.4), so it needs no state estimate and has
 no false positives. Arrays may carry any leading batch axes; only the goal's own axes are reduced. NumPy arrays are scored by
 NumPy, so that a learner on the host (see `adapters`) pays for no transfer and no compilation.
 """
@@ -44,7 +44,7 @@ def oracle_reward(
     return _namespace(achieved_state, goal_state).where(is_reached, positive, negative).astype(jnp.float32)
 
 
-def indicator_reward(picture: jax.Array, goal_picture: jax.Array, positive: float = 1.0, negative: float = -1.0) -> jax.Array:
-    """Indicator reward of [..., C, H, W] pictures (thesis, equation 5.4): ``positive`` where all bytes agree: [...] float32."""
-    equal = jnp.all(picture == goal_picture, axis=(-3, -2, -1))
+def indicator_reward(image: jax.Array, goal_image: jax.Array, positive: float = 1.0, negative: float = -1.0) -> jax.Array:
+    """Indicator reward of [..., C, H, W] images (thesis, equation 5.4): ``positive`` where all bytes agree: [...] float32."""
+    equal = jnp.all(image == goal_image, axis=(-3, -2, -1))
     return jnp.where(equal, positive, negative).astype(jnp.float32)

@@ -1,12 +1,12 @@
 """What the agent sees: which channels, in which order, at which size, and how a depth becomes a byte.
 
-A picture is planar, [C, H, W] uint8, with the channels R, G, B, D, as many of them as ``pixels`` asks for. Depth is
+An image is planar, [C, H, W] uint8, with the channels R, G, B, D, as many of them as ``pixels`` asks for. Depth is
 planar (along the camera's axis) and metric: 0 is the near end of the task's depth range, 255 the far end, linear between,
 clipped outside.
 
-``frames`` pictures, of this control step and those before it, may be stacked along the channels, the newest first. What came
-before is kept as joint positions (`State.history`), a few numbers, and drawn again: a picture costs less than the physics
-that leads to it, and no picture has to travel with the state.
+``frames`` images, of this control step and those before it, may be stacked along the channels, the newest first. What came
+before is kept as joint positions (`State.history`), a few numbers, and drawn again: an image costs less than the physics
+that leads to it, and no image has to travel with the state.
 """
 
 import dataclasses
@@ -17,17 +17,17 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
+from jaxrl_vis_envs.physics import mjx_model
+from jaxrl_vis_envs.physics.mjx_model import mjx
 from jaxrl_vis_envs.randomization import Domain, varied_scene
 from jaxrl_vis_envs.render import Scene, render_planes
-from jaxrl_vis_envs.tasks import mjx_model
-from jaxrl_vis_envs.tasks.mjx_model import mjx
 
 CHANNELS = {"rgbd": 4, "rgb": 3, "depth": 1}
 
 
 @dataclasses.dataclass(frozen=True)
 class PixelsConfig:
-    """Settings of the pictures."""
+    """Settings of the images."""
 
     image_size: int = 64
     """Height and width, in pixels."""
@@ -36,7 +36,7 @@ class PixelsConfig:
     depth_range: tuple[float, float] = (0.1, 10.0)
     """Depths that bytes 0 and 255 stand for, m. Tasks choose it as tight as what moves allows."""
     frames: int = 1
-    """Pictures of the latest control steps that an observation stacks. With one, velocities are hidden."""
+    """Images of the latest control steps that an observation stacks. With one, velocities are hidden."""
 
     def __post_init__(self) -> None:
         if self.frames < 1:
@@ -55,8 +55,8 @@ Observer = Callable[..., jax.Array]
 look in ``domain`` (see `State`)."""
 
 
-class PictureObserver:
-    """A function from the poses of one environment to its pictures [frames * channels, H, W] uint8.
+class ImageObserver:
+    """A function from the poses of one environment to its images [frames * channels, H, W] uint8.
 
     Attributes:
         scene: What is drawn, before randomisation.
@@ -64,7 +64,7 @@ class PictureObserver:
     """
 
     def __init__(self, mj_model: mujoco.MjModel, camera: str, config: PixelsConfig) -> None:
-        """Reads the scene; see `picture_observer`."""
+        """Reads the scene; see `image_observer`."""
         size = config.image_size
         self.scene = Scene.from_mjmodel(mj_model, camera=camera, height=size, width=size)
         self.spec = jax.ShapeDtypeStruct((config.frames * CHANNELS[config.pixels], size, size), jnp.uint8)
@@ -77,8 +77,8 @@ class PictureObserver:
         Args:
             data: Poses, up to date.
             history: [frames - 1, nq] float32, joint positions one, two, ... control steps ago. Without, the world has stood
-                still, and one picture is repeated.
-            domain: The look of the episode (`randomization`), which holds for all pictures.
+                still, and one image is repeated.
+            domain: The look of the episode (`randomization`), which holds for all images.
         """
         scene = varied_scene(self.scene, domain)
         if self._config.frames == 1 or history is None:
@@ -88,11 +88,11 @@ class PictureObserver:
             with jax.default_matmul_precision("highest"):
                 return self._draw(scene, mjx_model.kinematics(self._model, data.replace(qpos=qpos)))
 
-        pictures = jax.vmap(draw_at)(jnp.concatenate([data.qpos[None], history]))
-        return pictures.reshape(-1, *pictures.shape[2:])
+        images = jax.vmap(draw_at)(jnp.concatenate([data.qpos[None], history]))
+        return images.reshape(-1, *images.shape[2:])
 
     def _draw(self, scene: Scene, data: mjx.Data) -> jax.Array:
-        """One picture [channels, H, W]."""
+        """One image [channels, H, W]."""
         wants_colour, wants_depth = self._config.pixels != "depth", self._config.pixels != "rgb"
         planes = render_planes(scene, data, rgb=wants_colour, depth=wants_depth, quantized=True)
         channels = []
@@ -103,13 +103,13 @@ class PictureObserver:
         return jnp.concatenate(channels)
 
 
-def picture_observer(mj_model: mujoco.MjModel, camera: str, config: PixelsConfig) -> PictureObserver:
-    """What a picture task sees with, for `MjxGoalEnv`.
+def image_observer(mj_model: mujoco.MjModel, camera: str, config: PixelsConfig) -> ImageObserver:
+    """What an image task sees with, for `MjxGoalEnv`.
 
     Raises:
         ValueError: There is no such camera, or something in its view cannot be drawn.
     """
-    return PictureObserver(mj_model, camera, config)
+    return ImageObserver(mj_model, camera, config)
 
 
 def encode_depth(depth: jax.Array, depth_range: tuple[float, float]) -> jax.Array:

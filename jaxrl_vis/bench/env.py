@@ -1,4 +1,4 @@
-"""Whole episodes: reset with its goal picture, then physics and a picture at every step, under random actions."""
+"""Whole episodes: reset with its goal image, then physics and an image at every step, under random actions."""
 
 from collections.abc import Iterator
 
@@ -8,14 +8,14 @@ from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.settings import Settings
 from jaxrl_vis.bench.timing import assert_varied, compile_timed
 from jaxrl_vis.bench.timing import measure as measure_time
-from jaxrl_vis_envs.compilation import world_jit
+from jaxrl_vis_envs.compilation import env_jit
 
 CPU_COUNTS = (16, 256)
 ACCELERATOR_COUNTS = (256, 1024, 4096, 8192)
 
 
 def measure(settings: Settings) -> Iterator[Measurement]:
-    """Environment steps per second, resets and goal pictures amortised over the horizon."""
+    """Environment steps per second, resets and goal images amortised over the horizon."""
     env = settings.make_env()
 
     def episode(key: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -33,7 +33,7 @@ def measure(settings: Settings) -> Iterator[Measurement]:
 
     for count in settings.counts(CPU_COUNTS, ACCELERATOR_COUNTS):
         keys = jax.random.split(jax.random.key(3), count)
-        compiled, compile_s = compile_timed(world_jit(jax.vmap(episode, out_axes=(1, 0))), keys)
+        compiled, compile_s = compile_timed(env_jit(jax.vmap(episode, out_axes=(1, 0))), keys)
         frames, goals = compiled(keys)
         assert_varied(frames[-1], "last frames")
         assert_varied(goals, "goals")
@@ -43,6 +43,6 @@ def measure(settings: Settings) -> Iterator[Measurement]:
             name="env/steps",
             value=count * env.horizon / timing.median_s,
             unit="env-steps/s",
-            config={**settings.picture_config(), "envs": count},
+            config={**settings.image_config(), "envs": count},
             details=timing.details(compile_s),
         )

@@ -10,13 +10,13 @@ import numpy as np
 from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.render_scenes import set_poses
 from jaxrl_vis.bench.timing import Timing, assert_varied
-from jaxrl_vis.config import RequestError
+from jaxrl_vis.errors import RequestError
 
 POSES = 64
 
 
 def check() -> None:
-    """Draws one empty picture.
+    """Draws one empty image.
 
     Raises:
         RequestError: There is no OpenGL.
@@ -43,11 +43,11 @@ def measure(
         config: What the record says was drawn.
         mj_model: The model; its first camera looks.
         batches: Poses, see `render_scenes.random_poses`. The first counts.
-        repeats: Unused; every picture is timed.
+        repeats: Unused; every image is timed.
         depth: [K, H, W] of ours in the first poses, metres, inf for the sky.
         ours: Our images per second.
     """
-    from jaxrl_vis.bench.scene_pictures import agreement
+    from jaxrl_vis.bench.scene_images import agreement
 
     size, poses = config["image_size"], batches[0]
     count = min(POSES, len(poses["geom_xpos"]))
@@ -74,7 +74,7 @@ def measure(
             seconds.append(time.perf_counter() - start)
             colours.append(colour)
             depths.append(metres)
-    assert_varied(np.stack(colours[1:]), "pictures of mujoco.Renderer")
+    assert_varied(np.stack(colours[1:]), "images of mujoco.Renderer")
     median = float(np.median(seconds[1:]))
     timing = Timing(median, (max(seconds[1:]) - min(seconds[1:])) / median, count)
     far = 0.999 * mj_model.vis.map.zfar * mj_model.stat.extent

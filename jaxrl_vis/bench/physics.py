@@ -1,4 +1,4 @@
-"""Physics alone: `advance` under random actions, no pictures; MuJoCo Playground's FingerTurn beside ours on request."""
+"""Physics alone: `advance` under random actions, no images; MuJoCo Playground's FingerTurn beside ours on request."""
 
 from collections.abc import Iterator
 
@@ -10,18 +10,18 @@ from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.settings import Settings
 from jaxrl_vis.bench.timing import assert_varied, compile_timed
 from jaxrl_vis.bench.timing import measure as measure_time
-from jaxrl_vis.config import RequestError
+from jaxrl_vis.errors import RequestError
 from jaxrl_vis_envs.base import GoalEnv, State
-from jaxrl_vis_envs.compilation import world_jit
+from jaxrl_vis_envs.compilation import env_jit
 
 CPU_COUNTS = (16, 256)
 ACCELERATOR_COUNTS = (256, 1024, 4096, 8192)
 
 
 def start_states(env: GoalEnv, count: int) -> State:
-    """``count`` different starts, without pictures."""
+    """``count`` different starts, without images."""
     keys = jax.random.split(jax.random.key(1), count)
-    return world_jit(jax.vmap(lambda key: env.reset(key).replace(obs=None)))(keys)
+    return env_jit(jax.vmap(lambda key: env.reset(key).replace(obs=None)))(keys)
 
 
 def measure(settings: Settings) -> Iterator[Measurement]:
@@ -45,7 +45,7 @@ def measure(settings: Settings) -> Iterator[Measurement]:
 
     for count in counts:
         arguments = jax.tree.map(lambda leaf, count=count: leaf[:count], states), jax.random.key(2)
-        compiled, compile_s = compile_timed(world_jit(advance), *arguments)
+        compiled, compile_s = compile_timed(env_jit(advance), *arguments)
         final = compiled(*arguments)
         assert_varied(final.achieved_state, "end states")
         if not bool(jnp.isfinite(final.achieved_state).all()):

@@ -1,7 +1,7 @@
-"""Pictures alone, without physics: what an agent sees of its task, or a scene beside other renderers.
+"""Images alone, without physics: what an agent sees of its task, or a scene beside other renderers.
 
-Every batch is drawn from poses that all differ, and every other call draws another batch, so nothing can be kept from picture
-to picture; that both differ is asserted.
+Every batch is drawn from poses that all differ, and every other call draws another batch, so nothing can be kept from image
+to image; that both differ is asserted.
 """
 
 import itertools
@@ -16,8 +16,8 @@ from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.settings import Settings
 from jaxrl_vis.bench.timing import assert_varied, compile_timed
 from jaxrl_vis.bench.timing import measure as measure_time
-from jaxrl_vis.config import RequestError
-from jaxrl_vis_envs.compilation import world_jit
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis_envs.compilation import env_jit
 
 CPU_COUNTS = (64,)
 ACCELERATOR_COUNTS = (256, 1024, 4096)
@@ -27,23 +27,23 @@ _STEPS = 5  # random control steps from the common start, after which no two rob
 
 
 def measure(settings: Settings) -> Iterator[Measurement]:
-    """Images per second for each picture size, output and batch: of the task, or of scenes where one or a peer is asked for."""
+    """Images per second for each image size, output and batch: of the task, or of scenes where one or a peer is asked for."""
     if settings.scene is not None or settings.peer is not None:
-        from jaxrl_vis.bench import scene_pictures
+        from jaxrl_vis.bench import scene_images
 
-        yield from scene_pictures.measure(settings, picture_sizes(settings))
+        yield from scene_images.measure(settings, image_sizes(settings))
         return
     if not settings.env.startswith("Visual"):
-        raise RequestError(f"bench render needs a task with pictures: --env Visual{settings.env}")
+        raise RequestError(f"bench render needs a task with images: --env Visual{settings.env}")
     counts = settings.counts(CPU_COUNTS, ACCELERATOR_COUNTS)
     batches = [poses(settings, max(counts), seed) for seed in (4, 5)]
-    for size in picture_sizes(settings):
+    for size in image_sizes(settings):
         for output in ("depth", "rgb", "rgbd") if settings.on_accelerator else ("depth", "rgbd"):
             env = settings.make_env(image_size=size, pixels=output)
             for count in counts:
                 some = [jax.tree.map(lambda leaf, count=count: leaf[:count], states) for states in batches]
-                compiled, compile_s = compile_timed(world_jit(jax.vmap(env.observe)), some[0])
-                assert_new_pictures(compiled, some)
+                compiled, compile_s = compile_timed(env_jit(jax.vmap(env.observe)), some[0])
+                assert_new_images(compiled, some)
                 timing = measure_time(alternate(compiled, some), settings.repeats)
                 yield Measurement(
                     name="render/images",
@@ -54,7 +54,7 @@ def measure(settings: Settings) -> Iterator[Measurement]:
                 )
 
 
-def picture_sizes(settings: Settings) -> tuple[int, ...]:
+def image_sizes(settings: Settings) -> tuple[int, ...]:
     """Heights and widths to measure: the device's own, or the one that was asked for where it is another."""
     sizes = ACCELERATOR_SIZES if settings.on_accelerator else CPU_SIZES
     if settings.image_size is not None and settings.image_size not in sizes:
@@ -73,7 +73,7 @@ def poses(settings: Settings, count: int, seed: int = 4) -> Any:
 
         return jax.lax.scan(step, state, jax.random.split(key, _STEPS))[0]
 
-    return world_jit(jax.vmap(scatter))(start_states(env, count), jax.random.split(jax.random.key(seed), count))
+    return env_jit(jax.vmap(scatter))(start_states(env, count), jax.random.split(jax.random.key(seed), count))
 
 
 def alternate(draw: Callable[[Any], Any], batches: list[Any]) -> Callable[[], Any]:
@@ -82,8 +82,8 @@ def alternate(draw: Callable[[Any], Any], batches: list[Any]) -> Callable[[], An
     return lambda: draw(next(turns))
 
 
-def assert_new_pictures(draw: Callable[[Any], Any], batches: list[Any]) -> None:
-    """Asserts that pictures differ within a batch and between batches.
+def assert_new_images(draw: Callable[[Any], Any], batches: list[Any]) -> None:
+    """Asserts that images differ within a batch and between batches.
 
     Args:
         draw: Gives arrays [N, ...], or a tree of them.
@@ -91,16 +91,16 @@ def assert_new_pictures(draw: Callable[[Any], Any], batches: list[Any]) -> None:
     """
     drawn = [rows_of(draw(batch)) for batch in batches]
     for rows in drawn:
-        assert_varied(rows, "pictures")
+        assert_varied(rows, "images")
     for first, second in itertools.pairwise(drawn):
         same = int(np.sum(np.all(first == second, axis=1)))
         if len(first) > 1 and same >= len(first) / 2:
             raise AssertionError(
-                f"{same} of {len(first)} pictures stay the same in the next batch: this would measure a broadcast"
+                f"{same} of {len(first)} images stay the same in the next batch: this would measure a broadcast"
             )
 
 
-def rows_of(pictures: Any) -> np.ndarray:
+def rows_of(images: Any) -> np.ndarray:
     """[N, bytes] of a tree of arrays [N, ...]."""
-    planes = [np.ascontiguousarray(plane) for plane in jax.tree.leaves(jax.device_get(pictures))]
+    planes = [np.ascontiguousarray(plane) for plane in jax.tree.leaves(jax.device_get(images))]
     return np.concatenate([plane.reshape(len(plane), -1).view(np.uint8) for plane in planes], axis=1)

@@ -1,4 +1,4 @@
-"""The least arithmetic that a picture takes: what perfect culling would leave, counted in the renderer's own functions.
+"""The least arithmetic that an image takes: what perfect culling would leave, counted in the renderer's own functions.
 
 A compiler counts what it compiled: tests that a kernel skips, and nothing of the kernel itself. Here every operation on a pixel
 counts as one (so a fused multiply-add as two, and a square root as one), once per pixel and object that has to be tested, and
@@ -21,7 +21,7 @@ _MOVES = {"broadcast_in_dim", "squeeze", "reshape", "slice", "dynamic_slice", "c
 
 
 def operations_per_pixel(scene: Scene, tests: np.ndarray, coloured: bool = True) -> float | None:
-    """Operations for one pixel of a picture.
+    """Operations for one pixel of an image.
 
     Args:
         scene: The scene; what haze, shadows and transparent objects take is left out.

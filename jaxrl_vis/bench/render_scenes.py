@@ -8,7 +8,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from jaxrl_vis.config import RequestError
+from jaxrl_vis.errors import RequestError
 
 SCENES = ("finger", "fetch_reach", "primitives")
 POSES = ("geom_xpos", "geom_xmat", "site_xpos", "site_xmat", "cam_xpos", "cam_xmat", "light_xpos", "light_xdir")
@@ -136,7 +136,7 @@ def _turned(quaternions: np.ndarray, most: float, rng: np.random.Generator) -> n
 
 
 def forward(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> None:
-    """Runs what a picture needs: the poses of bodies, geoms, sites, cameras and lights."""
+    """Runs what an image needs: the poses of bodies, geoms, sites, cameras and lights."""
     mujoco.mj_kinematics(mj_model, mj_data)
     mujoco.mj_comPos(mj_model, mj_data)
     mujoco.mj_camlight(mj_model, mj_data)
@@ -169,7 +169,7 @@ def needed_tests(mj_model: mujoco.MjModel, poses: dict[str, np.ndarray], size: i
     Args:
         mj_model: The model; its first camera looks.
         poses: From `random_poses`.
-        size: Height and width of the picture in pixels.
+        size: Height and width of the image in pixels.
     """
     drawn = np.isin(mj_model.geom_group, (0, 1, 2)) & (mj_model.geom_rgba[:, 3] > 0)
     endless = drawn & (mj_model.geom_rbound <= 0)

@@ -10,7 +10,7 @@ from typing import Any
 
 import jax
 
-from jaxrl_vis.networks import Networks
+from jaxrl_vis.learner.networks import Networks
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,8 +57,8 @@ def compiler_cost(compiled: Any) -> Cost | None:
 
 
 def encoder_products(networks: Networks) -> tuple[int, int]:
-    """Multiply-adds of one network's encoder for one picture: all of them, and the first layer's alone."""
-    if not networks.sees_pictures:
+    """Multiply-adds of one network's encoder for one image: all of them, and the first layer's alone."""
+    if not networks.sees_images:
         return 0, 0
     channels, height, width = networks.observation_spec.shape
     filters = networks.config.encoder_filters
@@ -80,11 +80,11 @@ def head_products(sizes: tuple[int, ...]) -> int:
 def least_cost(networks: Networks, params: Any, batch_size: int) -> Cost:
     """The count from the layers' shapes.
 
-    Products: both targets encode two pictures a transition forward; both online networks two pictures forward and backward
-    (twice a forward pass, less the gradient of the picture itself). The actor's head runs once forward as target and once both
+    Products: both targets encode two images a transition forward; both online networks two images forward and backward
+    (twice a forward pass, less the gradient of the image itself). The actor's head runs once forward as target and once both
     ways; the critic's once as target, once both ways, and once more in the actor's loss, forward and back to the action.
 
-    Bytes: three pictures a transition are read once as they lie in the replay; online parameters and two Adam moments are read
+    Bytes: three images a transition are read once as they lie in the replay; online parameters and two Adam moments are read
     and written once, target parameters are read and written once. Activations are taken to stay on the chip.
 
     Args:
@@ -94,14 +94,14 @@ def least_cost(networks: Networks, params: Any, batch_size: int) -> Cost:
     """
     encoder, first_layer = encoder_products(networks)
     spec, hidden, actions = networks.observation_spec, networks.config.hidden_sizes, networks.action_size
-    latent = networks.config.latent_size if networks.sees_pictures else math.prod(spec.shape)
+    latent = networks.config.latent_size if networks.sees_images else math.prod(spec.shape)
     actor_head = head_products((2 * latent, *hidden, actions))
     critic_head = head_products((2 * latent + actions, *hidden, 1))
     encoders = 2 * 2 * encoder + 2 * 2 * (3 * encoder - first_layer)
     products = encoders + (1 + 3) * actor_head + (1 + 3 + 2) * critic_head
-    pictures = 3 * batch_size * math.prod(spec.shape) * spec.dtype.itemsize
+    images = 3 * batch_size * math.prod(spec.shape) * spec.dtype.itemsize
     parameters = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(params))
-    return Cost(flops=2.0 * batch_size * products, bytes=pictures + (2 + 4 + 2) * parameters)
+    return Cost(flops=2.0 * batch_size * products, bytes=images + (2 + 4 + 2) * parameters)
 
 
 def peak_of(device_kind: str) -> Peak | None:

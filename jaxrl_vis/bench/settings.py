@@ -10,8 +10,8 @@ class Settings:
 
     Attributes:
         env: The task.
-        envs: Environments (or pictures) side by side; one measurement each.
-        image_size: Height and width of pictures.
+        envs: Environments (or images) side by side; one measurement each.
+        image_size: Height and width of images.
         pixels: Channels: rgbd, rgb or depth.
         batch_size: Transitions in a gradient step.
         repeats: Timed repeats at most; see `timing.measure`.
@@ -47,13 +47,13 @@ class Settings:
         return self.envs or (accelerator if self.on_accelerator else cpu)
 
     def make_env(self, **overrides: Any) -> Any:
-        """The task, with these pictures where it makes pictures."""
+        """The task, with these images where it makes images."""
         import jaxrl_vis_envs
 
-        pictures = {"image_size": self.image_size, "pixels": self.pixels, **overrides}
-        return jaxrl_vis_envs.make(self.env, **(pictures if self.env.startswith("Visual") else {}))
+        images = {"image_size": self.image_size, "pixels": self.pixels, **overrides}
+        return jaxrl_vis_envs.make(self.env, **(images if self.env.startswith("Visual") else {}))
 
-    def picture_config(self) -> dict[str, Any]:
+    def image_config(self) -> dict[str, Any]:
         """What a record says about the world that was measured."""
         if not self.env.startswith("Visual"):
             return {"env": self.env}

@@ -12,7 +12,7 @@ from jaxrl_vis.bench.settings import Settings
 from jaxrl_vis.bench.timing import compile_timed
 from jaxrl_vis.bench.timing import measure as measure_time
 from jaxrl_vis.bench.update import training_config
-from jaxrl_vis.train_step import make_train_step
+from jaxrl_vis.learner.train_step import make_train_step
 
 
 def measure(settings: Settings) -> Iterator[Measurement]:
@@ -36,7 +36,7 @@ def measure(settings: Settings) -> Iterator[Measurement]:
             raise FloatingPointError("training gave numbers that are not finite")
         sizes = {"num_envs": config.num_envs, "batch_size": config.batch_size, "updates": program.updates_per_iteration}
         shared = {
-            "config": {**settings.picture_config(), "preset": config.preset, "method": config.method, **sizes},
+            "config": {**settings.image_config(), "preset": config.preset, "method": config.method, **sizes},
             "details": timing.details(compile_s, measured_s=round(time.perf_counter() - started, 1)),
         }
         yield Measurement("train/env_steps", program.steps_per_iteration / timing.median_s, "env-steps/s", **shared)

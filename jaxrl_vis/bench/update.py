@@ -12,12 +12,12 @@ from jaxrl_vis.bench.settings import Settings
 from jaxrl_vis.bench.timing import Timing, assert_varied, compile_timed
 from jaxrl_vis.bench.timing import measure as measure_time
 from jaxrl_vis.config import Config, preset
-from jaxrl_vis.train_step import TrainStep, make_train_step
+from jaxrl_vis.learner.train_step import TrainStep, make_train_step
 from jaxrl_vis.types import LoopState, ReplayState
 
 
 def training_config(settings: Settings, **overrides: Any) -> Config:
-    """The preset of this device, with the benchmark's task, pictures and sizes."""
+    """The preset of this device, with the benchmark's task, images and sizes."""
     if settings.env.startswith("Visual"):
         overrides |= {"image_size": settings.image_size, "pixels": settings.pixels}
     if settings.batch_size is not None:
@@ -28,7 +28,7 @@ def training_config(settings: Settings, **overrides: Any) -> Config:
 def fill_replay(replay: ReplayState, key: jax.Array) -> ReplayState:
     """A replay full of noise: no two frames are equal, and every part of the memory is read.
 
-    Filled one episode at a time: random words for a whole replay of pictures would take several times its memory.
+    Filled one episode at a time: random words for a whole replay of images would take several times its memory.
     """
 
     def noise(leaf: jax.Array, leaf_key: jax.Array) -> jax.Array:
@@ -98,6 +98,6 @@ def measure(settings: Settings) -> Iterator[Measurement]:
         name="update/gradient_steps",
         value=1.0 / seconds,
         unit="updates/s",
-        config={**settings.picture_config(), "method": config.method, "batch_size": config.batch_size, "dtype": dtype},
+        config={**settings.image_config(), "method": config.method, "batch_size": config.batch_size, "dtype": dtype},
         details=timing.details(compile_s, replay_mb=round(program.replay_bytes / 1e6, 1), **costs),
     )

@@ -1,8 +1,8 @@
 """MuJoCo Warp's renderer on the same poses, for comparison. Needs an NVIDIA GPU and the package mujoco-warp 4.0.0.
 
-What is timed is what a simulation of many worlds would do for its pictures: refit the bounding volumes, then draw, captured in
+What is timed is what a simulation of many worlds would do for its images: refit the bounding volumes, then draw, captured in
 one CUDA graph. World poses are given, and its own kinematics are never run. Two graphs read two sets of poses, so every launch
-draws new pictures and nothing is copied in between.
+draws new images and nothing is copied in between.
 
 JAX takes most of a GPU's memory when it starts; where Warp then finds too little, set XLA_PYTHON_CLIENT_MEM_FRACTION=.5.
 """
@@ -17,9 +17,9 @@ import mujoco
 import numpy as np
 
 from jaxrl_vis.bench.record import Measurement
-from jaxrl_vis.bench.render import alternate, assert_new_pictures
+from jaxrl_vis.bench.render import alternate, assert_new_images
 from jaxrl_vis.bench.timing import measure as measure_time
-from jaxrl_vis.config import RequestError
+from jaxrl_vis.errors import RequestError
 
 VERSION = "4.0.0"
 
@@ -57,7 +57,7 @@ def measure(
         depth: [K, H, W] of ours in the first poses, metres, inf for the sky.
         ours: Our images per second.
     """
-    from jaxrl_vis.bench.scene_pictures import agreement
+    from jaxrl_vis.bench.scene_images import agreement
 
     start = time.perf_counter()
     context, draws = prepare(config, mj_model, batches)
@@ -66,13 +66,13 @@ def measure(
 
     import warp as wp  # pyright: ignore[reportMissingImports]
 
-    def pictures(draw: Callable[[], None]) -> tuple[np.ndarray, np.ndarray]:
+    def images(draw: Callable[[], None]) -> tuple[np.ndarray, np.ndarray]:
         draw()
         wp.synchronize_device()
         return context.rgb_data.numpy(), context.depth_data.numpy()
 
-    assert_new_pictures(pictures, draws)
-    seen = pictures(draws[0])[1].reshape(-1, size, size)[: len(depth)]
+    assert_new_images(images, draws)
+    seen = images(draws[0])[1].reshape(-1, size, size)[: len(depth)]
     share = agreement(depth[: len(seen)], np.where(seen > 0.0, seen, np.inf))  # its sky has depth 0
     timing = measure_time(alternate(lambda draw: draw(), draws), repeats, wait=lambda _: wp.synchronize_device())
     value = config["images"] / timing.median_s

@@ -25,8 +25,8 @@ import numpy as np
 
 from jaxrl_vis_envs.adapters.rewards import Reward, reward_function
 from jaxrl_vis_envs.base import GoalEnv, State
+from jaxrl_vis_envs.physics import mjx_model  # noqa: F401 - before brax, for it imports MJX without MJX's remarks on stdout
 from jaxrl_vis_envs.registry import make
-from jaxrl_vis_envs.tasks import mjx_model  # noqa: F401 - before brax, for it imports MJX without MJX's remarks on stdout
 
 try:
     from brax.envs.base import Env
@@ -38,8 +38,8 @@ except ImportError as error:
 class BraxEnv(Env):
     """A world with brax's interface.
 
-    What brax's agents see is, for a state task, one vector [2 S] float32: observation, then goal. For a picture task it is a
-    dictionary of ``pixels/observation`` and ``pixels/goal``, [H, W, C] float32 from 0 to 1, as brax's PPO for pictures takes it
+    What brax's agents see is, for a state task, one vector [2 S] float32: observation, then goal. For an image task it is a
+    dictionary of ``pixels/observation`` and ``pixels/goal``, [H, W, C] float32 from 0 to 1, as brax's PPO for images takes it
     (its SAC takes vectors only).
 
     Args:
@@ -57,7 +57,7 @@ class BraxEnv(Env):
             raise ValueError(f"{', '.join(overrides)}: options go with the name of a world, not with one that is made already")
         self.goal_env = make(env, **overrides) if isinstance(env, str) else env
         self._score = reward_function(reward, self.goal_env.threshold)
-        self._sees_pictures = len(self.goal_env.observation_spec.shape) == 3
+        self._sees_images = len(self.goal_env.observation_spec.shape) == 3
 
     def reset(self, rng: jax.Array) -> BraxState:
         """Starts an episode from a key, [2] uint32 as brax's are, or typed.
@@ -91,9 +91,9 @@ class BraxEnv(Env):
 
     @property
     def observation_size(self) -> Any:
-        """2 S, or for pictures the shape of each key."""
+        """2 S, or for images the shape of each key."""
         shape = self.goal_env.observation_spec.shape
-        if not self._sees_pictures:
+        if not self._sees_images:
             return 2 * shape[0]
         height_width_channels = (*shape[1:], shape[0])
         return {"pixels/observation": height_width_channels, "pixels/goal": height_width_channels}
@@ -116,10 +116,10 @@ class BraxEnv(Env):
     def _observe(self, state: State) -> Any:
         assert state.obs is not None
         observation, goal = state.obs["observation"], state.obs["desired_goal"]
-        if not self._sees_pictures:
+        if not self._sees_images:
             return jnp.concatenate([observation, goal])
-        pictures = {"pixels/observation": observation, "pixels/goal": goal}
-        return {name: jnp.moveaxis(picture, 0, -1).astype(jnp.float32) / 255.0 for name, picture in pictures.items()}
+        images = {"pixels/observation": observation, "pixels/goal": goal}
+        return {name: jnp.moveaxis(image, 0, -1).astype(jnp.float32) / 255.0 for name, image in images.items()}
 
     def _reward(self, state: State) -> jax.Array:
         return self._score(state.achieved_state, state.goal_state)

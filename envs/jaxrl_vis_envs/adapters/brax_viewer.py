@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from jaxrl_vis_envs.tasks import mjx_model  # noqa: F401 - before brax, for it imports MJX without MJX's remarks on stdout
+from jaxrl_vis_envs.physics import mjx_model  # noqa: F401 - before brax, for it imports MJX without MJX's remarks on stdout
 
 try:
     from brax.io import html

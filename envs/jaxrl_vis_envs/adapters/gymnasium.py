@@ -11,11 +11,11 @@ Observations are dictionaries:
     observation     [S] float32, what the state variant of the task sees
     achieved_goal   [G] float32, the true state that goals are about
     desired_goal    [G] float32, the state that is asked for
-    pixels          [H, W, C] uint8, what the robot sees (picture tasks only)
-    goal_pixels     [H, W, C] uint8, the picture of the goal (picture tasks only)
+    pixels          [H, W, C] uint8, what the robot sees (image tasks only)
+    goal_pixels     [H, W, C] uint8, the image of the goal (image tasks only)
 
-Goals are states, not pictures, so that ``compute_reward`` is vectorised and right for goals that a learner puts in later
-(hindsight relabelling). An agent that shall see pictures only is given those two keys, and none of the others, with
+Goals are states, not images, so that ``compute_reward`` is vectorised and right for goals that a learner puts in later
+(hindsight relabelling). An agent that shall see images only is given those two keys, and none of the others, with
 `gymnasium.wrappers.FilterObservation`.
 
 Episodes have one length and end in truncation, never in termination.
@@ -47,7 +47,7 @@ class GymnasiumEnv(gymnasium.Env):
     Args:
         env: The name of a world, or one that is made already.
         reward: ``oracle`` (0 at the goal, -1 elsewhere) or ``dense`` (minus the distance to the goal).
-        render_mode: None, or ``rgb_array`` for pictures from the camera of the task, which state tasks have as well.
+        render_mode: None, or ``rgb_array`` for images from the camera of the task, which state tasks have as well.
         render_size: Height and width of what `render` returns, px; it has nothing to do with ``pixels``.
         **overrides: Fields of the world's configuration to change, as in `jaxrl_vis_envs.make`.
 
@@ -108,9 +108,9 @@ class GymnasiumEnv(gymnasium.Env):
         return self.compute_terminated(achieved_goal, desired_goal, info)
 
     def render(self) -> Any:
-        """A picture [size, size, 3] uint8, or None where no render mode was asked for."""
-        pictures = self._worlds.render()
-        return None if pictures is None else pictures[0]
+        """An image [size, size, 3] uint8, or None where no render mode was asked for."""
+        images = self._worlds.render()
+        return None if images is None else images[0]
 
     def _info(self, observations: Observations) -> dict[str, Any]:
         return {name: values[0].item() for name, values in self._worlds.info(observations).items()}
@@ -216,9 +216,9 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         return observations, reward, never, all_over.copy(), infos
 
     def render(self) -> tuple[Any, ...] | None:
-        """Pictures [size, size, 3] uint8, one for each environment, or None where no render mode was asked for."""
-        pictures = self._worlds.render()
-        return None if pictures is None else tuple(pictures)
+        """Images [size, size, 3] uint8, one for each environment, or None where no render mode was asked for."""
+        images = self._worlds.render()
+        return None if images is None else tuple(images)
 
     def _restart(self) -> tuple[Observations, dict[str, Any]]:
         observations = self._worlds.reset(np.array([_draw_seed(generator) for generator in self._generators]))

@@ -12,7 +12,7 @@ from gymnasium import spaces
 from jaxrl_vis_envs import render
 from jaxrl_vis_envs.adapters.rewards import Reward, reward_function
 from jaxrl_vis_envs.base import GoalEnv, State
-from jaxrl_vis_envs.compilation import world_jit
+from jaxrl_vis_envs.compilation import env_jit
 from jaxrl_vis_envs.registry import make
 
 Observations = dict[str, np.ndarray]
@@ -56,22 +56,22 @@ def _world(env: str | GoalEnv, overrides: dict[str, Any]) -> GoalEnv:
 @functools.cache
 def _programs(env: GoalEnv) -> _Programs:
     spec = env.observation_spec
-    sees_pictures = len(spec.shape) == 3
+    sees_images = len(spec.shape) == 3
     observe_state = getattr(env, "observe_state", None)
 
     def observe(state: State) -> dict[str, jax.Array]:
         observation = {"achieved_goal": state.achieved_state, "desired_goal": state.goal_state}
-        if not sees_pictures:
+        if not sees_images:
             return {"observation": env.observe(state), **observation}
-        # A world of somebody else's making may have nothing but pictures.
+        # A world of somebody else's making may have nothing but images.
         vector = state.achieved_state if observe_state is None else observe_state(state.data)
         return {"observation": vector, **observation, "pixels": _to_public(env.observe(state))}
 
     def reset(seeds: jax.Array) -> tuple[State, dict[str, jax.Array]]:
         state = jax.vmap(lambda seed: env.reset(jax.random.key(seed)))(seeds)
         assert state.obs is not None
-        goals = {"goal_pixels": _to_public(state.obs["desired_goal"])} if sees_pictures else {}
-        # Pictures are handed out, not carried.
+        goals = {"goal_pixels": _to_public(state.obs["desired_goal"])} if sees_images else {}
+        # Images are handed out, not carried.
         state = state.replace(obs=None)
         return state, {**jax.vmap(observe)(state), **goals}
 
@@ -80,12 +80,12 @@ def _programs(env: GoalEnv) -> _Programs:
         return state, jax.vmap(observe)(state)
 
     _, shapes = jax.eval_shape(reset, jax.ShapeDtypeStruct((1,), jnp.uint32))
-    return _Programs(env, _space(shapes), world_jit(reset), world_jit(step, donate_argnums=0))
+    return _Programs(env, _space(shapes), env_jit(reset), env_jit(step, donate_argnums=0))
 
 
-def _to_public(picture: jax.Array) -> jax.Array:
+def _to_public(image: jax.Array) -> jax.Array:
     """[..., C, H, W] -> [..., H, W, C]."""
-    return jnp.moveaxis(picture, -3, -1)
+    return jnp.moveaxis(image, -3, -1)
 
 
 def _space(shapes: dict[str, jax.ShapeDtypeStruct]) -> spaces.Dict:
@@ -100,12 +100,12 @@ def _space(shapes: dict[str, jax.ShapeDtypeStruct]) -> spaces.Dict:
 
 @functools.cache
 def _camera(env: GoalEnv, size: int) -> Any:
-    """A compiled function from the physics of N environments to their pictures [N, size, size, 3] uint8."""
+    """A compiled function from the physics of N environments to their images [N, size, size, 3] uint8."""
     mj_model, camera = getattr(env, "mj_model", None), getattr(env, "camera", None)
     if mj_model is None or camera is None:
         raise ValueError(f"{env.name} has no MuJoCo model with a camera to render through")
     scene = render.Scene.from_mjmodel(mj_model, camera=camera, height=size, width=size)
-    return world_jit(jax.vmap(lambda data: render.render(scene, data).rgb))
+    return env_jit(jax.vmap(lambda data: render.render(scene, data).rgb))
 
 
 class Worlds:
@@ -162,7 +162,7 @@ class Worlds:
             raise ValueError(f"actions must have the shape {expected}, got {actions.shape}")
         self._state, observations = self.programs.step(self._state, actions)
         self.steps += 1
-        observations = _to_host(observations) | {name: pictures.copy() for name, pictures in self._goal_pixels.items()}
+        observations = _to_host(observations) | {name: images.copy() for name, images in self._goal_pixels.items()}
         # Scored here, and not by the compiled step, so that it is `compute_reward` of what was handed out to the last bit.
         return observations, self.score(observations["achieved_goal"], observations["desired_goal"])
 
@@ -172,7 +172,7 @@ class Worlds:
         return {"is_success": distance <= self.env.threshold, "goal_distance": distance}
 
     def render(self) -> np.ndarray | None:
-        """Pictures [N, size, size, 3] uint8, or None where no render mode was asked for.
+        """Images [N, size, size, 3] uint8, or None where no render mode was asked for.
 
         Raises:
             gymnasium.error.ResetNeeded: There was no `reset`.

@@ -1,4 +1,4 @@
-"""Pictures as an ordinary JAX function: any batch, any subset, inside ``vmap``, ``scan`` and ``grad``, on any backend.
+"""Images as an ordinary JAX function: any batch, any subset, inside ``vmap``, ``scan`` and ``grad``, on any backend.
 
 Example::
 
@@ -7,7 +7,7 @@ Example::
     planes = render_planes(scene, data, rgb=False)    # the hot path: only what is asked for, never interleaved
 """
 
-from jaxrl_vis_envs.render.pictures import Frame, Planes, quantize, render, render_planes
+from jaxrl_vis_envs.render.images import Frame, Planes, quantize, render, render_planes
 from jaxrl_vis_envs.render.scene import Scene
 
 __all__ = ["Frame", "Planes", "Scene", "quantize", "render", "render_planes"]

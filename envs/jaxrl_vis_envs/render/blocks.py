@@ -19,14 +19,14 @@ from jaxrl_vis_envs.render.scene import Scene
 
 # Pixels of one environment that a CPU works on at a time where much is stored for each.
 _CPU_BLOCK = 512
-# Height and width of a tile, if the picture can be cut so. Small ones see fewer objects, but each costs a round of a loop.
+# Height and width of a tile, if the image can be cut so. Small ones see fewer objects, but each costs a round of a loop.
 _CPU_TILE, _TILE = 8, 16
 
 
 class Layout(NamedTuple):
     """The pixels in blocks: rows and columns [blocks, P], NumPy; and the height and width of a tile, None for strips.
 
-    The tiles of a picture that cannot be cut evenly hang over its right and lower border.
+    The tiles of an image that cannot be cut evenly hang over its right and lower border.
     """
 
     rows: np.ndarray
@@ -35,7 +35,7 @@ class Layout(NamedTuple):
 
 
 def layout(scene: Scene) -> Layout:
-    """Cuts the picture of a scene into blocks: tiles if there is much in it, otherwise strips."""
+    """Cuts the image of a scene into blocks: tiles if there is much in it, otherwise strips."""
     if not tiled(scene):
         pixels = np.arange(scene.height * scene.width).reshape(_half_count(scene.height * scene.width), -1)
         return Layout(pixels // scene.width, pixels % scene.width, None)
@@ -44,7 +44,7 @@ def layout(scene: Scene) -> Layout:
 
 
 def tiles(scene: Scene, high: int, wide: int) -> Layout:
-    """Cuts the picture of a scene into tiles of this height and width."""
+    """Cuts the image of a scene into tiles of this height and width."""
     down, across = -(-scene.height // high), -(-scene.width // wide)
     rows, columns = np.indices((down * high, across * wide))
 

@@ -53,7 +53,7 @@ def _rotation(vector: jax.Array) -> jax.Array:
 
 
 def lens(scene: Scene) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Where the picture lies on the plane at depth 1 m (or at any depth, if orthographic).
+    """Where the image lies on the plane at depth 1 m (or at any depth, if orthographic).
 
     Returns:
         Middle across and up, half the width and half the height, each [] float32 (m).

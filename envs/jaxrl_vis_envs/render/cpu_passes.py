@@ -1,4 +1,4 @@
-"""The same picture on a CPU, with colours of 8 bits: passes over the pixels that each give one integer of 32 bits per pixel.
+"""The same image on a CPU, with colours of 8 bits: passes over the pixels that each give one integer of 32 bits per pixel.
 
 XLA computes a loop on a CPU anew for each of its outputs, and with it most of what they share: three channels cost three times
 the shading. So each pass has one output, and what the next one needs of it is packed into its bits: the key of the nearest
@@ -160,8 +160,8 @@ class _Colouring:
 
     def _texture(self, seen: _Seen) -> jax.Array:
         """What the colours of objects are multiplied with, and the colour of the sky: packed, 10 bits a channel."""
-        picture = surface.texture_colour(self.scene, *self._met(seen)) or (jnp.ones_like(seen.u),) * 3
-        return _pack(self._in_front(seen, picture, shade.sky(self.scene, self.rotation, seen.u, seen.v)), 10)
+        image = surface.texture_colour(self.scene, *self._met(seen)) or (jnp.ones_like(seen.u),) * 3
+        return _pack(self._in_front(seen, image, shade.sky(self.scene, self.rotation, seen.u, seen.v)), 10)
 
     def _finish(self, seen: _Seen, normal: jax.Array | None, texture: jax.Array | None) -> jax.Array:
         """What is seen: packed, 8 bits a channel. Without a ``normal`` it is that of a plane, which is not much to compute."""

@@ -1,10 +1,10 @@
 """The nearest object of every pixel on a CPU, tile by tile, and in a tile only what may be seen there.
 
-A program for a batch cannot leave out of one picture what it does in another. But cameras mostly stand still, and robots stay
-where they are: most tiles show the same few objects in all pictures of a batch. So what depends on a tile is a loop of no or
-one round (`once`), which all pictures of the batch go through or leave out together.
+A program for a batch cannot leave out of one image what it does in another. But cameras mostly stand still, and robots stay
+where they are: most tiles show the same few objects in all images of a batch. So what depends on a tile is a loop of no or
+one round (`once`), which all images of the batch go through or leave out together.
 
-XLA needs to be told so in three ways. A condition that differs between the pictures would become a choice after the work is
+XLA needs to be told so in three ways. A condition that differs between the images would become a choice after the work is
 done: it is made one for the batch (`_anywhere`). A branch of ``cond`` runs on one core, the body of a ``while`` on all. And a
 loop that reads what it overwrites is not vectorised, so every object has keys of its own, which are compared afterwards.
 """
@@ -18,7 +18,7 @@ import numpy as np
 from jaxrl_vis_envs.render import blocks, camera, raycast, shapes
 from jaxrl_vis_envs.render.scene import Scene
 
-# So many tiles across and down. Each costs some microseconds for each object, and smaller pictures than this would lose by it.
+# So many tiles across and down. Each costs some microseconds for each object, and smaller images than this would lose by it.
 _TILES = 4
 _LEAST_PIXELS = 48 * 48
 
@@ -29,7 +29,7 @@ def _culls(scene: Scene) -> bool:
 
 
 def layout(scene: Scene) -> blocks.Layout:
-    """The tiles of the picture."""
+    """The tiles of the image."""
     if not _culls(scene):
         return blocks.layout(scene)
     high, wide = (blocks.near_divisor(pixels, -(-pixels // _TILES)) for pixels in (scene.height, scene.width))
@@ -37,7 +37,7 @@ def layout(scene: Scene) -> blocks.Layout:
 
 
 def seen_in_tiles(scene: Scene, unit: shapes.UnitShapes, u: jax.Array, v: jax.Array) -> jax.Array:
-    """Which objects may be seen in which tiles, in any picture of the batch.
+    """Which objects may be seen in which tiles, in any image of the batch.
 
     Args:
         scene: The scene.

@@ -1,7 +1,7 @@
-"""The same picture as one GPU kernel (Pallas, by Triton), for scenes of plain primitives: most scenes that robots learn in.
+"""The same image as one GPU kernel (Pallas, by Triton), for scenes of plain primitives: most scenes that robots learn in.
 
-As XLA operations, every pixel meets every object. Here a program draws one tile of one picture: it walks through the objects,
-type by type, skips each whose bounding rectangle in the picture misses the tile, and goes on to shade what it found without
+As XLA operations, every pixel meets every object. Here a program draws one tile of one image: it walks through the objects,
+type by type, skips each whose bounding rectangle in the image misses the tile, and goes on to shade what it found without
 leaving the chip. What happens to a pixel is the same code either way (`raycast.entry`, `surface.meet`, `shade.shade`): in the
 kernel, what it reads are scalars and blocks of memory instead of arrays.
 """
@@ -40,7 +40,7 @@ def supports(scene: Scene) -> bool:
 
 
 def tile_shape(height: int, width: int) -> tuple[int, int]:
-    """Rows and columns of a tile: about twice as wide as high, with little hanging over the picture's border."""
+    """Rows and columns of a tile: about twice as wide as high, with little hanging over the image's border."""
 
     def cost(shape: tuple[int, int]) -> float:
         high, wide = shape

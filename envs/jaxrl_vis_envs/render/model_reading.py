@@ -37,7 +37,7 @@ def find_camera(mj_model: mujoco.MjModel, camera: str | int) -> int:
 
 
 def projection(mj_model: mujoco.MjModel, camera_id: int) -> str:
-    """How the camera maps space to the picture, as in `Scene`."""
+    """How the camera maps space to the image, as in `Scene`."""
     if mj_model.cam_projection[camera_id] == mujoco.mjtProjection.mjPROJ_ORTHOGRAPHIC:
         return "orthographic"
     return "intrinsic" if np.all(mj_model.cam_sensorsize[camera_id] > 0) else "perspective"

@@ -136,7 +136,7 @@ def nearest_key(scene: Scene, unit: shapes.UnitShapes, u: jax.Array, v: jax.Arra
 
 
 def _rows_by_type(scene: Scene, rows: list[int]) -> dict[int, np.ndarray]:
-    """The rows of each type that has enough of them for a loop. Planes fill the picture: a loop would save nothing."""
+    """The rows of each type that has enough of them for a loop. Planes fill the image: a loop would save nothing."""
     kinds = np.array(scene.object_types)[rows]
     counted = {int(kind): np.array(rows)[kinds == kind] for kind in np.unique(kinds) if kind != shapes.PLANE}
     return {kind: found for kind, found in counted.items() if len(found) > _FEW}

@@ -1,6 +1,6 @@
-"""MuJoCo's own OpenGL renderer behind the same `Frame`: the truth for tests, and the better picture for videos.
+"""MuJoCo's own OpenGL renderer behind the same `Frame`: the truth for tests, and the better image for videos.
 
-It needs a GL library (``MUJOCO_GL=egl`` or ``osmesa`` without a display), one MuJoCo call per picture, and NumPy only. GL is
+It needs a GL library (``MUJOCO_GL=egl`` or ``osmesa`` without a display), one MuJoCo call per image, and NumPy only. GL is
 touched when a `ReferenceRenderer` is made, not when this module is imported.
 """
 
@@ -9,21 +9,21 @@ from typing import Any, Self
 import mujoco
 import numpy as np
 
-from jaxrl_vis_envs.render.pictures import Frame
+from jaxrl_vis_envs.render.images import Frame
 
 
 class ReferenceRenderer:
     """Draws `mujoco.MjData` with `mujoco.Renderer`. Close it, or use it in a ``with`` statement.
 
     Args:
-        mj_model: The model. Its ``vis.global_.offwidth`` and ``offheight`` bound the picture's size.
+        mj_model: The model. Its ``vis.global_.offwidth`` and ``offheight`` bound the image's size.
         height: H, pixels.
         width: W, pixels.
         effects: Whether to draw what `render` does not: shadows, reflections, haze, tendons, skins, flexes and rangefinders.
         site_groups: Site groups that are drawn.
 
     Raises:
-        ValueError: The picture is larger than the model's offscreen buffer.
+        ValueError: The image is larger than the model's offscreen buffer.
         RuntimeError: There is no usable GL library.
     """
 
@@ -47,7 +47,7 @@ class ReferenceRenderer:
                 self._renderer.scene.flags[flag] = False
 
     def __call__(self, mj_data: mujoco.MjData, camera: str | int) -> Frame:
-        """The picture as NumPy arrays: a `Frame` of rgb [H, W, 3] uint8, depth [H, W] float32 and segmentation [H, W] int32."""
+        """The image as NumPy arrays: a `Frame` of rgb [H, W, 3] uint8, depth [H, W] float32 and segmentation [H, W] int32."""
         self._renderer.update_scene(mj_data, camera, self._options)
         colour = self._renderer.render().copy()
         self._renderer.enable_depth_rendering()

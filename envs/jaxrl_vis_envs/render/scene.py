@@ -1,7 +1,7 @@
-"""What is drawn: everything that a picture needs besides the poses, read once from a MuJoCo model.
+"""What is drawn: everything that an image needs besides the poses, read once from a MuJoCo model.
 
 A `Scene` is a pytree. Sizes, colours, materials, lights and the camera are leaves, so a batch of different looks is
-``jax.vmap`` over ``scene.replace(rgba=...)``; what is drawn (geom types, ids, the picture's size) is static and fixes the
+``jax.vmap`` over ``scene.replace(rgba=...)``; what is drawn (geom types, ids, the image's size) is static and fixes the
 compiled program.
 
 Arrays over objects are indexed as the segmentation is: object ``i`` is geom ``i`` of the model, and object ``ngeom + i`` is
@@ -161,8 +161,8 @@ class Scene:
         Args:
             mj_model: The model.
             camera: Name or index of the camera that looks.
-            height: Picture height in pixels.
-            width: Picture width in pixels.
+            height: Image height in pixels.
+            width: Image width in pixels.
             groups: Geom groups that are drawn (the default is that of `mujoco.Renderer`).
             site_groups: Site groups that are drawn. None by default, unlike `mujoco.Renderer`: a site is a marker for people.
             textured: Whether textures are drawn. Without, an object has the mean colour of its texture, and the sky is a
@@ -181,7 +181,7 @@ class Scene:
                 (skins, flexes, signed distance fields, lights that are images, shadows of meshes).
         """
         if height < 1 or width < 1:
-            raise ValueError(f"a picture needs at least one pixel each way, not height={height}, width={width}")
+            raise ValueError(f"an image needs at least one pixel each way, not height={height}, width={width}")
         reading = model_reading
         camera_id = reading.find_camera(mj_model, camera)
         look = reading.object_looks(mj_model)

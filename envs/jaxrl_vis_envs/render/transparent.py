@@ -1,4 +1,4 @@
-"""Objects that let light through, laid over the opaque picture as MuJoCo does it.
+"""Objects that let light through, laid over the opaque image as MuJoCo does it.
 
 MuJoCo sorts them by the distance of their nearest point and draws them twice, front to back and then back to front, so that a
 single sheet of alpha a covers 1 - (1 - a)^2 of what is behind it. In depth and segmentation they count like any other object.

@@ -1,7 +1,7 @@
 """Fetch reach: move the gripper of a Fetch robot to a point over the table.
 
 Follows the release of the authors of "Adaptive Auxiliary Task Weighting for Reinforcement Learning" (OL-AUX), itself a child of
-OpenAI Gym's FetchReach. Differences, all deliberate: the goal picture shows the grip *site* at the goal (the release showed the
+OpenAI Gym's FetchReach. Differences, all deliberate: the goal image shows the grip *site* at the goal (the release showed the
 gripper's link there, 2 cm off); the mocap cross-hair, which stood at the goal in the first frame, is not drawn.
 
     VisualFetchReach   sees RGB-D from a camera that faces the robot
@@ -19,12 +19,12 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from jaxrl_vis_envs.pixels import Observer, PixelsConfig, picture_observer
+from jaxrl_vis_envs.physics import inverse_kinematics, mjx_model
+from jaxrl_vis_envs.physics.mjx_model import mjx
+from jaxrl_vis_envs.pixels import Observer, PixelsConfig, image_observer
 from jaxrl_vis_envs.randomization import OFF, Randomization
 from jaxrl_vis_envs.registry import register
-from jaxrl_vis_envs.tasks import inverse_kinematics, mjx_model
 from jaxrl_vis_envs.tasks.mjx_env import MjxGoalEnv
-from jaxrl_vis_envs.tasks.mjx_model import mjx
 
 # The gripper points down. Added to the link's own unit quaternion, as the original does, it turns the target about 60 % of the
 # way back to this orientation in each control step.
@@ -66,7 +66,7 @@ class FetchReachConfig:
 
 @dataclasses.dataclass(frozen=True)
 class VisualFetchReachConfig(PixelsConfig, FetchReachConfig):
-    """Settings of the task and its pictures."""
+    """Settings of the task and its images."""
 
     depth_range: tuple[float, float] = (0.4, 1.8)
     """Depths that bytes 0 and 255 stand for, m: 5.5 mm a step, from before the nearest gripper to behind the robot."""
@@ -89,7 +89,7 @@ class FetchReach(MjxGoalEnv):
 
         Args:
             config: The settings.
-            observer: Given the model, returns the function from poses to pictures. Default: `observe_state`.
+            observer: Given the model, returns the function from poses to images. Default: `observe_state`.
         """
         mj_model = mjx_model.load_model("fetch_reach.xml")
         mj_model.opt.iterations = config.solver_iterations
@@ -162,7 +162,7 @@ def _settle_at_start(mj_model: mujoco.MjModel) -> mujoco.MjData:
 
 
 def _visual(config: VisualFetchReachConfig) -> FetchReach:
-    return FetchReach(config, lambda mj_model: picture_observer(mj_model, FetchReach.camera, config))
+    return FetchReach(config, lambda mj_model: image_observer(mj_model, FetchReach.camera, config))
 
 
 register("FetchReach", FetchReach, FetchReachConfig)

@@ -1,10 +1,10 @@
-"""Finger turn: turn a free spinner with a two-link finger until its tip is where the goal picture shows it.
+"""Finger turn: turn a free spinner with a two-link finger until its tip is where the goal image shows it.
 
 dm_control's finger as the authors of OL-AUX used it: any contact-free start, a goal angle of the spinner, a tolerance of .07 m
 at its tip (31 degrees), and 21 physics steps of 10 ms in an action. With dm_control's own two, random actions move the spinner
-in 16 % of the episodes; with 21 in 86 %. In the goal picture the finger hangs straight down, where it touches nothing.
+in 16 % of the episodes; with 21 in 86 %. In the goal image the finger hangs straight down, where it touches nothing.
 
-    VisualFingerTurn   sees three stacked RGB-D pictures from the side
+    VisualFingerTurn   sees three stacked RGB-D images from the side
     FingerTurn         sees joint angles, the spinner's tip and joint velocities
 
 State: x and z of the spinner's tip relative to its hinge, m. Action: torques of the two finger joints, of 30 and 15 N m.
@@ -18,12 +18,12 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from jaxrl_vis_envs.pixels import Observer, PixelsConfig, picture_observer
+from jaxrl_vis_envs.physics import mjx_model
+from jaxrl_vis_envs.physics.mjx_model import mjx
+from jaxrl_vis_envs.pixels import Observer, PixelsConfig, image_observer
 from jaxrl_vis_envs.randomization import OFF, Randomization
 from jaxrl_vis_envs.registry import register
-from jaxrl_vis_envs.tasks import mjx_model
 from jaxrl_vis_envs.tasks.mjx_env import MjxGoalEnv
-from jaxrl_vis_envs.tasks.mjx_model import mjx
 
 # Starts tried at once; the first without contact is taken. One in ten is in contact, so all are once in 10^16 episodes.
 _START_CANDIDATES = 16
@@ -54,12 +54,12 @@ class FingerTurnConfig:
 
 @dataclasses.dataclass(frozen=True)
 class VisualFingerTurnConfig(PixelsConfig, FingerTurnConfig):
-    """Settings of the task and its pictures."""
+    """Settings of the task and its images."""
 
     depth_range: tuple[float, float] = (0.8, 1.3)
     """Depths that bytes 0 and 255 stand for, m: 2 mm a step; finger and spinner lie between .85 and 1.25 m."""
     frames: int = 3
-    """Pictures of the latest control steps that an observation stacks: three in the thesis, one in the authors' release."""
+    """Images of the latest control steps that an observation stacks: three in the thesis, one in the authors' release."""
 
     def __post_init__(self) -> None:
         FingerTurnConfig.__post_init__(self)
@@ -79,7 +79,7 @@ class FingerTurn(MjxGoalEnv):
 
         Args:
             config: The settings.
-            observer: Given the model, returns the function from poses to pictures. Default: `observe_state`.
+            observer: Given the model, returns the function from poses to images. Default: `observe_state`.
         """
         mj_model = mjx_model.load_model("finger_turn.xml")
         mj_model.opt.iterations = config.solver_iterations
@@ -126,7 +126,7 @@ class FingerTurn(MjxGoalEnv):
 
 
 def _visual(config: VisualFingerTurnConfig) -> FingerTurn:
-    return FingerTurn(config, lambda mj_model: picture_observer(mj_model, FingerTurn.camera, config))
+    return FingerTurn(config, lambda mj_model: image_observer(mj_model, FingerTurn.camera, config))
 
 
 register("FingerTurn", FingerTurn, FingerTurnConfig)

@@ -1,4 +1,4 @@
-"""Hand reach: bring the five fingertips of a Shadow hand to where the goal picture shows them.
+"""Hand reach: bring the five fingertips of a Shadow hand to where the goal image shows them.
 
 HandReach of Gym's robotics environments with the goals of the OL-AUX release: where the fingertips are after 20 random actions
 from the start, most of which fully open or close each joint. ``goal_rule="meet"`` is Gym's own: the thumb meets a finger over
@@ -21,12 +21,12 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from jaxrl_vis_envs.pixels import Observer, PixelsConfig, picture_observer
+from jaxrl_vis_envs.physics import mjx_model
+from jaxrl_vis_envs.physics.mjx_model import mjx
+from jaxrl_vis_envs.pixels import Observer, PixelsConfig, image_observer
 from jaxrl_vis_envs.randomization import OFF, Randomization
 from jaxrl_vis_envs.registry import register
-from jaxrl_vis_envs.tasks import mjx_model
 from jaxrl_vis_envs.tasks.mjx_env import MjxGoalEnv
-from jaxrl_vis_envs.tasks.mjx_model import mjx
 
 _CONTROL_PERIOD = 0.04  # s
 _FINGERTIPS = ("fftip", "mftip", "rftip", "lftip", "thtip")
@@ -78,7 +78,7 @@ class HandReachConfig:
 
 @dataclasses.dataclass(frozen=True)
 class VisualHandReachConfig(PixelsConfig, HandReachConfig):
-    """Settings of the task and its pictures."""
+    """Settings of the task and its images."""
 
     depth_range: tuple[float, float] = (0.7, 0.96)
     """Depths that bytes 0 and 255 stand for, m: 1 mm a step, from above fingers that point up to below the lowest knuckle."""
@@ -101,7 +101,7 @@ class HandReach(MjxGoalEnv):
 
         Args:
             config: The settings.
-            observer: Given the model, returns the function from poses to pictures. Default: `observe_state`.
+            observer: Given the model, returns the function from poses to images. Default: `observe_state`.
         """
         mj_model = mjx_model.load_model("hand_reach.xml")
         mj_model.opt.iterations = config.solver_iterations
@@ -201,7 +201,7 @@ def _joints_by_actuator(mj_model: mujoco.MjModel) -> np.ndarray:
 
 
 def _visual(config: VisualHandReachConfig) -> HandReach:
-    return HandReach(config, lambda mj_model: picture_observer(mj_model, HandReach.camera, config))
+    return HandReach(config, lambda mj_model: image_observer(mj_model, HandReach.camera, config))
 
 
 register("HandReach", HandReach, HandReachConfig)

@@ -16,8 +16,8 @@ import mujoco
 
 from jaxrl_vis_envs import randomization
 from jaxrl_vis_envs.base import GoalEnv, State, push_history, sanitize_action, start_history
-from jaxrl_vis_envs.pixels import Observer, PictureObserver
-from jaxrl_vis_envs.tasks.mjx_model import mjx
+from jaxrl_vis_envs.physics.mjx_model import mjx
+from jaxrl_vis_envs.pixels import ImageObserver, Observer
 
 
 class MjxGoalEnv(GoalEnv):
@@ -31,10 +31,10 @@ class MjxGoalEnv(GoalEnv):
         Args:
             config: The settings of the task.
             mj_model: The model; changes to it after this have no effect.
-            observer: Given the model, returns the function from poses to pictures. None: `observe_state` is what is seen.
+            observer: Given the model, returns the function from poses to images. None: `observe_state` is what is seen.
 
         Raises:
-            ValueError: The look shall vary (``config.randomization``), but there are no pictures of a scene.
+            ValueError: The look shall vary (``config.randomization``), but there are no images of a scene.
         """
         self.config = config
         self.horizon = config.horizon
@@ -46,7 +46,7 @@ class MjxGoalEnv(GoalEnv):
         self._randomization: randomization.Randomization = getattr(config, "randomization", randomization.OFF)
         self._scene = getattr(self._draw, "scene", None)
         if self._randomization.varies_look and self._scene is None:
-            raise ValueError("camera, lights and colours can only be randomized in a task that draws pictures")
+            raise ValueError("camera, lights and colours can only be randomized in a task that draws images")
 
     @abc.abstractmethod
     def sample_start(self, key: jax.Array) -> mjx.Data:
@@ -54,7 +54,7 @@ class MjxGoalEnv(GoalEnv):
 
     @abc.abstractmethod
     def sample_goal(self, key: jax.Array) -> mjx.Data:
-        """The configuration that the goal picture of ``reset(key)`` shows."""
+        """The configuration that the goal image of ``reset(key)`` shows."""
 
     @abc.abstractmethod
     def act(self, data: mjx.Data, action: jax.Array) -> mjx.Data:
@@ -90,14 +90,14 @@ class MjxGoalEnv(GoalEnv):
         return self._observe(state.data, state.history, state.domain)
 
     def state_at(self, data: mjx.Data, goal_state: jax.Array, domain: randomization.Domain | None = None) -> State:
-        """An episode that starts at ``data``, with a goal state [G] and no pictures, where nothing but ``domain`` varies."""
+        """An episode that starts at ``data``, with a goal state [G] and no images, where nothing but ``domain`` varies."""
         history = start_history(data.qpos, self.frames)
         return self._measure(data, self.achieved(data), goal_state, None, history, domain)
 
     @property
     def observation_spec(self) -> jax.ShapeDtypeStruct:
         """Shape and dtype of `observe`, without tracing physics or renderer."""
-        if isinstance(self._draw, PictureObserver):
+        if isinstance(self._draw, ImageObserver):
             return self._draw.spec
         shape = jax.eval_shape(lambda data: self._observe(data, start_history(data.qpos, self.frames), None), self._data_shape)
         return jax.ShapeDtypeStruct(shape.shape, shape.dtype)

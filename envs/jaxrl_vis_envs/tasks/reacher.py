@@ -1,4 +1,4 @@
-"""Reacher: bring the fingertip of a two-link arm to where the goal picture shows it.
+"""Reacher: bring the fingertip of a two-link arm to where the goal image shows it.
 
 As the authors of "Reinforcement Learning without Ground-Truth State" used it: the joint velocities are overwritten at the
 start of a control step and then decay, and the goal is the fingertip of a random configuration. ``control="torque"`` gives the
@@ -18,12 +18,12 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
-from jaxrl_vis_envs.pixels import Observer, PixelsConfig, picture_observer
+from jaxrl_vis_envs.physics import mjx_model
+from jaxrl_vis_envs.physics.mjx_model import mjx
+from jaxrl_vis_envs.pixels import Observer, PixelsConfig, image_observer
 from jaxrl_vis_envs.randomization import OFF, Randomization
 from jaxrl_vis_envs.registry import register
-from jaxrl_vis_envs.tasks import mjx_model
 from jaxrl_vis_envs.tasks.mjx_env import MjxGoalEnv
-from jaxrl_vis_envs.tasks.mjx_model import mjx
 
 _DEFAULT_SUBSTEPS = {"velocity": 10, "torque": 2}
 
@@ -56,7 +56,7 @@ class ReacherConfig:
 
 @dataclasses.dataclass(frozen=True)
 class VisualReacherConfig(PixelsConfig, ReacherConfig):
-    """Settings of the task and its pictures."""
+    """Settings of the task and its images."""
 
     depth_range: tuple[float, float] = (0.8, 1.1)
     """Depths that bytes 0 and 255 stand for, m: 1.2 mm a step; the arm lies between .82 and 1.04 m."""
@@ -79,7 +79,7 @@ class Reacher(MjxGoalEnv):
 
         Args:
             config: The settings.
-            observer: Given the model, returns the function from poses to pictures. Default: `observe_state`.
+            observer: Given the model, returns the function from poses to images. Default: `observe_state`.
         """
         mj_model = mjx_model.load_model("reacher.xml")
         self._substeps = config.substeps or _DEFAULT_SUBSTEPS[config.control]
@@ -118,7 +118,7 @@ class Reacher(MjxGoalEnv):
 
 
 def _visual(config: VisualReacherConfig) -> Reacher:
-    return Reacher(config, lambda mj_model: picture_observer(mj_model, Reacher.camera, config))
+    return Reacher(config, lambda mj_model: image_observer(mj_model, Reacher.camera, config))
 
 
 register("Reacher", Reacher, ReacherConfig)

@@ -19,12 +19,12 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from jaxrl_vis_envs.pixels import Observer, PixelsConfig, picture_observer
+from jaxrl_vis_envs.physics import inverse_kinematics, mjx_model
+from jaxrl_vis_envs.physics.mjx_model import mjx
+from jaxrl_vis_envs.pixels import Observer, PixelsConfig, image_observer
 from jaxrl_vis_envs.randomization import OFF, Randomization
 from jaxrl_vis_envs.registry import register
-from jaxrl_vis_envs.tasks import inverse_kinematics, mjx_model
 from jaxrl_vis_envs.tasks.mjx_env import MjxGoalEnv
-from jaxrl_vis_envs.tasks.mjx_model import mjx
 
 _CONTROL_PERIOD = 0.04  # s
 _SETTLING_SUBSTEPS = 1000
@@ -71,7 +71,7 @@ class SawyerReachConfig:
 
 @dataclasses.dataclass(frozen=True)
 class VisualSawyerReachConfig(PixelsConfig, SawyerReachConfig):
-    """Settings of the task and its pictures."""
+    """Settings of the task and its images."""
 
     depth_range: tuple[float, float] = (1.4, 2.6)
     """Depths that bytes 0 and 255 stand for, m: 4.7 mm a step, from before the highest hand to the table behind the lowest."""
@@ -94,7 +94,7 @@ class SawyerReach(MjxGoalEnv):
 
         Args:
             config: The settings.
-            observer: Given the model, returns the function from poses to pictures. Default: `observe_state`.
+            observer: Given the model, returns the function from poses to images. Default: `observe_state`.
         """
         mj_model = mjx_model.load_model("sawyer_reach.xml")
         mj_model.opt.iterations = config.solver_iterations
@@ -153,7 +153,7 @@ def _settle_at(mj_model: mujoco.MjModel, position: tuple[float, float, float]) -
 
 
 def _visual(config: VisualSawyerReachConfig) -> SawyerReach:
-    return SawyerReach(config, lambda mj_model: picture_observer(mj_model, SawyerReach.camera, config))
+    return SawyerReach(config, lambda mj_model: image_observer(mj_model, SawyerReach.camera, config))
 
 
 register("SawyerReach", SawyerReach, SawyerReachConfig)

@@ -1,12 +1,12 @@
-"""What goal pictures show: whether what matters can be seen in each, and whether two different goals ever look the same.
+"""What goal images show: whether what matters can be seen in each, and whether two different goals ever look the same.
 
-    python benchmarks/goal_pictures.py [ENV ...] [--goals 1000] [--image-size 100] [--save FOLDER]
+    python benchmarks/goal_images.py [ENV ...] [--goals 1000] [--image-size 100] [--save FOLDER]
 
 For each visual task, over its goals, as the agent sees them (RGB-D bytes):
 
     visible      the fewest pixels of each part that must be seen, over all goals, and the share of goals that show none of it
-    identical    pairs of goals further apart than a threshold with the same picture; must be 0
-    nearest      the fewest bytes in which two pictures differ, among pairs 1 to 1.5 thresholds apart
+    identical    pairs of goals further apart than a threshold with the same image; must be 0
+    nearest      the fewest bytes in which two images differ, among pairs 1 to 1.5 thresholds apart
 
 Exit status: 1 where two different goals look the same, or where a goal shows none of the parts that must be seen; else 0.
 """
@@ -26,7 +26,7 @@ import numpy as np  # noqa: E402
 from PIL import Image  # noqa: E402
 
 import jaxrl_vis_envs  # noqa: E402
-from jaxrl_vis_envs.compilation import world_jit  # noqa: E402
+from jaxrl_vis_envs.compilation import env_jit  # noqa: E402
 from jaxrl_vis_envs.render import Scene, render_planes  # noqa: E402
 
 # What an agent has to see, by the names of its geoms. Parts in one tuple count together.
@@ -42,10 +42,10 @@ _BATCH = 25  # goals drawn at once
 
 
 class Goals(NamedTuple):
-    """Goals of a task: states [N, G] float32, pictures [N, C, H, W] uint8, visible geom of each pixel [N, H, W] int32."""
+    """Goals of a task: states [N, G] float32, images [N, C, H, W] uint8, visible geom of each pixel [N, H, W] int32."""
 
     states: np.ndarray
-    pictures: np.ndarray
+    images: np.ndarray
     labels: np.ndarray
 
 
@@ -59,13 +59,13 @@ def draw_goals(env: Any, count: int, seed: int = 0) -> Goals:
         return env.achieved(data), data
 
     def draw(data: Any) -> tuple[jax.Array, jax.Array]:
-        picture = env.observe(env.state_at(data, env.achieved(data)).replace(history=None))
-        return picture[: len(picture) // env.frames], render_planes(scene, data, False, False, segmentation=True).segmentation
+        image = env.observe(env.state_at(data, env.achieved(data)).replace(history=None))
+        return image[: len(image) // env.frames], render_planes(scene, data, False, False, segmentation=True).segmentation
 
     keys = jax.random.split(jax.random.key(seed), count)
-    states, data = world_jit(jax.vmap(sample))(keys)
-    pictures, labels = world_jit(lambda data: jax.lax.map(draw, data, batch_size=_BATCH))(data)
-    return Goals(np.asarray(states), np.asarray(pictures), np.asarray(labels))
+    states, data = env_jit(jax.vmap(sample))(keys)
+    images, labels = env_jit(lambda data: jax.lax.map(draw, data, batch_size=_BATCH))(data)
+    return Goals(np.asarray(states), np.asarray(images), np.asarray(labels))
 
 
 def visible_pixels(env: Any, labels: np.ndarray, geoms: tuple[str, ...]) -> np.ndarray:
@@ -76,7 +76,7 @@ def visible_pixels(env: Any, labels: np.ndarray, geoms: tuple[str, ...]) -> np.n
 def compare(goals: Goals, threshold: float) -> tuple[int, int, int, tuple[int, int]]:
     """Of pairs of goals: identical ones more than a threshold apart; pairs just over it; their least difference; and where."""
     distance = np.linalg.norm(goals.states[:, None] - goals.states[None], axis=-1)
-    flat = goals.pictures.reshape(len(goals.pictures), -1)
+    flat = goals.images.reshape(len(goals.images), -1)
     kinds = np.unique(flat, axis=0, return_inverse=True)[1].reshape(-1)
     apart = np.triu(distance > threshold, 1)
     identical = int(np.sum(apart & (kinds[:, None] == kinds[None])))
@@ -93,11 +93,11 @@ def report(name: str, count: int, size: int, folder: pathlib.Path | None) -> boo
     env: Any = jaxrl_vis_envs.make(name, image_size=size, pixels="rgbd")
     goals = draw_goals(env, count)
     identical, near, least, pair = compare(goals, env.threshold)
-    print(f"{name}: {count} goals at {size}x{size}, {len(goals.pictures[0])} channels")
-    print(f"  identical pictures of goals more than {env.threshold:g} {env.distance_unit} apart: {identical} pairs")
+    print(f"{name}: {count} goals at {size}x{size}, {len(goals.images[0])} channels")
+    print(f"  identical images of goals more than {env.threshold:g} {env.distance_unit} apart: {identical} pairs")
     span = f"{env.threshold:g} to {_NEAR * env.threshold:g} {env.distance_unit}"
     nearest = f"{least} bytes differ (goals {pair[0]} and {pair[1]})" if near else "none"
-    print(f"  nearest pictures of {near} pairs {span} apart: {nearest}")
+    print(f"  nearest images of {near} pairs {span} apart: {nearest}")
     good, worst = identical == 0, {}
     for part, geoms in PARTS.get(name, {}).items():
         pixels = visible_pixels(env, goals.labels, geoms)
@@ -109,8 +109,8 @@ def report(name: str, count: int, size: int, folder: pathlib.Path | None) -> boo
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
         for title, index in [*worst.items(), ("pair_1", pair[0]), ("pair_2", pair[1])]:
-            picture = np.moveaxis(goals.pictures[index, :3], 0, -1)
-            scaled = Image.fromarray(picture).resize((4 * size, 4 * size), Image.Resampling.NEAREST)
+            image = np.moveaxis(goals.images[index, :3], 0, -1)
+            scaled = Image.fromarray(image).resize((4 * size, 4 * size), Image.Resampling.NEAREST)
             scaled.save(folder / f"{name}_{title.replace(' ', '_')}.png")
     sys.stdout.flush()
     return good
@@ -118,7 +118,7 @@ def report(name: str, count: int, size: int, folder: pathlib.Path | None) -> boo
 
 def main(arguments: list[str] | None = None) -> int:
     """Prints the figures of each task; 1 where one fails."""
-    parser = argparse.ArgumentParser(description="Whether goal pictures show and tell apart what matters.")
+    parser = argparse.ArgumentParser(description="Whether goal images show and tell apart what matters.")
     parser.add_argument("env", nargs="*", default=sorted(PARTS), help=f"any of {', '.join(sorted(PARTS))}; default: all")
     parser.add_argument("--goals", type=int, default=1000)
     parser.add_argument("--image-size", type=int, default=100)

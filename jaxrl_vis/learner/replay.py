@@ -5,7 +5,7 @@
              |                +-- four pixels (uint8) a word: XLA copies element by element, and words cost no more than bytes
              +-- rollouts of E episodes, one after the other; N is a multiple of E
 
-Pictures whose width four does not divide, and state vectors, are kept as they are.
+Images whose width four does not divide, and state vectors, are kept as they are.
 
 A rollout is written as one contiguous slice. The place follows from the iteration, which all seeds share, so that under `vmap`
 over seeds it stays a slice and does not become a scatter. Samples are drawn from the newest ``size`` episodes.

@@ -6,15 +6,11 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis.checkpoint import named_leaves, to_host
-from jaxrl_vis.metrics import PerSeed
+from jaxrl_vis.run.checkpoint import named_leaves, to_host
+from jaxrl_vis.run.metrics import PerSeed
 from jaxrl_vis.types import LoopState
 
 _MAX_EPISODES = 64
-
-
-class NonFiniteError(FloatingPointError):
-    """A loss, a state or a parameter is not finite any more. One line: what, where the state was dumped, what is still good."""
 
 
 def nonfinite_leaves(tree: Any) -> list[str]:

@@ -1,4 +1,4 @@
-"""What `jaxrl-vis envs` shows: a table of the tasks, and a sheet of pictures, one row a task.
+"""What `jaxrl-vis envs` shows: a table of the tasks, and a sheet of images, one row a task.
 
     start: colours, depth, geoms | a goal: colours, depth, geoms | more goals: colours
 
@@ -16,8 +16,8 @@ from rich.console import Console
 from rich.table import Table
 
 import jaxrl_vis_envs
-from jaxrl_vis.config import RequestError
-from jaxrl_vis_envs.compilation import world_jit
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis_envs.compilation import env_jit
 from jaxrl_vis_envs.render import Frame, Scene, render
 
 _COLUMNS = ("name", "actions", "observation", "goal state", "horizon", "threshold", "control period", "chance", "difficulty")
@@ -67,8 +67,8 @@ class _Poses(NamedTuple):
     subtree_com: jax.Array
 
 
-def picture_tasks() -> list[str]:
-    """Names of the tasks that show the agent pictures."""
+def image_tasks() -> list[str]:
+    """Names of the tasks that show the agent images."""
     return [name for name in jaxrl_vis_envs.list_envs() if len(jaxrl_vis_envs.make(name).observation_spec.shape) == 3]
 
 
@@ -88,9 +88,9 @@ def frames_of(env: Any, key: jax.Array, goals: int, size: int) -> Frame:
         return _Poses(*(jnp.concatenate([getattr(data, name) for data in both]) for name in _Poses._fields))
 
     scene = Scene.from_mjmodel(env.mj_model, env.camera, size, size)
-    # A loop over one picture compiles sooner than a batch, and a few pictures take no time.
-    draw = world_jit(lambda poses: jax.lax.map(lambda one: render(scene, one), poses))
-    return jax.tree.map(np.asarray, draw(world_jit(sample)(keys)))
+    # A loop over one image compiles sooner than a batch, and a few images take no time.
+    draw = env_jit(lambda poses: jax.lax.map(lambda one: render(scene, one), poses))
+    return jax.tree.map(np.asarray, draw(env_jit(sample)(keys)))
 
 
 def draw(path: Path, names: Sequence[str] | None = None, image_size: int = 128, goals: int = 4) -> None:
@@ -98,21 +98,21 @@ def draw(path: Path, names: Sequence[str] | None = None, image_size: int = 128, 
 
     Args:
         path: The file, whose ending names the format.
-        names: Tasks that show pictures; default: all.
-        image_size: Height and width of a picture, pixels.
+        names: Tasks that show images; default: all.
+        image_size: Height and width of an image, pixels.
         goals: Goals of each task.
 
     Raises:
-        RequestError: A task shows no pictures, or the file's ending names no format.
+        RequestError: A task shows no images, or the file's ending names no format.
     """
     from PIL import Image
 
     if path.suffix.lower() not in Image.registered_extensions():
         raise RequestError(f"cannot write {path}: end its name in .png or .jpg")
-    names = picture_tasks() if names is None else names
+    names = image_tasks() if names is None else names
     for name in names:
-        if name not in picture_tasks():
-            raise RequestError(f"{name} shows no pictures; its visual twin is Visual{name}")
+        if name not in image_tasks():
+            raise RequestError(f"{name} shows no images; its visual twin is Visual{name}")
     rows = []
     for name in names:
         env: Any = jaxrl_vis_envs.make(name)
@@ -126,8 +126,8 @@ def _row(env: Any, frames: Frame) -> np.ndarray:
 
     geoms, groups = env.mj_model.ngeom, []
     for index, title in ((0, "start"), (1, "goal")):
-        depth = _depth_picture(np.asarray(frames.depth[index]), env.config.depth_range)
-        labels = _label_picture(np.asarray(frames.segmentation[index]), geoms)
+        depth = _depth_image(np.asarray(frames.depth[index]), env.config.depth_range)
+        labels = _label_image(np.asarray(frames.segmentation[index]), geoms)
         groups.append([(title, frames.rgb[index]), ("depth", depth), ("geoms", labels)])
     groups.append([("other goals" if index == 2 else "", frames.rgb[index]) for index in range(2, len(frames.rgb))])
     size, count = frames.rgb.shape[1], sum(map(len, groups))
@@ -136,15 +136,15 @@ def _row(env: Any, frames: Frame) -> np.ndarray:
     pencil.text((left, 2), env.name, fill=(0, 0, 0), font=ImageFont.load_default(size=13))
     font = ImageFont.load_default(size=11)
     for group in groups:
-        for title, picture in group:
+        for title, image in group:
             pencil.text((left, _TITLE + 2), title, fill=(90, 90, 90), font=font)
-            strip.paste(Image.fromarray(np.asarray(picture)), (left, 2 * _TITLE))
+            strip.paste(Image.fromarray(np.asarray(image)), (left, 2 * _TITLE))
             left += size + _GAP
         left += _GROUP_GAP
     return np.asarray(strip)
 
 
-def _depth_picture(depth: np.ndarray, depth_range: tuple[float, float]) -> np.ndarray:
+def _depth_image(depth: np.ndarray, depth_range: tuple[float, float]) -> np.ndarray:
     """Depth [H, W] (m) in colours, over the range (m) that the agent's bytes span; near is bright."""
     import matplotlib
 
@@ -153,7 +153,7 @@ def _depth_picture(depth: np.ndarray, depth_range: tuple[float, float]) -> np.nd
     return (matplotlib.colormaps["magma"](0.97 - 0.92 * share)[..., :3] * 255).round().astype(np.uint8)
 
 
-def _label_picture(labels: np.ndarray, geoms: int) -> np.ndarray:
+def _label_image(labels: np.ndarray, geoms: int) -> np.ndarray:
     """Geom ids [H, W] in colours that differ between neighbours: steps of the golden ratio round the hues; the sky is white."""
     import matplotlib
 

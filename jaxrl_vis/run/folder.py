@@ -19,7 +19,8 @@ from typing import Any
 
 import jax
 
-from jaxrl_vis.config import Config, RequestError
+from jaxrl_vis.config import Config
+from jaxrl_vis.errors import RequestError
 
 SCHEMA = 1
 
@@ -38,7 +39,7 @@ def default_folder(config: Config) -> Path:
 
 @dataclasses.dataclass(frozen=True)
 class RunFolder:
-    """Names of the files of a run; see the module's picture.
+    """Names of the files of a run; see the module's image.
 
     Attributes:
         path: The folder itself.

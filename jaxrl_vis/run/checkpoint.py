@@ -25,7 +25,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 from orbax.checkpoint.checkpoint_managers import LatestN
 
-from jaxrl_vis.config import RequestError
+from jaxrl_vis.errors import RequestError
 from jaxrl_vis.types import LoopState, TrainState
 
 LIGHT, FULL = "light", "full"

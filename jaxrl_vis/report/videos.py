@@ -1,6 +1,6 @@
-"""video.gif: what the robot saw, beside the picture of the goal that it was given.
+"""video.gif: what the robot saw, beside the image of the goal that it was given.
 
-Pictures come in planar, [C, H, W] uint8, and are shown in rows: colour, then depth, whichever there are.
+Images come in planar, [C, H, W] uint8, and are shown in rows: colour, then depth, whichever there are.
 """
 
 import base64
@@ -14,11 +14,11 @@ import matplotlib
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from jaxrl_vis.config import RequestError
+from jaxrl_vis.errors import RequestError
 
 SUFFIXES = (".gif", ".mp4", ".html", ".png")
 
-_PICTURE_SIZE = 256  # px, about; pictures are enlarged by a whole factor
+_IMAGE_SIZE = 256  # px, about; images are enlarged by a whole factor
 _GAP, _BORDER, _HEADER, _FOOTER = 14, 5, 30, 40
 _BACKGROUND, _TEXT, _FAINT = (24, 26, 31), (232, 234, 237), (139, 145, 154)
 _REACHED, _MISSED, _PLAIN = (62, 207, 142), (226, 109, 92), (52, 56, 64)
@@ -40,44 +40,44 @@ class Recording:
     success: np.ndarray
 
 
-def shows_pictures(shape: Sequence[int]) -> bool:
-    """Whether frames of this shape, episodes by steps by observation, are pictures that can be shown."""
+def shows_images(shape: Sequence[int]) -> bool:
+    """Whether frames of this shape, episodes by steps by observation, are images that can be shown."""
     return len(shape) == 5 and shape[2] in (1, 3, 4)
 
 
-def _depth_picture(depth: np.ndarray, near: float, far: float) -> np.ndarray:
+def _depth_image(depth: np.ndarray, near: float, far: float) -> np.ndarray:
     """Depth [H, W] in grey levels -> [H, W, 3] uint8: near is bright, the steps look equally large."""
     scaled = np.clip((depth.astype(np.float32) - near) / max(far - near, 1.0), 0.0, 1.0)
     return (matplotlib.colormaps["magma"](0.97 - 0.92 * scaled)[..., :3] * 255).round().astype(np.uint8)
 
 
-def first_seed(pictures: dict[str, Any]) -> Recording:
+def first_seed(images: dict[str, Any]) -> Recording:
     """What `Trainer.watch` saw of the first seed ([S, K, ...] arrays, on any device), on the host."""
-    first = {name: np.asarray(values[0]) for name, values in pictures.items()}
+    first = {name: np.asarray(values[0]) for name, values in images.items()}
     return Recording(first["frames"], first["goals"], first["success"])
 
 
 def _depth_range(recording: Recording) -> tuple[float, float]:
-    """Grey levels between which this recording's depth lies, a few outliers aside; the same for all its pictures."""
+    """Grey levels between which this recording's depth lies, a few outliers aside; the same for all its images."""
     depth = np.concatenate([recording.frames[:, ::5, -1].ravel(), recording.goals[:, -1].ravel()])
     near, far = np.percentile(depth, [0.5, 99.5])
     return float(near), float(far)
 
 
-def _rows_of(picture: np.ndarray, depth_range: tuple[float, float]) -> list[tuple[str, np.ndarray]]:
-    """[C, H, W] -> captions and pictures [H, W, 3] uint8."""
+def _rows_of(image: np.ndarray, depth_range: tuple[float, float]) -> list[tuple[str, np.ndarray]]:
+    """[C, H, W] -> captions and images [H, W, 3] uint8."""
     rows = []
-    if picture.shape[0] >= 3:
-        rows.append(("colour", np.moveaxis(picture[:3], 0, -1)))
-    if picture.shape[0] in (1, 4):
-        rows.append(("depth", _depth_picture(picture[-1], *depth_range)))
+    if image.shape[0] >= 3:
+        rows.append(("colour", np.moveaxis(image[:3], 0, -1)))
+    if image.shape[0] in (1, 4):
+        rows.append(("depth", _depth_image(image[-1], *depth_range)))
     return rows
 
 
-def _enlarge(picture: np.ndarray) -> Image.Image:
-    factor = max(1, round(_PICTURE_SIZE / picture.shape[0]))
-    size = (picture.shape[1] * factor, picture.shape[0] * factor)
-    return Image.fromarray(picture).resize(size, Image.Resampling.NEAREST)
+def _enlarge(image: np.ndarray) -> Image.Image:
+    factor = max(1, round(_IMAGE_SIZE / image.shape[0]))
+    size = (image.shape[1] * factor, image.shape[0] * factor)
+    return Image.fromarray(image).resize(size, Image.Resampling.NEAREST)
 
 
 def _compose(
@@ -98,22 +98,22 @@ def _compose(
         share: Of the episode that is over, 0 to 1.
         colour: Of the border.
     """
-    left, right = (_rows_of(picture, depth_range) for picture in (observation, goal))
-    pictures = [(_enlarge(seen), _enlarge(wanted)) for (_, seen), (_, wanted) in zip(left, right, strict=True)]
-    width, height = pictures[0][0].size
+    left, right = (_rows_of(image, depth_range) for image in (observation, goal))
+    images = [(_enlarge(seen), _enlarge(wanted)) for (_, seen), (_, wanted) in zip(left, right, strict=True)]
+    width, height = images[0][0].size
     cell = height + 2 * _BORDER + _GAP
-    size = (2 * (width + 2 * _BORDER) + 3 * _GAP, _HEADER + _GAP // 2 + cell * len(pictures) + _FOOTER)
+    size = (2 * (width + 2 * _BORDER) + 3 * _GAP, _HEADER + _GAP // 2 + cell * len(images) + _FOOTER)
     canvas = Image.new("RGB", size, _BACKGROUND)
     draw = ImageDraw.Draw(canvas)
     font, small = ImageFont.load_default(size=17), ImageFont.load_default(size=14)
     columns = (_GAP, 2 * _GAP + width + 2 * _BORDER)
     for x, text in zip(columns, ("what the robot sees", "what it is asked for"), strict=True):
         draw.text((x + 2, _HEADER // 2 + 4), text, font=font, fill=_TEXT, anchor="lm")
-    for row, pair in enumerate(pictures):
+    for row, pair in enumerate(images):
         y = _HEADER + _GAP // 2 + row * cell
-        for x, picture, border in zip(columns, pair, (colour, _PLAIN), strict=True):
+        for x, image, border in zip(columns, pair, (colour, _PLAIN), strict=True):
             draw.rectangle((x, y, x + width + 2 * _BORDER - 1, y + height + 2 * _BORDER - 1), fill=border)
-            canvas.paste(picture, (x + _BORDER, y + _BORDER))
+            canvas.paste(image, (x + _BORDER, y + _BORDER))
     y = size[1] - _FOOTER
     draw.rectangle((_GAP, y, size[0] - _GAP, y + 3), fill=_PLAIN)
     draw.rectangle((_GAP, y, _GAP + (size[0] - 2 * _GAP) * share, y + 3), fill=colour if colour != _PLAIN else _FAINT)
@@ -149,7 +149,7 @@ def draw_frames(recording: Recording, frame_seconds: float, max_episodes: int) -
 def _gif_bytes(images: list[Image.Image], seconds: list[float]) -> bytes:
     """An endless GIF. One palette for all frames, without dithering: nothing flickers, and equal frames pack well."""
     samples = images[:: max(1, len(images) // 16)] + images[-1:]
-    # Swatches give the colours of borders and texts a place in the palette, however colourful the pictures are.
+    # Swatches give the colours of borders and texts a place in the palette, however colourful the images are.
     swatches = (_REACHED, _MISSED, _PLAIN, _BACKGROUND, _TEXT, _FAINT)
     height = samples[0].height
     montage = Image.new("RGB", (samples[0].width, height * len(samples) + 48 * len(swatches)))
@@ -179,7 +179,7 @@ def _strip(recording: Recording) -> Image.Image:
         shown = [(recording.frames[episode, t], border if t == num_frames - 1 else _PLAIN) for t in instants]
         shown.append((recording.goals[episode], _PLAIN))
         views = [([_enlarge(view).resize((128, 128)) for _, view in _rows_of(each, depth_range)], edge) for each, edge in shown]
-        rows += [[(pictures[row], edge) for pictures, edge in views] for row in range(len(views[0][0]))]
+        rows += [[(images[row], edge) for images, edge in views] for row in range(len(views[0][0]))]
     cell = 128 + 2 * 3 + 8
     canvas = Image.new("RGB", (cell * len(rows[0]) + 24, cell * len(rows) + 34), _BACKGROUND)
     draw = ImageDraw.Draw(canvas)
@@ -189,10 +189,10 @@ def _strip(recording: Recording) -> Image.Image:
         x = 8 + column * cell + (12 if is_goal else 0)
         draw.text((x + 3, 17), "goal" if is_goal else f"step {instants[column]}", font=font, fill=_TEXT, anchor="lm")
         for line, row in enumerate(rows):
-            picture, edge = row[column]
+            image, edge = row[column]
             y = 30 + line * cell
             draw.rectangle((x, y, x + 133, y + 133), fill=edge)
-            canvas.paste(picture, (x + 3, y + 3))
+            canvas.paste(image, (x + 3, y + 3))
     return canvas
 
 
@@ -221,11 +221,11 @@ def write_video(recording: Recording, path: Path, frame_seconds: float = 0.04, m
         max_episodes: How many of them to show; a .png shows at most four.
 
     Raises:
-        RequestError: See `check_output`; or the frames are no pictures.
+        RequestError: See `check_output`; or the frames are no images.
     """
     check_output(path)
-    if not shows_pictures(recording.frames.shape):
-        raise RequestError(f"nothing to see: observations are vectors of {recording.frames.shape[-1]} numbers, not pictures")
+    if not shows_images(recording.frames.shape):
+        raise RequestError(f"nothing to see: observations are vectors of {recording.frames.shape[-1]} numbers, not images")
     path.parent.mkdir(parents=True, exist_ok=True)
     suffix = path.suffix.lower()
     if suffix == ".png":

@@ -1,4 +1,4 @@
-"""The encoder's first three layers as one GPU kernel each way (Pallas, by Triton), and pictures in the order that it reads.
+"""The encoder's first three layers as one GPU kernel each way (Pallas, by Triton), and images in the order that it reads.
 
 Windows of 2x2 pixels with stride 2 never overlap, so three layers see a *patch* of 8x8 pixels at a time and nothing else. A
 tile of R patches passes through all three without leaving the chip:
@@ -34,7 +34,7 @@ _LEAST_ROWS = 16  # of a product
 # Measured on an H200: patches in a tile, tiles that one program works through, and how they are run.
 _FORWARD_PATCHES, _FORWARD_TILES, _FORWARD = 16, 8, plgpu.CompilerParams(num_warps=4, num_stages=3)
 _BACKWARD_PATCHES, _BACKWARD_TILES, _BACKWARD = 16, 16, plgpu.CompilerParams(num_warps=4, num_stages=1)
-_PREPARE_PATCHES, _PREPARE_PICTURES, _PREPARE = 16, 16, plgpu.CompilerParams(num_warps=8, num_stages=2)
+_PREPARE_PATCHES, _PREPARE_IMAGES, _PREPARE = 16, 16, plgpu.CompilerParams(num_warps=8, num_stages=2)
 
 
 class Weights(NamedTuple):
@@ -58,7 +58,7 @@ class Weights(NamedTuple):
 
 
 def supports(filters: tuple[int, ...], shape: tuple[int, ...]) -> bool:
-    """Whether the kernel can take encoders with these output channels, and pictures [C, H, W] of this shape."""
+    """Whether the kernel can take encoders with these output channels, and images [C, H, W] of this shape."""
     channels, _, width = shape
     powers = all(16 <= size <= 64 and size & (size - 1) == 0 for size in filters[:LEVELS])
     return len(filters) >= LEVELS and powers and channels <= _MOST_CHANNELS and width % WORD == 0
@@ -74,7 +74,7 @@ def _divisor(number: int, limit: int) -> int:
 
 
 def make_weights(params: dict[str, Any], channels: int) -> Weights:
-    """The first three layers of an encoder (`networks`) for pictures of ``channels`` channels."""
+    """The first three layers of an encoder (`networks`) for images of ``channels`` channels."""
     window = params["kernel_0"].reshape(2, 2, channels, -1)  # row, column, channel, filter
     window = jnp.pad(window, [(0, 0), (0, 0), (0, _padded(channels) - channels), (0, 0)])
     # From (channel, window's row, row, window's column, column) to (window's row, window's column, filter), where a window only
@@ -92,13 +92,13 @@ def make_weights(params: dict[str, Any], channels: int) -> Weights:
     )
 
 
-# -- Pictures
+# -- Images
 
 
 def _word_offsets(first_patch: Any, patches: int, shape: tuple[int, int, int], levels: int) -> tuple[jax.Array, jax.Array]:
-    """Where the words of some patches lie in a planar picture, and whether they are there: [patches, 16 C'] int32 and bool.
+    """Where the words of some patches lie in a planar image, and whether they are there: [patches, 16 C'] int32 and bool.
 
-    Patches run over the 2^levels blocks of the picture, row by row, and within a block over its halves of halves (as
+    Patches run over the 2^levels blocks of the image, row by row, and within a block over its halves of halves (as
     `networks.to_blocks`), so that the next layers find their windows side by side. Words of a patch run over (quarter's row,
     quarter's column, channel, row).
     """
@@ -124,33 +124,33 @@ def _word_offsets(first_patch: Any, patches: int, shape: tuple[int, int, int], l
 
 
 def _prepare_kernel(words_ref, mean_ref, scale_ref, out_ref, *, shape, levels, limit):
-    pictures, patches, size = out_ref.shape
+    images, patches, size = out_ref.shape
     offsets, there = _word_offsets(pl.program_id(0) * patches, patches, shape, levels)
     pixels = (patches, size // WORD, WORD)
     byte = jax.lax.broadcasted_iota(jnp.int32, pixels, 2)
     inside = jnp.broadcast_to(there[:, :, None], pixels)
     places = offsets[:, :, None] * WORD + byte
-    # The same pixels of every picture: their statistics stay in registers.
+    # The same pixels of every image: their statistics stay in registers.
     mean = plgpu.load(mean_ref.at[places], mask=inside, other=0.0)
     scale = plgpu.load(scale_ref.at[places], mask=inside, other=0.0)
     shift = (8 * byte).astype(jnp.uint32)
 
-    def one_picture(picture, _):
-        words = plgpu.load(words_ref.at[picture, offsets], mask=there, other=0)
+    def one_image(image, _):
+        words = plgpu.load(words_ref.at[image, offsets], mask=there, other=0)
         values = (jax.lax.shift_right_logical(jnp.broadcast_to(words[:, :, None], pixels), shift) & 255).astype(jnp.float32)
         values = jnp.clip((values - mean) * scale, -limit, limit)
-        out_ref[picture] = values.astype(out_ref.dtype).reshape(patches, size)
+        out_ref[image] = values.astype(out_ref.dtype).reshape(patches, size)
 
-    jax.lax.fori_loop(0, pictures, one_picture, None)
+    jax.lax.fori_loop(0, images, one_image, None)
 
 
 def prepare(
     frames: jax.Array, mean: jax.Array, scale: jax.Array, levels: int, limit: float, dtype: Any, interpret: bool = False
 ) -> jax.Array:
-    """Normalises pictures and puts them into patches: [B, C, H, W] uint8 -> [B, patches, 64 C'] of ``dtype``.
+    """Normalises images and puts them into patches: [B, C, H, W] uint8 -> [B, patches, 64 C'] of ``dtype``.
 
     Args:
-        frames: Planar pictures, their width a multiple of `WORD`.
+        frames: Planar images, their width a multiple of `WORD`.
         mean, scale: [C, H, W] float32.
         levels: All the encoder's layers; borders that do not fill a block of 2^levels pixels are cropped.
         limit: Normalised values are clipped to plus and minus this.
@@ -161,16 +161,16 @@ def prepare(
     channels, height, width = shape
     patches = (height >> levels) * (width >> levels) * 4 ** (levels - LEVELS)
     size = 64 * _padded(channels)
-    tile, pictures = _divisor(patches, _PREPARE_PATCHES), _divisor(batch, _PREPARE_PICTURES)
+    tile, images = _divisor(patches, _PREPARE_PATCHES), _divisor(batch, _PREPARE_IMAGES)
     pixels = math.prod(shape)
     words = jax.lax.bitcast_convert_type(frames.reshape(batch, pixels // WORD, WORD), jnp.uint32)
-    whole = pl.BlockSpec((pixels,), lambda patch, picture: (0,))
+    whole = pl.BlockSpec((pixels,), lambda patch, image: (0,))
     return pl.pallas_call(
         functools.partial(_prepare_kernel, shape=tuple(shape), levels=levels, limit=limit),
         out_shape=jax.ShapeDtypeStruct((batch, patches, size), dtype),
-        grid=(patches // tile, batch // pictures),
-        in_specs=[pl.BlockSpec((pictures, pixels // WORD), lambda patch, picture: (picture, 0)), whole, whole],
-        out_specs=pl.BlockSpec((pictures, tile, size), lambda patch, picture: (picture, patch, 0)),
+        grid=(patches // tile, batch // images),
+        in_specs=[pl.BlockSpec((images, pixels // WORD), lambda patch, image: (image, 0)), whole, whole],
+        out_specs=pl.BlockSpec((images, tile, size), lambda patch, image: (image, patch, 0)),
         compiler_params=_PREPARE,
         interpret=interpret,
         name="prepare_patches",
@@ -323,16 +323,16 @@ apply.defvjp(_apply_forward, _apply_backward)
 
 
 def encode(patches: jax.Array, weights: Weights, which: slice = slice(None), interpret: bool = False) -> jax.Array:
-    """`apply` to ``which`` of the pictures: [B, patches, 64 C'] -> [pictures, patches, F3], same dtype.
+    """`apply` to ``which`` of the images: [B, patches, 64 C'] -> [images, patches, F3], same dtype.
 
-    Pictures are chosen here rather than by slicing before, because a slice that a kernel reads is a copy.
+    Images are chosen here rather than by slicing before, because a slice that a kernel reads is a copy.
     """
-    batch, per_picture, size = patches.shape
-    pictures = range(batch)[which]
-    first, count = pictures.start * per_picture, len(pictures) * per_picture
+    batch, per_image, size = patches.shape
+    images = range(batch)[which]
+    first, count = images.start * per_image, len(images) * per_image
     rows = count
-    if math.gcd(first, count) % _LEAST_ROWS:  # a few small pictures
-        patches = jnp.pad(patches[which], ((0, -len(pictures) % _LEAST_ROWS), (0, 0), (0, 0)))
-        first, rows = 0, patches.shape[0] * per_picture
+    if math.gcd(first, count) % _LEAST_ROWS:  # a few small images
+        patches = jnp.pad(patches[which], ((0, -len(images) % _LEAST_ROWS), (0, 0), (0, 0)))
+        first, rows = 0, patches.shape[0] * per_image
     out: jax.Array = apply(patches.reshape(-1, size), weights, first, rows, interpret)  # type: ignore[assignment]
-    return out[:count].reshape(-1, per_picture, out.shape[-1])
+    return out[:count].reshape(-1, per_image, out.shape[-1])

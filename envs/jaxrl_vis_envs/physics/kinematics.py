@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from jaxrl_vis_envs.tasks.quiet_mjx import math, mjx, smooth, support
+from jaxrl_vis_envs.physics.quiet_mjx import math, mjx, smooth, support
 
 _ONE_DEGREE_OF_FREEDOM = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 

@@ -1,6 +1,6 @@
 """Deep deterministic policy gradient with goals (Lillicrap et al., 2016), one gradient step as one pure function.
 
-Four networks read three pictures (observation, goal, next observation). Each picture is normalised and ordered once, and each
+Four networks read three images (observation, goal, next observation). Each image is normalised and ordered once, and each
 network encodes what it needs in one pass:
 
     critic, actor (online, with gradient)   observation, goal
@@ -16,9 +16,9 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from jaxrl_vis import losses, normalizer
 from jaxrl_vis.config import Config, Resolved
-from jaxrl_vis.networks import Networks
+from jaxrl_vis.learner import losses, normalizer
+from jaxrl_vis.learner.networks import Networks
 from jaxrl_vis.types import Batch, Metrics, Params, TrainState
 
 
@@ -99,7 +99,7 @@ def make_ddpg(networks: Networks, config: Config, resolved: Resolved) -> Algorit
         return Working(*map(networks.working_copy, _networks_of(state)))
 
     def encode_pair(params: Params, inputs: jax.Array, first: int) -> jax.Array:
-        """Latents [2, B, latent] of pictures ``first`` and ``first`` + 1 of the three."""
+        """Latents [2, B, latent] of images ``first`` and ``first`` + 1 of the three."""
         size = inputs.shape[0] // 3
         return networks.encode(params, inputs, slice(first * size, (first + 2) * size)).reshape(2, size, -1)
 
@@ -120,7 +120,7 @@ def make_ddpg(networks: Networks, config: Config, resolved: Resolved) -> Algorit
         # Observation, goal, next observation: the online networks read the first two, their targets the last two.
         inputs = networks.prepare(state.normalizer, batch.frames.reshape(-1, *batch.frames.shape[2:]))
 
-        # Turned round: their pictures come as (goal, observation).
+        # Turned round: their images come as (goal, observation).
         action_tp1 = networks.act(now.target_actor, encode_pair(now.target_actor, inputs, 1)[::-1])
         value_tp1 = networks.value(now.target_critic, encode_pair(now.target_critic, inputs, 1)[::-1], action_tp1)
         target = losses.td_target(reward, value_tp1, resolved.discount, resolved.target_minimum, resolved.target_maximum)

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxrl_vis.run_folder import write_atomically
+from jaxrl_vis.run.folder import write_atomically
 
 PerSeed = dict[str, list[float]]
 """Name -> one number per seed."""

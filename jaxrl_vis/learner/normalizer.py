@@ -1,6 +1,6 @@
 """Running mean and deviation of observations, per pixel and channel, merged batch by batch (Chan et al., 1979).
 
-A camera that stands still sees mostly things that never change: subtracting the mean picture leaves what moves.
+A camera that stands still sees mostly things that never change: subtracting the mean image leaves what moves.
 """
 
 import jax

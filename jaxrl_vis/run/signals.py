@@ -5,12 +5,7 @@ import threading
 from types import FrameType
 from typing import Self
 
-
-class Terminated(SystemExit):
-    """The run was stopped by SIGTERM, after saving. Left alone, it ends the program with status 143."""
-
-    def __init__(self) -> None:
-        super().__init__(128 + signal.SIGTERM)
+from jaxrl_vis.errors import Terminated
 
 
 class Interruption:

@@ -7,7 +7,7 @@ For the transition from slot t to t+1:
     with p1 (1 - p2)    a slot of t+1 ... T, evenly  hindsight experience replay's "future" (Andrychowicz et al., 2017)
     with 1 - p1         slot T+1                     the goal that the policy was given
 
-Where an observation stacks pictures of several control steps, it also says how things move, and a goal stands still: what was
+Where an observation stacks images of several control steps, it also says how things move, and a goal stands still: what was
 observed in the chosen slot becomes a goal by a function of the world's (`GoalEnv.as_goal`).
 """
 

@@ -1,6 +1,6 @@
 """Plays whole episodes with the current policy, all environments in step.
 
-reset S x E environments (each draws its goal picture once)
+reset S x E environments (each draws its goal image once)
 scan over T:  act -> advance -> observe        frames [T, S, E, ...], each kept once
 """
 
@@ -9,7 +9,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxrl_vis.networks import Networks
+from jaxrl_vis.learner.networks import Networks
 from jaxrl_vis.types import Episodes, Metrics, TrainState
 from jaxrl_vis_envs.base import GoalEnv
 
@@ -30,7 +30,7 @@ NO_EXPLORATION = Exploration()
 
 
 def encode(networks: Networks, train: TrainState, frames: jax.Array) -> jax.Array:
-    """What the online actor makes of pictures (or states) [E, ...]: [E, Z]."""
+    """What the online actor makes of images (or states) [E, ...]: [E, Z]."""
     return networks.encode(train.actor, networks.prepare(train.normalizer, frames))
 
 

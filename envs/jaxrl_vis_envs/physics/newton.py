@@ -3,7 +3,7 @@
 MJX's Newton iterations and line searches are loops that end when the last episode of a batch is done, and each iteration calls
 a library for one small matrix. Here an iteration is arithmetic on whole batches: the factorization is written out, and the line
 search is exact and needs no loop, since along a line the cost is a parabola between the points where a constraint starts or
-ends. FetchReach, pictures included, is 1.2 times as fast on two CPU cores with 16 environments, and twice with 256.
+ends. FetchReach, images included, is 1.2 times as fast on two CPU cores with 16 environments, and twice with 256.
 
 Source: the primal problem of MuJoCo's documentation, "Computation", constraint model; Newton's method as there.
 """
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from jaxrl_vis_envs.tasks.quiet_mjx import mjx, support
+from jaxrl_vis_envs.physics.quiet_mjx import mjx, support
 
 # Written out, a factorization has a sixth of the cube of this many operations.
 _MOST_JOINTS = 12

@@ -6,7 +6,7 @@ The encoder is a stack of 2x2 convolutions with stride 2. Such windows never ove
     [B, C, H, W]  ->  [B, H/16, W/16, 2*2, 2*2, 2*2, 2*2 * C]      (four layers; the finest block last)
 
 every layer is one reshape and one matrix product over the last axis, with no copy between layers. The order is made on the
-uint8 picture, where it is cheapest. Borders that do not fill a block are cropped, as a convolution without padding does.
+uint8 image, where it is cheapest. Borders that do not fill a block are cropped, as a convolution without padding does.
 
 Observation and goal go through the same encoder; actor and critic have one each.
 """
@@ -20,8 +20,9 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from jaxrl_vis import encoder_kernel, normalizer
-from jaxrl_vis.config import Config, RequestError
+from jaxrl_vis.config import Config
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.learner import encoder_kernel, normalizer
 from jaxrl_vis.types import NormalizerState, Params
 from jaxrl_vis_envs.compilation import runs_gpu_kernels
 
@@ -50,7 +51,7 @@ _product.defvjp(lambda values, kernel: (values @ kernel, (values, kernel)), _pro
 
 
 def to_blocks(frames: jax.Array, levels: int) -> jax.Array:
-    """Planar pictures in nested 2x2 blocks: [..., C, H, W] -> [..., (H / 2^levels) * (W / 2^levels), 4^levels * C], same dtype.
+    """Planar images in nested 2x2 blocks: [..., C, H, W] -> [..., (H / 2^levels) * (W / 2^levels), 4^levels * C], same dtype.
 
     The last axis runs over (coarsest block, ..., finest block, channel).
     """
@@ -155,12 +156,12 @@ class Networks:
     critic_output_bias: float
 
     def __post_init__(self) -> None:
-        """Checks the picture's size.
+        """Checks the image's size.
 
         Raises:
-            RequestError: The picture is smaller than one block of the encoder.
+            RequestError: The image is smaller than one block of the encoder.
         """
-        if self.sees_pictures:
+        if self.sees_images:
             *_, height, width = self.observation_spec.shape
             least = 2**self._levels
             if min(height, width) < least:
@@ -170,15 +171,15 @@ class Networks:
                 )
 
     @property
-    def sees_pictures(self) -> bool:
-        """Whether observations are planar pictures rather than state vectors."""
+    def sees_images(self) -> bool:
+        """Whether observations are planar images rather than state vectors."""
         return len(self.observation_spec.shape) == 3
 
     @property
     def uses_kernel(self) -> bool:
         """Whether the first layers run as one GPU kernel (`encoder_kernel`) instead of one product each."""
         return (
-            self.sees_pictures
+            self.sees_images
             and runs_gpu_kernels()
             and self.dtype == jnp.bfloat16
             and encoder_kernel.supports(self.config.encoder_filters, self.observation_spec.shape)
@@ -205,12 +206,12 @@ class Networks:
 
     @property
     def _latent_size(self) -> int:
-        return self.config.latent_size if self.sees_pictures else math.prod(self.observation_spec.shape)
+        return self.config.latent_size if self.sees_images else math.prod(self.observation_spec.shape)
 
     def _init(self, key: jax.Array, head: _Head, head_inputs: int) -> Params:
         encoder_key, head_key = jax.random.split(key)
         params = {"head": head.init(head_key, jnp.zeros((1, head_inputs)))["params"]}
-        if self.sees_pictures:
+        if self.sees_images:
             blocks = to_blocks(jnp.zeros((1, *self.observation_spec.shape)), self._levels)
             params["encoder"] = self._encoder.init(encoder_key, blocks)["params"]
         return params
@@ -247,14 +248,14 @@ class Networks:
         mean, scale = statistics.mean, normalizer.scale(statistics, self.config.normalizer_floor)
         if self.uses_kernel:
             return encoder_kernel.prepare(frames, mean, scale, self._levels, self.config.normalizer_clip, self.dtype)
-        if self.sees_pictures:
+        if self.sees_images:
             frames, mean, scale = (to_blocks(array, self._levels) for array in (frames, mean, scale))
         limit = self.config.normalizer_clip
         return jnp.clip((frames.astype(jnp.float32) - mean) * scale, -limit, limit).astype(self.dtype)
 
     def encode(self, params: Params, inputs: jax.Array, which: slice = slice(None)) -> jax.Array:
         """Latents of ``which`` of the prepared observations, [B, latent]; a state vector is its own latent."""
-        if not self.sees_pictures:
+        if not self.sees_images:
             return inputs[which]
         first_layer = 0
         if self.uses_kernel:

@@ -20,12 +20,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental.compilation_cache import compilation_cache
 
-from jaxrl_vis import videos, viewer
-from jaxrl_vis.checkpoint import Checkpoints, Restored
-from jaxrl_vis.config import Config, RequestError
-from jaxrl_vis.interruption import Terminated
-from jaxrl_vis.run_folder import RunFolder, default_folder, read_config
-from jaxrl_vis.run_loop import NonFiniteError, Report, RunLoop
+from jaxrl_vis.config import Config
+from jaxrl_vis.errors import NonFiniteError, RequestError, Terminated
+from jaxrl_vis.report import videos, viewer
+from jaxrl_vis.run.checkpoint import Checkpoints, Restored
+from jaxrl_vis.run.folder import RunFolder, default_folder, read_config
+from jaxrl_vis.run.loop import Report, RunLoop
 from jaxrl_vis.types import LoopState, Metrics, TrainState
 
 __all__ = [
@@ -67,7 +67,7 @@ class Trainer:
 
     Args:
         config: The run.
-        program: What `jaxrl_vis.train_step.make_train_step` returns, or anything with the same attributes.
+        program: What `jaxrl_vis.learner.train_step.make_train_step` returns, or anything with the same attributes.
         run_dir: Where `run` puts its files; None: `run_folder.default_folder`.
         resume: Go on with the run in ``run_dir``.
         overwrite: Delete the run in ``run_dir`` and start again.
@@ -110,12 +110,12 @@ class Trainer:
         return jax.eval_shape(self.program.init, self.run_keys)
 
     @functools.cached_property
-    def shows_pictures(self) -> bool:
+    def shows_images(self) -> bool:
         """Whether what the robot sees can be shown in a video."""
-        seeds, episodes, slots, *picture = self.shapes.replay.episodes.frames.shape
-        if len(picture) == 3:  # of stacked pictures the newest is shown
-            picture[0] //= getattr(self.env, "frames", 1)
-        return videos.shows_pictures((episodes, slots, *picture))
+        seeds, episodes, slots, *image = self.shapes.replay.episodes.frames.shape
+        if len(image) == 3:  # of stacked images the newest is shown
+            image[0] //= getattr(self.env, "frames", 1)
+        return videos.shows_images((episodes, slots, *image))
 
     @property
     def frame_seconds(self) -> float:
@@ -182,7 +182,7 @@ class Trainer:
         return self.watch(loop, key)[0]
 
     def watch(self, loop: LoopState | TrainState, key: jax.Array | None = None) -> tuple[Metrics, dict[str, jax.Array]]:
-        """As `evaluate`, and with it the pictures of the first few episodes of every seed: for `videos.first_seed`."""
+        """As `evaluate`, and with it the images of the first few episodes of every seed: for `videos.first_seed`."""
         key = jax.random.key(_EVALUATION_SEED) if key is None else key
         return self._call("evaluate", loop.train if isinstance(loop, LoopState) else loop, key)
 
@@ -216,7 +216,10 @@ def make_trainer(config: Config, run_dir: Path | str | None = None, resume: bool
     Raises:
         RequestError: The configuration asks for something that cannot be, or contradicts the saved run.
     """
-    from jaxrl_vis.train_step import make_env, make_train_step  # here: a trainer with a program of its own needs no world
+    from jaxrl_vis.learner.train_step import (  # here: a trainer with a program of its own needs no world
+        make_env,
+        make_train_step,
+    )
 
     if run_dir is not None:
         RunFolder(Path(run_dir)).check(config, resume, overwrite)  # building a world takes a while: refuse before
@@ -272,25 +275,25 @@ def play_run(run_dir: Path | str, out: Path | str, episodes: int = 6, three_dime
         run_dir: The run folder.
         out: .gif, .mp4 (needs imageio-ffmpeg), .html or .png.
         episodes: How many to show.
-        three_dimensional: Write an .html page for brax's viewer (needs brax) instead of the robot's pictures; for state tasks,
+        three_dimensional: Write an .html page for brax's viewer (needs brax) instead of the robot's images; for state tasks,
             too.
 
     Raises:
-        RequestError: There is no run, nothing usable in it, no picture to show, or no way to write ``out``.
+        RequestError: There is no run, nothing usable in it, no image to show, or no way to write ``out``.
     """
     out = Path(out)
     (viewer.check_page if three_dimensional else videos.check_output)(out)
     trainer = _open_run(run_dir, eval_episodes=max(1, episodes))
-    if not (trainer.shows_pictures or three_dimensional):
-        raise RequestError(f"{trainer.config.env} shows the robot no pictures: play a run on a Visual task, or with --html")
+    if not (trainer.shows_images or three_dimensional):
+        raise RequestError(f"{trainer.config.env} shows the robot no images: play a run on a Visual task, or with --html")
     restored = _load(trainer)
     key, parts, count = jax.random.key(_EVALUATION_SEED), [], 0
     if three_dimensional:
         viewer.write_page(trainer.program, restored.train, key, max(1, episodes), out)
         return
     while count < episodes:
-        _, pictures = trainer.watch(restored.train, jax.random.fold_in(key, count) if parts else None)
-        parts.append(videos.first_seed(pictures))
+        _, images = trainer.watch(restored.train, jax.random.fold_in(key, count) if parts else None)
+        parts.append(videos.first_seed(images))
         count += len(parts[-1].success)
     joined = videos.Recording(
         *(np.concatenate([getattr(part, name) for part in parts])[:episodes] for name in ("frames", "goals", "success"))

@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis.config import RequestError
-from jaxrl_vis.networks import Networks
-from jaxrl_vis.rollout import NO_EXPLORATION, choose_actions, encode
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.learner.networks import Networks
+from jaxrl_vis.learner.rollout import NO_EXPLORATION, choose_actions, encode
 from jaxrl_vis.types import TrainState
-from jaxrl_vis_envs.compilation import world_jit
+from jaxrl_vis_envs.compilation import env_jit
 
 _HOLD = 0.6  # s, how long the last instant of an episode stays
 
@@ -74,7 +74,7 @@ def write_page(program: Any, train: TrainState, key: jax.Array, episodes: int, o
     from jaxrl_vis_envs.adapters.brax_viewer import Poses, viewer_page
 
     env = program.env
-    play = world_jit(lambda train, key: play_poses(env, program.networks, train, key, episodes))
+    play = env_jit(lambda train, key: play_poses(env, program.networks, train, key, episodes))
     played = {name: np.asarray(values) for name, values in play(jax.tree.map(lambda leaf: leaf[0], train), key).items()}
     # One instant is repeated at the end of each episode, so that one sees where it ended.
     hold = max(1, round(_HOLD / env.control_period))

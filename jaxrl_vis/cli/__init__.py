@@ -21,10 +21,11 @@ from typing import Annotated, Any, Literal
 import tyro
 
 import jaxrl_vis
-from jaxrl_vis.config import Config, RequestError, nearest
+from jaxrl_vis.config import Config
+from jaxrl_vis.errors import RequestError, nearest
 
 PROGRAM = "jaxrl-vis"
-DESCRIPTION = "Trains robots to reach goals that are given as pictures."
+DESCRIPTION = "Trains robots to reach goals that are given as images."
 Benchmark = Literal["render", "physics", "env", "update", "train"]
 
 
@@ -37,7 +38,7 @@ class Train(Config):
     preset: str = "auto"
     """paper, fast, cpu or debug; auto is fast on an accelerator, else cpu."""
     run_dir: Path | None = None
-    """Folder for metrics, pictures and checkpoints; a new one under runs/ if not given."""
+    """Folder for metrics, images and checkpoints; a new one under runs/ if not given."""
     resume: tyro.conf.FlagCreatePairsOff[bool] = False
     """Go on from the newest full checkpoint in the run folder."""
     overwrite: tyro.conf.FlagCreatePairsOff[bool] = False
@@ -81,16 +82,16 @@ class Envs:
     env: tuple[str, ...] = ()
     """Only these tasks; all if not given."""
     gallery: Path | None = None
-    """Also draw the picture tasks here: start and goals as colours, depth and geoms."""
+    """Also draw the image tasks here: start and goals as colours, depth and geoms."""
     image_size: int = 128
-    """Height and width of a picture of the gallery, in pixels."""
+    """Height and width of an image of the gallery, in pixels."""
     goals: int = 4
     """Goals that the gallery shows of each task."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Doctor:
-    """Say whether this installation works: versions, devices, one physics step, one picture."""
+    """Say whether this installation works: versions, devices, one physics step, one image."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,13 +99,13 @@ class Bench:
     """Measure this machine, keep a record, and print the change against the last record of the same device."""
 
     benchmark: tyro.conf.Positional[Benchmark]
-    """What to measure: pictures, physics, both with resets, gradient steps, or whole training iterations."""
+    """What to measure: images, physics, both with resets, gradient steps, or whole training iterations."""
     env: str = "VisualFetchReach"
     """The task."""
     envs: tuple[int, ...] = ()
-    """Environments (or pictures) side by side, one measurement each; sizes that suit the device if not given."""
+    """Environments (or images) side by side, one measurement each; sizes that suit the device if not given."""
     image_size: int | None = None
-    """Height and width of pictures; 64 on accelerators and 32 on a CPU if not given."""
+    """Height and width of images; 64 on accelerators and 32 on a CPU if not given."""
     pixels: Literal["rgbd", "rgb", "depth"] | None = None
     """Channels; rgbd on accelerators and depth on a CPU if not given."""
     batch_size: int | None = None
@@ -235,7 +236,7 @@ def training_config(options: Train, tokens: Sequence[str]) -> Config:
     """
     name = options.preset
     if name == "auto" and options.resume and options.run_dir is not None and (options.run_dir / "config.json").exists():
-        from jaxrl_vis.run_folder import read_config
+        from jaxrl_vis.run.folder import read_config
 
         base = read_config(options.run_dir)
         name = base.preset
@@ -272,7 +273,7 @@ def run_train(options: Train, tokens: Sequence[str]) -> int:
     config = training_config(options, tokens)
     check_env(config.env)
     load_simulator()
-    from jaxrl_vis import trainer
+    from jaxrl_vis.run import trainer
 
     try:
         run = trainer.make_trainer(config, run_dir=options.run_dir, resume=options.resume, overwrite=options.overwrite)
@@ -295,7 +296,7 @@ def run_eval(options: Eval, _: Sequence[str]) -> int:
     """Evaluates a run and prints its figures."""
     _check_run(options.run)
     load_simulator()
-    from jaxrl_vis.trainer import evaluate_run
+    from jaxrl_vis.run.trainer import evaluate_run
 
     figures = evaluate_run(options.run, episodes=options.episodes)
     for name, per_seed in figures.items():
@@ -312,7 +313,7 @@ def run_play(options: Play, _: Sequence[str]) -> int:
     if options.episodes < 1:
         raise RequestError(f"--episodes must be at least 1, not {options.episodes}")
     load_simulator()
-    from jaxrl_vis.trainer import play_run
+    from jaxrl_vis.run.trainer import play_run
 
     play_run(options.run, out, episodes=options.episodes, three_dimensional=options.html)
     print(out)
@@ -326,7 +327,7 @@ def run_envs(options: Envs, _: Sequence[str]) -> int:
     if options.goals < 1 or options.image_size < 1:
         raise RequestError("--goals and --image-size must be at least 1")
     load_simulator()
-    from jaxrl_vis import gallery
+    from jaxrl_vis.report import gallery
 
     names = options.env or None
     gallery.print_table(names)

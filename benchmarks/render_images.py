@@ -1,6 +1,6 @@
-"""Makes the pictures of docs/renderer.md: ours, MuJoCo's own, and the difference. Needs a GL library.
+"""Makes the images of docs/renderer.md: ours, MuJoCo's own, and the difference. Needs a GL library.
 
-    MUJOCO_GL=egl python benchmarks/render_pictures.py [SHEET ...]
+    MUJOCO_GL=egl python benchmarks/render_images.py [SHEET ...]
 
 Each sheet is a PNG in docs/renderer/. The models are those of tests/render_models.py, in their first random pose.
 """
@@ -38,7 +38,7 @@ def sheets() -> dict[str, list[str]]:
 
 
 def panel(name: str) -> tuple[str, Image.Image]:
-    """Title, and the three pictures of one model side by side."""
+    """Title, and the three images of one model side by side."""
     entry = render_models.MODELS[name]
     mj_model, camera = render_models.build(name)
     mj_data = mujoco.MjData(mj_model)
@@ -67,10 +67,10 @@ def sheet(names: list[str], columns: int = 2) -> Image.Image:
     rows = -(-len(panels) // columns)
     page = Image.new("RGB", (columns * (width + 4 * GAP), rows * (height + TITLE + GAP) + GAP), "white")
     pen, font = ImageDraw.Draw(page), ImageFont.load_default(13)
-    for index, (title, picture) in enumerate(panels):
+    for index, (title, image) in enumerate(panels):
         left, top = index % columns * (width + 4 * GAP), index // columns * (height + TITLE + GAP)
         pen.text((left + 2, top + 1), title, fill="black", font=font)
-        page.paste(picture, (left, top + TITLE))
+        page.paste(image, (left, top + TITLE))
     return page
 
 

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from jaxrl_vis_envs.tasks import mjx_model
-from jaxrl_vis_envs.tasks.mjx_model import mjx
+from jaxrl_vis_envs.physics import mjx_model
+from jaxrl_vis_envs.physics.mjx_model import mjx
 
 _SETTLING_STEPS = 3
 # Of the three directions (m^2) and the three turns (rad^2). Near a singular pose a real arm gives up orientation before

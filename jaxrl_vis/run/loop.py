@@ -1,4 +1,4 @@
-"""A training run from its first line to its last: iterations, evaluations, checkpoints, pictures.
+"""A training run from its first line to its last: iterations, evaluations, checkpoints, images.
 
     dispatch iteration k+1                 the device never waits for the host ...
     read the metrics of iteration k        ... because the host reads one iteration late
@@ -18,18 +18,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis import metrics, plots, videos
-from jaxrl_vis.checkpoint import FULL, LIGHT, Checkpoints, Restored
-from jaxrl_vis.console import RunConsole, show_seconds, show_shares
-from jaxrl_vis.interruption import Interruption
-from jaxrl_vis.memory import check_compiled, check_memory
-from jaxrl_vis.metrics import PerSeed
-from jaxrl_vis.nonfinite import NonFiniteError, dump, nonfinite_leaves
-from jaxrl_vis.run_folder import RunFolder
+from jaxrl_vis.errors import NonFiniteError
+from jaxrl_vis.report import plots, videos
+from jaxrl_vis.run import metrics
+from jaxrl_vis.run.checkpoint import FULL, LIGHT, Checkpoints, Restored
+from jaxrl_vis.run.console import RunConsole, show_seconds, show_shares
+from jaxrl_vis.run.folder import RunFolder
+from jaxrl_vis.run.memory import check_compiled, check_memory
+from jaxrl_vis.run.metrics import PerSeed
+from jaxrl_vis.run.nonfinite import dump, nonfinite_leaves
+from jaxrl_vis.run.signals import Interruption
 from jaxrl_vis.types import LoopState
 
 if TYPE_CHECKING:
-    from jaxrl_vis.trainer import Trainer
+    from jaxrl_vis.run.trainer import Trainer
 
 _FILTERED_TOO_MUCH, _FILTERED_EVALUATIONS = 0.9, 3
 
@@ -98,7 +100,7 @@ class RunLoop:
         self._memo = Memo()
         self._done = 0
         self._loop: LoopState | None = None
-        self._pictures: dict[str, jax.Array] = {}
+        self._images: dict[str, jax.Array] = {}
         self._started = self._mark = time.monotonic()
         self._begun, self._begun_at = 0, self._mark
         self._marked_iteration = 0
@@ -242,7 +244,7 @@ class RunLoop:
         """Evaluates the learner, writes a line per seed, and adds the figures to the report."""
         assert self._loop is not None
         speed = self._speed(self._done)
-        outcome, self._pictures = self._trainer.watch(self._loop)
+        outcome, self._images = self._trainer.watch(self._loop)
         values = {name: self._per_seed(value) for name, value in jax.device_get(outcome).items()}
         if not all(np.isfinite(row).all() for row in values.values()):
             self._stop_nonfinite(f"the evaluation after iteration {self._done}", values)
@@ -352,10 +354,10 @@ class RunLoop:
         self._console.stop()
         if not interruption:
             self._draw_curve()
-        if not interruption and self._trainer.shows_pictures:
-            if not self._pictures:  # killed after the last evaluation, before this: resumed with nothing left to evaluate
-                _, self._pictures = self._trainer.watch(self._loop)
-            videos.write_video(videos.first_seed(self._pictures), self._folder.video, self._trainer.frame_seconds)
+        if not interruption and self._trainer.shows_images:
+            if not self._images:  # killed after the last evaluation, before this: resumed with nothing left to evaluate
+                _, self._images = self._trainer.watch(self._loop)
+            videos.write_video(videos.first_seed(self._images), self._folder.video, self._trainer.frame_seconds)
         if interruption:
             interruption.end()
         wall = self._memo.wall_s + time.monotonic() - self._started

@@ -8,7 +8,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxrl_vis.config import Config, RequestError
+from jaxrl_vis.config import Config
+from jaxrl_vis.errors import RequestError
 
 # What stays unclaimed: XLA's workspaces and the allocator's gaps on an accelerator, the program and its libraries on a host.
 _SLACK_BYTES = 256 * 2**20
@@ -20,7 +21,7 @@ _ROLLOUT_COPIES = 3
 # Copies of the parameters and optimiser states: gradients, updates, and what XLA does not write in place.
 _TRAIN_COPIES = 2
 
-# Float32 copies of a batch's pictures in a gradient step, hidden layers included; measured with XLA's memory_analysis (preset
+# Float32 copies of a batch's images in a gradient step, hidden layers included; measured with XLA's memory_analysis (preset
 # cpu, one and three seeds). On an accelerator, `check_compiled` asks again with the compiler's own figures.
 _BATCH_COPIES = 30
 

@@ -1,4 +1,4 @@
-"""Pictures of one environment: `render` for people and files, `render_planes` for the hot path. `jax.vmap` them for a batch.
+"""Images of one environment: `render` for people and files, `render_planes` for the hot path. `jax.vmap` them for a batch.
 
 Three steps: once per environment, everything linear (`shapes`, `lights`); per pixel, which object is nearest (`raycast`,
 `triangles`), which gives integers and is never differentiated; per pixel, once, depth, normal and colour of that object from
@@ -18,7 +18,7 @@ from jaxrl_vis_envs.render.scene import Scene
 
 
 class Frame(NamedTuple):
-    """A picture as people and files want it.
+    """An image as people and files want it.
 
     Attributes:
         rgb: [H, W, 3] uint8.
@@ -36,7 +36,7 @@ class Frame(NamedTuple):
 
 
 class Planes(NamedTuple):
-    """A picture as the hot path wants it: planes, not quantised, and only those that were asked for.
+    """An image as the hot path wants it: planes, not quantised, and only those that were asked for.
 
     Attributes:
         rgb: [3, H, W] float32 in [0, 1], or uint8 where that was asked for; or None.

@@ -15,19 +15,19 @@ import numpy as np
 
 from jaxrl_vis.bench import program_memory, render_operations, render_scenes
 from jaxrl_vis.bench.record import Measurement
-from jaxrl_vis.bench.render import alternate, assert_new_pictures
+from jaxrl_vis.bench.render import alternate, assert_new_images
 from jaxrl_vis.bench.settings import Settings
 from jaxrl_vis.bench.timing import compile_timed
 from jaxrl_vis.bench.timing import measure as measure_time
-from jaxrl_vis_envs.compilation import world_jit
+from jaxrl_vis_envs.compilation import env_jit
 from jaxrl_vis_envs.render import Scene, quantize, render_planes
 
 CPU_COUNTS = (64,)
 ACCELERATOR_COUNTS = (4096,)
 ACCELERATOR_COUNTS_OF = {"primitives": (8192,)}
 CPU_SCENES = ("finger", "fetch_reach")
-PEER_POSES = 64  # pictures that mujoco.Renderer draws, one after the other
-COMPARED = 32  # pictures that are compared with the peer's
+PEER_POSES = 64  # images that mujoco.Renderer draws, one after the other
+COMPARED = 32  # images that are compared with the peer's
 _SAMPLE = 32  # poses that the needed tests are counted in
 _DEPTH_RANGE = 10.0  # metres that an 8-bit depth spans
 # Single-precision operations per second outside the matrix units, from data sheets.
@@ -71,13 +71,13 @@ def _measure_size(settings: Settings, config: dict[str, Any], mj_model: mujoco.M
     if settings.peer is not None and ours is not None:
         some = {name: jnp.asarray(rows[:COMPARED]) for name, rows in batches[0].items()}
         scene = Scene.from_mjmodel(mj_model, 0, config["image_size"], config["image_size"])
-        depth = np.asarray(world_jit(jax.vmap(lambda poses: _picture(scene, poses, "depth")))(some))
+        depth = np.asarray(env_jit(jax.vmap(lambda poses: _image(scene, poses, "depth")))(some))
         depth = np.where(depth < float(scene.zfar), depth, np.inf)
         yield _peer(settings.peer).measure({**config, "pixels": "rgbd"}, mj_model, batches, settings.repeats, depth, ours.value)
 
 
-def _picture(scene: Scene, poses: dict[str, jax.Array], output: str) -> Any:
-    """One picture as planes: rgbd (uint8 and float32 metres), rgbd8 (all uint8) or depth (float32 metres)."""
+def _image(scene: Scene, poses: dict[str, jax.Array], output: str) -> Any:
+    """One image as planes: rgbd (uint8 and float32 metres), rgbd8 (all uint8) or depth (float32 metres)."""
     planes = render_planes(scene, SimpleNamespace(**poses), rgb=output != "depth", quantized=True)
     assert planes.depth is not None
     if planes.rgb is None:
@@ -89,9 +89,9 @@ def _measure_ours(settings: Settings, config: dict[str, Any], mj_model: mujoco.M
     count, size, output = config["images"], config["image_size"], config["pixels"]
     scene = Scene.from_mjmodel(mj_model, 0, size, size)
     some = [{name: jnp.asarray(rows[:count]) for name, rows in batch.items()} for batch in batches]
-    draw = world_jit(jax.vmap(lambda poses: _picture(scene, poses, output)))
+    draw = env_jit(jax.vmap(lambda poses: _image(scene, poses, output)))
     compiled, compile_s = compile_timed(draw, some[0])
-    assert_new_pictures(compiled, some)
+    assert_new_images(compiled, some)
     timing = measure_time(alternate(compiled, some), settings.repeats)
     sample = {name: rows[:_SAMPLE] for name, rows in batches[0].items()}
     needed = render_scenes.needed_tests(mj_model, sample, size)
@@ -106,7 +106,7 @@ def _effort(compiled: Any, pixels: int, seconds: float, tests: float, operations
 
     Args:
         compiled: The program.
-        pixels: Of all pictures together.
+        pixels: Of all images together.
         seconds: Of one call.
         tests: A pixel, which perfect culling would leave.
         operations: A pixel, which these tests and the shading take (`render_operations`); None where that is not known.

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from jaxrl_vis_envs.tasks import newton
-from jaxrl_vis_envs.tasks.kinematics import kinematics
-from jaxrl_vis_envs.tasks.quiet_mjx import math, mjx, sensor, smooth, solver
+from jaxrl_vis_envs.physics import newton
+from jaxrl_vis_envs.physics.kinematics import kinematics
+from jaxrl_vis_envs.physics.quiet_mjx import math, mjx, sensor, smooth, solver
 
 __all__ = ["kinematics", "load_model", "mjx", "simulate", "start_data", "step", "still_data", "take_steps", "tip_jacobian"]
 
@@ -44,7 +44,7 @@ def simulate(model: mjx.Model, data: mjx.Data, substeps: int, exact: bool = Fals
     """``substeps`` physics steps (`step`), after which every pose belongs to the final ``qpos``.
 
     `mjx.step` leaves the poses of the state *before* its last integration, so `kinematics` is needed once more for the
-    picture, the true state and ``qpos`` to agree.
+    image, the true state and ``qpos`` to agree.
     """
     return kinematics(model, take_steps(model, data, substeps, exact))
 

@@ -18,24 +18,25 @@ import jax
 import jax.numpy as jnp
 
 import jaxrl_vis_envs
-from jaxrl_vis import normalizer
-from jaxrl_vis.config import Config, RequestError, Resolved, resolve, validate
-from jaxrl_vis.ddpg import Algorithm, Working, make_ddpg
-from jaxrl_vis.networks import Networks
-from jaxrl_vis.relabel import choose_goal_slots, stand_still
-from jaxrl_vis.replay import Indices, Replay, make_replay, num_bytes
-from jaxrl_vis.rollout import Exploration, play
+from jaxrl_vis.config import Config, Resolved, resolve, validate
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.learner import normalizer
+from jaxrl_vis.learner.ddpg import Algorithm, Working, make_ddpg
+from jaxrl_vis.learner.networks import Networks
+from jaxrl_vis.learner.relabel import choose_goal_slots, stand_still
+from jaxrl_vis.learner.replay import Indices, Replay, make_replay, num_bytes
+from jaxrl_vis.learner.rollout import Exploration, play
 from jaxrl_vis.types import Batch, Episodes, LoopState, Metrics, ReplayState, TrainState
 from jaxrl_vis_envs import goals
 from jaxrl_vis_envs.base import GoalEnv
-from jaxrl_vis_envs.compilation import world_jit
+from jaxrl_vis_envs.compilation import env_jit
 from jaxrl_vis_envs.randomization import typical
 from jaxrl_vis_envs.registry import config_class
 
 # A leading seed axis on everything but the iteration, which all seeds share (see `replay`).
 _SEED_AXES = LoopState(train=0, replay=0, key=0, iteration=None)  # type: ignore[arg-type]
 
-# Episodes of an evaluation whose pictures are handed back, for videos.
+# Episodes of an evaluation whose images are handed back, for videos.
 _NUM_RECORDED = 8
 
 
@@ -162,8 +163,8 @@ def make_train_step(env: GoalEnv, config: Config) -> TrainStep:
     """
     resolved = resolve(validate(config), env.horizon)
     networks = Networks(config, env.observation_spec, env.action_size, resolved.critic_output_bias)
-    if config.method != "oracle" and not networks.sees_pictures:
-        raise RequestError(f"method {config.method} compares pictures: use --env Visual{config.env}, or --method oracle")
+    if config.method != "oracle" and not networks.sees_images:
+        raise RequestError(f"method {config.method} compares images: use --env Visual{config.env}, or --method oracle")
     algorithm = make_ddpg(networks, config, resolved)
     replay = make_replay(config.replay_transitions, config.num_envs, env.horizon)
     update_many = _make_update_many(config, resolved, env, replay, algorithm)
@@ -197,7 +198,7 @@ def make_train_step(env: GoalEnv, config: Config) -> TrainStep:
         num_recorded = min(_NUM_RECORDED, config.eval_episodes)
         keys = jnp.broadcast_to(key, (jax.tree.leaves(train)[0].shape[0],))
         episodes, outcome = play(env, networks, train, keys, config.eval_episodes, num_kept=num_recorded)
-        # For people, the newest of stacked pictures, which come first.
+        # For people, the newest of stacked images, which come first.
         newest = episodes.frames
         if env.frames > 1:
             newest = newest[:, :, :, : newest.shape[3] // env.frames]
@@ -215,8 +216,8 @@ def make_train_step(env: GoalEnv, config: Config) -> TrainStep:
         resolved=resolved,
         networks=networks,
         replay=replay,
-        init=world_jit(per_seed(init, out_axes=_SEED_AXES), runs_once=True),
-        train_iteration=world_jit(train_iteration, donate_argnums=0),
-        evaluate=world_jit(evaluate),
-        update_many=world_jit(per_seed(update_many, (0, 0, 0, None)), donate_argnums=0),
+        init=env_jit(per_seed(init, out_axes=_SEED_AXES), runs_once=True),
+        train_iteration=env_jit(train_iteration, donate_argnums=0),
+        evaluate=env_jit(evaluate),
+        update_many=env_jit(per_seed(update_many, (0, 0, 0, None)), donate_argnums=0),
     )
