@@ -60,7 +60,7 @@ def draw_goals(env: Any, count: int, seed: int = 0) -> Goals:
 
     def draw(data: Any) -> tuple[jax.Array, jax.Array]:
         image = env.observe(env.state_at(data, env.achieved(data)).replace(history=None))
-        return image[: len(image) // env.frames], render_planes(scene, data, False, False, segmentation=True).segmentation
+        return image[: len(image) // env.frame_stack], render_planes(scene, data, False, False, segmentation=True).segmentation
 
     keys = jax.random.split(jax.random.key(seed), count)
     states, data = env_jit(jax.vmap(sample))(keys)

@@ -37,7 +37,7 @@ class Config:
     """Channels of the image."""
     image_size: int = 64
     """Height and width of the image, in pixels."""
-    frames: int | None = None
+    frame_stack: int | None = None
     """Images of the latest control steps that an observation stacks. None: as many as the task does."""
     randomize: tuple[Kind, ...] = ()
     """What varies between episodes, in training and evaluation: any of camera, lights, colours, dynamics."""
@@ -277,8 +277,8 @@ def validate(config: Config) -> Config:
     for kind in config.randomize:
         if kind not in RANDOMIZED:
             raise RequestError(f"cannot randomize {kind!r}{nearest(str(kind), RANDOMIZED)}")
-    if config.frames is not None and config.frames < 1:
-        raise RequestError(f"frames must be at least 1, not {config.frames}")
+    if config.frame_stack is not None and config.frame_stack < 1:
+        raise RequestError(f"frame_stack must be at least 1, not {config.frame_stack}")
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
         if field.type is int and field.name not in ("seed", "full_checkpoint_interval") and value < 1:

@@ -188,13 +188,13 @@ def test_images_stack_newest_first():
     """Against an environment that shows one image, from the same key, under the same actions."""
     keys = jax.random.split(jax.random.key(0), 1)
     actions = jnp.ones((3, 1, 2)) * jnp.array([1.0, -0.5, 0.8])[:, None, None]
-    env, env_1 = (PointMass(PointMassConfig(image_size=16, frames=frames)) for frames in (3, 1))
+    env, env_1 = (PointMass(PointMassConfig(image_size=16, frame_stack=frames)) for frames in (3, 1))
     (start, steps), (start_1, steps_1) = (
         tuple(state.obs for state in play_images(world, keys, actions)) for world in (env, env_1)
     )
     one = [start_1["observation"][0], *steps_1["observation"][:, 0]]
     assert len({np.asarray(image).tobytes() for image in one}) == 4
-    assert env.frames == 3 and env.observation_spec.shape == (12, 16, 16)
+    assert env.frame_stack == 3 and env.observation_spec.shape == (12, 16, 16)
     np.testing.assert_array_equal(start["observation"][0], np.concatenate([one[0], one[0], one[0]]))
     np.testing.assert_array_equal(steps["observation"][0, 0], np.concatenate([one[1], one[0], one[0]]))
     np.testing.assert_array_equal(steps["observation"][2, 0], np.concatenate([one[3], one[2], one[1]]))
@@ -260,7 +260,7 @@ def test_names_that_do_not_exist():
     for name, bad in (
         ("VisualReacher", {"pixels": "hsv"}),
         ("VisualReacher", {"image_size": 0}),
-        ("VisualReacher", {"frames": 0}),
+        ("VisualReacher", {"frame_stack": 0}),
         ("FingerTurn", {"substeps": 0}),
         ("VisualFetchReach", {"depth_range": (2.0, 1.0)}),
         ("Reacher", {"control": "telepathy"}),

@@ -63,7 +63,7 @@ def test_the_finger_hangs_away_from_the_spinner_in_the_goal():
 
 def test_three_images_by_default_and_one_by_choice():
     assert jaxrl_vis_envs.make("VisualFingerTurn", image_size=8).observation_spec.shape == (12, 8, 8)
-    assert jaxrl_vis_envs.make("VisualFingerTurn", image_size=8, frames=1).observation_spec.shape == (4, 8, 8)
+    assert jaxrl_vis_envs.make("VisualFingerTurn", image_size=8, frame_stack=1).observation_spec.shape == (4, 8, 8)
 
 
 @pytest.mark.parametrize(("substeps", "period"), [(21, 0.21), (2, 0.02)])

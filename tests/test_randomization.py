@@ -270,8 +270,8 @@ def test_the_learner_asks_for_it() -> None:
         ({"randomize": ("dynamics",), "randomize_strength": 10.0}, "mass"),
         ({"randomize_strength": 0.0}, "randomize_strength"),
         ({"env": "Reacher", "randomize": ("colours",)}, "draws images"),
-        ({"env": "Reacher", "frames": 2}, "frames"),
-        ({"frames": 0}, "frames"),
+        ({"env": "Reacher", "frame_stack": 2}, "frame_stack"),
+        ({"frame_stack": 0}, "frame_stack"),
     ):
         with pytest.raises(RequestError, match=words):
             make_env(preset("debug", **({"env": "VisualReacher"} | wrong)))

@@ -23,7 +23,7 @@ ENVS, SETTINGS = 2, {"batch_size": 64, "updates_per_iteration": 1, "replay_trans
 
 def test_relabelled_goals_are_what_was_reached_standing_still():
     """VisualReacher's own rule, on episodes whose images hold their number and their slot, newest first."""
-    env = jaxrl_vis_envs.make("VisualReacher", frames=2, image_size=4, pixels="depth")
+    env = jaxrl_vis_envs.make("VisualReacher", frame_stack=2, image_size=4, pixels="depth")
     horizon = 5
     slots = np.arange(horizon + 2)
     newest = 10 * np.arange(ENVS)[:, None] + slots
@@ -53,17 +53,17 @@ def test_relabelled_goals_are_what_was_reached_standing_still():
 class Walker(Probe):
     """A point that walks; an image is as bright as the point is far, on six grey levels, so that goals can be met."""
 
-    def __init__(self, frames: int):
-        self.frames = frames
+    def __init__(self, frame_stack: int):
+        self.frame_stack = frame_stack
 
     def image(self, position):
         return jnp.full((3, 8, 8), jnp.clip(jnp.round(position[0]) % 6, 0, 5), jnp.uint8)
 
     def reset(self, key):
         position, goal = jax.random.uniform(key, (2, 1), maxval=6.0)
-        still, wanted = (jnp.tile(self.image(place), (self.frames, 1, 1)) for place in (position, goal))
+        still, wanted = (jnp.tile(self.image(place), (self.frame_stack, 1, 1)) for place in (position, goal))
         obs = {"observation": still, "achieved_goal": still, "desired_goal": wanted}
-        return self._measure(position, position, goal, obs, start_history(position, self.frames))
+        return self._measure(position, position, goal, obs, start_history(position, self.frame_stack))
 
     def advance(self, state, action):
         position, history = state.data + 1.5 + 0.5 * action, push_history(state.history, state.data)

@@ -68,7 +68,7 @@ class GoalEnv(abc.ABC):
     # How hard the task is before anything is learned, as measured by benchmarks/task_difficulty.py; None: not measured.
     chance: float | None = None  # share of episodes that uniformly random actions end in success
     difficulty: float | None = None  # mean distance from start to goal, in thresholds
-    frames: int = 1  # F, images of the latest control steps that an observation stacks
+    frame_stack: int = 1  # F, images of the latest control steps that an observation stacks
 
     @abc.abstractmethod
     def reset(self, key: jax.Array) -> State:
@@ -99,9 +99,9 @@ class GoalEnv(abc.ABC):
 
         A goal stands still; whoever relabels with something observed on the way has to say so in the same way.
         """
-        if self.frames == 1:
+        if self.frame_stack == 1:
             return frame
-        return jnp.tile(frame[: frame.shape[0] // self.frames], (self.frames, 1, 1))
+        return jnp.tile(frame[: frame.shape[0] // self.frame_stack], (self.frame_stack, 1, 1))
 
     def step(self, state: State, action: jax.Array) -> State:
         """`advance`, then `observe`: the one to use where every step's image is wanted."""
@@ -151,9 +151,9 @@ class GoalEnv(abc.ABC):
         )
 
 
-def start_history(qpos: jax.Array, frames: int) -> jax.Array | None:
-    """`State.history` at the start of an episode, where ``qpos`` [nq] has stood still: [frames - 1, nq], None for one frame."""
-    return None if frames == 1 else jnp.tile(qpos, (frames - 1, 1))
+def start_history(qpos: jax.Array, frame_stack: int) -> jax.Array | None:
+    """`State.history` at the start of an episode, where ``qpos`` [nq] has stood still: [frame_stack - 1, nq], or None for one."""
+    return None if frame_stack == 1 else jnp.tile(qpos, (frame_stack - 1, 1))
 
 
 def push_history(history: jax.Array | None, qpos: jax.Array) -> jax.Array | None:

@@ -4,7 +4,7 @@ An image is planar, [C, H, W] uint8, with the channels R, G, B, D, as many of th
 planar (along the camera's axis) and metric: 0 is the near end of the task's depth range, 255 the far end, linear between,
 clipped outside.
 
-``frames`` images, of this control step and those before it, may be stacked along the channels, the newest first. What came
+``frame_stack`` images, of this control step and those before it, may be stacked along the channels, the newest first. What came
 before is kept as joint positions (`State.history`), a few numbers, and drawn again: an image costs less than the physics
 that leads to it, and no image has to travel with the state.
 """
@@ -35,12 +35,12 @@ class PixelsConfig:
     """Channels."""
     depth_range: tuple[float, float] = (0.1, 10.0)
     """Depths that bytes 0 and 255 stand for, m. Tasks choose it as tight as what moves allows."""
-    frames: int = 1
+    frame_stack: int = 1
     """Images of the latest control steps that an observation stacks. With one, velocities are hidden."""
 
     def __post_init__(self) -> None:
-        if self.frames < 1:
-            raise ValueError(f"frames must be at least 1, got {self.frames}")
+        if self.frame_stack < 1:
+            raise ValueError(f"frame_stack must be at least 1, got {self.frame_stack}")
         if self.image_size < 1:
             raise ValueError(f"image_size must be at least 1, got {self.image_size}")
         if self.pixels not in CHANNELS:
@@ -56,7 +56,7 @@ look in ``domain`` (see `State`)."""
 
 
 class ImageObserver:
-    """A function from the poses of one environment to its images [frames * channels, H, W] uint8.
+    """A function from the poses of one environment to its images [frame_stack * channels, H, W] uint8.
 
     Attributes:
         scene: What is drawn, before randomisation.
@@ -67,7 +67,7 @@ class ImageObserver:
         """Reads the scene; see `image_observer`."""
         size = config.image_size
         self.scene = Scene.from_mjmodel(mj_model, camera=camera, height=size, width=size)
-        self.spec = jax.ShapeDtypeStruct((config.frames * CHANNELS[config.pixels], size, size), jnp.uint8)
+        self.spec = jax.ShapeDtypeStruct((config.frame_stack * CHANNELS[config.pixels], size, size), jnp.uint8)
         self._config = config
         self._model = mjx.put_model(mj_model)
 
@@ -76,13 +76,13 @@ class ImageObserver:
 
         Args:
             data: Poses, up to date.
-            history: [frames - 1, nq] float32, joint positions one, two, ... control steps ago. Without, the world has stood
+            history: [frame_stack - 1, nq] float32, joint positions one, two, ... control steps ago. Without, all has stood
                 still, and one image is repeated.
             domain: The look of the episode (`randomization`), which holds for all images.
         """
         scene = varied_scene(self.scene, domain)
-        if self._config.frames == 1 or history is None:
-            return jnp.tile(self._draw(scene, data), (self._config.frames, 1, 1))
+        if self._config.frame_stack == 1 or history is None:
+            return jnp.tile(self._draw(scene, data), (self._config.frame_stack, 1, 1))
 
         def draw_at(qpos: jax.Array) -> jax.Array:
             with jax.default_matmul_precision("highest"):

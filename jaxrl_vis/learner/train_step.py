@@ -50,8 +50,8 @@ def make_env(config: Config) -> GoalEnv:
     try:
         fields = {field.name for field in dataclasses.fields(config_class(config.env))}
         settings: dict[str, Any] = {name: getattr(config, name) for name in ("image_size", "pixels") if name in fields}
-        if config.frames is not None:
-            settings["frames"] = config.frames
+        if config.frame_stack is not None:
+            settings["frame_stack"] = config.frame_stack
         if config.randomize:
             settings["randomization"] = typical(*config.randomize, strength=config.randomize_strength)
         return jaxrl_vis_envs.make(config.env, **settings)
@@ -136,7 +136,7 @@ def _make_update_many(config: Config, resolved: Resolved, env: GoalEnv, replay: 
 
         def one_update(carry: tuple[TrainState, Working], chosen: tuple[Indices, jax.Array]) -> tuple[Any, Metrics]:
             batch, reached = replay.gather(memory, *chosen), None
-            if env.frames > 1:
+            if env.frame_stack > 1:
                 batch, reached = stand_still(batch, env.as_goal)
             reward = reward_of(config, resolved, env.threshold, batch, reached)
             train, working, metrics = algorithm.update(*carry, batch, reward)
@@ -200,8 +200,8 @@ def make_train_step(env: GoalEnv, config: Config) -> TrainStep:
         episodes, outcome = play(env, networks, train, keys, config.eval_episodes, num_kept=num_recorded)
         # For people, the newest of stacked images, which come first.
         newest = episodes.frames
-        if env.frames > 1:
-            newest = newest[:, :, :, : newest.shape[3] // env.frames]
+        if env.frame_stack > 1:
+            newest = newest[:, :, :, : newest.shape[3] // env.frame_stack]
         frames, goals = newest[:, :, :-1], newest[:, :, -1]
         metrics = {
             "eval/success": jnp.mean(outcome["success"], axis=1),

@@ -114,7 +114,7 @@ class Trainer:
         """Whether what the robot sees can be shown in a video."""
         seeds, episodes, slots, *image = self.shapes.replay.episodes.frames.shape
         if len(image) == 3:  # of stacked images the newest is shown
-            image[0] //= getattr(self.env, "frames", 1)
+            image[0] //= getattr(self.env, "frame_stack", 1)
         return videos.shows_images((episodes, slots, *image))
 
     @property

@@ -58,7 +58,7 @@ class VisualFingerTurnConfig(PixelsConfig, FingerTurnConfig):
 
     depth_range: tuple[float, float] = (0.8, 1.3)
     """Depths that bytes 0 and 255 stand for, m: 2 mm a step; finger and spinner lie between .85 and 1.25 m."""
-    frames: int = 3
+    frame_stack: int = 3
     """Images of the latest control steps that an observation stacks: three in the thesis, one in the authors' release."""
 
     def __post_init__(self) -> None:

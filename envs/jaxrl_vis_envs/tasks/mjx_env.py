@@ -39,7 +39,7 @@ class MjxGoalEnv(GoalEnv):
         self.config = config
         self.horizon = config.horizon
         self.threshold = config.threshold
-        self.frames = getattr(config, "frames", 1)
+        self.frame_stack = getattr(config, "frame_stack", 1)
         self.mj_model = mj_model
         self._model = mjx.put_model(mj_model)
         self._draw = observer(mj_model) if observer is not None else None
@@ -91,7 +91,7 @@ class MjxGoalEnv(GoalEnv):
 
     def state_at(self, data: mjx.Data, goal_state: jax.Array, domain: randomization.Domain | None = None) -> State:
         """An episode that starts at ``data``, with a goal state [G] and no images, where nothing but ``domain`` varies."""
-        history = start_history(data.qpos, self.frames)
+        history = start_history(data.qpos, self.frame_stack)
         return self._measure(data, self.achieved(data), goal_state, None, history, domain)
 
     @property
@@ -99,7 +99,9 @@ class MjxGoalEnv(GoalEnv):
         """Shape and dtype of `observe`, without tracing physics or renderer."""
         if isinstance(self._draw, ImageObserver):
             return self._draw.spec
-        shape = jax.eval_shape(lambda data: self._observe(data, start_history(data.qpos, self.frames), None), self._data_shape)
+        shape = jax.eval_shape(
+            lambda data: self._observe(data, start_history(data.qpos, self.frame_stack), None), self._data_shape
+        )
         return jax.ShapeDtypeStruct(shape.shape, shape.dtype)
 
     @property
