@@ -15,7 +15,7 @@ from jaxrl_vis_envs.physics.quiet_mjx import math, mjx, sensor, smooth, solver
 
 __all__ = ["kinematics", "load_model", "mjx", "simulate", "start_data", "step", "still_data", "take_steps", "tip_jacobian"]
 
-_ASSETS = pathlib.Path(__file__).parent / "assets"
+_ASSETS = pathlib.Path(__file__).resolve().parents[1] / "tasks" / "assets"
 
 
 def load_model(file_name: str) -> mujoco.MjModel:
