@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from benchmarks import worlds
+from benchmarks import environments
 from jaxrl_vis_envs.compilation import env_jit
 from jaxrl_vis_envs.physics import mjx_model, newton
 from jaxrl_vis_envs.physics.mjx_model import mjx
@@ -51,7 +51,7 @@ def test_nothing_moves_where_nothing_pulls():
 
 def test_a_step_is_that_of_mjx():
     """With forces from outside, from configurations beyond the limits of the joints and with the fingers in the table."""
-    env = worlds.make("FetchReach")
+    env = environments.make("FetchReach")
     mj_model = copy.copy(env.mj_model)
     mj_model.opt.iterations, mj_model.opt.ls_iterations = 20, 20
     model, start = mjx.put_model(mj_model), env.sample_start(jax.random.key(0))
@@ -104,19 +104,19 @@ def test_what_is_not_small_and_simple_is_left_to_mjx(joint, option, fits):
     assert newton.fits(mjx.put_model(mujoco.MjModel.from_xml_string(xml))) is fits
 
 
-# What a task's speed rests on: on a GPU Reacher makes 1.73 M steps a second with the small solver, 0.78 M with MJX's. The finger
-# has elliptic cones and friction in a joint, the hand 24 joints and friction in them.
+# What the speed of a task rests on: VisualReacher makes 1.73 M steps a second on an H100 with the small solver, 0.78 M with MJX's.
+# The finger has elliptic cones and friction in a joint, the hand 24 joints and friction in them.
 SOLVERS = {"FetchReach": "small", "FingerTurn": "mjx", "HandReach": "mjx", "Reacher": "small", "SawyerReach": "small"}
 
 
 @pytest.mark.parametrize("name", SOLVERS)
 def test_the_solver_of_each_task(name):
-    assert mjx_model.solver_of(mjx.put_model(worlds.make(name).mj_model)) == SOLVERS[name]
+    assert mjx_model.solver_of(mjx.put_model(environments.make(name).mj_model)) == SOLVERS[name]
 
 
 def test_without_warm_starts_the_last_accelerations_do_not_matter():
     """The reacher's elbow near its limit, with one iteration, from a warm start that is far off; against MJX."""
-    mj_model = copy.copy(worlds.make("Reacher").mj_model)
+    mj_model = copy.copy(environments.make("Reacher").mj_model)
     mj_model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER  # four forward dynamics in a program take long to compile
     assert mj_model.opt.iterations == 1 and mj_model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_WARMSTART
     model, still = mjx.put_model(mj_model), mjx_model.still_data(mj_model)

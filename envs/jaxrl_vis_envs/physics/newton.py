@@ -24,8 +24,8 @@ _MOST_JOINTS = 12
 def fits(model: mjx.Model) -> bool:
     """Whether the functions here can take the place of MJX's.
 
-    They can for few joints of one degree of freedom, pyramidal cones, no friction in joints or tendons, no activations, explicit
-    integrators, and implicit damping of joints, as is MuJoCo's default. Warm starts may be on or off.
+    They can for few joints of one degree of freedom, pyramidal cones, no friction in joints or tendons, no activations, and the
+    Euler (with implicit damping of joints, MuJoCo's default) or Runge-Kutta integrator. Warm starts may be on or off.
     """
     is_newton = model.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON and model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
     is_small = model.nq == model.nv <= _MOST_JOINTS and model.na == 0
