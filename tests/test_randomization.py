@@ -290,7 +290,7 @@ def test_a_learner_trains_in_worlds_that_vary() -> None:
         return loop, rows
 
     (loop, rows), (_, again) = train(), train()
-    starts = np.asarray(loop.replay.episodes.frames[0, :, 0])
+    starts = np.asarray(loop.replay.episodes.observations[0, :, 0])
     np.testing.assert_array_equal(loop.replay.episodes.states[0, :, 0], 0.0)
     assert len({start.tobytes() for start in starts}) == len(starts) == 8
     assert all(np.isfinite(value).all() and row["guard/nonfinite"] == 0 for row in rows for value in row.values())

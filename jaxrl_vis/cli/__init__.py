@@ -296,7 +296,7 @@ def run_eval(options: Eval, _: Sequence[str]) -> int:
     """Evaluates a run and prints its figures."""
     _check_run(options.run)
     load_simulator()
-    from jaxrl_vis.run.trainer import evaluate_run
+    from jaxrl_vis.run.trained import evaluate_run
 
     figures = evaluate_run(options.run, episodes=options.episodes)
     for name, per_seed in figures.items():
@@ -313,7 +313,7 @@ def run_play(options: Play, _: Sequence[str]) -> int:
     if options.episodes < 1:
         raise RequestError(f"--episodes must be at least 1, not {options.episodes}")
     load_simulator()
-    from jaxrl_vis.run.trainer import play_run
+    from jaxrl_vis.run.trained import play_run
 
     play_run(options.run, out, episodes=options.episodes, three_dimensional=options.html)
     print(out)
