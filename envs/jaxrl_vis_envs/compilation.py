@@ -10,8 +10,8 @@ about half as fast (FetchReach, 64 environments, two cores: 1,100 environment st
 What is fast on a CPU is slow on a GPU and the other way round, and some functions have a hand-written kernel for NVIDIA GPUs
 (Pallas, by Triton). Which of these is used follows the platform that a program is compiled for, which is not always that of the
 default backend: `by_platform`. The environment variable ``JAXRL_VIS_KERNELS`` and the context manager `kernels` choose between
-the kernels and the same functions in plain JAX: ``0`` never uses a kernel, ``1`` uses them on every NVIDIA GPU, and ``auto`` (the
-default) uses each where a small instance of it compiles.
+the kernels and the same functions in plain JAX: ``0`` never uses a kernel, ``1`` uses them on every NVIDIA GPU, and ``auto``
+(the default) uses each where a small instance of it compiles.
 """
 
 import contextlib

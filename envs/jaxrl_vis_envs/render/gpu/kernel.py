@@ -358,7 +358,12 @@ def draw(
 
 
 def probe() -> None:
-    """Compiles a small instance of the kernel, with every type of object and of light and a texture."""
+    """Compiles a small instance of the kernel."""
+    probe_program().lower().compile()
+
+
+def probe_program() -> Any:
+    """A small instance of the kernel, traced (`jax.stages.Traced`): every type of object, two lights, a texture, a sky."""
     mj_model = mujoco.MjModel.from_xml_string(_PROBE)
     mj_data = mujoco.MjData(mj_model)
     mujoco.mj_forward(mj_model, mj_data)
@@ -367,7 +372,8 @@ def probe() -> None:
     unit = shapes.unit_shapes(scene, mj_data, position, rotation, finite)
     table = lights.pack(lights.camera_lights(scene, mj_data, position, rotation))
     outputs = Outputs(rgb=True, depth=True, segmentation=True, quantized=True)
-    jax.jit(functools.partial(draw, outputs)).lower(scene, rotation, unit, table).compile()
+    assert supports(scene)
+    return jax.jit(functools.partial(draw, outputs)).trace(scene, rotation, unit, table)
 
 
 def _whole(shape: tuple[int, ...]) -> pl.BlockSpec:
