@@ -1,9 +1,6 @@
 """Says whether this installation works: one line a check, and the mend where one fails."""
 
-import contextlib
-import importlib
 import importlib.metadata
-import io
 import os
 import platform
 import time
@@ -63,8 +60,6 @@ def physics_and_camera() -> str:
     import jaxrl_vis_envs
     from jaxrl_vis_envs.compilation import env_jit
 
-    with contextlib.redirect_stdout(io.StringIO()):  # it tells stdout that Warp is missing, which nothing here uses
-        importlib.import_module("mujoco.mjx")
     env = jaxrl_vis_envs.make("VisualReacher", image_size=32)
     start = time.perf_counter()
 

@@ -10,11 +10,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.report.colours import depth_colours
+from jaxrl_vis.report.outputs import check_writable
 
 SUFFIXES = (".gif", ".mp4", ".html", ".png")
 
@@ -45,12 +46,6 @@ def shows_images(shape: Sequence[int]) -> bool:
     return len(shape) == 5 and shape[2] in (1, 3, 4)
 
 
-def _depth_image(depth: np.ndarray, near: float, far: float) -> np.ndarray:
-    """Depth [H, W] in grey levels -> [H, W, 3] uint8: near is bright, the steps look equally large."""
-    scaled = np.clip((depth.astype(np.float32) - near) / max(far - near, 1.0), 0.0, 1.0)
-    return (matplotlib.colormaps["magma"](0.97 - 0.92 * scaled)[..., :3] * 255).round().astype(np.uint8)
-
-
 def first_seed(images: dict[str, Any]) -> Recording:
     """What `Trainer.watch` saw of the first seed ([S, K, ...] arrays, on any device), on the host."""
     first = {name: np.asarray(values[0]) for name, values in images.items()}
@@ -61,7 +56,7 @@ def _depth_range(recording: Recording) -> tuple[float, float]:
     """Grey levels between which this recording's depth lies, a few outliers aside; the same for all its images."""
     depth = np.concatenate([recording.frames[:, ::5, -1].ravel(), recording.goals[:, -1].ravel()])
     near, far = np.percentile(depth, [0.5, 99.5])
-    return float(near), float(far)
+    return float(near), max(float(far), float(near) + 1.0)
 
 
 def _rows_of(image: np.ndarray, depth_range: tuple[float, float]) -> list[tuple[str, np.ndarray]]:
@@ -70,7 +65,7 @@ def _rows_of(image: np.ndarray, depth_range: tuple[float, float]) -> list[tuple[
     if image.shape[0] >= 3:
         rows.append(("colour", np.moveaxis(image[:3], 0, -1)))
     if image.shape[0] in (1, 4):
-        rows.append(("depth", _depth_image(image[-1], *depth_range)))
+        rows.append(("depth", depth_colours(image[-1], *depth_range)))
     return rows
 
 
@@ -200,7 +195,8 @@ def check_output(path: Path) -> None:
     """Whether a video can be written under this name. Ask before spending a minute on playing episodes.
 
     Raises:
-        RequestError: The suffix is not one of `SUFFIXES`, or it needs a package that is not installed.
+        RequestError: The suffix is not one of `SUFFIXES`, it needs a package that is not installed, or the file cannot be
+            written there.
     """
     if path.suffix.lower() not in SUFFIXES:
         raise RequestError(f"cannot write {path}: the name must end in one of {', '.join(SUFFIXES)}")
@@ -209,6 +205,7 @@ def check_output(path: Path) -> None:
             import imageio_ffmpeg  # noqa: F401  # pyright: ignore[reportMissingImports]
         except ImportError as error:
             raise RequestError(f"writing {path} needs imageio-ffmpeg: install it, or ask for a .gif") from error
+    check_writable(path)
 
 
 def write_video(recording: Recording, path: Path, frame_seconds: float = 0.04, max_episodes: int = 6) -> None:

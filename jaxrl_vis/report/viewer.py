@@ -10,6 +10,7 @@ import numpy as np
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.networks import Networks
 from jaxrl_vis.learner.rollout import NO_EXPLORATION, choose_actions, encode
+from jaxrl_vis.report.outputs import check_writable
 from jaxrl_vis.types import TrainState
 from jaxrl_vis_envs.compilation import env_jit
 
@@ -20,7 +21,7 @@ def check_page(path: Path) -> None:
     """Whether a page can be written under this name.
 
     Raises:
-        RequestError: The suffix is not .html, or brax is not installed.
+        RequestError: The suffix is not .html, brax is not installed, or the file cannot be written there.
     """
     if path.suffix.lower() != ".html":
         raise RequestError(f"cannot write {path}: the name of a 3-D page must end in .html")
@@ -28,6 +29,7 @@ def check_page(path: Path) -> None:
         import jaxrl_vis_envs.adapters.brax_viewer  # noqa: F401
     except ImportError as error:
         raise RequestError(f"--html: {error}") from error
+    check_writable(path)
 
 
 def play_poses(env: Any, networks: Networks, train: TrainState, key: jax.Array, num_envs: int) -> dict[str, jax.Array]:
