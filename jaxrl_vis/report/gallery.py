@@ -2,7 +2,7 @@
 
     start: colours, depth, geoms | a goal: colours, depth, geoms | more goals: colours
 
-The table compiles nothing. A row of the sheet takes two programs: one samples poses, one draws them all.
+The table compiles nothing. A row of the sheet compiles two programs: one samples poses, one renders them all.
 """
 
 from collections.abc import Sequence
@@ -52,7 +52,7 @@ def print_table(names: Sequence[str] | None = None) -> None:
             "-" if env.difficulty is None else f"{env.difficulty:.1f}",
         )
     console = Console()
-    # A pipe gets whole lines; a terminal gets the width that it has.
+    # A pipe gets whole lines, a terminal lines of its own width.
     (console if console.is_terminal else Console(width=160)).print(table)
 
 
@@ -81,7 +81,7 @@ def frames_of(env: Any, key: jax.Array, goals: int, size: int) -> Frame:
     Args:
         env: An environment with a camera (`MjxGoalEnv`).
         key: [] a typed key.
-        goals: How many.
+        goals: The number of goals.
         size: Height and width, pixels.
     """
     keys = jax.random.split(key, goals)
@@ -97,7 +97,10 @@ def frames_of(env: Any, key: jax.Array, goals: int, size: int) -> Frame:
 
 
 def check_gallery(path: Path, names: Sequence[str] | None = None) -> Sequence[str]:
-    """The environments that a gallery shows, if it can be drawn. Ask before spending a minute on it.
+    """Checks that a gallery can be drawn. Call it before spending a minute on drawing.
+
+    Returns:
+        The environments that it shows.
 
     Raises:
         RequestError: The file cannot be written, its ending names no format, or an environment shows no images.
@@ -116,7 +119,7 @@ def draw(path: Path, names: Sequence[str] | None = None, image_size: int = 128, 
     """Writes the sheet.
 
     Args:
-        path: The file, whose ending names the format.
+        path: The file; its ending names the format.
         names: Environments that show images; default: all.
         image_size: Height and width of an image, pixels.
         goals: Goals of each environment.
