@@ -1,4 +1,4 @@
-"""The page of `play --html`: what it tells brax's viewer."""
+"""The page that `play --html` writes: what it tells brax's viewer."""
 
 import base64
 import json
@@ -114,7 +114,7 @@ def test_the_page_shows_the_episodes_that_the_video_shows(tmp_path):
     system = system_in((tmp_path / "new" / "page.html").read_text())
     scale = 5.0 / env.mj_model.stat.extent
     shown = np.array([state["pos"][system["geoms"]["world"][0]["link_idx"]][0] for state in system["states"]["x"]])
-    # The last instant of an episode is held for .6 s, which is one instant of this world.
+    # The last step of an episode is held for .6 s, which is one step of this environment.
     expected = [[*states[:-1, 0], states[-2, 0]] for states in np.asarray(episodes.states)]
     np.testing.assert_allclose(shown, scale * (np.ravel(expected) - env.mj_model.stat.center[0]), atol=1e-3)
 

@@ -1,4 +1,4 @@
-"""The page of ``play --html``: episodes in three dimensions, for brax's viewer."""
+"""The page that ``play --html`` writes: episodes in three dimensions, for brax's viewer."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,17 +9,18 @@ import numpy as np
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.networks import Networks
 from jaxrl_vis.learner.rollout import play, split_keys
+from jaxrl_vis.report.outputs import check_writable
 from jaxrl_vis.types import TrainState
 from jaxrl_vis_envs.compilation import env_jit
 
-_HOLD = 0.6  # s, how long the last instant of an episode stays
+_HOLD = 0.6  # s, how long the last step of an episode stays
 
 
 def check_page(path: Path) -> None:
-    """Whether a page can be written under this name.
+    """Checks that a page can be written to ``path``. Call it before playing the episodes.
 
     Raises:
-        RequestError: The suffix is not .html, or brax is not installed.
+        RequestError: The suffix is not .html, brax is not installed, or the file cannot be written there.
     """
     if path.suffix.lower() != ".html":
         raise RequestError(f"cannot write {path}: the name of a 3-D page must end in .html")
@@ -27,6 +28,7 @@ def check_page(path: Path) -> None:
         import jaxrl_vis_envs.adapters.brax_viewer  # noqa: F401
     except ImportError as error:
         raise RequestError(f"--html: {error}") from error
+    check_writable(path)
 
 
 class PosedEpisodes(NamedTuple):
@@ -61,13 +63,13 @@ def play_poses(env: Any, networks: Networks, train: TrainState, key: jax.Array, 
 
 
 def write_page(program: Any, train: TrainState, key: jax.Array, episodes: int, out: Path) -> None:
-    """Plays ``episodes`` with the first seed of a learner, and writes the page.
+    """Plays ``episodes`` episodes with the first seed of a learner, and writes the page.
 
     Args:
         program: `train_step.TrainStep`.
         train: The learner, [S, ...].
         key: Draws the episodes.
-        episodes: How many, one after the other.
+        episodes: How many; the page shows one after the other.
         out: The file.
     """
     from jaxrl_vis_envs.adapters.brax_viewer import Poses, viewer_page
@@ -75,14 +77,14 @@ def write_page(program: Any, train: TrainState, key: jax.Array, episodes: int, o
     env = program.env
     play_all = env_jit(lambda train, key: play_poses(env, program.networks, train, key, episodes))
     played = jax.tree.map(np.asarray, play_all(train, key))
-    # One instant is repeated at the end of each episode, so that one sees where it ended.
+    # The last step of each episode is repeated, so that one sees where it ended.
     hold = max(1, round(_HOLD / env.control_period))
-    instants = np.append(np.arange(env.horizon + 1), np.full(hold, env.horizon))
+    steps = np.append(np.arange(env.horizon + 1), np.full(hold, env.horizon))
 
     def joined(values: np.ndarray) -> np.ndarray:
-        return values[:, instants].reshape(-1, *values.shape[2:])
+        return values[:, steps].reshape(-1, *values.shape[2:])
 
     poses = Poses(joined(played.positions), joined(played.rotations))
-    goals = Poses(*(np.repeat(of_goals, len(instants), axis=0) for of_goals in (played.goal_positions, played.goal_rotations)))
+    goals = Poses(*(np.repeat(of_goals, len(steps), axis=0) for of_goals in (played.goal_positions, played.goal_rotations)))
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text(viewer_page(env.mj_model, poses, goals, env.control_period), encoding="utf-8")
