@@ -17,7 +17,7 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 
-from benchmarks import worlds
+from benchmarks import environments
 from jaxrl_vis_envs.compilation import env_jit
 
 LEAST_SUCCESS = 0.95
@@ -83,8 +83,8 @@ POLICIES: dict[str, Callable[[Any], tuple[Policy, Any]]] = {
 
 def success_rate(name: str, episodes: int, seed: int = 0, **overrides: Any) -> float:
     """Share of the episodes of the task ``name`` (with ``overrides`` of its settings) that its controller ends in success."""
-    env = worlds.make(name, **overrides)
-    state, goals = worlds.reset(env, jax.random.split(jax.random.key(seed), episodes))
+    env = environments.make(name, **overrides)
+    state, goals = environments.reset(env, jax.random.split(jax.random.key(seed), episodes))
     if name == "FingerTurn":
         return turn_the_finger(env, state, np.random.default_rng(seed))
     policy, memory = POLICIES[name](env)
@@ -92,7 +92,7 @@ def success_rate(name: str, episodes: int, seed: int = 0, **overrides: Any) -> f
     memory = jax.tree.map(lambda leaf: jnp.tile(leaf, (episodes, 1)), memory)
     for _ in range(env.horizon):
         action, memory = act(state, goals, memory)
-        state = worlds.advance(env, state, action)
+        state = environments.advance(env, state, action)
     return float(np.mean(state.metrics["success"]))
 
 
@@ -109,7 +109,7 @@ def turn_the_finger(env: Any, state: Any, generator: np.random.Generator) -> flo
             start = np.concatenate([np.zeros((len(plans), 1)), state.data.qpos, state.data.qvel], axis=1)
             goals = np.asarray(state.goal_state)
             plans = _plan(try_out, start, np.arctan2(goals[:, 0], goals[:, 1]), plans, env.config.substeps, generator)
-            state = worlds.advance(env, state, plans[:, 0])
+            state = environments.advance(env, state, plans[:, 0])
             plans = np.concatenate([plans[:, 1:], np.zeros_like(plans[:, :1])], axis=1)
     return float(np.mean(state.metrics["success"]))
 

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from benchmarks import worlds
+from benchmarks import environments
 from jaxrl_vis_envs.base import State
 
 Recording = Mapping[str, np.ndarray]
@@ -56,7 +56,7 @@ def play(env: Any, state: State, actions: np.ndarray) -> tuple[np.ndarray, np.nd
     """
     qpos, achieved = [], []
     for time in range(actions.shape[1]):
-        state = worlds.advance(env, state, actions[:, time])
+        state = environments.advance(env, state, actions[:, time])
         qpos.append(state.data.qpos)
         achieved.append(state.achieved_state)
     return np.stack(qpos, axis=1), np.stack(achieved, axis=1)
@@ -72,9 +72,9 @@ def distance_figures(name: str, error: np.ndarray, median: float | None, high: f
 
 def fetch_reach(recording: Recording) -> list[Figure]:
     """Grip position, up to where the recorded one leaves its neighbourhood."""
-    env = worlds.make("FetchReach")
+    env = environments.make("FetchReach")
     actions, recorded = _take(recording, "actions", "grip_pos_m")
-    start, _ = worlds.reset(env, jax.random.split(jax.random.key(0), len(actions)))
+    start, _ = environments.reset(env, jax.random.split(jax.random.key(0), len(actions)))
     _, grip = play(env, start, actions)
     # Only while the grip has not yet left the box around its start (goals lie within .15 m): farther out the arm stretches,
     # swings through the table's edge or its own base, and tells little about the task.
@@ -94,9 +94,9 @@ def finger_turn(recording: Recording) -> list[Figure]:
         keys = (f"qpos_rad_nsub{substeps}", f"qvel_rad_s_nsub{substeps}")
         if substeps == 2 and not any(key in recording for key in keys):
             continue
-        env = worlds.make("FingerTurn", substeps=substeps)
+        env = environments.make("FingerTurn", substeps=substeps)
         actions, qpos, qvel = _take(recording, "actions", *keys)
-        ours, _ = play(env, worlds.start_at(env, qpos[:, 0], qvel[:, 0]), actions)
+        ours, _ = play(env, environments.start_at(env, qpos[:, 0], qvel[:, 0]), actions)
         error = np.abs(ours[:, -1] - qpos[:, -1]).max(axis=-1)
         name = f"{substeps} substeps, joint and spinner angles at the end: "
         figures += [
@@ -117,8 +117,8 @@ def hand_reach(recording: Recording) -> list[Figure]:
     actions, qpos, tips = _take(recording, "actions", "qpos", "tip_pos_m")
     figures = []
     for contacts in (True, False):
-        env = worlds.make("HandReach", contacts=contacts)
-        _, ours = play(env, worlds.start_at(env, qpos[:, 0], np.zeros_like(qpos[:, 0])), actions)
+        env = environments.make("HandReach", contacts=contacts)
+        _, ours = play(env, environments.start_at(env, qpos[:, 0], np.zeros_like(qpos[:, 0])), actions)
         error = np.linalg.norm((ours - tips[:, 1:]).reshape(*ours.shape[:2], 5, 3), axis=-1)
         for number, finger in enumerate(("first finger", "middle finger", "ring finger", "little finger", "thumb")):
             name = finger if contacts else f"without contacts, {finger}"
@@ -129,9 +129,9 @@ def hand_reach(recording: Recording) -> list[Figure]:
 
 def reacher(recording: Recording) -> list[Figure]:
     """Joint angles and fingertip under torque control."""
-    env = worlds.make("Reacher", control="torque")
+    env = environments.make("Reacher", control="torque")
     actions, qpos, qvel, fingertip = _take(recording, "actions", "qpos_rad", "qvel_rad_s", "fingertip_pos_m")
-    our_qpos, our_fingertip = play(env, worlds.start_at(env, qpos[:, 0], qvel[:, 0]), actions)
+    our_qpos, our_fingertip = play(env, environments.start_at(env, qpos[:, 0], qvel[:, 0]), actions)
     error = np.abs(our_qpos - qpos[:, 1:])
     tip_error = np.linalg.norm(our_fingertip - fingertip[:, 1:, :2], axis=-1)
     return [

@@ -13,6 +13,10 @@ class NonFiniteError(FloatingPointError):
     """A loss, a state or a parameter is not finite any more. One line: what, where the state was dumped, what is still good."""
 
 
+class StorageError(RuntimeError):
+    """A run could not write its files, for instance because the disk is full. One line: what, what is kept, and the mend."""
+
+
 class Terminated(SystemExit):
     """The run was stopped by SIGTERM, after saving. Left alone, it ends the program with status 143."""
 

@@ -35,7 +35,7 @@ def git(*arguments: str, folder: Path = CHECKOUT) -> str | None:
 
 
 def is_checkout(folder: Path = CHECKOUT) -> bool:
-    """Whether ``folder`` is the top of a git checkout; an installed copy may lie inside somebody else's, which does not count."""
+    """Whether ``folder`` is the top of a git checkout: an installed copy may lie inside somebody else's."""
     top = git("rev-parse", "--show-toplevel", folder=folder)
     return top is not None and Path(top).resolve() == folder.resolve()
 

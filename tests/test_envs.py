@@ -15,7 +15,7 @@ import pytest
 from point_mass import PointMass, PointMassConfig
 
 import jaxrl_vis_envs
-from benchmarks import worlds
+from benchmarks import environments
 from jaxrl_vis_envs import compilation, goals, pixels, registry
 from jaxrl_vis_envs.base import GoalEnv, State, sanitize_action
 from jaxrl_vis_envs.compilation import env_jit
@@ -44,15 +44,15 @@ class Episode(NamedTuple):
 
 @functools.cache
 def episode(name: str) -> Episode:
-    state, goals = worlds.reset(worlds.make(name), jax.random.split(jax.random.key(0), BATCH))
-    actions = jax.random.uniform(jax.random.key(1), (STEPS, BATCH, worlds.make(name).action_size), minval=-1.0)
+    state, goals = environments.reset(environments.make(name), jax.random.split(jax.random.key(0), BATCH))
+    actions = jax.random.uniform(jax.random.key(1), (STEPS, BATCH, environments.make(name).action_size), minval=-1.0)
     return Episode(play(name, state, actions), goals)
 
 
 def play(name: str, state: State, actions: Any) -> list[State]:
     states = [state]
     for action in actions:
-        states.append(worlds.advance(worlds.make(name), states[-1], action))
+        states.append(environments.advance(environments.make(name), states[-1], action))
     return states
 
 
@@ -71,11 +71,11 @@ _LATE_START = """
     import time
     import jax
     jax.jit(lambda x: x + 1)(1).block_until_ready()
-    from benchmarks import worlds
-    env = worlds.make("FetchReach")
-    state, _ = worlds.reset(env, jax.random.split(jax.random.key(0), 16))
+    from benchmarks import environments
+    env = environments.make("FetchReach")
+    state, _ = environments.reset(env, jax.random.split(jax.random.key(0), 16))
     idle = jax.numpy.zeros((16, env.action_size))
-    advance = worlds._advance_program(env)
+    advance = environments._advance_program(env)
     state = advance(jax.device_put(state.replace(obs=None)), idle)
     begin = time.time()
     for _ in range(3):
@@ -92,7 +92,7 @@ def test_every_world_is_tested():
 
 @EACH_TASK
 def test_reset_and_advance(name: str) -> None:
-    env, (states, goal_data) = worlds.make(name), episode(name)
+    env, (states, goal_data) = environments.make(name), episode(name)
     assert env.name == name and env.horizon == HORIZONS[name] and env.control_period > 0
     start = states[0]
     assert start.obs is not None and set(start.obs) == {"observation", "achieved_goal", "desired_goal"}
@@ -114,7 +114,7 @@ def test_reset_and_advance(name: str) -> None:
 
 @EACH_TASK
 def test_reward_and_success_follow_from_the_true_states(name: str) -> None:
-    env = worlds.make(name)
+    env = environments.make(name)
     for state in episode(name).states:
         reward = goals.oracle_reward(state.achieved_state, state.goal_state, env.threshold)
         np.testing.assert_array_equal(reward, state.reward)
@@ -127,7 +127,7 @@ def test_reward_and_success_follow_from_the_true_states(name: str) -> None:
 @EACH_TASK
 def test_bad_actions_do_not_poison_the_physics(name: str) -> None:
     first = jax.tree.map(lambda leaf: np.repeat(leaf[:1], BATCH, axis=0), jax.device_get(episode(name).states[0]))
-    actions = np.zeros((STEPS, BATCH, worlds.make(name).action_size), np.float32)
+    actions = np.zeros((STEPS, BATCH, environments.make(name).action_size), np.float32)
     actions[:, :5] = np.array([np.nan, np.inf, -1e30, 1.0, -1.0])[:, None]
     states = np.stack([state.achieved_state for state in play(name, first, actions)])
     assert np.isfinite(states).all()
@@ -214,7 +214,7 @@ def test_a_goal_vector_is_at_rest_at_the_goal(name: str) -> None:
 
 
 def test_fetch_reach_start_and_goals():
-    env, start = worlds.make("FetchReach"), episode("FetchReach").states[0]
+    env, start = environments.make("FetchReach"), episode("FetchReach").states[0]
     np.testing.assert_allclose(start.achieved_state, np.tile([1.3418, 0.7491, 0.5347], (BATCH, 1)), atol=2e-3)
     assert abs(float(start.metrics["goal_distance"].mean()) - 0.14) < 0.02
     offset = np.asarray(start.goal_state - start.achieved_state)
@@ -233,7 +233,7 @@ def test_reacher_start_and_goals():
 
 def test_a_unit_of_reacher_action_turns_a_joint_by_nearly_a_radian():
     start = episode("Reacher").states[0]
-    moved = worlds.advance(worlds.make("Reacher"), start, np.tile([1.0, 0.0], (BATCH, 1)))
+    moved = environments.advance(environments.make("Reacher"), start, np.tile([1.0, 0.0], (BATCH, 1)))
     np.testing.assert_allclose(moved.data.qpos[:, 0] - start.data.qpos[:, 0], 0.95, atol=0.01)
 
 
@@ -273,12 +273,12 @@ def test_names_that_do_not_exist():
 def test_register(monkeypatch):
     monkeypatch.setattr(registry, "_ENTRIES", dict(registry._ENTRIES))  # undone after the test
     config_class = registry.config_class("Reacher")
-    registry.register("Mine", lambda config: worlds.make("Reacher"), config_class)
+    registry.register("Mine", lambda config: environments.make("Reacher"), config_class)
     assert "Mine" in jaxrl_vis_envs.list_envs()
     with pytest.raises(ValueError, match="exists already"):
-        registry.register("Mine", lambda config: worlds.make("FetchReach"), config_class)
+        registry.register("Mine", lambda config: environments.make("FetchReach"), config_class)
     with pytest.raises(ValueError, match="dataclass"):
-        registry.register("Other", lambda config: worlds.make("Reacher"), dict)
+        registry.register("Other", lambda config: environments.make("Reacher"), dict)
 
 
 def test_goals_need_no_mujoco():

@@ -5,11 +5,10 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-import one_step
 import pytest
 
 import jaxrl_vis_envs
-from benchmarks import worlds
+from benchmarks import environments, one_step
 from jaxrl_vis_envs.compilation import env_jit
 
 COUNT = 128
@@ -23,13 +22,13 @@ START_TIPS = [
 
 
 def make(**overrides):
-    return worlds.make("HandReach", **overrides)
+    return environments.make("HandReach", **overrides)
 
 
 @functools.cache
 def goals():
     """Configurations of COUNT goals."""
-    return worlds.reset(make(), jax.random.split(jax.random.key(3), COUNT))[1]
+    return environments.reset(make(), jax.random.split(jax.random.key(3), COUNT))[1]
 
 
 def tips(data):
@@ -92,17 +91,11 @@ def test_settings_out_of_range(bad):
         jaxrl_vis_envs.make("HandReach", **bad)
 
 
-def test_mjx_steps_as_mujoco_does():
+def test_a_step_is_that_of_mujoco():
+    """With the task's own single iteration."""
     env = make()
-    rng = np.random.default_rng(0)
-    low, high = env.mj_model.actuator_ctrlrange.T
-    controls = low + (high - low) * rng.integers(0, 2, (8, 12, 20))
-    start = np.asarray(env.sample_start(jax.random.key(0)).qpos, np.float64)
-    states = one_step.visited_states(env.mj_model, np.tile(start, (8, 1)), controls, every=17)
-    env.mj_model.opt.iterations, env.mj_model.opt.ls_iterations = 8, 12  # the engines, not one iteration of their solvers
-    try:
-        excess, contacts = one_step.velocity_difference(env.mj_model, states)
-    finally:
-        env.mj_model.opt.iterations, env.mj_model.opt.ls_iterations = 1, 4
-    assert (contacts > 0).sum() > 30
-    assert excess.max() <= 1.0, f"{np.sort(excess)[-10:]}"
+    states = one_step.hand_states(env)
+    theirs = one_step.mujoco_step(env.mj_model, states, weld_term=True)
+    assert (theirs.contacts > 0).sum() > 30
+    multiples = one_step.in_bounds(one_step.our_step(env, states, "task"), theirs.qvel)
+    assert multiples.max() <= 1.0, f"{np.sort(multiples)[-10:]}"

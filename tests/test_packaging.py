@@ -14,7 +14,8 @@ ROOT = Path(__file__).resolve().parents[1]
 
 # Folders and single files of jaxrl_vis. A folder imports from earlier rows only; files of one row do not import each other.
 LAYERS: tuple[tuple[str, ...], ...] = (
-    ("errors",),
+    ("errors", "methods"),
+    ("fields",),
     ("config", "types", "provenance", "files"),
     ("learner",),
     ("report",),

@@ -5,21 +5,20 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-import one_step
 
-from benchmarks import worlds
+from benchmarks import environments, one_step
 
 COUNT = 512
 
 
 def make():
-    return worlds.make("SawyerReach")
+    return environments.make("SawyerReach")
 
 
 @functools.cache
 def starts():
     """State of COUNT episodes at their start."""
-    return worlds.reset(make(), jax.random.split(jax.random.key(3), COUNT))[0]
+    return environments.reset(make(), jax.random.split(jax.random.key(3), COUNT))[0]
 
 
 def test_the_numbers_of_the_thesis():
@@ -47,24 +46,24 @@ def test_chance_is_the_share_of_the_box_within_the_threshold():
 def test_a_unit_of_action_is_five_centimetres():
     state = jax.tree.map(lambda leaf: leaf[:2], starts())
     action = jnp.array([[1.0, -1.0, 0.5], [0.0, 0.0, 0.0]])
-    moved = worlds.advance(make(), state, action)
+    moved = environments.advance(make(), state, action)
     for _ in range(3):
-        moved = worlds.advance(make(), moved, jnp.zeros((2, 3)))
+        moved = environments.advance(make(), moved, jnp.zeros((2, 3)))
     np.testing.assert_allclose(moved.achieved_state - state.achieved_state, 0.05 * action, atol=2e-3)
 
 
 def test_the_gripper_stays_over_the_table():
     state = jax.tree.map(lambda leaf: leaf[:2], starts())
     for _ in range(12):
-        state = worlds.advance(make(), state, jnp.tile(jnp.array([0.0, 0.0, -1.0]), (2, 1)))
+        state = environments.advance(make(), state, jnp.tile(jnp.array([0.0, 0.0, -1.0]), (2, 1)))
     assert np.asarray(state.achieved_state)[:, 2].min() > 0.69
 
 
-def test_mjx_steps_as_mujoco_does():
+def test_a_step_is_that_of_mujoco_less_a_term_of_welds():
     env = make()
-    rng = np.random.default_rng(0)
-    targets = np.array(env.config.goal_centre) + np.array(env.config.goal_size) * rng.uniform(-0.5, 0.5, (12, 10, 3))
-    starts_qpos = np.tile(np.asarray(starts().data.qpos[0], np.float64), (12, 1))
-    states = one_step.visited_states(env.mj_model, starts_qpos, np.zeros((12, 10, 0)), every=13, mocap=targets)
-    excess, _ = one_step.velocity_difference(env.mj_model, states)
-    assert excess.max() <= 1.0, f"{np.sort(excess)[-10:]}"
+    states = one_step.sawyer_states(env)
+    less = one_step.mujoco_step(env.mj_model, states, weld_term=False)
+    multiples = one_step.in_bounds(one_step.our_step(env, states, "more"), less.qvel)
+    assert multiples.max() <= 1.0, f"{np.sort(multiples)[-10:]}"
+    # With the task's own iteration, all but a few states with a joint at its limit.
+    assert (one_step.in_bounds(one_step.our_step(env, states, "task"), less.qvel) <= 1.0).mean() > 0.95

@@ -111,7 +111,7 @@ def test_training_samples_goals_that_stand_still():
 def test_people_are_shown_the_newest_image():
     made = program()
     trainer = Trainer(made.config, made)
-    assert trainer.shows_images
+    assert trainer.programs.shows_images
     _, images = jax.eval_shape(made.evaluate, trainer.shapes.train, jax.random.key(0))
     horizon = made.env.horizon
     assert images["frames"].shape == (1, 8, horizon + 1, 3, 8, 8)

@@ -152,7 +152,7 @@ class GoalEnv(abc.ABC):
 
 
 def start_history(qpos: jax.Array, frame_stack: int) -> jax.Array | None:
-    """`State.history` at the start of an episode, where ``qpos`` [nq] has stood still: [frame_stack - 1, nq], or None for one."""
+    """`State.history` [frame_stack - 1, nq] of an episode that starts at rest at ``qpos`` [nq]; None for a stack of one."""
     return None if frame_stack == 1 else jnp.tile(qpos, (frame_stack - 1, 1))
 
 

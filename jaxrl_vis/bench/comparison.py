@@ -16,8 +16,8 @@ COMPARED = 32
 """Images of a batch that are compared."""
 
 # Renderers that draw the same scene differ by rounding, and on the silhouettes of what they draw. On a CPU, in all scenes and
-# sizes, depths agree in at least 99.92 % of the pixels (mujoco.Renderer) and 99.99 % (Warp), and colours without a texture differ
-# by at most 1.0 (mujoco.Renderer) and 0.6 grey levels (Warp).
+# sizes, depths agree in at least 99.92 % of the pixels (mujoco.Renderer) and 99.99 % (Warp), and colours without a texture
+# differ by at most 1.0 (mujoco.Renderer) and 0.6 grey levels (Warp).
 LEAST_DEPTH_AGREEMENT = 0.995
 MOST_DIFFERENCE = 1.5  # grey levels of 255, the mean over pixels and channels
 

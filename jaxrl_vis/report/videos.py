@@ -53,7 +53,7 @@ def _depth_image(depth: np.ndarray, near: float, far: float) -> np.ndarray:
 
 def first_seed(images: dict[str, Any]) -> Recording:
     """What `Trainer.watch` saw of the first seed ([S, K, ...] arrays, on any device), on the host."""
-    first = {name: np.asarray(values[0]) for name, values in images.items()}
+    first = {name: np.asarray(values)[0] for name, values in images.items()}
     return Recording(first["frames"], first["goals"], first["success"])
 
 

@@ -4,12 +4,14 @@ The files:
 
     config.json     schema, versions, device, git revision, configuration      metrics.jsonl   see `metrics`
     checkpoints/    see `checkpoint`      nonfinite/   what a run that went wrong held      curve.png   video.gif
+    run.lock        while a process writes here, see `lock`
 """
 
 import dataclasses
 import json
 import shutil
 import typing
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,8 @@ from jaxrl_vis import provenance
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.files import write_atomically
+from jaxrl_vis.run.lock import FILE_NAME as LOCK_NAME
+from jaxrl_vis.run.lock import run_lock
 
 SCHEMA = 1
 
@@ -71,6 +75,10 @@ class RunFolder:
         """A few episodes of the trained policy."""
         return self.path / "video.gif"
 
+    def lock(self) -> AbstractContextManager[None]:
+        """See `run_lock`."""
+        return run_lock(self.path)
+
     def check(self, config: Config, resume: bool = False, overwrite: bool = False) -> bool:
         """Whether this folder may be used for ``config``. Changes nothing.
 
@@ -84,7 +92,7 @@ class RunFolder:
             raise RequestError("--resume and --overwrite contradict each other: give one of them")
         if self.path.exists() and not self.path.is_dir():
             raise RequestError(f"{self.path} is a file: choose another --run-dir")
-        if not self.path.exists() or not any(self.path.iterdir()):
+        if not self.path.exists() or all(entry.name == LOCK_NAME for entry in self.path.iterdir()):
             return False
         if not (resume or overwrite):
             raise RequestError(f"run folder {self.path} exists: --resume goes on with it, --overwrite starts again")
@@ -97,6 +105,8 @@ class RunFolder:
 
     def open(self, config: Config, resume: bool = False, overwrite: bool = False) -> bool:
         """`check`, then makes the folder ready: with ``overwrite``, an earlier run's files are deleted, and nothing else.
+
+        Call it last, when nothing can refuse the run any more.
 
         Returns:
             True where an earlier run goes on.

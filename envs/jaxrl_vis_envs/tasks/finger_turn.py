@@ -72,6 +72,7 @@ class FingerTurn(MjxGoalEnv):
     action_size = 2
     camera = "side"
     distance_unit = "m"
+    exact_contacts = True  # they decide what happens
     chance, difficulty = 0.16, 2.4  # benchmarks/task_difficulty.py FingerTurn --episodes 1000
 
     def __init__(self, config: FingerTurnConfig, observer: Callable[[mujoco.MjModel], Observer] | None = None):
@@ -107,7 +108,7 @@ class FingerTurn(MjxGoalEnv):
         return self.configuration(self._still.qpos.at[2].set(angle))
 
     def act(self, data: mjx.Data, action: jax.Array) -> mjx.Data:
-        return mjx_model.simulate(self._model, data.replace(ctrl=action), self.config.substeps, exact=True)
+        return mjx_model.simulate(self._model, data.replace(ctrl=action), self.config.substeps, self.exact_contacts)
 
     def achieved(self, data: mjx.Data) -> jax.Array:
         return (data.site_xpos[self._tip] - data.xpos[self._hinge])[jnp.array([0, 2])]

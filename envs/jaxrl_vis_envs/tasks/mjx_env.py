@@ -24,6 +24,7 @@ class MjxGoalEnv(GoalEnv):
     """A `GoalEnv` whose `State.data` is an `mjx.Data` with poses that belong to its ``qpos``."""
 
     camera: str  # the camera of the model that the visual task sees through
+    exact_contacts: bool = False  # whether its physics steps are those of `mjx_model.step` with ``exact``
 
     def __init__(self, config: Any, mj_model: mujoco.MjModel, observer: Callable[[mujoco.MjModel], Observer] | None) -> None:
         """Keeps what is common.
