@@ -1,8 +1,10 @@
 """What can go wrong with a request or a run, each with one line that says what, and how to mend it. Imports nothing heavy."""
 
-import difflib
 import signal
-from collections.abc import Iterable
+
+from jaxrl_vis_envs.names import nearest
+
+__all__ = ["NonFiniteError", "RequestError", "Terminated", "nearest"]
 
 
 class RequestError(ValueError):
@@ -18,10 +20,3 @@ class Terminated(SystemExit):
 
     def __init__(self) -> None:
         super().__init__(128 + signal.SIGTERM)
-
-
-def nearest(word: str, choices: Iterable[str]) -> str:
-    """'; did you mean X or Y?' for a misspelt ``word``, or a list of all ``choices`` when none is near."""
-    lowered = {choice.lower(): choice for choice in choices}
-    found = [lowered[match] for match in difflib.get_close_matches(word.lower(), list(lowered), n=3, cutoff=0.5)]
-    return f"; did you mean {' or '.join(found)}?" if found else f"; choose one of {', '.join(lowered.values())}"
