@@ -1,29 +1,26 @@
 """Says whether this installation works, in one line for each check."""
 
-import importlib.metadata
 import os
-import platform
 import time
 from collections.abc import Callable
 from typing import Any
 
-PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy")
+from jaxrl_vis import provenance
 
 
 def versions() -> str:
     """Versions of Python and of the packages that matter."""
-    found = [f"Python {platform.python_version()}"]
-    return ", ".join(found + [f"{name} {importlib.metadata.version(name)}" for name in PACKAGES])
+    found = provenance.versions()
+    # The checkout itself need not be installed.
+    missing = [name for name, version in found.items() if version == provenance.NOT_INSTALLED and name != "jaxrl-vis"]
+    if missing:
+        raise ModuleNotFoundError(f"{', '.join(missing)} missing; install this project with `pip install .`")
+    return ", ".join(f"{name} {version}" for name, version in found.items())
 
 
 def devices() -> str:
     """What JAX runs on."""
-    import jax
-
-    kinds: dict[str, int] = {}
-    for device in jax.devices():
-        kinds[device.device_kind] = kinds.get(device.device_kind, 0) + 1
-    return f"{jax.default_backend()}: " + ", ".join(f"{count} x {kind}" for kind, count in kinds.items())
+    return f"{provenance.device_record()['platform']}: {provenance.device_name()}"
 
 
 def memory() -> str:

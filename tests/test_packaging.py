@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 LAYERS: tuple[tuple[str, ...], ...] = (
     ("errors", "methods"),
     ("fields",),
-    ("config", "types", "provenance"),
+    ("config", "types", "provenance", "files"),
     ("learner",),
     ("report",),
     ("run",),

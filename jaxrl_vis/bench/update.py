@@ -17,8 +17,8 @@ from jaxrl_vis.types import LoopState, ReplayState
 
 
 def training_config(settings: Settings, **overrides: Any) -> Config:
-    """The preset of this device, with the benchmark's task, images and sizes."""
-    if settings.env.startswith("Visual"):
+    """The preset of this device, with the benchmark's environment, images and sizes."""
+    if settings.has_images:
         overrides |= {"image_size": settings.image_size, "pixels": settings.pixels}
     if settings.batch_size is not None:
         overrides["batch_size"] = settings.batch_size
@@ -26,9 +26,9 @@ def training_config(settings: Settings, **overrides: Any) -> Config:
 
 
 def fill_replay(replay: ReplayState, key: jax.Array) -> ReplayState:
-    """A replay full of noise: no two frames are equal, and every part of the memory is read.
+    """A replay full of noise: no two frames are equal, and every part of the replay is read.
 
-    Filled one episode at a time: random words for a whole replay of images would take several times its memory.
+    Filled one episode at a time: random words for a whole replay of images would take several times as much memory.
     """
 
     def noise(leaf: jax.Array, leaf_key: jax.Array) -> jax.Array:

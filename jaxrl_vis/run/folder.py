@@ -8,21 +8,17 @@ The files:
 """
 
 import dataclasses
-import importlib.metadata
 import json
-import os
-import platform
 import shutil
-import subprocess
 import typing
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-import jax
-
+from jaxrl_vis import provenance
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.files import write_atomically
 from jaxrl_vis.run.lock import FILE_NAME as LOCK_NAME
 from jaxrl_vis.run.lock import run_lock
 
@@ -30,8 +26,6 @@ SCHEMA = 1
 
 MAY_CHANGE = ("preset", "env_steps", "eval_interval", "eval_episodes", "checkpoint_interval", "full_checkpoint_interval")
 """Fields that a resumed run may set anew: how long to train, how often to look and save. All others shape what is learned."""
-
-_PACKAGES = ("jaxrl-vis", "jax", "jaxlib", "numpy", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint")
 
 
 def default_folder(config: Config) -> Path:
@@ -134,57 +128,13 @@ class RunFolder:
         return goes_on
 
 
-def write_atomically(path: Path, text: str) -> None:
-    """Replaces a file's contents in one step: a reader, or a power cut, sees the old contents or the new ones."""
-    temporary = path.with_name(path.name + ".tmp")
-    with temporary.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
-
-
-def git_revision() -> str | None:
-    """Revision of the checkout that this file belongs to, with ``-dirty`` for changes; None outside a checkout."""
-    here = Path(__file__).resolve()
-
-    def git(*words: str) -> str | None:
-        try:
-            done = subprocess.run(("git", "-C", str(here.parent), *words), capture_output=True, text=True, timeout=10)
-        except (OSError, subprocess.TimeoutExpired):
-            return None
-        return done.stdout.strip() if done.returncode == 0 else None
-
-    # An installed copy may lie inside somebody else's checkout, whose revision says nothing about this code.
-    if git("ls-files", "--error-unmatch", here.name) is None:
-        return None
-    return git("describe", "--always", "--dirty", "--abbrev=40", "--exclude", "*")
-
-
-def versions() -> dict[str, str]:
-    """Versions of Python and of the libraries that a result depends on."""
-    found = {"python": platform.python_version()}
-    for package in _PACKAGES:
-        try:
-            found[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            found[package] = "not installed"
-    return found
-
-
-def device_record() -> dict[str, Any]:
-    """The devices that JAX runs on."""
-    device = jax.devices()[0]
-    return {"platform": device.platform, "kind": device.device_kind, "count": jax.device_count(), "cpu_count": os.cpu_count()}
-
-
 def _record(config: Config) -> dict[str, Any]:
     return {
         "schema": SCHEMA,
         "preset": config.preset,
-        "git_revision": git_revision(),
-        "versions": versions(),
-        "device": device_record(),
+        "git_revision": provenance.revision(),
+        "versions": provenance.versions(),
+        "device": provenance.device_record(),
         "config": dataclasses.asdict(config),
     }
 
