@@ -98,8 +98,12 @@ class Doctor:
 class Bench:
     """Measure this machine, keep a record, and print the change against the last record of the same device."""
 
-    benchmark: tyro.conf.Positional[Benchmark]
+    benchmark: tyro.conf.Positional[Benchmark | None] = None
     """What to measure: images, physics, both with resets, gradient steps, or whole training iterations."""
+    check: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Measure nothing: list records whose code has changed since, and rows of the README that have no record."""
+    tables: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Measure nothing: write the tables of the README from the records."""
     env: str = "VisualFetchReach"
     """The task."""
     envs: tuple[int, ...] = ()
@@ -345,7 +349,11 @@ def run_doctor(_: Doctor, __: Sequence[str]) -> int:
 
 
 def run_bench(options: Bench, _: Sequence[str]) -> int:
-    """Runs one benchmark."""
+    """Runs one benchmark, or looks after the records; 1 where one of these is stale or missing."""
+    if options.check or options.tables:
+        return _keep_records(options)
+    if options.benchmark is None:
+        raise RequestError(f"no benchmark given; choose one of {', '.join(typing.get_args(Benchmark))}, --check or --tables")
     for option, benchmark in (("scene", "render"), ("peer", "physics" if options.peer == "playground" else "render")):
         value = getattr(options, option)
         if value is not None and options.benchmark != benchmark:
@@ -357,8 +365,22 @@ def run_bench(options: Bench, _: Sequence[str]) -> int:
     from jaxrl_vis import bench
 
     settings = {field.name: getattr(options, field.name) for field in dataclasses.fields(options)}
+    del settings["check"], settings["tables"]
     bench.run(**settings)
     return 0
+
+
+def _keep_records(options: Bench) -> int:
+    if options.benchmark is not None:
+        raise RequestError(f"--check and --tables measure nothing: leave out {options.benchmark}")
+    from jaxrl_vis.bench import check, record, tables
+
+    if options.tables:
+        changed = tables.write_tables(check.README, options.results or record.results_folder())
+        print(f"{check.README}: {'written' if changed else 'as it was'}")
+    complaints = check.check(options.results) if options.check else []
+    print("\n".join(complaints) if complaints or not options.check else "every record is of today's code, every row has one")
+    return 1 if complaints else 0
 
 
 RUNNERS: dict[type, Callable[[Any, Sequence[str]], int]] = {
