@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jaxrl_vis import bench, provenance
-from jaxrl_vis.bench import peaks, record, roofline, timing, train, update
+from jaxrl_vis.bench import peaks, record, roofline, timing, train, update, variation
 from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.settings import Settings
 from jaxrl_vis.config import preset
@@ -71,10 +71,10 @@ def test_a_record_of_no_checkout_has_an_unknown_revision(monkeypatch: pytest.Mon
 
 
 def test_copies_are_refused() -> None:
-    timing.assert_varied(np.arange(8).reshape(4, 2), "rows")
+    variation.assert_varied(np.arange(8).reshape(4, 2), "rows")
     with pytest.raises(AssertionError, match="only 1 of 4 rows differ"):
-        timing.assert_varied(np.ones((4, 2)), "rows")
-    timing.assert_varied(np.ones((1, 2)), "rows")
+        variation.assert_varied(np.ones((4, 2)), "rows")
+    variation.assert_varied(np.ones((1, 2)), "rows")
 
 
 def test_timing_keeps_its_budget_and_takes_the_median() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from jaxrl_vis import bench
-from jaxrl_vis.bench import comparison, record, render_operations, render_scenes, timing, warp_renderer
+from jaxrl_vis.bench import comparison, record, render_operations, render_scenes, variation, warp_renderer
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis_envs.render import Scene
 
@@ -133,14 +133,14 @@ def test_operations_are_those_of_the_tests_and_of_one_shading(ball: str) -> None
 def test_images_that_do_not_change_are_refused() -> None:
     rows = np.arange(8, dtype=np.float32)[:, None]
     with pytest.raises(AssertionError, match="8 of 8 images stay the same"):
-        timing.assert_new_images(lambda batch: (jnp.asarray(batch), None), [rows, rows])
+        variation.assert_new_images(lambda batch: (jnp.asarray(batch), None), [rows, rows])
     with pytest.raises(AssertionError, match="only 1 of 8 images differ"):
-        timing.assert_new_images(lambda batch: 0 * batch, [rows, rows + 8])
-    timing.assert_new_images(lambda batch: batch, [rows, rows + 8])
+        variation.assert_new_images(lambda batch: 0 * batch, [rows, rows + 8])
+    variation.assert_new_images(lambda batch: batch, [rows, rows + 8])
 
 
 def test_calls_alternate_between_batches() -> None:
-    draw = timing.alternate(lambda batch: batch, [1, 2])
+    draw = variation.alternate(lambda batch: batch, [1, 2])
     assert [draw() for _ in range(5)] == [1, 2, 1, 2, 1]
 
 

@@ -9,7 +9,8 @@ import numpy as np
 from jaxrl_vis.bench.comparison import Comparison
 from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.render_scenes import set_poses
-from jaxrl_vis.bench.timing import Timing, assert_varied
+from jaxrl_vis.bench.timing import Timing
+from jaxrl_vis.bench.variation import assert_varied
 from jaxrl_vis.errors import RequestError
 
 POSES = 64

@@ -7,6 +7,7 @@ import dataclasses
 import datetime
 import json
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +73,21 @@ def load(path: Path) -> list[dict[str, Any]]:
     if not isinstance(records, list) or any(record.get("schema") != SCHEMA for record in records):
         raise ValueError(f"{path} holds no records of schema {SCHEMA}; move it away to start a new one")
     return records
+
+
+def read_all(folder: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """Every record in ``folder`` and below with its file, sorted by file. Files that hold something else are passed over."""
+    for path in sorted(folder.rglob("*.json")):
+        contents = json.loads(path.read_text(encoding="utf-8"))
+        for record in contents if isinstance(contents, list) else [contents]:
+            if isinstance(record, dict) and record.get("schema") == SCHEMA:
+                yield path, record
+
+
+def is_of_cpu(record: dict[str, Any]) -> bool:
+    """Whether a record was made on a CPU; its device is a name (`provenance.device_name`) or, of a run, a dictionary."""
+    device = record["device"]
+    return device["platform"] == "cpu" if isinstance(device, dict) else device.endswith(" cores")
 
 
 def _key(record: dict[str, Any]) -> str:

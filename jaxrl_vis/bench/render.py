@@ -13,8 +13,9 @@ from jaxrl_vis.bench import scene_images
 from jaxrl_vis.bench.physics import start_states
 from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.settings import Settings
-from jaxrl_vis.bench.timing import alternate, assert_new_images, compile_timed
+from jaxrl_vis.bench.timing import compile_timed
 from jaxrl_vis.bench.timing import measure as measure_time
+from jaxrl_vis.bench.variation import alternate, assert_new_images
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis_envs.compilation import env_jit
 

@@ -18,8 +18,9 @@ from jaxrl_vis.bench.comparison import compare
 from jaxrl_vis.bench.peaks import peak_of
 from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.settings import Settings
-from jaxrl_vis.bench.timing import alternate, assert_new_images, compile_timed
+from jaxrl_vis.bench.timing import compile_timed
 from jaxrl_vis.bench.timing import measure as measure_time
+from jaxrl_vis.bench.variation import alternate, assert_new_images
 from jaxrl_vis_envs.compilation import env_jit
 from jaxrl_vis_envs.render import Scene, quantize, render_planes
 

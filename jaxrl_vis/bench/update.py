@@ -9,8 +9,9 @@ import jax.numpy as jnp
 from jaxrl_vis.bench import roofline
 from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.settings import Settings
-from jaxrl_vis.bench.timing import Timing, assert_varied, compile_timed
+from jaxrl_vis.bench.timing import Timing, compile_timed
 from jaxrl_vis.bench.timing import measure as measure_time
+from jaxrl_vis.bench.variation import assert_varied
 from jaxrl_vis.config import Config, preset
 from jaxrl_vis.learner.train_step import TrainStep, make_train_step
 from jaxrl_vis.types import LoopState, ReplayState

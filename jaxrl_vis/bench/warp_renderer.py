@@ -18,8 +18,8 @@ import numpy as np
 
 from jaxrl_vis.bench.comparison import Comparison, textured_geoms
 from jaxrl_vis.bench.record import Measurement
-from jaxrl_vis.bench.timing import alternate, assert_new_images
 from jaxrl_vis.bench.timing import measure as measure_time
+from jaxrl_vis.bench.variation import alternate, assert_new_images
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis_envs.render import Scene
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 import tyro
 
@@ -18,8 +18,12 @@ Benchmark = Literal["render", "physics", "env", "update", "train"]
 class Bench:
     """Measure this machine, keep a record, and print the change since the last record of the same device."""
 
-    benchmark: Annotated[Benchmark, tyro.conf.Positional]
+    benchmark: Annotated[Benchmark | None, tyro.conf.Positional] = None
     """What to measure: images, physics, both with resets, gradient steps, or whole training iterations."""
+    check: bool = False
+    """Measure nothing: list records whose measured code has changed since, and rows of the README that have no record."""
+    tables: bool = False
+    """Measure nothing: write the tables of the README from the records."""
     env: str = "VisualFetchReach"
     """The environment."""
     envs: tuple[int, ...] = ()
@@ -44,7 +48,11 @@ class Bench:
 
 
 def run(options: Bench) -> int:
-    """Runs one benchmark."""
+    """Runs one benchmark, or looks after the records; 1 where one of these is stale or missing."""
+    if options.check or options.tables:
+        return _keep_records(options)
+    if options.benchmark is None:
+        raise RequestError(f"no benchmark given; choose one of {', '.join(get_args(Benchmark))}, --check or --tables")
     for option, benchmark in (("scene", "render"), ("peer", "physics" if options.peer == "playground" else "render")):
         value = getattr(options, option)
         if value is not None and options.benchmark != benchmark:
@@ -59,5 +67,20 @@ def run(options: Bench) -> int:
         check_writable(options.results, "--results", folder=True)
     from jaxrl_vis import bench
 
-    bench.run(**{field.name: getattr(options, field.name) for field in dataclasses.fields(options)})
+    settings = {field.name: getattr(options, field.name) for field in dataclasses.fields(options)}
+    del settings["check"], settings["tables"]
+    bench.run(**settings)
     return 0
+
+
+def _keep_records(options: Bench) -> int:
+    if options.benchmark is not None:
+        raise RequestError(f"--check and --tables measure nothing: leave out {options.benchmark}")
+    from jaxrl_vis.bench import check, record, tables
+
+    if options.tables:
+        changed = tables.write_tables(check.README, options.results or record.results_folder())
+        print(f"{check.README}: {'written' if changed else 'as it was'}")
+    complaints = check.check(options.results) if options.check else []
+    print("\n".join(complaints) if complaints or not options.check else "every record is of today's code, every row has one")
+    return 1 if complaints else 0
