@@ -102,7 +102,7 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
         (["train", "VisualReacher", "--preset", "debug", "--encoder-filters", "0", "8"], ["encoder_filters", "not 0 8"]),
         (["train", "VisualReacher", "--preset", "debug", "--encoder-filters", "-4", "8"], ["encoder_filters", "not -4 8"]),
         (["train", "VisualReacher", "--preset", "debug", "--seed", "99999999999999999999"], ["seed", "too large"]),
-        (["train", "--preset", "debug", "--run-dir", "pyproject.toml"], ["--run-dir pyproject.toml is a file"]),
+        (["train", "--preset", "debug", "--run-dir", __file__], [f"--run-dir {__file__} is a file"]),
         (["train", "--preset", "debug", "--run-dir", "/proc/run"], ["cannot write --run-dir /proc/run"]),
         (["bench", "physics", "--repeats", "0"], ["--repeats", "at least 1"]),
         (["envs", "--env", "FetchReach", "--gallery", "x.png"], ["FetchReach shows no images; VisualFetchReach does"]),
@@ -232,9 +232,16 @@ def test_results_must_be_a_folder_that_can_be_written(tmp_path: Path, capsys: py
         assert wrong in one_line(capsys, cli.main(["bench", "physics", "--results", str(path)]))
 
 
-def test_folders_for_outputs_are_made(
+def test_the_default_run_folder_is_checked_before_the_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("runs").write_text("")
+    line = one_line(capsys, cli.main(["train", "VisualReacher", "--preset", "debug"]))
+    assert "runs/VisualReacher-oracle-debug-seed0" in line and "is a file, not a folder" in line
+
+
+def test_missing_folders_are_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     from jaxrl_vis.run import trained
 
     (tmp_path / "config.json").write_text("{}")
