@@ -44,6 +44,8 @@ class Config:
     """Height and width of the image, in pixels."""
     frame_stack: int | None = None
     """Images of the latest control steps that an observation stacks. None: the environment's own number."""
+    env_options: tuple[str, ...] = ()
+    """Further options of the environment, as name=value; docs/tasks.md has those that undo a departure from a release."""
     randomize: tuple[Randomized, ...] = ()
     """What varies between episodes, in training and in evaluation."""
     randomize_strength: float = 1.0

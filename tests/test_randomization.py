@@ -15,7 +15,8 @@ import jaxrl_vis_envs
 from jaxrl_vis import config as config_file
 from jaxrl_vis.config import preset
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner.train_step import make_env, make_train_step
+from jaxrl_vis.learner.environment import make_env
+from jaxrl_vis.learner.train_step import make_train_step
 from jaxrl_vis_envs import pixels, randomization
 from jaxrl_vis_envs.compilation import env_jit
 from jaxrl_vis_envs.randomization import KINDS, OFF, Randomization, typical

@@ -7,6 +7,7 @@ files skipped; 4 stopped on a number that is not finite; 130 Ctrl-C and 143 SIGT
 """
 
 import inspect
+import os
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -60,6 +61,20 @@ def main(words: Sequence[str] | None = None) -> int:
         return 130
     except Terminated as stop:
         return int(stop.code or 0)
+
+
+def entry() -> None:
+    """The program: `main`, and the end of this process.
+
+    After a signal the process ends at once: what was to be saved is saved, and threads that still write a checkpoint, which a
+    second signal has given up, are not waited for.
+    """
+    status = main()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    if status in (130, 143):
+        os._exit(status)
+    sys.exit(status)
 
 
 def _run(words: Sequence[str]) -> int:

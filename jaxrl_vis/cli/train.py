@@ -60,7 +60,10 @@ def training_config(options: Train) -> Config:
     if name == "auto":
         import jax
 
-        name = "cpu" if jax.default_backend() == "cpu" else "fast"
+        from jaxrl_vis.run.signals import shielded_children
+
+        with shielded_children():  # threads that JAX starts with its first use of a device never see signals
+            name = "cpu" if jax.default_backend() == "cpu" else "fast"
     return preset(name, **changes)
 
 
