@@ -31,7 +31,7 @@ def one_line(capsys: pytest.CaptureFixture[str], status: int) -> str:
 
 
 @pytest.mark.parametrize("command", [[], *([name] for name in cli.COMMANDS)])
-def test_help_is_quick_and_imports_no_jax(command: list[str], clean_environment: dict[str, str]) -> None:
+def test_help_imports_nothing_heavy(command: list[str], clean_environment: dict[str, str]) -> None:
     code = f"""
 import sys
 from jaxrl_vis import cli
@@ -42,15 +42,9 @@ except SystemExit as stop:
 heavy = {{"jax", "jaxlib", "flax", "mujoco", "numpy", "matplotlib"}} & set(sys.modules)
 assert not heavy, heavy
 """
-    seconds = []
-    for _ in range(2):  # the first may write byte code
-        start = time.perf_counter()
-        done = subprocess.run([sys.executable, "-c", code], env=clean_environment, capture_output=True, text=True)
-        seconds.append(time.perf_counter() - start)
-        assert done.returncode == 0, done.stderr
+    done = subprocess.run([sys.executable, "-c", code], env=clean_environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
     assert "usage: jaxrl-vis" in done.stdout
-    print(f"help {' '.join(command)}: {min(seconds):.2f} s")
-    assert min(seconds) < 3.0  # 0.3 s on an idle machine; tests share theirs
 
 
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:

@@ -139,7 +139,7 @@ def make_train_step(env: GoalEnv, config: Config) -> TrainStep:
     resolved = resolve(validate(config), env.horizon)
     networks = Networks(config, env.observation_spec, env.action_size, resolved.critic_output_bias)
     if METHODS[config.method].needs_images and not networks.sees_images:
-        raise RequestError(f"method {config.method} compares images: use --env Visual{config.env}, or --method oracle")
+        raise RequestError(f"method {config.method} compares images: train on Visual{config.env}, or use --method oracle")
     algorithm = make_ddpg(networks, config, resolved)
     replay = make_replay(config.replay_transitions, config.num_envs, env.horizon)
     sampler = Sampler(config, resolved, replay, env.threshold, env.as_goal if env.frame_stack > 1 else None)

@@ -10,13 +10,12 @@ The files:
 import dataclasses
 import json
 import shutil
-import typing
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 from jaxrl_vis import provenance
-from jaxrl_vis.config import Config
+from jaxrl_vis.config import Config, config_from_dict
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.files import write_atomically
 from jaxrl_vis.run.lock import FILE_NAME as LOCK_NAME
@@ -100,7 +99,7 @@ class RunFolder:
             raise RequestError(f"{self.path} holds files but no config.json, so it is not a run: choose another --run-dir")
         if overwrite:
             return False
-        _check_same(self.path, read_record(self.path).get("config", {}), config)
+        _check_same(self.path, read_config(self.path), config)
         return True
 
     def open(self, config: Config, resume: bool = False, overwrite: bool = False) -> bool:
@@ -163,25 +162,19 @@ def read_config(path: Path) -> Config:
     Raises:
         RequestError: There is no run, or another version wrote it.
     """
-    saved = read_record(path).get("config", {})
-    hints = typing.get_type_hints(Config)
-    unknown = sorted(set(saved) - set(hints))
-    if unknown:
-        raise RequestError(f"the run in {path} has options that this version does not know: {', '.join(unknown)}")
-    # JSON has no tuples.
-    fields: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in saved.items()}
-    return Config(**fields)
+    try:
+        return config_from_dict(read_record(path).get("config", {}))
+    except RequestError as error:
+        raise RequestError(f"the run in {path} cannot be used: {error}") from error
 
 
-def _check_same(path: Path, saved: dict[str, Any], config: Config) -> None:
+def _check_same(path: Path, saved: Config, config: Config) -> None:
     """Raises RequestError, naming the fields, where ``config`` would not learn what ``saved`` learned."""
-    asked = json.loads(json.dumps(dataclasses.asdict(config)))  # tuples as lists, like the saved ones
-    # An option that is newer than the saved run had its default value then.
-    saved = json.loads(json.dumps(dataclasses.asdict(Config()))) | saved
+    before, asked = dataclasses.asdict(saved), dataclasses.asdict(config)
     contradictions = [
-        f"{name} (saved {saved[name]}, asked {asked.get(name, 'nothing: no such option now')})"
-        for name in sorted(saved)
-        if name not in MAY_CHANGE and saved[name] != asked.get(name)
+        f"{name} (saved {before[name]}, asked {asked[name]})"
+        for name in sorted(before)
+        if name not in MAY_CHANGE and before[name] != asked[name]
     ]
     if contradictions:
         raise RequestError(
