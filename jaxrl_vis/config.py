@@ -104,6 +104,10 @@ class Config:
     """Arithmetic of the networks; parameters and losses are float32. auto: bfloat16 on accelerators."""
     normalizer_floor: float = 0.01
     """Smallest standard deviation that an observation is divided by, in the observation's unit (grey levels for images)."""
+    normalizers: Literal["shared", "separate"] = "shared"
+    """Whether goals are normalised with the statistics of all observations, or, as in the authors' release, with their own."""
+    normalizer_source: Literal["rollouts", "relabelled"] = "rollouts"
+    """What statistics are of: every observation of a rollout, or, as in the authors' release, its relabelled transitions."""
     normalizer_clip: float = 5.0
     """Normalised observations are clipped to plus and minus this."""
 

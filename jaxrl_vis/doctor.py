@@ -1,4 +1,4 @@
-"""Says whether this installation works: one line a check, and the mend where one fails."""
+"""Says whether this installation works, in one line for each check."""
 
 import os
 import time
@@ -50,7 +50,7 @@ def compilation_cache() -> str:
 
 
 def physics_and_camera() -> str:
-    """Compiles and takes one control step, draws what it led to, and checks that the image shows something."""
+    """Compiles and takes one control step, renders the result, and checks that the image shows something."""
     import jax
     import jax.numpy as jnp
 
@@ -86,7 +86,7 @@ CHECKS: tuple[tuple[str, Callable[[], str]], ...] = (
 
 
 def main() -> int:
-    """Runs every check, whatever the earlier ones said; 1 where one fails."""
+    """Runs every check, whatever came of the earlier ones. Returns 1 if one fails, else 0."""
     failures = 0
     for name, check in CHECKS:
         try:

@@ -55,7 +55,7 @@ class FakeProgram:
                 updates=jnp.zeros((), jnp.int32),
             )
             replay = Episodes(
-                frames=jnp.zeros((episodes, HORIZON + 2, 1, size, size), jnp.uint8),
+                observations=jnp.zeros((episodes, HORIZON + 2, 1, size, size), jnp.uint8),
                 states=jnp.zeros((episodes, HORIZON + 2, 3)),
                 actions=jnp.zeros((episodes, HORIZON, 4)),
             )
@@ -79,7 +79,7 @@ class FakeProgram:
             if break_state:
                 new = new.replace(states=jnp.where(bad, jnp.nan, new.states))
             replay = jax.tree.map(lambda whole, part: jax.lax.dynamic_update_slice_in_dim(whole, part, start, 0), old, new)
-            step = 0.1 * (noise - 0.5) + 1e-3 * replay.states.mean() + 1e-4 * replay.frames.mean()
+            step = 0.1 * (noise - 0.5) + 1e-3 * replay.states.mean() + 1e-4 * replay.observations.mean()
             actor = {"layer": {"kernel": loop.train.actor["layer"]["kernel"] + step, "bias": loop.train.actor["layer"]["bias"]}}
             loss = jnp.where(bad, jnp.nan, step**2)
             critic = jax.tree.map(lambda leaf: leaf + 0.0 * loss, loop.train.critic)

@@ -130,7 +130,7 @@ def test_noise_fills_the_whole_replay() -> None:
     full = fill_replay(empty, jax.random.key(0))
     assert jax.tree.map(jax.typeof, full) == jax.tree.map(jax.typeof, empty)
     assert int(full.size) == replay.num_episodes
-    frames = np.asarray(full.episodes.frames).reshape(replay.num_episodes * 7, -1)
+    frames = np.asarray(full.episodes.observations).reshape(replay.num_episodes * 7, -1)
     assert len({frame.tobytes() for frame in frames}) == len(frames)
 
 

@@ -85,7 +85,7 @@ def test_a_full_save_does_not_keep_the_replay(tmp_path):
     checkpoints = Checkpoints(tmp_path)
     checkpoints.save_full(1, loop, {})
     trainer.train_iteration(loop)
-    assert loop.replay.episodes.frames.is_deleted()
+    assert loop.replay.episodes.observations.is_deleted()
     checkpoints.close()
 
 

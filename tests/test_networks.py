@@ -1,7 +1,6 @@
 """The encoder is the convolution stack that it says it is; statistics are those of the whole data."""
 
 import functools
-import types
 
 import flax.linen as nn
 import jax
@@ -13,7 +12,6 @@ from jaxrl_vis.config import preset
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import encoder_kernel, losses, normalizer
 from jaxrl_vis.learner.networks import Networks, to_blocks
-from jaxrl_vis_envs.compilation import runs_gpu_kernels
 
 
 def make_networks(size, filters=(4, 8, 16), **overrides):
@@ -85,16 +83,6 @@ def test_the_gpu_kernel_computes_and_differentiates_the_same_function(shape, bat
     np.testing.assert_allclose(latent, expected, rtol=1e-4, atol=1e-4)
     for (path, ours), theirs in zip(jax.tree.leaves_with_path(gradient), jax.tree.leaves(expected_gradient), strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-3, atol=1e-4 * np.abs(theirs).max(), err_msg=str(path))
-
-
-@pytest.mark.parametrize(
-    ("backend", "capability", "expected"),
-    [("cpu", None, False), ("gpu", "9.0", True), ("gpu", "8.0", True), ("gpu", "7.5", False), ("gpu", "gfx942", False)],
-)
-def test_kernels_are_left_to_gpus_that_run_them(backend, capability, expected, monkeypatch):
-    monkeypatch.setattr(jax, "default_backend", lambda: backend)
-    monkeypatch.setattr(jax, "devices", lambda: [types.SimpleNamespace(compute_capability=capability)])
-    assert runs_gpu_kernels() is expected
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,8 @@ from jaxrl_vis.learner.train_step import make_env, make_train_step
 from jaxrl_vis_envs import pixels, randomization
 from jaxrl_vis_envs.compilation import env_jit
 from jaxrl_vis_envs.randomization import KINDS, OFF, Randomization, typical
-from jaxrl_vis_envs.render import Scene, gpu_kernel, images, render_planes
+from jaxrl_vis_envs.render import Scene, render_planes
+from jaxrl_vis_envs.render.gpu import kernel
 
 SIZE, COUNT, STEPS = 16, 3, 2
 TASKS = ["FetchReach", "FingerTurn", "HandReach", "Reacher", "SawyerReach"]
@@ -217,15 +218,15 @@ def test_the_gpu_kernel_draws_varied_scenes(monkeypatch: pytest.MonkeyPatch) -> 
     """By Pallas's interpreter: the scene's leaves differ between the environments of a batch, and both ways draw the same."""
     scene, _ = draw_shape()
     start = episodes(ALL)[0]
-    assert gpu_kernel.supports(scene)
+    assert kernel.supports(scene)
 
     def draw(data: Any, domain: Any) -> jax.Array:
         planes = render_planes(randomization.varied_scene(scene, domain), data)
         return jnp.concatenate([planes.rgb, planes.depth[None]])
 
     plain = np.asarray(env_jit(jax.vmap(draw))(start.data, start.domain))
-    monkeypatch.setattr(gpu_kernel, "takes", gpu_kernel.supports)
-    monkeypatch.setattr(images.gpu_kernel, "draw", functools.partial(gpu_kernel.draw, interpret=True))
+    monkeypatch.setattr(kernel, "takes", lambda scene, outputs: kernel.supports(scene))
+    monkeypatch.setattr(kernel, "draw", functools.partial(kernel.draw, interpret=True))
     by_kernel = np.asarray(jax.vmap(draw)(start.data, start.domain))
     assert (np.abs(plain - by_kernel).max(axis=1) < 1e-3).mean() > 0.98  # but for pixels on an edge
     assert len({image.tobytes() for image in by_kernel}) == COUNT
@@ -290,7 +291,7 @@ def test_a_learner_trains_in_worlds_that_vary() -> None:
         return loop, rows
 
     (loop, rows), (_, again) = train(), train()
-    starts = np.asarray(loop.replay.episodes.frames[0, :, 0])
+    starts = np.asarray(loop.replay.episodes.observations[0, :, 0])
     np.testing.assert_array_equal(loop.replay.episodes.states[0, :, 0], 0.0)
     assert len({start.tobytes() for start in starts}) == len(starts) == 8
     assert all(np.isfinite(value).all() and row["guard/nonfinite"] == 0 for row in rows for value in row.values())

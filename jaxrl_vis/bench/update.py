@@ -58,7 +58,7 @@ def time_updates(program: TrainStep, settings: Settings) -> tuple[Timing, float]
     loop = start(program)
     keys = jax.random.split(jax.random.key(2), 1)
     compiled, compile_s = compile_timed(program.update_many, loop.train, loop.replay, keys, loop.iteration)
-    assert_varied(loop.replay.episodes.frames[0, :64, 0], "frames of the replay")
+    assert_varied(loop.replay.episodes.observations[0, :64, 0], "observations of the replay")
     train = loop.train
     before = jax.device_get(train.actor)
 

@@ -81,7 +81,7 @@ class Programs:
     @functools.cached_property
     def shows_images(self) -> bool:
         """Whether what the robot sees can be shown in a video."""
-        _, episodes, slots, *image = self.shapes.replay.episodes.frames.shape
+        _, episodes, slots, *image = self.shapes.replay.episodes.observations.shape
         if len(image) == 3:  # of stacked images the newest is shown
             image[0] //= self.env.frame_stack
         return videos.shows_images((episodes, slots, *image))

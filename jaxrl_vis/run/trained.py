@@ -90,7 +90,7 @@ def play_run(run_dir: Path | str, out: Path | str, episodes: int = 6, three_dime
         _, recorded = programs.evaluate(train, jax.random.fold_in(programs.evaluation_key, count) if parts else None)
         parts.append(videos.first_seed(recorded))
         count += len(parts[-1].success)
-    joined = videos.Recording(
+    joined = videos.EpisodeImages(
         *(np.concatenate([getattr(part, name) for part in parts])[:episodes] for name in ("frames", "goals", "success"))
     )
     videos.write_video(joined, out, programs.image_seconds, max_episodes=episodes)

@@ -33,7 +33,7 @@ try:
 except ImportError as error:
     raise ImportError("this adapter needs Gymnasium: pip install 'jaxrl-vis[gymnasium]'") from error
 
-from jaxrl_vis_envs.adapters.gymnasium_worlds import Observations, Worlds
+from jaxrl_vis_envs.adapters.gymnasium_environments import Observations, Worlds
 from jaxrl_vis_envs.adapters.rewards import Reward
 from jaxrl_vis_envs.base import GoalEnv
 from jaxrl_vis_envs.registry import list_envs
