@@ -32,9 +32,9 @@ def measure(name: str, episodes: int, seed: int = 0, **overrides: Any) -> tuple[
     env: Any = jaxrl_vis_envs.make(name, **overrides)
 
     def play(key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        world_key, action_key = jax.random.split(key)
-        goal_state = env.achieved(env.sample_goal(world_key))
-        start = env.state_at(env.sample_start(world_key), goal_state)
+        env_key, action_key = jax.random.split(key)
+        goal_state = env.goal_state_of(env_key, env.sample_goal(env_key))
+        start = env.state_at(env.sample_start(env_key), goal_state)
         actions = jax.random.uniform(action_key, (env.horizon, env.action_size), minval=-1.0)
         end, _ = jax.lax.scan(lambda state, action: (env.advance(state, action), None), start, actions)
         return end.metrics["success"], start.metrics["goal_distance"]

@@ -1,7 +1,5 @@
 """``python -m jaxrl_vis`` is the command line."""
 
-import sys
+from jaxrl_vis.cli import entry
 
-from jaxrl_vis.cli import main
-
-sys.exit(main())
+entry()

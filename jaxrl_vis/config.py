@@ -44,6 +44,8 @@ class Config:
     """Height and width of the image, in pixels."""
     frame_stack: int | None = None
     """Images of the latest control steps that an observation stacks. None: the environment's own number."""
+    env_options: tuple[str, ...] = ()
+    """Further options of the environment, as name=value; docs/tasks.md has those that undo a departure from a release."""
     randomize: tuple[Randomized, ...] = ()
     """What varies between episodes, in training and in evaluation."""
     randomize_strength: float = 1.0
@@ -307,11 +309,13 @@ def validate(config: Config) -> Config:
     return config
 
 
-_RENAMED = {"frames": "frame_stack"}
+_OLD_NAMES = {"frames": "frame_stack"}
 
 
 def config_from_dict(values: Mapping[str, Any]) -> Config:
     """The configuration that a run saved: what JSON makes of `dataclasses.asdict`, which has lists in the place of tuples.
+
+    Fields that had another name when it was saved are known by that, too; fields that are missing have their defaults.
 
     Raises:
         RequestError: ``values`` is no dictionary, or a field is unknown or of the wrong type. The message names the field.
@@ -319,9 +323,12 @@ def config_from_dict(values: Mapping[str, Any]) -> Config:
     if not isinstance(values, Mapping):
         raise RequestError(f"a configuration must be a dictionary of options, not {type(values).__name__}")
     hints = fields.hints(Config)
-    for name in values:
-        if name in _RENAMED:
-            raise RequestError(f"option {name!r} is now called {_RENAMED[name]!r}: another version saved this configuration")
+    found: dict[str, Any] = {}
+    for saved_name, value in values.items():
+        name = _OLD_NAMES.get(saved_name, saved_name)
         if name not in hints:
-            raise RequestError(f"unknown option {name!r}{nearest(name, hints)}")
-    return Config(**{name: fields.check(name, hints[name], value) for name, value in values.items()})
+            raise RequestError(f"unknown option {name!r}{nearest(str(name), hints)}")
+        if name in found:
+            raise RequestError(f"{name} is given twice, once by its old name")
+        found[name] = fields.check(name, hints[name], value)
+    return Config(**found)

@@ -13,6 +13,7 @@ from typing import Any, Literal, NoReturn
 
 from jaxrl_vis.errors import RequestError, nearest
 
+_TRUTH = {"true": True, "false": False}
 _KINDS = {bool: "true or false", int: "a whole number", float: "a finite number", str: "a word", Path: "a path"}
 
 
@@ -94,7 +95,7 @@ def read(label: str, hint: Any, words: Sequence[str]) -> Any:
     if optional and word.lower() == "none":
         return None
     try:
-        value = one(word) if one in (int, float, Path) else word
+        value = _TRUTH.get(word.lower(), word) if one is bool else one(word) if one in (int, float, Path) else word
     except ValueError:
         _refuse(label, one, word)
     return check(label, one, value)

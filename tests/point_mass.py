@@ -1,4 +1,4 @@
-"""A world that compiles in a moment, made as a user would make one: a ball on two rails, a motor for each."""
+"""An environment that compiles in a moment, made as a user would make one: a ball on two rails, a motor for each."""
 
 import dataclasses
 from typing import Any

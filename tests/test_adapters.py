@@ -1,4 +1,4 @@
-"""The worlds behind other libraries' interfaces: each library's own checker, and what goes wrong where adapters are wrong."""
+"""The environments behind other libraries' interfaces: each library's own checker, and what wrong adapters get wrong."""
 
 import dataclasses
 import functools
@@ -66,7 +66,7 @@ def registered(monkeypatch):
     monkeypatch.setattr(gymnasium, "registry", gymnasium.envs.registration.registry)
 
 
-def test_gymnasium_checks_a_world_that_it_made_by_name(registered):
+def test_gymnasium_checks_an_environment_that_it_made_by_name(registered):
     def build(config: Any) -> Any:
         return ReacherWithoutPhysics(config, lambda model: image_observer(model, "above", config))
 

@@ -14,8 +14,8 @@ from test_provenance import commit
 from jaxrl_vis import cli
 from jaxrl_vis.bench import check, learning, record, staleness, tables
 from jaxrl_vis.bench.table_rows import DEVICES, LEARNING, Figure, Learning
-from jaxrl_vis.cli import train
 from jaxrl_vis.cli.parsing import parse
+from jaxrl_vis.cli.train import Train, training_config
 from jaxrl_vis.config import preset
 from jaxrl_vis.errors import RequestError
 
@@ -244,7 +244,7 @@ def test_a_run_is_kept_small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ca
         "jaxrl-vis train VisualFetchReach --preset debug --seeds 3 --no-clip-targets-above --hidden-sizes 8 8"
     )
     words = evidence.record["command"].split()
-    assert train.training_config(parse(train.Train, words[2:])) == learning.read_config(run)
+    assert training_config(parse(Train, words[2:])) == preset("debug", seeds=3, hidden_sizes=(8, 8), clip_targets_above=False)
     assert [entry["name"] for _, entry in record.read_all(tmp_path) if entry.get("name")] == ["learning"]
 
 

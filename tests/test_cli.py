@@ -15,6 +15,7 @@ from jaxrl_vis.cli.bench import Benchmark
 from jaxrl_vis.cli.parsing import parse
 from jaxrl_vis.cli.train import Train, training_config
 from jaxrl_vis.config import PRESETS, Config
+from jaxrl_vis.errors import NonFiniteError, StorageError, Terminated
 from jaxrl_vis.report.outputs import check_writable
 
 
@@ -101,7 +102,7 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
         (["train", "VisualReacher", "--preset", "debug", "--encoder-filters", "0", "8"], ["encoder_filters", "not 0 8"]),
         (["train", "VisualReacher", "--preset", "debug", "--encoder-filters", "-4", "8"], ["encoder_filters", "not -4 8"]),
         (["train", "VisualReacher", "--preset", "debug", "--seed", "99999999999999999999"], ["seed", "too large"]),
-        (["train", "--preset", "debug", "--run-dir", "pyproject.toml"], ["--run-dir pyproject.toml is a file"]),
+        (["train", "--preset", "debug", "--run-dir", __file__], [f"--run-dir {__file__} is a file"]),
         (["train", "--preset", "debug", "--run-dir", "/proc/run"], ["cannot write --run-dir /proc/run"]),
         (["bench", "physics", "--repeats", "0"], ["--repeats", "at least 1"]),
         (["envs", "--env", "FetchReach", "--gallery", "x.png"], ["FetchReach shows no images; VisualFetchReach does"]),
@@ -183,8 +184,8 @@ def test_allowed_values_of_bench_are_those_there_are() -> None:
     assert get_args(Benchmark) == bench.BENCHMARKS
 
 
-def test_the_module_runs_as_a_program(clean_environment: dict[str, str]) -> None:
-    command = [sys.executable, "-m", "jaxrl_vis.cli", "--version"]
+def test_the_package_runs_as_a_program(clean_environment: dict[str, str]) -> None:
+    command = [sys.executable, "-m", "jaxrl_vis", "--version"]
     assert subprocess.check_output(command, env=clean_environment, text=True).strip() == jaxrl_vis.__version__
 
 
@@ -231,13 +232,20 @@ def test_results_must_be_a_folder_that_can_be_written(tmp_path: Path, capsys: py
         assert wrong in one_line(capsys, cli.main(["bench", "physics", "--results", str(path)]))
 
 
-def test_folders_for_outputs_are_made(
+def test_the_default_run_folder_is_checked_before_the_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from jaxrl_vis.run import trainer
+    monkeypatch.chdir(tmp_path)
+    Path("runs").write_text("")
+    line = one_line(capsys, cli.main(["train", "VisualReacher", "--preset", "debug"]))
+    assert "runs/VisualReacher-oracle-debug-seed0" in line and "is a file, not a folder" in line
+
+
+def test_missing_folders_are_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    from jaxrl_vis.run import trained
 
     (tmp_path / "config.json").write_text("{}")
-    monkeypatch.setattr(trainer, "evaluate_run", lambda *_, **__: {"eval/success": [0.5]})
+    monkeypatch.setattr(trained, "evaluate_run", lambda *_, **__: {"eval/success": [0.5]})
     path = tmp_path / "new" / "folder" / "figures.json"
     assert cli.main(["eval", str(tmp_path), "--json", str(path)]) == 0
     assert json.loads(path.read_text()) == {"eval/success": [0.5]}
@@ -266,7 +274,7 @@ def test_play_refuses_an_unknown_kind_of_file(tmp_path: Path, capsys: pytest.Cap
 
 
 def test_exit_status_of_a_run_that_stops(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    trainer = pytest.importorskip("jaxrl_vis.run.trainer")
+    from jaxrl_vis.run import trainer
 
     class Stopping:
         def __init__(self, error: BaseException) -> None:
@@ -277,13 +285,17 @@ def test_exit_status_of_a_run_that_stops(monkeypatch: pytest.MonkeyPatch, capsys
             yield
 
     for make_error, status in (
-        (lambda: trainer.NonFiniteError("loss is NaN at iteration 3"), 4),
+        (lambda: NonFiniteError("loss is NaN at iteration 3"), 4),
+        (lambda: StorageError("cannot write to runs/x: make room"), 1),
         (lambda: KeyboardInterrupt(), 130),
-        (lambda: trainer.Terminated(), 143),
+        (lambda: Terminated(), 143),
     ):
         monkeypatch.setattr(trainer, "make_trainer", lambda *_, make_error=make_error, **__: Stopping(make_error()))
         assert cli.main(["train", "--preset", "debug"]) == status
-    assert "iteration 3" in capsys.readouterr().err
+    assert capsys.readouterr().err.splitlines() == [
+        "jaxrl-vis: loss is NaN at iteration 3",
+        "jaxrl-vis: cannot write to runs/x: make room",
+    ]
 
 
 def test_doctor_finds_nothing_wrong(capsys: pytest.CaptureFixture[str]) -> None:

@@ -76,7 +76,8 @@ def test_numbers_from_elsewhere_are_welcome() -> None:
     ("values", "complaint"),
     [
         ([1], "a configuration must be a dictionary"),
-        ({"frames": 2}, "'frames' is now called 'frame_stack'"),
+        ({"frames": "two"}, "frame_stack must be a whole number, not 'two'"),
+        ({"frames": 2, "frame_stack": 3}, "frame_stack is given twice"),
         ({"batch_sizes": 2}, "unknown option 'batch_sizes'; did you mean batch_size"),
         ({"num_envs": "abc"}, "num_envs must be a whole number, not 'abc'"),
         ({"method": "indicator", "env": 5}, "env must be a word, not 5"),
@@ -89,6 +90,10 @@ def test_a_saved_configuration_of_the_wrong_types_is_refused_by_name(values: Any
     with pytest.raises(RequestError) as refused:
         config_from_dict(values)
     assert complaint in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_fields_are_known_by_their_old_names() -> None:
+    assert config_from_dict({"frames": 3, "env": "VisualReacher"}) == Config(env="VisualReacher", frame_stack=3)
 
 
 def test_words_become_values() -> None:

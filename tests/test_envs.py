@@ -1,4 +1,4 @@
-"""The contract that every registered world keeps, and what is particular to each task."""
+"""The contract that every registered environment keeps, and what is particular to each task."""
 
 import functools
 import os
@@ -86,7 +86,7 @@ _LATE_START = """
 """
 
 
-def test_every_world_is_tested():
+def test_every_environment_is_tested():
     assert jaxrl_vis_envs.list_envs() == sorted([*TASKS, *(f"Visual{task}" for task in TASKS)])
 
 
@@ -107,7 +107,7 @@ def test_reset_and_advance(name: str) -> None:
         assert not np.asarray(state.done).any()
         for leaf in jax.tree.leaves(state):
             assert np.isfinite(np.asarray(leaf, np.float64)).all()
-    # The goal stays, the world moves.
+    # The goal stays, the robot moves.
     np.testing.assert_array_equal(states[-1].goal_state, start.goal_state)
     assert (np.abs(states[-1].data.qpos - start.data.qpos).max(axis=-1) > 1e-3).all()
 
@@ -179,6 +179,22 @@ def test_a_visual_task_resets_and_steps_as_its_parts_say() -> None:
     assert (np.abs(np.diff(steps.data.qpos, axis=0)).max(axis=-1) > 1e-4).all()
 
 
+@EACH_TASK
+@pytest.mark.parametrize("wrong", [(1,), (2, 3), ()])
+def test_an_action_of_another_shape_is_refused(name: str, wrong: tuple[int, ...]) -> None:
+    env = environments.make(name)
+    state = jax.tree.map(lambda leaf: leaf[0], episode(name).states[0])
+    for move in (env.advance, env.step):
+        with pytest.raises(ValueError, match=rf"{name} takes an action of shape \({env.action_size},\), got"):
+            move(state, jnp.zeros(wrong))
+
+
+@EACH_TASK
+def test_tasks_refuse_64_bits(name: str) -> None:
+    with jax.enable_x64(True), pytest.raises(ValueError, match=f"{name} simulates in 32 bits.*unset JAX_ENABLE_X64"):
+        jaxrl_vis_envs.make(name)
+
+
 def test_sanitize_action():
     action = sanitize_action(jnp.array([jnp.nan, jnp.inf, -jnp.inf, 0.5]))
     np.testing.assert_array_equal(action, [0.0, 1.0, -1.0, 0.5])
@@ -190,7 +206,7 @@ def test_images_stack_newest_first():
     actions = jnp.ones((3, 1, 2)) * jnp.array([1.0, -0.5, 0.8])[:, None, None]
     env, env_1 = (PointMass(PointMassConfig(image_size=16, frame_stack=frames)) for frames in (3, 1))
     (start, steps), (start_1, steps_1) = (
-        tuple(state.obs for state in play_images(world, keys, actions)) for world in (env, env_1)
+        tuple(state.obs for state in play_images(each, keys, actions)) for each in (env, env_1)
     )
     one = [start_1["observation"][0], *steps_1["observation"][:, 0]]
     assert len({np.asarray(image).tobytes() for image in one}) == 4
@@ -257,17 +273,46 @@ def test_names_that_do_not_exist():
         jaxrl_vis_envs.make("VisualFetchReach", image_sise=32)
     with pytest.raises(jaxrl_vis_envs.UnknownOverrideError, match="no option 'image_size'"):
         jaxrl_vis_envs.make("FetchReach", image_size=32)
-    for name, bad in (
-        ("VisualReacher", {"pixels": "hsv"}),
-        ("VisualReacher", {"image_size": 0}),
-        ("VisualReacher", {"frame_stack": 0}),
-        ("FingerTurn", {"substeps": 0}),
-        ("VisualFetchReach", {"depth_range": (2.0, 1.0)}),
-        ("Reacher", {"control": "telepathy"}),
+
+
+@pytest.mark.parametrize(
+    ("name", "bad"),
+    [
+        *((name, {field: value}) for name in TASKS for field in ("horizon", "threshold") for value in (0, -1, "2", np.nan)),
+        *((name, {"randomization": "camera"}) for name in TASKS),
+        *((name, {"substeps": value}) for name in TASKS for value in (0, 4.5, True)),
+        *(("VisualReacher", {"pixels": value}) for value in ("hsv", 3)),
+        *(("VisualReacher", {field: value}) for field in ("image_size", "frame_stack") for value in (0, 4.5, "64", True)),
+        *(
+            ("VisualFetchReach", {field: value})
+            for field in ("depth_range", "clip_range")
+            for value in ((2.0, 1.0), (1.0,), (0.5, np.inf), 3.0, ("a", "b"))
+        ),
+        ("VisualFetchReach", {"clip_range": (0.0, 1.0)}),
+        ("VisualFetchReach", {"depth_encoding": "log"}),
+        ("VisualFetchReach", {"cross_hair": "yes"}),
+        ("VisualFetchReach", {"finger_colour": "pink"}),
+        ("FetchReach", {"goal_at": "nose"}),
         ("FetchReach", {"substeps": 1}),
-    ):
-        with pytest.raises(ValueError, match=next(iter(bad))):
-            jaxrl_vis_envs.make(name, **bad)
+        ("FetchReach", {"goal_range": -0.1}),
+        ("FetchReach", {"action_scale": 0.0}),
+        ("FetchReach", {"solver_iterations": 0}),
+        ("FingerTurn", {"line_search_iterations": 0}),
+        ("HandReach", {"goal_rule": "wave"}),
+        ("HandReach", {"goal_actions": 0}),
+        ("HandReach", {"goal_noise": np.nan}),
+        ("HandReach", {"contacts": "no"}),
+        ("Reacher", {"control": "telepathy"}),
+        ("Reacher", {"start_range": -0.1}),
+        ("Reacher", {"velocity_scale": np.inf}),
+        ("SawyerReach", {"goal_size": (1.0, 0.0, 1.0)}),
+        ("SawyerReach", {"goal_centre": (1.0, 0.0)}),
+        ("SawyerReach", {"workspace_margin": -0.01}),
+    ],
+)
+def test_settings_out_of_range(name: str, bad: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=f"^{next(iter(bad))} must be .*got"):
+        jaxrl_vis_envs.make(name, **bad)
 
 
 def test_register(monkeypatch):
@@ -279,6 +324,35 @@ def test_register(monkeypatch):
         registry.register("Mine", lambda config: environments.make("FetchReach"), config_class)
     with pytest.raises(ValueError, match="dataclass"):
         registry.register("Other", lambda config: environments.make("Reacher"), dict)
+
+
+def test_what_an_environment_sees_is_known_before_it_is_built(monkeypatch):
+    for task in TASKS:
+        assert registry.has_images(f"Visual{task}") and not registry.has_images(task)
+        assert registry.state_variant(f"Visual{task}") == registry.state_variant(task) == task
+    monkeypatch.setattr(registry, "_ENTRIES", dict(registry._ENTRIES))
+    registry.register("Ball", PointMass, PointMassConfig)  # images, whatever its name
+    assert registry.has_images("Ball") and registry.state_variant("Ball") is None
+    with pytest.raises(jaxrl_vis_envs.UnknownEnvironmentError):
+        registry.has_images("Bowl")
+
+
+def test_numpy_is_rewarded_by_numpy():
+    """A learner on the host pays for no transfer and no compilation."""
+    images = np.zeros((2, 3, 4, 4), np.uint8)
+    other = images.copy()
+    other[1, 0, 0, 0] = 1
+    states = np.zeros((2, 3), np.float32)
+    for reward in (
+        goals.indicator_reward(images, other),
+        goals.oracle_reward(states, states, 0.1),
+        goals.success(states, states, 0.1),
+    ):
+        assert isinstance(reward, np.ndarray) and reward.dtype == np.float32
+    np.testing.assert_array_equal(goals.indicator_reward(images, other), [1.0, -1.0])
+    on_device = goals.indicator_reward(jnp.asarray(images), jnp.asarray(other))
+    assert isinstance(on_device, jax.Array)
+    np.testing.assert_array_equal(on_device, [1.0, -1.0])
 
 
 def test_goals_need_no_mujoco():

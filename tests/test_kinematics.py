@@ -86,7 +86,7 @@ def test_balls_and_free_bodies_are_left_to_mjx():
         assert_poses_agree(mj_model, ("xpos", "geom_xpos", "geom_xmat"))
 
 
-def test_a_world_without_joints():
+def test_a_model_without_joints():
     assert_poses_agree(
         mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='.1'/></worldbody></mujoco>"), ("geom_xpos",)
     )

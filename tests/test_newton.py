@@ -104,7 +104,7 @@ def test_what_is_not_small_and_simple_is_left_to_mjx(joint, option, fits):
     assert newton.fits(mjx.put_model(mujoco.MjModel.from_xml_string(xml))) is fits
 
 
-# The speed of a task rests on it: VisualReacher makes 1.73 M steps a second on an H100 with the small solver, 0.78 M with MJX's.
+# The speed of a task rests on it: VisualReacher makes 1.73 M steps a second on an H100 with this one, 0.78 M with MJX's.
 # The finger has elliptic cones and friction in a joint, the hand 24 joints and friction in them.
 SOLVERS = {"FetchReach": "small", "FingerTurn": "mjx", "HandReach": "mjx", "Reacher": "small", "SawyerReach": "small"}
 

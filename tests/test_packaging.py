@@ -22,10 +22,11 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("run",),
     ("bench", "doctor"),
     ("cli",),
+    ("__main__",),
 )
 # The same for the environments.
 ENVIRONMENT_LAYERS: tuple[tuple[str, ...], ...] = (
-    ("compilation", "goals"),
+    ("checks", "compilation", "goals", "names"),
     ("physics", "render"),
     ("randomization",),
     ("base",),
@@ -125,6 +126,11 @@ assert not {"mujoco", "matplotlib", "orbax"} & set(sys.modules)
 
 def test_importing_the_package_loads_no_jax(clean_environment: dict[str, str]) -> None:
     code = "import sys, jaxrl_vis; jaxrl_vis.preset('cpu'); assert not {'jax', 'numpy'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], env=clean_environment, check=True)
+
+
+def test_names_load_no_jax(clean_environment: dict[str, str]) -> None:
+    code = "import sys, jaxrl_vis_envs.names, jaxrl_vis.errors; assert not {'jax', 'numpy', 'mujoco'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], env=clean_environment, check=True)
 
 

@@ -15,7 +15,8 @@ import jaxrl_vis_envs
 from jaxrl_vis import config as config_file
 from jaxrl_vis.config import preset
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner.train_step import make_env, make_train_step
+from jaxrl_vis.learner.environment import make_env
+from jaxrl_vis.learner.train_step import make_train_step
 from jaxrl_vis_envs import pixels, randomization
 from jaxrl_vis_envs.compilation import env_jit
 from jaxrl_vis_envs.randomization import KINDS, OFF, Randomization, typical
@@ -278,7 +279,7 @@ def test_the_learner_asks_for_it() -> None:
             make_env(preset("debug", **({"env": "VisualReacher"} | wrong)))
 
 
-def test_a_learner_trains_in_worlds_that_vary() -> None:
+def test_a_learner_trains_in_environments_that_vary() -> None:
     """Every episode starts at the same place and looks different; learning goes on, and repeats itself bit for bit."""
     settings = {"num_envs": 4, "replay_transitions": 40, "updates_per_iteration": 2, "batch_size": 16, "eval_episodes": 2}
     program = make_train_step(make(ALL), preset("debug", **settings))

@@ -14,6 +14,7 @@ from fake_program import FakeProgram, as_plain, final_state, make_fake_trainer, 
 from jaxrl_vis.config import Config, preset
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import train_step
+from jaxrl_vis.learner.environment import make_env
 from jaxrl_vis.run import loop as run_loop
 from jaxrl_vis.run import memory, metrics, trained, trainer
 from jaxrl_vis.run.checkpoint import Checkpoints
@@ -143,7 +144,7 @@ def test_evaluate_and_play_a_run(straight, tmp_path, monkeypatch):
 def test_the_real_program_resumes_bit_for_bit(tmp_path, capsys):
     """The same as above with physics, cameras and networks. Traced once: the three runs share the program."""
     config = preset("debug", env="VisualReacher", full_checkpoint_interval=2)
-    program = train_step.make_train_step(train_step.make_env(config), config)
+    program = train_step.make_train_step(make_env(config), config)
     original, calls = program.train_iteration.__wrapped__, []
 
     def train_iteration(loop):  # of the same name, so that the next test finds it compiled

@@ -1,4 +1,4 @@
-"""The worlds: physics, cameras and goals, as traceable JAX functions.
+"""The environments: physics, cameras and goals, as traceable JAX functions.
 
     env = jaxrl_vis_envs.make("VisualFetchReach", image_size=64)
     state = env.reset(jax.random.key(0))

@@ -1,4 +1,4 @@
-"""What every goal-reaching world has in common: its state, and the four functions that move it.
+"""What every goal-reaching environment has in common: its state, and the four functions that move it.
 
     state = env.reset(key)              one environment; vmap it for a batch
     state = env.advance(state, action)  physics, reward, success; no pixels
@@ -17,6 +17,7 @@ from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxrl_vis_envs import goals
 
@@ -56,7 +57,7 @@ class State:
 
 
 class GoalEnv(abc.ABC):
-    """A world with a goal. Subclasses say how it starts, moves and looks; success and reward are the same for all."""
+    """An environment with a goal. Subclasses say how it starts, moves and looks; success and reward are the same for all."""
 
     # Set by each task.
     name: str
@@ -85,6 +86,9 @@ class GoalEnv(abc.ABC):
         Args:
             state: The state to start from.
             action: [A] float32 in [-1, 1]; values outside are clipped, and a NaN counts as 0.
+
+        Raises:
+            ValueError: ``action`` has another shape (`check_action`).
         """
 
     @abc.abstractmethod
@@ -104,12 +108,28 @@ class GoalEnv(abc.ABC):
         return jnp.tile(frame[: frame.shape[0] // self.frame_stack], (self.frame_stack, 1, 1))
 
     def step(self, state: State, action: jax.Array) -> State:
-        """`advance`, then `observe`: the one to use where every step's image is wanted."""
+        """`advance`, then `observe`: the one to use where every step's image is wanted.
+
+        Raises:
+            ValueError: ``action`` has another shape than [A].
+        """
+        self.check_action(action)
         state = self.advance(state, action)
         frame = self.observe(state)
         achieved_goal = self.as_goal(frame)
         desired_goal = achieved_goal if state.obs is None else state.obs["desired_goal"]
         return state.replace(obs={"observation": frame, "achieved_goal": achieved_goal, "desired_goal": desired_goal})
+
+    def check_action(self, action: jax.Array) -> None:
+        """Refuses an action of the wrong size, which NumPy's rules might broadcast.
+
+        Raises:
+            ValueError: ``action`` has another shape than [A].
+        """
+        if np.shape(action) != (self.action_size,):
+            raise ValueError(
+                f"{self.name} takes an action of shape ({self.action_size},), got {np.shape(action)}; vmap over a batch"
+            )
 
     @functools.cached_property
     def _reset_shape(self) -> State:

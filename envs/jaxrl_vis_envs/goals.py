@@ -46,5 +46,6 @@ def oracle_reward(
 
 def indicator_reward(image: jax.Array, goal_image: jax.Array, positive: float = 1.0, negative: float = -1.0) -> jax.Array:
     """Indicator reward of [..., C, H, W] images (thesis, equation 5.4): ``positive`` where all bytes agree: [...] float32."""
-    equal = jnp.all(image == goal_image, axis=(-3, -2, -1))
-    return jnp.where(equal, positive, negative).astype(jnp.float32)
+    numpy = _namespace(image, goal_image)
+    equal = numpy.all(image == goal_image, axis=(-3, -2, -1))
+    return numpy.where(equal, positive, negative).astype(jnp.float32)

@@ -2,7 +2,7 @@
 
 An image is planar, [C, H, W] uint8, with the channels R, G, B, D, as many of them as ``pixels`` asks for. Depth is
 planar (along the camera's axis) and metric: 0 is the near end of the task's depth range, 255 the far end, linear between,
-clipped outside.
+clipped outside. With ``depth_encoding="zbuffer"`` it is what OpenGL's buffer holds, which mujoco-py handed out.
 
 ``frame_stack`` images, of this control step and those before it, may be stacked along the channels, the newest first. What came
 before is kept as joint positions (`State.history`), a few numbers, and drawn again: an image costs less than the physics
@@ -11,22 +11,24 @@ that leads to it, and no image has to travel with the state.
 
 import dataclasses
 from collections.abc import Callable
-from typing import Literal
+from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
 import mujoco
 
+from jaxrl_vis_envs import checks
 from jaxrl_vis_envs.physics import mjx_model
 from jaxrl_vis_envs.physics.mjx_model import mjx
 from jaxrl_vis_envs.randomization import Domain, varied_scene
 from jaxrl_vis_envs.render import Scene, render_planes
 
 CHANNELS = {"rgbd": 4, "rgb": 3, "depth": 1}
+DepthEncoding = Literal["metric", "zbuffer"]
 
 
 @dataclasses.dataclass(frozen=True)
-class PixelsConfig:
+class PixelsConfig(checks.CheckedConfig):
     """Settings of the images."""
 
     image_size: int = 64
@@ -37,17 +39,20 @@ class PixelsConfig:
     """Depths that bytes 0 and 255 stand for, m. Tasks choose it as tight as what moves allows."""
     frame_stack: int = 1
     """Images of the latest control steps that an observation stacks. With one, velocities are hidden."""
+    depth_encoding: DepthEncoding = "metric"
+    """What bytes of depth stand for: metres, linear over ``depth_range``; or OpenGL's z-buffer from 0 to 1, as in mujoco-py."""
+    clip_range: tuple[float, float] = (0.01, 50.0)
+    """The camera's near and far clipping planes, m, where z is 0 and 1. Only for ``depth_encoding="zbuffer"``."""
 
     def __post_init__(self) -> None:
-        if self.frame_stack < 1:
-            raise ValueError(f"frame_stack must be at least 1, got {self.frame_stack}")
-        if self.image_size < 1:
-            raise ValueError(f"image_size must be at least 1, got {self.image_size}")
-        if self.pixels not in CHANNELS:
-            raise ValueError(f"pixels must be one of {', '.join(CHANNELS)}, got {self.pixels!r}")
-        near, far = self.depth_range
-        if not 0.0 <= near < far:
-            raise ValueError(f"depth_range must be (near, far) with 0 <= near < far, got {self.depth_range}")
+        super().__post_init__()
+        checks.whole(self, "image_size", "frame_stack")
+        checks.one_of(self, "pixels", CHANNELS)
+        checks.one_of(self, "depth_encoding", get_args(DepthEncoding))
+        for field, least in (("depth_range", 0.0), ("clip_range", 1e-6)):
+            near, far = checks.vector(self, field, 2)
+            if not least <= near < far:
+                raise ValueError(f"{field} must be (near, far) with {least:g} <= near < far, got {getattr(self, field)}")
 
 
 Observer = Callable[..., jax.Array]
@@ -99,8 +104,13 @@ class ImageObserver:
         if planes.rgb is not None:
             channels.append(planes.rgb)
         if planes.depth is not None:
-            channels.append(encode_depth(planes.depth, self._config.depth_range)[None])
+            channels.append(self._encode(planes.depth)[None])
         return jnp.concatenate(channels)
+
+    def _encode(self, depth: jax.Array) -> jax.Array:
+        if self._config.depth_encoding == "zbuffer":
+            return encode_zbuffer(depth, self._config.clip_range)
+        return encode_depth(depth, self._config.depth_range)
 
 
 def image_observer(mj_model: mujoco.MjModel, camera: str, config: PixelsConfig) -> ImageObserver:
@@ -117,6 +127,13 @@ def encode_depth(depth: jax.Array, depth_range: tuple[float, float]) -> jax.Arra
     near, far = depth_range
     share = jnp.clip((depth - near) / (far - near), 0.0, 1.0)
     return jnp.round(255.0 * share).astype(jnp.uint8)
+
+
+def encode_zbuffer(depth: jax.Array, clip_range: tuple[float, float]) -> jax.Array:
+    """Bytes of OpenGL's z for depths ``[...]`` (m): 0 on the near plane of ``clip_range`` (m), 255 on the far one or beyond."""
+    near, far = clip_range
+    z = jnp.clip(far / (far - near) * (1.0 - near / depth), 0.0, 1.0)
+    return jnp.round(255.0 * z).astype(jnp.uint8)
 
 
 def decode_depth(encoded: jax.Array, depth_range: tuple[float, float]) -> jax.Array:

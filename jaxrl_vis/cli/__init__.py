@@ -2,11 +2,12 @@
 
 Nothing here imports JAX until a command runs, so that help and mistakes are answered at once.
 
-Exit status: 0 done; 1 unexpected; 2 the request was wrong (one line on stderr); 3 finished, with files skipped; 4 stopped on a
-number that is not finite; 130 Ctrl-C and 143 SIGTERM, both after saving.
+Exit status: 0 done; 1 unexpected, or files could not be written; 2 the request was wrong (one line on stderr); 3 finished, with
+files skipped; 4 stopped on a number that is not finite; 130 Ctrl-C and 143 SIGTERM, both after saving.
 """
 
 import inspect
+import os
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -14,7 +15,7 @@ from typing import Any
 import jaxrl_vis
 from jaxrl_vis.cli import bench, doctor, envs, eval, play, train
 from jaxrl_vis.cli.parsing import PROGRAM, parse
-from jaxrl_vis.errors import NonFiniteError, RequestError, Terminated, nearest
+from jaxrl_vis.errors import NonFiniteError, RequestError, StorageError, Terminated, nearest
 
 DESCRIPTION = "Trains robots to reach goals that are given as images."
 COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
@@ -25,6 +26,9 @@ COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
     "doctor": (doctor.Doctor, doctor.run),
     "bench": (bench.Bench, bench.run),
 }
+
+# Of the errors that are told in one line.
+_STATUS: dict[type[Exception], int] = {RequestError: 2, StorageError: 1, NonFiniteError: 4}
 
 
 def overview() -> str:
@@ -50,16 +54,27 @@ def main(words: Sequence[str] | None = None) -> int:
     words = sys.argv[1:] if words is None else words
     try:
         return _run(words)
-    except RequestError as error:
+    except tuple(_STATUS) as error:
         print(f"{PROGRAM}: {' '.join(str(error).splitlines())}", file=sys.stderr)
-        return 2
-    except NonFiniteError as error:
-        print(f"{PROGRAM}: {error}", file=sys.stderr)
-        return 4
+        return next(status for kind, status in _STATUS.items() if isinstance(error, kind))
     except KeyboardInterrupt:
         return 130
     except Terminated as stop:
         return int(stop.code or 0)
+
+
+def entry() -> None:
+    """The program: `main`, and the end of this process.
+
+    After a signal the process ends at once: what was to be saved is saved, and threads that still write a checkpoint, which a
+    second signal has given up, are not waited for.
+    """
+    status = main()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    if status in (130, 143):
+        os._exit(status)
+    sys.exit(status)
 
 
 def _run(words: Sequence[str]) -> int:

@@ -21,7 +21,7 @@ class Bench:
     benchmark: Annotated[Benchmark | None, tyro.conf.Positional] = None
     """What to measure: images, physics, both with resets, gradient steps, or whole training iterations."""
     check: bool = False
-    """Measure nothing: list the records whose code has changed since, and the rows of the README that have no record."""
+    """Measure nothing: list records whose code has changed since, and rows of the README that have no record."""
     tables: bool = False
     """Measure nothing: write the tables of the README from the records."""
     env: str = "VisualFetchReach"
@@ -48,11 +48,11 @@ class Bench:
 
 
 def run(options: Bench) -> int:
-    """Runs one benchmark, or looks after the records; 1 where --check finds one that is stale or missing."""
-    if options.benchmark is None and not (options.check or options.tables):
-        raise RequestError(f"no benchmark given; choose one of {', '.join(get_args(Benchmark))}, --check or --tables")
-    if options.benchmark is not None and (options.check or options.tables):
-        raise RequestError(f"--check and --tables measure nothing: leave out {options.benchmark}")
+    """Runs one benchmark, or looks after the records; 1 where one of these is stale or missing."""
+    if options.check or options.tables:
+        return _look_after_records(options)
+    if options.benchmark is None:
+        raise RequestError(f"no benchmark given; choose one of {', '.join(get_args(Benchmark))}, or --check or --tables")
     for option, benchmark in (("scene", "render"), ("peer", "physics" if options.peer == "playground" else "render")):
         value = getattr(options, option)
         if value is not None and options.benchmark != benchmark:
@@ -63,12 +63,10 @@ def run(options: Bench) -> int:
     check_env(options.env)
     if options.json is not None:
         check_writable(options.json, "--json")
-    if options.results is not None:
-        check_writable(options.results, "--results", folder=True)
-    if options.benchmark is None:
-        return _look_after_records(options)
     from jaxrl_vis import bench
+    from jaxrl_vis.bench.record import results_folder
 
+    check_writable(options.results or results_folder(), "--results", folder=True)
     settings = {field.name: getattr(options, field.name) for field in dataclasses.fields(options)}
     del settings["check"], settings["tables"]
     bench.run(**settings)
@@ -76,14 +74,15 @@ def run(options: Bench) -> int:
 
 
 def _look_after_records(options: Bench) -> int:
-    """Writes the tables, then checks, as far as that was asked for; 1 where something is stale or missing."""
+    if options.benchmark is not None:
+        raise RequestError(f"--check and --tables measure nothing: leave out {options.benchmark}")
     from jaxrl_vis.bench import check, record, tables
 
     if options.tables:
+        check_writable(check.README)
         changed = tables.write_tables(check.README, options.results or record.results_folder())
-        print(f"{check.README}: {'written' if changed else 'as it was'}")
-    if not options.check:
-        return 0
-    complaints = check.check(options.results)
-    print("\n".join(complaints) if complaints else "every record is of today's code, and every row of the README has one")
+        print(f"{check.README}: {'written' if changed else 'unchanged'}")
+    complaints = check.check(options.results) if options.check else []
+    if options.check:
+        print("\n".join(complaints) or "every record is of today's code, and every row has one")
     return 1 if complaints else 0

@@ -60,7 +60,10 @@ def training_config(options: Train) -> Config:
     if name == "auto":
         import jax
 
-        name = "cpu" if jax.default_backend() == "cpu" else "fast"
+        from jaxrl_vis.run.signals import shielded_children
+
+        with shielded_children():  # threads that JAX starts with its first use of a device never see signals
+            name = "cpu" if jax.default_backend() == "cpu" else "fast"
     return preset(name, **changes)
 
 
@@ -68,14 +71,14 @@ def run(options: Train) -> int:
     """Trains; every report has already been shown and saved by the trainer."""
     if options.resume and options.overwrite:
         raise RequestError("--resume and --overwrite contradict each other; give one of them")
-    if options.run_dir is not None:
-        check_writable(options.run_dir, "--run-dir", folder=True)
     if options.env is not None:
         check_env(options.env)
     config = validate(training_config(options))
     check_env(config.env)
     from jaxrl_vis.run import trainer
+    from jaxrl_vis.run.folder import default_folder
 
+    check_writable(options.run_dir or default_folder(config), "--run-dir", folder=True)
     for _ in trainer.make_trainer(config, options.run_dir, resume=options.resume, overwrite=options.overwrite).run():
         pass
     return 0

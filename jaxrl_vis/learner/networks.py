@@ -24,7 +24,6 @@ from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import encoder_kernel, normalizer
 from jaxrl_vis.types import Batch, NormalizerState, Params, TrainState
-from jaxrl_vis_envs.compilation import runs_gpu_kernels
 
 _glorot = nn.initializers.glorot_uniform()
 
@@ -177,12 +176,12 @@ class Networks:
 
     @property
     def uses_kernel(self) -> bool:
-        """Whether the first layers run as one GPU kernel (`encoder_kernel`) instead of one product each."""
+        """Whether the first layers are those of `encoder_kernel`, one kernel on a GPU, instead of one product each."""
         return (
             self.sees_images
-            and runs_gpu_kernels()
             and self.dtype == jnp.bfloat16
             and encoder_kernel.supports(self.config.encoder_filters, self.observation_spec.shape)
+            and encoder_kernel.is_available()
         )
 
     @property

@@ -17,7 +17,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-import jaxrl_vis_envs
 from jaxrl_vis.config import Config, Resolved, resolve, validate
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import normalizer
@@ -31,33 +30,12 @@ from jaxrl_vis.methods import METHODS
 from jaxrl_vis.types import Episodes, LoopState, Metrics, ReplayState, TrainState
 from jaxrl_vis_envs.base import GoalEnv
 from jaxrl_vis_envs.compilation import env_jit
-from jaxrl_vis_envs.randomization import typical
-from jaxrl_vis_envs.registry import config_class
 
 # A leading seed axis on everything but the iteration, which all seeds share (see `replay`).
 _SEED_AXES = LoopState(train=0, replay=0, key=0, iteration=None)  # type: ignore[arg-type]
 
 # Folded into an iteration's key for what draws statistics. Large, because small numbers give the keys of `jax.random.split`.
 _STATISTICS = 0x73656E
-
-
-def make_env(config: Config) -> GoalEnv:
-    """The task that a configuration asks for.
-
-    Raises:
-        RequestError: There is no such task, or it cannot be made like that.
-    """
-    validate(config)
-    try:
-        fields = {field.name for field in dataclasses.fields(config_class(config.env))}
-        settings: dict[str, Any] = {name: getattr(config, name) for name in ("image_size", "pixels") if name in fields}
-        if config.frame_stack is not None:
-            settings["frame_stack"] = config.frame_stack
-        if config.randomize:
-            settings["randomization"] = typical(*config.randomize, strength=config.randomize_strength)
-        return jaxrl_vis_envs.make(config.env, **settings)
-    except ValueError as error:
-        raise RequestError(str(error)) from error
 
 
 @dataclasses.dataclass(frozen=True)

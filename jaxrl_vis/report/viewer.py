@@ -49,10 +49,10 @@ def play_poses(env: Any, networks: Networks, train: TrainState, key: jax.Array, 
     """Plays an episode of the first learner in each of E environments, without exploration.
 
     Args:
-        env: An environment of MuJoCo's.
-        networks: What the parameters mean.
+        env: A MuJoCo environment.
+        networks: The networks that the parameters belong to.
         train: The learners, [S, ...].
-        key: [] typed; draws the episodes, as in `rollout.play`.
+        key: [] a typed key; draws the episodes, as in `rollout.play`.
         num_envs: E.
     """
     first = jax.tree.map(lambda leaf: leaf[:1], train)

@@ -16,7 +16,8 @@ import jax
 
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import NonFiniteError, Terminated
-from jaxrl_vis.learner.train_step import make_env, make_train_step
+from jaxrl_vis.learner.environment import make_env
+from jaxrl_vis.learner.train_step import make_train_step
 from jaxrl_vis.run.folder import RunFolder, default_folder
 from jaxrl_vis.run.loop import Report, RunLoop
 from jaxrl_vis.run.programs import Programs, enable_compilation_cache

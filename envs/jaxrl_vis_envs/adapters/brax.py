@@ -1,4 +1,4 @@
-"""The worlds as brax environments, for brax's own agents.
+"""The tasks as brax environments, for brax's own agents.
 
     from brax.training.agents.ppo import train as ppo
     from jaxrl_vis_envs.adapters.brax import BraxEnv, lend_jax
@@ -36,25 +36,27 @@ except ImportError as error:
 
 
 class BraxEnv(Env):
-    """A world with brax's interface.
+    """An environment with brax's interface.
 
     What brax's agents see is, for a state task, one vector [2 S] float32: observation, then goal. For an image task it is a
     dictionary of ``pixels/observation`` and ``pixels/goal``, [H, W, C] float32 from 0 to 1, as brax's PPO for images takes it
     (its SAC takes vectors only).
 
     Args:
-        env: The name of a world, or one that is made already.
+        env: The name of an environment, or a `GoalEnv`.
         reward: ``oracle`` (0 at the goal, -1 elsewhere) or ``dense`` (minus the distance to the goal). Without relabelling of
             goals, which brax's agents do not do, little is learned from ``oracle`` alone.
-        **overrides: Fields of the world's configuration to change, as in `jaxrl_vis_envs.make`.
+        **overrides: Fields of the environment's configuration to change, as in `jaxrl_vis_envs.make`.
 
     Raises:
-        ValueError: There is no such world, option or reward.
+        ValueError: There is no such environment, option or reward.
     """
 
     def __init__(self, env: str | GoalEnv, reward: Reward = "oracle", **overrides: Any) -> None:
         if overrides and not isinstance(env, str):
-            raise ValueError(f"{', '.join(overrides)}: options go with the name of a world, not with one that is made already")
+            raise ValueError(
+                f"{', '.join(overrides)}: options go with the name of an environment, not with one that is made already"
+            )
         self.goal_env = make(env, **overrides) if isinstance(env, str) else env
         self._score = reward_function(reward, self.goal_env.threshold)
         self._sees_images = len(self.goal_env.observation_spec.shape) == 3
@@ -65,23 +67,24 @@ class BraxEnv(Env):
         Brax's wrappers read the batch's shape from such an untyped key, so what they wrap needs untyped ones.
         """
         is_typed = jnp.issubdtype(rng.dtype, jax.dtypes.prng_key)
-        world = self.goal_env.reset(rng if is_typed else jax.random.wrap_key_data(rng))
-        physics: Any = world  # brax says that it must be a state of its own physics, and never looks
-        return BraxState(physics, self._observe(world), self._reward(world), jnp.zeros(()), dict(world.metrics))
+        episode = self.goal_env.reset(rng if is_typed else jax.random.wrap_key_data(rng))
+        physics: Any = episode  # brax's annotation asks for a state of its own physics, but brax never looks inside
+        return BraxState(physics, self._observe(episode), self._reward(episode), jnp.zeros(()), dict(episode.metrics))
 
     def step(self, state: BraxState, action: jax.Array) -> BraxState:
-        """Moves by ``action`` [A] in [-1, 1]. ``done`` stays 0, ``info`` is passed on, ``metrics`` are those of the world.
+        """Moves by ``action`` [A] in [-1, 1]. ``done`` stays 0, ``info`` is passed on.
 
-        Those are ``success`` (0 or 1) and ``goal_distance`` (unit of the task). Brax's evaluation sums them over an episode.
+        ``metrics`` are ``success`` (0 or 1) and ``goal_distance`` (unit of the task). Brax's evaluation sums them over an
+        episode.
         """
-        world: Any = state.pipeline_state
-        world = self.goal_env.step(world, action)
+        episode: Any = state.pipeline_state
+        episode = self.goal_env.step(episode, action)
         return state.replace(  # type: ignore[attr-defined] - flax gives it
-            pipeline_state=world,
-            obs=self._observe(world),
-            reward=self._reward(world),
+            pipeline_state=episode,
+            obs=self._observe(episode),
+            reward=self._reward(episode),
             done=jnp.zeros(()),
-            metrics={**state.metrics, **world.metrics},
+            metrics={**state.metrics, **episode.metrics},
         )
 
     @property
@@ -127,9 +130,9 @@ class BraxEnv(Env):
 
 @contextlib.contextmanager
 def lend_jax() -> Iterator[None]:
-    """Lends JAX, for as long as it is open, a function that brax's agents call and JAX 0.10 has no more.
+    """Puts back ``jax.device_put_replicated``, which brax's agents call and JAX 0.10 has dropped, while the context is open.
 
-    It is ``jax.device_put_replicated``; where JAX still has it, nothing happens. Up to brax 0.14.2, PPO and SAC need it.
+    Where JAX still has it, nothing happens. PPO and SAC need it up to brax 0.14.2.
     """
     if hasattr(jax, "device_put_replicated"):
         yield

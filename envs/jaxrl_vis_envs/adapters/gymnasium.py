@@ -1,4 +1,4 @@
-"""The worlds as Gymnasium environments, single and vector, with the goal dictionaries of Gymnasium-Robotics.
+"""The tasks as Gymnasium environments, single and vector, with the goal dictionaries of Gymnasium-Robotics.
 
     import gymnasium
     import jaxrl_vis_envs.adapters.gymnasium  # registers the names
@@ -33,7 +33,7 @@ try:
 except ImportError as error:
     raise ImportError("this adapter needs Gymnasium: pip install 'jaxrl-vis[gymnasium]'") from error
 
-from jaxrl_vis_envs.adapters.gymnasium_environments import Observations, Worlds
+from jaxrl_vis_envs.adapters.gymnasium_environments import Environments, Observations
 from jaxrl_vis_envs.adapters.rewards import Reward
 from jaxrl_vis_envs.base import GoalEnv
 from jaxrl_vis_envs.registry import list_envs
@@ -45,14 +45,14 @@ class GymnasiumEnv(gymnasium.Env):
     """One environment.
 
     Args:
-        env: The name of a world, or one that is made already.
+        env: The name of an environment, or a `GoalEnv`.
         reward: ``oracle`` (0 at the goal, -1 elsewhere) or ``dense`` (minus the distance to the goal).
         render_mode: None, or ``rgb_array`` for images from the camera of the task, which state tasks have as well.
         render_size: Height and width of what `render` returns, px; it has nothing to do with ``pixels``.
-        **overrides: Fields of the world's configuration to change, as in `jaxrl_vis_envs.make`.
+        **overrides: Fields of the environment's configuration to change, as in `jaxrl_vis_envs.make`.
 
     Raises:
-        ValueError: There is no such world, option, reward or render mode.
+        ValueError: There is no such environment, option, reward or render mode.
     """
 
     metadata = {"render_modes": ["rgb_array"]}
@@ -65,21 +65,21 @@ class GymnasiumEnv(gymnasium.Env):
         render_size: int = 256,
         **overrides: Any,
     ) -> None:
-        self._worlds = Worlds(env, reward, render_mode, render_size, overrides)
-        self.metadata = self._worlds.metadata
+        self._environments = Environments(env, reward, render_mode, render_size, overrides)
+        self.metadata = self._environments.metadata
         self.render_mode = render_mode
-        self.observation_space = self._worlds.programs.space
-        self.action_space = self._worlds.action_space
+        self.observation_space = self._environments.programs.space
+        self.action_space = self._environments.action_space
 
     @property
     def goal_env(self) -> GoalEnv:
-        """The world behind it."""
-        return self._worlds.env
+        """The environment behind it."""
+        return self._environments.env
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observations, dict[str, Any]]:
         """Starts an episode; a ``seed`` settles it and all that follow. ``options`` has no meaning here."""
         super().reset(seed=seed)
-        observations = self._worlds.reset(np.array([_draw_seed(self.np_random)]))
+        observations = self._environments.reset(np.array([_draw_seed(self.np_random)]))
         return _first(observations), self._info(observations)
 
     def step(self, action: np.ndarray) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
@@ -92,12 +92,12 @@ class GymnasiumEnv(gymnasium.Env):
             gymnasium.error.ResetNeeded: There was no `reset`.
             ValueError: ``action`` has another shape.
         """
-        observations, reward = self._worlds.step(np.asarray(action)[None])
-        return _first(observations), float(reward[0]), False, self._worlds.is_over, self._info(observations)
+        observations, reward = self._environments.step(np.asarray(action)[None])
+        return _first(observations), float(reward[0]), False, self._environments.is_over, self._info(observations)
 
     def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any = None) -> np.ndarray:
         """Rewards of states [..., G] for goals [..., G]: [...] float32. ``info`` is not read."""
-        return self._worlds.score(np.asarray(achieved_goal), np.asarray(desired_goal))
+        return self._environments.score(np.asarray(achieved_goal), np.asarray(desired_goal))
 
     def compute_terminated(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any = None) -> np.ndarray:
         """Whether states [..., G] end an episode with goals [..., G]: never, [...] bool."""
@@ -109,11 +109,11 @@ class GymnasiumEnv(gymnasium.Env):
 
     def render(self) -> Any:
         """An image [size, size, 3] uint8, or None where no render mode was asked for."""
-        images = self._worlds.render()
+        images = self._environments.render()
         return None if images is None else images[0]
 
     def _info(self, observations: Observations) -> dict[str, Any]:
-        return {name: values[0].item() for name, values in self._worlds.info(observations).items()}
+        return {name: values[0].item() for name, values in self._environments.info(observations).items()}
 
 
 def _first(observations: Observations) -> Observations:
@@ -126,7 +126,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
     All episodes have one length, so all end at once.
 
     Args:
-        env: The name of a world, or one that is made already.
+        env: The name of an environment, or a `GoalEnv`.
         num_envs: N.
         reward: See `GymnasiumEnv`.
         autoreset_mode: ``NextStep`` (the step after the last one starts new episodes, whatever the action) or ``SameStep`` (the
@@ -136,7 +136,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         **overrides: See `GymnasiumEnv`.
 
     Raises:
-        ValueError: There is no such world, option, reward or mode.
+        ValueError: There is no such environment, option, reward or mode.
     """
 
     def __init__(
@@ -154,12 +154,12 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         mode = AutoresetMode(autoreset_mode)
         if mode == AutoresetMode.DISABLED:
             raise ValueError("autoreset_mode must be NextStep or SameStep")
-        self._worlds = Worlds(env, reward, render_mode, render_size, overrides)
+        self._environments = Environments(env, reward, render_mode, render_size, overrides)
         self.num_envs = num_envs
-        self.metadata = {**self._worlds.metadata, "autoreset_mode": mode}
+        self.metadata = {**self._environments.metadata, "autoreset_mode": mode}
         self.render_mode = render_mode
-        self.single_observation_space = self._worlds.programs.space
-        self.single_action_space = self._worlds.action_space
+        self.single_observation_space = self._environments.programs.space
+        self.single_action_space = self._environments.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._resets_in_step = mode == AutoresetMode.SAME_STEP
@@ -167,8 +167,8 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
 
     @property
     def goal_env(self) -> GoalEnv:
-        """The world behind it."""
-        return self._worlds.env
+        """The environment behind it."""
+        return self._environments.env
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
@@ -200,12 +200,12 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
             ValueError: ``actions`` has another shape.
         """
         never, all_over = np.zeros(self.num_envs, bool), np.ones(self.num_envs, bool)
-        if self._worlds.is_over and not self._resets_in_step:
+        if self._environments.is_over and not self._resets_in_step:
             observations, infos = self._restart()
             return observations, np.zeros(self.num_envs), never, never.copy(), infos
-        observations, reward = self._worlds.step(actions)
+        observations, reward = self._environments.step(actions)
         infos, reward = self._infos(observations), reward.astype(np.float64)
-        if not self._worlds.is_over:
+        if not self._environments.is_over:
             return observations, reward, never, never.copy(), infos
         if self._resets_in_step:
             final = np.empty(self.num_envs, object)
@@ -217,16 +217,16 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
 
     def render(self) -> tuple[Any, ...] | None:
         """Images [size, size, 3] uint8, one for each environment, or None where no render mode was asked for."""
-        images = self._worlds.render()
+        images = self._environments.render()
         return None if images is None else tuple(images)
 
     def _restart(self) -> tuple[Observations, dict[str, Any]]:
-        observations = self._worlds.reset(np.array([_draw_seed(generator) for generator in self._generators]))
+        observations = self._environments.reset(np.array([_draw_seed(generator) for generator in self._generators]))
         return observations, self._infos(observations)
 
     def _infos(self, observations: Observations) -> dict[str, Any]:
         """Infos as arrays, each with a mask of the environments that have it: all."""
-        infos = self._worlds.info(observations)
+        infos = self._environments.info(observations)
         return infos | {f"_{name}": np.ones(self.num_envs, bool) for name in infos}
 
 
@@ -235,7 +235,7 @@ def _draw_seed(generator: np.random.Generator) -> np.uint32:
 
 
 def register_all() -> None:
-    """Registers every world as ``jaxrl_vis/<name>-v0``. Importing this module does it; call it for worlds added since then."""
+    """Registers every environment as ``jaxrl_vis/<name>-v0``. Importing this module does it; call it again for later ones."""
     for name in list_envs():
         if f"{NAMESPACE}/{name}-v0" not in gymnasium.registry:
             gymnasium.register(

@@ -19,10 +19,10 @@ Observations = dict[str, np.ndarray]
 
 
 class _Programs(NamedTuple):
-    """The compiled half of a world, for any number N of environments; shared by all environments with the same settings.
+    """The compiled half of an environment, for any number N of environments; shared by all environments with the same settings.
 
     Attributes:
-        env: The world.
+        env: The environment.
         space: The observation space of one environment.
         reset: seeds [N] uint32 -> (State, observations).
         step: (State, donated; actions [N, A] float32) -> (State, observations but for ``goal_pixels``, which stay).
@@ -39,17 +39,19 @@ def _make_cached(name: str, overrides: tuple[tuple[str, Any], ...]) -> GoalEnv:
     return make(name, **dict(overrides))
 
 
-def _world(env: str | GoalEnv, overrides: dict[str, Any]) -> GoalEnv:
-    """The world of that name and those settings, made once.
+def _made(env: str | GoalEnv, overrides: dict[str, Any]) -> GoalEnv:
+    """The environment of that name and those settings, made once.
 
     Raises:
-        ValueError: As `jaxrl_vis_envs.make`; or there are overrides for a world that exists already.
+        ValueError: As `jaxrl_vis_envs.make`; or there are overrides for an environment that exists already.
     """
     if isinstance(env, str):
         settings = ((key, tuple(value) if isinstance(value, list) else value) for key, value in sorted(overrides.items()))
         return _make_cached(env, tuple(settings))
     if overrides:
-        raise ValueError(f"{', '.join(overrides)}: options go with the name of a world, not with one that is made already")
+        raise ValueError(
+            f"{', '.join(overrides)}: options go with the name of an environment, not with one that is made already"
+        )
     return env
 
 
@@ -63,7 +65,7 @@ def _programs(env: GoalEnv) -> _Programs:
         observation = {"achieved_goal": state.achieved_state, "desired_goal": state.goal_state}
         if not sees_images:
             return {"observation": env.observe(state), **observation}
-        # A world of somebody else's making may have nothing but images.
+        # An environment of somebody else's making may have nothing but images.
         vector = state.achieved_state if observe_state is None else observe_state(state.data)
         return {"observation": vector, **observation, "pixels": _to_public(env.observe(state))}
 
@@ -108,11 +110,11 @@ def _camera(env: GoalEnv, size: int) -> Any:
     return env_jit(jax.vmap(lambda data: render.render(scene, data).rgb))
 
 
-class Worlds:
+class Environments:
     """N environments in step, on the device. The arguments are those of `gymnasium.GymnasiumEnv`.
 
     Attributes:
-        env: The world.
+        env: The environment.
         programs: Its compiled half.
         score: Rewards of states [..., G] for goals [..., G]: [...] float32.
         metadata: As Gymnasium wants it.
@@ -125,7 +127,7 @@ class Worlds:
     ) -> None:
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
-        self.env = _world(env, overrides)
+        self.env = _made(env, overrides)
         self.programs = _programs(self.env)
         self.score = reward_function(reward, self.env.threshold)
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": max(1, round(1 / self.env.control_period))}

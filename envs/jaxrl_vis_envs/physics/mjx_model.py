@@ -2,6 +2,7 @@
 
 import functools
 import pathlib
+from collections.abc import Callable
 from typing import Any, Literal
 
 import jax
@@ -29,9 +30,14 @@ __all__ = [
 _ASSETS = pathlib.Path(__file__).resolve().parents[1] / "tasks" / "assets"
 
 
-def load_model(file_name: str) -> mujoco.MjModel:
-    """The MuJoCo model of ``tasks/assets/<file_name>``."""
-    return mujoco.MjModel.from_xml_path(str(_ASSETS / file_name))
+def load_model(file_name: str, edit: Callable[[mujoco.MjSpec], None] | None = None) -> mujoco.MjModel:
+    """The MuJoCo model of ``tasks/assets/<file_name>``, after ``edit`` has changed what was read."""
+    path = str(_ASSETS / file_name)
+    if edit is None:
+        return mujoco.MjModel.from_xml_path(path)
+    spec = mujoco.MjSpec.from_file(path)
+    edit(spec)
+    return spec.compile()
 
 
 def start_data(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> mjx.Data:

@@ -18,23 +18,22 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from jaxrl_vis_envs import checks
 from jaxrl_vis_envs.physics import mjx_model
 from jaxrl_vis_envs.physics.mjx_model import mjx
-from jaxrl_vis_envs.pixels import Observer, PixelsConfig, image_observer
-from jaxrl_vis_envs.randomization import OFF, Randomization
-from jaxrl_vis_envs.registry import register
-from jaxrl_vis_envs.tasks.mjx_env import MjxGoalEnv
+from jaxrl_vis_envs.pixels import Observer, PixelsConfig
+from jaxrl_vis_envs.tasks.config import TaskConfig
+from jaxrl_vis_envs.tasks.mjx_env import MjxGoalEnv, register_task
 
 # Starts tried at once; the first without contact is taken. One in ten is in contact, so all are once in 10^16 episodes.
 _START_CANDIDATES = 16
 
 
 @dataclasses.dataclass(frozen=True)
-class FingerTurnConfig:
+class FingerTurnConfig(TaskConfig):
     """Settings of the task. Lengths in m."""
 
     horizon: int = 50
-    """Control steps in an episode."""
     threshold: float = 0.07
     """An episode succeeds where the spinner's tip is within this distance of the goal, m."""
     substeps: int = 21
@@ -43,13 +42,10 @@ class FingerTurnConfig:
     """Newton iterations in a physics step."""
     line_search_iterations: int = 8
     """Line search iterations in a Newton iteration."""
-    randomization: Randomization = OFF
-    """What varies between episodes, and how far."""
 
     def __post_init__(self) -> None:
-        for field in ("horizon", "substeps", "solver_iterations", "line_search_iterations"):
-            if getattr(self, field) < 1:
-                raise ValueError(f"{field} must be at least 1, got {getattr(self, field)}")
+        super().__post_init__()
+        checks.whole(self, "substeps", "solver_iterations", "line_search_iterations")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,10 +56,6 @@ class VisualFingerTurnConfig(PixelsConfig, FingerTurnConfig):
     """Depths that bytes 0 and 255 stand for, m: 2 mm a step; finger and spinner lie between .85 and 1.25 m."""
     frame_stack: int = 3
     """Images of the latest control steps that an observation stacks: three in the thesis, one in the authors' release."""
-
-    def __post_init__(self) -> None:
-        FingerTurnConfig.__post_init__(self)
-        PixelsConfig.__post_init__(self)
 
 
 class FingerTurn(MjxGoalEnv):
@@ -118,7 +110,7 @@ class FingerTurn(MjxGoalEnv):
         return jnp.concatenate([data.qpos[:2], self.achieved(data), data.qvel])
 
     def configuration(self, joint_angles: jax.Array) -> mjx.Data:
-        """The world at rest with ``joint_angles`` [3] float32: proximal (-pi/2 hangs down), distal, spinner, rad."""
+        """Finger and spinner at rest with ``joint_angles`` [3] float32: proximal (-pi/2 hangs down), distal, spinner, rad."""
         return mjx_model.kinematics(self._model, self._still.replace(qpos=joint_angles))
 
     def _clearance(self, data: mjx.Data) -> jax.Array:
@@ -126,9 +118,4 @@ class FingerTurn(MjxGoalEnv):
         return jnp.min(mjx.collision(self._model, data)._impl.contact.dist)
 
 
-def _visual(config: VisualFingerTurnConfig) -> FingerTurn:
-    return FingerTurn(config, lambda mj_model: image_observer(mj_model, FingerTurn.camera, config))
-
-
-register("FingerTurn", FingerTurn, FingerTurnConfig)
-register("VisualFingerTurn", _visual, VisualFingerTurnConfig)
+register_task(FingerTurn, FingerTurnConfig, VisualFingerTurnConfig)

@@ -21,12 +21,12 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from jaxrl_vis_envs import checks
 from jaxrl_vis_envs.physics import mjx_model
 from jaxrl_vis_envs.physics.mjx_model import mjx
-from jaxrl_vis_envs.pixels import Observer, PixelsConfig, image_observer
-from jaxrl_vis_envs.randomization import OFF, Randomization
-from jaxrl_vis_envs.registry import register
-from jaxrl_vis_envs.tasks.mjx_env import MjxGoalEnv
+from jaxrl_vis_envs.pixels import Observer, PixelsConfig
+from jaxrl_vis_envs.tasks.config import TaskConfig
+from jaxrl_vis_envs.tasks.mjx_env import MjxGoalEnv, register_task
 
 _CONTROL_PERIOD = 0.04  # s
 _FINGERTIPS = ("fftip", "mftip", "rftip", "lftip", "thtip")
@@ -42,11 +42,10 @@ _IK_LARGEST_STEP = 0.2  # rad
 
 
 @dataclasses.dataclass(frozen=True)
-class HandReachConfig:
+class HandReachConfig(TaskConfig):
     """Settings of the task. Lengths in m."""
 
     horizon: int = 50
-    """Control steps in an episode."""
     threshold: float = 0.03
     """An episode succeeds where the 15 numbers lie within this distance of the goal's, m (1.3 cm rms a finger)."""
     goal_rule: Literal["random_actions", "meet"] = "random_actions"
@@ -65,15 +64,13 @@ class HandReachConfig:
     """Newton iterations in a physics step."""
     line_search_iterations: int = 4
     """Line search iterations in a Newton iteration."""
-    randomization: Randomization = OFF
-    """What varies between episodes, and how far."""
 
     def __post_init__(self) -> None:
-        for field in ("horizon", "goal_actions", "substeps", "goal_substeps", "solver_iterations", "line_search_iterations"):
-            if getattr(self, field) < 1:
-                raise ValueError(f"{field} must be at least 1, got {getattr(self, field)}")
-        if self.goal_rule not in ("random_actions", "meet"):
-            raise ValueError(f"goal_rule must be 'random_actions' or 'meet', got {self.goal_rule!r}")
+        super().__post_init__()
+        checks.whole(self, "goal_actions", "substeps", "goal_substeps", "solver_iterations", "line_search_iterations")
+        checks.one_of(self, "goal_rule", ("random_actions", "meet"))
+        checks.not_negative(self, "goal_noise")
+        checks.true_or_false(self, "contacts")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,10 +79,8 @@ class VisualHandReachConfig(PixelsConfig, HandReachConfig):
 
     depth_range: tuple[float, float] = (0.7, 0.96)
     """Depths that bytes 0 and 255 stand for, m: 1 mm a step, from above fingers that point up to below the lowest knuckle."""
-
-    def __post_init__(self) -> None:
-        HandReachConfig.__post_init__(self)
-        PixelsConfig.__post_init__(self)
+    clip_range: tuple[float, float] = (0.0124, 62.0)
+    """The clipping planes of the release, m."""
 
 
 class HandReach(MjxGoalEnv):
@@ -203,9 +198,4 @@ def _joints_by_actuator(mj_model: mujoco.MjModel) -> np.ndarray:
     return ratios
 
 
-def _visual(config: VisualHandReachConfig) -> HandReach:
-    return HandReach(config, lambda mj_model: image_observer(mj_model, HandReach.camera, config))
-
-
-register("HandReach", HandReach, HandReachConfig)
-register("VisualHandReach", _visual, VisualHandReachConfig)
+register_task(HandReach, HandReachConfig, VisualHandReachConfig)

@@ -1,7 +1,7 @@
 """What the MJX tasks share. A task says how it starts, what its goals are, what an action does and what is true.
 
 A task is a subclass of `MjxGoalEnv` with five methods, and a frozen config with ``horizon`` and ``threshold``. Seen through
-a `pixels.Observer` it is the visual task, without one the state task.
+a `pixels.Observer` it is the visual task, without one the state task; `register_task` registers both.
 """
 
 import abc
@@ -16,8 +16,10 @@ import mujoco
 
 from jaxrl_vis_envs import randomization
 from jaxrl_vis_envs.base import GoalEnv, State, push_history, sanitize_action, start_history
+from jaxrl_vis_envs.names import visual_name
 from jaxrl_vis_envs.physics.mjx_model import mjx
-from jaxrl_vis_envs.pixels import ImageObserver, Observer
+from jaxrl_vis_envs.pixels import ImageObserver, Observer, image_observer
+from jaxrl_vis_envs.registry import register
 
 
 class MjxGoalEnv(GoalEnv):
@@ -35,8 +37,14 @@ class MjxGoalEnv(GoalEnv):
             observer: Given the model, returns the function from poses to images. None: `observe_state` is what is seen.
 
         Raises:
-            ValueError: The look shall vary (``config.randomization``), but there are no images of a scene.
+            ValueError: JAX computes in 64 bits; or the appearance is to vary (``config.randomization``), and there are no
+                images of a scene.
         """
+        if jax.config.jax_enable_x64:
+            raise ValueError(
+                f"{type(self).__name__} simulates in 32 bits and JAX is set to 64: unset JAX_ENABLE_X64, or call"
+                " jax.config.update('jax_enable_x64', False) first"
+            )
         self.config = config
         self.horizon = config.horizon
         self.threshold = config.threshold
@@ -68,6 +76,10 @@ class MjxGoalEnv(GoalEnv):
     def achieved(self, data: mjx.Data) -> jax.Array:
         """The true quantity that goals are about, `State.achieved_state`: [G] float32."""
 
+    def goal_state_of(self, key: jax.Array, goal_data: mjx.Data) -> jax.Array:
+        """The goal state [G] of ``reset(key)``, whose goal image shows ``goal_data``: what that configuration achieves."""
+        return self.achieved(goal_data)
+
     @abc.abstractmethod
     def observe_state(self, data: mjx.Data) -> jax.Array:
         """What the state task sees: [S] float32."""
@@ -75,13 +87,14 @@ class MjxGoalEnv(GoalEnv):
     def reset(self, key: jax.Array) -> State:
         data, goal_data = self.sample_start(key), self.sample_goal(key)
         domain = randomization.sample(key, self._randomization, self._model, self.action_size, self._scene)
-        state = self.state_at(data, self.achieved(goal_data), domain)
+        state = self.state_at(data, self.goal_state_of(key, goal_data), domain)
         # One program draws both: that halves what there is to compile.
         both = jax.tree.map(lambda *leaves: jnp.stack(leaves), data, goal_data)
         frame, goal = jax.vmap(lambda data: self._observe(data, None, domain))(both)
         return state.replace(obs={"observation": frame, "achieved_goal": frame, "desired_goal": goal})
 
     def advance(self, state: State, action: jax.Array) -> State:
+        self.check_action(action)
         action = randomization.varied_action(sanitize_action(action), state.domain)
         data = self._under(state.domain).act(state.data, action)
         history = push_history(state.history, state.data.qpos)
@@ -125,3 +138,21 @@ class MjxGoalEnv(GoalEnv):
         if self._draw is None:
             return self.observe_state(data)
         return self._draw(data, history) if self._scene is None else self._draw(data, history, domain)
+
+
+def register_task(task: type[MjxGoalEnv], config_class: type, visual_config_class: type) -> None:
+    """Registers the two environments of a task.
+
+    Args:
+        task: Built from a config and an observer or None. Its name is that of the environment that observes the state.
+        config_class: Of the environment that observes the state.
+        visual_config_class: Of the one that sees images: the same fields and those of `pixels.PixelsConfig`.
+    """
+    build: Any = task  # subclasses build the model themselves, and take no `mj_model`
+
+    def build_visual(config: Any) -> MjxGoalEnv:
+        return build(config, lambda mj_model: image_observer(mj_model, task.camera, config))
+
+    name = task.__name__
+    register(name, lambda config: build(config, None), config_class)
+    register(visual_name(name), build_visual, visual_config_class, state_variant=name)

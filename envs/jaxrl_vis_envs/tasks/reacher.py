@@ -18,22 +18,21 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
+from jaxrl_vis_envs import checks
 from jaxrl_vis_envs.physics import mjx_model
 from jaxrl_vis_envs.physics.mjx_model import mjx
-from jaxrl_vis_envs.pixels import Observer, PixelsConfig, image_observer
-from jaxrl_vis_envs.randomization import OFF, Randomization
-from jaxrl_vis_envs.registry import register
-from jaxrl_vis_envs.tasks.mjx_env import MjxGoalEnv
+from jaxrl_vis_envs.pixels import Observer, PixelsConfig
+from jaxrl_vis_envs.tasks.config import TaskConfig
+from jaxrl_vis_envs.tasks.mjx_env import MjxGoalEnv, register_task
 
 _DEFAULT_SUBSTEPS = {"velocity": 10, "torque": 2}
 
 
 @dataclasses.dataclass(frozen=True)
-class ReacherConfig:
+class ReacherConfig(TaskConfig):
     """Settings of the task. Lengths in m, angles in rad."""
 
     horizon: int = 50
-    """Control steps in an episode."""
     threshold: float = 0.01
     """An episode succeeds where the fingertip is within this distance of the goal, m."""
     start_range: float = 0.1
@@ -44,14 +43,14 @@ class ReacherConfig:
     """Joint velocity of an action of 1 under velocity control, rad/s (it turns the joint by .95 rad)."""
     substeps: int | None = None
     """Physics steps of 10 ms in a control step. None: 10 under velocity control, 2 under torque control."""
-    randomization: Randomization = OFF
-    """What varies between episodes, and how far."""
 
     def __post_init__(self) -> None:
-        if self.control not in _DEFAULT_SUBSTEPS:
-            raise ValueError(f"control must be 'velocity' or 'torque', got {self.control!r}")
-        if self.horizon < 1 or (self.substeps is not None and self.substeps < 1):
-            raise ValueError(f"horizon and substeps must be at least 1, got {self.horizon} and {self.substeps}")
+        super().__post_init__()
+        checks.one_of(self, "control", _DEFAULT_SUBSTEPS)
+        checks.not_negative(self, "start_range")
+        checks.positive(self, "velocity_scale")
+        if self.substeps is not None:
+            checks.whole(self, "substeps")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,10 +59,6 @@ class VisualReacherConfig(PixelsConfig, ReacherConfig):
 
     depth_range: tuple[float, float] = (0.8, 1.1)
     """Depths that bytes 0 and 255 stand for, m: 1.2 mm a step; the arm lies between .82 and 1.04 m."""
-
-    def __post_init__(self) -> None:
-        ReacherConfig.__post_init__(self)
-        PixelsConfig.__post_init__(self)
 
 
 class Reacher(MjxGoalEnv):
@@ -117,9 +112,4 @@ class Reacher(MjxGoalEnv):
         return mjx_model.kinematics(self._model, self._still.replace(qpos=joint_angles))
 
 
-def _visual(config: VisualReacherConfig) -> Reacher:
-    return Reacher(config, lambda mj_model: image_observer(mj_model, Reacher.camera, config))
-
-
-register("Reacher", Reacher, ReacherConfig)
-register("VisualReacher", _visual, VisualReacherConfig)
+register_task(Reacher, ReacherConfig, VisualReacherConfig)

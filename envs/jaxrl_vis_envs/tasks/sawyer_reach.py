@@ -19,14 +19,13 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from jaxrl_vis_envs import checks
 from jaxrl_vis_envs.physics import inverse_kinematics, mjx_model
 from jaxrl_vis_envs.physics.mjx_model import mjx
-from jaxrl_vis_envs.pixels import Observer, PixelsConfig, image_observer
-from jaxrl_vis_envs.randomization import OFF, Randomization
-from jaxrl_vis_envs.registry import register
-from jaxrl_vis_envs.tasks.mjx_env import MjxGoalEnv
+from jaxrl_vis_envs.pixels import Observer, PixelsConfig
+from jaxrl_vis_envs.tasks.mjx_env import register_task
+from jaxrl_vis_envs.tasks.pulled_arm import PulledArm, PulledArmConfig, pull
 
-_CONTROL_PERIOD = 0.04  # s
 _SETTLING_SUBSTEPS = 1000
 _DOWN_ROTATION = np.diag([1.0, -1.0, -1.0])  # of the hand
 # Joint angles at a goal: within 6 mm for 99 % of the box, 6 cm in its far corners, where the arm is nearly stretched.
@@ -35,11 +34,10 @@ _IK_STEPS = 20
 
 
 @dataclasses.dataclass(frozen=True)
-class SawyerReachConfig:
+class SawyerReachConfig(PulledArmConfig):
     """Settings of the task. Lengths in m."""
 
     horizon: int = 25
-    """Control steps in an episode."""
     threshold: float = 0.1
     """An episode succeeds within this distance of the goal, m."""
     goal_centre: tuple[float, float, float] = (-0.055, 0.485, 0.975)
@@ -48,25 +46,13 @@ class SawyerReachConfig:
     """Sides of the box of goals, m."""
     workspace_margin: float = 0.05
     """How far the hand may be pulled out of the box on each side, m. The table is 5 cm below it."""
-    action_scale: float = 0.05
-    """Displacement of an action of 1, m."""
-    substeps: int = 20
-    """Physics steps in a control step of 40 ms (20 as in the authors' simulation; 10 is nearly twice as fast)."""
-    solver_iterations: int = 1
-    """Newton iterations in a physics step."""
-    randomization: Randomization = OFF
-    """What varies between episodes, and how far."""
 
     def __post_init__(self) -> None:
-        for field in ("horizon", "solver_iterations"):
-            if getattr(self, field) < 1:
-                raise ValueError(f"{field} must be at least 1, got {getattr(self, field)}")
-        if self.substeps < 4:
-            raise ValueError(f"substeps must be at least 4, got {self.substeps}: the weld's time constant is 20 ms")
-        if min(self.goal_size) <= 0 or self.workspace_margin < 0:
-            raise ValueError(
-                f"goal_size must be positive and workspace_margin not negative, got {self.goal_size}, {self.workspace_margin}"
-            )
+        super().__post_init__()
+        checks.vector(self, "goal_centre", 3)
+        if min(checks.vector(self, "goal_size", 3)) <= 0:
+            raise ValueError(f"goal_size must be above 0 along each axis, got {self.goal_size}")
+        checks.not_negative(self, "workspace_margin")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,17 +62,13 @@ class VisualSawyerReachConfig(PixelsConfig, SawyerReachConfig):
     depth_range: tuple[float, float] = (1.4, 2.6)
     """Depths that bytes 0 and 255 stand for, m: 4.7 mm a step, from before the highest hand to the table behind the lowest."""
 
-    def __post_init__(self) -> None:
-        SawyerReachConfig.__post_init__(self)
-        PixelsConfig.__post_init__(self)
 
-
-class SawyerReach(MjxGoalEnv):
+class SawyerReach(PulledArm):
     """The task; what the agent sees of it is up to ``observer``."""
 
+    config: SawyerReachConfig
     action_size = 3
     camera = "above"
-    distance_unit = "m"
     chance, difficulty = 0.010, 3.5  # benchmarks/task_difficulty.py SawyerReach --episodes 1000
 
     def __init__(self, config: SawyerReachConfig, observer: Callable[[mujoco.MjModel], Observer] | None = None):
@@ -96,18 +78,17 @@ class SawyerReach(MjxGoalEnv):
             config: The settings.
             observer: Given the model, returns the function from poses to images. Default: `observe_state`.
         """
-        mj_model = mjx_model.load_model("sawyer_reach.xml")
-        mj_model.opt.iterations = config.solver_iterations
-        self.control_period = _CONTROL_PERIOD
-        self._hand = mj_model.body("hand").id
-        self._grip = mj_model.site("grip").id
-        # The start is found with the timestep of the model file, so that it does not depend on `substeps`.
-        self._start = mjx_model.start_data(mj_model, _settle_at(mj_model, config.goal_centre))
-        mj_model.opt.timestep = _CONTROL_PERIOD / config.substeps
-        super().__init__(config, mj_model, observer)
+        super().__init__(config, mjx_model.load_model("sawyer_reach.xml"), "hand", observer)
 
-    def sample_start(self, key: jax.Array) -> mjx.Data:
-        return self._start
+    def _settled(self, mj_model: mujoco.MjModel, config: SawyerReachConfig) -> mujoco.MjData:
+        """The arm at rest with its grip at the centre of the goals, after it was pulled there from its ready pose."""
+        mj_data = mujoco.MjData(mj_model)
+        mujoco.mj_resetDataKeyframe(mj_model, mj_data, mj_model.key("ready").id)
+        down = mj_model.body_quat[mj_model.body("mocap").id]
+        pull(mj_model, mj_data, np.array(config.goal_centre), down, _SETTLING_SUBSTEPS)
+        mj_data.qvel[:] = 0.0
+        mujoco.mj_forward(mj_model, mj_data)
+        return mj_data
 
     def sample_goal(self, key: jax.Array) -> mjx.Data:
         half = 0.5 * jnp.asarray(self.config.goal_size, jnp.float32)
@@ -120,15 +101,6 @@ class SawyerReach(MjxGoalEnv):
         target = jnp.clip(data.mocap_pos[0] + self.config.action_scale * action, centre - reach, centre + reach)
         return mjx_model.simulate(self._model, data.replace(mocap_pos=target[None]), self.config.substeps)
 
-    def achieved(self, data: mjx.Data) -> jax.Array:
-        return data.site_xpos[self._grip]
-
-    def observe_state(self, data: mjx.Data) -> jax.Array:
-        """Position of the grip (m), its displacement in a control step at its present speed (m): [6] float32."""
-        position = data.site_xpos[self._grip]
-        velocity = mjx_model.point_velocity(self.mj_model, data, self._hand, position)
-        return jnp.concatenate([position, self.control_period * velocity])
-
     def goal_configuration(self, goal: jax.Array) -> mjx.Data:
         """The arm at rest with its grip at or near ``goal`` [3] (m, world), the hand down."""
         hand = goal - jnp.asarray(_DOWN_ROTATION @ self.mj_model.site_pos[self._grip], jnp.float32)
@@ -137,24 +109,4 @@ class SawyerReach(MjxGoalEnv):
         )
 
 
-def _settle_at(mj_model: mujoco.MjModel, position: tuple[float, float, float]) -> mujoco.MjData:
-    """The arm at rest with its grip at ``position`` (m, world), after it was pulled there from its ready pose."""
-    mj_data = mujoco.MjData(mj_model)
-    mujoco.mj_resetDataKeyframe(mj_model, mj_data, mj_model.key("ready").id)
-    mj_data.mocap_pos[0] = position
-    mj_data.mocap_quat[0] = mj_model.body_quat[mj_model.body("mocap").id]
-    for _ in range(_SETTLING_SUBSTEPS):
-        mujoco.mj_step(mj_model, mj_data)
-    mj_data.qvel[:] = 0.0
-    mj_data.qacc_warmstart[:] = 0.0
-    mj_data.time = 0.0
-    mujoco.mj_forward(mj_model, mj_data)
-    return mj_data
-
-
-def _visual(config: VisualSawyerReachConfig) -> SawyerReach:
-    return SawyerReach(config, lambda mj_model: image_observer(mj_model, SawyerReach.camera, config))
-
-
-register("SawyerReach", SawyerReach, SawyerReachConfig)
-register("VisualSawyerReach", _visual, VisualSawyerReachConfig)
+register_task(SawyerReach, SawyerReachConfig, VisualSawyerReachConfig)
