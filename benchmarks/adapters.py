@@ -28,7 +28,7 @@ EVALUATION_SEED = 10_000
 
 
 def evaluate(env: str, act: Callable[[dict[str, np.ndarray]], np.ndarray]) -> dict[str, float]:
-    """Success and distance (unit of the task) at the last step, of a policy from observations [N, ...] to actions [N, A]."""
+    """Success and distance (the environment's unit) at the last step of a policy: observations [N, ...] to actions [N, A]."""
     from jaxrl_vis_envs.adapters.gymnasium import GymnasiumVectorEnv
 
     envs = GymnasiumVectorEnv(env, EVALUATION_EPISODES)
@@ -161,7 +161,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Trains, prints and keeps the record; 1 where success did not rise."""
     parser = argparse.ArgumentParser(description="Trains other libraries' agents through the adapters.")
     parser.add_argument("agent", choices=sorted(TRAINERS))
-    parser.add_argument("--env", help="a state task; default: one that the agent is known to learn")
+    parser.add_argument("--env", help="a state environment; default: one that the agent is known to learn")
     parser.add_argument("--steps", type=int, help="environment steps")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args(arguments)

@@ -24,7 +24,7 @@ def devices() -> str:
 
 
 def memory() -> str:
-    """Bytes of the host and of the first device."""
+    """Memory of the host and of the first device."""
     import jax
 
     host = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 0
@@ -42,7 +42,7 @@ def compilation_cache() -> str:
     trainer.enable_compilation_cache()
     folder = jax.config.jax_compilation_cache_dir
     if not folder:
-        return "off: every start compiles anew"
+        return "off: every run compiles again"
     os.makedirs(folder, exist_ok=True)
     if not os.access(folder, os.W_OK):
         raise PermissionError(f"{folder} cannot be written; set JAX_COMPILATION_CACHE_DIR to a folder that can")
@@ -66,12 +66,12 @@ def physics_and_camera() -> str:
 
     position, obs = env_jit(step_once, runs_once=True)(jax.random.key(0))
     if not bool(jnp.isfinite(position).all()):
-        raise FloatingPointError("one physics step gave a number that is not finite")
+        raise FloatingPointError("a number after one physics step is not finite")
     frame, goal = obs["observation"], obs["desired_goal"]
     if int(frame.max()) == int(frame.min()):
         raise ValueError("the image is empty")
     if bool((frame == goal).all()):
-        raise ValueError("the image equals the goal's")
+        raise ValueError("the image is equal to the goal image")
     size = "x".join(map(str, frame.shape))
     return f"one step of {env.name} and its {size} image in {time.perf_counter() - start:.1f} s, compilation included"
 

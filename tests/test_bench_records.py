@@ -1,4 +1,4 @@
-"""What becomes of records: which are stale, and what the README says of them."""
+"""What happens to kept records: which of them are stale, and what the README says about them."""
 
 import dataclasses
 import json
@@ -108,7 +108,7 @@ def test_a_constant_is_named(discs: Path) -> None:
         ({"revision": "f" * 12}, "its revision is not in this repository"),
         ({"revision": "unknown"}, "its revision is not in this repository"),
         ({"revision": "0123456789ab-dirty"}, "never committed"),
-        ({"name": "disc/weight"}, "nobody says which code disc/weight measures"),
+        ({"name": "disc/weight"}, "which code disc/weight measures is unknown"),
     ],
 )
 def test_what_cannot_be_traced_is_stale(discs: Path, change: dict[str, str], why: str) -> None:
@@ -131,7 +131,7 @@ def test_without_git_it_says_so_in_one_line(tmp_path: Path, capsys: pytest.Captu
     (tmp_path / "disc.json").write_text(json.dumps([kept()]))
     assert check.check(tmp_path, tmp_path / "no.md", tmp_path) == []
     (line,) = capsys.readouterr().out.splitlines()
-    assert "no git checkout" in line
+    assert "not a git checkout" in line
 
 
 @pytest.mark.parametrize("name", staleness.MEASURED)

@@ -1,7 +1,10 @@
 """Measures one machine and keeps a record, so that a change can be told from noise and from another machine.
 
+    settings -> render | physics | env | update | train -> Measurement -> record -> staleness, tables
+
 Every benchmark varies the state of each environment, asserts that the results differ, warms up, waits for the device, repeats,
-and reports the median; compilation is timed apart. `record` keeps the figures and prints each change.
+and reports the median; compilation is timed separately. `record` keeps the figures and prints each change, `staleness` finds
+records that are older than the code they measured, and `tables` writes the README's tables from them.
 """
 
 import importlib
@@ -19,7 +22,7 @@ def run(benchmark: str, results: Path | None = None, json: Path | None = None, *
 
     Args:
         benchmark: One of `BENCHMARKS`.
-        results: Folder of kept records; None for the checkout's own, or benchmarks/results under the current folder.
+        results: Folder of kept records; None for benchmarks/results of the checkout, or of the current folder without one.
         json: Also write this run's records here.
         **settings: Fields of `Settings`.
 

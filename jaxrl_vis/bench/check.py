@@ -1,4 +1,4 @@
-"""`jaxrl-vis bench --check`: records that outlived their code, and rows of the README that no record stands behind."""
+"""`jaxrl-vis bench --check`: records that are older than the code they measured, and rows of the README without a record."""
 
 from pathlib import Path
 
@@ -22,7 +22,7 @@ def check(results: Path | None = None, readme: Path = README, checkout: Path = p
     if provenance.is_checkout(checkout):
         complaints += [str(stale) for stale in staleness.stale_records(results, checkout)]
     else:
-        print(f"{checkout} is no git checkout, so whether records outlived their code cannot be said")
+        print(f"{checkout} is not a git checkout: whether records are older than the code they measured is unknown")
     if not readme.exists():
         return complaints
     complaints += [f"{readme.name}: {what}" for what in tables.missing_rows(results)]

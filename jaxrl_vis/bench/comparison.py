@@ -28,7 +28,7 @@ class Comparison:
 
     Attributes:
         config: What the record says was drawn.
-        mj_model: The model; its first camera looks.
+        mj_model: The model, seen by its first camera.
         scene: Our reading of it.
         batches: Poses, see `render_scenes.random_poses`; ``config["images"]`` of each are drawn.
         repeats: Timed repeats at most.

@@ -16,7 +16,7 @@ ACCELERATOR_COUNTS = (256, 1024, 4096, 8192)
 
 
 def measure(settings: Settings) -> Iterator[Measurement]:
-    """Environment steps per second, resets and goal images amortised over the horizon."""
+    """Yields environment steps per second; resets and goal images are spread over the horizon."""
     env = settings.make_env()
 
     def episode(key: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -29,7 +29,7 @@ def measure(settings: Settings) -> Iterator[Measurement]:
             state = env.advance(state, action)
             return state, env.observe(state)
 
-        # Every frame is returned, so none can be left out of the program.
+        # Every image is returned, so that the compiler cannot drop any.
         return jax.lax.scan(step, state.replace(obs=None), jax.random.split(action_key, env.horizon))[1], goal
 
     for count in settings.counts(CPU_COUNTS, ACCELERATOR_COUNTS):

@@ -24,7 +24,7 @@ def check() -> None:
     """
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # what is missing is said once, below
+            warnings.simplefilter("ignore")  # the error below says what is missing
             mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), height=8, width=8).close()
     except Exception as error:  # every OpenGL binding fails in its own way
         raise RequestError(
@@ -59,8 +59,8 @@ def measure(comparison: Comparison) -> Measurement:
             renderer.disable_depth_rendering()
             return colour, metres
 
-        for index in [0, *range(count)]:  # the first twice: once to warm up
-            set_poses(mj_data, poses, index)  # the pose is given: not part of the figure
+        for index in [0, *range(count)]:  # the first pose twice: once to warm up
+            set_poses(mj_data, poses, index)  # not timed: the pose is given
             start = time.perf_counter()
             colour, metres = draw()
             seconds.append(time.perf_counter() - start)

@@ -1,4 +1,4 @@
-"""Physics alone: `advance` under random actions, no images; MuJoCo Playground's FingerTurn beside ours on request."""
+"""Physics alone: `advance` with random actions and no images; on request, MuJoCo Playground's FingerTurn beside ours."""
 
 from collections.abc import Iterator
 
@@ -20,21 +20,21 @@ ACCELERATOR_COUNTS = (256, 1024, 4096, 8192)
 
 
 def start_states(env: GoalEnv, count: int) -> State:
-    """``count`` different starts, without images."""
+    """``count`` different initial states, without images."""
     keys = jax.random.split(jax.random.key(1), count)
     return env_jit(jax.vmap(lambda key: env.reset(key).replace(obs=None)))(keys)
 
 
 def measure(settings: Settings) -> Iterator[Measurement]:
-    """Environment steps per second."""
+    """Yields environment steps per second."""
     if settings.peer is not None:
         if settings.env != "FingerTurn":
             raise RequestError("bench physics --peer playground needs --env FingerTurn")
-        playground.load()  # first: it is the part that may be missing
+        playground.load()  # first, because it may be missing
     env = settings.make_env()
     steps = env.horizon if settings.on_accelerator else 10
     counts = settings.counts(CPU_COUNTS, ACCELERATOR_COUNTS)
-    # One program starts them all; smaller measurements take the first ones.
+    # One program makes all initial states; smaller batches take the first of them.
     states = start_states(env, max(counts))
 
     def advance(states: State, key: jax.Array) -> State:

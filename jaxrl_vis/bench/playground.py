@@ -1,7 +1,7 @@
-"""FingerTurn of MuJoCo Playground beside ours: states only, the same simulated time in an action, random actions.
+"""FingerTurn of MuJoCo Playground beside ours: states only, random actions, the same simulated time per action.
 
-Playground's is another model of dm_control's finger (implicit integration, 5 ms a physics step, two Newton iterations). It is
-measured as it comes, and at our 10 ms. Its default engine is MuJoCo Warp; here both run on MJX's.
+Playground models dm_control's finger differently (implicit integration, physics steps of 5 ms, two Newton iterations). It is
+measured with its own steps and with our 10 ms. Its default engine is MuJoCo Warp; here both run on MJX.
 """
 
 from collections.abc import Iterator
@@ -20,7 +20,7 @@ _TIMESTEPS = (0.005, 0.01)  # s; its own, and ours
 
 
 def load() -> Any:
-    """Playground's module of the task.
+    """Playground's module of the environment.
 
     Raises:
         RequestError: It is not installed.
@@ -33,13 +33,13 @@ def load() -> Any:
 
 
 def measure(settings: Settings, count: int, steps: int, control_period: float, ours: float) -> Iterator[Measurement]:
-    """Actions per second.
+    """Yields actions per second.
 
     Args:
-        settings: How often to repeat.
+        settings: ``repeats`` counts.
         count: Environments.
-        steps: Actions in a call.
-        control_period: Simulated time of an action, s.
+        steps: Actions per call.
+        control_period: Simulated time per action, s.
         ours: Our actions per second.
     """
     finger = load()

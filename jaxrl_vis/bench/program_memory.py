@@ -1,6 +1,6 @@
-"""How large the largest array is that a compiled program keeps between its operations, read from the program itself.
+"""The size of the largest array that a compiled program keeps between its operations, read from the program itself.
 
-The compiler's own figure (`Compiled.memory_analysis`) is what all of them take together.
+The compiler's own figure (`Compiled.memory_analysis`) is the size of all of them together.
 """
 
 import math
@@ -11,15 +11,15 @@ import numpy as np
 
 _HEAD = re.compile(r"(ENTRY )?%?([\w.\-]+) \(.*\{$")
 _ARRAY = re.compile(r"\s+(ROOT )?%?[\w.\-]+ = (\w+)\[([\d,]*)\]\S* ([\w\-]+)\(")
-# These are names for memory that something else has written, or is part of the program.
+# These only name memory that something else has written, or that belongs to the program.
 _NO_MEMORY = {"parameter", "get-tuple-element", "bitcast", "constant"}
 _BITS = re.compile(r"[a-z]+(\d+)")
 
 
 def largest_temporary(compiled: Any) -> int:
-    """Bytes of the largest array that an operation of the program writes and that is no result of the program.
+    """Bytes of the largest array that an operation of the program writes and that is not a result of the program.
 
-    Operations within a fusion write nothing. A program's result counts where it is made by way of another array.
+    Operations within a fusion write nothing. A result counts where it is copied from another array.
 
     Args:
         compiled: From ``jax.jit(...).lower(...).compile()``.
@@ -36,6 +36,6 @@ def largest_temporary(compiled: Any) -> int:
 
 
 def _bytes(dtype: str) -> int:
-    """Of one number, by XLA's name for its type."""
+    """The size of one number, given XLA's name for its type."""
     bits = _BITS.match(dtype)
     return int(np.ceil(int(bits[1]) / 8)) if bits else 1

@@ -1,4 +1,4 @@
-"""Benchmark records: one JSON file for each benchmark and device, and the change against what it held before.
+"""Benchmark records: one JSON file per benchmark and device, and the change since the record that was there before.
 
 A file holds the newest record of every configuration; older ones are in its git history.
 """
@@ -26,8 +26,8 @@ class Measurement:
         name: What was measured, as ``benchmark/quantity``.
         value: The figure.
         unit: Its unit; larger is better.
-        config: What was asked for. Two figures compare only where this and the device agree.
-        details: What else was seen: compile time, spread, roofline.
+        config: What was asked for. Two figures can be compared only where this and the device agree.
+        details: Whatever else was observed: compilation time, spread, roofline.
     """
 
     name: str
@@ -38,7 +38,7 @@ class Measurement:
 
 
 def to_record(measurement: Measurement) -> dict[str, Any]:
-    """The measurement with everything that says where it comes from."""
+    """The measurement with its provenance, as it is kept."""
     return {
         "schema": SCHEMA,
         **dataclasses.asdict(measurement),
@@ -50,7 +50,7 @@ def to_record(measurement: Measurement) -> dict[str, Any]:
 
 
 def results_folder() -> Path:
-    """benchmarks/results of the checkout that this code lies in, or else of the current folder."""
+    """benchmarks/results of the checkout that holds this code, or of the current folder where there is none."""
     home = provenance.CHECKOUT if (provenance.CHECKOUT / "pyproject.toml").exists() else Path.cwd()
     return home / "benchmarks" / "results"
 
@@ -105,7 +105,7 @@ def write_json(path: Path, measurements: list[Measurement]) -> None:
 
 
 def keep(path: Path, record: dict[str, Any]) -> dict[str, Any] | None:
-    """Puts a record into a file, in the place of the last one of the same configuration and device, which is returned."""
+    """Puts a record into a file. It replaces the one of the same configuration and device, which is returned."""
     record = json.loads(json.dumps(record))  # as it will be read back: tuples are lists
     records = load(path)
     previous = next((old for old in records if _key(old) == _key(record)), None)
@@ -115,7 +115,7 @@ def keep(path: Path, record: dict[str, Any]) -> dict[str, Any] | None:
 
 
 def describe(record: dict[str, Any], previous: dict[str, Any] | None) -> str:
-    """One line: what, how much, and the change."""
+    """One line: what was measured, the figure, and its change."""
     config = " ".join(f"{name}={value}" for name, value in record["config"].items())
     line = f"{record['name']:24} {config:72} {format_figure(record['value']):>12} {record['unit']}"
     if previous is None:
@@ -125,7 +125,7 @@ def describe(record: dict[str, Any], previous: dict[str, Any] | None) -> str:
 
 
 def format_figure(value: float) -> str:
-    """Three or more significant figures, with thousands apart."""
+    """At least three significant figures, with thousands separators."""
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
 
 

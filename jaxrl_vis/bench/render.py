@@ -1,7 +1,7 @@
-"""Images alone, without physics: what an agent sees of its task, or a scene beside other renderers.
+"""Images alone, without physics: an environment's observations, or a scene beside other renderers.
 
-Every batch is drawn from poses that all differ, and every other call draws another batch, so nothing can be kept from image
-to image; that both differ is asserted.
+All poses in a batch differ, and calls alternate between two batches, so no renderer can reuse an image; that the images differ
+is asserted.
 """
 
 from collections.abc import Iterator
@@ -23,11 +23,11 @@ CPU_COUNTS = (64,)
 ACCELERATOR_COUNTS = (256, 1024, 4096)
 CPU_SIZES = (32, 64)
 ACCELERATOR_SIZES = (64, 100)
-_STEPS = 5  # random control steps from the common start, after which no two robots stand alike
+_STEPS = 5  # random control steps from the common start, after which no two robots have the same pose
 
 
 def measure(settings: Settings) -> Iterator[Measurement]:
-    """Images per second for each image size, output and batch: of the task, or of scenes where one or a peer is asked for."""
+    """Yields images per second of each size, output and batch: of the environment, or of scenes if one or a peer is given."""
     if settings.scene is not None or settings.peer is not None:
         yield from scene_images.measure(settings, image_sizes(settings))
         return
@@ -55,7 +55,7 @@ def measure(settings: Settings) -> Iterator[Measurement]:
 
 
 def image_sizes(settings: Settings) -> tuple[int, ...]:
-    """Heights and widths to measure: the device's own, or the one that was asked for where it is another."""
+    """Heights and widths to measure: those of the device, or only the one that was asked for if it is not among them."""
     sizes = ACCELERATOR_SIZES if settings.on_accelerator else CPU_SIZES
     if settings.image_size is not None and settings.image_size not in sizes:
         return (settings.image_size,)

@@ -1,8 +1,8 @@
 """The least arithmetic that an image takes: what perfect culling would leave, counted in the renderer's own functions.
 
-A compiler counts what it compiled: tests that a kernel skips, and nothing of the kernel itself. Here every operation on a pixel
-counts as one (so a fused multiply-add as two, and a square root as one), once per pixel and object that has to be tested, and
-once per pixel for what follows: depth, normal, texture and colour. What is done once per environment does not count.
+The compiler's own count will not do: it includes tests that a kernel skips, and nothing of what is inside a kernel. Here every
+operation on a pixel counts as one (a fused multiply-add as two, a square root as one): once per pixel and object that has to be
+tested, and once per pixel for depth, normal, texture and colour. What is done once per environment does not count.
 """
 
 from collections.abc import Callable, Iterator
@@ -16,9 +16,9 @@ from jaxrl_vis_envs.render import Scene, camera
 from jaxrl_vis_envs.render.camera import Rays
 from jaxrl_vis_envs.render.pixel import lights, lookup, raycast, shade, shapes, surface
 
-# So many pixels are traced: a length that nothing else has.
+# Pixels that are traced: a length that nothing else has.
 _PIXELS = 7919
-# Copies, views and choices of memory, which are no arithmetic.
+# Copies, views and indexing, which are not arithmetic.
 _MOVES = {"broadcast_in_dim", "squeeze", "reshape", "slice", "dynamic_slice", "concatenate", "gather", "iota", "transpose"}
 
 
@@ -26,9 +26,9 @@ def operations_per_pixel(scene: Scene, tests: np.ndarray, coloured: bool = True)
     """Operations for one pixel of an image.
 
     Args:
-        scene: The scene; what haze, shadows and transparent objects take is left out.
+        scene: The scene; the cost of haze, shadows and transparent objects is left out.
         tests: [ngeom] float, how often each geom is tested per pixel, see `render_scenes.needed_tests`.
-        coloured: Whether colours are wanted; else depth alone, which the tests themselves give.
+        coloured: Whether colours are wanted, or only depth, which the tests themselves give.
 
     Returns:
         The operations, or None for a scene with triangles, whose tests are not counted.
@@ -62,13 +62,13 @@ def operations_per_pixel(scene: Scene, tests: np.ndarray, coloured: bool = True)
 
 
 def _count(function: Callable, *arguments: Any) -> int:
-    """Operations of a function on single pixels."""
+    """Operations on single pixels in a function."""
     equations = _equations(jax.make_jaxpr(function)(*arguments).jaxpr)
     return sum(found.primitive.name not in _MOVES and _PIXELS in found.outvars[0].aval.shape for found in equations)
 
 
 def _equations(jaxpr: Any) -> Iterator[Any]:
-    """Of a jaxpr and of the functions that it calls."""
+    """The equations of a jaxpr and of the functions that it calls."""
     for equation in jaxpr.eqns:
         inner = [value for value in equation.params.values() if hasattr(value, "jaxpr") or hasattr(value, "eqns")]
         if not inner:

@@ -19,12 +19,12 @@ SPREADS = {"scattered": 1.0, "start": 0.01}
 
 
 def load(scene: str, textures: bool = True, highlights: bool = True) -> mujoco.MjModel:
-    """The model of a scene; its first camera looks. Multisampling and shadows are off.
+    """The model of a scene, which its first camera sees. Multisampling and shadows are off.
 
     Args:
         scene: ``finger`` (that of the dm_control suite), ``fetch_reach`` (ours), ``primitives`` (127 mixed primitives on and
             over a table), or the path of an MJCF file with a camera.
-        textures: Whether materials keep their textures, and the sky its own.
+        textures: Whether materials and the sky keep their textures.
         highlights: Whether lights keep their specular part.
 
     Raises:
@@ -71,7 +71,8 @@ def _path_of(scene: str) -> Path:
 def primitives_xml() -> str:
     """127 geoms: a floor, a table top, and 25 each of sphere, capsule, ellipsoid, cylinder and box, all free bodies.
 
-    Kinds, sizes, places, camera and lights are those of MuJoCo Warp's own benchmark of that name, so that figures compare.
+    Kinds, sizes, places, camera and lights are those of MuJoCo Warp's own benchmark of that name, so that its figures can be
+    compared.
     """
     kinds = (
         ("sphere", ".05", "1 0 0 1", 0.8),
@@ -117,7 +118,7 @@ def scatter_joints(mj_model: mujoco.MjModel, mj_data: mujoco.MjData, rng: np.ran
         mj_model: The model.
         mj_data: Its state, whose ``qpos`` is written.
         rng: Where the numbers come from.
-        spread: The share of the way from the start to that position which every joint goes.
+        spread: How far each joint goes from its start to that position, in [0, 1].
     """
     mujoco.mj_resetData(mj_model, mj_data)
     joints = mujoco.mjtJoint
@@ -148,7 +149,7 @@ def _turned(quaternions: np.ndarray, most: float, rng: np.random.Generator) -> n
 
 
 def forward(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> None:
-    """Runs what an image needs: the poses of bodies, geoms, sites, cameras and lights."""
+    """Computes the poses that an image needs: of bodies, geoms, sites, cameras and lights."""
     mujoco.mj_kinematics(mj_model, mj_data)
     mujoco.mj_comPos(mj_model, mj_data)
     mujoco.mj_camlight(mj_model, mj_data)
@@ -177,13 +178,13 @@ def set_poses(mj_data: mujoco.MjData, poses: dict[str, np.ndarray], index: int) 
 
 
 def needed_tests(mj_model: mujoco.MjModel, poses: dict[str, np.ndarray], size: int) -> np.ndarray:
-    """Ray-geom tests a pixel that perfect culling by bounding sphere would leave, in the mean over ``poses``; [ngeom] float.
+    """Ray-geom tests per pixel that perfect culling by bounding spheres would leave, the mean over ``poses``; [ngeom] float.
 
-    A geom needs a test in every pixel that the projection of its bounding sphere covers; a plane in every one. Geoms that are
-    not drawn (their group, or alpha 0) need none.
+    A geom needs a test in every pixel that the projection of its bounding sphere covers, a plane in every pixel. Geoms that
+    are not drawn (because of their group, or with alpha 0) need none.
 
     Args:
-        mj_model: The model; its first camera looks.
+        mj_model: The model, seen by its first camera.
         poses: From `random_poses`.
         size: Height and width of the image in pixels.
     """

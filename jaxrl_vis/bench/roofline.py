@@ -1,7 +1,7 @@
-"""What a gradient step costs at the least, and what share of the device that is.
+"""The least that a gradient step costs, and what share of the device's peak is achieved.
 
-Two counts stand side by side: the compiler's own (`Compiled.cost_analysis`), which includes what it made of the program, and
-one from the layers' shapes, which cannot be beaten without changing the algorithm.
+There are two counts: the compiler's own of the program that it made (`Compiled.cost_analysis`), and one from the shapes of the
+layers, which cannot be beaten without changing the algorithm.
 """
 
 import dataclasses
@@ -64,7 +64,7 @@ def least_cost(networks: Networks, params: Any, batch_size: int) -> Cost:
     and written once, target parameters are read and written once. Activations are taken to stay on the chip.
 
     Args:
-        networks: What the parameters mean.
+        networks: The networks whose parameters these are.
         params: Online actor and critic parameters.
         batch_size: Transitions in a gradient step.
     """

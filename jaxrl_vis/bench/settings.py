@@ -1,4 +1,4 @@
-"""What a benchmark is asked to measure, with sizes that suit the device filled in."""
+"""What a benchmark is asked to measure, with defaults that suit the device."""
 
 import dataclasses
 from typing import Any, Self
@@ -10,7 +10,7 @@ from jaxrl_vis_envs import registry
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """What to measure. None and the empty tuple stand for what suits the device.
+    """What to measure. None and the empty tuple stand for a default that suits the device.
 
     Attributes:
         env: The environment.
@@ -45,7 +45,7 @@ class Settings:
         )
 
     def counts(self, cpu: tuple[int, ...], accelerator: tuple[int, ...]) -> tuple[int, ...]:
-        """The environments to measure: those asked for, or the device's own."""
+        """How many environments to measure: the numbers that were asked for, or the device's defaults."""
         return self.envs or (accelerator if self.on_accelerator else cpu)
 
     @property

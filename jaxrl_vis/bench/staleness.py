@@ -1,4 +1,4 @@
-"""Which records outlived the code that they measured.
+"""Which records are older than the code that they measured.
 
 Every benchmark names the files that it measures. A record is stale where one of them holds a definition (a function, a class or
 another top-level statement; of files that are not Python, the whole contents) that did not exist anywhere at the record's
@@ -55,7 +55,7 @@ _SHOWN = 4  # changed files that a message names
 
 @dataclasses.dataclass(frozen=True)
 class Stale:
-    """Records of one file, name and revision that outlived their code.
+    """Records of one file, name and revision that are older than their code.
 
     Attributes:
         file: The file of records.
@@ -77,7 +77,7 @@ class Stale:
 
 
 def stale_records(folder: Path, checkout: Path = provenance.CHECKOUT) -> list[Stale]:
-    """The records below ``folder`` whose measured code changed, grouped.
+    """The records in ``folder`` whose measured code has changed since, grouped.
 
     Args:
         folder: Kept records, see `record.read_all`.
@@ -104,7 +104,7 @@ def why_stale(name: str, env: str | None, of_cpu: bool, revision: str, checkout:
         checkout: Where its revision is looked up.
     """
     if name not in MEASURED:
-        return f"nobody says which code {name} measures: add it to MEASURED in {Path(__file__).name}"
+        return f"which code {name} measures is unknown: add it to MEASURED in {Path(__file__).name}"
     if revision.endswith("-dirty"):
         return "it was measured with changes that were never committed"
     then = definitions_at(revision, checkout)

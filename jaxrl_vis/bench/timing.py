@@ -1,4 +1,4 @@
-"""Timing that means something: compiled ahead, warmed up, waited for, repeated."""
+"""Timing that means something: compiled ahead of time, warmed up, waited for, repeated."""
 
 import dataclasses
 import statistics
@@ -32,7 +32,7 @@ class Timing:
 
 
 def compile_timed(jitted: Any, *arguments: Any) -> tuple[Any, float]:
-    """Compiles ahead of time: the program, and the seconds of tracing and compiling (few where a cache had it)."""
+    """Compiles ahead of time: the program, and the seconds of tracing and compiling (few if a cache had it)."""
     start = time.perf_counter()
     compiled = jitted.lower(*arguments).compile()
     return compiled, time.perf_counter() - start
@@ -44,10 +44,10 @@ def measure(
     budget_s: float = 30.0,
     wait: Callable[[Any], Any] = jax.block_until_ready,
 ) -> Timing:
-    """Times ``call`` after one untimed call, until its result is there.
+    """Times ``call`` until its result is there, after one untimed call.
 
-    Short calls are made one after the other and waited for together, as in a loop that does something with the results on the
-    device: a wait after each would time how fast the host gives orders.
+    Short calls are made one after the other and waited for together, as in a loop that uses the results on the device: waiting
+    after each would measure how fast the host dispatches.
 
     Args:
         call: The work; returns arrays.

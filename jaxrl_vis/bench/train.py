@@ -16,7 +16,7 @@ from jaxrl_vis.learner.train_step import make_train_step
 
 
 def measure(settings: Settings) -> Iterator[Measurement]:
-    """Environment steps and gradient steps per second of the device's preset, one seed."""
+    """Yields environment steps and gradient steps per second of the device's preset, one seed."""
     env = settings.make_env()
     for count in settings.counts((0,), (0,)):  # 0: the preset's own number of environments
         config = training_config(settings, **({"num_envs": count} if count else {}))

@@ -1,4 +1,4 @@
-"""Gradient steps alone, sampling and relabelling from the replay included."""
+"""Gradient steps alone, including sampling from the replay and relabelling."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -54,7 +54,7 @@ def start(program: TrainStep) -> LoopState:
 
 
 def time_updates(program: TrainStep, settings: Settings) -> tuple[Timing, float]:
-    """Seconds of one call of ``update_many``, and those of its compilation."""
+    """The time of one call of ``update_many``, and the seconds of its compilation."""
     loop = start(program)
     keys = jax.random.split(jax.random.key(2), 1)
     compiled, compile_s = compile_timed(program.update_many, loop.train, loop.replay, keys, loop.iteration)
@@ -75,7 +75,7 @@ def time_updates(program: TrainStep, settings: Settings) -> tuple[Timing, float]
 
 
 def measure(settings: Settings) -> Iterator[Measurement]:
-    """Gradient steps per second, with the roofline beside."""
+    """Yields gradient steps per second, and how far they are from the roofline."""
     updates = 200 if settings.on_accelerator else 20
     config = training_config(settings, updates_per_iteration=updates)
     env = settings.make_env()

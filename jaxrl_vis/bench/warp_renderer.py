@@ -1,10 +1,10 @@
-"""MuJoCo Warp's renderer on the same poses, for comparison. Needs an NVIDIA GPU and the package mujoco-warp 4.0.0.
+"""MuJoCo Warp's renderer on the same poses, for comparison. It needs an NVIDIA GPU and the package mujoco-warp 4.0.0.
 
 What is timed is what a simulation of many environments would do for its images: refit the bounding volumes, then draw,
 captured in one CUDA graph. Poses in world coordinates are given, and its own kinematics are never run. Two graphs read two sets
 of poses, so every launch draws new images and nothing is copied in between. It gets the options that the scene needs, no more.
 
-JAX takes most of a GPU's memory when it starts; where Warp then finds too little, set XLA_PYTHON_CLIENT_MEM_FRACTION=.5.
+JAX takes most of a GPU's memory when it starts; if Warp then runs out, set XLA_PYTHON_CLIENT_MEM_FRACTION=.5.
 """
 
 import dataclasses
@@ -197,7 +197,7 @@ def prepare(comparison: Comparison, options: dict[str, bool]) -> tuple[Any, list
 
 
 def _with_poses(blank: Any, poses: dict[str, np.ndarray]) -> Any:
-    """Warp's Data with these world poses, and as many worlds as there are."""
+    """Warp's Data with these poses, and as many environments (Warp: worlds) as there are of them."""
     import warp as wp  # pyright: ignore[reportMissingImports]
 
     count = len(poses["geom_xpos"])
