@@ -16,14 +16,14 @@ from point_mass import PointMass, PointMassConfig
 
 import jaxrl_vis_envs
 from benchmarks import environments
-from jaxrl_vis_envs import compilation, goals, pixels, registry
+from jaxrl_vis_envs import compilation, goals, names, pixels, registry
 from jaxrl_vis_envs.base import GoalEnv, State, sanitize_action
 from jaxrl_vis_envs.compilation import env_jit
 
 BATCH, STEPS = 32, 8
 SOURCES = pathlib.Path(__file__).resolve().parents[1] / "envs"
 SUBPROCESS_ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join((str(SOURCES), str(SOURCES.parent)))}
-TASKS = ["FetchReach", "FingerTurn", "HandReach", "Reacher", "SawyerReach"]
+TASKS = list(names.TASKS)
 HORIZONS = {"FetchReach": 50, "FingerTurn": 50, "HandReach": 50, "Reacher": 50, "SawyerReach": 25}
 
 
