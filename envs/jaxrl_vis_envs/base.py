@@ -57,7 +57,7 @@ class State:
 
 
 class GoalEnv(abc.ABC):
-    """An environment with a goal. Subclasses say how it starts, moves and looks; success and reward are the same for all."""
+    """An environment with a goal. Subclasses say how it starts, moves and appears; success and reward are the same for all."""
 
     # Set by each task.
     name: str
@@ -101,7 +101,7 @@ class GoalEnv(abc.ABC):
     def as_goal(self, frame: jax.Array) -> jax.Array:
         """The goal that says "be where ``frame`` was", in the shape of ``frame``: its newest image, F times.
 
-        A goal stands still; whoever relabels with something observed on the way has to say so in the same way.
+        A goal stands still, so whoever relabels with an observation passes it through this function.
         """
         if self.frame_stack == 1:
             return frame
