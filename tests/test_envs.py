@@ -195,6 +195,12 @@ def test_tasks_refuse_64_bits(name: str) -> None:
         jaxrl_vis_envs.make(name)
 
 
+def test_an_environment_without_a_registered_name_refuses_such_actions_too():
+    env = PointMass(PointMassConfig())
+    with pytest.raises(ValueError, match=r"PointMass takes an action of shape \(2,\), got \(1,\)"):
+        jax.eval_shape(lambda key: env.step(env.reset(key), jnp.zeros(1)), jax.random.key(0))
+
+
 def test_sanitize_action():
     action = sanitize_action(jnp.array([jnp.nan, jnp.inf, -jnp.inf, 0.5]))
     np.testing.assert_array_equal(action, [0.0, 1.0, -1.0, 0.5])

@@ -127,8 +127,9 @@ class GoalEnv(abc.ABC):
             ValueError: ``action`` has another shape than [A].
         """
         if np.shape(action) != (self.action_size,):
+            task = type(self).__name__  # an environment that was not made by its name has none
             raise ValueError(
-                f"{self.name} takes an action of shape ({self.action_size},), got {np.shape(action)}; vmap over a batch"
+                f"{task} takes an action of shape ({self.action_size},), got {np.shape(action)}; vmap over a batch"
             )
 
     @functools.cached_property
