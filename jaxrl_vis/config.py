@@ -1,20 +1,25 @@
-"""What a training run is made of: one frozen record, four presets, and checks that say what is wrong in one line.
+"""The configuration of a training run: one frozen dataclass, four presets, and checks that say what is wrong in one line.
 
 Imports no JAX, so that the command line can print its help at once.
 """
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from typing import Any, Literal, Self
 
+from jaxrl_vis import fields
 from jaxrl_vis.errors import RequestError, nearest
+from jaxrl_vis.methods import METHODS, MethodName
 
-Method = Literal["oracle", "indicator", "indicator_balance_filter"]
-METHODS: tuple[str, ...] = ("oracle", "indicator", "indicator_balance_filter")
-PIXELS: tuple[str, ...] = ("rgbd", "rgb", "depth")
-Kind = Literal["camera", "lights", "colours", "dynamics"]
-RANDOMIZED: tuple[str, ...] = ("camera", "lights", "colours", "dynamics")
-DTYPES: tuple[str, ...] = ("auto", "float32", "bfloat16")
+# Values that a field allows, for everything that asks: checks, the command line and its help.
+Pixels = Literal["rgbd", "rgb", "depth"]
+Randomized = Literal["camera", "lights", "colours", "dynamics"]
+ComputeDtype = Literal["auto", "float32", "bfloat16"]
+
+
+_LARGEST_SEED = 2**32 - 1  # a random key is made of 32 bits of it: larger seeds would repeat smaller ones
+_LARGEST_COUNT = 2**31 - 1  # arrays are indexed by int32; environment steps are counted on the host, without a bound
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,27 +27,29 @@ class Config:
     """One training run. Counts are per seed; lengths of time are in control steps unless a unit is given."""
 
     env: str = "VisualFetchReach"
-    """The task; `jaxrl-vis envs` lists them."""
+    """The environment; `jaxrl-vis envs` lists them."""
     preset: str = "fast"
     """The preset that this configuration started from; kept for the record."""
-    method: Method = "oracle"
+    method: MethodName = "oracle"
     """Where rewards come from: the true state (oracle), or equality of images, without or with balancing and filtering."""
     seed: int = 0
     """First seed."""
     seeds: int = 1
     """How many seeds to train side by side in one program: seed, seed + 1, ..."""
 
-    # -- The world
-    pixels: Literal["rgbd", "rgb", "depth"] = "rgbd"
+    # -- The environment
+    pixels: Pixels = "rgbd"
     """Channels of the image."""
     image_size: int = 64
     """Height and width of the image, in pixels."""
     frame_stack: int | None = None
-    """Images of the latest control steps that an observation stacks. None: as many as the task does."""
-    randomize: tuple[Kind, ...] = ()
-    """What varies between episodes, in training and evaluation: any of camera, lights, colours, dynamics."""
+    """Images of the latest control steps that an observation stacks. None: the environment's own number."""
+    env_options: tuple[str, ...] = ()
+    """Further options of the environment, as name=value; docs/tasks.md has those that undo a departure from a release."""
+    randomize: tuple[Randomized, ...] = ()
+    """What varies between episodes, in training and in evaluation."""
     randomize_strength: float = 1.0
-    """How far it varies: 1 is typical (`jaxrl_vis_envs.randomization.KINDS`), 2 twice as far."""
+    """How far it varies, in multiples of the typical ranges (`jaxrl_vis_envs.randomization.KINDS`)."""
     num_envs: int = 80
     """Environments in a rollout; each plays one episode per iteration."""
 
@@ -60,9 +67,9 @@ class Config:
     relabel_probability: float = 0.9
     """p1: share of samples whose goal is replaced by an observation of the same episode."""
     balance_probability: float | None = None
-    """p2: share of those that take the very next observation, a sure positive. None: 0.5 for balancing methods, else 0."""
+    """p2: share of those whose goal is the very next observation, a sure positive. None: 0.5 for balancing methods, else 0."""
     filter_threshold: float | None = None
-    """q0: negatives with Q above it are taken as false and dropped. None: the middle of its band for filtering methods."""
+    """q0: negatives with Q above it are dropped as false. None: the middle of its band, for filtering methods."""
     reward_positive: float | None = None
     """R+. None: 0 for the oracle, 1 for indicator methods."""
     reward_negative: float | None = None
@@ -76,7 +83,7 @@ class Config:
     critic_learning_rate: float = 1e-3
     """Adam step size of the critic."""
     target_decay: float = 0.98
-    """Share of a target network that stays at each target update."""
+    """Share of a target network that stays at each update of it."""
     target_update_interval: int = 40
     """Gradient steps between target updates."""
     action_penalty: float = 1.0
@@ -95,18 +102,22 @@ class Config:
     """Size of an encoded image."""
     hidden_sizes: tuple[int, ...] = (256, 256, 256)
     """Hidden layers of the actor's and the critic's heads."""
-    compute_dtype: Literal["auto", "float32", "bfloat16"] = "auto"
+    compute_dtype: ComputeDtype = "auto"
     """Arithmetic of the networks; parameters and losses are float32. auto: bfloat16 on accelerators."""
     normalizer_floor: float = 0.01
-    """Smallest standard deviation that an observation is divided by, in its own unit (grey levels for images)."""
+    """Smallest standard deviation that an observation is divided by, in the observation's unit (grey levels for images)."""
+    normalizers: Literal["shared", "separate"] = "shared"
+    """Whether goals are normalised with the statistics of all observations, or, as in the authors' release, with their own."""
+    normalizer_source: Literal["rollouts", "relabelled"] = "rollouts"
+    """What statistics are of: every observation of a rollout, or, as in the authors' release, its relabelled transitions."""
     normalizer_clip: float = 5.0
     """Normalised observations are clipped to plus and minus this."""
 
-    # -- Looking and saving
+    # -- Evaluating and saving
     eval_interval: int = 5
     """Iterations between evaluations; one more comes at the end."""
     eval_episodes: int = 1000
-    """Episodes of an evaluation, on keys of their own."""
+    """Episodes of an evaluation, always the same ones."""
     checkpoint_interval: int = 5
     """Iterations between light checkpoints (networks and optimisers; enough for eval and play)."""
     full_checkpoint_interval: int = 0
@@ -127,7 +138,7 @@ class Config:
 
 @dataclasses.dataclass(frozen=True)
 class Resolved:
-    """What follows from a `Config` and the task's horizon: no None left.
+    """What follows from a `Config` and the environment's horizon: no None left.
 
     Attributes:
         horizon: T, control steps in an episode.
@@ -135,7 +146,7 @@ class Resolved:
         reward_positive, reward_negative: R+ and R-.
         balance_probability: p2.
         filter_threshold: q0; infinity where the method does not filter.
-        critic_output_bias: What the critic says before it has learned anything.
+        critic_output_bias: What the critic predicts before it has learned anything.
         target_minimum, target_maximum: Bounds of the critic's targets.
     """
 
@@ -160,31 +171,31 @@ def resolve(config: Config, horizon: int) -> Resolved:
     Raises:
         RequestError: The discount or the filter threshold lies outside its range.
     """
-    indicator, filtering = config.method.startswith("indicator"), config.method == "indicator_balance_filter"
+    method = METHODS[config.method]
     discount = 1.0 - 1.0 / horizon if config.discount is None else config.discount
     if not 0.0 <= discount < 1.0:
         raise RequestError(f"discount must lie in [0, 1), not {discount}; leave it out for 1 - 1/horizon")
-    positive = (1.0 if indicator else 0.0) if config.reward_positive is None else config.reward_positive
-    negative = -1.0 if config.reward_negative is None else config.reward_negative
+    positive = method.reward_positive if config.reward_positive is None else config.reward_positive
+    negative = method.reward_negative if config.reward_negative is None else config.reward_negative
     if positive <= negative:
         raise RequestError(f"reward_positive ({positive}) must be larger than reward_negative ({negative})")
     best, worst = positive / (1.0 - discount), negative / (1.0 - discount)
     low = negative + discount * best
     threshold = math.inf
-    if filtering:
+    if method.filter:
         threshold = (low + best) / 2 if config.filter_threshold is None else config.filter_threshold
     if config.filter_threshold is not None:
-        if not filtering:
-            raise RequestError("filter_threshold needs --method indicator_balance_filter")
+        if not method.filter:
+            filtering = " or ".join(name for name, other in METHODS.items() if other.filter)
+            raise RequestError(f"filter_threshold needs --method {filtering}")
         if not low < threshold < best:
             raise RequestError(f"filter_threshold {threshold} lies outside its band ({low:g}, {best:g})")
-    balance = 0.5 if filtering else 0.0
     return Resolved(
         horizon=horizon,
         discount=discount,
         reward_positive=positive,
         reward_negative=negative,
-        balance_probability=balance if config.balance_probability is None else config.balance_probability,
+        balance_probability=method.balance_probability if config.balance_probability is None else config.balance_probability,
         filter_threshold=threshold,
         critic_output_bias=worst if threshold <= 0.0 else 0.0,
         target_minimum=worst,
@@ -265,24 +276,24 @@ def preset(name: str, **overrides: Any) -> Config:
 
 
 def validate(config: Config) -> Config:
-    """Returns ``config`` if it makes sense in itself; what depends on the task is checked where the task is known.
+    """Returns ``config`` if it makes sense in itself; what depends on the environment is checked where that is known.
 
     Raises:
-        RequestError: A field is out of range. The message names the field and its value.
+        RequestError: A field is of the wrong type or out of range. The message names the field and its value.
     """
-    for name, choices in (("method", METHODS), ("pixels", PIXELS), ("compute_dtype", DTYPES)):
-        value = getattr(config, name)
-        if value not in choices:
-            raise RequestError(f"unknown {name} {value!r}{nearest(str(value), choices)}")
-    for kind in config.randomize:
-        if kind not in RANDOMIZED:
-            raise RequestError(f"cannot randomize {kind!r}{nearest(str(kind), RANDOMIZED)}")
-    if config.frame_stack is not None and config.frame_stack < 1:
-        raise RequestError(f"frame_stack must be at least 1, not {config.frame_stack}")
-    for field in dataclasses.fields(config):
+    for name, hint in fields.hints(Config).items():
+        fields.check(name, hint, getattr(config, name))
+    for field in dataclasses.fields(Config):
         value = getattr(config, field.name)
         if field.type is int and field.name not in ("seed", "full_checkpoint_interval") and value < 1:
             raise RequestError(f"{field.name} must be at least 1, not {value}")
+        if field.type is int and field.name not in ("seed", "env_steps") and value > _LARGEST_COUNT:
+            raise RequestError(f"{field.name} must be at most {_LARGEST_COUNT}, not {value}")
+    if config.frame_stack is not None and config.frame_stack < 1:
+        raise RequestError(f"frame_stack must be at least 1, not {config.frame_stack}")
+    for name in ("encoder_filters", "hidden_sizes"):
+        if any(size < 1 for size in getattr(config, name)):
+            raise RequestError(f"{name} must all be at least 1, not {' '.join(map(str, getattr(config, name)))}")
     for name in ("relabel_probability", "balance_probability", "random_action_probability", "target_decay"):
         value = getattr(config, name)
         if value is not None and not 0.0 <= value <= 1.0:
@@ -290,8 +301,34 @@ def validate(config: Config) -> Config:
     for name in ("actor_learning_rate", "critic_learning_rate", "normalizer_floor", "normalizer_clip", "randomize_strength"):
         if not getattr(config, name) > 0.0:
             raise RequestError(f"{name} must be positive, not {getattr(config, name)}")
-    if config.seed < 0 or config.full_checkpoint_interval < 0:
-        raise RequestError(
-            f"seed ({config.seed}) and full_checkpoint_interval ({config.full_checkpoint_interval}) must be >= 0"
-        )
+    for name in ("seed", "full_checkpoint_interval", "action_noise"):
+        if getattr(config, name) < 0:
+            raise RequestError(f"{name} must be at least 0, not {getattr(config, name)}")
+    if config.seed + config.seeds - 1 > _LARGEST_SEED:
+        raise RequestError(f"seed {config.seed} is too large: the last of {config.seeds} must be at most {_LARGEST_SEED}")
     return config
+
+
+_OLD_NAMES = {"frames": "frame_stack"}
+
+
+def config_from_dict(values: Mapping[str, Any]) -> Config:
+    """The configuration that a run saved: what JSON makes of `dataclasses.asdict`, which has lists in the place of tuples.
+
+    Fields that had another name when it was saved are known by that, too; fields that are missing have their defaults.
+
+    Raises:
+        RequestError: ``values`` is no dictionary, or a field is unknown or of the wrong type. The message names the field.
+    """
+    if not isinstance(values, Mapping):
+        raise RequestError(f"a configuration must be a dictionary of options, not {type(values).__name__}")
+    hints = fields.hints(Config)
+    found: dict[str, Any] = {}
+    for saved_name, value in values.items():
+        name = _OLD_NAMES.get(saved_name, saved_name)
+        if name not in hints:
+            raise RequestError(f"unknown option {name!r}{nearest(str(name), hints)}")
+        if name in found:
+            raise RequestError(f"{name} is given twice, once by its old name")
+        found[name] = fields.check(name, hints[name], value)
+    return Config(**found)

@@ -1,32 +1,26 @@
-"""Says whether this installation works: one line a check, and the mend where one fails."""
+"""Says whether this installation works, in one line for each check."""
 
-import contextlib
-import importlib
-import importlib.metadata
-import io
 import os
-import platform
 import time
 from collections.abc import Callable
 from typing import Any
 
-PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy")
+from jaxrl_vis import provenance
 
 
 def versions() -> str:
     """Versions of Python and of the packages that matter."""
-    found = [f"Python {platform.python_version()}"]
-    return ", ".join(found + [f"{name} {importlib.metadata.version(name)}" for name in PACKAGES])
+    found = provenance.versions()
+    # The checkout itself need not be installed.
+    missing = [name for name, version in found.items() if version == provenance.NOT_INSTALLED and name != "jaxrl-vis"]
+    if missing:
+        raise ModuleNotFoundError(f"{', '.join(missing)} missing; install this project with `pip install .`")
+    return ", ".join(f"{name} {version}" for name, version in found.items())
 
 
 def devices() -> str:
     """What JAX runs on."""
-    import jax
-
-    kinds: dict[str, int] = {}
-    for device in jax.devices():
-        kinds[device.device_kind] = kinds.get(device.device_kind, 0) + 1
-    return f"{jax.default_backend()}: " + ", ".join(f"{count} x {kind}" for kind, count in kinds.items())
+    return f"{provenance.device_record()['platform']}: {provenance.device_name()}"
 
 
 def memory() -> str:
@@ -56,15 +50,13 @@ def compilation_cache() -> str:
 
 
 def physics_and_camera() -> str:
-    """Compiles and takes one control step, draws what it led to, and checks that the image shows something."""
+    """Compiles and takes one control step, renders the result, and checks that the image shows something."""
     import jax
     import jax.numpy as jnp
 
     import jaxrl_vis_envs
     from jaxrl_vis_envs.compilation import env_jit
 
-    with contextlib.redirect_stdout(io.StringIO()):  # it tells stdout that Warp is missing, which nothing here uses
-        importlib.import_module("mujoco.mjx")
     env = jaxrl_vis_envs.make("VisualReacher", image_size=32)
     start = time.perf_counter()
 
@@ -89,12 +81,12 @@ CHECKS: tuple[tuple[str, Callable[[], str]], ...] = (
     ("devices", devices),
     ("memory", memory),
     ("compile cache", compilation_cache),
-    ("world", physics_and_camera),
+    ("environment", physics_and_camera),
 )
 
 
 def main() -> int:
-    """Runs every check, whatever the earlier ones said; 1 where one fails."""
+    """Runs every check, whatever came of the earlier ones. Returns 1 if one fails, else 0."""
     failures = 0
     for name, check in CHECKS:
         try:

@@ -1,10 +1,10 @@
-"""What can go wrong with a request or a run, each with one line that says what, and how to mend it. Imports nothing heavy."""
+"""What can go wrong with a request or a run: each says in one line what it is, and how to mend it. Imports nothing heavy."""
 
 import signal
 
 from jaxrl_vis_envs.names import nearest
 
-__all__ = ["NonFiniteError", "RequestError", "Terminated", "nearest"]
+__all__ = ["NonFiniteError", "RequestError", "StorageError", "Terminated", "nearest"]
 
 
 class RequestError(ValueError):
@@ -13,6 +13,10 @@ class RequestError(ValueError):
 
 class NonFiniteError(FloatingPointError):
     """A loss, a state or a parameter is not finite any more. One line: what, where the state was dumped, what is still good."""
+
+
+class StorageError(RuntimeError):
+    """A run could not write its files, for instance because the disk is full. One line: what, what is kept, and the mend."""
 
 
 class Terminated(SystemExit):

@@ -27,18 +27,18 @@ class Replaceable:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Episodes(Replaceable):
-    """E whole episodes, episode-major, each frame once. Slot T+1 of frames and states holds the goal.
+    """E whole episodes, episode-major, each observation once. Slot T+1 of observations and states holds the goal.
 
-    One array for an episode's frames *and* its goal makes relabelling the choice of a slot: t+1 to T is a frame of the same
-    episode, T+1 the goal that the episode was started with.
+    One array for an episode's observations *and* its goal makes relabelling the choice of a slot: t+1 to T is an observation of
+    the same episode, T+1 the goal that the episode was started with.
 
     Attributes:
-        frames: [E, T+2, ...] observations after 0, 1, ... T steps, then the goal's.
+        observations: [E, T+2, ...] after 0, 1, ... T steps, then the goal's.
         states: [E, T+2, G] float32, the true goal-space states of the same instants.
         actions: [E, T, A] float32, as executed (with exploration noise).
     """
 
-    frames: jax.Array
+    observations: jax.Array
     states: jax.Array
     actions: jax.Array
 
@@ -60,35 +60,37 @@ class ReplayState(Replaceable):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Batch(Replaceable):
-    """B transitions with a goal each, as sampled and relabelled; rewards come from these.
+    """B transitions with a goal each, as sampled and relabelled.
 
     Attributes:
-        frames: [3, B, ...] observations before the action, of the goal (relabelled or original), and after the action: side by
+        observations: [3, B, ...] before the action, of the goal (relabelled or original), and after the action: side by
             side, as they are read and as the networks take them, so that nothing is copied in between.
         action: [B, A] float32.
         state_tp1: [B, G] float32, the true state after the action.
         goal_state: [B, G] float32, the true state that the goal shows.
+        reward: [B] float32 of reaching that goal; None as long as goals may still change.
     """
 
-    frames: jax.Array
+    observations: jax.Array
     action: jax.Array
     state_tp1: jax.Array
     goal_state: jax.Array
+    reward: jax.Array | None = None
 
     @property
     def observation_t(self) -> jax.Array:
         """[B, ...] before the action."""
-        return self.frames[0]
+        return self.observations[0]
 
     @property
     def goal(self) -> jax.Array:
         """[B, ...] the goal's observation."""
-        return self.frames[1]
+        return self.observations[1]
 
     @property
     def observation_tp1(self) -> jax.Array:
         """[B, ...] after the action."""
-        return self.frames[2]
+        return self.observations[2]
 
 
 @jax.tree_util.register_dataclass
@@ -97,7 +99,7 @@ class NormalizerState(Replaceable):
     """Running mean and variance of observations, per pixel and channel.
 
     Attributes:
-        count: [] float32, frames seen.
+        count: [] float32, observations seen.
         mean: [...] float32, in the observation's own unit (0 to 255 for images).
         sum_of_squares: [...] float32, of deviations from the mean.
     """
@@ -117,6 +119,7 @@ class TrainState(Replaceable):
         target_actor, target_critic: Slowly following copies.
         actor_optimizer, critic_optimizer: optax states.
         normalizer: Observation statistics.
+        goal_normalizer: Those of goals, where they have their own; else None.
         updates: [] int32, gradient steps taken (fewer than 2^31 in any run that ends).
     """
 
@@ -128,6 +131,12 @@ class TrainState(Replaceable):
     critic_optimizer: Any
     normalizer: NormalizerState
     updates: jax.Array
+    goal_normalizer: NormalizerState | None = None
+
+    @property
+    def goal_statistics(self) -> NormalizerState:
+        """What goals are normalised with."""
+        return self.normalizer if self.goal_normalizer is None else self.goal_normalizer
 
 
 @jax.tree_util.register_dataclass

@@ -1,7 +1,7 @@
 """Trains a robot from Python: the command line does no more than this.
 
     python notebooks/train.py                            a small run for two laptop cores
-    python notebooks/train.py fast VisualFetchReach      preset and task
+    python notebooks/train.py fast VisualFetchReach      preset and environment
 
 Watch the curve and the video appear in the folder that it prints.
 """
@@ -17,18 +17,18 @@ def main(preset: str = "cpu", env: str = "VisualFetchReach", run_dir: str | None
     config = jaxrl_vis.preset(preset, env=env)
     trainer = jaxrl_vis.make_trainer(config, run_dir=run_dir)
 
-    # One iteration by hand, to see that there is nothing behind the curtain: a rollout, then gradient steps, one compiled call.
+    # One iteration by hand: a rollout, then gradient steps, in one compiled call.
     loop = trainer.init(jax.random.key(config.seed))
     loop, metrics = trainer.train_iteration(loop)
     print({name: float(value[0]) for name, value in metrics.items()})
     del loop, metrics  # the replay is large; run() makes its own
 
     # The whole thing: it evaluates, saves and draws by itself. The reports are for you.
-    best = 0.0
+    success = 0.0
     for report in trainer.run():
         if "eval/success" in report.metrics:
-            best = max(best, *report.metrics["eval/success"])
-    print(f"best evaluation: {best:.2f}; files are in {trainer.folder.path}")
+            (success,) = report.metrics["eval/success"]
+    print(f"success at the last evaluation: {success:.2f}; files are in {trainer.folder.path}")
 
 
 if __name__ == "__main__":

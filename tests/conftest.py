@@ -4,7 +4,6 @@ import gc
 import getpass
 import os
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +23,6 @@ gc.set_threshold(100_000, 20, 20)
 
 
 @pytest.fixture
-def strict_promotion() -> Iterator[None]:
-    """Implicit promotion of dtypes or ranks is an error. For the learner's leaves; MJX relies on both."""
-    with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
-        yield
-
-
-@pytest.fixture
 def checkout() -> Path:
     """The folder that holds pyproject.toml."""
     return Path(__file__).resolve().parents[1]
@@ -42,6 +34,16 @@ def clean_environment(checkout: Path) -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": os.pathsep.join((str(checkout), str(checkout / "envs")))}
 
 
+@pytest.fixture(scope="session")
+def straight(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any, list]:
+    """A run of the fake program, of eight iterations without interruption: its folder, its trainer, its reports."""
+    from fake_program import make_fake_trainer, small_config
+
+    path = tmp_path_factory.mktemp("runs") / "straight"
+    trainer = make_fake_trainer(small_config(), path)
+    return path, trainer, list(trainer.run())
+
+
 # Files whose tests play a task, and the tasks, by the word that names of files and tests have in common; the one that takes
 # longest to compile first.
 WORLD_TESTS = ("controllers", "envs", "finger_turn", "hand_reach", "physics_parity", "sawyer_reach")
@@ -49,7 +51,7 @@ WORLDS = ("hand", "sawyer", "fetch", "finger", "reacher")
 # At the end of a run no worker should wait for the other, so what takes longest comes first.
 FIRST = (*WORLDS, "test_trainer", "test_render_parity")
 # Files that share the programs of another one: notebooks train with the smallest preset, as tests of the trainer do.
-SHARED = {"test_notebooks": "test_trainer"}
+SHARED = {"test_notebooks": "test_trainer", "test_resume": "test_trainer", "test_signals": "test_trainer"}
 
 
 def group_of(nodeid: str) -> str:

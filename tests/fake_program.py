@@ -14,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxrl_vis.config import Config
+from jaxrl_vis.run import metrics
+from jaxrl_vis.run.checkpoint import Checkpoints
 from jaxrl_vis.run.trainer import Trainer
 from jaxrl_vis.types import Episodes, LoopState, NormalizerState, ReplayState, TrainState
 
@@ -32,7 +34,7 @@ class FakeProgram:
 
     def __init__(self, config: Config, nan_at: int | None = None, break_state: bool = False, filtered_share: float = 0.1):
         self.config, self.traces = config, 0
-        self.env = types.SimpleNamespace(distance_unit="m", threshold=0.05, control_period=0.04, horizon=HORIZON)
+        self.env = types.SimpleNamespace(distance_unit="m", threshold=0.05, control_period=0.04, horizon=HORIZON, frame_stack=1)
         self.steps_per_iteration = config.num_envs * HORIZON
         self.updates_per_iteration = 3
         self.num_iterations = math.ceil(config.env_steps / self.steps_per_iteration)
@@ -53,7 +55,7 @@ class FakeProgram:
                 updates=jnp.zeros((), jnp.int32),
             )
             replay = Episodes(
-                frames=jnp.zeros((episodes, HORIZON + 2, 1, size, size), jnp.uint8),
+                observations=jnp.zeros((episodes, HORIZON + 2, 1, size, size), jnp.uint8),
                 states=jnp.zeros((episodes, HORIZON + 2, 3)),
                 actions=jnp.zeros((episodes, HORIZON, 4)),
             )
@@ -77,7 +79,7 @@ class FakeProgram:
             if break_state:
                 new = new.replace(states=jnp.where(bad, jnp.nan, new.states))
             replay = jax.tree.map(lambda whole, part: jax.lax.dynamic_update_slice_in_dim(whole, part, start, 0), old, new)
-            step = 0.1 * (noise - 0.5) + 1e-3 * replay.states.mean() + 1e-4 * replay.frames.mean()
+            step = 0.1 * (noise - 0.5) + 1e-3 * replay.states.mean() + 1e-4 * replay.observations.mean()
             actor = {"layer": {"kernel": loop.train.actor["layer"]["kernel"] + step, "bias": loop.train.actor["layer"]["bias"]}}
             loss = jnp.where(bad, jnp.nan, step**2)
             critic = jax.tree.map(lambda leaf: leaf + 0.0 * loss, loop.train.critic)
@@ -108,6 +110,17 @@ class FakeProgram:
 
 def make_fake_trainer(config: Config, run_dir: Path, resume: bool = False, overwrite: bool = False, **program) -> Trainer:
     return Trainer(config, FakeProgram(config, **program), run_dir, resume=resume, overwrite=overwrite)
+
+
+def rows_without_time(path: Path) -> list[dict]:
+    return [
+        {name: row[name] for name in row if not name.startswith("time/")} for row in metrics.read_rows(path / "metrics.jsonl")
+    ]
+
+
+def final_state(path: Path, shapes) -> list[np.ndarray]:
+    checkpoints = Checkpoints(path / "checkpoints", read_only=True)
+    return as_plain(checkpoints.restore_for_resume(shapes).loop)
 
 
 def as_plain(tree) -> list[np.ndarray]:

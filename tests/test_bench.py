@@ -1,3 +1,4 @@
+import functools
 import json
 import time
 from pathlib import Path
@@ -7,13 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxrl_vis import bench
-from jaxrl_vis.bench import record, roofline, timing, train, update
+from jaxrl_vis import bench, provenance
+from jaxrl_vis.bench import peaks, record, roofline, timing, train, update, variation
 from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.settings import Settings
 from jaxrl_vis.config import preset
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis_envs import registry
 from jaxrl_vis_envs.base import GoalEnv, State
+from jaxrl_vis_envs.pixels import PixelsConfig
 
 
 def measurement(value: float, envs: int = 4, unit: str = "images/s") -> Measurement:
@@ -62,15 +65,16 @@ def test_json_holds_this_run_s_records(tmp_path: Path) -> None:
     assert [entry["value"] for entry in json.loads((tmp_path / "deep" / "out.json").read_text())] == [1.0, 2.0]
 
 
-def test_revision_of_no_checkout(tmp_path: Path) -> None:
-    assert record.git_revision(tmp_path) == "unknown"
+def test_a_record_of_no_checkout_has_an_unknown_revision(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(provenance, "revision", lambda digits: None)
+    assert record.to_record(measurement(1.0))["revision"] == "unknown"
 
 
 def test_copies_are_refused() -> None:
-    timing.assert_varied(np.arange(8).reshape(4, 2), "rows")
+    variation.assert_varied(np.arange(8).reshape(4, 2), "rows")
     with pytest.raises(AssertionError, match="only 1 of 4 rows differ"):
-        timing.assert_varied(np.ones((4, 2)), "rows")
-    timing.assert_varied(np.ones((1, 2)), "rows")
+        variation.assert_varied(np.ones((4, 2)), "rows")
+    variation.assert_varied(np.ones((1, 2)), "rows")
 
 
 def test_timing_keeps_its_budget_and_takes_the_median() -> None:
@@ -108,8 +112,9 @@ def test_encoder_products_count_every_layer() -> None:
 
 
 def test_peaks_take_the_longest_name() -> None:
-    assert roofline.peak_of("NVIDIA H100 80GB HBM3") is roofline.PEAKS["NVIDIA H100 80GB HBM3"]
-    assert roofline.peak_of("cpu") is None
+    assert peaks.peak_of("NVIDIA H100 80GB HBM3") is peaks.PEAKS["NVIDIA H100 80GB HBM3"]
+    assert peaks.peak_of("NVIDIA H200 NVL") is peaks.PEAKS["NVIDIA H200"]
+    assert peaks.peak_of("cpu") is None
     shares = roofline.describe(roofline.Cost(989e9, 3.35e9), 0.01, "bfloat16", "NVIDIA H100 80GB HBM3")
     assert shares["share_of_peak_flops"] == pytest.approx(0.1)
     assert shares["share_of_peak_bandwidth"] == pytest.approx(0.1)
@@ -125,16 +130,16 @@ def test_noise_fills_the_whole_replay() -> None:
     full = fill_replay(empty, jax.random.key(0))
     assert jax.tree.map(jax.typeof, full) == jax.tree.map(jax.typeof, empty)
     assert int(full.size) == replay.num_episodes
-    frames = np.asarray(full.episodes.frames).reshape(replay.num_episodes * 7, -1)
+    frames = np.asarray(full.episodes.observations).reshape(replay.num_episodes * 7, -1)
     assert len({frame.tobytes() for frame in frames}) == len(frames)
 
 
 class Dot(GoalEnv):
-    """A bright dot that moves in a dark image: a world that compiles at once."""
+    """A bright dot that moves in a dark image: an environment that compiles at once."""
 
-    name, horizon, action_size, threshold, control_period = "VisualDot", 3, 2, 0.1, 0.1
+    name, horizon, action_size, threshold, control_period = "Dot", 3, 2, 0.1, 0.1
 
-    def __init__(self, moves: bool = True) -> None:
+    def __init__(self, config: PixelsConfig | None = None, moves: bool = True) -> None:
         self.moves = moves
 
     def draw(self, place: jax.Array) -> jax.Array:
@@ -156,6 +161,15 @@ class Dot(GoalEnv):
         return self.draw(state.data)
 
 
+@pytest.fixture
+def dots(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two environments: one whose dot moves, and one whose dot does not. Images are told by the configuration, not the name."""
+    for name, moves in (("Dot", True), ("StillDot", False)):
+        make = functools.partial(Dot, moves=moves)
+        monkeypatch.setitem(registry._ENTRIES, name, registry._Entry(make, PixelsConfig))
+
+
+@pytest.mark.usefixtures("dots")
 @pytest.mark.parametrize("benchmark", bench.BENCHMARKS)
 def test_every_benchmark_keeps_records(benchmark: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def tiny(_: Settings, **overrides: int):
@@ -163,18 +177,27 @@ def test_every_benchmark_keeps_records(benchmark: str, tmp_path: Path, monkeypat
 
     for module in (train, update):
         monkeypatch.setattr(module, "training_config", tiny)
-    monkeypatch.setattr(Settings, "make_env", lambda self, **_: Dot())
-    found = bench.run(benchmark, env="VisualDot", envs=(3,), repeats=1, results=tmp_path, json=tmp_path / "out" / "run.json")
+    found = bench.run(benchmark, env="Dot", envs=(3,), repeats=1, results=tmp_path, json=tmp_path / "out" / "run.json")
     assert found and all(entry.value > 0.0 for entry in found)
     assert len(json.loads((tmp_path / "out" / "run.json").read_text())) == len(found)
     assert len(record.load(record.results_path(benchmark, tmp_path))) == len(found)
 
 
+@pytest.mark.usefixtures("dots")
 @pytest.mark.parametrize("benchmark", ["render", "physics", "env"])
-def test_a_broadcast_is_not_measured(benchmark: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Settings, "make_env", lambda self, **_: Dot(moves=False))
+def test_a_broadcast_is_not_measured(benchmark: str, tmp_path: Path) -> None:
     with pytest.raises(AssertionError, match="broadcast"):
-        bench.run(benchmark, env="VisualDot", envs=(3,), repeats=1, results=tmp_path)
+        bench.run(benchmark, env="StillDot", envs=(3,), repeats=1, results=tmp_path)
+
+
+@pytest.mark.usefixtures("dots")
+def test_settings_of_images_go_to_environments_that_have_them() -> None:
+    images, none = Settings(env="Dot", image_size=16, pixels="rgb"), Settings(env="Reacher", image_size=16, pixels="rgb")
+    assert images.image_config() == {"env": "Dot", "image_size": 16, "pixels": "rgb"}
+    assert none.image_config() == {"env": "Reacher"}
+    assert update.training_config(images).image_size == 16
+    with pytest.raises(RequestError, match="needs an environment with images, and Reacher has none"):
+        bench.run("render", env="Reacher")
 
 
 def test_a_missing_opengl_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -55,7 +55,7 @@ def test_everything_comes_back_bit_for_bit(states, saved):
     checkpoints = Checkpoints(saved, lines.append)
     assert checkpoints.iterations(FULL) == checkpoints.iterations(LIGHT) == [2, 3]
     restored = checkpoints.restore_for_resume(shapes)
-    assert (restored.tier, restored.iteration, restored.memo) == (FULL, 3, {"wall_s": 4.5}) and not lines
+    assert (restored.tier, restored.iteration, restored.progress) == (FULL, 3, {"wall_s": 4.5}) and not lines
     assert jax.tree.structure(restored.loop) == jax.tree.structure(loops[2])
     for new, old in zip(jax.tree.leaves(restored.loop), jax.tree.leaves(loops[2]), strict=True):
         assert new.dtype == old.dtype and new.shape == old.shape
@@ -85,7 +85,7 @@ def test_a_full_save_does_not_keep_the_replay(tmp_path):
     checkpoints = Checkpoints(tmp_path)
     checkpoints.save_full(1, loop, {})
     trainer.train_iteration(loop)
-    assert loop.replay.episodes.frames.is_deleted()
+    assert loop.replay.episodes.observations.is_deleted()
     checkpoints.close()
 
 
@@ -110,11 +110,13 @@ def damage(folder: Path, how: str) -> None:
 def test_a_damaged_checkpoint_is_skipped_with_one_line(states, saved, how, capfd):
     loops, shapes = states
     damage(saved / FULL / "3", how)
+    damage(saved / LIGHT / "3", how)
     lines = []
     restored = Checkpoints(saved, lines.append).restore_for_resume(shapes)
     assert (restored.tier, restored.iteration) == (FULL, 2)
     assert all(map(np.array_equal, as_plain(restored.loop), as_plain(loops[1])))
-    assert len(lines) == 1 and "full/3 is damaged" in lines[0] and "\n" not in lines[0]
+    assert len(lines) == 2 and "full/3 is damaged" in lines[0] and "light/3 is damaged" in lines[1]
+    assert not any("\n" in line for line in lines)
     assert "Traceback" not in capfd.readouterr().err
 
 
@@ -123,15 +125,29 @@ def test_only_light_left(states, saved):
         damage(saved / FULL / iteration, "delete data")
     lines = []
     restored = Checkpoints(saved, lines.append).restore_for_resume(states[1])
-    assert (restored.tier, restored.iteration, restored.loop, len(lines)) == (LIGHT, 3, None, 2)
+    assert (restored.tier, restored.iteration, restored.loop, len(lines)) == (LIGHT, 3, None, 1)
 
 
-def test_later_checkpoints_are_discarded_and_written_again(states, saved):
+def test_the_newest_checkpoint_counts_whatever_its_tier(states, saved):
+    shutil.rmtree(saved / FULL / "3")
+    restored = Checkpoints(saved).restore_for_resume(states[1])
+    assert (restored.tier, restored.iteration) == (LIGHT, 3)
+    assert all(map(np.array_equal, as_plain(restored.train), as_plain(states[0][2].train)))
+
+
+def test_a_full_checkpoint_retires_when_a_newer_light_one_is_there(saved):
     checkpoints = Checkpoints(saved)
-    checkpoints.discard_after(2)
+    checkpoints.retire_full()
+    assert checkpoints.iterations(FULL) == [3] and checkpoints.iterations(LIGHT) == [2, 3]
+
+
+def test_later_checkpoints_are_set_aside_and_written_again(states, saved):
+    checkpoints = Checkpoints(saved)
+    moved = checkpoints.set_aside_after(2)
+    assert sorted(path.name for path in moved) == ["full-3", "light-3"] and all((path / "manifest").exists() for path in moved)
     assert checkpoints.iterations(FULL) == checkpoints.iterations(LIGHT) == [2]
     checkpoints.save_full(2, states[0][0], {"again": True})  # the same iteration once more replaces it
-    assert checkpoints.restore_for_resume(states[1]).memo == {"again": True}
+    assert checkpoints.restore_for_resume(states[1]).progress == {"again": True}
     checkpoints.save_full(3, states[0][2], {})
     assert checkpoints.iterations(FULL) == [2, 3]
     checkpoints.close()
@@ -148,6 +164,12 @@ def test_nothing_saved_yet(states, tmp_path):
     checkpoints = Checkpoints(tmp_path / "none", read_only=True)
     assert checkpoints.newest() is None and checkpoints.restore_train(states[1]) is None
     assert not (tmp_path / "none").exists()
+
+
+def test_a_manifest_of_the_first_schema_is_read(states, saved):
+    (file,) = [path for path in (saved / FULL / "3" / "manifest").iterdir() if "progress" in path.read_text(errors="replace")]
+    file.write_text(file.read_text().replace('"schema": 2', '"schema": 1').replace('"progress"', '"memo"'))
+    assert Checkpoints(saved).restore_for_resume(states[1]).progress == {"wall_s": 4.5}
 
 
 def test_kill_while_saving_keeps_the_checkpoint_before(tmp_path, clean_environment):

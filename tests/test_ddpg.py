@@ -7,6 +7,7 @@ import probe_environments as probes
 import pytest
 
 from jaxrl_vis.config import preset
+from jaxrl_vis.learner import rollout
 from jaxrl_vis.learner.train_step import make_train_step
 
 DISCOUNT = 0.75  # 1 - 1/horizon of the probes
@@ -167,3 +168,87 @@ def test_replay_is_written_in_place():
     assert replay > 10e6
     assert memory.alias_size_in_bytes >= replay
     assert memory.temp_size_in_bytes < 0.2 * replay
+
+
+@pytest.mark.parametrize(("interval", "updates"), [(1, 1), (3, 2), (3, 3), (3, 7), (40, 40)])
+def test_targets_follow_once_an_interval(interval, updates):
+    """After U updates in one iteration, targets have moved floor(U / interval) times: by each step's own online networks."""
+    config = preset("debug", num_envs=4, batch_size=8, target_update_interval=interval, target_decay=0.9)
+    program = make_train_step(probes.GoWhereTold(), config.replace(updates_per_iteration=updates))
+    single = make_train_step(probes.GoWhereTold(), config.replace(updates_per_iteration=1))
+    first = program.init(jax.random.key(0)[None]).train
+    loop, _ = program.train_iteration(program.init(jax.random.key(0)[None]))
+    moved = jax.tree.map(lambda new, old: bool(jnp.any(new != old)), loop.train.target_critic, first.target_critic)
+    assert any(jax.tree.leaves(moved)) == (updates >= interval)
+    if interval == 1:  # and by how much: a tenth of the way to where the online network is
+        loop, _ = single.train_iteration(single.init(jax.random.key(0)[None]))
+        for target, online, old in zip(*map(jax.tree.leaves, (loop.train.target_actor, loop.train.actor, first.actor))):
+            np.testing.assert_allclose(target, 0.9 * old + 0.1 * online, atol=1e-6)
+
+
+def test_exploration_has_its_shares_and_spread():
+    """Whole vectors are uniform with the share asked for; the others stray from the policy with the deviation asked for."""
+    program = make_train_step(probes.GoWhereTold(), preset("debug"))
+    train = jax.tree.map(lambda leaf: leaf[0], program.init(jax.random.key(0)[None]).train)
+    observations, count = jnp.zeros((20_000, 1)), 20_000
+    latents = rollout.encode(program.networks, train, train.normalizer, observations)
+
+    def actions(exploration):
+        act = jax.jit(lambda key: rollout.choose_actions(program.networks, train, latents, exploration, key, observations))
+        return np.asarray(act(jax.random.key(5)))[:, 0]
+
+    policy = actions(rollout.NO_EXPLORATION)
+    assert np.ptp(policy) == 0.0 and abs(policy[0]) < 0.5
+    noise = actions(rollout.Exploration(0.0, 0.1)) - policy
+    assert abs(noise.std() - 0.1) < 0.003 and abs(noise.mean()) < 0.003
+    random = actions(rollout.Exploration(1.0, 0.1))
+    assert abs(random.mean()) < 0.02 and abs(random.std() - 1 / np.sqrt(3)) < 0.01 and np.abs(random).max() <= 1.0
+    share = np.mean(actions(rollout.Exploration(0.3, 0.0)) != policy)
+    assert abs(share - 0.3) < 4 * np.sqrt(0.21 / count)
+    assert np.abs(actions(rollout.Exploration(0.0, 5.0))).max() == 1.0  # clipped
+
+
+def test_success_counts_at_the_last_step():
+    """A robot that passes through its goal and goes on has failed; one that arrives at the very end has not."""
+
+    class Passing(probes.GoWhereTold):
+        """Moves by one a step, whatever the action; the goal is where it is after ``reached`` steps."""
+
+        def __init__(self, reached):
+            self.reached = reached
+
+        def start(self, key):
+            return jnp.zeros(1), jnp.full(1, float(self.reached))
+
+        def advance(self, state, action):
+            position = state.data + 1.0
+            return self._measure(position, position, state.goal_state, state.obs)
+
+    for reached, success in ((2, 0.0), (probes.Probe.horizon, 1.0)):
+        program = make_train_step(Passing(reached), preset("debug", eval_episodes=4))
+        outcome, recording = program.evaluate(program.init(jax.random.key(0)[None]).train, jax.random.key(1))
+        assert outcome["eval/success"][0] == success
+        assert outcome["eval/goal_distance"][0] == probes.Probe.horizon - reached
+        np.testing.assert_array_equal(recording["success"], success)
+
+
+@pytest.mark.parametrize("source", ["rollouts", "relabelled"])
+def test_goals_can_have_statistics_of_their_own(source):
+    """Goals of this probe never equal what is observed: shared statistics mix the two, separate ones do not."""
+    settings = {"normalizer_source": source, "num_envs": 64, "relabel_probability": 0.0, "updates_per_iteration": 1}
+    env = probes.ThreeStepsAway()  # from -3 to 0, and the goal is 0
+
+    def statistics(normalizers):
+        program = make_train_step(env, preset("debug", normalizers=normalizers, **settings))
+        loop, metrics = program.train_iteration(program.init(jax.random.key(0)[None]))
+        assert metrics["guard/nonfinite"][0] == 0
+        outcome, _ = program.evaluate(loop.train, jax.random.key(1))
+        assert np.isfinite(outcome["eval/goal_distance"]).all()
+        return loop.train.normalizer, loop.train.goal_normalizer
+
+    shared, none = statistics("shared")
+    observed, goals = statistics("separate")
+    assert none is None and float(goals.mean[0, 0]) == 0.0 and float(goals.sum_of_squares[0, 0]) == 0.0
+    per_episode = {"rollouts": 5, "relabelled": 4}[source]  # T+1 observations, or T transitions
+    assert float(observed.count[0]) == 64 * per_episode
+    assert float(observed.mean[0, 0]) < float(shared.mean[0, 0]) < 0.0

@@ -16,8 +16,8 @@ from jaxrl_vis_envs import registry
 
 
 @pytest.fixture
-def own_task() -> Iterator[str]:
-    """A task of a user's own, for the length of a test."""
+def own_environment() -> Iterator[str]:
+    """An environment of a user, registered for the length of a test."""
     registry.register("VisualPointMass", PointMass, PointMassConfig)
     yield "VisualPointMass"
     del registry._ENTRIES["VisualPointMass"]
@@ -28,7 +28,7 @@ def rows(output: str) -> dict[str, list[str]]:
     return {cell[0]: cell[1:] for cell in cells}
 
 
-def test_the_table_says_what_the_tasks_are(own_task: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_table_says_what_the_environments_are(own_environment: str, capsys: pytest.CaptureFixture[str]) -> None:
     traced = []
     with pytest.MonkeyPatch.context() as patch:
         for part in ("reset", "advance"):  # the table is quick because it asks for neither
@@ -40,22 +40,23 @@ def test_the_table_says_what_the_tasks_are(own_task: str, capsys: pytest.Capture
     assert table["VisualFingerTurn"][:6] == ["2", "12x64x64 uint8", "2", "50", "0.07 m", "210 ms"]
     assert table["HandReach"][:6] == ["20", "63 float32", "15", "50", "0.03 m", "40 ms"]
     for name, cells in table.items():
-        assert (cells[6:] == ["-", "-"]) == (name == own_task), name  # nobody has measured the user's
-        assert cells[6:] == table[name.removeprefix("Visual")][6:] if name != own_task else True
+        assert (cells[6:] == ["-", "-"]) == (name == own_environment), name  # nobody has measured the user's
+        assert cells[6:] == table[name.removeprefix("Visual")][6:] if name != own_environment else True
 
 
-def test_the_table_of_some_tasks(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_table_of_some_environments(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["envs", "--env", "Reacher", "FetchReach"]) == 0
     assert list(rows(capsys.readouterr().out)) == ["Reacher", "FetchReach"]
 
 
-def test_the_gallery_shows_start_and_goals(own_task: str, tmp_path: Path) -> None:
+def test_the_gallery_shows_start_and_goals(own_environment: str, tmp_path: Path) -> None:
     size, goals = 20, 3
     path = tmp_path / "gallery.png"
-    assert cli.main(["envs", "--env", own_task, "--gallery", str(path), "--image-size", str(size), "--goals", str(goals)]) == 0
+    options = ["--gallery", str(path), "--image-size", str(size), "--goals", str(goals)]
+    assert cli.main(["envs", "--env", own_environment, *options]) == 0
     sheet = np.asarray(Image.open(path))
     assert sheet.shape[0] > size and sheet.shape[1] > (4 + goals) * size
-    frames = gallery.frames_of(jaxrl_vis_envs.make(own_task), jax.random.key(1), goals, size)
+    frames = gallery.frames_of(jaxrl_vis_envs.make(own_environment), jax.random.key(1), goals, size)
     assert frames.rgb.shape == (1 + goals, size, size, 3)
     for labels in frames.segmentation:
         assert set(np.unique(labels)) == {0, 1}  # ground and ball

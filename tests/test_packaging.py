@@ -14,13 +14,15 @@ ROOT = Path(__file__).resolve().parents[1]
 
 # Folders and single files of jaxrl_vis. A folder imports from earlier rows only; files of one row do not import each other.
 LAYERS: tuple[tuple[str, ...], ...] = (
-    ("errors",),
-    ("config", "types", "provenance"),
+    ("errors", "methods"),
+    ("fields",),
+    ("config", "types", "provenance", "files"),
     ("learner",),
     ("report",),
     ("run",),
     ("bench", "doctor"),
     ("cli",),
+    ("__main__",),
 )
 # The same for the environments.
 ENVIRONMENT_LAYERS: tuple[tuple[str, ...], ...] = (

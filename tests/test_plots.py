@@ -16,13 +16,13 @@ def make_rows(seeds: int, evaluations: int) -> list[dict]:
     ]
 
 
-def make_recording(channels: int, size: int = 16, per_step: bool = False) -> videos.Recording:
+def make_images(channels: int, size: int = 16, per_step: bool = False) -> videos.EpisodeImages:
     greys = np.random.default_rng(0).integers(0, 255, (3, 6, 1, size, size), np.uint8)
     frames = np.repeat(greys, channels, axis=2)
     success = np.array([True, False, True])
     if per_step:
         success = np.arange(6)[None] >= np.array([[3], [9], [5]])
-    return videos.Recording(frames, frames[:, -1], success)
+    return videos.EpisodeImages(frames, frames[:, -1], success)
 
 
 def count_colour(image: Image.Image, colour: tuple[int, int, int]) -> int:
@@ -53,7 +53,7 @@ def test_gaps_and_nothing_at_all(tmp_path):
 @pytest.mark.parametrize("channels", [1, 3, 4])
 def test_a_video_shows_the_observation_beside_the_goal(tmp_path, channels):
     path = tmp_path / "video.gif"
-    videos.write_video(make_recording(channels), path, frame_seconds=0.05)
+    videos.write_video(make_images(channels), path, frame_seconds=0.05)
     image = Image.open(path)
     rows = 2 if channels == 4 else 1
     assert image.n_frames == 18 and image.info["loop"] == 0
@@ -71,26 +71,26 @@ def test_a_video_shows_the_observation_beside_the_goal(tmp_path, channels):
 def test_colours_survive_enlargement(tmp_path):
     frames = np.zeros((1, 2, 3, 8, 8), np.uint8)
     frames[:, :, 0, :4] = 250
-    recording = videos.Recording(frames, frames[:, -1], np.array([False]))
-    images, seconds = videos.draw_frames(recording, 0.04, max_episodes=1)
+    episodes = videos.EpisodeImages(frames, frames[:, -1], np.array([False]))
+    images, seconds = videos.draw_frames(episodes, 0.04, max_episodes=1)
     assert seconds == [0.04, 1.0]
     assert count_colour(images[0], (250, 0, 0)) == 2 * 256 * 128
 
 
 def test_borders_turn_green_when_success_is_known_at_each_step():
-    images, _ = videos.draw_frames(make_recording(3, per_step=True), 0.04, max_episodes=1)
+    images, _ = videos.draw_frames(make_images(3, per_step=True), 0.04, max_episodes=1)
     assert [count_colour(image, (62, 207, 142)) > 2000 for image in images] == [False] * 3 + [True] * 3
 
 
 def test_other_formats(tmp_path):
-    recording = make_recording(4)
-    videos.write_video(recording, tmp_path / "a.html")
+    episodes = make_images(4)
+    videos.write_video(episodes, tmp_path / "a.html")
     assert "data:image/gif;base64," in (tmp_path / "a.html").read_text()
-    videos.write_video(recording, tmp_path / "deep" / "a.png")
+    videos.write_video(episodes, tmp_path / "deep" / "a.png")
     assert Image.open(tmp_path / "deep" / "a.png").width > 700
     with pytest.raises(RequestError, match="must end in one of"):
-        videos.write_video(recording, tmp_path / "a.webm")
-    vectors = videos.Recording(np.zeros((2, 6, 10), np.float32), np.zeros((2, 10), np.float32), np.zeros(2))
+        videos.write_video(episodes, tmp_path / "a.webm")
+    vectors = videos.EpisodeImages(np.zeros((2, 6, 10), np.float32), np.zeros((2, 10), np.float32), np.zeros(2))
     with pytest.raises(RequestError, match="not images"):
         videos.write_video(vectors, tmp_path / "b.gif")
 
@@ -100,7 +100,7 @@ def test_mp4_needs_a_package_and_says_so(tmp_path):
         import imageio_ffmpeg  # noqa: F401
     except ImportError:
         with pytest.raises(RequestError, match="imageio-ffmpeg"):
-            videos.write_video(make_recording(3), tmp_path / "a.mp4")
+            videos.write_video(make_images(3), tmp_path / "a.mp4")
     else:
-        videos.write_video(make_recording(3), tmp_path / "a.mp4")
+        videos.write_video(make_images(3), tmp_path / "a.mp4")
         assert (tmp_path / "a.mp4").stat().st_size > 1000

@@ -1,7 +1,7 @@
 """Domain randomisation: what is on changes what it should and nothing else, and off is as if there were none."""
 
 import functools
-from typing import Any
+from typing import Any, get_args
 
 import jax
 import jax.numpy as jnp
@@ -15,11 +15,13 @@ import jaxrl_vis_envs
 from jaxrl_vis import config as config_file
 from jaxrl_vis.config import preset
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner.train_step import make_env, make_train_step
+from jaxrl_vis.learner.environment import make_env
+from jaxrl_vis.learner.train_step import make_train_step
 from jaxrl_vis_envs import pixels, randomization
 from jaxrl_vis_envs.compilation import env_jit
 from jaxrl_vis_envs.randomization import KINDS, OFF, Randomization, typical
-from jaxrl_vis_envs.render import Scene, gpu_kernel, images, render_planes
+from jaxrl_vis_envs.render import Scene, render_planes
+from jaxrl_vis_envs.render.gpu import kernel
 
 SIZE, COUNT, STEPS = 16, 3, 2
 TASKS = ["FetchReach", "FingerTurn", "HandReach", "Reacher", "SawyerReach"]
@@ -217,15 +219,15 @@ def test_the_gpu_kernel_draws_varied_scenes(monkeypatch: pytest.MonkeyPatch) -> 
     """By Pallas's interpreter: the scene's leaves differ between the environments of a batch, and both ways draw the same."""
     scene, _ = draw_shape()
     start = episodes(ALL)[0]
-    assert gpu_kernel.supports(scene)
+    assert kernel.supports(scene)
 
     def draw(data: Any, domain: Any) -> jax.Array:
         planes = render_planes(randomization.varied_scene(scene, domain), data)
         return jnp.concatenate([planes.rgb, planes.depth[None]])
 
     plain = np.asarray(env_jit(jax.vmap(draw))(start.data, start.domain))
-    monkeypatch.setattr(gpu_kernel, "takes", gpu_kernel.supports)
-    monkeypatch.setattr(images.gpu_kernel, "draw", functools.partial(gpu_kernel.draw, interpret=True))
+    monkeypatch.setattr(kernel, "takes", lambda scene, outputs: kernel.supports(scene))
+    monkeypatch.setattr(kernel, "draw", functools.partial(kernel.draw, interpret=True))
     by_kernel = np.asarray(jax.vmap(draw)(start.data, start.domain))
     assert (np.abs(plain - by_kernel).max(axis=1) < 1e-3).mean() > 0.98  # but for pixels on an edge
     assert len({image.tobytes() for image in by_kernel}) == COUNT
@@ -234,7 +236,7 @@ def test_the_gpu_kernel_draws_varied_scenes(monkeypatch: pytest.MonkeyPatch) -> 
 def test_typical_ranges_and_bad_ones() -> None:
     assert typical() == OFF and not OFF.active
     assert typical("dynamics", strength=0.5).mass == 0.5 * KINDS["dynamics"]["mass"]
-    assert set(KINDS) == set(config_file.RANDOMIZED)
+    assert set(KINDS) == set(get_args(config_file.Randomized))
     assert {name for kind in KINDS.values() for name in kind} == set(Randomization.__dataclass_fields__)
     for bad in (lambda: Randomization(mass=-0.1), lambda: Randomization(colour=float("nan")), lambda: Randomization(mass=1.0)):
         with pytest.raises(ValueError, match="of the randomization"):
@@ -290,7 +292,7 @@ def test_a_learner_trains_in_environments_that_vary() -> None:
         return loop, rows
 
     (loop, rows), (_, again) = train(), train()
-    starts = np.asarray(loop.replay.episodes.frames[0, :, 0])
+    starts = np.asarray(loop.replay.episodes.observations[0, :, 0])
     np.testing.assert_array_equal(loop.replay.episodes.states[0, :, 0], 0.0)
     assert len({start.tobytes() for start in starts}) == len(starts) == 8
     assert all(np.isfinite(value).all() and row["guard/nonfinite"] == 0 for row in rows for value in row.values())

@@ -1,5 +1,6 @@
 """Scenes, poses and peers of `bench render`, without GL and without a GPU."""
 
+import dataclasses
 import sys
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 from jaxrl_vis import bench
-from jaxrl_vis.bench import record, render, render_operations, render_scenes, scene_images, warp_renderer
+from jaxrl_vis.bench import comparison, record, render_operations, render_scenes, variation, warp_renderer
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis_envs.render import Scene
 
@@ -132,14 +133,14 @@ def test_operations_are_those_of_the_tests_and_of_one_shading(ball: str) -> None
 def test_images_that_do_not_change_are_refused() -> None:
     rows = np.arange(8, dtype=np.float32)[:, None]
     with pytest.raises(AssertionError, match="8 of 8 images stay the same"):
-        render.assert_new_images(lambda batch: (jnp.asarray(batch), None), [rows, rows])
+        variation.assert_new_images(lambda batch: (jnp.asarray(batch), None), [rows, rows])
     with pytest.raises(AssertionError, match="only 1 of 8 images differ"):
-        render.assert_new_images(lambda batch: 0 * batch, [rows, rows + 8])
-    render.assert_new_images(lambda batch: batch, [rows, rows + 8])
+        variation.assert_new_images(lambda batch: 0 * batch, [rows, rows + 8])
+    variation.assert_new_images(lambda batch: batch, [rows, rows + 8])
 
 
 def test_calls_alternate_between_batches() -> None:
-    draw = render.alternate(lambda batch: batch, [1, 2])
+    draw = variation.alternate(lambda batch: batch, [1, 2])
     assert [draw() for _ in range(5)] == [1, 2, 1, 2, 1]
 
 
@@ -163,7 +164,120 @@ def test_a_scene_that_stands_still_is_not_measured(tmp_path: Path) -> None:
 def test_agreement_counts_sky_and_closeness() -> None:
     ours = np.array([[[np.inf, 2.0, 2.0, np.inf]]])
     theirs = np.array([[[np.inf, 2.01, 2.2, 1.0]]])
-    assert scene_images.agreement(ours, theirs) == 0.5
+    assert comparison.depth_agreement(ours, theirs) == 0.5
+
+
+@pytest.fixture(scope="module")
+def drawn_ball(tmp_path_factory: pytest.TempPathFactory) -> comparison.Comparison:
+    path = tmp_path_factory.mktemp("scene") / "ball.xml"
+    path.write_text(BALL)
+    mj_model = render_scenes.load(str(path))
+    batches = [render_scenes.random_poses(mj_model, 3, seed) for seed in (1, 2)]
+    return comparison.compare({"image_size": 16, "images": 3}, mj_model, batches, repeats=1, rate=1.0)
+
+
+def test_a_peer_must_draw_the_same(drawn_ball: comparison.Comparison) -> None:
+    ours = drawn_ball
+    assert ours.agreement(ours.colours, ours.depth) == {"depth_agreement": 1.0, "colour_difference": 0.0}
+    brighter = np.minimum(ours.colours.astype(int) + 10, 255).astype(np.uint8)
+    with pytest.raises(AssertionError, match="colour_difference is .* grey levels, and 1.5 at most"):
+        ours.agreement(brighter, ours.depth)
+    moved = np.where(np.isfinite(ours.depth), ours.depth * 1.05, np.inf)
+    with pytest.raises(AssertionError, match="depths agree in .* of the pixels"):
+        ours.agreement(ours.colours, moved)
+    # A peer may draw fewer images than we do.
+    assert ours.agreement(ours.colours[:2], ours.depth[:2])["depth_agreement"] == 1.0
+
+
+def test_textures_have_a_bound_of_their_own(drawn_ball: comparison.Comparison) -> None:
+    lower_half = np.zeros_like(drawn_ball.textured)
+    lower_half[:, 8:] = True
+    ours = dataclasses.replace(drawn_ball, textured=lower_half)
+    theirs = np.where(lower_half[..., None], ours.colours // 2 + 64, ours.colours)
+    with pytest.raises(AssertionError, match="textured_difference"):
+        ours.agreement(theirs, ours.depth)
+    assert ours.agreement(theirs, ours.depth, 200.0)["textured_difference"] > comparison.MOST_DIFFERENCE
+
+
+def test_textured_geoms_are_those_whose_material_has_a_texture() -> None:
+    assert comparison.textured_geoms(render_scenes.load("primitives")).nonzero()[0].tolist() == [0]
+    assert not comparison.textured_geoms(render_scenes.load("primitives", textures=False)).any()
+    assert not comparison.textured_geoms(render_scenes.load("fetch_reach")).any()
+
+
+def test_start_poses_barely_move_and_still_differ() -> None:
+    mj_model = render_scenes.load("primitives")
+    mj_data = mujoco.MjData(mj_model)
+    render_scenes.forward(mj_model, mj_data)
+    poses = render_scenes.random_poses(mj_model, 4, 1, render_scenes.SPREADS["start"])
+    assert np.abs(poses["geom_xpos"] - mj_data.geom_xpos).max() < 3e-3
+    assert len({row.tobytes() for row in poses["geom_xpos"]}) == 4
+    finger = render_scenes.load("finger")
+    mj_data = mujoco.MjData(finger)
+    rng = np.random.default_rng(0)
+    render_scenes.scatter_joints(finger, mj_data, rng, spread=0.0)
+    np.testing.assert_array_equal(mj_data.qpos, finger.qpos0)
+
+
+WARP_NEEDS = {
+    "finger": {"use_textures", "render_skybox", "use_ambient_lighting", "enable_specular"},
+    "fetch_reach": {"use_ambient_lighting"},
+    "primitives": {"use_textures", "render_skybox", "use_ambient_lighting", "enable_specular"},
+}
+
+
+def warp_options(scene: str, **variant: bool) -> set[str]:
+    mj_model = render_scenes.load(scene, **variant)
+    batches = [render_scenes.random_poses(mj_model, 2, 1)]
+    options = warp_renderer.render_options(Scene.from_mjmodel(mj_model, 0, 8, 8), mj_model, batches)
+    # Whatever is not said explicitly would be on.
+    assert {name for name in options if name.startswith("enable_")} == {
+        "enable_specular",
+        "enable_emission",
+        "enable_per_light_ambient",
+        "enable_backface_culling",
+    }
+    return {name for name, on in options.items() if on}
+
+
+@pytest.mark.parametrize("scene", WARP_NEEDS)
+def test_warp_gets_the_options_that_a_scene_needs(scene: str) -> None:
+    assert warp_options(scene) == WARP_NEEDS[scene]
+
+
+def test_warp_is_spared_textures_and_highlights_where_there_are_none() -> None:
+    assert warp_options("primitives", textures=False, highlights=False) == {"use_ambient_lighting"}
+
+
+GLOW = '<asset><material name="glow" emission=".5"/></asset><worldbody>'
+LIGHT = '<worldbody><light ambient=".1 .1 .1" pos="0 0 3"/>'
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "option"),
+    [
+        ("<worldbody>", LIGHT, "enable_per_light_ambient"),
+        ('size=".2"', 'size="3"', "enable_backface_culling"),
+        ("<worldbody>", GLOW, None),  # a material that nothing has
+    ],
+)
+def test_warp_gets_what_a_scene_adds(old: str, new: str, option: str | None, tmp_path: Path) -> None:
+    path = tmp_path / "scene.xml"
+    path.write_text(BALL.replace(old, new, 1))
+    assert warp_options(str(path)) == {"use_ambient_lighting", "enable_specular"} | ({option} if option else set())
+
+
+def test_warp_draws_emission_where_something_emits(tmp_path: Path) -> None:
+    path = tmp_path / "scene.xml"
+    path.write_text(BALL.replace("<worldbody>", GLOW).replace('type="sphere"', 'type="sphere" material="glow"'))
+    assert "enable_emission" in warp_options(str(path))
+
+
+def test_warp_s_buffers_become_images() -> None:
+    packed = np.array([[0xFF030201, 0xFF060504, 0, 0]], np.uint32)
+    colours, depth = warp_renderer.images(packed, np.array([[0.0, 2.0, 3.0, 4.0]], np.float32), 2)
+    assert colours.shape == (1, 2, 2, 3) and colours[0, 0].tolist() == [[3, 2, 1], [6, 5, 4]]
+    assert depth.shape == (1, 2, 2) and np.isinf(depth[0, 0, 0]) and depth[0, 1, 1] == 4.0
 
 
 def test_a_missing_warp_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,13 +9,16 @@ import pytest
 from small_scene import MORE_SPHERES, ORTHOGRAPHIC, small_scene
 
 from jaxrl_vis_envs.compilation import env_jit
-from jaxrl_vis_envs.render import camera, cpu_passes, cpu_search, pixel_math, render_planes, shapes
+from jaxrl_vis_envs.render import camera, render_planes
+from jaxrl_vis_envs.render.cpu import passes, tiles
+from jaxrl_vis_envs.render.outputs import Outputs
+from jaxrl_vis_envs.render.pixel import arithmetic, shapes
 
 
 @pytest.fixture
 def plainly(monkeypatch):
     """Makes `render_planes` draw without the passes from here on."""
-    return lambda: monkeypatch.setattr(cpu_passes, "takes", lambda scene: False)
+    return lambda: monkeypatch.setattr(passes, "takes", lambda scene, outputs: False)
 
 
 @pytest.mark.parametrize(
@@ -31,7 +34,7 @@ def plainly(monkeypatch):
 def test_the_passes_draw_the_same_image(lens, more, shape, options, plainly):
     height, width = shape
     scene, poses = small_scene(lens, more, height, width, **options)
-    assert cpu_passes.takes(scene)
+    assert passes.takes(scene, Outputs(rgb=True, depth=True, segmentation=True, quantized=True))
 
     def draw_all(places):
         def draw(geom_xpos):
@@ -63,8 +66,8 @@ def test_what_is_computed_once_is_computed_for_all_or_none():
     """A loop of no or one round, in a batch too; and the answer to whether is one for the batch."""
 
     def double(flags, x):
-        seen = cpu_search._anywhere(flags)
-        return jnp.stack([cpu_search.once(flag, lambda zero: 2 * x + zero, x) for flag in seen])
+        seen = tiles._anywhere(flags)
+        return jnp.stack([tiles.once(flag, lambda zero: 2 * x + zero, x) for flag in seen])
 
     flags = jnp.array([[False, True, False], [False, False, True]])
     np.testing.assert_array_equal(jax.vmap(double)(flags, jnp.array([3, 5])), [[3, 6, 6], [5, 10, 10]])
@@ -75,11 +78,11 @@ def test_what_is_computed_once_is_computed_for_all_or_none():
 
 def test_tiles_see_what_is_in_them():
     scene, poses = small_scene(height=64, width=64)
-    layout = cpu_search.layout(scene)
-    u, v = camera.pixel_rays(scene, layout.rows, layout.columns)
+    layout = tiles.layout(scene)
+    rays = camera.pixel_rays(scene, layout.rows, layout.columns)
     position, rotation, finite = camera.camera_pose(scene, poses)
     unit = shapes.unit_shapes(scene, poses, position, rotation, finite)
-    seen = np.asarray(cpu_search.seen_in_tiles(scene, unit, u, v))
+    seen = np.asarray(tiles.seen_in_tiles(scene, unit, rays))
     labels = np.asarray(render_planes(scene, poses, rgb=False, segmentation=True).segmentation)
     for tile, (rows, columns) in enumerate(zip(layout.rows, layout.columns, strict=True)):
         shown = set(labels[rows, columns].tolist()) - {-1}
@@ -104,14 +107,14 @@ def test_the_passes_have_the_gradients_of_the_plain_renderer(plainly):
 
 def test_packed_normals_come_back():
     directions = jax.random.normal(jax.random.key(0), (3, 1000)) * jnp.array([[1e-3], [1.0], [30.0]])
-    found = jnp.stack(cpu_passes._unpack_normal(cpu_passes._pack_normal(tuple(directions))))
+    found = jnp.stack(passes._unpack_normal(passes._pack_normal(tuple(directions))))
     np.testing.assert_allclose(found, directions / jnp.linalg.norm(directions, axis=0), atol=1e-4)
 
 
 @pytest.mark.parametrize("exponent", [0.0, 0.5, 1.0, 10.0, 64.0, 128.0])
 def test_powers_are_right_to_a_fifth_of_a_grey_level(exponent):
     base = np.concatenate([np.linspace(0.0, 1.0, 20_001), 1.0 - np.geomspace(1e-7, 1e-2, 1000)]).astype(np.float32)
-    found = jax.jit(pixel_math.power)(base, jnp.float32(exponent))
+    found = jax.jit(arithmetic.power)(base, jnp.float32(exponent))
     np.testing.assert_allclose(found, np.maximum(base, np.float64(1e-6)) ** exponent, atol=1.0 / 5 / 255)
-    slope = jax.vmap(jax.grad(pixel_math.power), in_axes=(0, None))(base[1:], jnp.float32(exponent))
+    slope = jax.vmap(jax.grad(arithmetic.power), in_axes=(0, None))(base[1:], jnp.float32(exponent))
     np.testing.assert_allclose(slope, exponent * np.float64(base[1:]) ** (exponent - 1.0), rtol=1e-3, atol=1e-6)

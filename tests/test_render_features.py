@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from jaxrl_vis_envs.compilation import env_jit
-from jaxrl_vis_envs.render import Scene, blocks, images, raycast, render, render_planes
+from jaxrl_vis_envs.render import Scene, images, render, render_planes
+from jaxrl_vis_envs.render.pixel import blocks, raycast
 
 POSES = ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat", "xpos", "xmat")
 HEAD = '<visual><headlight ambient="{} {} {}" diffuse="0 0 0" specular="0 0 0"/></visual><statistic extent="1"/>'

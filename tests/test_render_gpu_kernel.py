@@ -10,7 +10,8 @@ import pytest
 from small_scene import MORE_SPHERES, ORTHOGRAPHIC, small_scene
 
 from jaxrl_vis_envs.compilation import env_jit
-from jaxrl_vis_envs.render import gpu_kernel, render_planes
+from jaxrl_vis_envs.render import render_planes
+from jaxrl_vis_envs.render.gpu import kernel
 
 
 @pytest.fixture
@@ -18,8 +19,8 @@ def with_kernel(monkeypatch):
     """Makes `render_planes` take the kernel from here on."""
 
     def switch() -> None:
-        monkeypatch.setattr(gpu_kernel, "takes", gpu_kernel.supports)
-        monkeypatch.setattr(gpu_kernel, "draw", functools.partial(gpu_kernel.draw, interpret=True))
+        monkeypatch.setattr(kernel, "takes", lambda scene, outputs: kernel.supports(scene))
+        monkeypatch.setattr(kernel, "draw", functools.partial(kernel.draw, interpret=True))
 
     return switch
 
@@ -27,7 +28,7 @@ def with_kernel(monkeypatch):
 @pytest.mark.parametrize(("lens", "textured", "more"), [("", True, MORE_SPHERES), (ORTHOGRAPHIC, False, "")])
 def test_the_kernel_draws_the_same_image(lens, textured, more, with_kernel):
     scene, poses = small_scene(lens, more, textured=textured)
-    assert gpu_kernel.supports(scene)
+    assert kernel.supports(scene)
 
     def draw(poses):
         return render_planes(scene, poses, segmentation=True, normals=True, distance=True)
@@ -72,7 +73,7 @@ def test_the_kernel_has_the_gradients_of_the_plain_renderer(with_kernel):
 
 @pytest.mark.parametrize("size", [8, 32, 64, 84, 100, 128, 250])
 def test_tiles_cover_the_image_and_little_else(size):
-    high, wide = gpu_kernel.tile_shape(size, size)
+    high, wide = kernel.tile_shape(size, size)
     drawn = -(-size // high) * -(-size // wide) * 128
     assert high * wide <= 128
     assert drawn <= max(1.3 * size * size, 128)

@@ -18,7 +18,7 @@ def encoded_rollout(first_episode: int) -> Episodes:
     slots = jnp.arange(HORIZON + 2)
     both = jnp.stack(jnp.broadcast_arrays(episode[:, None], slots[None]), axis=-1)  # [E, T+2, 2]
     frames = jnp.broadcast_to(both[..., None, None], (ENVS, HORIZON + 2, 2, 4, 4)).astype(jnp.uint8)
-    return Episodes(frames=frames, states=both.astype(jnp.float32), actions=both[:, :HORIZON].astype(jnp.float32))
+    return Episodes(observations=frames, states=both.astype(jnp.float32), actions=both[:, :HORIZON].astype(jnp.float32))
 
 
 @pytest.mark.parametrize("width", [8, 6])

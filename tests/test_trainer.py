@@ -4,46 +4,22 @@ import dataclasses
 import itertools
 import json
 import runpy
-import shutil
-import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
-from fake_program import FakeProgram, as_plain, make_fake_trainer, small_config
+from fake_program import FakeProgram, as_plain, final_state, make_fake_trainer, rows_without_time, small_config
 
 from jaxrl_vis.config import Config, preset
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import train_step
+from jaxrl_vis.learner.environment import make_env
 from jaxrl_vis.run import loop as run_loop
-from jaxrl_vis.run import memory, metrics, trainer
-from jaxrl_vis.run.checkpoint import FULL, LIGHT, Checkpoints
+from jaxrl_vis.run import memory, metrics, trained, trainer
+from jaxrl_vis.run.checkpoint import Checkpoints
 from jaxrl_vis.run.folder import RunFolder, default_folder, read_config
 from jaxrl_vis_envs.compilation import env_jit
-
-FAKE = Path(__file__).with_name("fake_program.py")
-
-
-def rows_without_time(path: Path) -> list[dict]:
-    return [
-        {name: row[name] for name in row if not name.startswith("time/")} for row in metrics.read_rows(path / "metrics.jsonl")
-    ]
-
-
-def final_state(path: Path, shapes) -> list[np.ndarray]:
-    checkpoints = Checkpoints(path / "checkpoints", read_only=True)
-    return as_plain(checkpoints.restore_for_resume(shapes).loop)
-
-
-@pytest.fixture(scope="module")
-def straight(tmp_path_factory):
-    """A run of eight iterations without interruption: its folder, its trainer, its reports."""
-    path = tmp_path_factory.mktemp("runs") / "straight"
-    straight_trainer = make_fake_trainer(small_config(), path)
-    return path, straight_trainer, list(straight_trainer.run())
 
 
 def test_a_run_reports_logs_and_draws(straight, capsys):
@@ -69,177 +45,6 @@ def test_train_iteration_is_traced_once(straight):
     assert straight[1].program.traces == 1
 
 
-@pytest.mark.parametrize("cut", [2, 4])
-def test_resumed_equals_straight_bit_for_bit(straight, tmp_path, cut, capsys):
-    straight_path, straight_trainer, reports = straight
-    path = tmp_path / "run"
-    list(make_fake_trainer(small_config(env_steps=10 * cut), path).run())
-    resumed_reports = list(make_fake_trainer(small_config(), path, resume=True).run())
-    assert "exactly" in capsys.readouterr().out
-    assert [report.iteration for report in resumed_reports] == list(range(cut + 1, 9))
-    assert all(a == b for a, b in zip(resumed_reports, reports[cut:], strict=True))
-    assert rows_without_time(path) == rows_without_time(straight_path)
-    wall = [row["time/wall_s"] for row in metrics.read_rows(path / "metrics.jsonl")]
-    assert wall == sorted(wall)
-    shapes = straight_trainer.shapes
-    assert all(map(np.array_equal, final_state(path, shapes), final_state(straight_path, shapes)))
-
-
-def test_resume_between_evaluations_goes_on_with_the_means(straight, tmp_path):
-    """Abandoned after iteration 5, saved at 3: rows after 3 are written again, with means over iterations 3 and 4."""
-    path = tmp_path / "run"
-    config = small_config(full_checkpoint_interval=3, checkpoint_interval=1)
-    for report in make_fake_trainer(config, path).run():
-        if report.iteration == 5:
-            break
-    list(make_fake_trainer(config, path, resume=True).run())
-    assert rows_without_time(path) == rows_without_time(straight[0])
-
-
-def test_damaged_newest_checkpoint_on_resume(straight, tmp_path, capsys):
-    path = tmp_path / "run"
-    list(make_fake_trainer(small_config(env_steps=60), path).run())
-    for file in (path / "checkpoints" / FULL / "6").rglob("d/*"):
-        file.unlink()
-    list(make_fake_trainer(small_config(), path, resume=True).run())
-    out = capsys.readouterr().out
-    assert "full/6 is damaged" in out and "resumed at iteration 4 of 8, exactly" in out
-    assert rows_without_time(path) == rows_without_time(straight[0])
-
-
-def test_killed_between_the_last_evaluation_and_the_end(straight, tmp_path, capsys):
-    path = tmp_path / "run"
-    list(make_fake_trainer(small_config(), path).run())
-    shutil.rmtree(path / "checkpoints" / LIGHT)
-    (path / "video.gif").unlink()
-    assert list(make_fake_trainer(small_config(), path, resume=True).run()) == []
-    assert rows_without_time(path) == rows_without_time(straight[0]) and (path / "video.gif").exists()
-    assert capsys.readouterr().out.count("success at the end: seed 0") == 2
-
-
-def test_resume_from_light_says_what_it_is(tmp_path, capsys):
-    path = tmp_path / "run"
-    config = small_config(full_checkpoint_interval=0)
-    list(make_fake_trainer(config.replace(env_steps=40), path).run())
-    assert not Checkpoints(path / "checkpoints").iterations(FULL)
-    reports = list(make_fake_trainer(config, path, resume=True).run())
-    assert "not an exact continuation" in capsys.readouterr().out
-    assert [report.iteration for report in reports] == [5, 6, 7, 8] and reports[-1].updates == 24
-
-
-def test_finished_run_says_so(straight, capsys):
-    assert list(make_fake_trainer(small_config(), straight[0], resume=True).run()) == []
-    assert "finished already" in capsys.readouterr().out
-
-
-def test_resume_of_nothing_starts(tmp_path, capsys):
-    reports = make_fake_trainer(small_config(env_steps=20), tmp_path / "run", resume=True).run()
-    assert [report.iteration for report in reports] == [1, 2]
-    assert "nothing to resume" in capsys.readouterr().out
-
-
-def start(run_dir: Path, environment: dict[str, str]) -> subprocess.Popen:
-    command = [sys.executable, str(FAKE), str(run_dir), "signal"]
-    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, -signal.SIGINT)])
-def test_a_signal_saves_and_loses_at_most_one_iteration(tmp_path, clean_environment, number, status):
-    run_dir = tmp_path / "run"
-    process = start(run_dir, clean_environment)
-    seen = 0
-    for line in process.stdout:
-        if line.startswith("report"):
-            seen = int(line.split()[1])
-        if seen == 7:
-            process.send_signal(number)
-            break
-    rest, errors = process.communicate(timeout=60)
-    assert process.returncode == status, errors
-    assert "--resume" in rest
-    seen = max([seen, *(int(line.split()[1]) for line in rest.splitlines() if line.startswith("report"))])
-    shapes = make_fake_trainer(small_config(), None).shapes
-    checkpoints = Checkpoints(run_dir / "checkpoints")
-    restored = checkpoints.restore_for_resume(shapes)
-    assert restored.tier == FULL and restored.iteration >= seen - 1 and not checkpoints.iterations(LIGHT)
-    config = read_config(run_dir).replace(env_steps=10 * (restored.iteration + 2), eval_interval=1)
-    reports = list(make_fake_trainer(config, run_dir, resume=True).run())
-    assert [report.iteration for report in reports] == [restored.iteration + 1, restored.iteration + 2]
-
-
-def test_an_evaluation_that_a_signal_prevented_is_made_up_for(straight, tmp_path):
-    path = tmp_path / "run"
-    reports = make_fake_trainer(small_config(), path).run()
-    with pytest.raises(trainer.Terminated) as stopped:
-        for report in reports:
-            if report.iteration == 3:  # iteration 4, which ends with an evaluation, comes next
-                signal.raise_signal(signal.SIGTERM)
-    assert stopped.value.code == 143
-    assert len(rows_without_time(path)) == 2
-    list(make_fake_trainer(small_config(), path, resume=True).run())
-    assert rows_without_time(path) == rows_without_time(straight[0])
-
-
-def test_handlers_are_put_back(tmp_path):
-    before = signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)
-    reports = make_fake_trainer(small_config(), tmp_path / "run").run()
-    next(reports)
-    assert signal.getsignal(signal.SIGTERM) != before[0]
-    reports.close()
-    assert (signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)) == before
-
-
-def test_a_second_signal_does_not_wait(tmp_path):
-    reports = make_fake_trainer(small_config(), tmp_path / "run").run()
-    next(reports)
-    signal.raise_signal(signal.SIGINT)
-    with pytest.raises(KeyboardInterrupt):
-        signal.raise_signal(signal.SIGINT)
-    reports.close()
-
-
-def test_an_existing_folder_is_refused(straight, tmp_path):
-    with pytest.raises(RequestError, match="--resume goes on with it, --overwrite starts again"):
-        make_fake_trainer(small_config(), straight[0])
-    with pytest.raises(RequestError, match="contradict each other"):
-        make_fake_trainer(small_config(), straight[0], resume=True, overwrite=True)
-    (tmp_path / "thesis.txt").write_text("precious")
-    with pytest.raises(RequestError, match="not a run"):
-        make_fake_trainer(small_config(), tmp_path, overwrite=True)
-    assert (tmp_path / "thesis.txt").read_text() == "precious"
-    with pytest.raises(RequestError, match="is a file"):
-        make_fake_trainer(small_config(), tmp_path / "thesis.txt")
-
-
-def test_overwrite_deletes_the_run_and_nothing_else(tmp_path):
-    path = tmp_path / "run"
-    list(make_fake_trainer(small_config(env_steps=20), path).run())
-    (path / "notes.txt").write_text("mine")
-    assert len(list(make_fake_trainer(small_config(seed=5, env_steps=20), path, overwrite=True).run())) == 2
-    assert (path / "notes.txt").exists() and {row["seed"] for row in rows_without_time(path)} == {5, 6}
-
-
-def test_a_contradicting_config_is_named(straight):
-    with pytest.raises(RequestError) as refused:
-        make_fake_trainer(small_config(num_envs=3, discount=0.5, eval_interval=1), straight[0], resume=True)
-    text = str(refused.value)
-    assert "num_envs (saved 2, asked 3)" in text and "discount (saved None, asked 0.5)" in text
-    assert "eval_interval" not in text and "\n" not in text
-
-
-def test_a_broken_config_file_is_one_line(straight, tmp_path):
-    with pytest.raises(RequestError, match="no run in"):
-        read_config(tmp_path)
-    (tmp_path / "config.json").write_text("{")
-    with pytest.raises(RequestError, match="cannot be read"):
-        make_fake_trainer(small_config(), tmp_path, resume=True)
-    record = json.loads((straight[0] / "config.json").read_text())
-    record["config"]["old_option"] = 1
-    (tmp_path / "config.json").write_text(json.dumps(record))
-    with pytest.raises(RequestError, match="old_option"):
-        make_fake_trainer(small_config(), tmp_path, resume=True)
-
-
 def test_a_replay_that_cannot_fit_is_refused_before_allocation(tmp_path, monkeypatch):
     there = memory.available_bytes()  # once: it changes with whatever else runs
     monkeypatch.setattr(memory, "available_bytes", lambda: there)
@@ -256,14 +61,6 @@ def test_a_replay_that_cannot_fit_is_refused_before_allocation(tmp_path, monkeyp
     monkeypatch.setattr(memory, "available_bytes", lambda: 1000)
     with pytest.raises(RequestError, match="not even one rollout fits"):
         memory.check_memory(fits.config, fits.shapes, fits.program.replay_bytes, 10)
-
-
-def test_an_earlier_run_outlives_a_new_one_that_cannot_be(straight, tmp_path):
-    shutil.copytree(straight[0], tmp_path / "run")
-    before = {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()}
-    with pytest.raises(RequestError, match="bytes"):
-        list(make_fake_trainer(small_config(replay_transitions=10**12, seeds=1), tmp_path / "run", overwrite=True).run())
-    assert before == {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()}
 
 
 @pytest.mark.parametrize("break_state", [False, True])
@@ -326,28 +123,28 @@ def test_evaluate_and_play_a_run(straight, tmp_path, monkeypatch):
     def fake_make_trainer(config, *arguments, **options):
         return trainer.Trainer(config, FakeProgram(config), *arguments, **options)
 
-    monkeypatch.setattr(trainer, "make_trainer", fake_make_trainer)
-    found = trainer.evaluate_run(path, episodes=7)
+    monkeypatch.setattr(trained, "make_trainer", fake_make_trainer)
+    found = trained.evaluate_run(path, episodes=7)
     assert found["eval/success"] == pytest.approx(reports[-1].metrics["eval/success"], rel=1e-5)
     assert [type(value) for value in found["eval/success"]] == [float, float]
     for suffix in (".gif", ".png", ".html"):
-        trainer.play_run(path, tmp_path / f"out{suffix}", episodes=4)
+        trained.play_run(path, tmp_path / f"out{suffix}", episodes=4)
         assert (tmp_path / f"out{suffix}").stat().st_size > 1000
     with pytest.raises(RequestError, match="must end in"):
-        trainer.play_run(path, tmp_path / "out.avi")
+        trained.play_run(path, tmp_path / "out.avi")
     (tmp_path / "empty").mkdir()
     with pytest.raises(RequestError, match="no run in"):
-        trainer.evaluate_run(tmp_path / "empty")
+        trained.evaluate_run(tmp_path / "empty")
     RunFolder(tmp_path / "new").open(small_config())
     with pytest.raises(RequestError, match="no usable checkpoint"):
-        trainer.evaluate_run(tmp_path / "new")
+        trained.evaluate_run(tmp_path / "new")
 
 
 @pytest.mark.slow
 def test_the_real_program_resumes_bit_for_bit(tmp_path, capsys):
     """The same as above with physics, cameras and networks. Traced once: the three runs share the program."""
     config = preset("debug", env="VisualReacher", full_checkpoint_interval=2)
-    program = train_step.make_train_step(train_step.make_env(config), config)
+    program = train_step.make_train_step(make_env(config), config)
     original, calls = program.train_iteration.__wrapped__, []
 
     def train_iteration(loop):  # of the same name, so that the next test finds it compiled
@@ -379,9 +176,9 @@ def test_the_script_runs(tmp_path, checkout, capsys):
     assert len((checkout / "notebooks" / "train.py").read_text().splitlines()) < 40
     script["main"]("debug", "VisualReacher", str(tmp_path / "run"))
     assert "best evaluation" in capsys.readouterr().out
-    figures = trainer.evaluate_run(tmp_path / "run")
+    figures = trained.evaluate_run(tmp_path / "run")
     assert len(figures["eval/success"]) == 1
-    trainer.play_run(tmp_path / "run", tmp_path / "strip.png", episodes=8)  # as many as an evaluation: compiled already
+    trained.play_run(tmp_path / "run", tmp_path / "strip.png", episodes=8)  # as many as an evaluation: compiled already
     assert (tmp_path / "strip.png").exists()
 
 

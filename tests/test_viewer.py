@@ -1,4 +1,4 @@
-"""The page of `play --html`: what it tells brax's viewer."""
+"""The page that `play --html` writes: what it tells brax's viewer."""
 
 import base64
 import json
@@ -102,20 +102,19 @@ def test_the_page_shows_the_episodes_that_the_video_shows(tmp_path):
     settings = {"num_envs": 2, "hidden_sizes": (8,), "replay_transitions": 40, "batch_size": 4, "eval_episodes": 3}
     program = make_train_step(env, preset("debug", **settings))
     trains = program.init(jax.random.key(0)[None]).train
-    train = jax.tree.map(lambda leaf: leaf[0], trains)
     key = jax.random.key(5)
-    posed = jax.jit(lambda train: viewer.play_poses(env, program.networks, train, key, 3))(train)
-    played, _ = jax.jit(lambda trains: play(env, program.networks, trains, key[None], 3))(trains)
+    posed = jax.jit(lambda trains: viewer.play_poses(env, program.networks, trains, key, 3))(trains)
+    played = jax.jit(lambda trains: play(env, program.networks, trains, key[None], 3).episodes)(trains)
     episodes = jax.tree.map(lambda leaf: leaf[0], played)
-    np.testing.assert_allclose(posed["positions"][..., 0, :1], episodes.states[:, :-1], atol=1e-6)
-    np.testing.assert_allclose(posed["goal_positions"][:, 0, :1], episodes.states[:, -1], atol=1e-6)
-    assert posed["rotations"].shape == (3, HORIZON + 1, 1, 4)
+    np.testing.assert_allclose(posed.positions[..., 0, :1], episodes.states[:, :-1], atol=1e-6)
+    np.testing.assert_allclose(posed.goal_positions[:, 0, :1], episodes.states[:, -1], atol=1e-6)
+    assert posed.rotations.shape == (3, HORIZON + 1, 1, 4)
     env.mj_model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
     viewer.write_page(program, trains, key, 3, tmp_path / "new" / "page.html")
     system = system_in((tmp_path / "new" / "page.html").read_text())
     scale = 5.0 / env.mj_model.stat.extent
     shown = np.array([state["pos"][system["geoms"]["world"][0]["link_idx"]][0] for state in system["states"]["x"]])
-    # The last instant of an episode is held for .6 s, which is one instant of this world.
+    # The last step of an episode is held for .6 s, which is one step of this environment.
     expected = [[*states[:-1, 0], states[-2, 0]] for states in np.asarray(episodes.states)]
     np.testing.assert_allclose(shown, scale * (np.ravel(expected) - env.mj_model.stat.center[0]), atol=1e-3)
 

@@ -1,4 +1,4 @@
-"""One way to compile anything that contains the world.
+"""How programs that contain physics or rendering are compiled: with which options, for which platform, with which kernels.
 
 XLA's CPU fusion emitters recompute a deep kinematic chain once for every use, which makes MuJoCo's forward kinematics hundreds
 of times slower on a CPU. They are switched off per function here, and never by environment variable: a notebook has started JAX
@@ -6,12 +6,30 @@ long before this package is imported.
 
 JAX 0.11 has no such option per function any more (it refuses the name). Its emitters do not explode, but leave physics on a CPU
 about half as fast (FetchReach, 64 environments, two cores: 1,100 environment steps a second against 2,350).
+
+What is fast on a CPU is slow on a GPU and the other way round, and some functions have a hand-written kernel for NVIDIA GPUs
+(Pallas, by Triton). Which of these is used follows the platform that a program is compiled for, which is not always that of the
+default backend: `by_platform`. The environment variable ``JAXRL_VIS_KERNELS`` and the context manager `kernels` choose between
+the kernels and the same functions in plain JAX: ``0`` never uses a kernel, ``1`` uses them on every NVIDIA GPU, and ``auto``
+(the default) uses each where a small instance of it compiles.
 """
 
-from collections.abc import Callable
+import contextlib
+import contextvars
+import functools
+import os
+import sys
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
+
+KERNELS_VARIABLE = "JAXRL_VIS_KERNELS"
+_CHOICES = {"auto": None, "": None, "0": False, "1": True}
+
+# The platform of the branch of `by_platform` that is being traced, and the choice of `kernels`; None outside of them.
+_platform: contextvars.ContextVar[str | None] = contextvars.ContextVar("platform", default=None)
+_kernels: contextvars.ContextVar[bool | None] = contextvars.ContextVar("kernels", default=None)
 
 
 def compiler_options(backend: str | None = None, *, runs_once: bool = False) -> dict[str, Any]:
@@ -29,18 +47,137 @@ def compiler_options(backend: str | None = None, *, runs_once: bool = False) -> 
 
 
 def env_jit(function: Callable, *, runs_once: bool = False, **jit_options: Any) -> Any:
-    """`jax.jit` with the options of `compiler_options`; every jit of a function that moves or draws a world goes through it."""
+    """`jax.jit` with the options of `compiler_options`; every jit of a function that steps or draws environments uses it."""
     return jax.jit(function, compiler_options=compiler_options(runs_once=runs_once), **jit_options)
 
 
-def runs_gpu_kernels() -> bool:
-    """Whether hand-written kernels (Pallas, by Triton) run here: on NVIDIA GPUs of compute capability 8.0 or more.
+def accelerator() -> str | None:
+    """The platform besides "cpu" that this process can compile for: "cuda", "rocm", "tpu" or another's name; None for none."""
+    backend = jax.default_backend()
+    if backend not in ("cpu", "gpu"):
+        return backend
+    return next((name for name in ("cuda", "rocm", "tpu") if _has_devices(name)), None)
 
-    Everything that has a kernel has the same function in plain JAX, for all other devices.
-    """
-    if jax.default_backend() != "gpu":
-        return False
+
+def _has_devices(platform: str) -> bool:
     try:
-        return float(jax.devices()[0].compute_capability) >= 8.0
-    except (AttributeError, TypeError, ValueError):  # another maker's
+        return bool(jax.devices(platform))
+    except RuntimeError:  # unknown to this JAX, or not there
         return False
+
+
+def by_platform(function: Callable, *arguments: Any) -> Any:
+    """Calls a function that asks for its platform (`targets_cpu`, `runs_gpu_kernels`) and has the same result on all of them.
+
+    In a process with an accelerator the function is traced twice, for that and for a CPU, and a program that is compiled for
+    either contains only the one for it, whatever the default backend is: under `jax.jit` with a device or with committed
+    arrays, `jax.vmap`, `jax.grad`. Within such a call further ones do nothing.
+
+    Args:
+        function: Takes pytrees of arrays and returns one.
+        arguments: What it is called with.
+
+    Returns:
+        Its result.
+    """
+    other = accelerator() if _platform.get() is None else None
+    if other is None:
+        return function(*arguments)
+
+    def branch(platform: str) -> Callable:
+        def trace(*arguments: Any) -> Any:
+            with tracing_for(platform):
+                return function(*arguments)
+
+        return trace
+
+    # What is written for a CPU is plain JAX, so it is right for any other platform that a program is exported to.
+    return jax.lax.platform_dependent(*arguments, default=branch("cpu"), **{other: branch(other)})
+
+
+@contextlib.contextmanager
+def tracing_for(platform: str | None) -> Iterator[None]:
+    """What is traced inside is for ``platform``; for rules of derivatives, which JAX traces after the branch they belong to."""
+    token = _platform.set(platform)
+    try:
+        yield
+    finally:
+        _platform.reset(token)
+
+
+def target_platform() -> str:
+    """The platform of the innermost `tracing_for` or branch of `by_platform`; outside of them, the default backend."""
+    return _platform.get() or jax.default_backend()
+
+
+def targets_cpu() -> bool:
+    """Whether what is being traced is for a CPU."""
+    return target_platform() == "cpu"
+
+
+@contextlib.contextmanager
+def kernels(enabled: bool | None) -> Iterator[None]:
+    """What is traced inside uses kernels on NVIDIA GPUs (True), never does (False), or as the environment says (None).
+
+    A function that `jax.jit` has traced before is not traced again.
+    """
+    token = _kernels.set(enabled)
+    try:
+        yield
+    finally:
+        _kernels.reset(token)
+
+
+def runs_gpu_kernels(probe: Callable[[], object] | None = None) -> bool:
+    """Whether hand-written kernels are used in what is being traced.
+
+    They are on NVIDIA GPUs of compute capability 8.0 or more where the probe compiles, unless JAXRL_VIS_KERNELS or `kernels`
+    says otherwise. Everything that has a kernel has the same function in plain JAX, for all other devices.
+
+    Args:
+        probe: Compiles a small instance of the kernel, and raises whatever that raises. It is called once in a process; if it
+            raises, one line on stderr says so. None for a kernel that is known to compile.
+
+    Raises:
+        ValueError: The environment variable holds something else than 0, 1 or auto.
+    """
+    chosen = _kernels.get()
+    if chosen is None:
+        chosen = _chosen_by_environment()
+    if target_platform() not in ("cuda", "gpu") or chosen is False:
+        return False
+    return chosen is True or (_has_tensor_cores() and (probe is None or _compiles(probe)))
+
+
+def _chosen_by_environment() -> bool | None:
+    value = os.environ.get(KERNELS_VARIABLE, "auto").strip().lower()
+    if value not in _CHOICES:
+        raise ValueError(f"{KERNELS_VARIABLE} is {value!r}: set it to 0 (plain JAX), 1 (kernels) or auto")
+    return _CHOICES[value]
+
+
+def _has_tensor_cores() -> bool:
+    """Whether there is an NVIDIA GPU of compute capability 8.0 or more, which is what Pallas asks for."""
+    try:
+        return float(jax.devices("cuda")[0].compute_capability) >= 8.0
+    except (RuntimeError, AttributeError, TypeError, ValueError):  # none there, or another maker's
+        return False
+
+
+@functools.cache
+def _compiles(probe: Callable[[], object]) -> bool:
+    """Whether a probe compiles for the first NVIDIA GPU."""
+    gpu = jax.devices("cuda")[0]
+    try:
+        # Probes are called while something else is traced, of which they are no part.
+        with jax.ensure_compile_time_eval(), jax.default_device(gpu), tracing_for("cuda"):
+            probe()
+    except Exception as error:  # Pallas, Triton, ptxas and XLA each have their own
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        print(
+            f"jaxrl-vis: a GPU kernel ({probe.__module__}) does not compile on {gpu.device_kind}, so plain JAX takes its place "
+            f"({KERNELS_VARIABLE}=0 does so without trying): {reason}",
+            file=sys.stderr,
+        )
+        return False
+    return True

@@ -18,8 +18,16 @@ def visual_name(task: str) -> str:
     return f"Visual{task}"
 
 
-def nearest(word: str, choices: Iterable[str]) -> str:
-    """'; did you mean X or Y?' for a misspelt ``word``, or a list of all ``choices`` when none is near."""
+def nearest(word: str, choices: Iterable[str], otherwise: str | None = None) -> str:
+    """How to mend a misspelt word: '; did you mean X or Y?', with the nearest of ``choices``.
+
+    Args:
+        word: What was given.
+        choices: What is allowed.
+        otherwise: What to say where none is near; None for a list of all ``choices``.
+    """
     lowered = {choice.lower(): choice for choice in choices}
     found = [lowered[match] for match in difflib.get_close_matches(word.lower(), list(lowered), n=3, cutoff=0.5)]
-    return f"; did you mean {' or '.join(found)}?" if found else f"; choose one of {', '.join(lowered.values())}"
+    if found:
+        return f"; did you mean {' or '.join(found)}?"
+    return f"; choose one of {', '.join(lowered.values())}" if otherwise is None else f"; {otherwise}"

@@ -18,7 +18,7 @@ _BUILT_IN = {**TASKS, **{visual_name(task): module for task, module in TASKS.ite
 class _Entry:
     factory: Callable[[Any], GoalEnv]
     config_class: type
-    state_variant: str | None
+    state_variant: str | None = None
 
 
 _ENTRIES: dict[str, _Entry] = {}

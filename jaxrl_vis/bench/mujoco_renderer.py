@@ -2,14 +2,15 @@
 
 import time
 import warnings
-from typing import Any
 
 import mujoco
 import numpy as np
 
+from jaxrl_vis.bench.comparison import Comparison
 from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.render_scenes import set_poses
-from jaxrl_vis.bench.timing import Timing, assert_varied
+from jaxrl_vis.bench.timing import Timing
+from jaxrl_vis.bench.variation import assert_varied
 from jaxrl_vis.errors import RequestError
 
 POSES = 64
@@ -32,25 +33,16 @@ def check() -> None:
         ) from error
 
 
-def measure(
-    config: dict[str, Any], mj_model: mujoco.MjModel, batches: list, repeats: int, depth: np.ndarray, ours: float
-) -> Measurement:
-    """Images per second, colours and depth, one pose after the other: that is how this renderer works.
+def measure(comparison: Comparison) -> Measurement:
+    """Images per second, colours and depth, one pose after the other, which is how this renderer works. Each image is timed.
 
     Shadows, reflections and haze are off; multisampling is as the model has it (`render_scenes.load` switches it off).
 
-    Args:
-        config: What the record says was drawn.
-        mj_model: The model; its first camera looks.
-        batches: Poses, see `render_scenes.random_poses`. The first counts.
-        repeats: Unused; every image is timed.
-        depth: [K, H, W] of ours in the first poses, metres, inf for the sky.
-        ours: Our images per second.
+    Raises:
+        AssertionError: Its images are not ours.
     """
-    from jaxrl_vis.bench.scene_images import agreement
-
-    size, poses = config["image_size"], batches[0]
-    count = min(POSES, len(poses["geom_xpos"]))
+    config, mj_model, poses = comparison.config, comparison.mj_model, comparison.batches[0]
+    size, count = config["image_size"], min(POSES, len(poses["geom_xpos"]))
     colours, depths, seconds = [], [], []
     mj_data, flags = mujoco.MjData(mj_model), mujoco.mjtRndFlag
     with mujoco.Renderer(mj_model, height=size, width=size) as renderer:
@@ -78,12 +70,12 @@ def measure(
     median = float(np.median(seconds[1:]))
     timing = Timing(median, (max(seconds[1:]) - min(seconds[1:])) / median, count)
     far = 0.999 * mj_model.vis.map.zfar * mj_model.stat.extent
-    theirs = np.stack(depths[1:])[: len(depth)]
-    share = agreement(depth[: len(theirs)], np.where(theirs < far, theirs, np.inf))
+    depth = np.stack(depths[1:])
+    agreement = comparison.agreement(np.stack(colours[1:]), np.where(depth < far, depth, np.inf))
     return Measurement(
         name="render/peer_mujoco",
         value=1.0 / median,
         unit="images/s",
         config={**config, "images": count},
-        details=timing.details(0.0, depth_agreement=round(share, 4), ours_over_peer=round(ours * median, 1)),
+        details=timing.details(0.0, **agreement, ours_over_peer=round(comparison.rate * median, 1)),
     )

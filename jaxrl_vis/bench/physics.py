@@ -8,8 +8,9 @@ import jax.numpy as jnp
 from jaxrl_vis.bench import playground
 from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.settings import Settings
-from jaxrl_vis.bench.timing import assert_varied, compile_timed
+from jaxrl_vis.bench.timing import compile_timed
 from jaxrl_vis.bench.timing import measure as measure_time
+from jaxrl_vis.bench.variation import assert_varied
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis_envs.base import GoalEnv, State
 from jaxrl_vis_envs.compilation import env_jit

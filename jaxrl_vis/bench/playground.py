@@ -11,8 +11,9 @@ import jax
 
 from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.settings import Settings
-from jaxrl_vis.bench.timing import assert_varied, compile_timed
+from jaxrl_vis.bench.timing import compile_timed
 from jaxrl_vis.bench.timing import measure as measure_time
+from jaxrl_vis.bench.variation import assert_varied
 from jaxrl_vis.errors import RequestError
 
 _TIMESTEPS = (0.005, 0.01)  # s; its own, and ours

@@ -5,19 +5,17 @@ A file holds the newest record of every configuration; older ones are in its git
 
 import dataclasses
 import datetime
-import functools
-import importlib.metadata
 import json
-import os
-import platform
 import re
-import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from jaxrl_vis import provenance
+from jaxrl_vis.files import write_atomically
+
 SCHEMA = 1
-LIBRARIES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax")
-_CHECKOUT = Path(__file__).resolve().parents[2]
+REVISION_DIGITS = 12
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,67 +37,27 @@ class Measurement:
     details: dict[str, Any] = dataclasses.field(default_factory=dict)
 
 
-@functools.cache
-def device_name() -> str:
-    """The machine that computes: the accelerator's name and count, or the processor's name and usable cores."""
-    import jax
-
-    if jax.default_backend() != "cpu":
-        return f"{jax.devices()[0].device_kind} x{jax.device_count()}"
-    name = platform.processor() or platform.machine()
-    if os.path.exists("/proc/cpuinfo"):
-        with open("/proc/cpuinfo", encoding="utf-8") as file:
-            name = next((line.split(":", 1)[1].strip() for line in file if line.startswith("model name")), name)
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return f"{name}, {cores} cores"
-
-
-def library_versions() -> dict[str, str]:
-    """Versions of what decides speed."""
-    return {"python": platform.python_version(), **{name: importlib.metadata.version(name) for name in LIBRARIES}}
-
-
-def git_revision(folder: Path = _CHECKOUT) -> str:
-    """The checkout's revision, with ``-dirty`` where code differs from it (kept records do not count); or ``unknown``.
-
-    JAXRL_VIS_REVISION, where it is set, goes first: for a copy that travelled without its history.
-    """
-    if os.environ.get("JAXRL_VIS_REVISION"):
-        return os.environ["JAXRL_VIS_REVISION"]
-
-    def git(*arguments: str) -> str:
-        return subprocess.run(["git", "-C", folder, *arguments], capture_output=True, text=True, check=True).stdout.strip()
-
-    try:
-        if Path(git("rev-parse", "--show-toplevel")).resolve() != folder.resolve():
-            return "unknown"
-        dirty = git("status", "--porcelain", "--", ".", ":!benchmarks/results")
-        return git("rev-parse", "--short=12", "HEAD") + ("-dirty" if dirty else "")
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-
-
 def to_record(measurement: Measurement) -> dict[str, Any]:
     """The measurement with everything that says where it comes from."""
     return {
         "schema": SCHEMA,
         **dataclasses.asdict(measurement),
-        "device": device_name(),
-        "versions": library_versions(),
-        "revision": git_revision(),
+        "device": provenance.device_name(),
+        "versions": provenance.versions(),
+        "revision": provenance.revision(REVISION_DIGITS) or "unknown",
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }
 
 
 def results_folder() -> Path:
     """benchmarks/results of the checkout that this code lies in, or else of the current folder."""
-    home = _CHECKOUT if (_CHECKOUT / "pyproject.toml").exists() else Path.cwd()
+    home = provenance.CHECKOUT if (provenance.CHECKOUT / "pyproject.toml").exists() else Path.cwd()
     return home / "benchmarks" / "results"
 
 
 def results_path(benchmark: str, folder: Path | None = None) -> Path:
     """The file of one benchmark on this device."""
-    slug = re.sub(r"[^a-z0-9]+", "-", device_name().lower().replace("(r)", "").replace("(tm)", "")).strip("-")
+    slug = re.sub(r"[^a-z0-9]+", "-", provenance.device_name().lower().replace("(r)", "").replace("(tm)", "")).strip("-")
     return (folder or results_folder()) / f"{benchmark}-{slug}.json"
 
 
@@ -117,15 +75,28 @@ def load(path: Path) -> list[dict[str, Any]]:
     return records
 
 
+def read_all(folder: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """Every record in ``folder`` and below with its file, sorted by file. Files that hold something else are passed over."""
+    for path in sorted(folder.rglob("*.json")):
+        contents = json.loads(path.read_text(encoding="utf-8"))
+        for record in contents if isinstance(contents, list) else [contents]:
+            if isinstance(record, dict) and record.get("schema") == SCHEMA:
+                yield path, record
+
+
+def is_of_cpu(record: dict[str, Any]) -> bool:
+    """Whether a record was made on a CPU; its device is a name (`provenance.device_name`) or, of a run, a dictionary."""
+    device = record["device"]
+    return device["platform"] == "cpu" if isinstance(device, dict) else device.endswith(" cores")
+
+
 def _key(record: dict[str, Any]) -> str:
     return json.dumps([record["name"], record["unit"], record["device"], record["config"]], sort_keys=True)
 
 
 def _write(path: Path, records: list[dict[str, Any]]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    scratch = path.with_suffix(".json.part")
-    scratch.write_text(json.dumps(records, indent=1, sort_keys=True) + "\n")
-    scratch.replace(path)
+    write_atomically(path, json.dumps(records, indent=1, sort_keys=True) + "\n")
 
 
 def write_json(path: Path, measurements: list[Measurement]) -> None:

@@ -4,18 +4,18 @@ Every batch is drawn from poses that all differ, and every other call draws anot
 to image; that both differ is asserted.
 """
 
-import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import jax
-import numpy as np
 
+from jaxrl_vis.bench import scene_images
 from jaxrl_vis.bench.physics import start_states
 from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.settings import Settings
-from jaxrl_vis.bench.timing import assert_varied, compile_timed
+from jaxrl_vis.bench.timing import compile_timed
 from jaxrl_vis.bench.timing import measure as measure_time
+from jaxrl_vis.bench.variation import alternate, assert_new_images
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis_envs.compilation import env_jit
 
@@ -29,12 +29,12 @@ _STEPS = 5  # random control steps from the common start, after which no two rob
 def measure(settings: Settings) -> Iterator[Measurement]:
     """Images per second for each image size, output and batch: of the task, or of scenes where one or a peer is asked for."""
     if settings.scene is not None or settings.peer is not None:
-        from jaxrl_vis.bench import scene_images
-
         yield from scene_images.measure(settings, image_sizes(settings))
         return
-    if not settings.env.startswith("Visual"):
-        raise RequestError(f"bench render needs a task with images: --env Visual{settings.env}")
+    if not settings.has_images:
+        raise RequestError(
+            f"bench render needs an environment with images, and {settings.env} has none: try --env Visual{settings.env}"
+        )
     counts = settings.counts(CPU_COUNTS, ACCELERATOR_COUNTS)
     batches = [poses(settings, max(counts), seed) for seed in (4, 5)]
     for size in image_sizes(settings):
@@ -74,33 +74,3 @@ def poses(settings: Settings, count: int, seed: int = 4) -> Any:
         return jax.lax.scan(step, state, jax.random.split(key, _STEPS))[0]
 
     return env_jit(jax.vmap(scatter))(start_states(env, count), jax.random.split(jax.random.key(seed), count))
-
-
-def alternate(draw: Callable[[Any], Any], batches: list[Any]) -> Callable[[], Any]:
-    """A call without arguments that draws the next of the batches, round and round."""
-    turns = itertools.cycle(batches)
-    return lambda: draw(next(turns))
-
-
-def assert_new_images(draw: Callable[[Any], Any], batches: list[Any]) -> None:
-    """Asserts that images differ within a batch and between batches.
-
-    Args:
-        draw: Gives arrays [N, ...], or a tree of them.
-        batches: Two or more.
-    """
-    drawn = [rows_of(draw(batch)) for batch in batches]
-    for rows in drawn:
-        assert_varied(rows, "images")
-    for first, second in itertools.pairwise(drawn):
-        same = int(np.sum(np.all(first == second, axis=1)))
-        if len(first) > 1 and same >= len(first) / 2:
-            raise AssertionError(
-                f"{same} of {len(first)} images stay the same in the next batch: this would measure a broadcast"
-            )
-
-
-def rows_of(images: Any) -> np.ndarray:
-    """[N, bytes] of a tree of arrays [N, ...]."""
-    planes = [np.ascontiguousarray(plane) for plane in jax.tree.leaves(jax.device_get(images))]
-    return np.concatenate([plane.reshape(len(plane), -1).view(np.uint8) for plane in planes], axis=1)

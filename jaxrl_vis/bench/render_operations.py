@@ -12,7 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis_envs.render import Scene, camera, lights, raycast, shade, shapes, surface
+from jaxrl_vis_envs.render import Scene, camera
+from jaxrl_vis_envs.render.camera import Rays
+from jaxrl_vis_envs.render.pixel import lights, lookup, raycast, shade, shapes, surface
 
 # So many pixels are traced: a length that nothing else has.
 _PIXELS = 7919
@@ -40,21 +42,22 @@ def operations_per_pixel(scene: Scene, tests: np.ndarray, coloured: bool = True)
     for row, geom in enumerate(scene.object_ids):
 
         def test(u: jax.Array, v: jax.Array, best: jax.Array, row: int = row) -> jax.Array:
-            return jnp.minimum(best, raycast.object_key(scene, unit, row, u, v, best, raycast.code_mask(scene)))
+            return jnp.minimum(best, raycast.object_key(scene, unit, row, Rays(u, v), best, raycast.code_mask(scene)))
 
         keys = jax.ShapeDtypeStruct((_PIXELS,), jnp.int32)
         total += float(tests[geom]) * _count(test, pixels, pixels, keys)
-    total += _count(lambda u, v: camera.ray_parts(scene, u, v)[2], pixels, pixels)
+    total += _count(lambda u, v: camera.ray_parts(scene, Rays(u, v))[2], pixels, pixels)
     if not coloured:
         return total
-    columns = surface.object_table(scene, unit).shape[1]
+    columns = lookup.object_table(scene, unit).shape[1]
 
     def finish(values: list[jax.Array], table: jax.Array, u: jax.Array, v: jax.Array, depth: jax.Array) -> Any:
-        row = surface.row_of(values)
-        hit = surface.meet(scene, row, None, u, v, depth)
-        return hit.depth, shade.shade(scene, unit, lights.unpack(scene, table), row, hit, u, v)
+        rays = Rays(u, v)
+        row = lookup.row_of(values)
+        hit = surface.meet(scene, row, None, rays, depth)
+        return hit.depth, shade.shade(scene, unit, lights.unpack(scene, table), row, hit, rays)
 
-    table = jax.ShapeDtypeStruct((len(lights.facts(scene)), 20), jnp.float32)
+    table = jax.ShapeDtypeStruct((len(lights.facts(scene)), lights.COLUMNS), jnp.float32)
     return total + _count(finish, [pixels] * columns, table, pixels, pixels, pixels)
 
 

@@ -1,4 +1,4 @@
-"""Scenes that renderers are compared on, and batches of poses to draw them in: world poses, so that no kinematics is timed."""
+"""Scenes that renderers are compared on, and batches of poses to draw them in: world coordinates, so no kinematics is timed."""
 
 import importlib.util
 import itertools
@@ -14,15 +14,18 @@ SCENES = ("finger", "fetch_reach", "primitives")
 POSES = ("geom_xpos", "geom_xmat", "site_xpos", "site_xmat", "cam_xpos", "cam_xmat", "light_xpos", "light_xdir")
 POSES += ("xpos", "xmat", "subtree_com")
 FREE_METRES, FREE_RADIANS, BALL_RADIANS, SLIDE_METRES = 0.2, 0.5, 1.0, 0.3
+SPREADS = {"scattered": 1.0, "start": 0.01}
+"""How far joints are scattered, as a share of `scatter_joints`: at the start just enough that no two images are the same."""
 
 
-def load(scene: str, textures: bool = True) -> mujoco.MjModel:
+def load(scene: str, textures: bool = True, highlights: bool = True) -> mujoco.MjModel:
     """The model of a scene; its first camera looks. Multisampling and shadows are off.
 
     Args:
         scene: ``finger`` (that of the dm_control suite), ``fetch_reach`` (ours), ``primitives`` (127 mixed primitives on and
             over a table), or the path of an MJCF file with a camera.
         textures: Whether materials keep their textures, and the sky its own.
+        highlights: Whether lights keep their specular part.
 
     Raises:
         RequestError: The scene is unknown, its package is missing, or it has no camera.
@@ -45,6 +48,8 @@ def load(scene: str, textures: bool = True) -> mujoco.MjModel:
         mj_model.mat_texid[:] = -1
         # A sky is found by its type.
         mj_model.tex_type[mj_model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX] = mujoco.mjtTexture.mjTEXTURE_CUBE
+    if not highlights:
+        mj_model.light_specular[:] = mj_model.vis.headlight.specular[:] = 0
     return mj_model
 
 
@@ -102,11 +107,17 @@ def primitives_xml() -> str:
 """
 
 
-def scatter_joints(mj_model: mujoco.MjModel, mj_data: mujoco.MjData, rng: np.random.Generator) -> None:
+def scatter_joints(mj_model: mujoco.MjModel, mj_data: mujoco.MjData, rng: np.random.Generator, spread: float = 1.0) -> None:
     """Puts every joint into a random position, in place; does not run the kinematics.
 
     Hinges and slides are uniform within their limits (hinges without: any angle; slides without: 0.3 m each way), balls turn by
     up to a radian, free bodies move by a tenth of the model's extent (0.2 m at most) and turn by up to half a radian.
+
+    Args:
+        mj_model: The model.
+        mj_data: Its state, whose ``qpos`` is written.
+        rng: Where the numbers come from.
+        spread: The share of the way from the start to that position which every joint goes.
     """
     mujoco.mj_resetData(mj_model, mj_data)
     joints = mujoco.mjtJoint
@@ -115,13 +126,14 @@ def scatter_joints(mj_model: mujoco.MjModel, mj_data: mujoco.MjData, rng: np.ran
     low, high = np.where(mj_model.jnt_limited[:, None], mj_model.jnt_range, reach).T
     angles = rng.uniform(low, high)
     simple = (kinds == joints.mjJNT_HINGE) | (kinds == joints.mjJNT_SLIDE)
-    mj_data.qpos[starts[simple]] = angles[simple]
+    here = starts[simple]
+    mj_data.qpos[here] = (1.0 - spread) * mj_data.qpos[here] + spread * angles[simple]
     free = starts[kinds == joints.mjJNT_FREE][:, None]
-    most = min(0.1 * mj_model.stat.extent, FREE_METRES)
+    most = spread * min(0.1 * mj_model.stat.extent, FREE_METRES)
     mj_data.qpos[free + np.arange(3)] += most * rng.uniform(-1.0, 1.0, (len(free), 3))
     balls = starts[kinds == joints.mjJNT_BALL][:, None]
     for places, radians in ((free + 3 + np.arange(4), FREE_RADIANS), (balls + np.arange(4), BALL_RADIANS)):
-        mj_data.qpos[places] = _turned(mj_data.qpos[places], radians, rng)
+        mj_data.qpos[places] = _turned(mj_data.qpos[places], spread * radians, rng)
 
 
 def _turned(quaternions: np.ndarray, most: float, rng: np.random.Generator) -> np.ndarray:
@@ -142,12 +154,16 @@ def forward(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> None:
     mujoco.mj_camlight(mj_model, mj_data)
 
 
-def random_poses(mj_model: mujoco.MjModel, count: int, seed: int) -> dict[str, np.ndarray]:
-    """World poses of ``count`` random positions of the joints: each of `POSES`, [count, ...] float32 as MjData has it."""
+def random_poses(mj_model: mujoco.MjModel, count: int, seed: int, spread: float = 1.0) -> dict[str, np.ndarray]:
+    """Poses in world coordinates of ``count`` random positions of the joints, see `scatter_joints`.
+
+    Returns:
+        Each of `POSES`, [count, ...] float32 as MjData has it.
+    """
     rng, mj_data = np.random.default_rng(seed), mujoco.MjData(mj_model)
     poses = {name: np.empty((count, *getattr(mj_data, name).shape), np.float32) for name in POSES}
     for index in range(count):
-        scatter_joints(mj_model, mj_data, rng)
+        scatter_joints(mj_model, mj_data, rng, spread)
         forward(mj_model, mj_data)
         for name, rows in poses.items():
             rows[index] = getattr(mj_data, name)

@@ -10,32 +10,8 @@ from typing import Any
 
 import jax
 
+from jaxrl_vis.bench.peaks import peak_of
 from jaxrl_vis.learner.networks import Networks
-
-
-@dataclasses.dataclass(frozen=True)
-class Peak:
-    """A device's data-sheet limits: dense matrix products without sparsity, and memory.
-
-    Attributes:
-        bfloat16: Floating-point operations per second.
-        float32: The same for float32 inputs (TF32, which is what XLA uses by default).
-        memory: Bytes per second.
-    """
-
-    bfloat16: float
-    float32: float
-    memory: float
-
-
-# The longest name that a device's kind starts with counts.
-PEAKS = {
-    "NVIDIA H100 80GB HBM3": Peak(989e12, 494e12, 3.35e12),
-    "NVIDIA H100 PCIe": Peak(756e12, 378e12, 2.0e12),
-    "NVIDIA H200": Peak(989e12, 494e12, 4.8e12),
-    "NVIDIA A100-SXM4-80GB": Peak(312e12, 156e12, 2.04e12),
-    "NVIDIA A100-SXM4-40GB": Peak(312e12, 156e12, 1.56e12),
-}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,12 +78,6 @@ def least_cost(networks: Networks, params: Any, batch_size: int) -> Cost:
     images = 3 * batch_size * math.prod(spec.shape) * spec.dtype.itemsize
     parameters = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(params))
     return Cost(flops=2.0 * batch_size * products, bytes=images + (2 + 4 + 2) * parameters)
-
-
-def peak_of(device_kind: str) -> Peak | None:
-    """The limits of a device, where they are known."""
-    names = [name for name in PEAKS if device_kind.startswith(name)]
-    return PEAKS[max(names, key=len)] if names else None
 
 
 def describe(cost: Cost, seconds: float, dtype: str, device_kind: str) -> dict[str, Any]:

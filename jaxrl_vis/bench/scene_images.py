@@ -1,7 +1,7 @@
 """Our renderer on the scenes of `render_scenes`, and other renderers beside it in the same run, on the same poses.
 
-All are given world poses, and write 8-bit colours and float32 depth in metres, without shadows. What a renderer does to find
-its way in a new pose (culling, refitting of bounding volumes) is part of its figure.
+All are given poses in world coordinates, and write 8-bit colours and float32 depth in metres, without shadows. What a renderer
+does to prepare for a new pose (culling, refitting of bounding volumes) is part of its figure.
 """
 
 from collections.abc import Iterator
@@ -13,12 +13,14 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from jaxrl_vis.bench import program_memory, render_operations, render_scenes
+from jaxrl_vis.bench import mujoco_renderer, program_memory, render_operations, render_scenes, warp_renderer
+from jaxrl_vis.bench.comparison import compare
+from jaxrl_vis.bench.peaks import peak_of
 from jaxrl_vis.bench.record import Measurement
-from jaxrl_vis.bench.render import alternate, assert_new_images
 from jaxrl_vis.bench.settings import Settings
 from jaxrl_vis.bench.timing import compile_timed
 from jaxrl_vis.bench.timing import measure as measure_time
+from jaxrl_vis.bench.variation import alternate, assert_new_images
 from jaxrl_vis_envs.compilation import env_jit
 from jaxrl_vis_envs.render import Scene, quantize, render_planes
 
@@ -26,12 +28,20 @@ CPU_COUNTS = (64,)
 ACCELERATOR_COUNTS = (4096,)
 ACCELERATOR_COUNTS_OF = {"primitives": (8192,)}
 CPU_SCENES = ("finger", "fetch_reach")
-PEER_POSES = 64  # images that mujoco.Renderer draws, one after the other
-COMPARED = 32  # images that are compared with the peer's
-_SAMPLE = 32  # poses that the needed tests are counted in
+PEERS: dict[str, Any] = {"mujoco": mujoco_renderer, "warp": warp_renderer}
+_SAMPLE = 32  # poses in which the needed tests are counted
 _DEPTH_RANGE = 10.0  # metres that an 8-bit depth spans
-# Single-precision operations per second outside the matrix units, from data sheets.
-_VECTOR_PEAKS = {"NVIDIA H100 80GB HBM3": 67e12, "NVIDIA H100 PCIe": 51e12, "NVIDIA H200": 67e12, "NVIDIA A100": 19.5e12}
+
+# Without textures first: that is what MuJoCo Warp is fastest at.
+VARIANTS = tuple({"poses": "scattered", "textures": textures, "highlights": True} for textures in (False, True))
+# Its own scene also as it measures it: at the start, where its bounding volumes fit best, and without highlights.
+VARIANTS_OF = {
+    "primitives": (
+        *VARIANTS,
+        *({**variant, "poses": "start"} for variant in VARIANTS),
+        {"poses": "start", "textures": False, "highlights": False},
+    )
+}
 
 
 def measure(settings: Settings, sizes: tuple[int, ...]) -> Iterator[Measurement]:
@@ -42,38 +52,30 @@ def measure(settings: Settings, sizes: tuple[int, ...]) -> Iterator[Measurement]
         sizes: Heights and widths.
     """
     if settings.peer is not None:
-        _peer(settings.peer).check()  # First: it is the part that may be missing.
+        PEERS[settings.peer].check()  # First: it is the part that may be missing.
     scenes = render_scenes.SCENES if settings.on_accelerator else CPU_SCENES
     for scene in (settings.scene,) if settings.scene else scenes:
-        # Without textures first: that is what MuJoCo Warp is fastest at.
-        for textures in (False, True):
-            mj_model = render_scenes.load(scene, textures)
+        for variant in VARIANTS_OF.get(scene, VARIANTS):
+            mj_model = render_scenes.load(scene, variant["textures"], variant["highlights"])
+            spread = render_scenes.SPREADS[variant["poses"]]
             for count in settings.counts(CPU_COUNTS, ACCELERATOR_COUNTS_OF.get(scene, ACCELERATOR_COUNTS)):
-                batches = [render_scenes.random_poses(mj_model, max(count, PEER_POSES), seed) for seed in (1, 2)]
+                most = max(count, mujoco_renderer.POSES)
+                batches = [render_scenes.random_poses(mj_model, most, seed, spread) for seed in (1, 2)]
                 for size in sizes:
-                    config = {"scene": scene, "textures": textures, "image_size": size, "images": count}
+                    config = {"scene": scene, **variant, "image_size": size, "images": count}
                     yield from _measure_size(settings, config, mj_model, batches)
 
 
-def _peer(name: str) -> Any:
-    from jaxrl_vis.bench import mujoco_renderer, warp_renderer
-
-    return {"mujoco": mujoco_renderer, "warp": warp_renderer}[name]
-
-
 def _measure_size(settings: Settings, config: dict[str, Any], mj_model: mujoco.MjModel, batches: list) -> Iterator[Measurement]:
-    """All outputs of ours for one scene, size and batch, and the peer, which has one output."""
-    ours: Measurement | None = None
+    """All outputs of ours for one scene, size and batch, and the peer, which has one output: our first."""
+    rates = {}
     for output in ("rgbd", "rgbd8", "depth"):
         found = _measure_ours(settings, {**config, "pixels": output}, mj_model, batches)
+        rates[output] = found.value
         yield found
-        ours = ours or found
-    if settings.peer is not None and ours is not None:
-        some = {name: jnp.asarray(rows[:COMPARED]) for name, rows in batches[0].items()}
-        scene = Scene.from_mjmodel(mj_model, 0, config["image_size"], config["image_size"])
-        depth = np.asarray(env_jit(jax.vmap(lambda poses: _image(scene, poses, "depth")))(some))
-        depth = np.where(depth < float(scene.zfar), depth, np.inf)
-        yield _peer(settings.peer).measure({**config, "pixels": "rgbd"}, mj_model, batches, settings.repeats, depth, ours.value)
+    if settings.peer is not None:
+        asked = {**config, "pixels": "rgbd"}
+        yield PEERS[settings.peer].measure(compare(asked, mj_model, batches, settings.repeats, rates["rgbd"]))
 
 
 def _image(scene: Scene, poses: dict[str, jax.Array], output: str) -> Any:
@@ -118,24 +120,12 @@ def _effort(compiled: Any, pixels: int, seconds: float, tests: float, operations
     if operations is not None:
         effort["needed_operations_per_pixel"] = round(operations)
         effort["needed_tflop_per_s"] = round(1e-12 * operations * pixels / seconds, 4)
-        kind = jax.devices()[0].device_kind
-        peak = next((peak for name, peak in _VECTOR_PEAKS.items() if kind.startswith(name)), None)
+        peak = peak_of(jax.devices()[0].device_kind)
         if peak is not None:
-            effort["share_of_peak_flops"] = round(operations * pixels / seconds / peak, 4)
+            effort["share_of_peak_flops"] = round(operations * pixels / seconds / peak.vector, 4)
     memory = compiled.memory_analysis()
     if memory is not None and memory.output_size_in_bytes:
         output = memory.output_size_in_bytes
         effort["temporaries_over_output"] = round(memory.temp_size_in_bytes / output, 3)
         effort["largest_temporary_over_output"] = round(program_memory.largest_temporary(compiled) / output, 3)
     return effort
-
-
-def agreement(ours: np.ndarray, theirs: np.ndarray) -> float:
-    """Share of pixels where two depths [N, H, W] in metres, inf for the sky, are within a centimetre or a hundredth.
-
-    Silhouettes count too: two renderers that draw the same scene agree on most pixels, not on all.
-    """
-    sky = np.isinf(ours) & np.isinf(theirs)
-    with np.errstate(invalid="ignore"):
-        close = np.abs(ours - theirs) <= np.maximum(1e-2, 1e-2 * np.abs(theirs))
-    return float(np.mean(sky | (close & np.isfinite(ours) & np.isfinite(theirs))))

@@ -3,20 +3,24 @@
 import dataclasses
 from typing import Any, Self
 
+import jax
+
+from jaxrl_vis_envs import registry
+
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
     """What to measure. None and the empty tuple stand for what suits the device.
 
     Attributes:
-        env: The task.
+        env: The environment.
         envs: Environments (or images) side by side; one measurement each.
         image_size: Height and width of images.
         pixels: Channels: rgbd, rgb or depth.
         batch_size: Transitions in a gradient step.
         repeats: Timed repeats at most; see `timing.measure`.
-        peer: Another renderer, or another's physics, to measure side by side.
-        scene: A scene of `render_scenes`, or the path of an MJCF file, to be drawn in the place of a task.
+        peer: Another renderer, or another physics, to measure beside ours.
+        scene: A scene of `render_scenes`, or the path of an MJCF file, to draw instead of an environment.
         on_accelerator: Whether JAX runs on one; filled in by `for_this_device`.
     """
 
@@ -32,8 +36,6 @@ class Settings:
 
     def for_this_device(self) -> Self:
         """Fills in what depends on the device alone; each benchmark fills in its own sizes."""
-        import jax
-
         accelerator = jax.default_backend() != "cpu"
         return dataclasses.replace(
             self,
@@ -46,15 +48,18 @@ class Settings:
         """The environments to measure: those asked for, or the device's own."""
         return self.envs or (accelerator if self.on_accelerator else cpu)
 
-    def make_env(self, **overrides: Any) -> Any:
-        """The task, with these images where it makes images."""
-        import jaxrl_vis_envs
+    @property
+    def has_images(self) -> bool:
+        """Whether the environment's observations are images: then its configuration says which channels they have."""
+        return "pixels" in {field.name for field in dataclasses.fields(registry.config_class(self.env))}
 
+    def make_env(self, **overrides: Any) -> Any:
+        """The environment; where its observations are images, with these settings of them."""
         images = {"image_size": self.image_size, "pixels": self.pixels, **overrides}
-        return jaxrl_vis_envs.make(self.env, **(images if self.env.startswith("Visual") else {}))
+        return registry.make(self.env, **(images if self.has_images else {}))
 
     def image_config(self) -> dict[str, Any]:
-        """What a record says about the world that was measured."""
-        if not self.env.startswith("Visual"):
+        """What a record says about the environment that was measured."""
+        if not self.has_images:
             return {"env": self.env}
         return {"env": self.env, "image_size": self.image_size, "pixels": self.pixels}

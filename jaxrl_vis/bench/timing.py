@@ -7,7 +7,6 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import numpy as np
 
 _LEAST_SECONDS = 0.2
 
@@ -73,15 +72,3 @@ def measure(
         seconds.append(seconds_of(calls))
     median = statistics.median(seconds)
     return Timing(median, (max(seconds) - min(seconds)) / median, len(seconds))
-
-
-def assert_varied(rows: Any, what: str) -> None:
-    """Asserts that [N, ...] ``rows`` are not copies of each other: more than half are unlike all others.
-
-    A benchmark whose environments all do the same measures one environment and a broadcast.
-    """
-    rows = np.asarray(rows)
-    count = rows.shape[0]
-    distinct = len({row.tobytes() for row in rows})
-    if count > 1 and distinct <= count // 2:
-        raise AssertionError(f"only {distinct} of {count} {what} differ: this would measure a broadcast")

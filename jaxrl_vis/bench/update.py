@@ -9,16 +9,17 @@ import jax.numpy as jnp
 from jaxrl_vis.bench import roofline
 from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.settings import Settings
-from jaxrl_vis.bench.timing import Timing, assert_varied, compile_timed
+from jaxrl_vis.bench.timing import Timing, compile_timed
 from jaxrl_vis.bench.timing import measure as measure_time
+from jaxrl_vis.bench.variation import assert_varied
 from jaxrl_vis.config import Config, preset
 from jaxrl_vis.learner.train_step import TrainStep, make_train_step
 from jaxrl_vis.types import LoopState, ReplayState
 
 
 def training_config(settings: Settings, **overrides: Any) -> Config:
-    """The preset of this device, with the benchmark's task, images and sizes."""
-    if settings.env.startswith("Visual"):
+    """The preset of this device, with the benchmark's environment, images and sizes."""
+    if settings.has_images:
         overrides |= {"image_size": settings.image_size, "pixels": settings.pixels}
     if settings.batch_size is not None:
         overrides["batch_size"] = settings.batch_size
@@ -26,9 +27,9 @@ def training_config(settings: Settings, **overrides: Any) -> Config:
 
 
 def fill_replay(replay: ReplayState, key: jax.Array) -> ReplayState:
-    """A replay full of noise: no two frames are equal, and every part of the memory is read.
+    """A replay full of noise: no two frames are equal, and every part of the replay is read.
 
-    Filled one episode at a time: random words for a whole replay of images would take several times its memory.
+    Filled one episode at a time: random words for a whole replay of images would take several times as much memory.
     """
 
     def noise(leaf: jax.Array, leaf_key: jax.Array) -> jax.Array:
@@ -57,7 +58,7 @@ def time_updates(program: TrainStep, settings: Settings) -> tuple[Timing, float]
     loop = start(program)
     keys = jax.random.split(jax.random.key(2), 1)
     compiled, compile_s = compile_timed(program.update_many, loop.train, loop.replay, keys, loop.iteration)
-    assert_varied(loop.replay.episodes.frames[0, :64, 0], "frames of the replay")
+    assert_varied(loop.replay.episodes.observations[0, :64, 0], "observations of the replay")
     train = loop.train
     before = jax.device_get(train.actor)
 

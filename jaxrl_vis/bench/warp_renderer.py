@@ -1,8 +1,8 @@
 """MuJoCo Warp's renderer on the same poses, for comparison. Needs an NVIDIA GPU and the package mujoco-warp 4.0.0.
 
-What is timed is what a simulation of many worlds would do for its images: refit the bounding volumes, then draw, captured in
-one CUDA graph. World poses are given, and its own kinematics are never run. Two graphs read two sets of poses, so every launch
-draws new images and nothing is copied in between.
+What is timed is what a simulation of many environments would do for its images: refit the bounding volumes, then draw,
+captured in one CUDA graph. Poses in world coordinates are given, and its own kinematics are never run. Two graphs read two sets
+of poses, so every launch draws new images and nothing is copied in between. It gets the options that the scene needs, no more.
 
 JAX takes most of a GPU's memory when it starts; where Warp then finds too little, set XLA_PYTHON_CLIENT_MEM_FRACTION=.5.
 """
@@ -16,12 +16,18 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from jaxrl_vis.bench.comparison import Comparison, textured_geoms
 from jaxrl_vis.bench.record import Measurement
-from jaxrl_vis.bench.render import alternate, assert_new_images
 from jaxrl_vis.bench.timing import measure as measure_time
+from jaxrl_vis.bench.variation import alternate, assert_new_images
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis_envs.render import Scene
 
 VERSION = "4.0.0"
+
+# Warp takes the nearest texel of the finest level, where OpenGL and we filter, and multiplies by the texture before the light
+# is clamped to 1, where OpenGL and we do so after. Seen: 8 grey levels in `finger`, 20 in `primitives`.
+MOST_TEXTURED_DIFFERENCE = 25.0
 
 
 def check() -> None:
@@ -44,60 +50,106 @@ def check() -> None:
         raise RequestError("--peer warp needs an NVIDIA GPU that Warp can use (its CPU device is for debugging)")
 
 
-def measure(
-    config: dict[str, Any], mj_model: mujoco.MjModel, batches: list, repeats: int, depth: np.ndarray, ours: float
-) -> Measurement:
+def measure(comparison: Comparison) -> Measurement:
     """Images per second: 8-bit colours and float32 planar depth in metres, no shadows.
 
-    Args:
-        config: What the record says was drawn.
-        mj_model: The model; its first camera looks.
-        batches: Poses, see `render_scenes.random_poses`; ``config["images"]`` of each are drawn.
-        repeats: Timed repeats at most.
-        depth: [K, H, W] of ours in the first poses, metres, inf for the sky.
-        ours: Our images per second.
+    Raises:
+        AssertionError: Its images are not ours.
     """
-    from jaxrl_vis.bench.scene_images import agreement
-
     start = time.perf_counter()
-    context, draws = prepare(config, mj_model, batches)
+    options = render_options(comparison.scene, comparison.mj_model, comparison.batches)
+    context, draws = prepare(comparison, options)
     compile_s = time.perf_counter() - start
-    size = config["image_size"]
 
     import warp as wp  # pyright: ignore[reportMissingImports]
 
-    def images(draw: Callable[[], None]) -> tuple[np.ndarray, np.ndarray]:
+    def raw(draw: Callable[[], None]) -> tuple[np.ndarray, np.ndarray]:
         draw()
         wp.synchronize_device()
         return context.rgb_data.numpy(), context.depth_data.numpy()
 
-    assert_new_images(images, draws)
-    seen = images(draws[0])[1].reshape(-1, size, size)[: len(depth)]
-    share = agreement(depth[: len(seen)], np.where(seen > 0.0, seen, np.inf))  # its sky has depth 0
-    timing = measure_time(alternate(lambda draw: draw(), draws), repeats, wait=lambda _: wp.synchronize_device())
-    value = config["images"] / timing.median_s
+    assert_new_images(raw, draws)
+    colours, depth = images(*raw(draws[0]), comparison.config["image_size"])
+    agreement = comparison.agreement(colours, depth, MOST_TEXTURED_DIFFERENCE)
+    timing = measure_time(alternate(lambda draw: draw(), draws), comparison.repeats, wait=lambda _: wp.synchronize_device())
+    value = comparison.config["images"] / timing.median_s
     return Measurement(
         name="render/peer_warp",
         value=value,
         unit="images/s",
-        config=config,
+        config=comparison.config,
         details=timing.details(
             compile_s,
-            depth_agreement=round(share, 4),
-            ours_over_peer=round(ours / value, 2),
+            **agreement,
+            ours_over_peer=round(comparison.rate / value, 2),
+            options=[name for name, on in options.items() if on],
             mujoco_warp=importlib.metadata.version("mujoco-warp"),
             warp=wp.config.version,
         ),
     )
 
 
-def prepare(config: dict[str, Any], mj_model: mujoco.MjModel, batches: list) -> tuple[Any, list[Callable[[], None]]]:
+def images(rgb: np.ndarray, depth: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Warp's buffers as images.
+
+    Args:
+        rgb: [N, size * size] uint32, blue in the lowest byte.
+        depth: [N, size * size] float32, planar metres, 0 for the sky.
+        size: Height and width.
+
+    Returns:
+        [N, size, size, 3] uint8 colours, and [N, size, size] float32 metres, inf for the sky.
+    """
+    channels = np.ascontiguousarray(rgb).view(np.uint8).reshape(-1, size, size, 4)
+    return channels[..., 2::-1], np.where(depth > 0.0, depth, np.inf).reshape(-1, size, size)
+
+
+def render_options(scene: Scene, mj_model: mujoco.MjModel, batches: list[dict[str, np.ndarray]]) -> dict[str, bool]:
+    """Which of Warp's optional terms the scene needs: each of the others costs it time and changes no pixel.
+
+    Our renderer leaves out by itself what a scene does not have, so its reading of the model decides here, too.
+
+    Args:
+        scene: Our reading.
+        mj_model: The model.
+        batches: The poses that are drawn.
+    """
+    drawn, lights = np.array(scene.object_ids, int), np.asarray(scene.light_ambient)
+    per_light_ambient = bool(np.any(lights > 0))
+    return {
+        "use_textures": bool(np.any(textured_geoms(mj_model)[drawn])),
+        "render_skybox": bool(np.any(mj_model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)),
+        "use_shadows": any(scene.light_shadows),
+        "use_ambient_lighting": per_light_ambient
+        or (scene.headlight and bool(np.any(np.asarray(scene.headlight_ambient) > 0))),
+        "enable_per_light_ambient": per_light_ambient,
+        "enable_specular": any(scene.light_highlights[:-1]) or (scene.headlight and scene.light_highlights[-1]),
+        "enable_emission": bool(np.any(np.asarray(scene.emission)[drawn] > 0)),
+        "enable_backface_culling": may_show_backs(scene, mj_model, batches),
+    }
+
+
+def may_show_backs(scene: Scene, mj_model: mujoco.MjModel, batches: list[dict[str, np.ndarray]]) -> bool:
+    """Whether a camera may see a surface from inside: it is within a geom's bounding sphere, or there are triangles.
+
+    Planes do not count: our renderer draws both sides of them, as Warp does without culling.
+    """
+    if {mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_HFIELD, mujoco.mjtGeom.mjGEOM_SDF} & set(scene.object_types):
+        return True
+    bounded = [geom for geom in scene.object_ids if mj_model.geom_rbound[geom] > 0]
+    reach = mj_model.geom_rbound[bounded] + float(scene.znear)
+    return any(
+        bool(np.any(np.linalg.norm(poses["geom_xpos"][:, bounded] - poses["cam_xpos"][:, :1], axis=-1) <= reach))
+        for poses in batches
+    )
+
+
+def prepare(comparison: Comparison, options: dict[str, bool]) -> tuple[Any, list[Callable[[], None]]]:
     """Builds the render context, and for each batch a call that has it drawn.
 
     Args:
-        config: Has ``images``, ``image_size`` and ``textures``.
-        mj_model: The model; its first camera looks.
-        batches: Poses of at least ``images`` worlds each.
+        comparison: What is drawn.
+        options: From `render_options`.
 
     Returns:
         Warp's render context, whose ``rgb_data`` [images, H * W] (packed uint32) and ``depth_data`` [images, H * W] (float32)
@@ -106,7 +158,7 @@ def prepare(config: dict[str, Any], mj_model: mujoco.MjModel, batches: list) -> 
     import mujoco_warp as mjw  # pyright: ignore[reportMissingImports]
     import warp as wp  # pyright: ignore[reportMissingImports]
 
-    count, size = config["images"], config["image_size"]
+    count, size, mj_model = comparison.config["images"], comparison.config["image_size"], comparison.mj_model
     model = mjw.put_model(mj_model)
     context = mjw.create_render_context(
         mj_model,
@@ -115,14 +167,12 @@ def prepare(config: dict[str, Any], mj_model: mujoco.MjModel, batches: list) -> 
         render_rgb=True,
         render_depth=True,
         render_seg=False,
-        use_textures=config["textures"],
-        use_shadows=False,
         cam_active=[0],
-        render_skybox=config["textures"],
+        **options,
     )
-    # One world's buffers suffice, because only the poses are read; those of thousands of free bodies would fill the memory.
+    # One environment's buffers suffice, because only poses are read; those of thousands of free bodies would fill the memory.
     blank = mjw.make_data(mj_model, nworld=1)
-    datas = [_with_poses(blank, {name: rows[:count] for name, rows in batch.items()}) for batch in batches]
+    datas = [_with_poses(blank, {name: rows[:count] for name, rows in batch.items()}) for batch in comparison.batches]
 
     def launch(data: Any) -> None:
         mjw.refit_bvh(model, data, context)

@@ -12,7 +12,9 @@ products, the layers would spend nine tenths of their time on writing and readin
 computes layers 1 and 2 again, keeps the gradients of the weights in registers over several tiles, and writes a partial sum
 for each program; those are added up in a fixed order, so a resumed run repeats itself exactly.
 
-`networks` has the same function as plain matrix products: that is the reference, and what every other backend runs.
+`networks` has the same function as plain matrix products: that is the reference, and what a process without such a GPU runs.
+Where there is one, images are put into patches whatever a program is compiled for, and a program for another platform computes
+the layers here, from the same patches, in plain JAX.
 """
 
 import functools
@@ -24,6 +26,8 @@ import jax
 import jax.numpy as jnp
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
+
+from jaxrl_vis_envs.compilation import accelerator, by_platform, runs_gpu_kernels, tracing_for
 
 LEVELS = 3
 """Layers in the kernel."""
@@ -62,6 +66,39 @@ def supports(filters: tuple[int, ...], shape: tuple[int, ...]) -> bool:
     channels, _, width = shape
     powers = all(16 <= size <= 64 and size & (size - 1) == 0 for size in filters[:LEVELS])
     return len(filters) >= LEVELS and powers and channels <= _MOST_CHANNELS and width % WORD == 0
+
+
+def is_available() -> bool:
+    """Whether this process has a GPU that the kernels run on; `jaxrl_vis_envs.compilation` says how to choose."""
+    if accelerator() != "cuda":
+        return False
+    with tracing_for("cuda"):
+        return runs_gpu_kernels(probe)
+
+
+def probe() -> None:
+    """Compiles small instances of all three kernels for the device that is the default; raises what that raises."""
+    shape = (_MOST_CHANNELS, 8, 8)
+    images, of_pixels = jnp.zeros((_LEAST_ROWS, *shape), jnp.uint8), jnp.zeros(shape)
+    channels = (_MOST_CHANNELS, 16, 16, 16)
+    layers = list(zip(range(LEVELS), channels, channels[1:], strict=False))
+    kernels = {f"kernel_{level}": jnp.zeros((4 * inputs, outputs)) for level, inputs, outputs in layers}
+    biases = {f"bias_{level}": jnp.zeros(outputs) for level, _, outputs in layers}
+
+    def all_three(images: jax.Array, mean: jax.Array, scale: jax.Array, weights: Weights) -> Weights:
+        patches = _prepare_on_gpu(images, mean, scale, LEVELS, 5.0, jnp.bfloat16)[:, 0]
+        out = _apply_on_gpu(patches, weights, 0, patches.shape[0])
+        return _backward_on_gpu(patches, weights, out, out, 0, patches.shape[0])
+
+    weights = make_weights(kernels | biases, _MOST_CHANNELS)
+    jax.jit(all_three).lower(images, of_pixels, of_pixels, weights).compile()
+
+
+def _dispatch(on_gpu: Any, plain: Any, *arguments: Any, interpret: bool) -> Any:
+    """The kernel where a program is compiled for a GPU that runs it, and the same in plain JAX for every other platform."""
+    if interpret:
+        return on_gpu(*arguments)
+    return by_platform(lambda *given: (on_gpu if runs_gpu_kernels(probe) else plain)(*given), *arguments)
 
 
 def _padded(channels: int) -> int:
@@ -145,36 +182,65 @@ def _prepare_kernel(words_ref, mean_ref, scale_ref, out_ref, *, shape, levels, l
 
 
 def prepare(
-    frames: jax.Array, mean: jax.Array, scale: jax.Array, levels: int, limit: float, dtype: Any, interpret: bool = False
+    images: jax.Array, mean: jax.Array, scale: jax.Array, levels: int, limit: float, dtype: Any, interpret: bool = False
 ) -> jax.Array:
     """Normalises images and puts them into patches: [B, C, H, W] uint8 -> [B, patches, 64 C'] of ``dtype``.
 
     Args:
-        frames: Planar images, their width a multiple of `WORD`.
+        images: Planar images, their width a multiple of `WORD`.
         mean, scale: [C, H, W] float32.
         levels: All the encoder's layers; borders that do not fill a block of 2^levels pixels are cropped.
         limit: Normalised values are clipped to plus and minus this.
         dtype: Of the result.
-        interpret: Run without a GPU, slowly.
+        interpret: Run the kernel without a GPU, slowly.
     """
-    batch, *shape = frames.shape
+    settings = {"levels": levels, "limit": limit, "dtype": dtype}
+    on_gpu = functools.partial(_prepare_on_gpu, **settings, interpret=interpret)
+    return _dispatch(on_gpu, functools.partial(_prepare_plainly, **settings), images, mean, scale, interpret=interpret)
+
+
+def _prepare_on_gpu(
+    images: jax.Array, mean: jax.Array, scale: jax.Array, levels: int, limit: float, dtype: Any, interpret: bool = False
+) -> jax.Array:
+    batch, *shape = images.shape
     channels, height, width = shape
     patches = (height >> levels) * (width >> levels) * 4 ** (levels - LEVELS)
     size = 64 * _padded(channels)
-    tile, images = _divisor(patches, _PREPARE_PATCHES), _divisor(batch, _PREPARE_IMAGES)
+    tile, together = _divisor(patches, _PREPARE_PATCHES), _divisor(batch, _PREPARE_IMAGES)
     pixels = math.prod(shape)
-    words = jax.lax.bitcast_convert_type(frames.reshape(batch, pixels // WORD, WORD), jnp.uint32)
+    words = jax.lax.bitcast_convert_type(images.reshape(batch, pixels // WORD, WORD), jnp.uint32)
     whole = pl.BlockSpec((pixels,), lambda patch, image: (0,))
     return pl.pallas_call(
         functools.partial(_prepare_kernel, shape=tuple(shape), levels=levels, limit=limit),
         out_shape=jax.ShapeDtypeStruct((batch, patches, size), dtype),
-        grid=(patches // tile, batch // images),
-        in_specs=[pl.BlockSpec((images, pixels // WORD), lambda patch, image: (image, 0)), whole, whole],
-        out_specs=pl.BlockSpec((images, tile, size), lambda patch, image: (image, patch, 0)),
+        grid=(patches // tile, batch // together),
+        in_specs=[pl.BlockSpec((together, pixels // WORD), lambda patch, image: (image, 0)), whole, whole],
+        out_specs=pl.BlockSpec((together, tile, size), lambda patch, image: (image, patch, 0)),
         compiler_params=_PREPARE,
         interpret=interpret,
         name="prepare_patches",
     )(words, mean.reshape(pixels), scale.reshape(pixels))
+
+
+def _prepare_plainly(images: jax.Array, mean: jax.Array, scale: jax.Array, levels: int, limit: float, dtype: Any) -> jax.Array:
+    patches, mean, scale = (_to_patches(array, levels) for array in (images, mean, scale))
+    return jnp.clip((patches.astype(jnp.float32) - mean) * scale, -limit, limit).astype(dtype)
+
+
+def _to_patches(images: jax.Array, levels: int) -> jax.Array:
+    """[..., C, H, W] -> [..., patches, 64 C'], in the order of `_word_offsets`; channels that are padding hold zeros."""
+    *batch, channels, height, width = images.shape
+    rows, columns, finer = height >> levels, width >> levels, (2,) * (levels - LEVELS)
+    images = images[..., : rows << levels, : columns << levels]
+    images = images.reshape(*batch, channels, rows, *finer, 2, WORD, columns, *finer, 2, WORD)
+    first, along = len(batch), levels - LEVELS + 3  # axes before the channels', and those of a side
+    row_axis, column_axis = first + 1, first + 1 + along
+    # Coarse to fine; within a quarter of a patch: channel, row, column.
+    pairs = [axis for level in range(along - 1) for axis in (row_axis + level, column_axis + level)]
+    images = images.transpose(*range(first), *pairs, first, row_axis + along - 1, column_axis + along - 1)
+    images = images.reshape(*batch, -1, 4, channels, WORD * WORD)
+    images = jnp.pad(images, [(0, 0)] * (first + 2) + [(0, _padded(channels) - channels), (0, 0)])
+    return images.reshape(*batch, -1, 64 * _padded(channels))
 
 
 # -- Layers
@@ -267,8 +333,14 @@ def apply(patches: jax.Array, weights: Weights, first: int, count: int, interpre
         patches: [M, 64 C'] from `prepare`.
         weights: From `make_weights`.
         first, count: Which rows; both multiples of 16.
-        interpret: Run without a GPU, slowly.
+        interpret: Run the kernel without a GPU, slowly.
     """
+    rows = {"first": first, "count": count}
+    on_gpu = functools.partial(_apply_on_gpu, **rows, interpret=interpret)
+    return _dispatch(on_gpu, functools.partial(_apply_plainly, **rows), patches, weights, interpret=interpret)
+
+
+def _apply_on_gpu(patches: jax.Array, weights: Weights, first: int, count: int, interpret: bool = False) -> jax.Array:
     size, outputs = patches.shape[1], weights.bias_3.shape[0]
     tile = _divisor(math.gcd(first, count), _FORWARD_PATCHES)
     block = tile * _divisor(math.gcd(first, count) // tile, _FORWARD_TILES)
@@ -285,6 +357,13 @@ def apply(patches: jax.Array, weights: Weights, first: int, count: int, interpre
     )(patches.reshape(-1, size // 4), *cast)
 
 
+def _apply_plainly(patches: jax.Array, weights: Weights, first: int, count: int) -> jax.Array:
+    cast = _cast(weights, patches.dtype)
+    quarters = patches[first : first + count].reshape(-1, patches.shape[1] // 4)
+    hidden = _layer(_layer(quarters, cast.kernel_1, cast.bias_1), cast.kernel_2, cast.bias_2)
+    return _layer(hidden.reshape(count, -1), cast.kernel_3, cast.bias_3)
+
+
 def _apply_forward(patches: jax.Array, weights: Weights, first: int, count: int, interpret: bool):
     out = apply(patches, weights, first, count, interpret)
     return out, (patches, weights, out)
@@ -292,6 +371,16 @@ def _apply_forward(patches: jax.Array, weights: Weights, first: int, count: int,
 
 def _apply_backward(first: int, count: int, interpret: bool, residuals: Any, gradient: jax.Array):
     patches, weights, out = residuals
+    rows = {"first": first, "count": count}
+    on_gpu = functools.partial(_backward_on_gpu, **rows, interpret=interpret)
+    plainly = functools.partial(_backward_plainly, **rows)
+    return jnp.zeros_like(patches), _dispatch(on_gpu, plainly, patches, weights, out, gradient, interpret=interpret)
+
+
+def _backward_on_gpu(
+    patches: jax.Array, weights: Weights, out: jax.Array, gradient: jax.Array, first: int, count: int, interpret: bool = False
+) -> Weights:
+    """Gradients of the weights, float32."""
     size, outputs = patches.shape[1], out.shape[1]
     tile = _divisor(math.gcd(first, count), _BACKWARD_PATCHES)
     block = tile * _divisor(math.gcd(first, count) // tile, _BACKWARD_TILES)
@@ -315,8 +404,13 @@ def _apply_backward(first: int, count: int, interpret: bool, residuals: Any, gra
         name="encode_patches_backward",
     )(patches.reshape(-1, size // 4), out, gradient, *cast)
     sums = jnp.split(jnp.sum(partial_sums, axis=0), list(itertools.accumulate(array.size for array in weights))[:-1])
-    gradients = (part.reshape(like.shape).astype(like.dtype) for part, like in zip(sums, weights, strict=True))
-    return jnp.zeros_like(patches), Weights(*gradients)
+    return Weights(*(part.reshape(like.shape).astype(like.dtype) for part, like in zip(sums, weights, strict=True)))
+
+
+def _backward_plainly(
+    patches: jax.Array, weights: Weights, out: jax.Array, gradient: jax.Array, first: int, count: int
+) -> Weights:
+    return jax.vjp(lambda weights: _apply_plainly(patches, weights, first, count), weights)[1](gradient)[0]
 
 
 apply.defvjp(_apply_forward, _apply_backward)

@@ -23,8 +23,7 @@ import jax.numpy as jnp
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import encoder_kernel, normalizer
-from jaxrl_vis.types import NormalizerState, Params
-from jaxrl_vis_envs.compilation import runs_gpu_kernels
+from jaxrl_vis.types import Batch, NormalizerState, Params, TrainState
 
 _glorot = nn.initializers.glorot_uniform()
 
@@ -144,7 +143,7 @@ class Networks:
 
     Attributes:
         init_actor, init_critic: key -> {"encoder": ..., "head": ...}.
-        prepare: (normalizer, frames [B, ...]) -> inputs: what every encoder reads; made once, shared by all four networks.
+        prepare: (normalizer, observations [B, ...]) -> inputs: what encoders read; made once for all four networks.
         encode: (actor or critic parameters, inputs [B, ...]) -> latent [B, latent].
         act: (actor, latents [2, B, latent] of observations and goals) -> [B, A] float32 in (-1, 1).
         value: (critic, latents [2, B, latent], action [B, A]) -> [B] float32.
@@ -177,12 +176,12 @@ class Networks:
 
     @property
     def uses_kernel(self) -> bool:
-        """Whether the first layers run as one GPU kernel (`encoder_kernel`) instead of one product each."""
+        """Whether the first layers are those of `encoder_kernel`, one kernel on a GPU, instead of one product each."""
         return (
             self.sees_images
-            and runs_gpu_kernels()
             and self.dtype == jnp.bfloat16
             and encoder_kernel.supports(self.config.encoder_filters, self.observation_spec.shape)
+            and encoder_kernel.is_available()
         )
 
     @property
@@ -224,10 +223,10 @@ class Networks:
         """Fresh critic parameters."""
         return self._init(key, self._head(1, self.critic_output_bias), 2 * self._latent_size + self.action_size)
 
-    def working_copy(self, params: Params) -> Params:
+    def compute_copy(self, params: Params) -> Params:
         """The large kernels in the dtype that the networks compute in; None for all parameters that stay as they are.
 
-        With `with_working_copy`, a learner that makes this copy where it changes the parameters saves the networks a conversion
+        With `with_compute_copy`, a learner that makes this copy where it changes the parameters saves the networks a conversion
         at every use.
         """
 
@@ -237,21 +236,28 @@ class Networks:
 
         return jax.tree_util.tree_map_with_path(copy, params)
 
-    def with_working_copy(self, params: Params, copy: Params) -> Params:
+    def with_compute_copy(self, params: Params, copy: Params) -> Params:
         """Parameters that are computed with: the copy where there is one. Every function here takes them like the originals."""
         return jax.tree.map(
             lambda converted, leaf: leaf if converted is None else converted, copy, params, is_leaf=lambda leaf: leaf is None
         )
 
-    def prepare(self, statistics: NormalizerState, frames: jax.Array) -> jax.Array:
+    def prepare_batch(self, train: TrainState, batch: Batch) -> jax.Array:
+        """`prepare` of the three observations of B transitions, side by side: [3 B, ...]."""
+        if train.goal_normalizer is None:
+            return self.prepare(train.normalizer, batch.observations.reshape(-1, *batch.observations.shape[2:]))
+        statistics = (train.normalizer, train.goal_normalizer, train.normalizer)
+        return jnp.concatenate([self.prepare(each, rows) for each, rows in zip(statistics, batch.observations, strict=True)])
+
+    def prepare(self, statistics: NormalizerState, observations: jax.Array) -> jax.Array:
         """Normalises and orders [B, ...] observations for the encoders: [B, blocks, block size], or [B, S] for states."""
         mean, scale = statistics.mean, normalizer.scale(statistics, self.config.normalizer_floor)
         if self.uses_kernel:
-            return encoder_kernel.prepare(frames, mean, scale, self._levels, self.config.normalizer_clip, self.dtype)
+            return encoder_kernel.prepare(observations, mean, scale, self._levels, self.config.normalizer_clip, self.dtype)
         if self.sees_images:
-            frames, mean, scale = (to_blocks(array, self._levels) for array in (frames, mean, scale))
+            observations, mean, scale = (to_blocks(array, self._levels) for array in (observations, mean, scale))
         limit = self.config.normalizer_clip
-        return jnp.clip((frames.astype(jnp.float32) - mean) * scale, -limit, limit).astype(self.dtype)
+        return jnp.clip((observations.astype(jnp.float32) - mean) * scale, -limit, limit).astype(self.dtype)
 
     def encode(self, params: Params, inputs: jax.Array, which: slice = slice(None)) -> jax.Array:
         """Latents of ``which`` of the prepared observations, [B, latent]; a state vector is its own latent."""

@@ -15,19 +15,19 @@ def init(observation_spec: jax.ShapeDtypeStruct) -> NormalizerState:
     return NormalizerState(count=jnp.zeros((), jnp.float32), mean=zeros, sum_of_squares=zeros)
 
 
-def update(state: NormalizerState, frames: jax.Array, axes: tuple[int, ...] = (0, 1)) -> NormalizerState:
-    """Merges the statistics of ``frames`` [E, T+2, ...] into the running ones.
+def update(state: NormalizerState, observations: jax.Array, axes: tuple[int, ...] = (0, 1)) -> NormalizerState:
+    """Merges the statistics of ``observations`` [E, T+2, ...] into the running ones.
 
     Args:
         state: Statistics so far.
-        frames: Observations in their own dtype, with leading axes to reduce.
+        observations: In their own dtype, with leading axes to reduce.
         axes: The leading axes.
     """
     count = jnp.float32(1.0)
     for axis in axes:
-        count = count * frames.shape[axis]
+        count = count * observations.shape[axis]
     # Deviations are taken from the running mean, not from zero: close to it they are small, and squares keep their digits.
-    centred = frames.astype(jnp.float32) - state.mean
+    centred = observations.astype(jnp.float32) - state.mean
     shift = jnp.mean(centred, axis=axes)
     batch_squares = jnp.sum(jnp.square(centred), axis=axes) - count * jnp.square(shift)
     total = state.count + count

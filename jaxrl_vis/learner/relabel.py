@@ -7,16 +7,11 @@ For the transition from slot t to t+1:
     with p1 (1 - p2)    a slot of t+1 ... T, evenly  hindsight experience replay's "future" (Andrychowicz et al., 2017)
     with 1 - p1         slot T+1                     the goal that the policy was given
 
-Where an observation stacks images of several control steps, it also says how things move, and a goal stands still: what was
-observed in the chosen slot becomes a goal by a function of the world's (`GoalEnv.as_goal`).
+What is observed in that slot becomes the goal in `sampling`.
 """
-
-from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-
-from jaxrl_vis.types import Batch
 
 
 def choose_goal_slots(
@@ -38,19 +33,3 @@ def choose_goal_slots(
     future = jnp.minimum(future, horizon)
     slots = jnp.where(strategy < relabel_probability, future, horizon + 1)
     return jnp.where(strategy < relabel_probability * balance_probability, time + 1, slots).astype(jnp.int32)
-
-
-def stand_still(batch: Batch, as_goal: Callable[[jax.Array], jax.Array]) -> tuple[Batch, jax.Array]:
-    """Makes goals of what was observed.
-
-    Args:
-        batch: Transitions whose goals are observations, or goals, which ``as_goal`` leaves as they are.
-        as_goal: [...] -> [...], the goal that says "be where this observation was".
-
-    Returns:
-        The batch with such goals, and what its transitions have reached in the same terms, [B, ...]: where the two are equal,
-        the goal is reached.
-    """
-    observed_t, goal, observed_tp1 = batch.frames
-    frames = jnp.stack([observed_t, jax.vmap(as_goal)(goal), observed_tp1])
-    return batch.replace(frames=frames), jax.vmap(as_goal)(observed_tp1)

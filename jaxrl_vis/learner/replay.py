@@ -1,9 +1,9 @@
-"""A ring of whole episodes, byte for byte as they came in, each frame once.
+"""A ring of whole episodes, byte for byte as they came in, each observation once.
 
-    frames  [N, T+2, C, H, W/4] uint32     slots 0 ... T: the episode;  slot T+1: its goal
-             |                |
-             |                +-- four pixels (uint8) a word: XLA copies element by element, and words cost no more than bytes
-             +-- rollouts of E episodes, one after the other; N is a multiple of E
+    observations  [N, T+2, C, H, W/4] uint32     slots 0 ... T: the episode;  slot T+1: its goal
+                   |                |
+                   |                +-- four pixels (uint8) a word: XLA copies element by element, whatever their size
+                   +-- rollouts of E episodes, one after the other; N is a multiple of E
 
 Images whose width four does not divide, and state vectors, are kept as they are.
 
@@ -26,19 +26,20 @@ def _packs(dtype: Any, width: int) -> bool:
     return dtype == jnp.uint8 and width % _WORD == 0
 
 
-def pack(frames: jax.Array) -> jax.Array:
+def pack(observations: jax.Array) -> jax.Array:
     """Observations as they are stored: [..., W] uint8 -> [..., W/4] uint32 where four divides W, else unchanged."""
-    *shape, width = frames.shape
-    if not _packs(frames.dtype, width):
-        return frames
-    return jax.lax.bitcast_convert_type(frames.reshape(*shape, width // _WORD, _WORD), jnp.uint32)
+    *shape, width = observations.shape
+    if not _packs(observations.dtype, width):
+        return observations
+    return jax.lax.bitcast_convert_type(observations.reshape(*shape, width // _WORD, _WORD), jnp.uint32)
 
 
-def unpack(frames: jax.Array) -> jax.Array:
+def unpack(observations: jax.Array) -> jax.Array:
     """Undoes `pack`."""
-    if frames.dtype != jnp.uint32:
-        return frames
-    return jax.lax.bitcast_convert_type(frames, jnp.uint8).reshape(*frames.shape[:-1], frames.shape[-1] * _WORD)
+    if observations.dtype != jnp.uint32:
+        return observations
+    *shape, words = observations.shape
+    return jax.lax.bitcast_convert_type(observations, jnp.uint8).reshape(*shape, words * _WORD)
 
 
 class Indices(NamedTuple):
@@ -76,7 +77,7 @@ class Replay(NamedTuple):
         episodes, horizon = self.num_episodes, self.horizon
         return ReplayState(
             episodes=Episodes(
-                frames=pack(jnp.zeros((episodes, horizon + 2, *observation.shape), observation.dtype)),
+                observations=pack(jnp.zeros((episodes, horizon + 2, *observation.shape), observation.dtype)),
                 states=jnp.zeros((episodes, horizon + 2, goal_state_size), jnp.float32),
                 actions=jnp.zeros((episodes, horizon, action_size), jnp.float32),
             ),
@@ -87,10 +88,15 @@ class Replay(NamedTuple):
         """Shapes and dtypes of the storage, without allocating it."""
         return jax.eval_shape(lambda: self.init(observation, goal_state_size, action_size))
 
+    def of_rollout(self, rollout: Episodes) -> ReplayState:
+        """A replay of one rollout that holds just these E episodes."""
+        episodes = rollout.replace(observations=pack(rollout.observations))
+        return ReplayState(episodes=episodes, size=jnp.full((), self.num_envs, jnp.int32))
+
     def insert(self, state: ReplayState, rollout: Episodes, iteration: jax.Array) -> ReplayState:
         """Writes the E episodes of ``iteration`` ([] int32), over the oldest ones once the ring is full."""
         start = (iteration % self.num_rollouts) * self.num_envs
-        rollout = rollout.replace(frames=pack(rollout.frames))
+        rollout = rollout.replace(observations=pack(rollout.observations))
         episodes = jax.tree.map(
             lambda storage, new: jax.lax.dynamic_update_slice_in_dim(storage, new, start, axis=0), state.episodes, rollout
         )
@@ -108,11 +114,11 @@ class Replay(NamedTuple):
 
     def gather(self, state: ReplayState, indices: Indices, goal_slot: jax.Array) -> Batch:
         """Reads transitions with the goal in ``goal_slot`` ([B] int32 in [1, T+1])."""
-        frames, states, actions = state.episodes.frames, state.episodes.states, state.episodes.actions
+        observations, states, actions = state.episodes.observations, state.episodes.states, state.episodes.actions
         episode, time = indices
         slots = jnp.stack([time, goal_slot, time + 1])
         return Batch(
-            frames=unpack(frames[jnp.broadcast_to(episode, slots.shape), slots]),
+            observations=unpack(observations[jnp.broadcast_to(episode, slots.shape), slots]),
             action=actions[episode, time],
             state_tp1=states[episode, time + 1],
             goal_state=states[episode, goal_slot],

@@ -1,17 +1,18 @@
 """Plays whole episodes with the current policy, all environments in step.
 
 reset S x E environments (each draws its goal image once)
-scan over T:  act -> advance -> observe        frames [T, S, E, ...], each kept once
+scan over T:  act -> advance -> observe        observations [T, S, E, ...], each kept once
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from jaxrl_vis.learner.networks import Networks
-from jaxrl_vis.types import Episodes, Metrics, TrainState
-from jaxrl_vis_envs.base import GoalEnv
+from jaxrl_vis.types import Episodes, Metrics, NormalizerState, TrainState
+from jaxrl_vis_envs.base import GoalEnv, State
 
 
 class Exploration(NamedTuple):
@@ -29,13 +30,18 @@ class Exploration(NamedTuple):
 NO_EXPLORATION = Exploration()
 
 
-def encode(networks: Networks, train: TrainState, frames: jax.Array) -> jax.Array:
-    """What the online actor makes of images (or states) [E, ...]: [E, Z]."""
-    return networks.encode(train.actor, networks.prepare(train.normalizer, frames))
+def encode(networks: Networks, train: TrainState, statistics: NormalizerState, observations: jax.Array) -> jax.Array:
+    """What the online actor makes of images (or states) [E, ...] with these ``statistics``: [E, Z]."""
+    return networks.encode(train.actor, networks.prepare(statistics, observations))
 
 
 def choose_actions(
-    networks: Networks, train: TrainState, goal_latents: jax.Array, exploration: Exploration, key: jax.Array, frames: jax.Array
+    networks: Networks,
+    train: TrainState,
+    goal_latents: jax.Array,
+    exploration: Exploration,
+    key: jax.Array,
+    observations: jax.Array,
 ) -> jax.Array:
     """The online actor, with noise where it is asked for.
 
@@ -45,12 +51,12 @@ def choose_actions(
         goal_latents: [E, Z] from `encode`: goals stay, so they are encoded once an episode.
         exploration: The noise.
         key: [] typed; draws the noise.
-        frames: [E, ...] observations.
+        observations: [E, ...].
 
     Returns:
         [E, A] float32 in [-1, 1].
     """
-    action = networks.act(train.actor, jnp.stack([encode(networks, train, frames), goal_latents]))
+    action = networks.act(train.actor, jnp.stack([encode(networks, train, train.normalizer, observations), goal_latents]))
     if exploration == NO_EXPLORATION:
         return action
     noise_key, choice_key, random_key = jax.random.split(key, 3)
@@ -58,6 +64,26 @@ def choose_actions(
     uniform = jax.random.uniform(random_key, action.shape, minval=-1.0, maxval=1.0)
     choose = jax.random.bernoulli(choice_key, exploration.random_action_probability, (*action.shape[:-1], 1))
     return jnp.where(choose, uniform, action)
+
+
+def split_keys(keys: jax.Array, num_envs: int) -> tuple[jax.Array, jax.Array]:
+    """Keys of a rollout: [S] typed keys -> those of all S x E resets, seed after seed, and those of the policies, [S]."""
+    reset_keys, policy_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
+    return jax.vmap(lambda key: jax.random.split(key, num_envs))(reset_keys).reshape(-1), policy_keys
+
+
+class Rollout(NamedTuple):
+    """What `play` has seen.
+
+    Attributes:
+        episodes: The kept episodes, [S, K, ...].
+        outcome: Of all episodes at their last step: ``success`` and ``goal_distance``, [S, E].
+        record: What ``record`` made of the kept episodes' states after 0, 1, ... T steps, [S, K, T+1, ...]; or None.
+    """
+
+    episodes: Episodes
+    outcome: Metrics
+    record: Any
 
 
 def play(
@@ -68,22 +94,21 @@ def play(
     num_envs: int,
     exploration: Exploration = NO_EXPLORATION,
     num_kept: int | None = None,
-) -> tuple[Episodes, Metrics]:
+    record: Callable[[State], Any] | None = None,
+) -> Rollout:
     """Plays one episode in each of E environments, for each of S learners side by side.
 
-    To the world learners are nothing but more environments: one `jax.vmap` less means half as much to trace.
+    To the environments learners are nothing but more environments: one `jax.vmap` less means half as much to trace.
 
     Args:
-        env: The world.
+        env: The environment.
         networks: What the parameters mean.
         train: The learners, [S, ...].
         keys: [S] typed keys of this rollout.
         num_envs: E.
         exploration: The noise.
-        num_kept: How many of the episodes to keep (the first ones); None: all.
-
-    Returns:
-        The kept episodes [S, E, ...], and the outcome of all at their last step: ``success`` and ``goal_distance``, [S, E].
+        num_kept: K, how many of the episodes to keep (the first ones); None: all.
+        record: What else to keep, a pytree made of the state of one environment after reset and after each step.
     """
     num_seeds = keys.shape[0]
 
@@ -93,35 +118,39 @@ def play(
     def kept(leaf: jax.Array) -> jax.Array:
         return by_seed(leaf)[:, :num_kept]
 
-    reset_keys, policy_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
-    state = jax.vmap(env.reset)(jax.vmap(lambda key: jax.random.split(key, num_envs))(reset_keys).reshape(-1))
-    assert state.obs is not None
-    first_frame, goal_frame = state.obs["observation"], state.obs["desired_goal"]
-    first_state = state.achieved_state
-    goal_latents = jax.vmap(lambda train, goals: encode(networks, train, goals))(train, by_seed(goal_frame))
+    def recorded(state: State) -> Any:
+        return None if record is None else jax.tree.map(kept, jax.vmap(record)(state))
 
-    def act(train: TrainState, goal_latents: jax.Array, key: jax.Array, frames: jax.Array) -> jax.Array:
-        return choose_actions(networks, train, goal_latents, exploration, key, frames)
+    reset_keys, policy_keys = split_keys(keys, num_envs)
+    state = jax.vmap(env.reset)(reset_keys)
+    assert state.obs is not None
+    first_observation, goal = state.obs["observation"], state.obs["desired_goal"]
+    first_state, first_record = state.achieved_state, recorded(state)
+    goal_latents = jax.vmap(lambda train, goals: encode(networks, train, train.goal_statistics, goals))(train, by_seed(goal))
+
+    def act(train: TrainState, goal_latents: jax.Array, key: jax.Array, observations: jax.Array) -> jax.Array:
+        return choose_actions(networks, train, goal_latents, exploration, key, observations)
 
     def step(carry, step_keys):
-        state, frame = carry
-        action = jax.vmap(act)(train, goal_latents, step_keys, by_seed(frame)).reshape(num_seeds * num_envs, -1)
+        state, observation = carry
+        action = jax.vmap(act)(train, goal_latents, step_keys, by_seed(observation)).reshape(num_seeds * num_envs, -1)
         state = jax.vmap(env.advance)(state, action)
-        frame = jax.vmap(env.observe)(state)
-        return (state, frame), tuple(kept(leaf) for leaf in (frame, state.achieved_state, action))
+        observation = jax.vmap(env.observe)(state)
+        step_results = tuple(kept(leaf) for leaf in (observation, state.achieved_state, action))
+        return (state, observation), (step_results, recorded(state))
 
-    carry = (state.replace(obs=None), first_frame)
+    carry = (state.replace(obs=None), first_observation)
     step_keys = jax.vmap(lambda key: jax.random.split(key, env.horizon), out_axes=1)(policy_keys)
-    (state, _), steps = jax.lax.scan(step, carry, step_keys)
+    (state, _), ((observations, states, actions), records) = jax.lax.scan(step, carry, step_keys)
     outcome = {name: by_seed(state.metrics[name]) for name in ("success", "goal_distance")}
 
-    def episode_major(first: jax.Array, rest: jax.Array, goal: jax.Array) -> jax.Array:
-        return jnp.moveaxis(jnp.concatenate([kept(first)[None], rest, kept(goal)[None]]), 0, 2)
+    def episode_major(*parts: jax.Array) -> jax.Array:
+        return jnp.moveaxis(jnp.concatenate(parts), 0, 2)
 
-    frames, states, actions = steps
     episodes = Episodes(
-        frames=episode_major(first_frame, frames, goal_frame),
-        states=episode_major(first_state, states, state.goal_state),
+        observations=episode_major(kept(first_observation)[None], observations, kept(goal)[None]),
+        states=episode_major(kept(first_state)[None], states, kept(state.goal_state)[None]),
         actions=jnp.moveaxis(actions, 0, 2),
     )
-    return episodes, outcome
+    record_of_all = jax.tree.map(lambda first, rest: episode_major(first[None], rest), first_record, records)
+    return Rollout(episodes, outcome, record_of_all)

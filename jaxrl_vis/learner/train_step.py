@@ -17,46 +17,25 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-import jaxrl_vis_envs
 from jaxrl_vis.config import Config, Resolved, resolve, validate
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import normalizer
-from jaxrl_vis.learner.ddpg import Algorithm, Working, make_ddpg
+from jaxrl_vis.learner.ddpg import Algorithm, Working, combine, make_ddpg
+from jaxrl_vis.learner.evaluate import make_evaluate
 from jaxrl_vis.learner.networks import Networks
-from jaxrl_vis.learner.relabel import choose_goal_slots, stand_still
-from jaxrl_vis.learner.replay import Indices, Replay, make_replay, num_bytes
+from jaxrl_vis.learner.replay import Replay, make_replay, num_bytes
 from jaxrl_vis.learner.rollout import Exploration, play
-from jaxrl_vis.types import Batch, Episodes, LoopState, Metrics, ReplayState, TrainState
-from jaxrl_vis_envs import goals
+from jaxrl_vis.learner.sampling import Choice, Sampler
+from jaxrl_vis.methods import METHODS
+from jaxrl_vis.types import Episodes, LoopState, Metrics, ReplayState, TrainState
 from jaxrl_vis_envs.base import GoalEnv
 from jaxrl_vis_envs.compilation import env_jit
-from jaxrl_vis_envs.randomization import typical
-from jaxrl_vis_envs.registry import config_class
 
 # A leading seed axis on everything but the iteration, which all seeds share (see `replay`).
 _SEED_AXES = LoopState(train=0, replay=0, key=0, iteration=None)  # type: ignore[arg-type]
 
-# Episodes of an evaluation whose images are handed back, for videos.
-_NUM_RECORDED = 8
-
-
-def make_env(config: Config) -> GoalEnv:
-    """The task that a configuration asks for.
-
-    Raises:
-        RequestError: There is no such task, or it cannot be made like that.
-    """
-    validate(config)
-    try:
-        fields = {field.name for field in dataclasses.fields(config_class(config.env))}
-        settings: dict[str, Any] = {name: getattr(config, name) for name in ("image_size", "pixels") if name in fields}
-        if config.frame_stack is not None:
-            settings["frame_stack"] = config.frame_stack
-        if config.randomize:
-            settings["randomization"] = typical(*config.randomize, strength=config.randomize_strength)
-        return jaxrl_vis_envs.make(config.env, **settings)
-    except ValueError as error:
-        raise RequestError(str(error)) from error
+# Folded into an iteration's key for what draws statistics. Large, because small numbers give the keys of `jax.random.split`.
+_STATISTICS = 0x73656E
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,8 +46,7 @@ class TrainStep:
         env, config, resolved, networks, replay: What it was made of.
         init: keys [S] -> LoopState.
         train_iteration: LoopState (donated) -> (LoopState, metrics of [S] float32).
-        evaluate: (TrainState [S, ...], key) -> (metrics of [S] float32, recording [S, K, ...]), without noise. All seeds play
-            the same episodes, and of the first K each frame is handed back, so that no video needs a program of its own.
+        evaluate: See `evaluate.make_evaluate`.
         update_many: (TrainState, ReplayState, key, iteration) of one seed -> the same after ``updates_per_iteration`` steps.
     """
 
@@ -108,46 +86,43 @@ class TrainStep:
         return num_bytes(self.replay_spec)
 
 
-def reward_of(
-    config: Config, resolved: Resolved, threshold: float, batch: Batch, reached: jax.Array | None = None
-) -> jax.Array:
-    """Rewards [B] float32 of relabelled transitions, by the same functions that score the environments.
-
-    Args:
-        config: Which reward.
-        resolved: Its two values.
-        threshold: Of the oracle's reward, in the unit of the true states.
-        batch: The transitions.
-        reached: [B, ...] what they have reached, as a goal would show it; None: as it was observed.
-    """
-    values = {"positive": resolved.reward_positive, "negative": resolved.reward_negative}
-    if config.method == "oracle":
-        return goals.oracle_reward(batch.state_tp1, batch.goal_state, threshold, **values)
-    return goals.indicator_reward(batch.observation_tp1 if reached is None else reached, batch.goal, **values)
-
-
-def _make_update_many(config: Config, resolved: Resolved, env: GoalEnv, replay: Replay, algorithm: Algorithm):
-    def update_many(train: TrainState, memory: ReplayState, key: jax.Array, iteration: jax.Array) -> tuple[TrainState, Metrics]:
-        def choose(update_key: jax.Array) -> tuple[Indices, jax.Array]:
-            sample_key, goal_key = jax.random.split(update_key)
-            indices = replay.sample_indices(memory, sample_key, iteration, config.batch_size)
-            relabel, balance = config.relabel_probability, resolved.balance_probability
-            return indices, choose_goal_slots(goal_key, indices.time, env.horizon, relabel, balance)
-
-        def one_update(carry: tuple[TrainState, Working], chosen: tuple[Indices, jax.Array]) -> tuple[Any, Metrics]:
-            batch, reached = replay.gather(memory, *chosen), None
-            if env.frame_stack > 1:
-                batch, reached = stand_still(batch, env.as_goal)
-            reward = reward_of(config, resolved, env.threshold, batch, reached)
-            train, working, metrics = algorithm.update(*carry, batch, reward)
-            return (train, working), metrics
+def _make_update_many(config: Config, sampler: Sampler, algorithm: Algorithm):
+    def update_many(train: TrainState, replay: ReplayState, key: jax.Array, iteration: jax.Array) -> tuple[TrainState, Metrics]:
+        def one_update(working: Working, choice: Choice) -> tuple[Working, Metrics]:
+            batch = sampler.batch(replay, choice)
+            gradients, metrics = algorithm.gradients(working, batch)
+            return algorithm.apply(working, combine(gradients)), metrics
 
         # What all updates learn from is chosen at once: in the loop, drawing numbers would be a dozen tiny kernels an update.
-        chosen = jax.vmap(choose)(jax.random.split(key, config.updates_per_iteration))
-        (train, _), metrics = jax.lax.scan(one_update, (train, algorithm.working(train)), chosen)
-        return train, jax.tree.map(jnp.mean, metrics)
+        keys = jax.random.split(key, config.updates_per_iteration)
+        choices = jax.vmap(lambda update_key: sampler.choose(replay, update_key, iteration))(keys)
+        working, metrics = jax.lax.scan(one_update, algorithm.begin(train), choices)
+        return algorithm.end(working), jax.tree.map(jnp.mean, metrics)
 
     return update_many
+
+
+def _see(train: TrainState, episodes: Episodes, key: jax.Array, config: Config, sampler: Sampler) -> TrainState:
+    """Takes the observations of a rollout into the statistics that observations are normalised with."""
+    if config.normalizer_source == "rollouts":
+        seen, goals = episodes.observations, episodes.observations[:, -1:]
+        if train.goal_normalizer is not None:
+            seen = seen[:, :-1]
+        axes = (0, 1)
+    else:  # as the authors' release: as many transitions as the rollout has, relabelled
+        count = config.num_envs * sampler.replay.horizon
+        latest = sampler.replay._replace(num_rollouts=1)
+        sampler = dataclasses.replace(sampler, config=config.replace(batch_size=count), replay=latest)
+        rollout = latest.of_rollout(episodes)
+        batch = sampler.batch(rollout, sampler.choose(rollout, key, jnp.zeros((), jnp.int32)))
+        seen, goals = batch.observation_t, batch.goal
+        if train.goal_normalizer is None:
+            seen = jnp.concatenate([seen, goals])
+        axes = (0,)
+    train = train.replace(normalizer=normalizer.update(train.normalizer, seen, axes))
+    if train.goal_normalizer is None:
+        return train
+    return train.replace(goal_normalizer=normalizer.update(train.goal_normalizer, goals, axes))
 
 
 def _count_nonfinite(tree: Any) -> jax.Array:
@@ -163,11 +138,13 @@ def make_train_step(env: GoalEnv, config: Config) -> TrainStep:
     """
     resolved = resolve(validate(config), env.horizon)
     networks = Networks(config, env.observation_spec, env.action_size, resolved.critic_output_bias)
-    if config.method != "oracle" and not networks.sees_images:
-        raise RequestError(f"method {config.method} compares images: use --env Visual{config.env}, or --method oracle")
+    if METHODS[config.method].needs_images and not networks.sees_images:
+        raise RequestError(f"method {config.method} compares images: train on Visual{config.env}, or use --method oracle")
     algorithm = make_ddpg(networks, config, resolved)
     replay = make_replay(config.replay_transitions, config.num_envs, env.horizon)
-    update_many = _make_update_many(config, resolved, env, replay, algorithm)
+    sampler = Sampler(config, resolved, replay, env.threshold, env.as_goal if env.frame_stack > 1 else None)
+    update_many = _make_update_many(config, sampler, algorithm)
+    exploration = Exploration(config.random_action_probability, config.action_noise)
 
     def init(key: jax.Array) -> LoopState:
         return LoopState(
@@ -182,33 +159,16 @@ def make_train_step(env: GoalEnv, config: Config) -> TrainStep:
 
     def train_iteration(loop: LoopState) -> tuple[LoopState, Metrics]:
         keys = per_seed(lambda key: jax.random.split(jax.random.fold_in(key, loop.iteration)), out_axes=1)(loop.key)
-        exploration = Exploration(config.random_action_probability, config.action_noise)
-        episodes, outcome = play(env, networks, loop.train, keys[0], config.num_envs, exploration)
+        episodes, outcome, _ = play(env, networks, loop.train, keys[0], config.num_envs, exploration)
         return per_seed(learn, (_SEED_AXES, 0, 0, 0), (_SEED_AXES, 0))(loop, episodes, outcome, keys[1])
 
     def learn(loop: LoopState, episodes: Episodes, outcome: Metrics, key: jax.Array) -> tuple[LoopState, Metrics]:
-        memory = replay.insert(loop.replay, episodes, loop.iteration)
-        train = loop.train.replace(normalizer=normalizer.update(loop.train.normalizer, episodes.frames))
-        train, metrics = update_many(train, memory, key, loop.iteration)
+        replay_state = replay.insert(loop.replay, episodes, loop.iteration)
+        train = _see(loop.train, episodes, jax.random.fold_in(key, _STATISTICS), config, sampler)
+        train, metrics = update_many(train, replay_state, key, loop.iteration)
         metrics |= {f"train/{name}": jnp.mean(values) for name, values in outcome.items()}
         metrics["guard/nonfinite"] = _count_nonfinite((metrics, episodes.states, episodes.actions))
-        return LoopState(train=train, replay=memory, key=loop.key, iteration=loop.iteration + 1), metrics
-
-    def evaluate(train: TrainState, key: jax.Array) -> tuple[Metrics, dict[str, jax.Array]]:
-        num_recorded = min(_NUM_RECORDED, config.eval_episodes)
-        keys = jnp.broadcast_to(key, (jax.tree.leaves(train)[0].shape[0],))
-        episodes, outcome = play(env, networks, train, keys, config.eval_episodes, num_kept=num_recorded)
-        # For people, the newest of stacked images, which come first.
-        newest = episodes.frames
-        if env.frame_stack > 1:
-            newest = newest[:, :, :, : newest.shape[3] // env.frame_stack]
-        frames, goals = newest[:, :, :-1], newest[:, :, -1]
-        metrics = {
-            "eval/success": jnp.mean(outcome["success"], axis=1),
-            "eval/goal_distance": jnp.mean(outcome["goal_distance"], axis=1),
-            "eval/goal_distance_median": jnp.median(outcome["goal_distance"], axis=1),
-        }
-        return metrics, {"frames": frames, "goals": goals, "success": outcome["success"][:, :num_recorded]}
+        return LoopState(train=train, replay=replay_state, key=loop.key, iteration=loop.iteration + 1), metrics
 
     return TrainStep(
         env=env,
@@ -218,6 +178,6 @@ def make_train_step(env: GoalEnv, config: Config) -> TrainStep:
         replay=replay,
         init=env_jit(per_seed(init, out_axes=_SEED_AXES), runs_once=True),
         train_iteration=env_jit(train_iteration, donate_argnums=0),
-        evaluate=env_jit(evaluate),
+        evaluate=env_jit(make_evaluate(env, networks, config)),
         update_many=env_jit(per_seed(update_many, (0, 0, 0, None)), donate_argnums=0),
     )

@@ -1,8 +1,8 @@
-"""What `jaxrl-vis envs` shows: a table of the tasks, and a sheet of images, one row a task.
+"""What `jaxrl-vis envs` shows: a table of the environments, and a sheet of images with one row for each environment.
 
     start: colours, depth, geoms | a goal: colours, depth, geoms | more goals: colours
 
-The table compiles nothing. A row of the sheet takes two programs: one samples poses, one draws them all.
+The table compiles nothing. A row of the sheet compiles two programs: one samples poses, one renders them all.
 """
 
 from collections.abc import Sequence
@@ -12,11 +12,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from PIL import Image, ImageDraw, ImageFont
 from rich.console import Console
 from rich.table import Table
 
 import jaxrl_vis_envs
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.report.colours import depth_colours, label_colours
+from jaxrl_vis.report.outputs import check_writable
 from jaxrl_vis_envs.compilation import env_jit
 from jaxrl_vis_envs.render import Frame, Scene, render
 
@@ -30,8 +33,8 @@ _SKY = (255, 255, 255)
 
 
 def print_table(names: Sequence[str] | None = None) -> None:
-    """One row for each of the tasks ``names`` (default: all), from their definitions; nothing is compiled."""
-    table = Table(title="Tasks", caption=_LEGEND, caption_justify="left")
+    """One row for each of the environments ``names`` (default: all), from their definitions; nothing is compiled."""
+    table = Table(title="Environments", caption=_LEGEND, caption_justify="left")
     for column in _COLUMNS:
         table.add_column(column, no_wrap=True)
     for name in jaxrl_vis_envs.list_envs() if names is None else names:
@@ -49,7 +52,7 @@ def print_table(names: Sequence[str] | None = None) -> None:
             "-" if env.difficulty is None else f"{env.difficulty:.1f}",
         )
     console = Console()
-    # A pipe gets whole lines; a terminal gets the width that it has.
+    # A pipe gets whole lines, a terminal lines of its own width.
     (console if console.is_terminal else Console(width=160)).print(table)
 
 
@@ -67,18 +70,18 @@ class _Poses(NamedTuple):
     subtree_com: jax.Array
 
 
-def image_tasks() -> list[str]:
-    """Names of the tasks that show the agent images."""
+def image_environments() -> list[str]:
+    """Names of the environments that show the agent images."""
     return [name for name in jaxrl_vis_envs.list_envs() if len(jaxrl_vis_envs.make(name).observation_spec.shape) == 3]
 
 
 def frames_of(env: Any, key: jax.Array, goals: int, size: int) -> Frame:
-    """The start of an episode and ``goals`` goals as the task's camera sees them: [1 + goals, ...] NumPy arrays.
+    """The start of an episode and ``goals`` goals as the environment's camera sees them: [1 + goals, ...] NumPy arrays.
 
     Args:
-        env: A task with a camera (`MjxGoalEnv`).
+        env: An environment with a camera (`MjxGoalEnv`).
         key: [] a typed key.
-        goals: How many.
+        goals: The number of goals.
         size: Height and width, pixels.
     """
     keys = jax.random.split(key, goals)
@@ -93,41 +96,52 @@ def frames_of(env: Any, key: jax.Array, goals: int, size: int) -> Frame:
     return jax.tree.map(np.asarray, draw(env_jit(sample)(keys)))
 
 
+def check_gallery(path: Path, names: Sequence[str] | None = None) -> Sequence[str]:
+    """Checks that a gallery can be drawn. Call it before spending a minute on drawing.
+
+    Returns:
+        The environments that it shows.
+
+    Raises:
+        RequestError: The file cannot be written, its ending names no format, or an environment shows no images.
+    """
+    if path.suffix.lower() not in Image.registered_extensions():
+        raise RequestError(f"cannot write {path}: end its name in .png or .jpg")
+    check_writable(path)
+    with_images = image_environments()
+    for name in names or ():
+        if name not in with_images:
+            raise RequestError(f"{name} shows no images; Visual{name} does")
+    return with_images if names is None else names
+
+
 def draw(path: Path, names: Sequence[str] | None = None, image_size: int = 128, goals: int = 4) -> None:
     """Writes the sheet.
 
     Args:
-        path: The file, whose ending names the format.
-        names: Tasks that show images; default: all.
+        path: The file; its ending names the format.
+        names: Environments that show images; default: all.
         image_size: Height and width of an image, pixels.
-        goals: Goals of each task.
+        goals: Goals of each environment.
 
     Raises:
-        RequestError: A task shows no images, or the file's ending names no format.
+        RequestError: See `check_gallery`.
     """
-    from PIL import Image
-
-    if path.suffix.lower() not in Image.registered_extensions():
-        raise RequestError(f"cannot write {path}: end its name in .png or .jpg")
-    names = image_tasks() if names is None else names
-    for name in names:
-        if name not in image_tasks():
-            raise RequestError(f"{name} shows no images; its visual twin is Visual{name}")
+    names = check_gallery(path, names)
     rows = []
     for name in names:
         env: Any = jaxrl_vis_envs.make(name)
         rows.append(_row(env, frames_of(env, jax.random.key(1), goals, image_size)))
+    path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(np.concatenate(rows)).save(path)
 
 
 def _row(env: Any, frames: Frame) -> np.ndarray:
-    """One task's strip: [H, W, 3] uint8."""
-    from PIL import Image, ImageDraw, ImageFont
-
+    """The strip of one environment: [H, W, 3] uint8."""
     geoms, groups = env.mj_model.ngeom, []
     for index, title in ((0, "start"), (1, "goal")):
-        depth = _depth_image(np.asarray(frames.depth[index]), env.config.depth_range)
-        labels = _label_image(np.asarray(frames.segmentation[index]), geoms)
+        depth = depth_colours(np.asarray(frames.depth[index]), *env.config.depth_range)
+        labels = label_colours(np.asarray(frames.segmentation[index]), geoms, _SKY)
         groups.append([(title, frames.rgb[index]), ("depth", depth), ("geoms", labels)])
     groups.append([("other goals" if index == 2 else "", frames.rgb[index]) for index in range(2, len(frames.rgb))])
     size, count = frames.rgb.shape[1], sum(map(len, groups))
@@ -142,23 +156,3 @@ def _row(env: Any, frames: Frame) -> np.ndarray:
             left += size + _GAP
         left += _GROUP_GAP
     return np.asarray(strip)
-
-
-def _depth_image(depth: np.ndarray, depth_range: tuple[float, float]) -> np.ndarray:
-    """Depth [H, W] (m) in colours, over the range (m) that the agent's bytes span; near is bright."""
-    import matplotlib
-
-    near, far = depth_range
-    share = np.clip((depth - near) / (far - near), 0.0, 1.0)
-    return (matplotlib.colormaps["magma"](0.97 - 0.92 * share)[..., :3] * 255).round().astype(np.uint8)
-
-
-def _label_image(labels: np.ndarray, geoms: int) -> np.ndarray:
-    """Geom ids [H, W] in colours that differ between neighbours: steps of the golden ratio round the hues; the sky is white."""
-    import matplotlib
-
-    hues = (np.arange(geoms) * 0.61803399) % 1.0
-    values = np.where(np.arange(geoms) % 2 == 0, 0.95, 0.65)
-    palette = matplotlib.colors.hsv_to_rgb(np.stack([hues, np.full(geoms, 0.65), values], axis=-1))
-    palette = np.concatenate([(palette * 255).round(), [_SKY]]).astype(np.uint8)
-    return palette[np.where((labels >= 0) & (labels < geoms), labels, geoms)]

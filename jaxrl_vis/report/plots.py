@@ -1,4 +1,4 @@
-"""curve.png: how often the robot reaches its goal, and how near it gets, against environment steps."""
+"""curve.png: success and distance to the goal at the end of an episode, against environment steps."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,8 +17,8 @@ def gather(rows: Sequence[Mapping[str, Any]], name: str) -> tuple[np.ndarray, np
     """One metric as a table.
 
     Args:
-        rows: Of metrics.jsonl, any order.
-        name: Such as ``eval/success``.
+        rows: The rows of metrics.jsonl, in any order.
+        name: The metric, such as ``eval/success``.
 
     Returns:
         env_steps [P], ascending, and values [S, P] float64; NaN where a seed has no number there.
@@ -45,10 +45,10 @@ def draw_curves(axes: Axes, steps: np.ndarray, values: np.ndarray, colour: str) 
         axes: Where to draw.
         steps: [P] env_steps.
         values: [S, P], NaN for gaps.
-        colour: Of all of it.
+        colour: The colour of all of these.
 
     Returns:
-        The last median; NaN where there is no number at all.
+        The last median; NaN if there is no number at all.
     """
     measured = ~np.isnan(values).all(axis=0)
     steps, values = steps[measured], values[:, measured]
@@ -94,15 +94,15 @@ def plot_run(
     """Writes the curve of a run.
 
     Args:
-        rows: Of metrics.jsonl.
-        path: A .png, or any other name that matplotlib knows how to write.
-        title: First line, bold.
-        subtitle: Second line.
-        unit: Of eval/goal_distance.
-        threshold: Distance below which an episode is a success; drawn as a dashed line.
+        rows: The rows of metrics.jsonl.
+        path: A .png, or any other format that matplotlib can write.
+        title: The first line, bold.
+        subtitle: The second line.
+        unit: The unit of eval/goal_distance.
+        threshold: The distance below which an episode is a success; drawn as a dashed line.
 
     Returns:
-        False where there are no rows, and nothing was written.
+        False if there are no rows and nothing was written.
     """
     if not rows:
         return False
@@ -112,14 +112,14 @@ def plot_run(
     _, distance = gather(rows, "eval/goal_distance")
 
     last = draw_curves(success_axes, steps, success, _SUCCESS)
-    _style(success_axes, "Goals reached at the end of an episode")
+    _style(success_axes, "Success at the end of an episode")
     success_axes.set_ylim(-0.02, 1.03)
     success_axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
     if np.isfinite(last):
         _label_end(success_axes, steps, last, f"{last:.0%}", _SUCCESS)
 
     last = draw_curves(distance_axes, steps, distance, _DISTANCE)
-    _style(distance_axes, f"Distance to the goal at the end ({unit})")
+    _style(distance_axes, f"Distance to the goal at the end of an episode ({unit})")
     finite = distance[np.isfinite(distance)]
     distance_axes.set_ylim(0.0, 1.08 * max(finite.max(initial=0.0), threshold or 0.0) or 1.0)
     if np.isfinite(last):
@@ -127,7 +127,7 @@ def plot_run(
     if threshold is not None:
         distance_axes.axhline(threshold, color=_FAINT, linewidth=1.1, linestyle=(0, (5, 4)))
         distance_axes.annotate(
-            f"reached: {threshold:g} {unit}", (1, threshold), xycoords=("axes fraction", "data"), xytext=(-2, 4),
+            f"threshold {threshold:g} {unit}", (1, threshold), xycoords=("axes fraction", "data"), xytext=(-2, 4),
             textcoords="offset points", ha="right", color=_FAINT, fontsize=9,  # curves come down from the left
         )  # fmt: skip
     for axes in (success_axes, distance_axes):

@@ -1,6 +1,6 @@
-"""video.gif: what the robot saw, beside the image of the goal that it was given.
+"""video.gif: the observations of a few episodes, each beside its goal.
 
-Images come in planar, [C, H, W] uint8, and are shown in rows: colour, then depth, whichever there are.
+Images are planar, [C, H, W] uint8, and are shown in rows: colour, then depth, whichever there are.
 """
 
 import base64
@@ -10,11 +10,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.report.colours import depth_colours
+from jaxrl_vis.report.outputs import check_writable
 
 SUFFIXES = (".gif", ".mp4", ".html", ".png")
 
@@ -26,12 +27,12 @@ _HOLD = 1.0  # s, how long the last frame of an episode stays
 
 
 @dataclasses.dataclass(frozen=True)
-class Recording:
-    """Some episodes.
+class EpisodeImages:
+    """The images of K episodes.
 
     Attributes:
-        frames: [K, T+1, C, H, W] uint8, what the robot saw.
-        goals: [K, C, H, W] uint8, what it was asked for.
+        frames: [K, T+1, C, H, W] uint8, the observations.
+        goals: [K, C, H, W] uint8, the desired goals.
         success: [K] bool, at the last step; or [K, T+1] at every step.
     """
 
@@ -41,27 +42,21 @@ class Recording:
 
 
 def shows_images(shape: Sequence[int]) -> bool:
-    """Whether frames of this shape, episodes by steps by observation, are images that can be shown."""
+    """Whether frames of this shape, [episodes, steps, *observation], are images that can be shown."""
     return len(shape) == 5 and shape[2] in (1, 3, 4)
 
 
-def _depth_image(depth: np.ndarray, near: float, far: float) -> np.ndarray:
-    """Depth [H, W] in grey levels -> [H, W, 3] uint8: near is bright, the steps look equally large."""
-    scaled = np.clip((depth.astype(np.float32) - near) / max(far - near, 1.0), 0.0, 1.0)
-    return (matplotlib.colormaps["magma"](0.97 - 0.92 * scaled)[..., :3] * 255).round().astype(np.uint8)
+def first_seed(images: dict[str, Any]) -> EpisodeImages:
+    """The first seed's part of the images of an evaluation, [S, K, ...] arrays on any device, on the host."""
+    first = {name: np.asarray(values)[0] for name, values in images.items()}
+    return EpisodeImages(first["frames"], first["goals"], first["success"])
 
 
-def first_seed(images: dict[str, Any]) -> Recording:
-    """What `Trainer.watch` saw of the first seed ([S, K, ...] arrays, on any device), on the host."""
-    first = {name: np.asarray(values[0]) for name, values in images.items()}
-    return Recording(first["frames"], first["goals"], first["success"])
-
-
-def _depth_range(recording: Recording) -> tuple[float, float]:
-    """Grey levels between which this recording's depth lies, a few outliers aside; the same for all its images."""
-    depth = np.concatenate([recording.frames[:, ::5, -1].ravel(), recording.goals[:, -1].ravel()])
+def _depth_range(episodes: EpisodeImages) -> tuple[float, float]:
+    """The grey levels between which the depth of all these images lies, except for a few outliers."""
+    depth = np.concatenate([episodes.frames[:, ::5, -1].ravel(), episodes.goals[:, -1].ravel()])
     near, far = np.percentile(depth, [0.5, 99.5])
-    return float(near), float(far)
+    return float(near), max(float(far), float(near) + 1.0)
 
 
 def _rows_of(image: np.ndarray, depth_range: tuple[float, float]) -> list[tuple[str, np.ndarray]]:
@@ -70,7 +65,7 @@ def _rows_of(image: np.ndarray, depth_range: tuple[float, float]) -> list[tuple[
     if image.shape[0] >= 3:
         rows.append(("colour", np.moveaxis(image[:3], 0, -1)))
     if image.shape[0] in (1, 4):
-        rows.append(("depth", _depth_image(image[-1], *depth_range)))
+        rows.append(("depth", depth_colours(image[-1], *depth_range)))
     return rows
 
 
@@ -94,9 +89,9 @@ def _compose(
         observation: [C, H, W] uint8.
         goal: [C, H, W] uint8.
         depth_range: See `_depth_range`.
-        footer: Texts at the left and at the right.
-        share: Of the episode that is over, 0 to 1.
-        colour: Of the border.
+        footer: The texts at the left and at the right.
+        share: The share of the episode that is over, 0 to 1.
+        colour: The border's colour.
     """
     left, right = (_rows_of(image, depth_range) for image in (observation, goal))
     images = [(_enlarge(seen), _enlarge(wanted)) for (_, seen), (_, wanted) in zip(left, right, strict=True)]
@@ -107,7 +102,7 @@ def _compose(
     draw = ImageDraw.Draw(canvas)
     font, small = ImageFont.load_default(size=17), ImageFont.load_default(size=14)
     columns = (_GAP, 2 * _GAP + width + 2 * _BORDER)
-    for x, text in zip(columns, ("what the robot sees", "what it is asked for"), strict=True):
+    for x, text in zip(columns, ("observation", "goal"), strict=True):
         draw.text((x + 2, _HEADER // 2 + 4), text, font=font, fill=_TEXT, anchor="lm")
     for row, pair in enumerate(images):
         y = _HEADER + _GAP // 2 + row * cell
@@ -122,34 +117,34 @@ def _compose(
     return canvas
 
 
-def draw_frames(recording: Recording, frame_seconds: float, max_episodes: int) -> tuple[list[Image.Image], list[float]]:
+def draw_frames(episodes: EpisodeImages, frame_seconds: float, max_episodes: int) -> tuple[list[Image.Image], list[float]]:
     """All frames of a video, and how long each is shown, in seconds.
 
-    Borders turn green where the goal is reached; at the end of an episode that missed, red.
+    The border turns green where the goal is reached, and red at the end of an episode that missed it.
     """
-    episodes, num_frames = recording.frames.shape[:2]
-    episodes = min(episodes, max_episodes)
-    depth_range = _depth_range(recording)
+    num_episodes, num_frames = episodes.frames.shape[:2]
+    count = min(num_episodes, max_episodes)
+    depth_range = _depth_range(episodes)
     images, seconds = [], []
-    for episode in range(episodes):
-        success = np.asarray(recording.success[episode], bool)
+    for episode in range(count):
+        success = np.asarray(episodes.success[episode], bool)
         for t in range(num_frames):
             is_last = t == num_frames - 1
             reached = bool(success[t]) if success.ndim else is_last and bool(success)
             colour = _REACHED if reached else _MISSED if is_last else _PLAIN
             verdict = "goal reached" if reached else "missed" if is_last else ""
-            footer = (f"episode {episode + 1} of {episodes}   step {t} of {num_frames - 1}", verdict)
+            footer = (f"episode {episode + 1} of {count}   step {t} of {num_frames - 1}", verdict)
             share = t / max(1, num_frames - 1)
-            frame, goal = recording.frames[episode, t], recording.goals[episode]
+            frame, goal = episodes.frames[episode, t], episodes.goals[episode]
             images.append(_compose(frame, goal, depth_range, footer, share, colour))
             seconds.append(_HOLD if is_last else frame_seconds)
     return images, seconds
 
 
 def _gif_bytes(images: list[Image.Image], seconds: list[float]) -> bytes:
-    """An endless GIF. One palette for all frames, without dithering: nothing flickers, and equal frames pack well."""
+    """An endless GIF. All frames share one palette, without dithering: nothing flickers, and equal frames compress well."""
     samples = images[:: max(1, len(images) // 16)] + images[-1:]
-    # Swatches give the colours of borders and texts a place in the palette, however colourful the images are.
+    # Swatches reserve places in the palette for the colours of borders and texts, however colourful the images are.
     swatches = (_REACHED, _MISSED, _PLAIN, _BACKGROUND, _TEXT, _FAINT)
     height = samples[0].height
     montage = Image.new("RGB", (samples[0].width, height * len(samples) + 48 * len(swatches)))
@@ -167,17 +162,17 @@ def _gif_bytes(images: list[Image.Image], seconds: list[float]) -> bytes:
     return file.getvalue()
 
 
-def _strip(recording: Recording) -> Image.Image:
-    """Six instants of up to four episodes, one below the other, each with its goal at the right."""
-    num_frames = recording.frames.shape[1]
-    depth_range = _depth_range(recording)
-    instants = sorted({round(share * (num_frames - 1)) for share in (0, 0.1, 0.2, 0.35, 0.6, 1)})
+def _strip(episodes: EpisodeImages) -> Image.Image:
+    """Six steps of up to four episodes, one episode below the other, each with its goal at the right."""
+    num_frames = episodes.frames.shape[1]
+    depth_range = _depth_range(episodes)
+    steps = sorted({round(share * (num_frames - 1)) for share in (0, 0.1, 0.2, 0.35, 0.6, 1)})
     rows = []
-    for episode in range(min(4, recording.frames.shape[0])):
-        success = np.asarray(recording.success[episode], bool)
+    for episode in range(min(4, episodes.frames.shape[0])):
+        success = np.asarray(episodes.success[episode], bool)
         border = _REACHED if bool(success if success.ndim == 0 else success[-1]) else _MISSED
-        shown = [(recording.frames[episode, t], border if t == num_frames - 1 else _PLAIN) for t in instants]
-        shown.append((recording.goals[episode], _PLAIN))
+        shown = [(episodes.frames[episode, t], border if t == num_frames - 1 else _PLAIN) for t in steps]
+        shown.append((episodes.goals[episode], _PLAIN))
         views = [([_enlarge(view).resize((128, 128)) for _, view in _rows_of(each, depth_range)], edge) for each, edge in shown]
         rows += [[(images[row], edge) for images, edge in views] for row in range(len(views[0][0]))]
     cell = 128 + 2 * 3 + 8
@@ -185,9 +180,9 @@ def _strip(recording: Recording) -> Image.Image:
     draw = ImageDraw.Draw(canvas)
     font = ImageFont.load_default(size=15)
     for column in range(len(rows[0])):
-        is_goal = column == len(instants)
+        is_goal = column == len(steps)
         x = 8 + column * cell + (12 if is_goal else 0)
-        draw.text((x + 3, 17), "goal" if is_goal else f"step {instants[column]}", font=font, fill=_TEXT, anchor="lm")
+        draw.text((x + 3, 17), "goal" if is_goal else f"step {steps[column]}", font=font, fill=_TEXT, anchor="lm")
         for line, row in enumerate(rows):
             image, edge = row[column]
             y = 30 + line * cell
@@ -197,10 +192,11 @@ def _strip(recording: Recording) -> Image.Image:
 
 
 def check_output(path: Path) -> None:
-    """Whether a video can be written under this name. Ask before spending a minute on playing episodes.
+    """Checks that a video can be written to ``path``. Call it before spending a minute on playing episodes.
 
     Raises:
-        RequestError: The suffix is not one of `SUFFIXES`, or it needs a package that is not installed.
+        RequestError: The suffix is not one of `SUFFIXES`, it needs a package that is not installed, or the file cannot be
+            written there.
     """
     if path.suffix.lower() not in SUFFIXES:
         raise RequestError(f"cannot write {path}: the name must end in one of {', '.join(SUFFIXES)}")
@@ -209,29 +205,30 @@ def check_output(path: Path) -> None:
             import imageio_ffmpeg  # noqa: F401  # pyright: ignore[reportMissingImports]
         except ImportError as error:
             raise RequestError(f"writing {path} needs imageio-ffmpeg: install it, or ask for a .gif") from error
+    check_writable(path)
 
 
-def write_video(recording: Recording, path: Path, frame_seconds: float = 0.04, max_episodes: int = 6) -> None:
-    """Writes episodes as a .gif, an .mp4, an .html page with the gif in it, or a .png with some frames side by side.
+def write_video(episodes: EpisodeImages, path: Path, frame_seconds: float = 0.04, max_episodes: int = 6) -> None:
+    """Writes episodes as a .gif, an .mp4, an .html page that holds the gif, or a .png with some frames side by side.
 
     Args:
-        recording: The episodes.
+        episodes: The episodes.
         path: The suffix decides the format.
         frame_seconds: How long a frame is shown, s.
         max_episodes: How many of them to show; a .png shows at most four.
 
     Raises:
-        RequestError: See `check_output`; or the frames are no images.
+        RequestError: See `check_output`; or the observations are not images.
     """
     check_output(path)
-    if not shows_images(recording.frames.shape):
-        raise RequestError(f"nothing to see: observations are vectors of {recording.frames.shape[-1]} numbers, not images")
+    if not shows_images(episodes.frames.shape):
+        raise RequestError(f"nothing to show: observations are vectors of {episodes.frames.shape[-1]} numbers, not images")
     path.parent.mkdir(parents=True, exist_ok=True)
     suffix = path.suffix.lower()
     if suffix == ".png":
-        _strip(recording).save(path)
+        _strip(episodes).save(path)
         return
-    images, seconds = draw_frames(recording, frame_seconds, max_episodes)
+    images, seconds = draw_frames(episodes, frame_seconds, max_episodes)
     if suffix == ".gif":
         path.write_bytes(_gif_bytes(images, seconds))
     elif suffix == ".html":

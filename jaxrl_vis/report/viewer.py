@@ -1,26 +1,26 @@
-"""The page of ``play --html``: episodes in three dimensions, for brax's viewer."""
+"""The page that ``play --html`` writes: episodes in three dimensions, for brax's viewer."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.networks import Networks
-from jaxrl_vis.learner.rollout import NO_EXPLORATION, choose_actions, encode
+from jaxrl_vis.learner.rollout import play, split_keys
+from jaxrl_vis.report.outputs import check_writable
 from jaxrl_vis.types import TrainState
 from jaxrl_vis_envs.compilation import env_jit
 
-_HOLD = 0.6  # s, how long the last instant of an episode stays
+_HOLD = 0.6  # s, how long the last step of an episode stays
 
 
 def check_page(path: Path) -> None:
-    """Whether a page can be written under this name.
+    """Checks that a page can be written to ``path``. Call it before playing the episodes.
 
     Raises:
-        RequestError: The suffix is not .html, or brax is not installed.
+        RequestError: The suffix is not .html, brax is not installed, or the file cannot be written there.
     """
     if path.suffix.lower() != ".html":
         raise RequestError(f"cannot write {path}: the name of a 3-D page must end in .html")
@@ -28,62 +28,63 @@ def check_page(path: Path) -> None:
         import jaxrl_vis_envs.adapters.brax_viewer  # noqa: F401
     except ImportError as error:
         raise RequestError(f"--html: {error}") from error
+    check_writable(path)
 
 
-def play_poses(env: Any, networks: Networks, train: TrainState, key: jax.Array, num_envs: int) -> dict[str, jax.Array]:
-    """Plays an episode in each of E environments without exploration: the episodes that `rollout.play` plays with that key.
+class PosedEpisodes(NamedTuple):
+    """Poses of all bodies in E episodes and in their goals.
+
+    Attributes:
+        positions, rotations: [E, T+1, B, 3] (m) and [E, T+1, B, 4], unit quaternions.
+        goal_positions, goal_rotations: [E, B, 3] and [E, B, 4].
+    """
+
+    positions: jax.Array
+    rotations: jax.Array
+    goal_positions: jax.Array
+    goal_rotations: jax.Array
+
+
+def play_poses(env: Any, networks: Networks, train: TrainState, key: jax.Array, num_envs: int) -> PosedEpisodes:
+    """Plays an episode of the first learner in each of E environments, without exploration.
 
     Args:
-        env: A world of MuJoCo's.
-        networks: What the parameters mean.
-        train: The learner, one seed's.
-        key: [] typed.
+        env: A MuJoCo environment.
+        networks: The networks that the parameters belong to.
+        train: The learners, [S, ...].
+        key: [] a typed key; draws the episodes, as in `rollout.play`.
         num_envs: E.
-
-    Returns:
-        ``positions`` and ``rotations`` of the bodies, [E, T + 1, B, 3] (m) and [E, T + 1, B, 4], and the same of the goals,
-        ``goal_positions`` and ``goal_rotations``, [E, B, 3] and [E, B, 4].
     """
-    reset_key, _ = jax.random.split(key)
-    reset_keys = jax.random.split(reset_key, num_envs)
-    first = jax.vmap(env.reset)(reset_keys)
-    goal = jax.vmap(env.sample_goal)(reset_keys)
-    goal_latents = encode(networks, train, first.obs["desired_goal"])
-
-    def step(carry: Any, _: None) -> Any:
-        state, frame = carry
-        state = jax.vmap(env.advance)(state, choose_actions(networks, train, goal_latents, NO_EXPLORATION, key, frame))
-        return (state, jax.vmap(env.observe)(state)), (state.data.xpos, state.data.xquat)
-
-    _, poses = jax.lax.scan(step, (first.replace(obs=None), first.obs["observation"]), length=env.horizon)
-    start = (first.data.xpos, first.data.xquat)
-    positions, rotations = (jnp.moveaxis(jnp.concatenate([a[None], b]), 0, 1) for a, b in zip(start, poses))
-    return {"positions": positions, "rotations": rotations, "goal_positions": goal.xpos, "goal_rotations": goal.xquat}
+    first = jax.tree.map(lambda leaf: leaf[:1], train)
+    played = play(env, networks, first, key[None], num_envs, record=lambda state: (state.data.xpos, state.data.xquat))
+    goal = jax.vmap(env.sample_goal)(split_keys(key[None], num_envs)[0])
+    positions, rotations = (poses[0] for poses in played.record)
+    return PosedEpisodes(positions, rotations, goal.xpos, goal.xquat)
 
 
 def write_page(program: Any, train: TrainState, key: jax.Array, episodes: int, out: Path) -> None:
-    """Plays ``episodes`` with the first seed of a learner, and writes the page.
+    """Plays ``episodes`` episodes with the first seed of a learner, and writes the page.
 
     Args:
         program: `train_step.TrainStep`.
         train: The learner, [S, ...].
         key: Draws the episodes.
-        episodes: How many, one after the other.
+        episodes: How many; the page shows one after the other.
         out: The file.
     """
     from jaxrl_vis_envs.adapters.brax_viewer import Poses, viewer_page
 
     env = program.env
-    play = env_jit(lambda train, key: play_poses(env, program.networks, train, key, episodes))
-    played = {name: np.asarray(values) for name, values in play(jax.tree.map(lambda leaf: leaf[0], train), key).items()}
-    # One instant is repeated at the end of each episode, so that one sees where it ended.
+    play_all = env_jit(lambda train, key: play_poses(env, program.networks, train, key, episodes))
+    played = jax.tree.map(np.asarray, play_all(train, key))
+    # The last step of each episode is repeated, so that one sees where it ended.
     hold = max(1, round(_HOLD / env.control_period))
-    instants = np.append(np.arange(env.horizon + 1), np.full(hold, env.horizon))
+    steps = np.append(np.arange(env.horizon + 1), np.full(hold, env.horizon))
 
     def joined(values: np.ndarray) -> np.ndarray:
-        return values[:, instants].reshape(-1, *values.shape[2:])
+        return values[:, steps].reshape(-1, *values.shape[2:])
 
-    poses = Poses(joined(played["positions"]), joined(played["rotations"]))
-    goals = Poses(*(np.repeat(played[name], len(instants), axis=0) for name in ("goal_positions", "goal_rotations")))
+    poses = Poses(joined(played.positions), joined(played.rotations))
+    goals = Poses(*(np.repeat(of_goals, len(steps), axis=0) for of_goals in (played.goal_positions, played.goal_rotations)))
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text(viewer_page(env.mj_model, poses, goals, env.control_period), encoding="utf-8")

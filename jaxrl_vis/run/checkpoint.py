@@ -6,6 +6,9 @@
 Each also holds a manifest: names, shapes and types of all arrays, their checksums, and what the host has to remember. orbax
 makes a folder appear under its final name only when it is complete; the checksums find what went wrong later: without them, a
 flipped byte in a data file would be restored without a word. The newest two of each tier are kept.
+
+A run goes on from the newest good checkpoint of either tier, and from the full one of two that are equally new. Nothing newer
+than that is ever deleted: a checkpoint that turns out to be damaged is moved to checkpoints/damaged/.
 """
 
 import contextlib
@@ -25,12 +28,14 @@ import numpy as np
 import orbax.checkpoint as ocp
 from orbax.checkpoint.checkpoint_managers import LatestN
 
-from jaxrl_vis.errors import RequestError
+from jaxrl_vis.errors import RequestError, StorageError
 from jaxrl_vis.types import LoopState, TrainState
 
 LIGHT, FULL = "light", "full"
-SCHEMA = 1
+SCHEMA = 2
+_READABLE = (1, 2)  # schema 1 called the progress "memo"
 _KEPT = 2
+DAMAGED = "damaged"
 
 Arrays = dict[str, np.ndarray]
 
@@ -48,14 +53,14 @@ class Restored:
         iteration: Iterations that the run had done.
         train: The learner, [S, ...].
         loop: Everything; None from the light tier.
-        memo: What the caller gave to `Checkpoints.save` to remember.
+        progress: What the caller gave to be remembered.
     """
 
     tier: str
     iteration: int
     train: TrainState
     loop: LoopState | None
-    memo: dict[str, Any]
+    progress: dict[str, Any]
 
 
 def named_leaves(tree: Any) -> dict[str, Any]:
@@ -124,6 +129,7 @@ class Checkpoints:
         self._say = say
         self._read_only = read_only
         self._managers: dict[str, ocp.CheckpointManager] = {}
+        self._reported: set[tuple[str, int]] = set()  # damaged ones
 
     def _manager(self, tier: str) -> ocp.CheckpointManager:
         if tier not in self._managers:
@@ -147,56 +153,96 @@ class Checkpoints:
         """The newest iteration of either tier; None where there is no checkpoint."""
         return max([*self.iterations(LIGHT), *self.iterations(FULL)], default=None)
 
-    def save_light(self, iteration: int, train: TrainState, memo: dict[str, Any]) -> None:
+    def save_light(self, iteration: int, train: TrainState, progress: dict[str, Any]) -> None:
         """Copies the learner to the host and writes it in the background; ``train`` may be donated as soon as this returns.
 
         Args:
             iteration: Iterations done.
             train: The learner, [S, ...].
-            memo: Anything that JSON can hold.
+            progress: Anything that JSON can hold.
         """
-        self._save(LIGHT, iteration, {"train": to_host(train, copy=True)}, memo)
+        self._save(LIGHT, iteration, {"train": to_host(train, copy=True)}, progress)
 
-    def save_full(self, iteration: int, loop: LoopState, memo: dict[str, Any]) -> None:
+    def save_full(self, iteration: int, loop: LoopState, progress: dict[str, Any]) -> None:
         """Writes everything, and returns when it is on the disk: a second copy of the replay would need memory for two."""
         items = {"train": to_host(loop.train, copy=False), "rest": to_host(_rest(loop), copy=False)}
-        self._save(FULL, iteration, items, memo)
+        self._save(FULL, iteration, items, progress)
         self.wait()
 
-    def _save(self, tier: str, iteration: int, items: dict[str, Arrays], memo: dict[str, Any]) -> None:
-        manager = self._manager(tier)
-        manager.wait_until_finished()
-        if iteration in self.iterations(tier):  # orbax would quietly keep the old one
-            manager.delete(iteration)
+    def _save(self, tier: str, iteration: int, items: dict[str, Arrays], progress: dict[str, Any]) -> None:
         described = {name: _describe(arrays) for name, arrays in items.items()}
-        manifest = {"schema": SCHEMA, "iteration": iteration, "items": described, "memo": memo}
+        manifest = {"schema": SCHEMA, "iteration": iteration, "items": described, "progress": progress}
         arguments: dict[str, Any] = {name: ocp.args.StandardSave(arrays) for name, arrays in items.items()}
         arguments["manifest"] = ocp.args.JsonSave(manifest)
-        if not manager.save(iteration, args=ocp.args.Composite(**arguments), force=True):
-            raise RuntimeError(f"checkpoint {tier}/{iteration} was not written")
+        with self._writing(tier):
+            manager = self._manager(tier)
+            manager.wait_until_finished()
+            if iteration in self.iterations(tier):  # orbax would quietly keep the old one
+                manager.delete(iteration)
+            if not manager.save(iteration, args=ocp.args.Composite(**arguments), force=True):
+                raise RuntimeError(f"checkpoint {tier}/{iteration} was not written")
+
+    @contextlib.contextmanager
+    def _writing(self, tier: str) -> Iterator[None]:
+        """Turns whatever orbax raises when it cannot write into a `StorageError`."""
+        try:
+            yield
+        except Exception as error:
+            # A manager whose writing failed in the background reports it again and again: start with a new one.
+            self._managers.pop(tier, None)
+            text = " ".join(str(error).split())
+            shown = "no space left on the device" if "No space left" in text else f"{type(error).__name__}: {text[:160]}"
+            raise StorageError(f"cannot write a {tier} checkpoint into {self._folder} ({shown})") from error
 
     def wait(self) -> None:
-        """Returns when everything is on the disk."""
-        for manager in self._managers.values():
-            manager.wait_until_finished()
+        """Returns when everything is on the disk.
+
+        Raises:
+            StorageError: Something could not be written.
+        """
+        for tier, manager in list(self._managers.items()):
+            with self._writing(tier):
+                manager.wait_until_finished()
 
     def close(self) -> None:
         """`wait`, then lets go of orbax's threads."""
-        for manager in self._managers.values():
-            manager.close()
+        for tier, manager in list(self._managers.items()):
+            with self._writing(tier):
+                manager.close()
         self._managers.clear()
 
-    def discard_after(self, iteration: int) -> None:
-        """Deletes the checkpoints after ``iteration``, which a resumed run writes again, and damaged ones among them."""
+    def retire_full(self) -> None:
+        """Deletes full checkpoints that are older than a light one which is safely on the disk: nothing goes on from them."""
+        newest = max(self.iterations(LIGHT), default=-1)
+        for iteration in self.iterations(FULL):
+            if iteration < newest:
+                self._forget(FULL)
+                shutil.rmtree(self._folder / FULL / str(iteration), ignore_errors=True)
+
+    def set_aside_after(self, iteration: int) -> list[Path]:
+        """Moves checkpoints after ``iteration``, from which no run can go on, to checkpoints/damaged/.
+
+        Returns:
+            Where they are now.
+        """
+        moved = []
         for tier in (LIGHT, FULL):
             for later in self.iterations(tier):
                 if later > iteration:
-                    shutil.rmtree(self._folder / tier / str(later), ignore_errors=True)
-            if tier in self._managers:
-                self._managers.pop(tier).close()  # it remembers what it has seen
+                    self._forget(tier)
+                    moved.append(self._folder / DAMAGED / f"{tier}-{later}")
+                    moved[-1].parent.mkdir(exist_ok=True)
+                    shutil.rmtree(moved[-1], ignore_errors=True)
+                    (self._folder / tier / str(later)).rename(moved[-1])
+        return moved
+
+    def _forget(self, tier: str) -> None:
+        """Closes the tier's manager, which remembers what it has seen; the next use makes a new one."""
+        if tier in self._managers:
+            self._managers.pop(tier).close()
 
     def restore_for_resume(self, template: LoopState) -> Restored | None:
-        """The newest good full checkpoint, or, where there is none, the newest good light one; None where there is neither.
+        """The newest good checkpoint of either tier, full before light where both are equally new; None where there is none.
 
         Args:
             template: Shapes and types of the loop state, as `jax.eval_shape` makes them.
@@ -204,31 +250,33 @@ class Checkpoints:
         Raises:
             RequestError: A checkpoint has another structure.
         """
-        return self._newest_good([(FULL, step) for step in _descending(self.iterations(FULL))], template, with_rest=True) or (
-            self._newest_good([(LIGHT, step) for step in _descending(self.iterations(LIGHT))], template, with_rest=False)
-        )
+        return self._newest_good(template, with_rest=True)
 
     def restore_train(self, template: LoopState) -> Restored | None:
-        """The learner of the newest good checkpoint of either tier; None where there is none. See `restore_for_resume`."""
-        found = [(step, tier) for tier in (FULL, LIGHT) for step in self.iterations(tier)]
-        return self._newest_good([(tier, step) for step, tier in sorted(found, reverse=True)], template, with_rest=False)
+        """The learner alone, of the newest good checkpoint of either tier. See `restore_for_resume`."""
+        return self._newest_good(template, with_rest=False)
 
-    def _newest_good(self, candidates: list[tuple[str, int]], template: LoopState, with_rest: bool) -> Restored | None:
-        for tier, iteration in candidates:
+    def _newest_good(self, template: LoopState, with_rest: bool) -> Restored | None:
+        found = [(iteration, tier) for tier in (FULL, LIGHT) for iteration in self.iterations(tier)]
+        # Of two tiers the light one is read where the learner alone is wanted, for it is smaller.
+        first = FULL if with_rest else LIGHT
+        for iteration, tier in sorted(found, key=lambda item: (item[0], item[1] == first), reverse=True):
             try:
-                return self._restore(tier, iteration, template, with_rest)
+                return self._restore(tier, iteration, template, with_rest and tier == FULL)
             except _Damaged as damage:
-                self._say(f"checkpoint {tier}/{iteration} is damaged ({damage}); trying the one before")
+                if (tier, iteration) not in self._reported:
+                    self._say(f"checkpoint {tier}/{iteration} is damaged ({damage}); trying the one before")
+                self._reported.add((tier, iteration))
         return None
 
     def _restore(self, tier: str, iteration: int, template: LoopState, with_rest: bool) -> Restored:
         manifest = self._read(tier, iteration, {"manifest": ocp.args.JsonRestore()})["manifest"]
-        if not isinstance(manifest, dict) or not {"schema", "items", "memo"} <= set(manifest):
+        if not isinstance(manifest, dict) or not {"schema", "items"} <= set(manifest):
             raise _Damaged("its manifest is incomplete")
         templates = {"train": template.train} | ({"rest": _rest(template)} if with_rest else {})
         specs = {name: _host_specs(tree) for name, tree in templates.items()}
         where = self._folder / tier / str(iteration)
-        if manifest["schema"] != SCHEMA:
+        if manifest["schema"] not in _READABLE:
             raise RequestError(f"{where} is of schema {manifest['schema']}, not {SCHEMA}: use the version that wrote it")
         for name, spec in specs.items():
             _check_structure(where, manifest["items"].get(name, {}), spec)
@@ -240,7 +288,7 @@ class Checkpoints:
                     raise _Damaged(f"wrong checksum of {leaf_name}")
             trees[name] = _rebuild(tree, read[name])
         loop = LoopState(train=trees["train"], **trees["rest"]) if with_rest else None
-        return Restored(tier, iteration, trees["train"], loop, manifest["memo"])
+        return Restored(tier, iteration, trees["train"], loop, manifest.get("progress", manifest.get("memo", {})))
 
     def _read(self, tier: str, iteration: int, arguments: dict[str, Any]) -> Any:
         with _hushed():
@@ -250,10 +298,6 @@ class Checkpoints:
             except Exception as error:
                 text = " ".join(str(error).split())[:80]
                 raise _Damaged(f"{type(error).__name__}: {text}") from None
-
-
-def _descending(steps: list[int]) -> list[int]:
-    return sorted(steps, reverse=True)
 
 
 def _host_specs(tree: Any) -> dict[str, jax.ShapeDtypeStruct]:

@@ -4,30 +4,27 @@ The files:
 
     config.json     schema, versions, device, git revision, configuration      metrics.jsonl   see `metrics`
     checkpoints/    see `checkpoint`      nonfinite/   what a run that went wrong held      curve.png   video.gif
+    run.lock        while a process writes here, see `lock`
 """
 
 import dataclasses
-import importlib.metadata
 import json
-import os
-import platform
 import shutil
-import subprocess
-import typing
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-import jax
-
-from jaxrl_vis.config import Config
+from jaxrl_vis import provenance
+from jaxrl_vis.config import Config, config_from_dict
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.files import write_atomically
+from jaxrl_vis.run.lock import FILE_NAME as LOCK_NAME
+from jaxrl_vis.run.lock import run_lock
 
 SCHEMA = 1
 
 MAY_CHANGE = ("preset", "env_steps", "eval_interval", "eval_episodes", "checkpoint_interval", "full_checkpoint_interval")
 """Fields that a resumed run may set anew: how long to train, how often to look and save. All others shape what is learned."""
-
-_PACKAGES = ("jaxrl-vis", "jax", "jaxlib", "numpy", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint")
 
 
 def default_folder(config: Config) -> Path:
@@ -77,6 +74,10 @@ class RunFolder:
         """A few episodes of the trained policy."""
         return self.path / "video.gif"
 
+    def lock(self) -> AbstractContextManager[None]:
+        """See `run_lock`."""
+        return run_lock(self.path)
+
     def check(self, config: Config, resume: bool = False, overwrite: bool = False) -> bool:
         """Whether this folder may be used for ``config``. Changes nothing.
 
@@ -90,7 +91,7 @@ class RunFolder:
             raise RequestError("--resume and --overwrite contradict each other: give one of them")
         if self.path.exists() and not self.path.is_dir():
             raise RequestError(f"{self.path} is a file: choose another --run-dir")
-        if not self.path.exists() or not any(self.path.iterdir()):
+        if not self.path.exists() or all(entry.name == LOCK_NAME for entry in self.path.iterdir()):
             return False
         if not (resume or overwrite):
             raise RequestError(f"run folder {self.path} exists: --resume goes on with it, --overwrite starts again")
@@ -98,11 +99,13 @@ class RunFolder:
             raise RequestError(f"{self.path} holds files but no config.json, so it is not a run: choose another --run-dir")
         if overwrite:
             return False
-        _check_same(self.path, read_record(self.path).get("config", {}), config)
+        _check_same(self.path, read_config(self.path), config)
         return True
 
     def open(self, config: Config, resume: bool = False, overwrite: bool = False) -> bool:
         """`check`, then makes the folder ready: with ``overwrite``, an earlier run's files are deleted, and nothing else.
+
+        Call it last, when nothing can refuse the run any more.
 
         Returns:
             True where an earlier run goes on.
@@ -124,57 +127,13 @@ class RunFolder:
         return goes_on
 
 
-def write_atomically(path: Path, text: str) -> None:
-    """Replaces a file's contents in one step: a reader, or a power cut, sees the old contents or the new ones."""
-    temporary = path.with_name(path.name + ".tmp")
-    with temporary.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
-
-
-def git_revision() -> str | None:
-    """Revision of the checkout that this file belongs to, with ``-dirty`` for changes; None outside a checkout."""
-    here = Path(__file__).resolve()
-
-    def git(*words: str) -> str | None:
-        try:
-            done = subprocess.run(("git", "-C", str(here.parent), *words), capture_output=True, text=True, timeout=10)
-        except (OSError, subprocess.TimeoutExpired):
-            return None
-        return done.stdout.strip() if done.returncode == 0 else None
-
-    # An installed copy may lie inside somebody else's checkout, whose revision says nothing about this code.
-    if git("ls-files", "--error-unmatch", here.name) is None:
-        return None
-    return git("describe", "--always", "--dirty", "--abbrev=40", "--exclude", "*")
-
-
-def versions() -> dict[str, str]:
-    """Versions of Python and of the libraries that a result depends on."""
-    found = {"python": platform.python_version()}
-    for package in _PACKAGES:
-        try:
-            found[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            found[package] = "not installed"
-    return found
-
-
-def device_record() -> dict[str, Any]:
-    """The devices that JAX runs on."""
-    device = jax.devices()[0]
-    return {"platform": device.platform, "kind": device.device_kind, "count": jax.device_count(), "cpu_count": os.cpu_count()}
-
-
 def _record(config: Config) -> dict[str, Any]:
     return {
         "schema": SCHEMA,
         "preset": config.preset,
-        "git_revision": git_revision(),
-        "versions": versions(),
-        "device": device_record(),
+        "git_revision": provenance.revision(),
+        "versions": provenance.versions(),
+        "device": provenance.device_record(),
         "config": dataclasses.asdict(config),
     }
 
@@ -203,25 +162,19 @@ def read_config(path: Path) -> Config:
     Raises:
         RequestError: There is no run, or another version wrote it.
     """
-    saved = read_record(path).get("config", {})
-    hints = typing.get_type_hints(Config)
-    unknown = sorted(set(saved) - set(hints))
-    if unknown:
-        raise RequestError(f"the run in {path} has options that this version does not know: {', '.join(unknown)}")
-    # JSON has no tuples.
-    fields: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in saved.items()}
-    return Config(**fields)
+    try:
+        return config_from_dict(read_record(path).get("config", {}))
+    except RequestError as error:
+        raise RequestError(f"the run in {path} cannot be used: {error}") from error
 
 
-def _check_same(path: Path, saved: dict[str, Any], config: Config) -> None:
+def _check_same(path: Path, saved: Config, config: Config) -> None:
     """Raises RequestError, naming the fields, where ``config`` would not learn what ``saved`` learned."""
-    asked = json.loads(json.dumps(dataclasses.asdict(config)))  # tuples as lists, like the saved ones
-    # An option that is newer than the saved run had its default value then.
-    saved = json.loads(json.dumps(dataclasses.asdict(Config()))) | saved
+    before, asked = dataclasses.asdict(saved), dataclasses.asdict(config)
     contradictions = [
-        f"{name} (saved {saved[name]}, asked {asked.get(name, 'nothing: no such option now')})"
-        for name in sorted(saved)
-        if name not in MAY_CHANGE and saved[name] != asked.get(name)
+        f"{name} (saved {before[name]}, asked {asked[name]})"
+        for name in sorted(before)
+        if name not in MAY_CHANGE and before[name] != asked[name]
     ]
     if contradictions:
         raise RequestError(

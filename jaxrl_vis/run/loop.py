@@ -4,21 +4,22 @@
     read the metrics of iteration k        ... because the host reads one iteration late
     at a boundary (evaluation, checkpoint, signal): read the current iteration too, then evaluate, write metrics, save
 
-Metrics are on the disk before the checkpoint of the same iteration is, so a checkpoint never runs ahead of metrics.jsonl; and
-nothing is saved before the iteration's metrics were read and found finite.
+Everything that can refuse a run (folder, lock, memory, checkpoints, compilation, memory again) comes before the first byte is
+written or deleted. Metrics are on the disk before the checkpoint of the same iteration is, so a checkpoint never runs ahead of
+metrics.jsonl; and nothing is saved before the iteration's metrics were read and found finite.
 """
 
 import contextlib
 import dataclasses
 import time
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis.errors import NonFiniteError
+from jaxrl_vis.errors import NonFiniteError, StorageError
 from jaxrl_vis.report import plots, videos
 from jaxrl_vis.run import metrics
 from jaxrl_vis.run.checkpoint import FULL, LIGHT, Checkpoints, Restored
@@ -26,14 +27,15 @@ from jaxrl_vis.run.console import RunConsole, show_seconds, show_shares
 from jaxrl_vis.run.folder import RunFolder
 from jaxrl_vis.run.memory import check_compiled, check_memory
 from jaxrl_vis.run.metrics import PerSeed
-from jaxrl_vis.run.nonfinite import dump, nonfinite_leaves
+from jaxrl_vis.run.programs import Programs
+from jaxrl_vis.run.progress import Progress
+from jaxrl_vis.run.saving import Saver
 from jaxrl_vis.run.signals import Interruption
 from jaxrl_vis.types import LoopState
 
-if TYPE_CHECKING:
-    from jaxrl_vis.run.trainer import Trainer
-
 _FILTERED_TOO_MUCH, _FILTERED_EVALUATIONS = 0.9, 3
+GUARD = "guard/"
+"""Metrics whose names begin like this stop a run where they are not 0; all others reach metrics.jsonl."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,54 +55,26 @@ class Report:
     metrics: PerSeed
 
 
-@dataclasses.dataclass
-class Memo:
-    """What the host remembers from one part of a run to the next; saved with every checkpoint.
-
-    Attributes:
-        wall_s, compile_s: Spent by earlier parts, s.
-        updates: Gradient steps so far, per seed.
-        since_evaluation: train/* of every iteration since the last scheduled evaluation.
-        evaluation_due: The iteration ends with an evaluation, which a signal prevented.
-        filtered: Evaluations in a row with too large a filtered share.
-    """
-
-    wall_s: float = 0.0
-    compile_s: float = 0.0
-    updates: int = 0
-    since_evaluation: list[PerSeed] = dataclasses.field(default_factory=list)
-    evaluation_due: bool = False
-    filtered: int = 0
-
-
-@dataclasses.dataclass(frozen=True)
-class _Pending:
-    """Results of an iteration that the device may still be working on."""
-
-    iteration: int
-    metrics: dict[str, jax.Array]
-    updates: jax.Array
-
-
 class RunLoop:
     """One call of `Trainer.run`.
 
     Args:
-        trainer: What to run.
+        programs: What to run.
         folder: Where its files go.
     """
 
-    def __init__(self, trainer: "Trainer", folder: RunFolder):
-        self._trainer, self._folder = trainer, folder
-        self._config, self._program = trainer.config, trainer.program
+    def __init__(self, programs: Programs, folder: RunFolder):
+        self._programs, self._folder = programs, folder
+        self._config, self._program = programs.config, programs.program
         self._console = RunConsole()
         self._say = self._console.say
         self._checkpoints = Checkpoints(folder.checkpoints, self._say)
+        self._saver = Saver(programs, folder, self._checkpoints, self._say)
         self._total: int = self._program.num_iterations
-        self._memo = Memo()
+        self._progress = Progress()
         self._done = 0
         self._loop: LoopState | None = None
-        self._images: dict[str, jax.Array] = {}
+        self._recorded: dict[str, jax.Array] = {}
         self._started = self._mark = time.monotonic()
         self._begun, self._begun_at = 0, self._mark
         self._marked_iteration = 0
@@ -110,26 +84,47 @@ class RunLoop:
         goes_on = self._folder.check(self._config, resume, overwrite)
         if resume and not goes_on:
             self._say(f"nothing to resume in {self._folder.path}: starting at the beginning")
-        if goes_on and max(self._checkpoints.iterations(LIGHT), default=0) >= self._total:
-            self._say(f"{self._folder.path} is finished already ({self._total} iterations): ask for more --env-steps to go on")
-            return
-        # Before anything is written or, to start again, deleted.
         steps = self._program.steps_per_iteration
-        memory = check_memory(self._config, self._trainer.shapes, self._program.replay_bytes, steps)
-        self._folder.open(self._config, resume, overwrite)
-        with self._console:
+        memory = check_memory(self._config, self._programs.shapes, self._program.replay_bytes, steps)
+        with self._folder.lock(), self._console:
+            if goes_on and self._is_finished():
+                self._say(
+                    f"{self._folder.path} is finished already ({self._total} iterations): ask for more --env-steps to go on"
+                )
+                return
+            interruption = Interruption()
             try:
-                self._prepare(goes_on, memory)
+                self._prepare(goes_on, overwrite, memory)
                 # Not before: while XLA compiles, no Python runs that could look at a flag, and there is nothing to save.
-                with Interruption() as interruption:
+                with interruption:
                     yield from self._train(interruption)
                     self._finish(interruption)
                 self._checkpoints.close()
-            except BaseException:
-                # What is being written becomes whole; an error on the way must not hide the first one.
-                with contextlib.suppress(Exception):
-                    self._checkpoints.close()
+            except (OSError, StorageError) as error:
+                self._rescue()
+                raise self._storage_error(error) from error
+            except NonFiniteError:
                 raise
+            except Exception:
+                self._rescue()
+                raise
+            finally:
+                # What is being written becomes whole, unless somebody is in a hurry; and no error on the way hides the first.
+                if not interruption.is_urgent:
+                    with contextlib.suppress(StorageError):
+                        self._checkpoints.close()
+
+    def _storage_error(self, error: OSError | StorageError) -> StorageError:
+        what = str(error)
+        if isinstance(error, OSError):
+            what = f"cannot write to {self._folder.path} ({error.strerror or type(error).__name__})"
+        kept = self._checkpoints.newest()
+        good = "there is no checkpoint yet" if kept is None else f"the last checkpoint is of iteration {kept}"
+        return StorageError(f"{what}; {good}: make room, then go on with --run-dir {self._folder.path} --resume")
+
+    def _rescue(self) -> None:
+        self._console.stop()
+        self._saver.rescue(self._loop, self._done, self._progress_now())
 
     @property
     def _asked(self) -> str:
@@ -139,33 +134,50 @@ class RunLoop:
 
     # -- Before
 
-    def _prepare(self, goes_on: bool, memory: str) -> None:
-        trainer, steps = self._trainer, self._program.steps_per_iteration
+    def _is_finished(self) -> bool:
+        """Whether an earlier part has trained to the end: a good checkpoint, a row for it, and what it draws."""
+        if (self._checkpoints.newest() or 0) < self._total:
+            return False
+        restored = self._checkpoints.restore_train(self._programs.shapes)
+        if restored is None or restored.iteration < self._total:
+            self._say("the last checkpoint is not usable, so the run is not finished: going on from the last good one")
+            return False
+        files = [self._folder.curve, self._folder.video] if self._programs.shows_images else [self._folder.curve]
+        return not Progress.from_dict(restored.progress).evaluation_due and all(file.exists() for file in files)
+
+    def _prepare(self, goes_on: bool, overwrite: bool, memory: str) -> None:
+        programs, steps = self._programs, self._program.steps_per_iteration
         self._say(f"{self._config.env}, {self._asked}, on {jax.devices()[0].device_kind}; {memory}")
         self._say(f"{self._total} iterations of {steps:,} environment steps per seed; files go to {self._folder.path}")
-        restored = self._checkpoints.restore_for_resume(trainer.shapes) if goes_on else None
+        restored = self._checkpoints.restore_for_resume(programs.shapes) if goes_on else None
         if restored is not None:
             self._take_over(restored)
         elif goes_on:
             self._say("no usable checkpoint: starting at the beginning")
-        if goes_on:
-            metrics.cut_back(self._folder.metrics, self._done)
-            self._checkpoints.discard_after(self._done)
 
         started = time.monotonic()
         self._say("compiling (once; the next start finds it in the cache) ...")
-        programs = trainer.compile()
-        self._memo.compile_s += time.monotonic() - started
+        compiled = programs.compile()
+        self._progress.compile_s += time.monotonic() - started
         self._say(f"compiled in {show_seconds(time.monotonic() - started)}")
-        check_compiled(programs, already_there=self._loop is not None)
+        check_compiled(compiled, already_there=self._loop is not None)
+
+        # Nothing refuses the run from here on.
+        self._folder.open(self._config, goes_on, overwrite)
+        if goes_on:
+            damaged = self._checkpoints.set_aside_after(self._done)
+            last = self._done - self._progress.evaluation_due  # an evaluation that is due writes its rows again
+            metrics.cut_back(self._folder.metrics, last, damaged[0].parent / "metrics.jsonl" if damaged else None)
+            for path in damaged:
+                self._say(f"kept for inspection: {path}")
         if self._loop is None:
-            self._loop = trainer.init(trainer.run_keys)
+            self._loop = programs.init(programs.run_keys)
         self._console.start(self._total, self._done)
         self._set_mark()
         self._begun, self._begun_at = self._done, self._mark
 
     def _take_over(self, restored: Restored) -> None:
-        self._memo = Memo(**restored.memo)
+        self._progress = Progress.from_dict(restored.progress)
         self._done = restored.iteration
         if restored.loop is not None:
             self._loop = restored.loop
@@ -174,8 +186,10 @@ class RunLoop:
         # A light checkpoint has no replay. Networks, optimisers, statistics and the iteration go on (and with it the random
         # draws); the replay starts empty, and knows that it is. Until it has filled up again, updates see fewer and newer
         # episodes than they would have: a sound run, but not the one that was interrupted.
-        fresh = self._trainer.init(self._trainer.run_keys)
+        fresh = self._programs.init(self._programs.run_keys)
         self._loop = fresh.replace(train=restored.train, iteration=jnp.asarray(self._done, fresh.iteration.dtype))
+        if self._done < self._total:
+            self._progress.replay_lost_at = self._done
         self._say(
             f"resumed at iteration {self._done} of {self._total} from a light checkpoint: networks go on, but the replay was "
             "not saved and fills up anew, so this is not an exact continuation (--full-checkpoint-interval saves the replay)"
@@ -185,30 +199,29 @@ class RunLoop:
 
     def _train(self, interruption: Interruption) -> Iterator[Report]:
         config = self._config
-        if self._memo.evaluation_due:
-            yield self._evaluate(Report(self._done, self._env_steps(self._done), self._memo.updates, {}))
-        pending: _Pending | None = None
+        if self._progress.evaluation_due:
+            yield self._evaluate(self._report(self._done, {}))
+        waiting: tuple[int, dict[str, jax.Array]] | None = None  # an iteration that the device may still be working on
         while self._done < self._total:
             assert self._loop is not None
-            self._loop, values = self._trainer.train_iteration(self._loop)
+            self._loop, values = self._programs.train_iteration(self._loop)
             self._done += 1
-            # A copy: the counter itself is donated to the next iteration before the host reads it.
-            waiting, pending = pending, _Pending(self._done, values, jnp.copy(self._loop.train.updates))
-            if waiting is not None:
-                yield self._read(waiting)
+            before, waiting = waiting, (self._done, values)
+            if before is not None:
+                yield self._read(*before)
             evaluation = self._is_due(config.eval_interval) or self._done == self._total
             light, full = self._is_due(config.checkpoint_interval), self._is_due(config.full_checkpoint_interval)
             if not (evaluation or light or full or interruption):
                 continue
-            report, pending = self._read(pending), None
+            report, waiting = self._read(*waiting), None
             if interruption:
                 self._save_and_end(evaluation, interruption)
             if evaluation:
                 report = self._evaluate(report)
             if light:
-                self._save_light()
+                self._saver.light(self._loop, self._done, self._progress_now())
             if full:
-                self._save_full()
+                self._saver.full(self._loop, self._done, self._progress_now())
             # A signal that came during the evaluation must not wait for another iteration.
             if interruption and self._done < self._total:
                 self._save_and_end(False, interruption)
@@ -217,24 +230,24 @@ class RunLoop:
     def _is_due(self, interval: int) -> bool:
         return interval > 0 and self._done % interval == 0
 
-    def _env_steps(self, iteration: int) -> int:
-        return iteration * self._program.steps_per_iteration
+    def _report(self, iteration: int, values: PerSeed) -> Report:
+        env_steps, updates = self._program.steps_per_iteration, self._program.updates_per_iteration
+        return Report(iteration, iteration * env_steps, iteration * updates, values)
 
-    def _read(self, pending: _Pending) -> Report:
+    def _read(self, iteration: int, on_device: dict[str, jax.Array]) -> Report:
         """Waits for an iteration's metrics and takes them in.
 
         Raises:
-            NonFiniteError: The guard has counted something.
+            NonFiniteError: A guard has counted something.
         """
-        values = {name: self._per_seed(value) for name, value in jax.device_get(pending.metrics).items()}
-        guard = values.pop("guard/nonfinite", None)
-        if guard is not None and any(count != 0 for count in guard):
-            bad = [self._config.seed + i for i, count in enumerate(guard) if count != 0]
-            self._stop_nonfinite(f"iteration {pending.iteration}, seed {', '.join(map(str, bad))}", values)
-        self._memo.updates = int(np.max(np.asarray(pending.updates)))
-        self._memo.since_evaluation.append({name: value for name, value in values.items() if name.startswith("train/")})
-        self._console.advance(pending.iteration, self._speed(pending.iteration))
-        return Report(pending.iteration, self._env_steps(pending.iteration), self._memo.updates, values)
+        values = {name: self._per_seed(value) for name, value in jax.device_get(on_device).items()}
+        guards = [values.pop(name) for name in list(values) if name.startswith(GUARD)]
+        bad = sorted({self._config.seed + seed for counts in guards for seed, count in enumerate(counts) if count != 0})
+        if bad:
+            self._stop_nonfinite(f"iteration {iteration}, seed {', '.join(map(str, bad))}", values)
+        self._progress.since_evaluation.append(values)
+        self._console.advance(iteration, self._speed(iteration))
+        return self._report(iteration, values)
 
     def _per_seed(self, value: Any) -> list[float]:
         array = np.broadcast_to(np.asarray(value, np.float32), (self._config.seeds,))
@@ -243,44 +256,48 @@ class RunLoop:
     def _evaluate(self, report: Report) -> Report:
         """Evaluates the learner, writes a line per seed, and adds the figures to the report."""
         assert self._loop is not None
-        speed = self._speed(self._done)
-        outcome, self._images = self._trainer.watch(self._loop)
+        progress, speed = self._progress, self._speed(self._done)
+        progress.evaluation_due = True  # until its rows are on the disk, whatever happens in between
+        outcome, self._recorded = self._programs.evaluate(self._loop.train)
         values = {name: self._per_seed(value) for name, value in jax.device_get(outcome).items()}
         if not all(np.isfinite(row).all() for row in values.values()):
             self._stop_nonfinite(f"the evaluation after iteration {self._done}", values)
-        self._memo.evaluation_due = False
-        means = metrics.mean_of(self._memo.since_evaluation)
+        means = metrics.mean_of(progress.since_evaluation)
         times = {
-            "time/wall_s": self._memo.wall_s + time.monotonic() - self._started,
-            "time/compile_s": self._memo.compile_s,
+            "time/wall_s": progress.wall_s + time.monotonic() - self._started,
+            "time/compile_s": progress.compile_s,
             "time/env_steps_per_s": speed,
         }
         rounded = {name: [round(value, 3)] * self._config.seeds for name, value in times.items()}
         counts = {"iteration": self._done, "updates": report.updates, "env_steps": report.env_steps}
-        rows = metrics.make_rows(self._trainer.seeds, counts, values | means | rounded)
+        if progress.replay_lost_at is not None:
+            counts["resume/replay_lost_at"] = progress.replay_lost_at
+        rows = metrics.make_rows(self._programs.seeds, counts, values | means | rounded)
         metrics.append_rows(self._folder.metrics, rows)
+        progress.evaluation_due = False
         self._warn_if_filtered(means)
         # The last evaluation may come between two scheduled ones; a longer run, resumed from here, goes on with the means.
         if self._is_due(self._config.eval_interval):
-            self._memo.since_evaluation = []
+            progress.since_evaluation = []
         self._show(values, speed)
         self._set_mark()
         return dataclasses.replace(report, metrics=report.metrics | values)
 
     def _show(self, values: PerSeed, speed: float) -> None:
-        success, distance = values["eval/success"], values["eval/goal_distance"]
-        self._console.evaluated(success, distance, self._trainer.distance_unit)
+        success, distance, unit = values["eval/success"], values["eval/goal_distance"], self._programs.env.distance_unit
+        self._console.evaluated(success, distance, unit)
         left = (self._total - self._done) * (time.monotonic() - self._begun_at) / max(1, self._done - self._begun)
+        env_steps = self._done * self._program.steps_per_iteration
         line = (
-            f"iteration {self._done}/{self._total}  {self._env_steps(self._done):,} steps  success {show_shares(success)}  "
-            f"distance {np.median(distance):.3f} {self._trainer.distance_unit}  {speed:,.0f} steps/s"
+            f"iteration {self._done}/{self._total}  {env_steps:,} steps  success {show_shares(success)}  "
+            f"distance {np.median(distance):.3f} {unit}  {speed:,.0f} steps/s"
         )
         self._say(line if self._done == self._total else f"{line}  about {show_seconds(left)} left")
 
     def _warn_if_filtered(self, means: PerSeed) -> None:
         too_much = max(means.get("train/filtered_share", [0.0])) > _FILTERED_TOO_MUCH
-        self._memo.filtered = self._memo.filtered + 1 if too_much else 0
-        if self._memo.filtered == _FILTERED_EVALUATIONS:
+        self._progress.filtered = self._progress.filtered + 1 if too_much else 0
+        if self._progress.filtered == _FILTERED_EVALUATIONS:
             self._say(
                 f"warning: more than {_FILTERED_TOO_MUCH:.0%} of the negatives were filtered since "
                 f"{_FILTERED_EVALUATIONS} evaluations: Q lies above q0 almost everywhere and cannot come down; "
@@ -297,85 +314,58 @@ class RunLoop:
 
     # -- Saving
 
-    def _memo_now(self) -> dict[str, Any]:
-        memo = dataclasses.asdict(self._memo)
-        memo["wall_s"] = self._memo.wall_s + time.monotonic() - self._started
-        return memo
-
-    def _save_light(self) -> None:
-        assert self._loop is not None
-        self._refuse_nonfinite(self._loop.train)
-        self._checkpoints.save_light(self._done, self._loop.train, self._memo_now())
-
-    def _save_full(self) -> None:
-        assert self._loop is not None
-        self._refuse_nonfinite(self._loop)
-        self._checkpoints.save_full(self._done, self._loop, self._memo_now())
+    def _progress_now(self) -> Progress:
+        return dataclasses.replace(self._progress, wall_s=self._progress.wall_s + time.monotonic() - self._started)
 
     def _save_and_end(self, evaluation_due: bool, interruption: Interruption) -> None:
         """Saves everything and raises what the signal stands for."""
+        assert self._loop is not None
         self._console.stop()
-        self._say(f"{interruption.name}: saving iteration {self._done} (once more quits without saving) ...")
-        self._memo.evaluation_due = evaluation_due
-        if self._done not in self._checkpoints.iterations(FULL) or evaluation_due:
-            self._save_full()
-        self._draw_curve()
-        self._say(f"saved; go on with --run-dir {self._folder.path} --resume")
+        self._progress.evaluation_due = evaluation_due
+        self._saver.on_signal(self._loop, self._done, self._progress_now(), interruption.name)
+        with contextlib.suppress(OSError):
+            self._draw_curve()
         interruption.end()
-
-    def _refuse_nonfinite(self, tree: Any) -> None:
-        # The guard looks at losses and states; a parameter that broke in the very last update shows in the next iteration's.
-        if nonfinite_leaves(tree):
-            self._stop_nonfinite(f"the state after iteration {self._done}", {})
 
     def _stop_nonfinite(self, where: str, values: PerSeed) -> None:
         """Dumps the state and raises NonFiniteError."""
         assert self._loop is not None
         self._console.stop()
-        self._checkpoints.wait()
-        kept = self._checkpoints.newest()
-        leaves = nonfinite_leaves(self._loop.train)
-        file = self._folder.nonfinite / f"iteration_{self._done}.npz"
-        dump(file, self._loop, values, leaves)
-        names = [name for name, row in values.items() if not np.isfinite(row).all()] + leaves
-        broken = f" ({', '.join(names[:3])}{f' and {len(names) - 3} more' if len(names) > 3 else ''})" if names else ""
-        good = "there is no checkpoint yet" if kept is None else f"the last good checkpoint is of iteration {kept}"
-        raise NonFiniteError(f"non-finite numbers in {where}{broken}: state dumped to {file}; {good}")
+        self._saver.stop_nonfinite(self._loop, self._done, where, values)
 
     # -- After
 
     def _finish(self, interruption: Interruption) -> None:
         assert self._loop is not None
-        if self._done not in self._checkpoints.iterations(LIGHT):
-            self._save_light()
-        if self._config.full_checkpoint_interval and self._done not in self._checkpoints.iterations(FULL):
-            self._save_full()
-        self._checkpoints.wait()
+        if not self._saver.has(LIGHT, self._done):
+            self._saver.light(self._loop, self._done, self._progress_now())
+        if self._config.full_checkpoint_interval and not self._saver.has(FULL, self._done):
+            self._saver.full(self._loop, self._done, self._progress_now())
+        self._saver.finish()
         self._console.stop()
-        if not interruption:
-            self._draw_curve()
-        if not interruption and self._trainer.shows_images:
-            if not self._images:  # killed after the last evaluation, before this: resumed with nothing left to evaluate
-                _, self._images = self._trainer.watch(self._loop)
-            videos.write_video(videos.first_seed(self._images), self._folder.video, self._trainer.frame_seconds)
         if interruption:
             interruption.end()
-        wall = self._memo.wall_s + time.monotonic() - self._started
+        self._draw_curve()
+        if self._programs.shows_images:
+            if not self._recorded:  # killed after the last evaluation, before this: resumed with nothing left to evaluate
+                _, self._recorded = self._programs.evaluate(self._loop.train)
+            videos.write_video(videos.first_seed(self._recorded), self._folder.video, self._programs.image_seconds)
+        wall = self._progress.wall_s + time.monotonic() - self._started
         rows = [row for row in metrics.read_rows(self._folder.metrics) if row["iteration"] == self._done]
         success = ", ".join(f"seed {row['seed']}: {row['eval/success']:.3f}" for row in rows)
         written = [file.name for file in (self._folder.curve, self._folder.video) if file.exists()]
-        compiling = show_seconds(self._memo.compile_s)
+        compiling = show_seconds(self._progress.compile_s)
         self._say(f"success at the end: {success}; {show_seconds(wall)}, of which {compiling} compiling")
         self._say(f"see {', '.join([*written, self._folder.metrics.name])} in {self._folder.path}")
 
     def _draw_curve(self) -> None:
-        config, trainer = self._config, self._trainer
+        config, env = self._config, self._programs.env
         plots.plot_run(
             metrics.read_rows(self._folder.metrics),
             self._folder.curve,
             title=config.env,
             subtitle=f"{self._asked}, {config.eval_episodes} episodes per evaluation"
             + ("; thick: median, band: middle half" if config.seeds > 1 else ""),
-            unit=trainer.distance_unit,
-            threshold=trainer.threshold,
+            unit=env.distance_unit,
+            threshold=env.threshold,
         )

@@ -1,7 +1,8 @@
 """metrics.jsonl, and the numbers that go into it. No JAX here: everything is plain Python by now.
 
 One line per seed and evaluation: seed, iteration, updates, env_steps (counts per seed, since the beginning), eval/*, the means
-of train/* since the last evaluation, and time/wall_s (the run so far, with evaluation, compilation and what came before a
+of train/* since the last evaluation, resume/replay_lost_at (where a run went on from a light checkpoint: the last iteration at
+which its replay was lost), and time/wall_s (the run so far, with evaluation, compilation and what came before a
 resumption), time/compile_s (of that, compilation), time/env_steps_per_s (all seeds together, since the last evaluation).
 """
 
@@ -69,8 +70,18 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def cut_back(path: Path, iteration: int) -> None:
-    """Takes out every row after ``iteration``: a resumed run writes those again."""
-    if path.exists():
-        kept = [row for row in read_rows(path) if row["iteration"] <= iteration]
-        write_atomically(path, "".join(json.dumps(row) + "\n" for row in kept))
+def cut_back(path: Path, iteration: int, cut_to: Path | None = None) -> None:
+    """Takes out every row after ``iteration``: a resumed run writes those again.
+
+    Args:
+        path: The file.
+        iteration: The last one to keep.
+        cut_to: Append what is taken out to this file; None: it is dropped.
+    """
+    if not path.exists():
+        return
+    rows = read_rows(path)
+    later = [row for row in rows if row["iteration"] > iteration]
+    if cut_to is not None and later:
+        append_rows(cut_to, later)
+    write_atomically(path, "".join(json.dumps(row) + "\n" for row in rows if row["iteration"] <= iteration))

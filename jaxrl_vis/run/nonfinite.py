@@ -1,8 +1,9 @@
-"""A number that is not finite: how the host notices it, and what is kept for whoever looks for its cause."""
+"""A number that is not finite: how it is noticed, and what is kept for whoever looks for its cause."""
 
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -13,17 +14,17 @@ from jaxrl_vis.types import LoopState
 _MAX_EPISODES = 64
 
 
-def nonfinite_leaves(tree: Any) -> list[str]:
-    """Names of the floating-point leaves that hold a NaN or an infinity."""
-    return [
-        name
-        for name, leaf in named_leaves(tree).items()
-        if jnp.issubdtype(leaf.dtype, jnp.floating) and not bool(jnp.isfinite(leaf).all())
-    ]
+def _checked(tree: Any) -> dict[str, Any]:
+    return {name: leaf for name, leaf in named_leaves(tree).items() if jnp.issubdtype(leaf.dtype, jnp.floating)}
+
+
+def broken_leaves(loop: LoopState) -> dict[str, jax.Array]:
+    """Which floating-point leaves hold a NaN or an infinity: name -> [] bool. Traceable; compiled before training starts."""
+    return {name: ~jnp.isfinite(leaf).all() for name, leaf in _checked(loop).items()}
 
 
 def dump(file: Path, loop: LoopState, values: PerSeed, leaves: list[str]) -> None:
-    """Writes an .npz that shows where a non-finite number came from.
+    """Writes an .npz that shows where a non-finite number came from. Runs on the host alone: nothing is compiled here.
 
     ``train.*``: the learner. ``episodes.*``: states and actions of up to 64 replay episodes with a bad number in them, with
     their seed_index and slot. ``metrics.*``: losses and the like, [S]. ``key`` (words) and ``iteration``: what the next
@@ -36,11 +37,11 @@ def dump(file: Path, loop: LoopState, values: PerSeed, leaves: list[str]) -> Non
         leaves: Names of the learner's leaves that are not finite.
     """
     found = {f"train.{name}": array for name, array in to_host(loop.train, copy=True).items()}
-    episodes = loop.replay.episodes
-    bad = ~(jnp.isfinite(episodes.states).all((-2, -1)) & jnp.isfinite(episodes.actions).all((-2, -1)))
-    seeds, slots = (index[:_MAX_EPISODES] for index in np.nonzero(np.asarray(bad)))
+    episodes = {name: np.asarray(getattr(loop.replay.episodes, name)) for name in ("states", "actions")}
+    bad = ~(np.isfinite(episodes["states"]).all((-2, -1)) & np.isfinite(episodes["actions"]).all((-2, -1)))
+    seeds, slots = (index[:_MAX_EPISODES] for index in np.nonzero(bad))
     found |= {"episodes.seed_index": seeds, "episodes.slot": slots}
-    found |= {f"episodes.{name}": np.asarray(getattr(episodes, name)[seeds, slots]) for name in ("states", "actions")}
+    found |= {f"episodes.{name}": array[seeds, slots] for name, array in episodes.items()}
     found |= {f"metrics.{name}": np.asarray(row) for name, row in values.items()}
     found |= to_host({"key": loop.key, "iteration": loop.iteration}, copy=True)
     found["nonfinite_leaves"] = np.asarray(leaves, dtype=np.str_)

@@ -6,7 +6,7 @@ perspective the start is 0 and the direction (u, v, -1); an orthographic camera 
 (0, 0, -1).
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,18 @@ import numpy as np
 from jaxrl_vis_envs.render.scene import Scene
 
 _DEGREES = np.pi / 180.0
+
+
+class Rays(NamedTuple):
+    """The rays of pixels: where they meet the plane at depth 1 m (any depth, if orthographic). Float32 arrays of one shape.
+
+    Attributes:
+        u: Metres to the right of the camera's axis.
+        v: Metres above it.
+    """
+
+    u: jax.Array
+    v: jax.Array
 
 
 def camera_pose(scene: Scene, data: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -67,8 +79,8 @@ def lens(scene: Scene) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     return zero, zero, half_height * (scene.width / scene.height), half_height
 
 
-def pixel_rays(scene: Scene, rows: np.ndarray, columns: np.ndarray) -> tuple[jax.Array, jax.Array]:
-    """The u and v of the rays through the middles of pixels.
+def pixel_rays(scene: Scene, rows: np.ndarray, columns: np.ndarray) -> Rays:
+    """The rays through the middles of pixels.
 
     Args:
         scene: The scene.
@@ -76,12 +88,13 @@ def pixel_rays(scene: Scene, rows: np.ndarray, columns: np.ndarray) -> tuple[jax
         columns: Columns, the same shape.
 
     Returns:
-        u and v, float32, the shape of ``rows``.
+        Rays of the shape of ``rows``.
     """
     middle_u, middle_v, half_u, half_v = lens(scene)
     unit_u = (2.0 * columns + 1.0 - scene.width) / scene.width
     unit_v = (scene.height - 1.0 - 2.0 * rows) / scene.height
-    return middle_u + jnp.asarray(unit_u, jnp.float32) * half_u, middle_v + jnp.asarray(unit_v, jnp.float32) * half_v
+    u = middle_u + jnp.asarray(unit_u, jnp.float32) * half_u
+    return Rays(u, middle_v + jnp.asarray(unit_v, jnp.float32) * half_v)
 
 
 def pixel_pitch(scene: Scene) -> tuple[jax.Array, jax.Array]:
@@ -90,28 +103,32 @@ def pixel_pitch(scene: Scene) -> tuple[jax.Array, jax.Array]:
     return half_u * (2.0 / scene.width), half_v * (2.0 / scene.height)
 
 
-def ray_parts(scene: Scene, u: jax.Array, v: jax.Array) -> tuple[tuple, tuple, jax.Array | float]:
+def ray_parts(scene: Scene, rays: Rays) -> tuple[tuple, tuple, jax.Array | float]:
     """Start and direction of rays in the camera's frame, and the inverse square of the direction's length.
 
     Returns:
         Three [P] arrays or numbers, three more, and [P] or a number. Numbers are what is the same for every ray.
     """
+    u, v = rays
     if scene.projection == "orthographic":
         return (u, v, 0.0), (0.0, 0.0, -1.0), 1.0
     return (0.0, 0.0, 0.0), (u, v, -1.0), 1.0 / (u * u + v * v + 1.0)
 
 
-def in_view(
-    scene: Scene, middle: jax.Array, radius: jax.Array, u: jax.Array, v: jax.Array, depth: jax.Array | None
-) -> jax.Array:
+def ray_length(scene: Scene, rays: Rays) -> jax.Array | float:
+    """Metres along the rays for each metre of depth."""
+    u, v = rays
+    return 1.0 if scene.projection == "orthographic" else jnp.sqrt(u * u + v * v + 1.0)
+
+
+def in_view(scene: Scene, middle: jax.Array, radius: jax.Array, rays: Rays, depth: jax.Array | None) -> jax.Array:
     """Which balls the rays through a block of pixels may meet.
 
     Args:
         scene: The scene.
         middle: [K, 3] float32, metres, camera's frame.
         radius: [K] float32, metres.
-        u: [P] float32, see `camera.pixel_rays`.
-        v: [P] float32.
+        rays: [P].
         depth: [P] float32, metres, beyond which nothing counts; None for no such depth.
 
     Returns:
@@ -119,7 +136,7 @@ def in_view(
     """
     ahead = -middle[:, 2]
     touching = (ahead + radius > scene.znear) & (ahead - radius < (scene.zfar if depth is None else jnp.max(depth)))
-    for axis, coordinate in enumerate((u, v)):
+    for axis, coordinate in enumerate(rays):
         low, high = jnp.min(coordinate), jnp.max(coordinate)
         if scene.projection == "orthographic":
             touching &= (middle[:, axis] - high <= radius) & (low - middle[:, axis] <= radius)

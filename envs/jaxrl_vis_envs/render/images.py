@@ -1,56 +1,27 @@
 """Images of one environment: `render` for people and files, `render_planes` for the hot path. `jax.vmap` them for a batch.
 
-Three steps: once per environment, everything linear (`shapes`, `lights`); per pixel, which object is nearest (`raycast`,
-`triangles`), which gives integers and is never differentiated; per pixel, once, depth, normal and colour of that object from
-the row of a table (`surface`, `shade`). For most scenes the last two are one kernel on a GPU (`gpu_kernel`), and passes that do
-nothing twice on a CPU (`cpu_passes`).
+Three steps: once per environment, everything linear (`pixel.shapes`, `pixel.lights`); per pixel, which object is nearest
+(`pixel.raycast`, `pixel.triangles`), which gives integers and is never differentiated; per pixel, once, depth, normal and
+colour of that object from the row of a table (`pixel.surface`, `pixel.shade`). For most scenes the last two are one kernel on a
+GPU (`gpu.kernel`), and passes that compute nothing twice on a CPU (`cpu.passes`).
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis_envs.render import blocks, camera, cpu_passes, gpu_kernel, lights, raycast, shade, shapes, surface, transparent
+from jaxrl_vis_envs.compilation import by_platform, target_platform, tracing_for
+from jaxrl_vis_envs.render import camera
+from jaxrl_vis_envs.render.camera import Rays
+from jaxrl_vis_envs.render.cpu import passes
+from jaxrl_vis_envs.render.gpu import kernel
+from jaxrl_vis_envs.render.outputs import Frame, Outputs, Planes
+from jaxrl_vis_envs.render.pixel import blocks, lights, lookup, raycast, shade, shapes, surface, transparent
 from jaxrl_vis_envs.render.scene import Scene
-
-
-class Frame(NamedTuple):
-    """An image as people and files want it.
-
-    Attributes:
-        rgb: [H, W, 3] uint8.
-        depth: [H, W] float32, planar metres (distance along the camera's axis), the scene's ``zfar`` for the sky.
-        segmentation: [H, W] int32: geom id, ngeom + site id for a site, -1 for the sky.
-        normals: [H, W, 3] float32, unit, in the camera's frame (x right, y up, z towards the viewer), 0 for the sky; or None.
-        distance: [H, W] float32, metres along the ray, ``zfar`` for the sky; or None.
-    """
-
-    rgb: jax.Array
-    depth: jax.Array
-    segmentation: jax.Array
-    normals: jax.Array | None = None
-    distance: jax.Array | None = None
-
-
-class Planes(NamedTuple):
-    """An image as the hot path wants it: planes, not quantised, and only those that were asked for.
-
-    Attributes:
-        rgb: [3, H, W] float32 in [0, 1], or uint8 where that was asked for; or None.
-        depth: [H, W] float32 as in `Frame`, or None.
-        segmentation: [H, W] int32 as in `Frame`, or None.
-        normals: [3, H, W] float32 as in `Frame`, or None.
-        distance: [H, W] float32 as in `Frame`, or None.
-    """
-
-    rgb: jax.Array | None
-    depth: jax.Array | None
-    segmentation: jax.Array | None
-    normals: jax.Array | None = None
-    distance: jax.Array | None = None
 
 
 class _View(NamedTuple):
@@ -60,6 +31,13 @@ class _View(NamedTuple):
     unit: shapes.UnitShapes
     table: jax.Array
     lights: list[lights.Light]
+
+
+class _Path(NamedTuple):
+    """How planes are drawn: by which fast function (None: by `_draw`), and for which platform."""
+
+    fast: Callable[..., Planes] | None
+    platform: str
 
 
 def render_planes(
@@ -89,85 +67,84 @@ def render_planes(
     Returns:
         The planes that were asked for.
     """
-    wanted = (rgb, depth, segmentation, normals, distance)
+    outputs = Outputs(rgb, depth, segmentation, normals, distance, quantized)
     if not scene.object_ids:
-        planes = _draw_nothing(scene, data, wanted)
-    else:
-        position, rotation, finite = camera.camera_pose(scene, data)
-        unit = shapes.unit_shapes(scene, data, position, rotation, finite)
-        table = lights.pack(lights.camera_lights(scene, data, position, rotation) if rgb else [])
-        outputs = (wanted, quantized)
-        planes = _drawn(_fast_way(scene, outputs), outputs, scene, rotation, unit, table)
-    if quantized and planes.rgb is not None and planes.rgb.dtype != jnp.uint8:
-        planes = planes._replace(rgb=quantize(planes.rgb))
-    return planes
+        return _quantized(outputs, _draw_nothing(scene, data, outputs))
+    position, rotation, finite = camera.camera_pose(scene, data)
+    unit = shapes.unit_shapes(scene, data, position, rotation, finite)
+    light_table = lights.pack(lights.camera_lights(scene, data, position, rotation) if rgb else [])
+
+    def draw(scene: Scene, *prepared: Any) -> Planes:
+        return _drawn(_Path(_fast(scene, outputs), target_platform()), outputs, scene, *prepared)
+
+    return by_platform(draw, scene, rotation, unit, light_table)
 
 
-def _fast_way(scene: Scene, outputs: tuple) -> Any:
-    """The module that draws these outputs of a scene faster than `_draw`, if there is one for this device."""
-    (rgb, _, _, normals, distance), quantized = outputs
-    if gpu_kernel.takes(scene):
-        return gpu_kernel
-    if (quantized or not rgb) and not (normals or distance) and cpu_passes.takes(scene):
-        return cpu_passes
+def _fast(scene: Scene, outputs: Outputs) -> Callable[..., Planes] | None:
+    """What draws these outputs of a scene faster than `_draw` on the platform that is being traced for, if anything does."""
+    for path in (kernel, passes):
+        if path.takes(scene, outputs):
+            return path.draw
     return None
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
-def _drawn(way: Any, outputs: tuple, *arguments: Any) -> Planes:
-    """`_draw`, in the faster way that there is, if any. Jitted so that it is traced once, in however many programs it is."""
-    return _draw(outputs, *arguments) if way is None else _draw_fast(way, outputs, *arguments)
+def _drawn(path: _Path, outputs: Outputs, *arguments: Any) -> Planes:
+    """The planes, drawn as ``path`` says. Jitted so that it is traced once, in however many programs it is."""
+    with tracing_for(path.platform):
+        return _draw(outputs, *arguments) if path.fast is None else _draw_fast(path, outputs, *arguments)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _draw_fast(
-    way: Any, outputs: tuple, scene: Scene, rotation: jax.Array, unit: shapes.UnitShapes, light_table: jax.Array
+    path: _Path, outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.UnitShapes, light_table: jax.Array
 ) -> Planes:
-    """`_draw` as one GPU kernel, or as passes on a CPU (``way`` is the module), with the derivatives of `_draw`."""
-    (rgb, depth, segmentation, normals, distance), quantized = outputs
-    wanted = (rgb, depth, normals, distance, segmentation)
-    colour, near, normal, length, labels = way.draw(wanted, quantized, scene, rotation, unit, light_table)
-    return Planes(colour, near, labels, normal, length)
+    """`_draw` as one GPU kernel, or as passes on a CPU, with the derivatives of `_draw`."""
+    assert path.fast is not None
+    return path.fast(outputs, scene, rotation, unit, light_table)
 
 
 @_draw_fast.defjvp
-def _differentiate(way: Any, outputs: tuple, primals: tuple, tangents: tuple) -> tuple[Planes, Planes]:
-    return jax.jvp(functools.partial(_draw, outputs), primals, tangents)
+def _differentiate(path: _Path, outputs: Outputs, primals: tuple, tangents: tuple) -> tuple[Planes, Planes]:
+    with tracing_for(path.platform):
+        return jax.jvp(functools.partial(_draw, outputs), primals, tangents)
 
 
-def _draw(outputs: tuple, scene: Scene, rotation: jax.Array, unit: shapes.UnitShapes, light_table: jax.Array) -> Planes:
-    """The wanted planes of a scene with objects.
+def _draw(outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.UnitShapes, light_table: jax.Array) -> Planes:
+    """The wanted planes of a scene with objects, in plain JAX.
 
     Args:
-        outputs: Which planes, as `render_planes` takes them, and whether colours are bytes.
+        outputs: Which planes, and whether colours are bytes.
         scene: The scene.
         rotation: [3, 3] float32, see `camera.camera_pose`.
         unit: The drawn objects.
         light_table: From `lights.pack`.
     """
-    (rgb, depth, segmentation, normals, distance), quantized = outputs
     layout = blocks.layout(scene)
-    u, v = camera.pixel_rays(scene, layout.rows, layout.columns)
+    rays = camera.pixel_rays(scene, layout.rows, layout.columns)
     # A barrier, because XLA would otherwise redo the work per object in every pixel.
     unit = _barrier(unit)
-    if not (rgb or segmentation or normals or blocks.tiled(scene) or any(scene.transparent)):
-        far = blocks.scan(lambda u, v: raycast.nearest_distance(scene, unit, u, v), u, v)
+    beyond_depth = outputs.rgb or outputs.segmentation or outputs.normals
+    if not (beyond_depth or blocks.tiled(scene) or any(scene.transparent)):
+        far = blocks.scan(lambda rays: raycast.nearest_distance(scene, unit, rays), rays)
         near = length = None
-        if depth:
+        if outputs.depth:
             near = blocks.restore(scene, layout, far)
-        if distance:
-            along = jnp.where(far < scene.zfar, far * _ray_length(scene, u, v), scene.zfar)
+        if outputs.distance:
+            along = jnp.where(far < scene.zfar, far * camera.ray_length(scene, rays), scene.zfar)
             length = blocks.restore(scene, layout, along)
         return Planes(None, near, None, None, length)
-    key, triangle = blocks.nearest(scene, unit, u, v)
+    key, triangle = blocks.nearest(scene, unit, rays)
     # Barriers here too: each output would otherwise look for the nearest object again.
     key, triangle = jax.lax.optimization_barrier((key, triangle))
-    view = _View(rotation, unit, surface.object_table(scene, unit), lights.unpack(scene, light_table) if rgb else [])
-    pixels = blocks.joined((u, v, key, triangle))
-    planes = blocks.scan(lambda *block: _finish(scene, view, outputs[0], *block), *pixels)
+    rows = lookup.object_table(scene, unit)
+    view = _View(rotation, unit, rows, lights.unpack(scene, light_table) if outputs.rgb else [])
+    pixels = blocks.joined((rays, key, triangle))
+    planes = blocks.scan(lambda *block: _finish(scene, view, outputs, *block), *pixels)
     planes = jax.lax.optimization_barrier(planes)
-    planes = _collect(outputs[0], [blocks.restore(scene, layout, plane) for plane in planes])
-    return planes._replace(rgb=quantize(planes.rgb)) if quantized and planes.rgb is not None else planes
+    planes = jax.tree.map(lambda plane: blocks.restore(scene, layout, plane), planes)
+    vectors = {name: jnp.stack(vector) for name in ("rgb", "normals") if (vector := getattr(planes, name)) is not None}
+    return _quantized(outputs, planes._replace(**vectors))
 
 
 @jax.custom_jvp
@@ -181,77 +158,59 @@ def _barrier_tangents(primals: tuple, tangents: tuple) -> tuple:
     return _barrier(*primals), tangents[0]
 
 
-def _finish(scene: Scene, view: _View, wanted: tuple, u: Any, v: Any, key: Any, triangle: Any) -> tuple:
-    """Everything about a block of pixels whose nearest objects are known: the wanted planes, [P] each, one after the other."""
-    rgb, depth, segmentation, normals, distance = wanted
+def _finish(scene: Scene, view: _View, outputs: Outputs, rays: Rays, key: Any, triangle: Any) -> Planes:
+    """The wanted planes of a block of pixels whose nearest objects are known, [P] each; colours and normals in three."""
     near, index = raycast.decode(scene, key)
     sees = index >= 0
-    planes: list[jax.Array] = []
     far = near
-    normal: tuple = ()
-    if rgb or depth or normals or distance or any(scene.transparent):
-        row = surface.fetch(view.table, index)
-        hit = surface.meet(scene, row, surface.fetch_triangle(scene, triangle), u, v, near)
+    colour: Any = None
+    normal: Any = None
+    length = labels = None
+    if outputs.rgb or outputs.depth or outputs.normals or outputs.distance or any(scene.transparent):
+        row = lookup.fetch(view.table, index)
+        hit = surface.meet(scene, row, lookup.fetch_triangle(scene, triangle), rays, near)
         far = jnp.where(sees, hit.depth, scene.zfar)
         normal = tuple(jnp.where(sees, component, 0.0) for component in hit.normal)
-        sheets = transparent.sheets(scene, view.unit, view.table, u, v, far)
-        if rgb:
-            colour = shade.shade(scene, view.unit, view.lights, row, hit, u, v)
-            background = shade.sky(scene, view.rotation, u, v)
-            colour = tuple(jnp.where(sees, front, back) for front, back in zip(colour, background, strict=True))
+        sheets = transparent.sheets(scene, view.unit, view.table, rays, far)
+        if outputs.rgb:
+            front = shade.shade(scene, view.unit, view.lights, row, hit, rays)
+            background = shade.sky(scene, view.rotation, rays)
+            colour = tuple(jnp.where(sees, one, other) for one, other in zip(front, background, strict=True))
             if scene.haze[0] >= 0:
-                colour = shade.haze(scene, view.unit, u, v, far, colour)
-            planes.extend(transparent.blend(scene, view.unit, view.lights, sheets, u, v, colour))
+                colour = shade.haze(scene, view.unit, rays, far, colour)
+            colour = transparent.blend(scene, view.unit, view.lights, sheets, rays, colour)
         far, index, normal = transparent.nearest(sheets, far, index, normal)
-    if depth:
-        planes.append(far)
-    if normals:
-        planes.extend(normal)
-    if distance:
-        planes.append(jnp.where(index >= 0, far * _ray_length(scene, u, v), scene.zfar))
-    if segmentation:
+    if outputs.distance:
+        length = jnp.where(index >= 0, far * camera.ray_length(scene, rays), scene.zfar)
+    if outputs.segmentation:
         # One entry more than there are drawn objects, so that -1 finds the sky's label at the end.
-        planes.append(jnp.asarray(np.array([*scene.object_ids, -1], np.int32))[index])
-    return tuple(planes)
+        labels = jnp.asarray(np.array([*scene.object_ids, -1], np.int32))[index]
+    return Planes(colour, far if outputs.depth else None, labels, normal if outputs.normals else None, length)
 
 
-def _collect(wanted: tuple, planes: list[jax.Array]) -> Planes:
-    """Sorts the planes of `_finish`, [H, W] each, into `Planes`."""
-    rgb, depth, segmentation, normals, distance = wanted
-    left = list(planes)
-
-    def take(want: bool, count: int = 1) -> jax.Array | None:
-        if not want:
-            return None
-        taken = [left.pop(0) for _ in range(count)]
-        return jnp.stack(taken) if count > 1 else taken[0]
-
-    colour, near, normal, length = take(rgb, 3), take(depth), take(normals, 3), take(distance)
-    return Planes(colour, near, take(segmentation), normal, length)
-
-
-def _draw_nothing(scene: Scene, data: Any, wanted: tuple) -> Planes:
+def _draw_nothing(scene: Scene, data: Any, outputs: Outputs) -> Planes:
     """A scene without objects: sky."""
-    rgb, depth, segmentation, normals, distance = wanted
     shape = (scene.height, scene.width)
     colour = None
-    if rgb:
+    if outputs.rgb:
         rows, columns = np.indices(shape)
-        u, v = camera.pixel_rays(scene, rows, columns)
-        colour = jnp.stack(shade.sky(scene, camera.camera_pose(scene, data)[1], u, v))
+        rays = camera.pixel_rays(scene, rows, columns)
+        colour = jnp.stack(shade.sky(scene, camera.camera_pose(scene, data)[1], rays))
     far = jnp.broadcast_to(scene.zfar, shape)
     return Planes(
         colour,
-        far if depth else None,
-        jnp.full(shape, -1, jnp.int32) if segmentation else None,
-        jnp.zeros((3, *shape)) if normals else None,
-        far if distance else None,
+        far if outputs.depth else None,
+        jnp.full(shape, -1, jnp.int32) if outputs.segmentation else None,
+        jnp.zeros((3, *shape), jnp.float32) if outputs.normals else None,
+        far if outputs.distance else None,
     )
 
 
-def _ray_length(scene: Scene, u: jax.Array, v: jax.Array) -> jax.Array | float:
-    """Metres along the ray for each metre of depth."""
-    return 1.0 if scene.projection == "orthographic" else jnp.sqrt(u * u + v * v + 1.0)
+def _quantized(outputs: Outputs, planes: Planes) -> Planes:
+    """With colours as bytes, if they are asked for and are not yet."""
+    if not outputs.quantized or planes.rgb is None or planes.rgb.dtype == jnp.uint8:
+        return planes
+    return planes._replace(rgb=quantize(planes.rgb))
 
 
 def render(scene: Scene, data: Any, normals: bool = False, distance: bool = False) -> Frame:

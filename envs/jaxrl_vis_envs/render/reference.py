@@ -9,7 +9,7 @@ from typing import Any, Self
 import mujoco
 import numpy as np
 
-from jaxrl_vis_envs.render.images import Frame
+from jaxrl_vis_envs.render.outputs import Frame
 
 
 class ReferenceRenderer:

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from jaxrl_vis_envs.render import meshes, model_reading, textures
+from jaxrl_vis_envs.render.model import meshes, reading, textures
 
 
 def _leaf() -> Any:
@@ -182,7 +182,6 @@ class Scene:
         """
         if height < 1 or width < 1:
             raise ValueError(f"an image needs at least one pixel each way, not height={height}, width={width}")
-        reading = model_reading
         camera_id = reading.find_camera(mj_model, camera)
         look = reading.object_looks(mj_model)
         types = np.concatenate([mj_model.geom_type, mj_model.site_type])

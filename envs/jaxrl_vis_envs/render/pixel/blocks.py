@@ -7,6 +7,7 @@ wherever the number of pixels can be divided; what lies between two operations t
 Anywhere, in scenes with much in them: a block is then a tile, and most things are not in it.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -14,7 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis_envs.render import raycast, shapes, triangles
+from jaxrl_vis_envs.compilation import targets_cpu
+from jaxrl_vis_envs.render.camera import Rays
+from jaxrl_vis_envs.render.pixel import raycast, shapes, triangles
 from jaxrl_vis_envs.render.scene import Scene
 
 # Pixels of one environment that a CPU works on at a time where much is stored for each.
@@ -39,7 +42,7 @@ def layout(scene: Scene) -> Layout:
     if not tiled(scene):
         pixels = np.arange(scene.height * scene.width).reshape(_half_count(scene.height * scene.width), -1)
         return Layout(pixels // scene.width, pixels % scene.width, None)
-    wish = _CPU_TILE if jax.default_backend() == "cpu" else _TILE
+    wish = _CPU_TILE if targets_cpu() else _TILE
     return tiles(scene, near_divisor(scene.height, wish), near_divisor(scene.width, wish))
 
 
@@ -72,7 +75,7 @@ def near_divisor(pixels: int, wish: int) -> int:
 
 def _block_count(pixels: int) -> int:
     """Into how many equal blocks the pixels are cut: 1 on an accelerator, on a CPU so that a block is about `_CPU_BLOCK`."""
-    if jax.default_backend() != "cpu":
+    if not targets_cpu():
         return 1
     counts = [count for count in range(2, max(3, pixels // 64)) if pixels % count == 0]
     return min(counts, key=lambda count: abs(np.log(pixels / count / _CPU_BLOCK)), default=1)
@@ -80,12 +83,12 @@ def _block_count(pixels: int) -> int:
 
 def _half_count(pixels: int) -> int:
     """Two blocks on a CPU, if that is possible: the fewest that make a loop."""
-    return 2 if jax.default_backend() == "cpu" and pixels % 2 == 0 else _block_count(pixels)
+    return 2 if targets_cpu() and pixels % 2 == 0 else _block_count(pixels)
 
 
 def scan(function: Callable, *pixels: Any) -> Any:
-    """Applies ``function``, which takes and gives arrays [P], to arrays [blocks, P], block by block."""
-    if pixels[0].shape[0] == 1:
+    """Applies ``function``, which takes and gives trees of arrays [P], to trees of arrays [blocks, P], block by block."""
+    if _shape(pixels)[0] == 1:
         first = jax.tree.map(lambda plane: plane[0], pixels)
         return jax.tree.map(lambda plane: plane[None], function(*first))
     return jax.lax.scan(lambda carry, block: (carry, function(*block)), None, pixels)[1]
@@ -97,10 +100,10 @@ def scan_one(function: Callable, *pixels: Any) -> jax.Array:
     What goes straight into the stacked results of a loop, XLA computes on one thread. What is carried, on all of them: so
     results are carried a round before they are stacked.
     """
-    count = pixels[0].shape[0]
-    if count == 1 or jax.default_backend() != "cpu":
+    count, *shape = _shape(pixels)
+    if count == 1 or not targets_cpu():
         return scan(function, *pixels)
-    empty = jnp.zeros(pixels[0].shape[1:], jnp.int32)
+    empty = jnp.zeros(shape, jnp.int32)
     if count == 2:
         halves, _ = jax.lax.scan(lambda halves, block: ((halves[1], function(*block)), None), (empty, empty), pixels)
         return jnp.stack(halves)
@@ -108,10 +111,15 @@ def scan_one(function: Callable, *pixels: Any) -> jax.Array:
     return jnp.concatenate([before[1:], last[None]])
 
 
-def joined(planes: tuple) -> tuple:
-    """Arrays [blocks, P] (or None) in fewer and longer blocks, for what does not depend on which pixels are in a block."""
-    count = _block_count(planes[0].size)
-    return tuple(None if plane is None else plane.reshape(count, -1) for plane in planes)
+def _shape(pixels: Any) -> tuple[int, ...]:
+    """Of the arrays of a tree, which all have the same."""
+    return jax.tree.leaves(pixels)[0].shape
+
+
+def joined(pixels: Any) -> Any:
+    """Arrays [blocks, P] in fewer and longer blocks, for what does not depend on which pixels are in a block."""
+    count = _block_count(math.prod(_shape(pixels)))
+    return jax.tree.map(lambda plane: plane.reshape(count, -1), pixels)
 
 
 def tiled(scene: Scene) -> bool:
@@ -119,21 +127,21 @@ def tiled(scene: Scene) -> bool:
     return scene.clusters.shape[-2] > 0 or len(raycast.primitive_rows(scene, transparent=False)) > raycast.UNROLLED
 
 
-def nearest(scene: Scene, unit: shapes.UnitShapes, u: jax.Array, v: jax.Array) -> tuple[jax.Array, jax.Array | None]:
+def nearest(scene: Scene, unit: shapes.UnitShapes, rays: Rays) -> tuple[jax.Array, jax.Array | None]:
     """Keys of the nearest opaque objects [blocks, P] int32, and rows of their triangles [blocks, P] int32 (-1: a primitive).
 
     The triangles are None in a scene without any.
     """
-    key = scan_one(lambda u, v: raycast.nearest_key(scene, unit, u, v), u, v)
+    key = scan_one(lambda rays: raycast.nearest_key(scene, unit, rays), rays)
     if not scene.clusters.shape[-2]:
         return key, None
 
-    def add_triangles(u: jax.Array, v: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        depth, row, owner = triangles.nearest_triangle(scene, unit, u, v, raycast.decode(scene, key)[0])
+    def add_triangles(rays: Rays, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        depth, row, owner = triangles.nearest_triangle(scene, unit, rays, raycast.decode(scene, key)[0])
         mask = raycast.code_mask(scene)
         met = (jax.lax.bitcast_convert_type(depth, jnp.int32) & ~mask) | owner
         return jnp.where(row >= 0, met, key), row
 
     # Nothing here is differentiated: `surface.meet` is.
     unit = jax.lax.stop_gradient(unit)
-    return scan(add_triangles, u, v, key)
+    return scan(add_triangles, rays, key)

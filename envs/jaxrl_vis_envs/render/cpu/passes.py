@@ -3,7 +3,7 @@
 XLA computes a loop on a CPU anew for each of its outputs, and with it most of what they share: three channels cost three times
 the shading. So each pass has one output, and what the next one needs of it is packed into its bits: the key of the nearest
 object (`raycast`), its normal (as a point of an octahedron, 16 bits an axis), the colour of its texture (10 bits a channel),
-and the colour that is seen (8 bits a channel). Each pass over a tile is a loop of one round (`cpu_search.once`), because XLA
+and the colour that is seen (8 bits a channel). Each pass over a tile is a loop of one round (`tiles.once`), because XLA
 would fuse them otherwise; and where only planes are seen in a tile, it is a cheaper one.
 
 What happens to a pixel is the code of the plain renderer, but for the last bits: depths beside colours are those of the keys.
@@ -16,10 +16,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis_envs.render import blocks, camera, cpu_search, lights, raycast, shade, shapes, surface
-from jaxrl_vis_envs.render.pixel_math import clipped, larger, reciprocal
+from jaxrl_vis_envs.compilation import targets_cpu
+from jaxrl_vis_envs.render import camera
+from jaxrl_vis_envs.render.camera import Rays
+from jaxrl_vis_envs.render.cpu import tiles
+from jaxrl_vis_envs.render.outputs import Outputs, Planes
+from jaxrl_vis_envs.render.pixel import blocks, lights, lookup, raycast, shade, shapes, surface, texturing
+from jaxrl_vis_envs.render.pixel.arithmetic import Vector, clipped, larger, normalized, reciprocal
 from jaxrl_vis_envs.render.scene import Scene
-from jaxrl_vis_envs.render.surface import Vector
 
 _FINE = {shapes.MESH, shapes.HFIELD}
 # So many objects at most are chosen from by comparing.
@@ -27,53 +31,46 @@ _CHOSEN = 24
 _NORMAL_STEPS = 32767.0
 
 
-def takes(scene: Scene) -> bool:
-    """Whether these passes draw this scene here: opaque primitives without haze, on a CPU."""
+def takes(scene: Scene, outputs: Outputs) -> bool:
+    """Whether these passes draw these planes on the platform that is being traced for.
+
+    They are for CPUs, and draw opaque primitives without haze, with colours of 8 bits, and neither normals nor distances.
+    """
     plain = not any(scene.transparent) and scene.haze[0] < 0 and not _FINE & set(scene.object_types)
-    return jax.default_backend() == "cpu" and plain
+    return targets_cpu() and plain and (outputs.quantized or not outputs.rgb) and not (outputs.normals or outputs.distance)
 
 
-def draw(
-    wanted: tuple[bool, ...],
-    quantized: bool,
-    scene: Scene,
-    rotation: jax.Array,
-    unit: shapes.UnitShapes,
-    light_table: jax.Array,
-) -> list[jax.Array | None]:
+def draw(outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.UnitShapes, light_table: jax.Array) -> Planes:
     """Draws one environment; ``jax.vmap`` it for a batch. Not differentiable.
 
     Args:
-        wanted: Whether to return rgb, depth, normals (which must be false), distance (false) and segmentation.
-        quantized: Whether rgb is uint8 (must be true if it is wanted).
-        scene: One that the passes take.
+        outputs: Which planes.
+        scene: One of which the passes take these planes.
         rotation: [3, 3] float32 of the camera, see `camera.camera_pose`.
         unit: The drawn objects.
         light_table: From `lights.pack`.
 
     Returns:
-        Those five planes, [3, H, W] uint8 or [H, W], None where not wanted.
+        The planes.
     """
-    rgb, depth, normals, distance, segmentation = wanted
-    assert not (normals or distance) and (quantized or not rgb)
-    layout = cpu_search.layout(scene)
-    u, v = camera.pixel_rays(scene, layout.rows, layout.columns)
+    layout = tiles.layout(scene)
+    rays = camera.pixel_rays(scene, layout.rows, layout.columns)
     # Where nothing but depths is wanted, no bit of the keys is needed for anything else.
-    labelled = rgb or segmentation
-    colouring = _Colouring(scene, unit, rotation, light_table) if rgb else None
-    key, packed = (blocks.restore(scene, layout, plane) for plane in _tiles(scene, unit, colouring, labelled, u, v))
-    colours = _unpack(packed) if rgb else None
+    labelled = outputs.rgb or outputs.segmentation
+    colouring = _Colouring(scene, unit, rotation, light_table) if outputs.rgb else None
+    key, packed = (blocks.restore(scene, layout, plane) for plane in _tiles(scene, unit, colouring, labelled, rays))
+    colours = _unpack(packed) if outputs.rgb else None
     if not labelled:
-        return [colours, jax.lax.bitcast_convert_type(key, jnp.float32), None, None, None]
+        return Planes(colours, jax.lax.bitcast_convert_type(key, jnp.float32), None)
     near, index = raycast.decode(scene, key)
     far = labels = None
-    if depth:
+    if outputs.depth:
         # A key's depth has lost its lowest bits: half of them come back.
         centre = jax.lax.bitcast_convert_type(near, jnp.int32) | (raycast.code_mask(scene) >> 1)
         far = jnp.where(index >= 0, jax.lax.bitcast_convert_type(centre, jnp.float32), scene.zfar)
-    if segmentation:
+    if outputs.segmentation:
         labels = jnp.asarray(np.array([*scene.object_ids, -1], np.int32))[index]
-    return [colours, far, None, None, labels]
+    return Planes(colours, far, labels)
 
 
 class _Tile(NamedTuple):
@@ -87,39 +84,38 @@ class _Tile(NamedTuple):
 
 
 def _tiles(
-    scene: Scene, unit: shapes.UnitShapes, colouring: "_Colouring | None", labelled: bool, u: jax.Array, v: jax.Array
+    scene: Scene, unit: shapes.UnitShapes, colouring: "_Colouring | None", labelled: bool, rays: Rays
 ) -> tuple[jax.Array, jax.Array]:
     """Keys and packed colours of all pixels, [tiles, P] int32 each, one tile after the other."""
-    seen = cpu_search.seen_in_tiles(scene, unit, u, v)
+    seen = tiles.seen_in_tiles(scene, unit, rays)
 
-    def draw_tile(carry: tuple, rays: tuple) -> tuple:
+    def draw_tile(carry: tuple, pixels: tuple) -> tuple:
         number, tile, keys, colours = carry
         # What goes straight into the results of a loop is computed on one core: it is copied there a round later.
         before = jnp.maximum(number - 1, 0)
         keys, colours = keys.at[before].set(tile.key), colours.at[before].set(tile.colour)
-        u, v, seen = rays
-        key, own_keys = cpu_search.nearest_key(scene, unit, u, v, seen, tile.own_keys, labelled)
+        rays, seen = pixels
+        key, own_keys = tiles.nearest_key(scene, unit, rays, seen, tile.own_keys, labelled)
         tile = tile._replace(key=key, own_keys=own_keys)
         if colouring is not None:
-            tile = colouring.colour(tile, u, v, jnp.any(seen[np.array(cpu_search.solids(scene), int)]))
+            tile = colouring.colour(tile, rays, jnp.any(seen[np.array(tiles.solids(scene), int)]))
         return (number + 1, tile, keys, colours), None
 
-    count = len(u)
-    empty = jnp.zeros(u.shape[1:], jnp.int32)
+    shape = rays.u.shape
+    empty = jnp.zeros(shape[1:], jnp.int32)
     # Zeros that XLA does not know to be the same: it would fill one array on one core, and copy it.
-    results = [jnp.zeros(u.shape, jnp.int32) + (0.0 * unit.origin[0, axis]).astype(jnp.int32) for axis in range(2)]
-    first = _Tile(empty, empty, cpu_search.memory(scene, empty), empty, empty)
-    (_, last, keys, colours), _ = jax.lax.scan(draw_tile, (jnp.int32(0), first, *results), (u, v, seen))
-    return keys.at[count - 1].set(last.key), colours.at[count - 1].set(last.colour)
+    results = [jnp.zeros(shape, jnp.int32) + (0.0 * unit.origin[0, axis]).astype(jnp.int32) for axis in range(2)]
+    first = _Tile(empty, empty, tiles.memory(scene, empty), empty, empty)
+    (_, last, keys, colours), _ = jax.lax.scan(draw_tile, (jnp.int32(0), first, *results), (rays, seen))
+    return keys.at[shape[0] - 1].set(last.key), colours.at[shape[0] - 1].set(last.colour)
 
 
 class _Seen(NamedTuple):
-    """What a pass starts from: rows of the objects that may be seen, `surface.object_table`, and rays and keys, [P] each."""
+    """What a pass starts from: rows of the objects that may be seen, `lookup.object_table`, and rays and keys, [P] each."""
 
     rows: list[int]
     table: jax.Array
-    u: jax.Array
-    v: jax.Array
+    rays: Rays
     key: jax.Array
 
 
@@ -128,10 +124,10 @@ class _Colouring:
 
     def __init__(self, scene: Scene, unit: shapes.UnitShapes, rotation: jax.Array, light_table: jax.Array) -> None:
         self.scene, self.unit, self.rotation = scene, unit, rotation
-        self.table = surface.object_table(scene, unit)
+        self.table = lookup.object_table(scene, unit)
         self.lights = lights.unpack(scene, light_table)
 
-    def colour(self, tile: _Tile, u: jax.Array, v: jax.Array, busy: jax.Array) -> _Tile:
+    def colour(self, tile: _Tile, rays: Rays, busy: jax.Array) -> _Tile:
         """The tile with its colours. In one that is not ``busy`` only planes are seen, and the sky."""
         every = list(range(len(self.scene.object_types)))
         planes = [row for row in every if self.scene.object_types[row] == shapes.PLANE]
@@ -139,19 +135,18 @@ class _Colouring:
         def seeing(rows: list[int], what: Callable, *more: jax.Array | None) -> Callable[[jax.Array], jax.Array]:
             def see(zero: jax.Array) -> jax.Array:
                 # Everything depends on the zero, or XLA would compute and store parts of it for every tile.
-                seen, packed = jax.tree.map(lambda leaf: leaf + zero.astype(leaf.dtype), ((self.table, u, v, tile.key), more))
-                table, moved_u, moved_v, key = seen
-                return what(_Seen(rows, table, moved_u, moved_v, key), *packed)
+                seen, packed = jax.tree.map(lambda leaf: leaf + zero.astype(leaf.dtype), ((self.table, rays, tile.key), more))
+                return what(_Seen(rows, *seen), *packed)
 
             return see
 
-        normal = cpu_search.once(busy, seeing(every, self._normal), tile.normal)
+        normal = tiles.once(busy, seeing(every, self._normal), tile.normal)
         texture: jax.Array | None = None
         if self.scene.atlas.used or self.scene.atlas.sky is not None:
-            texture = cpu_search.once(~busy, seeing(planes, self._texture), tile.texture)
-            texture = cpu_search.once(busy, seeing(every, self._texture), texture)
-        colour = cpu_search.once(~busy, seeing(planes, self._finish, None, texture), tile.colour)
-        colour = cpu_search.once(busy, seeing(every, self._finish, normal, texture), colour)
+            texture = tiles.once(~busy, seeing(planes, self._texture), tile.texture)
+            texture = tiles.once(busy, seeing(every, self._texture), texture)
+        colour = tiles.once(~busy, seeing(planes, self._finish, None, texture), tile.colour)
+        colour = tiles.once(busy, seeing(every, self._finish, normal, texture), colour)
         return tile._replace(normal=normal, texture=tile.texture if texture is None else texture, colour=colour)
 
     def _normal(self, seen: _Seen) -> jax.Array:
@@ -160,27 +155,27 @@ class _Colouring:
 
     def _texture(self, seen: _Seen) -> jax.Array:
         """What the colours of objects are multiplied with, and the colour of the sky: packed, 10 bits a channel."""
-        image = surface.texture_colour(self.scene, *self._met(seen)) or (jnp.ones_like(seen.u),) * 3
-        return _pack(self._in_front(seen, image, shade.sky(self.scene, self.rotation, seen.u, seen.v)), 10)
+        image = texturing.texture_colour(self.scene, *self._met(seen)) or (jnp.ones_like(seen.rays.u),) * 3
+        return _pack(self._in_front(seen, image, shade.sky(self.scene, self.rotation, seen.rays)), 10)
 
     def _finish(self, seen: _Seen, normal: jax.Array | None, texture: jax.Array | None) -> jax.Array:
         """What is seen: packed, 8 bits a channel. Without a ``normal`` it is that of a plane, which is not much to compute."""
         row, hit = self._met(seen)
         if normal is not None:
             hit = hit._replace(normal=_unpack_normal(normal))
-        colour = shade.lighted(self.scene, self.unit, self.lights, row, hit, seen.u, seen.v)
+        colour = shade.lighted(self.scene, self.unit, self.lights, row, hit, seen.rays)
         if texture is None:
-            sky = shade.sky(self.scene, self.rotation, seen.u, seen.v)
+            sky = shade.sky(self.scene, self.rotation, seen.rays)
         else:
             sky = tuple(((texture >> shift) & 1023).astype(jnp.float32) / 1023.0 for shift in (0, 10, 20))
             colour = tuple(value * texel for value, texel in zip(colour, sky, strict=True))
         return _pack(self._in_front(seen, colour, sky), 8)
 
-    def _met(self, seen: _Seen) -> tuple[surface.Row, surface.Hit]:
+    def _met(self, seen: _Seen) -> tuple[lookup.Row, surface.Hit]:
         """The object that each pixel sees, and where."""
         depth, index = raycast.decode(self.scene, seen.key)
         row = _row(seen.table, seen.rows, index)
-        return row, surface.meet(self.scene, row, None, seen.u, seen.v, depth, refined=False)
+        return row, surface.meet(self.scene, row, None, seen.rays, depth, refined=False)
 
     def _in_front(self, seen: _Seen, colour: Vector, sky: Vector) -> Vector:
         """The colours of pixels that see an object, the sky's elsewhere."""
@@ -188,16 +183,16 @@ class _Colouring:
         return tuple(jnp.where(sees, front, back) for front, back in zip(colour, sky, strict=True))
 
 
-def _row(table: jax.Array, rows: list[int], index: jax.Array) -> surface.Row:
-    """The row of every pixel, as `surface.fetch`; few are chosen from, because rows that are looked up would be stored."""
+def _row(table: jax.Array, rows: list[int], index: jax.Array) -> lookup.Row:
+    """The row of every pixel, as `lookup.fetch`; few are chosen from, because rows that are looked up would be stored."""
     if len(rows) > _CHOSEN:
-        return surface.fetch(table, index)
+        return lookup.fetch(table, index)
     first, *others = rows or [0]
     columns = [jnp.broadcast_to(value, index.shape) for value in table[first]]
     for number in others:
         here = index == number
         columns = [jnp.where(here, value, column) for value, column in zip(table[number], columns, strict=True)]
-    return surface.row_of(columns)
+    return lookup.row_of(columns)
 
 
 def _pack(colour: Vector, bits: int) -> jax.Array:
@@ -233,4 +228,4 @@ def _unpack_normal(packed: jax.Array) -> Vector:
     )
     z = 1.0 - jnp.abs(x) - jnp.abs(y)
     fold = larger(-z, 0.0)
-    return surface.normalized((x - jnp.where(x >= 0.0, fold, -fold), y - jnp.where(y >= 0.0, fold, -fold), z))
+    return normalized((x - jnp.where(x >= 0.0, fold, -fold), y - jnp.where(y >= 0.0, fold, -fold), z))

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis_envs.render import shapes
+from jaxrl_vis_envs.render.pixel import shapes
 
 
 def chart(types: set[int], kind: jax.Array, half_length: jax.Array, local: tuple) -> tuple[jax.Array, jax.Array]:

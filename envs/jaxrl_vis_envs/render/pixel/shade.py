@@ -13,12 +13,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis_envs.render import camera, charts, shapes, surface, textures
-from jaxrl_vis_envs.render import lights as lighting
-from jaxrl_vis_envs.render.pixel_math import clipped
-from jaxrl_vis_envs.render.raycast import entry
+from jaxrl_vis_envs.render import camera
+from jaxrl_vis_envs.render.camera import Rays
+from jaxrl_vis_envs.render.pixel import charts, sampling, shapes, surface, texturing
+from jaxrl_vis_envs.render.pixel import lights as lighting
+from jaxrl_vis_envs.render.pixel.arithmetic import Vector, clipped, normalized
+from jaxrl_vis_envs.render.pixel.lookup import Row
+from jaxrl_vis_envs.render.pixel.raycast import entry
+from jaxrl_vis_envs.render.pixel.surface import Hit
 from jaxrl_vis_envs.render.scene import Scene
-from jaxrl_vis_envs.render.surface import Hit, Row, Vector
 
 # What MuJoCo lights a scene with that has no light at all.
 _AMBIENT_WITHOUT_LIGHTS = 0.3
@@ -26,19 +29,17 @@ _AMBIENT_WITHOUT_LIGHTS = 0.3
 _SKY_DISTANCE = 0.7
 
 
-def shade(
-    scene: Scene, unit: shapes.UnitShapes | None, lights: list[lighting.Light], row: Row, hit: Hit, u: jax.Array, v: jax.Array
-) -> Vector:
-    """Colour of surfaces: `lighted`, with their textures."""
-    colour = lighted(scene, unit, lights, row, hit, u, v)
-    texture = surface.texture_colour(scene, row, hit)
+def shade(scene: Scene, unit: shapes.UnitShapes | None, lights: list[lighting.Light], row: Row, hit: Hit, rays: Rays) -> Vector:
+    """Colour of surfaces: `lighted`, with their sampling."""
+    colour = lighted(scene, unit, lights, row, hit, rays)
+    texture = texturing.texture_colour(scene, row, hit)
     return colour if texture is None else tuple(value * texel for value, texel in zip(colour, texture, strict=True))
 
 
 def lighted(
-    scene: Scene, unit: shapes.UnitShapes | None, lights: list[lighting.Light], row: Row, hit: Hit, u: jax.Array, v: jax.Array
+    scene: Scene, unit: shapes.UnitShapes | None, lights: list[lighting.Light], row: Row, hit: Hit, rays: Rays
 ) -> Vector:
-    """Colour of surfaces as if they had no textures.
+    """Colour of surfaces as if they had no sampling.
 
     Args:
         scene: The scene.
@@ -46,21 +47,21 @@ def lighted(
         lights: The lights in the camera's frame.
         row: The object of each pixel.
         hit: Where it is met.
-        u: [P] float32, see `camera.pixel_rays`.
-        v: [P] float32.
+        rays: [P].
 
     Returns:
         Red, green and blue, each [P] float32 in [0, 1].
     """
     if hit.triangle is None:
+        u, v = rays
         if scene.projection == "orthographic":
-            to_camera = surface.normalized(tuple(-p for p in hit.point))  # OpenGL's viewer is a point all the same
+            to_camera = normalized(tuple(-p for p in hit.point))  # OpenGL's viewer is a point all the same
         else:
-            to_camera = surface.normalized((-u, -v, jnp.ones_like(u)))
+            to_camera = normalized((-u, -v, jnp.ones_like(u)))
         return _lighted(scene, unit, lights, row, hit, to_camera)
     colour: Vector = (0.0, 0.0, 0.0)
     for share, corner in surface.corners(row, hit):
-        to_camera = surface.normalized(tuple(-p for p in corner.point))
+        to_camera = normalized(tuple(-p for p in corner.point))
         of_corner = _lighted(scene, unit, lights, row, corner, to_camera)
         colour = tuple(total + share * own for total, own in zip(colour, of_corner, strict=True))
     return colour
@@ -103,12 +104,13 @@ def _lit(scene: Scene, unit: shapes.UnitShapes | None, light: lighting.Light, hi
     return 1.0 - shadowed.astype(jnp.float32)
 
 
-def sky(scene: Scene, camera_rotation: Any, u: jax.Array, v: jax.Array) -> Vector:
+def sky(scene: Scene, camera_rotation: Any, rays: Rays) -> Vector:
     """Colour of the sky along every ray.
 
     Returns:
         Red, green and blue, each [P] float32 in [0, 1].
     """
+    u, v = rays
     if scene.projection == "orthographic":
         far = 1.0 / (_SKY_DISTANCE * scene.zfar)
         u, v = u * far, v * far
@@ -116,18 +118,16 @@ def sky(scene: Scene, camera_rotation: Any, u: jax.Array, v: jax.Array) -> Vecto
     image = scene.atlas.sky
     if image is not None:
         # MuJoCo's skies have their up along y.
-        face, place, choice = textures.cube_place((world[0], world[2], -world[1]))
+        face, place, choice = sampling.cube_place((world[0], world[2], -world[1]))
         pitches = _pitches(scene)
         spreads = []
         for axis, pitch in enumerate(pitches):
             change = [camera_rotation[i, axis] * pitch for i in range(3)]
-            moved = textures.cube_move(choice, place, (change[0], change[2], -change[1]))
+            moved = sampling.cube_move(choice, place, (change[0], change[2], -change[1]))
             spreads.append(moved[0] * moved[0] + moved[1] * moved[1])
         spread = jnp.maximum(spreads[0], spreads[1]) * float(scene.atlas.levels[image.first_level][1]) ** 2
         face = face if image.faces == 6 else 0
-        return textures.sample(
-            scene.texels, scene.atlas.levels, image.first_level, image.levels, face, place, spread, repeats=False
-        )
+        return sampling.sample(sampling.texels_of(scene), image.first_level, image.levels, face, place, spread, repeats=False)
     sine = jnp.clip(world[2] * jax.lax.rsqrt(u * u + v * v + 1.0), -1.0, 1.0)
     elevation = charts.elevation(sine)
     # The curve that MuJoCo fills a gradient texture with; 0 straight down, 1 straight up.
@@ -136,7 +136,7 @@ def sky(scene: Scene, camera_rotation: Any, u: jax.Array, v: jax.Array) -> Vecto
 
 
 def _pitches(scene: Scene) -> tuple[jax.Array, jax.Array]:
-
+    """How much u and v of the rays to the sky change from one pixel to the next."""
     pitches = camera.pixel_pitch(scene)
     if scene.projection == "orthographic":
         far = 1.0 / (_SKY_DISTANCE * scene.zfar)
@@ -144,14 +144,13 @@ def _pitches(scene: Scene) -> tuple[jax.Array, jax.Array]:
     return pitches
 
 
-def haze(scene: Scene, unit: shapes.UnitShapes, u: jax.Array, v: jax.Array, depth: jax.Array, colour: Vector) -> Vector:
+def haze(scene: Scene, unit: shapes.UnitShapes, rays: Rays, depth: jax.Array, colour: Vector) -> Vector:
     """The colours with the horizon's haze over them, which MuJoCo draws as a wide funnel around the camera.
 
     Args:
         scene: A scene with a hazy plane.
         unit: The drawn objects.
-        u: [P] float32, see `camera.pixel_rays`.
-        v: [P] float32.
+        rays: [P].
         depth: [P] float32, metres, of what is seen; the funnel only counts in front of it.
         colour: Three [P] float32.
     """
@@ -160,6 +159,7 @@ def haze(scene: Scene, unit: shapes.UnitShapes, u: jax.Array, v: jax.Array, dept
     axes, origin = unit.axes[row], unit.origin[row]
     height = origin[2]  # of the camera above the plane: the shape's z is in metres
     reach = _SKY_DISTANCE * scene.zfar
+    u, v = rays
     up = axes[2, 0] * u + axes[2, 1] * v - axes[2, 2]
     level = jnp.sqrt(jnp.maximum(u * u + v * v + 1.0 - up * up, 1e-12))
     safe_height = jnp.maximum(height, 1e-9)

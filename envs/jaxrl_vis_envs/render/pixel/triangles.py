@@ -8,7 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis_envs.render import camera, meshes, raycast, shapes
+from jaxrl_vis_envs.render import camera
+from jaxrl_vis_envs.render.camera import Rays
+from jaxrl_vis_envs.render.model import meshes
+from jaxrl_vis_envs.render.pixel import raycast, shapes
 from jaxrl_vis_envs.render.scene import Scene
 
 # How far outside of its edges, as a share of them, a triangle is still met, so that no ray slips between two.
@@ -17,15 +20,14 @@ _NUMBER = meshes.CLUSTER - 1  # the lowest bits of a depth, that hold the number
 
 
 def nearest_triangle(
-    scene: Scene, unit: shapes.UnitShapes, u: jax.Array, v: jax.Array, depth: jax.Array, only: int | None = None
+    scene: Scene, unit: shapes.UnitShapes, rays: Rays, depth: jax.Array, only: int | None = None
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The nearest triangle before ``depth``.
 
     Args:
         scene: The scene.
         unit: The drawn objects.
-        u: [P] float32, see `camera.pixel_rays`. The pixels should lie close together.
-        v: [P] float32.
+        rays: [P]. The pixels should lie close together.
         depth: [P] float32, metres.
         only: Row of the only object that counts; all opaque ones if None.
 
@@ -34,7 +36,7 @@ def nearest_triangle(
         -1 where there is none.
     """
     # Counts of clusters up to each one: the k-th that touches is the number of counts that are at most k.
-    counts = jnp.cumsum(_touching(scene, unit, u, v, depth, only).astype(jnp.int32))
+    counts = jnp.cumsum(_touching(scene, unit, rays, depth, only).astype(jnp.int32))
     last = counts.shape[0] - 1
     far = jnp.asarray(np.inf, jnp.float32)
 
@@ -45,11 +47,11 @@ def nearest_triangle(
         number = jax.lax.bitcast_convert_type(met, jnp.int32) & _NUMBER
         best, found = jnp.where(nearer, met, best), jnp.where(nearer, cluster * meshes.CLUSTER + number, found)
         cluster = jnp.minimum(jnp.sum((counts <= step).astype(jnp.int32)), last)
-        met = jnp.where(step < counts[last], _meet_cluster(scene, unit, cluster, u, v), far)
+        met = jnp.where(step < counts[last], _meet_cluster(scene, unit, cluster, rays), far)
         return step + 1, best, found, met, cluster
 
-    none = jnp.full(u.shape, -1, jnp.int32)
-    start = (jnp.zeros((), jnp.int32), depth, none, jnp.full(u.shape, np.inf, jnp.float32), jnp.zeros((), jnp.int32))
+    none = jnp.full(rays.u.shape, -1, jnp.int32)
+    start = (jnp.zeros((), jnp.int32), depth, none, jnp.full(rays.u.shape, np.inf, jnp.float32), jnp.zeros((), jnp.int32))
     # One round more than there are clusters, to weigh what the last one met.
     _, best, found, _, _ = jax.lax.while_loop(lambda state: state[0] <= counts[last], advance, start)
     places = scene.cluster_places.at[jnp.maximum(found, 0) // meshes.CLUSTER].get(mode="promise_in_bounds")
@@ -57,22 +59,20 @@ def nearest_triangle(
     return best, row, jnp.where(found >= 0, places[:, 0], -1)
 
 
-def _touching(
-    scene: Scene, unit: shapes.UnitShapes, u: jax.Array, v: jax.Array, depth: jax.Array, only: int | None
-) -> jax.Array:
+def _touching(scene: Scene, unit: shapes.UnitShapes, rays: Rays, depth: jax.Array, only: int | None) -> jax.Array:
     """[K] bool: which clusters may be met by the rays before the depths."""
     owner = scene.cluster_places[:, 0]
     axes, origin = unit.axes[owner], unit.origin[owner]
     offset = scene.clusters[:, :3] - origin
     middle = jnp.sum(axes * offset[:, :, None], axis=1)  # back to the camera's frame: the axes of a mesh are a rotation
-    touching = camera.in_view(scene, middle, scene.clusters[:, 3], u, v, depth)
+    touching = camera.in_view(scene, middle, scene.clusters[:, 3], rays, depth)
     if only is not None:
         return touching & (owner == only)
     opaque = np.array(scene.transparent) == raycast.OPAQUE
     return touching & jnp.asarray(opaque)[owner]
 
 
-def _meet_cluster(scene: Scene, unit: shapes.UnitShapes, cluster: jax.Array, u: jax.Array, v: jax.Array) -> jax.Array:
+def _meet_cluster(scene: Scene, unit: shapes.UnitShapes, cluster: jax.Array, rays: Rays) -> jax.Array:
     """Depth of the nearest triangle of one cluster, its number in the lowest bits, infinite for none; [P] float32."""
     place = scene.cluster_places[cluster]
     axes, origin = unit.axes[place[0]], unit.origin[place[0]]
@@ -82,8 +82,8 @@ def _meet_cluster(scene: Scene, unit: shapes.UnitShapes, cluster: jax.Array, u: 
     # From the camera's frame to that of each unit triangle: a handful of numbers, so that a ray needs one map only.
     turned = jnp.sum(maps[:, :, :3, None] * axes[None, None], axis=2)
     begin = jnp.sum(maps[:, :, :3] * origin, axis=2) + maps[:, :, 3]
-    start, direction, _ = camera.ray_parts(scene, u, v)
-    best = jnp.full(u.shape, np.iinfo(np.int32).max, jnp.int32)
+    start, direction, _ = camera.ray_parts(scene, rays)
+    best = jnp.full(rays.u.shape, np.iinfo(np.int32).max, jnp.int32)
     for number in range(meshes.CLUSTER):
         ray = camera.mapped(turned[number], direction)
         offset = camera.mapped(turned[number], start)

@@ -12,8 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis_envs.render import camera, shapes
-from jaxrl_vis_envs.render.pixel_math import larger, smaller
+from jaxrl_vis_envs.render import camera
+from jaxrl_vis_envs.render.camera import Rays
+from jaxrl_vis_envs.render.pixel import shapes
+from jaxrl_vis_envs.render.pixel.arithmetic import larger, smaller
 from jaxrl_vis_envs.render.scene import Scene
 
 # Keeps a division by a ray component that is exactly 0 finite; far too small to change any other number.
@@ -48,9 +50,9 @@ def behind(unit: shapes.UnitShapes, row: int) -> jax.Array:
     return unit.origin[row, 2] < 0.0
 
 
-def _solid_entry(scene: Scene, unit: shapes.UnitShapes, row: int, u: jax.Array, v: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _solid_entry(scene: Scene, unit: shapes.UnitShapes, row: int, rays: Rays) -> tuple[jax.Array, jax.Array]:
     """`row_entry` for objects that are opaque from this side, and not before the near plane."""
-    t, meets = row_entry(scene, unit, row, u, v)
+    t, meets = row_entry(scene, unit, row, rays)
     meets = meets & (t > scene.znear)
     if scene.transparent[row] == CLEAR_FROM_BEHIND:
         meets = meets & ~behind(unit, row)
@@ -64,9 +66,9 @@ def decode(scene: Scene, key: jax.Array) -> tuple[jax.Array, jax.Array]:
     return jax.lax.bitcast_convert_type(key & ~mask, jnp.float32), jnp.where(row == mask, -1, row)
 
 
-def row_entry(scene: Scene, unit: shapes.UnitShapes, row: int, u: jax.Array, v: jax.Array) -> tuple[jax.Array, jax.Array]:
+def row_entry(scene: Scene, unit: shapes.UnitShapes, row: int, rays: Rays) -> tuple[jax.Array, jax.Array]:
     """Where the ray of each pixel enters the object of one row (t, metres of planar depth), and whether it does; [P] each."""
-    start, direction, inverse_square = camera.ray_parts(scene, u, v)
+    start, direction, inverse_square = camera.ray_parts(scene, rays)
     kind = scene.object_types[row]
     bare_ball = kind == shapes.SPHERE and scene.atlas.mappings[row] == 0
     return entry(kind, _row_values(unit, row, bare_ball), start, direction, inverse_square)
@@ -108,30 +110,28 @@ def sky_key(scene: Scene, mask: int) -> jax.Array:
     return (jax.lax.bitcast_convert_type(scene.zfar, jnp.int32) & ~mask) | mask
 
 
-def object_key(
-    scene: Scene, unit: shapes.UnitShapes, row: int, u: jax.Array, v: jax.Array, missed: jax.Array, mask: int
-) -> jax.Array:
+def object_key(scene: Scene, unit: shapes.UnitShapes, row: int, rays: Rays, missed: jax.Array, mask: int) -> jax.Array:
     """The keys of one opaque object, [P] int32, and ``missed`` where a ray does not meet it; ``mask`` as in `sky_key`."""
-    t, meets = _solid_entry(scene, unit, row, u, v)
+    t, meets = _solid_entry(scene, unit, row, rays)
     return jnp.where(meets, (jax.lax.bitcast_convert_type(t, jnp.int32) & ~mask) | (row & mask), missed)
 
 
-def nearest_key(scene: Scene, unit: shapes.UnitShapes, u: jax.Array, v: jax.Array, labelled: bool = True) -> jax.Array:
+def nearest_key(scene: Scene, unit: shapes.UnitShapes, rays: Rays, labelled: bool = True) -> jax.Array:
     """The key of the nearest opaque primitive along every ray, [P] int32; not ``labelled``, only the bits of its depth.
 
     Few objects are unrolled into one pass. Of many, those of a type whose balls touch the pyramid of the rays are counted
     through, and a loop runs up to their count; the rays should then lie close together.
     """
     mask = code_mask(scene) if labelled else 0
-    unit, u, v = jax.lax.stop_gradient((unit, u, v))
-    best = jnp.broadcast_to(sky_key(scene, mask), u.shape)
+    unit, rays = jax.lax.stop_gradient((unit, rays))
+    best = jnp.broadcast_to(sky_key(scene, mask), rays.u.shape)
     rows = primitive_rows(scene, transparent=False)
     listed = {} if len(rows) <= UNROLLED else _rows_by_type(scene, rows)
     for row in rows:
         if scene.object_types[row] not in listed:
-            best = jnp.minimum(best, object_key(scene, unit, row, u, v, best, mask))
+            best = jnp.minimum(best, object_key(scene, unit, row, rays, best, mask))
     for kind, rows in listed.items():
-        best = _nearest_listed(scene, unit, kind, rows, u, v, best, mask)
+        best = _nearest_listed(scene, unit, kind, rows, rays, best, mask)
     return best
 
 
@@ -143,15 +143,15 @@ def _rows_by_type(scene: Scene, rows: list[int]) -> dict[int, np.ndarray]:
 
 
 def _nearest_listed(
-    scene: Scene, unit: shapes.UnitShapes, kind: int, rows: np.ndarray, u: jax.Array, v: jax.Array, best: jax.Array, mask: int
+    scene: Scene, unit: shapes.UnitShapes, kind: int, rows: np.ndarray, rays: Rays, best: jax.Array, mask: int
 ) -> jax.Array:
     """The least of ``best`` [P] and the keys of those objects among ``rows``, all of one type, that the rays may meet."""
     ball = unit.ball[rows]
-    start, direction, inverse_square = camera.ray_parts(scene, u, v)
+    start, direction, inverse_square = camera.ray_parts(scene, rays)
     bare_ball = kind == shapes.SPHERE and not any(scene.atlas.mappings[row] for row in rows)
     # The k-th object that touches is the number of these counts that are at most k. All of them are brought to the front of a
     # table at once: whatever is done in the loop, but for the pixels, costs more than it does.
-    counts = jnp.cumsum(camera.in_view(scene, ball[:, :3], ball[:, 3], u, v, None).astype(jnp.int32))
+    counts = jnp.cumsum(camera.in_view(scene, ball[:, :3], ball[:, 3], rays, None).astype(jnp.int32))
     total = counts[-1]
     order = jnp.sum(counts[None, :] <= np.arange(len(rows))[:, None], axis=1)
     columns = [unit.origin[rows], unit.axes[rows].reshape(-1, 9), unit.extra[rows, None], unit.extra_square[rows, None]]
@@ -171,11 +171,11 @@ def _nearest_listed(
     return jax.lax.while_loop(lambda state: state[0] < total, advance, (jnp.zeros((), jnp.int32), best))[1]
 
 
-def nearest_distance(scene: Scene, unit: shapes.UnitShapes, u: jax.Array, v: jax.Array) -> jax.Array:
+def nearest_distance(scene: Scene, unit: shapes.UnitShapes, rays: Rays) -> jax.Array:
     """The depth alone, [P] float32 (m), differentiable as it is: cheaper where nothing else is asked for."""
-    depth = jnp.broadcast_to(scene.zfar, u.shape)
+    depth = jnp.broadcast_to(scene.zfar, rays.u.shape)
     for row in primitive_rows(scene, transparent=False):
-        t, meets = _solid_entry(scene, unit, row, u, v)
+        t, meets = _solid_entry(scene, unit, row, rays)
         depth = jnp.where(meets & (t < depth), t, depth)
     return depth
 

@@ -8,12 +8,10 @@ lookup gives all that a bilinear mean needs.
 
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from jaxrl_vis_envs.render import model_reading
+from jaxrl_vis_envs.render.model import reading
 
 NONE, FLAT, CUBE, UNWRAPPED = range(4)
 """How a texture lies on an object: not at all, projected along z, from a cube around it, or by a mesh's own coordinates."""
@@ -69,12 +67,12 @@ def build_atlas(mj_model: mujoco.MjModel, ids: np.ndarray, textured: bool) -> tu
                 parts.append(quads.reshape(-1, 4))
         return images[texture]
 
-    material = model_reading.object_materials(mj_model)[ids]
-    texture = model_reading.object_textures(mj_model)[ids]
+    material = reading.object_materials(mj_model)[ids]
+    texture = reading.object_textures(mj_model)[ids]
     mappings = [_mapping(mj_model, int(i), int(t)) if textured else NONE for i, t in zip(ids, texture, strict=True)]
     placed = tuple(place(int(t)) if how != NONE else None for how, t in zip(mappings, texture, strict=True))
     uniform = tuple(bool(how != NONE and mj_model.mat_texuniform[m]) for how, m in zip(mappings, material, strict=True))
-    skybox = model_reading.skybox(mj_model)
+    skybox = reading.skybox(mj_model)
     sky = None
     if textured and skybox >= 0 and not _is_plain_sky(mj_model, skybox):
         sky = place(skybox)
@@ -97,7 +95,7 @@ def _mapping(mj_model: mujoco.MjModel, index: int, texture: int) -> int:
 
 def _faces(mj_model: mujoco.MjModel, texture: int) -> np.ndarray:
     """[faces, height, width, 3] float64 in [0, 255]."""
-    pixels = model_reading.texture_pixels(mj_model, texture)[..., :3].astype(np.float64)
+    pixels = reading.texture_pixels(mj_model, texture)[..., :3].astype(np.float64)
     if mj_model.tex_colorspace[texture] == mujoco.mjtColorSpace.mjCOLORSPACE_SRGB:
         share = pixels / 255.0
         pixels = 255.0 * np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
@@ -169,130 +167,5 @@ def _is_gradient(mj_model: mujoco.MjModel, faces: np.ndarray, place: np.ndarray)
     sine = heights / np.sqrt(1.0 + across**2 + down**2)
     elevation = np.arcsin(sine) * 2.0 / np.pi
     share = (0.5 + elevation / np.sqrt(2.0 * (1.0 + elevation**2)))[..., None]
-    top, bottom = model_reading.sky_colours(mj_model)
+    top, bottom = reading.sky_colours(mj_model)
     return bool(np.abs(255.0 * (bottom * (1.0 - share) + top * share) - faces).max() <= 4.0)
-
-
-def sample(
-    texels: jax.Array,
-    levels: tuple[tuple[int, int, int], ...],
-    first_level: jax.Array | int,
-    level_count: jax.Array | int,
-    face: jax.Array | int,
-    place: tuple[jax.Array, jax.Array],
-    spread_square: jax.Array,
-    repeats: jax.Array | bool,
-) -> tuple[jax.Array, ...]:
-    """Colours of textures at many places.
-
-    Args:
-        texels: [T, 4] uint32, or in a kernel a block of memory that is looked up like it and brings the table of levels along.
-        levels: As in `Atlas`.
-        first_level: [P] int32 or a number: which texture.
-        level_count: [P] int32 or a number.
-        face: [P] int32 or a number: which face of a cube.
-        place: Coordinates across and down, [P] float32 each; 0 to 1 is the whole image.
-        spread_square: [P] float32, the square of how many texels (of the finest level) a pixel spans.
-        repeats: [P] bool or a bool: whether the image goes on beyond its border, or its border does.
-
-    Returns:
-        Red, green and blue, [P] float32 each, in [0, 1].
-    """
-    level = jnp.clip(0.5 * jnp.log2(jnp.maximum(spread_square, 1e-12)), 0.0, level_count - 1.0)
-    fine = jnp.floor(level)
-    weight = level - fine
-    fine = fine.astype(jnp.int32)
-    coarse = jnp.minimum(fine + 1, level_count - 1)
-    table = jnp.asarray(levels, jnp.int32) if isinstance(texels, jax.Array) else texels.levels
-    near = _bilinear(texels, table, first_level + fine, face, place, repeats)
-    far = _bilinear(texels, table, first_level + coarse, face, place, repeats)
-    return tuple(a + weight * (b - a) for a, b in zip(near, far, strict=True))
-
-
-def _bilinear(texels: jax.Array, table: jax.Array, level: jax.Array, face: jax.Array | int, place: tuple, repeats) -> tuple:
-    facts = table.at[jnp.clip(level, 0, len(table) - 1)].get(mode="promise_in_bounds")
-    first, shape = facts[..., 0], (facts[..., 1], facts[..., 2])
-    lows, shares = [], []
-    for axis in range(2):
-        count = shape[axis].astype(jnp.float32)
-        at = place[axis] * count - 0.5
-        at = jnp.where(repeats, at, jnp.clip(at, 0.0, count - 1.0))
-        low = jnp.floor(at)
-        shares.append(at - low)
-        lows.append((low - count * jnp.floor(low / count)).astype(jnp.int32))
-    index = first + (face * shape[1] + lows[1]) * shape[0] + lows[0]
-    # Clipped also against what is not a number.
-    quad = texels.at[jnp.clip(index, 0, len(texels) - 1)].get(mode="promise_in_bounds")
-    corners = tuple(quad[..., corner] for corner in range(4))
-    return (_mixed if isinstance(texels, jax.Array) else _mix)(corners, *shares)
-
-
-def _mix(corners: tuple, right: jax.Array, below: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Red, green and blue between four texels, with weights of 1/256 as graphics hardware has them.
-
-    So two channels fit into one product of integers.
-    """
-    right, below = ((256.0 * share + 0.5).astype(jnp.int32) for share in (right, below))
-    both = (right * below + 128) >> 8
-    weights = (256 - right - below + both, right - both, below - both, both)
-    red_blue, green = jnp.uint32(0), jnp.uint32(0)
-    for texel, weight in zip(corners, weights, strict=True):
-        weight = weight.astype(jnp.uint32)
-        red_blue += (texel & 0xFF00FF) * weight
-        green += ((texel >> 8) & 0xFF) * weight
-    red, green, blue = (
-        part.astype(jnp.int32).astype(jnp.float32) * (1.0 / (255.0 * 256.0))
-        for part in (red_blue & 0xFFFF, green, red_blue >> 16)
-    )
-    return red, green, blue
-
-
-_mixed = jax.custom_jvp(_mix)
-
-
-@_mixed.defjvp
-def _mix_tangents(primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
-    """Integers have no slope; that of the mean that they stand for."""
-    corners, right, below = primals
-    _, right_move, below_move = tangents
-    moves = []
-    for channel in range(3):
-        one, two, three, four = (((c >> (8 * channel)) & 255).astype(jnp.int32).astype(jnp.float32) / 255.0 for c in corners)
-        to_right = (two - one) * (1.0 - below) + (four - three) * below
-        to_below = (three - one) * (1.0 - right) + (four - two) * right
-        moves.append(to_right * right_move + to_below * below_move)
-    return _mix(corners, right, below), tuple(moves)
-
-
-def cube_place(direction: tuple) -> tuple[jax.Array, tuple[jax.Array, jax.Array], tuple]:
-    """Where a direction meets a cube map, as OpenGL has it.
-
-    Args:
-        direction: Three [P] float32, of any length.
-
-    Returns:
-        The face [P] int32, the coordinates on it (across and down, [P] each), and what `cube_move` needs.
-    """
-    x, y, z = direction
-    ax, ay, az = jnp.abs(x), jnp.abs(y), jnp.abs(z)
-    along_x = (ax >= ay) & (ax >= az)
-    along_y = ~along_x & (ay >= az)
-    major = jnp.where(along_x, x, jnp.where(along_y, y, z))
-    negative = major < 0.0
-    face = jnp.where(along_x, 0, jnp.where(along_y, 2, 4)) + negative
-    sign = jnp.where(negative, -1.0, 1.0)
-    across = jnp.where(along_x, -sign * z, jnp.where(along_y, x, sign * x))
-    down = jnp.where(along_y, sign * z, -y)
-    inverse = 0.5 / jnp.maximum(jnp.abs(major), 1e-20)
-    place = (across * inverse + 0.5, down * inverse + 0.5)
-    return face, place, (along_x, along_y, sign, inverse)
-
-
-def cube_move(choice: tuple, place: tuple, change: tuple) -> tuple[jax.Array, jax.Array]:
-    """How the place on a cube's face moves (across and down, [P] each) when the direction moves by ``change``."""
-    along_x, along_y, sign, inverse = choice
-    x, y, z = change
-    major = sign * jnp.where(along_x, x, jnp.where(along_y, y, z))
-    across = jnp.where(along_x, -sign * z, jnp.where(along_y, x, sign * x))
-    down = jnp.where(along_y, sign * z, -y)
-    return (across - (2.0 * place[0] - 1.0) * major) * inverse, (down - (2.0 * place[1] - 1.0) * major) * inverse

@@ -7,12 +7,13 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from jaxrl_vis_envs.render.pixel_math import larger, power
+from jaxrl_vis_envs.render.pixel.arithmetic import Vector, dot, larger, normalized, power
 from jaxrl_vis_envs.render.scene import Scene
-from jaxrl_vis_envs.render.surface import Vector, dot, normalized
 
 _DIRECTIONAL = int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
 _SPOT = int(mujoco.mjtLightType.mjLIGHT_SPOT)
+COLUMNS = 20
+"""Of the table of lights: six vectors and two numbers."""
 
 
 class Light(NamedTuple):
@@ -108,7 +109,7 @@ def facts(scene: Scene) -> list[LightFacts]:
 
 
 def pack(lights: list[Light]) -> jax.Array:
-    """All numbers of the lights as one table: [L, 20] float32."""
+    """All numbers of the lights as one table: [L, COLUMNS] float32."""
     rows = []
     for light in lights:
         zeros, zero = jnp.zeros(3), jnp.zeros(())
@@ -120,14 +121,14 @@ def pack(lights: list[Light]) -> jax.Array:
                 + [(zero if number is None else number)[None] for number in numbers]
             )
         )
-    return jnp.stack(rows) if rows else jnp.zeros((0, 20))
+    return jnp.stack(rows) if rows else jnp.zeros((0, COLUMNS))
 
 
 def unpack(scene: Scene, table: Any) -> list[Light]:
     """Undoes `pack`; vectors come as three scalars. The table may be an array or, in a kernel, a block of memory."""
     found = []
     for index, fact in enumerate(facts(scene)):
-        values = [table[index, column] for column in range(20)]
+        values = [table[index, column] for column in range(COLUMNS)]
         vectors: list[Any] = [tuple(values[first : first + 3]) for first in range(0, 18, 3)]
         if fact.directional:
             vectors[0] = vectors[5] = None

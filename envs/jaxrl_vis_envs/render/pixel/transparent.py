@@ -9,8 +9,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxrl_vis_envs.render import model_reading, raycast, shade, shapes, surface, triangles
-from jaxrl_vis_envs.render.lights import Light
+from jaxrl_vis_envs.render.camera import Rays
+from jaxrl_vis_envs.render.model import reading
+from jaxrl_vis_envs.render.pixel import lookup, raycast, shade, shapes, surface, triangles
+from jaxrl_vis_envs.render.pixel.lights import Light
 from jaxrl_vis_envs.render.scene import Scene
 
 # What MuJoCo leaves of a plane's alpha when it is seen from behind.
@@ -21,14 +23,12 @@ class Sheet(NamedTuple):
     """One transparent object: its row, its columns, where it is met and where that is before all that is opaque ([P] bool)."""
 
     index: int
-    row: surface.Row
+    row: lookup.Row
     hit: surface.Hit
     seen: jax.Array
 
 
-def sheets(
-    scene: Scene, unit: shapes.UnitShapes, table: jax.Array, u: jax.Array, v: jax.Array, depth: jax.Array
-) -> list[Sheet]:
+def sheets(scene: Scene, unit: shapes.UnitShapes, rows: jax.Array, rays: Rays, depth: jax.Array) -> list[Sheet]:
     """The transparent objects before ``depth`` ([P] float32, metres, of what is opaque)."""
     depth = jax.lax.stop_gradient(depth)
     found = []
@@ -36,17 +36,17 @@ def sheets(
         triangle = None
         if scene.object_types[index] in (shapes.MESH, shapes.HFIELD):
             frozen = jax.lax.stop_gradient(unit)
-            t, triangle, _ = triangles.nearest_triangle(scene, frozen, u, v, depth, only=index)
+            t, triangle, _ = triangles.nearest_triangle(scene, frozen, rays, depth, only=index)
             seen = triangle >= 0
         else:
-            t, meets = raycast.row_entry(scene, jax.lax.stop_gradient(unit), index, u, v)
+            t, meets = raycast.row_entry(scene, jax.lax.stop_gradient(unit), index, rays)
             seen = meets & (t > scene.znear) & (t < depth)
         if scene.transparent[index] == raycast.CLEAR_FROM_BEHIND:
             seen = seen & raycast.behind(unit, index)
-        row = surface.read_row(table[index])
+        row = lookup.read_row(rows[index])
         # A start that means nothing would be a source of NaN in gradients.
         t = jnp.where(seen, t, 1.0)
-        found.append(Sheet(index, row, surface.meet(scene, row, surface.fetch_triangle(scene, triangle), u, v, t), seen))
+        found.append(Sheet(index, row, surface.meet(scene, row, lookup.fetch_triangle(scene, triangle), rays, t), seen))
     return found
 
 
@@ -65,8 +65,7 @@ def blend(
     unit: shapes.UnitShapes,
     lights: list[Light],
     found: list[Sheet],
-    u: jax.Array,
-    v: jax.Array,
+    rays: Rays,
     colour: tuple,
 ) -> tuple:
     """The colours [P] (three) of what is opaque, with the sheets laid over them."""
@@ -75,13 +74,13 @@ def blend(
     layers, distances = [], []
     bare = [light._replace(shadows=False) for light in lights]  # only what is opaque shows shadows
     for index, row, hit, seen in found:
-        own: Any = shade.shade(scene, unit, bare, row, hit, u, v)
+        own: Any = shade.shade(scene, unit, bare, row, hit, rays)
         alpha = scene.rgba[scene.object_ids[index], 3]
         ball = unit.ball[index]
         near = jnp.sqrt(jnp.sum(jnp.square(ball[:3])) + 1e-20) - ball[3]
         if scene.object_types[index] == shapes.PLANE:
             alpha = jnp.where(raycast.behind(unit, index), _PLANE_BACK * alpha, alpha)
-            near = jnp.full((), model_reading.ENDLESS)
+            near = jnp.full((), reading.ENDLESS)
         layers.append(jnp.stack([*own, jnp.where(seen, alpha, 0.0)]))
         distances.append(near)
     stack = jnp.stack(layers)

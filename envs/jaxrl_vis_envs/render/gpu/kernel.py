@@ -11,28 +11,49 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
 
 from jaxrl_vis_envs.compilation import runs_gpu_kernels
-from jaxrl_vis_envs.render import camera, lights, raycast, shade, shapes, surface
+from jaxrl_vis_envs.render import camera
+from jaxrl_vis_envs.render.camera import Rays
+from jaxrl_vis_envs.render.outputs import Outputs, Planes
+from jaxrl_vis_envs.render.pixel import lights, lookup, raycast, shade, shapes, surface
 from jaxrl_vis_envs.render.scene import Scene
 
 # Measured on an H200: pixels of a tile (a power of two, of which a few may be idle), and how a program is run.
 _PIXELS = 128
 _COMPILER = plgpu.CompilerParams(num_warps=4, num_stages=1)
 _ENDLESS = 1e9
+# Where the camera's numbers are in the vector that the kernel reads.
+_LENS, _CLIP, _ROTATION, _SKY_TOP, _SKY_BOTTOM, _FOVY = range(4), range(4, 6), range(6, 15), range(15, 18), range(18, 21), 21
+_PROBE = """
+<mujoco>
+  <asset>
+    <texture name="t" type="2d" builtin="checker" width="8" height="8"/><material name="t" texture="t"/>
+    <texture name="sky" type="skybox" builtin="checker" width="8" height="8"/>
+  </asset>
+  <worldbody>
+    <light type="directional"/><light type="spot" pos="0 0 2"/>
+    <geom type="plane" size="1 1 1" material="t"/><geom type="sphere" size=".1"/><geom type="capsule" size=".1 .1"/>
+    <geom type="ellipsoid" size=".1 .2 .1"/><geom type="cylinder" size=".1 .1"/><geom type="box" size=".1 .1 .1"/>
+    <camera pos="0 0 1"/>
+  </worldbody>
+</mujoco>
+"""
 _TYPES = {shapes.PLANE, shapes.SPHERE, shapes.CAPSULE, shapes.ELLIPSOID, shapes.CYLINDER, shapes.BOX}
 
 
-def takes(scene: Scene) -> bool:
-    """Whether the kernel draws this scene here: opaque primitives without shadows or haze, on a GPU that runs kernels."""
-    return runs_gpu_kernels() and supports(scene)
+def takes(scene: Scene, outputs: Outputs) -> bool:
+    """Whether the kernel draws these planes on the platform that is being traced for: any of a scene that it supports."""
+    del outputs
+    return supports(scene) and runs_gpu_kernels(probe)
 
 
 def supports(scene: Scene) -> bool:
-    """Whether the kernel can draw this scene, wherever it runs."""
+    """Whether the kernel can draw this scene, wherever it runs: opaque primitives without shadows or haze."""
     plain = not any(scene.transparent) and not any(scene.light_shadows) and scene.haze[0] < 0
     textured = scene.atlas.used or scene.atlas.sky is not None
     # How far a texture is spread over a pixel is found out in the kernel, which does not know lenses with a sensor.
@@ -121,10 +142,10 @@ class _Refs(NamedTuple):
     ids: Any
 
 
-def _nearest(scene: Scene, refs: _Refs, place: Any, u: jax.Array, v: jax.Array, znear: Any, best: jax.Array) -> jax.Array:
+def _nearest(scene: Scene, refs: _Refs, place: Any, rays: Rays, znear: Any, best: jax.Array) -> jax.Array:
     """The least key of the objects of a tile."""
     mask = raycast.code_mask(scene)
-    start, direction, inverse_square = camera.ray_parts(scene, u, v)
+    start, direction, inverse_square = camera.ray_parts(scene, rays)
     kinds = sorted(scene.object_types)
     bare_balls = not any(
         textured for kind, textured in zip(scene.object_types, scene.atlas.mappings, strict=True) if kind == shapes.SPHERE
@@ -155,10 +176,9 @@ def _nearest(scene: Scene, refs: _Refs, place: Any, u: jax.Array, v: jax.Array, 
     return best
 
 
-def _kernel(*refs, scene, wanted, quantized, tile):
+def _kernel(*refs, scene: Scene, outputs: Outputs, tile: tuple[int, int]):
     count = len(_Refs._fields)
     refs, out = _Refs(*refs[:count]), list(refs[count:])
-    rgb, depth, normals, distance, segmentation = wanted
     high, wide = tile
     across = -(-scene.width // wide)
     place = pl.program_id(0)
@@ -167,13 +187,15 @@ def _kernel(*refs, scene, wanted, quantized, tile):
     row, column = top + jax.lax.div(lane, jnp.int32(wide)), left + jax.lax.rem(lane, jnp.int32(wide))
     inside = (lane < high * wide) & (row < scene.height) & (column < scene.width)
 
-    middle_u, middle_v, half_u, half_v, znear, zfar = (refs.view[index] for index in range(6))
+    middle_u, middle_v, half_u, half_v = (refs.view[index] for index in _LENS)
+    znear, zfar = (refs.view[index] for index in _CLIP)
     u = middle_u + (2.0 * column.astype(jnp.float32) + (1.0 - scene.width)) * (1.0 / scene.width) * half_u
     v = middle_v + ((scene.height - 1.0) - 2.0 * row.astype(jnp.float32)) * (1.0 / scene.height) * half_v
+    rays = Rays(u, v)
 
     mask = raycast.code_mask(scene)
     sky_key = (jax.lax.bitcast_convert_type(zfar, jnp.int32) & ~mask) | mask
-    best = _nearest(scene, refs, place, u, v, znear, jnp.broadcast_to(sky_key, (_PIXELS,)))
+    best = _nearest(scene, refs, place, rays, znear, jnp.broadcast_to(sky_key, (_PIXELS,)))
     index = best & mask
     near = jax.lax.bitcast_convert_type(best & ~mask, jnp.float32)
     sees = index != mask
@@ -183,83 +205,81 @@ def _kernel(*refs, scene, wanted, quantized, tile):
         ref = out[0].at[pixel] if plane is None else out[0].at[plane, pixel]
         plgpu.store(ref, value.astype(out[0].dtype), mask=inside)
 
-    top_colour, bottom_colour = ([refs.view[first + i] for i in range(3)] for first in (15, 18))
-    texels = _Rows(refs.texels, levels=_Rows(refs.levels))
-    inner = scene.replace(sky_top=top_colour, sky_bottom=bottom_colour, zfar=zfar, fovy=refs.view[21], texels=texels)
+    top_colour, bottom_colour = ([refs.view[index] for index in colour] for colour in (_SKY_TOP, _SKY_BOTTOM))
+    texels: Any = _BlockTexels(refs.texels, refs.levels)
+    inner = scene.replace(sky_top=top_colour, sky_bottom=bottom_colour, zfar=zfar, fovy=refs.view[_FOVY], texels=texels)
     zero = jnp.zeros((_PIXELS,))
     far, normal, colour = zero, (zero,) * 3, (zero,) * 3
-    if rgb or depth or normals or distance:
+    if outputs.rgb or outputs.depth or outputs.normals or outputs.distance:
 
         def surfaces():
             cell = _fetch(refs, jnp.where(sees, index, 0))
-            hit = surface.meet(inner, cell, None, u, v, near)
-            colour = shade.shade(inner, None, lights.unpack(scene, refs.lights), cell, hit, u, v) if rgb else (zero,) * 3
+            hit = surface.meet(inner, cell, None, rays, near)
+            colour = (zero,) * 3
+            if outputs.rgb:
+                colour = shade.shade(inner, None, lights.unpack(scene, refs.lights), cell, hit, rays)
             return hit.depth, tuple(hit.normal), tuple(colour)
 
         # A whole tile of sky is common.
         far, normal, colour = jax.lax.cond(jnp.max(sees.astype(jnp.int32)) > 0, surfaces, lambda: (far, normal, colour))
         far = jnp.where(sees, far, zfar)
-    if rgb:
+    if outputs.rgb:
 
         def with_sky():
-            rotation = _Matrix([[refs.view[6 + 3 * i + j] for j in range(3)] for i in range(3)])
-            background = shade.sky(inner, rotation, u, v)
+            rotation = _Matrix([[refs.view[_ROTATION[3 * i + j]] for j in range(3)] for i in range(3)])
+            background = shade.sky(inner, rotation, rays)
             return tuple(jnp.where(sees, front, back) for front, back in zip(colour, background, strict=True))
 
         colour = jax.lax.cond(jnp.min(sees.astype(jnp.int32)) > 0, lambda: colour, with_sky)
         for plane, value in enumerate(colour):
-            if quantized:
+            if outputs.quantized:
                 value = (jnp.clip(value, 0.0, 1.0) * 255.0 + 0.5).astype(jnp.int32)
             store(value, plane)
         out.pop(0)
-    if depth:
+    if outputs.depth:
         store(far)
         out.pop(0)
-    if normals:
+    if outputs.normals:
         for plane, value in enumerate(normal):
             store(jnp.where(sees, value, 0.0), plane)
         out.pop(0)
-    if distance:
-        length = 1.0 if scene.projection == "orthographic" else jnp.sqrt(u * u + v * v + 1.0)
-        store(jnp.where(sees, far * length, zfar))
+    if outputs.distance:
+        store(jnp.where(sees, far * camera.ray_length(scene, rays), zfar))
         out.pop(0)
-    if segmentation:
+    if outputs.segmentation:
         store(jnp.where(sees, plgpu.load(refs.ids.at[jnp.where(sees, index, 0)]), -1))
 
 
-def _fetch(refs: _Refs, index: jax.Array) -> surface.Row:
+def _fetch(refs: _Refs, index: jax.Array) -> lookup.Row:
     """Of each pixel's object, the values that `surface.meet` and `shade.shade` need."""
-
-    def column(ref, *place):
-        return plgpu.load(ref.at[(index, *(jnp.full(index.shape, number, jnp.int32) for number in place))])
-
-    columns = [column(refs.axes, i, j) for i in range(3) for j in range(3)] + [column(refs.origin, i) for i in range(3)]
-    return surface.row_of(
-        [*columns, column(refs.extra), *(column(refs.looks, number) for number in range(refs.looks.shape[1]))]
-    )
+    columns = [_column(refs.axes, index, i, j) for i in range(3) for j in range(3)]
+    columns += [_column(refs.origin, index, i) for i in range(3)] + [_column(refs.extra, index)]
+    return lookup.row_of(columns + [_column(refs.looks, index, number) for number in range(refs.looks.shape[1])])
 
 
-class _Rows:
-    """A block of memory whose rows are looked up as those of an array; only the columns that are asked for are read."""
+def _column(ref: Any, index: jax.Array, *place: int) -> jax.Array:
+    """One column of the rows ``index`` [P] of a block of memory."""
+    return plgpu.load(ref.at[(index, *(jnp.full(index.shape, number, jnp.int32) for number in place))])
 
-    def __init__(self, ref: Any, row: Any = None, levels: Any = None):
-        self.ref, self.row, self.levels = ref, row, levels
 
-    def __len__(self) -> int:
-        return self.ref.shape[0]
+class _BlockTexels:
+    """The atlas as blocks of memory, see `sampling.Texels`."""
 
-    @property
-    def at(self) -> Any:
-        return self
+    few_textures = True  # many tiles see nothing that has one
+    differentiable = False
 
-    def get(self, mode: str) -> Any:
-        del mode
-        return self
+    def __init__(self, texels: Any, levels: Any):
+        self.texels, self.levels = texels, levels
 
-    def __getitem__(self, place: Any) -> Any:
-        if self.row is None:
-            return _Rows(self.ref, place)
-        return plgpu.load(self.ref.at[self.row, jnp.full(self.row.shape, place[-1], jnp.int32)])
+    def level(self, number: jax.Array) -> tuple[jax.Array, ...]:
+        """See `sampling.Texels`."""
+        number = jnp.clip(number, 0, self.levels.shape[0] - 1)
+        return tuple(_column(self.levels, number, column) for column in range(3))
+
+    def quad(self, row: jax.Array) -> tuple[jax.Array, ...]:
+        """See `sampling.Texels`."""
+        row = jnp.clip(row, 0, self.texels.shape[0] - 1)
+        return tuple(_column(self.texels, row, corner) for corner in range(4))
 
 
 class _Matrix:
@@ -273,27 +293,25 @@ class _Matrix:
 
 
 def draw(
-    wanted: tuple[bool, ...],
-    quantized: bool,
+    outputs: Outputs,
     scene: Scene,
     rotation: jax.Array,
     unit: shapes.UnitShapes,
     light_table: jax.Array,
     interpret: bool = False,
-) -> list[jax.Array | None]:
+) -> Planes:
     """Draws one environment; ``jax.vmap`` it for a batch. Not differentiable.
 
     Args:
-        wanted: Whether to return rgb, depth, normals, distance and segmentation.
-        quantized: Whether rgb is uint8 rather than float32 in [0, 1].
-        scene: One that the kernel `takes`.
+        outputs: Which planes.
+        scene: One that the kernel `supports`.
         rotation: [3, 3] float32 of the camera, see `camera.camera_pose`.
         unit: The drawn objects.
         light_table: From `lights.pack`.
         interpret: Run without a GPU, slowly.
 
     Returns:
-        Those five planes, [3, H, W] or [H, W], None where not wanted.
+        The planes.
     """
     tile = tile_shape(scene.height, scene.width)
     words, order = tile_words(scene, rectangles(scene, unit), tile)
@@ -306,7 +324,7 @@ def draw(
         origin=unit.origin,
         extra=unit.extra,
         extra_square=unit.extra_square,
-        looks=jnp.stack(surface.look_columns(scene), axis=1),
+        looks=jnp.stack(lookup.look_columns(scene), axis=1),
         texels=scene.texels if len(scene.texels) else jnp.zeros((1, 4), jnp.uint32),
         levels=jnp.asarray(scene.atlas.levels or [(0, 1, 1)], jnp.int32),
         lights=light_table if len(light_table) else jnp.zeros((1, 1)),
@@ -314,26 +332,48 @@ def draw(
         ids=jnp.asarray(ids),
     )
     pixels = scene.height * scene.width
-    kinds = (
-        ((3, pixels), jnp.uint8 if quantized else jnp.float32),
-        ((pixels,), jnp.float32),
-        ((3, pixels), jnp.float32),
-        ((pixels,), jnp.float32),
-        ((pixels,), jnp.int32),
-    )
-    outputs = [jax.ShapeDtypeStruct(*kind) for want, kind in zip(wanted, kinds, strict=True) if want]
-    drawn = pl.pallas_call(
-        functools.partial(_kernel, scene=_without_arrays(scene), wanted=wanted, quantized=quantized, tile=tile),
-        out_shape=outputs,
+    # In the order in which the kernel writes them.
+    kinds = {
+        "rgb": ((3, pixels), jnp.uint8 if outputs.quantized else jnp.float32),
+        "depth": ((pixels,), jnp.float32),
+        "normals": ((3, pixels), jnp.float32),
+        "distance": ((pixels,), jnp.float32),
+        "segmentation": ((pixels,), jnp.int32),
+    }
+    drawn = {name: jax.ShapeDtypeStruct(*kind) for name, kind in kinds.items() if getattr(outputs, name)}
+    planes = pl.pallas_call(
+        functools.partial(_kernel, scene=_without_arrays(scene), outputs=outputs, tile=tile),
+        out_shape=list(drawn.values()),
         grid=(words.shape[0],),
         in_specs=[_whole(array.shape) for array in inputs],
-        out_specs=[_whole(like.shape) for like in outputs],
+        out_specs=[_whole(like.shape) for like in drawn.values()],
         compiler_params=_COMPILER,
         interpret=interpret,
         name="draw_tiles",
     )(*inputs)
-    planes = iter([plane.reshape(*plane.shape[:-1], scene.height, scene.width) for plane in drawn])
-    return [next(planes) if want else None for want in wanted]
+    upright = {
+        name: plane.reshape(*plane.shape[:-1], scene.height, scene.width) for name, plane in zip(drawn, planes, strict=True)
+    }
+    return Planes(**{**dict.fromkeys(Planes._fields), **upright})
+
+
+def probe() -> None:
+    """Compiles a small instance of the kernel."""
+    probe_program().lower().compile()
+
+
+def probe_program() -> Any:
+    """A small instance of the kernel, traced (`jax.stages.Traced`): every type of object, two lights, a texture, a sky."""
+    mj_model = mujoco.MjModel.from_xml_string(_PROBE)
+    mj_data = mujoco.MjData(mj_model)
+    mujoco.mj_forward(mj_model, mj_data)
+    scene = Scene.from_mjmodel(mj_model, 0, 8, 8)
+    position, rotation, finite = camera.camera_pose(scene, mj_data)
+    unit = shapes.unit_shapes(scene, mj_data, position, rotation, finite)
+    table = lights.pack(lights.camera_lights(scene, mj_data, position, rotation))
+    outputs = Outputs(rgb=True, depth=True, segmentation=True, quantized=True)
+    assert supports(scene)
+    return jax.jit(functools.partial(draw, outputs)).trace(scene, rotation, unit, table)
 
 
 def _whole(shape: tuple[int, ...]) -> pl.BlockSpec:

@@ -15,7 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis_envs.render import blocks, camera, raycast, shapes
+from jaxrl_vis_envs.render import camera
+from jaxrl_vis_envs.render.camera import Rays
+from jaxrl_vis_envs.render.pixel import blocks, raycast, shapes
 from jaxrl_vis_envs.render.scene import Scene
 
 # So many tiles across and down. Each costs some microseconds for each object, and smaller images than this would lose by it.
@@ -36,19 +38,18 @@ def layout(scene: Scene) -> blocks.Layout:
     return blocks.tiles(scene, high, wide)
 
 
-def seen_in_tiles(scene: Scene, unit: shapes.UnitShapes, u: jax.Array, v: jax.Array) -> jax.Array:
+def seen_in_tiles(scene: Scene, unit: shapes.UnitShapes, rays: Rays) -> jax.Array:
     """Which objects may be seen in which tiles, in any image of the batch.
 
     Args:
         scene: The scene.
         unit: The drawn objects.
-        u: [tiles, P] float32, see `camera.pixel_rays`.
-        v: [tiles, P] float32.
+        rays: [tiles, P].
 
     Returns:
         [tiles, G] bool, the same for the whole batch; planes are always there.
     """
-    touching = jax.vmap(lambda u, v: camera.in_view(scene, unit.ball[:, :3], unit.ball[:, 3], u, v, None))(u, v)
+    touching = jax.vmap(lambda rays: camera.in_view(scene, unit.ball[:, :3], unit.ball[:, 3], rays, None))(rays)
     return _anywhere(touching) | (np.array(scene.object_types) == shapes.PLANE)
 
 
@@ -65,8 +66,7 @@ def memory(scene: Scene, plane: jax.Array) -> tuple[jax.Array, ...]:
 def nearest_key(
     scene: Scene,
     unit: shapes.UnitShapes,
-    u: jax.Array,
-    v: jax.Array,
+    rays: Rays,
     seen: jax.Array,
     own: tuple[jax.Array, ...],
     labelled: bool,
@@ -76,8 +76,7 @@ def nearest_key(
     Args:
         scene: The scene.
         unit: The drawn objects.
-        u: [P] float32, see `camera.pixel_rays`.
-        v: [P] float32.
+        rays: [P].
         seen: [G] bool, a row of `seen_in_tiles`.
         own: From `memory`, whatever is in it now.
         labelled: Whether the keys say which object it is, or are nothing but the bits of its depth.
@@ -86,7 +85,7 @@ def nearest_key(
         The keys [P] int32, and the memory for the next tile.
     """
     if not _culls(scene):
-        return raycast.nearest_key(scene, unit, u, v, labelled), own
+        return raycast.nearest_key(scene, unit, rays, labelled), own
     mask = raycast.code_mask(scene) if labelled else 0
     sky = raycast.sky_key(scene, mask)
     rows = solids(scene)
@@ -94,15 +93,15 @@ def nearest_key(
     def keys_of(row: int) -> Callable[[jax.Array], jax.Array]:
         def find(nothing: jax.Array) -> jax.Array:
             moving = jax.tree.map(lambda leaf: leaf + nothing.astype(jnp.float32), unit)
-            return raycast.object_key(scene, moving, row, u, v, sky, mask)
+            return raycast.object_key(scene, moving, row, rays, sky, mask)
 
         return find
 
     own = tuple(once(seen[row], keys_of(row), old) for row, old in zip(rows, own, strict=True))
-    best = jnp.broadcast_to(sky, u.shape)
+    best = jnp.broadcast_to(sky, rays.u.shape)
     for row in raycast.primitive_rows(scene, transparent=False):
         if row not in rows:
-            best = jnp.minimum(best, raycast.object_key(scene, unit, row, u, v, sky, mask))
+            best = jnp.minimum(best, raycast.object_key(scene, unit, row, rays, sky, mask))
     for row, key in zip(rows, own, strict=True):
         best = jnp.minimum(best, jnp.where(seen[row], key, sky))
     return best, own

@@ -1,0 +1,175 @@
+"""Colours of textures as MuJoCo's renderer samples them, and where a direction meets a cube of six faces.
+
+Bilinear within a resolution and linear between two (OpenGL's trilinear filter). See `textures` for what is stored.
+"""
+
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+
+from jaxrl_vis_envs.render.scene import Scene
+
+
+class Texels(Protocol):
+    """Where an atlas is read: from arrays (`ArrayTexels`), or from blocks of memory in a kernel.
+
+    Attributes:
+        few_textures: Whether it pays to find out first if any of the pixels has a texture at all.
+        differentiable: Whether there are derivatives with respect to places.
+    """
+
+    few_textures: bool
+    differentiable: bool
+
+    def level(self, number: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """First row in the texels, width and height of levels [P] int32; numbers out of range are clipped."""
+        ...
+
+    def quad(self, row: jax.Array) -> tuple[jax.Array, ...]:
+        """The four texels of rows [P] int32, packed; rows out of range are clipped."""
+        ...
+
+
+class ArrayTexels:
+    """The atlas as arrays: texels [T, 4] uint32 and levels as in `textures.Atlas`."""
+
+    few_textures = False
+    differentiable = True
+
+    def __init__(self, texels: jax.Array, levels: tuple[tuple[int, int, int], ...]):
+        self.texels, self.levels = texels, jnp.asarray(levels, jnp.int32)
+
+    def level(self, number: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """See `Texels`."""
+        facts = self.levels.at[jnp.clip(number, 0, len(self.levels) - 1)].get(mode="promise_in_bounds")
+        return facts[..., 0], facts[..., 1], facts[..., 2]
+
+    def quad(self, row: jax.Array) -> tuple[jax.Array, ...]:
+        """See `Texels`."""
+        quad = self.texels.at[jnp.clip(row, 0, len(self.texels) - 1)].get(mode="promise_in_bounds")
+        return tuple(quad[..., corner] for corner in range(4))
+
+
+def texels_of(scene: Scene) -> Texels:
+    """Where the scene's atlas is read: a kernel puts its own reader in the place of the texels."""
+    own: Any = scene.texels
+    return own if hasattr(own, "quad") else ArrayTexels(own, scene.atlas.levels)
+
+
+def sample(
+    texels: Texels,
+    first_level: jax.Array | int,
+    level_count: jax.Array | int,
+    face: jax.Array | int,
+    place: tuple[jax.Array, jax.Array],
+    spread_square: jax.Array,
+    repeats: jax.Array | bool,
+) -> tuple[jax.Array, ...]:
+    """Colours of textures at many places.
+
+    Args:
+        texels: Where they are read.
+        first_level: [P] int32 or a number: which texture.
+        level_count: [P] int32 or a number.
+        face: [P] int32 or a number: which face of a cube.
+        place: Coordinates across and down, [P] float32 each; 0 to 1 is the whole image.
+        spread_square: [P] float32, the square of how many texels (of the finest level) a pixel spans.
+        repeats: [P] bool or a bool: whether the image goes on beyond its border, or its border does.
+
+    Returns:
+        Red, green and blue, [P] float32 each, in [0, 1].
+    """
+    level = jnp.clip(0.5 * jnp.log2(jnp.maximum(spread_square, 1e-12)), 0.0, level_count - 1.0)
+    fine = jnp.floor(level)
+    weight = level - fine
+    fine = fine.astype(jnp.int32)
+    coarse = jnp.minimum(fine + 1, level_count - 1)
+    near = _bilinear(texels, first_level + fine, face, place, repeats)
+    far = _bilinear(texels, first_level + coarse, face, place, repeats)
+    return tuple(a + weight * (b - a) for a, b in zip(near, far, strict=True))
+
+
+def _bilinear(texels: Texels, level: jax.Array, face: jax.Array | int, place: tuple, repeats: jax.Array | bool) -> tuple:
+    first, *shape = texels.level(level)
+    lows, shares = [], []
+    for axis in range(2):
+        count = shape[axis].astype(jnp.float32)
+        at = place[axis] * count - 0.5
+        at = jnp.where(repeats, at, jnp.clip(at, 0.0, count - 1.0))
+        low = jnp.floor(at)
+        shares.append(at - low)
+        lows.append((low - count * jnp.floor(low / count)).astype(jnp.int32))
+    index = first + (face * shape[1] + lows[1]) * shape[0] + lows[0]
+    return (_mixed if texels.differentiable else _mix)(texels.quad(index), *shares)
+
+
+def _mix(corners: tuple, right: jax.Array, below: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Red, green and blue between four texels, with weights of 1/256 as graphics hardware has them.
+
+    So two channels fit into one product of integers.
+    """
+    right, below = ((256.0 * share + 0.5).astype(jnp.int32) for share in (right, below))
+    both = (right * below + 128) >> 8
+    weights = (256 - right - below + both, right - both, below - both, both)
+    red_blue, green = jnp.uint32(0), jnp.uint32(0)
+    for texel, weight in zip(corners, weights, strict=True):
+        weight = weight.astype(jnp.uint32)
+        red_blue += (texel & 0xFF00FF) * weight
+        green += ((texel >> 8) & 0xFF) * weight
+    red, green, blue = (
+        part.astype(jnp.int32).astype(jnp.float32) * (1.0 / (255.0 * 256.0))
+        for part in (red_blue & 0xFFFF, green, red_blue >> 16)
+    )
+    return red, green, blue
+
+
+_mixed = jax.custom_jvp(_mix)
+
+
+@_mixed.defjvp
+def _mix_tangents(primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
+    """Integers have no slope; that of the mean that they stand for."""
+    corners, right, below = primals
+    _, right_move, below_move = tangents
+    moves = []
+    for channel in range(3):
+        one, two, three, four = (((c >> (8 * channel)) & 255).astype(jnp.int32).astype(jnp.float32) / 255.0 for c in corners)
+        to_right = (two - one) * (1.0 - below) + (four - three) * below
+        to_below = (three - one) * (1.0 - right) + (four - two) * right
+        moves.append(to_right * right_move + to_below * below_move)
+    return _mix(corners, right, below), tuple(moves)
+
+
+def cube_place(direction: tuple) -> tuple[jax.Array, tuple[jax.Array, jax.Array], tuple]:
+    """Where a direction meets a cube map, as OpenGL has it.
+
+    Args:
+        direction: Three [P] float32, of any length.
+
+    Returns:
+        The face [P] int32, the coordinates on it (across and down, [P] each), and what `cube_move` needs.
+    """
+    x, y, z = direction
+    ax, ay, az = jnp.abs(x), jnp.abs(y), jnp.abs(z)
+    along_x = (ax >= ay) & (ax >= az)
+    along_y = ~along_x & (ay >= az)
+    major = jnp.where(along_x, x, jnp.where(along_y, y, z))
+    negative = major < 0.0
+    face = jnp.where(along_x, 0, jnp.where(along_y, 2, 4)) + negative
+    sign = jnp.where(negative, -1.0, 1.0)
+    across = jnp.where(along_x, -sign * z, jnp.where(along_y, x, sign * x))
+    down = jnp.where(along_y, sign * z, -y)
+    inverse = 0.5 / jnp.maximum(jnp.abs(major), 1e-20)
+    place = (across * inverse + 0.5, down * inverse + 0.5)
+    return face, place, (along_x, along_y, sign, inverse)
+
+
+def cube_move(choice: tuple, place: tuple, change: tuple) -> tuple[jax.Array, jax.Array]:
+    """How the place on a cube's face moves (across and down, [P] each) when the direction moves by ``change``."""
+    along_x, along_y, sign, inverse = choice
+    x, y, z = change
+    major = sign * jnp.where(along_x, x, jnp.where(along_y, y, z))
+    across = jnp.where(along_x, -sign * z, jnp.where(along_y, x, sign * x))
+    down = jnp.where(along_y, sign * z, -y)
+    return (across - (2.0 * place[0] - 1.0) * major) * inverse, (down - (2.0 * place[1] - 1.0) * major) * inverse

@@ -1,0 +1,151 @@
+"""The evidence behind learning figures: what a run evaluated, kept small, and what follows from it.
+
+    benchmarks/results/learning/NAME.json             schema, name, configuration, command, device, versions, revision, date
+    benchmarks/results/learning/NAME.metrics.jsonl    the run's metrics.jsonl, less everything but evaluations and times
+
+`benchmarks/keep_learning.py` keeps a run. A figure "X by N steps" means that the evaluation at N and the next two all reach X,
+in the median over seeds.
+"""
+
+import dataclasses
+import datetime
+import json
+import shlex
+import statistics
+from pathlib import Path
+from typing import Any
+
+from jaxrl_vis.bench.record import SCHEMA
+from jaxrl_vis.config import Config, preset
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.files import write_atomically
+from jaxrl_vis.run.folder import RunFolder, read_config, read_record
+from jaxrl_vis.run.metrics import read_rows
+
+FOLDER = "learning"
+NAME = "learning"
+"""What a record of a run is a record of; see `staleness.MEASURED`."""
+CONFIRMATIONS = 2  # evaluations after the first that must reach a value, too
+_COLUMNS = ("seed", "env_steps", "updates")
+_PREFIXES = ("eval/", "time/", "resume/")
+
+
+@dataclasses.dataclass(frozen=True)
+class Evidence:
+    """A run that was kept.
+
+    Attributes:
+        record: The contents of NAME.json.
+        rows: Those of NAME.metrics.jsonl: one for each seed and evaluation.
+    """
+
+    record: dict[str, Any]
+    rows: list[dict[str, Any]]
+
+
+def keep(run: Path, name: str, results: Path) -> tuple[Path, Path]:
+    """Keeps the evidence of a finished run.
+
+    Args:
+        run: The run folder.
+        name: What the evidence will be called.
+        results: The folder of records; the evidence goes into `FOLDER` below it.
+
+    Returns:
+        The two files.
+
+    Raises:
+        RequestError: There is no run, or it evaluated nothing.
+    """
+    folder = RunFolder(run)
+    about, config = read_record(run), read_config(run)
+    rows = [
+        {column: value for column, value in row.items() if column in _COLUMNS or column.startswith(_PREFIXES)}
+        for row in read_rows(folder.metrics)
+    ]
+    rows = [row for row in rows if any(column.startswith("eval/") for column in row)]
+    if not rows:
+        raise RequestError(f"{folder.metrics} holds no evaluation: there is nothing to keep")
+    ended = datetime.datetime.fromtimestamp(folder.metrics.stat().st_mtime, datetime.UTC)
+    kept = {
+        "schema": SCHEMA,
+        "name": NAME,
+        "config": dataclasses.asdict(config),
+        "command": command_of(config),
+        "device": about["device"],
+        "versions": about["versions"],
+        "revision": about["git_revision"] or "unknown",
+        "date": ended.isoformat(timespec="seconds"),
+    }
+    target = results / FOLDER
+    target.mkdir(parents=True, exist_ok=True)
+    record_file, metrics_file = target / f"{name}.json", target / f"{name}.metrics.jsonl"
+    write_atomically(metrics_file, "".join(json.dumps(row) + "\n" for row in rows))
+    write_atomically(record_file, json.dumps(kept, indent=1, sort_keys=True) + "\n")
+    return record_file, metrics_file
+
+
+def load(name: str, results: Path) -> Evidence | None:
+    """The evidence of that name; None where none was kept."""
+    folder = results / FOLDER
+    record_file, metrics_file = folder / f"{name}.json", folder / f"{name}.metrics.jsonl"
+    if not (record_file.exists() and metrics_file.exists()):
+        return None
+    rows = [json.loads(line) for line in metrics_file.read_text(encoding="utf-8").splitlines()]
+    return Evidence(json.loads(record_file.read_text(encoding="utf-8")), rows)
+
+
+def command_of(config: Config) -> str:
+    """The shortest command that trains as ``config`` says: the preset, and what differs from it."""
+    words = ["jaxrl-vis", "train", config.env, "--preset", config.preset]
+    base = preset(config.preset)
+    for field in dataclasses.fields(Config):
+        value = getattr(config, field.name)
+        if field.name in ("env", "preset") or value == getattr(base, field.name):
+            continue
+        option = "--" + field.name.replace("_", "-")
+        if isinstance(value, bool):
+            words.append(option if value else option.replace("--", "--no-", 1))
+        else:
+            words += [option, *map(str, value)] if isinstance(value, tuple) else [option, str(value)]
+    return shlex.join(words)
+
+
+def curve(rows: list[dict[str, Any]], metric: str) -> list[tuple[int, float]]:
+    """The median over seeds of a metric against environment steps, at the steps where every seed was evaluated.
+
+    Args:
+        rows: From one run or several, see `Evidence`. No seed may appear twice at the same step.
+        metric: A column, such as ``eval/success``.
+
+    Raises:
+        ValueError: A seed appears twice.
+    """
+    seeds = {row["seed"] for row in rows}
+    values: dict[int, dict[int, float]] = {}
+    for row in rows:
+        if row["seed"] in values.setdefault(row["env_steps"], {}):
+            raise ValueError(f"seed {row['seed']} appears twice at {row['env_steps']} steps: are these different runs?")
+        values[row["env_steps"]][row["seed"]] = row[metric]
+    return [(steps, statistics.median(found.values())) for steps, found in sorted(values.items()) if set(found) == seeds]
+
+
+def steps_to(points: list[tuple[int, float]], target: float, least: bool = False) -> int | None:
+    """The first step from which on this evaluation and the next `CONFIRMATIONS` all reach ``target``; None for never.
+
+    Args:
+        points: From `curve`.
+        target: What is to be reached.
+        least: Whether lower is better.
+    """
+    for index in range(len(points) - CONFIRMATIONS):
+        window = [value for _, value in points[index : index + 1 + CONFIRMATIONS]]
+        if all(value <= target if least else value >= target for value in window):
+            return points[index][0]
+    return None
+
+
+def seconds(rows: list[dict[str, Any]]) -> tuple[float, float]:
+    """Seconds of a run until its last evaluation, and those of them that went into compiling."""
+    last = max(rows, key=lambda row: row["time/wall_s"])
+    return last["time/wall_s"], last["time/compile_s"]

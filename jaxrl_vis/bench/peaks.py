@@ -1,0 +1,36 @@
+"""Data-sheet limits of devices."""
+
+import dataclasses
+
+
+@dataclasses.dataclass(frozen=True)
+class Peak:
+    """A device's limits: dense matrix products without sparsity, everything else, and memory.
+
+    Attributes:
+        bfloat16: Floating-point operations per second in matrix products.
+        float32: The same for float32 inputs (TF32, which is what XLA uses by default).
+        vector: Single-precision operations per second outside the matrix units.
+        memory: Bytes per second.
+    """
+
+    bfloat16: float
+    float32: float
+    vector: float
+    memory: float
+
+
+# The longest name that a device's kind starts with counts.
+PEAKS = {
+    "NVIDIA H100 80GB HBM3": Peak(989e12, 494e12, 67e12, 3.35e12),
+    "NVIDIA H100 PCIe": Peak(756e12, 378e12, 51e12, 2.0e12),
+    "NVIDIA H200": Peak(989e12, 494e12, 67e12, 4.8e12),
+    "NVIDIA A100-SXM4-80GB": Peak(312e12, 156e12, 19.5e12, 2.04e12),
+    "NVIDIA A100-SXM4-40GB": Peak(312e12, 156e12, 19.5e12, 1.56e12),
+}
+
+
+def peak_of(device_kind: str) -> Peak | None:
+    """The limits of a device, where they are known."""
+    names = [name for name in PEAKS if device_kind.startswith(name)]
+    return PEAKS[max(names, key=len)] if names else None

@@ -1,0 +1,226 @@
+"""Which records outlived the code that they measured.
+
+Every benchmark names the files that it measures. A record is stale where one of them holds a definition (a function, a class or
+another top-level statement; of files that are not Python, the whole contents) that did not exist anywhere at the record's
+revision. So moved and renamed files, comments, docstrings, annotations, imports and what an error says do not count. A renamed
+variable does: nothing short of measuring again says that it changed no figure.
+"""
+
+import ast
+import dataclasses
+import functools
+import hashlib
+import subprocess
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+from jaxrl_vis import provenance
+from jaxrl_vis.bench import record
+
+_ENVS = "envs/jaxrl_vis_envs"
+_PHYSICS = tuple(f"{_ENVS}/{name}" for name in ("base.py", "goals.py", "compilation.py", "physics", "tasks/mjx_env.py"))
+_RENDERER = (f"{_ENVS}/render",)
+_IMAGES = (*_RENDERER, f"{_ENVS}/pixels.py")
+_TASK = (f"{_ENVS}/tasks/{{task}}.py", f"{_ENVS}/tasks/assets/{{task}}.xml")
+_LEARNER = ("jaxrl_vis/learner", "jaxrl_vis/config.py", "jaxrl_vis/methods.py")
+_TIMING = "jaxrl_vis/bench/timing.py"
+_SCENES = ("jaxrl_vis/bench/scene_images.py", "jaxrl_vis/bench/render_scenes.py", _TIMING)
+
+MEASURED: dict[str, tuple[str, ...]] = {
+    "render/images": (*_IMAGES, *_TASK, "jaxrl_vis/bench/render.py", _TIMING),
+    "render/scene": (*_RENDERER, *_SCENES),
+    "render/peer_mujoco": (*_SCENES, "jaxrl_vis/bench/mujoco_renderer.py"),
+    "render/peer_warp": (*_SCENES, "jaxrl_vis/bench/warp_renderer.py"),
+    "physics/steps": (*_PHYSICS, *_TASK, "jaxrl_vis/bench/physics.py", _TIMING),
+    "physics/peer_playground": ("jaxrl_vis/bench/playground.py", _TIMING),
+    "env/steps": (*_PHYSICS, *_IMAGES, *_TASK, "jaxrl_vis/bench/env.py", _TIMING),
+    "update/gradient_steps": (*_LEARNER, "jaxrl_vis/bench/update.py", _TIMING),
+    "train/env_steps": (*_PHYSICS, *_IMAGES, *_TASK, *_LEARNER, "jaxrl_vis/bench/train.py", _TIMING),
+    "train/updates": (*_PHYSICS, *_IMAGES, *_TASK, *_LEARNER, "jaxrl_vis/bench/train.py", _TIMING),
+    "adapters/success": (*_PHYSICS, *_TASK, f"{_ENVS}/adapters", "benchmarks/adapters.py"),
+    "learning": (*_PHYSICS, *_IMAGES, *_TASK, *_LEARNER),
+}
+"""Files and folders that a record of each name measures; ``{task}`` stands for the file of the record's environment."""
+
+# MuJoCo's own renderer, which only tests and videos use.
+_NEVER = (f"{_ENVS}/render/reference.py",)
+# What the other kind of device runs: paths that start so.
+_ON_CPU = (f"{_ENVS}/render/cpu",)
+_ON_GPU = (f"{_ENVS}/render/gpu", "jaxrl_vis/learner/encoder_kernel")
+# Folders whose files count as what existed at a revision.
+_SOURCES = ("jaxrl_vis", "envs", "benchmarks")
+_SHOWN = 4  # changed files that a message names
+
+
+@dataclasses.dataclass(frozen=True)
+class Stale:
+    """Records of one file, name and revision that outlived their code.
+
+    Attributes:
+        file: The file of records.
+        name: The records' name.
+        revision: Their revision.
+        count: How many there are.
+        why: What changed since, in words.
+    """
+
+    file: str
+    name: str
+    revision: str
+    count: int
+    why: str
+
+    def __str__(self) -> str:
+        records = "1 record" if self.count == 1 else f"{self.count} records"
+        return f"stale: {self.file}: {records} {self.name} of {self.revision}: {self.why}"
+
+
+def stale_records(folder: Path, checkout: Path = provenance.CHECKOUT) -> list[Stale]:
+    """The records below ``folder`` whose measured code changed, grouped.
+
+    Args:
+        folder: Kept records, see `record.read_all`.
+        checkout: The git checkout that the records' revisions belong to. Its working tree is compared.
+    """
+    groups: dict[tuple[str, str, str, str], int] = {}
+    ask = functools.cache(functools.partial(why_stale, checkout=checkout))
+    for path, kept in record.read_all(folder):
+        why = ask(kept["name"], kept["config"].get("env"), record.is_of_cpu(kept), kept["revision"])
+        if why is not None:
+            key = (path.relative_to(folder).as_posix(), kept["name"], kept["revision"], why)
+            groups[key] = groups.get(key, 0) + 1
+    return [Stale(file, name, revision, count, why) for (file, name, revision, why), count in sorted(groups.items())]
+
+
+def why_stale(name: str, env: str | None, of_cpu: bool, revision: str, checkout: Path) -> str | None:
+    """What changed since ``revision`` in the code that a record measures; None where nothing did.
+
+    Args:
+        name: The record's name.
+        env: Its environment, if it has one.
+        of_cpu: Whether a CPU was measured.
+        revision: Its revision.
+        checkout: Where its revision is looked up.
+    """
+    if name not in MEASURED:
+        return f"nobody says which code {name} measures: add it to MEASURED in {Path(__file__).name}"
+    if revision.endswith("-dirty"):
+        return "it was measured with changes that were never committed"
+    then = definitions_at(revision, checkout)
+    if then is None:
+        return "its revision is not in this repository"
+    changed = []
+    for path in measured_files(name, env, of_cpu, checkout):
+        new = [word for digest, word in definitions(path.suffix, path.read_bytes()) if digest not in then]
+        if new:
+            words = [word for word in dict.fromkeys(new) if word]
+            shown = ", ".join(words[:3]) + (", ..." if len(words) > 3 else "")
+            changed.append(path.name + (f" ({shown})" if shown else ""))
+    more = f" and {len(changed) - _SHOWN} more files" if len(changed) > _SHOWN else ""
+    return f"changed since: {', '.join(changed[:_SHOWN])}{more}" if changed else None
+
+
+def measured_files(name: str, env: str | None, of_cpu: bool, checkout: Path) -> Iterator[Path]:
+    """The files of `MEASURED` that the device of a record runs.
+
+    Raises:
+        FileNotFoundError: One that is named does not exist.
+    """
+    for pattern in MEASURED[name]:
+        if "{task}" in pattern:
+            if env is None:
+                continue
+            pattern = pattern.format(task=task_of(env))
+        path = checkout / pattern
+        if not path.exists():
+            raise FileNotFoundError(f"{path} is named in MEASURED of {Path(__file__).name}, and is not there")
+        files = sorted(path.rglob("*")) if path.is_dir() else [path]
+        for file in files:
+            left_out = file.relative_to(checkout).as_posix().startswith(_NEVER + (_ON_GPU if of_cpu else _ON_CPU))
+            if file.is_file() and "__pycache__" not in file.parts and not left_out:
+                yield file
+
+
+def task_of(env: str) -> str:
+    """The name of the file in `tasks` that makes an environment: ``VisualFetchReach`` is in fetch_reach."""
+    from jaxrl_vis_envs import registry
+
+    return registry.config_class(env).__module__.rpartition(".")[2]
+
+
+@functools.cache
+def definitions_at(revision: str, checkout: Path) -> frozenset[str] | None:
+    """Digests of all definitions at a revision; None where the repository does not have it."""
+    listing = provenance.git("ls-tree", "-r", revision, "--", *_SOURCES, folder=checkout)
+    if listing is None:
+        return None
+    blobs = {}
+    for line in listing.splitlines():
+        facts, path = line.split("\t", 1)
+        blobs[facts.split()[2]] = Path(path).suffix
+    found: set[str] = set()
+    for blob, contents in _read_blobs(blobs, checkout):
+        found |= {digest for digest, _ in definitions(blobs[blob], contents)}
+    return frozenset(found)
+
+
+def _read_blobs(blobs: Iterable[str], checkout: Path) -> Iterator[tuple[str, bytes]]:
+    names = list(blobs)
+    command = ("git", "-C", str(checkout), "cat-file", "--batch")
+    output = subprocess.run(command, input="\n".join(names).encode() + b"\n", capture_output=True, check=True).stdout
+    place = 0
+    for name in names:
+        end = output.index(b"\n", place)
+        length = int(output[place:end].split()[2])
+        yield name, output[end + 1 : end + 1 + length]
+        place = end + 1 + length + 1
+
+
+@functools.cache  # revisions share most of their files
+def definitions(suffix: str, contents: bytes) -> tuple[tuple[str, str], ...]:
+    """Digest and name ("" for none) of each top-level statement of a Python file, or of the whole of another file."""
+    if suffix != ".py":
+        return ((hashlib.sha256(contents).hexdigest(), ""),)
+    found = []
+    for statement in ast.parse(contents).body:
+        if isinstance(statement, ast.Import | ast.ImportFrom) or _is_text(statement):
+            continue
+        plain: Any = _Plain().visit(statement)
+        names = [plain.name] if hasattr(plain, "name") else [target.id for target in _targets(plain)]
+        found.append((hashlib.sha256(ast.dump(plain).encode()).hexdigest(), ", ".join(names)))
+    return tuple(found)
+
+
+def _targets(statement: ast.AST) -> list[ast.Name]:
+    targets = statement.targets if isinstance(statement, ast.Assign) else [getattr(statement, "target", None)]
+    return [target for target in targets if isinstance(target, ast.Name)]
+
+
+def _is_text(statement: ast.AST) -> bool:
+    return (
+        isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant) and isinstance(statement.value.value, str)
+    )
+
+
+class _Plain(ast.NodeTransformer):
+    """Takes out what computes nothing: docstrings, imports, annotations of functions, and what errors say."""
+
+    def generic_visit(self, node: ast.AST) -> ast.AST:
+        super().generic_visit(node)
+        body = getattr(node, "body", None)
+        if isinstance(body, list):
+            kept = [part for part in body if not _is_text(part) and not isinstance(part, ast.Import | ast.ImportFrom)]
+            node.body = kept or [ast.Pass()]  # pyright: ignore[reportAttributeAccessIssue]
+        return node
+
+    def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.AST:
+        node.returns = None
+        return self.generic_visit(node)
+
+    def visit_arg(self, node: ast.arg) -> ast.AST:
+        node.annotation = None
+        return node
+
+    def visit_Raise(self, node: ast.Raise) -> ast.AST:
+        return ast.Raise(exc=None, cause=None)

@@ -1,0 +1,177 @@
+"""What the rows of the README's tables are: which records they show, in which words. `tables` writes them."""
+
+import dataclasses
+from typing import Any
+
+from jaxrl_vis.config import Config, preset
+
+DEVICES = {"H100": "NVIDIA H100 80GB HBM3 x1", "2 CPU cores": "AMD EPYC, 2 cores"}
+"""Columns of the speed table, and the devices that their records name."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Figure:
+    """A figure of the speed table: one record, in words.
+
+    Of several records that match, the one with the largest value counts, which is the batch size that suits the device.
+
+    Attributes:
+        name: The record's name.
+        config: What its configuration says; what is not mentioned may be anything.
+        text: A format string of the record's configuration and details, and of ``value``, which is shortened. See `tables`.
+        least: Instead, the record in which this detail is least counts: the one that is hardest for us.
+    """
+
+    name: str
+    config: dict[str, Any]
+    text: str
+    least: str | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Speed:
+    """A row of the speed table.
+
+    Attributes:
+        label: What was measured.
+        figures: Column (a name in `DEVICES`) -> its figures. The cell of a column that is not mentioned stays empty.
+    """
+
+    label: str
+    figures: dict[str, tuple[Figure, ...]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Learning:
+    """A row of the results table: runs that `benchmarks/keep_learning.py` kept.
+
+    Attributes:
+        label: What was trained.
+        runs: Name of the evidence -> the configuration that it must have. Their seeds count together.
+        metric: The column that is quoted.
+        word: What the column is called in the table, with a unit in braces after the figure: ``success {}``.
+        targets: Values whose first steps are quoted ("X by N steps").
+        steps: Environment steps whose values are quoted.
+        least: Whether lower is better.
+        command: The command, where it is not the one that the configuration would be trained with.
+    """
+
+    label: str
+    runs: dict[str, Config]
+    metric: str = "eval/success"
+    word: str = "success {:.2f}"
+    targets: tuple[float, ...] = ()
+    steps: tuple[int, ...] = ()
+    least: bool = False
+    command: str | None = None
+
+
+_IMAGES = "{image_size}x{image_size} {pixels}"
+
+
+def _environment(env: str, more: str = "") -> Speed:
+    text = f"{{value}} env-steps/s ({{envs:,}} environments, {_IMAGES})"
+    figures = (Figure("env/steps", {"env": env}, text),)
+    return Speed(f"`bench env --env {env}`{more}", {"H100": figures, "2 CPU cores": figures})
+
+
+def _scene(size: int, pixels: str) -> Figure:
+    config = {"scene": "fetch_reach", "textures": True, "image_size": size, "pixels": pixels}
+    return Figure("render/scene", config, f"{{value}} images/s {_IMAGES}")
+
+
+def _peer(name: str, peer: str, size: int) -> Figure:
+    config = {"scene": "fetch_reach", "textures": True, "image_size": size}
+    return Figure(name, config, f"{peer}: {{value}} images/s {_IMAGES} (batch {{images:,}})")
+
+
+_FINGER = {"env": "FingerTurn"}
+_PLAYGROUND = "physics/peer_playground"
+_UPDATE = f"{{value}} updates/s (batch {{batch_size}}, {_IMAGES}, {{dtype}})"
+
+SPEED = (
+    _environment("VisualFetchReach"),
+    _environment("VisualReacher"),
+    _environment("VisualHandReach", ", 20 physics steps each"),
+    _environment("VisualFingerTurn", ", 21 physics steps of 10 ms each, 3 stacked images"),
+    _environment("VisualSawyerReach"),
+    Speed(
+        "`bench physics --env FingerTurn --peer playground`: states alone; Playground makes half our Newton iterations",
+        {
+            "H100": (
+                Figure("physics/steps", _FINGER, "{value} env-steps/s ({envs:,} environments)"),
+                Figure(_PLAYGROUND, {**_FINGER, "timestep": 0.005}, "MuJoCo Playground: {value} at its 5 ms steps"),
+                Figure(_PLAYGROUND, {**_FINGER, "timestep": 0.01}, "{value} at our 10 ms"),
+            )
+        },
+    ),
+    Speed(
+        "`bench render --scene fetch_reach`: images of new poses ([more](docs/renderer.md))",
+        {
+            "H100": (_scene(64, "rgbd"), _scene(64, "depth"), _peer("render/peer_warp", "MuJoCo Warp", 64)),
+            "2 CPU cores": (_scene(32, "rgbd"), _scene(64, "rgbd"), _peer("render/peer_mujoco", "`mujoco.Renderer`", 64)),
+        },
+    ),
+    Speed(
+        "`bench render --scene primitives --peer warp`: MuJoCo Warp's own 127 geoms, the variant that is hardest for us",
+        {
+            "H100": (
+                Figure(
+                    "render/peer_warp",
+                    {"scene": "primitives"},
+                    f"{{ours_over_peer}} times MuJoCo Warp's {{value}} images/s {_IMAGES} ({{variant}}, batch {{images:,}})",
+                    least="ours_over_peer",
+                ),
+            )
+        },
+    ),
+    Speed(
+        "`bench update`: DDPG, replay included",
+        {
+            "H100": (
+                Figure("update/gradient_steps", {"env": "VisualFetchReach"}, _UPDATE),
+                Figure(
+                    "update/gradient_steps",
+                    {"env": "VisualFetchReach"},
+                    "{roofline[gflop]:.1f} GFLOP and {roofline[mbyte]:.0f} MB an update at the least, so "
+                    "{roofline[tflop_per_s]:.0f} TFLOP/s",
+                ),
+            ),
+            "2 CPU cores": (Figure("update/gradient_steps", {"env": "VisualFetchReach"}, _UPDATE),),
+        },
+    ),
+)
+
+
+LEARNING = (
+    Learning(
+        "VisualFetchReach, 32x32 depth, seeds 0, 1 and 2, one after the other",
+        {f"fetch_reach_cpu_seed{seed}": preset("cpu", seed=seed) for seed in (0, 1, 2)},
+        targets=(0.9,),
+        command="make train SEED=0",
+    ),
+    Learning(
+        "VisualFetchReach, 64x64 RGB-D, oracle reward",
+        {"fetch_reach_oracle": preset("fast", seeds=5)},
+        targets=(0.9, 0.97),
+    ),
+    Learning(
+        "VisualFetchReach, 64x64 RGB-D, indicator rewards with balancing and filtering (images only)",
+        {"fetch_reach_indicator": preset("fast", seeds=5, method="indicator_balance_filter", env_steps=72_000)},
+        targets=(0.9, 0.97),
+    ),
+    Learning(
+        "VisualFetchReach, 100x100 RGB-D, with the authors' hyper-parameters (`paper`: 1 update per 100 steps, no auxiliary "
+        "losses); their curve: 0.75 at 100 k, 0.98 at 160 k, 0.96 at 200 k",
+        {"fetch_reach_paper": preset("paper", seeds=5, env_steps=200_000)},
+        steps=(100_000, 160_000),
+    ),
+    Learning(
+        "VisualReacher, 64x64 RGB-D, oracle reward",
+        {"reacher_oracle": preset("fast", env="VisualReacher", seeds=5, env_steps=80_000)},
+        metric="eval/goal_distance",
+        word="mean final distance {:.3f} m",
+        targets=(0.03, 0.02),
+        least=True,
+    ),
+)

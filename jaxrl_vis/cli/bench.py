@@ -1,0 +1,88 @@
+"""``jaxrl-vis bench``."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Literal, get_args
+
+import tyro
+
+from jaxrl_vis.cli.checks import check_counts, check_env
+from jaxrl_vis.config import Pixels
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.report.outputs import check_writable
+
+Benchmark = Literal["render", "physics", "env", "update", "train"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Bench:
+    """Measure this machine, keep a record, and print the change since the last record of the same device."""
+
+    benchmark: Annotated[Benchmark | None, tyro.conf.Positional] = None
+    """What to measure: images, physics, both with resets, gradient steps, or whole training iterations."""
+    check: bool = False
+    """Measure nothing: list records whose code has changed since, and rows of the README that have no record."""
+    tables: bool = False
+    """Measure nothing: write the tables of the README from the records."""
+    env: str = "VisualFetchReach"
+    """The environment."""
+    envs: tuple[int, ...] = ()
+    """Environments (or images) side by side, one measurement each; sizes that suit the device if not given."""
+    image_size: int | None = None
+    """Height and width of images; 64 on accelerators and 32 on a CPU if not given."""
+    pixels: Pixels | None = None
+    """Channels; rgbd on accelerators and depth on a CPU if not given."""
+    batch_size: int | None = None
+    """Transitions in a gradient step (update)."""
+    repeats: int = 5
+    """Timed repeats; the median counts."""
+    peer: Literal["mujoco", "warp", "playground"] | None = None
+    """Measure another side by side: a renderer on the same poses (render), or MuJoCo Playground's FingerTurn (physics)."""
+    scene: str | None = None
+    """finger, fetch_reach, primitives or the path of an MJCF file: draw this in the place of an environment; all three for a
+    peer if not given (render)."""
+    json: Path | None = None
+    """Also write this run's records here."""
+    results: Path | None = None
+    """Folder of kept records; benchmarks/results of the checkout (or here) if not given."""
+
+
+def run(options: Bench) -> int:
+    """Runs one benchmark, or looks after the records; 1 where one of these is stale or missing."""
+    if options.check or options.tables:
+        return _look_after_records(options)
+    if options.benchmark is None:
+        raise RequestError(f"no benchmark given; choose one of {', '.join(get_args(Benchmark))}, or --check or --tables")
+    for option, benchmark in (("scene", "render"), ("peer", "physics" if options.peer == "playground" else "render")):
+        value = getattr(options, option)
+        if value is not None and options.benchmark != benchmark:
+            raise RequestError(f"--{option} {value} goes with `bench {benchmark}` only")
+    check_counts(repeats=options.repeats, image_size=options.image_size, batch_size=options.batch_size)
+    for count in options.envs:
+        check_counts(envs=count)
+    check_env(options.env)
+    if options.json is not None:
+        check_writable(options.json, "--json")
+    from jaxrl_vis import bench
+    from jaxrl_vis.bench.record import results_folder
+
+    check_writable(options.results or results_folder(), "--results", folder=True)
+    settings = {field.name: getattr(options, field.name) for field in dataclasses.fields(options)}
+    del settings["check"], settings["tables"]
+    bench.run(**settings)
+    return 0
+
+
+def _look_after_records(options: Bench) -> int:
+    if options.benchmark is not None:
+        raise RequestError(f"--check and --tables measure nothing: leave out {options.benchmark}")
+    from jaxrl_vis.bench import check, record, tables
+
+    if options.tables:
+        check_writable(check.README)
+        changed = tables.write_tables(check.README, options.results or record.results_folder())
+        print(f"{check.README}: {'written' if changed else 'unchanged'}")
+    complaints = check.check(options.results) if options.check else []
+    if options.check:
+        print("\n".join(complaints) or "every record is of today's code, and every row has one")
+    return 1 if complaints else 0

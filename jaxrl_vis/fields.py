@@ -1,0 +1,112 @@
+"""Values of a dataclass's fields, checked against their annotations: as JSON saved them, or as words of a command line.
+
+Annotations may be bool, int, float, str, Path, a Literal of words, an optional one of these, or a tuple of any length.
+"""
+
+import math
+import numbers
+import types
+import typing
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal, NoReturn
+
+from jaxrl_vis.errors import RequestError, nearest
+
+_TRUTH = {"true": True, "false": False}
+_KINDS = {bool: "true or false", int: "a whole number", float: "a finite number", str: "a word", Path: "a path"}
+
+
+def hints(record: type) -> dict[str, Any]:
+    """Field name -> annotation, without what `typing.Annotated` adds."""
+    return typing.get_type_hints(record)
+
+
+def unwrap(hint: Any) -> tuple[Any, bool, bool]:
+    """What one value of a field is.
+
+    Returns:
+        The annotation of one value, whether None is allowed, and whether there are several.
+    """
+    optional = several = False
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        (hint,) = (part for part in typing.get_args(hint) if part is not types.NoneType)
+        optional = True
+    if typing.get_origin(hint) is tuple:
+        hint, several = typing.get_args(hint)[0], True
+    return hint, optional, several
+
+
+def choices(hint: Any) -> tuple[str, ...]:
+    """The words that a field allows, where it is a Literal, optional or not, or a tuple of them; else none."""
+    hint, _, _ = unwrap(hint)
+    return typing.get_args(hint) if typing.get_origin(hint) is Literal else ()
+
+
+def check(label: str, hint: Any, value: Any) -> Any:
+    """The value as its field holds it: a tuple for a list, a float for a whole number where one is wanted.
+
+    Args:
+        label: What the field is called in complaints.
+        hint: Its annotation.
+        value: Anything.
+
+    Raises:
+        RequestError: The value does not suit the annotation.
+    """
+    one, optional, several = unwrap(hint)
+    if value is None and optional:
+        return None
+    if several:
+        if not isinstance(value, list | tuple):
+            raise RequestError(f"{label} must be a list, not {value!r}")
+        return tuple(check(label, one, each) for each in value)
+    if typing.get_origin(one) is Literal:
+        if value not in typing.get_args(one):
+            raise RequestError(f"{label} cannot be {value!r}{nearest(str(value), typing.get_args(one))}")
+        return value
+    if isinstance(value, bool):  # which is an int as well
+        if one is bool:
+            return value
+    elif one is int and isinstance(value, numbers.Integral):
+        return int(value)
+    elif one is float and isinstance(value, numbers.Real) and _is_finite(value):
+        return float(value)
+    elif one in (str, Path) and isinstance(value, one):
+        return value
+    _refuse(label, one, value)
+
+
+def read(label: str, hint: Any, words: Sequence[str]) -> Any:
+    """The value that a command line spells.
+
+    Args:
+        label: What the option is called in complaints.
+        hint: The annotation of its field.
+        words: What follows the option: one word, or any number where the field is a tuple.
+
+    Raises:
+        RequestError: The words do not spell such a value.
+    """
+    one, optional, several = unwrap(hint)
+    if several:
+        return tuple(read(label, one, [word]) for word in words)
+    (word,) = words
+    if optional and word.lower() == "none":
+        return None
+    try:
+        value = _TRUTH.get(word.lower(), word) if one is bool else one(word) if one in (int, float, Path) else word
+    except ValueError:
+        _refuse(label, one, word)
+    return check(label, one, value)
+
+
+def _is_finite(value: Any) -> bool:
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # a whole number of more digits than a float holds
+        return False
+
+
+def _refuse(label: str, one: Any, value: Any) -> NoReturn:
+    raise RequestError(f"{label} must be {_KINDS[one]}, not {value!r}")

@@ -1,0 +1,22 @@
+"""Writing files so that nobody ever reads half of one."""
+
+import os
+from pathlib import Path
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Replaces a file's contents in one step: a reader, or a power cut, sees the old contents or the new ones.
+
+    Args:
+        path: The file; its folder exists.
+        text: The new contents, written as UTF-8.
+
+    Raises:
+        OSError: The folder is missing or cannot be written to.
+    """
+    temporary = path.with_name(path.name + ".tmp")
+    with temporary.open("w", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.replace(path)

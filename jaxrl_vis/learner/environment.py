@@ -1,0 +1,61 @@
+"""The environment that a configuration asks for."""
+
+import dataclasses
+from typing import Any
+
+import jaxrl_vis_envs
+from jaxrl_vis import fields
+from jaxrl_vis.config import Config, validate
+from jaxrl_vis.errors import RequestError, nearest
+from jaxrl_vis_envs.base import GoalEnv
+from jaxrl_vis_envs.randomization import typical
+from jaxrl_vis_envs.registry import config_class
+
+# Options of an environment that `Config` has fields of its own for.
+_OWN_FIELDS = {
+    "image_size": "--image-size",
+    "pixels": "--pixels",
+    "frame_stack": "--frame-stack",
+    "randomization": "--randomize",
+}
+
+
+def make_env(config: Config) -> GoalEnv:
+    """Builds the environment of a configuration.
+
+    Raises:
+        RequestError: There is no such environment, or it cannot be made like that.
+    """
+    validate(config)
+    try:
+        names = {field.name for field in dataclasses.fields(config_class(config.env))}
+        settings: dict[str, Any] = {name: getattr(config, name) for name in ("image_size", "pixels") if name in names}
+        if config.frame_stack is not None:
+            settings["frame_stack"] = config.frame_stack
+        if config.randomize:
+            settings["randomization"] = typical(*config.randomize, strength=config.randomize_strength)
+        return jaxrl_vis_envs.make(config.env, **settings, **_read_options(config))
+    except ValueError as error:
+        raise RequestError(str(error)) from error
+
+
+def _read_options(config: Config) -> dict[str, Any]:
+    """``env_options`` as the fields of the environment's configuration hold them.
+
+    Raises:
+        RequestError: One is not ``name=value``, names no field, or has a value that does not suit.
+    """
+    hints = fields.hints(config_class(config.env))
+    found: dict[str, Any] = {}
+    for option in config.env_options:
+        name, equals, value = option.partition("=")
+        if not equals:
+            raise RequestError(f"an environment's option is written name=value, not {option!r}")
+        if name in _OWN_FIELDS:
+            raise RequestError(f"{name} has an option of its own: {_OWN_FIELDS[name]}")
+        if name not in hints:
+            choices = [each for each in hints if each not in _OWN_FIELDS]
+            raise RequestError(f"{config.env} has no option {name!r}{nearest(name, choices)}")
+        _, _, several = fields.unwrap(hints[name])
+        found[name] = fields.read(name, hints[name], value.split(",") if several else [value])
+    return found

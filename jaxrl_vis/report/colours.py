@@ -1,0 +1,37 @@
+"""Colours for what has none: depth and geom ids, in the video and in the gallery."""
+
+import matplotlib
+import matplotlib.colors
+import numpy as np
+
+
+def depth_colours(depth: np.ndarray, near: float, far: float) -> np.ndarray:
+    """Depth in colours whose steps look equally large; near is bright.
+
+    Args:
+        depth: [H, W], in any unit: metres, or the grey levels of an observation.
+        near, far: What the brightest and the darkest colour stand for, in the same unit; beyond them colours stay the same.
+
+    Returns:
+        [H, W, 3] uint8.
+    """
+    share = np.clip((depth.astype(np.float32) - near) / (far - near), 0.0, 1.0)
+    return (matplotlib.colormaps["magma"](0.97 - 0.92 * share)[..., :3] * 255).round().astype(np.uint8)
+
+
+def label_colours(labels: np.ndarray, geoms: int, sky: tuple[int, int, int]) -> np.ndarray:
+    """Geom ids in colours that differ between neighbours: hues are steps of the golden ratio.
+
+    Args:
+        labels: [H, W] int; ids below 0 and from ``geoms`` on are sky.
+        geoms: How many there are.
+        sky: Its colour.
+
+    Returns:
+        [H, W, 3] uint8.
+    """
+    hues = (np.arange(geoms) * 0.61803399) % 1.0
+    values = np.where(np.arange(geoms) % 2 == 0, 0.95, 0.65)
+    palette = matplotlib.colors.hsv_to_rgb(np.stack([hues, np.full(geoms, 0.65), values], axis=-1))
+    palette = np.concatenate([(palette * 255).round(), [sky]]).astype(np.uint8)
+    return palette[np.where((labels >= 0) & (labels < geoms), labels, geoms)]

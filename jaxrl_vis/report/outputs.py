@@ -1,0 +1,37 @@
+"""Whether files can be written where they are wanted: asked before the work that makes them."""
+
+import tempfile
+from pathlib import Path
+
+from jaxrl_vis.errors import RequestError
+
+
+def check_writable(path: Path, option: str = "", folder: bool = False) -> None:
+    """Checks that a file, or files in a folder, can be written. Leaves nothing behind.
+
+    Folders that are missing on the way need not be there: writers make them.
+
+    Args:
+        path: The file or the folder.
+        option: The option that asked for it, for the message.
+        folder: ``path`` is a folder.
+
+    Raises:
+        RequestError: It cannot.
+    """
+    wanted = f"{option} {path}".strip()
+    try:
+        if path.exists() and path.is_dir() != folder:
+            raise RequestError(f"{wanted} is a {'file: name a folder' if folder else 'folder: name a file'}")
+        if path.is_file():
+            with path.open("ab"):
+                return
+        if path.exists() and not folder:
+            return  # a device or a pipe
+        there = next(parent for parent in (path, *path.absolute().parents) if parent.exists())
+        if not there.is_dir():
+            raise RequestError(f"cannot write {wanted}: {there} is a file, not a folder")
+        with tempfile.TemporaryFile(dir=there):
+            pass
+    except OSError as error:
+        raise RequestError(f"cannot write {wanted}: {error.strerror or error}") from error

@@ -1,0 +1,147 @@
+"""A configuration and its compiled programs: everything that a run, an evaluation or a notebook executes on the device.
+
+All of it is compiled before training starts, so that the end of a run, where signals and full disks come, compiles nothing.
+"""
+
+import concurrent.futures
+import functools
+import os
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.experimental.compilation_cache import compilation_cache
+
+from jaxrl_vis.config import Config
+from jaxrl_vis.report import videos
+from jaxrl_vis.run.checkpoint import to_host
+from jaxrl_vis.run.nonfinite import broken_leaves
+from jaxrl_vis.run.signals import shield_this_thread
+from jaxrl_vis.types import LoopState, Metrics, TrainState
+
+# Evaluation draws from a key of its own, the same at every evaluation and for every seed.
+_EVALUATION_SEED = 2**31 - 1
+_NAMES = ("init", "train_iteration", "evaluate", "broken_leaves")
+
+
+def enable_compilation_cache() -> str:
+    """Keeps compiled programs in a folder, so that the second start takes seconds.
+
+    A folder that was chosen already (JAX_COMPILATION_CACHE_DIR, or jax.config) is left as it is; otherwise it is
+    ``jaxrl-vis/xla`` in the user's cache folder.
+
+    Returns:
+        The folder.
+    """
+    if not jax.config.jax_compilation_cache_dir:
+        caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        jax.config.update("jax_compilation_cache_dir", str(caches / "jaxrl-vis" / "xla"))
+        # JAX decides at its first compilation whether it has a cache, and a notebook has compiled something by now.
+        compilation_cache.reset_cache()
+    if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+    return str(jax.config.jax_compilation_cache_dir)
+
+
+class Programs:
+    """What a configuration executes. Nothing is compiled or allocated until it is called or `compile` is.
+
+    Args:
+        config: The run.
+        program: What `jaxrl_vis.learner.train_step.make_train_step` returns, or anything with the same attributes.
+
+    Attributes:
+        config: The run.
+        program: The jitted functions and their sizes.
+        env: The environment.
+        seeds: The seeds, in the order of the seed axis.
+    """
+
+    def __init__(self, config: Config, program: Any):
+        self.config, self.program, self.env = config, program, program.env
+        self.seeds = range(config.seed, config.seed + config.seeds)
+        self._compiled: dict[str, Any] = {}
+
+    @functools.cached_property
+    def run_keys(self) -> jax.Array:
+        """[S] typed keys: seed i of a run starts from ``jax.random.key(config.seed + i)``."""
+        return jnp.stack([jax.random.key(seed) for seed in self.seeds])
+
+    @functools.cached_property
+    def evaluation_key(self) -> jax.Array:
+        """[] the typed key that draws the episodes of every evaluation."""
+        return jax.random.key(_EVALUATION_SEED)
+
+    @functools.cached_property
+    def shapes(self) -> LoopState:
+        """Shapes and types of the loop state; traced, not allocated."""
+        return jax.eval_shape(self.program.init, self.run_keys)
+
+    @functools.cached_property
+    def shows_images(self) -> bool:
+        """Whether what the robot sees can be shown in a video."""
+        _, episodes, slots, *image = self.shapes.replay.episodes.observations.shape
+        if len(image) == 3:  # of stacked images the newest is shown
+            image[0] //= self.env.frame_stack
+        return videos.shows_images((episodes, slots, *image))
+
+    @property
+    def image_seconds(self) -> float:
+        """How long an image of the video is shown, s: as long as it lasted, but not too fast to follow."""
+        return max(0.04, float(self.env.control_period))
+
+    def compile(self) -> dict[str, Any]:
+        """Compiles everything that a run needs, side by side, the small operations of saving and evaluating included.
+
+        Each function is traced once, here, and what was compiled here is what runs later.
+
+        Returns:
+            The compiled programs by name.
+        """
+        enable_compilation_cache()
+        # Tracing is Python and goes one by one; XLA compiles without the interpreter's lock.
+        lowered = {name: self._lower(name) for name in _NAMES if name not in self._compiled}
+        with concurrent.futures.ThreadPoolExecutor(initializer=shield_this_thread) as pool:
+            futures = {name: pool.submit(program.compile) for name, program in lowered.items()}
+            self._compiled |= {name: future.result() for name, future in futures.items()}
+        to_host({"keys": self.run_keys, "evaluation": self.evaluation_key}, copy=True)  # taking keys apart is a program, too
+        return dict(self._compiled)
+
+    def _lower(self, name: str) -> Any:
+        if name == "broken_leaves":
+            return jax.jit(broken_leaves).lower(self.shapes)
+        arguments: dict[str, tuple] = {
+            "init": (self.run_keys,),
+            "train_iteration": (self.shapes,),
+            "evaluate": (self.shapes.train, self.evaluation_key),
+        }
+        return getattr(self.program, name).lower(*arguments[name])
+
+    def compiled(self, name: str) -> Any:
+        """One compiled program: ``init``, ``train_iteration``, ``evaluate`` or ``broken_leaves``."""
+        if name not in self._compiled:
+            enable_compilation_cache()
+            self._compiled[name] = self._lower(name).compile()
+        return self._compiled[name]
+
+    def init(self, keys: jax.Array) -> LoopState:
+        """A fresh learner with an empty replay, for each of the typed keys [S]."""
+        return self.compiled("init")(keys)
+
+    def train_iteration(self, loop: LoopState) -> tuple[LoopState, Metrics]:
+        """One iteration; ``loop`` is donated. See `Trainer.train_iteration`."""
+        return self.compiled("train_iteration")(loop)
+
+    def evaluate(self, train: TrainState, key: jax.Array | None = None) -> tuple[Metrics, dict[str, jax.Array]]:
+        """Metrics of the policy without noise, [S] float32, and images of the first few episodes of every seed.
+
+        Args:
+            train: The learner, [S, ...].
+            key: Draws the episodes; None: always the same ones.
+        """
+        return self.compiled("evaluate")(train, self.evaluation_key if key is None else key)
+
+    def broken_leaves(self, loop: LoopState) -> list[str]:
+        """Names of the floating-point leaves of the loop state that hold a NaN or an infinity."""
+        return [name for name, is_broken in jax.device_get(self.compiled("broken_leaves")(loop)).items() if is_broken]

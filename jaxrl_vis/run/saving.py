@@ -1,0 +1,119 @@
+"""What a run saves, when it may, and in which order.
+
+A checkpoint holds finite numbers only, and metrics.jsonl is on the disk before a checkpoint of the same iteration is. On a
+signal the light checkpoint is written first, which takes seconds, and the full one, with the replay, after it: whoever runs out
+of patience, or of disk, in between keeps the networks.
+"""
+
+import contextlib
+import dataclasses
+from collections.abc import Callable
+
+import jax
+import numpy as np
+
+from jaxrl_vis.errors import NonFiniteError, StorageError
+from jaxrl_vis.run.checkpoint import FULL, LIGHT, Checkpoints
+from jaxrl_vis.run.folder import RunFolder
+from jaxrl_vis.run.metrics import PerSeed
+from jaxrl_vis.run.nonfinite import dump
+from jaxrl_vis.run.programs import Programs
+from jaxrl_vis.run.progress import Progress
+from jaxrl_vis.types import LoopState
+
+
+class Saver:
+    """Saves the state of one run.
+
+    Args:
+        programs: Of the run.
+        folder: Where its files go.
+        checkpoints: Of that folder.
+        say: Called with one line about what happens.
+    """
+
+    def __init__(self, programs: Programs, folder: RunFolder, checkpoints: Checkpoints, say: Callable[[str], None]):
+        self._programs, self._folder, self._checkpoints, self._say = programs, folder, checkpoints, say
+        self._keeps_full = programs.config.full_checkpoint_interval > 0
+
+    def has(self, tier: str, iteration: int) -> bool:
+        """Whether there is a checkpoint of that tier and iteration."""
+        return iteration in self._checkpoints.iterations(tier)
+
+    def light(self, loop: LoopState, iteration: int, progress: Progress) -> None:
+        """Saves the learner in the background.
+
+        Raises:
+            NonFiniteError: The state is not finite; it was dumped instead.
+            StorageError: It cannot be written, or the one before could not.
+        """
+        self._refuse_nonfinite(loop, iteration)
+        self._checkpoints.save_light(iteration, loop.train, dataclasses.asdict(progress))
+        if not self._keeps_full:
+            self._checkpoints.retire_full()
+
+    def full(self, loop: LoopState, iteration: int, progress: Progress) -> None:
+        """Saves everything, and returns when it is on the disk. Raises as `light`."""
+        self._refuse_nonfinite(loop, iteration)
+        self._checkpoints.save_full(iteration, loop, dataclasses.asdict(progress))
+
+    def finish(self) -> None:
+        """Returns when everything is on the disk, and deletes a full checkpoint that a newer light one has replaced.
+
+        Raises:
+            StorageError: Something could not be written.
+        """
+        self._checkpoints.wait()
+        if not self._keeps_full:
+            self._checkpoints.retire_full()
+
+    def on_signal(self, loop: LoopState, iteration: int, progress: Progress, signal_name: str) -> None:
+        """Saves the learner, then everything. A full disk in between leaves the light checkpoint, and says so.
+
+        Raises:
+            NonFiniteError, StorageError: As `light`.
+        """
+        self._say(f"{signal_name}: saving iteration {iteration} (once more quits at once, without the replay) ...")
+        if not self.has(LIGHT, iteration) or progress.evaluation_due:
+            self.light(loop, iteration, progress)
+        self._checkpoints.wait()
+        resume = f"go on with --run-dir {self._folder.path} --resume"
+        if not self.has(FULL, iteration) or progress.evaluation_due:
+            try:
+                self.full(loop, iteration, progress)
+            except StorageError as error:
+                self._say(f"the networks are saved, the replay is not: {error}; {resume}")
+                return
+        self._say(f"saved; {resume}")
+
+    def rescue(self, loop: LoopState | None, iteration: int, progress: Progress) -> None:
+        """Tries to save the learner after something unexpected went wrong; what stands in the way is not reported."""
+        if loop is None or iteration == 0 or any(leaf.is_deleted() for leaf in jax.tree.leaves(loop)):
+            return
+        with contextlib.suppress(Exception):
+            self._checkpoints.wait()
+        with contextlib.suppress(Exception):
+            if iteration > (self._checkpoints.newest() or 0):
+                self.light(loop, iteration, progress)
+                self._checkpoints.wait()
+
+    def _refuse_nonfinite(self, loop: LoopState, iteration: int) -> None:
+        # The guard looks at losses and states; a parameter that broke in the very last update shows in the next iteration's.
+        if broken := self._programs.broken_leaves(loop):
+            self.stop_nonfinite(loop, iteration, f"the state after iteration {iteration}", {}, broken)
+
+    def stop_nonfinite(
+        self, loop: LoopState, iteration: int, where: str, values: PerSeed, broken: list[str] | None = None
+    ) -> None:
+        """Dumps the state and raises NonFiniteError."""
+        with contextlib.suppress(StorageError):
+            self._checkpoints.wait()
+        kept = self._checkpoints.newest()
+        leaves = self._programs.broken_leaves(loop) if broken is None else broken
+        leaves = [name.removeprefix("train.") for name in leaves if name.startswith("train.")]
+        file = self._folder.nonfinite / f"iteration_{iteration}.npz"
+        dump(file, loop, values, leaves)
+        names = [name for name, row in values.items() if not np.isfinite(row).all()] + leaves
+        shown = f" ({', '.join(names[:3])}{f' and {len(names) - 3} more' if len(names) > 3 else ''})" if names else ""
+        good = "there is no checkpoint yet" if kept is None else f"the last good checkpoint is of iteration {kept}"
+        raise NonFiniteError(f"non-finite numbers in {where}{shown}: state dumped to {file}; {good}")

@@ -1,0 +1,96 @@
+"""Using what a run has trained: evaluating it anew, and watching it play."""
+
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.report import videos, viewer
+from jaxrl_vis.run.checkpoint import Checkpoints, Restored
+from jaxrl_vis.run.folder import read_config
+from jaxrl_vis.run.memory import check_compiled
+from jaxrl_vis.run.trainer import Trainer, make_trainer
+
+
+def open_run(run_dir: Path | str, **changes: object) -> Trainer:
+    """The trainer of a run, with fields of its configuration changed; nothing in its folder is touched.
+
+    Raises:
+        RequestError: There is no run, or it cannot be made any more.
+    """
+    return make_trainer(read_config(Path(run_dir)).replace(**changes))
+
+
+def load(trainer: Trainer, run_dir: Path | str) -> Restored:
+    """The newest good learner of a run.
+
+    Args:
+        trainer: From `open_run`.
+        run_dir: The run folder.
+
+    Raises:
+        RequestError: There is none.
+    """
+    checkpoints = Checkpoints(Path(run_dir) / "checkpoints", read_only=True)
+    try:
+        restored = checkpoints.restore_train(trainer.shapes)
+    finally:
+        checkpoints.close()
+    if restored is None:
+        raise RequestError(f"the run in {run_dir} has no usable checkpoint: train it first")
+    return restored
+
+
+def evaluate_run(run_dir: Path | str, episodes: int | None = None) -> dict[str, list[float]]:
+    """Evaluates the newest good checkpoint of a run.
+
+    Args:
+        run_dir: The run folder.
+        episodes: How many; None: as many as during training.
+
+    Returns:
+        ``eval/success``, ``eval/goal_distance`` and the like: one number per seed.
+
+    Raises:
+        RequestError: There is no run, nothing usable in it, or too little memory for so many episodes.
+    """
+    trainer = open_run(run_dir, **({} if episodes is None else {"eval_episodes": episodes}))
+    restored = load(trainer, run_dir)
+    check_compiled({"evaluate": trainer.programs.compiled("evaluate")}, already_there=True)
+    values = jax.device_get(trainer.evaluate(restored.train))
+    return {name: [float(number) for number in value] for name, value in values.items()}
+
+
+def play_run(run_dir: Path | str, out: Path | str, episodes: int = 6, three_dimensional: bool = False) -> None:
+    """Plays episodes with the first seed of the newest good checkpoint of a run, and writes them as a video.
+
+    Args:
+        run_dir: The run folder.
+        out: .gif, .mp4 (needs imageio-ffmpeg), .html or .png.
+        episodes: How many to show.
+        three_dimensional: Write an .html page for brax's viewer (needs brax) instead of the robot's images; for state
+            variants, too.
+
+    Raises:
+        RequestError: There is no run, nothing usable in it, no image to show, or no way to write ``out``.
+    """
+    out = Path(out)
+    (viewer.check_page if three_dimensional else videos.check_output)(out)
+    trainer = open_run(run_dir, eval_episodes=max(1, episodes))
+    programs = trainer.programs
+    if not (programs.shows_images or three_dimensional):
+        raise RequestError(f"{trainer.config.env} shows the robot no images: play a run on a Visual task, or with --html")
+    train = load(trainer, run_dir).train
+    if three_dimensional:
+        viewer.write_page(programs.program, train, programs.evaluation_key, max(1, episodes), out)
+        return
+    parts, count = [], 0
+    while count < episodes:
+        _, recorded = programs.evaluate(train, jax.random.fold_in(programs.evaluation_key, count) if parts else None)
+        parts.append(videos.first_seed(recorded))
+        count += len(parts[-1].success)
+    joined = videos.EpisodeImages(
+        *(np.concatenate([getattr(part, name) for part in parts])[:episodes] for name in ("frames", "goals", "success"))
+    )
+    videos.write_video(joined, out, programs.image_seconds, max_episodes=episodes)

@@ -1,0 +1,141 @@
+"""Which implementation a program contains follows its platform and what people ask for; no GPU is needed."""
+
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_scene import small_scene
+
+from jaxrl_vis_envs import compilation
+from jaxrl_vis_envs.compilation import by_platform, kernels, runs_gpu_kernels, targets_cpu, tracing_for
+from jaxrl_vis_envs.render import render_planes
+
+KERNEL_CALL = "__gpu$xla.gpu.triton"
+
+
+@pytest.fixture
+def gpu(monkeypatch):
+    """Makes the process believe that there is an NVIDIA GPU beside the CPU; call it with a compute capability."""
+
+    def add(capability: str = "9.0") -> None:
+        card = SimpleNamespace(compute_capability=capability, device_kind="NVIDIA Test")
+        devices = {"cuda": [card], None: jax.devices()}
+        monkeypatch.setattr(compilation, "accelerator", lambda: "cuda")
+        monkeypatch.setattr(jax, "devices", lambda platform=None: devices[platform])
+        monkeypatch.setattr(jax, "default_device", lambda device: tracing_for("cuda"))
+
+    return add
+
+
+def lowered(function, platform: str, *arguments) -> str:
+    return jax.jit(function).trace(*arguments).lower(lowering_platforms=(platform,)).as_text()
+
+
+def test_a_process_without_an_accelerator_traces_for_the_cpu_alone():
+    assert compilation.accelerator() is None
+    traced = []
+    by_platform(lambda x: traced.append(compilation.target_platform()) or x, jnp.ones(()))
+    assert traced == ["cpu"]
+
+
+@pytest.mark.parametrize(
+    ("platform", "capability", "expected"),
+    [("cpu", "9.0", False), ("cuda", "9.0", True), ("cuda", "8.0", True), ("cuda", "7.5", False), ("rocm", "9.0", False)],
+)
+def test_kernels_are_left_to_gpus_that_run_them(platform, capability, expected, gpu):
+    gpu(capability)
+    with tracing_for(platform):
+        assert runs_gpu_kernels() is expected
+
+
+@pytest.mark.parametrize(
+    ("variable", "inside", "expected"),
+    [("auto", None, True), ("0", None, False), ("0", True, True), ("1", False, False), ("auto", False, False)],
+)
+def test_kernels_can_be_switched_off_and_on(variable, inside, expected, gpu, monkeypatch):
+    gpu()
+    monkeypatch.setenv("JAXRL_VIS_KERNELS", variable)
+    with tracing_for("cuda"), kernels(inside):
+        assert runs_gpu_kernels() is expected
+    with kernels(True), tracing_for("cpu"):
+        assert not runs_gpu_kernels()
+
+
+def test_a_wrong_value_of_the_variable_is_refused(monkeypatch):
+    monkeypatch.setenv("JAXRL_VIS_KERNELS", "yes")
+    with pytest.raises(ValueError, match="JAXRL_VIS_KERNELS is 'yes'.*0 .*1 .*auto"):
+        runs_gpu_kernels()
+
+
+def test_a_kernel_that_does_not_compile_is_left_out_and_named_once(gpu, monkeypatch, capsys):
+    gpu()
+    calls = []
+
+    def breaks() -> None:
+        calls.append(compilation.target_platform())
+        raise RuntimeError("ptxas: no\nsecond line")
+
+    def works() -> None:
+        calls.append("works")
+
+    @jax.jit
+    def traced(x):
+        with tracing_for("cuda"):
+            return x + runs_gpu_kernels(breaks) + 2 * runs_gpu_kernels(works) + 4 * runs_gpu_kernels(breaks)
+
+    assert traced(jnp.float32(0)) == 2
+    assert calls == ["cuda", "works"]
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 1 and "NVIDIA Test" in said[0] and "ptxas: no" in said[0] and "JAXRL_VIS_KERNELS=0" in said[0]
+    monkeypatch.setenv("JAXRL_VIS_KERNELS", "1")  # asks for the error itself
+    with tracing_for("cuda"):
+        assert runs_gpu_kernels(breaks)
+
+
+def test_a_program_holds_the_branch_of_its_own_platform(gpu):
+    gpu()
+
+    def function(x):
+        return jnp.sin(x) if targets_cpu() else jnp.sin(x) + 0.0 * jnp.exp(x)
+
+    def slope(x):
+        return jax.vmap(jax.grad(lambda x: by_platform(function, x)))(x)
+
+    x = jnp.arange(3.0)
+    assert "exponential" in lowered(slope, "cuda", x) and "exponential" not in lowered(slope, "cpu", x)
+    np.testing.assert_allclose(jax.jit(slope)(x), jnp.cos(x), rtol=1e-6)
+
+
+def test_an_image_is_drawn_by_the_kernel_of_its_own_platform(gpu, monkeypatch):
+    scene, poses = small_scene(height=12, width=12, few=True)
+
+    def draw(places, rgb=True):
+        def one(place):
+            moved = SimpleNamespace(**{**vars(poses), "geom_xpos": place})
+            return render_planes(scene, moved, rgb=rgb, depth=not rgb, quantized=True)
+
+        return jax.vmap(one)(places)
+
+    def slope(places):
+        return jax.grad(lambda places: jnp.sum(jnp.sin(draw(places, rgb=False).depth)))(places)
+
+    places = jnp.stack([poses.geom_xpos, poses.geom_xpos + 0.01])
+    expected, expected_slope = jax.jit(draw)(places), jax.jit(slope)(places)
+    gpu()
+    monkeypatch.setenv("JAXRL_VIS_KERNELS", "1")
+    # Other functions, because JAX would not trace the same ones again.
+    assert KERNEL_CALL in lowered(lambda x: draw(x), "cuda", places)
+    assert KERNEL_CALL not in lowered(lambda x: draw(x), "cpu", places)
+    with kernels(False):
+        assert KERNEL_CALL not in lowered(lambda x: draw(x), "cuda", places)
+    np.testing.assert_array_equal(jax.jit(lambda x: draw(x))(places).rgb, expected.rgb)
+    np.testing.assert_allclose(jax.jit(lambda x: slope(x))(places), expected_slope, rtol=1e-5, atol=1e-6)
+
+
+def test_the_probe_of_the_kernel_is_an_instance_of_it(monkeypatch):
+    """That it compiles needs a GPU; that it can be lowered does not."""
+    from jaxrl_vis_envs.render.gpu import kernel
+
+    assert KERNEL_CALL in kernel.probe_program().lower(lowering_platforms=("cuda",)).as_text()

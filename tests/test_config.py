@@ -1,0 +1,141 @@
+"""Configurations: what is checked, where their defaults come from, and how they come back from a file."""
+
+import dataclasses
+import json
+import math
+import typing
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from jaxrl_vis import fields
+from jaxrl_vis.config import PRESETS, Config, Pixels, config_from_dict, preset, resolve, validate
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.methods import METHODS, MethodName
+from jaxrl_vis_envs.pixels import CHANNELS
+
+BAD_VALUES: tuple[tuple[str, Any, str], ...] = (
+    ("hidden_sizes", (0,), "hidden_sizes must all be at least 1, not 0"),
+    ("encoder_filters", (0, 8), "encoder_filters must all be at least 1, not 0 8"),
+    ("encoder_filters", (-4, 8), "encoder_filters must all be at least 1, not -4 8"),
+    ("seed", 99999999999999999999, "seed 99999999999999999999 is too large"),
+    ("seed", 2**32, "seed 4294967296 is too large"),
+    ("seed", -1, "seed must be at least 0"),
+    ("num_envs", 10**20, "num_envs must be at most"),
+    ("num_envs", "abc", "num_envs must be a whole number, not 'abc'"),
+    ("num_envs", 2.5, "num_envs must be a whole number"),
+    ("num_envs", True, "num_envs must be a whole number"),
+    ("num_envs", None, "num_envs must be a whole number"),
+    ("env", 5, "env must be a word, not 5"),
+    ("method", "orakel", "method cannot be 'orakel'; did you mean oracle"),
+    ("pixels", ["rgb"], "pixels cannot be"),
+    ("randomize", "camera", "randomize must be a list"),
+    ("randomize", ("camra",), "randomize cannot be 'camra'; did you mean camera"),
+    ("hidden_sizes", (8, "8"), "hidden_sizes must be a whole number, not '8'"),
+    ("clip_targets_above", "no", "clip_targets_above must be true or false"),
+    ("action_noise", math.nan, "action_noise must be a finite number"),
+    ("action_noise", -0.1, "action_noise must be at least 0"),
+    ("discount", math.inf, "discount must be a finite number"),
+    ("action_penalty", -math.inf, "action_penalty must be a finite number"),
+    ("action_penalty", 10**400, "action_penalty must be a finite number"),
+    ("balance_probability", 1.5, "balance_probability is a share"),
+)
+
+
+@pytest.mark.parametrize(("name", "value", "complaint"), BAD_VALUES, ids=lambda value: str(value)[:24])
+def test_bad_values_are_refused_by_name(name: str, value: Any, complaint: str) -> None:
+    with pytest.raises(RequestError) as refused:
+        validate(preset("debug", **{name: value}))
+    assert str(refused.value).startswith(complaint)
+
+
+def test_the_largest_seeds_are_different_ones() -> None:
+    config = validate(preset("debug", seed=2**32 - 2, seeds=2))
+    with pytest.raises(RequestError, match="seed 4294967294 is too large: the last of 3"):
+        validate(config.replace(seeds=3))
+    first, last = (jax.random.key_data(jax.random.key(seed)) for seed in (config.seed, config.seed + 1))
+    assert not np.array_equal(first, last)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_make_sense_and_come_back_from_json(name: str) -> None:
+    config = validate(PRESETS[name].replace(randomize=("camera", "lights"), discount=0.5))
+    assert config_from_dict(json.loads(json.dumps(dataclasses.asdict(config)))) == config
+
+
+def test_numbers_from_elsewhere_are_welcome() -> None:
+    config = validate(preset("debug", seed=np.int64(3), action_noise=np.float32(0.5)))
+    assert config_from_dict(dataclasses.asdict(config)) == config
+    assert isinstance(config_from_dict({"discount": 0}).discount, float)
+
+
+@pytest.mark.parametrize(
+    ("values", "complaint"),
+    [
+        ([1], "a configuration must be a dictionary"),
+        ({"frames": "two"}, "frame_stack must be a whole number, not 'two'"),
+        ({"frames": 2, "frame_stack": 3}, "frame_stack is given twice"),
+        ({"batch_sizes": 2}, "unknown option 'batch_sizes'; did you mean batch_size"),
+        ({"num_envs": "abc"}, "num_envs must be a whole number, not 'abc'"),
+        ({"method": "indicator", "env": 5}, "env must be a word, not 5"),
+        ({"hidden_sizes": [8, None]}, "hidden_sizes must be a whole number, not None"),
+        ({"hidden_sizes": 8}, "hidden_sizes must be a list"),
+        ({"discount": [0.9]}, "discount must be a finite number"),
+    ],
+)
+def test_a_saved_configuration_of_the_wrong_types_is_refused_by_name(values: Any, complaint: str) -> None:
+    with pytest.raises(RequestError) as refused:
+        config_from_dict(values)
+    assert complaint in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_fields_are_known_by_their_old_names() -> None:
+    assert config_from_dict({"frames": 3, "env": "VisualReacher"}) == Config(env="VisualReacher", frame_stack=3)
+
+
+def test_words_become_values() -> None:
+    assert fields.read("x", int | None, ["None"]) is None
+    assert fields.read("x", float | None, ["1e-3"]) == 1e-3
+    assert fields.read("x", tuple[int, ...], ["-4", "8"]) == (-4, 8)
+    assert fields.read("x", tuple[int, ...], []) == ()
+    assert fields.read("x", Path | None, ["a/b"]) == Path("a/b")
+    for hint, word in ((int, "1.5"), (int, "none"), (float, "nan"), (float | None, "inf"), (Pixels, "rgba")):
+        with pytest.raises(RequestError, match="^x "):
+            fields.read("x", hint, [word])
+
+
+def test_allowed_values_are_written_once() -> None:
+    assert typing.get_args(MethodName) == tuple(METHODS)
+    assert typing.get_args(Pixels) == tuple(CHANNELS)
+    hints = fields.hints(Config)
+    assert fields.choices(hints["method"]) == tuple(METHODS)
+    assert fields.choices(hints["randomize"]) == ("camera", "lights", "colours", "dynamics")
+    assert fields.choices(hints["seed"]) == ()
+
+
+def test_defaults_follow_the_method() -> None:
+    """Thesis, section 5.1.4: R+ = 1 and R- = -1 for the indicator; the filter's threshold is the middle of its band."""
+    resolved = {name: resolve(Config(method=name), 50) for name in METHODS}
+    discount = 1 - 1 / 50
+    for name, (positive, balance) in {
+        "oracle": (0.0, 0.0),
+        "indicator": (1.0, 0.0),
+        "indicator_balance_filter": (1.0, 0.5),
+    }.items():
+        assert (resolved[name].reward_positive, resolved[name].reward_negative) == (positive, -1.0)
+        assert resolved[name].balance_probability == balance and resolved[name].discount == discount
+    assert resolved["oracle"].filter_threshold == resolved["indicator"].filter_threshold == math.inf
+    best = 1 / (1 - discount)
+    assert resolved["indicator_balance_filter"].filter_threshold == pytest.approx((-1 + discount * best + best) / 2)
+    assert METHODS["indicator_balance_filter"].balance and not METHODS["indicator"].balance
+    assert METHODS["indicator"].needs_images and not METHODS["oracle"].needs_images
+
+
+def test_a_threshold_needs_a_method_that_filters() -> None:
+    with pytest.raises(RequestError, match="--method indicator_balance_filter"):
+        resolve(Config(filter_threshold=0.0), 50)
+    with pytest.raises(RequestError, match="outside its band"):
+        resolve(Config(method="indicator_balance_filter", filter_threshold=1000.0), 50)
