@@ -1,8 +1,8 @@
 """Tasks played from the host, by two compiled programs each that serve any number of episodes.
 
-The physics of a task takes much longer to compile than to play for a few episodes. Whoever plays it in one way and then in
-another (a controller, a recording, a test) shares these programs: they take `LANES` episodes at a time, and the last few are
-filled up with copies.
+The physics of a task takes much longer to compile than to play for a few episodes. Whoever plays it for different purposes
+(a controller, a recording, a test) shares these programs: they take `LANES` episodes at a time, and the last few are filled up
+with copies.
 """
 
 import copy

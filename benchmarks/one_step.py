@@ -2,8 +2,8 @@
 
     python benchmarks/one_step.py [TASK ...]
 
-Prints a table of the differences of joint velocities, which docs/tasks.md keeps. Two things are measured both ways, because
-each hides a difference that a task has:
+Prints a table of the differences of joint velocities, which docs/tasks.md keeps. Two things are measured both with and
+without, because each hides a difference that a task has:
 
     weld term    C MuJoCo 4 adds to the acceleration that a weld asks for how fast its Jacobian turns; MJX lacks the term. Taken
                  away from C MuJoCo, what is left says whether MJX does what it sets out to do. With it, how far a task is from
@@ -34,7 +34,7 @@ Iterations = Literal["task", "more"]
 
 
 class Visited(NamedTuple):
-    """N states on the way, float32: all that a step depends on."""
+    """N states of an episode, float32: all that a step depends on."""
 
     qpos: np.ndarray  # [N, nq]
     qvel: np.ndarray  # [N, nv]

@@ -22,6 +22,7 @@ import jax
 import numpy as np
 
 from benchmarks import environments
+from jaxrl_vis_envs import registry
 from jaxrl_vis_envs.base import State
 
 Recording = Mapping[str, np.ndarray]
@@ -150,15 +151,15 @@ COMPARISONS: dict[str, Callable[[Recording], list[Figure]]] = {
 
 
 def compare(name: str, recording: Recording) -> list[Figure]:
-    """Errors of the task ``name`` (with or without "Visual" before it: the physics is the same) against a recording.
+    """Errors of the environment ``name`` against a recording; those that see images have the physics of their state variants.
 
     Raises:
         NothingToCompareError: Recordings of that task are unknown, or this one lacks a key or holds a wrong shape.
     """
-    name = name.removeprefix("Visual")
-    if name not in COMPARISONS:
+    task = registry.state_variant(name) if name in registry.list_envs() else None
+    if task not in COMPARISONS:
         raise NothingToCompareError(f"no recordings of {name!r} are known; choose one of {', '.join(COMPARISONS)}")
-    return COMPARISONS[name](recording)
+    return COMPARISONS[task](recording)
 
 
 def _take(recording: Recording, *keys: str) -> list[np.ndarray]:

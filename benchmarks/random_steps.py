@@ -15,8 +15,8 @@ import jax.numpy as jnp
 
 import jaxrl_vis_envs
 from jaxrl_vis_envs.compilation import env_jit
+from jaxrl_vis_envs.names import TASKS
 
-TASKS = ("FetchReach", "FingerTurn", "HandReach", "Reacher", "SawyerReach")
 _BAD_SHARE = 0.01
 _BAD = (1e6, -1e6, jnp.inf, -jnp.inf, jnp.nan)
 
@@ -55,7 +55,7 @@ def count_bad_episodes(name: str, steps: int, count: int) -> tuple[int, int]:
 def main(arguments: list[str] | None = None) -> int:
     """Prints a line for each task; 1 where any was not finite."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("tasks", nargs="*", default=TASKS, metavar="TASK")
+    parser.add_argument("tasks", nargs="*", default=list(TASKS), metavar="TASK")
     parser.add_argument("--steps", type=int, default=1_000_000)
     parser.add_argument("--envs", type=int, default=8192)
     options = parser.parse_args(arguments)

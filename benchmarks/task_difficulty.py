@@ -22,9 +22,9 @@ import numpy as np  # noqa: E402
 
 import jaxrl_vis_envs  # noqa: E402
 from jaxrl_vis_envs.compilation import env_jit  # noqa: E402
+from jaxrl_vis_envs.names import TASKS  # noqa: E402
 
 _BATCH = 200  # episodes side by side
-NAMES = ["FetchReach", "FingerTurn", "HandReach", "Reacher", "SawyerReach"]
 
 
 def measure(name: str, episodes: int, seed: int = 0, **overrides: Any) -> tuple[float, float]:
@@ -74,7 +74,7 @@ def measure_hand(episodes: int, seed: int = 0) -> tuple[float, float]:
 def main(arguments: list[str] | None = None) -> int:
     """Prints one line a task."""
     parser = argparse.ArgumentParser(description="Chance level and difficulty of tasks.")
-    parser.add_argument("env", nargs="*", default=NAMES, help=f"any of {', '.join(NAMES)}; default: all")
+    parser.add_argument("env", nargs="*", default=list(TASKS), help=f"any of {', '.join(TASKS)}; default: all")
     parser.add_argument("--episodes", type=int, default=1000)
     options = parser.parse_args(arguments)
     for name in options.env:

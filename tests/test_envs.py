@@ -16,14 +16,14 @@ from point_mass import PointMass, PointMassConfig
 
 import jaxrl_vis_envs
 from benchmarks import environments
-from jaxrl_vis_envs import compilation, goals, pixels, registry
+from jaxrl_vis_envs import compilation, goals, names, pixels, registry
 from jaxrl_vis_envs.base import GoalEnv, State, sanitize_action
 from jaxrl_vis_envs.compilation import env_jit
 
 BATCH, STEPS = 32, 8
 SOURCES = pathlib.Path(__file__).resolve().parents[1] / "envs"
 SUBPROCESS_ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join((str(SOURCES), str(SOURCES.parent)))}
-TASKS = ["FetchReach", "FingerTurn", "HandReach", "Reacher", "SawyerReach"]
+TASKS = list(names.TASKS)
 HORIZONS = {"FetchReach": 50, "FingerTurn": 50, "HandReach": 50, "Reacher": 50, "SawyerReach": 25}
 
 
@@ -193,6 +193,12 @@ def test_an_action_of_another_shape_is_refused(name: str, wrong: tuple[int, ...]
 def test_tasks_refuse_64_bits(name: str) -> None:
     with jax.enable_x64(True), pytest.raises(ValueError, match=f"{name} simulates in 32 bits.*unset JAX_ENABLE_X64"):
         jaxrl_vis_envs.make(name)
+
+
+def test_an_environment_without_a_registered_name_refuses_such_actions_too():
+    env = PointMass(PointMassConfig())
+    with pytest.raises(ValueError, match=r"PointMass takes an action of shape \(2,\), got \(1,\)"):
+        jax.eval_shape(lambda key: env.step(env.reset(key), jnp.zeros(1)), jax.random.key(0))
 
 
 def test_sanitize_action():

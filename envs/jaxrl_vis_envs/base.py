@@ -57,7 +57,7 @@ class State:
 
 
 class GoalEnv(abc.ABC):
-    """An environment with a goal. Subclasses say how it starts, moves and looks; success and reward are the same for all."""
+    """An environment with a goal. Subclasses say how it starts, moves and appears; success and reward are the same for all."""
 
     # Set by each task.
     name: str
@@ -101,7 +101,7 @@ class GoalEnv(abc.ABC):
     def as_goal(self, frame: jax.Array) -> jax.Array:
         """The goal that says "be where ``frame`` was", in the shape of ``frame``: its newest image, F times.
 
-        A goal stands still; whoever relabels with something observed on the way has to say so in the same way.
+        A goal stands still, so whoever relabels with an observation passes it through this function.
         """
         if self.frame_stack == 1:
             return frame
@@ -127,8 +127,9 @@ class GoalEnv(abc.ABC):
             ValueError: ``action`` has another shape than [A].
         """
         if np.shape(action) != (self.action_size,):
+            task = type(self).__name__  # an environment that was not made by its name has none
             raise ValueError(
-                f"{self.name} takes an action of shape ({self.action_size},), got {np.shape(action)}; vmap over a batch"
+                f"{task} takes an action of shape ({self.action_size},), got {np.shape(action)}; vmap over a batch"
             )
 
     @functools.cached_property

@@ -57,7 +57,7 @@ class PixelsConfig(checks.CheckedConfig):
 
 Observer = Callable[..., jax.Array]
 """observer(data, history=None, domain=None): an observation of the poses in ``data``, after those in ``history``, under the
-look in ``domain`` (see `State`)."""
+appearance in ``domain`` (see `State`)."""
 
 
 class ImageObserver:
@@ -83,7 +83,7 @@ class ImageObserver:
             data: Poses, up to date.
             history: [frame_stack - 1, nq] float32, joint positions one, two, ... control steps ago. Without, all has stood
                 still, and one image is repeated.
-            domain: The look of the episode (`randomization`), which holds for all images.
+            domain: The appearance of the episode (`randomization`), which holds for all images.
         """
         scene = varied_scene(self.scene, domain)
         if self._config.frame_stack == 1 or history is None:

@@ -4,7 +4,7 @@
     env = make("VisualFetchReach", randomization=typical("camera", "lights", "colours", "dynamics"))
 
     reset     draws what is on, from a key of its own, into `State.domain`      starts and goals stay what they are without
-    observe   draws through a scene with those leaves changed                   the goal image has the look of its episode
+    observe   draws through a scene with those leaves changed                   goal images have the appearance of their episode
     advance   steps a model with those leaves changed
 
 Only numbers vary, so one compiled program serves all values, and under `jax.vmap` each environment has its own. The GPU kernel
@@ -81,7 +81,7 @@ class Randomization:
         return {name: value for name, value in dataclasses.asdict(self).items() if value > 0.0}
 
     @property
-    def varies_look(self) -> bool:
+    def varies_appearance(self) -> bool:
         """Whether images of the same poses differ between episodes."""
         return any(name not in _DYNAMICS for name in self.active)
 
@@ -129,7 +129,7 @@ def sample(key: jax.Array, ranges: Randomization, model: Any, action_size: int, 
         ranges: What varies how far.
         model: The `mjx.Model`.
         action_size: A.
-        scene: What images are drawn of; None for a task without images, whose ``ranges`` must leave the look alone.
+        scene: What images are drawn of; None for a task without images, whose ``ranges`` must not vary the appearance.
 
     Returns:
         The deviations of what is on, or None where all is off. Each has a key of its own, so that it does not depend on what

@@ -26,7 +26,7 @@ def reach(
 ) -> mjx.Data:
     """The arm at rest with ``body`` as near to a pose as the joints let it.
 
-    Damped least squares from ``start``, weighted by the joints' mobilities (1/damping), which is the way the physics takes.
+    Damped least squares from ``start``, weighted by the joints' mobilities (1/damping), as the physics moves them.
 
     Args:
         mj_model: The model; the joints on the way to ``body`` are hinges. Others stay as they are.

@@ -1,4 +1,4 @@
-"""MuJoCo's constraint solver for small trees, with nothing to wait for.
+"""MuJoCo's constraint solver for small trees, without loops that wait for the slowest episode of a batch.
 
 MJX's Newton iterations and line searches are loops that end when the last episode of a batch is done, and each iteration calls
 a library for one small matrix. Here an iteration is arithmetic on whole batches: the factorization is written out, and the line
@@ -119,7 +119,7 @@ def _line_search(
     after = jnp.min(jnp.where(is_after, corners, jnp.inf))
     middle = jnp.where(jnp.isfinite(after), 0.5 * (before + after), before + 1.0)
     slope, curvature = slope_at(middle)
-    return middle - slope / jnp.where(curvature > 0, curvature, 1.0)  # 0 where there is no way to go
+    return middle - slope / jnp.where(curvature > 0, curvature, 1.0)  # 0 where every direction is level
 
 
 def solve_positive(matrix: jax.Array, right: jax.Array) -> jax.Array:

@@ -178,7 +178,7 @@ def _add_cross_hair(spec: mujoco.MjSpec) -> None:
     """Gym's mocap body: a small cube and three bars, of half a length of 1 m, that nothing touches."""
     for *size, alpha in _CROSS_HAIR:
         spec.body("mocap").add_geom(
-            type=mujoco.mjtGeom.mjGEOM_BOX, size=size, rgba=(0.0, 0.5, 0.0, alpha), contype=0, conaffinity=0
+            type=mujoco.mjtGeom.mjGEOM_BOX, size=size, rgba=(0.0, 0.5, 0.0, alpha), contype=0, conaffinity=0, mass=0.0
         )
 
 

@@ -159,7 +159,7 @@ class HandReach(MjxGoalEnv):
         return 0.5 * (low + high) + 0.5 * (high - low) * action
 
     def _after_random_actions(self, key: jax.Array) -> mjx.Data:
-        """The hand on its way, after random actions from the start, stopped there."""
+        """The hand where random actions from the start have led it, at rest."""
         uniform_key, noise_key = jax.random.split(key)
         shape = (self.config.goal_actions, self.action_size)
         actions = jax.random.uniform(uniform_key, shape, jnp.float32, -1.0, 1.0)

@@ -54,7 +54,7 @@ class MjxGoalEnv(GoalEnv):
         self._draw = observer(mj_model) if observer is not None else None
         self._randomization: randomization.Randomization = getattr(config, "randomization", randomization.OFF)
         self._scene = getattr(self._draw, "scene", None)
-        if self._randomization.varies_look and self._scene is None:
+        if self._randomization.varies_appearance and self._scene is None:
             raise ValueError("camera, lights and colours can only be randomized in a task that draws images")
 
     @abc.abstractmethod
