@@ -14,6 +14,7 @@ the kernels and the same functions in plain JAX: ``0`` never uses a kernel, ``1`
 (the default) uses each where a small instance of it compiles.
 """
 
+import concurrent.futures
 import contextlib
 import contextvars
 import functools
@@ -168,10 +169,16 @@ def _has_tensor_cores() -> bool:
 def _compiles(probe: Callable[[], object]) -> bool:
     """Whether a probe compiles for the first NVIDIA GPU."""
     gpu = jax.devices("cuda")[0]
-    try:
-        # Probes are called while something else is traced, of which they are no part.
-        with jax.ensure_compile_time_eval(), jax.default_device(gpu), tracing_for("cuda"):
+
+    def compile_it() -> None:
+        with jax.default_device(gpu), tracing_for("cuda"):
             probe()
+
+    try:
+        # Probes are called while something else is traced, of which they are no part: what is being traced is a thread's own.
+        # (`jax.ensure_compile_time_eval` would evaluate the insides of the kernel, too, which nothing can.)
+        with concurrent.futures.ThreadPoolExecutor(1) as pool:
+            pool.submit(compile_it).result()
     except Exception as error:  # Pallas, Triton, ptxas and XLA each have their own
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         print(
