@@ -43,7 +43,7 @@ class RenderModel:
             multiples of the model's extent.
         site_groups: Groups of sites that are drawn.
         leave_out: What is not drawn, as `Scene.from_mjmodel` takes it.
-        plane_backs: Whether planes are seen from behind, where MuJoCo draws them half transparent.
+        plane_backs: As `Scene.from_mjmodel` takes it: True where planes turn around.
         finish: Changes the compiled model in place.
     """
 
@@ -53,7 +53,7 @@ class RenderModel:
     view: tuple[float, ...] = _VIEW
     site_groups: tuple[int, ...] = ()
     leave_out: tuple[str, ...] = ()
-    plane_backs: bool = False
+    plane_backs: bool | None = None
     finish: Callable[[mujoco.MjModel], None] | None = None
 
 
@@ -86,8 +86,13 @@ def _ours(task: str) -> RenderModel:
 
 def _feature(name: str) -> RenderModel:
     feature = FEATURES[name]
-    boards = any('type="plane"' in thing for thing in feature.things)
-    return RenderModel("feature", lambda: scene_spec(feature), "eye", site_groups=(0,), plane_backs=boards)
+    boards = any('type="plane"' in thing for thing in feature.things) or None
+
+    def finish(mj_model: mujoco.MjModel) -> None:
+        for number, size in enumerate(feature.sizes):
+            mj_model.geom_size[mj_model.geom(f"thing{number}").id] = size
+
+    return RenderModel("feature", lambda: scene_spec(feature), "eye", site_groups=(0,), plane_backs=boards, finish=finish)
 
 
 def _raise_terrain(mj_model: mujoco.MjModel) -> None:
@@ -106,8 +111,7 @@ _SUITE = ("acrobot", "ball_in_cup", "cartpole", "cheetah", "finger", "fish", "ho
 _SUITE += ("manipulator", "pendulum", "point_mass", "reacher", "stacker", "swimmer", "walker")
 
 MODELS: dict[str, RenderModel] = {
-    "fetch_reach": _ours("fetch_reach"),
-    "reacher": _ours("reacher"),
+    **{task: _ours(task) for task in ("fetch_reach", "reacher", "finger_turn", "hand_reach", "sawyer_reach")},
     **{f"dm_{domain.lower()}": _suite(domain) for domain in _SUITE},
     "dm_lqr": _suite("lqr", None),
     "dm_dog": _suite("dog", None, view=(60.0, -15.0, 1.0), leave_out=("skin",)),
@@ -206,9 +210,10 @@ def set_pose(mj_model: mujoco.MjModel, mj_data: mujoco.MjData, number: int) -> N
 
 
 def _orbit(position: np.ndarray, quaternion: np.ndarray, rng: np.random.Generator) -> None:
-    """Puts the eye somewhere around the middle of a feature scene, looking at it."""
+    """Puts the eye somewhere around the middle of a feature scene, looking at it, on the side of the floor that it is on."""
+    side = np.sign(position[2])
     turn, distance = rng.uniform(-np.pi, np.pi), rng.uniform(1.2, 1.8)
-    position[:] = distance * np.cos(turn), distance * np.sin(turn), rng.uniform(0.6, 1.5)
+    position[:] = distance * np.cos(turn), distance * np.sin(turn), side * rng.uniform(0.6, 1.5)
     back = position - np.array([0.0, 0.0, 0.35])
     right = np.cross([0.0, 0.0, 1.0], back)
     axes = np.stack([right, np.cross(back, right), back], axis=1)

@@ -259,25 +259,34 @@ REFUSALS = {
         ' vertid="0 1 2" vertweight="1 1 1"/></skin>',
         "coat.*leave_out",
         {},
+        ("skin",),
+    ),
+    "a flex in a group beyond the last, which counts as the last": (
+        '<body name="b"><freejoint/><geom size=".1"/></body>' + ABOVE,
+        '<flex name="cloth" dim="2" group="9" body="b b b" vertex="0 0 0 1 0 0 0 1 0" element="0 1 2"/>',
+        "cloth.*leave_out",
+        {"groups": (5,)},
+        ("flex",),
     ),
     "shadows of a mesh": (
         '<geom name="statue" type="mesh" mesh="m"/>' + ABOVE,
         '<mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/>',
         "statue.*shadows=False",
         {"shadows": True},
+        ("statue",),
     ),
 }
 
 
 @pytest.mark.parametrize("case", REFUSALS)
 def test_refusals_name_the_culprit_and_the_mend(case):
-    body, assets, message, options = REFUSALS[case]
+    body, assets, message, options, culprits = REFUSALS[case]
     deformable = ""
-    if "<skin" in assets:
+    if "<mesh" not in assets:
         deformable, assets = f"<deformable>{assets}</deformable>", ""
     xml = f"<mujoco>{deformable}<asset>{assets}</asset><worldbody>{body}</worldbody></mujoco>"
     mj_model = mujoco.MjModel.from_xml_string(xml)
     with pytest.raises(ValueError, match=message) as refusal:
         Scene.from_mjmodel(mj_model, "above", **options)
     assert "\n" not in str(refusal.value)
-    Scene.from_mjmodel(mj_model, "above", leave_out=("skin", "statue"), **options)
+    Scene.from_mjmodel(mj_model, "above", leave_out=culprits, **options)

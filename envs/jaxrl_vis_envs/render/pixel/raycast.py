@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxrl_vis_envs.render import camera
 from jaxrl_vis_envs.render.camera import Rays
+from jaxrl_vis_envs.render.model.reading import CLEAR, CLEAR_FROM_BEHIND, SOLID
 from jaxrl_vis_envs.render.pixel import shapes
 from jaxrl_vis_envs.render.pixel.arithmetic import larger, smaller
 from jaxrl_vis_envs.render.scene import Scene
@@ -25,9 +26,6 @@ _TINY = 1e-20
 UNROLLED = 48
 _FEW = 3
 
-# Values of `Scene.transparent`.
-OPAQUE, CLEAR, CLEAR_FROM_BEHIND = range(3)
-
 
 def code_mask(scene: Scene) -> int:
     """The lowest bits of a key, that hold the row of the object; all ones is the sky."""
@@ -37,7 +35,7 @@ def code_mask(scene: Scene) -> int:
 def primitive_rows(scene: Scene, transparent: bool) -> list[int]:
     """Rows of the drawn objects that are primitives, and transparent or not."""
     fine = (shapes.MESH, shapes.HFIELD)
-    wanted = (CLEAR, CLEAR_FROM_BEHIND) if transparent else (OPAQUE, CLEAR_FROM_BEHIND)
+    wanted = (CLEAR, CLEAR_FROM_BEHIND) if transparent else (SOLID, CLEAR_FROM_BEHIND)
     return [
         row
         for row, (kind, clear) in enumerate(zip(scene.object_types, scene.transparent, strict=True))

@@ -41,7 +41,7 @@ def sheets(scene: Scene, unit: shapes.UnitShapes, rows: jax.Array, rays: Rays, d
         else:
             t, meets = raycast.row_entry(scene, jax.lax.stop_gradient(unit), index, rays)
             seen = meets & (t > scene.znear) & (t < depth)
-        if scene.transparent[index] == raycast.CLEAR_FROM_BEHIND:
+        if scene.transparent[index] == reading.CLEAR_FROM_BEHIND:
             seen = seen & raycast.behind(unit, index)
         row = lookup.read_row(rows[index])
         # A start that means nothing would be a source of NaN in gradients.

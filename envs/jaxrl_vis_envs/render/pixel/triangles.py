@@ -10,8 +10,8 @@ import numpy as np
 
 from jaxrl_vis_envs.render import camera
 from jaxrl_vis_envs.render.camera import Rays
-from jaxrl_vis_envs.render.model import meshes
-from jaxrl_vis_envs.render.pixel import raycast, shapes
+from jaxrl_vis_envs.render.model import meshes, reading
+from jaxrl_vis_envs.render.pixel import shapes
 from jaxrl_vis_envs.render.scene import Scene
 
 # How far outside of its edges, as a share of them, a triangle is still met, so that no ray slips between two.
@@ -68,7 +68,7 @@ def _touching(scene: Scene, unit: shapes.UnitShapes, rays: Rays, depth: jax.Arra
     touching = camera.in_view(scene, middle, scene.clusters[:, 3], rays, depth)
     if only is not None:
         return touching & (owner == only)
-    opaque = np.array(scene.transparent) == raycast.OPAQUE
+    opaque = np.array(scene.transparent) == reading.SOLID
     return touching & jnp.asarray(opaque)[owner]
 
 
