@@ -32,6 +32,7 @@ BATCH = 10  # poses that we draw at a time
 COLUMNS = {
     "segmentation": ("segm %", 100.0, 3),
     "iou": ("min IoU", 1.0, 3),
+    "matched": ("min match", 1.0, 3),
     "depth": ("depth %", 100.0, 3),
     "bare_mean": ("rgb mean", 1.0, 2),
     "bare_p99": ("rgb p99", 1.0, 0),
@@ -67,16 +68,21 @@ def compare(name: str, poses: int, size: int) -> dict[str, Any]:
             ours_s += time.perf_counter() - mark
             for our, their in zip(ours, theirs, strict=False):
                 tally.add(our, their)
-    worst = tally.worst[1]
-    name_of = mj_model.geom(worst).name if 0 <= worst < mj_model.ngeom else ""
     return {
         **row,
         "geoms": len(scene.object_ids),
         "measures": {name: None if np.isnan(value) else round(value, 5) for name, value in tally.measures().items()},
-        "worst_iou": {"object": worst, "name": name_of, "pose": tally.worst[2]},
+        "worst_iou": named(mj_model, tally.worst),
+        "worst_match": named(mj_model, tally.worst_match),
         "failures": tally.failures(),
         "seconds": {"ours": round(ours_s, 1), "all": round(time.perf_counter() - start, 1)},
     }
+
+
+def named(mj_model: mujoco.MjModel, worst: tuple[float, int, int]) -> dict[str, Any]:
+    """Where the worst of a measure was found."""
+    _, number, pose = worst
+    return {"object": number, "name": mj_model.geom(number).name if 0 <= number < mj_model.ngeom else "", "pose": pose}
 
 
 def table_row(row: dict[str, Any]) -> str:

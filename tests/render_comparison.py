@@ -1,7 +1,9 @@
 """How far our images are from MuJoCo's own, in the measures that the project has set itself bounds for.
 
-A pixel within one pixel of an edge of the segmentation, in either image, is left out of everything: there OpenGL and a ray
-caster may choose differently. All other pixels count, whether or not the two agree on what they show.
+A pixel within one pixel of an edge of the segmentation, in either image, is left out of colour, depth and the shares of the
+segmentation: there OpenGL and a ray caster may choose differently. All other pixels count, whether or not the two agree on what
+they show. So that nothing thin is lost with the edges, each object is also matched by itself, with all its pixels: those in one
+image must lie within one pixel of the same object's in the other, in both directions.
 """
 
 import dataclasses
@@ -11,6 +13,7 @@ import mujoco
 import numpy as np
 
 VISIBLE_PIXELS = 30  # a geom with fewer in an image (edges counted) has no IoU there
+MATCHED_PIXELS = 10  # an object with fewer, in the image where it has more of them, may be hidden in the other
 DEPTH_METRES, DEPTH_SHARE = 1e-3, 1e-3  # whichever is more
 
 PLANE, SKY, BARE, TEXTURED = "plane", "sky", "bare", "textured"
@@ -32,6 +35,7 @@ class Bound:
 BOUNDS = {
     "segmentation": Bound(0.997, True),
     "iou": Bound(0.95, True),
+    "matched": Bound(0.8, True),
     "depth": Bound(0.999, True),
     "bare_mean": Bound(4.0, False),
     "bare_p99": Bound(12.0, False),
@@ -58,6 +62,29 @@ def near_edges(labels: np.ndarray) -> np.ndarray:
     return np.any([neighbour != labels for neighbour in shifted], axis=0)
 
 
+def dilated(mask: np.ndarray) -> np.ndarray:
+    """Where a pixel or one of its eight neighbours is set. [H, W] -> bool."""
+    height, width = mask.shape
+    padded = np.pad(mask, 1)
+    return np.any([padded[row : row + height, column : column + width] for row in range(3) for column in range(3)], axis=0)
+
+
+def matched_shares(ours: np.ndarray, theirs: np.ndarray) -> dict[int, float]:
+    """Of each object with enough pixels, the share of them that lies within a pixel of its own in the other image; the lesser.
+
+    Args:
+        ours: Segmentation [H, W] as `Frame` has it.
+        theirs: The other one.
+    """
+    found = {}
+    for label in set(np.unique(ours)) | set(np.unique(theirs)):
+        one, other = ours == label, theirs == label
+        if label >= 0 and max(one.sum(), other.sum()) >= MATCHED_PIXELS:
+            shares = [_share((a & dilated(b)).sum(), a.sum()) for a, b in ((one, other), (other, one)) if a.any()]
+            found[int(label)] = float(min(shares))
+    return found
+
+
 @dataclasses.dataclass
 class Tally:
     """Sums over the images of one model. Feed it with `add`; read `measures`.
@@ -70,6 +97,7 @@ class Tally:
         solid: Kept pixels that show an object in either image.
         close: Of these, where the depths agree.
         worst: The least IoU, with the object and the image that it was found in.
+        worst_match: The same of `matched_shares`.
         colours: For each kind of surface, counts [256] of absolute differences of colour values, in 1/255.
     """
 
@@ -80,6 +108,7 @@ class Tally:
     solid: int = 0
     close: int = 0
     worst: tuple[float, int, int] = (np.nan, -1, -1)
+    worst_match: tuple[float, int, int] = (np.nan, -1, -1)
     colours: dict[str, np.ndarray] = dataclasses.field(
         default_factory=lambda: {kind: np.zeros(256, np.int64) for kind in (BARE, TEXTURED, PLANE, SKY)}
     )
@@ -102,6 +131,9 @@ class Tally:
             # Not `<`, which NaN (none yet) would never pass.
             if either and not both / either >= self.worst[0]:
                 self.worst = (both / either, int(label), self.images)
+        for label, share in matched_shares(ours.segmentation, theirs.segmentation).items():
+            if not share >= self.worst_match[0]:
+                self.worst_match = (share, label, self.images)
         difference = np.abs(ours.rgb.astype(np.int16) - theirs.rgb)
         surface = np.append(self.kinds, SKY)[theirs.segmentation]  # -1 finds the sky at the end
         for kind, counts in self.colours.items():
@@ -116,6 +148,7 @@ class Tally:
         found = {
             "segmentation": _share(self.agreeing, self.kept),
             "iou": self.worst[0],
+            "matched": self.worst_match[0],
             "depth": _share(self.close, self.solid),
         }
         for kind, counts in self.colours.items():

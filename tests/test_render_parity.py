@@ -64,7 +64,29 @@ def test_a_image_agrees_with_itself_away_from_edges() -> None:
 
 
 def test_another_object_fails() -> None:
-    assert tally_of(frame(label=1), frame(label=0)).failures() == ["segmentation", "iou"]
+    assert tally_of(frame(label=1), frame(label=0)).failures() == ["segmentation", "iou", "matched"]
+
+
+def thin(width: int, column: int = 3, label: int = 1) -> Frame:
+    """`frame` with a geom of some columns and twelve rows in it, all of whose pixels lie near its edges."""
+    changed = frame()
+    changed.segmentation[2:14, column : column + width] = label
+    changed.rgb[2:14, column : column + width] = 255
+    return changed
+
+
+def test_a_thin_object_that_is_missing_fails_in_both_directions() -> None:
+    for ours, theirs in ((frame(), thin(2)), (thin(2), frame())):
+        tally = tally_of(ours, theirs)
+        assert tally.failures() == ["matched"]
+        assert tally.worst_match == (0.0, 1, 0)
+
+
+def test_a_thin_object_may_be_a_pixel_away_and_no_further() -> None:
+    assert tally_of(thin(1), thin(1, column=4)).failures() == []
+    assert tally_of(thin(1), thin(1, column=5)).failures() == ["matched"]
+    assert tally_of(thin(1), thin(3, column=2)).measures()["matched"] == 1.0  # wider by a pixel on each side
+    assert "matched" in tally_of(thin(1), thin(4)).failures()
 
 
 def test_a_wrong_object_inside_counts_though_edges_are_left_out() -> None:

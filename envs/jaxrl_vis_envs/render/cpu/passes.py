@@ -204,7 +204,7 @@ def _pack(colour: Vector, bits: int) -> jax.Array:
 
 def _unpack(packed: jax.Array) -> jax.Array:
     """Colours of 8 bits a channel, [H, W] int32 -> [3, H, W] uint8."""
-    return (packed >> jnp.array([0, 8, 16])[:, None, None]).astype(jnp.uint8)
+    return (packed >> jnp.array([0, 8, 16], jnp.int32)[:, None, None]).astype(jnp.uint8)
 
 
 def _pack_normal(normal: Vector) -> jax.Array:
@@ -224,7 +224,7 @@ def _unpack_normal(packed: jax.Array) -> Vector:
     """Undoes `_pack_normal`: unit vectors, right to 5e-5."""
     x, y = (
         half.astype(jnp.float32) * (1.0 / _NORMAL_STEPS) - 1.0
-        for half in (packed & 0xFFFF, jax.lax.shift_right_logical(packed, 16))
+        for half in (packed & 0xFFFF, jax.lax.shift_right_logical(packed, np.int32(16)))
     )
     z = 1.0 - jnp.abs(x) - jnp.abs(y)
     fold = larger(-z, 0.0)

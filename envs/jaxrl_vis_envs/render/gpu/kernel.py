@@ -180,7 +180,7 @@ def _kernel(*refs, scene: Scene, outputs: Outputs, tile: tuple[int, int]):
     count = len(_Refs._fields)
     refs, out = _Refs(*refs[:count]), list(refs[count:])
     high, wide = tile
-    across = -(-scene.width // wide)
+    across = np.int32(-(-scene.width // wide))
     place = pl.program_id(0)
     top, left = jax.lax.div(place, across) * high, jax.lax.rem(place, across) * wide
     lane = jax.lax.broadcasted_iota(jnp.int32, (_PIXELS,), 0)
@@ -208,7 +208,7 @@ def _kernel(*refs, scene: Scene, outputs: Outputs, tile: tuple[int, int]):
     top_colour, bottom_colour = ([refs.view[index] for index in colour] for colour in (_SKY_TOP, _SKY_BOTTOM))
     texels: Any = _BlockTexels(refs.texels, refs.levels)
     inner = scene.replace(sky_top=top_colour, sky_bottom=bottom_colour, zfar=zfar, fovy=refs.view[_FOVY], texels=texels)
-    zero = jnp.zeros((_PIXELS,))
+    zero = jnp.zeros((_PIXELS,), jnp.float32)
     far, normal, colour = zero, (zero,) * 3, (zero,) * 3
     if outputs.rgb or outputs.depth or outputs.normals or outputs.distance:
 
@@ -327,7 +327,7 @@ def draw(
         looks=jnp.stack(lookup.look_columns(scene), axis=1),
         texels=scene.texels if len(scene.texels) else jnp.zeros((1, 4), jnp.uint32),
         levels=jnp.asarray(scene.atlas.levels or [(0, 1, 1)], jnp.int32),
-        lights=light_table if len(light_table) else jnp.zeros((1, 1)),
+        lights=light_table if len(light_table) else jnp.zeros((1, 1), jnp.float32),
         view=jnp.concatenate([lens, jnp.stack([scene.znear, scene.zfar]), rotation.reshape(9), *sky, scene.fovy[None]]),
         ids=jnp.asarray(ids),
     )

@@ -149,16 +149,16 @@ def _nearest_listed(
     bare_ball = kind == shapes.SPHERE and not any(scene.atlas.mappings[row] for row in rows)
     # The k-th object that touches is the number of these counts that are at most k. All of them are brought to the front of a
     # table at once: whatever is done in the loop, but for the pixels, costs more than it does.
-    counts = jnp.cumsum(camera.in_view(scene, ball[:, :3], ball[:, 3], rays, None).astype(jnp.int32))
+    counts = jnp.cumsum(camera.in_view(scene, ball[:, :3], ball[:, 3], rays, None).astype(jnp.int32), dtype=jnp.int32)
     total = counts[-1]
-    order = jnp.sum(counts[None, :] <= np.arange(len(rows))[:, None], axis=1)
+    order = jnp.sum(counts[None, :] <= np.arange(len(rows), dtype=np.int32)[:, None], axis=1, dtype=jnp.int32)
     columns = [unit.origin[rows], unit.axes[rows].reshape(-1, 9), unit.extra[rows, None], unit.extra_square[rows, None]]
     table = jnp.concatenate([*columns, jnp.asarray(rows, jnp.float32)[:, None]], axis=1)
     table = table.at[jnp.minimum(order, len(rows) - 1)].get(mode="promise_in_bounds")
 
     def advance(state: tuple) -> tuple:
         step, best = state
-        values = jax.lax.dynamic_slice(table, (step, 0), (1, table.shape[1]))[0]
+        values = jax.lax.dynamic_slice(table, (step, np.int32(0)), (1, table.shape[1]))[0]
         origin, axes = [values[i] for i in range(3)], [[values[3 + 3 * i + j] for j in range(3)] for i in range(3)]
         form = (origin, None if bare_ball else axes, values[12], values[13])
         t, meets = entry(kind, form, start, direction, inverse_square)

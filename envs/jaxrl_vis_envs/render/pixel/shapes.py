@@ -71,13 +71,13 @@ def unit_shapes(
     away = position - camera_position
     offset = _added(lambda k: away[:, k, None] * camera_rotation[k])  # [G, 3] in the camera's frame
     relative = _added(lambda k: rotation[:, k, :, None] * camera_rotation[k])  # [G, shape axis, camera axis]
-    offset = jnp.where(finite[:, None], offset, jnp.array([0.0, 0.0, _BEHIND]))
-    relative = jnp.where(finite[:, None, None], relative, jnp.eye(3))
+    offset = jnp.where(finite[:, None], offset, jnp.array([0.0, 0.0, _BEHIND], jnp.float32))
+    relative = jnp.where(finite[:, None, None], relative, jnp.eye(3, dtype=jnp.float32))
 
     half = _half_sizes(kinds, size)
     # A ball looks the same from everywhere: leaving its rotation out saves operations in every pixel, unless it has a texture.
     bare = np.array(scene.atlas.mappings)[:, None] == 0
-    relative = jnp.where(((kinds == SPHERE) & bare)[:, :, None], jnp.eye(3), relative)
+    relative = jnp.where(((kinds == SPHERE) & bare)[:, :, None], jnp.eye(3, dtype=jnp.float32), relative)
     axes = relative / half[:, :, None]
     origin = -_added(lambda k: axes[:, :, k] * offset[:, k, None])
     capsules = kinds[:, 0] == CAPSULE

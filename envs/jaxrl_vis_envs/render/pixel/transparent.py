@@ -80,7 +80,7 @@ def blend(
         near = jnp.sqrt(jnp.sum(jnp.square(ball[:3])) + 1e-20) - ball[3]
         if scene.object_types[index] == shapes.PLANE:
             alpha = jnp.where(raycast.behind(unit, index), _PLANE_BACK * alpha, alpha)
-            near = jnp.full((), reading.ENDLESS)
+            near = jnp.full((), reading.ENDLESS, jnp.float32)
         layers.append(jnp.stack([*own, jnp.where(seen, alpha, 0.0)]))
         distances.append(near)
     stack = jnp.stack(layers)
