@@ -1,10 +1,11 @@
 """Compares our renderer with MuJoCo's own on many models, live, and prints a table. Needs a GL library.
 
-    MUJOCO_GL=egl python benchmarks/render_parity.py [MODEL ...] [--poses N] [--size PIXELS] [--out FILE] [--print]
+    MUJOCO_GL=egl python benchmarks/render_parity.py [MODEL ...] [--poses N] [--size PIXELS] [--out FILE] [--print | --page]
 
 Every model of tests/render_models.py is drawn in N seeded random poses by both, with shadows, reflections and multisampling
 off. What is measured, and the bounds, are in tests/render_comparison.py. The exit status is 1 where a bound does not hold. A
-model that our renderer refuses is a row of the table like any other, with the reason.
+model that our renderer refuses is a row of the table like any other, with the reason. `--page` writes the table of the rows
+that --out holds into docs/renderer_parity.md.
 """
 
 import argparse
@@ -13,6 +14,7 @@ import os
 import pathlib
 import sys
 import time
+from collections.abc import Iterable
 from typing import Any
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
@@ -28,6 +30,7 @@ from render_comparison import BOUNDS, Tally, looks  # noqa: E402
 from jaxrl_vis_envs.render.reference import ReferenceRenderer  # noqa: E402
 
 TARGET = ROOT / "benchmarks" / "results" / "render_parity.json"
+PAGE, MARK = ROOT / "docs" / "renderer_parity.md", "<!-- table -->\n"
 BATCH = 10  # poses that we draw at a time
 COLUMNS = {
     "segmentation": ("segm %", 100.0, 3),
@@ -110,6 +113,11 @@ def table_head() -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in (names, ["---"] * len(names), [*bounds, ""]))
 
 
+def table(rows: Iterable[dict[str, Any]]) -> str:
+    """The whole table, Markdown."""
+    return "\n".join([table_head(), *map(table_row, rows)]) + "\n"
+
+
 def main() -> int:
     """Compares the models that were named, or all."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -118,6 +126,7 @@ def main() -> int:
     parser.add_argument("--size", type=int, default=128, help="height and width in pixels")
     parser.add_argument("--out", type=pathlib.Path, default=TARGET, help="rows of other models that this file holds are kept")
     parser.add_argument("--print", action="store_true", help="only print the rows that --out holds")
+    parser.add_argument("--page", action="store_true", help=f"only write the rows that --out holds into {PAGE.name}")
     options = parser.parse_args()
     unknown = set(options.models) - set(render_models.MODELS)
     if unknown:
@@ -126,10 +135,12 @@ def main() -> int:
     rows = {row["model"]: row for row in kept["rows"] if row["model"] in render_models.MODELS}
     versions = render_models.versions()  # first: a package may be missing
     failed = 0
-    print(table_head())
-    if options.print:
-        print("\n".join(table_row(row) for row in rows.values()))
+    if options.page:
+        PAGE.write_text(PAGE.read_text().partition(MARK)[0] + MARK + table(rows.values()))
+    if options.print or options.page:
+        print(table(rows.values()), end="")
         return int(any(row["failures"] for row in rows.values()))
+    print(table_head())
     for name in options.models or render_models.MODELS:
         rows[name] = compare(name, options.poses, options.size)
         failed += bool(rows[name]["failures"])
