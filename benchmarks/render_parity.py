@@ -25,7 +25,7 @@ import jax  # noqa: E402
 import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 import render_models  # noqa: E402
-from render_comparison import BOUNDS, Tally, looks  # noqa: E402
+from render_comparison import BOUNDS, Tally, surface_kinds  # noqa: E402
 
 from jaxrl_vis_envs.render.reference import ReferenceRenderer  # noqa: E402
 
@@ -56,7 +56,7 @@ def compare(name: str, poses: int, size: int) -> dict[str, Any]:
         scene = render_models.make_scene(name, mj_model, camera, size, size)
     except (ValueError, ModuleNotFoundError) as error:
         return {**row, "refused": " ".join(str(error).split()), "failures": ["refused"]}
-    mj_data, tally, ours_s = mujoco.MjData(mj_model), Tally(looks(mj_model)), 0.0
+    mj_data, tally, ours_s = mujoco.MjData(mj_model), Tally(surface_kinds(mj_model)), 0.0
     with ReferenceRenderer(render_models.build(name, truth=True)[0], size, size, site_groups=entry.site_groups) as reference:
         for first in range(0, poses, BATCH):
             theirs, inputs = [], []
@@ -77,7 +77,7 @@ def compare(name: str, poses: int, size: int) -> dict[str, Any]:
         "measures": {name: None if np.isnan(value) else round(value, 5) for name, value in tally.measures().items()},
         "worst_iou": named(mj_model, tally.worst),
         "worst_match": named(mj_model, tally.worst_match),
-        "failures": tally.failures(),
+        "failures": tally.failures(entry.limits),
         "seconds": {"ours": round(ours_s, 1), "all": round(time.perf_counter() - start, 1)},
     }
 

@@ -7,6 +7,8 @@ image must lie within one pixel of the same object's in the other, in both direc
 """
 
 import dataclasses
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import mujoco
@@ -43,7 +45,7 @@ BOUNDS = {
 }
 
 
-def looks(mj_model: mujoco.MjModel) -> np.ndarray:
+def surface_kinds(mj_model: mujoco.MjModel) -> np.ndarray:
     """[ngeom + nsite] of PLANE, BARE or TEXTURED, indexed as the segmentation is."""
     kinds = []
     for types, materials in ((mj_model.geom_type, mj_model.geom_matid), (mj_model.site_type, mj_model.site_matid)):
@@ -90,7 +92,7 @@ class Tally:
     """Sums over the images of one model. Feed it with `add`; read `measures`.
 
     Attributes:
-        kinds: What `looks` gives for the model.
+        kinds: What `surface_kinds` gives for the model.
         images: How many were added.
         kept: Pixels away from edges.
         agreeing: Of these, where the segmentations agree.
@@ -156,10 +158,11 @@ class Tally:
             found[f"{kind}_p99"] = _percentile(counts, 0.99)
         return found
 
-    def failures(self) -> list[str]:
-        """Names of the bounds that do not hold."""
+    def failures(self, limits: Mapping[str, float] = MappingProxyType({})) -> list[str]:
+        """Names of the bounds that do not hold; ``limits`` are a model's own, that its measures must not exceed."""
         measures = self.measures()
-        return [name for name, bound in BOUNDS.items() if not bound.holds(measures[name])]
+        bounds = {**BOUNDS, **{name: Bound(limit, False) for name, limit in limits.items()}}
+        return [name for name, bound in bounds.items() if not bound.holds(measures[name])]
 
 
 def _share(part: float, whole: int) -> float:

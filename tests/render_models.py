@@ -10,8 +10,8 @@ import importlib.util
 import pathlib
 import warnings
 import zlib
-from collections.abc import Callable
-from types import SimpleNamespace
+from collections.abc import Callable, Mapping
+from types import MappingProxyType, SimpleNamespace
 from typing import Any
 
 import jax
@@ -33,7 +33,7 @@ _VIEW = (120.0, -25.0, 1.5)
 
 @dataclasses.dataclass(frozen=True)
 class RenderModel:
-    """A model and how to look at it.
+    """A model and the camera that sees it.
 
     Attributes:
         source: What it comes from: "ours", the name of a distribution, or "feature".
@@ -43,6 +43,7 @@ class RenderModel:
             multiples of the model's extent.
         site_groups: Groups of sites that are drawn.
         leave_out: What is not drawn, as `Scene.from_mjmodel` takes it.
+        limits: Bounds of its own, see `Tally.failures`.
         plane_backs: As `Scene.from_mjmodel` takes it: True where planes turn around.
         finish: Changes the compiled model in place.
     """
@@ -53,6 +54,7 @@ class RenderModel:
     view: tuple[float, ...] = _VIEW
     site_groups: tuple[int, ...] = ()
     leave_out: tuple[str, ...] = ()
+    limits: Mapping[str, float] = MappingProxyType({})
     plane_backs: bool | None = None
     finish: Callable[[mujoco.MjModel], None] | None = None
 
@@ -92,7 +94,8 @@ def _feature(name: str) -> RenderModel:
         for number, size in enumerate(feature.sizes):
             mj_model.geom_size[mj_model.geom(f"thing{number}").id] = size
 
-    return RenderModel("feature", lambda: scene_spec(feature), "eye", site_groups=(0,), plane_backs=boards, finish=finish)
+    options: dict[str, Any] = {"site_groups": (0,), "plane_backs": boards, "limits": dict(feature.limits), "finish": finish}
+    return RenderModel("feature", lambda: scene_spec(feature), "eye", **options)
 
 
 def _raise_terrain(mj_model: mujoco.MjModel) -> None:
@@ -131,9 +134,9 @@ MODELS: dict[str, RenderModel] = {
 
 
 def build(name: str, truth: bool = False) -> tuple[mujoco.MjModel, int]:
-    """The model, ready to be drawn, and the index of the camera that looks.
+    """The model, ready to be drawn, and the index of its camera.
 
-    Multisampling is off and surfaces are finely divided; nothing else of the model's look is changed.
+    Multisampling is off and surfaces are finely divided; nothing else of the model's appearance is changed.
 
     Args:
         name: One of `MODELS`.
@@ -252,7 +255,7 @@ _draw_all, _draw_quick = (
 
 
 def fingerprint(mj_model: mujoco.MjModel) -> int:
-    """A number that changes when what the model looks like does: another version of the package that it comes from."""
+    """A number that changes with the model's appearance, so with another version of the package that it comes from."""
     numbers = (
         mj_model.geom_type, mj_model.geom_size, mj_model.geom_pos, mj_model.geom_rgba, mj_model.body_pos, mj_model.light_pos,
         mj_model.cam_pos, mj_model.mat_rgba, mj_model.mesh_vert, mj_model.hfield_data,

@@ -1,6 +1,6 @@
 """What is drawn: everything that an image needs besides the poses, read once from a MuJoCo model.
 
-A `Scene` is a pytree. Sizes, colours, materials, lights and the camera are leaves, so a batch of different looks is
+A `Scene` is a pytree. Sizes, colours, materials, lights and the camera are leaves, so a batch of different appearances is
 ``jax.vmap`` over ``scene.replace(rgba=...)``; what is drawn (geom types, ids, the image's size) is static and fixes the
 compiled program.
 
@@ -161,7 +161,7 @@ class Scene:
 
         Args:
             mj_model: The model.
-            camera: Name or index of the camera that looks.
+            camera: Name or index of the camera.
             height: Image height in pixels.
             width: Image width in pixels.
             groups: Geom groups that are drawn (the default is that of `mujoco.Renderer`).
@@ -188,20 +188,20 @@ class Scene:
                 raise ValueError(f"an image needs a whole number of pixels each way, at least one, not {name}={pixels!r}")
         reading.check_names(mj_model, leave_out)
         camera_id = reading.find_camera(mj_model, camera)
-        look = reading.object_looks(mj_model)
+        appearance = reading.object_appearance(mj_model)
         types = np.concatenate([mj_model.geom_type, mj_model.site_type])
-        drawn = reading.drawn_objects(mj_model, look["rgba"], groups, site_groups, leave_out)
+        drawn = reading.drawn_objects(mj_model, appearance["rgba"], groups, site_groups, leave_out)
         reading.refuse_unsupported(mj_model, types, drawn, groups, leave_out, shadows)
         ids = np.flatnonzero(drawn)[::-1]
         atlas, texels, sky = textures.build_atlas(mj_model, ids, textured)
         if not textured:
-            look["rgba"][:, :3] *= reading.mean_texture_colours(mj_model)
-        lights, light_facts = reading.lights(mj_model, look["specular"][ids], shadows)
-        leaves = {**look, **lights, **reading.camera_parameters(mj_model, camera_id)}
+            appearance["rgba"][:, :3] *= reading.mean_texture_colours(mj_model)
+        lights, light_facts = reading.lights(mj_model, appearance["specular"][ids], shadows)
+        leaves = {**appearance, **lights, **reading.camera_parameters(mj_model, camera_id)}
         leaves["sky_top"], leaves["sky_bottom"] = reading.sky_colours(mj_model)
         leaves["haze_colour"] = mj_model.vis.rgba.haze[:3]
         clear = np.where(reading.planes_seen_through(mj_model, camera_id, plane_backs)[ids], reading.CLEAR_FROM_BEHIND, 0)
-        clear = np.where(look["rgba"][ids, 3] < reading.OPAQUE, reading.CLEAR, clear)
+        clear = np.where(appearance["rgba"][ids, 3] < reading.OPAQUE, reading.CLEAR, clear)
         return cls(
             **{name: jnp.asarray(value, jnp.float32) for name, value in leaves.items()},
             texels=jnp.asarray(texels),

@@ -150,7 +150,7 @@ def object_textures(mj_model: mujoco.MjModel) -> np.ndarray:
     return np.where(material >= 0, mj_model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB], -1)
 
 
-def object_looks(mj_model: mujoco.MjModel) -> dict[str, np.ndarray]:
+def object_appearance(mj_model: mujoco.MjModel) -> dict[str, np.ndarray]:
     """Size, colour and material of every geom, then of every site. Keys as in `Scene`."""
     size = np.concatenate([mj_model.geom_size, mj_model.site_size]).reshape(-1, 3)
     rgba = np.concatenate([mj_model.geom_rgba, mj_model.site_rgba]).reshape(-1, 4).astype(np.float64)

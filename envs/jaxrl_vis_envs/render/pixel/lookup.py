@@ -76,10 +76,10 @@ def object_table(scene: Scene, unit: shapes.UnitShapes) -> jax.Array:
         *(unit.origin[:, axis] for axis in range(3)),
         unit.extra,
     ]
-    return jnp.stack(columns + look_columns(scene), axis=-1)
+    return jnp.stack(columns + appearance_columns(scene), axis=-1)
 
 
-def look_columns(scene: Scene) -> list[jax.Array]:
+def appearance_columns(scene: Scene) -> list[jax.Array]:
     """The columns of `object_table` that do not depend on poses, from the kind on; [G] float32 each."""
     ids = np.array(scene.object_ids)
     columns = [jnp.asarray(scene.object_types, jnp.float32), *(scene.rgba[ids, channel] for channel in range(3))]

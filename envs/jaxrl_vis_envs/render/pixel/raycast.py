@@ -22,7 +22,7 @@ from jaxrl_vis_envs.render.scene import Scene
 # Keeps a division by a ray component that is exactly 0 finite; far too small to change any other number.
 _TINY = 1e-20
 
-# So many primitives are unrolled in any case, and of more, those of a type of which there are at most so many.
+# Up to this many primitives are unrolled; of more than these, only those of a type with at most _FEW objects.
 UNROLLED = 48
 _FEW = 3
 

@@ -2,7 +2,7 @@
 
 An object is brought to a unit shape (ball, cylinder, cube, square; a mesh keeps its metres) by an affine map of the camera's
 frame. What is left per pixel and object is a ray that is linear in the pixel's (u, v), and a handful of operations. All of it
-is in a few small tables whose rows are the drawn objects, which is what any other way to find the nearest hit needs too.
+is in a few small tables whose rows are the drawn objects, which any other method of finding the nearest hit needs too.
 """
 
 from collections.abc import Callable
