@@ -30,7 +30,7 @@ class Feature:
         stand_in: What the truth is drawn with in the place of some text of ``lights``: (old, new). MuJoCo's own renderer leaves
             lights of type "point" out, but draws a spot light of cutoff 180, which is OpenGL's point light.
         eye: Where the camera is before it is moved at random: it stays above the floor, or below.
-        limits: Measures of the comparison with a bound closer than that of all models, which its fault would not exceed.
+        limits: Measures of the comparison and closer bounds for them, where the common ones would let the fault pass.
         sizes: Sizes that the things get once the model is compiled, which would refuse some of them.
     """
 

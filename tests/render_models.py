@@ -11,7 +11,7 @@ import pathlib
 import warnings
 import zlib
 from collections.abc import Callable, Mapping
-from types import MappingProxyType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -54,7 +54,7 @@ class RenderModel:
     view: tuple[float, ...] = _VIEW
     site_groups: tuple[int, ...] = ()
     leave_out: tuple[str, ...] = ()
-    limits: Mapping[str, float] = MappingProxyType({})
+    limits: Mapping[str, float] = dataclasses.field(default_factory=dict)
     plane_backs: bool | None = None
     finish: Callable[[mujoco.MjModel], None] | None = None
 
