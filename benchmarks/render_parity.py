@@ -1,10 +1,11 @@
 """Compares our renderer with MuJoCo's own on many models, live, and prints a table. Needs a GL library.
 
-    MUJOCO_GL=egl python benchmarks/render_parity.py [MODEL ...] [--poses N] [--size PIXELS] [--out FILE] [--print]
+    MUJOCO_GL=egl python benchmarks/render_parity.py [MODEL ...] [--poses N] [--size PIXELS] [--out FILE] [--print | --page]
 
 Every model of tests/render_models.py is drawn in N seeded random poses by both, with shadows, reflections and multisampling
 off. What is measured, and the bounds, are in tests/render_comparison.py. The exit status is 1 where a bound does not hold. A
-model that our renderer refuses is a row of the table like any other, with the reason.
+model that our renderer refuses is a row of the table like any other, with the reason. `--page` writes the table of the rows
+that --out holds into docs/renderer_parity.md.
 """
 
 import argparse
@@ -13,6 +14,7 @@ import os
 import pathlib
 import sys
 import time
+from collections.abc import Iterable
 from typing import Any
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
@@ -23,15 +25,17 @@ import jax  # noqa: E402
 import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 import render_models  # noqa: E402
-from render_comparison import BOUNDS, Tally, looks  # noqa: E402
+from render_comparison import BOUNDS, Tally, surface_kinds  # noqa: E402
 
 from jaxrl_vis_envs.render.reference import ReferenceRenderer  # noqa: E402
 
 TARGET = ROOT / "benchmarks" / "results" / "render_parity.json"
+PAGE, MARK = ROOT / "docs" / "renderer_parity.md", "<!-- table -->\n"
 BATCH = 10  # poses that we draw at a time
 COLUMNS = {
     "segmentation": ("segm %", 100.0, 3),
     "iou": ("min IoU", 1.0, 3),
+    "matched": ("min match", 1.0, 3),
     "depth": ("depth %", 100.0, 3),
     "bare_mean": ("rgb mean", 1.0, 2),
     "bare_p99": ("rgb p99", 1.0, 0),
@@ -52,7 +56,7 @@ def compare(name: str, poses: int, size: int) -> dict[str, Any]:
         scene = render_models.make_scene(name, mj_model, camera, size, size)
     except (ValueError, ModuleNotFoundError) as error:
         return {**row, "refused": " ".join(str(error).split()), "failures": ["refused"]}
-    mj_data, tally, ours_s = mujoco.MjData(mj_model), Tally(looks(mj_model)), 0.0
+    mj_data, tally, ours_s = mujoco.MjData(mj_model), Tally(surface_kinds(mj_model)), 0.0
     with ReferenceRenderer(render_models.build(name, truth=True)[0], size, size, site_groups=entry.site_groups) as reference:
         for first in range(0, poses, BATCH):
             theirs, inputs = [], []
@@ -67,16 +71,21 @@ def compare(name: str, poses: int, size: int) -> dict[str, Any]:
             ours_s += time.perf_counter() - mark
             for our, their in zip(ours, theirs, strict=False):
                 tally.add(our, their)
-    worst = tally.worst[1]
-    name_of = mj_model.geom(worst).name if 0 <= worst < mj_model.ngeom else ""
     return {
         **row,
         "geoms": len(scene.object_ids),
         "measures": {name: None if np.isnan(value) else round(value, 5) for name, value in tally.measures().items()},
-        "worst_iou": {"object": worst, "name": name_of, "pose": tally.worst[2]},
-        "failures": tally.failures(),
+        "worst_iou": named(mj_model, tally.worst),
+        "worst_match": named(mj_model, tally.worst_match),
+        "failures": tally.failures(entry.limits),
         "seconds": {"ours": round(ours_s, 1), "all": round(time.perf_counter() - start, 1)},
     }
+
+
+def named(mj_model: mujoco.MjModel, worst: tuple[float, int, int]) -> dict[str, Any]:
+    """Where the worst of a measure was found."""
+    _, number, pose = worst
+    return {"object": number, "name": mj_model.geom(number).name if 0 <= number < mj_model.ngeom else "", "pose": pose}
 
 
 def table_row(row: dict[str, Any]) -> str:
@@ -104,6 +113,11 @@ def table_head() -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in (names, ["---"] * len(names), [*bounds, ""]))
 
 
+def table(rows: Iterable[dict[str, Any]]) -> str:
+    """The whole table, Markdown."""
+    return "\n".join([table_head(), *map(table_row, rows)]) + "\n"
+
+
 def main() -> int:
     """Compares the models that were named, or all."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -112,6 +126,7 @@ def main() -> int:
     parser.add_argument("--size", type=int, default=128, help="height and width in pixels")
     parser.add_argument("--out", type=pathlib.Path, default=TARGET, help="rows of other models that this file holds are kept")
     parser.add_argument("--print", action="store_true", help="only print the rows that --out holds")
+    parser.add_argument("--page", action="store_true", help=f"only write the rows that --out holds into {PAGE.name}")
     options = parser.parse_args()
     unknown = set(options.models) - set(render_models.MODELS)
     if unknown:
@@ -120,10 +135,12 @@ def main() -> int:
     rows = {row["model"]: row for row in kept["rows"] if row["model"] in render_models.MODELS}
     versions = render_models.versions()  # first: a package may be missing
     failed = 0
-    print(table_head())
-    if options.print:
-        print("\n".join(table_row(row) for row in rows.values()))
+    if options.page:
+        PAGE.write_text(PAGE.read_text().partition(MARK)[0] + MARK + table(rows.values()))
+    if options.print or options.page:
+        print(table(rows.values()), end="")
         return int(any(row["failures"] for row in rows.values()))
+    print(table_head())
     for name in options.models or render_models.MODELS:
         rows[name] = compare(name, options.poses, options.size)
         failed += bool(rows[name]["failures"])

@@ -29,6 +29,9 @@ class Feature:
         sites: Attributes of one site each, on the things' bodies.
         stand_in: What the truth is drawn with in the place of some text of ``lights``: (old, new). MuJoCo's own renderer leaves
             lights of type "point" out, but draws a spot light of cutoff 180, which is OpenGL's point light.
+        eye: Where the camera is before it is moved at random: it stays above the floor, or below.
+        limits: Measures of the comparison and closer bounds for them, where the common ones would let the fault pass.
+        sizes: Sizes that the things get once the model is compiled, which would refuse some of them.
     """
 
     sheet: str
@@ -41,12 +44,15 @@ class Feature:
     visual: str = ""
     sites: tuple[str, ...] = ()
     stand_in: tuple[str, str] | None = None
+    eye: str = "0 -1.5 1"
+    limits: tuple[tuple[str, float], ...] = ()
+    sizes: tuple[tuple[float, float, float], ...] = ()
 
 
 _PLACES = ((-0.3, -0.25, 0.4), (0.3, -0.2, 0.35), (0.0, 0.3, 0.45), (-0.35, 0.35, 0.3), (0.4, 0.3, 0.5), (0.0, -0.05, 0.65))
 _COLOURS = ("1 .3 .2 1", ".2 .8 .3 1", ".3 .4 1 1", ".9 .8 .2 1", ".7 .3 .8 1", ".2 .8 .8 1")
 
-# The same six bodies, to be given a look: a ball, a pill, an egg, a can, a brick and a board.
+# The same six bodies, to be given a colour or a texture: a ball, a pill, an egg, a can, a brick and a board.
 _SHAPES = (
     'type="sphere" size=".16"',
     'type="capsule" size=".09 .14"',
@@ -79,6 +85,11 @@ def _elevation() -> str:
     return " ".join(f"{height:.3f}" for height in heights.reshape(-1))
 
 
+_CHECKS = (
+    '<texture name="checks" type="2d" builtin="checker" rgb1=".9 .8 .6" rgb2=".2 .3 .5" width="64" height="64"/>'
+    '<material name="checks" texture="checks" texuniform="true"/>'
+)
+_CHECKED = 'type="plane" size="0 0 .1" material="checks"'
 _HFIELD = f'<hfield {_HILLS} elevation="{_elevation()}"/>'
 
 
@@ -95,7 +106,7 @@ def _three(kind: str, *sizes: str) -> tuple[str, ...]:
 
 
 def _geoms() -> dict[str, Feature]:
-    def of(title: str, *things: str, **more: str) -> Feature:
+    def of(title: str, *things: str, **more: Any) -> Feature:
         return Feature("geoms", title, tuple(things), **{"assets": _SKY, **more})
 
     return {
@@ -126,6 +137,22 @@ def _geoms() -> dict[str, Feature]:
             "mesh: flat, smooth, hollow", *_three("mesh", 'mesh="wedge"', 'mesh="ring"', 'mesh="cone"'), assets=_SKY + _MESHES
         ),
         "geom_hfield": of("height field", *_three("hfield", 'hfield="hills"', 'hfield="hills"'), assets=_SKY + _HFIELD),
+        "geom_plane_below": of(
+            "plane without end, seen from below",
+            *_coloured(_BODIES[:3]),
+            assets=_SKY + _CHECKS,
+            floor=_CHECKED,
+            eye="0 -1.5 -1",
+            limits=(("plane_mean", 2.0),),
+        ),
+        # Without a light the normal does not count: OpenGL has none for what is flat.
+        "geom_flat": of(
+            "what is left where a size is 0: box, box, cylinder, ellipsoid, capsule (nothing)",
+            *_coloured((_SHAPES[4], _SHAPES[4], _SHAPES[3], _SHAPES[2], _SHAPES[1])),
+            lights="",
+            visual='<headlight active="0"/>',
+            sizes=((0.2, 0.25, 0.0), (0.0, 0.2, 0.3), (0.2, 0.0, 0.0), (0.2, 0.0, 0.25), (0.15, 0.0, 0.0)),
+        ),
         "sites": Feature(
             "geoms",
             "sites",
@@ -183,17 +210,17 @@ def _lights() -> dict[str, Feature]:
 
 
 def _textures() -> dict[str, Feature]:
-    checker = '<texture name="look" type="{}" builtin="checker" rgb1=".9 .8 .6" rgb2=".2 .3 .5" width="64" height="{}"/>'
-    gradient = '<texture name="look" type="{}" builtin="gradient" rgb1="1 .8 .1" rgb2=".1 .1 .7" width="64" height="{}"/>'
+    checker = '<texture name="pattern" type="{}" builtin="checker" rgb1=".9 .8 .6" rgb2=".2 .3 .5" width="64" height="{}"/>'
+    gradient = '<texture name="pattern" type="{}" builtin="gradient" rgb1="1 .8 .1" rgb2=".1 .1 .7" width="64" height="{}"/>'
     marked = (
-        '<texture name="look" type="{}" builtin="flat" mark="cross" markrgb="1 1 1" rgb1=".7 .3 .2" rgb2=".2 .3 .7"'
+        '<texture name="pattern" type="{}" builtin="flat" mark="cross" markrgb="1 1 1" rgb1=".7 .3 .2" rgb2=".2 .3 .7"'
         ' width="65" height="{}"/>'
     )
-    image = '<texture name="look" type="2d" file="image.png"/>'
-    die = '<texture name="look" type="cube" file="image.png" gridsize="1 1"/>'
-    plain = '<material name="look" texture="look"/>'
-    uniform = '<material name="look" texture="look" texuniform="true" texrepeat="3 2"/>'
-    repeated = '<material name="look" texture="look" texrepeat="2 3" rgba=".8 1 .8 1"/>'
+    image = '<texture name="pattern" type="2d" file="image.png"/>'
+    die = '<texture name="pattern" type="cube" file="image.png" gridsize="1 1"/>'
+    plain = '<material name="pattern" texture="pattern"/>'
+    uniform = '<material name="pattern" texture="pattern" texuniform="true" texrepeat="3 2"/>'
+    repeated = '<material name="pattern" texture="pattern" texrepeat="2 3" rgba=".8 1 .8 1"/>'
 
     def flat(texture: str) -> str:
         return texture.format("2d", 64)
@@ -201,10 +228,10 @@ def _textures() -> dict[str, Feature]:
     def cube(texture: str) -> str:
         return texture.format("cube", 65 * 6 if "65" in texture else 64 * 6)
 
-    def of(title: str, assets: str, shapes: tuple[str, ...] = _SHAPES, **more: str) -> Feature:
-        return Feature("textures", title, _each('material="look"', shapes), _SKY + assets, **more)
+    def of(title: str, assets: str, shapes: tuple[str, ...] = _SHAPES, more: tuple[str, ...] = (), **rest: Any) -> Feature:
+        return Feature("textures", title, _each('material="pattern"', shapes) + more, _SKY + assets, **rest)
 
-    floor = 'type="plane" size="{}" material="look"'
+    floor = 'type="plane" size="{}" material="pattern"'
     meshes = tuple(f'type="mesh" mesh="{name}"' for name in ("wedge", "ring", "cone"))
     return {
         "texture_2d_checker": of("2-D checker", flat(checker) + plain),
@@ -229,6 +256,22 @@ def _textures() -> dict[str, Feature]:
             (*meshes[:2], 'type="mesh" mesh="imaged"'),
         ),
         "texture_mesh_cube": of("cube image on meshes", _MESHES + die + plain, meshes),
+        "texture_mesh_repeated": of(
+            "2-D image on a mesh with its own corners, repeated",
+            _IMAGED + image + repeated + uniform.replace('"pattern" texture', '"uniform" texture'),
+            ('type="mesh" mesh="imaged"',) * 2,
+            more=('type="mesh" mesh="imaged" material="uniform"',),
+            limits=(("textured_mean", 1.0),),
+        ),
+        "texture_srgb": of(
+            "images flagged as sRGB: 2-D, and a cube",
+            image.replace("/>", ' colorspace="sRGB"/>')
+            + plain
+            + die.replace('"pattern"', '"die"').replace("/>", ' colorspace="sRGB"/>')
+            + '<material name="die" texture="die"/>',
+            _SHAPES[:2],
+            more=tuple(f'{shape} material="die"' for shape in _SHAPES[3:5]),
+        ),
         "texture_hfield": of("2-D image on a height field", _HFIELD + image + plain, ('type="hfield" hfield="hills"',) * 2),
     }
 
@@ -277,7 +320,7 @@ def scene_spec(feature: Feature) -> mujoco.MjSpec:
     {feature.lights}
     {f'<geom name="floor" {feature.floor}/>' if feature.floor else ""}
     {"".join(things)}
-    <body name="eye" mocap="true" pos="0 -1.5 1"><camera name="eye" {feature.camera}/></body>
+    <body name="eye" mocap="true" pos="{feature.eye}"><camera name="eye" {feature.camera}/></body>
   </worldbody>
 </mujoco>
 """

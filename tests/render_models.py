@@ -10,7 +10,7 @@ import importlib.util
 import pathlib
 import warnings
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from types import SimpleNamespace
 from typing import Any
 
@@ -33,7 +33,7 @@ _VIEW = (120.0, -25.0, 1.5)
 
 @dataclasses.dataclass(frozen=True)
 class RenderModel:
-    """A model and how to look at it.
+    """A model and the camera that sees it.
 
     Attributes:
         source: What it comes from: "ours", the name of a distribution, or "feature".
@@ -43,7 +43,8 @@ class RenderModel:
             multiples of the model's extent.
         site_groups: Groups of sites that are drawn.
         leave_out: What is not drawn, as `Scene.from_mjmodel` takes it.
-        plane_backs: Whether planes are seen from behind, where MuJoCo draws them half transparent.
+        limits: Bounds of its own, see `Tally.failures`.
+        plane_backs: As `Scene.from_mjmodel` takes it: True where planes turn around.
         finish: Changes the compiled model in place.
     """
 
@@ -53,7 +54,8 @@ class RenderModel:
     view: tuple[float, ...] = _VIEW
     site_groups: tuple[int, ...] = ()
     leave_out: tuple[str, ...] = ()
-    plane_backs: bool = False
+    limits: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    plane_backs: bool | None = None
     finish: Callable[[mujoco.MjModel], None] | None = None
 
 
@@ -86,8 +88,14 @@ def _ours(task: str) -> RenderModel:
 
 def _feature(name: str) -> RenderModel:
     feature = FEATURES[name]
-    boards = any('type="plane"' in thing for thing in feature.things)
-    return RenderModel("feature", lambda: scene_spec(feature), "eye", site_groups=(0,), plane_backs=boards)
+    boards = any('type="plane"' in thing for thing in feature.things) or None
+
+    def finish(mj_model: mujoco.MjModel) -> None:
+        for number, size in enumerate(feature.sizes):
+            mj_model.geom_size[mj_model.geom(f"thing{number}").id] = size
+
+    options: dict[str, Any] = {"site_groups": (0,), "plane_backs": boards, "limits": dict(feature.limits), "finish": finish}
+    return RenderModel("feature", lambda: scene_spec(feature), "eye", **options)
 
 
 def _raise_terrain(mj_model: mujoco.MjModel) -> None:
@@ -106,8 +114,7 @@ _SUITE = ("acrobot", "ball_in_cup", "cartpole", "cheetah", "finger", "fish", "ho
 _SUITE += ("manipulator", "pendulum", "point_mass", "reacher", "stacker", "swimmer", "walker")
 
 MODELS: dict[str, RenderModel] = {
-    "fetch_reach": _ours("fetch_reach"),
-    "reacher": _ours("reacher"),
+    **{task: _ours(task) for task in ("fetch_reach", "reacher", "finger_turn", "hand_reach", "sawyer_reach")},
     **{f"dm_{domain.lower()}": _suite(domain) for domain in _SUITE},
     "dm_lqr": _suite("lqr", None),
     "dm_dog": _suite("dog", None, view=(60.0, -15.0, 1.0), leave_out=("skin",)),
@@ -127,9 +134,9 @@ MODELS: dict[str, RenderModel] = {
 
 
 def build(name: str, truth: bool = False) -> tuple[mujoco.MjModel, int]:
-    """The model, ready to be drawn, and the index of the camera that looks.
+    """The model, ready to be drawn, and the index of its camera.
 
-    Multisampling is off and surfaces are finely divided; nothing else of the model's look is changed.
+    Multisampling is off and surfaces are finely divided; nothing else of the model's appearance is changed.
 
     Args:
         name: One of `MODELS`.
@@ -206,9 +213,10 @@ def set_pose(mj_model: mujoco.MjModel, mj_data: mujoco.MjData, number: int) -> N
 
 
 def _orbit(position: np.ndarray, quaternion: np.ndarray, rng: np.random.Generator) -> None:
-    """Puts the eye somewhere around the middle of a feature scene, looking at it."""
+    """Puts the eye somewhere around the middle of a feature scene, looking at it, on the side of the floor that it is on."""
+    side = np.sign(position[2])
     turn, distance = rng.uniform(-np.pi, np.pi), rng.uniform(1.2, 1.8)
-    position[:] = distance * np.cos(turn), distance * np.sin(turn), rng.uniform(0.6, 1.5)
+    position[:] = distance * np.cos(turn), distance * np.sin(turn), side * rng.uniform(0.6, 1.5)
     back = position - np.array([0.0, 0.0, 0.35])
     right = np.cross([0.0, 0.0, 1.0], back)
     axes = np.stack([right, np.cross(back, right), back], axis=1)
@@ -247,7 +255,7 @@ _draw_all, _draw_quick = (
 
 
 def fingerprint(mj_model: mujoco.MjModel) -> int:
-    """A number that changes when what the model looks like does: another version of the package that it comes from."""
+    """A number that changes with the model's appearance, so with another version of the package that it comes from."""
     numbers = (
         mj_model.geom_type, mj_model.geom_size, mj_model.geom_pos, mj_model.geom_rgba, mj_model.body_pos, mj_model.light_pos,
         mj_model.cam_pos, mj_model.mat_rgba, mj_model.mesh_vert, mj_model.hfield_data,

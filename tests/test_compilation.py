@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from small_scene import small_scene
 
+from jaxrl_vis.learner import encoder_kernel
 from jaxrl_vis_envs import compilation
 from jaxrl_vis_envs.compilation import by_platform, kernels, runs_gpu_kernels, targets_cpu, tracing_for
 from jaxrl_vis_envs.render import render_planes
+from jaxrl_vis_envs.render.gpu import kernel
 
 KERNEL_CALL = "__gpu$xla.gpu.triton"
 
@@ -92,6 +94,22 @@ def test_a_kernel_that_does_not_compile_is_left_out_and_named_once(gpu, monkeypa
     monkeypatch.setenv("JAXRL_VIS_KERNELS", "1")  # asks for the error itself
     with tracing_for("cuda"):
         assert runs_gpu_kernels(breaks)
+
+
+@pytest.mark.parametrize("module", [kernel, encoder_kernel])
+def test_the_kernels_themselves_are_probed_in_the_midst_of_a_trace(module, gpu):
+    """As far as they can be compiled without a GPU: down to Triton's code."""
+    gpu()
+
+    def probe() -> None:
+        module.probe_program().lower(lowering_platforms=("cuda",))
+
+    @jax.jit
+    def traced(x):
+        with tracing_for("cuda"):
+            return x + runs_gpu_kernels(probe)
+
+    assert traced(jnp.float32(0)) == 1
 
 
 def test_a_program_holds_the_branch_of_its_own_platform(gpu):

@@ -244,6 +244,15 @@ def test_an_unknown_camera_is_refused_with_the_names_there_are(ball):
         Scene.from_mjmodel(ball[0], "side")
 
 
-def test_an_empty_image_is_refused(ball):
-    with pytest.raises(ValueError, match="height=0"):
-        Scene.from_mjmodel(ball[0], "front", 0, 4)
+@pytest.mark.parametrize(("height", "width", "named"), [(0, 4, "height=0"), (4, 4.5, "width=4.5"), ("4", 4, "height='4'")])
+def test_an_image_without_a_whole_number_of_pixels_is_refused(ball, height, width, named):
+    with pytest.raises(ValueError, match=named):
+        Scene.from_mjmodel(ball[0], "front", height, width)
+    assert Scene.from_mjmodel(ball[0], "front", np.int64(3), 4).height == 3
+
+
+def test_what_is_left_out_must_be_there(ball):
+    with pytest.raises(ValueError, match="'nosuch'.*'ball', 'ghost', 'wall'") as refusal:
+        Scene.from_mjmodel(ball[0], "front", leave_out=("ball", "nosuch"))
+    assert "\n" not in str(refusal.value) and "'ball'" not in str(refusal.value).partition(":")[0]
+    assert len(Scene.from_mjmodel(ball[0], "front", leave_out=("ball", "skin", "flex")).object_ids) == 1

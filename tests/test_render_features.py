@@ -144,13 +144,37 @@ def test_what_is_transparent_lets_what_is_behind_through():
     assert np.abs(drawn(body + ABOVE, assets=mesh).rgb[8, 8] - frame.rgb[8, 8].astype(int)).max() <= 2
 
 
-def test_planes_are_half_transparent_from_behind_where_asked_for():
+def test_planes_are_half_transparent_from_behind():
     body = '<geom type="plane" size="1 1 .1" rgba="1 0 0 1"/><geom type="sphere" size=".2" pos="0 0 .5" rgba="0 0 1 1"/>'
     body += '<camera name="below" pos="0 0 -2" xyaxes="1 0 0 0 -1 0"/><camera name="above" pos="0 0 2"/>'
     below, above = (drawn(body, camera, plane_backs=True) for camera in ("below", "above"))
     assert below.rgb[8, 8, 2] > 50 and below.rgb[8, 8, 0] > 50
+    mj_model, _ = load(body)
+    # Unasked, those are that the camera is behind of at the start.
+    assert [Scene.from_mjmodel(mj_model, camera).transparent for camera in ("below", "above")] == [(0, 2), (0, 0)]
     np.testing.assert_array_equal(above.rgb, drawn(body, "above").rgb)
-    assert not drawn(body, "below").rgb[8, 8, 2]
+    assert not drawn(body, "below", plane_backs=False).rgb[8, 8, 2]
+
+
+def test_what_has_no_thickness_is_a_sheet_and_what_has_no_area_is_not_there():
+    """MuJoCo's images of such things are in test_render_parity.py; here, that both implementations of a CPU draw the same."""
+    things = {"box": (0.2, 0.15, 0.0), "cylinder": (0.2, 0.0, 0.0), "capsule": (0.2, 0.0, 0.0), "sphere": (0.0, 0.0, 0.0)}
+    body = "".join(f'<geom type="{kind}" size=".2 .2 .2" pos="{x} 0 0"/>' for x, kind in zip((-0.6, -0.2, 0.2, 0.6), things))
+    mj_model, mj_data = load(body + ABOVE)
+    mj_model.geom_size[:] = list(things.values())
+    scene = Scene.from_mjmodel(mj_model, "above", 41, 41)
+    poses = {name: np.array(getattr(mj_data, name), np.float32) for name in POSES}
+
+    def depth_and_labels(**more):
+        planes = render_planes(scene, SimpleNamespace(**poses), rgb=False, segmentation=True, **more)
+        return planes.depth, planes.segmentation
+
+    (depth, labels), (plain_depth, plain_labels) = env_jit(lambda: (depth_and_labels(), depth_and_labels(distance=True)))()
+    np.testing.assert_array_equal(labels, plain_labels)
+    np.testing.assert_allclose(depth, plain_depth, rtol=1e-5)
+    assert set(np.unique(labels)) == {-1, 0, 1}
+    np.testing.assert_allclose(np.asarray(depth)[np.asarray(labels) >= 0], 2.0, atol=1e-4)
+    assert np.mean(np.asarray(labels) == 0) < 0.1
 
 
 def test_shadows_fall_where_the_light_is_hidden():
@@ -259,25 +283,34 @@ REFUSALS = {
         ' vertid="0 1 2" vertweight="1 1 1"/></skin>',
         "coat.*leave_out",
         {},
+        ("skin",),
+    ),
+    "a flex in a group beyond the last, which counts as the last": (
+        '<body name="b"><freejoint/><geom size=".1"/></body>' + ABOVE,
+        '<flex name="cloth" dim="2" group="9" body="b b b" vertex="0 0 0 1 0 0 0 1 0" element="0 1 2"/>',
+        "cloth.*leave_out",
+        {"groups": (5,)},
+        ("flex",),
     ),
     "shadows of a mesh": (
         '<geom name="statue" type="mesh" mesh="m"/>' + ABOVE,
         '<mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/>',
         "statue.*shadows=False",
         {"shadows": True},
+        ("statue",),
     ),
 }
 
 
 @pytest.mark.parametrize("case", REFUSALS)
 def test_refusals_name_the_culprit_and_the_mend(case):
-    body, assets, message, options = REFUSALS[case]
+    body, assets, message, options, culprits = REFUSALS[case]
     deformable = ""
-    if "<skin" in assets:
+    if "<mesh" not in assets:
         deformable, assets = f"<deformable>{assets}</deformable>", ""
     xml = f"<mujoco>{deformable}<asset>{assets}</asset><worldbody>{body}</worldbody></mujoco>"
     mj_model = mujoco.MjModel.from_xml_string(xml)
     with pytest.raises(ValueError, match=message) as refusal:
         Scene.from_mjmodel(mj_model, "above", **options)
     assert "\n" not in str(refusal.value)
-    Scene.from_mjmodel(mj_model, "above", leave_out=("skin", "statue"), **options)
+    Scene.from_mjmodel(mj_model, "above", leave_out=culprits, **options)

@@ -60,7 +60,7 @@ def no_change() -> dict:
 
 
 def moved(scene: Scene, poses: dict, thing: jax.Array, change: dict) -> tuple[Scene, dict]:
-    """The scene and the poses with small changes: of a thing's position and orientation, the camera, sizes, looks."""
+    """The scene and the poses with small changes: of a thing's position and orientation, the camera, sizes, colours."""
     x, y, z = change["turn"]
     cross = jnp.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     turned = poses["geom_xmat"].reshape(-1, 3, 3)

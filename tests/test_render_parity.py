@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import render_models
 import render_references
-from render_comparison import BARE, BOUNDS, PLANE, SKY, TEXTURED, Tally, looks
+from render_comparison import BARE, BOUNDS, PLANE, SKY, TEXTURED, Tally, surface_kinds
 
 from jaxrl_vis.bench.render_scenes import forward
 from jaxrl_vis_envs.render import Frame
@@ -32,14 +32,15 @@ def test_images_agree_with_mujoco(name: str) -> None:
         mj_data.qpos, mj_data.mocap_pos, mj_data.mocap_quat = qpos, position, quaternion
         forward(mj_model, mj_data)
         poses.append(render_models.poses_of(mj_data))
-    tally = Tally(looks(mj_model))
+    tally = Tally(surface_kinds(mj_model))
     quick = mj_model.nmeshface + 2 * mj_model.nhfielddata < MANY_TRIANGLES
     for index, ours in enumerate(render_models.draw(scene, poses, quick)):
         theirs = Frame(stored.rgb[index], stored.depth[index], stored.segmentation[index])  # pyright: ignore[reportArgumentType]
         tally.add(ours, theirs)
     assert len({row.tobytes() for row in stored.rgb}) == len(poses), "the stored images are copies of each other"
     assert tally.solid > 0, "nothing was compared"
-    assert not tally.failures(), {measure: tally.measures()[measure] for measure in tally.failures()}
+    failures = tally.failures(render_models.MODELS[name].limits)
+    assert not failures, {measure: tally.measures()[measure] for measure in failures}
 
 
 def frame(label: int = 0, depth: float = 2.0, colour: int = 100) -> Frame:
@@ -64,7 +65,29 @@ def test_a_image_agrees_with_itself_away_from_edges() -> None:
 
 
 def test_another_object_fails() -> None:
-    assert tally_of(frame(label=1), frame(label=0)).failures() == ["segmentation", "iou"]
+    assert tally_of(frame(label=1), frame(label=0)).failures() == ["segmentation", "iou", "matched"]
+
+
+def thin(width: int, column: int = 3, label: int = 1) -> Frame:
+    """`frame` with a geom of some columns and twelve rows in it, all of whose pixels lie near its edges."""
+    changed = frame()
+    changed.segmentation[2:14, column : column + width] = label
+    changed.rgb[2:14, column : column + width] = 255
+    return changed
+
+
+def test_a_thin_object_that_is_missing_fails_in_both_directions() -> None:
+    for ours, theirs in ((frame(), thin(2)), (thin(2), frame())):
+        tally = tally_of(ours, theirs)
+        assert tally.failures() == ["matched"]
+        assert tally.worst_match == (0.0, 1, 0)
+
+
+def test_a_thin_object_may_be_a_pixel_away_and_no_further() -> None:
+    assert tally_of(thin(1), thin(1, column=4)).failures() == []
+    assert tally_of(thin(1), thin(1, column=5)).failures() == ["matched"]
+    assert tally_of(thin(1), thin(3, column=2)).measures()["matched"] == 1.0  # wider by a pixel on each side
+    assert "matched" in tally_of(thin(1), thin(4)).failures()
 
 
 def test_a_wrong_object_inside_counts_though_edges_are_left_out() -> None:

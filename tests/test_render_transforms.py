@@ -47,6 +47,29 @@ def image(scene: Scene, poses: dict, height, quantized: bool = False):
     return jnp.concatenate([rgb, planes.depth[None]])
 
 
+@pytest.mark.parametrize(("kind", "rgb"), [("mesh", False), ("capsule", True)])
+def test_images_are_the_same_where_jax_computes_in_64_bits(kind, rgb):
+    def draw():
+        scene, poses = setting(kind)
+        poses = {name: jnp.asarray(value, float) for name, value in poses.items()}
+
+        @env_jit
+        def planes(poses, rgba):
+            changed = scene.replace(rgba=rgba)
+            return render_planes(changed, SimpleNamespace(**poses), rgb=rgb, segmentation=True, quantized=rgb)
+
+        return planes(poses, jnp.asarray(scene.rgba, float))
+
+    expected = draw()
+    with jax.enable_x64(True):
+        assert jnp.zeros(()).dtype == jnp.float64
+        drawn = draw()
+    for name in ("depth", "segmentation", *(["rgb"] if rgb else [])):
+        ours, theirs = getattr(drawn, name), getattr(expected, name)
+        assert ours.dtype == theirs.dtype
+        np.testing.assert_allclose(np.asarray(ours, float), np.asarray(theirs, float), atol=1e-5, rtol=1e-5, err_msg=name)
+
+
 @pytest.mark.parametrize(
     ("kind", "alpha", "quantized", "size"),
     [("capsule", 1.0, False, SIZE), ("capsule", 1.0, True, 48), ("capsule", 0.4, False, SIZE), ("mesh", 1.0, False, SIZE)],

@@ -7,7 +7,7 @@ long before this package is imported.
 JAX 0.11 has no such option per function any more (it refuses the name). Its emitters do not explode, but leave physics on a CPU
 about half as fast (FetchReach, 64 environments, two cores: 1,100 environment steps a second against 2,350).
 
-What is fast on a CPU is slow on a GPU and the other way round, and some functions have a hand-written kernel for NVIDIA GPUs
+What is fast on a CPU is slow on a GPU and vice versa, and some functions have a hand-written kernel for NVIDIA GPUs
 (Pallas, by Triton). Which of these is used follows the platform that a program is compiled for, which is not always that of the
 default backend: `by_platform`. The environment variable ``JAXRL_VIS_KERNELS`` and the context manager `kernels` choose between
 the kernels and the same functions in plain JAX: ``0`` never uses a kernel, ``1`` uses them on every NVIDIA GPU, and ``auto``

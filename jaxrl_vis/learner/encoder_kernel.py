@@ -78,6 +78,11 @@ def is_available() -> bool:
 
 def probe() -> None:
     """Compiles small instances of all three kernels for the device that is the default; raises what that raises."""
+    probe_program().lower().compile()
+
+
+def probe_program() -> Any:
+    """Small instances of all three kernels in one program, traced (`jax.stages.Traced`)."""
     shape = (_MOST_CHANNELS, 8, 8)
     images, of_pixels = jnp.zeros((_LEAST_ROWS, *shape), jnp.uint8), jnp.zeros(shape)
     channels = (_MOST_CHANNELS, 16, 16, 16)
@@ -91,7 +96,7 @@ def probe() -> None:
         return _backward_on_gpu(patches, weights, out, out, 0, patches.shape[0])
 
     weights = make_weights(kernels | biases, _MOST_CHANNELS)
-    jax.jit(all_three).lower(images, of_pixels, of_pixels, weights).compile()
+    return jax.jit(all_three).trace(images, of_pixels, of_pixels, weights)
 
 
 def _dispatch(on_gpu: Any, plain: Any, *arguments: Any, interpret: bool) -> Any:

@@ -61,7 +61,8 @@ def _rotation(vector: jax.Array) -> jax.Array:
     x, y, z = vector[0], vector[1], vector[2]
     zero = jnp.zeros_like(x)
     cross = jnp.stack([jnp.stack([zero, -z, y]), jnp.stack([z, zero, -x]), jnp.stack([-y, x, zero])])
-    return jnp.eye(3) + sine * cross + cosine * (vector[:, None] * vector[None, :] - square * jnp.eye(3))
+    identity = jnp.eye(3, dtype=jnp.float32)
+    return identity + sine * cross + cosine * (vector[:, None] * vector[None, :] - square * identity)
 
 
 def lens(scene: Scene) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
@@ -70,7 +71,7 @@ def lens(scene: Scene) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     Returns:
         Middle across and up, half the width and half the height, each [] float32 (m).
     """
-    zero = jnp.zeros(())
+    zero = jnp.zeros((), jnp.float32)
     if scene.projection == "intrinsic":
         middle = scene.principal / scene.focal
         half = 0.5 * scene.sensor / scene.focal

@@ -68,6 +68,7 @@ def render_planes(
         The planes that were asked for.
     """
     outputs = Outputs(rgb, depth, segmentation, normals, distance, quantized)
+    scene = _in_32_bits(scene)
     if not scene.object_ids:
         return _quantized(outputs, _draw_nothing(scene, data, outputs))
     position, rotation, finite = camera.camera_pose(scene, data)
@@ -78,6 +79,12 @@ def render_planes(
         return _drawn(_Path(_fast(scene, outputs), target_platform()), outputs, scene, *prepared)
 
     return by_platform(draw, scene, rotation, unit, light_table)
+
+
+def _in_32_bits(scene: Scene) -> Scene:
+    """The scene with leaves of 32 bits, which keys of pixels need, whatever it was given where JAX computes in 64."""
+    narrow = {jnp.dtype("float64"): jnp.float32, jnp.dtype("int64"): jnp.int32}
+    return jax.tree.map(lambda leaf: leaf.astype(narrow.get(leaf.dtype, leaf.dtype)), scene)
 
 
 def _fast(scene: Scene, outputs: Outputs) -> Callable[..., Planes] | None:

@@ -1,6 +1,6 @@
 """What is drawn: everything that an image needs besides the poses, read once from a MuJoCo model.
 
-A `Scene` is a pytree. Sizes, colours, materials, lights and the camera are leaves, so a batch of different looks is
+A `Scene` is a pytree. Sizes, colours, materials, lights and the camera are leaves, so a batch of different appearances is
 ``jax.vmap`` over ``scene.replace(rgba=...)``; what is drawn (geom types, ids, the image's size) is static and fixes the
 compiled program.
 
@@ -9,6 +9,7 @@ site ``i``. Objects that are never seen keep their row, so that a row can be fou
 """
 
 import dataclasses
+import numbers
 from typing import Any, Self
 
 import jax
@@ -153,14 +154,14 @@ class Scene:
         textured: bool = True,
         shadows: bool = False,
         haze: bool = False,
-        plane_backs: bool = False,
+        plane_backs: bool | None = None,
         leave_out: tuple[str, ...] = (),
     ) -> Self:
         """Reads what is drawn from ``mj_model``.
 
         Args:
             mj_model: The model.
-            camera: Name or index of the camera that looks.
+            camera: Name or index of the camera.
             height: Image height in pixels.
             width: Image width in pixels.
             groups: Geom groups that are drawn (the default is that of `mujoco.Renderer`).
@@ -169,34 +170,38 @@ class Scene:
                 gradient between its colours straight up and straight down; that is cheaper.
             shadows: Whether lights cast hard shadows, where the model says that they do: one more ray for each light.
             haze: Whether the horizon of the first endless plane is hazy, as the model's visual settings have it.
-            plane_backs: Whether planes are half transparent from behind, as MuJoCo draws them. Without, which is cheaper,
-                they look the same from both sides.
+            plane_backs: Whether planes are half transparent from behind, as MuJoCo draws them, or (False) the same from both
+                sides, which is cheaper. None: those are that the camera is behind of in the model's initial pose, which is
+                right for cameras and planes that do not pass each other.
             leave_out: Names of geoms that are not drawn, and "skin" and "flex" for all of these.
 
         Returns:
             The scene. Objects with alpha 0 and objects of other groups are left out; tendons are not drawn.
 
         Raises:
-            ValueError: The camera does not exist, the size is not positive, or something that would be seen cannot be drawn
-                (skins, flexes, signed distance fields, lights that are images, shadows of meshes).
+            ValueError: The camera or a geom to be left out does not exist, a size is no positive integer, or something that
+                would be seen cannot be drawn (skins, flexes, signed distance fields, lights that are images, shadows of
+                meshes).
         """
-        if height < 1 or width < 1:
-            raise ValueError(f"an image needs at least one pixel each way, not height={height}, width={width}")
+        for name, pixels in (("height", height), ("width", width)):
+            if not isinstance(pixels, numbers.Integral) or pixels < 1:
+                raise ValueError(f"an image needs a whole number of pixels each way, at least one, not {name}={pixels!r}")
+        reading.check_names(mj_model, leave_out)
         camera_id = reading.find_camera(mj_model, camera)
-        look = reading.object_looks(mj_model)
+        appearance = reading.object_appearance(mj_model)
         types = np.concatenate([mj_model.geom_type, mj_model.site_type])
-        drawn = reading.drawn_objects(mj_model, look["rgba"], groups, site_groups, leave_out)
+        drawn = reading.drawn_objects(mj_model, appearance["rgba"], groups, site_groups, leave_out)
         reading.refuse_unsupported(mj_model, types, drawn, groups, leave_out, shadows)
         ids = np.flatnonzero(drawn)[::-1]
         atlas, texels, sky = textures.build_atlas(mj_model, ids, textured)
         if not textured:
-            look["rgba"][:, :3] *= reading.mean_texture_colours(mj_model)
-        lights, light_facts = reading.lights(mj_model, look["specular"][ids], shadows)
-        leaves = {**look, **lights, **reading.camera_parameters(mj_model, camera_id)}
+            appearance["rgba"][:, :3] *= reading.mean_texture_colours(mj_model)
+        lights, light_facts = reading.lights(mj_model, appearance["specular"][ids], shadows)
+        leaves = {**appearance, **lights, **reading.camera_parameters(mj_model, camera_id)}
         leaves["sky_top"], leaves["sky_bottom"] = reading.sky_colours(mj_model)
         leaves["haze_colour"] = mj_model.vis.rgba.haze[:3]
-        clear = np.where(plane_backs & (types[ids] == mujoco.mjtGeom.mjGEOM_PLANE), 2, 0)
-        clear = np.where(look["rgba"][ids, 3] < reading.OPAQUE, 1, clear)
+        clear = np.where(reading.planes_seen_through(mj_model, camera_id, plane_backs)[ids], reading.CLEAR_FROM_BEHIND, 0)
+        clear = np.where(appearance["rgba"][ids, 3] < reading.OPAQUE, reading.CLEAR, clear)
         return cls(
             **{name: jnp.asarray(value, jnp.float32) for name, value in leaves.items()},
             texels=jnp.asarray(texels),

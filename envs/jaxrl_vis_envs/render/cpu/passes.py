@@ -26,7 +26,7 @@ from jaxrl_vis_envs.render.pixel.arithmetic import Vector, clipped, larger, norm
 from jaxrl_vis_envs.render.scene import Scene
 
 _FINE = {shapes.MESH, shapes.HFIELD}
-# So many objects at most are chosen from by comparing.
+# Up to this many objects, a pixel's row is chosen by comparing instead of being looked up.
 _CHOSEN = 24
 _NORMAL_STEPS = 32767.0
 
@@ -45,7 +45,7 @@ def draw(outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.UnitS
 
     Args:
         outputs: Which planes.
-        scene: One of which the passes take these planes.
+        scene: One that the passes take, with these planes.
         rotation: [3, 3] float32 of the camera, see `camera.camera_pose`.
         unit: The drawn objects.
         light_table: From `lights.pack`.
@@ -196,7 +196,7 @@ def _row(table: jax.Array, rows: list[int], index: jax.Array) -> lookup.Row:
 
 
 def _pack(colour: Vector, bits: int) -> jax.Array:
-    """Three channels [P] in [0, 1], rounded to so many bits each: [P] int32."""
+    """Three channels [P] in [0, 1], rounded to this many bits each: [P] int32."""
     steps = float(2**bits - 1)
     red, green, blue = ((clipped(channel) * steps + 0.5).astype(jnp.int32) for channel in colour)
     return red | (green << bits) | (blue << 2 * bits)
@@ -204,7 +204,7 @@ def _pack(colour: Vector, bits: int) -> jax.Array:
 
 def _unpack(packed: jax.Array) -> jax.Array:
     """Colours of 8 bits a channel, [H, W] int32 -> [3, H, W] uint8."""
-    return (packed >> jnp.array([0, 8, 16])[:, None, None]).astype(jnp.uint8)
+    return (packed >> jnp.array([0, 8, 16], jnp.int32)[:, None, None]).astype(jnp.uint8)
 
 
 def _pack_normal(normal: Vector) -> jax.Array:
@@ -224,7 +224,7 @@ def _unpack_normal(packed: jax.Array) -> Vector:
     """Undoes `_pack_normal`: unit vectors, right to 5e-5."""
     x, y = (
         half.astype(jnp.float32) * (1.0 / _NORMAL_STEPS) - 1.0
-        for half in (packed & 0xFFFF, jax.lax.shift_right_logical(packed, 16))
+        for half in (packed & 0xFFFF, jax.lax.shift_right_logical(packed, np.int32(16)))
     )
     z = 1.0 - jnp.abs(x) - jnp.abs(y)
     fold = larger(-z, 0.0)

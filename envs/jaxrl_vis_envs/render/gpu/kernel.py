@@ -2,8 +2,8 @@
 
 As XLA operations, every pixel meets every object. Here a program draws one tile of one image: it walks through the objects,
 type by type, skips each whose bounding rectangle in the image misses the tile, and goes on to shade what it found without
-leaving the chip. What happens to a pixel is the same code either way (`raycast.entry`, `surface.meet`, `shade.shade`): in the
-kernel, what it reads are scalars and blocks of memory instead of arrays.
+leaving the chip. What happens to a pixel is the same code as in plain JAX (`raycast.entry`, `surface.meet`, `shade.shade`), but
+in the kernel it reads scalars and blocks of memory instead of arrays.
 """
 
 import functools
@@ -134,7 +134,7 @@ class _Refs(NamedTuple):
     origin: Any
     extra: Any
     extra_square: Any
-    looks: Any
+    appearance: Any
     texels: Any
     levels: Any
     lights: Any
@@ -180,7 +180,7 @@ def _kernel(*refs, scene: Scene, outputs: Outputs, tile: tuple[int, int]):
     count = len(_Refs._fields)
     refs, out = _Refs(*refs[:count]), list(refs[count:])
     high, wide = tile
-    across = -(-scene.width // wide)
+    across = np.int32(-(-scene.width // wide))
     place = pl.program_id(0)
     top, left = jax.lax.div(place, across) * high, jax.lax.rem(place, across) * wide
     lane = jax.lax.broadcasted_iota(jnp.int32, (_PIXELS,), 0)
@@ -208,7 +208,7 @@ def _kernel(*refs, scene: Scene, outputs: Outputs, tile: tuple[int, int]):
     top_colour, bottom_colour = ([refs.view[index] for index in colour] for colour in (_SKY_TOP, _SKY_BOTTOM))
     texels: Any = _BlockTexels(refs.texels, refs.levels)
     inner = scene.replace(sky_top=top_colour, sky_bottom=bottom_colour, zfar=zfar, fovy=refs.view[_FOVY], texels=texels)
-    zero = jnp.zeros((_PIXELS,))
+    zero = jnp.zeros((_PIXELS,), jnp.float32)
     far, normal, colour = zero, (zero,) * 3, (zero,) * 3
     if outputs.rgb or outputs.depth or outputs.normals or outputs.distance:
 
@@ -254,7 +254,7 @@ def _fetch(refs: _Refs, index: jax.Array) -> lookup.Row:
     """Of each pixel's object, the values that `surface.meet` and `shade.shade` need."""
     columns = [_column(refs.axes, index, i, j) for i in range(3) for j in range(3)]
     columns += [_column(refs.origin, index, i) for i in range(3)] + [_column(refs.extra, index)]
-    return lookup.row_of(columns + [_column(refs.looks, index, number) for number in range(refs.looks.shape[1])])
+    return lookup.row_of(columns + [_column(refs.appearance, index, number) for number in range(refs.appearance.shape[1])])
 
 
 def _column(ref: Any, index: jax.Array, *place: int) -> jax.Array:
@@ -324,10 +324,10 @@ def draw(
         origin=unit.origin,
         extra=unit.extra,
         extra_square=unit.extra_square,
-        looks=jnp.stack(lookup.look_columns(scene), axis=1),
+        appearance=jnp.stack(lookup.appearance_columns(scene), axis=1),
         texels=scene.texels if len(scene.texels) else jnp.zeros((1, 4), jnp.uint32),
         levels=jnp.asarray(scene.atlas.levels or [(0, 1, 1)], jnp.int32),
-        lights=light_table if len(light_table) else jnp.zeros((1, 1)),
+        lights=light_table if len(light_table) else jnp.zeros((1, 1), jnp.float32),
         view=jnp.concatenate([lens, jnp.stack([scene.znear, scene.zfar]), rotation.reshape(9), *sky, scene.fovy[None]]),
         ids=jnp.asarray(ids),
     )

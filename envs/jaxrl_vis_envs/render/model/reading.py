@@ -20,6 +20,8 @@ SUPPORTED_TYPES = (
 ENDLESS = 1e10
 # MuJoCo draws what has less alpha than this as transparent.
 OPAQUE = 0.995
+# Values of `Scene.transparent`.
+SOLID, CLEAR, CLEAR_FROM_BEHIND = range(3)
 # OpenGL has eight lights; MuJoCo's renderer takes the headlight and then the model's in their order.
 MOST_LIGHTS = 8
 
@@ -66,13 +68,25 @@ def drawn_objects(
     leave_out: tuple[str, ...],
 ) -> np.ndarray:
     """[ngeom + nsite] bool: in a group that is drawn, not invisible, not left out."""
-    # MuJoCo counts groups beyond the last as the last one, and likewise below.
-    most = mujoco.mjNGROUP - 1
-    geoms = np.isin(np.clip(mj_model.geom_group, 0, most), groups)
-    sites = np.isin(np.clip(mj_model.site_group, 0, most), site_groups)
+    geoms = np.isin(_clamped(mj_model.geom_group), groups)
+    sites = np.isin(_clamped(mj_model.site_group), site_groups)
     left_out = [mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_GEOM, name) for name in leave_out]
     geoms[[index for index in left_out if index >= 0]] = False
     return np.concatenate([geoms, sites]) & (rgba[:, 3] > 0)
+
+
+def _clamped(group: np.ndarray) -> np.ndarray:
+    """Groups as MuJoCo's visualiser counts them: those beyond the last are the last one, and likewise below."""
+    return np.clip(group, 0, mujoco.mjNGROUP - 1)
+
+
+def check_names(mj_model: mujoco.MjModel, leave_out: tuple[str, ...]) -> None:
+    """Raises a ValueError that names whatever is to be left out and is neither a geom's name nor "skin" nor "flex"."""
+    geoms = [mj_model.geom(index).name for index in range(mj_model.ngeom)]
+    unknown = [name for name in leave_out if name not in geoms and name not in ("skin", "flex")]
+    if unknown:
+        names = ", ".join(repr(name) for name in geoms if name) or "none has a name"
+        raise ValueError(f"cannot leave out {', '.join(map(repr, unknown))}: the model's geoms are: {names}; or skin, flex")
 
 
 def refuse_unsupported(
@@ -91,10 +105,13 @@ def refuse_unsupported(
         raise ValueError(
             f"cannot draw {', '.join(refused)}: use a mesh or primitives, a group that is not drawn, alpha 0, or leave_out"
         )
-    for kind, count, group in (("skin", mj_model.nskin, "skin_group"), ("flex", mj_model.nflex, "flex_group")):
-        seen = [i for i in range(count) if getattr(mj_model, group)[i] in groups and kind not in leave_out]
+    deformables = (
+        ("skin", mj_model.skin_group, mujoco.mjtObj.mjOBJ_SKIN),
+        ("flex", mj_model.flex_group, mujoco.mjtObj.mjOBJ_FLEX),
+    )
+    for kind, group, accessor in deformables:
+        seen = np.flatnonzero(np.isin(_clamped(group), groups)).tolist() if kind not in leave_out else []
         if seen:
-            accessor = mujoco.mjtObj.mjOBJ_SKIN if kind == "skin" else mujoco.mjtObj.mjOBJ_FLEX
             names = ", ".join(f"{kind} {mujoco.mj_id2name(mj_model, accessor, i) or f'number {i}'}" for i in seen)
             raise ValueError(f"cannot draw {names}: use a group that is not drawn, or leave_out=({kind!r},)")
     images = np.flatnonzero((mj_model.light_type == mujoco.mjtLightType.mjLIGHT_IMAGE) & mj_model.light_active.astype(bool))
@@ -133,7 +150,7 @@ def object_textures(mj_model: mujoco.MjModel) -> np.ndarray:
     return np.where(material >= 0, mj_model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB], -1)
 
 
-def object_looks(mj_model: mujoco.MjModel) -> dict[str, np.ndarray]:
+def object_appearance(mj_model: mujoco.MjModel) -> dict[str, np.ndarray]:
     """Size, colour and material of every geom, then of every site. Keys as in `Scene`."""
     size = np.concatenate([mj_model.geom_size, mj_model.site_size]).reshape(-1, 3)
     rgba = np.concatenate([mj_model.geom_rgba, mj_model.site_rgba]).reshape(-1, 4).astype(np.float64)
@@ -157,11 +174,19 @@ def object_looks(mj_model: mujoco.MjModel) -> dict[str, np.ndarray]:
 
 
 def texture_pixels(mj_model: mujoco.MjModel, texture: int) -> np.ndarray:
-    """[rows, columns, channels] uint8."""
+    """[rows, columns, channels] float64 in [0, 255]: the texels that MuJoCo's renderer mixes.
+
+    It decodes flat textures that are flagged as sRGB, and leaves the faces of cubes and skies as they are.
+    """
     height, width = int(mj_model.tex_height[texture]), int(mj_model.tex_width[texture])
     channels = int(mj_model.tex_nchannel[texture])
     start = int(mj_model.tex_adr[texture])
-    return mj_model.tex_data[start : start + height * width * channels].reshape(height, width, channels)
+    pixels = mj_model.tex_data[start : start + height * width * channels].reshape(height, width, channels).astype(np.float64)
+    flat = mj_model.tex_type[texture] == mujoco.mjtTexture.mjTEXTURE_2D
+    if flat and mj_model.tex_colorspace[texture] == mujoco.mjtColorSpace.mjCOLORSPACE_SRGB:
+        share = pixels[..., :3] / 255.0  # and not of alpha
+        pixels[..., :3] = 255.0 * np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    return pixels
 
 
 def mean_texture_colours(mj_model: mujoco.MjModel) -> np.ndarray:
@@ -192,6 +217,20 @@ def sky_colours(mj_model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
     faces = pixels.reshape(-1, edge, edge, pixels.shape[-1])
     up, down = (faces[2], faces[3]) if len(faces) == 6 else (faces[0], faces[0])
     return up[middle, middle, :3] / 255.0, down[middle, middle, :3] / 255.0
+
+
+def planes_seen_through(mj_model: mujoco.MjModel, camera_id: int, plane_backs: bool | None) -> np.ndarray:
+    """[ngeom + nsite] bool: the planes that are half transparent from behind, given `Scene.from_mjmodel`'s ``plane_backs``."""
+    planes = mj_model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+    if plane_backs is None:
+        mj_data = mujoco.MjData(mj_model)
+        for step in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_camlight):
+            step(mj_model, mj_data)
+        normals = mj_data.geom_xmat.reshape(-1, 3, 3)[:, :, 2]
+        planes = planes & (np.sum((mj_data.cam_xpos[camera_id] - mj_data.geom_xpos) * normals, axis=1) < 0)
+    elif not plane_backs:
+        planes = np.zeros(mj_model.ngeom, bool)
+    return np.concatenate([planes, np.zeros(mj_model.nsite, bool)])
 
 
 def haze_plane(mj_model: mujoco.MjModel, drawn: np.ndarray) -> tuple[int, float]:

@@ -95,10 +95,7 @@ def _mapping(mj_model: mujoco.MjModel, index: int, texture: int) -> int:
 
 def _faces(mj_model: mujoco.MjModel, texture: int) -> np.ndarray:
     """[faces, height, width, 3] float64 in [0, 255]."""
-    pixels = reading.texture_pixels(mj_model, texture)[..., :3].astype(np.float64)
-    if mj_model.tex_colorspace[texture] == mujoco.mjtColorSpace.mjCOLORSPACE_SRGB:
-        share = pixels / 255.0
-        pixels = 255.0 * np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    pixels = reading.texture_pixels(mj_model, texture)[..., :3]
     if mj_model.tex_type[texture] == mujoco.mjtTexture.mjTEXTURE_2D:
         return pixels[None]
     edge = pixels.shape[1]

@@ -75,7 +75,7 @@ def _polynomial(coefficients: tuple[float, ...], x: jax.Array) -> jax.Array:
 def reciprocal(value: jax.Array) -> jax.Array:
     """1 / value for positive values, right to a few bits, by Newton's method from a guess at the exponent.
 
-    XLA never fuses a division of which the quotient is used twice: it would store it, and compute all else in the loop again.
+    XLA never fuses a division whose quotient is used twice: it stores the quotient and computes all else in the loop again.
     """
     guess = jax.lax.bitcast_convert_type(0x7EF311C7 - jax.lax.bitcast_convert_type(value, jnp.int32), jnp.float32)
     for _ in range(3):

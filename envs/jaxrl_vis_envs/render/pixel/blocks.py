@@ -1,4 +1,4 @@
-"""In which order pixels are worked on: blocks of them, one after the other.
+"""The order in which pixels are processed: in blocks, one after the other.
 
 On a CPU, because XLA drops optimization barriers before it fuses for a CPU, and then computes the nearest hit anew for every
 use of it (60 times slower with colour). The boundary of a loop is the one that it respects, so there are at least two blocks
@@ -123,7 +123,7 @@ def joined(pixels: Any) -> Any:
 
 
 def tiled(scene: Scene) -> bool:
-    """Whether there is so much in the scene that it pays to look at what each tile shows."""
+    """Whether there is enough in the scene that it pays to find out what each tile shows."""
     return scene.clusters.shape[-2] > 0 or len(raycast.primitive_rows(scene, transparent=False)) > raycast.UNROLLED
 
 

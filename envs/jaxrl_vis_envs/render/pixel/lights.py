@@ -112,7 +112,7 @@ def pack(lights: list[Light]) -> jax.Array:
     """All numbers of the lights as one table: [L, COLUMNS] float32."""
     rows = []
     for light in lights:
-        zeros, zero = jnp.zeros(3), jnp.zeros(())
+        zeros, zero = jnp.zeros(3, jnp.float32), jnp.zeros((), jnp.float32)
         vectors = (light.position, light.direction, light.ambient, light.diffuse, light.specular, light.attenuation)
         numbers = (light.cosine_cutoff, light.exponent)
         rows.append(
@@ -121,7 +121,7 @@ def pack(lights: list[Light]) -> jax.Array:
                 + [(zero if number is None else number)[None] for number in numbers]
             )
         )
-    return jnp.stack(rows) if rows else jnp.zeros((0, COLUMNS))
+    return jnp.stack(rows) if rows else jnp.zeros((0, COLUMNS), jnp.float32)
 
 
 def unpack(scene: Scene, table: Any) -> list[Light]:

@@ -76,10 +76,10 @@ def object_table(scene: Scene, unit: shapes.UnitShapes) -> jax.Array:
         *(unit.origin[:, axis] for axis in range(3)),
         unit.extra,
     ]
-    return jnp.stack(columns + look_columns(scene), axis=-1)
+    return jnp.stack(columns + appearance_columns(scene), axis=-1)
 
 
-def look_columns(scene: Scene) -> list[jax.Array]:
+def appearance_columns(scene: Scene) -> list[jax.Array]:
     """The columns of `object_table` that do not depend on poses, from the kind on; [G] float32 each."""
     ids = np.array(scene.object_ids)
     columns = [jnp.asarray(scene.object_types, jnp.float32), *(scene.rgba[ids, channel] for channel in range(3))]
@@ -100,12 +100,13 @@ def _texture_scales(scene: Scene, ids: np.ndarray) -> list[jax.Array]:
     """How the coordinates of a point become those of the texture: five [G].
 
     For a flat one, coordinates across and up (see `charts`) are multiplied with the first two and the last two added; for a
-    cube, the coordinates in the unit shape's frame are multiplied with the first three.
+    cube, the coordinates in the unit shape's frame are multiplied with the first three; for an unwrapped one, a mesh's own
+    coordinates with the first two (where it repeats per metre, MuJoCo multiplies them with the half-sizes of the mesh).
     """
     kinds, mappings = np.array(scene.object_types), np.array(scene.atlas.mappings)
     size = _visual_size(kinds, scene.size[ids])
     metres = np.isin(kinds, (shapes.MESH, shapes.HFIELD))
-    uniform, cube = np.array(scene.atlas.uniform), mappings == textures.CUBE
+    uniform, cube, unwrapped = np.array(scene.atlas.uniform), mappings == textures.CUBE, mappings == textures.UNWRAPPED
     endless = jnp.any((size[:, :2] >= reading.ENDLESS) & (kinds == shapes.PLANE)[:, None], axis=1)
     scales, shifts = [], []
     for axis in range(3):
@@ -116,11 +117,13 @@ def _texture_scales(scene: Scene, ids: np.ndarray) -> list[jax.Array]:
         # An endless plane repeats per metre, whatever the material says; a mesh's own frame is in metres already.
         over_object = jnp.where(metres, 1.0 / jnp.where(half > 0.0, half, 1.0), 1.0)
         per_metre = uniform | (half >= reading.ENDLESS)
-        repeat = scene.texture_repeat[ids][:, axis] * jnp.where(per_metre, jnp.where(metres, 1.0, half), over_object)
+        times = scene.texture_repeat[ids][:, axis]
+        repeat = times * jnp.where(per_metre, jnp.where(metres, 1.0, half), over_object)
         shift = jnp.where(half >= reading.ENDLESS, 0.0, 0.5 * repeat) + jnp.where(endless, 0.5, 0.0)
         shifts.append(jnp.where(metres, -0.5, shift))
         sign = 0.5 if axis == 0 else -0.5
-        scales.append(jnp.where(cube, jnp.where(uniform, half, 1.0), sign * repeat))
+        scale = jnp.where(cube, jnp.where(uniform, half, 1.0), sign * repeat)
+        scales.append(jnp.where(unwrapped, jnp.where(uniform, half, 1.0) * times, scale))
     return scales + shifts
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxrl_vis_envs.render import camera
 from jaxrl_vis_envs.render.camera import Rays
+from jaxrl_vis_envs.render.model.reading import CLEAR, CLEAR_FROM_BEHIND, SOLID
 from jaxrl_vis_envs.render.pixel import shapes
 from jaxrl_vis_envs.render.pixel.arithmetic import larger, smaller
 from jaxrl_vis_envs.render.scene import Scene
@@ -21,12 +22,9 @@ from jaxrl_vis_envs.render.scene import Scene
 # Keeps a division by a ray component that is exactly 0 finite; far too small to change any other number.
 _TINY = 1e-20
 
-# So many primitives are unrolled in any case, and of more, those of a type of which there are at most so many.
+# Up to this many primitives are unrolled; of more than these, only those of a type with at most _FEW objects.
 UNROLLED = 48
 _FEW = 3
-
-# Values of `Scene.transparent`.
-OPAQUE, CLEAR, CLEAR_FROM_BEHIND = range(3)
 
 
 def code_mask(scene: Scene) -> int:
@@ -37,7 +35,7 @@ def code_mask(scene: Scene) -> int:
 def primitive_rows(scene: Scene, transparent: bool) -> list[int]:
     """Rows of the drawn objects that are primitives, and transparent or not."""
     fine = (shapes.MESH, shapes.HFIELD)
-    wanted = (CLEAR, CLEAR_FROM_BEHIND) if transparent else (OPAQUE, CLEAR_FROM_BEHIND)
+    wanted = (CLEAR, CLEAR_FROM_BEHIND) if transparent else (SOLID, CLEAR_FROM_BEHIND)
     return [
         row
         for row, (kind, clear) in enumerate(zip(scene.object_types, scene.transparent, strict=True))
@@ -151,16 +149,16 @@ def _nearest_listed(
     bare_ball = kind == shapes.SPHERE and not any(scene.atlas.mappings[row] for row in rows)
     # The k-th object that touches is the number of these counts that are at most k. All of them are brought to the front of a
     # table at once: whatever is done in the loop, but for the pixels, costs more than it does.
-    counts = jnp.cumsum(camera.in_view(scene, ball[:, :3], ball[:, 3], rays, None).astype(jnp.int32))
+    counts = jnp.cumsum(camera.in_view(scene, ball[:, :3], ball[:, 3], rays, None).astype(jnp.int32), dtype=jnp.int32)
     total = counts[-1]
-    order = jnp.sum(counts[None, :] <= np.arange(len(rows))[:, None], axis=1)
+    order = jnp.sum(counts[None, :] <= np.arange(len(rows), dtype=np.int32)[:, None], axis=1, dtype=jnp.int32)
     columns = [unit.origin[rows], unit.axes[rows].reshape(-1, 9), unit.extra[rows, None], unit.extra_square[rows, None]]
     table = jnp.concatenate([*columns, jnp.asarray(rows, jnp.float32)[:, None]], axis=1)
     table = table.at[jnp.minimum(order, len(rows) - 1)].get(mode="promise_in_bounds")
 
     def advance(state: tuple) -> tuple:
         step, best = state
-        values = jax.lax.dynamic_slice(table, (step, 0), (1, table.shape[1]))[0]
+        values = jax.lax.dynamic_slice(table, (step, np.int32(0)), (1, table.shape[1]))[0]
         origin, axes = [values[i] for i in range(3)], [[values[3 + 3 * i + j] for j in range(3)] for i in range(3)]
         form = (origin, None if bare_ball else axes, values[12], values[13])
         t, meets = entry(kind, form, start, direction, inverse_square)

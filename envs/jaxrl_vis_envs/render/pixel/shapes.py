@@ -2,7 +2,7 @@
 
 An object is brought to a unit shape (ball, cylinder, cube, square; a mesh keeps its metres) by an affine map of the camera's
 frame. What is left per pixel and object is a ray that is linear in the pixel's (u, v), and a handful of operations. All of it
-is in a few small tables whose rows are the drawn objects, which is what any other way to find the nearest hit needs too.
+is in a few small tables whose rows are the drawn objects, which any other method of finding the nearest hit needs too.
 """
 
 from collections.abc import Callable
@@ -24,8 +24,10 @@ CYLINDER = int(mujoco.mjtGeom.mjGEOM_CYLINDER)
 BOX = int(mujoco.mjtGeom.mjGEOM_BOX)
 MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
 
-# Objects with a pose that is not finite go this far behind the camera, in metres: no ray meets them, and no NaN is left.
+# Objects that are not drawn go this far behind the camera, in metres: no ray meets them, and no NaN is left.
 _BEHIND = 1e6
+# Metres: what is thinner is drawn as thin as this, so that a sheet is neither divided by 0 nor lost between two float32.
+_THINNEST = 1e-5
 
 
 class UnitShapes(NamedTuple):
@@ -60,21 +62,22 @@ def unit_shapes(
     """
     position, rotation = _object_poses(scene, data)
     size = scene.size[np.array(scene.object_ids)]
+    kinds = np.array(scene.object_types)[:, None]
     finite = camera_finite & jnp.all(jnp.isfinite(position), -1) & jnp.all(jnp.isfinite(rotation), (-2, -1))
+    finite &= ~_without_area(kinds[:, 0], size)
     position = jnp.where(finite[:, None], position, 0.0)
     rotation = jnp.where(finite[:, None, None], rotation, 0.0)
     # Written out rather than as matrix products, which accelerators would do at low precision, and a CPU on one core.
     away = position - camera_position
     offset = _added(lambda k: away[:, k, None] * camera_rotation[k])  # [G, 3] in the camera's frame
     relative = _added(lambda k: rotation[:, k, :, None] * camera_rotation[k])  # [G, shape axis, camera axis]
-    offset = jnp.where(finite[:, None], offset, jnp.array([0.0, 0.0, _BEHIND]))
-    relative = jnp.where(finite[:, None, None], relative, jnp.eye(3))
+    offset = jnp.where(finite[:, None], offset, jnp.array([0.0, 0.0, _BEHIND], jnp.float32))
+    relative = jnp.where(finite[:, None, None], relative, jnp.eye(3, dtype=jnp.float32))
 
-    kinds = np.array(scene.object_types)[:, None]
     half = _half_sizes(kinds, size)
     # A ball looks the same from everywhere: leaving its rotation out saves operations in every pixel, unless it has a texture.
     bare = np.array(scene.atlas.mappings)[:, None] == 0
-    relative = jnp.where(((kinds == SPHERE) & bare)[:, :, None], jnp.eye(3), relative)
+    relative = jnp.where(((kinds == SPHERE) & bare)[:, :, None], jnp.eye(3, dtype=jnp.float32), relative)
     axes = relative / half[:, :, None]
     origin = -_added(lambda k: axes[:, :, k] * offset[:, k, None])
     capsules = kinds[:, 0] == CAPSULE
@@ -96,7 +99,18 @@ def _half_sizes(kinds: np.ndarray, size: jax.Array) -> jax.Array:
     half = jnp.where(kinds == PLANE, jnp.concatenate([size[:, :2], ones], 1), size)
     half = jnp.where((kinds == SPHERE) | (kinds == CAPSULE), jnp.broadcast_to(radius, size.shape), half)
     half = jnp.where(kinds == CYLINDER, jnp.concatenate([radius, radius, size[:, 1:2]], 1), half)
-    return jnp.where((kinds == MESH) | (kinds == HFIELD), 1.0, half)
+    return jnp.where((kinds == MESH) | (kinds == HFIELD), 1.0, jnp.maximum(half, _THINNEST))
+
+
+def _without_area(kinds: np.ndarray, size: jax.Array) -> jax.Array:
+    """[G] bool: which shapes have half-sizes of 0 that leave nothing of them to be seen, as MuJoCo draws them.
+
+    A box, an ellipsoid or a cylinder with one of them is a sheet; a capsule without a length is not drawn at all.
+    """
+    zero = size <= 0.0
+    none = jnp.where(np.isin(kinds, (SPHERE, CYLINDER)), zero[:, 0], False)
+    none = jnp.where(kinds == CAPSULE, zero[:, 0] | zero[:, 1], none)
+    return jnp.where(np.isin(kinds, (BOX, ELLIPSOID)), jnp.sum(zero, axis=1) > 1, none)
 
 
 def _radii(kinds: np.ndarray, size: jax.Array) -> jax.Array:

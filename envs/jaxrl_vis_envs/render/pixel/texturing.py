@@ -41,10 +41,10 @@ def _texture_colour(scene: Scene, row: Row, texture: TextureRow, hit: Hit) -> tu
     if textures.UNWRAPPED in scene.atlas.mappings and hit.triangle is not None:
         unwrapped, corners = texture.mapping == textures.UNWRAPPED, hit.triangle.coordinates
         own = surface.mix(corners, surface.shares(hit.triangle, hit.local))
-        place = tuple(jnp.where(unwrapped, o, p) for o, p in zip(own, place, strict=True))
+        place = tuple(jnp.where(unwrapped, s * o, p) for s, o, p in zip(texture.scale, own, place))
         for number, change in enumerate(changes):
             turned = surface.mix(corners, surface.shares(hit.triangle, change, moved=True), moved=True)
-            moves[number] = tuple(jnp.where(unwrapped, t, move) for t, move in zip(turned, moves[number], strict=True))
+            moves[number] = tuple(jnp.where(unwrapped, s * t, m) for s, t, m in zip(texture.scale, turned, moves[number]))
     if textures.CUBE in scene.atlas.mappings:
         is_cube = texture.mapping == textures.CUBE
         x, y, z = hit.local

@@ -41,7 +41,7 @@ def sheets(scene: Scene, unit: shapes.UnitShapes, rows: jax.Array, rays: Rays, d
         else:
             t, meets = raycast.row_entry(scene, jax.lax.stop_gradient(unit), index, rays)
             seen = meets & (t > scene.znear) & (t < depth)
-        if scene.transparent[index] == raycast.CLEAR_FROM_BEHIND:
+        if scene.transparent[index] == reading.CLEAR_FROM_BEHIND:
             seen = seen & raycast.behind(unit, index)
         row = lookup.read_row(rows[index])
         # A start that means nothing would be a source of NaN in gradients.
@@ -80,7 +80,7 @@ def blend(
         near = jnp.sqrt(jnp.sum(jnp.square(ball[:3])) + 1e-20) - ball[3]
         if scene.object_types[index] == shapes.PLANE:
             alpha = jnp.where(raycast.behind(unit, index), _PLANE_BACK * alpha, alpha)
-            near = jnp.full((), reading.ENDLESS)
+            near = jnp.full((), reading.ENDLESS, jnp.float32)
         layers.append(jnp.stack([*own, jnp.where(seen, alpha, 0.0)]))
         distances.append(near)
     stack = jnp.stack(layers)

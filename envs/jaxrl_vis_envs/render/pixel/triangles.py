@@ -10,8 +10,8 @@ import numpy as np
 
 from jaxrl_vis_envs.render import camera
 from jaxrl_vis_envs.render.camera import Rays
-from jaxrl_vis_envs.render.model import meshes
-from jaxrl_vis_envs.render.pixel import raycast, shapes
+from jaxrl_vis_envs.render.model import meshes, reading
+from jaxrl_vis_envs.render.pixel import shapes
 from jaxrl_vis_envs.render.scene import Scene
 
 # How far outside of its edges, as a share of them, a triangle is still met, so that no ray slips between two.
@@ -36,7 +36,7 @@ def nearest_triangle(
         -1 where there is none.
     """
     # Counts of clusters up to each one: the k-th that touches is the number of counts that are at most k.
-    counts = jnp.cumsum(_touching(scene, unit, rays, depth, only).astype(jnp.int32))
+    counts = jnp.cumsum(_touching(scene, unit, rays, depth, only).astype(jnp.int32), dtype=jnp.int32)
     last = counts.shape[0] - 1
     far = jnp.asarray(np.inf, jnp.float32)
 
@@ -46,7 +46,7 @@ def nearest_triangle(
         nearer = met < best
         number = jax.lax.bitcast_convert_type(met, jnp.int32) & _NUMBER
         best, found = jnp.where(nearer, met, best), jnp.where(nearer, cluster * meshes.CLUSTER + number, found)
-        cluster = jnp.minimum(jnp.sum((counts <= step).astype(jnp.int32)), last)
+        cluster = jnp.minimum(jnp.sum((counts <= step).astype(jnp.int32), dtype=jnp.int32), last)
         met = jnp.where(step < counts[last], _meet_cluster(scene, unit, cluster, rays), far)
         return step + 1, best, found, met, cluster
 
@@ -68,7 +68,7 @@ def _touching(scene: Scene, unit: shapes.UnitShapes, rays: Rays, depth: jax.Arra
     touching = camera.in_view(scene, middle, scene.clusters[:, 3], rays, depth)
     if only is not None:
         return touching & (owner == only)
-    opaque = np.array(scene.transparent) == raycast.OPAQUE
+    opaque = np.array(scene.transparent) == reading.SOLID
     return touching & jnp.asarray(opaque)[owner]
 
 
@@ -77,7 +77,7 @@ def _meet_cluster(scene: Scene, unit: shapes.UnitShapes, cluster: jax.Array, ray
     place = scene.cluster_places[cluster]
     axes, origin = unit.axes[place[0]], unit.origin[place[0]]
     columns = scene.triangles.shape[1]
-    rows = jax.lax.dynamic_slice(scene.triangles, (place[1], 0), (meshes.CLUSTER, columns))[:, meshes.MAP]
+    rows = jax.lax.dynamic_slice(scene.triangles, (place[1], np.int32(0)), (meshes.CLUSTER, columns))[:, meshes.MAP]
     maps = rows.reshape(meshes.CLUSTER, 3, 4)
     # From the camera's frame to that of each unit triangle: a handful of numbers, so that a ray needs one map only.
     turned = jnp.sum(maps[:, :, :3, None] * axes[None, None], axis=2)

@@ -1,0 +1,20 @@
+"""The rooms of the renderer: each imports only from those before it."""
+
+from test_packaging import imports_within
+
+# A room imports from earlier rows only; rooms of one row do not import each other.
+ROOMS = (("model", "outputs"), ("scene", "reference"), ("camera",), ("pixel",), ("cpu", "gpu"), ("images",))
+RENDER = "jaxrl_vis_envs.render."
+
+
+def test_imports_of_the_renderer_run_one_way() -> None:
+    depth_of = {name: depth for depth, names in enumerate(ROOMS) for name in names}
+    graph = imports_within("jaxrl_vis_envs", when_running=False)
+    inside = {name.removeprefix(RENDER): targets for name, targets in graph.items() if name.startswith(RENDER)}
+    assert {name.split(".")[0] for name in inside} == set(depth_of)
+    for name, targets in inside.items():
+        room = name.split(".")[0]
+        for target in targets:
+            other = target.removeprefix(RENDER).split(".")[0]
+            if target.startswith(RENDER):
+                assert other == room or depth_of[other] < depth_of[room], f"{name} must not import {target}"
