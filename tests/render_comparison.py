@@ -37,7 +37,7 @@ class Bound:
 BOUNDS = {
     "segmentation": Bound(0.997, True),
     "iou": Bound(0.95, True),
-    "matched": Bound(0.8, True),
+    "matched": Bound(0.7, True),
     "depth": Bound(0.999, True),
     "bare_mean": Bound(4.0, False),
     "bare_p99": Bound(12.0, False),

@@ -79,6 +79,17 @@ def test_an_orthographic_camera():
     np.testing.assert_array_equal(frame.depth, frame.distance)
 
 
+def test_an_orthographic_camera_sees_a_plane_whose_sides_its_place_and_its_direction_agree_on():
+    """As MuJoCo's renderer does; benchmarks/render_parity.py found it (camera_ortho, pose 12 of seed 0)."""
+    planes = "".join(
+        f'<geom type="plane" size=".5 .5 .1" pos="{x} 0 0" zaxis="{normal}"/>'
+        for x, normal in ((-2, ".9 0 -.3"), (0, ".9 0 .3"), (2, ".9 0 .3"))
+    )
+    camera = '<camera name="above" pos="0 0 2" projection="orthographic" fovy="6"/>'
+    frame = drawn(planes + camera, size=41, plane_backs=False)
+    assert set(np.unique(frame.segmentation)) == {-1, 1}
+
+
 def test_a_camera_with_a_sensor():
     lens = 'focal=".02 .04" sensorsize=".04 .04" resolution="20 20" principal=".005 .01"'
     frame = drawn(f'<geom type="sphere" size=".06"/><camera name="above" pos="0 0 2" {lens}/>', size=20)

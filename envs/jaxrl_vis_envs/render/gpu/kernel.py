@@ -169,6 +169,8 @@ def _nearest(scene: Scene, refs: _Refs, place: Any, rays: Rays, znear: Any, best
                 )
                 values = ([refs.origin[index, i] for i in range(3)], axes, refs.extra[index], refs.extra_square[index])
                 t, meets = raycast.entry(kind, values, start, direction, inverse_square)
+                if raycast.culls(scene, kind):
+                    meets = meets & raycast.one_sided(refs.origin[index, 2], refs.axes[index, 2, 2])
                 key = (jax.lax.bitcast_convert_type(t, jnp.int32) & ~mask) | index
                 return left & (left - 1), jnp.minimum(best, jnp.where(meets & (t > znear), key, best))
 

@@ -69,7 +69,24 @@ def row_entry(scene: Scene, unit: shapes.UnitShapes, row: int, rays: Rays) -> tu
     start, direction, inverse_square = camera.ray_parts(scene, rays)
     kind = scene.object_types[row]
     bare_ball = kind == shapes.SPHERE and scene.atlas.mappings[row] == 0
-    return entry(kind, _row_values(unit, row, bare_ball), start, direction, inverse_square)
+    t, meets = entry(kind, _row_values(unit, row, bare_ball), start, direction, inverse_square)
+    if culls(scene, kind):
+        meets = meets & one_sided(unit.origin[row, 2], unit.axes[row, 2, 2])
+    return t, meets
+
+
+def culls(scene: Scene, kind: int) -> bool:
+    """Whether objects of a type may be hidden although a ray meets them, see `one_sided`."""
+    return kind == shapes.PLANE and scene.projection == "orthographic"
+
+
+def one_sided(height: jax.Array, facing: jax.Array) -> jax.Array:
+    """Whether a plane is seen by an orthographic camera, [] bool.
+
+    MuJoCo takes the side that is seen from the camera's place (``height`` above the plane), and OpenGL culls by the camera's
+    direction (``facing`` is above 0 if it looks down on the plane): where the two differ, nothing is drawn.
+    """
+    return (height > 0.0) == (facing > 0.0)
 
 
 def _row_values(unit: shapes.UnitShapes, row: int | jax.Array, bare_ball: bool) -> tuple:
