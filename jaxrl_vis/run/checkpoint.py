@@ -115,8 +115,12 @@ def _hushed() -> Iterator[None]:
         absl.disabled, sys.unraisablehook = disabled, before
 
 
+def _is_not_orbax(record: logging.LogRecord) -> bool:
+    return "orbax" not in record.pathname
+
+
 class Checkpoints:
-    """The checkpoints of one run.
+    """The checkpoints of one run. While it saves, orbax's own log is silent: what goes wrong is raised, and told in one line.
 
     Args:
         folder: Where both tiers lie; made when something is saved.
@@ -133,6 +137,8 @@ class Checkpoints:
 
     def _manager(self, tier: str) -> ocp.CheckpointManager:
         if tier not in self._managers:
+            if not self._read_only:
+                logging.getLogger("absl").addFilter(_is_not_orbax)
             options = ocp.CheckpointManagerOptions(
                 preservation_policy=None if self._read_only else LatestN(_KEPT),
                 cleanup_tmp_directories=not self._read_only,
@@ -210,6 +216,7 @@ class Checkpoints:
             with self._writing(tier):
                 manager.close()
         self._managers.clear()
+        logging.getLogger("absl").removeFilter(_is_not_orbax)
 
     def retire_full(self) -> None:
         """Deletes full checkpoints that are older than a light one which is safely on the disk: nothing goes on from them."""
