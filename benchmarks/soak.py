@@ -34,8 +34,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-FAULTS_PER_RUN = 5
-ITERATIONS, STEPS = 150, 200  # environment steps of an iteration: 4 environments, 50 steps each
+FAULTS_PER_RUN = 6
+ITERATIONS, STEPS = 240, 200  # environment steps of an iteration: 4 environments, 50 steps each
 OPTIONS = [
     *("Reacher", "--preset", "debug", "--env-steps", str(ITERATIONS * STEPS), "--updates-per-iteration", "20"),
     *("--eval-interval", "10", "--checkpoint-interval", "4", "--replay-transitions", "4000"),
@@ -159,13 +159,15 @@ class Part:
         return any("tmp" in path.name for path in self.folder.glob("checkpoints/*/*"))
 
 
-def strike(part: Part, dice: random.Random, environment: dict[str, str]) -> None:
-    """Lets the fault of a part happen, at a random moment after it has begun to train."""
+def strike(part: Part, dice: random.Random, environment: dict[str, str]) -> bool:
+    """Lets the fault of a part happen, at a random moment of training; says whether it did, before the run was over."""
     fault = part.fault
     if fault in (None, "full disk"):
-        return
+        return part.end() != 0
     part.wait_for(part.is_training)
-    time.sleep(dice.uniform(0.0, 2.5))
+    time.sleep(dice.uniform(0.0, 1.0))
+    if not part.runs():
+        return False
     if fault == "second process":
         rows = rows_of(part.folder)
         other = Part.start(None, part.folder, environment)
@@ -174,6 +176,7 @@ def strike(part: Part, dice: random.Random, environment: dict[str, str]) -> None
             raise Broken(f"a second process ended with {status}: {other.lines[-3:]}")
         if rows_of(part.folder)[: len(rows)] != rows:
             raise Broken("a second process changed the rows of the first")
+        return status == 2
     elif fault in ("SIGTERM", "SIGINT", "two signals"):
         part.process.send_signal(signal.SIGINT if fault == "SIGINT" else signal.SIGTERM)
         if fault == "two signals":
@@ -186,6 +189,7 @@ def strike(part: Part, dice: random.Random, environment: dict[str, str]) -> None
             part.process.kill()
     else:
         part.process.kill()
+    return part.end() != 0
 
 
 @contextlib.contextmanager
@@ -280,11 +284,15 @@ class Soak:
             with small_disk(folder) if fault == "full disk" else contextlib.nullcontext((folder, None)) as (place, limit):
                 before, good = rows_of(place), checkpoints_of(place)
                 part = Part.start(fault, place, self._environment, limit)
-                strike(part, dice, self._environment)
+                struck = strike(part, dice, self._environment)
                 status = self._check_part(part, before, good[-1][0] if good else 0)
-            if fault == "damaged checkpoint" and len(checkpoints_of(folder)) > 1:
+            if fault == "damaged checkpoint" and struck and len(checkpoints_of(folder)) > 1:
                 self._damage_and_resume(folder, dice)
             if fault is None:
+                break
+            if not struck:  # the run was over before: another one gets it
+                with self._lock:
+                    self._waiting.append(fault)
                 break
             faults.append(fault)
             with self._lock:

@@ -5,7 +5,7 @@ from typing import Any
 
 from jaxrl_vis.config import Config, preset
 
-DEVICES = {"H100": "NVIDIA H100 80GB HBM3 x1", "2 CPU cores": "AMD EPYC, 2 cores"}
+DEVICES = {"H200": "NVIDIA H200 x1", "2 CPU cores": "AMD EPYC, 2 cores"}
 """Columns of the speed table, and the devices that their records name."""
 
 
@@ -72,7 +72,7 @@ _IMAGES = "{image_size}x{image_size} {pixels}"
 def _environment(env: str, more: str = "") -> Speed:
     text = f"{{value}} env-steps/s ({{envs:,}} environments, {_IMAGES})"
     figures = (Figure("env/steps", {"env": env}, text),)
-    return Speed(f"`bench env --env {env}`{more}", {"H100": figures, "2 CPU cores": figures})
+    return Speed(f"`bench env --env {env}`{more}", {"H200": figures, "2 CPU cores": figures})
 
 
 def _scene(size: int, pixels: str) -> Figure:
@@ -85,8 +85,6 @@ def _peer(name: str, peer: str, size: int) -> Figure:
     return Figure(name, config, f"{peer}: {{value}} images/s {_IMAGES} (batch {{images:,}})")
 
 
-_FINGER = {"env": "FingerTurn"}
-_PLAYGROUND = "physics/peer_playground"
 _UPDATE = f"{{value}} updates/s (batch {{batch_size}}, {_IMAGES}, {{dtype}})"
 
 SPEED = (
@@ -96,26 +94,16 @@ SPEED = (
     _environment("VisualFingerTurn", ", 21 physics steps of 10 ms each, 3 stacked images"),
     _environment("VisualSawyerReach"),
     Speed(
-        "`bench physics --env FingerTurn --peer playground`: states alone; Playground makes half our Newton iterations",
-        {
-            "H100": (
-                Figure("physics/steps", _FINGER, "{value} env-steps/s ({envs:,} environments)"),
-                Figure(_PLAYGROUND, {**_FINGER, "timestep": 0.005}, "MuJoCo Playground: {value} at its 5 ms steps"),
-                Figure(_PLAYGROUND, {**_FINGER, "timestep": 0.01}, "{value} at our 10 ms"),
-            )
-        },
-    ),
-    Speed(
         "`bench render --scene fetch_reach`: images of new poses ([more](docs/renderer.md))",
         {
-            "H100": (_scene(64, "rgbd"), _scene(64, "depth"), _peer("render/peer_warp", "MuJoCo Warp", 64)),
+            "H200": (_scene(64, "rgbd"), _scene(64, "depth"), _peer("render/peer_warp", "MuJoCo Warp", 64)),
             "2 CPU cores": (_scene(32, "rgbd"), _scene(64, "rgbd"), _peer("render/peer_mujoco", "`mujoco.Renderer`", 64)),
         },
     ),
     Speed(
         "`bench render --scene primitives --peer warp`: MuJoCo Warp's own 127 geoms, the variant that is hardest for us",
         {
-            "H100": (
+            "H200": (
                 Figure(
                     "render/peer_warp",
                     {"scene": "primitives"},
@@ -128,7 +116,7 @@ SPEED = (
     Speed(
         "`bench update`: DDPG, replay included",
         {
-            "H100": (
+            "H200": (
                 Figure("update/gradient_steps", {"env": "VisualFetchReach"}, _UPDATE),
                 Figure(
                     "update/gradient_steps",
