@@ -46,18 +46,18 @@ def straight(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any, list]
 
 # Files whose tests play a task, and the tasks, by the word that names of files and tests have in common; the one that takes
 # longest to compile first.
-WORLD_TESTS = ("controllers", "envs", "finger_turn", "hand_reach", "physics_parity", "sawyer_reach")
-WORLDS = ("hand", "sawyer", "fetch", "finger", "reacher")
+TASK_TESTS = ("controllers", "envs", "finger_turn", "hand_reach", "physics_parity", "sawyer_reach")
+TASKS = ("hand", "sawyer", "fetch", "finger", "reacher")
 # At the end of a run no worker should wait for the other, so what takes longest comes first.
-FIRST = (*WORLDS, "test_trainer", "test_render_parity")
+FIRST = (*TASKS, "test_trainer", "test_render_parity")
 # Files that share the programs of another one: notebooks train with the smallest preset, as tests of the trainer do.
 SHARED = {"test_notebooks": "test_trainer", "test_resume": "test_trainer", "test_signals": "test_trainer"}
 
 
 def group_of(nodeid: str) -> str:
-    """What shares compiled programs with other tests: those of one world, or else of one file."""
+    """What shares compiled programs with other tests: those of one task, or else of one file."""
     file = Path(nodeid.partition("::")[0]).stem
-    names = [world for world in WORLDS if world in nodeid.lower()] if file.removeprefix("test_") in WORLD_TESTS else []
+    names = [task for task in TASKS if task in nodeid.lower()] if file.removeprefix("test_") in TASK_TESTS else []
     return names[0] if names else SHARED.get(file, file)
 
 

@@ -1,4 +1,4 @@
-"""Worlds so small that the right answer is known, each failing for one reason only (after Andy Jones, "Debugging RL").
+"""Environments so small that the right answer is known, each failing for one reason only (after Andy Jones, "Debugging RL").
 
 They are pure arithmetic: no MuJoCo, no images, a few steps.
 """

@@ -1,4 +1,4 @@
-"""The learner on worlds with known answers, and the mechanisms of the thesis on batches with known shares."""
+"""The learner in environments with known answers, and the mechanisms of the thesis on batches with known shares."""
 
 import jax
 import jax.numpy as jnp

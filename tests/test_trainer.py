@@ -63,6 +63,21 @@ def test_a_replay_that_cannot_fit_is_refused_before_allocation(tmp_path, monkeyp
         memory.check_memory(fits.config, fits.shapes, fits.program.replay_bytes, 10)
 
 
+def test_the_compilers_own_figures_count_on_a_cpu_too(straight, tmp_path, monkeypatch):
+    """Scratch memory of the evaluation, which depends on --eval-episodes, is asked for before anything is allocated."""
+    compiled = straight[1].programs.compile()
+    memory.check_compiled(compiled, already_there=False)
+    state = compiled["train_iteration"].memory_analysis().argument_size_in_bytes
+    monkeypatch.setattr(memory, "available_bytes", lambda: state + 100)
+    with pytest.raises(RequestError, match="(evaluate|train_iteration|broken_leaves) needs .* --eval-episodes") as refused:
+        memory.check_compiled(compiled, already_there=False)
+    assert "\n" not in str(refused.value)
+    monkeypatch.setattr(trained, "make_trainer", lambda config: trainer.Trainer(config, FakeProgram(config)))
+    monkeypatch.setattr(memory, "available_bytes", lambda: 100)
+    with pytest.raises(RequestError, match="evaluate needs"):
+        trained.evaluate_run(straight[0])
+
+
 @pytest.mark.parametrize("break_state", [False, True])
 def test_a_non_finite_number_stops_the_run(tmp_path, break_state, capsys):
     path = tmp_path / "run"
