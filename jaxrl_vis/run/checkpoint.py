@@ -17,6 +17,7 @@ import gc
 import logging
 import shutil
 import sys
+import threading
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -115,8 +116,26 @@ def _hushed() -> Iterator[None]:
         absl.disabled, sys.unraisablehook = disabled, before
 
 
-def _is_not_orbax(record: logging.LogRecord) -> bool:
-    return "orbax" not in record.pathname
+def _silence_orbax() -> Callable[[], None]:
+    """Keeps orbax and tensorstore from printing, in threads of their own, what they also raise; returns what undoes that."""
+
+    def is_not_orbax(record: logging.LogRecord) -> bool:
+        return "orbax" not in record.pathname
+
+    def hook(*error: Any) -> None:
+        # For a thread this is called from C++ alone: tensorstore, about an event loop that has failed and is gone.
+        if threading.current_thread() is threading.main_thread():
+            before(*error)
+
+    def undo() -> None:
+        absl.removeFilter(is_not_orbax)
+        if sys.excepthook is hook:
+            sys.excepthook = before
+
+    absl, before = logging.getLogger("absl"), sys.excepthook
+    absl.addFilter(is_not_orbax)
+    sys.excepthook = hook
+    return undo
 
 
 class Checkpoints:
@@ -134,11 +153,12 @@ class Checkpoints:
         self._read_only = read_only
         self._managers: dict[str, ocp.CheckpointManager] = {}
         self._reported: set[tuple[str, int]] = set()  # damaged ones
+        self._unsilence: Callable[[], None] | None = None
 
     def _manager(self, tier: str) -> ocp.CheckpointManager:
         if tier not in self._managers:
-            if not self._read_only:
-                logging.getLogger("absl").addFilter(_is_not_orbax)
+            if not self._read_only and self._unsilence is None:
+                self._unsilence = _silence_orbax()
             options = ocp.CheckpointManagerOptions(
                 preservation_policy=None if self._read_only else LatestN(_KEPT),
                 cleanup_tmp_directories=not self._read_only,
@@ -216,7 +236,9 @@ class Checkpoints:
             with self._writing(tier):
                 manager.close()
         self._managers.clear()
-        logging.getLogger("absl").removeFilter(_is_not_orbax)
+        if self._unsilence is not None:
+            self._unsilence()
+            self._unsilence = None
 
     def retire_full(self) -> None:
         """Deletes full checkpoints that are older than a light one which is safely on the disk: nothing goes on from them."""
