@@ -94,9 +94,10 @@ class RunLoop:
                 return
             interruption = Interruption()
             try:
-                self._prepare(goes_on, overwrite, memory)
+                self._prepare(goes_on, memory)
                 # Not before: while XLA compiles, no Python runs that could look at a flag, and there is nothing to save.
                 with interruption:
+                    self._begin(goes_on, overwrite)
                     yield from self._train(interruption)
                     self._finish(interruption)
                 self._checkpoints.close()
@@ -145,7 +146,8 @@ class RunLoop:
         files = [self._folder.curve, self._folder.video] if self._programs.shows_images else [self._folder.curve]
         return not Progress.from_dict(restored.progress).evaluation_due and all(file.exists() for file in files)
 
-    def _prepare(self, goes_on: bool, overwrite: bool, memory: str) -> None:
+    def _prepare(self, goes_on: bool, memory: str) -> None:
+        """Restores, compiles, and asks for memory: whatever can refuse the run. Nothing is written."""
         programs, steps = self._programs, self._program.steps_per_iteration
         self._say(f"{self._config.env}, {self._asked}, on {jax.devices()[0].device_kind}; {memory}")
         self._say(f"{self._total} iterations of {steps:,} environment steps per seed; files go to {self._folder.path}")
@@ -162,7 +164,8 @@ class RunLoop:
         self._say(f"compiled in {show_seconds(time.monotonic() - started)}")
         check_compiled(compiled, already_there=self._loop is not None)
 
-        # Nothing refuses the run from here on.
+    def _begin(self, goes_on: bool, overwrite: bool) -> None:
+        """Makes the folder ready, and the state; nothing refuses the run any more."""
         self._folder.open(self._config, goes_on, overwrite)
         if goes_on:
             damaged = self._checkpoints.set_aside_after(self._done)
@@ -171,7 +174,7 @@ class RunLoop:
             for path in damaged:
                 self._say(f"kept for inspection: {path}")
         if self._loop is None:
-            self._loop = programs.init(programs.run_keys)
+            self._loop = self._programs.init(self._programs.run_keys)
         self._console.start(self._total, self._done)
         self._set_mark()
         self._begun, self._begun_at = self._done, self._mark
