@@ -77,7 +77,7 @@ class RunLoop:
         self._recorded: dict[str, jax.Array] = {}
         self._started = self._mark = time.monotonic()
         self._begun, self._begun_at = 0, self._mark
-        self._marked_iteration = 0
+        self._marked_iteration, self._compile_s = 0, 0.0
 
     def reports(self, resume: bool, overwrite: bool) -> Iterator[Report]:
         """The whole run; see `Trainer.run`."""
@@ -94,10 +94,10 @@ class RunLoop:
                 return
             interruption = Interruption()
             try:
-                self._prepare(goes_on, memory)
+                compiled = self._prepare(goes_on, memory)
                 # Not before: while XLA compiles, no Python runs that could look at a flag, and there is nothing to save.
                 with interruption:
-                    self._begin(goes_on, overwrite)
+                    self._begin(compiled, goes_on, overwrite)
                     yield from self._train(interruption)
                     self._finish(interruption)
                 self._checkpoints.close()
@@ -146,8 +146,8 @@ class RunLoop:
         files = [self._folder.curve, self._folder.video] if self._programs.shows_images else [self._folder.curve]
         return not Progress.from_dict(restored.progress).evaluation_due and all(file.exists() for file in files)
 
-    def _prepare(self, goes_on: bool, memory: str) -> None:
-        """Restores, compiles, and asks for memory: whatever can refuse the run. Nothing is written."""
+    def _prepare(self, goes_on: bool, memory: str) -> dict[str, Any]:
+        """Restores and compiles; the compiled programs by name. Nothing is written."""
         programs, steps = self._programs, self._program.steps_per_iteration
         self._say(f"{self._config.env}, {self._asked}, on {jax.devices()[0].device_kind}; {memory}")
         self._say(f"{self._total} iterations of {steps:,} environment steps per seed; files go to {self._folder.path}")
@@ -160,12 +160,14 @@ class RunLoop:
         started = time.monotonic()
         self._say("compiling (once; the next start finds it in the cache) ...")
         compiled = programs.compile()
-        self._progress.compile_s += time.monotonic() - started
-        self._say(f"compiled in {show_seconds(time.monotonic() - started)}")
-        check_compiled(compiled, already_there=self._loop is not None)
+        self._compile_s = time.monotonic() - started
+        self._progress.compile_s += self._compile_s
+        return compiled
 
-    def _begin(self, goes_on: bool, overwrite: bool) -> None:
-        """Makes the folder ready, and the state; nothing refuses the run any more."""
+    def _begin(self, compiled: dict[str, Any], goes_on: bool, overwrite: bool) -> None:
+        """Asks for memory once more, the last thing that can refuse the run; then makes the folder and the state ready."""
+        self._say(f"compiled in {show_seconds(self._compile_s)}")
+        check_compiled(compiled, already_there=self._loop is not None)
         self._folder.open(self._config, goes_on, overwrite)
         if goes_on:
             damaged = self._checkpoints.set_aside_after(self._done)
