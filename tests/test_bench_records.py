@@ -166,7 +166,7 @@ def test_tables_go_between_their_markers(tmp_path: Path) -> None:
 
 
 def test_a_figure_takes_the_best_record_or_the_hardest() -> None:
-    device = DEVICES["H100"]
+    device = DEVICES["H200"]
     records = [
         kept(2000.0, device=device, config={"discs": 8, "pixels": "rgbd"}, details={"ratio": 3.0}),
         kept(1000.0, device=device, config={"discs": 4, "pixels": "rgbd"}, details={"ratio": 2.0}),
