@@ -122,24 +122,24 @@ def _silence_orbax() -> Callable[[], None]:
     def is_not_orbax(record: logging.LogRecord) -> bool:
         return "orbax" not in record.pathname
 
-    def hook(*error: Any) -> None:
-        # For a thread this is called from C++ alone: tensorstore, about an event loop that has failed and is gone.
+    def hook(unraisable: Any) -> None:
+        # From another thread it is tensorstore, which wants to tell an event loop that has failed, and is gone.
         if threading.current_thread() is threading.main_thread():
-            before(*error)
+            before(unraisable)
 
     def undo() -> None:
         absl.removeFilter(is_not_orbax)
-        if sys.excepthook is hook:
-            sys.excepthook = before
+        if sys.unraisablehook is hook:
+            sys.unraisablehook = before
 
-    absl, before = logging.getLogger("absl"), sys.excepthook
+    absl, before = logging.getLogger("absl"), sys.unraisablehook
     absl.addFilter(is_not_orbax)
-    sys.excepthook = hook
+    sys.unraisablehook = hook
     return undo
 
 
 class Checkpoints:
-    """The checkpoints of one run. While it saves, orbax's own log is silent: what goes wrong is raised, and told in one line.
+    """The checkpoints of one run. While it is open, orbax's own log is silent: what goes wrong is raised, and told in one line.
 
     Args:
         folder: Where both tiers lie; made when something is saved.
@@ -157,7 +157,7 @@ class Checkpoints:
 
     def _manager(self, tier: str) -> ocp.CheckpointManager:
         if tier not in self._managers:
-            if not self._read_only and self._unsilence is None:
+            if self._unsilence is None:
                 self._unsilence = _silence_orbax()
             options = ocp.CheckpointManagerOptions(
                 preservation_policy=None if self._read_only else LatestN(_KEPT),
