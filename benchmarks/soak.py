@@ -34,8 +34,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-FAULTS_PER_RUN = 6
-ITERATIONS, STEPS = 240, 200  # environment steps of an iteration: 4 environments, 50 steps each
+FAULTS_PER_RUN = 8
+ITERATIONS, STEPS = 160, 200  # environment steps of an iteration: 4 environments, 50 steps each
 OPTIONS = [
     *("Reacher", "--preset", "debug", "--env-steps", str(ITERATIONS * STEPS), "--updates-per-iteration", "20"),
     *("--eval-interval", "10", "--checkpoint-interval", "4", "--replay-transitions", "4000"),
@@ -242,10 +242,12 @@ class Soak:
         folder: Where runs lie.
         faults: How many there are to be.
         seed: Of what happens when.
+        minutes: After so long no fault begins any more.
     """
 
-    def __init__(self, folder: Path, faults: int, seed: int):
+    def __init__(self, folder: Path, faults: int, seed: int, minutes: float):
         self._folder, self._seed = folder, seed
+        self._deadline = time.monotonic() + 60.0 * minutes
         self._environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
         self._waiting = [FAULTS[i % len(FAULTS)] for i in range(faults)]
         random.Random(seed).shuffle(self._waiting)
@@ -256,6 +258,8 @@ class Soak:
 
     def _next_fault(self, allowed: tuple[str, ...]) -> str | None:
         with self._lock:
+            if time.monotonic() > self._deadline:
+                self._waiting.clear()
             found = next((fault for fault in self._waiting if fault in allowed), None)
             if found is not None:
                 self._waiting.remove(found)
@@ -292,7 +296,7 @@ class Soak:
                 break
             if not struck:  # the run was over before: another one gets it
                 with self._lock:
-                    self._waiting.append(fault)
+                    self._waiting.insert(0, fault)
                 break
             faults.append(fault)
             with self._lock:
@@ -361,13 +365,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--faults", type=int, default=108)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--minutes", type=float, default=60.0, help="after so long no fault begins any more")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--table", type=Path, help="write the table here, between the markers")
     parser.add_argument("--folder", type=Path, help="where runs lie; a temporary folder if not given")
     options = parser.parse_args()
     folder = options.folder or Path(tempfile.mkdtemp(prefix="soak-"))
     folder.mkdir(parents=True, exist_ok=True)
-    soak = Soak(folder.resolve(), options.faults, options.seed)
+    soak = Soak(folder.resolve(), options.faults, options.seed, options.minutes)
     soak.undisturbed()
     with concurrent.futures.ThreadPoolExecutor(options.workers) as pool:
         for future in [pool.submit(soak.work, worker) for worker in range(options.workers)]:

@@ -138,6 +138,10 @@ def _silence_orbax() -> Callable[[], None]:
     return undo
 
 
+def _stay_silent() -> None:
+    """In the place of what undoes `_silence_orbax`."""
+
+
 class Checkpoints:
     """The checkpoints of one run. While it is open, orbax's own log is silent: what goes wrong is raised, and told in one line.
 
@@ -214,8 +218,10 @@ class Checkpoints:
         try:
             yield
         except Exception as error:
-            # A manager whose writing failed in the background reports it again and again: start with a new one.
+            # A manager whose writing failed in the background reports it again and again: start with a new one. Its threads go
+            # on failing for a while, so from here on the process stays silent about them.
             self._managers.pop(tier, None)
+            self._unsilence = _stay_silent
             text = " ".join(str(error).split())
             shown = "no space left on the device" if "No space left" in text else f"{type(error).__name__}: {text[:160]}"
             raise StorageError(f"cannot write a {tier} checkpoint into {self._folder} ({shown})") from error
