@@ -35,7 +35,7 @@ from pathlib import Path
 from typing import Any
 
 FAULTS_PER_RUN = 8
-ITERATIONS, STEPS = 160, 200  # environment steps of an iteration: 4 environments, 50 steps each
+ITERATIONS, STEPS = 240, 200  # environment steps of an iteration: 4 environments, 50 steps each
 OPTIONS = [
     *("Reacher", "--preset", "debug", "--env-steps", str(ITERATIONS * STEPS), "--updates-per-iteration", "20"),
     *("--eval-interval", "10", "--checkpoint-interval", "4", "--replay-transitions", "4000"),
@@ -150,6 +150,10 @@ class Part:
             time.sleep(0.002)
         return condition()
 
+    def is_compiling(self) -> bool:
+        """Whether compilation has begun."""
+        return any(line.startswith("compiling") for line in self.lines)
+
     def is_training(self) -> bool:
         """Whether compilation is over."""
         return any(line.startswith("compiled in") for line in self.lines)
@@ -164,7 +168,8 @@ def strike(part: Part, dice: random.Random, environment: dict[str, str]) -> bool
     fault = part.fault
     if fault in (None, "full disk"):
         return part.end() != 0
-    part.wait_for(part.is_training)
+    # A second process takes seconds to start; the first holds the folder from before it compiles.
+    part.wait_for(part.is_compiling if fault == "second process" else part.is_training)
     time.sleep(dice.uniform(0.0, 1.0))
     if not part.runs():
         return False
@@ -296,7 +301,7 @@ class Soak:
                 break
             if not struck:  # the run was over before: another one gets it
                 with self._lock:
-                    self._waiting.insert(0, fault)
+                    self._waiting.append(fault)
                 break
             faults.append(fault)
             with self._lock:
