@@ -15,6 +15,7 @@ from jaxrl_vis.errors import RequestError
 
 
 def main() -> int:
+    """Reads the command line and does what it asks for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path, help="the run folder")
     parser.add_argument("name", help="what the evidence is called")

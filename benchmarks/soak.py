@@ -367,6 +367,7 @@ class Soak:
 
 
 def main() -> int:
+    """Reads the command line and does what it asks for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--faults", type=int, default=108)
     parser.add_argument("--seed", type=int, default=0)
