@@ -3,7 +3,8 @@
 A pixel within one pixel of an edge of the segmentation, in either image, is left out of colour, depth and the shares of the
 segmentation: there OpenGL and a ray caster may choose differently. All other pixels count, whether or not the two agree on what
 they show. So that nothing thin is lost with the edges, each object is also matched by itself, with all its pixels: those in one
-image must lie within one pixel of the same object's in the other, in both directions.
+image must lie within one pixel of the same object's in the other, in both directions. Where two surfaces coincide, so that depth
+and colour are the same whichever is drawn, either object will do.
 """
 
 import dataclasses
@@ -17,6 +18,7 @@ import numpy as np
 VISIBLE_PIXELS = 30  # a geom with fewer in an image (edges counted) has no IoU there
 MATCHED_PIXELS = 10  # an object with fewer, in the image where it has more of them, may be hidden in the other
 DEPTH_METRES, DEPTH_SHARE = 1e-3, 1e-3  # whichever is more
+COINCIDENT_METRES, COINCIDENT_GREY_LEVELS = 1e-4, 4  # of two surfaces of which either may be drawn
 
 PLANE, SKY, BARE, TEXTURED = "plane", "sky", "bare", "textured"
 
@@ -37,7 +39,7 @@ class Bound:
 BOUNDS = {
     "segmentation": Bound(0.997, True),
     "iou": Bound(0.95, True),
-    "matched": Bound(0.7, True),
+    "matched": Bound(0.8, True),
     "depth": Bound(0.999, True),
     "bare_mean": Bound(4.0, False),
     "bare_p99": Bound(12.0, False),
@@ -71,18 +73,29 @@ def dilated(mask: np.ndarray) -> np.ndarray:
     return np.any([padded[row : row + height, column : column + width] for row in range(3) for column in range(3)], axis=0)
 
 
-def matched_shares(ours: np.ndarray, theirs: np.ndarray) -> dict[int, float]:
+def coincident(ours: Any, theirs: Any) -> np.ndarray:
+    """Where two images show surfaces of the same depth and colour, whichever object each of them names. [H, W] bool."""
+    same_depth = np.abs(ours.depth - theirs.depth) <= COINCIDENT_METRES
+    same_colour = np.max(np.abs(ours.rgb.astype(np.int16) - theirs.rgb), axis=-1) <= COINCIDENT_GREY_LEVELS
+    return same_depth & same_colour
+
+
+def matched_shares(ours: Any, theirs: Any) -> dict[int, float]:
     """Of each object with enough pixels, the share of them that lies within a pixel of its own in the other image; the lesser.
 
+    Pixels where the two surfaces are `coincident` count as the object's own.
+
     Args:
-        ours: Segmentation [H, W] as `Frame` has it.
+        ours: A `Frame` of NumPy arrays.
         theirs: The other one.
     """
     found = {}
-    for label in set(np.unique(ours)) | set(np.unique(theirs)):
-        one, other = ours == label, theirs == label
+    either_will_do = coincident(ours, theirs)
+    for label in set(np.unique(ours.segmentation)) | set(np.unique(theirs.segmentation)):
+        one, other = ours.segmentation == label, theirs.segmentation == label
         if label >= 0 and max(one.sum(), other.sum()) >= MATCHED_PIXELS:
-            shares = [_share((a & dilated(b)).sum(), a.sum()) for a, b in ((one, other), (other, one)) if a.any()]
+            pairs = ((one, other), (other, one))
+            shares = [_share((a & (dilated(b) | either_will_do)).sum(), a.sum()) for a, b in pairs if a.any()]
             found[int(label)] = float(min(shares))
     return found
 
@@ -133,7 +146,7 @@ class Tally:
             # Not `<`, which NaN (none yet) would never pass.
             if either and not both / either >= self.worst[0]:
                 self.worst = (both / either, int(label), self.images)
-        for label, share in matched_shares(ours.segmentation, theirs.segmentation).items():
+        for label, share in matched_shares(ours, theirs).items():
             if not share >= self.worst_match[0]:
                 self.worst_match = (share, label, self.images)
         difference = np.abs(ours.rgb.astype(np.int16) - theirs.rgb)

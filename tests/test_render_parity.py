@@ -65,7 +65,7 @@ def test_a_image_agrees_with_itself_away_from_edges() -> None:
 
 
 def test_another_object_fails() -> None:
-    assert tally_of(frame(label=1), frame(label=0)).failures() == ["segmentation", "iou", "matched"]
+    assert tally_of(frame(label=1, depth=2.001), frame(label=0)).failures() == ["segmentation", "iou", "matched"]
 
 
 def thin(width: int, column: int = 3, label: int = 1) -> Frame:
@@ -88,6 +88,15 @@ def test_a_thin_object_may_be_a_pixel_away_and_no_further() -> None:
     assert tally_of(thin(1), thin(1, column=5)).failures() == ["matched"]
     assert tally_of(thin(1), thin(3, column=2)).measures()["matched"] == 1.0  # wider by a pixel on each side
     assert "matched" in tally_of(thin(1), thin(4)).failures()
+
+
+def test_of_two_surfaces_that_coincide_either_may_be_drawn() -> None:
+    other, nearer = thin(1), thin(1)
+    other.segmentation[other.segmentation == 1] = 0  # the same image, by the name of the object behind
+    assert tally_of(thin(1), other).failures() == []
+    nearer.segmentation[nearer.segmentation == 1] = 0
+    nearer.depth[2:14, 3] -= 0.001  # within the bound of depths, but one surface lies before the other
+    assert tally_of(thin(1), nearer).failures() == ["matched"]
 
 
 def test_a_wrong_object_inside_counts_though_edges_are_left_out() -> None:
