@@ -3,8 +3,8 @@
 A pixel within one pixel of an edge of the segmentation, in either image, is left out of colour, depth and the shares of the
 segmentation: there OpenGL and a ray caster may choose differently. All other pixels count, whether or not the two agree on what
 they show. So that nothing thin is lost with the edges, each object is also matched by itself, with all its pixels: those in one
-image must lie within one pixel of the same object's in the other, in both directions. Where two surfaces coincide, so that depth
-and colour are the same whichever is drawn, either object will do.
+image must lie within one pixel of the same object's in the other, in both directions. Where two surfaces coincide, so that
+depth and colour are the same whichever is drawn, either object will do.
 """
 
 import dataclasses
