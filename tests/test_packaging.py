@@ -136,7 +136,7 @@ def test_names_load_no_jax(clean_environment: dict[str, str]) -> None:
 
 def test_pins_carry_no_address_and_every_hash() -> None:
     files = sorted((ROOT / "requirements").glob("*.txt"))
-    assert [file.name for file in files] == ["base.txt", "dev.txt", "gpu.txt"]
+    assert [file.name for file in files] == ["base.txt", "dev.txt", "docs.txt", "gpu.txt"]
     for file in files:
         text = file.read_text()
         assert "://" not in text

@@ -1,6 +1,6 @@
 """Writes the table of docs/configuration.md from `jaxrl_vis.config`; a test fails where the page is not what this writes.
 
-    python docs/tools/configuration.py
+python docs/tools/configuration.py
 """
 
 import dataclasses

@@ -1,1 +1,1 @@
-"""Pure functions of arrays, in the order in which data passes through: rollout, replay, sampling, ddpg, train_step, evaluate."""
+"""Pure functions of arrays, in the order of the data: rollout, replay, sampling, ddpg, train_step, evaluate."""
