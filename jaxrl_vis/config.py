@@ -267,6 +267,10 @@ PRESETS: dict[str, Config] = {config.preset: config for config in (_PAPER, _FAST
 def preset(name: str, **overrides: Any) -> Config:
     """A named configuration with some fields changed.
 
+    Args:
+        name: ``paper``, ``fast``, ``cpu`` or ``debug`` (`PRESETS`).
+        **overrides: Fields of `Config` and their values.
+
     Raises:
         RequestError: There is no such preset, or no such field.
     """

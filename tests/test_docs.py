@@ -324,15 +324,20 @@ def test_every_page_is_in_the_menu_and_reached_from_the_readme() -> None:
         assert f"(docs/{guide}.md)" in readme
 
 
-class Loaded(html.parser.HTMLParser):
-    """What a page loads by itself: scripts, styles, images, frames; not links that a reader may click."""
+class Reader(html.parser.HTMLParser):
+    """What a page loads by itself (scripts, styles, images, frames), where its links lead, and the anchors that it has."""
 
     def __init__(self) -> None:
         super().__init__()
         self.addresses: list[str] = []
+        self.links: list[str] = []
+        self.anchors: set[str] = set()
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         named = dict(attrs)
+        self.anchors |= {named[name] or "" for name in ("id", "name") if name in named}
+        if tag == "a":
+            self.links.append(named.get("href") or "")
         if tag == "link" and named.get("rel") not in ("prev", "next", "canonical"):
             self.addresses.append(named.get("href") or "")
         if tag in ("script", "img", "iframe", "source", "video", "object"):
@@ -347,10 +352,15 @@ def test_the_site_builds_and_loads_nothing_from_elsewhere(tmp_path: Path) -> Non
     assert done.returncode == 0 and not done.stderr, done.stdout + done.stderr
     pages = list(site.rglob("*.html"))
     assert len(pages) > len(list(DOCS.rglob("*.md")))  # and one for what is not found
-    for page in pages:
-        reader = Loaded()
-        text = page.read_text()
-        reader.feed(text)
+    readers = {page: Reader() for page in pages}
+    for page, reader in readers.items():
+        reader.feed(page.read_text())
+    for page, reader in readers.items():
+        for link in reader.links:
+            file, _, anchor = link.partition("#")
+            if anchor and "://" not in link and page.name != "404.html":
+                there = (page.parent / file).resolve() if file else page
+                assert anchor in {*readers[there].anchors, "__skip"}, f"{page.name} links {link}"
         for address in reader.addresses:
             assert not re.match(r"(https?:)?//", address), f"{page.name} loads {address}"
             if page.name != "404.html" and not address.startswith(("data:", "#")):

@@ -59,17 +59,22 @@ class MjxGoalEnv(GoalEnv):
 
     @abc.abstractmethod
     def sample_start(self, key: jax.Array) -> mjx.Data:
-        """The start of the episode ``reset(key)``."""
+        """The start of the episode ``reset(key)``, with poses that belong to its ``qpos``; ``key`` is [], typed."""
 
     @abc.abstractmethod
     def sample_goal(self, key: jax.Array) -> mjx.Data:
-        """The configuration that the goal image of ``reset(key)`` shows."""
+        """The configuration that the goal image of ``reset(key)`` shows, with its poses; ``key`` is [], typed."""
 
     @abc.abstractmethod
     def act(self, data: mjx.Data, action: jax.Array) -> mjx.Data:
         """The physics of one control step, of ``self._model``, whose numbers may vary (see `randomization`).
 
-        ``action`` is [A] float32, all finite and within [-1, 1], or in a somewhat other range where its scale varies.
+        Args:
+            data: The physics state, poses included.
+            action: [A] float32, all finite and within [-1, 1], or in a somewhat other range where its scale varies.
+
+        Returns:
+            The physics state `control_period` seconds later, poses included.
         """
 
     @abc.abstractmethod
