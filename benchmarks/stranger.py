@@ -197,7 +197,7 @@ def tiny(line: str) -> str:
             del words[at : at + 2]
         words += shlex.split(TINY)
     if words[1] == "bench":
-        words += shlex.split("--num-envs 8 --image-size 16")
+        words += shlex.split("--envs 8 --image-size 16 --repeats 1")
     return shlex.join(words)
 
 
