@@ -167,7 +167,7 @@ def test_help_explains_every_option(capsys: pytest.CaptureFixture[str], monkeypa
         for option, text in options.items():
             assert re.search(r"\w.*[.)]$", text), option
     assert set(texts["train"]) >= {f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(Config)} - {"--env"}
-    assert "(default: 64; paper 100, cpu 32, debug 16)" in texts["train"]["--image-size"]
+    assert "(default: 32; paper 100, fast 64, debug 16)" in texts["train"]["--image-size"]
     assert "(default: True; paper False)" in texts["train"]["--clip-targets-above"]
     assert "(default: oracle)" in texts["train"]["--method"]
 

@@ -87,6 +87,9 @@ def test_finished_run_says_so(straight, capsys):
 
 
 def test_resume_of_nothing_starts(tmp_path, capsys):
+    with pytest.raises(RequestError, match="nothing to resume: there is no folder .*leave out --resume"):
+        make_fake_trainer(small_config(env_steps=20), tmp_path / "run", resume=True)
+    (tmp_path / "run").mkdir()  # as a run that was killed before its first file leaves it
     reports = make_fake_trainer(small_config(env_steps=20), tmp_path / "run", resume=True).run()
     assert [report.iteration for report in reports] == [1, 2]
     assert "nothing to resume" in capsys.readouterr().out

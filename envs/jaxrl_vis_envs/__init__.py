@@ -13,10 +13,12 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from jaxrl_vis_envs.base import GoalEnv, State
     from jaxrl_vis_envs.registry import UnknownEnvironmentError, UnknownOverrideError, list_envs, make, register
+    from jaxrl_vis_envs.task_modules import TaskModuleError
 
 _HOME = {
     "GoalEnv": "base",
     "State": "base",
+    "TaskModuleError": "task_modules",
     "UnknownEnvironmentError": "registry",
     "UnknownOverrideError": "registry",
     "list_envs": "registry",
@@ -24,7 +26,16 @@ _HOME = {
     "register": "registry",
 }
 
-__all__ = ["GoalEnv", "State", "UnknownEnvironmentError", "UnknownOverrideError", "list_envs", "make", "register"]
+__all__ = [
+    "GoalEnv",
+    "State",
+    "TaskModuleError",
+    "UnknownEnvironmentError",
+    "UnknownOverrideError",
+    "list_envs",
+    "make",
+    "register",
+]
 
 
 def __getattr__(name: str) -> Any:
