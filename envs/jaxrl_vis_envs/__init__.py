@@ -4,11 +4,13 @@
     state = env.reset(jax.random.key(0))
 
 Importing this package loads neither MuJoCo nor JAX: the learner's leaves import `jaxrl_vis_envs.goals` alone. The names below
-are looked up when they are first used.
+are looked up when they are first used. Once it is imported, MJX does not print that Warp is missing.
 """
 
 import importlib
 from typing import TYPE_CHECKING, Any
+
+from jaxrl_vis_envs import quiet_warp
 
 if TYPE_CHECKING:
     from jaxrl_vis_envs.base import GoalEnv, State
@@ -36,6 +38,9 @@ __all__ = [
     "make",
     "register",
 ]
+
+
+quiet_warp.install()
 
 
 def __getattr__(name: str) -> Any:
