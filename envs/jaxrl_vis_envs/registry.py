@@ -22,6 +22,8 @@ from jaxrl_vis_envs.task_modules import TaskModuleError
 _BUILT_IN = {**TASKS, **{visual_name(task): module for task, module in TASKS.items()}}
 # What an environment must say of itself, and not every base class says for it.
 _CONSTANTS = ("horizon", "action_size", "threshold", "control_period")
+# What its methods are called with.
+_METHODS = {"reset": ("key",), "advance": ("state", "action"), "observe": ("state",)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -165,6 +167,12 @@ def make(name: str, **overrides: Any) -> GoalEnv:
     for constant in _CONSTANTS:
         if not hasattr(env, constant):
             raise ValueError(f"{name} has no {constant}: every environment says what its {', '.join(_CONSTANTS)} are")
+    for method, parameters in _METHODS.items():
+        signature = inspect.signature(getattr(env, method))
+        try:
+            signature.bind(*parameters)
+        except TypeError:
+            raise ValueError(f"{name}: {method} must take ({', '.join(parameters)}), not {signature}") from None
     env.name = name
     return env
 
@@ -196,7 +204,7 @@ def _entry(name: str, folder: str | None = None) -> _Entry:
             mend = "; a task of your own is written module:Name, such as my_task:MyReach"
         raise UnknownEnvironmentError(f"unknown environment {name!r}{mend}")
     if len(points) > 1:
-        choices = " or ".join(point.value for point in points)
+        choices = " or ".join(sorted(point.value for point in points))
         raise UnknownEnvironmentError(f"several installed packages have a {name}: ask for {choices}")
     (point,) = points
     return _entry_of(name, task_modules.load(point.module, installed=True), point.attr)

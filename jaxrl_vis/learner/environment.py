@@ -71,6 +71,8 @@ def _read_options(config: Config) -> dict[str, Any]:
         if name not in hints:
             choices = [each for each in hints if each not in _OWN_FIELDS]
             raise RequestError(f"{config.env} has no option {name!r}{nearest(name, choices)}")
+        if not fields.is_known(hints[name]):
+            raise RequestError(f"{name} cannot be set by name=value: it is a {hints[name]}, neither a number nor a word")
         _, _, several = fields.unwrap(hints[name])
         found[name] = fields.read(name, hints[name], value.split(",") if several else [value])
     return found
