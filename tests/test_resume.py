@@ -140,7 +140,7 @@ def test_a_broken_config_file_is_one_line(straight, tmp_path):
 def test_an_earlier_run_outlives_a_new_one_that_cannot_be(straight, tmp_path):
     shutil.copytree(straight[0], tmp_path / "run")
     before = {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()}
-    with pytest.raises(RequestError, match="bytes"):
+    with pytest.raises(RequestError, match="GiB"):
         list(make_fake_trainer(small_config(replay_transitions=10**12, seeds=1), tmp_path / "run", overwrite=True).run())
     assert before == {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()}
 

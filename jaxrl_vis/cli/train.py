@@ -11,6 +11,7 @@ from jaxrl_vis.config import PRESETS, Config, preset, validate
 from jaxrl_vis.devices import check_devices, guess_accelerator
 from jaxrl_vis.errors import RequestError, nearest
 from jaxrl_vis.report.outputs import check_writable
+from jaxrl_vis.run.folder import check_there, default_folder, read_config
 
 
 def _defaults(name: str) -> str:
@@ -63,8 +64,6 @@ def training_config(options: Train) -> Config:
     if name not in ("auto", *PRESETS):
         raise RequestError(f"unknown preset {name!r}{nearest(name, ['auto', *PRESETS])}")
     if name == "auto" and options.resume and options.run_dir is not None and (options.run_dir / "config.json").exists():
-        from jaxrl_vis.run.folder import read_config
-
         return read_config(options.run_dir).replace(**changes)
     if name == "auto":
         import jax
@@ -81,16 +80,17 @@ def run(options: Train) -> int:
     """Trains; every report has already been shown and saved by the trainer."""
     if options.resume and options.overwrite:
         raise RequestError("--resume and --overwrite contradict each other; give one of them")
-    if options.resume and options.run_dir is not None and not options.run_dir.exists():
-        raise RequestError(f"nothing to resume: there is no folder {options.run_dir}; leave out --resume to start a run there")
+    if options.run_dir is not None:
+        check_there(options.run_dir, options.resume)
     if options.env is not None:
         check_env(options.env, options.changes.get("env_folder"))
     config = validate(training_config(options))
     check_env(config.env, config.env_folder)
     from jaxrl_vis.run import trainer
-    from jaxrl_vis.run.folder import default_folder
 
-    check_writable(options.run_dir or default_folder(config), "--run-dir", folder=True)
+    run_dir = options.run_dir or default_folder(config)
+    check_there(run_dir, options.resume)
+    check_writable(run_dir, "--run-dir", folder=True)
     for _ in trainer.make_trainer(config, options.run_dir, resume=options.resume, overwrite=options.overwrite).run():
         pass
     return 0

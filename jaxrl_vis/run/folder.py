@@ -41,6 +41,12 @@ def default_folder(config: Config) -> Path:
     return Path("runs") / f"{config.env.replace(':', '-')}-{config.method}-{config.preset}-{seeds}"
 
 
+def check_there(path: Path, resume: bool) -> None:
+    """Raises a `RequestError` where a run is to go on in a folder that is not there."""
+    if resume and not path.exists():
+        raise RequestError(f"nothing to resume: there is no folder {path}; leave out --resume to start a run there")
+
+
 @dataclasses.dataclass(frozen=True)
 class RunFolder:
     """Names of the files of a run; see the module's image.
@@ -98,8 +104,7 @@ class RunFolder:
             raise RequestError("--resume and --overwrite contradict each other: give one of them")
         if self.path.exists() and not self.path.is_dir():
             raise RequestError(f"{self.path} is a file: choose another --run-dir")
-        if resume and not self.path.exists():
-            raise RequestError(f"nothing to resume: there is no folder {self.path}; leave out --resume to start a run there")
+        check_there(self.path, resume)
         if not self.path.exists() or all(entry.name == LOCK_NAME for entry in self.path.iterdir()):
             return False
         if not (resume or overwrite):
