@@ -27,7 +27,9 @@ class Config:
     """One training run. Counts are per seed; lengths of time are in control steps unless a unit is given."""
 
     env: str = "VisualFetchReach"
-    """The environment; `jaxrl-vis envs` lists them."""
+    """The environment; `jaxrl-vis envs` lists them, and module:Name is one of your own."""
+    env_folder: str | None = None
+    """Folder from which module:Name is imported; a run keeps it. None: the current one, or wherever Python finds the module."""
     preset: str = "fast"
     """The preset that this configuration started from; kept for the record."""
     method: MethodName = "oracle"

@@ -37,6 +37,15 @@ def unwrap(hint: Any) -> tuple[Any, bool, bool]:
     return hint, optional, several
 
 
+def is_known(hint: Any) -> bool:
+    """Whether values of a field with this annotation can be checked and read."""
+    try:
+        one, _, _ = unwrap(hint)
+    except (ValueError, IndexError):  # a union of several kinds, an empty tuple
+        return False
+    return one in _KINDS or typing.get_origin(one) is Literal
+
+
 def choices(hint: Any) -> tuple[str, ...]:
     """The words that a field allows, where it is a Literal, optional or not, or a tuple of them; else none."""
     hint, _, _ = unwrap(hint)

@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 LAYERS: tuple[tuple[str, ...], ...] = (
     ("errors", "methods"),
     ("fields",),
-    ("config", "types", "provenance", "files"),
+    ("config", "types", "provenance", "files", "devices"),
     ("learner",),
     ("report",),
     ("run",),
@@ -27,7 +27,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
 # The same for the environments.
 ENVIRONMENT_LAYERS: tuple[tuple[str, ...], ...] = (
     ("checks", "compilation", "goals", "names"),
-    ("physics", "render"),
+    ("physics", "render", "task_modules"),
     ("randomization",),
     ("base",),
     ("pixels", "registry"),

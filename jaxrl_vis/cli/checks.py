@@ -3,16 +3,31 @@
 from pathlib import Path
 
 from jaxrl_vis.cli.parsing import PROGRAM
-from jaxrl_vis.errors import RequestError, nearest
+from jaxrl_vis.devices import check_devices
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.run.signals import shielded_children
 
 
-def check_env(name: str) -> None:
-    """Raises a `RequestError` with the nearest names unless ``name`` is an environment."""
-    from jaxrl_vis_envs import list_envs
+def check_env(name: str, folder: str | None = None) -> None:
+    """Checks that there is an environment; one that is not built in is imported.
 
-    names = tuple(list_envs())
-    if name not in names:
-        raise RequestError(f"unknown environment {name!r}{nearest(name, names)}")
+    Args:
+        name: Of the environment.
+        folder: Where the module of ``module:Name`` was found before.
+
+    Raises:
+        RequestError: There is none, or what holds it cannot be imported.
+    """
+    from jaxrl_vis_envs import registry
+
+    try:
+        if registry.is_built_in(name):
+            return
+        with shielded_children():
+            check_devices()  # what somebody's module computes as it is imported must not be the first to ask
+        registry.load(name, folder)
+    except ValueError as error:
+        raise RequestError(str(error)) from error
 
 
 def check_run(folder: Path) -> None:

@@ -41,6 +41,22 @@ class ChangesOf:
 
 
 @dataclasses.dataclass(frozen=True)
+class ByPlaceToo:
+    """Marks a field that may be given by its place as well as by its name: ``train TASK`` or ``train --env TASK``."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SayDefault:
+    """Marks a field whose default the help cannot read off.
+
+    Attributes:
+        words: What the help says about it.
+    """
+
+    words: Callable[[], str]
+
+
+@dataclasses.dataclass(frozen=True)
 class _Option:
     """One option or positional argument.
 
@@ -52,6 +68,7 @@ class _Option:
         default: What the help says about its default; nothing where it goes without saying.
         required: Whether it must be given.
         changes: The field of the command that collects it; None where it is a field of the command itself.
+        twin: Whether it is the same field as another option, which is known by its name.
     """
 
     name: str
@@ -61,6 +78,12 @@ class _Option:
     default: str
     required: bool
     changes: str | None = None
+    twin: bool = False
+
+    @property
+    def key(self) -> str:
+        """What tyro calls it."""
+        return f"{self.name}_by_place" if self.twin else self.name
 
     @property
     def flag(self) -> str:
@@ -75,7 +98,7 @@ class _Option:
         word = f"{{{','.join(choices)}}}" if choices else "TEXT" if one is str else one.__name__.upper()
         if self.positional:
             word = word if choices else self.name.upper()
-            return word if self.required else f"[{word}]"
+            return f"[{word} ...]" if several else word if self.required else f"[{word}]"
         # None says nothing, but where it can undo what a preset or a saved run says.
         return f"[{word} ...]" if several else f"{word}|None" if optional and self.changes else word
 
@@ -115,14 +138,15 @@ def parse(command: type[T], words: Sequence[str]) -> T:
 
     Args:
         command: A frozen dataclass. Its docstring and those of its fields are the help. A field that is annotated with
-            `tyro.conf.Positional` is known by its place, one annotated with `ChangesOf` stands for many.
+            `tyro.conf.Positional` is known by its place, one annotated with `ByPlaceToo` by either, and one annotated with
+            `ChangesOf` stands for many.
         words: Of the command line.
 
     Raises:
         RequestError: The words do not make sense.
         SystemExit: Help was asked for, and printed.
     """
-    options = {option.name: option for option in _options_of(command)}
+    options = {option.key: option for option in _options_of(command)}
     program = f"{PROGRAM} {command.__name__.lower()}"
     given, left_over = _split(command, program, words, options)
     if left_over:
@@ -130,15 +154,22 @@ def parse(command: type[T], words: Sequence[str]) -> T:
         if not word.startswith("-"):
             raise RequestError(f"unexpected argument {word!r}; see {program} --help")
         flags = [option.flag for option in options.values() if not option.positional]
+        if word == "--version":
+            raise RequestError(f"--version goes without a command: {PROGRAM} --version")
         raise RequestError(f"unknown option {word}{nearest(word, flags, f'see {program} --help')}")
     values: dict[str, Any] = {}
-    for name, option in options.items():
+    for key, option in options.items():
         if option.changes is not None:
             values.setdefault(option.changes, {})
-        if name in given:
+        if key in given:
             target = values if option.changes is None else values[option.changes]
-            target[name] = _value(option, given[name])
-        elif option.required:
+            value = _value(option, given[key])
+            if target.get(option.name, value) != value:
+                here, there = (each if isinstance(each, tuple) else (each,) for each in (target[option.name], value))
+                both = f"{' '.join(map(str, here))} by {option.flag} and {' '.join(map(str, there))} by its place"
+                raise RequestError(f"{option.name} is given twice, {both}; give it once")
+            target[option.name] = value
+        elif option.required and option.name not in values:
             choices = fields.choices(option.hint)
             mend = f"; choose one of {', '.join(choices)}" if choices else f": {option.help} See {program} --help"
             raise RequestError(f"no {option.name if choices else option.metavar} given{mend}")
@@ -181,7 +212,10 @@ def _value(option: _Option, words: Any) -> Any:
 
 
 def _options_of(command: type) -> list[_Option]:
-    """The options of a command in the order of its fields, those that a `ChangesOf` stands for in its place."""
+    """The options of a command in the order of its fields, those that a `ChangesOf` stands for in its place.
+
+    A field that may be given either way is two options: first by its name, then by its place.
+    """
     own = {field.name for field in dataclasses.fields(command)}
     found = []
     for field, hint, extras, text in _described(command):
@@ -189,6 +223,12 @@ def _options_of(command: type) -> list[_Option]:
         if changes is None:
             required = field.default is dataclasses.MISSING
             default = "required" if required else f"default: {field.default}" if field.default else ""
+            for extra in extras:
+                default = extra.words() if isinstance(extra, SayDefault) else default
+            if ByPlaceToo() in extras:
+                found.append(_Option(field.name, hint, False, text, "" if required else default, False))
+                found.append(_Option(field.name, hint, True, text, default, required, twin=True))
+                continue
             found.append(_Option(field.name, hint, tyro.conf.Positional in extras, text, default, required))
             continue
         found += [

@@ -15,8 +15,9 @@ from typing import Any
 import jax
 
 from jaxrl_vis.config import Config
+from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import NonFiniteError, Terminated
-from jaxrl_vis.learner.environment import make_env
+from jaxrl_vis.learner.environment import locate_env, make_env
 from jaxrl_vis.learner.train_step import make_train_step
 from jaxrl_vis.run.folder import RunFolder, default_folder
 from jaxrl_vis.run.loop import Report, RunLoop
@@ -133,7 +134,7 @@ def make_trainer(config: Config, run_dir: Path | str | None = None, resume: bool
     Args:
         config: The run.
         run_dir: Where `Trainer.run` puts its files; None: below ``runs/``, named after the configuration.
-        resume: Go on with the run in that folder; a folder without a run starts at the beginning, and says so.
+        resume: Go on with the run in that folder; in an empty one it starts at the beginning, and says so.
         overwrite: Delete the run in that folder and start again.
 
     Raises:
@@ -142,5 +143,6 @@ def make_trainer(config: Config, run_dir: Path | str | None = None, resume: bool
     if run_dir is not None:
         RunFolder(Path(run_dir)).check(config, resume, overwrite)  # building an environment takes a while: refuse before
     with shielded_children():  # threads that JAX starts with its first use of a device never see signals
-        jax.devices()
+        check_devices()
+    config = locate_env(config)
     return Trainer(config, make_train_step(make_env(config), config), run_dir, resume, overwrite)

@@ -25,14 +25,13 @@ import numpy as np
 
 from jaxrl_vis_envs.adapters.rewards import Reward, reward_function
 from jaxrl_vis_envs.base import GoalEnv, State
-from jaxrl_vis_envs.physics import mjx_model  # noqa: F401 - before brax, for it imports MJX without MJX's remarks on stdout
 from jaxrl_vis_envs.registry import make
 
 try:
     from brax.envs.base import Env
     from brax.envs.base import State as BraxState
 except ImportError as error:
-    raise ImportError("this adapter needs brax: pip install 'jaxrl-vis[brax]'") from error
+    raise ImportError("this adapter needs brax, which comes with jaxrl-vis, but it is missing: pip install brax") from error
 
 
 class BraxEnv(Env):
