@@ -28,11 +28,12 @@ import jaxrl_vis
 from jaxrl_vis import cli, config
 from jaxrl_vis.cli.checks import check_env
 from jaxrl_vis.cli.parsing import parse
-from jaxrl_vis.cli.train import training_config
+from jaxrl_vis.cli.train import Train, training_config
 from jaxrl_vis.config import Config, validate
 from jaxrl_vis.learner.environment import make_env
 from jaxrl_vis.run import metrics, trainer
 from jaxrl_vis.run.folder import MAY_CHANGE
+from jaxrl_vis_envs import registry
 from jaxrl_vis_envs.names import TASKS
 
 DOCS = ROOT / "docs"
@@ -75,12 +76,20 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 @pytest.fixture
-def reader(desk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The current folder of somebody who types what a page says: a copy of the desk."""
+def reader(desk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The current folder of somebody who types what a page says: a copy of the desk. Tasks that are made in it go with it."""
     shutil.copytree(desk, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
-    return tmp_path
+    modules = set(sys.modules)
+    yield tmp_path
+    own = {
+        name for name in set(sys.modules) - modules if str(getattr(sys.modules[name], "__file__", "")).startswith(str(tmp_path))
+    }
+    for name in own:
+        del sys.modules[name]
+    for name in [name for name, entry in registry._ENTRIES.items() if entry.config_class.__module__ in own]:
+        del registry._ENTRIES[name]
 
 
 # -- Blocks
@@ -89,7 +98,7 @@ def reader(desk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def missing(what: str) -> bool:
     """Whether a thing that a mark says is needed is not there: a module, a name in one, or an option of `train`."""
     if what.startswith("--"):
-        return what[2:] not in {field.name for field in dataclasses.fields(Config)}
+        return what[2:] not in {field.name for field in (*dataclasses.fields(Config), *dataclasses.fields(Train))}
     module, _, name = what.rpartition(".")
     try:
         if importlib.util.find_spec(what) is not None:
@@ -111,11 +120,18 @@ def test_blocks_have_a_language_and_marks_are_true(page: Path) -> None:
             assert missing(block.mark.removeprefix("needs ")), f"{page}:{block.line}: it is there: take the mark away"
 
 
+def save_file(block: Block) -> bool:
+    """Writes a block that begins with `# file: name` to that file; whether it is one."""
+    file = re.match(r"# file: (\S+)\n", block.text)
+    if file:
+        Path(file[1]).write_text(block.text)
+    return bool(file)
+
+
 def run_block(page: Path, block: Block, names: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
     """Executes a block after those before it, and checks what it says that it prints (`# (...)`, `# [...]`, `# about 1.0`)."""
     capsys.readouterr()
-    if file := re.match(r"# file: (\S+)\n", block.text):
-        Path(file[1]).write_text(block.text)
+    if save_file(block):
         return
     text = functools.reduce(lambda text, large: text.replace(large, SMALLER[large]), SMALLER, block.text)
     exec(compile("\n" * block.line + text, str(page), "exec"), names)
@@ -141,7 +157,6 @@ def test_python_blocks_run(
             run_block(page, block, names, capsys)
 
 
-@functools.cache
 def checked_environment(env: str, env_options: tuple[str, ...], randomize: tuple[str, ...]) -> None:
     make_env(Config(env=env, env_options=env_options, randomize=randomize))  # type: ignore[arg-type]
 
@@ -149,6 +164,7 @@ def checked_environment(env: str, env_options: tuple[str, ...], randomize: tuple
 @pytest.mark.parametrize("page", pages_with("sh"), ids=name_of)
 def test_shell_blocks_could_be_typed(page: Path, reader: Path) -> None:
     for block in blocks(page):
+        save_file(block)
         for words in doc_blocks.commands(block) if block.language == "sh" and not block.mark else ():
             if words[0] != "jaxrl-vis":
                 doc_blocks.check_other(words)
