@@ -118,4 +118,13 @@ def _is_finite(value: Any) -> bool:
 
 
 def _refuse(label: str, one: Any, value: Any) -> NoReturn:
-    raise RequestError(f"{label} must be {_KINDS[one]}, not {value!r}")
+    raise RequestError(f"{label} must be {_KINDS[one]}, not {value!r}{_mend(one, value)}")
+
+
+def _mend(one: Any, value: Any) -> str:
+    """How to write a whole number that is written as another kind: 1e6."""
+    try:
+        number = float(value) if one is int and not isinstance(value, bool) else math.nan
+    except (TypeError, ValueError, OverflowError):
+        return ""
+    return f": write {int(number)}" if number.is_integer() and abs(number) < 2**53 else ""

@@ -190,6 +190,10 @@ def _build(name: str, entry: _Entry, config: Any) -> GoalEnv:
 
 
 def _entry(name: str, folder: str | None = None) -> _Entry:
+    if not isinstance(name, str):
+        raise UnknownEnvironmentError(
+            f"an environment is asked for by its name, and one of your own by 'module:Name', not {name!r}"
+        )
     if task_modules.is_own(name):
         module, task = task_modules.split(name)
         return _entry_of(name, task_modules.load(module, folder), task)

@@ -33,6 +33,9 @@ def check_env(name: str, folder: str | None = None) -> None:
 def check_run(folder: Path) -> None:
     """Raises a `RequestError` unless ``folder`` holds a run."""
     if not (folder / "config.json").exists():
+        above = next((parent for parent in folder.parents if (parent / "config.json").exists()), None)
+        if folder.exists() and above is not None:
+            raise RequestError(f"{folder} lies in a run folder: name that, {above}")
         raise RequestError(f"{folder} is not a run folder (it holds no config.json); {PROGRAM} train makes one")
 
 

@@ -15,6 +15,7 @@ import itertools
 import textwrap
 import typing
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import tyro
@@ -23,6 +24,23 @@ from jaxrl_vis import fields
 from jaxrl_vis.errors import RequestError, nearest
 
 PROGRAM = "jaxrl-vis"
+
+# Options of brax, Stable-Baselines3, its zoo and CleanRL that people try here -> what does the same.
+_ELSEWHERE = {
+    **dict.fromkeys(
+        ("--cuda", "--no-cuda", "--device", "--gpu", "--cpu"),
+        "JAX takes the accelerator that it finds; the environment variable JAX_PLATFORMS=cpu, cuda or tpu chooses",
+    ),
+    **dict.fromkeys(("--total-timesteps", "--num-timesteps", "--timesteps", "--n-timesteps"), "the option is --env-steps"),
+    **dict.fromkeys(("--buffer-size", "--max-replay-size"), "the option is --replay-transitions"),
+    **dict.fromkeys(("--gamma", "--discounting"), "the option is --discount"),
+    **dict.fromkeys(("--load", "--trained-agent", "--restore"), "the options are --run-dir FOLDER --resume"),
+    **dict.fromkeys(("--exp-name", "--log-folder", "--logdir"), "the option is --run-dir"),
+    **dict.fromkeys(
+        ("--capture-video", "--render", "--render-mode"), f"a run draws a video at its end; {PROGRAM} play draws more"
+    ),
+    "--algo": "there is one algorithm, DDPG; --method says where rewards come from",
+}
 
 T = TypeVar("T")
 
@@ -147,6 +165,7 @@ def parse(command: type[T], words: Sequence[str]) -> T:
         SystemExit: Help was asked for, and printed.
     """
     options = {option.key: option for option in _options_of(command)}
+    _check_values(words, list(options.values()))
     program = f"{PROGRAM} {command.__name__.lower()}"
     given, left_over = _split(command, program, words, options)
     if left_over:
@@ -156,6 +175,8 @@ def parse(command: type[T], words: Sequence[str]) -> T:
         flags = [option.flag for option in options.values() if not option.positional]
         if word == "--version":
             raise RequestError(f"--version goes without a command: {PROGRAM} --version")
+        if word in _ELSEWHERE and word not in flags:
+            raise RequestError(f"unknown option {word}: {_ELSEWHERE[word]}")
         raise RequestError(f"unknown option {word}{nearest(word, flags, f'see {program} --help')}")
     values: dict[str, Any] = {}
     for key, option in options.items():
@@ -199,6 +220,34 @@ def _split(
         if word.replace("_", "-") in flags and following.startswith("-") and not is_number:
             raise RequestError(f"{word} needs a value; see {program} --help")
     raise RequestError(f"an option needs a value; see {program} --help")
+
+
+def _check_values(words: Sequence[str], options: Sequence[_Option]) -> None:
+    """Refuses true or false after a flag, and several numbers after an option of one, which would be taken for a task.
+
+    Raises:
+        RequestError: That is so.
+    """
+    flags = {option.flag: option for option in options if not option.positional}
+    takes_path = any(option.positional and option.hint is Path for option in options)
+    for place, word in enumerate(words):
+        option = flags.get(word.replace("_", "-"))
+        following = list(itertools.takewhile(_is_number, words[place + 1 :]))
+        if option is None:
+            continue
+        if option.is_flag and words[place + 1 : place + 2] and words[place + 1].lower() in ("true", "false", "0", "1"):
+            opposite = f"write {option.flag.replace('--', '--no-', 1)}" if option.changes else "leave it out"
+            raise RequestError(f"{option.flag} takes no value: {opposite} for its opposite")
+        if option.takes_one_word and len(following) > 1 and not takes_path:
+            raise RequestError(f"{option.flag} takes one value, not {' '.join(following)}: {option.help}")
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def _value(option: _Option, words: Any) -> Any:

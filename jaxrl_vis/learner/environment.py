@@ -26,6 +26,7 @@ def locate_env(config: Config) -> Config:
     Raises:
         RequestError: There is no such environment, or what holds it cannot be imported.
     """
+    validate(config)
     try:
         return config.replace(env_folder=load(config.env, config.env_folder))
     except ValueError as error:
@@ -38,7 +39,6 @@ def make_env(config: Config) -> GoalEnv:
     Raises:
         RequestError: There is no such environment, or it cannot be made like that.
     """
-    validate(config)
     locate_env(config)
     try:
         names = {field.name for field in dataclasses.fields(config_class(config.env))}

@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from jaxrl_vis.config import Config
 from jaxrl_vis.devices import check_devices
-from jaxrl_vis.errors import NonFiniteError, Terminated
+from jaxrl_vis.errors import NonFiniteError, RequestError, Terminated
 from jaxrl_vis.learner.environment import locate_env, make_env
 from jaxrl_vis.learner.train_step import make_train_step
 from jaxrl_vis.run.folder import RunFolder, default_folder
@@ -86,7 +87,12 @@ class Trainer:
         Args:
             key: A typed key. With one seed it is that seed's key, so ``init(jax.random.key(0))`` is what `run` starts from with
                 ``seed=0``; with several it is split into one each. Or [S] keys, taken as they are.
+
+        Raises:
+            RequestError: ``key`` is a seed, or a key of the old kind.
         """
+        if not (hasattr(key, "dtype") and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)):
+            raise RequestError(f"init takes a typed JAX key, such as jax.random.key(0), not {key!r}")
         if key.ndim == 0:
             key = key[None] if self.config.seeds == 1 else jax.random.split(key, self.config.seeds)
         return self.programs.init(key)
@@ -140,6 +146,8 @@ def make_trainer(config: Config, run_dir: Path | str | None = None, resume: bool
     Raises:
         RequestError: The configuration asks for something that cannot be, or contradicts the saved run.
     """
+    if not isinstance(config, Config):
+        raise RequestError(f"make_trainer takes a configuration, such as jaxrl_vis.preset('cpu'), not {config!r}")
     if run_dir is not None:
         RunFolder(Path(run_dir)).check(config, resume, overwrite)  # building an environment takes a while: refuse before
     with shielded_children():  # threads that JAX starts with its first use of a device never see signals

@@ -65,6 +65,7 @@ class BraxEnv(Env):
 
         Brax's wrappers read the batch's shape from such an untyped key, so what they wrap needs untyped ones.
         """
+        self.goal_env.check_key(rng)
         is_typed = jnp.issubdtype(rng.dtype, jax.dtypes.prng_key)
         episode = self.goal_env.reset(rng if is_typed else jax.random.wrap_key_data(rng))
         physics: Any = episode  # brax's annotation asks for a state of its own physics, but brax never looks inside

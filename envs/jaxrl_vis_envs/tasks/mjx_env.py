@@ -90,6 +90,7 @@ class MjxGoalEnv(GoalEnv):
         """What the state task sees: [S] float32."""
 
     def reset(self, key: jax.Array) -> State:
+        self.check_key(key)
         data, goal_data = self.sample_start(key), self.sample_goal(key)
         domain = randomization.sample(key, self._randomization, self._model, self.action_size, self._scene)
         state = self.state_at(data, self.goal_state_of(key, goal_data), domain)
