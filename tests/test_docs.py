@@ -320,7 +320,8 @@ def test_links_and_images_lead_somewhere(page: Path) -> None:
     text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
     for target in re.findall(r"\]\(([^)]+)\)", text):
         file, _, _ = target.partition("#")
-        assert "://" not in file, f"{page}: {target} leads out of the project"
+        if "://" in file:  # a source that is cited
+            continue
         there = page.parent / file
         assert not file or there.exists(), f"{page}: {target}"
         if there.suffix == ".png":
