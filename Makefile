@@ -21,7 +21,7 @@ BIN := .venv/bin
 STAMPS := .venv/stamps
 ACCELERATOR := $(shell nvidia-smi -L >/dev/null 2>&1 && echo gpu || echo base)
 
-.PHONY: help train test lint format bench-cpu pins clean
+.PHONY: help train test docs lint format bench-cpu pins clean
 .DEFAULT_GOAL := help
 
 help: ## Show this list
@@ -34,6 +34,10 @@ train: $(STAMPS)/$(ACCELERATOR) ## Train on VisualFetchReach; curve.png and vide
 
 test: $(STAMPS)/dev ## Run the tests
 	@$(BIN)/python -m pytest -n $(WORKERS) $(ARGS)
+
+docs: $(STAMPS)/docs ## Build the documentation's site into build/site/
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet
+	@echo "open build/site/index.html"
 
 lint: $(STAMPS)/dev ## Check style, format and types
 	@$(BIN)/ruff check .
@@ -50,6 +54,7 @@ bench-cpu: $(STAMPS)/base ## Run the five benchmarks at CPU sizes; records land 
 pins: .venv/bin/python ## Write requirements/*.txt anew
 	@$(PINS) $(PINS_ARGS) pyproject.toml -o requirements/base.txt
 	@$(PINS) $(PINS_ARGS) pyproject.toml --group dev -c requirements/base.txt -o requirements/dev.txt
+	@$(PINS) $(PINS_ARGS) --group docs -c requirements/dev.txt -o requirements/docs.txt
 	@$(PINS) $(PINS_ARGS) pyproject.toml --extra cuda12 -c requirements/base.txt -o requirements/gpu.txt
 	@if grep -E -n '://|--(extra-)?(index-url|find-links)' requirements/*.txt; then echo "pins must carry no address" >&2; exit 1; fi
 

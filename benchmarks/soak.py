@@ -114,7 +114,8 @@ class Part:
             if file_bytes is not None:
                 resource.setrlimit(resource.RLIMIT_FSIZE, (file_bytes, resource.RLIM_INFINITY))
 
-        command = [sys.executable, "-m", "jaxrl_vis", "train", *OPTIONS, "--run-dir", str(folder), "--resume"]
+        goes_on = ["--resume"] if folder.exists() else []
+        command = [sys.executable, "-m", "jaxrl_vis", "train", *OPTIONS, "--run-dir", str(folder), *goes_on]
         process = subprocess.Popen(
             command, env=environment, cwd=folder.parent, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
             start_new_session=True, preexec_fn=limit,

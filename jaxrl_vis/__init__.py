@@ -3,6 +3,7 @@
     config = jaxrl_vis.preset("fast", env="VisualFetchReach")
     trainer = jaxrl_vis.make_trainer(config)
     for report in trainer.run(): ...
+    policy = jaxrl_vis.load_policy(run_dir)     # observation, goal -> action
 
 Importing the package imports no JAX; asking for the trainer does.
 """
@@ -15,7 +16,9 @@ __version__ = "0.1.0"
 # Public name -> the module that holds it, imported at first use.
 _HOMES = {
     "Config": "jaxrl_vis.config",
+    "Policy": "jaxrl_vis.run.policy",
     "RequestError": "jaxrl_vis.errors",
+    "load_policy": "jaxrl_vis.run.policy",
     "preset": "jaxrl_vis.config",
     "Trainer": "jaxrl_vis.run.trainer",
     "make_trainer": "jaxrl_vis.run.trainer",
@@ -24,9 +27,10 @@ _HOMES = {
 if TYPE_CHECKING:
     from jaxrl_vis.config import Config, preset
     from jaxrl_vis.errors import RequestError
+    from jaxrl_vis.run.policy import Policy, load_policy
     from jaxrl_vis.run.trainer import Trainer, make_trainer
 
-__all__ = ["Config", "RequestError", "Trainer", "__version__", "make_trainer", "preset"]
+__all__ = ["Config", "Policy", "RequestError", "Trainer", "__version__", "load_policy", "make_trainer", "preset"]
 
 
 def __getattr__(name: str) -> Any:

@@ -27,7 +27,9 @@ class Config:
     """One training run. Counts are per seed; lengths of time are in control steps unless a unit is given."""
 
     env: str = "VisualFetchReach"
-    """The environment; `jaxrl-vis envs` lists them."""
+    """The environment; `jaxrl-vis envs` lists them, and module:Name is one of your own."""
+    env_folder: str | None = None
+    """Folder from which module:Name is imported; a run keeps it. None: the current one, or wherever Python finds the module."""
     preset: str = "fast"
     """The preset that this configuration started from; kept for the record."""
     method: MethodName = "oracle"
@@ -266,6 +268,10 @@ PRESETS: dict[str, Config] = {config.preset: config for config in (_PAPER, _FAST
 
 def preset(name: str, **overrides: Any) -> Config:
     """A named configuration with some fields changed.
+
+    Args:
+        name: ``paper``, ``fast``, ``cpu`` or ``debug`` (`PRESETS`).
+        **overrides: Fields of `Config` and their values.
 
     Raises:
         RequestError: There is no such preset, or no such field.

@@ -6,6 +6,8 @@ from collections.abc import Callable
 from typing import Any
 
 from jaxrl_vis import provenance
+from jaxrl_vis.devices import check_devices
+from jaxrl_vis.errors import RequestError
 
 
 def versions() -> str:
@@ -20,6 +22,7 @@ def versions() -> str:
 
 def devices() -> str:
     """What JAX runs on."""
+    check_devices()
     return f"{provenance.device_record()['platform']}: {provenance.device_name()}"
 
 
@@ -86,11 +89,18 @@ CHECKS: tuple[tuple[str, Callable[[], str]], ...] = (
 
 
 def main() -> int:
-    """Runs every check, whatever came of the earlier ones. Returns 1 if one fails, else 0."""
+    """Runs every check, whatever came of the earlier ones, and says what it finds.
+
+    Returns:
+        0 where all is well; 1 where a check fails; 2 where JAX is asked for a device that is not there, which ends the checks.
+    """
     failures = 0
     for name, check in CHECKS:
         try:
             verdict, text = "ok  ", check()
+        except RequestError as error:
+            print(f"FAIL  {name:14} {error}", flush=True)
+            return 2
         except Exception as error:  # noqa: BLE001 - a doctor reports whatever is wrong
             failures += 1
             verdict, text = "FAIL", f"{type(error).__name__}: {' '.join(str(error).split())}"

@@ -37,6 +37,15 @@ def unwrap(hint: Any) -> tuple[Any, bool, bool]:
     return hint, optional, several
 
 
+def is_known(hint: Any) -> bool:
+    """Whether values of a field with this annotation can be checked and read."""
+    try:
+        one, _, _ = unwrap(hint)
+    except (ValueError, IndexError):  # a union of several kinds, an empty tuple
+        return False
+    return one in _KINDS or typing.get_origin(one) is Literal
+
+
 def choices(hint: Any) -> tuple[str, ...]:
     """The words that a field allows, where it is a Literal, optional or not, or a tuple of them; else none."""
     hint, _, _ = unwrap(hint)
@@ -109,4 +118,13 @@ def _is_finite(value: Any) -> bool:
 
 
 def _refuse(label: str, one: Any, value: Any) -> NoReturn:
-    raise RequestError(f"{label} must be {_KINDS[one]}, not {value!r}")
+    raise RequestError(f"{label} must be {_KINDS[one]}, not {value!r}{_mend(one, value)}")
+
+
+def _mend(one: Any, value: Any) -> str:
+    """How to write a whole number that is written as another kind: 1e6."""
+    try:
+        number = float(value) if one is int and not isinstance(value, bool) else math.nan
+    except (TypeError, ValueError, OverflowError):
+        return ""
+    return f": write {int(number)}" if number.is_integer() and abs(number) < 2**53 else ""

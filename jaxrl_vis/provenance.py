@@ -5,9 +5,11 @@ Importing this loads no JAX; asking for the device does.
 
 import functools
 import importlib.metadata
+import importlib.util
 import os
 import platform
 import re
+import shutil
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -56,6 +58,17 @@ def revision(digits: int = 40, folder: Path = CHECKOUT) -> str | None:
     if not head:
         return None
     return head[:digits] + ("-dirty" if git("status", "--porcelain", "--", *_CODE, folder=folder) else "")
+
+
+def install_command(extra: str) -> str:
+    """The command that installs one of this project's extras here: in a clone or an installed copy, with or without pip."""
+    in_clone = (CHECKOUT / "pyproject.toml").exists()
+    local_uv = CHECKOUT / ".uv" / "bin" / "uv"
+    if importlib.util.find_spec("pip"):
+        installer = "pip"
+    else:  # as in an environment that uv made
+        installer = ".uv/bin/uv pip" if local_uv.exists() and shutil.which("uv") is None else "uv pip"
+    return f"{installer} install '.[{extra}]' in {CHECKOUT}" if in_clone else f"{installer} install 'jaxrl-vis[{extra}]'"
 
 
 def versions() -> dict[str, str]:

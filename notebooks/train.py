@@ -24,11 +24,12 @@ def main(preset: str = "cpu", env: str = "VisualFetchReach", run_dir: str | None
     del loop, metrics  # the replay is large; run() makes its own
 
     # The whole thing: it evaluates, saves and draws by itself. The reports are for you.
-    success = 0.0
+    successes = []
     for report in trainer.run():
         if "eval/success" in report.metrics:
-            (success,) = report.metrics["eval/success"]
-    print(f"success at the last evaluation: {success:.2f}; files are in {trainer.folder.path}")
+            successes.append(float(report.metrics["eval/success"][0]))
+    print(f"success at the last evaluation: {successes[-1]:.2f}, the best: {max(successes):.2f}")
+    print(f"files are in {trainer.folder.path}")
 
 
 if __name__ == "__main__":

@@ -5,14 +5,18 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import pytest
 
 import jaxrl_vis
-from jaxrl_vis import cli
-from jaxrl_vis.cli.bench import Benchmark
+from jaxrl_vis import cli, provenance
+from jaxrl_vis.cli import train
+from jaxrl_vis.cli.bench import Bench, Benchmark
+from jaxrl_vis.cli.envs import Envs
+from jaxrl_vis.cli.eval import Eval
 from jaxrl_vis.cli.parsing import parse
+from jaxrl_vis.cli.play import Play
 from jaxrl_vis.cli.train import Train, training_config
 from jaxrl_vis.config import PRESETS, Config
 from jaxrl_vis.errors import NonFiniteError, StorageError, Terminated
@@ -48,6 +52,8 @@ assert not heavy, heavy
 
 
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["--help"]) == 0
+    assert "--version   show the version" in capsys.readouterr().out
     assert cli.main(["--version"]) == 0
     assert capsys.readouterr().out.strip() == jaxrl_vis.__version__
 
@@ -124,6 +130,62 @@ def test_every_preset_survives_the_command_line(name: str) -> None:
     assert training_config(parse(Train, tokens)) == PRESETS[name]
 
 
+def test_a_task_is_named_by_its_place_or_by_its_name(capsys: pytest.CaptureFixture[str]) -> None:
+    for command, before in ((Train, ["--preset", "debug"]), (Bench, ["env"])):
+        for words in (["Reacher"], ["--env", "Reacher"], ["--env=Reacher"], ["Reacher", "--env", "Reacher"]):
+            options: Any = parse(command, [*before, *words])
+            assert options.env == "Reacher", words
+    assert parse(Bench, ["env"]).env == "VisualFetchReach" and parse(Train, []).env is None
+    for words in (["Reacher", "FetchReach"], ["--env", "Reacher", "FetchReach"]):
+        assert parse(Envs, words).env == ("Reacher", "FetchReach")
+    for command in (Eval, Play):
+        for words in (["runs/mine"], ["--run-dir", "runs/mine"]):
+            assert parse(command, words).run_dir == Path("runs/mine")
+    for words in (["train", "Reacher", "--env", "FetchReach"], ["bench", "env", "Reacher", "--env", "FetchReach"]):
+        assert "env is given twice, FetchReach by --env and Reacher by its place; give it once" in one_line(
+            capsys, cli.main(words)
+        )
+    assert "run_dir is given twice, a by --run-dir and b by its place" in one_line(
+        capsys, cli.main(["eval", "b", "--run-dir", "a"])
+    )
+    assert "env is given twice" in one_line(capsys, cli.main(["envs", "Reacher", "--env", "FetchReach", "Reacher"]))
+
+
+@pytest.mark.parametrize(("accelerator", "preset"), [(False, "cpu"), (True, "fast")])
+def test_help_shows_what_auto_takes_here(
+    accelerator: bool, preset: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "500")
+    monkeypatch.setattr(train, "guess_accelerator", lambda: accelerator)
+    with pytest.raises(SystemExit):
+        cli.main(["train", "--help"])
+    text = capsys.readouterr().out
+    assert f"(default: auto, which is {preset} on this machine; its values are the defaults shown below)" in text
+    for name in ("image_size", "num_envs", "batch_size"):
+        value = getattr(PRESETS[preset], name)
+        assert re.search(rf"--{name.replace('_', '-')} INT .*\(default: {value}; ", text)
+
+
+def test_resuming_what_is_not_there_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for words in (["--run-dir", "runs/mine"], ["--preset", "debug"], ["--preset", "debug", "--run-dir", "runs/mine"]):
+        line = one_line(capsys, cli.main(["train", "Reacher", "--resume", *words]))
+        folder = "runs/mine" if "--run-dir" in words else "runs/Reacher-oracle-debug-seed0"
+        assert f"nothing to resume: there is no folder {folder}; leave out --resume to start a run there" in line
+    assert not list(tmp_path.iterdir())
+
+
+def test_examples_of_the_readme_leave_nothing_untracked(checkout: Path) -> None:
+    readme = (checkout / "README.md").read_text()
+    files = re.findall(r"(?:--out|--gallery|--json|--run-dir) ([\w./]+)", readme)
+    assert {"reach.gif", "tasks.png", "runs/mine"} <= set(files)
+    if provenance.is_checkout(checkout):
+        for file in files:
+            assert provenance.git("check-ignore", f"{file}/x" if file.startswith("runs") else file, folder=checkout), file
+
+
 def test_flags_may_contradict_a_preset_both_ways() -> None:
     for preset, word, expected in (("paper", "--clip-targets-above", True), ("cpu", "--no-clip-targets-above", False)):
         assert training_config(parse(Train, ["--preset", preset, word])).clip_targets_above is expected
@@ -167,7 +229,7 @@ def test_help_explains_every_option(capsys: pytest.CaptureFixture[str], monkeypa
         for option, text in options.items():
             assert re.search(r"\w.*[.)]$", text), option
     assert set(texts["train"]) >= {f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(Config)} - {"--env"}
-    assert "(default: 64; paper 100, cpu 32, debug 16)" in texts["train"]["--image-size"]
+    assert "(default: 32; paper 100, fast 64, debug 16)" in texts["train"]["--image-size"]
     assert "(default: True; paper False)" in texts["train"]["--clip-targets-above"]
     assert "(default: oracle)" in texts["train"]["--method"]
 

@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 LAYERS: tuple[tuple[str, ...], ...] = (
     ("errors", "methods"),
     ("fields",),
-    ("config", "types", "provenance", "files"),
+    ("config", "types", "provenance", "files", "devices"),
     ("learner",),
     ("report",),
     ("run",),
@@ -26,8 +26,8 @@ LAYERS: tuple[tuple[str, ...], ...] = (
 )
 # The same for the environments.
 ENVIRONMENT_LAYERS: tuple[tuple[str, ...], ...] = (
-    ("checks", "compilation", "goals", "names"),
-    ("physics", "render"),
+    ("checks", "compilation", "goals", "names", "quiet_warp"),
+    ("physics", "render", "task_modules"),
     ("randomization",),
     ("base",),
     ("pixels", "registry"),
@@ -136,7 +136,7 @@ def test_names_load_no_jax(clean_environment: dict[str, str]) -> None:
 
 def test_pins_carry_no_address_and_every_hash() -> None:
     files = sorted((ROOT / "requirements").glob("*.txt"))
-    assert [file.name for file in files] == ["base.txt", "dev.txt", "gpu.txt"]
+    assert [file.name for file in files] == ["base.txt", "dev.txt", "docs.txt", "gpu.txt"]
     for file in files:
         text = file.read_text()
         assert "://" not in text

@@ -87,6 +87,9 @@ def test_finished_run_says_so(straight, capsys):
 
 
 def test_resume_of_nothing_starts(tmp_path, capsys):
+    with pytest.raises(RequestError, match="nothing to resume: there is no folder .*leave out --resume"):
+        make_fake_trainer(small_config(env_steps=20), tmp_path / "run", resume=True)
+    (tmp_path / "run").mkdir()  # as a run that was killed before its first file leaves it
     reports = make_fake_trainer(small_config(env_steps=20), tmp_path / "run", resume=True).run()
     assert [report.iteration for report in reports] == [1, 2]
     assert "nothing to resume" in capsys.readouterr().out
@@ -137,7 +140,7 @@ def test_a_broken_config_file_is_one_line(straight, tmp_path):
 def test_an_earlier_run_outlives_a_new_one_that_cannot_be(straight, tmp_path):
     shutil.copytree(straight[0], tmp_path / "run")
     before = {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()}
-    with pytest.raises(RequestError, match="bytes"):
+    with pytest.raises(RequestError, match="GiB"):
         list(make_fake_trainer(small_config(replay_transitions=10**12, seeds=1), tmp_path / "run", overwrite=True).run())
     assert before == {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()}
 

@@ -49,7 +49,7 @@ def test_a_replay_that_cannot_fit_is_refused_before_allocation(tmp_path, monkeyp
     there = memory.available_bytes()  # once: it changes with whatever else runs
     monkeypatch.setattr(memory, "available_bytes", lambda: there)
     config = small_config(replay_transitions=10**12, seeds=1)
-    with pytest.raises(RequestError, match="bytes") as refused:
+    with pytest.raises(RequestError, match="GiB") as refused:
         list(make_fake_trainer(config, tmp_path / "run").run())
     assert not (tmp_path / "run").exists()
     text = str(refused.value)

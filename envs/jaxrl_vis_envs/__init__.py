@@ -4,19 +4,23 @@
     state = env.reset(jax.random.key(0))
 
 Importing this package loads neither MuJoCo nor JAX: the learner's leaves import `jaxrl_vis_envs.goals` alone. The names below
-are looked up when they are first used.
+are looked up when they are first used. Once it is imported, MJX does not print that Warp is missing.
 """
 
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from jaxrl_vis_envs import quiet_warp
+
 if TYPE_CHECKING:
     from jaxrl_vis_envs.base import GoalEnv, State
     from jaxrl_vis_envs.registry import UnknownEnvironmentError, UnknownOverrideError, list_envs, make, register
+    from jaxrl_vis_envs.task_modules import TaskModuleError
 
 _HOME = {
     "GoalEnv": "base",
     "State": "base",
+    "TaskModuleError": "task_modules",
     "UnknownEnvironmentError": "registry",
     "UnknownOverrideError": "registry",
     "list_envs": "registry",
@@ -24,7 +28,19 @@ _HOME = {
     "register": "registry",
 }
 
-__all__ = ["GoalEnv", "State", "UnknownEnvironmentError", "UnknownOverrideError", "list_envs", "make", "register"]
+__all__ = [
+    "GoalEnv",
+    "State",
+    "TaskModuleError",
+    "UnknownEnvironmentError",
+    "UnknownOverrideError",
+    "list_envs",
+    "make",
+    "register",
+]
+
+
+quiet_warp.install()
 
 
 def __getattr__(name: str) -> Any:

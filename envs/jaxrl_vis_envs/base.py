@@ -13,13 +13,16 @@ method is a pure function that can be jitted, vmapped, scanned and differentiate
 import abc
 import dataclasses
 import functools
-from typing import Any, Self
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any, NoReturn, Self
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxrl_vis_envs import goals
+
+_ONE_STATE = "reset and step return one State, whose parts are attributes: obs, reward, metrics"
 
 
 @jax.tree_util.register_dataclass
@@ -55,6 +58,12 @@ class State:
         """A copy with some fields changed."""
         return dataclasses.replace(self, **changes)
 
+    def __iter__(self) -> Iterator[Any]:
+        raise TypeError(f"{_ONE_STATE}; Gymnasium's tuples come from jaxrl_vis_envs.adapters.gymnasium.GymnasiumEnv")
+
+    def __getitem__(self, key: Any) -> Any:
+        raise TypeError(f"{_ONE_STATE}, such as state.obs['observation']")
+
 
 class GoalEnv(abc.ABC):
     """An environment with a goal. Subclasses say how it starts, moves and appears; success and reward are the same for all."""
@@ -70,6 +79,14 @@ class GoalEnv(abc.ABC):
     chance: float | None = None  # share of episodes that uniformly random actions end in success
     difficulty: float | None = None  # mean distance from start to goal, in thresholds
     frame_stack: int = 1  # F, images of the latest control steps that an observation stacks
+
+    if not TYPE_CHECKING:  # a type checker would take it for every attribute
+
+        def __getattr__(self, name: str) -> NoReturn:
+            message = f"{type(self).__name__!r} object has no attribute {name!r}"
+            if name in ("render", "action_space", "observation_space", "seed", "close"):
+                message += "; Gymnasium's interface is jaxrl_vis_envs.adapters.gymnasium.GymnasiumEnv(name)"
+            raise AttributeError(message)
 
     @abc.abstractmethod
     def reset(self, key: jax.Array) -> State:
@@ -119,6 +136,18 @@ class GoalEnv(abc.ABC):
         achieved_goal = self.as_goal(frame)
         desired_goal = achieved_goal if state.obs is None else state.obs["desired_goal"]
         return state.replace(obs={"observation": frame, "achieved_goal": achieved_goal, "desired_goal": desired_goal})
+
+    def check_key(self, key: Any) -> None:
+        """Refuses what is not one JAX key.
+
+        Raises:
+            ValueError: ``key`` is a seed, or several keys.
+        """
+        is_typed = hasattr(key, "dtype") and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
+        if not is_typed and getattr(key, "dtype", None) != np.uint32:
+            raise ValueError(f"reset takes a JAX key, such as jax.random.key(0), not {key!r}")
+        if len(key.shape) != (0 if is_typed else 1):
+            raise ValueError(f"reset takes one JAX key, not an array of shape {key.shape}; vmap over a batch")
 
     def check_action(self, action: jax.Array) -> None:
         """Refuses an action of the wrong size, which NumPy's rules might broadcast.

@@ -48,7 +48,13 @@ def compiler_options(backend: str | None = None, *, runs_once: bool = False) -> 
 
 
 def env_jit(function: Callable, *, runs_once: bool = False, **jit_options: Any) -> Any:
-    """`jax.jit` with the options of `compiler_options`; every jit of a function that steps or draws environments uses it."""
+    """`jax.jit` with the options of `compiler_options`; every jit of a function that steps or draws environments uses it.
+
+    Args:
+        function: The function to compile.
+        runs_once: It takes longer to compile than to run; see `compiler_options`.
+        **jit_options: Of `jax.jit`, such as ``donate_argnums``.
+    """
     return jax.jit(function, compiler_options=compiler_options(runs_once=runs_once), **jit_options)
 
 

@@ -39,13 +39,27 @@ def oracle_reward(
     """Ground-truth reward of [..., G] float32 states (thesis, equation 5.6): [...] float32.
 
     The defaults are those of Gymnasium's Fetch tasks: 0 at the goal, -1 elsewhere.
+
+    Args:
+        achieved_state: [..., G] float32, what was reached.
+        goal_state: [..., G] float32, what the goal asks for, in the same unit.
+        threshold: Distance up to which the goal counts as reached, in that unit.
+        positive: R+.
+        negative: R-.
     """
     is_reached = goal_distance(achieved_state, goal_state) <= threshold
     return _namespace(achieved_state, goal_state).where(is_reached, positive, negative).astype(jnp.float32)
 
 
 def indicator_reward(image: jax.Array, goal_image: jax.Array, positive: float = 1.0, negative: float = -1.0) -> jax.Array:
-    """Indicator reward of [..., C, H, W] images (thesis, equation 5.4): ``positive`` where all bytes agree: [...] float32."""
+    """Indicator reward of [..., C, H, W] images (thesis, equation 5.4): ``positive`` where all bytes agree: [...] float32.
+
+    Args:
+        image: [..., C, H, W] uint8, what was reached.
+        goal_image: [..., C, H, W] uint8, what the goal shows.
+        positive: R+.
+        negative: R-.
+    """
     numpy = _namespace(image, goal_image)
     equal = numpy.all(image == goal_image, axis=(-3, -2, -1))
     return numpy.where(equal, positive, negative).astype(jnp.float32)

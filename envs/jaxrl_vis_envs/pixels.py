@@ -116,6 +116,11 @@ class ImageObserver:
 def image_observer(mj_model: mujoco.MjModel, camera: str, config: PixelsConfig) -> ImageObserver:
     """What an image task sees with, for `MjxGoalEnv`.
 
+    Args:
+        mj_model: The model.
+        camera: The name of one of its cameras.
+        config: Size, channels, depth range, frame stack.
+
     Raises:
         ValueError: There is no such camera, or something in its view cannot be drawn.
     """

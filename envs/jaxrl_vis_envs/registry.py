@@ -1,17 +1,29 @@
 """Names of environments, and how to make them. A new built-in task is one file in `tasks` and one line in `names.TASKS`.
 
-Imports no MuJoCo: a built-in task's file is loaded when the task is first made, and registers its own names then.
+    Reacher             built in, or registered by `register`, or offered by an installed package (see `task_modules`)
+    my_task:MyReach     in a module of somebody's own: a subclass of `GoalEnv`, or what the module registers by that name
+
+Imports no MuJoCo: the file that holds a task is loaded when the task is first asked for, and registers its own names then.
 """
 
 import dataclasses
 import importlib
+import inspect
+import typing
 from collections.abc import Callable
+from types import ModuleType
 from typing import Any
 
+from jaxrl_vis_envs import task_modules
 from jaxrl_vis_envs.base import GoalEnv
 from jaxrl_vis_envs.names import TASKS, nearest, visual_name
+from jaxrl_vis_envs.task_modules import TaskModuleError
 
 _BUILT_IN = {**TASKS, **{visual_name(task): module for task, module in TASKS.items()}}
+# What an environment must say of itself, and not every base class says for it.
+_CONSTANTS = ("horizon", "action_size", "threshold", "control_period")
+# What its methods are called with.
+_METHODS = {"reset": ("key",), "advance": ("state", "action"), "observe": ("state",)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,14 +60,19 @@ def register(name: str, factory: Callable[[Any], GoalEnv], config_class: type, s
     if not dataclasses.is_dataclass(config_class):
         raise ValueError(f"config_class of {name!r} must be a dataclass, got {config_class!r}")
     entry = _Entry(factory, config_class, state_variant)
-    if _ENTRIES.get(name, entry) != entry:
+    if _ENTRIES.get(name, entry) != entry or _BUILT_IN.get(name, config_class.__module__) != config_class.__module__:
         raise ValueError(f"an environment called {name!r} exists already; choose another name")
     _ENTRIES[name] = entry
 
 
 def list_envs() -> list[str]:
-    """Names of all environments, sorted."""
-    return sorted({*_BUILT_IN, *_ENTRIES})
+    """Names of all environments that are built in, registered, or offered by an installed package, sorted."""
+    return sorted({*_BUILT_IN, *_ENTRIES, *task_modules.entry_points()})
+
+
+def is_built_in(name: str) -> bool:
+    """Whether the environment comes with this package."""
+    return name in _BUILT_IN
 
 
 def config_class(name: str) -> type:
@@ -63,6 +80,7 @@ def config_class(name: str) -> type:
 
     Raises:
         UnknownEnvironmentError: No such environment; the message names the nearest ones.
+        TaskModuleError: The module that holds it cannot be imported.
     """
     return _entry(name).config_class
 
@@ -72,6 +90,7 @@ def has_images(name: str) -> bool:
 
     Raises:
         UnknownEnvironmentError: No such environment.
+        TaskModuleError: The module that holds it cannot be imported.
     """
     return any(field.name == "image_size" for field in dataclasses.fields(config_class(name)))
 
@@ -81,20 +100,62 @@ def state_variant(name: str) -> str | None:
 
     Raises:
         UnknownEnvironmentError: No such environment.
+        TaskModuleError: The module that holds it cannot be imported.
     """
-    return _entry(name).state_variant if has_images(name) else name
+    variant = _entry(name).state_variant if has_images(name) else name
+    if variant is None or not task_modules.is_own(name) or task_modules.is_own(variant):
+        return variant
+    return f"{task_modules.split(name)[0]}:{variant}"
+
+
+def visual_variant(name: str) -> str | None:
+    """The environment with the same physics that observes images, without building it; None where there is none.
+
+    Raises:
+        UnknownEnvironmentError: No such environment.
+        TaskModuleError: The module that holds it cannot be imported.
+    """
+    if has_images(name):
+        return name
+    module, colon, task = name.rpartition(":")
+    visual = f"{module}{colon}{visual_name(task)}"
+    try:
+        return visual if state_variant(visual) == name else None
+    except UnknownEnvironmentError:
+        return None
+
+
+def load(name: str, folder: str | None = None) -> str | None:
+    """Imports what holds an environment, and says where it was, so that it is found again from another folder.
+
+    Args:
+        name: An environment.
+        folder: Of ``module:Name``, where the module was found before. It is looked for there first, then in the current folder.
+
+    Returns:
+        The folder that makes the module of ``module:Name`` importable; None for an installed one, and for all other names.
+
+    Raises:
+        UnknownEnvironmentError: No such environment; the message names the nearest ones.
+        TaskModuleError: The module that holds it cannot be imported.
+    """
+    _entry(name, folder)
+    if not task_modules.is_own(name):
+        return None
+    return task_modules.folder_of(task_modules.load(task_modules.split(name)[0], folder))
 
 
 def make(name: str, **overrides: Any) -> GoalEnv:
     """Builds an environment.
 
     Args:
-        name: One of `list_envs`.
+        name: One of `list_envs`, or ``module:Name`` for one in a module of your own: in the current folder or importable.
         **overrides: Fields of its configuration to change, such as ``image_size=32``.
 
     Raises:
         UnknownEnvironmentError: No such environment; the message names the nearest ones.
         UnknownOverrideError: No such field; the message names the nearest ones.
+        TaskModuleError: The module that holds it cannot be imported, or its environment cannot be built.
         ValueError: A field's value is out of range, or JAX computes in 64 bits and the environment does not.
     """
     entry = _entry(name)
@@ -102,14 +163,110 @@ def make(name: str, **overrides: Any) -> GoalEnv:
     for override in overrides:
         if override not in fields:
             raise UnknownOverrideError(f"{name} has no option {override!r}{nearest(override, fields)}")
-    env = entry.factory(entry.config_class(**overrides))
+    env = _build(name, entry, entry.config_class(**overrides))
+    for constant in _CONSTANTS:
+        if not hasattr(env, constant):
+            raise ValueError(f"{name} has no {constant}: every environment says what its {', '.join(_CONSTANTS)} are")
+    for method, parameters in _METHODS.items():
+        signature = inspect.signature(getattr(env, method))
+        try:
+            signature.bind(*parameters)
+        except TypeError:
+            raise ValueError(f"{name}: {method} must take ({', '.join(parameters)}), not {signature}") from None
     env.name = name
     return env
 
 
-def _entry(name: str) -> _Entry:
+def _build(name: str, entry: _Entry, config: Any) -> GoalEnv:
+    if name in _BUILT_IN:
+        return entry.factory(config)
+    try:
+        return entry.factory(config)
+    except ValueError:
+        raise
+    except Exception as error:  # noqa: BLE001 - somebody else's code may raise anything
+        file = inspect.getsourcefile(entry.config_class)
+        raise TaskModuleError(f"{name} cannot be built: {task_modules.blame(error, file)}") from error
+
+
+def _entry(name: str, folder: str | None = None) -> _Entry:
+    if not isinstance(name, str):
+        raise UnknownEnvironmentError(
+            f"an environment is asked for by its name, and one of your own by 'module:Name', not {name!r}"
+        )
+    if task_modules.is_own(name):
+        module, task = task_modules.split(name)
+        return _entry_of(name, task_modules.load(module, folder), task)
     if name not in _ENTRIES and name in _BUILT_IN:
         importlib.import_module(_BUILT_IN[name])
-    if name not in _ENTRIES:
-        raise UnknownEnvironmentError(f"no environment is called {name!r}{nearest(name, list_envs())}")
-    return _ENTRIES[name]
+    if name in _ENTRIES:
+        return _ENTRIES[name]
+    points = task_modules.entry_points().get(name, [])
+    if not points:
+        mend = nearest(name, list_envs())
+        if "." in name:
+            mend = "; a task of your own is written module:Name, such as my_task:MyReach"
+        raise UnknownEnvironmentError(f"unknown environment {name!r}{mend}")
+    if len(points) > 1:
+        choices = " or ".join(sorted(point.value for point in points))
+        raise UnknownEnvironmentError(f"several installed packages have a {name}: ask for {choices}")
+    (point,) = points
+    return _entry_of(name, task_modules.load(point.module, installed=True), point.attr)
+
+
+def _entry_of(name: str, module: ModuleType, task: str) -> _Entry:
+    """The environment ``task`` of a module: what the module has registered by that name, or else its class.
+
+    Raises:
+        UnknownEnvironmentError: There is none; the message names those that there are.
+    """
+    registered = {
+        each: entry
+        for each, entry in _ENTRIES.items()
+        if each not in _BUILT_IN and f"{entry.config_class.__module__}.".startswith(f"{module.__name__}.")
+    }
+    if task in registered:
+        return registered[task]
+    if not hasattr(module, task):
+        classes = [each for each, value in vars(module).items() if _is_task(value) and not inspect.isabstract(value)]
+        choices = sorted({*registered, *classes})
+        mend = nearest(task, choices) if choices else ", nor any other subclass of jaxrl_vis_envs.GoalEnv"
+        raise UnknownEnvironmentError(f"{module.__name__} has no {task}{mend}")
+    found = getattr(module, task)
+    if not _is_task(found):
+        kind = "a class" if inspect.isclass(found) else f"of type {type(found).__name__}"
+        raise UnknownEnvironmentError(f"{name} is no environment but {kind}: it must be a subclass of jaxrl_vis_envs.GoalEnv")
+    if inspect.isabstract(found):
+        missing = ", ".join(sorted(found.__abstractmethods__))
+        raise UnknownEnvironmentError(f"{name} is not complete: it must define {missing}")
+    return _entry_of_class(name, found)
+
+
+def _entry_of_class(name: str, task: type[GoalEnv]) -> _Entry:
+    """How to build a task from its class: ``task(config)``, where the annotation of ``config`` is the config class."""
+    build: Any = task
+    parameters = list(inspect.signature(task).parameters.values())
+    if not parameters:
+        return _Entry(lambda config: build(), _NoSettings)
+    first = parameters[0].name
+    try:
+        settings = typing.get_type_hints(task.__init__).get(first)
+    except NameError as error:
+        raise UnknownEnvironmentError(f"the annotations of {name} cannot be read: {error}") from error
+    if not (isinstance(settings, type) and dataclasses.is_dataclass(settings)):
+        raise UnknownEnvironmentError(
+            f"the settings of {name} are unknown: annotate {first!r} of its __init__ with a dataclass of them"
+        )
+    for field in dataclasses.fields(settings):
+        if field.init and field.default is field.default_factory is dataclasses.MISSING:
+            raise UnknownEnvironmentError(f"{settings.__name__}.{field.name} of {name} needs a default")
+    return _Entry(build, settings)
+
+
+@dataclasses.dataclass(frozen=True)
+class _NoSettings:
+    """The configuration of an environment that has none."""
+
+
+def _is_task(value: Any) -> bool:
+    return inspect.isclass(value) and issubclass(value, GoalEnv)

@@ -17,6 +17,7 @@ from jaxrl_vis.bench.timing import compile_timed
 from jaxrl_vis.bench.timing import measure as measure_time
 from jaxrl_vis.bench.variation import alternate, assert_new_images
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis_envs import registry
 from jaxrl_vis_envs.compilation import env_jit
 
 CPU_COUNTS = (64,)
@@ -32,9 +33,9 @@ def measure(settings: Settings) -> Iterator[Measurement]:
         yield from scene_images.measure(settings, image_sizes(settings))
         return
     if not settings.has_images:
-        raise RequestError(
-            f"bench render needs an environment with images, and {settings.env} has none: try --env Visual{settings.env}"
-        )
+        visual = registry.visual_variant(settings.env)
+        mend = f": try --env {visual}" if visual else ""
+        raise RequestError(f"bench render needs an environment with images, and {settings.env} has none{mend}")
     counts = settings.counts(CPU_COUNTS, ACCELERATOR_COUNTS)
     batches = [poses(settings, max(counts), seed) for seed in (4, 5)]
     for size in image_sizes(settings):

@@ -5,6 +5,7 @@ from typing import Any, Self
 
 import jax
 
+from jaxrl_vis.errors import RequestError
 from jaxrl_vis_envs import registry
 
 
@@ -54,9 +55,16 @@ class Settings:
         return "pixels" in {field.name for field in dataclasses.fields(registry.config_class(self.env))}
 
     def make_env(self, **overrides: Any) -> Any:
-        """The environment; where its observations are images, with these settings of them."""
+        """The environment; where its observations are images, with these settings of them.
+
+        Raises:
+            RequestError: There is no such environment, or it cannot be made like that.
+        """
         images = {"image_size": self.image_size, "pixels": self.pixels, **overrides}
-        return registry.make(self.env, **(images if self.has_images else {}))
+        try:
+            return registry.make(self.env, **(images if self.has_images else {}))
+        except ValueError as error:
+            raise RequestError(str(error)) from error
 
     def image_config(self) -> dict[str, Any]:
         """What a record says about the environment that was measured."""

@@ -129,9 +129,10 @@ def measured_files(name: str, env: str | None, of_cpu: bool, checkout: Path) -> 
     """
     for pattern in MEASURED[name]:
         if "{task}" in pattern:
-            if env is None:
+            task = None if env is None else task_of(env)
+            if task is None:
                 continue
-            pattern = pattern.format(task=task_of(env))
+            pattern = pattern.format(task=task)
         path = checkout / pattern
         if not path.exists():
             raise FileNotFoundError(f"{path} is named in MEASURED of {Path(__file__).name}, and is not there")
@@ -142,10 +143,12 @@ def measured_files(name: str, env: str | None, of_cpu: bool, checkout: Path) -> 
                 yield file
 
 
-def task_of(env: str) -> str:
-    """The name of the file in `tasks` that makes an environment: ``VisualFetchReach`` is in fetch_reach."""
+def task_of(env: str) -> str | None:
+    """The name of the file in `tasks` that makes an environment: ``VisualFetchReach`` is in fetch_reach; None for others."""
     from jaxrl_vis_envs import registry
 
+    if not registry.is_built_in(env):
+        return None
     return registry.config_class(env).__module__.rpartition(".")[2]
 
 

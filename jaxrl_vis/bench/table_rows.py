@@ -121,7 +121,7 @@ SPEED = (
                 Figure(
                     "update/gradient_steps",
                     {"env": "VisualFetchReach"},
-                    "{roofline[gflop]:.1f} GFLOP and {roofline[mbyte]:.0f} MB an update at the least, so "
+                    "{roofline[gflop]:.1f} GFLOP and {moved_gib:.2f} GiB an update at the least, so "
                     "{roofline[tflop_per_s]:.0f} TFLOP/s",
                 ),
             ),

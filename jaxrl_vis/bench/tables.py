@@ -50,6 +50,8 @@ def _words(kept: dict[str, Any]) -> dict[str, Any]:
     """What a figure's text may mention."""
     config = kept["config"]
     words = {**kept["details"], **config, "value": short(kept["value"])}
+    if "mbyte" in words.get("roofline", {}):
+        words["moved_gib"] = words["roofline"]["mbyte"] * 1e6 / 2**30
     if "pixels" in config:
         words["pixels"] = {"rgbd": "RGB-D", "rgb": "RGB", "depth": "depth"}.get(config["pixels"], config["pixels"])
     if "poses" in config:

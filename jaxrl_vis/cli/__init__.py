@@ -36,6 +36,7 @@ def overview() -> str:
     lines = [f"usage: {PROGRAM} [-h] [--version] COMMAND ...", "", DESCRIPTION, "", "commands:"]
     for name, (command, _) in COMMANDS.items():
         lines.append(f"  {name:8} {(inspect.getdoc(command) or '').splitlines()[0]}")
+    lines += ["", "options:", "  -h, --help  show this", "  --version   show the version"]
     return "\n".join([*lines, "", f"`{PROGRAM} COMMAND --help` lists the options of a command."])
 
 

@@ -7,7 +7,9 @@ from typing import Annotated, Literal, get_args
 import tyro
 
 from jaxrl_vis.cli.checks import check_counts, check_env
+from jaxrl_vis.cli.parsing import ByPlaceToo
 from jaxrl_vis.config import Pixels
+from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.report.outputs import check_writable
 
@@ -24,8 +26,8 @@ class Bench:
     """Measure nothing: list records whose code has changed since, and rows of the README that have no record."""
     tables: bool = False
     """Measure nothing: write the tables of the README from the records."""
-    env: str = "VisualFetchReach"
-    """The environment."""
+    env: Annotated[str, ByPlaceToo()] = "VisualFetchReach"
+    """The environment; module:Name is one of your own."""
     envs: tuple[int, ...] = ()
     """Environments (or images) side by side, one measurement each; sizes that suit the device if not given."""
     image_size: int | None = None
@@ -66,6 +68,7 @@ def run(options: Bench) -> int:
     from jaxrl_vis import bench
     from jaxrl_vis.bench.record import results_folder
 
+    check_devices()
     check_writable(options.results or results_folder(), "--results", folder=True)
     settings = {field.name: getattr(options, field.name) for field in dataclasses.fields(options)}
     del settings["check"], settings["tables"]

@@ -3,21 +3,39 @@
 from pathlib import Path
 
 from jaxrl_vis.cli.parsing import PROGRAM
-from jaxrl_vis.errors import RequestError, nearest
+from jaxrl_vis.devices import check_devices
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.run.signals import shielded_children
 
 
-def check_env(name: str) -> None:
-    """Raises a `RequestError` with the nearest names unless ``name`` is an environment."""
-    from jaxrl_vis_envs import list_envs
+def check_env(name: str, folder: str | None = None) -> None:
+    """Checks that there is an environment; one that is not built in is imported.
 
-    names = tuple(list_envs())
-    if name not in names:
-        raise RequestError(f"unknown environment {name!r}{nearest(name, names)}")
+    Args:
+        name: Of the environment.
+        folder: Where the module of ``module:Name`` was found before.
+
+    Raises:
+        RequestError: There is none, or what holds it cannot be imported.
+    """
+    from jaxrl_vis_envs import registry
+
+    try:
+        if registry.is_built_in(name):
+            return
+        with shielded_children():
+            check_devices()  # what somebody's module computes as it is imported must not be the first to ask
+        registry.load(name, folder)
+    except ValueError as error:
+        raise RequestError(str(error)) from error
 
 
 def check_run(folder: Path) -> None:
     """Raises a `RequestError` unless ``folder`` holds a run."""
     if not (folder / "config.json").exists():
+        above = next((parent for parent in folder.parents if (parent / "config.json").exists()), None)
+        if folder.exists() and above is not None:
+            raise RequestError(f"{folder} lies in a run folder: name that, {above}")
         raise RequestError(f"{folder} is not a run folder (it holds no config.json); {PROGRAM} train makes one")
 
 

@@ -2,8 +2,11 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Annotated
 
 from jaxrl_vis.cli.checks import check_counts, check_env
+from jaxrl_vis.cli.parsing import ByPlaceToo
+from jaxrl_vis.devices import check_devices
 
 
 @dataclasses.dataclass(frozen=True)
@@ -14,8 +17,8 @@ class Envs:
     thresholds.
     """
 
-    env: tuple[str, ...] = ()
-    """Only these environments; all if not given."""
+    env: Annotated[tuple[str, ...], ByPlaceToo()] = ()
+    """Only these environments, built in, of an installed package or module:Name; all of the first two if not given."""
     gallery: Path | None = None
     """Also draw the environments that show images, to this file: start and goals as colours, depth and geoms."""
     image_size: int = 128
@@ -31,6 +34,7 @@ def run(options: Envs) -> int:
     check_counts(goals=options.goals, image_size=options.image_size)
     from jaxrl_vis.report import gallery
 
+    check_devices()
     names = options.env or None
     if options.gallery is not None:
         gallery.check_gallery(options.gallery, names)

@@ -15,6 +15,7 @@ import itertools
 import textwrap
 import typing
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import tyro
@@ -23,6 +24,23 @@ from jaxrl_vis import fields
 from jaxrl_vis.errors import RequestError, nearest
 
 PROGRAM = "jaxrl-vis"
+
+# Options of brax, Stable-Baselines3, its zoo and CleanRL that people try here -> what does the same.
+_ELSEWHERE = {
+    **dict.fromkeys(
+        ("--cuda", "--no-cuda", "--device", "--gpu", "--cpu"),
+        "JAX takes the accelerator that it finds; the environment variable JAX_PLATFORMS=cpu, cuda or tpu chooses",
+    ),
+    **dict.fromkeys(("--total-timesteps", "--num-timesteps", "--timesteps", "--n-timesteps"), "the option is --env-steps"),
+    **dict.fromkeys(("--buffer-size", "--max-replay-size"), "the option is --replay-transitions"),
+    **dict.fromkeys(("--gamma", "--discounting"), "the option is --discount"),
+    **dict.fromkeys(("--load", "--trained-agent", "--restore"), "the options are --run-dir FOLDER --resume"),
+    **dict.fromkeys(("--exp-name", "--log-folder", "--logdir"), "the option is --run-dir"),
+    **dict.fromkeys(
+        ("--capture-video", "--render", "--render-mode"), f"a run draws a video at its end; {PROGRAM} play draws more"
+    ),
+    "--algo": "there is one algorithm, DDPG; --method says where rewards come from",
+}
 
 T = TypeVar("T")
 
@@ -41,6 +59,22 @@ class ChangesOf:
 
 
 @dataclasses.dataclass(frozen=True)
+class ByPlaceToo:
+    """Marks a field that may be given by its place as well as by its name: ``train TASK`` or ``train --env TASK``."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SayDefault:
+    """Marks a field whose default the help cannot read off.
+
+    Attributes:
+        words: What the help says about it.
+    """
+
+    words: Callable[[], str]
+
+
+@dataclasses.dataclass(frozen=True)
 class _Option:
     """One option or positional argument.
 
@@ -52,6 +86,7 @@ class _Option:
         default: What the help says about its default; nothing where it goes without saying.
         required: Whether it must be given.
         changes: The field of the command that collects it; None where it is a field of the command itself.
+        twin: Whether it is the same field as another option, which is known by its name.
     """
 
     name: str
@@ -61,6 +96,12 @@ class _Option:
     default: str
     required: bool
     changes: str | None = None
+    twin: bool = False
+
+    @property
+    def key(self) -> str:
+        """What tyro calls it."""
+        return f"{self.name}_by_place" if self.twin else self.name
 
     @property
     def flag(self) -> str:
@@ -75,7 +116,7 @@ class _Option:
         word = f"{{{','.join(choices)}}}" if choices else "TEXT" if one is str else one.__name__.upper()
         if self.positional:
             word = word if choices else self.name.upper()
-            return word if self.required else f"[{word}]"
+            return f"[{word} ...]" if several else word if self.required else f"[{word}]"
         # None says nothing, but where it can undo what a preset or a saved run says.
         return f"[{word} ...]" if several else f"{word}|None" if optional and self.changes else word
 
@@ -115,14 +156,16 @@ def parse(command: type[T], words: Sequence[str]) -> T:
 
     Args:
         command: A frozen dataclass. Its docstring and those of its fields are the help. A field that is annotated with
-            `tyro.conf.Positional` is known by its place, one annotated with `ChangesOf` stands for many.
+            `tyro.conf.Positional` is known by its place, one annotated with `ByPlaceToo` by either, and one annotated with
+            `ChangesOf` stands for many.
         words: Of the command line.
 
     Raises:
         RequestError: The words do not make sense.
         SystemExit: Help was asked for, and printed.
     """
-    options = {option.name: option for option in _options_of(command)}
+    options = {option.key: option for option in _options_of(command)}
+    _check_values(words, list(options.values()))
     program = f"{PROGRAM} {command.__name__.lower()}"
     given, left_over = _split(command, program, words, options)
     if left_over:
@@ -130,15 +173,24 @@ def parse(command: type[T], words: Sequence[str]) -> T:
         if not word.startswith("-"):
             raise RequestError(f"unexpected argument {word!r}; see {program} --help")
         flags = [option.flag for option in options.values() if not option.positional]
+        if word == "--version":
+            raise RequestError(f"--version goes without a command: {PROGRAM} --version")
+        if word in _ELSEWHERE and word not in flags:
+            raise RequestError(f"unknown option {word}: {_ELSEWHERE[word]}")
         raise RequestError(f"unknown option {word}{nearest(word, flags, f'see {program} --help')}")
     values: dict[str, Any] = {}
-    for name, option in options.items():
+    for key, option in options.items():
         if option.changes is not None:
             values.setdefault(option.changes, {})
-        if name in given:
+        if key in given:
             target = values if option.changes is None else values[option.changes]
-            target[name] = _value(option, given[name])
-        elif option.required:
+            value = _value(option, given[key])
+            if target.get(option.name, value) != value:
+                here, there = (each if isinstance(each, tuple) else (each,) for each in (target[option.name], value))
+                both = f"{' '.join(map(str, here))} by {option.flag} and {' '.join(map(str, there))} by its place"
+                raise RequestError(f"{option.name} is given twice, {both}; give it once")
+            target[option.name] = value
+        elif option.required and option.name not in values:
             choices = fields.choices(option.hint)
             mend = f"; choose one of {', '.join(choices)}" if choices else f": {option.help} See {program} --help"
             raise RequestError(f"no {option.name if choices else option.metavar} given{mend}")
@@ -170,6 +222,34 @@ def _split(
     raise RequestError(f"an option needs a value; see {program} --help")
 
 
+def _check_values(words: Sequence[str], options: Sequence[_Option]) -> None:
+    """Refuses true or false after a flag, and several numbers after an option of one, which would be taken for a task.
+
+    Raises:
+        RequestError: That is so.
+    """
+    flags = {option.flag: option for option in options if not option.positional}
+    takes_path = any(option.positional and option.hint is Path for option in options)
+    for place, word in enumerate(words):
+        option = flags.get(word.replace("_", "-"))
+        following = list(itertools.takewhile(_is_number, words[place + 1 :]))
+        if option is None:
+            continue
+        if option.is_flag and words[place + 1 : place + 2] and words[place + 1].lower() in ("true", "false", "0", "1"):
+            opposite = f"write {option.flag.replace('--', '--no-', 1)}" if option.changes else "leave it out"
+            raise RequestError(f"{option.flag} takes no value: {opposite} for its opposite")
+        if option.takes_one_word and len(following) > 1 and not takes_path:
+            raise RequestError(f"{option.flag} takes one value, not {' '.join(following)}: {option.help}")
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
 def _value(option: _Option, words: Any) -> Any:
     if isinstance(words, bool):
         return words
@@ -181,7 +261,10 @@ def _value(option: _Option, words: Any) -> Any:
 
 
 def _options_of(command: type) -> list[_Option]:
-    """The options of a command in the order of its fields, those that a `ChangesOf` stands for in its place."""
+    """The options of a command in the order of its fields, those that a `ChangesOf` stands for in its place.
+
+    A field that may be given either way is two options: first by its name, then by its place.
+    """
     own = {field.name for field in dataclasses.fields(command)}
     found = []
     for field, hint, extras, text in _described(command):
@@ -189,6 +272,12 @@ def _options_of(command: type) -> list[_Option]:
         if changes is None:
             required = field.default is dataclasses.MISSING
             default = "required" if required else f"default: {field.default}" if field.default else ""
+            for extra in extras:
+                default = extra.words() if isinstance(extra, SayDefault) else default
+            if ByPlaceToo() in extras:
+                found.append(_Option(field.name, hint, False, text, "" if required else default, False))
+                found.append(_Option(field.name, hint, True, text, default, required, twin=True))
+                continue
             found.append(_Option(field.name, hint, tyro.conf.Positional in extras, text, default, required))
             continue
         found += [

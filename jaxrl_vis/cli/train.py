@@ -5,38 +5,48 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
-import tyro
-
 from jaxrl_vis.cli.checks import check_env
-from jaxrl_vis.cli.parsing import ChangesOf
+from jaxrl_vis.cli.parsing import ByPlaceToo, ChangesOf, SayDefault
 from jaxrl_vis.config import PRESETS, Config, preset, validate
+from jaxrl_vis.devices import check_devices, guess_accelerator
 from jaxrl_vis.errors import RequestError, nearest
 from jaxrl_vis.report.outputs import check_writable
+from jaxrl_vis.run.folder import check_there, default_folder, read_config
 
 
 def _defaults(name: str) -> str:
-    """What the presets say about a field: what ``fast`` says, and after it those that differ from it."""
+    """What the presets say about a field: what ``auto`` takes on this machine, and after it those that differ from that."""
+    here = _auto(guess_accelerator())
     values = {each: getattr(config, name) for each, config in PRESETS.items()}
     words = {
         each: " ".join(map(str, value)) or "none" if isinstance(value, tuple) else str(value) for each, value in values.items()
     }
-    others = ", ".join(f"{each} {word}" for each, word in words.items() if word != words["fast"])
-    return f"default: {words['fast']}" + (f"; {others}" if others else "")
+    others = ", ".join(f"{each} {word}" for each, word in words.items() if word != words[here])
+    return f"default: {words[here]}" + (f"; {others}" if others else "")
+
+
+def _auto(on_accelerator: bool) -> str:
+    """The preset that suits the hardware."""
+    return "fast" if on_accelerator else "cpu"
+
+
+def _default_preset() -> str:
+    return f"default: auto, which is {_auto(guess_accelerator())} on this machine; its values are the defaults shown below"
 
 
 @dataclasses.dataclass(frozen=True)
 class Train:
     """Train on an environment. Options that are not given come from the preset, or with --resume from the run."""
 
-    env: Annotated[str | None, tyro.conf.Positional] = None
-    """The environment; `jaxrl-vis envs` lists them. VisualFetchReach if not given."""
-    preset: str = "auto"
+    env: Annotated[str | None, ByPlaceToo()] = None
+    """The environment; `jaxrl-vis envs` lists them, and module:Name is one of your own. VisualFetchReach if not given."""
+    preset: Annotated[str, SayDefault(_default_preset)] = "auto"
     """paper, fast, cpu or debug; auto is fast on an accelerator, else cpu."""
     changes: Annotated[Mapping[str, Any], ChangesOf(Config, _defaults)] = dataclasses.field(default_factory=dict)
     run_dir: Path | None = None
     """Folder for metrics, images and checkpoints; a new one under runs/ if not given."""
     resume: bool = False
-    """Continue from the newest checkpoint in the run folder."""
+    """Continue from the newest checkpoint in the run folder, which must be there."""
     overwrite: bool = False
     """Start afresh in a run folder that exists."""
 
@@ -54,8 +64,6 @@ def training_config(options: Train) -> Config:
     if name not in ("auto", *PRESETS):
         raise RequestError(f"unknown preset {name!r}{nearest(name, ['auto', *PRESETS])}")
     if name == "auto" and options.resume and options.run_dir is not None and (options.run_dir / "config.json").exists():
-        from jaxrl_vis.run.folder import read_config
-
         return read_config(options.run_dir).replace(**changes)
     if name == "auto":
         import jax
@@ -63,7 +71,8 @@ def training_config(options: Train) -> Config:
         from jaxrl_vis.run.signals import shielded_children
 
         with shielded_children():  # threads that JAX starts with its first use of a device never see signals
-            name = "cpu" if jax.default_backend() == "cpu" else "fast"
+            check_devices()
+            name = _auto(jax.default_backend() != "cpu")
     return preset(name, **changes)
 
 
@@ -71,14 +80,17 @@ def run(options: Train) -> int:
     """Trains; every report has already been shown and saved by the trainer."""
     if options.resume and options.overwrite:
         raise RequestError("--resume and --overwrite contradict each other; give one of them")
+    if options.run_dir is not None:
+        check_there(options.run_dir, options.resume)
     if options.env is not None:
-        check_env(options.env)
+        check_env(options.env, options.changes.get("env_folder"))
     config = validate(training_config(options))
-    check_env(config.env)
+    check_env(config.env, config.env_folder)
     from jaxrl_vis.run import trainer
-    from jaxrl_vis.run.folder import default_folder
 
-    check_writable(options.run_dir or default_folder(config), "--run-dir", folder=True)
+    run_dir = options.run_dir or default_folder(config)
+    check_there(run_dir, options.resume)
+    check_writable(run_dir, "--run-dir", folder=True)
     for _ in trainer.make_trainer(config, options.run_dir, resume=options.resume, overwrite=options.overwrite).run():
         pass
     return 0

@@ -9,7 +9,7 @@ from jaxrl_vis.config import Config, validate
 from jaxrl_vis.errors import RequestError, nearest
 from jaxrl_vis_envs.base import GoalEnv
 from jaxrl_vis_envs.randomization import typical
-from jaxrl_vis_envs.registry import config_class
+from jaxrl_vis_envs.registry import config_class, load
 
 # Options of an environment that `Config` has fields of its own for.
 _OWN_FIELDS = {
@@ -20,13 +20,26 @@ _OWN_FIELDS = {
 }
 
 
+def locate_env(config: Config) -> Config:
+    """``config`` with the folder that its environment, where that is ``module:Name``, was imported from.
+
+    Raises:
+        RequestError: There is no such environment, or what holds it cannot be imported.
+    """
+    validate(config)
+    try:
+        return config.replace(env_folder=load(config.env, config.env_folder))
+    except ValueError as error:
+        raise RequestError(str(error)) from error
+
+
 def make_env(config: Config) -> GoalEnv:
     """Builds the environment of a configuration.
 
     Raises:
         RequestError: There is no such environment, or it cannot be made like that.
     """
-    validate(config)
+    locate_env(config)
     try:
         names = {field.name for field in dataclasses.fields(config_class(config.env))}
         settings: dict[str, Any] = {name: getattr(config, name) for name in ("image_size", "pixels") if name in names}
@@ -45,6 +58,8 @@ def _read_options(config: Config) -> dict[str, Any]:
     Raises:
         RequestError: One is not ``name=value``, names no field, or has a value that does not suit.
     """
+    if not config.env_options:
+        return {}
     hints = fields.hints(config_class(config.env))
     found: dict[str, Any] = {}
     for option in config.env_options:
@@ -56,6 +71,8 @@ def _read_options(config: Config) -> dict[str, Any]:
         if name not in hints:
             choices = [each for each in hints if each not in _OWN_FIELDS]
             raise RequestError(f"{config.env} has no option {name!r}{nearest(name, choices)}")
+        if not fields.is_known(hints[name]):
+            raise RequestError(f"{name} cannot be set by name=value: it is a {hints[name]}, neither a number nor a word")
         _, _, several = fields.unwrap(hints[name])
         found[name] = fields.read(name, hints[name], value.split(",") if several else [value])
     return found

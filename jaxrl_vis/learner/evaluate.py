@@ -20,6 +20,11 @@ def make_evaluate(
 ) -> Callable[[TrainState, jax.Array], tuple[Metrics, dict[str, jax.Array]]]:
     """Evaluation without exploration, as a function to be compiled.
 
+    Args:
+        env: The environment.
+        networks: What the parameters mean.
+        config: The number of episodes, ``eval_episodes``.
+
     Returns:
         (TrainState [S, ...], key []) -> metrics of [S] float32 and, of the first K episodes, ``frames`` [S, K, T+1, ...],
         ``goals`` [S, K, ...] and ``success`` [S, K]. All seeds play the same ``config.eval_episodes`` episodes.

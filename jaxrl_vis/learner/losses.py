@@ -13,6 +13,13 @@ def td_target(
     """r + gamma Q'(s', pi'(s')) clipped to what a sum of rewards can be: [B] float32, without gradient.
 
     Episodes end by running out of time, never by a terminal state, so the discount is never zeroed.
+
+    Args:
+        reward_t: [B] float32, rewards of the transitions.
+        value_tp1: [B] float32, the target critic's values of the target actor's actions in the next states.
+        discount: gamma.
+        minimum: Least target, R-/(1-gamma).
+        maximum: Greatest target, R+/(1-gamma).
     """
     return jax.lax.stop_gradient(jnp.clip(reward_t + discount * value_tp1, minimum, maximum))
 
@@ -21,8 +28,8 @@ def keep_mask(reward_t: jax.Array, value_t: jax.Array, reward_negative: float, t
     """1 for transitions to learn from, 0 for negatives whose value says that they are false (thesis, 5.1.4): [B] float32.
 
     Args:
-        reward_t: [B] rewards.
-        value_t: [B] the online critic's values of the same transitions.
+        reward_t: [B] float32, rewards.
+        value_t: [B] float32, the online critic's values of the same transitions.
         reward_negative: R-.
         threshold: q0; infinity keeps everything.
     """
@@ -31,10 +38,22 @@ def keep_mask(reward_t: jax.Array, value_t: jax.Array, reward_negative: float, t
 
 
 def critic_loss(value_t: jax.Array, target: jax.Array, keep: jax.Array) -> jax.Array:
-    """Mean squared temporal-difference error over the transitions with ``keep`` 1: [] float32; 0 where there are none."""
+    """Mean squared temporal-difference error over the transitions with ``keep`` 1: [] float32; 0 where there are none.
+
+    Args:
+        value_t: [B] float32, the online critic's values.
+        target: [B] float32, from `td_target`.
+        keep: [B] float32, 0 or 1, from `keep_mask`.
+    """
     return jnp.sum(keep * jnp.square(value_t - target)) / jnp.maximum(jnp.sum(keep), 1.0)
 
 
 def actor_loss(value_t: jax.Array, action: jax.Array, action_penalty: float) -> jax.Array:
-    """Minus the mean value of the policy's own actions [B, A], plus their weighted mean square: [] float32."""
+    """Minus the mean value of the policy's own actions, plus their weighted mean square: [] float32.
+
+    Args:
+        value_t: [B] float32, the online critic's values of ``action``.
+        action: [B, A] float32 in [-1, 1], the policy's own.
+        action_penalty: Weight of the mean square.
+    """
     return -jnp.mean(value_t) + action_penalty * jnp.mean(jnp.square(action))

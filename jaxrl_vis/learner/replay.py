@@ -73,7 +73,13 @@ class Replay(NamedTuple):
         return self.num_rollouts * self.num_envs
 
     def init(self, observation: jax.ShapeDtypeStruct, goal_state_size: int, action_size: int) -> ReplayState:
-        """An empty replay."""
+        """An empty replay.
+
+        Args:
+            observation: Shape and dtype of one observation (`GoalEnv.observation_spec`).
+            goal_state_size: G.
+            action_size: A.
+        """
         episodes, horizon = self.num_episodes, self.horizon
         return ReplayState(
             episodes=Episodes(
@@ -85,7 +91,7 @@ class Replay(NamedTuple):
         )
 
     def spec(self, observation: jax.ShapeDtypeStruct, goal_state_size: int, action_size: int) -> ReplayState:
-        """Shapes and dtypes of the storage, without allocating it."""
+        """Shapes and dtypes of the storage, without allocating it; arguments as of `init`."""
         return jax.eval_shape(lambda: self.init(observation, goal_state_size, action_size))
 
     def of_rollout(self, rollout: Episodes) -> ReplayState:
@@ -94,7 +100,13 @@ class Replay(NamedTuple):
         return ReplayState(episodes=episodes, size=jnp.full((), self.num_envs, jnp.int32))
 
     def insert(self, state: ReplayState, rollout: Episodes, iteration: jax.Array) -> ReplayState:
-        """Writes the E episodes of ``iteration`` ([] int32), over the oldest ones once the ring is full."""
+        """Writes the E episodes of a rollout, over the oldest ones once the ring is full.
+
+        Args:
+            state: The replay before.
+            rollout: E episodes, unpacked.
+            iteration: [] int32, iterations before this one: it settles the place.
+        """
         start = (iteration % self.num_rollouts) * self.num_envs
         rollout = rollout.replace(observations=pack(rollout.observations))
         episodes = jax.tree.map(
@@ -103,7 +115,14 @@ class Replay(NamedTuple):
         return ReplayState(episodes=episodes, size=jnp.minimum(state.size + self.num_envs, self.num_episodes))
 
     def sample_indices(self, state: ReplayState, key: jax.Array, iteration: jax.Array, batch_size: int) -> Indices:
-        """B transitions, evenly over the stored ones, after the rollout of ``iteration`` was inserted."""
+        """B transitions, evenly over the stored ones.
+
+        Args:
+            state: The replay, with the rollout of ``iteration`` inserted.
+            key: [] a typed key.
+            iteration: [] int32.
+            batch_size: B.
+        """
         episode_key, time_key = jax.random.split(key)
         end = (iteration % self.num_rollouts + 1) * self.num_envs
         age = jax.random.randint(episode_key, (batch_size,), 1, jnp.maximum(state.size, 1) + 1)
@@ -113,7 +132,16 @@ class Replay(NamedTuple):
         )
 
     def gather(self, state: ReplayState, indices: Indices, goal_slot: jax.Array) -> Batch:
-        """Reads transitions with the goal in ``goal_slot`` ([B] int32 in [1, T+1])."""
+        """Reads transitions, with what is in a slot of the same episode as their goal.
+
+        Args:
+            state: The replay.
+            indices: Where the transitions lie, [B] each.
+            goal_slot: [B] int32 in [1, T+1].
+
+        Returns:
+            The transitions, without rewards.
+        """
         observations, states, actions = state.episodes.observations, state.episodes.states, state.episodes.actions
         episode, time = indices
         slots = jnp.stack([time, goal_slot, time + 1])
@@ -126,7 +154,13 @@ class Replay(NamedTuple):
 
 
 def make_replay(transitions: int, num_envs: int, horizon: int) -> Replay:
-    """A replay of at least ``transitions`` transitions, rounded up to whole rollouts of ``num_envs`` episodes."""
+    """A replay of at least ``transitions`` transitions, rounded up to whole rollouts; nothing is allocated yet.
+
+    Args:
+        transitions: Least number of transitions to hold.
+        num_envs: E, episodes in a rollout.
+        horizon: T, control steps in an episode.
+    """
     return Replay(num_rollouts=max(1, math.ceil(transitions / (num_envs * horizon))), num_envs=num_envs, horizon=horizon)
 
 

@@ -52,7 +52,13 @@ class Sampler:
     as_goal: Callable[[jax.Array], jax.Array] | None = None
 
     def choose(self, state: ReplayState, key: jax.Array, iteration: jax.Array) -> Choice:
-        """B transitions and their goals, after the rollout of ``iteration`` ([] int32) was inserted."""
+        """Draws B transitions and their goals.
+
+        Args:
+            state: The replay, with the rollout of ``iteration`` inserted.
+            key: [] a typed key.
+            iteration: [] int32.
+        """
         sample_key, goal_key = jax.random.split(key)
         indices = self.replay.sample_indices(state, sample_key, iteration, self.config.batch_size)
         return Choice(indices, self.goal_slots(goal_key, indices.time))
@@ -63,7 +69,15 @@ class Sampler:
         return choose_goal_slots(key, time, self.replay.horizon, *shares)
 
     def batch(self, state: ReplayState, choice: Choice) -> Batch:
-        """Reads what was chosen, with goals that stand still and rewards that belong to them."""
+        """Reads what was chosen, with goals that stand still and rewards that belong to them.
+
+        Args:
+            state: The replay.
+            choice: From `choose`.
+
+        Returns:
+            B transitions with rewards.
+        """
         batch = self.replay.gather(state, *choice)
         reached = batch.observation_tp1
         if self.as_goal is not None:

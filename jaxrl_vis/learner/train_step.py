@@ -133,6 +133,10 @@ def _count_nonfinite(tree: Any) -> jax.Array:
 def make_train_step(env: GoalEnv, config: Config) -> TrainStep:
     """Builds the program of a run. Nothing is compiled or allocated yet.
 
+    Args:
+        env: The environment.
+        config: The run; what belongs to the environment is taken from ``env``.
+
     Raises:
         RequestError: The configuration asks for something that cannot be.
     """

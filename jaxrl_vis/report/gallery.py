@@ -20,6 +20,7 @@ import jaxrl_vis_envs
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.report.colours import depth_colours, label_colours
 from jaxrl_vis.report.outputs import check_writable
+from jaxrl_vis_envs import registry
 from jaxrl_vis_envs.compilation import env_jit
 from jaxrl_vis_envs.render import Frame, Scene, render
 
@@ -33,12 +34,18 @@ _SKY = (255, 255, 255)
 
 
 def print_table(names: Sequence[str] | None = None) -> None:
-    """One row for each of the environments ``names`` (default: all), from their definitions; nothing is compiled."""
+    """One row for each of the environments ``names`` (default: all), from their definitions; nothing is compiled.
+
+    Of all environments, those of installed packages that cannot be made are named below the table, each with its fault.
+
+    Raises:
+        RequestError: One of ``names`` cannot be made.
+    """
     table = Table(title="Environments", caption=_LEGEND, caption_justify="left")
     for column in _COLUMNS:
         table.add_column(column, no_wrap=True)
-    for name in jaxrl_vis_envs.list_envs() if names is None else names:
-        env = jaxrl_vis_envs.make(name)
+    environments, faults = _make_each(names)
+    for name, env in environments.items():
         spec = env.observation_spec
         table.add_row(
             name,
@@ -54,6 +61,30 @@ def print_table(names: Sequence[str] | None = None) -> None:
     console = Console()
     # A pipe gets whole lines, a terminal lines of its own width.
     (console if console.is_terminal else Console(width=160)).print(table)
+    for name, fault in faults.items():
+        print(f"{name} cannot be used: {fault}")
+
+
+def _make_each(names: Sequence[str] | None) -> tuple[dict[str, Any], dict[str, str]]:
+    """The environments ``names``; or all, and what is wrong with those that cannot be made though nobody asked for them.
+
+    Raises:
+        RequestError: One of ``names`` cannot be made.
+    """
+    environments, faults = {}, {}
+    for name in jaxrl_vis_envs.list_envs() if names is None else names:
+        try:
+            environments[name] = jaxrl_vis_envs.make(name)
+            environments[name].observation_spec  # noqa: B018 - traces somebody's code, which may raise anything
+        except Exception as error:
+            if registry.is_built_in(name):
+                raise
+            if names is not None:
+                fault = f"{name} cannot be used: {type(error).__name__}: {error}"
+                raise RequestError(str(error) if isinstance(error, ValueError) else fault) from error
+            environments.pop(name, None)
+            faults[name] = " ".join(str(error).split()) or type(error).__name__
+    return environments, faults
 
 
 class _Poses(NamedTuple):
@@ -71,8 +102,17 @@ class _Poses(NamedTuple):
 
 
 def image_environments() -> list[str]:
-    """Names of the environments that show the agent images."""
-    return [name for name in jaxrl_vis_envs.list_envs() if len(jaxrl_vis_envs.make(name).observation_spec.shape) == 3]
+    """Names of the environments that show the agent images, and can be drawn."""
+    return [name for name, env in _make_each(None)[0].items() if _sees_images(env) and _can_be_drawn(env)]
+
+
+def _sees_images(env: Any) -> bool:
+    return len(env.observation_spec.shape) == 3
+
+
+def _can_be_drawn(env: Any) -> bool:
+    needed = ("sample_start", "sample_goal", "mj_model", "camera", "config")
+    return all(hasattr(env, name) for name in needed) and hasattr(env.config, "depth_range")
 
 
 def frames_of(env: Any, key: jax.Array, goals: int, size: int) -> Frame:
@@ -108,11 +148,15 @@ def check_gallery(path: Path, names: Sequence[str] | None = None) -> Sequence[st
     if path.suffix.lower() not in Image.registered_extensions():
         raise RequestError(f"cannot write {path}: end its name in .png or .jpg")
     check_writable(path)
-    with_images = image_environments()
-    for name in names or ():
-        if name not in with_images:
-            raise RequestError(f"{name} shows no images; Visual{name} does")
-    return with_images if names is None else names
+    if names is None:
+        return image_environments()
+    for name, env in _make_each(names)[0].items():
+        if not _sees_images(env):
+            visual = registry.visual_variant(name)
+            raise RequestError(f"{name} shows no images" + (f"; {visual} does" if visual else ""))
+        if not _can_be_drawn(env):
+            raise RequestError(f"{name} cannot be drawn: the gallery shows tasks that are subclasses of MjxGoalEnv")
+    return names
 
 
 def draw(path: Path, names: Sequence[str] | None = None, image_size: int = 128, goals: int = 4) -> None:

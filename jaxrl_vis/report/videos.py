@@ -14,6 +14,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.provenance import install_command
 from jaxrl_vis.report.colours import depth_colours
 from jaxrl_vis.report.outputs import check_writable
 
@@ -204,7 +205,7 @@ def check_output(path: Path) -> None:
         try:
             import imageio_ffmpeg  # noqa: F401  # pyright: ignore[reportMissingImports]
         except ImportError as error:
-            raise RequestError(f"writing {path} needs imageio-ffmpeg: install it, or ask for a .gif") from error
+            raise RequestError(f"writing {path} needs imageio-ffmpeg: {install_command('video')}, or ask for a .gif") from error
     check_writable(path)
 
 

@@ -287,12 +287,14 @@ class Checkpoints:
         """
         return self._newest_good(template, with_rest=True)
 
-    def restore_train(self, template: LoopState) -> Restored | None:
-        """The learner alone, of the newest good checkpoint of either tier. See `restore_for_resume`."""
-        return self._newest_good(template, with_rest=False)
+    def restore_train(self, template: LoopState, iteration: int | None = None) -> Restored | None:
+        """The learner alone, of the newest good checkpoint of either tier, or of ``iteration``. See `restore_for_resume`."""
+        return self._newest_good(template, with_rest=False, only=iteration)
 
-    def _newest_good(self, template: LoopState, with_rest: bool) -> Restored | None:
-        found = [(iteration, tier) for tier in (FULL, LIGHT) for iteration in self.iterations(tier)]
+    def _newest_good(self, template: LoopState, with_rest: bool, only: int | None = None) -> Restored | None:
+        found = [
+            (iteration, tier) for tier in (FULL, LIGHT) for iteration in self.iterations(tier) if only in (None, iteration)
+        ]
         # Of two tiers the light one is read where the learner alone is wanted, for it is smaller.
         first = FULL if with_rest else LIGHT
         for iteration, tier in sorted(found, key=lambda item: (item[0], item[1] == first), reverse=True):

@@ -23,15 +23,28 @@ from jaxrl_vis.run.lock import run_lock
 
 SCHEMA = 1
 
-MAY_CHANGE = ("preset", "env_steps", "eval_interval", "eval_episodes", "checkpoint_interval", "full_checkpoint_interval")
-"""Fields that a resumed run may set anew: how long to train, how often to look and save. All others shape what is learned."""
+MAY_CHANGE = (
+    *("preset", "env_folder", "env_steps"),
+    *("eval_interval", "eval_episodes", "checkpoint_interval", "full_checkpoint_interval"),
+)
+"""Fields that a resumed run may set anew: where its task lies now, how long to train, how often to look and save. All others
+shape what is learned."""
 
 
 def default_folder(config: Config) -> Path:
-    """``runs/<env>-<method>-<preset>-seed<first>`` or ``...-seeds<first>to<last>``, below the working directory."""
+    """``runs/<env>-<method>-<preset>-seed<first>`` or ``...-seeds<first>to<last>``, below the working directory.
+
+    The colon of ``module:Name`` becomes a hyphen: Windows allows none in the name of a file.
+    """
     last = config.seed + config.seeds - 1
     seeds = f"seed{config.seed}" if config.seeds == 1 else f"seeds{config.seed}to{last}"
-    return Path("runs") / f"{config.env}-{config.method}-{config.preset}-{seeds}"
+    return Path("runs") / f"{config.env.replace(':', '-')}-{config.method}-{config.preset}-{seeds}"
+
+
+def check_there(path: Path, resume: bool) -> None:
+    """Raises a `RequestError` where a run is to go on in a folder that is not there."""
+    if resume and not path.exists():
+        raise RequestError(f"nothing to resume: there is no folder {path}; leave out --resume to start a run there")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,6 +104,7 @@ class RunFolder:
             raise RequestError("--resume and --overwrite contradict each other: give one of them")
         if self.path.exists() and not self.path.is_dir():
             raise RequestError(f"{self.path} is a file: choose another --run-dir")
+        check_there(self.path, resume)
         if not self.path.exists() or all(entry.name == LOCK_NAME for entry in self.path.iterdir()):
             return False
         if not (resume or overwrite):

@@ -70,8 +70,9 @@ def _container_bytes() -> int:
 
 
 def show_bytes(count: float) -> str:
-    """``1.5 GiB`` and the like."""
-    return f"{count / 2**30:.1f} GiB" if count >= 2**30 / 10 else f"{count / 2**20:.1f} MiB"
+    """``1.5 GiB`` and the like: always in GiB, so that any two sizes can be compared at a glance."""
+    gib = count / 2**30
+    return f"{gib:.1f} GiB" if gib >= 0.1 else f"{gib:.3f} GiB" if gib >= 0.001 else "under 0.001 GiB"
 
 
 def check_memory(config: Config, loop_shapes: Any, replay_bytes: int, steps_per_iteration: int) -> str:
@@ -107,8 +108,7 @@ def check_memory(config: Config, loop_shapes: Any, replay_bytes: int, steps_per_
         seeds = "1 seed" if config.seeds == 1 else f"{config.seeds} seeds"
         raise RequestError(
             f"a replay of {config.replay_transitions} transitions for {seeds} needs "
-            f"{replay} bytes ({show_bytes(replay)}), and networks and rollouts {show_bytes(beside)} more; "
-            f"there are {there} bytes ({show_bytes(there)}): {mend}"
+            f"{show_bytes(replay)}, and networks and rollouts {show_bytes(beside)} more; there are {show_bytes(there)}: {mend}"
         )
     return f"replay {show_bytes(replay)} of {show_bytes(there)}"
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.report import videos, viewer
-from jaxrl_vis.run.checkpoint import Checkpoints, Restored
+from jaxrl_vis.run.checkpoint import FULL, LIGHT, Checkpoints, Restored
 from jaxrl_vis.run.folder import read_config
 from jaxrl_vis.run.memory import check_compiled
 from jaxrl_vis.run.trainer import Trainer, make_trainer
@@ -22,21 +22,28 @@ def open_run(run_dir: Path | str, **changes: object) -> Trainer:
     return make_trainer(read_config(Path(run_dir)).replace(**changes))
 
 
-def load(trainer: Trainer, run_dir: Path | str) -> Restored:
-    """The newest good learner of a run.
+def load(trainer: Trainer, run_dir: Path | str, checkpoint: int | None = None) -> Restored:
+    """A learner that a run has saved.
 
     Args:
         trainer: From `open_run`.
         run_dir: The run folder.
+        checkpoint: Its iteration; None: the newest good one.
 
     Raises:
-        RequestError: There is none.
+        RequestError: There is none, or none that can be used.
     """
     checkpoints = Checkpoints(Path(run_dir) / "checkpoints", read_only=True)
+    kept = sorted({*checkpoints.iterations(LIGHT), *checkpoints.iterations(FULL)})
+    if checkpoint is not None and kept and checkpoint not in kept:
+        there = ", ".join(map(str, kept))
+        raise RequestError(f"the run in {run_dir} keeps no checkpoint of iteration {checkpoint}; it keeps {there}")
     try:
-        restored = checkpoints.restore_train(trainer.shapes)
+        restored = checkpoints.restore_train(trainer.shapes, checkpoint)
     finally:
         checkpoints.close()
+    if restored is None and kept and checkpoint is not None:
+        raise RequestError(f"checkpoint {checkpoint} of the run in {run_dir} is damaged: leave it out for the newest good one")
     if restored is None:
         raise RequestError(f"the run in {run_dir} has no usable checkpoint: train it first")
     return restored
@@ -67,7 +74,7 @@ def play_run(run_dir: Path | str, out: Path | str, episodes: int = 6, three_dime
 
     Args:
         run_dir: The run folder.
-        out: .gif, .mp4 (needs imageio-ffmpeg), .html or .png.
+        out: .gif, .mp4 (needs imageio-ffmpeg, the extra ``video``), .html or .png.
         episodes: How many to show.
         three_dimensional: Write an .html page for brax's viewer (needs brax) instead of the robot's images; for state
             variants, too.

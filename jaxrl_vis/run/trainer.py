@@ -13,10 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from jaxrl_vis.config import Config
-from jaxrl_vis.errors import NonFiniteError, Terminated
-from jaxrl_vis.learner.environment import make_env
+from jaxrl_vis.devices import check_devices
+from jaxrl_vis.errors import NonFiniteError, RequestError, Terminated
+from jaxrl_vis.learner.environment import locate_env, make_env
 from jaxrl_vis.learner.train_step import make_train_step
 from jaxrl_vis.run.folder import RunFolder, default_folder
 from jaxrl_vis.run.loop import Report, RunLoop
@@ -85,7 +87,12 @@ class Trainer:
         Args:
             key: A typed key. With one seed it is that seed's key, so ``init(jax.random.key(0))`` is what `run` starts from with
                 ``seed=0``; with several it is split into one each. Or [S] keys, taken as they are.
+
+        Raises:
+            RequestError: ``key`` is a seed, or a key of the old kind.
         """
+        if not (hasattr(key, "dtype") and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)):
+            raise RequestError(f"init takes a typed JAX key, such as jax.random.key(0), not {key!r}")
         if key.ndim == 0:
             key = key[None] if self.config.seeds == 1 else jax.random.split(key, self.config.seeds)
         return self.programs.init(key)
@@ -133,14 +140,17 @@ def make_trainer(config: Config, run_dir: Path | str | None = None, resume: bool
     Args:
         config: The run.
         run_dir: Where `Trainer.run` puts its files; None: below ``runs/``, named after the configuration.
-        resume: Go on with the run in that folder; a folder without a run starts at the beginning, and says so.
+        resume: Go on with the run in that folder; in an empty one it starts at the beginning, and says so.
         overwrite: Delete the run in that folder and start again.
 
     Raises:
         RequestError: The configuration asks for something that cannot be, or contradicts the saved run.
     """
+    if not isinstance(config, Config):
+        raise RequestError(f"make_trainer takes a configuration, such as jaxrl_vis.preset('cpu'), not {config!r}")
     if run_dir is not None:
         RunFolder(Path(run_dir)).check(config, resume, overwrite)  # building an environment takes a while: refuse before
     with shielded_children():  # threads that JAX starts with its first use of a device never see signals
-        jax.devices()
+        check_devices()
+    config = locate_env(config)
     return Trainer(config, make_train_step(make_env(config), config), run_dir, resume, overwrite)

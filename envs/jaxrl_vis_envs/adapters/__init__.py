@@ -1,5 +1,5 @@
 """The environments behind other libraries' interfaces: `adapters.brax` and `adapters.gymnasium`.
 
-Each needs the library it is named after (``pip install 'jaxrl-vis[brax]'``, ``pip install 'jaxrl-vis[gymnasium]'``), and says
-so where that is missing. Nothing else in this package imports them.
+Each needs the library it is named after, and says so where that is missing. brax comes with jaxrl-vis; Gymnasium is an extra:
+``pip install 'jaxrl-vis[gymnasium]'``, or in a clone ``pip install '.[gymnasium]'``. Nothing else in this package imports them.
 """

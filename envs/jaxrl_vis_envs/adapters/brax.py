@@ -25,14 +25,13 @@ import numpy as np
 
 from jaxrl_vis_envs.adapters.rewards import Reward, reward_function
 from jaxrl_vis_envs.base import GoalEnv, State
-from jaxrl_vis_envs.physics import mjx_model  # noqa: F401 - before brax, for it imports MJX without MJX's remarks on stdout
 from jaxrl_vis_envs.registry import make
 
 try:
     from brax.envs.base import Env
     from brax.envs.base import State as BraxState
 except ImportError as error:
-    raise ImportError("this adapter needs brax: pip install 'jaxrl-vis[brax]'") from error
+    raise ImportError("this adapter needs brax, which comes with jaxrl-vis, but it is missing: pip install brax") from error
 
 
 class BraxEnv(Env):
@@ -66,6 +65,7 @@ class BraxEnv(Env):
 
         Brax's wrappers read the batch's shape from such an untyped key, so what they wrap needs untyped ones.
         """
+        self.goal_env.check_key(rng)
         is_typed = jnp.issubdtype(rng.dtype, jax.dtypes.prng_key)
         episode = self.goal_env.reset(rng if is_typed else jax.random.wrap_key_data(rng))
         physics: Any = episode  # brax's annotation asks for a state of its own physics, but brax never looks inside

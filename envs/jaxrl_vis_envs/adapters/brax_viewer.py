@@ -10,12 +10,10 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from jaxrl_vis_envs.physics import mjx_model  # noqa: F401 - before brax, for it imports MJX without MJX's remarks on stdout
-
 try:
     from brax.io import html
 except ImportError as error:
-    raise ImportError("the 3-D viewer needs brax: pip install 'jaxrl-vis[brax]'") from error
+    raise ImportError("the 3-D viewer needs brax, which comes with jaxrl-vis, but it is missing: pip install brax") from error
 
 # What brax's viewer calls the shapes that it can draw.
 _SHAPES = {

@@ -31,7 +31,9 @@ try:
     from gymnasium.vector import AutoresetMode
     from gymnasium.vector.utils import batch_space
 except ImportError as error:
-    raise ImportError("this adapter needs Gymnasium: pip install 'jaxrl-vis[gymnasium]'") from error
+    raise ImportError(
+        "this adapter needs Gymnasium: pip install 'jaxrl-vis[gymnasium]' (in a clone: pip install '.[gymnasium]')"
+    ) from error
 
 from jaxrl_vis_envs.adapters.gymnasium_environments import Environments, Observations
 from jaxrl_vis_envs.adapters.rewards import Reward
@@ -106,6 +108,15 @@ class GymnasiumEnv(gymnasium.Env):
     def compute_truncated(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any = None) -> np.ndarray:
         """Whether states cut an episode short: never, [...] bool. Only its length does, which a state does not tell."""
         return self.compute_terminated(achieved_goal, desired_goal, info)
+
+    def learner_view(self) -> tuple[np.ndarray, np.ndarray]:
+        """Observation and goal as a policy of this package takes them: planar [C, H, W] uint8, or [S] float32 (state tasks).
+
+        Raises:
+            gymnasium.error.ResetNeeded: There was no `reset`.
+        """
+        observation, goal = self._environments.learner_view()
+        return observation[0], goal[0]
 
     def render(self) -> Any:
         """An image [size, size, 3] uint8, or None where no render mode was asked for."""
@@ -214,6 +225,10 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
             observations, infos = self._restart()
             infos |= last_infos
         return observations, reward, never, all_over.copy(), infos
+
+    def learner_view(self) -> tuple[np.ndarray, np.ndarray]:
+        """Those of all environments, [N, ...]; see `GymnasiumEnv.learner_view`."""
+        return self._environments.learner_view()
 
     def render(self) -> tuple[Any, ...] | None:
         """Images [size, size, 3] uint8, one for each environment, or None where no render mode was asked for."""

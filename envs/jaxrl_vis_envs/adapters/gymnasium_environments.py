@@ -24,7 +24,7 @@ class _Programs(NamedTuple):
     Attributes:
         env: The environment.
         space: The observation space of one environment.
-        reset: seeds [N] uint32 -> (State, observations).
+        reset: seeds [N] uint32 -> (State, observations, goals [N, ...] as the task shows them to its learner).
         step: (State, donated; actions [N, A] float32) -> (State, observations but for ``goal_pixels``, which stay).
     """
 
@@ -69,19 +69,20 @@ def _programs(env: GoalEnv) -> _Programs:
         vector = state.achieved_state if observe_state is None else observe_state(state.data)
         return {"observation": vector, **observation, "pixels": _to_public(env.observe(state))}
 
-    def reset(seeds: jax.Array) -> tuple[State, dict[str, jax.Array]]:
+    def reset(seeds: jax.Array) -> tuple[State, dict[str, jax.Array], jax.Array]:
         state = jax.vmap(lambda seed: env.reset(jax.random.key(seed)))(seeds)
         assert state.obs is not None
-        goals = {"goal_pixels": _to_public(state.obs["desired_goal"])} if sees_images else {}
+        goal = state.obs["desired_goal"]
+        goals = {"goal_pixels": _to_public(goal)} if sees_images else {}
         # Images are handed out, not carried.
         state = state.replace(obs=None)
-        return state, {**jax.vmap(observe)(state), **goals}
+        return state, {**jax.vmap(observe)(state), **goals}, goal
 
     def step(state: State, actions: jax.Array) -> tuple[State, dict[str, jax.Array]]:
         state = jax.vmap(env.advance)(state, actions)
         return state, jax.vmap(observe)(state)
 
-    _, shapes = jax.eval_shape(reset, jax.ShapeDtypeStruct((1,), jnp.uint32))
+    _, shapes, _ = jax.eval_shape(reset, jax.ShapeDtypeStruct((1,), jnp.uint32))
     return _Programs(env, _space(shapes), env_jit(reset), env_jit(step, donate_argnums=0))
 
 
@@ -136,6 +137,7 @@ class Environments:
         self._camera = None if render_mode is None else _camera(self.env, render_size)
         self._state: State | None = None
         self._goal_pixels: Observations = {}
+        self._view: tuple[np.ndarray, np.ndarray] | None = None
 
     @property
     def is_over(self) -> bool:
@@ -144,10 +146,11 @@ class Environments:
 
     def reset(self, seeds: np.ndarray) -> Observations:
         """Starts the episodes of ``seeds`` [N] uint32."""
-        self._state, observations = self.programs.reset(seeds)
+        self._state, observations, goal = self.programs.reset(seeds)
         self.steps = 0
         observations = _to_host(observations)
         self._goal_pixels = {name: observations[name].copy() for name in observations if name == "goal_pixels"}
+        self._view = _planar(observations), np.array(goal)
         return observations
 
     def step(self, actions: Any) -> tuple[Observations, np.ndarray]:
@@ -164,7 +167,10 @@ class Environments:
             raise ValueError(f"actions must have the shape {expected}, got {actions.shape}")
         self._state, observations = self.programs.step(self._state, actions)
         self.steps += 1
-        observations = _to_host(observations) | {name: images.copy() for name, images in self._goal_pixels.items()}
+        observations = _to_host(observations)
+        assert self._view is not None
+        self._view = _planar(observations), self._view[1]
+        observations |= {name: images.copy() for name, images in self._goal_pixels.items()}
         # Scored here, and not by the compiled step, so that it is `compute_reward` of what was handed out to the last bit.
         return observations, self.score(observations["achieved_goal"], observations["desired_goal"])
 
@@ -172,6 +178,16 @@ class Environments:
         """``is_success`` [N] bool and ``goal_distance`` [N] float32."""
         distance = -reward_function("dense", self.env.threshold)(observations["achieved_goal"], observations["desired_goal"])
         return {"is_success": distance <= self.env.threshold, "goal_distance": distance}
+
+    def learner_view(self) -> tuple[np.ndarray, np.ndarray]:
+        """Observations and goals [N, ...] as the task itself shows them to a learner, see `GymnasiumEnv.learner_view`.
+
+        Raises:
+            gymnasium.error.ResetNeeded: There was no `reset`.
+        """
+        if self._view is None:
+            raise gymnasium.error.ResetNeeded("call reset() before learner_view()")
+        return self._view
 
     def render(self) -> np.ndarray | None:
         """Images [N, size, size, 3] uint8, or None where no render mode was asked for.
@@ -184,6 +200,13 @@ class Environments:
         if self._state is None:
             raise gymnasium.error.ResetNeeded("call reset() before render()")
         return np.array(self._camera(self._state.data))
+
+
+def _planar(observations: Observations) -> np.ndarray:
+    """What a learner sees: copies of images [N, C, H, W] uint8, or of vectors [N, S] float32."""
+    if "pixels" in observations:
+        return np.array(np.moveaxis(observations["pixels"], -1, -3), order="C")
+    return observations["observation"].copy()
 
 
 def _to_host(observations: dict[str, jax.Array]) -> Observations:

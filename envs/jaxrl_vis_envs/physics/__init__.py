@@ -4,5 +4,4 @@ mjx_model           loading a model, and stepping it: `step`, `take_steps`, `sim
 newton              the constraint solver for models of few joints; all others are left to MJX
 kinematics          poses of all bodies at once
 inverse_kinematics  joint angles that bring the last link of a chain to a pose
-quiet_mjx           MJX and its private parts, imported without what they print
 """

@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-
-from jaxrl_vis_envs.physics.quiet_mjx import math, mjx, smooth, support
+from mujoco import mjx
+from mujoco.mjx._src import math, smooth, support
 
 _ONE_DEGREE_OF_FREEDOM = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 

@@ -9,10 +9,11 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from mujoco import mjx
+from mujoco.mjx._src import math, sensor, smooth, solver
 
 from jaxrl_vis_envs.physics import newton
 from jaxrl_vis_envs.physics.kinematics import kinematics
-from jaxrl_vis_envs.physics.quiet_mjx import math, mjx, sensor, smooth, solver
 
 __all__ = [
     "kinematics",

@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-
-from jaxrl_vis_envs.physics.quiet_mjx import mjx, support
+from mujoco import mjx
+from mujoco.mjx._src import support
 
 # Written out, a factorization has a sixth of the cube of this many operations.
 _MOST_JOINTS = 12

@@ -59,17 +59,22 @@ class MjxGoalEnv(GoalEnv):
 
     @abc.abstractmethod
     def sample_start(self, key: jax.Array) -> mjx.Data:
-        """The start of the episode ``reset(key)``."""
+        """The start of the episode ``reset(key)``, with poses that belong to its ``qpos``; ``key`` is [], typed."""
 
     @abc.abstractmethod
     def sample_goal(self, key: jax.Array) -> mjx.Data:
-        """The configuration that the goal image of ``reset(key)`` shows."""
+        """The configuration that the goal image of ``reset(key)`` shows, with its poses; ``key`` is [], typed."""
 
     @abc.abstractmethod
     def act(self, data: mjx.Data, action: jax.Array) -> mjx.Data:
         """The physics of one control step, of ``self._model``, whose numbers may vary (see `randomization`).
 
-        ``action`` is [A] float32, all finite and within [-1, 1], or in a somewhat other range where its scale varies.
+        Args:
+            data: The physics state, poses included.
+            action: [A] float32, all finite and within [-1, 1], or in a somewhat other range where its scale varies.
+
+        Returns:
+            The physics state `control_period` seconds later, poses included.
         """
 
     @abc.abstractmethod
@@ -85,6 +90,7 @@ class MjxGoalEnv(GoalEnv):
         """What the state task sees: [S] float32."""
 
     def reset(self, key: jax.Array) -> State:
+        self.check_key(key)
         data, goal_data = self.sample_start(key), self.sample_goal(key)
         domain = randomization.sample(key, self._randomization, self._model, self.action_size, self._scene)
         state = self.state_at(data, self.goal_state_of(key, goal_data), domain)

@@ -1,0 +1,67 @@
+"""Writes the table of docs/configuration.md from `jaxrl_vis.config`; a test fails where the page is not what this writes.
+
+python docs/tools/configuration.py
+"""
+
+import dataclasses
+import inspect
+import re
+from pathlib import Path
+
+from jaxrl_vis import fields
+from jaxrl_vis.cli.parsing import _described
+from jaxrl_vis.config import PRESETS, Config
+from jaxrl_vis.run.folder import MAY_CHANGE
+
+PAGE = Path(__file__).resolve().parents[1] / "configuration.md"
+BEGIN, END = "<!-- fields: begin -->\n", "<!-- fields: end -->"
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, tuple):
+        return " ".join(map(str, value)) or "none"
+    return f"{value:,}" if type(value) is int and value >= 10_000 else str(value)
+
+
+def _default(name: str) -> str:
+    """What ``fast`` says, and after it the presets that say something else."""
+    values = {preset: getattr(config, name) for preset, config in PRESETS.items()}
+    others = [f"{preset}: {_shown(value)}" for preset, value in values.items() if value not in (values["fast"], preset)]
+    return "<br>".join([f"**{_shown(values['fast'])}**", *others])
+
+
+def _groups() -> dict[str, str]:
+    """Field -> the comment that heads its group in the source."""
+    group, found = "What to train", {}
+    for line in inspect.getsource(Config).splitlines():
+        if head := re.fullmatch(r"    # -- (.*)", line):
+            group = head[1]
+        elif field := re.match(r"    (\w+): .* = ", line):
+            found[field[1]] = group
+    return found
+
+
+def table() -> str:
+    """All fields, group by group."""
+    groups, lines, last = _groups(), [], ""
+    for field, hint, _, text in _described(Config):
+        if groups[field.name] != last:
+            last = groups[field.name]
+            lines += ["", f"## {last}", "", "| field | default | meaning |", "|---|---|---|"]
+        allowed = fields.choices(hint)
+        choices = f" One of {', '.join(f'`{choice}`' for choice in allowed)}." if allowed else ""
+        mark = " ↻" if field.name in MAY_CHANGE else ""
+        lines.append(f"| `{field.name}`{mark} | {_default(field.name)} | {text}{choices} |".replace("  ", " "))
+    assert set(groups) == {field.name for field in dataclasses.fields(Config)}
+    return "\n".join([*lines[1:], ""])
+
+
+def page(text: str) -> str:
+    """The page with its table as it is to be."""
+    before, _, rest = text.partition(BEGIN)
+    _, _, after = rest.partition(END)
+    return f"{before}{BEGIN}{table()}{END}{after}"
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(PAGE.read_text()))

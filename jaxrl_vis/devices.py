@@ -1,0 +1,70 @@
+"""What there is to compute on: asked of JAX, or, where an answer must not wait for JAX, guessed."""
+
+import importlib.util
+import os
+from pathlib import Path
+
+from jaxrl_vis.errors import RequestError
+
+# The packages by which JAX reaches an accelerator, and files that show that the machine has one.
+_NVIDIA = (("jax_cuda12_plugin", "jax_cuda13_plugin"), ("/dev/nvidiactl", "/dev/nvidia0", "/dev/dxg"))
+_TPU = (("libtpu",), ("/dev/accel0", "/dev/vfio/0"))
+
+
+def check_devices() -> None:
+    """Starts JAX, which fails where it is told to use what is not there.
+
+    Raises:
+        RequestError: JAX_PLATFORMS asks for a platform that JAX cannot use here.
+    """
+    import jax
+
+    asked = jax.config.jax_platforms
+    try:
+        jax.default_backend()
+        jax.devices()
+    except (RuntimeError, AssertionError) as error:
+        if not asked:
+            raise RequestError(f"JAX finds no device to compute on: {' '.join(str(error).split())}") from error
+        there = _platforms_without(asked)
+        raise RequestError(f"JAX_PLATFORMS={asked}, but JAX finds no such device here, only {there}{_mend(asked)}") from error
+
+
+def guess_accelerator() -> bool:
+    """Whether JAX will run on an accelerator: asked without importing JAX, so a guess, for help that comes at once."""
+    asked = [word.strip() for word in os.environ.get("JAX_PLATFORMS", "").split(",") if word.strip()]
+    if asked:
+        return asked[0] != "cpu"
+    return any(_is_installed(packages) and _is_there(files) for packages, files in (_NVIDIA, _TPU))
+
+
+def _is_installed(packages: tuple[str, ...]) -> bool:
+    return any(importlib.util.find_spec(package) for package in packages)
+
+
+def _is_there(files: tuple[str, ...]) -> bool:
+    return any(Path(file).exists() for file in files)
+
+
+def _platforms_without(asked: str) -> str:
+    """What JAX finds if it is not told what to use: such as ``cpu``. What it is told stays as it is."""
+    import jax
+    from jax.extend.backend import clear_backends
+
+    try:
+        jax.config.update("jax_platforms", "")
+        return jax.default_backend()
+    except (RuntimeError, AssertionError):
+        return "nothing"
+    finally:
+        jax.config.update("jax_platforms", asked)
+        clear_backends()  # or else the next question would be answered with what was found here
+
+
+def _mend(asked: str) -> str:
+    wanted = {word.strip().lower() for word in asked.split(",")}
+    if "cpu" in wanted:
+        return "; write JAX_PLATFORMS=cpu"
+    packages, files = _NVIDIA
+    install = wanted & {"cuda", "gpu"} and _is_there(files) and not _is_installed(packages)
+    return "; install this project with the extra cuda12 or cuda13" if install else "; unset JAX_PLATFORMS to run on that"

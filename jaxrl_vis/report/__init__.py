@@ -1,0 +1,1 @@
+"""What people look at: curves, videos, the gallery of tasks, the 3-D viewer."""

@@ -1,0 +1,137 @@
+"""What a run has learned, as a function.
+
+policy = load_policy("runs/mine")
+action = policy(observation, goal)              # one environment: planar [C, H, W] uint8, or [S] float32
+actions = jax.vmap(policy)(observations, goals) # many
+"""
+
+import dataclasses
+import functools
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxrl_vis.config import Config
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.learner.networks import Networks
+from jaxrl_vis.run.programs import enable_compilation_cache
+from jaxrl_vis.run.trained import load, open_run
+from jaxrl_vis.types import NormalizerState, Params
+from jaxrl_vis_envs.base import GoalEnv
+
+_Parameters = tuple[Params, NormalizerState, NormalizerState]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Policy:
+    """A trained actor without exploration, normalisation included. Make it with `load_policy`; call it, vmap it, scan it.
+
+    Attributes:
+        env: The environment that it was trained on, with the image size and all other options of the run.
+        config: The configuration of the run.
+        seed: Which of the run's seeds this is.
+        iteration: The iteration that its checkpoint was saved after.
+        parameters: The actor, and the statistics that observations and goals are normalised with.
+    """
+
+    env: GoalEnv
+    config: Config
+    seed: int
+    iteration: int
+    parameters: _Parameters = dataclasses.field(repr=False)
+    _networks: Networks = dataclasses.field(repr=False)
+
+    @property
+    def env_name(self) -> str:
+        """The name of the environment, as `jaxrl_vis_envs.make` takes it."""
+        return self.config.env
+
+    @property
+    def observation_spec(self) -> jax.ShapeDtypeStruct:
+        """Shape and dtype of an observation, and of a goal: [C, H, W] uint8 or [S] float32."""
+        return self.env.observation_spec
+
+    @property
+    def action_size(self) -> int:
+        """A, the length of an action."""
+        return self.env.action_size
+
+    def __call__(self, observation: Any, goal: Any) -> jax.Array:
+        """What to do now.
+
+        Args:
+            observation: What `GoalEnv.observe` shows: planar [C, H, W] uint8, or [S] float32 for state tasks.
+            goal: What ``obs["desired_goal"]`` shows, in the same form.
+
+        Returns:
+            [A] float32 in [-1, 1].
+
+        Raises:
+            RequestError: A shape or a dtype is another.
+        """
+        self._check("observation", observation)
+        self._check("goal", goal)
+        return self._act(self.parameters, observation, goal)
+
+    @functools.cached_property
+    def _act(self) -> Any:
+        networks = self._networks
+
+        def act(parameters: _Parameters, observation: jax.Array, goal: jax.Array) -> jax.Array:
+            actor, *statistics = parameters
+            dtype = self.observation_spec.dtype
+            latents = [
+                networks.encode(actor, networks.prepare(each, jnp.asarray(seen, dtype)[None]))
+                for each, seen in zip(statistics, (observation, goal), strict=True)
+            ]
+            return networks.act(actor, jnp.stack(latents))[0]
+
+        return jax.jit(act)
+
+    def _check(self, name: str, value: Any) -> None:
+        """Raises a RequestError unless ``value`` looks like an observation."""
+        spec = self.observation_spec
+        shape, wanted = np.shape(value), tuple(spec.shape)
+        if shape != wanted:
+            mend = ""
+            if shape[1:] == wanted:
+                mend = ": jax.vmap(policy) takes a batch"
+            elif len(wanted) == 3 and shape == (*wanted[1:], wanted[0]):
+                mend = f": images are planar here, so move the channels first, np.moveaxis({name}, -1, 0)"
+            elif len(wanted) == 3 and name == "goal" and shape == (wanted[0] // self.env.frame_stack, *wanted[1:]):
+                mend = f": repeat the goal's image {self.env.frame_stack} times, as policy.env.as_goal does"
+            raise RequestError(f"{self.env_name}: {name} must have the shape {wanted}, not {shape}{mend}")
+        dtype = np.dtype(getattr(value, "dtype", None) or np.asarray(value).dtype)
+        if spec.dtype == jnp.uint8:
+            if dtype != np.uint8:
+                raise RequestError(f"{self.env_name}: {name} must be uint8 from 0 to 255, not {dtype}")
+        elif not jnp.issubdtype(dtype, jnp.floating):
+            raise RequestError(f"{self.env_name}: {name} must be {spec.dtype}, not {dtype}")
+
+
+def load_policy(run_dir: Path | str, seed: int | None = None, checkpoint: int | None = None) -> Policy:
+    """The policy that a run has trained, on whatever platform JAX runs on here.
+
+    Args:
+        run_dir: The run folder.
+        seed: Which seed of a run with several; None: the first.
+        checkpoint: The iteration of a checkpoint that the run keeps; None: the newest good one.
+
+    Raises:
+        RequestError: There is no run, no such seed or checkpoint, or none that can be used; or its task cannot be made here.
+    """
+    trainer = open_run(run_dir)
+    seed = trainer.config.seed if seed is None else seed
+    if seed not in trainer.seeds:
+        trained = f"seed {trainer.seeds[0]}" if len(trainer.seeds) == 1 else f"seeds {trainer.seeds[0]} to {trainer.seeds[-1]}"
+        raise RequestError(f"the run in {run_dir} has trained no seed {seed}, only {trained}")
+    restored = load(trainer, run_dir, checkpoint)
+    enable_compilation_cache()
+    train = restored.train
+    parameters = (train.actor, train.normalizer, train.goal_statistics)
+    index = trainer.seeds.index(seed)
+    of_seed = jax.tree.map(lambda leaf: jnp.asarray(leaf[index]), parameters)
+    return Policy(trainer.env, trainer.config, seed, restored.iteration, of_seed, trainer.program.networks)
