@@ -206,8 +206,8 @@ def clone(shell: Shell, python: Path) -> None:
     shell.type(f"git clone --quiet {CHECKOUT} jaxrl-vis")
     shell.folder /= "jaxrl-vis"
     shell.type("make help", shows="make train")
-    tiny_run = f"PRESET=debug RUN_DIR=runs/mine PYTHON={python}"
-    shell.type(f"make train {tiny_run} ARGS='--env-steps 400' && ls runs/mine", shows="video.gif")
+    tiny_run = f"PRESET=debug RUN_DIR=runs/first PYTHON={python}"
+    shell.type(f"make train {tiny_run} ARGS='--env-steps 400' && ls runs/first", shows="video.gif")
     shell.type(".venv/bin/python --version", shows=f"Python {python.name.removeprefix('python')}")
     shell.activate(shell.folder / ".venv")
     for line in readme_commands():

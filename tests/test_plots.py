@@ -1,5 +1,10 @@
 """The images that a run leaves behind: the curve and the video."""
 
+import contextlib
+import sys
+import types
+import warnings
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -93,6 +98,29 @@ def test_other_formats(tmp_path):
     vectors = videos.EpisodeImages(np.zeros((2, 6, 10), np.float32), np.zeros((2, 10), np.float32), np.zeros(2))
     with pytest.raises(RequestError, match="not images"):
         videos.write_video(vectors, tmp_path / "b.gif")
+
+
+def test_frames_of_an_mp4_have_even_sizes_and_starting_ffmpeg_warns_of_nothing(tmp_path, monkeypatch, recwarn):
+    class Writer(contextlib.AbstractContextManager):
+        frames: list[np.ndarray] = []
+
+        def __exit__(self, *error):
+            pass
+
+        def append_data(self, frame):
+            self.frames.append(frame)
+            warnings.warn(
+                "os.fork() was called. os.fork() is incompatible with multithreaded code", RuntimeWarning, stacklevel=1
+            )
+
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", types.ModuleType("imageio_ffmpeg"))
+    monkeypatch.setattr("imageio.v2.get_writer", lambda *args, **options: Writer())
+    episodes = make_images(1)
+    videos.write_video(episodes, tmp_path / "a.mp4")
+    (odd,) = {image.size for image in videos.draw_frames(episodes, 0.04, 6)[0]}
+    assert odd[1] % 2
+    assert {frame.shape for frame in Writer.frames} == {(odd[1] + 1, odd[0] + odd[0] % 2, 3)}
+    assert not recwarn.list
 
 
 def test_mp4_needs_a_package_and_says_so(tmp_path):

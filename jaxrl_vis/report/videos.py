@@ -6,6 +6,7 @@ Images are planar, [C, H, W] uint8, and are shown in rows: colour, then depth, w
 import base64
 import dataclasses
 import io
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -240,7 +241,11 @@ def write_video(episodes: EpisodeImages, path: Path, frame_seconds: float = 0.04
         import imageio.v2 as imageio
 
         rate = max(1, round(1 / frame_seconds))
-        with imageio.get_writer(path, fps=rate, macro_block_size=2, quality=8) as writer:
+        width, height = images[0].size
+        even = (0, 0, width + width % 2, height + height % 2)  # what most players ask for
+        with warnings.catch_warnings(), imageio.get_writer(path, fps=rate, macro_block_size=2, quality=8) as writer:
+            # ffmpeg starts at the first frame, and JAX warns of every fork, also of one that becomes another program at once.
+            warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
             for image, duration in zip(images, seconds, strict=True):
                 for _ in range(max(1, round(duration * rate))):
-                    writer.append_data(np.asarray(image))
+                    writer.append_data(np.asarray(image.crop(even)))
