@@ -3,7 +3,9 @@
 import gc
 import getpass
 import os
+import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +34,25 @@ def checkout() -> Path:
 def clean_environment(checkout: Path) -> dict[str, str]:
     """Environment variables for a subprocess that imports the checkout."""
     return {**os.environ, "PYTHONPATH": os.pathsep.join((str(checkout), str(checkout / "envs")))}
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The current folder, empty; what is imported or registered from it is forgotten after the test."""
+    from jaxrl_vis_envs import registry
+
+    folder = tmp_path / "here"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    before, registered = set(sys.modules), set(registry._ENTRIES)
+    yield folder
+    for name in set(registry._ENTRIES) - registered:
+        if not registry.is_built_in(name):
+            del registry._ENTRIES[name]
+    for name in set(sys.modules) - before:
+        if str(tmp_path) in str(getattr(sys.modules[name], "__file__", "") or ""):
+            del sys.modules[name]
 
 
 @pytest.fixture(scope="session")

@@ -45,15 +45,14 @@ def start() -> State:
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(here: Path) -> Path:
     """The current folder: runs/mine, which is trained no further than its config.json, and a task in my_task.py."""
-    monkeypatch.chdir(tmp_path)
-    run = tmp_path / "runs" / "mine"
+    run = here / "runs" / "mine"
     (run / "checkpoints").mkdir(parents=True)
     (run / "config.json").write_text(json.dumps({"schema": 1, "config": {"env": "Reacher", "preset": "debug"}}))
-    (tmp_path / "my_task.py").write_text("class MyReach:\n    pass\n")
-    (tmp_path / "model.zip").write_text("")
-    return tmp_path
+    (here / "my_task.py").write_text("class MyReach:\n    pass\n")
+    (here / "model.zip").write_text("")
+    return here
 
 
 @pytest.mark.parametrize(("mistake", "shown"), [row[:2] for row in ROWS], ids=[row[0] for row in ROWS])

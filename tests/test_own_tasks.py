@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -61,23 +61,6 @@ class OldReset(PointMass):
 register("VisualPush", MyReach, MyConfig, state_variant="Push")
 helper = 3
 '''
-
-
-@pytest.fixture
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """The current folder, empty; what is imported or registered from it is forgotten after the test."""
-    folder = tmp_path / "here"
-    folder.mkdir()
-    monkeypatch.chdir(folder)
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    before, registered = set(sys.modules), set(registry._ENTRIES)
-    yield folder
-    for name in set(registry._ENTRIES) - registered:
-        if not registry.is_built_in(name):
-            del registry._ENTRIES[name]
-    for name in set(sys.modules) - before:
-        if str(tmp_path) in str(getattr(sys.modules[name], "__file__", "") or ""):
-            del sys.modules[name]
 
 
 @pytest.fixture
