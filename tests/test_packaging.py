@@ -26,7 +26,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
 )
 # The same for the environments.
 ENVIRONMENT_LAYERS: tuple[tuple[str, ...], ...] = (
-    ("checks", "compilation", "goals", "names"),
+    ("checks", "compilation", "goals", "names", "quiet_warp"),
     ("physics", "render"),
     ("randomization",),
     ("base",),
