@@ -341,14 +341,14 @@ def test_a_free_camera_stands_where_mujoco_puts_it() -> None:
     mj_model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{box}</worldbody></mujoco>")
     mj_data = mujoco.MjData(mj_model)
     mujoco.mj_forward(mj_model, mj_data)
-    frame = render(Scene.from_mjmodel(mj_model, free_view(), 32, 32), mj_data)
-    rows, columns = np.nonzero(np.asarray(frame.segmentation) == 0)
+    frame = shown(Scene.from_mjmodel(mj_model, free_view(), 32, 32), mj_data)
+    rows, columns = np.nonzero(frame.segmentation == 0)
     assert abs(rows.mean() - 15.5) < 0.5 and columns.min() > 16
-    np.testing.assert_allclose(np.asarray(frame.depth)[rows, columns].min(), 1.9, atol=1e-5)
+    np.testing.assert_allclose(frame.depth[rows, columns].min(), 1.9, atol=1e-5)
     behind = Scene.from_mjmodel(mj_model, free_view(azimuth=-90.0), 32, 32)
-    assert np.nonzero(np.asarray(render(behind, mj_data).segmentation) == 0)[1].max() < 15
+    assert np.nonzero(shown(behind, mj_data).segmentation == 0)[1].max() < 15
     default = Scene.from_mjmodel(mj_model, height=32, width=32)
-    assert np.asarray(render(default, mj_data).segmentation)[16, 16] == 0  # the middle of the model is in the middle
+    assert shown(default, mj_data).segmentation[16, 16] == 0  # the middle of the model is in the middle
 
 
 def test_a_camera_that_there_is_not_is_told() -> None:
