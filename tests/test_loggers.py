@@ -111,7 +111,7 @@ def test_both_show_what_the_run_has_written(tmp_path: Path, capsys: pytest.Captu
     assert '"num_envs": 2' in text.tensor.string_val[0].decode()
     last = wandb_runs(path)[0][-1]
     assert (last["env_steps"], last["video/_type"], last["curve/_type"]) == (80, "video-file", "image-file")
-    (file,) = path.glob(f"wandb/*/run-{json.loads((path / 'wandb.json').read_text())['1']['id']}.wandb")
+    (file,) = path.glob(f"wandb/*run-*/run-{json.loads((path / 'wandb.json').read_text())['1']['id']}.wandb")
     run, *_ = [record.run for record in records(file) if record.WhichOneof("record_type") == "run"]
     config = {item.key: json.loads(item.value_json) for item in run.config.update}
     assert (run.run_group, run.display_name, run.project) == ("run", "run-seed1", "jaxrl-vis")
