@@ -10,6 +10,7 @@ SEED ?= 0
 PRESET ?= auto
 RUN_DIR ?= runs/seed$(SEED)-$(shell date +%Y%m%d-%H%M%S)
 ARGS ?=
+RESULTS ?=
 WORKERS ?= 2
 PYTHON ?= >=3.11,<3.14
 
@@ -48,8 +49,9 @@ format: $(STAMPS)/dev ## Mend style and format
 	@$(BIN)/ruff check --fix .
 	@$(BIN)/ruff format .
 
-bench-cpu: $(STAMPS)/base ## Run the five benchmarks at CPU sizes; records land in benchmarks/results
-	@for benchmark in render physics env update train; do JAX_PLATFORMS=cpu $(BIN)/jaxrl-vis bench $$benchmark $(ARGS); done
+bench-cpu: $(STAMPS)/base ## Run the five benchmarks at CPU sizes; records land in your cache, or in RESULTS=folder
+	@for benchmark in render physics env update train; do \
+		JAX_PLATFORMS=cpu $(BIN)/jaxrl-vis bench $$benchmark $(if $(RESULTS),--results "$(RESULTS)") $(ARGS); done
 
 pins: .venv/bin/python ## Write requirements/*.txt anew
 	@$(PINS) $(PINS_ARGS) pyproject.toml -o requirements/base.txt

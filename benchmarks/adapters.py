@@ -12,6 +12,7 @@ import os
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 # brax compiles by itself, without what `compilation.env_jit` would have asked for. Read by JAX at its first import: a script
@@ -164,10 +165,11 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--env", help="a state environment; default: one that the agent is known to learn")
     parser.add_argument("--steps", type=int, help="environment steps")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--results", type=Path, help="folder of kept records; default: in the user's cache")
     options = parser.parse_args(arguments)
     train, env, steps = TRAINERS[options.agent]
     measurement = train(options.env or env, options.steps or steps, options.seed)
-    compare_and_keep("adapters", measurement)
+    compare_and_keep("adapters", measurement, options.results)
     return 0 if measurement.details["success_after"] > measurement.details["success_before"] else 1
 
 

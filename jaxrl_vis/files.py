@@ -4,6 +4,11 @@ import os
 from pathlib import Path
 
 
+def user_cache() -> Path:
+    """The folder for what this project keeps for a user: ``jaxrl-vis`` in the user's cache folder."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxrl-vis"
+
+
 def write_atomically(path: Path, text: str) -> None:
     """Replaces a file's contents in one step: a reader, or a power cut, sees the old contents or the new ones.
 

@@ -4,6 +4,7 @@ As a script (`python fake_program.py RUN_DIR KIND`), it trains until somebody st
 """
 
 import math
+import signal
 import sys
 import time
 import types
@@ -14,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxrl_vis.config import Config
+from jaxrl_vis.errors import Terminated
 from jaxrl_vis.run import metrics
 from jaxrl_vis.run.checkpoint import Checkpoints
 from jaxrl_vis.run.trainer import Trainer
@@ -108,8 +110,21 @@ class FakeProgram:
         self.evaluate = jax.jit(jax.vmap(evaluate_one, in_axes=(0, None)))
 
 
-def make_fake_trainer(config: Config, run_dir: Path, resume: bool = False, overwrite: bool = False, **program) -> Trainer:
-    return Trainer(config, FakeProgram(config, **program), run_dir, resume=resume, overwrite=overwrite)
+def make_fake_trainer(
+    config: Config, run_dir: Path, resume: bool = False, overwrite: bool = False, log: tuple[str, ...] | None = None, **program
+) -> Trainer:
+    return Trainer(config, FakeProgram(config, **program), run_dir, resume=resume, overwrite=overwrite, log=log)
+
+
+def interrupted_at(trainer: Trainer, iteration: int) -> None:
+    """Runs until SIGTERM comes after ``iteration``, and is acted upon."""
+    try:
+        for report in trainer.run():
+            if report.iteration == iteration:
+                signal.raise_signal(signal.SIGTERM)
+    except Terminated:
+        return
+    raise AssertionError("the run did not end")
 
 
 def rows_without_time(path: Path) -> list[dict]:

@@ -23,6 +23,7 @@ import jaxrl_vis_envs
 from jaxrl_vis.bench.render_scenes import forward, scatter_joints
 from jaxrl_vis_envs.compilation import compiler_options
 from jaxrl_vis_envs.render import Frame, Scene, render
+from jaxrl_vis_envs.render.model.reading import FREE_CAMERA
 
 SEED = 0
 # OpenGL draws polygons where a ray caster draws balls, and lights their corners: with fine ones the two mean the same.
@@ -38,7 +39,8 @@ class RenderModel:
     Attributes:
         source: What it comes from: "ours", the name of a distribution, or "feature".
         load: Reads it; called without arguments.
-        camera: Name or index of one of its cameras; None for one that `build` adds.
+        camera: Name or index of one of its cameras; `FREE_CAMERA` for MuJoCo's default free one; None for one that `build`
+            adds.
         view: For an added camera: azimuth and elevation in degrees as MuJoCo's free camera counts them, and the distance in
             multiples of the model's extent.
         site_groups: Groups of sites that are drawn.
@@ -110,6 +112,12 @@ def _lower_ground(mj_model: mujoco.MjModel) -> None:
     mj_model.geom_pos[mj_model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD, 2] -= 0.4
 
 
+def _look_from_the_left(mj_model: mujoco.MjModel) -> None:
+    """Makes the model's free camera orthographic, and has it look from another side."""
+    view = mj_model.vis.global_
+    view.orthographic, view.fovy, view.azimuth, view.elevation = 1, 2.5, 20.0, -15.0
+
+
 _SUITE = ("acrobot", "ball_in_cup", "cartpole", "cheetah", "finger", "fish", "hopper", "humanoid", "humanoid_CMU")
 _SUITE += ("manipulator", "pendulum", "point_mass", "reacher", "stacker", "swimmer", "walker")
 
@@ -129,6 +137,8 @@ MODELS: dict[str, RenderModel] = {
     "mjx_shadow_hand": _mjx("shadow_hand/scene_right"),
     "mjx_barkour": _mjx("barkour_v0/assets/barkour_v0_mjx", 0, finish=_lower_ground),
     "mujoco_model": RenderModel("mujoco", _from_package("mujoco", "testdata/model.xml")),
+    "free_camera": _mjx("pendula", FREE_CAMERA),
+    "free_camera_ortho": _suite("humanoid", FREE_CAMERA, finish=_look_from_the_left),
     **{name: _feature(name) for name in FEATURES},
 }
 

@@ -2,6 +2,7 @@ import functools
 import json
 import time
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from jaxrl_vis import bench, provenance
-from jaxrl_vis.bench import peaks, record, roofline, timing, train, update, variation
+from jaxrl_vis.bench import conditions, peaks, record, roofline, timing, train, update, variation
 from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.settings import Settings
 from jaxrl_vis.config import preset
@@ -25,9 +26,16 @@ def measurement(value: float, envs: int = 4, unit: str = "images/s") -> Measurem
     )
 
 
+def under(speed: float = 1.0, **changes: Any) -> dict[str, Any]:
+    """Conditions of an idle machine, at ``speed`` times a speed."""
+    calibration = {"gflops": 100.0 * speed, "gbytes_per_s": 10.0 * speed}
+    same = {"machine": "a", "cores": 2, "busy_cores": 0.0, "calibration": {"before": calibration, "after": calibration}}
+    return {**same, **changes}
+
+
 def test_record_round_trip_and_change(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for value in (100.0, 110.0):
-        record.compare_and_keep("render", measurement(value), tmp_path)
+        record.compare_and_keep("render", measurement(value), tmp_path, under())
     record.compare_and_keep("render", measurement(50.0, envs=8), tmp_path)
     lines = capsys.readouterr().out.splitlines()
     assert "(first record)" in lines[0]
@@ -38,9 +46,56 @@ def test_record_round_trip_and_change(tmp_path: Path, capsys: pytest.CaptureFixt
     kept = {entry["config"]["envs"]: entry for entry in record.load(path)}
     assert {envs: entry["value"] for envs, entry in kept.items()} == {4: 110.0, 8: 50.0}
     assert kept[4]["config"]["sizes"] == [1, 2]
-    expected = {"schema", "name", "value", "unit", "config", "details", "device", "versions", "revision", "date"}
+    expected = {"conditions", "schema", "name", "value", "unit", "config", "details", "device", "versions", "revision", "date"}
     assert set(kept[4]) == expected
     assert kept[4]["versions"]["jax"] == jax.__version__
+
+
+@pytest.mark.parametrize(
+    ("now", "then", "why"),
+    [
+        (under(), None, "it does not say how fast its machine was"),
+        (under(machine="b"), under(), "it is of another machine of this name"),
+        (under(0.58), under(), "the machine itself runs at 0.58 times the speed that it had then"),
+        (under(busy_cores=1.2), under(), "other programs used 1.2 of 2 cores now"),
+        (under(), under(busy_cores=1.9), "other programs used 1.9 of 2 cores then"),
+        (
+            under(calibration={"before": {"gflops": 100.0}, "after": {"gflops": 60.0}}),
+            under(calibration={"before": {"gflops": 80.0}, "after": {"gflops": 80.0}}),
+            "while it was measured now, the machine's speed changed by -40%",
+        ),
+    ],
+)
+def test_only_like_is_compared_with_like(now: dict, then: dict | None, why: str) -> None:
+    """A machine of the same name at 0.58 times the speed was once told as a loss of 42 %."""
+    old, new = (record.to_record(measurement(value), each) for value, each in ((100.0, then), (58.0, now)))
+    line = record.describe(new, old)
+    assert line.endswith(f": {why})") and "not compared with 100 of" in line and "42" not in line and "-42 %" not in line
+
+
+def test_a_change_is_told_with_the_spread_of_the_repeats() -> None:
+    old, new = (record.to_record(measurement(value), under(speed)) for value, speed in ((100.0, 1.0), (97.0, 0.95)))
+    line = record.describe(new, old)
+    assert "-3.0 % against 100 of" in line and line.endswith("the same machine at the same speed)")
+    new["details"]["spread"] = 0.04
+    assert record.describe(new, old).endswith("the same speed, no more than the spread of the repeats, 4.0 %)")
+
+
+def test_the_machine_is_watched() -> None:
+    watch = conditions.Watch()
+    found = watch.conditions()
+    assert conditions.machine() == found["machine"] and len(found["machine"]) == 12
+    assert found["busy_cores"] is None or 0.0 <= found["busy_cores"] <= 2 * found["cores"]
+    for each in found["calibration"].values():
+        assert set(each) == {"gflops", "gbytes_per_s"} and all(value > 0.0 for value in each.values())
+    assert found["calibration"]["after"] == watch.conditions()["calibration"]["before"]
+
+
+def test_a_user_s_records_go_into_the_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    record.compare_and_keep("render", measurement(1.0))
+    assert [path.parent for path in tmp_path.rglob("*.json")] == [tmp_path / "jaxrl-vis" / "bench"]
+    assert "conditions" in record.load(record.results_path("render"))[0]
 
 
 def test_records_of_another_device_do_not_compare(tmp_path: Path) -> None:
@@ -61,7 +116,8 @@ def test_a_file_of_something_else_is_not_overwritten(tmp_path: Path) -> None:
 
 
 def test_json_holds_this_run_s_records(tmp_path: Path) -> None:
-    record.write_json(tmp_path / "deep" / "out.json", [measurement(1.0), measurement(2.0, envs=8)])
+    records = [record.to_record(measurement(1.0), under()), record.to_record(measurement(2.0, envs=8))]
+    record.write_json(tmp_path / "deep" / "out.json", records)
     assert [entry["value"] for entry in json.loads((tmp_path / "deep" / "out.json").read_text())] == [1.0, 2.0]
 
 

@@ -129,6 +129,13 @@ def test_importing_the_package_loads_no_jax(clean_environment: dict[str, str]) -
     subprocess.run([sys.executable, "-c", code], env=clean_environment, check=True)
 
 
+def test_mjx_does_not_print_that_warp_is_missing(clean_environment: dict[str, str]) -> None:
+    """Neither in our own imports nor in those that come after them; what else is printed there is printed."""
+    for code in ("import jaxrl_vis_envs; from mujoco import mjx", "import jaxrl_vis_envs.adapters.brax_viewer"):
+        done = subprocess.run([sys.executable, "-c", code], env=clean_environment, capture_output=True, text=True)
+        assert (done.returncode, done.stdout) == (0, ""), done.stdout + done.stderr
+
+
 def test_names_load_no_jax(clean_environment: dict[str, str]) -> None:
     code = "import sys, jaxrl_vis_envs.names, jaxrl_vis.errors; assert not {'jax', 'numpy', 'mujoco'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], env=clean_environment, check=True)

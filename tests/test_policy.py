@@ -1,6 +1,7 @@
 """`jaxrl_vis.load_policy`: what a run has learned, used elsewhere."""
 
 import dataclasses
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -192,3 +193,13 @@ def test_it_plays_in_gymnasium(name: str, policies: dict[str, jaxrl_vis.Policy])
     np.testing.assert_allclose(first[0], actions[0], atol=1e-6)
     envs.step(np.asarray(first))
     assert not np.array_equal(envs.learner_view()[0][0], envs.learner_view()[0][1])
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/adapters.md"])
+def test_examples_of_the_pages_run(page: str, runs: dict[str, Path], checkout: Path) -> None:
+    blocks = re.findall(r"```python\n(.*?)```", (checkout / page).read_text(), re.DOTALL)
+    (block,) = [each for each in blocks if "load_policy" in each]
+    names: dict[str, Any] = {"jax": jax, "jaxrl_vis": jaxrl_vis}
+    exec(compile(block.replace("runs/mine", str(runs["VisualTold"])), page, "exec"), names)
+    assert names["action"].shape == (1,)
+    assert page == "README.md" or names["actions"].shape == (16, 1) and names["truncated"]

@@ -70,7 +70,7 @@ def test_what_is_no_scene_is_refused_in_one_line(content: str | None, complaint:
 
 def test_a_missing_suite_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(render_scenes.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(RequestError, match="pip install dm_control"):
+    with pytest.raises(RequestError, match="pip install --no-deps dm_control"):
         render_scenes.load("finger")
 
 

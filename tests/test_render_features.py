@@ -325,3 +325,35 @@ def test_refusals_name_the_culprit_and_the_mend(case):
         Scene.from_mjmodel(mj_model, "above", **options)
     assert "\n" not in str(refusal.value)
     Scene.from_mjmodel(mj_model, "above", leave_out=culprits, **options)
+
+
+def free_view(**changes: float) -> mujoco.MjvCamera:
+    view = mujoco.MjvCamera()
+    view.lookat, view.distance, view.azimuth, view.elevation = (0.0, 0.0, 0.5), 2.0, 90.0, 0.0
+    for name, value in changes.items():
+        setattr(view, name, value)
+    return view
+
+
+def test_a_free_camera_stands_where_mujoco_puts_it() -> None:
+    """Looking along +y from 2 m before the middle: the box, which is half a metre to the right, is seen to the right."""
+    box = "<geom type='box' pos='.5 0 .5' size='.1 .1 .1'/>"
+    mj_model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{box}</worldbody></mujoco>")
+    mj_data = mujoco.MjData(mj_model)
+    mujoco.mj_forward(mj_model, mj_data)
+    frame = shown(Scene.from_mjmodel(mj_model, free_view(), 32, 32), mj_data)
+    rows, columns = np.nonzero(frame.segmentation == 0)
+    assert abs(rows.mean() - 15.5) < 0.5 and columns.min() > 16
+    np.testing.assert_allclose(frame.depth[rows, columns].min(), 1.9, atol=1e-5)
+    behind = Scene.from_mjmodel(mj_model, free_view(azimuth=-90.0), 32, 32)
+    assert np.nonzero(shown(behind, mj_data).segmentation == 0)[1].max() < 15
+    default = Scene.from_mjmodel(mj_model, height=32, width=32)
+    assert shown(default, mj_data).segmentation[16, 16] == 0  # the middle of the model is in the middle
+
+
+def test_a_camera_that_there_is_not_is_told() -> None:
+    mj_model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
+    with pytest.raises(ValueError, match="its cameras are: none; or None for a free one"):
+        Scene.from_mjmodel(mj_model, "front")
+    with pytest.raises(ValueError, match="must be free or fixed"):
+        Scene.from_mjmodel(mj_model, free_view(type=mujoco.mjtCamera.mjCAMERA_TRACKING))

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_program import final_state, make_fake_trainer, rows_without_time, small_config
+from fake_program import final_state, interrupted_at, make_fake_trainer, rows_without_time, small_config
 
-from jaxrl_vis.errors import RequestError, StorageError, Terminated
+from jaxrl_vis.errors import RequestError, StorageError
 from jaxrl_vis.run import loop, metrics
 from jaxrl_vis.run.checkpoint import FULL, LIGHT, Checkpoints
 from jaxrl_vis.run.folder import read_config
@@ -147,11 +147,7 @@ def test_an_earlier_run_outlives_a_new_one_that_cannot_be(straight, tmp_path):
 
 def interrupted(config, path, after: int) -> None:
     """A run that SIGTERM ends after iteration ``after``, with a light and a full checkpoint."""
-    reports = make_fake_trainer(config, path).run()
-    with pytest.raises(Terminated):
-        for report in reports:
-            if report.iteration == after:
-                signal.raise_signal(signal.SIGTERM)
+    interrupted_at(make_fake_trainer(config, path), after)
 
 
 def test_a_stale_full_checkpoint_destroys_nothing(tmp_path, capsys):

@@ -3,15 +3,17 @@
     settings -> render | physics | env | update | train -> Measurement -> record -> staleness, tables
 
 Every benchmark varies the state of each environment, asserts that the results differ, warms up, waits for the device, repeats,
-and reports the median; compilation is timed separately. `record` keeps the figures and prints each change, `staleness` finds
-records that are older than the code they measured, and `tables` writes the README's tables from them.
+and reports the median; compilation is timed separately. `conditions` says which figures may be compared, `record` keeps them
+and prints each change, `staleness` finds records that are older than the code they measured, and `tables` writes the README's
+tables from those in benchmarks/results.
 """
 
 import importlib
 from pathlib import Path
 from typing import Any
 
-from jaxrl_vis.bench.record import Measurement, compare_and_keep, write_json
+from jaxrl_vis.bench.conditions import Watch
+from jaxrl_vis.bench.record import Measurement, compare_and_keep, results_path, write_json
 from jaxrl_vis.bench.settings import Settings
 
 BENCHMARKS = ("render", "physics", "env", "update", "train")
@@ -22,7 +24,7 @@ def run(benchmark: str, results: Path | None = None, json: Path | None = None, *
 
     Args:
         benchmark: One of `BENCHMARKS`.
-        results: Folder of kept records; None for benchmarks/results of the checkout, or of the current folder without one.
+        results: Folder of kept records; None for the user's cache, see `record.user_folder`.
         json: Also write this run's records here.
         **settings: Fields of `Settings`.
 
@@ -30,12 +32,15 @@ def run(benchmark: str, results: Path | None = None, json: Path | None = None, *
         RequestError: A setting cannot be met.
     """
     measure = importlib.import_module(f"jaxrl_vis.bench.{benchmark}").measure
-    measurements = []
-    for measurement in measure(Settings(**settings).for_this_device()):
+    measurements, records = [], []
+    chosen, watch = Settings(**settings).for_this_device(), Watch()
+    for measurement in measure(chosen):
         measurements.append(measurement)
-        compare_and_keep(benchmark, measurement, results)
+        records.append(compare_and_keep(benchmark, measurement, results, watch.conditions()))
     if json is not None:
-        write_json(json, measurements)
+        write_json(json, records)
+    if records:
+        print(f"kept in {results_path(benchmark, results)}")
     return measurements
 
 

@@ -1,6 +1,7 @@
 """Benchmark records: one JSON file per benchmark and device, and the change since the record that was there before.
 
-A file holds the newest record of every configuration; older ones are in its git history.
+A file holds the newest record of every configuration. Records lie in the user's cache, unless a folder is named; those that the
+README quotes lie in benchmarks/results, whose git history has the older ones.
 """
 
 import dataclasses
@@ -12,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from jaxrl_vis import provenance
-from jaxrl_vis.files import write_atomically
+from jaxrl_vis.bench.conditions import why_not_comparable
+from jaxrl_vis.files import user_cache, write_atomically
 
 SCHEMA = 1
 REVISION_DIGITS = 12
@@ -37,11 +39,12 @@ class Measurement:
     details: dict[str, Any] = dataclasses.field(default_factory=dict)
 
 
-def to_record(measurement: Measurement) -> dict[str, Any]:
-    """The measurement with its provenance, as it is kept."""
+def to_record(measurement: Measurement, conditions: dict[str, Any] | None = None) -> dict[str, Any]:
+    """The measurement with its provenance and the conditions it was made under (see `conditions`), as it is kept."""
     return {
         "schema": SCHEMA,
         **dataclasses.asdict(measurement),
+        "conditions": conditions,
         "device": provenance.device_name(),
         "versions": provenance.versions(),
         "revision": provenance.revision(REVISION_DIGITS) or "unknown",
@@ -49,8 +52,13 @@ def to_record(measurement: Measurement) -> dict[str, Any]:
     }
 
 
+def user_folder() -> Path:
+    """Where a user's records lie."""
+    return user_cache() / "bench"
+
+
 def results_folder() -> Path:
-    """benchmarks/results of the checkout that holds this code, or of the current folder where there is none."""
+    """The records that the README quotes: benchmarks/results of the checkout that holds this code, or of the current folder."""
     home = provenance.CHECKOUT if (provenance.CHECKOUT / "pyproject.toml").exists() else Path.cwd()
     return home / "benchmarks" / "results"
 
@@ -58,7 +66,7 @@ def results_folder() -> Path:
 def results_path(benchmark: str, folder: Path | None = None) -> Path:
     """The file of one benchmark on this device."""
     slug = re.sub(r"[^a-z0-9]+", "-", provenance.device_name().lower().replace("(r)", "").replace("(tm)", "")).strip("-")
-    return (folder or results_folder()) / f"{benchmark}-{slug}.json"
+    return (folder or user_folder()) / f"{benchmark}-{slug}.json"
 
 
 def load(path: Path) -> list[dict[str, Any]]:
@@ -99,9 +107,9 @@ def _write(path: Path, records: list[dict[str, Any]]) -> None:
     write_atomically(path, json.dumps(records, indent=1, sort_keys=True) + "\n")
 
 
-def write_json(path: Path, measurements: list[Measurement]) -> None:
+def write_json(path: Path, records: list[dict[str, Any]]) -> None:
     """Writes the records of one run."""
-    _write(path, [to_record(measurement) for measurement in measurements])
+    _write(path, records)
 
 
 def keep(path: Path, record: dict[str, Any]) -> dict[str, Any] | None:
@@ -115,13 +123,19 @@ def keep(path: Path, record: dict[str, Any]) -> dict[str, Any] | None:
 
 
 def describe(record: dict[str, Any], previous: dict[str, Any] | None) -> str:
-    """One line: what was measured, the figure, and its change."""
+    """One line: what was measured, the figure, and its change where that says something about the code."""
     config = " ".join(f"{name}={value}" for name, value in record["config"].items())
     line = f"{record['name']:24} {config:72} {format_figure(record['value']):>12} {record['unit']}"
     if previous is None:
         return line + "  (first record)"
-    change = 100 * (record["value"] / previous["value"] - 1) if previous["value"] else float("nan")
-    return line + f"  ({change:+.1f} % against {previous['revision']}, {previous['date'][:10]})"
+    before = f"{format_figure(previous['value'])} of {previous['revision']}, {previous['date'][:10]}"
+    why = why_not_comparable(record["conditions"], previous.get("conditions"))
+    if why is not None:
+        return line + f"  (not compared with {before}: {why})"
+    change = record["value"] / previous["value"] - 1 if previous["value"] else float("nan")
+    spread = max(each["details"].get("spread", 0.0) for each in (record, previous))
+    noise = f", no more than the spread of the repeats, {100 * spread:.1f} %" if abs(change) <= spread else ""
+    return line + f"  ({100 * change:+.1f} % against {before}, the same machine at the same speed{noise})"
 
 
 def format_figure(value: float) -> str:
@@ -129,9 +143,19 @@ def format_figure(value: float) -> str:
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
 
 
-def compare_and_keep(benchmark: str, measurement: Measurement, folder: Path | None = None) -> None:
-    """Keeps a measurement and prints its line, with its details below."""
-    record = to_record(measurement)
+def compare_and_keep(
+    benchmark: str, measurement: Measurement, folder: Path | None = None, conditions: dict[str, Any] | None = None
+) -> dict[str, Any]:
+    """Keeps a measurement and prints its line, with its details below; returns the record.
+
+    Args:
+        benchmark: Its name.
+        measurement: The figure.
+        folder: Where it is kept; None: `user_folder`.
+        conditions: See `conditions.Watch`.
+    """
+    record = to_record(measurement, conditions)
     print(describe(record, keep(results_path(benchmark, folder), record)), flush=True)
     if measurement.details:
         print("    " + ", ".join(f"{name} {value}" for name, value in measurement.details.items()), flush=True)
+    return record

@@ -57,7 +57,10 @@ def _path_of(scene: str) -> Path:
     if scene == "finger":
         package = importlib.util.find_spec("dm_control")
         if package is None or not package.submodule_search_locations:
-            raise RequestError("scene finger is that of dm_control, which is missing: pip install dm_control")
+            raise RequestError(
+                "scene finger is that of dm_control, which is missing: pip install --no-deps dm_control (only its model is "
+                "read: dm_control 1.0.x itself does not run with MuJoCo 4)"
+            )
         return Path(package.submodule_search_locations[0]) / "suite" / "finger.xml"
     if scene == "fetch_reach":
         import jaxrl_vis_envs

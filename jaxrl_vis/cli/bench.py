@@ -18,7 +18,7 @@ Benchmark = Literal["render", "physics", "env", "update", "train"]
 
 @dataclasses.dataclass(frozen=True)
 class Bench:
-    """Measure this machine, keep a record, and print the change since the last record of the same device."""
+    """Measure this machine, keep a record, and print the change since the last record where the two can be compared."""
 
     benchmark: Annotated[Benchmark | None, tyro.conf.Positional] = None
     """What to measure: images, physics, both with resets, gradient steps, or whole training iterations."""
@@ -46,7 +46,8 @@ class Bench:
     json: Path | None = None
     """Also write this run's records here."""
     results: Path | None = None
-    """Folder of kept records; benchmarks/results of the checkout (or here) if not given."""
+    """Folder of kept records; jaxrl-vis/bench in your cache folder if not given. The README quotes benchmarks/results, which
+    --check and --tables read."""
 
 
 def run(options: Bench) -> int:
@@ -66,10 +67,10 @@ def run(options: Bench) -> int:
     if options.json is not None:
         check_writable(options.json, "--json")
     from jaxrl_vis import bench
-    from jaxrl_vis.bench.record import results_folder
+    from jaxrl_vis.bench.record import user_folder
 
     check_devices()
-    check_writable(options.results or results_folder(), "--results", folder=True)
+    check_writable(options.results or user_folder(), "--results", folder=True)
     settings = {field.name: getattr(options, field.name) for field in dataclasses.fields(options)}
     del settings["check"], settings["tables"]
     bench.run(**settings)

@@ -11,7 +11,9 @@ from jaxrl_vis.config import PRESETS, Config, preset, validate
 from jaxrl_vis.devices import check_devices, guess_accelerator
 from jaxrl_vis.errors import RequestError, nearest
 from jaxrl_vis.report.outputs import check_writable
+from jaxrl_vis.run import loggers
 from jaxrl_vis.run.folder import check_there, default_folder, read_config
+from jaxrl_vis.run.loggers import LoggerName
 
 
 def _defaults(name: str) -> str:
@@ -49,6 +51,8 @@ class Train:
     """Continue from the newest checkpoint in the run folder, which must be there."""
     overwrite: bool = False
     """Start afresh in a run folder that exists."""
+    log: tuple[LoggerName, ...] = ()
+    """Show the run in TensorBoard or in Weights & Biases, too; those of the run if not given with --resume."""
 
 
 def training_config(options: Train) -> Config:
@@ -80,6 +84,7 @@ def run(options: Train) -> int:
     """Trains; every report has already been shown and saved by the trainer."""
     if options.resume and options.overwrite:
         raise RequestError("--resume and --overwrite contradict each other; give one of them")
+    loggers.check(options.log)
     if options.run_dir is not None:
         check_there(options.run_dir, options.resume)
     if options.env is not None:
@@ -91,6 +96,8 @@ def run(options: Train) -> int:
     run_dir = options.run_dir or default_folder(config)
     check_there(run_dir, options.resume)
     check_writable(run_dir, "--run-dir", folder=True)
-    for _ in trainer.make_trainer(config, options.run_dir, resume=options.resume, overwrite=options.overwrite).run():
+    log = options.log or None
+    made = trainer.make_trainer(config, options.run_dir, resume=options.resume, overwrite=options.overwrite, log=log)
+    for _ in made.run():
         pass
     return 0

@@ -4,7 +4,7 @@ The files:
 
     config.json     schema, versions, device, git revision, configuration      metrics.jsonl   see `metrics`
     checkpoints/    see `checkpoint`      nonfinite/   what a run that went wrong held      curve.png   video.gif
-    run.lock        while a process writes here, see `lock`
+    run.lock        while a process writes here, see `lock`      tensorboard/, wandb/, wandb.json   see `loggers`
 """
 
 import dataclasses
@@ -22,6 +22,9 @@ from jaxrl_vis.run.lock import FILE_NAME as LOCK_NAME
 from jaxrl_vis.run.lock import run_lock
 
 SCHEMA = 1
+
+LOGGER_FOLDERS, WANDB_STATE = ("tensorboard", "wandb"), "wandb.json"
+"""What `loggers` leave in a run folder."""
 
 MAY_CHANGE = (
     *("preset", "env_folder", "env_steps"),
@@ -116,7 +119,7 @@ class RunFolder:
         _check_same(self.path, read_config(self.path), config)
         return True
 
-    def open(self, config: Config, resume: bool = False, overwrite: bool = False) -> bool:
+    def open(self, config: Config, resume: bool = False, overwrite: bool = False, log: tuple[str, ...] = ()) -> bool:
         """`check`, then makes the folder ready: with ``overwrite``, an earlier run's files are deleted, and nothing else.
 
         Call it last, when nothing can refuse the run any more.
@@ -130,24 +133,25 @@ class RunFolder:
         goes_on = self.check(config, resume, overwrite)
         try:
             if overwrite:
-                for folder in (self.checkpoints, self.nonfinite):
+                for folder in (self.checkpoints, self.nonfinite, *(self.path / name for name in LOGGER_FOLDERS)):
                     shutil.rmtree(folder, ignore_errors=True)
-                for file in (self.metrics, self.curve, self.video):
+                for file in (self.metrics, self.curve, self.video, self.path / WANDB_STATE):
                     file.unlink(missing_ok=True)
             self.path.mkdir(parents=True, exist_ok=True)
-            write_atomically(self.config, json.dumps(_record(config), indent=2) + "\n")
+            write_atomically(self.config, json.dumps(_record(config, log), indent=2) + "\n")
         except OSError as error:
             raise RequestError(f"cannot write to {self.path} ({error.strerror}): choose another --run-dir") from error
         return goes_on
 
 
-def _record(config: Config) -> dict[str, Any]:
+def _record(config: Config, log: tuple[str, ...]) -> dict[str, Any]:
     return {
         "schema": SCHEMA,
         "preset": config.preset,
         "git_revision": provenance.revision(),
         "versions": provenance.versions(),
         "device": provenance.device_record(),
+        "log": list(log),
         "config": dataclasses.asdict(config),
     }
 
@@ -168,6 +172,11 @@ def read_record(path: Path) -> dict[str, Any]:
     if not isinstance(record, dict) or record.get("schema") != SCHEMA:
         raise RequestError(f"{file} is not of schema {SCHEMA}: it was written by another version; use that, or --overwrite")
     return record
+
+
+def read_log(path: Path) -> tuple[str, ...]:
+    """The loggers that the run in ``path`` had; none where there is no run."""
+    return tuple(read_record(path).get("log", ())) if RunFolder(path).config.exists() else ()
 
 
 def read_config(path: Path) -> Config:

@@ -24,7 +24,8 @@ from jaxrl_vis.report import plots, videos
 from jaxrl_vis.run import metrics
 from jaxrl_vis.run.checkpoint import FULL, LIGHT, Checkpoints, Restored
 from jaxrl_vis.run.console import RunConsole, show_seconds, show_shares
-from jaxrl_vis.run.folder import RunFolder
+from jaxrl_vis.run.folder import RunFolder, read_record
+from jaxrl_vis.run.loggers import Loggers
 from jaxrl_vis.run.memory import check_compiled, check_memory
 from jaxrl_vis.run.metrics import PerSeed
 from jaxrl_vis.run.programs import Programs
@@ -61,15 +62,17 @@ class RunLoop:
     Args:
         programs: What to run.
         folder: Where its files go.
+        log: Names of the loggers that are told, see `loggers`.
     """
 
-    def __init__(self, programs: Programs, folder: RunFolder):
+    def __init__(self, programs: Programs, folder: RunFolder, log: tuple[str, ...] = ()):
         self._programs, self._folder = programs, folder
         self._config, self._program = programs.config, programs.program
         self._console = RunConsole()
         self._say = self._console.say
         self._checkpoints = Checkpoints(folder.checkpoints, self._say)
         self._saver = Saver(programs, folder, self._checkpoints, self._say)
+        self._log, self._loggers = log, Loggers(log, folder.path, self._say)
         self._total: int = self._program.num_iterations
         self._progress = Progress()
         self._done = 0
@@ -114,6 +117,7 @@ class RunLoop:
                 if not interruption.is_urgent:
                     with contextlib.suppress(StorageError):
                         self._checkpoints.close()
+                    self._loggers.close(in_a_hurry=bool(interruption))
 
     def _storage_error(self, error: OSError | StorageError) -> StorageError:
         what = str(error)
@@ -168,13 +172,14 @@ class RunLoop:
         """Asks for memory once more, the last thing that can refuse the run; then makes the folder and the state ready."""
         self._say(f"compiled in {show_seconds(self._compile_s)}")
         check_compiled(compiled, already_there=self._loop is not None)
-        self._folder.open(self._config, goes_on, overwrite)
+        self._folder.open(self._config, goes_on, overwrite, self._log)
         if goes_on:
             damaged = self._checkpoints.set_aside_after(self._done)
             last = self._done - self._progress.evaluation_due  # an evaluation that is due writes its rows again
             metrics.cut_back(self._folder.metrics, last, damaged[0].parent / "metrics.jsonl" if damaged else None)
             for path in damaged:
                 self._say(f"kept for inspection: {path}")
+        self._loggers.open(read_record(self._folder.path), self._programs.seeds, metrics.read_rows(self._folder.metrics))
         if self._loop is None:
             self._loop = self._programs.init(self._programs.run_keys)
         self._console.start(self._total, self._done)
@@ -279,6 +284,7 @@ class RunLoop:
             counts["resume/replay_lost_at"] = progress.replay_lost_at
         rows = metrics.make_rows(self._programs.seeds, counts, values | means | rounded)
         metrics.append_rows(self._folder.metrics, rows)
+        self._loggers.rows(rows)
         progress.evaluation_due = False
         self._warn_if_filtered(means)
         # The last evaluation may come between two scheduled ones; a longer run, resumed from here, goes on with the means.
@@ -355,6 +361,7 @@ class RunLoop:
             if not self._recorded:  # killed after the last evaluation, before this: resumed with nothing left to evaluate
                 _, self._recorded = self._programs.evaluate(self._loop.train)
             videos.write_video(videos.first_seed(self._recorded), self._folder.video, self._programs.image_seconds)
+            self._loggers.image("video", self._folder.video, self._done * self._program.steps_per_iteration)
         wall = self._progress.wall_s + time.monotonic() - self._started
         rows = [row for row in metrics.read_rows(self._folder.metrics) if row["iteration"] == self._done]
         success = ", ".join(f"seed {row['seed']}: {row['eval/success']:.3f}" for row in rows)
@@ -374,3 +381,4 @@ class RunLoop:
             unit=env.distance_unit,
             threshold=env.threshold,
         )
+        self._loggers.image("curve", self._folder.curve, self._done * self._program.steps_per_iteration)

@@ -18,6 +18,11 @@ from jaxrl_vis.run.folder import write_atomically
 PerSeed = dict[str, list[float]]
 """Name -> one number per seed."""
 
+Row = Mapping[str, Any]
+"""A line of the file."""
+
+_PLACE = ("seed", "iteration", "env_steps")  # of a row: where it belongs, not what it says
+
 
 def mean_of(history: Sequence[Mapping[str, Sequence[float]]]) -> PerSeed:
     """The mean of each metric over the iterations in ``history``, seed by seed.
@@ -45,6 +50,11 @@ def make_rows(seeds: Iterable[int], counts: Mapping[str, int], values: Mapping[s
         {"seed": seed, **counts, **{name: row[i] if math.isfinite(row[i]) else None for name, row in values.items()}}
         for i, seed in enumerate(seeds)
     ]
+
+
+def scalars(row: Row) -> dict[str, float]:
+    """The figures of a row by name; those that were not finite are left out."""
+    return {name: float(value) for name, value in row.items() if name not in _PLACE and value is not None}
 
 
 def append_rows(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:

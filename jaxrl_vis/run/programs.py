@@ -6,7 +6,6 @@ All of it is compiled before training starts, so that the end of a run, where si
 import concurrent.futures
 import functools
 import os
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -14,6 +13,7 @@ import jax.numpy as jnp
 from jax.experimental.compilation_cache import compilation_cache
 
 from jaxrl_vis.config import Config
+from jaxrl_vis.files import user_cache
 from jaxrl_vis.report import videos
 from jaxrl_vis.run.checkpoint import to_host
 from jaxrl_vis.run.nonfinite import broken_leaves
@@ -35,8 +35,7 @@ def enable_compilation_cache() -> str:
         The folder.
     """
     if not jax.config.jax_compilation_cache_dir:
-        caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        jax.config.update("jax_compilation_cache_dir", str(caches / "jaxrl-vis" / "xla"))
+        jax.config.update("jax_compilation_cache_dir", str(user_cache() / "xla"))
         # JAX decides at its first compilation whether it has a cache, and a notebook has compiled something by now.
         compilation_cache.reset_cache()
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:

@@ -8,7 +8,7 @@
 What was trained is used by `jaxrl_vis.run.trained`.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,8 @@ from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import NonFiniteError, RequestError, Terminated
 from jaxrl_vis.learner.environment import locate_env, make_env
 from jaxrl_vis.learner.train_step import make_train_step
-from jaxrl_vis.run.folder import RunFolder, default_folder
+from jaxrl_vis.run import loggers
+from jaxrl_vis.run.folder import RunFolder, default_folder, read_log
 from jaxrl_vis.run.loop import Report, RunLoop
 from jaxrl_vis.run.programs import Programs, enable_compilation_cache
 from jaxrl_vis.run.signals import shielded_children
@@ -38,6 +39,7 @@ class Trainer:
         run_dir: Where `run` puts its files; None: `jaxrl_vis.run.folder.default_folder`.
         resume: Go on with the run in ``run_dir``.
         overwrite: Delete the run in ``run_dir`` and start again.
+        log: Loggers that are told beside metrics.jsonl: ``tensorboard``, ``wandb``. None: those of the run that goes on.
 
     Attributes:
         config: The run.
@@ -54,6 +56,7 @@ class Trainer:
         run_dir: Path | str | None = None,
         resume: bool = False,
         overwrite: bool = False,
+        log: Sequence[str] | None = None,
     ):
         self.config, self.programs = config, Programs(config, program)
         self.env, self.seeds = self.programs.env, self.programs.seeds
@@ -61,6 +64,10 @@ class Trainer:
         self._resume, self._overwrite = resume, overwrite
         if run_dir is not None:
             self.folder.check(config, resume, overwrite)
+        if log is None:
+            log = read_log(self.folder.path) if resume else ()
+        loggers.check(log)
+        self._log = tuple(log)
 
     @property
     def program(self) -> Any:
@@ -129,12 +136,18 @@ class Trainer:
             Terminated: SIGTERM, after saving.
             KeyboardInterrupt: Ctrl-C, after saving.
         """
-        yield from RunLoop(self.programs, self.folder).reports(self._resume, self._overwrite)
+        yield from RunLoop(self.programs, self.folder, self._log).reports(self._resume, self._overwrite)
         # Asked again, a finished run is resumed, and says that there is nothing left to do.
         self._resume, self._overwrite = True, False
 
 
-def make_trainer(config: Config, run_dir: Path | str | None = None, resume: bool = False, overwrite: bool = False) -> Trainer:
+def make_trainer(
+    config: Config,
+    run_dir: Path | str | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    log: Sequence[str] | None = None,
+) -> Trainer:
     """Builds the environment and the programs of a configuration. Compiles, allocates and writes nothing.
 
     Args:
@@ -142,15 +155,17 @@ def make_trainer(config: Config, run_dir: Path | str | None = None, resume: bool
         run_dir: Where `Trainer.run` puts its files; None: below ``runs/``, named after the configuration.
         resume: Go on with the run in that folder; in an empty one it starts at the beginning, and says so.
         overwrite: Delete the run in that folder and start again.
+        log: Loggers that are told beside metrics.jsonl: ``tensorboard``, ``wandb``. None: those of the run that goes on.
 
     Raises:
         RequestError: The configuration asks for something that cannot be, or contradicts the saved run.
     """
     if not isinstance(config, Config):
         raise RequestError(f"make_trainer takes a configuration, such as jaxrl_vis.preset('cpu'), not {config!r}")
+    loggers.check(log or ())
     if run_dir is not None:
         RunFolder(Path(run_dir)).check(config, resume, overwrite)  # building an environment takes a while: refuse before
     with shielded_children():  # threads that JAX starts with its first use of a device never see signals
         check_devices()
     config = locate_env(config)
-    return Trainer(config, make_train_step(make_env(config), config), run_dir, resume, overwrite)
+    return Trainer(config, make_train_step(make_env(config), config), run_dir, resume, overwrite, log)

@@ -31,6 +31,17 @@ _VISIBLE_GROUPS = 3  # as in MuJoCo's viewers, geoms of group 3 and more are for
 _VIEW_SIZE = 5.0  # the viewer's camera stands 10 units away and cuts off what is nearer than .1
 
 
+# Without a network brax's page stays empty: say why.
+_OFFLINE = """
+    <p id="offline" hidden style="font: 16px sans-serif; position: absolute; top: 40vh; width: 100%; text-align: center">
+      The viewer could not be fetched: this page needs a network. The video (.gif) that play makes without --html needs none.
+    </p>
+    <script>
+      setTimeout(() => { document.getElementById("offline").hidden = !!document.querySelector("canvas"); }, 5000);
+    </script>
+"""
+
+
 class Poses(NamedTuple):
     """Where bodies are, the world's body among them.
 
@@ -78,7 +89,7 @@ def viewer_page(mj_model: mujoco.MjModel, poses: Poses, goals: Poses, seconds: f
     states = [{"pos": pos, "rot": rot} for pos, rot in zip(positions, rotations)]
     system = {"opt": {"timestep": seconds}, "geoms": links, "states": {"x": states}}
     page: Any = html.render_from_json(json.dumps(system), None, False, None)  # type: ignore[arg-type] - None fills the window
-    return page
+    return page.replace("</body>", _OFFLINE + "</body>")
 
 
 def _is_moved_by_joints(mj_model: mujoco.MjModel, body: int) -> bool:

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxrl_vis_envs.render.model.reading import FREE_CAMERA
 from jaxrl_vis_envs.render.scene import Scene
 
 _DEGREES = np.pi / 180.0
@@ -34,14 +35,18 @@ def camera_pose(scene: Scene, data: Any) -> tuple[jax.Array, jax.Array, jax.Arra
 
     Args:
         scene: The scene.
-        data: `mjx.Data`, `mujoco.MjData` or anything with ``cam_xpos`` [ncam, 3] and ``cam_xmat`` [ncam, 3, 3] or [ncam, 9].
+        data: `mjx.Data`, `mujoco.MjData` or anything with ``cam_xpos`` [ncam, 3] and ``cam_xmat`` [ncam, 3, 3] or [ncam, 9];
+            not read for a free camera.
 
     Returns:
         Position [3] float32 in metres, rotation [3, 3] float32 whose columns are the camera's axes, and whether both are finite
         ([] bool). A pose that is not finite comes back as the identity.
     """
-    position = jnp.asarray(data.cam_xpos, jnp.float32)[scene.camera_id]
-    rotation = jnp.asarray(data.cam_xmat, jnp.float32).reshape(-1, 3, 3)[scene.camera_id]
+    if scene.camera_id == FREE_CAMERA:
+        position, rotation = jnp.zeros(3, jnp.float32), jnp.eye(3, dtype=jnp.float32)
+    else:
+        position = jnp.asarray(data.cam_xpos, jnp.float32)[scene.camera_id]
+        rotation = jnp.asarray(data.cam_xmat, jnp.float32).reshape(-1, 3, 3)[scene.camera_id]
     # Written out rather than as matrix products, which accelerators would do at low precision.
     position = position + jnp.sum(rotation * scene.camera_shift, axis=1)
     rotation = jnp.sum(rotation[:, :, None] * _rotation(scene.camera_turn)[None], axis=1)

@@ -9,6 +9,7 @@ from typing import Any, Self
 import mujoco
 import numpy as np
 
+from jaxrl_vis_envs.render.model.reading import FREE_CAMERA, Camera
 from jaxrl_vis_envs.render.outputs import Frame
 
 
@@ -46,9 +47,14 @@ class ReferenceRenderer:
             for flag in (flags.mjRND_SHADOW, flags.mjRND_REFLECTION, flags.mjRND_HAZE):
                 self._renderer.scene.flags[flag] = False
 
-    def __call__(self, mj_data: mujoco.MjData, camera: str | int) -> Frame:
-        """The image as NumPy arrays: a `Frame` of rgb [H, W, 3] uint8, depth [H, W] float32 and segmentation [H, W] int32."""
-        self._renderer.update_scene(mj_data, camera, self._options)
+    def __call__(self, mj_data: mujoco.MjData, camera: Camera) -> Frame:
+        """The image as NumPy arrays: a `Frame` of rgb [H, W, 3] uint8, depth [H, W] float32 and segmentation [H, W] int32.
+
+        Args:
+            mj_data: The poses.
+            camera: As `Scene.from_mjmodel` takes it.
+        """
+        self._renderer.update_scene(mj_data, FREE_CAMERA if camera is None else camera, self._options)
         colour = self._renderer.render().copy()
         self._renderer.enable_depth_rendering()
         depth = self._renderer.render().astype(np.float32)

@@ -47,8 +47,10 @@ class Scene:
         focal: [2] float32, metres, of a camera with a sensor size.
         principal: [2] float32, metres, of a camera with a sensor size: where the axis meets the sensor, from its middle.
         sensor: [2] float32, metres, width and height of the sensor.
-        camera_shift: [3] float32, metres in the camera's own frame (right, up, back), added to the pose in the data.
-        camera_turn: [3] float32, radians, a rotation vector in the camera's own frame, applied to the pose in the data.
+        camera_shift: [3] float32, metres in the camera's own frame (right, up, back), added to the pose in the data. Of a free
+            camera, which is not in the data: its position in the world.
+        camera_turn: [3] float32, radians, a rotation vector in the camera's own frame, applied to the pose in the data. Of a
+            free camera: its rotation in the world.
         znear: [] float32, metres. What is nearer than this is cut away.
         zfar: [] float32, metres. What is further is not drawn, and it is the depth of the sky.
         light_position: [L, 3] float32, metres, in the light's frame (see `lights.light_poses`).
@@ -74,7 +76,7 @@ class Scene:
         object_types: G values of `mujoco.mjtGeom`.
         transparent: Which of the G objects let light through: 0 not, 1 yes, 2 a plane that does so from behind.
         geom_count: ngeom of the model.
-        camera_id: The camera's index in the model.
+        camera_id: The camera's index in the model; `reading.FREE_CAMERA` for a free one.
         projection: "perspective", "intrinsic" (a perspective camera with a sensor) or "orthographic".
         height: H, pixels.
         width: W, pixels.
@@ -146,7 +148,7 @@ class Scene:
     def from_mjmodel(
         cls,
         mj_model: mujoco.MjModel,
-        camera: str | int,
+        camera: reading.Camera = None,
         height: int = 64,
         width: int = 64,
         groups: tuple[int, ...] = (0, 1, 2),
@@ -161,7 +163,9 @@ class Scene:
 
         Args:
             mj_model: The model.
-            camera: Name or index of the camera.
+            camera: Name or index of one of the model's cameras. None: a free camera as `mujoco.Renderer` has it, which looks
+                at the whole model from outside; or an `mujoco.MjvCamera` with a ``lookat``, ``distance``, ``azimuth`` and
+                ``elevation`` of its own. A free camera stays where it is, whatever moves.
             height: Image height in pixels.
             width: Image width in pixels.
             groups: Geom groups that are drawn (the default is that of `mujoco.Renderer`).
@@ -197,10 +201,12 @@ class Scene:
         if not textured:
             appearance["rgba"][:, :3] *= reading.mean_texture_colours(mj_model)
         lights, light_facts = reading.lights(mj_model, appearance["specular"][ids], shadows)
-        leaves = {**appearance, **lights, **reading.camera_parameters(mj_model, camera_id)}
+        leaves = {**appearance, **lights, **reading.camera_parameters(mj_model, camera_id, camera)}
         leaves["sky_top"], leaves["sky_bottom"] = reading.sky_colours(mj_model)
         leaves["haze_colour"] = mj_model.vis.rgba.haze[:3]
-        clear = np.where(reading.planes_seen_through(mj_model, camera_id, plane_backs)[ids], reading.CLEAR_FROM_BEHIND, 0)
+        clear = np.where(
+            reading.planes_seen_through(mj_model, camera_id, camera, plane_backs)[ids], reading.CLEAR_FROM_BEHIND, 0
+        )
         clear = np.where(appearance["rgba"][ids, 3] < reading.OPAQUE, reading.CLEAR, clear)
         return cls(
             **{name: jnp.asarray(value, jnp.float32) for name, value in leaves.items()},
@@ -211,7 +217,7 @@ class Scene:
             transparent=tuple(clear.tolist()),
             geom_count=mj_model.ngeom,
             camera_id=camera_id,
-            projection=reading.projection(mj_model, camera_id),
+            projection=reading.projection(mj_model, camera_id, camera),
             height=int(height),
             width=int(width),
             **light_facts,

@@ -26,35 +26,85 @@ SOLID, CLEAR, CLEAR_FROM_BEHIND = range(3)
 MOST_LIGHTS = 8
 
 
-def find_camera(mj_model: mujoco.MjModel, camera: str | int) -> int:
-    """The camera's index, or a ValueError that names the cameras there are."""
+FREE_CAMERA = -1
+"""In the place of a camera's index, as MuJoCo has it: the free camera, which is not part of the model."""
+
+Camera = str | int | mujoco.MjvCamera | None
+"""A camera's name or index; None, -1 or an `MjvCamera` for a free one."""
+
+
+def find_camera(mj_model: mujoco.MjModel, camera: Camera) -> int:
+    """The camera's index (`FREE_CAMERA` for a free one), or a ValueError that names the cameras there are."""
+    if isinstance(camera, mujoco.MjvCamera):
+        view: Any = camera
+        if view.type == mujoco.mjtCamera.mjCAMERA_FIXED:
+            return find_camera(mj_model, int(view.fixedcamid))
+        if view.type != mujoco.mjtCamera.mjCAMERA_FREE:
+            raise ValueError("an MjvCamera must be free or fixed: one that tracks a body belongs into the model")
+        return FREE_CAMERA
+    if camera is None or camera == FREE_CAMERA:
+        return FREE_CAMERA
     if isinstance(camera, str):
         camera_id = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
     else:
         camera_id = int(camera)
     if not 0 <= camera_id < mj_model.ncam:
         names = ", ".join(repr(mj_model.camera(index).name) for index in range(mj_model.ncam)) or "none"
-        raise ValueError(f"there is no camera {camera!r} in the model; its cameras are: {names}")
+        raise ValueError(f"there is no camera {camera!r} in the model; its cameras are: {names}; or None for a free one")
     return camera_id
 
 
-def projection(mj_model: mujoco.MjModel, camera_id: int) -> str:
+def free_camera(mj_model: mujoco.MjModel, camera: Camera) -> mujoco.MjvCamera:
+    """A free camera: ``camera`` where it is one, or else MuJoCo's default, which looks at the middle of the whole model.
+
+    The default is that of `mjv_defaultFreeCamera`: 1.5 times ``stat.extent`` away from ``stat.center``, with the azimuth, the
+    elevation and the projection of ``vis.global``.
+    """
+    if isinstance(camera, mujoco.MjvCamera):
+        return camera
+    default = mujoco.MjvCamera()
+    mujoco.mjv_defaultFreeCamera(mj_model, default)
+    return default
+
+
+def free_camera_pose(camera: mujoco.MjvCamera) -> tuple[np.ndarray, np.ndarray]:
+    """Where a free camera stands, [3] m, and its rotation as a vector, [3] radians; both in the world's frame."""
+    azimuth, elevation = np.deg2rad([camera.azimuth, camera.elevation])
+    ahead = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+    right = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
+    quaternion, turn = np.zeros(4), np.zeros(3)
+    mujoco.mju_mat2Quat(quaternion, np.stack([right, np.cross(right, ahead), -ahead], axis=1).reshape(-1))
+    mujoco.mju_quat2Vel(turn, quaternion, 1.0)
+    return np.array(camera.lookat) - camera.distance * ahead, turn
+
+
+def projection(mj_model: mujoco.MjModel, camera_id: int, camera: Camera) -> str:
     """How the camera maps space to the image, as in `Scene`."""
+    if camera_id == FREE_CAMERA:
+        return "orthographic" if free_camera(mj_model, camera).orthographic else "perspective"
     if mj_model.cam_projection[camera_id] == mujoco.mjtProjection.mjPROJ_ORTHOGRAPHIC:
         return "orthographic"
     return "intrinsic" if np.all(mj_model.cam_sensorsize[camera_id] > 0) else "perspective"
 
 
-def camera_parameters(mj_model: mujoco.MjModel, camera_id: int) -> dict[str, Any]:
+def camera_parameters(mj_model: mujoco.MjModel, camera_id: int, camera: Camera) -> dict[str, Any]:
     """Leaves of the camera. Keys as in `Scene`."""
-    intrinsic = mj_model.cam_intrinsic[camera_id]
+    if camera_id == FREE_CAMERA:
+        position, turn = free_camera_pose(free_camera(mj_model, camera))
+        lens = dict(fovy=mj_model.vis.global_.fovy, focal=np.zeros(2), principal=np.zeros(2), sensor=np.zeros(2))
+        lens |= dict(camera_shift=position, camera_turn=turn)
+    else:
+        intrinsic = mj_model.cam_intrinsic[camera_id]
+        lens = dict(
+            fovy=mj_model.cam_fovy[camera_id],
+            focal=intrinsic[:2],
+            principal=intrinsic[2:],
+            sensor=mj_model.cam_sensorsize[camera_id],
+            camera_shift=np.zeros(3),
+            camera_turn=np.zeros(3),
+        )
     return dict(
-        fovy=mj_model.cam_fovy[camera_id],
-        focal=intrinsic[:2],
-        principal=intrinsic[2:],
-        sensor=mj_model.cam_sensorsize[camera_id],
-        camera_shift=np.zeros(3),
-        camera_turn=np.zeros(3),
+        **lens,
         znear=mj_model.vis.map.znear * mj_model.stat.extent,
         zfar=mj_model.vis.map.zfar * mj_model.stat.extent,
     )
@@ -219,7 +269,7 @@ def sky_colours(mj_model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
     return up[middle, middle, :3] / 255.0, down[middle, middle, :3] / 255.0
 
 
-def planes_seen_through(mj_model: mujoco.MjModel, camera_id: int, plane_backs: bool | None) -> np.ndarray:
+def planes_seen_through(mj_model: mujoco.MjModel, camera_id: int, camera: Camera, plane_backs: bool | None) -> np.ndarray:
     """[ngeom + nsite] bool: the planes that are half transparent from behind, given `Scene.from_mjmodel`'s ``plane_backs``."""
     planes = mj_model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
     if plane_backs is None:
@@ -227,7 +277,9 @@ def planes_seen_through(mj_model: mujoco.MjModel, camera_id: int, plane_backs: b
         for step in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_camlight):
             step(mj_model, mj_data)
         normals = mj_data.geom_xmat.reshape(-1, 3, 3)[:, :, 2]
-        planes = planes & (np.sum((mj_data.cam_xpos[camera_id] - mj_data.geom_xpos) * normals, axis=1) < 0)
+        is_free = camera_id == FREE_CAMERA
+        position = free_camera_pose(free_camera(mj_model, camera))[0] if is_free else mj_data.cam_xpos[camera_id]
+        planes = planes & (np.sum((position - mj_data.geom_xpos) * normals, axis=1) < 0)
     elif not plane_backs:
         planes = np.zeros(mj_model.ngeom, bool)
     return np.concatenate([planes, np.zeros(mj_model.nsite, bool)])

@@ -1,0 +1,123 @@
+"""``--log tensorboard wandb``: what metrics.jsonl holds, the configuration, the curve and the video, for people who look there.
+
+metrics.jsonl stays the truth. A logger is told what that file holds already when it starts, and from then on every row that is
+added, so that a run that was resumed, or that got a logger later, shows each evaluation once.
+
+A logger that fails says so in one line and is not asked again: training goes on without it.
+"""
+
+import importlib.util
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, Protocol, get_args
+
+from jaxrl_vis.errors import RequestError, nearest
+from jaxrl_vis.provenance import install_command
+from jaxrl_vis.run.metrics import Row
+
+LoggerName = Literal["tensorboard", "wandb"]
+NAMES: tuple[str, ...] = get_args(LoggerName)
+
+_MODULES = {"tensorboard": "tensorboardX", "wandb": "wandb"}
+_LEAVING_S = {True: 10.0, False: 60.0}  # seconds that a logger has to finish: after a signal, and at the end of a run
+
+
+def check(names: Sequence[str]) -> None:
+    """Checks that there are such loggers and that their libraries are installed, without importing them.
+
+    Raises:
+        RequestError: There is no such logger, or its library is missing.
+    """
+    for name in names:
+        if name not in _MODULES:
+            raise RequestError(f"unknown logger {name!r}{nearest(name, NAMES)}")
+        if importlib.util.find_spec(_MODULES[name]) is None:
+            raise RequestError(f"--log {name} needs {_MODULES[name]}: {install_command(name)}")
+
+
+class Logger(Protocol):
+    """What a logger does. Any method may raise anything."""
+
+    def rows(self, rows: Sequence[Row]) -> None:
+        """Takes in rows of metrics.jsonl."""
+
+    def image(self, name: str, file: Path, env_steps: int) -> None:
+        """Takes in a .png or a .gif that was drawn after ``env_steps`` steps."""
+
+    def close(self) -> None:
+        """Sees to it that everything has arrived."""
+
+
+class Loggers:
+    """The loggers of one run. Nothing is opened before `open`.
+
+    Args:
+        names: Which; those of `NAMES`.
+        folder: The run folder.
+        say: Called with one line about what goes wrong.
+    """
+
+    def __init__(self, names: Sequence[str], folder: Path, say: Callable[[str], None]):
+        self._names, self._folder, self._say = tuple(dict.fromkeys(names)), folder, say
+        self._open: dict[str, Logger] = {}
+
+    def open(self, record: Mapping[str, Any], seeds: Sequence[int], rows: Sequence[Row]) -> None:
+        """Opens them all.
+
+        Args:
+            record: The contents of config.json.
+            seeds: The seeds of the run.
+            rows: What metrics.jsonl holds already.
+        """
+        for name in self._names:
+
+            def begin(name: str = name) -> None:
+                self._open[name] = _OPEN[name](self._folder, record, seeds, self._say)
+                self._open[name].rows(rows)
+
+            self._try(name, begin)
+
+    def rows(self, rows: Sequence[Row]) -> None:
+        """Passes rows on."""
+        for name, logger in list(self._open.items()):
+            self._try(name, lambda logger=logger: logger.rows(rows))
+
+    def image(self, name: str, file: Path, env_steps: int) -> None:
+        """Passes an image on, if it is there."""
+        if file.exists():
+            for which, logger in list(self._open.items()):
+                self._try(which, lambda logger=logger: logger.image(name, file, env_steps))
+
+    def close(self, in_a_hurry: bool = False) -> None:
+        """Closes them, and does not wait for long: a library that waits for a network would never end the run."""
+        for name in list(self._open):
+            logger = self._open.pop(name)
+            thread = threading.Thread(target=self._try, args=(name, logger.close), daemon=True)
+            thread.start()
+            thread.join(_LEAVING_S[in_a_hurry])
+            if thread.is_alive():
+                self._say(f"--log {name} has not sent everything yet and is not waited for; metrics.jsonl has it all")
+
+    def _try(self, name: str, act: Callable[[], None]) -> None:
+        try:
+            act()
+        except Exception as error:
+            self._open.pop(name, None)
+            what = " ".join(f"{type(error).__name__}: {error}".split())
+            self._say(f"--log {name} failed and is left out from here on ({what[:200]}); metrics.jsonl has everything")
+
+
+def _open_tensorboard(folder: Path, record: Mapping[str, Any], seeds: Sequence[int], say: Callable[[str], None]) -> Logger:
+    from jaxrl_vis.run.tensorboard import TensorBoard
+
+    return TensorBoard(folder, record, seeds)
+
+
+def _open_wandb(folder: Path, record: Mapping[str, Any], seeds: Sequence[int], say: Callable[[str], None]) -> Logger:
+    from jaxrl_vis.run.weights_and_biases import WeightsAndBiases
+
+    return WeightsAndBiases(folder, record, seeds, say)
+
+
+_OPEN = {"tensorboard": _open_tensorboard, "wandb": _open_wandb}
