@@ -112,11 +112,12 @@ class Replay(NamedTuple):
             time=jax.random.randint(time_key, (batch_size,), 0, self.horizon),
         )
 
-    def gather(self, state: ReplayState, indices: Indices, goal_slot: jax.Array) -> Batch:
-        """Reads transitions with the goal in ``goal_slot`` ([B] int32 in [1, T+1])."""
+    def gather(self, state: ReplayState, indices: Indices, goal_slot: jax.Array, steps: int = 1) -> Batch:
+        """Reads transitions of ``steps`` steps, fewer at an episode's end, with the goal in ``goal_slot`` ([B] int32 in [1, T+1])."""
         observations, states, actions = state.episodes.observations, state.episodes.states, state.episodes.actions
         episode, time = indices
-        slots = jnp.stack([time, goal_slot, time + 1])
+        last = jnp.minimum(time + steps, self.horizon) if steps > 1 else time + 1
+        slots = jnp.stack([time, goal_slot, last])
         return Batch(
             observations=unpack(observations[jnp.broadcast_to(episode, slots.shape), slots]),
             action=actions[episode, time],
