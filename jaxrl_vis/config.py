@@ -71,7 +71,7 @@ class Config:
     filter_threshold: float | None = None
     """q0: negatives with Q above it are dropped as false. None: the middle of its band, for filtering methods."""
     trivial_goals: float = 1.0
-    """Share kept of the relabelled goals that are reached before the action already; the others give way to the original goal."""
+    """Share kept of relabelled goals that are reached already before the action; the others give way to the original goal."""
     reward_positive: float | None = None
     """R+. None: 0 for the oracle, 1 for indicator methods."""
     reward_negative: float | None = None
@@ -109,11 +109,11 @@ class Config:
     hidden_sizes: tuple[int, ...] = (256, 256, 256)
     """Hidden layers of the actor's and the critic's heads."""
     encoders: Literal["separate", "shared"] = "separate"
-    """Whether the actor has an encoder of its own, or acts on what the critic's encoder makes of images, without changing it."""
+    """Whether the actor has an encoder of its own, or acts on the latents of the critic's, which it cannot change."""
     target_encoder: bool = True
     """Whether targets have slowly following encoders, or, like their heads' online counterparts, read the online ones."""
     random_shift: int = 0
-    """Images of a batch are shifted by up to so many pixels each way, all three of a transition alike (Kostrikov et al., 2020)."""
+    """Images of a batch move by up to so many pixels each way, the three of a transition alike (Kostrikov et al., 2020)."""
     compute_dtype: ComputeDtype = "auto"
     """Arithmetic of the networks; parameters and losses are float32. auto: bfloat16 on accelerators."""
     normalizer_floor: float = 0.01

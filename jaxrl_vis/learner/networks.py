@@ -286,6 +286,7 @@ class Networks:
             for each, rows in zip(statistics, batch.observations, strict=True)
         ]
         height, width = self.observation_spec.shape[-2:]
+        assert batch.shift is not None
 
         def moved(image: jax.Array, shift: jax.Array) -> jax.Array:
             rows, columns = jnp.arange(height) - shift[0], jnp.arange(width) - shift[1]

@@ -113,7 +113,7 @@ class Replay(NamedTuple):
         )
 
     def gather(self, state: ReplayState, indices: Indices, goal_slot: jax.Array, steps: int = 1) -> Batch:
-        """Reads transitions of ``steps`` steps, fewer at an episode's end, with the goal in ``goal_slot`` ([B] int32 in [1, T+1])."""
+        """Reads transitions of ``steps`` steps, fewer at an episode's end; ``goal_slot`` [B] int32 lies in [1, T+1]."""
         observations, states, actions = state.episodes.observations, state.episodes.states, state.episodes.actions
         episode, time = indices
         last = jnp.minimum(time + steps, self.horizon) if steps > 1 else time + 1

@@ -74,7 +74,7 @@ class Sampler:
         return choose_goal_slots(key, time, self.replay.horizon, *shares)
 
     def _without_trivial(self, state: ReplayState, key: jax.Array, indices: Indices, goal_slot: jax.Array) -> jax.Array:
-        """``goal_slot``, but for most goals that hold before the action: the original goal, which asks for something to be done."""
+        """``goal_slot``, or the original goal for most of the goals that are reached before the action already."""
         episode, time = indices
         states = state.episodes.states
         is_trivial = goals.success(states[episode, time], states[episode, goal_slot], self.threshold) > 0

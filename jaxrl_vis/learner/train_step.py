@@ -11,6 +11,7 @@ it lies.
 """
 
 import dataclasses
+import functools
 import math
 from typing import Any
 
@@ -86,8 +87,8 @@ class TrainStep:
         return num_bytes(self.replay_spec)
 
 
-def _count(found: list[Metrics], name: str) -> int:
-    return sum(name in each for each in found)
+def _mean(values: list[jax.Array]) -> jax.Array:
+    return functools.reduce(jnp.add, values) / len(values)
 
 
 def _make_update_many(config: Config, sampler: Sampler, algorithm: Algorithm):
@@ -100,15 +101,13 @@ def _make_update_many(config: Config, sampler: Sampler, algorithm: Algorithm):
             return algorithm.apply(working, combine(gradients)), metrics
 
         def updates(working: Working, choices: Choice) -> tuple[Working, Metrics]:
-            """As many updates as the actor has one in: its last one. Written out, for the loop's body to have no conditional."""
+            """Updates of which the last one is the actor's, too; unrolled, so that the loop's body has no conditional."""
             found: list[Metrics] = []
             for number in range(interval):
                 choice = jax.tree.map(lambda leaf, number=number: leaf[number], choices)
                 working, metrics = one_update(working, choice, with_actor=number == interval - 1)
                 found.append(metrics)
-            return working, {
-                name: sum(each[name] for each in found if name in each) / _count(found, name) for name in found[-1]
-            }
+            return working, {name: _mean([each[name] for each in found if name in each]) for name in found[-1]}
 
         # What all updates learn from is chosen at once: in the loop, drawing numbers would be a dozen tiny kernels an update.
         keys = jax.random.split(key, config.updates_per_iteration)
