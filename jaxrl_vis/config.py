@@ -72,6 +72,8 @@ class Config:
     """p2: share of those whose goal is the very next observation, a sure positive. None: 0.5 for balancing methods, else 0."""
     filter_threshold: float | None = None
     """q0: negatives with Q above it are dropped as false. None: the middle of its band, for filtering methods."""
+    trivial_goals: float = 1.0
+    """Share kept of relabelled goals that are reached already before the action; the others give way to the original goal."""
     reward_positive: float | None = None
     """R+. None: 0 for the oracle, 1 for indicator methods."""
     reward_negative: float | None = None
@@ -88,6 +90,10 @@ class Config:
     """Share of a target network that stays at each update of it."""
     target_update_interval: int = 40
     """Gradient steps between target updates."""
+    actor_interval: int = 1
+    """Gradient steps of the critic for each one of the actor; divides updates_per_iteration."""
+    n_step: int = 1
+    """Rewards that a target sums before it trusts the critic. More than 1 needs true states, and a method without a filter."""
     action_penalty: float = 1.0
     """Weight of the mean squared action in the actor's loss."""
     clip_targets_above: bool = True
@@ -104,6 +110,12 @@ class Config:
     """Size of an encoded image."""
     hidden_sizes: tuple[int, ...] = (256, 256, 256)
     """Hidden layers of the actor's and the critic's heads."""
+    encoders: Literal["separate", "shared"] = "separate"
+    """Whether the actor has an encoder of its own, or acts on the latents of the critic's, which it cannot change."""
+    target_encoder: bool = True
+    """Whether targets have slowly following encoders, or, like their heads' online counterparts, read the online ones."""
+    random_shift: int = 0
+    """Images of a batch move by up to so many pixels each way, the three of a transition alike (Kostrikov et al., 2020)."""
     compute_dtype: ComputeDtype = "auto"
     """Arithmetic of the networks; parameters and losses are float32. auto: bfloat16 on accelerators."""
     normalizer_floor: float = 0.01
@@ -291,7 +303,7 @@ def validate(config: Config) -> Config:
         fields.check(name, hint, getattr(config, name))
     for field in dataclasses.fields(Config):
         value = getattr(config, field.name)
-        if field.type is int and field.name not in ("seed", "full_checkpoint_interval") and value < 1:
+        if field.type is int and field.name not in ("seed", "full_checkpoint_interval", "random_shift") and value < 1:
             raise RequestError(f"{field.name} must be at least 1, not {value}")
         if field.type is int and field.name not in ("seed", "env_steps") and value > _LARGEST_COUNT:
             raise RequestError(f"{field.name} must be at most {_LARGEST_COUNT}, not {value}")
@@ -300,16 +312,26 @@ def validate(config: Config) -> Config:
     for name in ("encoder_filters", "hidden_sizes"):
         if any(size < 1 for size in getattr(config, name)):
             raise RequestError(f"{name} must all be at least 1, not {' '.join(map(str, getattr(config, name)))}")
-    for name in ("relabel_probability", "balance_probability", "random_action_probability", "target_decay"):
+    for name in ("relabel_probability", "balance_probability", "trivial_goals", "random_action_probability", "target_decay"):
         value = getattr(config, name)
         if value is not None and not 0.0 <= value <= 1.0:
             raise RequestError(f"{name} is a share and must lie in [0, 1], not {value}")
     for name in ("actor_learning_rate", "critic_learning_rate", "normalizer_floor", "normalizer_clip", "randomize_strength"):
         if not getattr(config, name) > 0.0:
             raise RequestError(f"{name} must be positive, not {getattr(config, name)}")
-    for name in ("seed", "full_checkpoint_interval", "action_noise"):
+    for name in ("seed", "full_checkpoint_interval", "action_noise", "random_shift"):
         if getattr(config, name) < 0:
             raise RequestError(f"{name} must be at least 0, not {getattr(config, name)}")
+    if config.updates_per_iteration % config.actor_interval:
+        raise RequestError(
+            f"actor_interval ({config.actor_interval}) must divide updates_per_iteration ({config.updates_per_iteration})"
+        )
+    method = METHODS[config.method]
+    if config.n_step > 1 and method.filter:
+        raise RequestError(f"n_step {config.n_step} with method {config.method}: the filter's band is that of one step")
+    for name, is_set in (("n_step", config.n_step > 1), ("trivial_goals", config.trivial_goals < 1.0)):
+        if is_set and method.reward != "oracle":
+            raise RequestError(f"{name} reads true states, which method {config.method} does without; use --method oracle")
     if config.seed + config.seeds - 1 > _LARGEST_SEED:
         raise RequestError(f"seed {config.seed} is too large: the last of {config.seeds} must be at most {_LARGEST_SEED}")
     return config

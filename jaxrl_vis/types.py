@@ -68,7 +68,10 @@ class Batch(Replaceable):
         action: [B, A] float32.
         state_tp1: [B, G] float32, the true state after the action.
         goal_state: [B, G] float32, the true state that the goal shows.
-        reward: [B] float32 of reaching that goal; None as long as goals may still change.
+        reward: [B] float32 of reaching that goal, over the steps from the first observation to the last; None as long as goals
+            may still change.
+        discount: [B] float32 of what comes after these steps; None: that of one step.
+        shift: [B, 2] int32, pixels by which the images are to be moved down and to the right; None: not at all.
     """
 
     observations: jax.Array
@@ -76,6 +79,8 @@ class Batch(Replaceable):
     state_tp1: jax.Array
     goal_state: jax.Array
     reward: jax.Array | None = None
+    discount: jax.Array | None = None
+    shift: jax.Array | None = None
 
     @property
     def observation_t(self) -> jax.Array:
@@ -115,8 +120,8 @@ class TrainState(Replaceable):
     """The learner: networks, their targets, optimisers, observation statistics.
 
     Attributes:
-        actor, critic: Online parameters.
-        target_actor, target_critic: Slowly following copies.
+        actor, critic: Online parameters. The actor is a head alone where it shares the critic's encoder.
+        target_actor, target_critic: Slowly following copies; heads alone where there is no target encoder.
         actor_optimizer, critic_optimizer: optax states.
         normalizer: Observation statistics.
         goal_normalizer: Those of goals, where they have their own; else None.

@@ -119,3 +119,12 @@ class PointImage(Probe):
     def see(self, position):
         bits = jax.lax.bitcast_convert_type(position, jnp.uint8)  # [1, 4]: all of the float32, so equal bytes are equal points
         return jnp.broadcast_to(bits[:, None, :], (1, 4, 4))
+
+
+class SeenGoWhereTold(GoWhereTold):
+    """`GoWhereTold` as an image: the point is a bright column of 8x8 pixels, and the goal is where the column shall be."""
+
+    def see(self, position):
+        column = jnp.arange(8, dtype=jnp.float32) - 3.5
+        brightness = jnp.clip(255.0 * (1.0 - jnp.abs(column - 3.5 * position) / 2.0), 0.0, 255.0)
+        return jnp.broadcast_to(brightness, (1, 8, 8)).astype(jnp.uint8)

@@ -24,6 +24,11 @@ BAD_VALUES: tuple[tuple[str, Any, str], ...] = (
     ("seed", 99999999999999999999, "seed 99999999999999999999 is too large"),
     ("seed", 2**32, "seed 4294967296 is too large"),
     ("seed", -1, "seed must be at least 0"),
+    ("actor_interval", 3, "actor_interval (3) must divide updates_per_iteration"),
+    ("actor_interval", 0, "actor_interval must be at least 1"),
+    ("random_shift", -1, "random_shift must be at least 0"),
+    ("trivial_goals", 1.5, "trivial_goals is a share and must lie in [0, 1]"),
+    ("encoders", "joint", "encoders cannot be 'joint'"),
     ("num_envs", 10**20, "num_envs must be at most"),
     ("num_envs", "abc", "num_envs must be a whole number, not 'abc'"),
     ("num_envs", 2.5, "num_envs must be a whole number"),
@@ -139,3 +144,10 @@ def test_a_threshold_needs_a_method_that_filters() -> None:
         resolve(Config(filter_threshold=0.0), 50)
     with pytest.raises(RequestError, match="outside its band"):
         resolve(Config(method="indicator_balance_filter", filter_threshold=1000.0), 50)
+
+
+@pytest.mark.parametrize("option", [{"n_step": 3}, {"trivial_goals": 0.5}])
+@pytest.mark.parametrize("method", [name for name in METHODS if METHODS[name].reward != "oracle"])
+def test_what_reads_true_states_is_refused_where_there_are_none(option: dict[str, Any], method: MethodName):
+    with pytest.raises(RequestError, match=next(iter(option))):
+        validate(Config(method=method, **option))

@@ -252,3 +252,73 @@ def test_goals_can_have_statistics_of_their_own(source):
     per_episode = {"rollouts": 5, "relabelled": 4}[source]  # T+1 observations, or T transitions
     assert float(observed.count[0]) == 64 * per_episode
     assert float(observed.mean[0, 0]) < float(shared.mean[0, 0]) < 0.0
+
+
+CHEAPER = {
+    "shared": {"encoders": "shared"},
+    "no target encoder": {"target_encoder": False},
+    "all": {"encoders": "shared", "target_encoder": False, "actor_interval": 2, "random_shift": 1},
+}
+
+
+@pytest.mark.parametrize("options", CHEAPER.values(), ids=CHEAPER)
+def test_policy_learns_from_images_with_fewer_encoders(options):
+    """What is saved is not there: no second encoder, none of targets; and the policy still goes where the goal image says."""
+    settings = {"encoder_filters": (8, 8), "relabel_probability": 0.9, "normalizer_floor": 1.0, "iterations": 20}
+    program, train, _ = trained(probes.SeenGoWhereTold(), **settings, **options)
+    assert ("encoder" in train.actor) == (options.get("encoders") != "shared")
+    assert ("encoder" in train.target_critic) == options.get("target_encoder", True)
+    outcome, _ = program.evaluate(jax.tree.map(lambda leaf: leaf[None], train), jax.random.key(11))
+    assert outcome["eval/success"][0] >= 0.9
+
+
+def test_a_shared_encoder_learns_nothing_from_the_actor():
+    """Whatever the actor's step size, the critic and its encoder take the same first steps."""
+
+    def critic_after(learning_rate):
+        config = preset("debug", encoders="shared", actor_learning_rate=learning_rate, batch_size=8, updates_per_iteration=1)
+        program = make_train_step(probes.SeenGoWhereTold(), config)
+        loop, _ = program.train_iteration(program.init(jax.random.key(0)[None]))
+        return loop.train
+
+    slow, fast = critic_after(1e-5), critic_after(1e-1)
+    jax.tree.map(np.testing.assert_array_equal, slow.critic, fast.critic)
+    assert any(jax.tree.leaves(jax.tree.map(lambda one, other: bool(jnp.any(one != other)), slow.actor, fast.actor)))
+
+
+def test_the_actor_steps_once_an_interval():
+    config = preset("debug", num_envs=4, batch_size=8, updates_per_iteration=6)
+    counts = {}
+    for interval in (1, 3):
+        program = make_train_step(probes.GoWhereTold(), config.replace(actor_interval=interval))
+        loop, metrics = program.train_iteration(program.init(jax.random.key(0)[None]))
+        counts[interval] = tuple(
+            int(moments[0].count[0]) for moments in (loop.train.actor_optimizer, loop.train.critic_optimizer)
+        )
+        assert np.isfinite(metrics["train/actor_loss"]).all()
+    assert counts == {1: (6, 6), 3: (2, 6)}
+
+
+def test_a_target_sums_the_rewards_of_several_steps():
+    """With as many steps as the episode has, the critic needs no targets to know the value three steps away."""
+    program, train, _ = trained(probes.ThreeStepsAway(), n_step=4, target_decay=1.0, iterations=25)
+    # Targets never learn: what they add is the fresh critic's value, which is near 0, after the episode's end.
+    expected = [-1.0 - DISCOUNT, -1.0, 0.0]
+    np.testing.assert_allclose(values(program, train, [-3.0, -2.0, -1.0], [0.0] * 3), expected, atol=0.3)
+
+
+def test_goals_that_are_reached_already_give_way():
+    """A point that stays where it is has reached every relabelled goal; the original one is elsewhere."""
+
+    class Elsewhere(probes.AlwaysThere):
+        def start(self, key):
+            return jnp.zeros(1), jnp.ones(1)
+
+    shares = {}
+    for kept in (1.0, 0.25, 0.0):
+        config = preset("debug", num_envs=16, batch_size=512, relabel_probability=1.0, trivial_goals=kept)
+        program = make_train_step(Elsewhere(), config)
+        _, metrics = program.train_iteration(program.init(jax.random.key(0)[None]))
+        shares[kept] = float(metrics["train/positive_share"][0])
+    assert shares[1.0] == 1.0 and shares[0.0] == 0.0
+    assert shares[0.25] == pytest.approx(0.25, abs=0.05)

@@ -11,13 +11,16 @@ it needs in one pass:
     their targets                           goal, after
 
 The actor's loss values its actions with the critic's latents from the critic's own forward pass: the actor cannot change them.
+
+Encoding images is most of the work, and `Config` can save some of it: ``encoders="shared"`` lets the actor act on the critic's
+latents, too, ``target_encoder=False`` computes targets with the online encoders, and ``actor_interval`` spares the actor steps.
 """
 
 import functools
 import itertools
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -58,7 +61,7 @@ class LossGradients(NamedTuple):
 
     Attributes:
         critic: `MAIN`, and whatever is learned beside it.
-        actor: The same.
+        actor: The same; empty in a step of the critic alone.
     """
 
     critic: dict[str, Params]
@@ -66,10 +69,10 @@ class LossGradients(NamedTuple):
 
 
 class Gradients(NamedTuple):
-    """What the optimisers get: one gradient for each network, float32."""
+    """What the optimisers get: one gradient for each network, float32; None for an actor that stays as it is."""
 
     critic: Params
-    actor: Params
+    actor: Params | None
 
 
 class Algorithm(NamedTuple):
@@ -78,14 +81,14 @@ class Algorithm(NamedTuple):
     Attributes:
         init: key -> TrainState.
         begin: TrainState -> Working, before the first of several gradient steps.
-        gradients: (Working, Batch with rewards) -> (LossGradients, metrics of [] float32).
+        gradients: (Working, Batch with rewards, whether for the actor, too) -> (LossGradients, metrics of [] float32).
         apply: (Working, Gradients) -> Working, after one gradient step.
         end: Working -> TrainState.
     """
 
     init: Callable[[jax.Array], TrainState]
     begin: Callable[[TrainState], Working]
-    gradients: Callable[[Working, Batch], tuple[LossGradients, Metrics]]
+    gradients: Callable[[Working, Batch, bool], tuple[LossGradients, Metrics]]
     apply: Callable[[Working, Gradients], Working]
     end: Callable[[Working], TrainState]
 
@@ -104,6 +107,8 @@ def combine(gradients: LossGradients, weights: Mapping[str, jax.Array] = Mapping
         return jax.tree.map(lambda leaf: weights[name] * leaf, tree)
 
     def total(named: dict[str, Params]) -> Params:
+        if not named:
+            return None
         return functools.reduce(lambda one, other: jax.tree.map(jnp.add, one, other), itertools.starmap(scaled, named.items()))
 
     return Gradients(critic=total(gradients.critic), actor=total(gradients.actor))
@@ -131,9 +136,8 @@ def _start(networks: Networks, optimizers: "_Optimizers", key: jax.Array) -> Tra
     return TrainState(
         actor=actor,
         critic=critic,
-        # Copies: a donated buffer must not appear twice.
-        target_actor=jax.tree.map(jnp.copy, actor),
-        target_critic=jax.tree.map(jnp.copy, critic),
+        target_actor=networks.init_target(actor),
+        target_critic=networks.init_target(critic),
         actor_optimizer=optimizers.actor.init(actor),
         critic_optimizer=optimizers.critic.init(critic),
         normalizer=normalizer.init(networks.observation_spec),
@@ -149,21 +153,30 @@ class _Optimizers(NamedTuple):
 
 def _apply(state: TrainState, gradients: Gradients, optimizers: _Optimizers, config: Config) -> TrainState:
     """One step of both optimisers, and the targets a little after the online networks."""
-    critic_change, critic_moments = optimizers.critic.update(gradients.critic, state.critic_optimizer)
-    actor_change, actor_moments = optimizers.actor.update(gradients.actor, state.actor_optimizer)
-    actor = optax.apply_updates(state.actor, actor_change)
-    critic = optax.apply_updates(state.critic, critic_change)
+    critic, critic_moments = _step(optimizers.critic, state.critic, gradients.critic, state.critic_optimizer)
+    actor, actor_moments = state.actor, state.actor_optimizer
+    if gradients.actor is not None:
+        actor, actor_moments = _step(optimizers.actor, actor, gradients.actor, actor_moments)
     updates = state.updates + 1
     follow = jnp.where(updates % config.target_update_interval == 0, 1.0 - config.target_decay, 0.0)
+
+    def followed(online: Params, target: Params) -> Params:
+        return optax.incremental_update({part: online[part] for part in target}, target, follow)
+
     return state.replace(
         actor=actor,
         critic=critic,
-        target_actor=optax.incremental_update(actor, state.target_actor, follow),
-        target_critic=optax.incremental_update(critic, state.target_critic, follow),
+        target_actor=followed(actor, state.target_actor),
+        target_critic=followed(critic, state.target_critic),
         actor_optimizer=actor_moments,
         critic_optimizer=critic_moments,
         updates=updates,
     )
+
+
+def _step(optimizer: optax.GradientTransformation, params: Params, gradient: Params, moments: Any) -> tuple[Params, Any]:
+    change, moments = optimizer.update(gradient, moments)
+    return optax.apply_updates(params, change), moments
 
 
 def make_ddpg(networks: Networks, config: Config, resolved: Resolved) -> Algorithm:
@@ -179,49 +192,70 @@ def make_ddpg(networks: Networks, config: Config, resolved: Resolved) -> Algorit
     def begin(train: TrainState) -> Working:
         return Working(train, _ComputeCopies(*map(networks.compute_copy, _networks_of(train))))
 
-    def encode_pair(params: Params, inputs: jax.Array, first: int) -> jax.Array:
-        """Latents [2, B, latent] of observations ``first`` and ``first`` + 1 of the three."""
+    def encode(params: Params, inputs: jax.Array, first: int, count: int = 2) -> jax.Array:
+        """Latents [count, B, latent] of observations ``first``, ``first`` + 1, ... of the three."""
         size = inputs.shape[0] // 3
-        return networks.encode(params, inputs, slice(first * size, (first + 2) * size)).reshape(2, size, -1)
+        return networks.encode(params, inputs, slice(first * size, (first + count) * size)).reshape(count, size, -1)
 
-    def critic_loss(critic: Params, inputs: jax.Array, action: jax.Array, reward: jax.Array, target: jax.Array):
-        latents = encode_pair(critic, inputs, 0)
-        value = networks.value(critic, latents, action)
-        keep = losses.keep_mask(reward, value, resolved.reward_negative, resolved.filter_threshold)
-        loss = losses.critic_loss(value, target, keep)
-        return loss, (latents, value, keep)
+    def next_latents(now: _ComputeCopies, inputs: jax.Array, latents: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Latents [2, B, latent] of the observation after and the goal, for the target actor and for the target critic.
+
+        Heads take them in this order; observations come as (goal, after). ``latents`` are the critic's of the first two.
+        """
+        if config.target_encoder:
+            of_critic = encode(now.target_critic, inputs, 1)[::-1]
+        else:
+            of_critic = jnp.concatenate([encode(now.critic, inputs, 2, count=1), latents[1:]])
+        if config.encoders == "shared":
+            return of_critic, of_critic
+        return encode(networks.with_encoder(now.target_actor, now.actor), inputs, 1)[::-1], of_critic
+
+    def make_target(now: _ComputeCopies, inputs: jax.Array, latents: jax.Array, batch: Batch) -> jax.Array:
+        assert batch.reward is not None
+        of_actor, of_critic = next_latents(now, inputs, jax.lax.stop_gradient(latents))
+        value_tp1 = networks.value(now.target_critic, of_critic, networks.act(now.target_actor, of_actor))
+        discount = resolved.discount if batch.discount is None else batch.discount
+        return losses.td_target(batch.reward, value_tp1, discount, resolved.target_minimum, resolved.target_maximum)
+
+    def critic_loss(critic: Params, now: _ComputeCopies, inputs: jax.Array, batch: Batch):
+        assert batch.reward is not None
+        latents = encode(critic, inputs, 0)
+        target = make_target(now, inputs, latents, batch)
+        value = networks.value(critic, latents, batch.action)
+        keep = losses.keep_mask(batch.reward, value, resolved.reward_negative, resolved.filter_threshold)
+        return losses.critic_loss(value, target, keep), (latents, value, keep)
 
     def actor_loss(actor: Params, critic: Params, inputs: jax.Array, critic_latents: jax.Array):
-        action = networks.act(actor, encode_pair(actor, inputs, 0))
+        latents = critic_latents if config.encoders == "shared" else encode(actor, inputs, 0)
+        action = networks.act(actor, latents)
         value = networks.value(critic, critic_latents, action)
         return losses.actor_loss(value, action, config.action_penalty), action
 
-    def gradients(working: Working, batch: Batch) -> tuple[LossGradients, Metrics]:
+    def in_float32(tree: Params) -> Params:
+        return jax.tree.map(lambda leaf: leaf.astype(jnp.float32), tree)
+
+    def gradients(working: Working, batch: Batch, with_actor: bool = True) -> tuple[LossGradients, Metrics]:
         assert batch.reward is not None
         now = _ComputeCopies(*map(networks.with_compute_copy, _networks_of(working.train), working.copies))
         # Before, goal, after: the online networks read the first two, their targets the last two.
         inputs = networks.prepare_batch(working.train, batch)
-
-        # The targets' observations come as (goal, after); the heads take them the other way round.
-        action_tp1 = networks.act(now.target_actor, encode_pair(now.target_actor, inputs, 1)[::-1])
-        value_tp1 = networks.value(now.target_critic, encode_pair(now.target_critic, inputs, 1)[::-1], action_tp1)
-        target = losses.td_target(batch.reward, value_tp1, resolved.discount, resolved.target_minimum, resolved.target_maximum)
-
         (critic_error, (latents, value, keep)), critic_gradient = jax.value_and_grad(critic_loss, has_aux=True)(
-            now.critic, inputs, batch.action, batch.reward, target
+            now.critic, now, inputs, batch
         )
-        (policy_loss, action), actor_gradient = jax.value_and_grad(actor_loss, has_aux=True)(
-            now.actor, now.critic, inputs, latents
-        )
-        critic_gradient, actor_gradient = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), (critic_gradient, actor_gradient))
         metrics = {
             "train/critic_loss": critic_error,
-            "train/actor_loss": policy_loss,
             "train/value": jnp.mean(value),
-            "train/action_size": jnp.sqrt(jnp.mean(jnp.square(action))),
             **_shares(batch.reward, keep, resolved.reward_positive),
         }
-        return LossGradients({MAIN: critic_gradient}, {MAIN: actor_gradient}), metrics
+        found = LossGradients({MAIN: in_float32(critic_gradient)}, {})
+        if with_actor:
+            (policy_loss, action), actor_gradient = jax.value_and_grad(actor_loss, has_aux=True)(
+                now.actor, now.critic, inputs, latents
+            )
+            found = found._replace(actor={MAIN: in_float32(actor_gradient)})
+            metrics["train/actor_loss"] = policy_loss
+            metrics["train/action_size"] = jnp.sqrt(jnp.mean(jnp.square(action)))
+        return found, metrics
 
     return Algorithm(
         init=lambda key: _start(networks, optimizers, key),

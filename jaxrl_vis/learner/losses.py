@@ -8,7 +8,11 @@ import jax.numpy as jnp
 
 
 def td_target(
-    reward_t: jax.Array, value_tp1: jax.Array, discount: float, minimum: float = -jnp.inf, maximum: float = jnp.inf
+    reward_t: jax.Array,
+    value_tp1: jax.Array,
+    discount: float | jax.Array,
+    minimum: float = -jnp.inf,
+    maximum: float = jnp.inf,
 ) -> jax.Array:
     """r + gamma Q'(s', pi'(s')) clipped to what a sum of rewards can be: [B] float32, without gradient.
 

@@ -180,6 +180,7 @@ class Networks:
         return (
             self.sees_images
             and self.dtype == jnp.bfloat16
+            and not self.config.random_shift
             and encoder_kernel.supports(self.config.encoder_filters, self.observation_spec.shape)
             and encoder_kernel.is_available()
         )
@@ -207,21 +208,33 @@ class Networks:
     def _latent_size(self) -> int:
         return self.config.latent_size if self.sees_images else math.prod(self.observation_spec.shape)
 
-    def _init(self, key: jax.Array, head: _Head, head_inputs: int) -> Params:
+    def _init(self, key: jax.Array, head: _Head, head_inputs: int, has_encoder: bool = True) -> Params:
         encoder_key, head_key = jax.random.split(key)
         params = {"head": head.init(head_key, jnp.zeros((1, head_inputs)))["params"]}
-        if self.sees_images:
+        if self.sees_images and has_encoder:
             blocks = to_blocks(jnp.zeros((1, *self.observation_spec.shape)), self._levels)
             params["encoder"] = self._encoder.init(encoder_key, blocks)["params"]
         return params
 
     def init_actor(self, key: jax.Array) -> Params:
-        """Fresh actor parameters."""
-        return self._init(key, self._head(self.action_size, 0.0), 2 * self._latent_size)
+        """Fresh actor parameters: without an encoder where it shares the critic's."""
+        has_encoder = self.config.encoders == "separate"
+        return self._init(key, self._head(self.action_size, 0.0), 2 * self._latent_size, has_encoder=has_encoder)
 
     def init_critic(self, key: jax.Array) -> Params:
         """Fresh critic parameters."""
         return self._init(key, self._head(1, self.critic_output_bias), 2 * self._latent_size + self.action_size)
+
+    def init_target(self, online: Params) -> Params:
+        """A copy of online parameters for a target network to start with: the head alone where targets have no encoders."""
+        kept = online if self.config.target_encoder else {"head": online["head"]}
+        return jax.tree.map(jnp.copy, kept)  # a donated buffer must not appear twice
+
+    def with_encoder(self, params: Params, other: Params) -> Params:
+        """``params`` with the encoder of ``other``, unless they have their own or nobody needs one."""
+        if "encoder" in params or "encoder" not in other:
+            return params
+        return {**params, "encoder": other["encoder"]}
 
     def compute_copy(self, params: Params) -> Params:
         """The large kernels in the dtype that the networks compute in; None for all parameters that stay as they are.
@@ -244,6 +257,8 @@ class Networks:
 
     def prepare_batch(self, train: TrainState, batch: Batch) -> jax.Array:
         """`prepare` of the three observations of B transitions, side by side: [3 B, ...]."""
+        if batch.shift is not None and self.sees_images:
+            return self._prepare_shifted(train, batch)
         if train.goal_normalizer is None:
             return self.prepare(train.normalizer, batch.observations.reshape(-1, *batch.observations.shape[2:]))
         statistics = (train.normalizer, train.goal_normalizer, train.normalizer)
@@ -256,8 +271,31 @@ class Networks:
             return encoder_kernel.prepare(observations, mean, scale, self._levels, self.config.normalizer_clip, self.dtype)
         if self.sees_images:
             observations, mean, scale = (to_blocks(array, self._levels) for array in (observations, mean, scale))
+        return self._normalized(observations, mean, scale)
+
+    def _normalized(self, observations: jax.Array, mean: jax.Array, scale: jax.Array) -> jax.Array:
         limit = self.config.normalizer_clip
         return jnp.clip((observations.astype(jnp.float32) - mean) * scale, -limit, limit).astype(self.dtype)
+
+    def _prepare_shifted(self, train: TrainState, batch: Batch) -> jax.Array:
+        """As `prepare_batch`, of images that are moved after they were normalised: what moves in is the mean image."""
+        statistics = (train.normalizer, train.goal_statistics, train.normalizer)
+        floor = self.config.normalizer_floor
+        parts = [
+            self._normalized(rows, each.mean, normalizer.scale(each, floor))
+            for each, rows in zip(statistics, batch.observations, strict=True)
+        ]
+        height, width = self.observation_spec.shape[-2:]
+        assert batch.shift is not None
+
+        def moved(image: jax.Array, shift: jax.Array) -> jax.Array:
+            rows, columns = jnp.arange(height) - shift[0], jnp.arange(width) - shift[1]
+            inside = ((rows >= 0) & (rows < height))[:, None] & ((columns >= 0) & (columns < width))
+            rows, columns = jnp.clip(rows, 0, height - 1), jnp.clip(columns, 0, width - 1)
+            return jnp.where(inside, image[..., rows, :][..., columns], 0)
+
+        images = jax.vmap(jax.vmap(moved), in_axes=(0, None))(jnp.stack(parts), batch.shift)
+        return to_blocks(images.reshape(-1, *self.observation_spec.shape), self._levels)
 
     def encode(self, params: Params, inputs: jax.Array, which: slice = slice(None)) -> jax.Array:
         """Latents of ``which`` of the prepared observations, [B, latent]; a state vector is its own latent."""

@@ -131,20 +131,22 @@ class Replay(NamedTuple):
             time=jax.random.randint(time_key, (batch_size,), 0, self.horizon),
         )
 
-    def gather(self, state: ReplayState, indices: Indices, goal_slot: jax.Array) -> Batch:
+    def gather(self, state: ReplayState, indices: Indices, goal_slot: jax.Array, steps: int = 1) -> Batch:
         """Reads transitions, with what is in a slot of the same episode as their goal.
 
         Args:
             state: The replay.
             indices: Where the transitions lie, [B] each.
             goal_slot: [B] int32 in [1, T+1].
+            steps: Of a transition; it has fewer where the episode ends.
 
         Returns:
             The transitions, without rewards.
         """
         observations, states, actions = state.episodes.observations, state.episodes.states, state.episodes.actions
         episode, time = indices
-        slots = jnp.stack([time, goal_slot, time + 1])
+        last = jnp.minimum(time + steps, self.horizon) if steps > 1 else time + 1
+        slots = jnp.stack([time, goal_slot, last])
         return Batch(
             observations=unpack(observations[jnp.broadcast_to(episode, slots.shape), slots]),
             action=actions[episode, time],

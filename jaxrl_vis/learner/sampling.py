@@ -20,6 +20,9 @@ from jaxrl_vis.methods import METHODS
 from jaxrl_vis.types import Batch, ReplayState
 from jaxrl_vis_envs import goals
 
+# Folded into a key for draws that only some configurations make, so that they change nothing for the others.
+_TRIVIAL, _SHIFT = 0x747276, 0x736866
+
 
 class Choice(NamedTuple):
     """Which transitions to read, and with which goals; made ahead, for many batches at once.
@@ -27,10 +30,12 @@ class Choice(NamedTuple):
     Attributes:
         indices: Where the transitions lie, [B] each.
         goal_slot: [B] int32 in [t + 1, T + 1].
+        shift: [B, 2] int32, see `Batch`; or None.
     """
 
     indices: Indices
     goal_slot: jax.Array
+    shift: jax.Array | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,12 +66,26 @@ class Sampler:
         """
         sample_key, goal_key = jax.random.split(key)
         indices = self.replay.sample_indices(state, sample_key, iteration, self.config.batch_size)
-        return Choice(indices, self.goal_slots(goal_key, indices.time))
+        goal_slot = self.goal_slots(goal_key, indices.time)
+        if self.config.trivial_goals < 1.0:
+            goal_slot = self._without_trivial(state, jax.random.fold_in(key, _TRIVIAL), indices, goal_slot)
+        if not self.config.random_shift:
+            return Choice(indices, goal_slot)
+        most, shape = self.config.random_shift, (self.config.batch_size, 2)
+        return Choice(indices, goal_slot, jax.random.randint(jax.random.fold_in(key, _SHIFT), shape, -most, most + 1))
 
     def goal_slots(self, key: jax.Array, time: jax.Array) -> jax.Array:
         """Goal slots for transitions that start at ``time`` [B] int32; see `relabel`."""
         shares = self.config.relabel_probability, self.resolved.balance_probability
         return choose_goal_slots(key, time, self.replay.horizon, *shares)
+
+    def _without_trivial(self, state: ReplayState, key: jax.Array, indices: Indices, goal_slot: jax.Array) -> jax.Array:
+        """``goal_slot``, or the original goal for most of the goals that are reached before the action already."""
+        episode, time = indices
+        states = state.episodes.states
+        is_trivial = goals.success(states[episode, time], states[episode, goal_slot], self.threshold) > 0
+        gives_way = is_trivial & ~jax.random.bernoulli(key, self.config.trivial_goals, time.shape)
+        return jnp.where(gives_way, self.replay.horizon + 1, goal_slot)
 
     def batch(self, state: ReplayState, choice: Choice) -> Batch:
         """Reads what was chosen, with goals that stand still and rewards that belong to them.
@@ -78,7 +97,7 @@ class Sampler:
         Returns:
             B transitions with rewards.
         """
-        batch = self.replay.gather(state, *choice)
+        batch = self.replay.gather(state, choice.indices, choice.goal_slot, self.config.n_step).replace(shift=choice.shift)
         reached = batch.observation_tp1
         if self.as_goal is not None:
             # Stacked images also show how things move, and a goal stands still; what is reached is compared in the same terms.
@@ -86,7 +105,23 @@ class Sampler:
             observed_t, goal, observed_tp1 = batch.observations
             batch = batch.replace(observations=jnp.stack([observed_t, as_goal(goal), observed_tp1]))
             reached = as_goal(observed_tp1)
+        if self.config.n_step > 1:
+            return self._rewarded_over_steps(state, choice, batch)
         return batch.replace(reward=self.reward(batch, reached))
+
+    def _rewarded_over_steps(self, state: ReplayState, choice: Choice, batch: Batch) -> Batch:
+        """The oracle's rewards of up to ``n_step`` steps, discounted and summed, and the discount of what follows them."""
+        episode, time = choice.indices
+        after = time[:, None] + 1 + jnp.arange(self.config.n_step)  # slots that the steps lead to, [B, n]
+        is_step = after <= self.replay.horizon
+        reached = state.episodes.states[episode[:, None], jnp.minimum(after, self.replay.horizon)]
+        values = {"positive": self.resolved.reward_positive, "negative": self.resolved.reward_negative}
+        rewards = goals.oracle_reward(reached, batch.goal_state[:, None], self.threshold, **values)
+        weights = is_step * self.resolved.discount ** jnp.arange(self.config.n_step)
+        return batch.replace(
+            reward=jnp.sum(weights * rewards, axis=1),
+            discount=self.resolved.discount ** jnp.sum(is_step, axis=1).astype(jnp.float32),
+        )
 
     def reward(self, batch: Batch, reached: jax.Array) -> jax.Array:
         """Rewards [B] float32.

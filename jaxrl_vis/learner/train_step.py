@@ -11,6 +11,7 @@ it lies.
 """
 
 import dataclasses
+import functools
 import math
 from typing import Any
 
@@ -86,17 +87,33 @@ class TrainStep:
         return num_bytes(self.replay_spec)
 
 
+def _mean(values: list[jax.Array]) -> jax.Array:
+    return functools.reduce(jnp.add, values) / len(values)
+
+
 def _make_update_many(config: Config, sampler: Sampler, algorithm: Algorithm):
+    interval = config.actor_interval
+
     def update_many(train: TrainState, replay: ReplayState, key: jax.Array, iteration: jax.Array) -> tuple[TrainState, Metrics]:
-        def one_update(working: Working, choice: Choice) -> tuple[Working, Metrics]:
+        def one_update(working: Working, choice: Choice, with_actor: bool) -> tuple[Working, Metrics]:
             batch = sampler.batch(replay, choice)
-            gradients, metrics = algorithm.gradients(working, batch)
+            gradients, metrics = algorithm.gradients(working, batch, with_actor)
             return algorithm.apply(working, combine(gradients)), metrics
+
+        def updates(working: Working, choices: Choice) -> tuple[Working, Metrics]:
+            """Updates of which the last one is the actor's, too; unrolled, so that the loop's body has no conditional."""
+            found: list[Metrics] = []
+            for number in range(interval):
+                choice = jax.tree.map(lambda leaf, number=number: leaf[number], choices)
+                working, metrics = one_update(working, choice, with_actor=number == interval - 1)
+                found.append(metrics)
+            return working, {name: _mean([each[name] for each in found if name in each]) for name in found[-1]}
 
         # What all updates learn from is chosen at once: in the loop, drawing numbers would be a dozen tiny kernels an update.
         keys = jax.random.split(key, config.updates_per_iteration)
         choices = jax.vmap(lambda update_key: sampler.choose(replay, update_key, iteration))(keys)
-        working, metrics = jax.lax.scan(one_update, algorithm.begin(train), choices)
+        choices = jax.tree.map(lambda leaf: leaf.reshape(-1, interval, *leaf.shape[1:]), choices)
+        working, metrics = jax.lax.scan(updates, algorithm.begin(train), choices)
         return algorithm.end(working), jax.tree.map(jnp.mean, metrics)
 
     return update_many
