@@ -77,6 +77,7 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
         (["bench", "physics", "--peer", "mujoco"], ["bench render"]),
         (["bench", "render", "--peer", "playground"], ["bench physics"]),
         (["bench", "physics", "--peer", "playground"], ["--env FingerTurn"]),
+        (["bench", "train", "--peer", "torch"], ["bench update"]),
         (["bench", "render", "--peer", "mujocco"], ["--peer cannot be 'mujocco'", "mujoco"]),
         (["bench", "physics", "--envs", "0"], ["--envs", "at least 1"]),
         (["bench", "render", "--env", "FetchReach"], ["--env VisualFetchReach"]),

@@ -19,7 +19,7 @@ class Settings:
         pixels: Channels: rgbd, rgb or depth.
         batch_size: Transitions in a gradient step.
         repeats: Timed repeats at most; see `timing.measure`.
-        peer: Another renderer, or another physics, to measure beside ours.
+        peer: Another renderer, another physics, or PyTorch, to measure beside ours.
         scene: A scene of `render_scenes`, or the path of an MJCF file, to draw instead of an environment.
         on_accelerator: Whether JAX runs on one; filled in by `for_this_device`.
     """

@@ -1,4 +1,4 @@
-"""Gradient steps alone, including sampling from the replay and relabelling."""
+"""Gradient steps alone, including sampling from the replay and relabelling; on request, PyTorch beside ours."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxrl_vis.bench import roofline
+from jaxrl_vis.bench import roofline, torch_peer
 from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.settings import Settings
 from jaxrl_vis.bench.timing import Timing, compile_timed
@@ -78,8 +78,12 @@ def measure(settings: Settings) -> Iterator[Measurement]:
     """Yields gradient steps per second, and how far they are from the roofline."""
     updates = 200 if settings.on_accelerator else 20
     config = training_config(settings, updates_per_iteration=updates)
+    if settings.peer is not None:
+        torch_peer.load()  # first, because it may be missing
     env = settings.make_env()
     program = make_train_step(env, config)
+    if settings.peer is not None:
+        torch_peer.check_config(program)
     timing, compile_s = time_updates(program, settings)
     seconds = timing.median_s / updates
 
@@ -95,10 +99,14 @@ def measure(settings: Settings) -> Iterator[Measurement]:
     costs = {"roofline": roofline.describe(least, seconds, dtype, device)}
     if counted is not None:
         costs["compiler"] = roofline.describe(counted, seconds, dtype, device)
-    yield Measurement(
+    ours = Measurement(
         name="update/gradient_steps",
         value=1.0 / seconds,
         unit="updates/s",
         config={**settings.image_config(), "method": config.method, "batch_size": config.batch_size, "dtype": dtype},
         details=timing.details(compile_s, replay_mb=round(program.replay_bytes / 1e6, 1), **costs),
     )
+    yield ours
+    if settings.peer is not None:
+        fresh = jax.tree.map(lambda leaf: leaf[0], start(program).replace(iteration=jnp.zeros(1, jnp.int32)))
+        yield torch_peer.measure(program, fresh.train, fresh.replay, settings, ours)

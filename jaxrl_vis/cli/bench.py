@@ -12,6 +12,9 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.report.outputs import check_writable
 
 Benchmark = Literal["render", "physics", "env", "update", "train"]
+Peer = Literal["mujoco", "warp", "playground", "torch"]
+
+_BENCHMARK_OF: dict[str, Benchmark] = {"playground": "physics", "torch": "update"}  # of all other peers: render
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,8 +39,9 @@ class Bench:
     """Transitions in a gradient step (update)."""
     repeats: int = 5
     """Timed repeats; the median counts."""
-    peer: Literal["mujoco", "warp", "playground"] | None = None
-    """Measure another side by side: a renderer on the same poses (render), or MuJoCo Playground's FingerTurn (physics)."""
+    peer: Peer | None = None
+    """Measure another side by side: a renderer on the same poses (render: mujoco, warp), MuJoCo Playground's FingerTurn
+    (physics: playground), or the same gradient steps in PyTorch (update: torch)."""
     scene: str | None = None
     """finger, fetch_reach, primitives or the path of an MJCF file: draw this in the place of an environment; all three for a
     peer if not given (render)."""
@@ -53,7 +57,7 @@ def run(options: Bench) -> int:
         return _look_after_records(options)
     if options.benchmark is None:
         raise RequestError(f"no benchmark given; choose one of {', '.join(get_args(Benchmark))}, or --check or --tables")
-    for option, benchmark in (("scene", "render"), ("peer", "physics" if options.peer == "playground" else "render")):
+    for option, benchmark in (("scene", "render"), ("peer", _BENCHMARK_OF.get(options.peer or "", "render"))):
         value = getattr(options, option)
         if value is not None and options.benchmark != benchmark:
             raise RequestError(f"--{option} {value} goes with `bench {benchmark}` only")
