@@ -18,6 +18,7 @@ class Settings:
         image_size: Height and width of images.
         pixels: Channels: rgbd, rgb or depth.
         batch_size: Transitions in a gradient step.
+        seeds: Learners side by side in one program.
         repeats: Timed repeats at most; see `timing.measure`.
         peer: Another renderer, another physics, or PyTorch, to measure beside ours.
         scene: A scene of `render_scenes`, or the path of an MJCF file, to draw instead of an environment.
@@ -29,6 +30,7 @@ class Settings:
     image_size: int | None = None
     pixels: str | None = None
     batch_size: int | None = None
+    seeds: int = 1
     repeats: int = 5
     peer: str | None = None
     scene: str | None = None
@@ -63,3 +65,7 @@ class Settings:
         if not self.has_images:
             return {"env": self.env}
         return {"env": self.env, "image_size": self.image_size, "pixels": self.pixels}
+
+    def seeds_config(self) -> dict[str, int]:
+        """What a record says about the number of learners; nothing of one, as records from before there could be several."""
+        return {"seeds": self.seeds} if self.seeds > 1 else {}

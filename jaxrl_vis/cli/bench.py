@@ -37,6 +37,8 @@ class Bench:
     """Channels; rgbd on accelerators and depth on a CPU if not given."""
     batch_size: int | None = None
     """Transitions in a gradient step (update)."""
+    seeds: int = 1
+    """Learners side by side in one program (update, train)."""
     repeats: int = 5
     """Timed repeats; the median counts."""
     peer: Peer | None = None
@@ -61,7 +63,11 @@ def run(options: Bench) -> int:
         value = getattr(options, option)
         if value is not None and options.benchmark != benchmark:
             raise RequestError(f"--{option} {value} goes with `bench {benchmark}` only")
-    check_counts(repeats=options.repeats, image_size=options.image_size, batch_size=options.batch_size)
+    if options.seeds != 1 and options.benchmark not in ("update", "train"):
+        raise RequestError("--seeds goes with `bench update` and `bench train` only")
+    if options.seeds != 1 and options.peer == "torch":
+        raise RequestError("--peer torch learns with one seed: leave out --seeds")
+    check_counts(seeds=options.seeds, repeats=options.repeats, image_size=options.image_size, batch_size=options.batch_size)
     for count in options.envs:
         check_counts(envs=count)
     check_env(options.env)
