@@ -1,3 +1,4 @@
+import dataclasses
 import functools
 import json
 import time
@@ -237,6 +238,30 @@ def test_every_benchmark_keeps_records(benchmark: str, tmp_path: Path, monkeypat
     assert found and all(entry.value > 0.0 for entry in found)
     assert len(json.loads((tmp_path / "out" / "run.json").read_text())) == len(found)
     assert len(record.load(record.results_path(benchmark, tmp_path))) == len(found)
+    if benchmark == "train":
+        parts = found[0].details["milliseconds"]
+        assert set(parts) == {"rollout", "insert", "updates", "evaluation", "host", "env"}
+        assert all(part > 0.0 for name, part in parts.items() if name != "host") and parts["host"] >= 0.0
+        iteration = 1e3 * 3 * Dot.horizon / found[0].value  # ms; 3 environments
+        assert found[0].details["share_of_promise"] == pytest.approx((parts["env"] + parts["updates"]) / iteration, rel=0.01)
+
+
+def test_a_table_says_where_an_iteration_goes() -> None:
+    parts = {"rollout": 0.25, "insert": 0.05, "updates": 0.5, "evaluation": 0.1, "host": 0.0}
+    lines = {" ".join(line.split()[:-3]): line.split()[-3:] for line in train.describe(1.0, parts, 0.7).splitlines()}
+    assert lines["rollout"] == ["250.00", "ms", "25.0%"]
+    assert lines["sum without evaluation"] == ["800.00", "ms", "80.0%"]
+    assert lines["promised"] == ["700.00", "ms", "70.0%"]
+
+
+@pytest.mark.usefixtures("dots")
+def test_several_learners_are_measured_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = Settings(env="Dot", seeds=2)
+    assert update.training_config(settings).seeds == 2
+    monkeypatch.setattr(update, "training_config", lambda _, **overrides: preset("debug", seeds=2, **overrides))
+    (found,) = update.measure(dataclasses.replace(settings, repeats=1).for_this_device())
+    assert found.config["seeds"] == 2 and found.value > 0.0
+    assert "seeds" not in Settings(env="Dot").seeds_config()
 
 
 @pytest.mark.usefixtures("dots")

@@ -6,18 +6,18 @@ import jax
 
 from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.settings import Settings
-from jaxrl_vis.bench.timing import compile_timed
+from jaxrl_vis.bench.timing import Timing, compile_timed
 from jaxrl_vis.bench.timing import measure as measure_time
 from jaxrl_vis.bench.variation import assert_varied
+from jaxrl_vis_envs.base import GoalEnv
 from jaxrl_vis_envs.compilation import env_jit
 
 CPU_COUNTS = (16, 256)
 ACCELERATOR_COUNTS = (256, 1024, 4096, 8192)
 
 
-def measure(settings: Settings) -> Iterator[Measurement]:
-    """Yields environment steps per second; resets and goal images are spread over the horizon."""
-    env = settings.make_env()
+def time_episodes(env: GoalEnv, count: int, repeats: int) -> tuple[Timing, float]:
+    """The time of one episode in each of ``count`` environments, and the seconds of its compilation."""
 
     def episode(key: jax.Array) -> tuple[jax.Array, jax.Array]:
         reset_key, action_key = jax.random.split(key)
@@ -32,14 +32,20 @@ def measure(settings: Settings) -> Iterator[Measurement]:
         # Every image is returned, so that the compiler cannot drop any.
         return jax.lax.scan(step, state.replace(obs=None), jax.random.split(action_key, env.horizon))[1], goal
 
+    keys = jax.random.split(jax.random.key(3), count)
+    compiled, compile_s = compile_timed(env_jit(jax.vmap(episode, out_axes=(1, 0))), keys)
+    frames, goals = compiled(keys)
+    assert_varied(frames[-1], "last frames")
+    assert_varied(goals, "goals")
+    del frames, goals
+    return measure_time(lambda: compiled(keys), repeats), compile_s
+
+
+def measure(settings: Settings) -> Iterator[Measurement]:
+    """Yields environment steps per second; resets and goal images are spread over the horizon."""
+    env = settings.make_env()
     for count in settings.counts(CPU_COUNTS, ACCELERATOR_COUNTS):
-        keys = jax.random.split(jax.random.key(3), count)
-        compiled, compile_s = compile_timed(env_jit(jax.vmap(episode, out_axes=(1, 0))), keys)
-        frames, goals = compiled(keys)
-        assert_varied(frames[-1], "last frames")
-        assert_varied(goals, "goals")
-        del frames, goals
-        timing = measure_time(lambda: compiled(keys), settings.repeats)  # noqa: B023 - called at once
+        timing, compile_s = time_episodes(env, count, settings.repeats)
         yield Measurement(
             name="env/steps",
             value=count * env.horizon / timing.median_s,

@@ -19,8 +19,9 @@ class Settings:
         image_size: Height and width of images.
         pixels: Channels: rgbd, rgb or depth.
         batch_size: Transitions in a gradient step.
+        seeds: Learners side by side in one program.
         repeats: Timed repeats at most; see `timing.measure`.
-        peer: Another renderer, or another physics, to measure beside ours.
+        peer: Another renderer, another physics, or PyTorch, to measure beside ours.
         scene: A scene of `render_scenes`, or the path of an MJCF file, to draw instead of an environment.
         on_accelerator: Whether JAX runs on one; filled in by `for_this_device`.
     """
@@ -30,6 +31,7 @@ class Settings:
     image_size: int | None = None
     pixels: str | None = None
     batch_size: int | None = None
+    seeds: int = 1
     repeats: int = 5
     peer: str | None = None
     scene: str | None = None
@@ -71,3 +73,7 @@ class Settings:
         if not self.has_images:
             return {"env": self.env}
         return {"env": self.env, "image_size": self.image_size, "pixels": self.pixels}
+
+    def seeds_config(self) -> dict[str, int]:
+        """What a record says about the number of learners; nothing of one, as records from before there could be several."""
+        return {"seeds": self.seeds} if self.seeds > 1 else {}

@@ -25,6 +25,7 @@ _IMAGES = (*_RENDERER, f"{_ENVS}/pixels.py")
 _TASK = (f"{_ENVS}/tasks/{{task}}.py", f"{_ENVS}/tasks/assets/{{task}}.xml")
 _LEARNER = ("jaxrl_vis/learner", "jaxrl_vis/config.py", "jaxrl_vis/methods.py")
 _TIMING = "jaxrl_vis/bench/timing.py"
+_TORCH = ("jaxrl_vis/bench/torch_learner.py", "jaxrl_vis/bench/torch_peer.py")
 _SCENES = ("jaxrl_vis/bench/scene_images.py", "jaxrl_vis/bench/render_scenes.py", _TIMING)
 
 MEASURED: dict[str, tuple[str, ...]] = {
@@ -36,6 +37,7 @@ MEASURED: dict[str, tuple[str, ...]] = {
     "physics/peer_playground": ("jaxrl_vis/bench/playground.py", _TIMING),
     "env/steps": (*_PHYSICS, *_IMAGES, *_TASK, "jaxrl_vis/bench/env.py", _TIMING),
     "update/gradient_steps": (*_LEARNER, "jaxrl_vis/bench/update.py", _TIMING),
+    "update/peer_torch": (*_TORCH, _TIMING),
     "train/env_steps": (*_PHYSICS, *_IMAGES, *_TASK, *_LEARNER, "jaxrl_vis/bench/train.py", _TIMING),
     "train/updates": (*_PHYSICS, *_IMAGES, *_TASK, *_LEARNER, "jaxrl_vis/bench/train.py", _TIMING),
     "adapters/success": (*_PHYSICS, *_TASK, f"{_ENVS}/adapters", "benchmarks/adapters.py"),

@@ -1,43 +1,133 @@
-"""Whole training iterations, as `jaxrl-vis train` runs them: rollout, insert, gradient steps."""
+"""Whole training iterations, as `jaxrl-vis train` runs them, and where their time goes.
+
+    iteration    rollout, insert and updates as one program, the host reading the metrics of one iteration during the next
+    parts        each of the three as a program of its own, and what an iteration pays for evaluations and for the host
+    promise      the time that `bench env` and `bench update` give for the same environments and the same gradient steps
+
+An iteration that takes longer than the promise loses time between its parts, to the policy in the rollout, or to the replay.
+"""
 
 import time
 from collections.abc import Iterator
 from typing import Any
 
-import jax
 import numpy as np
 
+from jaxrl_vis.bench.env import time_episodes
 from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.settings import Settings
-from jaxrl_vis.bench.timing import compile_timed
+from jaxrl_vis.bench.timing import Timing, compile_timed
 from jaxrl_vis.bench.timing import measure as measure_time
-from jaxrl_vis.bench.update import training_config
-from jaxrl_vis.learner.train_step import make_train_step
+from jaxrl_vis.bench.update import seed_keys, time_updates, training_config
+from jaxrl_vis.learner.train_step import TrainStep, make_train_step
+from jaxrl_vis.types import LoopState
+
+_BUDGET_S = 40.0
+
+
+def time_iterations(program: TrainStep, repeats: int) -> tuple[LoopState, Timing, dict[str, float]]:
+    """Trains for a while.
+
+    Returns:
+        What was trained, the time of an iteration whose metrics the host reads during the next, and in seconds: ``compile``,
+        and ``host``, what that reading adds.
+
+    Raises:
+        FloatingPointError: A metric is not finite.
+    """
+    loop = program.init(seed_keys(program, 0))
+    compiled, compile_s = compile_timed(program.train_iteration, loop)
+    loop, waiting = compiled(loop)
+
+    def dispatch() -> Any:
+        nonlocal loop, waiting
+        loop, waiting = compiled(loop)
+        return waiting
+
+    def train() -> Any:
+        before = waiting
+        after = dispatch()
+        metrics = {name: np.asarray(values) for name, values in before.items()}
+        if any(not np.isfinite(values).all() for values in metrics.values()):
+            raise FloatingPointError("training gave numbers that are not finite")
+        return after
+
+    alone = measure_time(dispatch, repeats, _BUDGET_S)
+    timing = measure_time(train, repeats, _BUDGET_S)
+    return loop, timing, {"compile": compile_s, "host": max(0.0, timing.median_s - alone.median_s)}
+
+
+def time_parts(program: TrainStep, loop: LoopState, repeats: int) -> dict[str, float]:
+    """Seconds of what an iteration consists of, each as a program of its own at the iteration's own sizes.
+
+    Args:
+        program: What the iteration is made of.
+        loop: Donated.
+        repeats: Timed repeats at most.
+
+    Returns:
+        ``rollout``, ``insert``, ``updates``, and ``evaluation``, an iteration's part of it.
+    """
+    keys, iteration = seed_keys(program, 3), loop.iteration
+    evaluate, _ = compile_timed(program.evaluate, loop.train, keys[0])
+    evaluation = measure_time(lambda: evaluate(loop.train, keys[0]), repeats)
+    play, _ = compile_timed(program.rollout, loop.train, keys)
+    rollout = measure_time(lambda: play(loop.train, keys), repeats)
+    episodes, _ = play(loop.train, keys)
+    insert, _ = compile_timed(program.insert, loop.train, loop.replay, episodes, keys, iteration)
+    train, replay = loop.train, loop.replay
+
+    def put() -> Any:
+        nonlocal train, replay
+        train, replay = insert(train, replay, episodes, keys, iteration)
+        return train
+
+    inserted = measure_time(put, repeats)
+    updates, _ = time_updates(program, loop.replace(train=train, replay=replay), repeats)
+    return {
+        "rollout": rollout.median_s,
+        "insert": inserted.median_s,
+        "updates": updates.median_s,
+        "evaluation": evaluation.median_s / program.config.eval_interval,
+    }
+
+
+def describe(iteration: float, parts: dict[str, float], promised: float) -> str:
+    """A table of the parts: milliseconds, and percent of an iteration."""
+    whole = parts["rollout"] + parts["insert"] + parts["updates"] + parts["host"]
+    rows = {**parts, "sum without evaluation": whole, "iteration": iteration, "promised": promised}
+    lines = [f"    {name:24}{1e3 * seconds:12,.2f} ms {seconds / iteration:8.1%}" for name, seconds in rows.items()]
+    return "\n".join(lines)
 
 
 def measure(settings: Settings) -> Iterator[Measurement]:
-    """Yields environment steps and gradient steps per second of the device's preset, one seed."""
+    """Yields environment steps and gradient steps per second of the device's preset, of all seeds together."""
     env = settings.make_env()
     for count in settings.counts((0,), (0,)):  # 0: the preset's own number of environments
         config = training_config(settings, **({"num_envs": count} if count else {}))
-        program = make_train_step(env, config)
-        loop = program.init(jax.random.split(jax.random.key(0), 1))
-        compiled, compile_s = compile_timed(program.train_iteration, loop)
-
-        def call() -> Any:
-            nonlocal loop
-            loop, metrics = compiled(loop)  # noqa: B023 - called at once
-            return loop.iteration, metrics
-
-        started = time.perf_counter()
-        timing = measure_time(call, settings.repeats, budget_s=40.0)
-        metrics = {name: np.asarray(values) for name, values in call()[1].items()}
-        if any(not np.isfinite(values).all() for values in metrics.values()):
-            raise FloatingPointError("training gave numbers that are not finite")
+        program, started = make_train_step(env, config), time.perf_counter()
+        loop, timing, seconds = time_iterations(program, settings.repeats)
+        parts = {**time_parts(program, loop, settings.repeats), "host": seconds["host"]}
+        del loop
+        episodes, _ = time_episodes(env, config.num_envs * config.seeds, settings.repeats)
+        promised = episodes.median_s + parts["updates"]
+        print(describe(timing.median_s, parts, promised), flush=True)
         sizes = {"num_envs": config.num_envs, "batch_size": config.batch_size, "updates": program.updates_per_iteration}
         shared = {
-            "config": {**settings.image_config(), "preset": config.preset, "method": config.method, **sizes},
-            "details": timing.details(compile_s, measured_s=round(time.perf_counter() - started, 1)),
+            "config": {
+                **settings.image_config(),
+                "preset": config.preset,
+                "method": config.method,
+                **sizes,
+                **settings.seeds_config(),
+            },
+            "details": timing.details(
+                seconds["compile"],
+                measured_s=round(time.perf_counter() - started, 1),
+                milliseconds={name: round(1e3 * part, 3) for name, part in {**parts, "env": episodes.median_s}.items()},
+                share_of_promise=round(promised / timing.median_s, 3),
+            ),
         }
-        yield Measurement("train/env_steps", program.steps_per_iteration / timing.median_s, "env-steps/s", **shared)
-        yield Measurement("train/updates", program.updates_per_iteration / timing.median_s, "updates/s", **shared)
+        per_s = config.seeds / timing.median_s
+        yield Measurement("train/env_steps", program.steps_per_iteration * per_s, "env-steps/s", **shared)
+        yield Measurement("train/updates", program.updates_per_iteration * per_s, "updates/s", **shared)

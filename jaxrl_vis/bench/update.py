@@ -1,4 +1,4 @@
-"""Gradient steps alone, including sampling from the replay and relabelling."""
+"""Gradient steps alone, including sampling from the replay and relabelling; on request, PyTorch beside ours."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxrl_vis.bench import roofline
+from jaxrl_vis.bench import roofline, torch_peer
 from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.settings import Settings
 from jaxrl_vis.bench.timing import Timing, compile_timed
@@ -23,6 +23,7 @@ def training_config(settings: Settings, **overrides: Any) -> Config:
         overrides |= {"image_size": settings.image_size, "pixels": settings.pixels}
     if settings.batch_size is not None:
         overrides["batch_size"] = settings.batch_size
+    overrides["seeds"] = settings.seeds
     return preset("fast" if settings.on_accelerator else "cpu", env=settings.env, **overrides)
 
 
@@ -46,19 +47,22 @@ def fill_replay(replay: ReplayState, key: jax.Array) -> ReplayState:
     return replay.replace(episodes=episodes, size=jnp.full_like(replay.size, leaves[0].shape[0]))
 
 
+def seed_keys(program: TrainStep, seed: int) -> jax.Array:
+    """[S] typed keys, one for each learner."""
+    return jax.random.split(jax.random.key(seed), program.config.seeds)
+
+
 def start(program: TrainStep) -> LoopState:
-    """A fresh learner with a full replay: one seed."""
-    loop = program.init(jax.random.split(jax.random.key(0), 1))
+    """Fresh learners with full replays."""
+    loop = program.init(seed_keys(program, 0))
     fill = jax.jit(jax.vmap(fill_replay), donate_argnums=0)
-    return loop.replace(replay=fill(loop.replay, jax.random.split(jax.random.key(1), 1)))
+    return loop.replace(replay=fill(loop.replay, seed_keys(program, 1)))
 
 
-def time_updates(program: TrainStep, settings: Settings) -> tuple[Timing, float]:
-    """The time of one call of ``update_many``, and the seconds of its compilation."""
-    loop = start(program)
-    keys = jax.random.split(jax.random.key(2), 1)
+def time_updates(program: TrainStep, loop: LoopState, repeats: int) -> tuple[Timing, float]:
+    """The time of one call of ``update_many``, and the seconds of its compilation; the learners of ``loop`` are donated."""
+    keys = seed_keys(program, 2)
     compiled, compile_s = compile_timed(program.update_many, loop.train, loop.replay, keys, loop.iteration)
-    assert_varied(loop.replay.episodes.observations[0, :64, 0], "observations of the replay")
     train = loop.train
     before = jax.device_get(train.actor)
 
@@ -67,7 +71,7 @@ def time_updates(program: TrainStep, settings: Settings) -> tuple[Timing, float]
         train, metrics = compiled(train, loop.replay, keys, loop.iteration)
         return train, metrics
 
-    timing = measure_time(call, settings.repeats)
+    timing = measure_time(call, repeats)
     after = jax.device_get(train.actor)
     if all((old == new).all() for old, new in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True)):
         raise AssertionError("the parameters did not move: no gradient step was taken")
@@ -75,30 +79,49 @@ def time_updates(program: TrainStep, settings: Settings) -> tuple[Timing, float]
 
 
 def measure(settings: Settings) -> Iterator[Measurement]:
-    """Yields gradient steps per second, and how far they are from the roofline."""
+    """Yields gradient steps per second, of all seeds together, and how far they are from the roofline."""
     updates = 200 if settings.on_accelerator else 20
     config = training_config(settings, updates_per_iteration=updates)
+    if settings.peer is not None:
+        torch_peer.load()  # first, because it may be missing
     env = settings.make_env()
     program = make_train_step(env, config)
-    timing, compile_s = time_updates(program, settings)
-    seconds = timing.median_s / updates
+    if settings.peer is not None:
+        torch_peer.check_config(program)
+    loop = start(program)
+    assert_varied(loop.replay.episodes.observations[0, :64, 0], "observations of the replay")
+    timing, compile_s = time_updates(program, loop, settings.repeats)
+    del loop
+    seconds = timing.median_s / (updates * config.seeds)
 
-    # One gradient step on its own, compiled for its cost alone.
-    single = make_train_step(env, config.replace(updates_per_iteration=1))
-    loop = jax.eval_shape(single.init, jax.random.split(jax.random.key(0), 1))
-    keys = jax.random.split(jax.random.key(2), 1)
-    counted = roofline.compiler_cost(single.update_many.lower(loop.train, loop.replay, keys, loop.iteration).compile())
-    params = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), (loop.train.actor, loop.train.critic))
+    # One gradient step of one learner on its own, compiled for its cost alone.
+    single = make_train_step(env, config.replace(updates_per_iteration=1, seeds=1))
+    shapes = jax.eval_shape(single.init, seed_keys(single, 0))
+    arguments = shapes.train, shapes.replay, seed_keys(single, 2), shapes.iteration
+    counted = roofline.compiler_cost(single.update_many.lower(*arguments).compile())
+    params = jax.tree.map(
+        lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), (shapes.train.actor, shapes.train.critic)
+    )
     least = roofline.least_cost(program.networks, params, config.batch_size)
 
     dtype, device = str(program.networks.dtype), jax.devices()[0].device_kind
     costs = {"roofline": roofline.describe(least, seconds, dtype, device)}
     if counted is not None:
         costs["compiler"] = roofline.describe(counted, seconds, dtype, device)
-    yield Measurement(
+    ours = Measurement(
         name="update/gradient_steps",
         value=1.0 / seconds,
         unit="updates/s",
-        config={**settings.image_config(), "method": config.method, "batch_size": config.batch_size, "dtype": dtype},
+        config={
+            **settings.image_config(),
+            "method": config.method,
+            "batch_size": config.batch_size,
+            "dtype": dtype,
+            **settings.seeds_config(),
+        },
         details=timing.details(compile_s, replay_mb=round(program.replay_bytes / 1e6, 1), **costs),
     )
+    yield ours
+    if settings.peer is not None:
+        fresh = jax.tree.map(lambda leaf: leaf[0], start(program).replace(iteration=jnp.zeros(1, jnp.int32)))
+        yield torch_peer.measure(program, fresh.train, fresh.replay, settings, ours)

@@ -14,6 +14,9 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.report.outputs import check_writable
 
 Benchmark = Literal["render", "physics", "env", "update", "train"]
+Peer = Literal["mujoco", "warp", "playground", "torch"]
+
+_BENCHMARK_OF: dict[str, Benchmark] = {"playground": "physics", "torch": "update"}  # of all other peers: render
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,10 +39,13 @@ class Bench:
     """Channels; rgbd on accelerators and depth on a CPU if not given."""
     batch_size: int | None = None
     """Transitions in a gradient step (update)."""
+    seeds: int = 1
+    """Learners side by side in one program (update, train)."""
     repeats: int = 5
     """Timed repeats; the median counts."""
-    peer: Literal["mujoco", "warp", "playground"] | None = None
-    """Measure another side by side: a renderer on the same poses (render), or MuJoCo Playground's FingerTurn (physics)."""
+    peer: Peer | None = None
+    """Measure another side by side: a renderer on the same poses (render: mujoco, warp), MuJoCo Playground's FingerTurn
+    (physics: playground), or the same gradient steps in PyTorch (update: torch)."""
     scene: str | None = None
     """finger, fetch_reach, primitives or the path of an MJCF file: draw this in the place of an environment; all three for a
     peer if not given (render)."""
@@ -56,11 +62,15 @@ def run(options: Bench) -> int:
         return _look_after_records(options)
     if options.benchmark is None:
         raise RequestError(f"no benchmark given; choose one of {', '.join(get_args(Benchmark))}, or --check or --tables")
-    for option, benchmark in (("scene", "render"), ("peer", "physics" if options.peer == "playground" else "render")):
+    for option, benchmark in (("scene", "render"), ("peer", _BENCHMARK_OF.get(options.peer or "", "render"))):
         value = getattr(options, option)
         if value is not None and options.benchmark != benchmark:
             raise RequestError(f"--{option} {value} goes with `bench {benchmark}` only")
-    check_counts(repeats=options.repeats, image_size=options.image_size, batch_size=options.batch_size)
+    if options.seeds != 1 and options.benchmark not in ("update", "train"):
+        raise RequestError("--seeds goes with `bench update` and `bench train` only")
+    if options.seeds != 1 and options.peer == "torch":
+        raise RequestError("--peer torch learns with one seed: leave out --seeds")
+    check_counts(seeds=options.seeds, repeats=options.repeats, image_size=options.image_size, batch_size=options.batch_size)
     for count in options.envs:
         check_counts(envs=count)
     check_env(options.env)

@@ -48,7 +48,11 @@ class TrainStep:
         init: keys [S] -> LoopState.
         train_iteration: LoopState (donated) -> (LoopState, metrics of [S] float32).
         evaluate: See `evaluate.make_evaluate`.
-        update_many: (TrainState, ReplayState, key, iteration) of one seed -> the same after ``updates_per_iteration`` steps.
+        rollout, insert, update_many: The parts of an iteration as programs of their own, for whoever wants to time them:
+            (TrainState, keys [S]) -> (Episodes, outcome);
+            (TrainState, ReplayState, Episodes, keys [S], iteration) -> (TrainState, ReplayState), the first two donated;
+            (TrainState, ReplayState, keys [S], iteration) -> (TrainState, metrics) after ``updates_per_iteration`` steps, the
+            first donated.
     """
 
     env: GoalEnv
@@ -59,6 +63,8 @@ class TrainStep:
     init: Any
     train_iteration: Any
     evaluate: Any
+    rollout: Any
+    insert: Any
     update_many: Any
 
     @property
@@ -178,14 +184,23 @@ def make_train_step(env: GoalEnv, config: Config) -> TrainStep:
     def per_seed(function, in_axes: Any = 0, out_axes: Any = 0):
         return jax.vmap(function, in_axes=in_axes, out_axes=out_axes)
 
+    def rollout(train: TrainState, keys: jax.Array) -> tuple[Episodes, Metrics]:
+        episodes, outcome, _ = play(env, networks, train, keys, config.num_envs, exploration)
+        return episodes, outcome
+
+    def insert(
+        train: TrainState, replay_state: ReplayState, episodes: Episodes, key: jax.Array, iteration: jax.Array
+    ) -> tuple[TrainState, ReplayState]:
+        replay_state = replay.insert(replay_state, episodes, iteration)
+        return _see(train, episodes, jax.random.fold_in(key, _STATISTICS), config, sampler), replay_state
+
     def train_iteration(loop: LoopState) -> tuple[LoopState, Metrics]:
         keys = per_seed(lambda key: jax.random.split(jax.random.fold_in(key, loop.iteration)), out_axes=1)(loop.key)
-        episodes, outcome, _ = play(env, networks, loop.train, keys[0], config.num_envs, exploration)
+        episodes, outcome = rollout(loop.train, keys[0])
         return per_seed(learn, (_SEED_AXES, 0, 0, 0), (_SEED_AXES, 0))(loop, episodes, outcome, keys[1])
 
     def learn(loop: LoopState, episodes: Episodes, outcome: Metrics, key: jax.Array) -> tuple[LoopState, Metrics]:
-        replay_state = replay.insert(loop.replay, episodes, loop.iteration)
-        train = _see(loop.train, episodes, jax.random.fold_in(key, _STATISTICS), config, sampler)
+        train, replay_state = insert(loop.train, loop.replay, episodes, key, loop.iteration)
         train, metrics = update_many(train, replay_state, key, loop.iteration)
         metrics |= {f"train/{name}": jnp.mean(values) for name, values in outcome.items()}
         metrics["guard/nonfinite"] = _count_nonfinite((metrics, episodes.states, episodes.actions))
@@ -200,5 +215,7 @@ def make_train_step(env: GoalEnv, config: Config) -> TrainStep:
         init=env_jit(per_seed(init, out_axes=_SEED_AXES), runs_once=True),
         train_iteration=env_jit(train_iteration, donate_argnums=0),
         evaluate=env_jit(make_evaluate(env, networks, config)),
+        rollout=env_jit(rollout),
+        insert=env_jit(per_seed(insert, (0, 0, 0, 0, None)), donate_argnums=(0, 1)),
         update_many=env_jit(per_seed(update_many, (0, 0, 0, None)), donate_argnums=0),
     )

@@ -1,0 +1,316 @@
+"""`bench update --peer torch`: the same gradient steps in PyTorch (`torch_learner`), on the same device, in the same call.
+
+First it is checked that both compute the same: both start from our parameters, statistics and replay, take three gradient steps
+on the same three batches in float32, and must agree on every loss and on the gradient of one layer of each network. Then
+PyTorch's steps are timed in the dtype of ours, with either encoder, and the faster one counts.
+
+JAX takes most of a GPU's memory when it starts; if PyTorch then runs out, set XLA_PYTHON_CLIENT_MEM_FRACTION=.5.
+"""
+
+import dataclasses
+import importlib
+import math
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxrl_vis.bench.record import Measurement
+from jaxrl_vis.bench.settings import Settings
+from jaxrl_vis.bench.timing import measure as measure_time
+from jaxrl_vis.config import Config
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.learner import normalizer
+from jaxrl_vis.learner.ddpg import combine, make_ddpg
+from jaxrl_vis.learner.replay import unpack
+from jaxrl_vis.learner.sampling import Choice, Sampler
+from jaxrl_vis.learner.train_step import TrainStep
+from jaxrl_vis.types import ReplayState, TrainState
+from jaxrl_vis_envs.compilation import env_jit
+
+STEPS = 3
+"""Gradient steps that are compared."""
+LOSS_TOLERANCE, GRADIENT_TOLERANCE = 1e-3, 1e-3
+"""Most difference of a loss, and of a gradient in norm, as a share of ours; both computed in float32."""
+DTYPE_TOLERANCE = 0.1
+"""Most difference of the first critic loss between float32 and the dtype that is timed, as a share."""
+COMPARED_LAYER = {"critic": "encoder/kernel_1", "actor": "head/hidden_0/kernel"}
+"""The layer of each network whose gradients are compared."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Reference:
+    """Our first gradient steps in float32, and what they started from. All arrays are NumPy's.
+
+    Attributes:
+        parameters: Network -> its parameters by name, before the first step.
+        statistics: (mean, scale) of observations, and of goals, [C, H, W] float32.
+        choices: [STEPS, 3, B] int64, episode, time and goal slot of each transition.
+        losses: [STEPS, 2] float32 of critic and actor.
+        gradients: Network -> gradients by name, of the first step.
+    """
+
+    parameters: Mapping[str, Mapping[str, np.ndarray]]
+    statistics: tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+    choices: np.ndarray
+    losses: np.ndarray
+    gradients: Mapping[str, Mapping[str, np.ndarray]]
+
+
+def load() -> Any:
+    """The module that needs PyTorch.
+
+    Raises:
+        RequestError: It is not installed, or does not see the GPU that JAX runs on.
+    """
+    try:
+        learner = importlib.import_module("jaxrl_vis.bench.torch_learner")
+    except ImportError as error:
+        raise RequestError(f"--peer torch needs PyTorch, which is no dependency: pip install torch ({error})") from error
+    if jax.default_backend() == "gpu" and not learner.torch.cuda.is_available():
+        raise RequestError(f"--peer torch needs a PyTorch that sees the GPU; {learner.torch.__version__} does not")
+    return learner
+
+
+def by_name(tree: Any) -> dict[str, Any]:
+    """Leaves of nested dictionaries by their path: encoder/kernel_0."""
+    leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
+    return {"/".join(str(entry.key) for entry in path): leaf for path, leaf in leaves}
+
+
+def unalike(train: TrainState, program: TrainStep, replay: ReplayState) -> TrainState:
+    """A learner of one seed whose parts tell them apart: targets unlike the online networks, statistics of the replay.
+
+    Freshly made, targets are copies and statistics are zero: a comparison would not notice if one were taken for the other.
+    """
+    networks, target_key = program.networks, jax.random.key(7)
+    fresh = {"actor": networks.init_actor(target_key), "critic": networks.init_critic(target_key)}
+    images = unpack(replay.episodes.observations[:4])
+    changes: dict[str, Any] = {
+        f"target_{name}": {part: tree[part] for part in getattr(train, f"target_{name}")} for name, tree in fresh.items()
+    }
+    changes["normalizer"] = normalizer.update(train.normalizer, images)
+    if train.goal_normalizer is not None:
+        changes["goal_normalizer"] = normalizer.update(train.goal_normalizer, images[:, -1:])
+    return train.replace(**changes)
+
+
+def reference(program: TrainStep, train: TrainState, replay: ReplayState) -> Reference:
+    """Our steps, in float32 with exact products, from `unalike`.
+
+    Args:
+        program: Whose configuration and sizes count; its own dtype does not.
+        train, replay: Of one seed.
+    """
+    config = program.config.replace(compute_dtype="float32")
+    networks = dataclasses.replace(program.networks, config=config)
+    algorithm = make_ddpg(networks, config, program.resolved)
+    env = program.env
+    as_goal = env.as_goal if env.frame_stack > 1 else None
+    sampler = Sampler(config, program.resolved, program.replay, env.threshold, as_goal)
+
+    def begin(train: TrainState, replay: ReplayState) -> tuple[TrainState, Choice, Any]:
+        def choose(key: jax.Array) -> Choice:
+            return sampler.choose(replay, key, jnp.zeros((), jnp.int32))
+
+        train = unalike(train, program, replay)
+        pairs = [
+            (each.mean, normalizer.scale(each, config.normalizer_floor)) for each in (train.normalizer, train.goal_statistics)
+        ]
+        return train, jax.vmap(choose)(jax.random.split(jax.random.key(11), STEPS)), pairs
+
+    def step(train: TrainState, replay: ReplayState, choice: Choice) -> tuple[TrainState, jax.Array, Any]:
+        working = algorithm.begin(train)
+        gradients, metrics = algorithm.gradients(working, sampler.batch(replay, choice))
+        combined = combine(gradients)
+        losses = jnp.stack([metrics["train/critic_loss"], metrics["train/actor_loss"]])
+        return algorithm.end(algorithm.apply(working, combined)), losses, combined
+
+    train, choices, statistics = jax.device_get(env_jit(begin, runs_once=True)(train, replay))
+    now = train
+    stepped = env_jit(step)
+    losses, gradients = [], []
+    with jax.default_matmul_precision("highest"):
+        for index in range(STEPS):
+            now, *found = jax.device_get(stepped(now, replay, jax.tree.map(lambda leaf, index=index: leaf[index], choices)))
+            losses.append(found[0])
+            gradients.append(found[1])
+    names = ("actor", "critic", "target_actor", "target_critic")
+    return Reference(
+        parameters={name: by_name(getattr(train, name)) for name in names},
+        statistics=tuple(statistics),
+        choices=np.stack([np.asarray(part, np.int64) for part in (*choices.indices, choices.goal_slot)], axis=1),
+        losses=np.stack(losses),
+        gradients={"critic": by_name(gradients[0].critic), "actor": by_name(gradients[0].actor)},
+    )
+
+
+def compare(reference: Reference, losses: np.ndarray, gradients: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """Compares PyTorch's steps with ours; what a record keeps: the largest differences, as shares of ours.
+
+    Args:
+        reference: Ours.
+        losses: [STEPS, 2] float32.
+        gradients: Network -> the gradient of its `COMPARED_LAYER` in the first step, shaped as ours.
+
+    Raises:
+        AssertionError: They do not compute the same.
+    """
+    difference = float(np.max(np.abs(losses - reference.losses) / np.maximum(np.abs(reference.losses), 1e-3)))
+    found = {"loss_difference": difference}
+    for network, gradient in gradients.items():
+        ours = reference.gradients[network][COMPARED_LAYER[network]]
+        found[f"{network}_gradient_difference"] = float(np.linalg.norm(gradient - ours) / np.linalg.norm(ours))
+    bounds = {name: LOSS_TOLERANCE if name == "loss_difference" else GRADIENT_TOLERANCE for name in found}
+    if not all(found[name] <= bound for name, bound in bounds.items()):  # NaN is no agreement either
+        raise AssertionError(
+            f"PyTorch does not compute what we do: {found}, losses {losses.tolist()}, {reference.losses.tolist()}"
+        )
+    return found
+
+
+def _rules(learner: Any, program: TrainStep, train: TrainState, encoder: str, dtype: Any) -> Any:
+    """`torch_learner.Rules` of a configuration. Which networks have an encoder is read from the parameters."""
+    config, resolved = program.config, program.resolved
+    numbers = {**dataclasses.asdict(config), **dataclasses.asdict(resolved), "threshold": float(program.env.threshold)}
+    known = {
+        "encoder": encoder,
+        "dtype": dtype,
+        "levels": len(config.encoder_filters),
+        "hidden": len(config.hidden_sizes),
+        "shared_encoder": "encoder" not in train.actor,
+        "target_encoder": "encoder" in train.target_critic,
+        "actor_interval": numbers.get("actor_interval", 1),
+        "frame_stack": program.env.frame_stack,
+    }
+    names = [field.name for field in dataclasses.fields(learner.Rules)]
+    return learner.Rules(**{name: known[name] if name in known else numbers[name] for name in names})
+
+
+class _Peer:
+    """PyTorch's learners with our parameters and our replay.
+
+    Args:
+        program: Ours.
+        train, replay: Of one seed.
+    """
+
+    def __init__(self, program: TrainStep, train: TrainState, replay: ReplayState):
+        self._module = load()
+        self._torch = self._module.torch
+        self.version, self.encoders = str(self._torch.__version__), self._module.ENCODERS
+        self.device = "cpu" if jax.default_backend() == "cpu" else "cuda"
+        self._program, self._train = program, train
+        self.reference = reference(program, train, replay)
+        episodes = replay.episodes
+        self._episodes = [np.asarray(leaf) for leaf in (episodes.observations, episodes.states, episodes.actions)]
+
+    def replay(self, encoder: str) -> Any:
+        """Our replay as a `torch_learner.Replay`."""
+        words, *rest = self._episodes
+        images = words.view(np.uint8)  # four pixels a word, in order, where they are packed
+        return self._module.Replay(images, *rest, self._rules(encoder, "float32"), self.device)
+
+    def _rules(self, encoder: str, dtype: str) -> Any:
+        return _rules(self._module, self._program, self._train, encoder, getattr(self._torch, dtype))
+
+    def _learner(self, replay: Any, encoder: str, dtype: str) -> Any:
+        """A `torch_learner.Learner` that has not learned yet."""
+        tensor = self._torch.from_numpy
+        networks = {
+            network: {name: tensor(np.array(leaf)) for name, leaf in parameters.items()}
+            for network, parameters in self.reference.parameters.items()
+        }
+        statistics = [tuple(tensor(np.array(plane)) for plane in pair) for pair in self.reference.statistics]
+        return self._module.Learner(self._rules(encoder, dtype), networks, statistics, replay, self.device)
+
+    def check(self, replay: Any, encoder: str) -> dict[str, float]:
+        """Compares the first steps in float32; see `compare`."""
+        torch, learner = self._torch, self._learner(replay, encoder, "float32")
+        choices = torch.from_numpy(self.reference.choices).to(self.device)
+        losses, slopes = [], {}
+        precise = torch.backends.cuda.matmul.allow_tf32, torch.backends.cudnn.allow_tf32
+        torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = False
+        for choice in choices:
+            turns = learner.turns()
+            critic_error, policy_loss, critic, actor = learner.gradients(choice)
+            losses.append([float(critic_error), float(policy_loss)])
+            for network, gradients in (("critic", critic), ("actor", actor)):
+                name = COMPARED_LAYER[network]
+                slopes.setdefault(network, self._module.to_ours(name, gradients[name], encoder).cpu().numpy())
+            learner.apply(critic, actor if turns[0] else {}, turns[1])
+        torch.backends.cuda.matmul.allow_tf32, torch.backends.cudnn.allow_tf32 = precise
+        return compare(self.reference, np.asarray(losses), slopes)
+
+    def time(self, replay: Any, encoder: str, dtype: str, steps: int, repeats: int) -> tuple[Any, float]:
+        """The `Timing` of one call of ``steps`` gradient steps, and the seconds of compiling them."""
+        torch = self._torch
+        torch.set_float32_matmul_precision("high")  # as XLA's default
+        learner = self._learner(replay, encoder, dtype)
+        first = float(learner.gradients(torch.from_numpy(self.reference.choices[0]).to(self.device))[0])
+        expected = float(self.reference.losses[0, 0])
+        if not math.isclose(first, expected, rel_tol=DTYPE_TOLERANCE):
+            raise AssertionError(f"in {dtype} PyTorch's critic loss is {first}, in float32 {expected}")
+        before = {network: learner.networks[network][name].clone() for network, name in COMPARED_LAYER.items()}
+        started = time.perf_counter()
+        compiled = self._module.Compiled(learner, steps)
+        self._synchronize(None)
+        compile_s = time.perf_counter() - started
+        timing = measure_time(compiled, repeats, wait=self._synchronize)
+        if not bool(torch.isfinite(learner.losses).all()):
+            raise FloatingPointError("PyTorch's losses are not finite")
+        for network, name in COMPARED_LAYER.items():
+            if torch.equal(before[network], learner.networks[network][name]):
+                raise AssertionError(f"PyTorch's {network} did not move: no gradient step was taken")
+        return timing, compile_s
+
+    def _synchronize(self, _: Any) -> None:
+        if self.device != "cpu":
+            self._torch.cuda.synchronize()
+
+
+def check_config(program: TrainStep) -> None:
+    """Refuses what the peer does not learn from.
+
+    Raises:
+        RequestError: Rewards are not the oracle's, or observations are not images.
+    """
+    config: Config = program.config
+    if config.method != "oracle" or not program.networks.sees_images:
+        raise RequestError("--peer torch learns from images with --method oracle: choose a Visual environment")
+
+
+def measure(program: TrainStep, train: TrainState, replay: ReplayState, settings: Settings, ours: Measurement) -> Measurement:
+    """Gradient steps per second of the faster encoder.
+
+    Args:
+        program: Ours, one call of which takes ``updates_per_iteration`` steps.
+        train, replay: Of one seed, without the seed's axis.
+        settings: ``repeats`` counts.
+        ours: Our record of the same configuration.
+
+    Raises:
+        AssertionError: PyTorch does not compute what we do.
+    """
+    peer = _Peer(program, train, replay)
+    dtype, steps = str(program.networks.dtype), program.updates_per_iteration
+    found: dict[str, tuple[float, dict[str, Any]]] = {}
+    for encoder in peer.encoders:
+        episodes = peer.replay(encoder)
+        agreement = {name: float(f"{value:.2g}") for name, value in peer.check(episodes, encoder).items()}
+        timing, compile_s = peer.time(episodes, encoder, dtype, steps, settings.repeats)
+        found[encoder] = steps / timing.median_s, timing.details(compile_s, **agreement)
+        print(f"    PyTorch, {encoder}: {found[encoder][0]:,.0f} updates/s, compiled in {compile_s:.0f} s", flush=True)
+    fastest = max(found, key=lambda encoder: found[encoder][0])
+    rate, details = found[fastest]
+    rates = {f"{encoder}_per_s": round(each, 1) for encoder, (each, _) in found.items()}
+    return Measurement(
+        name="update/peer_torch",
+        value=rate,
+        unit="updates/s",
+        config=ours.config,
+        details={**details, "ours_over_peer": round(ours.value / rate, 2), "encoder": fastest, **rates, "torch": peer.version},
+    )
