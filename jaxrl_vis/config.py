@@ -283,8 +283,8 @@ _DEBUG = _CPU.replace(
 PRESETS: dict[str, Config] = {config.preset: config for config in (_PAPER, _FAST, _CPU, _DEBUG)}
 """``paper``: the authors' release. ``fast``: ours. ``cpu``: what two cores do in minutes. ``debug``: seconds, no learning."""
 
-# What a task asks for beside that, found by the ablations of docs/learner.md. Its rollouts wait for the latency of a GPU, so that
-# 500 environments take hardly longer than 100.
+# What a task asks for beside that, found by the ablations of docs/learner.md. Rollouts of these two wait for a GPU's latency:
+# several hundred environments take hardly longer than 100.
 _OF_TASK: dict[tuple[str, str], dict[str, Any]] = {
     ("fast", "HandReach"): {
         "num_envs": 500,

@@ -22,14 +22,14 @@ class Cost:
     bytes: float
 
 
-def compiler_cost(compiled: Any) -> Cost | None:
-    """The compiler's count. A loop's body counts once, so give it a program with one gradient step."""
+def compiler_cost(compiled: Any, steps: int = 1) -> Cost | None:
+    """The compiler's count of one of ``steps`` gradient steps. A loop's body counts once: give it a program with one turn."""
     analysis = compiled.cost_analysis()
     if isinstance(analysis, list):
         analysis = analysis[0] if analysis else None
     if not analysis or "flops" not in analysis:
         return None
-    return Cost(float(analysis["flops"]), float(analysis.get("bytes accessed", math.nan)))
+    return Cost(float(analysis["flops"]) / steps, float(analysis.get("bytes accessed", math.nan)) / steps)
 
 
 def encoder_products(networks: Networks) -> tuple[int, int]:
@@ -54,11 +54,12 @@ def head_products(sizes: tuple[int, ...]) -> int:
 
 
 def least_cost(networks: Networks, params: Any, batch_size: int) -> Cost:
-    """The count from the layers' shapes.
+    """The count from the layers' shapes, in the mean over the actor's interval.
 
-    Products: both targets encode two images a transition forward; both online networks two images forward and backward
-    (twice a forward pass, less the gradient of the image itself). The actor's head runs once forward as target and once both
-    ways; the critic's once as target, once both ways, and once more in the actor's loss, forward and back to the action.
+    Products: every online encoder takes two images a transition forward and backward (twice a forward pass, less the gradient
+    of the image itself), and every target encoder two forward; without those, every online encoder takes the image after, too.
+    The actor's head runs once forward as target and once both ways; the critic's once as target, once both ways, and once more
+    in the actor's loss, forward and back to the action.
 
     Bytes: three images a transition are read once as they lie in the replay; online parameters and two Adam moments are read
     and written once, target parameters are read and written once. Activations are taken to stay on the chip.
@@ -68,16 +69,29 @@ def least_cost(networks: Networks, params: Any, batch_size: int) -> Cost:
         params: Online actor and critic parameters.
         batch_size: Transitions in a gradient step.
     """
+    config = networks.config
     encoder, first_layer = encoder_products(networks)
-    spec, hidden, actions = networks.observation_spec, networks.config.hidden_sizes, networks.action_size
-    latent = networks.config.latent_size if networks.sees_images else math.prod(spec.shape)
+    spec, hidden, actions = networks.observation_spec, config.hidden_sizes, networks.action_size
+    latent = config.latent_size if networks.sees_images else math.prod(spec.shape)
     actor_head = head_products((2 * latent, *hidden, actions))
     critic_head = head_products((2 * latent + actions, *hidden, 1))
-    encoders = 2 * 2 * encoder + 2 * 2 * (3 * encoder - first_layer)
-    products = encoders + (1 + 3) * actor_head + (1 + 3 + 2) * critic_head
+    separate, actor_share = config.encoders == "separate", 1.0 / config.actor_interval
+    learned = 2 * (3 * encoder - first_layer)
+    followed = (2 if config.target_encoder else 1) * encoder
+    of_critic = learned + followed + (1 + 3) * critic_head
+    of_actor = (followed if separate else 0) + actor_head
+    of_actor_step = (learned if separate else 0) + 3 * actor_head + 2 * critic_head
+    products = of_critic + of_actor + actor_share * of_actor_step
+
     images = 3 * batch_size * math.prod(spec.shape) * spec.dtype.itemsize
-    parameters = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(params))
-    return Cost(flops=2.0 * batch_size * products, bytes=images + (2 + 4 + 2) * parameters)
+    actor, critic = params
+    online = _bytes(critic) + actor_share * _bytes(actor)
+    targets = sum(_bytes(each if config.target_encoder else each["head"]) for each in (actor, critic))
+    return Cost(flops=2.0 * batch_size * products, bytes=images + (2 + 4) * online + 2 * targets)
+
+
+def _bytes(tree: Any) -> int:
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
 
 
 def describe(cost: Cost, seconds: float, dtype: str, device_kind: str) -> dict[str, Any]:

@@ -94,11 +94,11 @@ def measure(settings: Settings) -> Iterator[Measurement]:
     del loop
     seconds = timing.median_s / (updates * config.seeds)
 
-    # One gradient step of one learner on its own, compiled for its cost alone.
-    single = make_train_step(env, config.replace(updates_per_iteration=1, seeds=1))
+    # The fewest gradient steps of one learner that a loop takes at once, compiled for their cost alone.
+    single = make_train_step(env, config.replace(updates_per_iteration=config.actor_interval, seeds=1))
     shapes = jax.eval_shape(single.init, seed_keys(single, 0))
     arguments = shapes.train, shapes.replay, seed_keys(single, 2), shapes.iteration
-    counted = roofline.compiler_cost(single.update_many.lower(*arguments).compile())
+    counted = roofline.compiler_cost(single.update_many.lower(*arguments).compile(), config.actor_interval)
     params = jax.tree.map(
         lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), (shapes.train.actor, shapes.train.critic)
     )
