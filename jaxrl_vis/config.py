@@ -242,7 +242,6 @@ _FAST = Config(
     target_update_interval=1,
     encoders="shared",
     target_encoder=False,
-    actor_interval=2,
     eval_interval=2,
 )
 
@@ -250,7 +249,6 @@ _CPU = _FAST.replace(
     preset="cpu",
     encoders="separate",
     target_encoder=True,
-    actor_interval=1,
     pixels="depth",
     image_size=32,
     num_envs=64,
@@ -291,6 +289,7 @@ _OF_TASK: dict[tuple[str, str], dict[str, Any]] = {
         "updates_per_iteration": 1000,
         "replay_transitions": 700_000,
         "random_action_probability": 0.1,
+        "actor_interval": 2,
         "random_shift": 3,
     },
     ("fast", "FingerTurn"): {"num_envs": 250, "updates_per_iteration": 1250, "trivial_goals": 0.2},
