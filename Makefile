@@ -77,6 +77,6 @@ clean: ## Remove what make built (not runs/)
 # dev holds all of base, at the same versions.
 $(STAMPS)/%: requirements/%.txt pyproject.toml | .venv/bin/python
 	@echo "installing requirements/$*.txt into .venv/"
-	@$(UV) pip install --quiet --python .venv --require-hashes -r requirements/$*.txt
+	@$(UV) pip install --quiet --compile-bytecode --python .venv --require-hashes -r requirements/$*.txt
 	@$(UV) pip install --quiet --python .venv --no-deps -e .
 	@mkdir -p $(STAMPS) && touch $@

@@ -11,6 +11,7 @@ metrics.jsonl; and nothing is saved before the iteration's metrics were read and
 
 import contextlib
 import dataclasses
+import importlib
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -20,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxrl_vis.errors import NonFiniteError, StorageError
-from jaxrl_vis.report import plots, videos
+from jaxrl_vis.report import videos
 from jaxrl_vis.run import metrics
 from jaxrl_vis.run.checkpoint import FULL, LIGHT, Checkpoints, Restored
 from jaxrl_vis.run.console import RunConsole, show_seconds, show_shares
@@ -215,6 +216,8 @@ class RunLoop:
         while self._done < self._total:
             assert self._loop is not None
             self._loop, values = self._programs.train_iteration(self._loop)
+            # Matplotlib takes half a second to import: now the device is busy. Once is enough; asking again costs nothing.
+            importlib.import_module("jaxrl_vis.report.plots")
             self._done += 1
             before, waiting = waiting, (self._done, values)
             if before is not None:
@@ -371,6 +374,8 @@ class RunLoop:
         self._say(f"see {', '.join([*written, self._folder.metrics.name])} in {self._folder.path}")
 
     def _draw_curve(self) -> None:
+        from jaxrl_vis.report import plots
+
         config, env = self._config, self._programs.env
         plots.plot_run(
             metrics.read_rows(self._folder.metrics),
