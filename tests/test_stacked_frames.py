@@ -39,7 +39,7 @@ def test_relabelled_goals_are_what_was_reached_standing_still():
     config = preset("debug", method="indicator")
     sampler = Sampler(config, resolve(config, horizon), replay, env.threshold, env.as_goal)
     choice = Choice(Indices(episode, time), goal_slot)
-    batch, still = replay.gather(state, *choice), sampler.batch(state, choice)
+    batch, still = replay.gather(state, choice.indices, choice.goal_slot), sampler.batch(state, choice)
     np.testing.assert_array_equal(still.observation_t, batch.observation_t)
     np.testing.assert_array_equal(still.observation_tp1, batch.observation_tp1)
     for row in range(len(time)):
@@ -81,10 +81,10 @@ def program(frame_stack: int = 2):
     config = preset("debug", method="indicator_balance_filter", relabel_probability=1.0, **SETTINGS)
     env = Walker(frame_stack)
 
-    def look(gradients, working, batch):
+    def look(gradients, working, batch, with_actor):
         goal, after = (images.reshape(len(batch.reward), frame_stack, -1) for images in (batch.goal, batch.observation_tp1))
         arrived = jnp.all(goal[:, 0] == after[:, 0], axis=-1)
-        return gradients(working, batch)[0], {
+        return gradients(working, batch, with_actor)[0], {
             "goals_that_stand_still": jnp.mean(jnp.all(goal == goal[:, :1], axis=(1, 2))),
             "observations_that_move": jnp.mean(jnp.any(after != after[:, :1], axis=(1, 2))),
             "arrived": jnp.mean(arrived),
