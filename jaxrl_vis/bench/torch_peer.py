@@ -122,20 +122,24 @@ def reference(program: TrainStep, train: TrainState, replay: ReplayState) -> Ref
         ]
         return train, jax.vmap(choose)(jax.random.split(jax.random.key(11), STEPS)), pairs
 
-    def step(train: TrainState, replay: ReplayState, choice: Choice) -> tuple[TrainState, jax.Array, Any]:
+    def step(with_actor: bool, train: TrainState, replay: ReplayState, choice: Choice) -> tuple[TrainState, jax.Array, Any]:
         working = algorithm.begin(train)
-        gradients, metrics = algorithm.gradients(working, sampler.batch(replay, choice))
+        # The actor's gradient is compared in every step, and taken where it is its turn.
+        gradients, metrics = algorithm.gradients(working, sampler.batch(replay, choice), True)
         combined = combine(gradients)
         losses = jnp.stack([metrics["train/critic_loss"], metrics["train/actor_loss"]])
-        return algorithm.end(algorithm.apply(working, combined)), losses, combined
+        taken = combined if with_actor else combined._replace(actor=None)
+        return algorithm.end(algorithm.apply(working, taken)), losses, combined
 
     train, choices, statistics = jax.device_get(env_jit(begin, runs_once=True)(train, replay))
     now = train
-    stepped = env_jit(step)
+    stepped = env_jit(step, static_argnums=0)
     losses, gradients = [], []
     with jax.default_matmul_precision("highest"):
         for index in range(STEPS):
-            now, *found = jax.device_get(stepped(now, replay, jax.tree.map(lambda leaf, index=index: leaf[index], choices)))
+            turn = (index + 1) % config.actor_interval == 0
+            choice = jax.tree.map(lambda leaf, index=index: leaf[index], choices)
+            now, *found = jax.device_get(stepped(turn, now, replay, choice))
             losses.append(found[0])
             gradients.append(found[1])
     names = ("actor", "critic", "target_actor", "target_critic")
@@ -276,9 +280,12 @@ def check_config(program: TrainStep) -> None:
     """Refuses what the peer does not learn from.
 
     Raises:
-        RequestError: Rewards are not the oracle's, or observations are not images.
+        RequestError: Rewards are not the oracle's, observations are not images, or an option is set that the peer does not have.
     """
     config: Config = program.config
+    for name in ("random_shift", "n_step", "trivial_goals"):
+        if getattr(config, name) != getattr(Config, name):
+            raise RequestError(f"--peer torch does not know {name}: leave it at {getattr(Config, name)}")
     if config.method != "oracle" or not program.networks.sees_images:
         raise RequestError("--peer torch learns from images with --method oracle: choose a Visual environment")
 
