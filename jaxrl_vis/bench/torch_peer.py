@@ -280,7 +280,7 @@ def check_config(program: TrainStep) -> None:
     """Refuses what the peer does not learn from.
 
     Raises:
-        RequestError: Rewards are not the oracle's, observations are not images, or an option is set that the peer does not have.
+        RequestError: Rewards are not the oracle's, observations are not images, or the peer lacks an option that is set.
     """
     config: Config = program.config
     for name in ("random_shift", "n_step", "trivial_goals"):

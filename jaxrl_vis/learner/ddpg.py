@@ -179,6 +179,28 @@ def _step(optimizer: optax.GradientTransformation, params: Params, gradient: Par
     return optax.apply_updates(params, change), moments
 
 
+def _encode(networks: Networks, params: Params, inputs: jax.Array, first: int, count: int = 2) -> jax.Array:
+    """Latents [count, B, latent] of observations ``first``, ``first`` + 1, ... of the three."""
+    size = inputs.shape[0] // 3
+    return networks.encode(params, inputs, slice(first * size, (first + count) * size)).reshape(count, size, -1)
+
+
+def _next_latents(
+    networks: Networks, now: _ComputeCopies, inputs: jax.Array, latents: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Latents [2, B, latent] of the observation after and the goal, for the target actor and for the target critic.
+
+    Heads take them in this order; observations come as (goal, after). ``latents`` are the critic's of the first two.
+    """
+    if networks.config.target_encoder:
+        of_critic = _encode(networks, now.target_critic, inputs, 1)[::-1]
+    else:
+        of_critic = jnp.concatenate([_encode(networks, now.critic, inputs, 2, count=1), latents[1:]])
+    if networks.config.encoders == "shared":
+        return of_critic, of_critic
+    return _encode(networks, networks.with_encoder(now.target_actor, now.actor), inputs, 1)[::-1], of_critic
+
+
 def make_ddpg(networks: Networks, config: Config, resolved: Resolved) -> Algorithm:
     """DDPG for these networks.
 
@@ -192,41 +214,23 @@ def make_ddpg(networks: Networks, config: Config, resolved: Resolved) -> Algorit
     def begin(train: TrainState) -> Working:
         return Working(train, _ComputeCopies(*map(networks.compute_copy, _networks_of(train))))
 
-    def encode(params: Params, inputs: jax.Array, first: int, count: int = 2) -> jax.Array:
-        """Latents [count, B, latent] of observations ``first``, ``first`` + 1, ... of the three."""
-        size = inputs.shape[0] // 3
-        return networks.encode(params, inputs, slice(first * size, (first + count) * size)).reshape(count, size, -1)
-
-    def next_latents(now: _ComputeCopies, inputs: jax.Array, latents: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Latents [2, B, latent] of the observation after and the goal, for the target actor and for the target critic.
-
-        Heads take them in this order; observations come as (goal, after). ``latents`` are the critic's of the first two.
-        """
-        if config.target_encoder:
-            of_critic = encode(now.target_critic, inputs, 1)[::-1]
-        else:
-            of_critic = jnp.concatenate([encode(now.critic, inputs, 2, count=1), latents[1:]])
-        if config.encoders == "shared":
-            return of_critic, of_critic
-        return encode(networks.with_encoder(now.target_actor, now.actor), inputs, 1)[::-1], of_critic
-
     def make_target(now: _ComputeCopies, inputs: jax.Array, latents: jax.Array, batch: Batch) -> jax.Array:
         assert batch.reward is not None
-        of_actor, of_critic = next_latents(now, inputs, jax.lax.stop_gradient(latents))
+        of_actor, of_critic = _next_latents(networks, now, inputs, jax.lax.stop_gradient(latents))
         value_tp1 = networks.value(now.target_critic, of_critic, networks.act(now.target_actor, of_actor))
         discount = resolved.discount if batch.discount is None else batch.discount
         return losses.td_target(batch.reward, value_tp1, discount, resolved.target_minimum, resolved.target_maximum)
 
     def critic_loss(critic: Params, now: _ComputeCopies, inputs: jax.Array, batch: Batch):
         assert batch.reward is not None
-        latents = encode(critic, inputs, 0)
+        latents = _encode(networks, critic, inputs, 0)
         target = make_target(now, inputs, latents, batch)
         value = networks.value(critic, latents, batch.action)
         keep = losses.keep_mask(batch.reward, value, resolved.reward_negative, resolved.filter_threshold)
         return losses.critic_loss(value, target, keep), (latents, value, keep)
 
     def actor_loss(actor: Params, critic: Params, inputs: jax.Array, critic_latents: jax.Array):
-        latents = critic_latents if config.encoders == "shared" else encode(actor, inputs, 0)
+        latents = critic_latents if config.encoders == "shared" else _encode(networks, actor, inputs, 0)
         action = networks.act(actor, latents)
         value = networks.value(critic, critic_latents, action)
         return losses.actor_loss(value, action, config.action_penalty), action

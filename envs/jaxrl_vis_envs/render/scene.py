@@ -204,9 +204,8 @@ class Scene:
         leaves = {**appearance, **lights, **reading.camera_parameters(mj_model, camera_id, camera)}
         leaves["sky_top"], leaves["sky_bottom"] = reading.sky_colours(mj_model)
         leaves["haze_colour"] = mj_model.vis.rgba.haze[:3]
-        clear = np.where(
-            reading.planes_seen_through(mj_model, camera_id, camera, plane_backs)[ids], reading.CLEAR_FROM_BEHIND, 0
-        )
+        seen_through = reading.planes_seen_through(mj_model, camera_id, camera, plane_backs)
+        clear = np.where(seen_through[ids], reading.CLEAR_FROM_BEHIND, 0)
         clear = np.where(appearance["rgba"][ids, 3] < reading.OPAQUE, reading.CLEAR, clear)
         return cls(
             **{name: jnp.asarray(value, jnp.float32) for name, value in leaves.items()},
