@@ -130,8 +130,8 @@ def load_policy(run_dir: Path | str, seed: int | None = None, checkpoint: int | 
         raise RequestError(f"the run in {run_dir} has trained no seed {seed}, only {trained}")
     restored = load(trainer, run_dir, checkpoint)
     enable_compilation_cache()
-    train = restored.train
-    parameters = (train.actor, train.normalizer, train.goal_statistics)
+    train, networks = restored.train, trainer.program.networks
+    parameters = (networks.with_encoder(train.actor, train.critic), train.normalizer, train.goal_statistics)
     index = trainer.seeds.index(seed)
     of_seed = jax.tree.map(lambda leaf: jnp.asarray(leaf[index]), parameters)
-    return Policy(trainer.env, trainer.config, seed, restored.iteration, of_seed, trainer.program.networks)
+    return Policy(trainer.env, trainer.config, seed, restored.iteration, of_seed, networks)
