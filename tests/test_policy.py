@@ -59,7 +59,8 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     with pytest.MonkeyPatch.context() as monkeypatch:
         register(monkeypatch)
         for name, seeds in (("VisualTold", {"seed": 3, "seeds": 2}), ("Told", {})):
-            config = jaxrl_vis.preset("debug", env=name, **SETTINGS, **seeds)
+            # With a shared encoder, the actor alone is not all of a policy.
+            config = jaxrl_vis.preset("debug", env=name, encoders="shared", **SETTINGS, **seeds)
             assert len(list(jaxrl_vis.make_trainer(config, folder / name).run())) == 3
     return {path.name: path for path in folder.iterdir()}
 
