@@ -99,16 +99,20 @@ def step(model: mjx.Model, data: mjx.Data, exact: bool = True) -> mjx.Data:
     first digit. One more Newton step, judged by the gradient, leaves the rounding error.
     """
     if model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER:
-        if solver_of(model) == "small":
-            return newton.euler(model, _forward(model, data, exact))
-        return mjx.euler(model, _one_factorization_at_a_time(_forward(model, data, exact)))
+        data, damped = _forward(model, data, exact)
+        if damped is not None:
+            return newton.euler(model, data, damped)
+        return mjx.euler(model, _one_factorization_at_a_time(data))
     if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 and model.na == 0 and model.nq == model.nv:
         return _runge_kutta_4(model, data, exact)
     return mjx.step(model, data)
 
 
-def _forward(model: mjx.Model, data: mjx.Data, exact: bool) -> mjx.Data:
-    """`mjx.forward`: accelerations from positions, velocities and controls; for ``exact`` see `step`."""
+def _forward(model: mjx.Model, data: mjx.Data, exact: bool) -> tuple[mjx.Data, jax.Array | None]:
+    """`mjx.forward`: accelerations from positions, velocities and controls; for ``exact`` see `step`.
+
+    With them come those with which Euler's method goes on [nv], where `newton` solves the constraints.
+    """
     data = smooth.com_pos(model, kinematics(model, data))
     data = smooth.crb(model, smooth.tendon(model, data))
     data = smooth.tendon_armature(model, data)
@@ -121,11 +125,14 @@ def _forward(model: mjx.Model, data: mjx.Data, exact: bool) -> mjx.Data:
     data = smooth.transmission(model, mjx.make_constraint(model, data))
     data = mjx.fwd_velocity(model, sensor.sensor_pos(model, data))
     data = mjx.fwd_actuation(model, sensor.sensor_vel(model, data))
-    data = newton.accelerate(model, data) if is_small else mjx.fwd_acceleration(model, data)
+    if is_small:
+        data, damped = newton.solve(model, data, exact)
+        return sensor.sensor_acc(model, data), damped
+    data = mjx.fwd_acceleration(model, data)
     if data._impl.nefc == 0:
-        return data.replace(qacc=data.qacc_smooth)
-    data = newton.solve(model, data) if is_small else mjx.solve(model, data)
-    return sensor.sensor_acc(model, _polish(model, data) if exact else data)
+        return data.replace(qacc=data.qacc_smooth), None
+    data = mjx.solve(model, data)
+    return sensor.sensor_acc(model, _polish(model, data) if exact else data), None
 
 
 def _one_factorization_at_a_time(data: mjx.Data) -> mjx.Data:
@@ -150,7 +157,7 @@ def _runge_kutta_4(model: mjx.Model, data: mjx.Data, exact: bool) -> mjx.Data:
         velocity = start.qvel + reach * timestep * data.qacc
         position = start.qpos + reach * timestep * data.qvel
         data = data.replace(qpos=position, qvel=velocity, time=start.time + reach * timestep)
-        data = _forward(model, data, exact)
+        data, _ = _forward(model, data, exact)
         return (data, mean_velocity + weight * velocity, mean_acceleration + weight * data.qacc), None
 
     tableau = jnp.array([[0.0, 1 / 6], [0.5, 1 / 3], [0.5, 1 / 3], [1.0, 1 / 6]], jnp.float32)

@@ -5,6 +5,6 @@ import io
 
 with contextlib.redirect_stdout(io.StringIO()):
     from mujoco import mjx
-    from mujoco.mjx._src import math, sensor, smooth, solver, support
+    from mujoco.mjx._src import collision_driver, constraint, math, sensor, smooth, solver, support
 
-__all__ = ["math", "mjx", "sensor", "smooth", "solver", "support"]
+__all__ = ["collision_driver", "constraint", "math", "mjx", "sensor", "smooth", "solver", "support"]
