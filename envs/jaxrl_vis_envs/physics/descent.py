@@ -1,27 +1,35 @@
 """Newton's method for constraint forces, written out number by number: a number is one array over the episodes of a batch.
 
-Written so, all of it is arithmetic without memory in between, which XLA fuses, and which is one GPU kernel (`newton_kernel`)
-where a batch of small matrices takes a library hundreds. Zeros that the structure of the model brings are never computed with:
-the mass matrix of a tree is factorized from the leaves on and keeps its zeros (Featherstone, "Rigid Body Dynamics Algorithms",
-6.5), and constraints that would fill them in are added afterwards (Woodbury's identity).
+Written so, all of it is arithmetic without memory in between, and one GPU kernel (`newton_kernel`) where a batch of small
+matrices takes a library hundreds. Zeros that the structure of the model brings are never computed with (`algebra`).
 
 Source: the primal problem of MuJoCo's documentation, "Computation", constraint model; Newton's method as there.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from jaxrl_vis_envs.physics.algebra import (
+    Matrix,
+    Numbers,
+    add_product,
+    add_square,
+    dot,
+    inner,
+    product,
+    ratio,
+    solve_positive,
+    total,
+)
+from jaxrl_vis_envs.physics.cones import Cone, cone_at
+
 LINE_SEARCH_STEPS = 10
 """Points of the line at which a slope is computed."""
-_TINY = 1e-15
 _ROUNDING = 1.2e-7  # of float32
 _ENDLESS = 1e30
-
-Numbers = list[Any]  # of arrays of one shape
-Matrix = dict[tuple[int, int], Any]  # row and column -> number, those that are not zero
 
 
 class Structure(NamedTuple):
@@ -128,8 +136,8 @@ def solve(structure: Structure, problem: Problem) -> Motion:
     steps = structure.iterations + structure.exact
     acceleration = list(jax.lax.fori_loop(0, steps, descent.improve, tuple(acceleration)))
     force = descent.at(acceleration).force
-    total = [one + other for one, other in zip(problem.force, force, strict=True)]
-    return Motion(free, acceleration, force, solve_positive(damped_mass, total))
+    forces = [one + other for one, other in zip(problem.force, force, strict=True)]
+    return Motion(free, acceleration, force, solve_positive(damped_mass, forces))
 
 
 class _Place(NamedTuple):
@@ -161,9 +169,9 @@ class _Descent:
     def cost(self, acceleration: Numbers, free: Numbers) -> Any:
         """The cost, up to a constant."""
         problem = self._problem
-        inertial = _product(problem.mass, acceleration)
+        inertial = product(problem.mass, acceleration)
         pairs = zip(inertial, problem.force, acceleration, free, strict=True)
-        cost = 0.5 * _sum((inertia - force) * (there - start) for inertia, force, there, start in pairs)
+        cost = 0.5 * total((inertia - force) * (there - start) for inertia, force, there, start in pairs)
         residual = self._residual(acceleration)
         for row in self._alone:
             x, most, stiffness = residual[row], self._most(row), problem.stiffness[row]
@@ -174,7 +182,7 @@ class _Descent:
                 cost = cost + jnp.where(slides, most * (jnp.abs(x) - 0.5 * most / stiffness), 0.5 * stiffness * x * x)
         for index in range(len(self._structure.cones)):
             cone = self._cone(index, residual)
-            stuck = _sum(problem.stiffness[row] * residual[row] * residual[row] for row in self._cone_rows(index))
+            stuck = total(problem.stiffness[row] * residual[row] * residual[row] for row in self._cone_rows(index))
             gap = cone.normal - cone.friction * cone.tangent
             cost = cost + 0.5 * jnp.where(cone.is_stuck, stuck, cone.stiffness * gap * gap)
         return cost
@@ -183,10 +191,10 @@ class _Descent:
         """One Newton step: as long as the cost is least along it, and the last one, if exact, whole or not at all."""
         here = self.at(list(acceleration))
         direction = self._direction(here)
-        # Where what there is to gain is less than rounding errors, a line tells nothing: then no further than Newton's own step.
-        gain = -_inner(here.gradient, direction)
+        # A line tells nothing where what there is to gain is less than rounding errors: then no further than Newton's own step.
+        gain = -inner(here.gradient, direction)
         forces = zip(self._problem.force, here.force, acceleration, strict=True)
-        work = _sum((jnp.abs(free) + jnp.abs(pull)) * jnp.abs(there) for free, pull, there in forces)
+        work = total((jnp.abs(free) + jnp.abs(pull)) * jnp.abs(there) for free, pull, there in forces)
         length = self._line_search(here, direction)
         length = jnp.where(gain > _ROUNDING * work, length, jnp.minimum(length, 1.0))
         if self._structure.exact:
@@ -195,7 +203,7 @@ class _Descent:
         moved = [start + length * part for start, part in zip(acceleration, direction, strict=True)]
         if self._structure.exact:
             there = self.at(moved)
-            is_better = _sum(part * part for part in there.gradient) < _sum(part * part for part in here.gradient)
+            is_better = total(part * part for part in there.gradient) < total(part * part for part in here.gradient)
             is_better = is_better | jnp.logical_not(is_last)
             moved = [jnp.where(is_better, *pair) for pair in zip(moved, acceleration, strict=True)]
         return tuple(moved)
@@ -204,7 +212,9 @@ class _Descent:
         """Forces and derivatives at some accelerations."""
         problem = self._problem
         residual = self._residual(acceleration)
-        stiffness, pull, cones = [0.0] * len(residual), [0.0] * len(residual), []
+        stiffness: Numbers = [0.0] * len(residual)
+        pull: Numbers = [0.0] * len(residual)
+        cones: list[Matrix] = []
         for row in self._alone:
             x, most = residual[row], self._most(row)
             if most is None:
@@ -227,13 +237,13 @@ class _Descent:
         for row, entries in enumerate(problem.jacobian):
             for joint, entry in entries.items():
                 force[joint] = force[joint] + entry * pull[row]
-        inertial = _product(problem.mass, acceleration)
+        inertial = product(problem.mass, acceleration)
         gradient = [left - right - pulled for left, right, pulled in zip(inertial, problem.force, force, strict=True)]
         return _Place(residual, stiffness, cones, force, gradient)
 
     def _residual(self, acceleration: Numbers) -> Numbers:
         rows = zip(self._problem.jacobian, self._problem.target, strict=True)
-        return [_dot(entries, acceleration) - target for entries, target in rows]
+        return [dot(entries, acceleration) - target for entries, target in rows]
 
     def _most(self, row: int) -> Any:
         """The greatest force of a row of dry friction; None for other rows."""
@@ -253,9 +263,9 @@ class _Descent:
         first, size = self._structure.cones[index]
         return range(first, first + size)
 
-    def _cone(self, index: int, residual: Numbers) -> "_Cone":
+    def _cone(self, index: int, residual: Numbers) -> Cone:
         rows = self._cone_rows(index)
-        return _cone(self._problem.cone[index], [residual[row] for row in rows], self._problem.stiffness[rows.start])
+        return cone_at(self._problem.cone[index], [residual[row] for row in rows], self._problem.stiffness[rows.start])
 
     def _direction(self, place: _Place) -> Numbers:
         """Newton's direction: downhill, as far as the cost's lowest point if nothing started or ended on the way."""
@@ -263,23 +273,25 @@ class _Descent:
         matrix: Matrix = dict(problem.mass)
         for row in self._alone:
             if row not in apart:
-                _add_square(matrix, problem.jacobian[row], place.stiffness[row])
+                add_square(matrix, problem.jacobian[row], place.stiffness[row])
         for index, second in enumerate(place.cones):
             rows = self._cone_rows(index)
             for (left, right), value in second.items():
                 stuck = place.stiffness[rows[left]] if left == right else 0.0
-                _add_product(matrix, problem.jacobian[rows[left]], problem.jacobian[rows[right]], value + stuck)
+                add_product(matrix, problem.jacobian[rows[left]], problem.jacobian[rows[right]], value + stuck)
         roots = [jnp.sqrt(place.stiffness[row]) for row in apart]
-        added = [{j: entry * root for j, entry in problem.jacobian[row].items()} for row, root in zip(apart, roots, strict=True)]
+        added = [
+            {j: entry * root for j, entry in problem.jacobian[row].items()} for row, root in zip(apart, roots, strict=True)
+        ]
         return [-part for part in solve_positive(matrix, place.gradient, added)]
 
     def _line_search(self, place: _Place, direction: Numbers) -> Any:
         """The length of the step along ``direction`` for which the cost is least."""
         problem = self._problem
-        along = [_dot(entries, direction) for entries in problem.jacobian]
+        along = [dot(entries, direction) for entries in problem.jacobian]
         # The inertial part of the slope at the start is the gradient's less the constraints'.
-        first = _sum((g + f) * d for g, f, d in zip(place.gradient, place.force, direction, strict=True))
-        second = _sum(m * d for m, d in zip(_product(problem.mass, direction), direction, strict=True))
+        first = total((g + f) * d for g, f, d in zip(place.gradient, place.force, direction, strict=True))
+        second = total(m * d for m, d in zip(product(problem.mass, direction), direction, strict=True))
 
         def slope_at(length: Any) -> tuple[Any, Any]:
             slope, curvature = first + length * second, second
@@ -295,8 +307,8 @@ class _Descent:
                     curvature = curvature + jnp.where(slides, 0.0, stiffness * v * v)
             for index in range(len(self._structure.cones)):
                 cone, rows = self._cone(index, there), self._cone_rows(index)
-                stuck_slope = _sum(problem.stiffness[row] * there[row] * along[row] for row in rows)
-                stuck_curvature = _sum(problem.stiffness[row] * along[row] * along[row] for row in rows)
+                stuck_slope = total(problem.stiffness[row] * there[row] * along[row] for row in rows)
+                stuck_curvature = total(problem.stiffness[row] * along[row] * along[row] for row in rows)
                 cone_slope, cone_curvature = cone.along([along[row] for row in rows])
                 slope = slope + jnp.where(cone.is_stuck, stuck_slope, cone_slope)
                 curvature = curvature + jnp.where(cone.is_stuck, stuck_curvature, cone_curvature)
@@ -306,7 +318,7 @@ class _Descent:
         for row in self._alone[self._structure.equalities :]:
             x, v, most = place.residual[row], along[row], self._most(row)
             ends = [0.0] if most is None else [most / problem.stiffness[row], -most / problem.stiffness[row]]
-            corners += [_ratio(end - x, v) for end in ends]
+            corners += [ratio(end - x, v) for end in ends]
         for index in range(len(self._structure.cones)):
             corners += self._cone(index, place.residual).corners([along[row] for row in self._cone_rows(index)])
         return lowest(slope_at, corners, first)
@@ -346,181 +358,3 @@ def lowest(slope_at: Callable[[Any], tuple[Any, Any]], corners: Numbers, like: A
     state = (start, endless, start, -endless, endless, endless)
     _, _, low, low_slope, high, high_slope = jax.lax.fori_loop(0, LINE_SEARCH_STEPS, narrow, state)
     return jnp.where(high_slope < -low_slope, high, low)
-
-
-class _Cone(NamedTuple):
-    """Where the forces of a contact stand relative to its elliptic cone.
-
-    Attributes:
-        scales: Of its rows, by which the cone becomes a circular one.
-        scaled: The residuals of its rows, scaled.
-        normal: The first of these.
-        tangent: The length of the others.
-        friction: That of the scaled cone.
-        stiffness: For what is outside of the cone and its opposite, 0 elsewhere.
-        is_stuck: Whether all rows act like equalities.
-    """
-
-    scales: Numbers
-    scaled: Numbers
-    normal: Any
-    tangent: Any
-    friction: Any
-    stiffness: Any
-    is_stuck: Any
-
-    def derivatives(self) -> tuple[Matrix, Numbers]:
-        """The cost's second derivatives by the rows' residuals, and the forces; both 0 where all rows are stuck or free."""
-        friction, safe = self.friction, jnp.maximum(self.tangent, _TINY)
-        gap = self.normal - friction * self.tangent
-        units = [part / safe for part in self.scaled[1:]]
-        bend = friction * gap / safe
-        size = len(self.scaled)
-        matrix: Matrix = {}
-        first = self.stiffness * self.scales[0]
-        matrix[0, 0] = first * self.scales[0]
-        for row in range(1, size):
-            outer = self.stiffness * self.scales[row]
-            matrix[row, 0] = matrix[0, row] = -friction * units[row - 1] * first * self.scales[row]
-            for column in range(1, size):
-                # Of (normal - friction * tangent)^2 / 2: the square of its slope, and how its slope turns.
-                turn = (1.0 if row == column else 0.0) - units[row - 1] * units[column - 1]
-                value = friction * friction * units[row - 1] * units[column - 1] - bend * turn
-                matrix[row, column] = outer * self.scales[column] * value
-        pull = self.stiffness * gap
-        forces = [-pull * self.scales[0]]
-        forces += [pull * friction * unit * scale for unit, scale in zip(units, self.scales[1:], strict=True)]
-        return matrix, forces
-
-    def along(self, direction: Numbers) -> tuple[Any, Any]:
-        """The cost's slope and curvature along a direction of the rows' residuals, where they are not stuck."""
-        turned = [part * scale for part, scale in zip(direction, self.scales, strict=True)]
-        safe = jnp.maximum(self.tangent, _TINY)
-        change = _sum(u * v for u, v in zip(self.scaled[1:], turned[1:], strict=True)) / safe
-        bend = (_sum(v * v for v in turned[1:]) - change * change) / safe
-        gap, opening = self.normal - self.friction * self.tangent, turned[0] - self.friction * change
-        slope = self.stiffness * gap * opening
-        return slope, self.stiffness * (opening * opening - self.friction * gap * bend)
-
-
-    def corners(self, direction: Numbers) -> Numbers:
-        """The lengths of steps along a direction of the rows' residuals at which they begin or cease to be stuck."""
-        turned = [part * scale for part, scale in zip(direction, self.scales, strict=True)]
-        # Where tangent^2 = (friction * normal)^2.
-        square = self.friction * self.friction
-        two = _sum(v * v for v in turned[1:]) - square * turned[0] * turned[0]
-        one = _sum(u * v for u, v in zip(self.scaled[1:], turned[1:], strict=True)) - square * self.normal * turned[0]
-        none = self.tangent * self.tangent - square * self.normal * self.normal
-        larger = -one - jnp.where(one < 0, -1.0, 1.0) * jnp.sqrt(jnp.maximum(one * one - two * none, 0.0))
-        return [_ratio(larger, two), _ratio(none, larger)]
-
-
-def _cone(scales: Numbers, residual: Numbers, stiffness: Any) -> _Cone:
-    """The cone whose rows have these residuals, the first of them with this stiffness."""
-    friction = scales[0]
-    scaled = [x * scale for x, scale in zip(residual, scales, strict=True)]
-    normal, tangent = scaled[0], jnp.sqrt(_sum(part * part for part in scaled[1:]))
-    is_stuck = jnp.where(tangent > 0, friction * normal + tangent <= 0, normal < 0)
-    is_outside = (tangent > 0) & (normal < friction * tangent) & (friction * normal + tangent > 0)
-    square = friction * friction
-    outside = jnp.where(is_outside, stiffness / jnp.maximum(square * (1.0 + square), _TINY), 0.0)
-    return _Cone(scales, scaled, normal, tangent, friction, outside, is_stuck)
-
-
-# -- Linear algebra
-
-
-def solve_positive(matrix: Matrix, right: Numbers, added: Iterable[dict[int, Any]] = ()) -> Numbers:
-    """``matrix``, symmetric and positive definite, plus squares of rows, divides ``right``.
-
-    Args:
-        matrix: On the diagonal and below it.
-        right: One number for each row.
-        added: Rows (joint -> number) whose squares are added to the matrix after its factorization.
-    """
-    factors, inverse = _factorize(matrix, len(right))
-    half = _towards_root(factors, right)
-    rows = [_towards_root(factors, [entries.get(joint, 0.0) for joint in range(len(right))]) for entries in added]
-    if rows:
-        # (S + W'W)^-1 b = S^-1 (b - W' (1 + W S^-1 W')^-1 W S^-1 b), with each S^-1 taken half on either side.
-        weighted = [[value * scale for value, scale in zip(row, inverse, strict=True)] for row in rows]
-        small: Matrix = {}
-        for one, left in enumerate(weighted):
-            for other in range(one + 1):
-                product = _inner(left, rows[other])
-                small[one, other] = 1.0 + product if one == other else product
-        answers = solve_positive(small, [_inner(row, half) for row in weighted])
-        for answer, row in zip(answers, rows, strict=True):
-            half = [value - answer * part for value, part in zip(half, row, strict=True)]
-    solution = [value * scale for value, scale in zip(half, inverse, strict=True)]
-    for joint in range(len(right)):
-        for ancestor, factor in factors[joint].items():
-            solution[joint] = solution[joint] - factor * solution[ancestor]
-    return solution
-
-
-def _factorize(matrix: Matrix, size: int) -> tuple[list[dict[int, Any]], Numbers]:
-    """``L' D L`` from the last row on: for each row of L what is before the diagonal, which is 1, and the inverses of D."""
-    left, factors, inverse = dict(matrix), [{} for _ in range(size)], [None] * size
-    for row in reversed(range(size)):
-        inverse[row] = 1.0 / left[row, row]
-        before = [column for column in range(row) if (row, column) in left]
-        factors[row] = {column: left[row, column] * inverse[row] for column in before}
-        for column in before:
-            for other in before:
-                if other <= column:
-                    change = factors[row][column] * left[row, other]
-                    left[column, other] = left[column, other] - change if (column, other) in left else -change
-    return factors, inverse
-
-
-def _towards_root(factors: list[dict[int, Any]], right: Numbers) -> Numbers:
-    """``L'^-1`` times a column."""
-    values = list(right)
-    for row in reversed(range(len(values))):
-        for column, factor in factors[row].items():
-            values[column] = values[column] - factor * values[row]
-    return values
-
-
-def _add_square(matrix: Matrix, row: dict[int, Any], weight: Any) -> None:
-    _add_product(matrix, row, row, weight)
-
-
-def _add_product(matrix: Matrix, left: dict[int, Any], right: dict[int, Any], weight: Any) -> None:
-    """Adds the weighted outer product of two rows, below the diagonal."""
-    for joint, entry in left.items():
-        scaled = weight * entry
-        for other, factor in right.items():
-            if other <= joint:
-                matrix[joint, other] = matrix[joint, other] + scaled * factor if (joint, other) in matrix else scaled * factor
-
-
-def _product(matrix: Matrix, column: Numbers) -> Numbers:
-    """A symmetric matrix, of which the lower half is given, times a column."""
-    product: Numbers = [0.0] * len(column)
-    for (row, other), value in matrix.items():
-        product[row] = product[row] + value * column[other]
-        if other != row:
-            product[other] = product[other] + value * column[row]
-    return product
-
-
-def _ratio(above: Any, below: Any) -> Any:
-    """``above / below``, and nothing that is not a number where the latter is 0."""
-    return above / jnp.where(below == 0, _TINY, below)
-
-
-def _dot(row: dict[int, Any], column: Numbers) -> Any:
-    return _sum(entry * column[joint] for joint, entry in row.items())
-
-
-def _inner(one: Numbers, other: Numbers) -> Any:
-    return _sum(a * b for a, b in zip(one, other, strict=True))
-
-
-def _sum(terms: Iterable[Any]) -> Any:
-    total: Any = None
-    for term in terms:
-        total = term if total is None else total + term
-    return 0.0 if total is None else total

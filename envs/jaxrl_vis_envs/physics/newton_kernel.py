@@ -1,11 +1,15 @@
-"""`descent.solve` as one GPU kernel (Pallas, by Triton): each program solves the problems of a few episodes, one in a lane.
+"""`descent.solve` as one GPU kernel (Pallas, by Triton): a program solves the problem of one episode.
 
-All numbers of a problem stay in registers, or in the processor's own memory, from its first read to the motion. As XLA
-operations, a physics step of the finger is 600 kernels and one of the hand 100, most of which do next to nothing.
+All numbers of a problem stay on the chip from its first read to the motion. As XLA operations, a physics step of the finger
+is some 850 kernels more, and one of the hand 150, most of which do next to nothing.
+
+Every thread of a program computes the same numbers. Were each of a warp's 32 to take another episode, the kernel would do
+with a thirtieth of the instructions, but it is other kernels that take the time, and Triton takes minutes to compile it:
+before it decides how the threads of a block share each read, it searches the whole program, which is thousands of operations
+here. Numbers that all threads share are no business of that search.
 """
 
 import functools
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -14,79 +18,38 @@ from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
 
 from jaxrl_vis_envs.physics import descent
-from jaxrl_vis_envs.physics.descent import Problem, Structure
+from jaxrl_vis_envs.physics.descent import Motion, Problem, Structure
 
-# Episodes of a program: as many as a warp has lanes, so that even few episodes occupy many processors.
-_LANES = 32
 _COMPILER = plgpu.CompilerParams(num_warps=1, num_stages=1)
 
 
-def solve(structure: Structure, problem: Problem) -> tuple[jax.Array, ...]:
-    """The arrays of `descent.Motion` for those of one problem; over the axes of `jax.vmap` in one kernel."""
-    motion = _batched(structure, False)(*(array[None] for array in problem))
-    return tuple(part[0] for part in motion)
-
-
-def solve_batch(structure: Structure, problems: Problem, interpret: bool = False) -> tuple[jax.Array, ...]:
-    """The arrays of `descent.Motion` [B, N] for arrays of problems with an axis [B] before the others.
+def solve(structure: Structure, problem: Problem, interpret: bool = False) -> Motion:
+    """`descent.solve` for the arrays of a problem, float32; over all axes of `jax.vmap` in one kernel.
 
     Args:
-        structure: Common to all of them.
-        problems: Float32.
+        structure: Of the problem.
+        problem: Its arrays.
         interpret: Run the kernel without a GPU, slowly.
     """
-    episodes = problems.mass.shape[0]
     # What has no numbers cannot be handed to a kernel, which never reads it.
-    used = Problem(*(array if array.size else jnp.zeros((episodes, 1), jnp.float32) for array in problems))
-    out = jax.ShapeDtypeStruct((episodes, structure.joints), jnp.float32)
-    return tuple(
-        pl.pallas_call(
-            functools.partial(_kernel, structure=structure, episodes=episodes),
-            out_shape=[out] * len(descent.Motion._fields),
-            grid=(pl.cdiv(episodes, _LANES),),
-            in_specs=[_whole(array) for array in used],
-            out_specs=[_whole(out)] * len(descent.Motion._fields),
-            compiler_params=_COMPILER,
-            interpret=interpret,
-            name="solve_constraints",
-        )(*used)
-    )
+    used = Problem(*(array if array.size else jnp.zeros(1, jnp.float32) for array in problem))
+    out = jax.ShapeDtypeStruct((structure.joints,), jnp.float32)
+    motion = pl.pallas_call(
+        functools.partial(_kernel, structure=structure),
+        out_shape=[out] * len(Motion._fields),
+        compiler_params=_COMPILER,
+        interpret=interpret,
+        name="solve_constraints",
+    )(*used)
+    return Motion(*motion)
 
 
-def _kernel(*refs: Any, structure: Structure, episodes: int) -> None:
+def _kernel(*refs: Any, structure: Structure) -> None:
     inputs, outputs = dict(zip(Problem._fields, refs)), refs[len(Problem._fields) :]
-    # Lanes beyond the last episode solve that one again, and write the same.
-    episode = jnp.minimum(pl.program_id(0) * _LANES + jnp.arange(_LANES), episodes - 1)
-    motion = descent.solve(structure, descent.numbers_of(structure, lambda name, *place: inputs[name][(episode, *place)]))
+    motion = descent.solve(structure, descent.numbers_of(structure, lambda name, *place: inputs[name][place]))
     for ref, part in zip(outputs, motion, strict=True):
         for joint, number in enumerate(part):
-            ref[episode, joint] = jnp.broadcast_to(number, (_LANES,)).astype(jnp.float32)
-
-
-def _whole(array: Any) -> pl.BlockSpec:
-    """Every program sees all of it."""
-    return pl.BlockSpec(array.shape, lambda program: (0,) * len(array.shape))
-
-
-@functools.cache
-def _batched(structure: Structure, interpret: bool) -> Callable[..., tuple[jax.Array, ...]]:
-    """`solve_batch` for a structure; what `jax.vmap` makes of it is another axis of the same batch."""
-
-    @jax.custom_batching.custom_vmap
-    def solve_all(*arrays: jax.Array) -> tuple[jax.Array, ...]:
-        return solve_batch(structure, Problem(*arrays), interpret)
-
-    @solve_all.def_vmap
-    def solve_more(size: int, batched: list[bool], *arrays: jax.Array) -> tuple[tuple[jax.Array, ...], tuple[bool, ...]]:
-        whole = [
-            array if has_axis else jnp.broadcast_to(array, (size, *array.shape))
-            for array, has_axis in zip(arrays, batched, strict=True)
-        ]
-        episodes = whole[0].shape[1]
-        motion = solve_all(*(array.reshape(size * episodes, *array.shape[2:]) for array in whole))
-        return tuple(part.reshape(size, episodes, -1) for part in motion), (True,) * len(motion)
-
-    return solve_all
+            ref[joint] = jnp.asarray(number, jnp.float32)
 
 
 def probe() -> None:
@@ -96,11 +59,10 @@ def probe() -> None:
 
 def probe_program() -> Any:
     """A small instance of the kernel, traced (`jax.stages.Traced`): every kind of constraint, warm starts, an exact step."""
-    joints, row = 3, (0, 1, 2)
     structure = Structure(
-        joints=joints,
-        mass=((0, 0), (1, 0), (1, 1), (2, 2)),
-        rows=(row, (1,), (0,), row, row, row, row),
+        joints=2,
+        mass=((0, 0), (1, 0), (1, 1)),
+        rows=((0, 1), (1,), (0,), (0, 1), (0, 1), (0, 1), (0, 1)),
         equalities=1,
         frictions=1,
         cones=((4, 3),),
@@ -109,6 +71,7 @@ def probe_program() -> Any:
         warm=True,
         exact=True,
     )
-    shapes = [(joints, joints), *[(joints,)] * 3, (len(structure.rows), joints), *[(len(structure.rows),)] * 3, (1, 6)]
-    problem = Problem(*(jnp.ones((_LANES, *shape), jnp.float32) for shape in shapes))
-    return jax.jit(functools.partial(solve_batch, structure)).trace(problem)
+    rows = len(structure.rows)
+    shapes = [(2, 2), (2,), (2,), (2,), (rows, 2), (rows,), (rows,), (rows,), (1, 6)]
+    problems = Problem(*(jnp.ones((2, *shape), jnp.float32) for shape in shapes))
+    return jax.jit(jax.vmap(functools.partial(solve, structure))).trace(problems)
