@@ -1,4 +1,4 @@
-"""The constraint solver for small trees against MJX, NumPy and brute force."""
+"""The constraint solver for small trees against MJX, NumPy and brute force, and which solver a model has."""
 
 import copy
 
@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from benchmarks import environments
-from jaxrl_vis_envs.compilation import env_jit
-from jaxrl_vis_envs.physics import mjx_model, newton
+from jaxrl_vis_envs.compilation import env_jit, kernels, tracing_for
+from jaxrl_vis_envs.physics import constraints, mjx_model, newton
 from jaxrl_vis_envs.physics.mjx_model import mjx
 
 
@@ -85,33 +85,44 @@ def test_a_step_is_that_of_mjx():
 
 
 @pytest.mark.parametrize(
-    ("joint", "option", "fits"),
+    ("joint", "option", "solver"),
     [
-        ('<joint type="hinge"/>', "", True),
-        ('<joint type="hinge" frictionloss="1"/>', "", False),
-        ('<joint type="hinge"/>', '<option cone="elliptic"/>', False),
-        ('<joint type="hinge"/>', '<option solver="CG"/>', False),
-        ("<freejoint/>", "", False),
-        ('<joint type="hinge"/>', '<option><flag eulerdamp="disable"/></option>', False),
-        ('<joint type="hinge"/>', '<option><flag warmstart="disable"/></option>', True),
-        ('<joint type="hinge"/>', '<option integrator="RK4"/>', True),
-        ('<joint type="hinge"/>', '<option integrator="implicitfast"/>', False),
+        ('<joint type="hinge"/>', "", "matrices"),
+        ('<joint type="hinge" frictionloss="1"/>', "", "numbers"),
+        ('<joint type="hinge"/>', '<option cone="elliptic"/>', "numbers"),
+        ('<joint type="hinge"/>', '<option solver="CG"/>', "mjx"),
+        ("<freejoint/>", "", "mjx"),
+        ('<joint type="hinge"/>', '<option><flag eulerdamp="disable"/></option>', "mjx"),
+        ('<joint type="hinge"/>', '<option><flag warmstart="disable"/></option>', "matrices"),
+        ('<joint type="hinge"/>', '<option integrator="RK4"/>', "matrices"),
+        ('<joint type="hinge"/>', '<option integrator="implicitfast"/>', "mjx"),
     ],
 )
-def test_what_is_not_small_and_simple_is_left_to_mjx(joint, option, fits):
+def test_what_is_not_small_and_simple_is_left_to_mjx(joint, option, solver):
     body = f'<body>{joint}<geom type="sphere" size=".1"/></body>'
-    xml = f"<mujoco>{option}<worldbody>{body}</worldbody></mujoco>"
-    assert newton.fits(mjx.put_model(mujoco.MjModel.from_xml_string(xml))) is fits
+    model = mjx.put_model(mujoco.MjModel.from_xml_string(f"<mujoco>{option}<worldbody>{body}</worldbody></mujoco>"))
+    assert constraints.solver_of(model) == solver
+    assert constraints.takes(model) is (solver != "mjx")
 
 
-# The speed of a task rests on it: VisualReacher makes 1.73 M steps a second on an H100 with this one, 0.78 M with MJX's.
-# The finger has elliptic cones and friction in a joint, the hand 24 joints and friction in them.
-SOLVERS = {"FetchReach": "small", "FingerTurn": "mjx", "HandReach": "mjx", "Reacher": "small", "SawyerReach": "small"}
+# The speed of a task rests on it: VisualReacher makes 1.73 M steps a second on an H100 with ours, 0.78 M with MJX's.
+# The finger has elliptic cones and friction in a joint, the hand 24 joints.
+SOLVERS_ON_A_CPU = {
+    "FetchReach": "matrices",
+    "FingerTurn": "numbers",
+    "HandReach": "mjx",
+    "Reacher": "matrices",
+    "SawyerReach": "matrices",
+}
 
 
-@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("name", SOLVERS_ON_A_CPU)
 def test_the_solver_of_each_task(name):
-    assert mjx_model.solver_of(mjx.put_model(environments.make(name).mj_model)) == SOLVERS[name]
+    model = mjx.put_model(environments.make(name).mj_model)
+    assert constraints.takes(model)
+    assert constraints.solver_of(model) == SOLVERS_ON_A_CPU[name]
+    with tracing_for("cuda"), kernels(True):
+        assert constraints.solver_of(model) == "numbers"
 
 
 def test_without_warm_starts_the_last_accelerations_do_not_matter():

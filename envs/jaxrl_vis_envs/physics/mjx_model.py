@@ -3,16 +3,16 @@
 import functools
 import pathlib
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 from mujoco import mjx
-from mujoco.mjx._src import math, sensor, smooth, solver
+from mujoco.mjx._src import math, sensor, smooth
 
-from jaxrl_vis_envs.physics import newton
+from jaxrl_vis_envs.physics import constraints
 from jaxrl_vis_envs.physics.kinematics import kinematics
 
 __all__ = [
@@ -20,7 +20,6 @@ __all__ = [
     "load_model",
     "mjx",
     "simulate",
-    "solver_of",
     "start_data",
     "step",
     "still_data",
@@ -82,11 +81,6 @@ def _full_precision() -> Any:
     return jax.default_matmul_precision("highest")
 
 
-def solver_of(model: mjx.Model) -> Literal["small", "mjx"]:
-    """Which constraint solver `step` runs for ``model``: ``small`` is `newton`, several times as fast on a GPU as MJX's."""
-    return "small" if newton.fits(model) else "mjx"
-
-
 @functools.partial(jax.jit, static_argnums=2)
 def step(model: mjx.Model, data: mjx.Data, exact: bool = True) -> mjx.Data:
     """`mjx.step` in fewer operations; if ``exact``, with contacts and forces as exact as float32 allows.
@@ -100,42 +94,34 @@ def step(model: mjx.Model, data: mjx.Data, exact: bool = True) -> mjx.Data:
     first digit. One more Newton step, judged by the gradient, leaves the rounding error.
     """
     if model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER:
-        if solver_of(model) == "small":
-            return newton.euler(model, _forward(model, data, exact))
-        return mjx.euler(model, _one_factorization_at_a_time(_forward(model, data, exact)))
+        data, damped = _forward(model, data, exact)
+        if damped is not None:
+            return constraints.euler(model, data, damped)
+        return mjx.euler(model, constraints.one_factorization_at_a_time(data))
     if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 and model.na == 0 and model.nq == model.nv:
         return _runge_kutta_4(model, data, exact)
     return mjx.step(model, data)
 
 
-def _forward(model: mjx.Model, data: mjx.Data, exact: bool) -> mjx.Data:
-    """`mjx.forward`: accelerations from positions, velocities and controls; for ``exact`` see `step`."""
+def _forward(model: mjx.Model, data: mjx.Data, exact: bool) -> tuple[mjx.Data, jax.Array | None]:
+    """`mjx.forward`: accelerations from positions, velocities and controls; for ``exact`` see `step`.
+
+    With them come those with which Euler's method goes on [nv], if `constraints` takes the model.
+    """
     data = smooth.com_pos(model, kinematics(model, data))
     data = smooth.crb(model, smooth.tendon(model, data))
-    data = smooth.tendon_armature(model, data)
-    is_small = solver_of(model) == "small"
-    data = data if is_small else smooth.factor_m(model, data)
-    data = mjx.collision(model, data)
+    data = mjx.collision(model, smooth.tendon_armature(model, data))
     pairs = np.stack([model.pair_geom1, model.pair_geom2])
     if exact and np.any(np.all(model.geom_type[pairs] == mujoco.mjtGeom.mjGEOM_CAPSULE, axis=0)):
         data = _place_capsule_contacts(model, data)
     data = smooth.transmission(model, mjx.make_constraint(model, data))
     data = mjx.fwd_velocity(model, sensor.sensor_pos(model, data))
     data = mjx.fwd_actuation(model, sensor.sensor_vel(model, data))
-    data = newton.accelerate(model, data) if is_small else mjx.fwd_acceleration(model, data)
-    if data._impl.nefc == 0:
-        return data.replace(qacc=data.qacc_smooth)
-    data = newton.solve(model, data) if is_small else mjx.solve(model, data)
-    return sensor.sensor_acc(model, _polish(model, data) if exact else data)
-
-
-def _one_factorization_at_a_time(data: mjx.Data) -> mjx.Data:
-    """The same, with a mass matrix that depends on the accelerations, as far as XLA can see.
-
-    `mjx.euler` factorizes it once more, with damping, and XLA on a CPU would do so beside the first time. With a batch, each of
-    the two waits in a thread of XLA's pool for work that it has handed to that same pool: on two cores they wait for ever.
-    """
-    return data.tree_replace({"_impl.M": data._impl.M + 0.0 * data.qacc[:, None]})  # type: ignore[dict-item] - a tree of arrays
+    if constraints.takes(model):
+        data, damped = constraints.solve(model, data, exact)
+    else:
+        data, damped = constraints.by_mjx(model, data, exact), None
+    return sensor.sensor_acc(model, data), damped
 
 
 def _runge_kutta_4(model: mjx.Model, data: mjx.Data, exact: bool) -> mjx.Data:
@@ -151,7 +137,7 @@ def _runge_kutta_4(model: mjx.Model, data: mjx.Data, exact: bool) -> mjx.Data:
         velocity = start.qvel + reach * timestep * data.qacc
         position = start.qpos + reach * timestep * data.qvel
         data = data.replace(qpos=position, qvel=velocity, time=start.time + reach * timestep)
-        data = _forward(model, data, exact)
+        data, _ = _forward(model, data, exact)
         return (data, mean_velocity + weight * velocity, mean_acceleration + weight * data.qacc), None
 
     tableau = jnp.array([[0.0, 1 / 6], [0.5, 1 / 3], [0.5, 1 / 3], [1.0, 1 / 6]], jnp.float32)
@@ -194,18 +180,6 @@ def _place_capsule_contacts(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         frame=jnp.where(is_of_capsules[:, None, None], frame, contact.frame),
     )
     return data.tree_replace({"_impl.contact": contact})  # type: ignore[dict-item] - a Contact is a tree of arrays
-
-
-def _polish(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """One Newton step of the constraint solver, taken whole, where it makes the gradient smaller."""
-    old = solver.Context.create(model, data)
-    new = solver.Context.create(model, data.replace(qacc=data.qacc - old.Mgrad), grad=False)
-    new_gradient = new.Ma - data.qfrc_smooth - new.qfrc_constraint
-    is_better = jnp.sum(jnp.square(new_gradient)) < jnp.sum(jnp.square(old.grad))
-    return data.replace(
-        qacc=jnp.where(is_better, new.qacc, data.qacc),
-        qfrc_constraint=jnp.where(is_better, new.qfrc_constraint, data.qfrc_constraint),
-    )
 
 
 def carriers(mj_model: mujoco.MjModel, body: int) -> np.ndarray:

@@ -41,7 +41,7 @@ class FingerTurnConfig(TaskConfig):
     solver_iterations: int = 4
     """Newton iterations in a physics step."""
     line_search_iterations: int = 8
-    """Line search iterations in a Newton iteration."""
+    """Line search iterations in a Newton iteration of MJX's solver; ours, which the task has, takes its own number."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -63,7 +63,7 @@ class HandReachConfig(TaskConfig):
     solver_iterations: int = 1
     """Newton iterations in a physics step."""
     line_search_iterations: int = 4
-    """Line search iterations in a Newton iteration."""
+    """Line search iterations in a Newton iteration of MJX's solver, which runs on a CPU (see `constraints`)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -1,0 +1,89 @@
+"""Elliptic friction cones, number by number (`algebra`): zones, forces and second derivatives of a contact's cost.
+
+Source: MuJoCo's documentation, "Computation", constraint model.
+"""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+
+from jaxrl_vis_envs.physics.algebra import TINY, Matrix, Numbers, ratio, total
+
+
+class Cone(NamedTuple):
+    """Where the forces of a contact stand relative to its elliptic cone.
+
+    Attributes:
+        scales: Of its rows, by which the cone becomes a circular one.
+        scaled: The residuals of its rows, scaled.
+        normal: The first of these.
+        tangent: The length of the others.
+        friction: That of the scaled cone.
+        stiffness: For what is outside of the cone and its opposite, 0 elsewhere.
+        is_stuck: Whether all rows act like equalities.
+    """
+
+    scales: Numbers
+    scaled: Numbers
+    normal: Any
+    tangent: Any
+    friction: Any
+    stiffness: Any
+    is_stuck: Any
+
+    def derivatives(self) -> tuple[Matrix, Numbers]:
+        """The cost's second derivatives by the rows' residuals, and the forces; both 0 where all rows are stuck or free."""
+        friction, safe = self.friction, jnp.maximum(self.tangent, TINY)
+        gap = self.normal - friction * self.tangent
+        units = [part / safe for part in self.scaled[1:]]
+        bend = friction * gap / safe
+        size = len(self.scaled)
+        matrix: Matrix = {}
+        first = self.stiffness * self.scales[0]
+        matrix[0, 0] = first * self.scales[0]
+        for row in range(1, size):
+            outer = self.stiffness * self.scales[row]
+            matrix[row, 0] = matrix[0, row] = -friction * units[row - 1] * first * self.scales[row]
+            for column in range(1, size):
+                # Of (normal - friction * tangent)^2 / 2: the square of its slope, and how its slope turns.
+                turn = (1.0 if row == column else 0.0) - units[row - 1] * units[column - 1]
+                value = friction * friction * units[row - 1] * units[column - 1] - bend * turn
+                matrix[row, column] = outer * self.scales[column] * value
+        pull = self.stiffness * gap
+        forces = [-pull * self.scales[0]]
+        forces += [pull * friction * unit * scale for unit, scale in zip(units, self.scales[1:], strict=True)]
+        return matrix, forces
+
+    def along(self, direction: Numbers) -> tuple[Any, Any]:
+        """The cost's slope and curvature along a direction of the rows' residuals, where they are not stuck."""
+        turned = [part * scale for part, scale in zip(direction, self.scales, strict=True)]
+        safe = jnp.maximum(self.tangent, TINY)
+        change = total(u * v for u, v in zip(self.scaled[1:], turned[1:], strict=True)) / safe
+        bend = (total(v * v for v in turned[1:]) - change * change) / safe
+        gap, opening = self.normal - self.friction * self.tangent, turned[0] - self.friction * change
+        slope = self.stiffness * gap * opening
+        return slope, self.stiffness * (opening * opening - self.friction * gap * bend)
+
+    def corners(self, direction: Numbers) -> Numbers:
+        """The lengths of steps along a direction of the rows' residuals at which they begin or cease to be stuck."""
+        turned = [part * scale for part, scale in zip(direction, self.scales, strict=True)]
+        # Where tangent^2 = (friction * normal)^2.
+        square = self.friction * self.friction
+        two = total(v * v for v in turned[1:]) - square * turned[0] * turned[0]
+        one = total(u * v for u, v in zip(self.scaled[1:], turned[1:], strict=True)) - square * self.normal * turned[0]
+        none = self.tangent * self.tangent - square * self.normal * self.normal
+        root = jnp.sqrt(jnp.maximum(one * one - two * none, 0.0))
+        larger = jnp.where(one < 0, root, -root) - one
+        return [ratio(larger, two), ratio(none, larger)]
+
+
+def cone_at(scales: Numbers, residual: Numbers, stiffness: Any) -> Cone:
+    """The cone whose rows have these residuals, the first of them with this stiffness."""
+    friction = scales[0]
+    scaled = [x * scale for x, scale in zip(residual, scales, strict=True)]
+    normal, tangent = scaled[0], jnp.sqrt(total(part * part for part in scaled[1:]))
+    is_stuck = jnp.where(tangent > 0, friction * normal + tangent <= 0, normal < 0)
+    is_outside = (tangent > 0) & (normal < friction * tangent) & (friction * normal + tangent > 0)
+    square = friction * friction
+    outside = jnp.where(is_outside, stiffness / jnp.maximum(square * (1.0 + square), TINY), 0.0)
+    return Cone(scales, scaled, normal, tangent, friction, outside, is_stuck)
