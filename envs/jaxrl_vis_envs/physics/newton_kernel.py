@@ -1,12 +1,11 @@
-"""`descent.solve` as one GPU kernel (Pallas, by Triton): a program solves the problem of one episode.
+"""`descent.solve` as one GPU kernel (Pallas, by Triton): a thread solves the problem of one episode, a program those of 32.
 
 All numbers of a problem stay on the chip from its first read to the motion. As XLA operations, a physics step of the finger
 is some 850 kernels more, and one of the hand 150, most of which do next to nothing.
 
-Every thread of a program computes the same numbers. Were each of a warp's 32 to take another episode, the kernel would do
-with a thirtieth of the instructions, but it is other kernels that take the time, and Triton takes minutes to compile it:
-before it decides how the threads of a block share each read, it searches the whole program, which is thousands of operations
-here. Numbers that all threads share are no business of that search.
+The numbers of a problem come in one vector, and so does the motion, and the kernel takes the vectors apart and puts them
+together itself. The reason is the compiler: before it decides how the threads of a block share a read or a write, it searches
+the whole program, which is thousands of operations here. With a read for each number, that takes minutes.
 """
 
 import functools
@@ -14,6 +13,8 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.custom_batching import custom_vmap
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
 
@@ -21,6 +22,7 @@ from jaxrl_vis_envs.physics import descent
 from jaxrl_vis_envs.physics.descent import Motion, Problem, Structure
 
 _COMPILER = plgpu.CompilerParams(num_warps=1, num_stages=1)
+_LANES = 32  # episodes of a program: the threads of a warp
 
 
 def solve(structure: Structure, problem: Problem, interpret: bool = False) -> Motion:
@@ -31,25 +33,76 @@ def solve(structure: Structure, problem: Problem, interpret: bool = False) -> Mo
         problem: Its arrays.
         interpret: Run the kernel without a GPU, slowly.
     """
-    # What has no numbers cannot be handed to a kernel, which never reads it.
-    used = Problem(*(array if array.size else jnp.zeros(1, jnp.float32) for array in problem))
-    out = jax.ShapeDtypeStruct((structure.joints,), jnp.float32)
-    motion = pl.pallas_call(
+    places = _places(structure)
+    parts = [array[tuple(np.array(places[name]).T)] for name, array in problem._asdict().items() if places[name]]
+    numbers = jnp.concatenate(parts)
+    vector = jnp.pad(numbers, (0, pl.next_power_of_2(numbers.size) - numbers.size))
+
+    @custom_vmap
+    def motion(vector: jax.Array) -> jax.Array:
+        return _batch(structure, vector[None], interpret)[0]
+
+    @motion.def_vmap
+    def _(axis_size: int, in_batched: list[bool], vectors: jax.Array) -> tuple[jax.Array, bool]:
+        del axis_size, in_batched  # there is one input, so it is batched
+        return _batch(structure, vectors, interpret), True
+
+    return Motion(*motion(vector)[: len(Motion._fields) * structure.joints].reshape(-1, structure.joints))
+
+
+def _places(structure: Structure) -> dict[str, list[tuple[int, ...]]]:
+    """For each array of a problem, the places of the numbers that the solver reads, in the order in which it reads them."""
+    places: dict[str, list[tuple[int, ...]]] = {name: [] for name in Problem._fields}
+    descent.numbers_of(structure, lambda name, *place: places[name].append(place))
+    return places
+
+
+def _batch(structure: Structure, vectors: jax.Array, interpret: bool) -> jax.Array:
+    """Motions [B, outputs] of problems [B, inputs], in numbers whose order is that of `_places` and of `Motion`."""
+    batch, inputs = vectors.shape
+    outputs = pl.next_power_of_2(len(Motion._fields) * structure.joints)
+    programs = pl.cdiv(batch, _LANES)
+    # Threads beyond the last episode solve it again: zeros would be no problem to solve.
+    vectors = jnp.pad(vectors, ((0, programs * _LANES - batch), (0, 0)), mode="edge")
+    motions = pl.pallas_call(
         functools.partial(_kernel, structure=structure),
-        out_shape=[out] * len(Motion._fields),
+        grid=(programs,),
+        in_specs=[pl.BlockSpec((_LANES, inputs), lambda program: (program, 0))],
+        out_specs=pl.BlockSpec((_LANES, outputs), lambda program: (program, 0)),
+        out_shape=jax.ShapeDtypeStruct((programs * _LANES, outputs), jnp.float32),
         compiler_params=_COMPILER,
         interpret=interpret,
         name="solve_constraints",
-    )(*used)
-    return Motion(*motion)
+    )(vectors)
+    return motions[:batch]
 
 
-def _kernel(*refs: Any, structure: Structure) -> None:
-    inputs, outputs = dict(zip(Problem._fields, refs)), refs[len(Problem._fields) :]
-    motion = descent.solve(structure, descent.numbers_of(structure, lambda name, *place: inputs[name][place]))
-    for ref, part in zip(outputs, motion, strict=True):
-        for joint, number in enumerate(part):
-            ref[joint] = jnp.asarray(number, jnp.float32)
+def _kernel(vectors: Any, motions: Any, *, structure: Structure) -> None:
+    every_place = [(name, place) for name, places in _places(structure).items() for place in places]
+    numbers = dict(zip(every_place, _columns(vectors[...])))  # the rest of the columns fills them up to a power of two
+    motion = descent.solve(structure, descent.numbers_of(structure, lambda name, *place: numbers[name, place]))
+    columns = [jnp.broadcast_to(jnp.asarray(number, jnp.float32), (_LANES,)) for part in motion for number in part]
+    nothing = jnp.zeros(_LANES, jnp.float32)
+    motions[...] = _from_columns(columns + [nothing] * (motions.shape[1] - len(columns)))
+
+
+def _columns(matrix: jax.Array) -> list[jax.Array]:
+    """The columns of a matrix [rows, a power of two], by the one operation that takes an array apart without memory: halving."""
+    parts = [matrix]
+    while parts[0].shape[1] > 1:
+        parts = [half for part in parts for half in jnp.split(part, 2, axis=1)]
+    return [part.reshape(-1) for part in parts]
+
+
+def _from_columns(columns: list[jax.Array]) -> jax.Array:
+    """The reverse of `_columns`."""
+    rows = columns[0].shape[0]
+    parts = [column.reshape(rows, 1) for column in columns]
+    while len(parts) > 1:
+        half = len(parts) // 2
+        # Only a last axis of 1 can be joined. The first one joined varies most slowly at the end.
+        parts = [jnp.concatenate(pair, axis=-1)[..., None] for pair in zip(parts[:half], parts[half:], strict=True)]
+    return parts[0].reshape(rows, -1)
 
 
 def probe() -> None:
