@@ -8,7 +8,6 @@ For every task and image size the file holds, under ``TASK/SIZE``:
 
     grey     [episodes, frames, H, W] uint8, luminance of frames one control step apart, under random actions
     flow     [episodes, frames - 1, H, W, 2] float16, (right, down) in pixels, of the frames as they are, 0 to 255
-    weak     the same of the frames divided by 255, where OpenCV's regularisation weighs more
 """
 
 import pathlib
@@ -30,7 +29,7 @@ SETTINGS = (0.5, 3, 15, 3, 5, 1.2, 0)
 
 def render(task: str) -> dict[int, np.ndarray]:
     """Frames [episodes, frames, 3, H, W] uint8 of the same episodes at every size."""
-    envs = {size: jaxrl_vis_envs.make(task, image_size=size, pixels="rgb") for size in SIZES}
+    envs = {size: jaxrl_vis_envs.make(task, image_size=size, pixels="rgb", frame_stack=1) for size in SIZES}
     env = envs[SIZES[0]]
 
     def episode(key: jax.Array):
@@ -51,10 +50,9 @@ def render(task: str) -> dict[int, np.ndarray]:
 
 
 def flows(grey: np.ndarray) -> np.ndarray:
-    """OpenCV's flow [episodes, frames - 1, H, W, 2] float16 between neighbours of [episodes, frames, H, W]."""
+    """OpenCV's flow [episodes, frames - 1, H, W, 2] float32 between neighbours of [episodes, frames, H, W]."""
     pairs = [[(episode[step], episode[step + 1]) for step in range(FRAMES - 1)] for episode in grey]
-    found = [[cv2.calcOpticalFlowFarneback(*pair, None, *SETTINGS) for pair in episode] for episode in pairs]
-    return np.array(found, np.float16)
+    return np.array([[cv2.calcOpticalFlowFarneback(*pair, None, *SETTINGS) for pair in episode] for episode in pairs])
 
 
 def main() -> None:
@@ -63,12 +61,9 @@ def main() -> None:
     for task in TASKS:
         for size, frames in render(task).items():
             grey = np.stack([[cv2.cvtColor(frame.transpose(1, 2, 0), cv2.COLOR_RGB2GRAY) for frame in row] for row in frames])
-            arrays |= {
-                f"{task}/{size}/grey": grey,
-                f"{task}/{size}/flow": flows(grey),
-                f"{task}/{size}/weak": flows(grey.astype(np.float32) / 255.0),
-            }
-            strength = np.linalg.norm(arrays[f"{task}/{size}/flow"].astype(np.float32), axis=-1)
+            flow = flows(grey)
+            arrays |= {f"{task}/{size}/grey": grey, f"{task}/{size}/flow": flow.astype(np.float16)}
+            strength = np.linalg.norm(flow, axis=-1)
             print(f"{task} at {size}: {np.mean(strength >= 0.25):.0%} of the pixels move, at most {strength.max():.1f} px", flush=True)
     np.savez_compressed(TARGET, **arrays)
     print(f"wrote {TARGET.name}: {TARGET.stat().st_size / 1000:.0f} kB")

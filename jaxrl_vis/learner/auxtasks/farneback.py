@@ -25,6 +25,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxrl_vis.learner.auxtasks.images import read_between
+
 _SMALLEST_LEVEL = 32  # pixels
 _REGULARIZATION = 1e-3  # of a determinant, in grey levels to the fourth power
 _BORDER_WEIGHTS = (0.14, 0.14, 0.4472, 0.4472, 0.4472)  # of the outermost pixels, from the border inwards
@@ -164,7 +166,10 @@ def _equations(expansion_t: jax.Array, expansion_tp1: jax.Array, found: jax.Arra
         found: [2, rows, columns], the displacements so far.
     """
     rows, columns, _ = expansion_t.shape
-    warped, is_inside = _read_at(expansion_tp1, found)
+    x = np.arange(columns, dtype=np.float32) + found[0]
+    y = np.arange(rows, dtype=np.float32)[:, None] + found[1]
+    is_inside = (x >= 0) & (x < columns - 1) & (y >= 0) & (y < rows - 1)
+    warped = read_between(expansion_tp1, x, y)
     # What has left the image says nothing about curvature, and its slope counts as 0.
     warped = jnp.where(is_inside[..., None], warped, expansion_t * np.array([0, 0, 1, 1, 1], np.float32))
     mean = jnp.moveaxis(0.5 * (expansion_t + warped), -1, 0)
@@ -183,22 +188,6 @@ def _border_weights(size: int) -> np.ndarray:
     weights[:border] *= _BORDER_WEIGHTS
     weights[-border:] *= _BORDER_WEIGHTS[::-1]
     return weights
-
-
-def _read_at(expansion: jax.Array, found: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Coefficients at displaced pixels [rows, columns, 5], by linear interpolation, and where these lie inside the image."""
-    rows, columns, _ = expansion.shape
-    x = np.arange(columns, dtype=np.float32) + found[0]
-    y = np.arange(rows, dtype=np.float32)[:, None] + found[1]
-    left, top = jnp.floor(x), jnp.floor(y)
-    is_inside = (left >= 0) & (left < columns - 1) & (top >= 0) & (top < rows - 1)
-    column, row = (jnp.clip(corner, 0, size - 2) for corner, size in ((left, columns), (top, rows)))
-    start = (row * columns + column).astype(jnp.int32)
-    flat = expansion.reshape(rows * columns, -1)
-    right, down = (x - column)[..., None], (y - row)[..., None]
-    upper = (1.0 - right) * flat[start] + right * flat[start + 1]
-    lower = (1.0 - right) * flat[start + columns] + right * flat[start + columns + 1]
-    return (1.0 - down) * upper + down * lower, is_inside
 
 
 def _solve(equations: jax.Array) -> jax.Array:
