@@ -64,7 +64,10 @@ def main() -> None:
             flow = flows(grey)
             arrays |= {f"{task}/{size}/grey": grey, f"{task}/{size}/flow": flow.astype(np.float16)}
             strength = np.linalg.norm(flow, axis=-1)
-            print(f"{task} at {size}: {np.mean(strength >= 0.25):.0%} of the pixels move, at most {strength.max():.1f} px", flush=True)
+            print(
+                f"{task} at {size}: {np.mean(strength >= 0.25):.0%} of the pixels move, at most {strength.max():.1f} px",
+                flush=True,
+            )
     np.savez_compressed(TARGET, **arrays)
     print(f"wrote {TARGET.name}: {TARGET.stat().st_size / 1000:.0f} kB")
 

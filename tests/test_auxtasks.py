@@ -47,7 +47,9 @@ def init_all(tasks):
 
 def test_each_task_learns_what_it_is_to_predict():
     spec = make_spec(4, 16, latent_size=24, levels=2)
-    tasks, view, optimizer = auxtasks.make(auxtasks.NAMES, spec), make_view(spec, 16), optax.adam(1e-2)
+    tasks, optimizer = auxtasks.make(auxtasks.NAMES, spec), optax.adam(1e-2)
+    patches = jax.random.normal(jax.random.key(2), (16, 4, 4, 4))  # images have some structure, unlike noise
+    view = make_view(spec, 16).replace(image=jnp.repeat(jnp.repeat(patches, 4, axis=2), 4, axis=3))
 
     def total(params):
         found = {name: task.loss(params[name], view) for name, task in tasks.items()}
@@ -65,7 +67,7 @@ def test_each_task_learns_what_it_is_to_predict():
         return jax.lax.scan(step, (params, optimizer.init(params)), length=400)[1]
 
     for name, curve in learn().items():
-        assert curve[-1] < 0.1 * curve[0], name
+        assert curve[-1] < 0.05 * curve[0], name
 
 
 # Of 100 pixels, an encoder of four layers reads the first 96.

@@ -6,9 +6,9 @@
     autoencoder        latent               -> image
     optical_flow       latent, next latent  -> strength of the optical flow
 
-Each is a head, a loss and a target, in a file of its own. Heads and losses are an `AuxTask`, functions of parameters and a `View`
-of latents and targets, and know nothing of the encoder. Targets (`make_targets`) are functions of raw images, free of
-parameters: they can be computed where a batch is sampled, or once for every transition when it is collected.
+Each is a head, a loss and a target, in a file of its own. An `AuxTask` is a head and its loss, functions of parameters and of a
+`View` of latents and targets, and knows nothing of the encoder. Targets (`make_targets`) are functions of raw images alone, so
+they can be computed for every batch that is sampled, or once for every transition that is collected.
 """
 
 import dataclasses
@@ -34,11 +34,12 @@ class Options:
     """Where the thesis and the authors' release differ; the defaults are the thesis's, `RELEASE` the others.
 
     Attributes:
-        detach: Whether the next latent is a target of forward dynamics only, which neither of them says; the release does not.
-        border: What becomes of corners that egomotion leaves empty.
-        max_shift: Of egomotion, as a share of the image's size.
+        detach: Whether the loss of forward dynamics leaves the next latent alone. The thesis does not say; in the release, it
+            does not.
+        border: What becomes of the corners that a rotation leaves empty.
+        max_shift: Farthest shift that comes with a rotation, as a share of the image's size.
         in_grey: Whether the autoencoder reconstructs one grey channel rather than the observation.
-        stretch: Whether masks of optical flow are stretched to [0, 1] one by one, rather than in pixels.
+        stretch: Whether each mask of optical flow is stretched to [0, 1], rather than being in pixels.
     """
 
     detach: bool = True

@@ -1,4 +1,4 @@
-"""Egomotion: how an image was rotated, from the latents of both, by one linear layer (thesis, 5.2.3.1; Agrawal et al., 2015)."""
+"""Egomotion: how an image was rotated, from its latent and the new one, by a linear layer (thesis, 5.2.3.1)."""
 
 import math
 from typing import Literal

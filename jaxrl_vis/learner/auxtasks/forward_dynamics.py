@@ -1,4 +1,4 @@
-"""Forward dynamics: the next latent from this one and the action, by one linear layer (thesis, 5.2.3.1; Agrawal et al., 2016)."""
+"""Forward dynamics: the next latent from this one and the action, by a linear layer (thesis, 5.2.3.1)."""
 
 import jax
 

@@ -16,7 +16,8 @@ def grey(images: jax.Array, frame_stack: int = 1) -> jax.Array:
     channels = images.shape[-3] // frame_stack
     if channels < len(_LUMINANCE):
         return images[..., 0, :, :].astype(jnp.float32)
-    return sum(weight * images[..., channel, :, :].astype(jnp.float32) for channel, weight in enumerate(_LUMINANCE))
+    red, green, blue = (weight * images[..., channel, :, :].astype(jnp.float32) for channel, weight in enumerate(_LUMINANCE))
+    return red + green + blue
 
 
 def read_between(values: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:

@@ -42,8 +42,9 @@ def flow_strength(images_t: jax.Array, images_tp1: jax.Array, frame_stack: int =
         images_t: [B, C, H, W] uint8, observations before the action.
         images_tp1: The same after it.
         frame_stack: Images that an observation stacks; the newest ones count.
-        stretch: Whether each mask is stretched to [0, 1], as in the authors' release: there, grey levels lie in [0, 1] too,
-            where Farneback's regularisation outweighs all but the sharpest edges. How fast things move is lost.
+        stretch: Whether each mask is stretched to [0, 1], as in the authors' release, where grey levels lie in [0, 1], too. How
+            fast things move is lost, and where nothing moves, traces of rounding are stretched. With such grey levels
+            Farneback's regularisation outweighs the images (`farneback`), so that sharp edges count more than their speed.
     """
     unit = 255.0 if stretch else 1.0
     flow = farneback.flow(grey(images_t, frame_stack) / unit, grey(images_tp1, frame_stack) / unit)
