@@ -130,16 +130,21 @@ def test_a_decoder_is_a_stack_of_transposed_convolutions():
 def test_bfloat16_decodes_nearly_what_float32_does():
     specs = [make_spec(3, 8, levels=1, dtype=dtype) for dtype in (jnp.float32, jnp.bfloat16)]
     full, half = (autoencoder.make(spec) for spec in specs)
-    params, view = full.init(jax.random.key(0)), make_view(specs[0], 4)
-    expected, found = full.predict(params, view), half.predict(params, view)
+
+    @jax.jit
+    def decode_in_both_ways():
+        params, view = full.init(jax.random.key(0)), make_view(specs[0], 4)
+        return full.predict(params, view), half.predict(params, view)
+
+    expected, found = decode_in_both_ways()
     assert 1e-4 < np.linalg.norm(found - expected) / np.linalg.norm(expected) < 2e-2
 
 
 def test_what_a_task_does_not_need_may_be_left_out():
     spec = make_spec(4, 16, levels=2)
-    everything = make_view(spec, 2)
-    for name, task in auxtasks.make(auxtasks.NAMES, spec).items():
-        params = task.init(jax.random.key(0))
+    everything = jax.eval_shape(lambda: make_view(spec, 2))
+    for task in auxtasks.make(auxtasks.NAMES, spec).values():
+        params = jax.eval_shape(task.init, jax.random.key(0))
         fields = {field: getattr(everything, field) for field in task.needs}
         bare = auxtasks.View(everything.latent_t, everything.action)
         assert jax.eval_shape(task.loss, params, bare.replace(**fields)).shape == ()
