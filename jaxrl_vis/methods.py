@@ -8,6 +8,7 @@ from typing import Literal
 
 MethodName = Literal["oracle", "indicator", "indicator_balance_filter"]
 RewardName = Literal["oracle", "indicator"]
+AuxTaskName = Literal["forward_dynamics", "inverse_dynamics", "egomotion", "autoencoder", "optical_flow"]
 
 
 @dataclasses.dataclass(frozen=True)

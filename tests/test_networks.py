@@ -11,7 +11,8 @@ import pytest
 from jaxrl_vis.config import preset
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import encoder_kernel, losses, normalizer
-from jaxrl_vis.learner.networks import Networks, to_blocks
+from jaxrl_vis.learner.blocks import from_blocks, to_blocks
+from jaxrl_vis.learner.networks import Networks
 
 
 def make_networks(size, filters=(4, 8, 16), **overrides):
@@ -128,6 +129,13 @@ def test_blocks_hold_every_pixel_once():
     assert blocks.shape == (2, 4, 48)
     np.testing.assert_array_equal(np.sort(np.asarray(blocks).ravel()), np.arange(blocks.size))
     np.testing.assert_array_equal(np.sort(np.asarray(blocks[0, 0])), np.sort(np.asarray(frames[0, :, :4, :4]).ravel()))
+
+
+@pytest.mark.parametrize(("height", "width", "levels"), [(8, 8, 2), (10, 21, 2), (9, 17, 3)])
+def test_blocks_become_images_again(height, width, levels):
+    frames = np.arange(2 * 3 * height * width).reshape(2, 3, height, width)
+    rows, columns = height >> levels << levels, width >> levels << levels  # the rest of the border fills no block
+    np.testing.assert_array_equal(from_blocks(to_blocks(frames, levels), rows, columns), frames[..., :rows, :columns])
 
 
 def test_an_image_smaller_than_a_block_is_refused():

@@ -8,7 +8,7 @@ networks compute in, which Adam writes with them. Everything is changed in place
 
 The replay holds images in the order that the encoder reads, which spares every step the rearrangement that ours makes:
 
-    blocks          nested 2x2 blocks, as `networks.to_blocks`: each layer is a matrix product
+    blocks          nested 2x2 blocks, as `blocks.to_blocks`: each layer is a matrix product
     convolutions    [H, W, C], PyTorch's channels_last: each layer is a convolution of 2x2 pixels with stride 2
 """
 

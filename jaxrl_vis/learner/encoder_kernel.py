@@ -141,7 +141,7 @@ def _word_offsets(first_patch: Any, patches: int, shape: tuple[int, int, int], l
     """Where the words of some patches lie in a planar image, and whether they are there: [patches, 16 C'] int32 and bool.
 
     Patches run over the 2^levels blocks of the image, row by row, and within a block over its halves of halves (as
-    `networks.to_blocks`), so that the next layers find their windows side by side. Words of a patch run over (quarter's row,
+    `blocks.to_blocks`), so that the next layers find their windows side by side. Words of a patch run over (quarter's row,
     quarter's column, channel, row).
     """
     channels, height, width = shape

@@ -23,6 +23,7 @@ import jax.numpy as jnp
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import encoder_kernel, normalizer
+from jaxrl_vis.learner.blocks import to_blocks
 from jaxrl_vis.types import Batch, NormalizerState, Params, TrainState
 
 _glorot = nn.initializers.glorot_uniform()
@@ -47,23 +48,6 @@ def _product_backward(residuals: tuple[jax.Array, jax.Array], gradient: jax.Arra
 
 
 _product.defvjp(lambda values, kernel: (values @ kernel, (values, kernel)), _product_backward)
-
-
-def to_blocks(frames: jax.Array, levels: int) -> jax.Array:
-    """Planar images in nested 2x2 blocks: [..., C, H, W] -> [..., (H / 2^levels) * (W / 2^levels), 4^levels * C], same dtype.
-
-    The last axis runs over (coarsest block, ..., finest block, channel).
-    """
-    *batch, channels, height, width = frames.shape
-    rows, columns = height >> levels, width >> levels
-    frames = frames[..., : rows << levels, : columns << levels]
-    twos = (2,) * levels
-    frames = frames.reshape(*batch, channels, rows, *twos, columns, *twos)
-    first = len(batch)
-    row_axis, column_axis = first + 1, first + 2 + levels
-    pairs = [axis for level in range(1, levels + 1) for axis in (row_axis + level, column_axis + level)]
-    frames = frames.transpose(*range(first), row_axis, column_axis, *pairs, first)
-    return frames.reshape(*batch, rows * columns, 4**levels * channels)
 
 
 class _Encoder(nn.Module):

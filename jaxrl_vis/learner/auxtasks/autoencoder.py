@@ -1,0 +1,37 @@
+"""Autoencoder: the observation from its latent, by a decoder (thesis, 5.2.3.1)."""
+
+import jax
+
+from jaxrl_vis.learner.auxtasks import heads
+from jaxrl_vis.learner.auxtasks.images import grey
+from jaxrl_vis.learner.auxtasks.task import AuxTask, Spec, View, mean_squared_error, read
+from jaxrl_vis.learner.blocks import from_blocks, to_blocks
+from jaxrl_vis.types import Params
+
+
+def make(spec: Spec, in_grey: bool = False) -> AuxTask:
+    """The task.
+
+    Args:
+        spec: Sizes.
+        in_grey: Whether one grey channel of the newest image is reconstructed, as in the authors' release, rather than all
+            channels of the observation. Here it is the luminance of the normalised channels; the release normalises again.
+    """
+    channels, height, width = spec.observation.shape
+    shape = (1 if in_grey else channels, height, width)
+    whole = (height >> spec.levels << spec.levels, width >> spec.levels << spec.levels)
+
+    def target(view: View) -> jax.Array:
+        image = read(view, "image")
+        return grey(image, spec.frame_stack)[:, None] if in_grey else image
+
+    def decode(params: Params, view: View) -> jax.Array:
+        return heads.decode(params, view.latent_t, spec.dtype)
+
+    return AuxTask(
+        name="autoencoder",
+        needs=frozenset({"image"}),
+        init=lambda key: heads.init_decoder(key, spec.latent_size, shape, spec.levels),
+        predict=lambda params, view: from_blocks(decode(params, view), *whole),
+        loss=lambda params, view: mean_squared_error(decode(params, view), to_blocks(target(view), spec.levels)),
+    )

@@ -1,0 +1,90 @@
+"""Egomotion: how an image was rotated, from its latent and the new one, by a linear layer (thesis, 5.2.3.1)."""
+
+import math
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+
+from jaxrl_vis.learner.auxtasks import heads
+from jaxrl_vis.learner.auxtasks.images import read_between
+from jaxrl_vis.learner.auxtasks.task import AuxTask, Spec, View, mean_squared_error, read
+from jaxrl_vis.types import Params
+
+MAX_ANGLE = math.radians(30.0)
+RELEASE_SHIFT = 0.1  # 10 of 100 pixels
+
+Border = Literal["clip", "zero"]
+"""What becomes of the corners that a rotation leaves empty. ``clip``: the image is clipped to the largest rectangle of its own
+proportions that has none, and scaled to its old size, as in the thesis. ``zero``: they are 0, as in the authors' release."""
+
+
+def make(spec: Spec, max_shift: float = 0.0) -> AuxTask:
+    """The task.
+
+    Args:
+        spec: Sizes.
+        max_shift: As of `egomotion_pair`; with one, three numbers are predicted rather than the angle alone.
+    """
+
+    def predict(params: Params, view: View) -> jax.Array:
+        return heads.linear(params, view.latent_t, read(view, "latent_moved"))
+
+    return AuxTask(
+        name="egomotion",
+        needs=frozenset({"latent_moved", "motion"}),
+        init=lambda key: heads.init_linear(key, 2 * spec.latent_size, 3 if max_shift else 1),
+        predict=predict,
+        loss=lambda params, view: mean_squared_error(predict(params, view), read(view, "motion")),
+    )
+
+
+def egomotion_pair(
+    key: jax.Array, images: jax.Array, border: Border = "clip", max_shift: float = 0.0
+) -> tuple[jax.Array, jax.Array]:
+    """Images rotated by random angles, evenly up to 30 degrees either way, and possibly shifted.
+
+    Args:
+        key: [] a typed key.
+        images: [B, C, H, W] uint8.
+        border: What becomes of empty corners.
+        max_shift: Farthest shift each way, as a share of the image's size; in the release 0.1, in the thesis none.
+
+    Returns:
+        The images moved, [B, C, H, W] uint8, and the motion in [-1, 1]: angles [B, 1], or angles and shifts to the right and
+        down [B, 3], float32.
+    """
+    motion = jax.random.uniform(key, (images.shape[0], 3 if max_shift else 1), minval=-1.0, maxval=1.0)
+    size = jnp.array([images.shape[-1], images.shape[-2]])
+    shift = max_shift * size * motion[:, 1:] if max_shift else jnp.zeros((images.shape[0], 2))
+    return rotate(images, MAX_ANGLE * motion[:, 0], shift, border), motion
+
+
+def rotate(images: jax.Array, angle: jax.Array, shift: jax.Array, border: Border = "clip") -> jax.Array:
+    """Images rotated about their centres, then shifted: [B, C, H, W] uint8. What comes from outside is 0.
+
+    Args:
+        images: [B, C, H, W] uint8.
+        angle: [B] float32 in radians, counter-clockwise as one sees it.
+        shift: [B, 2] float32 in pixels, to the right and down.
+        border: What becomes of empty corners.
+    """
+    height, width = images.shape[-2:]
+    last_x, last_y = width - 1.0, height - 1.0
+
+    def one(image: jax.Array, angle: jax.Array, shift: jax.Array) -> jax.Array:
+        cos, sin = jnp.cos(angle), jnp.sin(angle)
+        zoom = jnp.float32(1.0)
+        if border == "clip":
+            along, across = jnp.abs(cos), jnp.abs(sin)
+            zoom = jnp.minimum(last_x / (last_x * along + last_y * across), last_y / (last_x * across + last_y * along))
+        # Where each pixel comes from, as seen from the centre.
+        right = zoom * (jnp.arange(width) - last_x / 2 - shift[0])
+        down = zoom * (jnp.arange(height)[:, None] - last_y / 2 - shift[1])
+        x, y = cos * right - sin * down + last_x / 2, sin * right + cos * down + last_y / 2
+        # A pixel reaches half a pixel beyond its centre.
+        is_inside = (jnp.abs(x - last_x / 2) <= width / 2) & (jnp.abs(y - last_y / 2) <= height / 2)
+        values = read_between(image.transpose(1, 2, 0), x, y)
+        return jnp.where(is_inside[..., None], jnp.round(values), 0.0).astype(image.dtype).transpose(2, 0, 1)
+
+    return jax.vmap(one)(images, angle, shift)

@@ -1,0 +1,32 @@
+"""Forward dynamics: the next latent from this one and the action, by a linear layer (thesis, 5.2.3.1)."""
+
+import jax
+
+from jaxrl_vis.learner.auxtasks import heads
+from jaxrl_vis.learner.auxtasks.task import AuxTask, Spec, View, mean_squared_error, read
+from jaxrl_vis.types import Params
+
+
+def make(spec: Spec, detach: bool = True) -> AuxTask:
+    """The task.
+
+    Args:
+        spec: Sizes.
+        detach: Whether the next latent is a target only. The authors' release lets gradients into it, so that the encoder can
+            lower the loss by making all latents alike.
+    """
+
+    def predict(params: Params, view: View) -> jax.Array:
+        return heads.linear(params, view.latent_t, view.action)
+
+    def loss(params: Params, view: View) -> jax.Array:
+        target = read(view, "latent_tp1")
+        return mean_squared_error(predict(params, view), jax.lax.stop_gradient(target) if detach else target)
+
+    return AuxTask(
+        name="forward_dynamics",
+        needs=frozenset({"latent_tp1"}),
+        init=lambda key: heads.init_linear(key, spec.latent_size + spec.action_size, spec.latent_size),
+        predict=predict,
+        loss=loss,
+    )

@@ -1,0 +1,56 @@
+"""Optical flow: how strongly each pixel moves between two images, from the latents of both, by a decoder (thesis, 5.2.3.1)."""
+
+import jax
+import jax.numpy as jnp
+
+from jaxrl_vis.learner.auxtasks import farneback, heads
+from jaxrl_vis.learner.auxtasks.images import grey
+from jaxrl_vis.learner.auxtasks.task import AuxTask, Spec, View, mean_squared_error, read
+from jaxrl_vis.learner.blocks import from_blocks, to_blocks
+from jaxrl_vis.types import Params
+
+
+def make(spec: Spec) -> AuxTask:
+    """The task.
+
+    Args:
+        spec: Sizes.
+    """
+    _, height, width = spec.observation.shape
+    whole = (height >> spec.levels << spec.levels, width >> spec.levels << spec.levels)
+
+    def decode(params: Params, view: View) -> jax.Array:
+        latents = jnp.concatenate([view.latent_t, read(view, "latent_tp1")], axis=-1)
+        return heads.decode(params, latents, spec.dtype)
+
+    def loss(params: Params, view: View) -> jax.Array:
+        return mean_squared_error(decode(params, view), to_blocks(read(view, "flow")[:, None], spec.levels))
+
+    return AuxTask(
+        name="optical_flow",
+        needs=frozenset({"latent_tp1", "flow"}),
+        init=lambda key: heads.init_decoder(key, 2 * spec.latent_size, (1, height, width), spec.levels),
+        predict=lambda params, view: from_blocks(decode(params, view), *whole)[:, 0],
+        loss=loss,
+    )
+
+
+def flow_strength(images_t: jax.Array, images_tp1: jax.Array, frame_stack: int = 1, stretch: bool = False) -> jax.Array:
+    """The length of the optical flow at every pixel: [B, H, W] float32, in pixels.
+
+    Args:
+        images_t: [B, C, H, W] uint8, observations before the action.
+        images_tp1: The same after it.
+        frame_stack: Images that an observation stacks; the newest ones count.
+        stretch: Whether each mask is stretched to [0, 1], as in the authors' release, where grey levels lie in [0, 1], too. How
+            fast things move is lost, and where nothing moves, traces of rounding are stretched. With such grey levels
+            Farneback's regularisation outweighs the images (`farneback`), so that sharp edges count more than their speed.
+    """
+    unit = 255.0 if stretch else 1.0
+    flow = farneback.flow(grey(images_t, frame_stack) / unit, grey(images_tp1, frame_stack) / unit)
+    strength = jnp.sqrt(jnp.sum(jnp.square(flow), axis=-1))
+    if not stretch:
+        return strength
+    least, most = (reduce(strength, axis=(1, 2), keepdims=True) for reduce in (jnp.min, jnp.max))
+    # Where nothing moves at all, there is nothing to stretch.
+    return jnp.where(most > least, (strength - least) / jnp.where(most > least, most - least, 1.0), 0.0)

@@ -1,0 +1,37 @@
+"""Images in nested 2x2 blocks: the order in which strided 2x2 convolutions, and transposed ones, are plain matrix products."""
+
+import jax
+
+
+def to_blocks(frames: jax.Array, levels: int) -> jax.Array:
+    """Planar images in nested 2x2 blocks: [..., C, H, W] -> [..., (H / 2^levels) * (W / 2^levels), 4^levels * C], same dtype.
+
+    The last axis runs over (coarsest block, ..., finest block, channel).
+    """
+    *batch, channels, height, width = frames.shape
+    rows, columns = height >> levels, width >> levels
+    frames = frames[..., : rows << levels, : columns << levels]
+    twos = (2,) * levels
+    frames = frames.reshape(*batch, channels, rows, *twos, columns, *twos)
+    first = len(batch)
+    row_axis, column_axis = first + 1, first + 2 + levels
+    pairs = [axis for level in range(1, levels + 1) for axis in (row_axis + level, column_axis + level)]
+    frames = frames.transpose(*range(first), row_axis, column_axis, *pairs, first)
+    return frames.reshape(*batch, rows * columns, 4**levels * channels)
+
+
+def from_blocks(blocks: jax.Array, height: int, width: int) -> jax.Array:
+    """Undoes `to_blocks`: [..., blocks, 4^levels * C] -> [..., C, height, width], same dtype.
+
+    Args:
+        blocks: In nested blocks; the number of blocks and the size say how many levels there are.
+        height, width: Of the images without the border that `to_blocks` crops, pixels.
+    """
+    *batch, count, size = blocks.shape
+    levels = ((height * width // count).bit_length() - 1) // 2
+    channels = size // 4**levels
+    first, twos = len(batch), (2,) * (2 * levels)
+    blocks = blocks.reshape(*batch, height >> levels, width >> levels, *twos, channels)
+    inside = range(first + 2, first + 2 + 2 * levels)
+    blocks = blocks.transpose(*range(first), blocks.ndim - 1, first, *inside[::2], first + 1, *inside[1::2])
+    return blocks.reshape(*batch, channels, height, width)

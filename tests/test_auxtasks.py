@@ -1,0 +1,188 @@
+"""Every auxiliary task can be learned from latents, and its loss reaches what it should and nothing else."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.learner import auxtasks
+from jaxrl_vis.learner.auxtasks import autoencoder, heads
+from jaxrl_vis.learner.blocks import from_blocks
+
+LATENTS = ("latent_t", "latent_tp1", "latent_moved")
+# The latents that each loss has a gradient to.
+REACHES = {
+    "forward_dynamics": {"latent_t"},
+    "inverse_dynamics": {"latent_t", "latent_tp1"},
+    "egomotion": {"latent_t", "latent_moved"},
+    "autoencoder": {"latent_t"},
+    "optical_flow": {"latent_t", "latent_tp1"},
+}
+
+
+def make_spec(channels, size, latent_size=8, **sizes):
+    return auxtasks.Spec(jax.ShapeDtypeStruct((channels, size, size), jnp.uint8), 3, latent_size, **sizes)
+
+
+def make_view(spec, batch, motions=1):
+    """Random numbers wherever a loss may look."""
+    keys = iter(jax.random.split(jax.random.key(0), 7))
+    latents = {name: jax.random.normal(next(keys), (batch, spec.latent_size)).astype(spec.dtype) for name in LATENTS}
+    return auxtasks.View(
+        **latents,
+        action=jax.random.uniform(next(keys), (batch, spec.action_size), minval=-1.0),
+        motion=jax.random.uniform(next(keys), (batch, motions), minval=-1.0),
+        image=jax.random.normal(next(keys), (batch, *spec.observation.shape)),
+        flow=jax.random.exponential(next(keys), (batch, *spec.observation.shape[1:])),
+    )
+
+
+def init_all(tasks):
+    return {name: task.init(jax.random.fold_in(jax.random.key(1), number)) for number, (name, task) in enumerate(tasks.items())}
+
+
+def test_each_task_learns_what_it_is_to_predict():
+    spec = make_spec(4, 16, latent_size=24, levels=2)
+    tasks, optimizer = auxtasks.make(auxtasks.NAMES, spec), optax.adam(1e-2)
+    patches = jax.random.normal(jax.random.key(2), (16, 4, 4, 4))  # images have some structure, unlike noise
+    view = make_view(spec, 16).replace(image=jnp.repeat(jnp.repeat(patches, 4, axis=2), 4, axis=3))
+
+    def total(params):
+        found = {name: task.loss(params[name], view) for name, task in tasks.items()}
+        return sum(found.values()), found
+
+    def step(carry, _):
+        params, moments = carry
+        gradient, found = jax.grad(total, has_aux=True)(params)
+        change, moments = optimizer.update(gradient, moments)
+        return (optax.apply_updates(params, change), moments), found
+
+    @jax.jit
+    def learn():
+        params = init_all(tasks)
+        return jax.lax.scan(step, (params, optimizer.init(params)), length=400)[1]
+
+    for name, curve in learn().items():
+        assert curve[-1] < 0.05 * curve[0], name
+
+
+# Of 100 pixels, an encoder of four layers reads the first 96.
+@pytest.mark.parametrize(
+    ("channels", "size", "whole", "dtype", "options"),
+    [(4, 64, 64, jnp.float32, auxtasks.Options()), (12, 100, 96, jnp.bfloat16, auxtasks.RELEASE)],
+)
+def test_losses_reach_what_they_should(channels, size, whole, dtype, options):
+    spec = make_spec(channels, size, frame_stack=channels // 4, dtype=dtype)
+    tasks, view = auxtasks.make(auxtasks.NAMES, spec, options), make_view(spec, 2, 1 if options.max_shift == 0.0 else 3)
+
+    @jax.jit
+    def run():
+        params = init_all(tasks)
+        found = {name: jax.value_and_grad(task.loss, argnums=(0, 1))(params[name], view) for name, task in tasks.items()}
+        return found, {name: task.predict(params[name], view) for name, task in tasks.items()}
+
+    found, predictions = run()
+    shapes = {"forward_dynamics": (2, 8), "inverse_dynamics": (2, 3), "egomotion": (2, view.motion.shape[1])}
+    shapes |= {"autoencoder": (2, 1 if options.in_grey else channels, whole, whole), "optical_flow": (2, whole, whole)}
+    assert {name: prediction.shape for name, prediction in predictions.items()} == shapes
+    for name, (loss, (params_gradient, view_gradient)) in found.items():
+        assert loss.shape == () and loss.dtype == jnp.float32 and loss > 0.0
+        assert predictions[name].dtype == jnp.float32
+        assert all(leaf.dtype == jnp.float32 and np.any(leaf != 0.0) for leaf in jax.tree.leaves(params_gradient)), name
+        reached = {latent for latent in LATENTS if np.any(np.asarray(getattr(view_gradient, latent), np.float32) != 0.0)}
+        not_detached = {"latent_tp1"} if name == "forward_dynamics" and not options.detach else set()
+        assert reached == REACHES[name] | not_detached, name
+    flow_error = np.mean(np.square(predictions["optical_flow"] - view.flow[:, :whole, :whole]))
+    np.testing.assert_allclose(found["optical_flow"][0], flow_error, rtol=1e-5)
+    if not options.in_grey:
+        error = np.mean(np.square(predictions["autoencoder"] - view.image[..., :whole, :whole]))
+        np.testing.assert_allclose(found["autoencoder"][0], error, rtol=1e-5)
+
+
+def test_a_decoder_is_a_stack_of_transposed_convolutions():
+    shape, levels = (3, 8, 12), 2
+
+    @jax.jit
+    def images_in_both_ways():
+        params = heads.init_decoder(jax.random.key(0), 5, shape, levels)
+        params = jax.tree.map(lambda leaf: leaf + 0.1 * jax.random.normal(jax.random.key(1), leaf.shape), params)
+        values = jax.random.normal(jax.random.key(2), (2, 5))
+        expected = (values @ params["dense"]["kernel"] + params["dense"]["bias"]).reshape(2, 2, 3, -1)
+        for level in range(levels):
+            layer = params[f"up_{level}"]
+            # JAX's transposed convolution reads its kernel backwards.
+            kernel = layer["kernel"].reshape(expected.shape[-1], 2, 2, -1).transpose(1, 2, 0, 3)[::-1, ::-1]
+            expected = jax.lax.conv_transpose(
+                jax.nn.relu(expected), kernel, (2, 2), "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC")
+            )
+            expected = expected + layer["bias"]
+        return from_blocks(heads.decode(params, values, jnp.float32), *shape[1:]), expected.transpose(0, 3, 1, 2)
+
+    images, expected = images_in_both_ways()
+    assert np.abs(expected).max() > 0.1
+    np.testing.assert_allclose(images, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_bfloat16_decodes_nearly_what_float32_does():
+    specs = [make_spec(3, 8, levels=1, dtype=dtype) for dtype in (jnp.float32, jnp.bfloat16)]
+    full, half = (autoencoder.make(spec) for spec in specs)
+
+    @jax.jit
+    def decode_in_both_ways():
+        params, view = full.init(jax.random.key(0)), make_view(specs[0], 4)
+        return full.predict(params, view), half.predict(params, view)
+
+    expected, found = decode_in_both_ways()
+    assert 1e-4 < np.linalg.norm(found - expected) / np.linalg.norm(expected) < 2e-2
+
+
+def test_what_a_task_does_not_need_may_be_left_out():
+    spec = make_spec(4, 16, levels=2)
+    everything = jax.eval_shape(lambda: make_view(spec, 2))
+    for task in auxtasks.make(auxtasks.NAMES, spec).values():
+        params = jax.eval_shape(task.init, jax.random.key(0))
+        fields = {field: getattr(everything, field) for field in task.needs}
+        bare = auxtasks.View(everything.latent_t, everything.action)
+        assert jax.eval_shape(task.loss, params, bare.replace(**fields)).shape == ()
+        for field in task.needs:
+            with pytest.raises(ValueError, match=f"needs View.{field}"):
+                jax.eval_shape(task.loss, params, bare.replace(**{**fields, field: None}))
+
+
+def test_only_the_targets_that_are_needed_are_made():
+    images = jnp.zeros((2, 4, 16, 16), jnp.uint8)
+    spec = make_spec(4, 16, levels=2)
+    for names, needed in (
+        (("forward_dynamics", "autoencoder"), set()),
+        (("egomotion",), {"images_moved", "motion"}),
+        (("optical_flow", "inverse_dynamics"), {"flow"}),
+    ):
+        needs = auxtasks.needs_of(auxtasks.make(names, spec))
+        make_targets = functools.partial(auxtasks.make_targets, needs=needs)
+        targets = jax.eval_shape(make_targets, jax.random.key(0), images, images)
+        assert {name for name, value in vars(targets).items() if value is not None} == needed
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (["optical_flaw"], "unknown auxiliary task 'optical_flaw'; did you mean optical_flow?"),
+        (["egomotion", "egomotion"], "auxiliary task egomotion is given twice; give it once"),
+        (["xyz"], "unknown auxiliary task 'xyz'; choose one of forward_dynamics, "),
+    ],
+)
+def test_wrong_names_are_refused_in_one_line(names, message):
+    with pytest.raises(RequestError) as refusal:
+        auxtasks.make(names, make_spec(4, 16))
+    assert str(refusal.value).startswith(message) and "\n" not in str(refusal.value)
+
+
+def test_tasks_that_show_states_have_no_auxiliary_tasks():
+    spec = auxtasks.Spec(jax.ShapeDtypeStruct((10,), jnp.float32), 4, 10)
+    assert auxtasks.make([], spec) == {}
+    with pytest.raises(RequestError, match=r"auxiliary tasks \(egomotion\) train an encoder of images.*states of 10 numbers"):
+        auxtasks.make(["egomotion"], spec)
