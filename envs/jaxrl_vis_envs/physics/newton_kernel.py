@@ -3,12 +3,11 @@
 All numbers of a problem stay on the chip from its first read to the motion. As XLA operations, a physics step of the finger
 is some 850 kernels more, and one of the hand 150, most of which do next to nothing.
 
-The numbers of a problem come in one vector, and so does the motion, and the kernel takes the vectors apart and puts them
-together itself. The reason is the compiler: before it decides how the threads of a block share a read or a write, it searches
-the whole program, which is thousands of operations here. With a read for each number, that takes minutes.
+Numbers are read and written in a way of their own (`lanes`): Pallas's own takes minutes to compile, for so many.
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -18,11 +17,10 @@ from jax.custom_batching import custom_vmap
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
 
-from jaxrl_vis_envs.physics import descent
+from jaxrl_vis_envs.physics import descent, lanes
 from jaxrl_vis_envs.physics.descent import Motion, Problem, Structure
 
 _COMPILER = plgpu.CompilerParams(num_warps=1, num_stages=1)
-_LANES = 32  # episodes of a program: the threads of a warp
 
 
 def solve(structure: Structure, problem: Problem, interpret: bool = False) -> Motion:
@@ -35,19 +33,8 @@ def solve(structure: Structure, problem: Problem, interpret: bool = False) -> Mo
     """
     places = _places(structure)
     parts = [array[tuple(np.array(places[name]).T)] for name, array in problem._asdict().items() if places[name]]
-    numbers = jnp.concatenate(parts)
-    vector = jnp.pad(numbers, (0, pl.next_power_of_2(numbers.size) - numbers.size))
-
-    @custom_vmap
-    def motion(vector: jax.Array) -> jax.Array:
-        return _batch(structure, vector[None], interpret)[0]
-
-    @motion.def_vmap
-    def _(axis_size: int, in_batched: list[bool], vectors: jax.Array) -> tuple[jax.Array, bool]:
-        del axis_size, in_batched  # there is one input, so it is batched
-        return _batch(structure, vectors, interpret), True
-
-    return Motion(*motion(vector)[: len(Motion._fields) * structure.joints].reshape(-1, structure.joints))
+    motion = _batched(structure, interpret)(jnp.concatenate(parts)[None])[0]
+    return Motion(*motion.reshape(len(Motion._fields), structure.joints))
 
 
 def _places(structure: Structure) -> dict[str, list[tuple[int, ...]]]:
@@ -57,52 +44,57 @@ def _places(structure: Structure) -> dict[str, list[tuple[int, ...]]]:
     return places
 
 
-def _batch(structure: Structure, vectors: jax.Array, interpret: bool) -> jax.Array:
-    """Motions [B, outputs] of problems [B, inputs], in numbers whose order is that of `_places` and of `Motion`."""
-    batch, inputs = vectors.shape
-    outputs = pl.next_power_of_2(len(Motion._fields) * structure.joints)
-    programs = pl.cdiv(batch, _LANES)
-    # Threads beyond the last episode solve it again: zeros would be no problem to solve.
-    vectors = jnp.pad(vectors, ((0, programs * _LANES - batch), (0, 0)), mode="edge")
-    motions = pl.pallas_call(
-        functools.partial(_kernel, structure=structure),
+def _batched(structure: Structure, interpret: bool) -> Callable[[jax.Array], jax.Array]:
+    """Motions [B, outputs] of problems [B, inputs], in numbers whose order is that of `_places` and of `Motion`.
+
+    Another axis of `jax.vmap` makes B larger.
+    """
+
+    @custom_vmap
+    def motions(problems: jax.Array) -> jax.Array:
+        return _launch(structure, problems, interpret)
+
+    @motions.def_vmap
+    def _(size: int, in_batched: list[bool], problems: jax.Array) -> tuple[jax.Array, bool]:
+        del in_batched  # there is one input, so it is batched
+        flat = motions(problems.reshape(-1, problems.shape[-1]))
+        return flat.reshape(size, -1, flat.shape[-1]), True
+
+    return motions
+
+
+def _launch(structure: Structure, problems: jax.Array, interpret: bool) -> jax.Array:
+    batch = problems.shape[0]
+    programs = pl.cdiv(batch, lanes.LANES)
+    # Threads beyond the last episode solve that again: zeros would be no problem to solve.
+    problems = jnp.pad(problems, ((0, programs * lanes.LANES - batch), (0, 0)), mode="edge")
+    motions, _ = pl.pallas_call(
+        functools.partial(_kernel, structure=structure, interpret=interpret),
         grid=(programs,),
-        in_specs=[pl.BlockSpec((_LANES, inputs), lambda program: (program, 0))],
-        out_specs=pl.BlockSpec((_LANES, outputs), lambda program: (program, 0)),
-        out_shape=jax.ShapeDtypeStruct((programs * _LANES, outputs), jnp.float32),
+        out_shape=[
+            jax.ShapeDtypeStruct((len(Motion._fields) * structure.joints, programs * lanes.LANES), jnp.float32),
+            jax.ShapeDtypeStruct((programs,), jnp.int32),
+        ],
         compiler_params=_COMPILER,
         interpret=interpret,
         name="solve_constraints",
-    )(vectors)
-    return motions[:batch]
+    )(problems.T)
+    return motions.T[:batch]
 
 
-def _kernel(vectors: Any, motions: Any, *, structure: Structure) -> None:
+def _kernel(problems: Any, motions: Any, done: Any, *, structure: Structure, interpret: bool) -> None:
+    program = pl.program_id(0)
+    own = pl.ds(program * lanes.LANES, lanes.LANES)
+    rows = [problems[row, own] for row in range(problems.shape[0])] if interpret else lanes.read_rows(problems)
     every_place = [(name, place) for name, places in _places(structure).items() for place in places]
-    numbers = dict(zip(every_place, _columns(vectors[...])))  # the rest of the columns fills them up to a power of two
+    numbers = dict(zip(every_place, rows, strict=True))
     motion = descent.solve(structure, descent.numbers_of(structure, lambda name, *place: numbers[name, place]))
-    columns = [jnp.broadcast_to(jnp.asarray(number, jnp.float32), (_LANES,)) for part in motion for number in part]
-    nothing = jnp.zeros(_LANES, jnp.float32)
-    motions[...] = _from_columns(columns + [nothing] * (motions.shape[1] - len(columns)))
-
-
-def _columns(matrix: jax.Array) -> list[jax.Array]:
-    """The columns of a matrix [rows, a power of two], by the one operation that takes an array apart without memory: halving."""
-    parts = [matrix]
-    while parts[0].shape[1] > 1:
-        parts = [half for part in parts for half in jnp.split(part, 2, axis=1)]
-    return [part.reshape(-1) for part in parts]
-
-
-def _from_columns(columns: list[jax.Array]) -> jax.Array:
-    """The reverse of `_columns`."""
-    rows = columns[0].shape[0]
-    parts = [column.reshape(rows, 1) for column in columns]
-    while len(parts) > 1:
-        half = len(parts) // 2
-        # Only a last axis of 1 can be joined. The first one joined varies most slowly at the end.
-        parts = [jnp.concatenate(pair, axis=-1)[..., None] for pair in zip(parts[:half], parts[half:], strict=True)]
-    return parts[0].reshape(rows, -1)
+    results = [jnp.broadcast_to(jnp.asarray(number, jnp.float32), (lanes.LANES,)) for part in motion for number in part]
+    if interpret:
+        for row, result in enumerate(results):
+            motions[row, own] = result
+    else:
+        done[program] = lanes.write_rows(motions, results)
 
 
 def probe() -> None:
