@@ -7,9 +7,11 @@ from typing import Annotated, Literal
 import tyro
 
 from jaxrl_vis.devices import check_devices
+from jaxrl_vis.errors import RequestError
 from jaxrl_vis.report.outputs import check_writable
 
 FigureName = Literal["quadratic"]
+SUFFIXES = (".png", ".pdf", ".svg")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,6 +30,8 @@ class Figure:
 def run(options: Figure) -> int:
     """Draws one figure."""
     out = options.out or Path(f"{options.figure}.png")
+    if out.suffix.lower() not in SUFFIXES:
+        raise RequestError(f"--out {out}: a figure is a file that ends in {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
     check_writable(out, "--out")
     from jaxrl_vis.studies import quadratic
 

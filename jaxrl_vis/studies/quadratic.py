@@ -70,7 +70,7 @@ def descend(weighting: Weighting) -> Paths:
         return points, {name: state.weights[name] for name in AUXILIARY}
 
     points, weights = jax.jit(jax.vmap(path))(jnp.array(STARTS))
-    return Paths(np.asarray(points), {name: np.asarray(values) for name, values in weights.items()})
+    return Paths(np.asarray(points), {name: np.asarray(weights[name]) for name in AUXILIARY})
 
 
 def draw(path: Path) -> None:
@@ -112,7 +112,7 @@ def _draw_paths(axes: Axes, paths: Paths, title: str) -> None:
     axes.plot(0, 0, "*", color=_INK, markersize=11, zorder=0)
     axes.annotate("main", (0, 0), (-6, -11), textcoords="offset points", ha="right", fontsize=9, color=_INK)
     axes.plot(0.5, 0.5, "*", color=_FAINT, markersize=11, zorder=0)
-    axes.annotate("shifted", (0.5, 0.5), (7, 6), textcoords="offset points", fontsize=9, color=_FAINT)
+    axes.annotate("shifted", (0.5, 0.5), (10, -5), textcoords="offset points", fontsize=9, color=_FAINT)
     axes.set(xlim=(-2.1, 2.1), ylim=(-2.1, 2.1), aspect="equal")
 
 
