@@ -80,7 +80,7 @@ def draw(path: Path) -> None:
         path: A .png, or any other format that matplotlib can write.
     """
     fixed, adaptive = descend(make_weighting("sum")), descend(authors_rule())
-    figure = Figure(figsize=(13.5, 4.9), dpi=150, facecolor="white")
+    figure = Figure(figsize=(13.5, 4.9), dpi=110, facecolor="white")
     left, middle, right = figure.subplots(1, 3, width_ratios=[1, 1, 1.1])
     _draw_paths(left, fixed, "Weights stay at 1")
     _draw_paths(middle, adaptive, "Weights adapt")

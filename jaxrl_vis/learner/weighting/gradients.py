@@ -9,8 +9,8 @@ agree up to rounding:
                `jax.jvp` of all losses along d (its tangents are all dots), and one backward
                pass for the weighted sum; with weightings that need losses, the last alone     losses, dots
 
-On the right are the `Weighting.needs` that each can serve. The cost of the third hardly grows with the number of losses, but
-every operation must have a tangent rule, which those of `jax.custom_vjp` lack.
+On the right are the `Weighting.needs` that each can serve. The third makes as many passes for ten losses as for two, but every
+operation must have a tangent rule, which those of `jax.custom_vjp` lack.
 """
 
 from collections.abc import Callable, Mapping
