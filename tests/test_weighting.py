@@ -118,6 +118,24 @@ def test_ways_agree_and_find_the_gradient_of_the_weighted_objective(case: str) -
         assert (moved >= 0).all() and (np.abs(moved - 1) > 0.001).all() and moved[0] != moved[1]
 
 
+def passes_through_the_encoder(way: Any, losses: int) -> int:
+    """How often a step multiplies by the encoder's inputs: once a forward pass, a backward pass or a tangent."""
+    params, batch = in_float32(problem(0))
+    names = [MAIN, *(f"other{number}" for number in range(losses - 1))]
+    params["heads"] = {name: params["heads"][MAIN] for name in names}
+    batch = {"x": batch["x"], **{name: batch[MAIN] for name in names}}
+    weighting = make_weighting("ol_aux")
+    gradient = weighted_grad(losses_of, weighting, encoder_of, way)
+    equations = jax.make_jaxpr(gradient)(params, weighting.init(names), batch).eqns
+    products = [each for each in equations if each.primitive.name == "dot_general"]
+    return sum(batch["x"].shape in [operand.aval.shape for operand in each.invars] for each in products)
+
+
+def test_jvp_passes_do_not_grow_with_the_number_of_losses() -> None:
+    assert passes_through_the_encoder("jvp", 3) == passes_through_the_encoder("jvp", 10) <= 5
+    assert passes_through_the_encoder("per_loss", 10) >= 20
+
+
 def test_dots_are_those_of_finite_differences() -> None:
     weighting = make_weighting("ol_aux", log=False)
 

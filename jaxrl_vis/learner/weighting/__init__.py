@@ -7,7 +7,7 @@ table       all of them by name
 gradients   `weighted_grad`: anybody's losses and parameters, differentiated, weighted and added up
 """
 
-from jaxrl_vis.learner.weighting.base import MAIN, Weighting, WeightingState
+from jaxrl_vis.learner.weighting.base import MAIN, Weighting, WeightingState, weighted_sum
 from jaxrl_vis.learner.weighting.gradients import Weighted, loss_gradients, measure, weighted_grad
 from jaxrl_vis.learner.weighting.table import WEIGHTINGS, make_weighting
 
@@ -21,4 +21,5 @@ __all__ = [
     "make_weighting",
     "measure",
     "weighted_grad",
+    "weighted_sum",
 ]

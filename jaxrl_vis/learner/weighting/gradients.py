@@ -66,17 +66,18 @@ def loss_gradients(
         has_aux: See ``losses_fn``.
 
     Returns:
-        Losses, [] float32 by name; gradients by name, each like the parameters, in their dtype; what else there was.
+        Losses, [] float32 by name; gradients by name, each shaped like the parameters, float32; what else there was.
     """
     whole = _in_float32(losses_fn, has_aux)
     if way == "one_hot":
         losses, pullback, extra = jax.vjp(lambda params: whole(params, *args), params, has_aux=True)
         rows = dict(zip(losses, jnp.eye(len(losses), dtype=jnp.result_type(*losses.values())).T))
         (stacked,) = jax.vmap(pullback)(rows)
-        return losses, {name: jax.tree.map(lambda leaf, row=row: leaf[row], stacked) for row, name in enumerate(losses)}, extra
-    losses, extra = whole(params, *args)
-    gradients = {name: jax.grad(lambda params, name=name: whole(params, *args)[0][name])(params) for name in losses}
-    return losses, gradients, extra
+        gradients = {name: jax.tree.map(lambda leaf, row=row: leaf[row], stacked) for row, name in enumerate(losses)}
+    else:
+        losses, extra = whole(params, *args)
+        gradients = {name: jax.grad(lambda params, name=name: whole(params, *args)[0][name])(params) for name in losses}
+    return losses, jax.tree.map(_to_float32, gradients), extra
 
 
 def measure(weighting: Weighting, losses: Losses, gradients: Mapping[str, Params], state: WeightingState) -> Any:
