@@ -7,6 +7,18 @@ import pytest
 
 NOTEBOOKS = sorted((Path(__file__).resolve().parents[1] / "notebooks").glob("*.ipynb"))
 
+# Figures, and videos of a whole run as a page shows them wherever the notebook is read.
+SHOWN = {
+    "01_quickstart": (3, 1),  # start and goal; the curve; an episode of the policy
+    "02_new_environment": (2, 1),  # start and goals; the curve
+    "04_auxiliary_losses": (1, 0),  # errors and weights
+}
+SAID = {
+    "01_quickstart": ("of goals reached at the end", "of 64 goals reached"),
+    "02_new_environment": ("of goals reached at the end", "eval/success"),  # `eval` finds the task by what the run folder says
+    "04_auxiliary_losses": ("OL-AUX-5           error on unseen inputs",),
+}
+
 nbformat = pytest.importorskip("nbformat")
 nbclient = pytest.importorskip("nbclient")
 
@@ -35,13 +47,9 @@ def test_notebook_runs(path: Path, tmp_path: Path, clean_environment: dict[str, 
     shown = [(kind, data) for output in outputs for kind, data in output.get("data", {}).items()]
     figures = sum(kind == "image/png" for kind, _ in shown)
     text = "".join(output.get("text", "") for output in outputs)
-    # The video of a whole run, as a page shows it wherever the notebook is read.
-    assert sum(kind == "text/html" and "data:image/gif;base64," in data for kind, data in shown) == 1
-    assert "of goals reached at the end" in text
-    if path.stem == "01_quickstart":
-        assert figures == 3  # start and goal; the curve; an episode of the policy
-        assert "of 64 goals reached" in text
-    else:
-        assert figures == 2  # start and goals; the curve
+    videos = sum(kind == "text/html" and "data:image/gif;base64," in data for kind, data in shown)
+    assert (figures, videos) == SHOWN[path.stem]
+    for said in SAID[path.stem]:
+        assert said in text
+    if path.stem == "02_new_environment":
         assert (tmp_path / "puck_push.py").exists()
-        assert "eval/success" in text  # `eval` finds the task again by what the run folder says

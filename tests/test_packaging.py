@@ -20,6 +20,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("learner",),
     ("report",),
     ("run",),
+    ("studies",),
     ("bench", "doctor"),
     ("cli",),
     ("__main__",),
@@ -117,7 +118,7 @@ def test_nothing_imports_the_folder_of_sources() -> None:
 def test_leaves_load_no_mujoco(clean_environment: dict[str, str]) -> None:
     code = """
 import sys
-from jaxrl_vis.learner import auxtasks, losses, networks, normalizer, relabel, replay
+from jaxrl_vis.learner import auxtasks, losses, networks, normalizer, relabel, replay, weighting
 from jaxrl_vis_envs import goals
 assert not {"mujoco", "matplotlib", "orbax"} & set(sys.modules)
 """

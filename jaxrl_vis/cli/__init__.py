@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jaxrl_vis
-from jaxrl_vis.cli import bench, doctor, envs, eval, play, train
+from jaxrl_vis.cli import bench, doctor, envs, eval, figure, play, train
 from jaxrl_vis.cli.parsing import PROGRAM, parse
 from jaxrl_vis.errors import NonFiniteError, RequestError, StorageError, Terminated, nearest
 
@@ -25,6 +25,7 @@ COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
     "envs": (envs.Envs, envs.run),
     "doctor": (doctor.Doctor, doctor.run),
     "bench": (bench.Bench, bench.run),
+    "figure": (figure.Figure, figure.run),
 }
 
 # Of the errors that are told in one line.

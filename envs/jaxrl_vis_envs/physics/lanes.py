@@ -6,35 +6,39 @@ by an instruction of its own (PTX), of which Triton knows nothing. One primitive
 an array, and is added here.
 """
 
+import functools
 from collections.abc import Iterable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax._src import core
-from jax._src.lib import triton as triton_bindings
-from jax._src.pallas.triton import lowering as triton_lowering
 from jax.experimental.pallas import triton as plgpu
+from jax.interpreters import mlir
 
 LANES = 32
 """Threads of a program: those of a warp."""
 
-_address_p = core.Primitive("address")
 
+@functools.cache
+def _address_primitive() -> Any:
+    """A primitive that takes an array of a kernel and has its address, for all threads: [32] int64.
 
-@_address_p.def_abstract_eval
-def _(ref: Any) -> core.ShapedArray:
-    del ref
-    return core.ShapedArray((LANES,), jnp.dtype("int64"))
+    These are insides of JAX. They are imported here so that a JAX that has moved them loses the kernels, and nothing else.
+    """
+    from jax._src import core
+    from jax._src.lib import triton
+    from jax._src.pallas.triton import lowering
 
+    primitive = core.Primitive("address")
+    primitive.def_abstract_eval(lambda ref: core.ShapedArray((LANES,), jnp.dtype("int64")))
 
-@triton_lowering.register_lowering(_address_p)
-def _(context: Any, pointer: Any) -> Any:
-    dialect = triton_bindings.dialect  # pyright: ignore[reportPrivateImportUsage]
-    int64 = jax.interpreters.mlir.ir.IntegerType.get_signless(64)
-    address = dialect.ptr_to_int(int64, pointer)
-    tensor = jax.interpreters.mlir.aval_to_ir_type(context.context.mlir_ctx, context.avals_out[0])
-    return dialect.splat(tensor, address)
+    @lowering.register_lowering(primitive)
+    def _(context: Any, pointer: Any) -> Any:
+        dialect: Any = triton.dialect  # pyright: ignore[reportPrivateImportUsage]
+        address = dialect.ptr_to_int(mlir.ir.IntegerType.get_signless(64), pointer)
+        return dialect.splat(mlir.aval_to_ir_type(context.context.mlir_ctx, context.avals_out[0]), address)
+
+    return primitive
 
 
 def _assemble(lines: str, dtype: Any, *arguments: jax.Array) -> jax.Array:
@@ -61,7 +65,7 @@ def _own_address(ref: Any) -> jax.Array:
         }
         """,
         "int64",
-        _address_p.bind(ref),
+        _address_primitive().bind(ref),
     )
 
 

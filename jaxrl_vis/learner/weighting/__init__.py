@@ -1,0 +1,25 @@
+"""How much auxiliary losses count beside the main one. A leaf: knows neither DDPG nor environments.
+
+base        the interface, `Weighting`, and the logarithm of a loss
+members     weights that are given, or follow from one step
+ol_aux      weights that learn
+table       all of them by name
+gradients   `weighted_grad`: anybody's losses and parameters, differentiated, weighted and added up
+"""
+
+from jaxrl_vis.learner.weighting.base import MAIN, Weighting, WeightingState, weighted_sum
+from jaxrl_vis.learner.weighting.gradients import Weighted, loss_gradients, measure, weighted_grad
+from jaxrl_vis.learner.weighting.table import WEIGHTINGS, make_weighting
+
+__all__ = [
+    "MAIN",
+    "WEIGHTINGS",
+    "Weighted",
+    "Weighting",
+    "WeightingState",
+    "loss_gradients",
+    "make_weighting",
+    "measure",
+    "weighted_grad",
+    "weighted_sum",
+]

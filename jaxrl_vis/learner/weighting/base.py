@@ -1,0 +1,208 @@
+"""What a weighting is: how much each auxiliary loss counts beside the main one, and what it has to be told to decide that.
+
+One gradient step with losses L_i, shared parameters theta and a weighting:
+
+    c_i = w_i s_i,  s_i = 1, or d log(L_i + eps) / d L_i where the weighting takes logarithms     `Weighting.coefficients`
+    gradient = sum over i of c_i grad L_i, over all parameters; the optimiser takes it
+    statistics = what the weighting needs to know about the gradients with respect to theta alone
+
+Losses, dots and gradients cross this interface as they are, without logarithms; the weighting multiplies them by s_i itself.
+So they can be averaged over devices or minibatches first, which would be wrong for logarithms.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.types import Metrics, Params, Replaceable
+
+MAIN = "main"
+"""Name of the loss that the others are to help. Its weight is always 1."""
+
+Needs = Literal["losses", "dots", "gradients"]
+MainGradient = Literal["main", "total"]
+Losses = Mapping[str, jax.Array]  # [] floats by name, `MAIN` among them
+Weights = dict[str, jax.Array]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class WeightingState(Replaceable):
+    """What a weighting remembers. All shapes are fixed, so it can be scanned, mapped, sharded and saved like parameters.
+
+    Attributes:
+        weights: [] float32 by name, for all losses; `MAIN` is 1. What the next gradients are combined with, unless the
+            weighting decides by these gradients (`cosine`).
+        updates: [] int32, calls of `Weighting.update` so far.
+        sums: Sums over the calls since the weights last moved; None where nothing is summed up.
+        window: The latest gradients by name, [window, ...] each; None without a moving average.
+    """
+
+    weights: Weights
+    updates: jax.Array
+    sums: Any = None
+    window: Any = None
+
+
+class Weighting(NamedTuple):
+    """A way to weight losses. Pure; apart from ``init`` and ``update``, all fields are static.
+
+    Attributes:
+        name: As in `make_weighting`.
+        init: (names of all losses, `MAIN` among them; shared parameters or their shapes, which are read where ``needs`` is
+            gradients) -> WeightingState. Raises RequestError where names are missing or too many.
+        update: (losses, statistics, state) -> (weights of this step by name, state, metrics of [] float32). ``statistics`` is
+
+            - for ``needs`` losses: not read, None will do;
+            - dots: [] float32 for each auxiliary loss, <d, grad L_i>, where d is grad L_main, or with ``main_grad`` total the
+              combined gradient, sum over j of c_j grad L_j with the weights of the state;
+            - gradients: for every loss, grad L_i.
+
+            Gradients are those of the losses as they are, with respect to the shared parameters alone.
+        needs: What ``statistics`` must hold.
+        auxiliary: Whether auxiliary losses are learned at all; if not, they weigh 0 and need not be computed.
+        log: Whether logarithms of the losses are learned.
+        eps: Added to auxiliary losses before their logarithm is taken.
+        main_eps: Added to the main loss likewise.
+        main_grad: Whose gradient the others are compared with.
+        interval: N, calls of ``update`` from one change of the weights to the next.
+        held: Losses and statistics of the N calls of an interval must all belong to the parameters that the interval began
+            with, whatever the optimiser does in between.
+    """
+
+    name: str
+    init: Callable[..., WeightingState]
+    update: Callable[[Losses, Any, WeightingState], tuple[Weights, WeightingState, Metrics]]
+    needs: Needs = "losses"
+    auxiliary: bool = True
+    log: bool = False
+    eps: float = 0.02
+    main_eps: float = 1e-8
+    main_grad: MainGradient = "main"
+    interval: int = 1
+    held: bool = False
+
+    def slopes(self, losses: Losses) -> dict[str, jax.Array]:
+        """s_i: the derivative of what is learned by the loss itself, [] float32 by name. All 1 without logarithms."""
+        return {name: log_slope(loss, self._eps_of(name)) if self.log else jnp.ones(()) for name, loss in losses.items()}
+
+    def coefficients(self, weights: Weights, losses: Losses) -> dict[str, jax.Array]:
+        """c_i = w_i s_i: what gradients of the losses are multiplied with before they are added up, [] float32 by name."""
+        return {name: weights[name] * slope for name, slope in self.slopes(losses).items()}
+
+    def objective(self, weights: Weights, losses: Losses) -> jax.Array:
+        """What is learned: the weighted sum of the losses or of their logarithms, [] float32.
+
+        Its gradient, weights being constant, is the sum of c_i grad L_i.
+        """
+        weights = jax.lax.stop_gradient(weights)
+        learned = {name: log_loss(loss, self._eps_of(name)) if self.log else loss for name, loss in losses.items()}
+        return sum((weights[name] * loss for name, loss in learned.items()), jnp.zeros(()))
+
+    def _eps_of(self, name: str) -> float:
+        return self.main_eps if name == MAIN else self.eps
+
+
+def log_loss(loss: jax.Array, eps: float) -> jax.Array:
+    """log(L + eps), continued below L = 0 as a straight line: finite, and increasing everywhere.
+
+    Args:
+        loss: [] float.
+        eps: Greater than 0.
+    """
+    return jnp.log(jnp.maximum(loss, 0.0) + eps) + jnp.minimum(loss, 0.0) / eps
+
+
+def log_slope(loss: jax.Array, eps: float) -> jax.Array:
+    """The derivative of `log_loss`: 1 / (max(L, 0) + eps), without gradient."""
+    return 1.0 / (jnp.maximum(jax.lax.stop_gradient(loss), 0.0) + eps)
+
+
+def dot(one: Params, other: Params) -> jax.Array:
+    """Inner product of two trees of the same structure: [] float32, computed in it (or in what is finer) whatever theirs is.
+
+    Products are added up one by one instead of in a matrix unit, which on accelerators would round them to 10 bits.
+    """
+
+    def products(left: jax.Array, right: jax.Array) -> jax.Array:
+        dtype = jnp.promote_types(jnp.promote_types(left.dtype, right.dtype), jnp.float32)
+        return jnp.sum(left.astype(dtype) * right.astype(dtype))
+
+    return sum(jax.tree.leaves(jax.tree.map(products, one, other)), jnp.zeros(()))
+
+
+def scaled(tree: Params, factor: jax.Array | float) -> Params:
+    """A tree with all leaves multiplied by a number."""
+    return jax.tree.map(lambda leaf: factor * leaf, tree)
+
+
+def weighted_sum(gradients: Mapping[str, Params], coefficients: Mapping[str, jax.Array]) -> Params:
+    """Sum over the losses of c_i g_i, float32 (or finer): a tree like each of them.
+
+    Args:
+        gradients: Trees of one structure, by name.
+        coefficients: [] float32 by name.
+    """
+
+    def total(*leaves: jax.Array) -> jax.Array:
+        return sum(coefficients[name] * leaf for name, leaf in zip(gradients, leaves, strict=True))  # type: ignore[return-value]
+
+    return jax.tree.map(total, *gradients.values())
+
+
+def auxiliary_names(weighting: str, names: Iterable[str], needed: bool = True) -> tuple[str, ...]:
+    """The names without `MAIN`.
+
+    Args:
+        weighting: Its name, for the message.
+        names: Of all losses.
+        needed: Whether there must be some.
+
+    Raises:
+        RequestError: `MAIN` is missing, a name is there twice, or there are no others.
+    """
+    names = tuple(names)
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise RequestError(f"two losses are called {twice[0]!r}; give each a name of its own")
+    if MAIN not in names:
+        raise RequestError(f"no loss is called {MAIN!r}, only {', '.join(names) or 'none at all'}; name the main one so")
+    if needed and len(names) == 1:
+        raise RequestError(f"weighting {weighting} has no auxiliary loss to weight; add one, or use none or none_log")
+    return tuple(name for name in names if name != MAIN)
+
+
+def checked(weighting: Weighting) -> Weighting:
+    """The weighting itself.
+
+    Raises:
+        RequestError: It adds nothing, or something negative, before it takes logarithms.
+    """
+    for field in ("eps", "main_eps"):
+        value = getattr(weighting, field)
+        if not (math.isfinite(value) and value > 0.0):
+            raise RequestError(f"{field} of weighting {weighting.name} must be greater than 0, not {value}")
+    return weighting
+
+
+def start(names: Iterable[str], weights: Mapping[str, float], **more: Any) -> WeightingState:
+    """A state at its beginning.
+
+    Args:
+        names: Of the auxiliary losses.
+        weights: Of these.
+        more: Other fields.
+    """
+    filled = {MAIN: jnp.ones(())} | {name: jnp.asarray(weights[name], jnp.ones(()).dtype) for name in names}
+    return WeightingState(weights=filled, updates=jnp.zeros((), jnp.int32), **more)
+
+
+def report(weights: Weights, dots: Mapping[str, jax.Array] | None = None) -> Metrics:
+    """Metrics: ``weight/NAME`` of each auxiliary loss, and ``dot/NAME`` where there are dots."""
+    shown = {f"weight/{name}": weight for name, weight in weights.items() if name != MAIN}
+    return shown | {f"dot/{name}": value for name, value in (dots or {}).items()}

@@ -1,0 +1,210 @@
+"""Gradients of several losses, what weightings need to know about them, and their weighted sum.
+
+`weighted_grad` is to a dictionary of losses what `jax.grad` is to a single one. It finds gradients in one of three ways, which
+agree up to rounding:
+
+    per_loss   one `jax.grad` for each loss: the reference, and the default                    losses, dots, gradients
+    one_hot    one `jax.vjp` of all losses, mapped over one-hot cotangents                     losses, dots, gradients
+    jvp        one backward pass for the direction d that losses are compared with, one
+               `jax.jvp` of all losses along d (its tangents are all dots), and one backward
+               pass for the weighted sum; with weightings that need losses, the last alone     losses, dots
+
+On the right are the `Weighting.needs` that each can serve. The third makes as many passes for ten losses as for two, but every
+operation must have a tangent rule, which those of `jax.custom_vjp` lack.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any, Literal, NamedTuple, get_args
+
+import jax
+import jax.numpy as jnp
+
+from jaxrl_vis.errors import RequestError, nearest
+from jaxrl_vis.learner.weighting.base import MAIN, Losses, Weighting, WeightingState, Weights, dot, weighted_sum
+from jaxrl_vis.types import Metrics, Params
+
+Way = Literal["per_loss", "one_hot", "jvp"]
+LossesFunction = Callable[..., Any]
+Selector = Callable[[Params], Params]
+
+
+class Weighted(NamedTuple):
+    """What `weighted_grad` finds.
+
+    Attributes:
+        gradient: For the optimiser: the weighted sum of all gradients, shaped like the parameters, float32.
+        state: Of the weighting, after this step.
+        losses: [] float32 by name.
+        metrics: [] float32 by name.
+        weights: What each loss weighed in ``gradient``, [] float32 by name.
+        extra: What the losses' function returned beside them; None without ``has_aux``.
+    """
+
+    gradient: Params
+    state: WeightingState
+    losses: dict[str, jax.Array]
+    metrics: Metrics
+    weights: Weights
+    extra: Any = None
+
+
+def everything(params: Params) -> Params:
+    """Selects all parameters as shared."""
+    return params
+
+
+def loss_gradients(
+    losses_fn: LossesFunction, params: Params, *args: Any, way: Way = "per_loss", has_aux: bool = False
+) -> tuple[dict[str, jax.Array], dict[str, Params], Any]:
+    """Each loss, and its gradient by itself.
+
+    Args:
+        losses_fn: (params, *args) -> [] floats by name; with ``has_aux``, and anything else beside these.
+        params: What is differentiated.
+        args: More arguments.
+        way: per_loss or one_hot.
+        has_aux: See ``losses_fn``.
+
+    Returns:
+        Losses, [] float32 by name; gradients by name, each shaped like the parameters, float32; what else there was.
+    """
+    whole = _in_float32(losses_fn, has_aux)
+    if way == "one_hot":
+        losses, pullback, extra = jax.vjp(lambda params: whole(params, *args), params, has_aux=True)
+        rows = dict(zip(losses, jnp.eye(len(losses), dtype=jnp.result_type(*losses.values())).T))
+        (stacked,) = jax.vmap(pullback)(rows)
+        gradients = {name: jax.tree.map(lambda leaf, row=row: leaf[row], stacked) for row, name in enumerate(losses)}
+    else:
+        losses, extra = whole(params, *args)
+        gradients = {name: jax.grad(lambda params, name=name: whole(params, *args)[0][name])(params) for name in losses}
+    return losses, jax.tree.map(_to_float32, gradients), extra
+
+
+def measure(weighting: Weighting, losses: Losses, gradients: Mapping[str, Params], state: WeightingState) -> Any:
+    """The ``statistics`` that `Weighting.update` takes, from each loss's own gradient.
+
+    Args:
+        weighting: What needs them.
+        losses: [] float32 by name.
+        gradients: Of these, with respect to the shared parameters alone.
+        state: Of the weighting, before the update.
+    """
+    if weighting.needs == "losses":
+        return None
+    if weighting.needs == "gradients":
+        return dict(gradients)
+    direction = gradients[MAIN]
+    if weighting.main_grad == "total":
+        direction = weighted_sum(gradients, weighting.coefficients(state.weights, losses))
+    return {name: dot(direction, gradient) for name, gradient in gradients.items() if name != MAIN}
+
+
+def weighted_grad(
+    losses_fn: LossesFunction,
+    weighting: Weighting,
+    shared: Selector = everything,
+    way: Way = "per_loss",
+    has_aux: bool = False,
+    reduce: Selector = everything,
+) -> Callable[..., Weighted]:
+    """The gradient of a dictionary of losses, weighted.
+
+    Args:
+        losses_fn: (params, *args) -> [] floats by name, of which one is called `MAIN`; with ``has_aux``, and anything else
+            beside these. A gradient is taken for each loss as a whole, heads and shared parameters alike.
+        weighting: From `make_weighting`.
+        shared: Selects the parameters in which gradients are compared, for instance ``lambda params: params["encoder"]``. It
+            may only pick: what it returns must be parts of its argument.
+        way: How gradients are found, see above.
+        has_aux: See ``losses_fn``.
+        reduce: Applied to losses, gradients and dots before the weighting sees them, where each device has its own part of the
+            data and the losses are means: ``lambda tree: jax.lax.pmean(tree, axis)``.
+
+    Returns:
+        (params, state, *args) -> `Weighted`, with state from ``weighting.init(names, shared(params))``. A weighting with
+        ``held`` takes one more argument by name, ``held``: the parameters that its interval began with, at which gradients are
+        compared.
+
+    Raises:
+        RequestError: There is no such way, or it does not find what the weighting needs; from the function returned: the losses
+            are not those that the state began with, ``held`` is missing, or given without need.
+    """
+    if way not in get_args(Way):
+        raise RequestError(f"unknown way to find gradients {way!r}{nearest(way, get_args(Way))}")
+    if way == "jvp" and weighting.needs == "gradients":
+        raise RequestError(
+            f"weighting {weighting.name} needs whole gradients, which jvp does not find; use one_hot or per_loss"
+        )
+
+    def by_gradients(params: Params, state: WeightingState, *args: Any, held: Params = None) -> Weighted:
+        losses, gradients, extra = loss_gradients(losses_fn, params, *args, way=way, has_aux=has_aux)
+        _check_names(losses, state)
+        losses, gradients = reduce((losses, gradients))
+        seen, compared = losses, gradients
+        if weighting.held:
+            seen, compared = reduce(loss_gradients(losses_fn, held, *args, way=way, has_aux=has_aux)[:2])
+        statistics = measure(weighting, seen, {name: shared(tree) for name, tree in compared.items()}, state)
+        weights, state, metrics = weighting.update(seen, statistics, state)
+        combined = weighted_sum(gradients, weighting.coefficients(weights, losses))
+        return Weighted(combined, state, losses, metrics, weights, extra)
+
+    def by_jvp(params: Params, state: WeightingState, *args: Any) -> Weighted:
+        whole = _in_float32(losses_fn, has_aux)
+        local, pullback, extra = jax.vjp(lambda params: whole(params, *args), params, has_aux=True)
+        _check_names(local, state)
+        losses = reduce(local)
+
+        def backward(coefficients: Mapping[str, jax.Array]) -> Params:
+            (gradient,) = pullback({name: coefficients[name].astype(loss.dtype) for name, loss in local.items()})
+            return reduce(jax.tree.map(_to_float32, gradient))
+
+        combined = statistics = None
+        if weighting.needs == "dots":
+            if weighting.main_grad == "total":
+                direction = combined = backward(weighting.coefficients(state.weights, losses))
+            else:
+                direction = backward({name: jnp.full_like(loss, name == MAIN) for name, loss in losses.items()})
+            along = _embed(shared, params, direction)
+            _, tangents = jax.jvp(lambda params: whole(params, *args)[0], (params,), (along,))
+            statistics = reduce({name: tangent for name, tangent in tangents.items() if name != MAIN})
+        weights, state, metrics = weighting.update(losses, statistics, state)
+        if combined is None:
+            combined = backward(weighting.coefficients(weights, losses))
+        return Weighted(combined, state, losses, metrics, weights, extra)
+
+    def gradient(params: Params, state: WeightingState, *args: Any, held: Params = None) -> Weighted:
+        if weighting.held and held is None:
+            raise RequestError(f"weighting {weighting.name} needs held=, the parameters that its interval began with")
+        if not weighting.held and held is not None:
+            raise RequestError(f"weighting {weighting.name} holds no parameters; leave out held")
+        return by_jvp(params, state, *args) if way == "jvp" else by_gradients(params, state, *args, held=held)
+
+    return gradient
+
+
+def _check_names(losses: Losses, state: WeightingState) -> None:
+    if set(losses) != set(state.weights):
+        there, known = (", ".join(sorted(names)) for names in (losses, state.weights))
+        raise RequestError(f"losses are {there}, but the weighting began with {known}; give init the names of all losses")
+
+
+def _to_float32(leaf: jax.Array) -> jax.Array:
+    return leaf.astype(jnp.promote_types(leaf.dtype, jnp.float32))
+
+
+def _in_float32(losses_fn: LossesFunction, has_aux: bool) -> Callable[..., tuple[dict[str, jax.Array], Any]]:
+    """The same losses, at least float32, and what comes beside them, or None."""
+
+    def whole(params: Params, *args: Any) -> tuple[dict[str, jax.Array], Any]:
+        losses, extra = losses_fn(params, *args) if has_aux else (losses_fn(params, *args), None)
+        return {name: _to_float32(jnp.asarray(loss)) for name, loss in losses.items()}, extra
+
+    return whole
+
+
+def _embed(shared: Selector, params: Params, direction: Params) -> Params:
+    """``direction`` in the shared parameters and zero in all others, in the parameters' dtypes."""
+    direction = jax.tree.map(lambda leaf, like: leaf.astype(like.dtype), direction, params)
+    _, back = jax.vjp(shared, params)  # of a function that only picks, the transpose puts back
+    (placed,) = back(shared(direction))
+    return placed
