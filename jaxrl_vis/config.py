@@ -10,7 +10,7 @@ from typing import Any, Literal, Self
 
 from jaxrl_vis import fields
 from jaxrl_vis.errors import RequestError, nearest
-from jaxrl_vis.methods import METHODS, MethodName
+from jaxrl_vis.methods import METHODS, AuxTaskName, MethodName, WeightingName
 
 # Values that a field allows, for everything that asks: checks, the command line and its help.
 Pixels = Literal["rgbd", "rgb", "depth"]
@@ -102,6 +102,28 @@ class Config:
     """Exploration: share of actions drawn uniformly."""
     action_noise: float = 0.2
     """Exploration: standard deviation of the Gaussian noise on the other actions."""
+
+    # -- Auxiliary losses (thesis, section 5.2; docs/auxiliary_losses.md)
+    aux_tasks: tuple[AuxTaskName, ...] = ()
+    """What the encoders also learn to predict."""
+    weighting: WeightingName = "none"
+    """How much each auxiliary loss counts."""
+    weighting_interval: int = 5
+    """N of OL-AUX: gradient steps from one change of the weights to the next; divides updates_per_iteration."""
+    weighting_beta: float | None = None
+    """beta of OL-AUX: step size of the weights, in multiples of critic_learning_rate. None: 5 N."""
+    weighting_main_grad: Literal["main", "total"] = "main"
+    """Whose gradient OL-AUX compares others with: the main loss's, or, as in the authors' release, that of all losses."""
+    weighting_window: int = 1
+    """Gradient steps over which OL-AUX averages gradients before it compares them; 4 in the authors' release."""
+    weighting_fixed: float = 1.0
+    """Weight of every auxiliary loss, for weighting fixed."""
+    weighting_log: bool = False
+    """Whether weighting cosine learns logarithms of the losses."""
+    aux_form: Literal["thesis", "release"] = "thesis"
+    """Whose targets the auxiliary tasks have, where the thesis and the authors' release differ (`auxtasks.Options`)."""
+    aux_gradients: Literal["per_loss", "one_hot", "jvp"] = "per_loss"
+    """How gradients of the losses are compared; all ways agree (`learner.weighting.gradients`)."""
 
     # -- Networks
     encoder_filters: tuple[int, ...] = (16, 32, 64, 64)

@@ -8,6 +8,7 @@ from typing import Literal
 
 MethodName = Literal["oracle", "indicator", "indicator_balance_filter"]
 RewardName = Literal["oracle", "indicator"]
+WeightingName = Literal["none", "none_log", "sum", "fixed", "balance", "cosine", "ol_aux", "ol_aux_ablation"]
 AuxTaskName = Literal["forward_dynamics", "inverse_dynamics", "egomotion", "autoencoder", "optical_flow"]
 
 

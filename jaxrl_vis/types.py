@@ -72,6 +72,7 @@ class Batch(Replaceable):
             may still change.
         discount: [B] float32 of what comes after these steps; None: that of one step.
         shift: [B, 2] int32, pixels by which the images are to be moved down and to the right; None: not at all.
+        targets: `auxtasks.Targets` of auxiliary tasks; None where there are no tasks.
     """
 
     observations: jax.Array
@@ -81,6 +82,7 @@ class Batch(Replaceable):
     reward: jax.Array | None = None
     discount: jax.Array | None = None
     shift: jax.Array | None = None
+    targets: Any = None
 
     @property
     def observation_t(self) -> jax.Array:
@@ -125,6 +127,7 @@ class TrainState(Replaceable):
         actor_optimizer, critic_optimizer: optax states.
         normalizer: Observation statistics.
         goal_normalizer: Those of goals, where they have their own; else None.
+        weighting: `weighting.WeightingState` of the auxiliary losses; None where there is nothing to remember.
         updates: [] int32, gradient steps taken (fewer than 2^31 in any run that ends).
     """
 
@@ -137,6 +140,7 @@ class TrainState(Replaceable):
     normalizer: NormalizerState
     updates: jax.Array
     goal_normalizer: NormalizerState | None = None
+    weighting: Any = None
 
     @property
     def goal_statistics(self) -> NormalizerState:

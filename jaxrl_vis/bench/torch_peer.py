@@ -24,7 +24,7 @@ from jaxrl_vis.bench.timing import measure as measure_time
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import normalizer
-from jaxrl_vis.learner.ddpg import combine, make_ddpg
+from jaxrl_vis.learner.ddpg import make_ddpg
 from jaxrl_vis.learner.replay import unpack
 from jaxrl_vis.learner.sampling import Choice, Sampler
 from jaxrl_vis.learner.train_step import TrainStep
@@ -126,10 +126,9 @@ def reference(program: TrainStep, train: TrainState, replay: ReplayState) -> Ref
         working = algorithm.begin(train)
         # The actor's gradient is compared in every step, and taken where it is its turn.
         gradients, metrics = algorithm.gradients(working, sampler.batch(replay, choice), True)
-        combined = combine(gradients)
         losses = jnp.stack([metrics["train/critic_loss"], metrics["train/actor_loss"]])
-        taken = combined if with_actor else combined._replace(actor=None)
-        return algorithm.end(algorithm.apply(working, taken)), losses, combined
+        taken = gradients if with_actor else gradients._replace(actor=None)
+        return algorithm.end(algorithm.apply(working, taken)), losses, gradients
 
     train, choices, statistics = jax.device_get(env_jit(begin, runs_once=True)(train, replay))
     now = train

@@ -1,13 +1,12 @@
 """Deep deterministic policy gradient with goals (Lillicrap et al., 2016), one gradient step as pure functions.
 
-    gradients    losses of a batch, and their gradients by name: the main one of each network, and auxiliary ones beside it
-    combine      one gradient a network; the place of a weighting
+    gradients    losses of a batch, main and auxiliary, and one weighted gradient for each network
     apply        optimisers, then target networks
 
 Four networks read three observations (before, goal, after). Each is normalised and ordered once, and each network encodes what
 it needs in one pass:
 
-    critic, actor (online, with gradient)   before, goal
+    critic, actor (online, with gradient)   before, goal, and for auxiliary tasks after, moved
     their targets                           goal, after
 
 The actor's loss values its actions with the critic's latents from the critic's own forward pass: the actor cannot change them.
@@ -16,10 +15,8 @@ Encoding images is most of the work, and `Config` can save some of it: ``encoder
 latents, too, ``target_encoder=False`` computes targets with the online encoders, and ``actor_interval`` spares the actor steps.
 """
 
-import functools
-import itertools
-from collections.abc import Callable, Mapping
-from types import MappingProxyType
+import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -28,11 +25,13 @@ import optax
 
 from jaxrl_vis.config import Config, Resolved
 from jaxrl_vis.learner import losses, normalizer
+from jaxrl_vis.learner.auxiliary import Auxiliary, make_auxiliary
 from jaxrl_vis.learner.networks import Networks
+from jaxrl_vis.learner.weighting import MAIN, Weighted, WeightingState, weighted_grad
 from jaxrl_vis.types import Batch, Metrics, Params, TrainState
 
-MAIN = "main"
-"""Name of the loss that a network has in any case."""
+# Folded into the networks' keys for the heads of auxiliary tasks, so that these change nothing else.
+_HEADS = 0x686473
 
 
 class _ComputeCopies(NamedTuple):
@@ -50,29 +49,25 @@ class Working(NamedTuple):
     Attributes:
         train: The learner.
         copies: Its parameters as the networks compute with them.
+        held: The critic's parameters that the weighting's interval began with, for a weighting that asks for them; else None.
     """
 
     train: TrainState
     copies: _ComputeCopies
-
-
-class LossGradients(NamedTuple):
-    """Gradients of each loss by its name, float32, shaped like the parameters of the network.
-
-    Attributes:
-        critic: `MAIN`, and whatever is learned beside it.
-        actor: The same; empty in a step of the critic alone.
-    """
-
-    critic: dict[str, Params]
-    actor: dict[str, Params]
+    held: Params = None
 
 
 class Gradients(NamedTuple):
-    """What the optimisers get: one gradient for each network, float32; None for an actor that stays as it is."""
+    """What a batch changes.
+
+    Attributes:
+        critic, actor: For the optimisers, float32; None for an actor that stays as it is.
+        weighting: Of the auxiliary losses, after this batch; None where there is nothing to remember.
+    """
 
     critic: Params
     actor: Params | None
+    weighting: WeightingState | None = None
 
 
 class Algorithm(NamedTuple):
@@ -81,37 +76,16 @@ class Algorithm(NamedTuple):
     Attributes:
         init: key -> TrainState.
         begin: TrainState -> Working, before the first of several gradient steps.
-        gradients: (Working, Batch with rewards, whether for the actor, too) -> (LossGradients, metrics of [] float32).
+        gradients: (Working, Batch with rewards, whether for the actor, too) -> (Gradients, metrics of [] float32).
         apply: (Working, Gradients) -> Working, after one gradient step.
         end: Working -> TrainState.
     """
 
     init: Callable[[jax.Array], TrainState]
     begin: Callable[[TrainState], Working]
-    gradients: Callable[[Working, Batch, bool], tuple[LossGradients, Metrics]]
+    gradients: Callable[[Working, Batch, bool], tuple[Gradients, Metrics]]
     apply: Callable[[Working, Gradients], Working]
     end: Callable[[Working], TrainState]
-
-
-def combine(gradients: LossGradients, weights: Mapping[str, jax.Array] = MappingProxyType({})) -> Gradients:
-    """The weighted sum of each network's gradients.
-
-    Args:
-        gradients: Of all losses.
-        weights: [] float32 by name; a loss without one counts once.
-    """
-
-    def scaled(name: str, tree: Params) -> Params:
-        if name not in weights:
-            return tree
-        return jax.tree.map(lambda leaf: weights[name] * leaf, tree)
-
-    def total(named: dict[str, Params]) -> Params:
-        if not named:
-            return None
-        return functools.reduce(lambda one, other: jax.tree.map(jnp.add, one, other), itertools.starmap(scaled, named.items()))
-
-    return Gradients(critic=total(gradients.critic), actor=total(gradients.actor))
 
 
 def _networks_of(state: TrainState) -> tuple[Params, ...]:
@@ -128,21 +102,28 @@ def _shares(reward: jax.Array, keep: jax.Array, positive_reward: float) -> Metri
     }
 
 
-def _start(networks: Networks, optimizers: "_Optimizers", key: jax.Array) -> TrainState:
+def _start(networks: Networks, auxiliary: Auxiliary, optimizers: "_Optimizers", key: jax.Array) -> TrainState:
     """A learner that has learned nothing: targets equal the online networks."""
     actor_key, critic_key = jax.random.split(key)
     actor, critic = networks.init_actor(actor_key), networks.init_critic(critic_key)
+    target_actor, target_critic = networks.init_target(actor), networks.init_target(critic)
+    if auxiliary.tasks:
+        actor_key, critic_key = (jax.random.fold_in(each, _HEADS) for each in (actor_key, critic_key))
+        critic["heads"] = auxiliary.init_heads(critic_key)
+        if "encoder" in actor:
+            actor["heads"] = auxiliary.init_heads(actor_key)
     separate = networks.config.normalizers == "separate"
     return TrainState(
         actor=actor,
         critic=critic,
-        target_actor=networks.init_target(actor),
-        target_critic=networks.init_target(critic),
+        target_actor=target_actor,
+        target_critic=target_critic,
         actor_optimizer=optimizers.actor.init(actor),
         critic_optimizer=optimizers.critic.init(critic),
         normalizer=normalizer.init(networks.observation_spec),
         goal_normalizer=normalizer.init(networks.observation_spec) if separate else None,
         updates=jnp.zeros((), jnp.int32),
+        weighting=auxiliary.init_state(critic.get("encoder")),
     )
 
 
@@ -171,6 +152,7 @@ def _apply(state: TrainState, gradients: Gradients, optimizers: _Optimizers, con
         actor_optimizer=actor_moments,
         critic_optimizer=critic_moments,
         updates=updates,
+        weighting=gradients.weighting,
     )
 
 
@@ -179,9 +161,8 @@ def _step(optimizer: optax.GradientTransformation, params: Params, gradient: Par
     return optax.apply_updates(params, change), moments
 
 
-def _encode(networks: Networks, params: Params, inputs: jax.Array, first: int, count: int = 2) -> jax.Array:
-    """Latents [count, B, latent] of observations ``first``, ``first`` + 1, ... of the three."""
-    size = inputs.shape[0] // 3
+def _encode(networks: Networks, params: Params, inputs: jax.Array, size: int, first: int, count: int = 2) -> jax.Array:
+    """Latents [count, B, latent] of observations ``first``, ``first`` + 1, ... of those of a batch of ``size`` transitions."""
     return networks.encode(params, inputs, slice(first * size, (first + count) * size)).reshape(count, size, -1)
 
 
@@ -190,81 +171,144 @@ def _next_latents(
 ) -> tuple[jax.Array, jax.Array]:
     """Latents [2, B, latent] of the observation after and the goal, for the target actor and for the target critic.
 
-    Heads take them in this order; observations come as (goal, after). ``latents`` are the critic's of the first two.
+    Heads take them in this order; observations come as (goal, after). ``latents`` are the critic's of the first two or more.
     """
+    size = latents.shape[1]
     if networks.config.target_encoder:
-        of_critic = _encode(networks, now.target_critic, inputs, 1)[::-1]
+        of_critic = _encode(networks, now.target_critic, inputs, size, 1)[::-1]
+    elif latents.shape[0] > 2:
+        of_critic = latents[2:0:-1]
     else:
-        of_critic = jnp.concatenate([_encode(networks, now.critic, inputs, 2, count=1), latents[1:]])
+        of_critic = jnp.concatenate([_encode(networks, now.critic, inputs, size, 2, count=1), latents[1:]])
     if networks.config.encoders == "shared":
         return of_critic, of_critic
-    return _encode(networks, networks.with_encoder(now.target_actor, now.actor), inputs, 1)[::-1], of_critic
+    of_actor = _encode(networks, networks.with_encoder(now.target_actor, now.actor), inputs, size, 1)[::-1]
+    return of_actor, of_critic
 
 
-def make_ddpg(networks: Networks, config: Config, resolved: Resolved) -> Algorithm:
+def make_ddpg(networks: Networks, config: Config, resolved: Resolved, auxiliary: Auxiliary | None = None) -> Algorithm:
     """DDPG for these networks.
 
     Args:
         networks: What the parameters mean.
         config: Learning rates, target decay, action penalty.
         resolved: Discount, bounds of the targets, filter threshold.
+        auxiliary: What is learned beside; None for what ``config`` asks for, without stacked images.
     """
+    if auxiliary is None:
+        auxiliary = make_auxiliary(config, networks.observation_spec, networks.action_size, 1, networks.dtype)
     optimizers = _Optimizers(optax.adam(config.actor_learning_rate), optax.adam(config.critic_learning_rate))
+    learning = _Losses(networks, config, resolved, auxiliary)
+    keeps_state, held = auxiliary.weighting.name != "none", auxiliary.weighting.held
 
-    def begin(train: TrainState) -> Working:
-        return Working(train, _ComputeCopies(*map(networks.compute_copy, _networks_of(train))))
+    def begin(train: TrainState, held: Params = None) -> Working:
+        return Working(train, _ComputeCopies(*map(networks.compute_copy, _networks_of(train))), held)
 
-    def make_target(now: _ComputeCopies, inputs: jax.Array, latents: jax.Array, batch: Batch) -> jax.Array:
+    def gradients(working: Working, batch: Batch, with_actor: bool = True) -> tuple[Gradients, Metrics]:
         assert batch.reward is not None
+        train = working.train
+        now = _ComputeCopies(*map(networks.with_compute_copy, _networks_of(train), working.copies))
+        # Before, goal, after, moved: the online networks read the first two, their targets the second and third.
+        inputs = networks.prepare_batch(train, batch)
+        image = networks.normalize(train.normalizer, batch.observation_t) if "image" in auxiliary.needs else None
+        found = learning.of_critic(now, train.weighting, inputs, image, batch, working.held)
+        latents, value, keep = found.extra
+        metrics = {
+            "train/critic_loss": found.losses[MAIN],
+            "train/value": jnp.mean(value),
+            **_shares(batch.reward, keep, resolved.reward_positive),
+            **{f"train/{name}": number for name, number in found.metrics.items()},
+            **{f"train/loss/{name}": loss for name, loss in found.losses.items() if name != MAIN},
+        }
+        actor_gradient = None
+        if with_actor:
+            (policy_loss, action), actor_gradient = jax.value_and_grad(learning.of_actor, has_aux=True)(
+                now.actor, now.critic, inputs, latents, image, batch, found.weights
+            )
+            actor_gradient = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), actor_gradient)
+            metrics["train/actor_loss"] = policy_loss
+            metrics["train/action_size"] = jnp.sqrt(jnp.mean(jnp.square(action)))
+        return Gradients(found.gradient, actor_gradient, found.state if keeps_state else None), metrics
+
+    def apply(working: Working, chosen: Gradients) -> Working:
+        train = _apply(working.train, chosen, optimizers, config)
+        if not held:
+            return begin(train)
+        is_new = train.weighting.updates % auxiliary.weighting.interval == 0
+        return begin(train, jax.tree.map(lambda now, before: jnp.where(is_new, now, before), train.critic, working.held))
+
+    return Algorithm(
+        init=lambda key: _start(networks, auxiliary, optimizers, key),
+        begin=lambda train: begin(train, train.critic if held else None),
+        gradients=gradients,
+        apply=apply,
+        end=lambda working: working.train,
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class _Losses:
+    """The losses of both networks and their weighted gradients, for one configuration."""
+
+    networks: Networks
+    config: Config
+    resolved: Resolved
+    auxiliary: Auxiliary
+
+    def of_critic(
+        self,
+        now: _ComputeCopies,
+        state: WeightingState | None,
+        inputs: jax.Array,
+        image: jax.Array | None,
+        batch: Batch,
+        held: Params,
+    ) -> Weighted:
+        """The critic's losses and their gradient; ``extra`` is (latents of all observations, values [B], keep [B])."""
+        networks, weighting = self.networks, self.auxiliary.weighting
+        size = batch.action.shape[0]
+
+        def critic_losses(critic: Params):
+            assert batch.reward is not None
+            latents = _encode(networks, critic, inputs, size, 0, self.auxiliary.observations)
+            target = self._target(now, inputs, latents, batch)
+            value = networks.value(critic, latents[:2], batch.action)
+            keep = losses.keep_mask(batch.reward, value, self.resolved.reward_negative, self.resolved.filter_threshold)
+            others = self.auxiliary.losses(critic.get("heads", {}), latents, image, batch)
+            return {MAIN: losses.critic_loss(value, target, keep), **others}, (latents, value, keep)
+
+        # Weightings that compare no gradients need one backward pass only, which the last way of finding them takes.
+        way = "jvp" if weighting.needs == "losses" else self.config.aux_gradients
+        find = weighted_grad(critic_losses, weighting, lambda critic: critic["encoder"], way, has_aux=True)
+        state = self.auxiliary.start(now.critic.get("encoder")) if state is None else state
+        return find(now.critic, state, held=held) if weighting.held else find(now.critic, state)
+
+    def _target(self, now: _ComputeCopies, inputs: jax.Array, latents: jax.Array, batch: Batch) -> jax.Array:
+        assert batch.reward is not None
+        networks, resolved = self.networks, self.resolved
         of_actor, of_critic = _next_latents(networks, now, inputs, jax.lax.stop_gradient(latents))
         value_tp1 = networks.value(now.target_critic, of_critic, networks.act(now.target_actor, of_actor))
         discount = resolved.discount if batch.discount is None else batch.discount
         return losses.td_target(batch.reward, value_tp1, discount, resolved.target_minimum, resolved.target_maximum)
 
-    def critic_loss(critic: Params, now: _ComputeCopies, inputs: jax.Array, batch: Batch):
-        assert batch.reward is not None
-        latents = _encode(networks, critic, inputs, 0)
-        target = make_target(now, inputs, latents, batch)
-        value = networks.value(critic, latents, batch.action)
-        keep = losses.keep_mask(batch.reward, value, resolved.reward_negative, resolved.filter_threshold)
-        return losses.critic_loss(value, target, keep), (latents, value, keep)
-
-    def actor_loss(actor: Params, critic: Params, inputs: jax.Array, critic_latents: jax.Array):
-        latents = critic_latents if config.encoders == "shared" else _encode(networks, actor, inputs, 0)
-        action = networks.act(actor, latents)
-        value = networks.value(critic, critic_latents, action)
-        return losses.actor_loss(value, action, config.action_penalty), action
-
-    def in_float32(tree: Params) -> Params:
-        return jax.tree.map(lambda leaf: leaf.astype(jnp.float32), tree)
-
-    def gradients(working: Working, batch: Batch, with_actor: bool = True) -> tuple[LossGradients, Metrics]:
-        assert batch.reward is not None
-        now = _ComputeCopies(*map(networks.with_compute_copy, _networks_of(working.train), working.copies))
-        # Before, goal, after: the online networks read the first two, their targets the last two.
-        inputs = networks.prepare_batch(working.train, batch)
-        (critic_error, (latents, value, keep)), critic_gradient = jax.value_and_grad(critic_loss, has_aux=True)(
-            now.critic, now, inputs, batch
-        )
-        metrics = {
-            "train/critic_loss": critic_error,
-            "train/value": jnp.mean(value),
-            **_shares(batch.reward, keep, resolved.reward_positive),
-        }
-        found = LossGradients({MAIN: in_float32(critic_gradient)}, {})
-        if with_actor:
-            (policy_loss, action), actor_gradient = jax.value_and_grad(actor_loss, has_aux=True)(
-                now.actor, now.critic, inputs, latents
-            )
-            found = found._replace(actor={MAIN: in_float32(actor_gradient)})
-            metrics["train/actor_loss"] = policy_loss
-            metrics["train/action_size"] = jnp.sqrt(jnp.mean(jnp.square(action)))
-        return found, metrics
-
-    return Algorithm(
-        init=lambda key: _start(networks, optimizers, key),
-        begin=begin,
-        gradients=gradients,
-        apply=lambda working, chosen: begin(_apply(working.train, chosen, optimizers, config)),
-        end=lambda working: working.train,
-    )
+    def of_actor(
+        self,
+        actor: Params,
+        critic: Params,
+        inputs: jax.Array,
+        critic_latents: jax.Array,
+        image: jax.Array | None,
+        batch: Batch,
+        weights: dict[str, jax.Array],
+    ) -> tuple[jax.Array, jax.Array]:
+        """The actor's loss, those of its auxiliary tasks with the critic's weights added, and its actions [B, A]."""
+        has_encoder = self.config.encoders == "separate"
+        latents, others = critic_latents, {}
+        if has_encoder:
+            latents = _encode(self.networks, actor, inputs, batch.action.shape[0], 0, self.auxiliary.observations)
+            others = self.auxiliary.losses(actor.get("heads", {}), latents, image, batch)
+        action = self.networks.act(actor, latents[:2])
+        value = self.networks.value(critic, critic_latents[:2], action)
+        best = self.resolved.reward_positive / (1.0 - self.resolved.discount) if self.auxiliary.weighting.log else None
+        loss = losses.actor_loss(value, action, self.config.action_penalty, best)
+        return loss + self.auxiliary.weighting.objective(weights, others), action

@@ -6,6 +6,9 @@ Subscripts are time: ``value_t`` belongs to the state before the action, ``value
 import jax
 import jax.numpy as jnp
 
+LOG_FLOOR = 1e-6
+"""Least number whose logarithm is a loss; nearer to the greatest value, an actor has nothing to gain."""
+
 
 def td_target(
     reward_t: jax.Array,
@@ -52,12 +55,17 @@ def critic_loss(value_t: jax.Array, target: jax.Array, keep: jax.Array) -> jax.A
     return jnp.sum(keep * jnp.square(value_t - target)) / jnp.maximum(jnp.sum(keep), 1.0)
 
 
-def actor_loss(value_t: jax.Array, action: jax.Array, action_penalty: float) -> jax.Array:
+def actor_loss(value_t: jax.Array, action: jax.Array, action_penalty: float, log_below: float | None = None) -> jax.Array:
     """Minus the mean value of the policy's own actions, plus their weighted mean square: [] float32.
 
     Args:
         value_t: [B] float32, the online critic's values of ``action``.
         action: [B, A] float32 in [-1, 1], the policy's own.
         action_penalty: Weight of the mean square.
+        log_below: The greatest value that there can be, R+/(1-gamma): the logarithm of the distance to it takes the place of
+            minus the value, as auxiliary losses that are learned as logarithms ask for. With the rewards 0/-1 of the OL-AUX
+            release, it is 0, and this is the release's log(-Q). None: no logarithm.
     """
-    return -jnp.mean(value_t) + action_penalty * jnp.mean(jnp.square(action))
+    value = jnp.mean(value_t)
+    loss = -value if log_below is None else jnp.log(jnp.maximum(log_below - value, LOG_FLOOR))
+    return loss + action_penalty * jnp.mean(jnp.square(action))

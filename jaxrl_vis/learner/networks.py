@@ -240,13 +240,18 @@ class Networks:
         )
 
     def prepare_batch(self, train: TrainState, batch: Batch) -> jax.Array:
-        """`prepare` of the three observations of B transitions, side by side: [3 B, ...]."""
+        """`prepare` of the three observations of B transitions, side by side: [3 B, ...]; of moved images, [4 B, ...]."""
         if batch.shift is not None and self.sees_images:
             return self._prepare_shifted(train, batch)
         if train.goal_normalizer is None:
-            return self.prepare(train.normalizer, batch.observations.reshape(-1, *batch.observations.shape[2:]))
-        statistics = (train.normalizer, train.goal_normalizer, train.normalizer)
-        return jnp.concatenate([self.prepare(each, rows) for each, rows in zip(statistics, batch.observations, strict=True)])
+            inputs = self.prepare(train.normalizer, batch.observations.reshape(-1, *batch.observations.shape[2:]))
+        else:
+            statistics = (train.normalizer, train.goal_normalizer, train.normalizer)
+            parts = [self.prepare(each, rows) for each, rows in zip(statistics, batch.observations, strict=True)]
+            inputs = jnp.concatenate(parts)
+        if batch.targets is None or batch.targets.images_moved is None:
+            return inputs
+        return jnp.concatenate([inputs, self.prepare(train.normalizer, batch.targets.images_moved)])
 
     def prepare(self, statistics: NormalizerState, observations: jax.Array) -> jax.Array:
         """Normalises and orders [B, ...] observations for the encoders: [B, blocks, block size], or [B, S] for states."""
@@ -256,6 +261,10 @@ class Networks:
         if self.sees_images:
             observations, mean, scale = (to_blocks(array, self._levels) for array in (observations, mean, scale))
         return self._normalized(observations, mean, scale)
+
+    def normalize(self, statistics: NormalizerState, observations: jax.Array) -> jax.Array:
+        """Normalised [B, ...] observations in their own order, in the dtype that the networks compute in."""
+        return self._normalized(observations, statistics.mean, normalizer.scale(statistics, self.config.normalizer_floor))
 
     def _normalized(self, observations: jax.Array, mean: jax.Array, scale: jax.Array) -> jax.Array:
         limit = self.config.normalizer_clip

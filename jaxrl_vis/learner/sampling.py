@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxrl_vis.config import Config, Resolved
+from jaxrl_vis.learner.auxiliary import Auxiliary
 from jaxrl_vis.learner.relabel import choose_goal_slots
 from jaxrl_vis.learner.replay import Indices, Replay
 from jaxrl_vis.methods import METHODS
@@ -21,7 +22,7 @@ from jaxrl_vis.types import Batch, ReplayState
 from jaxrl_vis_envs import goals
 
 # Folded into a key for draws that only some configurations make, so that they change nothing for the others.
-_TRIVIAL, _SHIFT = 0x747276, 0x736866
+_TRIVIAL, _SHIFT, _TARGETS = 0x747276, 0x736866, 0x617578
 
 
 class Choice(NamedTuple):
@@ -31,11 +32,13 @@ class Choice(NamedTuple):
         indices: Where the transitions lie, [B] each.
         goal_slot: [B] int32 in [t + 1, T + 1].
         shift: [B, 2] int32, see `Batch`; or None.
+        target_key: [] a typed key, for targets of auxiliary tasks; or None.
     """
 
     indices: Indices
     goal_slot: jax.Array
     shift: jax.Array | None = None
+    target_key: jax.Array | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,6 +51,7 @@ class Sampler:
         replay: What to read from.
         threshold: Of the oracle's reward, in the unit of the true states.
         as_goal: [...] -> [...], makes a goal of an observation (`GoalEnv.as_goal`); None where an observation is one already.
+        auxiliary: Whose targets batches carry.
     """
 
     config: Config
@@ -55,6 +59,7 @@ class Sampler:
     replay: Replay
     threshold: float
     as_goal: Callable[[jax.Array], jax.Array] | None = None
+    auxiliary: Auxiliary | None = None
 
     def choose(self, state: ReplayState, key: jax.Array, iteration: jax.Array) -> Choice:
         """Draws B transitions and their goals.
@@ -69,10 +74,15 @@ class Sampler:
         goal_slot = self.goal_slots(goal_key, indices.time)
         if self.config.trivial_goals < 1.0:
             goal_slot = self._without_trivial(state, jax.random.fold_in(key, _TRIVIAL), indices, goal_slot)
-        if not self.config.random_shift:
-            return Choice(indices, goal_slot)
-        most, shape = self.config.random_shift, (self.config.batch_size, 2)
-        return Choice(indices, goal_slot, jax.random.randint(jax.random.fold_in(key, _SHIFT), shape, -most, most + 1))
+        choice = Choice(indices, goal_slot)
+        if self.config.random_shift:
+            most, shape = self.config.random_shift, (self.config.batch_size, 2)
+            choice = choice._replace(shift=jax.random.randint(jax.random.fold_in(key, _SHIFT), shape, -most, most + 1))
+        return choice._replace(target_key=jax.random.fold_in(key, _TARGETS)) if self._has_targets else choice
+
+    @property
+    def _has_targets(self) -> bool:
+        return self.auxiliary is not None and bool(self.auxiliary.tasks)
 
     def goal_slots(self, key: jax.Array, time: jax.Array) -> jax.Array:
         """Goal slots for transitions that start at ``time`` [B] int32; see `relabel`."""
@@ -98,6 +108,9 @@ class Sampler:
             B transitions with rewards.
         """
         batch = self.replay.gather(state, choice.indices, choice.goal_slot, self.config.n_step).replace(shift=choice.shift)
+        if choice.target_key is not None:
+            assert self.auxiliary is not None
+            batch = batch.replace(targets=self.auxiliary.targets(choice.target_key, batch))
         reached = batch.observation_tp1
         if self.as_goal is not None:
             # Stacked images also show how things move, and a goal stands still; what is reached is compared in the same terms.

@@ -21,7 +21,8 @@ import jax.numpy as jnp
 from jaxrl_vis.config import Config, Resolved, resolve, validate
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import normalizer
-from jaxrl_vis.learner.ddpg import Algorithm, Working, combine, make_ddpg
+from jaxrl_vis.learner.auxiliary import make_auxiliary
+from jaxrl_vis.learner.ddpg import Algorithm, Working, make_ddpg
 from jaxrl_vis.learner.evaluate import make_evaluate
 from jaxrl_vis.learner.networks import Networks
 from jaxrl_vis.learner.replay import Replay, make_replay, num_bytes
@@ -104,7 +105,7 @@ def _make_update_many(config: Config, sampler: Sampler, algorithm: Algorithm):
         def one_update(working: Working, choice: Choice, with_actor: bool) -> tuple[Working, Metrics]:
             batch = sampler.batch(replay, choice)
             gradients, metrics = algorithm.gradients(working, batch, with_actor)
-            return algorithm.apply(working, combine(gradients)), metrics
+            return algorithm.apply(working, gradients), metrics
 
         def updates(working: Working, choices: Choice) -> tuple[Working, Metrics]:
             """Updates of which the last one is the actor's, too; unrolled, so that the loop's body has no conditional."""
@@ -167,9 +168,10 @@ def make_train_step(env: GoalEnv, config: Config) -> TrainStep:
     networks = Networks(config, env.observation_spec, env.action_size, resolved.critic_output_bias)
     if METHODS[config.method].needs_images and not networks.sees_images:
         raise RequestError(f"method {config.method} compares images: train on Visual{config.env}, or use --method oracle")
-    algorithm = make_ddpg(networks, config, resolved)
+    auxiliary = make_auxiliary(config, env.observation_spec, env.action_size, env.frame_stack, networks.dtype)
+    algorithm = make_ddpg(networks, config, resolved, auxiliary)
     replay = make_replay(config.replay_transitions, config.num_envs, env.horizon)
-    sampler = Sampler(config, resolved, replay, env.threshold, env.as_goal if env.frame_stack > 1 else None)
+    sampler = Sampler(config, resolved, replay, env.threshold, env.as_goal if env.frame_stack > 1 else None, auxiliary)
     update_many = _make_update_many(config, sampler, algorithm)
     exploration = Exploration(config.random_action_probability, config.action_noise)
 
