@@ -109,10 +109,11 @@ _MANY_MEMORY_MAPPINGS = 20_000
 
 def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
     """Lets go of compiled programs between groups, in a process that has so many that it would run out of memory mappings."""
-    if nextitem is None or group_of(item.nodeid) == group_of(nextitem.nodeid):
+    if nextitem is None or item.path == nextitem.path:
         return
     mappings = Path("/proc/self/maps")
-    if mappings.exists() and mappings.read_bytes().count(b"\n") > _MANY_MEMORY_MAPPINGS:
+    last_of_group = group_of(item.nodeid) != group_of(nextitem.nodeid)
+    if last_of_group and mappings.exists() and mappings.read_bytes().count(b"\n") > _MANY_MEMORY_MAPPINGS:
         jax.clear_caches()
         gc.unfreeze()
     _spare_the_collector()
