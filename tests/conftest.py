@@ -15,7 +15,10 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(tempfile.gettempdir(
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
 os.environ.setdefault("MPLBACKEND", "Agg")
 # Programs of tests run for a moment: optimising their machine code takes longer. What XLA makes of them before is the same.
-os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0"
+# Both cores are busy with tests, so a program is not split into parts that could be compiled side by side either.
+os.environ["XLA_FLAGS"] = " ".join(
+    (os.environ.get("XLA_FLAGS", ""), "--xla_backend_optimization_level=0", "--xla_cpu_parallel_codegen_split_count=1")
+)
 
 import jax
 import pytest
@@ -90,17 +93,30 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=rank)
 
 
+def _spare_the_collector() -> None:
+    """What is there now (modules, compiled programs) mostly stays: the garbage collector need not look through it each time."""
+    gc.collect()
+    gc.freeze()
+
+
+def pytest_collection_finish() -> None:
+    _spare_the_collector()
+
+
 # Of the 65,530 that Linux gives a process by default; a compiled program takes some tens.
 _MANY_MEMORY_MAPPINGS = 20_000
 
 
 def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
     """Lets go of compiled programs between groups, in a process that has so many that it would run out of memory mappings."""
-    if nextitem is None or group_of(item.nodeid) == group_of(nextitem.nodeid):
+    if nextitem is None or item.path == nextitem.path:
         return
     mappings = Path("/proc/self/maps")
-    if mappings.exists() and mappings.read_bytes().count(b"\n") > _MANY_MEMORY_MAPPINGS:
+    last_of_group = group_of(item.nodeid) != group_of(nextitem.nodeid)
+    if last_of_group and mappings.exists() and mappings.read_bytes().count(b"\n") > _MANY_MEMORY_MAPPINGS:
         jax.clear_caches()
+        gc.unfreeze()
+    _spare_the_collector()
 
 
 @pytest.hookimpl(optionalhook=True)

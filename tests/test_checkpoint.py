@@ -5,6 +5,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -118,6 +119,27 @@ def test_a_damaged_checkpoint_is_skipped_with_one_line(states, saved, how, capfd
     assert len(lines) == 2 and "full/3 is damaged" in lines[0] and "light/3 is damaged" in lines[1]
     assert not any("\n" in line for line in lines)
     assert "Traceback" not in capfd.readouterr().err
+
+
+def test_complaints_about_a_damaged_checkpoint_that_come_late_are_not_shown(states, saved, monkeypatch):
+    """Threads that were reading it may fail when the reading has been given up, and the checkpoints are closed."""
+    shown = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda unraisable: shown.append(str(unraisable.exc_value)))
+
+    class Late:
+        def __del__(self):
+            raise RuntimeError("late")
+
+    damage(saved / FULL / "3", "delete data")
+    checkpoints = Checkpoints(saved, lambda _: None)
+    checkpoints.restore_for_resume(states[1])
+    checkpoints.close()
+    thread = threading.Thread(target=Late)
+    thread.start()
+    thread.join()
+    assert "late" not in shown
+    Late()
+    assert "late" in shown  # what fails in the main thread is ours
 
 
 def test_only_light_left(states, saved):

@@ -328,13 +328,15 @@ class Checkpoints:
         return Restored(tier, iteration, trees["train"], loop, manifest.get("progress", manifest.get("memo", {})))
 
     def _read(self, tier: str, iteration: int, arguments: dict[str, Any]) -> Any:
-        with _hushed():
-            try:
-                return self._manager(tier).restore(iteration, args=ocp.args.Composite(**arguments))
-            # orbax and tensorstore report damage as whatever exception they run into, plain Exception included.
-            except Exception as error:
-                text = " ".join(str(error).split())[:80]
-                raise _Damaged(f"{type(error).__name__}: {text}") from None
+        try:
+            manager = self._manager(tier)  # first, for `_hushed` puts back the hooks that it finds
+            with _hushed():
+                return manager.restore(iteration, args=ocp.args.Composite(**arguments))
+        # orbax and tensorstore report damage as whatever exception they run into, plain Exception included.
+        except Exception as error:
+            self._unsilence = _stay_silent  # as after a failed write: threads of this reading may complain later
+            text = " ".join(str(error).split())[:80]
+            raise _Damaged(f"{type(error).__name__}: {text}") from None
 
 
 def _host_specs(tree: Any) -> dict[str, jax.ShapeDtypeStruct]:

@@ -224,16 +224,17 @@ def object_appearance(mj_model: mujoco.MjModel) -> dict[str, np.ndarray]:
 
 
 def texture_pixels(mj_model: mujoco.MjModel, texture: int) -> np.ndarray:
-    """[rows, columns, channels] float64 in [0, 255]: the texels that MuJoCo's renderer mixes.
+    """[rows, columns, channels] in [0, 255]: the texels that MuJoCo's renderer mixes.
 
-    It decodes flat textures that are flagged as sRGB, and leaves the faces of cubes and skies as they are.
+    It decodes flat textures that are flagged as sRGB (float64), and leaves all others as they are (uint8).
     """
     height, width = int(mj_model.tex_height[texture]), int(mj_model.tex_width[texture])
     channels = int(mj_model.tex_nchannel[texture])
     start = int(mj_model.tex_adr[texture])
-    pixels = mj_model.tex_data[start : start + height * width * channels].reshape(height, width, channels).astype(np.float64)
+    pixels = mj_model.tex_data[start : start + height * width * channels].reshape(height, width, channels)
     flat = mj_model.tex_type[texture] == mujoco.mjtTexture.mjTEXTURE_2D
     if flat and mj_model.tex_colorspace[texture] == mujoco.mjtColorSpace.mjCOLORSPACE_SRGB:
+        pixels = pixels.astype(np.float64)
         share = pixels[..., :3] / 255.0  # and not of alpha
         pixels[..., :3] = 255.0 * np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
     return pixels
