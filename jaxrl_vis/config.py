@@ -21,6 +21,12 @@ ComputeDtype = Literal["auto", "float32", "bfloat16"]
 _LARGEST_SEED = 2**32 - 1  # a random key is made of 32 bits of it: larger seeds would repeat smaller ones
 _LARGEST_COUNT = 2**31 - 1  # arrays are indexed by int32; environment steps are counted on the host, without a bound
 
+_FALSE_REWARDS = ("reward_false_positives", "reward_false_negatives")
+_SHARES = (
+    *("relabel_probability", "balance_probability", "trivial_goals", "random_action_probability", "target_decay"),
+    *(*_FALSE_REWARDS, "reward_clutter"),
+)
+
 
 @dataclasses.dataclass(frozen=True)
 class Config:
@@ -33,7 +39,8 @@ class Config:
     preset: str = "fast"
     """The preset that this configuration started from; kept for the record."""
     method: MethodName = "oracle"
-    """Where rewards come from: the true state (oracle), or equality of images, without or with balancing and filtering."""
+    """Where rewards come from: the true state (oracle), similarity in the latent space of an autoencoder that is trained along,
+    or equality of observations (indicator), without or with balancing and filtering."""
     seed: int = 0
     """First seed."""
     seeds: int = 1
@@ -52,6 +59,8 @@ class Config:
     """What varies between episodes, in training and in evaluation."""
     randomize_strength: float = 1.0
     """How far it varies, in multiples of the typical ranges (`jaxrl_vis_envs.randomization.KINDS`)."""
+    observation_noise: float = 0.0
+    """Standard deviation of the camera's noise, in the observation's unit (grey levels for images); new in every frame."""
     num_envs: int = 80
     """Environments in a rollout; each plays one episode per iteration."""
 
@@ -75,9 +84,17 @@ class Config:
     trivial_goals: float = 1.0
     """Share kept of relabelled goals that are reached already before the action; the others give way to the original goal."""
     reward_positive: float | None = None
-    """R+. None: 0 for the oracle, 1 for indicator methods."""
+    """R+. None: 0 for the oracle, 1 for other methods."""
     reward_negative: float | None = None
-    """R-. None: -1."""
+    """R-. None: 0 for the autoencoder, -1 for other methods."""
+    reward_noise: float = 0.0
+    """Standard deviation of the noise on the state that the oracle's reward is computed from, in the unit of the state."""
+    reward_false_positives: float = 0.0
+    """Share of the oracle's negatives that are rewarded as positives."""
+    reward_false_negatives: float = 0.0
+    """Share of the oracle's positives that are rewarded as negatives."""
+    reward_clutter: float = 1.0
+    """Share of the workspace, from the low end of the state's first coordinate, where all those false rewards occur."""
 
     # -- DDPG
     discount: float | None = None
@@ -350,14 +367,14 @@ def validate(config: Config) -> Config:
     for name in ("encoder_filters", "hidden_sizes"):
         if any(size < 1 for size in getattr(config, name)):
             raise RequestError(f"{name} must all be at least 1, not {' '.join(map(str, getattr(config, name)))}")
-    for name in ("relabel_probability", "balance_probability", "trivial_goals", "random_action_probability", "target_decay"):
+    for name in _SHARES:
         value = getattr(config, name)
         if value is not None and not 0.0 <= value <= 1.0:
             raise RequestError(f"{name} is a share and must lie in [0, 1], not {value}")
     for name in ("actor_learning_rate", "critic_learning_rate", "normalizer_floor", "normalizer_clip", "randomize_strength"):
         if not getattr(config, name) > 0.0:
             raise RequestError(f"{name} must be positive, not {getattr(config, name)}")
-    for name in ("seed", "full_checkpoint_interval", "action_noise", "random_shift"):
+    for name in ("seed", "full_checkpoint_interval", "action_noise", "observation_noise", "reward_noise", "random_shift"):
         if getattr(config, name) < 0:
             raise RequestError(f"{name} must be at least 0, not {getattr(config, name)}")
     if config.updates_per_iteration % config.actor_interval:
@@ -367,12 +384,35 @@ def validate(config: Config) -> Config:
     method = METHODS[config.method]
     if config.n_step > 1 and method.filter:
         raise RequestError(f"n_step {config.n_step} with method {config.method}: the filter's band is that of one step")
-    for name, is_set in (("n_step", config.n_step > 1), ("trivial_goals", config.trivial_goals < 1.0)):
-        if is_set and method.reward != "oracle":
-            raise RequestError(f"{name} reads true states, which method {config.method} does without; use --method oracle")
+    _validate_reward(config)
     if config.seed + config.seeds - 1 > _LARGEST_SEED:
         raise RequestError(f"seed {config.seed} is too large: the last of {config.seeds} must be at most {_LARGEST_SEED}")
     return config
+
+
+def _validate_reward(config: Config) -> None:
+    """Raises a RequestError where options of a reward are given to a method with another one, or contradict each other."""
+    kind = METHODS[config.method].reward
+    errors = {name: getattr(config, name) > 0.0 for name in ("reward_noise", *_FALSE_REWARDS)}
+    reads_states = {"n_step": config.n_step > 1, "trivial_goals": config.trivial_goals < 1.0, **errors}
+    for name, is_set in reads_states.items():
+        if is_set and kind != "oracle":
+            raise RequestError(f"{name} reads true states, which method {config.method} does without; use --method oracle")
+        if is_set and name in errors and config.n_step > 1:
+            raise RequestError(f"n_step {config.n_step} and {name} exclude each other: errors are those of single rewards")
+    if config.reward_clutter < 1.0 and not any(getattr(config, name) for name in _FALSE_REWARDS):
+        raise RequestError(
+            f"reward_clutter is where false rewards occur, and there are none: set {' or '.join(_FALSE_REWARDS)}"
+        )
+    for name in _FALSE_REWARDS:
+        if getattr(config, name) > config.reward_clutter:
+            raise RequestError(
+                f"{name} ({getattr(config, name)}) is a share of the whole workspace and cannot exceed reward_clutter "
+                f"({config.reward_clutter}), the share of it where false rewards occur"
+            )
+    for name, is_set in (("random_shift", config.random_shift > 0), ("normalizers separate", config.normalizers == "separate")):
+        if is_set and kind == "autoencoder":
+            raise RequestError(f"{name} and method {config.method} exclude each other: it compares images as they were seen")
 
 
 _OLD_NAMES = {"frames": "frame_stack"}

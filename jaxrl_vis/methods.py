@@ -6,8 +6,8 @@ Imports no JAX. A new method is a row here and a name in `MethodName`; a new kin
 import dataclasses
 from typing import Literal
 
-MethodName = Literal["oracle", "indicator", "indicator_balance_filter"]
-RewardName = Literal["oracle", "indicator"]
+MethodName = Literal["oracle", "autoencoder", "indicator", "indicator_balance_filter"]
+RewardName = Literal["oracle", "autoencoder", "indicator"]
 WeightingName = Literal["none", "none_log", "sum", "fixed", "balance", "cosine", "ol_aux", "ol_aux_ablation"]
 AuxTaskName = Literal["forward_dynamics", "inverse_dynamics", "egomotion", "autoencoder", "optical_flow"]
 
@@ -17,7 +17,8 @@ class Method:
     """One method (thesis, section 5.1.4).
 
     Attributes:
-        reward: oracle: distance of the true states; indicator: equality of images.
+        reward: oracle: distance of the true states; autoencoder: cosine similarity of the latents of an autoencoder that is
+            trained along; indicator: equality of observations.
         filter: Whether negatives that the critic contradicts are dropped as false.
         reward_positive, reward_negative: Defaults of R+ and R-.
         balance_probability: Default of p2.
@@ -36,12 +37,13 @@ class Method:
 
     @property
     def needs_images(self) -> bool:
-        """Whether rewards compare images, so that the environment must show some."""
-        return self.reward != "oracle"
+        """Whether rewards are made from images, so that the environment must show some."""
+        return self.reward == "autoencoder"
 
 
 METHODS: dict[MethodName, Method] = {
     "oracle": Method(reward="oracle", filter=False, reward_positive=0.0),
+    "autoencoder": Method(reward="autoencoder", filter=False, reward_positive=1.0, reward_negative=0.0),
     "indicator": Method(reward="indicator", filter=False, reward_positive=1.0),
     "indicator_balance_filter": Method(reward="indicator", filter=True, reward_positive=1.0, balance_probability=0.5),
 }

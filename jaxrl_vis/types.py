@@ -69,10 +69,14 @@ class Batch(Replaceable):
         state_tp1: [B, G] float32, the true state after the action.
         goal_state: [B, G] float32, the true state that the goal shows.
         reward: [B] float32 of reaching that goal, over the steps from the first observation to the last; None as long as goals
-            may still change.
+            may still change, and where the learner itself makes the reward (method autoencoder).
         discount: [B] float32 of what comes after these steps; None: that of one step.
         shift: [B, 2] int32, pixels by which the images are to be moved down and to the right; None: not at all.
         targets: `auxtasks.Targets` of auxiliary tasks; None where there are no tasks.
+        reached: [B, ...] what the observation after the action is as a goal, where that is something else (stacked images);
+            else None.
+        success: [B] float32, 1 where the true state after the action lies at the goal's, else 0: for diagnostics alone. None
+            where rewards are of several steps.
     """
 
     observations: jax.Array
@@ -83,6 +87,8 @@ class Batch(Replaceable):
     discount: jax.Array | None = None
     shift: jax.Array | None = None
     targets: Any = None
+    reached: jax.Array | None = None
+    success: jax.Array | None = None
 
     @property
     def observation_t(self) -> jax.Array:
@@ -128,6 +134,7 @@ class TrainState(Replaceable):
         normalizer: Observation statistics.
         goal_normalizer: Those of goals, where they have their own; else None.
         weighting: `weighting.WeightingState` of the auxiliary losses; None where there is nothing to remember.
+        autoencoder: `latent_reward.AutoencoderState`; None where rewards come from elsewhere.
         updates: [] int32, gradient steps taken (fewer than 2^31 in any run that ends).
     """
 
@@ -141,6 +148,7 @@ class TrainState(Replaceable):
     updates: jax.Array
     goal_normalizer: NormalizerState | None = None
     weighting: Any = None
+    autoencoder: Any = None
 
     @property
     def goal_statistics(self) -> NormalizerState:

@@ -1,7 +1,7 @@
 """Rewards and success: the one place. Environments score with these, and the learner relabels with the same functions.
 
 Two rewards exist. The *oracle* compares true states within a threshold (thesis, equation 5.6). The *indicator* is positive only
-where the observed image equals the goal image in every byte (thesis, equation 5.4), so it needs no state estimate and has
+where the observation equals the goal's in every element (thesis, equation 5.4), so it needs no state estimate and has
 no false positives. Arrays may carry any leading batch axes; only the goal's own axes are reduced. NumPy arrays are scored by
 NumPy, so that a learner on the host (see `adapters`) pays for no transfer and no compilation.
 """
@@ -51,15 +51,18 @@ def oracle_reward(
     return _namespace(achieved_state, goal_state).where(is_reached, positive, negative).astype(jnp.float32)
 
 
-def indicator_reward(image: jax.Array, goal_image: jax.Array, positive: float = 1.0, negative: float = -1.0) -> jax.Array:
-    """Indicator reward of [..., C, H, W] images (thesis, equation 5.4): ``positive`` where all bytes agree: [...] float32.
+def indicator_reward(
+    observation: jax.Array, goal: jax.Array, positive: float = 1.0, negative: float = -1.0, num_axes: int = 3
+) -> jax.Array:
+    """Indicator reward (thesis, equation 5.4): ``positive`` where all elements of two observations agree: [...] float32.
 
     Args:
-        image: [..., C, H, W] uint8, what was reached.
-        goal_image: [..., C, H, W] uint8, what the goal shows.
+        observation: [..., C, H, W] uint8 images or [..., S] float32 state vectors, what was reached.
+        goal: The same of the goal.
         positive: R+.
         negative: R-.
+        num_axes: How many axes one observation has: 3 for images, 1 for state vectors.
     """
-    numpy = _namespace(image, goal_image)
-    equal = numpy.all(image == goal_image, axis=(-3, -2, -1))
+    numpy = _namespace(observation, goal)
+    equal = numpy.all(observation == goal, axis=tuple(range(-num_axes, 0)))
     return numpy.where(equal, positive, negative).astype(jnp.float32)

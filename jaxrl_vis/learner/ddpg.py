@@ -24,14 +24,17 @@ import jax.numpy as jnp
 import optax
 
 from jaxrl_vis.config import Config, Resolved
-from jaxrl_vis.learner import losses, normalizer
+from jaxrl_vis.learner import diagnostics, losses, normalizer
 from jaxrl_vis.learner.auxiliary import Auxiliary, make_auxiliary
+from jaxrl_vis.learner.latent_reward import LatentReward, make_latent_reward
 from jaxrl_vis.learner.networks import Networks
 from jaxrl_vis.learner.weighting import MAIN, Weighted, WeightingState, weighted_grad
 from jaxrl_vis.types import Batch, Metrics, Params, TrainState
 
 # Folded into the networks' keys for the heads of auxiliary tasks, so that these change nothing else.
 _HEADS = 0x686473
+# The same for the autoencoder that makes rewards.
+_AUTOENCODER = 0x617574
 
 
 class _ComputeCopies(NamedTuple):
@@ -63,11 +66,13 @@ class Gradients(NamedTuple):
     Attributes:
         critic, actor: For the optimisers, float32; None for an actor that stays as it is.
         weighting: Of the auxiliary losses, after this batch; None where there is nothing to remember.
+        autoencoder: For the optimiser of the autoencoder that makes rewards; None where there is none.
     """
 
     critic: Params
     actor: Params | None
     weighting: WeightingState | None = None
+    autoencoder: Params | None = None
 
 
 class Algorithm(NamedTuple):
@@ -79,6 +84,8 @@ class Algorithm(NamedTuple):
         gradients: (Working, Batch with rewards, whether for the actor, too) -> (Gradients, metrics of [] float32).
         apply: (Working, Gradients) -> Working, after one gradient step.
         end: Working -> TrainState.
+        value_at_goals: (TrainState, goals [E, ...]) -> [] float32, the mean value of the policy's actions where the goal itself
+            is observed.
     """
 
     init: Callable[[jax.Array], TrainState]
@@ -86,6 +93,7 @@ class Algorithm(NamedTuple):
     gradients: Callable[[Working, Batch, bool], tuple[Gradients, Metrics]]
     apply: Callable[[Working, Gradients], Working]
     end: Callable[[Working], TrainState]
+    value_at_goals: Callable[[TrainState, jax.Array], jax.Array]
 
 
 def _networks_of(state: TrainState) -> tuple[Params, ...]:
@@ -93,16 +101,9 @@ def _networks_of(state: TrainState) -> tuple[Params, ...]:
     return state.actor, state.critic, state.target_actor, state.target_critic
 
 
-def _shares(reward: jax.Array, keep: jax.Array, positive_reward: float) -> Metrics:
-    """Shares of the batch that are positives, and of its negatives (only those can be dropped) that are filtered."""
-    positive = (reward == positive_reward).astype(jnp.float32)
-    return {
-        "train/positive_share": jnp.mean(positive),
-        "train/filtered_share": jnp.sum(1.0 - keep) / jnp.maximum(jnp.sum(1.0 - positive), 1.0),
-    }
-
-
-def _start(networks: Networks, auxiliary: Auxiliary, optimizers: "_Optimizers", key: jax.Array) -> TrainState:
+def _start(
+    networks: Networks, auxiliary: Auxiliary, latent_reward: LatentReward | None, optimizers: "_Optimizers", key: jax.Array
+) -> TrainState:
     """A learner that has learned nothing: targets equal the online networks."""
     actor_key, critic_key = jax.random.split(key)
     actor, critic = networks.init_actor(actor_key), networks.init_critic(critic_key)
@@ -124,6 +125,7 @@ def _start(networks: Networks, auxiliary: Auxiliary, optimizers: "_Optimizers", 
         goal_normalizer=normalizer.init(networks.observation_spec) if separate else None,
         updates=jnp.zeros((), jnp.int32),
         weighting=auxiliary.init_state(critic.get("encoder")),
+        autoencoder=None if latent_reward is None else latent_reward.init(jax.random.fold_in(key, _AUTOENCODER)),
     )
 
 
@@ -198,6 +200,7 @@ def make_ddpg(networks: Networks, config: Config, resolved: Resolved, auxiliary:
     if auxiliary is None:
         auxiliary = make_auxiliary(config, networks.observation_spec, networks.action_size, 1, networks.dtype)
     optimizers = _Optimizers(optax.adam(config.actor_learning_rate), optax.adam(config.critic_learning_rate))
+    latent_reward = make_latent_reward(networks, config, resolved, auxiliary.frame_stack)
     learning = _Losses(networks, config, resolved, auxiliary)
     keeps_state, held = auxiliary.weighting.name != "none", auxiliary.weighting.held
 
@@ -205,19 +208,24 @@ def make_ddpg(networks: Networks, config: Config, resolved: Resolved, auxiliary:
         return Working(train, _ComputeCopies(*map(networks.compute_copy, _networks_of(train))), held)
 
     def gradients(working: Working, batch: Batch, with_actor: bool = True) -> tuple[Gradients, Metrics]:
-        assert batch.reward is not None
         train = working.train
         now = _ComputeCopies(*map(networks.with_compute_copy, _networks_of(train), working.copies))
         # Before, goal, after, moved: the online networks read the first two, their targets the second and third.
         inputs = networks.prepare_batch(train, batch)
+        rewarded = None if latent_reward is None else latent_reward.of_batch(train, inputs, batch)
+        if rewarded is not None:
+            batch = batch.replace(reward=rewarded.reward)
+        assert batch.reward is not None
         image = networks.normalize(train.normalizer, batch.observation_t) if "image" in auxiliary.needs else None
         found = learning.of_critic(now, train.weighting, inputs, image, batch, working.held)
         latents, value, keep = found.extra
+        shares = diagnostics.of_rewards(
+            batch.reward, keep, resolved.reward_positive, resolved.reward_negative, batch.success, rewarded is not None
+        )
         metrics = {
             "train/critic_loss": found.losses[MAIN],
             "train/value": jnp.mean(value),
-            **_shares(batch.reward, keep, resolved.reward_positive),
-            **{f"train/{name}": number for name, number in found.metrics.items()},
+            **{f"train/{name}": number for name, number in (shares | found.metrics).items()},
             **{f"train/loss/{name}": loss for name, loss in found.losses.items() if name != MAIN},
         }
         actor_gradient = None
@@ -228,21 +236,38 @@ def make_ddpg(networks: Networks, config: Config, resolved: Resolved, auxiliary:
             actor_gradient = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), actor_gradient)
             metrics["train/actor_loss"] = policy_loss
             metrics["train/action_size"] = jnp.sqrt(jnp.mean(jnp.square(action)))
-        return Gradients(found.gradient, actor_gradient, found.state if keeps_state else None), metrics
+        if rewarded is not None:
+            metrics["train/autoencoder_loss"] = rewarded.loss
+        state, of_autoencoder = found.state if keeps_state else None, rewarded.gradient if rewarded is not None else None
+        return Gradients(found.gradient, actor_gradient, state, of_autoencoder), metrics
 
     def apply(working: Working, chosen: Gradients) -> Working:
         train = _apply(working.train, chosen, optimizers, config)
+        if latent_reward is not None:
+            train = train.replace(autoencoder=latent_reward.apply(train.autoencoder, chosen.autoencoder))
         if not held:
             return begin(train)
         is_new = train.weighting.updates % auxiliary.weighting.interval == 0
         return begin(train, jax.tree.map(lambda now, before: jnp.where(is_new, now, before), train.critic, working.held))
 
+    def value_at_goals(train: TrainState, goals: jax.Array) -> jax.Array:
+        statistics = (train.normalizer,) if train.goal_normalizer is None else (train.normalizer, train.goal_normalizer)
+        inputs = [networks.prepare(each, goals) for each in statistics]
+
+        def latents(params: Params) -> jax.Array:
+            encoded = [networks.encode(params, each) for each in inputs]
+            return jnp.stack([encoded[0], encoded[-1]])
+
+        action = networks.act(train.actor, latents(networks.with_encoder(train.actor, train.critic)))
+        return jnp.mean(networks.value(train.critic, latents(train.critic), action))
+
     return Algorithm(
-        init=lambda key: _start(networks, auxiliary, optimizers, key),
+        init=lambda key: _start(networks, auxiliary, latent_reward, optimizers, key),
         begin=lambda train: begin(train, train.critic if held else None),
         gradients=gradients,
         apply=apply,
         end=lambda working: working.train,
+        value_at_goals=value_at_goals,
     )
 
 

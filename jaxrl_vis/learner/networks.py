@@ -196,9 +196,13 @@ class Networks:
         encoder_key, head_key = jax.random.split(key)
         params = {"head": head.init(head_key, jnp.zeros((1, head_inputs)))["params"]}
         if self.sees_images and has_encoder:
-            blocks = to_blocks(jnp.zeros((1, *self.observation_spec.shape)), self._levels)
-            params["encoder"] = self._encoder.init(encoder_key, blocks)["params"]
+            params["encoder"] = self.init_encoder(encoder_key)
         return params
+
+    def init_encoder(self, key: jax.Array) -> Params:
+        """Fresh parameters of an encoder of images, for ``{"encoder": ...}``."""
+        blocks = to_blocks(jnp.zeros((1, *self.observation_spec.shape)), self._levels)
+        return self._encoder.init(key, blocks)["params"]
 
     def init_actor(self, key: jax.Array) -> Params:
         """Fresh actor parameters: without an encoder where it shares the critic's."""

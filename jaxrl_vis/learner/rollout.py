@@ -14,6 +14,9 @@ from jaxrl_vis.learner.networks import Networks
 from jaxrl_vis.types import Episodes, Metrics, NormalizerState, TrainState
 from jaxrl_vis_envs.base import GoalEnv, State
 
+# Folded into keys for noise on observations, so that it changes nothing else.
+_FIRST_NOISE, _GOAL_NOISE, _STEP_NOISE = 0x6E6F30, 0x6E6F31, 0x6E6F32
+
 
 class Exploration(NamedTuple):
     """How far actions stray from the policy; the default not at all.
@@ -72,6 +75,20 @@ def split_keys(keys: jax.Array, num_envs: int) -> tuple[jax.Array, jax.Array]:
     return jax.vmap(lambda key: jax.random.split(key, num_envs))(reset_keys).reshape(-1), policy_keys
 
 
+def add_noise(key: jax.Array, observations: jax.Array, deviation: float) -> jax.Array:
+    """Observations [E, ...] as a noisy camera shows them: same shape and dtype; bytes are rounded and clipped.
+
+    Args:
+        key: [] a typed key.
+        observations: uint8 images or float32 state vectors.
+        deviation: Standard deviation of the noise, in the observation's unit.
+    """
+    noisy = observations + deviation * jax.random.normal(key, observations.shape)
+    if observations.dtype == jnp.uint8:
+        noisy = jnp.clip(jnp.round(noisy), 0.0, 255.0)
+    return noisy.astype(observations.dtype)
+
+
 class Rollout(NamedTuple):
     """What `play` has seen.
 
@@ -118,13 +135,23 @@ def play(
     def kept(leaf: jax.Array) -> jax.Array:
         return by_seed(leaf)[:, :num_kept]
 
+    def seen(observations: jax.Array, keys: jax.Array, number: int) -> jax.Array:
+        # Noise belongs to a frame: it is drawn here, once, and stored with the frame, which therefore equals itself as a goal.
+        deviation = networks.config.observation_noise
+        if not deviation:
+            return observations
+        noise_keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, number)
+        noisy = jax.vmap(lambda key, part: add_noise(key, part, deviation))(noise_keys, by_seed(observations))
+        return noisy.reshape(observations.shape)
+
     def recorded(state: State) -> Any:
         return None if record is None else jax.tree.map(kept, jax.vmap(record)(state))
 
     reset_keys, policy_keys = split_keys(keys, num_envs)
     state = jax.vmap(env.reset)(reset_keys)
     assert state.obs is not None
-    first_observation, goal = state.obs["observation"], state.obs["desired_goal"]
+    first_observation = seen(state.obs["observation"], policy_keys, _FIRST_NOISE)
+    goal = seen(state.obs["desired_goal"], policy_keys, _GOAL_NOISE)
     first_state, first_record = state.achieved_state, recorded(state)
     goal_latents = jax.vmap(lambda train, goals: encode(networks, train, train.goal_statistics, goals))(train, by_seed(goal))
 
@@ -135,7 +162,7 @@ def play(
         state, observation = carry
         action = jax.vmap(act)(train, goal_latents, step_keys, by_seed(observation)).reshape(num_seeds * num_envs, -1)
         state = jax.vmap(env.advance)(state, action)
-        observation = jax.vmap(env.observe)(state)
+        observation = seen(jax.vmap(env.observe)(state), step_keys, _STEP_NOISE)
         step_results = tuple(kept(leaf) for leaf in (observation, state.achieved_state, action))
         return (state, observation), (step_results, recorded(state))
 

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxrl_vis.config import Config, Resolved
+from jaxrl_vis.learner import reward_errors
 from jaxrl_vis.learner.auxiliary import Auxiliary
 from jaxrl_vis.learner.relabel import choose_goal_slots
 from jaxrl_vis.learner.replay import Indices, Replay
@@ -33,12 +34,14 @@ class Choice(NamedTuple):
         goal_slot: [B] int32 in [t + 1, T + 1].
         shift: [B, 2] int32, see `Batch`; or None.
         target_key: [] a typed key, for targets of auxiliary tasks; or None.
+        clutter_end: [] float32, see `reward_errors`; or None.
     """
 
     indices: Indices
     goal_slot: jax.Array
     shift: jax.Array | None = None
     target_key: jax.Array | None = None
+    clutter_end: jax.Array | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,6 +81,10 @@ class Sampler:
         if self.config.random_shift:
             most, shape = self.config.random_shift, (self.config.batch_size, 2)
             choice = choice._replace(shift=jax.random.randint(jax.random.fold_in(key, _SHIFT), shape, -most, most + 1))
+        if self.config.reward_clutter < 1.0:
+            goal_states = state.episodes.states[:, -1]
+            end = reward_errors.find_clutter_end(goal_states, state.size, self.config.reward_clutter)
+            choice = choice._replace(clutter_end=end)
         return choice._replace(target_key=jax.random.fold_in(key, _TARGETS)) if self._has_targets else choice
 
     @property
@@ -116,11 +123,14 @@ class Sampler:
             # Stacked images also show how things move, and a goal stands still; what is reached is compared in the same terms.
             as_goal = jax.vmap(self.as_goal)
             observed_t, goal, observed_tp1 = batch.observations
-            batch = batch.replace(observations=jnp.stack([observed_t, as_goal(goal), observed_tp1]))
             reached = as_goal(observed_tp1)
+            batch = batch.replace(observations=jnp.stack([observed_t, as_goal(goal), observed_tp1]), reached=reached)
         if self.config.n_step > 1:
             return self._rewarded_over_steps(state, choice, batch)
-        return batch.replace(reward=self.reward(batch, reached))
+        batch = batch.replace(success=goals.success(batch.state_tp1, batch.goal_state, self.threshold))
+        if METHODS[self.config.method].reward == "autoencoder":
+            return batch  # the learner rewards it, with the encoder as it is by then (`latent_reward`)
+        return batch.replace(reward=self.reward(batch, reached, choice.clutter_end))
 
     def _rewarded_over_steps(self, state: ReplayState, choice: Choice, batch: Batch) -> Batch:
         """The oracle's rewards of up to ``n_step`` steps, discounted and summed, and the discount of what follows them."""
@@ -136,14 +146,28 @@ class Sampler:
             discount=self.resolved.discount ** jnp.sum(is_step, axis=1).astype(jnp.float32),
         )
 
-    def reward(self, batch: Batch, reached: jax.Array) -> jax.Array:
+    def reward(self, batch: Batch, reached: jax.Array, clutter_end: jax.Array | None = None) -> jax.Array:
         """Rewards [B] float32.
 
         Args:
             batch: The transitions, relabelled.
             reached: [B, ...] what they have reached, as a goal would show it.
+            clutter_end: As of `Choice`.
         """
         values = {"positive": self.resolved.reward_positive, "negative": self.resolved.reward_negative}
         if METHODS[self.config.method].reward == "oracle":
-            return goals.oracle_reward(batch.state_tp1, batch.goal_state, self.threshold, **values)
-        return goals.indicator_reward(reached, batch.goal, **values)
+            return self._estimated_reward(batch, clutter_end)
+        return goals.indicator_reward(reached, batch.goal, num_axes=reached.ndim - 1, **values)
+
+    def _estimated_reward(self, batch: Batch, clutter_end: jax.Array | None) -> jax.Array:
+        """The oracle's rewards, with the errors of an estimator where the configuration asks for some."""
+        config, positive, negative = self.config, self.resolved.reward_positive, self.resolved.reward_negative
+        states = reward_errors.estimate(batch.state_tp1, config.reward_noise) if config.reward_noise else batch.state_tp1
+        reward = goals.oracle_reward(states, batch.goal_state, self.threshold, positive, negative)
+        shares = config.reward_false_positives, config.reward_false_negatives
+        if not any(shares):
+            return reward
+        is_positive = reward_errors.flip(
+            reward == positive, batch.state_tp1, batch.goal_state, *shares, config.reward_clutter, clutter_end
+        )
+        return jnp.where(is_positive, positive, negative).astype(jnp.float32)

@@ -19,7 +19,6 @@ import jax
 import jax.numpy as jnp
 
 from jaxrl_vis.config import Config, Resolved, resolve, validate
-from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import normalizer
 from jaxrl_vis.learner.auxiliary import make_auxiliary
 from jaxrl_vis.learner.ddpg import Algorithm, Working, make_ddpg
@@ -28,7 +27,6 @@ from jaxrl_vis.learner.networks import Networks
 from jaxrl_vis.learner.replay import Replay, make_replay, num_bytes
 from jaxrl_vis.learner.rollout import Exploration, play
 from jaxrl_vis.learner.sampling import Choice, Sampler
-from jaxrl_vis.methods import METHODS
 from jaxrl_vis.types import Episodes, LoopState, Metrics, ReplayState, TrainState
 from jaxrl_vis_envs.base import GoalEnv
 from jaxrl_vis_envs.compilation import env_jit
@@ -166,8 +164,6 @@ def make_train_step(env: GoalEnv, config: Config) -> TrainStep:
     """
     resolved = resolve(validate(config), env.horizon)
     networks = Networks(config, env.observation_spec, env.action_size, resolved.critic_output_bias)
-    if METHODS[config.method].needs_images and not networks.sees_images:
-        raise RequestError(f"method {config.method} compares images: train on Visual{config.env}, or use --method oracle")
     auxiliary = make_auxiliary(config, env.observation_spec, env.action_size, env.frame_stack, networks.dtype)
     algorithm = make_ddpg(networks, config, resolved, auxiliary)
     replay = make_replay(config.replay_transitions, config.num_envs, env.horizon)
@@ -205,6 +201,7 @@ def make_train_step(env: GoalEnv, config: Config) -> TrainStep:
         train, replay_state = insert(loop.train, loop.replay, episodes, key, loop.iteration)
         train, metrics = update_many(train, replay_state, key, loop.iteration)
         metrics |= {f"train/{name}": jnp.mean(values) for name, values in outcome.items()}
+        metrics["train/value_at_goals"] = algorithm.value_at_goals(train, episodes.observations[:, -1])
         metrics["guard/nonfinite"] = _count_nonfinite((metrics, episodes.states, episodes.actions))
         return LoopState(train=train, replay=replay_state, key=loop.key, iteration=loop.iteration + 1), metrics
 

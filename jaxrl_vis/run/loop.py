@@ -275,7 +275,7 @@ class RunLoop:
         values = {name: self._per_seed(value) for name, value in jax.device_get(outcome).items()}
         if not all(np.isfinite(row).all() for row in values.values()):
             self._stop_nonfinite(f"the evaluation after iteration {self._done}", values)
-        means = metrics.mean_of(progress.since_evaluation)
+        means = metrics.with_precision(metrics.mean_of(progress.since_evaluation))
         times = {
             "time/wall_s": progress.wall_s + time.monotonic() - self._started,
             "time/compile_s": progress.compile_s,

@@ -1,9 +1,10 @@
 """metrics.jsonl, and the numbers that go into it. No JAX here: everything is plain Python by now.
 
 One line per seed and evaluation: seed, iteration, updates, env_steps (counts per seed, since the beginning), eval/*, the means
-of train/* since the last evaluation, resume/replay_lost_at (where a run went on from a light checkpoint: the last iteration at
-which its replay was lost), and time/wall_s (the run so far, with evaluation, compilation and what came before a
-resumption), time/compile_s (of that, compilation), time/env_steps_per_s (all seeds together, since the last evaluation).
+of train/* since the last evaluation and a quotient of two of them (`with_precision`), resume/replay_lost_at (where a run went
+on from a light checkpoint: the last iteration at which its replay was lost), and time/wall_s (the run so far, with evaluation,
+compilation and what came before a resumption), time/compile_s (of that, compilation), time/env_steps_per_s (all seeds together,
+since the last evaluation).
 """
 
 import json
@@ -37,6 +38,18 @@ def mean_of(history: Sequence[Mapping[str, Sequence[float]]]) -> PerSeed:
         ]
         for name in history[0]
     }
+
+
+def with_precision(means: PerSeed) -> PerSeed:
+    """``means`` with the precision of the filter: the share of what it has dropped that truly was false; NaN for nothing.
+
+    The quotient is taken of means, not the mean of quotients: so it is the share among all that was dropped.
+    """
+    if "train/filtered_false_share" not in means:
+        return means
+    pairs = zip(means["train/filtered_false_share"], means["train/filtered_share"], strict=True)
+    precision = [_nine_digits(false / dropped) if dropped > 0.0 else math.nan for false, dropped in pairs]
+    return {**means, "train/filter_precision": precision}
 
 
 def _nine_digits(value: float) -> float:

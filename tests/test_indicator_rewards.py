@@ -1,0 +1,240 @@
+"""Learning without ground truth: rewards made of observations, their diagnostics, and what disturbs them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probe_environments as probes
+import pytest
+from test_ddpg import DISCOUNT, trained
+
+from jaxrl_vis.config import preset, resolve, validate
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.learner import diagnostics, reward_errors
+from jaxrl_vis.learner.latent_reward import cosine_reward
+from jaxrl_vis.learner.rollout import add_noise
+from jaxrl_vis.learner.sampling import Choice, Sampler
+from jaxrl_vis.learner.train_step import make_train_step
+from jaxrl_vis.run.metrics import with_precision
+from jaxrl_vis_envs import goals
+
+BEST = 1.0 / (1.0 - DISCOUNT)
+
+
+class StaysPut(probes.SeenGoWhereTold):
+    """The point stays where it starts; the goal is there, or on the other side."""
+
+    def start(self, key):
+        place_key, side_key = jax.random.split(key)
+        position = jax.random.uniform(place_key, (1,), minval=0.4, maxval=0.9)
+        return position, jnp.where(jax.random.bernoulli(side_key), position, -position)
+
+    def move(self, position, action):
+        return position
+
+
+# -- The autoencoder
+
+
+def test_an_autoencoder_pays_for_likeness_and_its_return_is_in_q():
+    """At the goal, Q is that of a reward of 1 for ever; across the image, where it looks different, less; never below 0."""
+    program, train, metrics = trained(StaysPut(), method="autoencoder", iterations=25)
+    networks = program.networks
+    see = jax.vmap(probes.SeenGoWhereTold().see)
+    places = see(jnp.linspace(0.45, 0.85, 8)[:, None])
+    other = see(jnp.linspace(-0.45, -0.85, 8)[:, None])
+
+    def values(goal_images):
+        latents = [networks.encode(train.critic, networks.prepare(train.normalizer, each)) for each in (places, goal_images)]
+        return np.asarray(networks.value(train.critic, jnp.stack(latents), jnp.zeros((8, 1))))
+
+    np.testing.assert_allclose(values(places), BEST, atol=0.35)
+    assert np.all(values(other) < 0.75 * BEST) and np.all(values(other) > -0.35)
+    assert abs(metrics["train/value_at_goals"][0] - BEST) < 0.35
+    assert (program.resolved.target_minimum, program.resolved.target_maximum) == (0.0, BEST)
+
+
+def test_an_autoencoder_learns_to_reconstruct():
+    _, _, early = trained(StaysPut(), method="autoencoder", iterations=1, updates_per_iteration=1)
+    _, train, late = trained(StaysPut(), method="autoencoder", iterations=25)
+    assert late["train/autoencoder_loss"][0] < 0.5 * early["train/autoencoder_loss"][0]
+    assert set(train.autoencoder.params) == {"encoder", "decoder"}
+
+
+def test_likeness_is_a_cosine_that_is_cut_off_at_a_right_angle():
+    latents = jnp.array([[3.0, 0.0], [1.0, 1.0], [0.0, 2.0], [-1.0, 0.0], [0.0, 0.0]])
+    goal = jnp.array([[0.5, 0.0]])
+    np.testing.assert_allclose(cosine_reward(latents, goal), [1.0, np.sqrt(0.5), 0.0, 0.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(cosine_reward(latents[:1], goal, 1.0, -1.0), [1.0])
+    gradient = jax.grad(lambda latents: jnp.sum(cosine_reward(latents, goal)))(latents)
+    assert not np.any(gradient)
+
+
+def test_other_methods_carry_no_autoencoder():
+    loop = jax.eval_shape(make_train_step(StaysPut(), preset("debug")).init, jax.random.key(0)[None])
+    assert loop.train.autoencoder is None
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"method": "autoencoder", "random_shift": 2}, "random_shift and method autoencoder exclude each other"),
+        ({"method": "autoencoder", "normalizers": "separate"}, "normalizers separate and method autoencoder"),
+        ({"method": "autoencoder", "n_step": 2}, "n_step reads true states, which method autoencoder does without"),
+        ({"method": "indicator", "reward_noise": 0.1}, "reward_noise reads true states, which method indicator does without"),
+        ({"reward_noise": 0.1, "n_step": 2}, "n_step 2 and reward_noise exclude each other"),
+        ({"reward_false_positives": 1.5}, "reward_false_positives is a share"),
+        ({"reward_noise": -1.0}, "reward_noise must be at least 0"),
+        ({"observation_noise": -1.0}, "observation_noise must be at least 0"),
+        ({"reward_clutter": 0.5}, "there are none: set reward_false_positives or reward_false_negatives"),
+        ({"reward_clutter": 0.2, "reward_false_positives": 0.3}, r"cannot exceed reward_clutter \(0.2\)"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_in_one_line(options, said):
+    with pytest.raises(RequestError, match=said) as caught:
+        validate(preset("debug", **options))
+    assert "\n" not in str(caught.value)
+
+
+def test_an_autoencoder_needs_images():
+    with pytest.raises(RequestError, match="method autoencoder encodes images.*use --method indicator"):
+        make_train_step(probes.GoWhereTold(), preset("debug", env="Reacher", method="autoencoder"))
+
+
+# -- State vectors
+
+
+def test_equality_of_state_vectors():
+    states = jnp.array([[0.0, 1.0], [0.0, 1.0], [2.0, 3.0]])
+    goal_states = jnp.array([[0.0, 1.0], [0.0, 1.5], [2.0, 3.0]])
+    np.testing.assert_array_equal(goals.indicator_reward(states, goal_states, num_axes=1), [1.0, -1.0, 1.0])
+
+
+def test_indicator_rewards_teach_from_state_vectors():
+    program, train, metrics = trained(
+        probes.GoWhereTold(), method="indicator_balance_filter", relabel_probability=0.9, iterations=25
+    )
+    outcome, _ = program.evaluate(jax.tree.map(lambda leaf: leaf[None], train), jax.random.key(11))
+    assert outcome["eval/success"][0] >= 0.95
+    assert abs(metrics["train/positive_share"][0] - (0.45 + 0.45 * 25 / 48)) < 0.03
+    assert metrics["train/false_positive_share"][0] == 0.0
+
+
+# -- Diagnostics
+
+
+def test_diagnostics_of_a_batch_that_can_be_counted():
+    reward = jnp.array([1.0, 1.0, -1.0, -1.0, -1.0, -1.0, -1.0, -1.0])
+    success = jnp.array([1.0, 0.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+    keep = jnp.array([1.0, 1.0, 0.0, 0.0, 1.0, 0.0, 1.0, 1.0])
+    found = diagnostics.of_rewards(reward, keep, 1.0, -1.0, success)
+    assert {name: round(float(value), 6) for name, value in found.items()} == {
+        "positive_share": 0.25,
+        "filtered_share": 0.5,  # 3 of 6 negatives
+        "false_positive_share": 0.25,  # 1 of 4 that are not there
+        "false_negative_share": 0.5,  # 3 of 6 negatives
+        "filtered_false_share": round(2 / 6, 6),
+    }
+    means = with_precision({f"train/{name}": [float(value), 0.0] for name, value in found.items()})
+    precision = means["train/filter_precision"]
+    assert precision[0] == pytest.approx(2 / 3) and np.isnan(precision[1])  # nothing was filtered
+
+
+def test_diagnostics_of_graded_rewards_count_what_is_paid():
+    found = diagnostics.of_rewards(
+        jnp.array([1.0, 0.5, 0.25, 0.0]), jnp.ones(4), 1.0, 0.0, jnp.array([1.0, 0.0, 0.0, 1.0]), graded=True
+    )
+    assert found["positive_share"] == 0.4375 and found["false_positive_share"] == 0.375
+    assert found["false_negative_share"] == pytest.approx(1 / 2.25)
+
+
+def test_diagnostics_without_the_truth_say_nothing_of_it():
+    found = diagnostics.of_rewards(jnp.array([0.0, -1.0]), jnp.ones(2), 0.0, -1.0)
+    assert set(found) == {"positive_share", "filtered_share"}
+
+
+# -- Estimators that err
+
+
+def spread(count=20_000):
+    keys = jax.random.split(jax.random.key(2))
+    return tuple(jax.random.uniform(key, (count, 3), minval=-1.0, maxval=1.0) for key in keys)
+
+
+def test_noise_on_the_estimate_has_its_deviation_and_is_the_same_every_time():
+    states, _ = spread()
+    error = np.asarray(reward_errors.estimate(states, 0.05) - states)
+    assert abs(error.std() - 0.05) < 0.001 and abs(error.mean()) < 0.001
+    assert np.abs(np.corrcoef(error.T) - np.eye(3)).max() < 0.03
+    again = reward_errors.estimate(states[::-1], 0.05)[::-1]
+    np.testing.assert_array_equal(states + error, again)
+
+
+@pytest.mark.parametrize("clutter", [1.0, 0.25])
+def test_false_rewards_have_their_shares_where_they_belong(clutter):
+    states, goal_states = spread()
+    end = None if clutter == 1.0 else reward_errors.find_clutter_end(goal_states, jnp.int32(20_000), clutter)
+    for is_positive, share in ((jnp.zeros(20_000, bool), 0.1), (jnp.ones(20_000, bool), 0.2)):
+        flipped = reward_errors.flip(is_positive, states, goal_states, 0.1, 0.2, clutter, end)
+        is_false = np.asarray(flipped != is_positive)
+        assert abs(is_false.mean() - share) < 0.01
+        if clutter < 1.0:
+            assert np.asarray(states)[is_false, 0].max() < -0.45  # the lowest quarter of -1 to 1
+        np.testing.assert_array_equal(flipped, reward_errors.flip(is_positive, states, goal_states, 0.1, 0.2, clutter, end))
+
+
+def test_the_clutter_ends_where_the_share_of_stored_goals_does():
+    stored = jnp.array([[3.0], [1.0], [2.0], [4.0], [-9.0], [-9.0]])  # two were never written
+    assert reward_errors.find_clutter_end(stored, jnp.int32(4), 0.5) == 3.0
+
+
+def test_errors_of_the_estimator_show_in_the_diagnostics():
+    options = {"reward_false_positives": 0.1, "reward_false_negatives": 0.2, "reward_clutter": 0.5, "relabel_probability": 0.9}
+    config = preset("debug", num_envs=256, updates_per_iteration=20, batch_size=512, **options)
+    program = make_train_step(probes.GoWhereTold(), config)
+    _, metrics = program.train_iteration(program.init(jax.random.key(3)[None]))
+    assert abs(metrics["train/false_positive_share"][0] - 0.1) < 0.03
+    true_share = metrics["train/positive_share"][0]  # of what is there, about a fifth is not paid
+    assert 0.0 < metrics["train/false_negative_share"][0] < 0.25 * true_share / (1.0 - true_share)
+
+
+# -- A noisy camera
+
+
+class StillImage(probes.SeenGoWhereTold):
+    """Nothing moves, so that without noise all frames are equal."""
+
+    def start(self, key):
+        return jnp.zeros(1), jnp.zeros(1)
+
+    def move(self, position, action):
+        return position
+
+
+@pytest.mark.parametrize("noise", [0.0, 8.0])
+def test_noisy_frames_equal_themselves_and_no_others(noise):
+    env = StillImage()
+    config = preset("debug", method="indicator", num_envs=4, batch_size=4 * env.horizon, observation_noise=noise)
+    program = make_train_step(env, config)
+    loop = jax.jit(program.init)(jax.random.key(0)[None])
+    episodes, _ = program.rollout(loop.train, jax.random.key(1)[None])
+    assert episodes.observations.dtype == jnp.uint8
+    frames = np.asarray(episodes.observations[0]).reshape(-1, 64)
+    assert len(np.unique(frames, axis=0)) == (1 if noise == 0.0 else len(frames))
+    state = program.replay.of_rollout(jax.tree.map(lambda leaf: leaf[0], episodes))
+    sampler = Sampler(config, resolve(config, env.horizon), program.replay, env.threshold)
+    choice = sampler.choose(state, jax.random.key(2), jnp.int32(0))
+    own = Choice(choice.indices, choice.indices.time + 1)
+    later = Choice(choice.indices, choice.indices.time + 2)
+    np.testing.assert_array_equal(sampler.batch(state, own).reward, 1.0)
+    np.testing.assert_array_equal(sampler.batch(state, later).reward, 1.0 if noise == 0.0 else -1.0)
+
+
+def test_noise_has_its_deviation_and_stays_in_range():
+    grey = jnp.full((4, 1, 64, 64), 100, jnp.uint8)
+    noisy = add_noise(jax.random.key(0), grey, 5.0)
+    assert noisy.dtype == jnp.uint8
+    assert abs(np.asarray(noisy, np.float32).std() - 5.0) < 0.1 and abs(np.asarray(noisy, np.float32).mean() - 100.0) < 0.2
+    dark = np.asarray(add_noise(jax.random.key(0), jnp.zeros_like(grey), 5.0))
+    assert dark.max() < 40  # clipped at 0, not wrapped around
+    states = add_noise(jax.random.key(0), jnp.zeros((1000, 3)), 0.1)
+    assert states.dtype == jnp.float32 and abs(np.asarray(states).std() - 0.1) < 0.01
