@@ -35,27 +35,37 @@ class StaysPut(probes.SeenGoWhereTold):
 # -- The autoencoder
 
 
-def test_an_autoencoder_pays_for_likeness_and_its_return_is_in_q():
-    """At the goal, Q is that of a reward of 1 for ever; across the image, where it looks different, less; never below 0."""
-    program, train, metrics = trained(StaysPut(), method="autoencoder", iterations=25)
+@pytest.fixture(scope="module")
+def with_autoencoder():
+    return trained(StaysPut(), method="autoencoder", iterations=25)
+
+
+def test_the_return_of_an_autoencoder_is_in_q(with_autoencoder):
+    """Nothing moves, so Q is the likeness of point and goal, paid for ever: 1 for equal ones, less across the image."""
+    program, train, metrics = with_autoencoder
     networks = program.networks
     see = jax.vmap(probes.SeenGoWhereTold().see)
-    places = see(jnp.linspace(0.45, 0.85, 8)[:, None])
-    other = see(jnp.linspace(-0.45, -0.85, 8)[:, None])
+    points = see(jnp.linspace(0.45, 0.85, 8)[:, None])
 
-    def values(goal_images):
-        latents = [networks.encode(train.critic, networks.prepare(train.normalizer, each)) for each in (places, goal_images)]
-        return np.asarray(networks.value(train.critic, jnp.stack(latents), jnp.zeros((8, 1))))
+    def values_and_rewards(goal_images):
+        inputs = [networks.prepare(train.normalizer, each) for each in (points, goal_images)]
+        latents = jnp.stack([networks.encode(train.critic, each) for each in inputs])
+        rewards = cosine_reward(*(networks.encode(train.autoencoder.params, each) for each in inputs))
+        return np.asarray(networks.value(train.critic, latents, jnp.zeros((8, 1)))), np.asarray(rewards)
 
-    np.testing.assert_allclose(values(places), BEST, atol=0.35)
-    assert np.all(values(other) < 0.75 * BEST) and np.all(values(other) > -0.35)
+    values, rewards = values_and_rewards(points)
+    np.testing.assert_allclose(rewards, 1.0, atol=1e-5)
+    np.testing.assert_allclose(values, BEST, atol=0.35)
+    values, rewards = values_and_rewards(see(jnp.linspace(-0.45, -0.85, 8)[:, None]))
+    assert rewards.min() < 0.5  # there are unlike ones among them
+    np.testing.assert_allclose(values, BEST * rewards, atol=0.5)
     assert abs(metrics["train/value_at_goals"][0] - BEST) < 0.35
     assert (program.resolved.target_minimum, program.resolved.target_maximum) == (0.0, BEST)
 
 
-def test_an_autoencoder_learns_to_reconstruct():
-    _, _, early = trained(StaysPut(), method="autoencoder", iterations=1, updates_per_iteration=1)
-    _, train, late = trained(StaysPut(), method="autoencoder", iterations=25)
+def test_an_autoencoder_learns_to_reconstruct(with_autoencoder):
+    program, train, late = with_autoencoder
+    _, early = program.train_iteration(program.init(jax.random.key(7)[None]))
     assert late["train/autoencoder_loss"][0] < 0.5 * early["train/autoencoder_loss"][0]
     assert set(train.autoencoder.params) == {"encoder", "decoder"}
 
@@ -215,7 +225,7 @@ def test_noisy_frames_equal_themselves_and_no_others(noise):
     env = StillImage()
     config = preset("debug", method="indicator", num_envs=4, batch_size=4 * env.horizon, observation_noise=noise)
     program = make_train_step(env, config)
-    loop = jax.jit(program.init)(jax.random.key(0)[None])
+    loop = program.init(jax.random.key(0)[None])
     episodes, _ = program.rollout(loop.train, jax.random.key(1)[None])
     assert episodes.observations.dtype == jnp.uint8
     frames = np.asarray(episodes.observations[0]).reshape(-1, 64)
