@@ -11,11 +11,13 @@ NOTEBOOKS = sorted((Path(__file__).resolve().parents[1] / "notebooks").glob("*.i
 SHOWN = {
     "01_quickstart": (3, 1),  # start and goal; the curve; an episode of the policy
     "02_new_environment": (2, 1),  # start and goals; the curve
+    "03_indicator_rewards": (3, 0),  # which frames count as equal; curves; diagnostics
     "04_auxiliary_losses": (1, 0),  # errors and weights
 }
 SAID = {
     "01_quickstart": ("of goals reached at the end", "of 64 goals reached"),
     "02_new_environment": ("of goals reached at the end", "eval/success"),  # `eval` finds the task by what the run folder says
+    "03_indicator_rewards": ("oracle  ", "indicator_balance_filter", "of goals reached"),
     "04_auxiliary_losses": ("OL-AUX-5           error on unseen inputs",),
 }
 
