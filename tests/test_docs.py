@@ -200,30 +200,34 @@ from jaxrl_vis import cli
 from jaxrl_vis.cli.parsing import parse
 from jaxrl_vis.cli.train import Train, training_config
 from jaxrl_vis.config import preset, resolve, validate
-from jaxrl_vis.learner import ddpg, losses
+from jaxrl_vis.learner import ddpg
+from jaxrl_vis.learner.auxtasks import Targets
 from jaxrl_vis.learner.networks import Networks
 from jaxrl_vis.learner.sampling import Sampler
 from jaxrl_vis.methods import METHODS
 from jaxrl_vis.types import Batch
 
-for words in {lines!r}:
-    config = validate(training_config(parse(Train, words[2:])))
+configs = [validate(training_config(parse(Train, words[2:]))) for words in {lines!r}]
+config = next(config for config in configs if config.method == "indicator_balance")
 resolved = resolve(config, 50)
-assert config.method == "indicator_balance" and resolved.balance_probability == 0.5
+assert resolved.balance_probability == 0.5
 
 images = jnp.zeros((3, 2, 1, 20, 20), jnp.uint8).at[2, :, 0, 0, 0].set(jnp.array([1, 0], jnp.uint8)).at[2, 1].set(9)
 batch = Batch(images, jnp.zeros((2, 2)), jnp.zeros((2, 2)), jnp.zeros((2, 2)))
 METHODS["indicator_balance"] = dataclasses.replace(METHODS["indicator_balance"], reward="nearly_equal")
 assert Sampler(config, resolved, None, 0.1).reward(batch, images[2]).tolist() == [1.0, -1.0]
 
-config = preset("debug", compute_dtype="float32")
-networks = Networks(config, jax.ShapeDtypeStruct((3,), jnp.float32), 2, 0.0)
+(asked,) = [config for config in configs if config.aux_tasks == ("latent_size",)]
+weights = {{name: getattr(asked, name) for name in ("aux_tasks", "weighting", "weighting_fixed")}}
+config = preset("debug", compute_dtype="float32", **weights)
+networks = Networks(config, jax.ShapeDtypeStruct((1, 20, 20), jnp.uint8), 2, 0.0)
 algorithm = ddpg.make_ddpg(networks, config, resolved)
 def one_step(key):
-    batch = Batch(jnp.zeros((3, 2, 3)), jnp.zeros((2, 2)), jnp.zeros((2, 2)), jnp.zeros((2, 2)), jnp.zeros(2))
-    gradients, metrics = algorithm.gradients(algorithm.begin(algorithm.init(key)), batch)
-    assert metrics["train/latent_size_loss"].shape == () and set(gradients.critic) == {{"main", "latent_size"}}
-    return ddpg.combine(gradients, {{"latent_size": jnp.float32(0.01)}})
+    batch = Batch(images, jnp.zeros((2, 2)), jnp.zeros((2, 2)), jnp.zeros((2, 2)), jnp.zeros(2), targets=Targets())
+    working = algorithm.begin(algorithm.init(key))
+    gradients, metrics = algorithm.gradients(working, batch, True)
+    assert metrics["train/loss/latent_size"].shape == ()
+    return algorithm.end(algorithm.apply(working, gradients))
 
 
 jax.eval_shape(one_step, jax.random.key(0))

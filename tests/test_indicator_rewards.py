@@ -9,12 +9,13 @@ from test_ddpg import DISCOUNT, trained
 
 from jaxrl_vis.config import preset, resolve, validate
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner import diagnostics, reward_errors
-from jaxrl_vis.learner.latent_reward import cosine_reward
+from jaxrl_vis.learner import diagnostics, normalizer, reward_errors
+from jaxrl_vis.learner.latent_reward import cosine_reward, make_latent_reward
 from jaxrl_vis.learner.rollout import add_noise
 from jaxrl_vis.learner.sampling import Choice, Sampler
 from jaxrl_vis.learner.train_step import make_train_step
 from jaxrl_vis.run.metrics import with_precision
+from jaxrl_vis.types import Batch
 from jaxrl_vis_envs import goals
 
 BEST = 1.0 / (1.0 - DISCOUNT)
@@ -77,6 +78,31 @@ def test_likeness_is_a_cosine_that_is_cut_off_at_a_right_angle():
     np.testing.assert_allclose(cosine_reward(latents[:1], goal, 1.0, -1.0), [1.0])
     gradient = jax.grad(lambda latents: jnp.sum(cosine_reward(latents, goal)))(latents)
     assert not np.any(gradient)
+
+
+def test_stacked_images_are_compared_as_goals():
+    """What was reached moved, and the goal stands still: alike in the newest image, they are alike."""
+
+    class Stacked(StaysPut):
+        frame_stack = 2
+
+        def see(self, position):
+            return self.as_goal(jnp.tile(super().see(position), (2, 1, 1)))
+
+    env, size = Stacked(), 3
+    program = make_train_step(env, preset("debug", method="autoencoder"))
+    networks, resolved = program.networks, program.resolved
+    latent_reward = make_latent_reward(networks, program.config, resolved, env.frame_stack)
+    assert latent_reward is not None
+    train = jax.tree.map(lambda leaf: leaf[0], program.init(jax.random.key(0)[None]).train)
+    moving = jax.random.bits(jax.random.key(1), (size, 2, 8, 8), jnp.uint8)
+    reached = jax.vmap(env.as_goal)(moving)
+    batch = Batch(jnp.stack([moving, reached, moving]), jnp.zeros((size, 1)), jnp.zeros((size, 1)), jnp.zeros((size, 1)))
+    train = train.replace(normalizer=normalizer.update(train.normalizer, batch.observations))
+    inputs = networks.prepare_batch(train, batch)
+    found = latent_reward.of_batch(train, inputs, batch.replace(reached=reached))
+    np.testing.assert_allclose(found.reward, 1.0, atol=1e-5)
+    assert np.all(latent_reward.of_batch(train, inputs, batch).reward < 0.999)
 
 
 def test_other_methods_carry_no_autoencoder():
