@@ -1,0 +1,408 @@
+"""Families of fields: what is drawn for every plot, and how far it varies. Loads neither JAX nor MuJoCo.
+
+    TRAINING                        what networks learn on
+    shift(TRAINING, "flash", ...)   the same with some of the factors in `SHIFTS` moved; SHIFTED has them all
+    read(path)                      a family from a JSON or TOML file: TRAINING, with the values of the file in its place
+
+A range (low, high) is drawn uniformly, a mean with an sd normally. Lengths are in metres and angles in degrees unless the name says
+otherwise. Sources: the thesis, section 3.3 (33 stalks on 2.134 m, 0.8 m away, 8 mm lens, 9 megapixels, 14.354 mm at 12 inches,
+0.405 mm of taper per inch), and published traits of grain sorghum for what it does not state (leaves, tillers, spread).
+"""
+
+import dataclasses
+import json
+import math
+import numbers
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from jaxrl_vis_envs.names import nearest
+
+Range = tuple[float, float]
+INCH = 0.0254
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """Where plants stand."""
+
+    plot_length: float = 2.134
+    """Length of a plot along the row, m; plots end at alleys, in which nothing grows."""
+    stalks_mean: float = 33.0
+    """Stalks of the near row in a plot, tillers included."""
+    stalks_sd: float = 6.0
+    """Standard deviation of their number."""
+    spacing_minimum: float = 0.028
+    """Least distance between plants, m."""
+    spacing_shape: float = 1.6
+    """Shape of the gamma distribution of what a distance has above the least."""
+    offset_sd: float = 0.025
+    """Standard deviation of the distance from the row's middle line, m."""
+    tillers: float = 0.2
+    """Share of stalks that are tillers, within `clump_radius` of their mother."""
+    clump_radius: float = 0.03
+    """Greatest distance of a tiller from its mother, m."""
+    gaps: float = 0.04
+    """Share of distances that are a missing stretch."""
+    gap_length: float = 0.25
+    """Length of a missing stretch, m."""
+    row_spacing: float = 0.762
+    """Distance between rows, m."""
+    rows_behind: int = 2
+    """Rows that stand behind the near one."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Stalks:
+    """Shape of the stalks."""
+
+    height: Range = (2.1, 2.6)
+    """Length of a stalk, m."""
+    diameter_mean: float = 0.014354
+    """Mean diameter 12 inches above the ground, m."""
+    diameter_sd: float = 0.0032
+    """Its standard deviation over stalks, m."""
+    diameter_least: float = 0.006
+    """Least diameter there, m."""
+    taper: float = 0.405e-3 / INCH
+    """Loss of diameter between 12 and 24 inches for a stalk of mean diameter, m per m."""
+    taper_spread: float = 0.25
+    """Its coefficient of variation."""
+    lean_sd: Range = (4.0, 4.0)
+    """Standard deviation of a plot's leans at the ground in both directions, degrees."""
+    lean_most: float = 20.0
+    """Greatest lean, degrees."""
+    curvature_sd: float = 0.06
+    """Standard deviation of the curvature, 1/m."""
+    zigzag: float = 0.8
+    """Standard deviation of the change of direction at a node, degrees."""
+    node_spacing: Range = (0.08, 0.20)
+    """Distance between nodes, m."""
+    node_swelling: Range = (0.05, 0.15)
+    """By how much a node is thicker than the stalk, of its diameter."""
+    ovality: Range = (1.0, 1.2)
+    """Greatest over least diameter of a cross section."""
+    sheaths: float = 0.6
+    """Share of nodes whose leaf sheath is still there, wrapped around the stalk above it."""
+    sheath_length: Range = (0.06, 0.16)
+    """Length of a sheath, m."""
+    sheath_thickness: Range = (0.2e-3, 0.6e-3)
+    """Thickness of a sheath, m; the diameter over it is larger by twice as much."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Leaves:
+    """Leaves, dry ones included."""
+
+    density: float = 1.0
+    """Multiplies the expected number of leaves."""
+    lower: float = 0.22
+    """Leaves per node below 0.3 m."""
+    middle: float = 0.34
+    """Leaves per node from 0.3 to 0.8 m."""
+    upper: float = 0.8
+    """Leaves per node above 0.8 m."""
+    dry: float = 0.75
+    """Share of dry leaves below 0.8 m; a third of it above."""
+    length_mean: float = 0.636
+    """Mean length of a green leaf, m."""
+    length_sd: float = 0.098
+    """Its standard deviation, m."""
+    width_mean: float = 0.07
+    """Mean width of a green leaf, m."""
+    width_sd: float = 0.012
+    """Its standard deviation, m."""
+    angle_mean: float = 45.0
+    """Mean angle between leaf and stalk, degrees."""
+    angle_sd: float = 10.7
+    """Its standard deviation, degrees."""
+    droop: Range = (50.0, 130.0)
+    """By how much a green leaf bends towards the ground along its length, degrees."""
+    litter: float = 60.0
+    """Pieces of dry leaf on the ground per m of row."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Textures:
+    """What surfaces look like; every plant draws its own values."""
+
+    stalk_hue: Range = (0.085, 0.19)
+    """Hue of stalks, of the colour circle: 0.08 is straw, 0.25 is green."""
+    leaf_hue: Range = (0.20, 0.27)
+    """Hue of green leaves."""
+    dry_hue: Range = (0.07, 0.11)
+    """Hue of dry leaves and sheaths."""
+    soil_hue: Range = (0.05, 0.08)
+    """Hue of the ground."""
+    fibre_pitch: Range = (0.7e-3, 1.4e-3)
+    """Distance between fibres, m."""
+    fibre_contrast: Range = (0.10, 0.25)
+    """How much darker the gaps between fibres are, of 1."""
+    blotch_size: Range = (0.006, 0.02)
+    """Size of blotches, m."""
+    blotch_contrast: Range = (0.15, 0.45)
+    """How much darker blotches are, of 1."""
+    speckles: Range = (0.0, 0.3)
+    """Share of the surface with small dark speckles."""
+    speckle_size: Range = (0.8e-3, 1.6e-3)
+    """Size of speckles, m."""
+    bands: Range = (0.0, 0.15)
+    """Contrast of bands across stalks and leaves, of 1."""
+    band_pitch: Range = (0.02, 0.05)
+    """Distance between bands, m."""
+    bloom: Range = (0.1, 0.5)
+    """Share of a stalk with a bright waxy bloom."""
+    gloss: Range = (0.03, 0.12)
+    """Strength of the highlight."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Rig:
+    """The two cameras, and how they pass the plants."""
+
+    width: int = 3376
+    """Width of an image, pixels."""
+    height: int = 2704
+    """Height of an image, pixels."""
+    focal: float = 2168.0
+    """Nominal focal length, pixels."""
+    baseline: float = 0.1
+    """Nominal distance between the cameras, m."""
+    stated_spread: float = 0.0
+    """Largest deviation of focal length and baseline from their nominal values, of 1; the calibration states it."""
+    calibration_error: float = 0.0
+    """Size of the error of stated focal length and stated baseline, of 1; its sign is drawn, and the calibration does not state it."""
+    rectification_error: float = 0.2
+    """Standard deviation of the vertical offset between rectified images, pixels at full width."""
+    distance: float = 0.8
+    """Mean distance from the cameras to the row, m."""
+    distance_sd: float = 0.015
+    """Its standard deviation over plots, m."""
+    camera_height: float = 0.42
+    """Mean height of the cameras, m."""
+    camera_height_sd: float = 0.015
+    """Its standard deviation over plots, m."""
+    wobble: float = 0.004
+    """Standard deviation of height and distance from image to image, m."""
+    pitch_sd: float = 0.7
+    """Standard deviation of the pitch over plots, degrees."""
+    frames: int = 34
+    """Pairs of a plot."""
+    speed: float = 0.05
+    """Speed of the robot, m/s."""
+    odometry_noise: Range = (0.01, 0.03)
+    """Error of the odometry's scale, of 1; its sign is drawn."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Imaging:
+    """Flash, lens and sensor."""
+
+    flash: Range = (0.92, 1.08)
+    """Strength of the flash."""
+    exposure_spread: float = 0.04
+    """Standard deviation of the brightness from image to image, of 1."""
+    ambient: float = 0.004
+    """Light that does not come from the flash, of what a white surface at the row's distance has from it."""
+    vignetting: float = 0.35
+    """Loss of light in the corners, of 1."""
+    blur: Range = (0.5, 1.0)
+    """Standard deviation of the point spread function, pixels at full width."""
+    full_well: float = 9000.0
+    """Electrons of a white pixel."""
+    read_noise: float = 12.0
+    """Standard deviation of the sensor's own noise, electrons."""
+    noise: float = 1.0
+    """Multiplies the standard deviation of all noise."""
+    samples: int = 4
+    """Rays a pixel: 1 or 4."""
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _check_range(label: str, value: Any) -> None:
+    low, high = value if isinstance(value, tuple) else (value, value)
+    if not (_is_number(low) and _is_number(high)) or low < 0:
+        raise ValueError(f"{label} must be finite and at least 0, got {value}")
+    if low > high:
+        raise ValueError(f"{label} must run from low to high, got {value}")
+
+
+def _least(family: Any, part: str, **bounds: float) -> None:
+    for name, bound in bounds.items():
+        value = getattr(getattr(family, part), name)
+        if (value[0] if isinstance(value, tuple) else value) < bound:
+            raise ValueError(f"{part}.{name} must be at least {bound}, got {value}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Family:
+    """A distribution of plots. Equal families with equal seeds give equal plots.
+
+    Raises:
+        ValueError: A value is out of range; the message names the field.
+    """
+
+    name: str = "training"
+    """What the family is called."""
+    stream: int = 1
+    """Families of different streams share no random numbers, whatever their seeds."""
+    layout: Layout = Layout()
+    """Where plants stand."""
+    stalks: Stalks = Stalks()
+    """Their stalks."""
+    leaves: Leaves = Leaves()
+    """Their leaves."""
+    textures: Textures = Textures()
+    """Their surfaces."""
+    rig: Rig = Rig()
+    """The cameras."""
+    imaging: Imaging = Imaging()
+    """Light and sensor."""
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            part = getattr(self, field.name)
+            if dataclasses.is_dataclass(part):
+                for each in dataclasses.fields(part):
+                    _check_range(f"{field.name}.{each.name}", getattr(part, each.name))
+        _least(self, "layout", plot_length=0.1, stalks_mean=0, spacing_minimum=0.005, spacing_shape=0.1, row_spacing=0.2)
+        _least(self, "stalks", diameter_least=0.001, node_spacing=0.04, ovality=1.0, height=0.3)
+        _least(self, "leaves", length_mean=0.05, width_mean=0.002)
+        _least(self, "textures", fibre_pitch=1e-4, blotch_size=1e-3, speckle_size=2e-4, band_pitch=1e-3)
+        _least(self, "rig", width=32, height=32, focal=16.0, baseline=0.005, distance=0.3, camera_height=0.05, frames=1, speed=1e-3)
+        _least(self, "imaging", flash=0.01, full_well=10.0)
+        if self.imaging.samples not in (1, 4):
+            raise ValueError(f"imaging.samples must be 1 or 4, got {self.imaging.samples}")
+
+    def at_width(self, width: int) -> "Family":
+        """The same cameras with fewer or more pixels: images ``width`` pixels wide that show the same."""
+        scale = width / self.rig.width
+        height = max(round(self.rig.height * scale), 1)
+        rig = dataclasses.replace(self.rig, width=width, height=height, focal=self.rig.focal * scale)
+        return dataclasses.replace(self, rig=rig)
+
+
+_UNSEEN = Textures(
+    stalk_hue=(0.045, 0.085),
+    leaf_hue=(0.155, 0.195),
+    dry_hue=(0.035, 0.065),
+    soil_hue=(0.085, 0.11),
+    fibre_pitch=(1.6e-3, 2.8e-3),
+    fibre_contrast=(0.28, 0.45),
+    blotch_size=(0.025, 0.05),
+    blotch_contrast=(0.46, 0.6),
+    speckles=(0.35, 0.6),
+    speckle_size=(1.8e-3, 3.0e-3),
+    bands=(0.18, 0.35),
+    band_pitch=(0.006, 0.015),
+    bloom=(0.0, 0.08),
+    gloss=(0.14, 0.25),
+)
+
+# Factor -> changes of the training family, by part.
+SHIFTS: dict[str, dict[str, dict[str, Any]]] = {
+    "flash": {"imaging": {"flash": (0.6, 1.6)}},
+    "lean": {"stalks": {"lean_sd": (4.0, 8.0)}},
+    "rig": {"rig": {"stated_spread": 0.05, "calibration_error": 0.005}},
+    "noise": {"imaging": {"noise": 2.0}},
+    "leaves": {"leaves": {"density": 1.3}},
+    "textures": {"textures": {each.name: getattr(_UNSEEN, each.name) for each in dataclasses.fields(_UNSEEN)}},
+}
+
+TRAINING = Family()
+
+
+def shift(family: Family, *factors: str, name: str = "", stream: int = 0) -> Family:
+    """The family with some factors moved.
+
+    Args:
+        family: Where to start from.
+        factors: Names in `SHIFTS`.
+        name: Of the result; the factors' names if not given.
+        stream: Of the result; if not given, one that depends on the factors, and is never that of ``family``.
+
+    Raises:
+        ValueError: There is no such factor.
+    """
+    for factor in factors:
+        if factor not in SHIFTS:
+            raise ValueError(f"there is no shift of {factor!r}{nearest(factor, SHIFTS)}")
+        for part, changes in SHIFTS[factor].items():
+            family = dataclasses.replace(family, **{part: dataclasses.replace(getattr(family, part), **changes)})
+    places = sum(1 << list(SHIFTS).index(factor) for factor in set(factors))
+    return dataclasses.replace(family, name=name or "+".join(factors), stream=stream or 100 + places + 1000 * family.stream)
+
+
+SHIFTED = shift(TRAINING, *SHIFTS, name="shifted", stream=2)
+FAMILIES = {family.name: family for family in (TRAINING, SHIFTED)}
+
+
+def read(path: Path) -> Family:
+    """A family from a file: the fields of `Family`, parts as tables; what is missing is as in the family called ``base``.
+
+    Args:
+        path: JSON or, by its suffix, TOML.
+
+    Raises:
+        ValueError: The file cannot be read, or holds an unknown key or a bad value. One line that says which.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+        values = tomllib.loads(text) if path.suffix.lower() == ".toml" else json.loads(text)
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read: {error.strerror}") from error
+    except (UnicodeDecodeError, ValueError) as error:
+        kind = "TOML" if path.suffix.lower() == ".toml" else "JSON"
+        raise ValueError(f"{path} is not {kind} (write .toml or .json): {' '.join(str(error).split())}") from error
+    if not isinstance(values, dict):
+        raise ValueError(f"{path} must hold one table of a family's fields, like {{\"stalks\": {{\"lean_most\": 15}}}}")
+    base = values.pop("base", TRAINING.name)
+    if not isinstance(base, str) or base not in FAMILIES:
+        raise ValueError(f"{path}: base must be one of {', '.join(FAMILIES)}, got {base!r}")
+    # Its own random numbers, so that a file that repeats a family's values still draws other plots.
+    name = values.get("name", path.stem)
+    start = dataclasses.replace(FAMILIES[base], name=name, stream=10_000 + sum(map(ord, str(name))))
+    try:
+        return _changed("", start, values)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _changed(where: str, record: Any, values: dict[str, Any]) -> Any:
+    """A dataclass with the values of a table in place of its own."""
+    known = {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
+    changes = {}
+    for name, value in values.items():
+        label = f"{where}{name}"
+        if name not in known:
+            raise ValueError(f"unknown key {label!r}{nearest(name, known)}")
+        if dataclasses.is_dataclass(known[name]):
+            if not isinstance(value, dict):
+                raise ValueError(f"{label} must be a table, got {value!r}")
+            changes[name] = _changed(f"{label}.", known[name], value)
+        else:
+            changes[name] = _like(label, known[name], value)
+    return dataclasses.replace(record, **changes)
+
+
+def _like(label: str, example: Any, value: Any) -> Any:
+    """A value of the kind that the example is of."""
+    if isinstance(example, tuple):
+        if not isinstance(value, list | tuple) or len(value) != 2 or not all(map(_is_number, value)):
+            raise ValueError(f"{label} must be a range of two numbers, [low, high], got {value!r}")
+        return (float(value[0]), float(value[1]))
+    if isinstance(example, str):
+        if not isinstance(value, str) or not value:
+            raise ValueError(f"{label} must be a word, got {value!r}")
+        return value
+    if not _is_number(value):
+        raise ValueError(f"{label} must be a number, got {value!r}")
+    if isinstance(example, int):
+        if not float(value).is_integer():
+            raise ValueError(f"{label} must be a whole number, got {value!r}")
+        return int(value)
+    return float(value)
