@@ -1,7 +1,7 @@
 """Error of every estimator of width on ideal strips: `python benchmarks/strip_widths.py`.
 
-A strip is a rectangle of known width, drawn leaning at many sub-pixel places, as pixels whose middle it covers (hard) and as the share
-of each pixel that it covers (soft). The figure is the largest mean error over widths, the mean being over places.
+A strip is a rectangle of known width, drawn leaning at many sub-pixel places, as pixels whose middle it covers (hard) and as
+the share of each pixel that it covers (soft). The figure is the largest mean error over widths, the mean being over places.
 """
 
 import argparse
@@ -56,7 +56,10 @@ def strip(mask: np.ndarray) -> float | None:
 def table(places: int = 12, widths: tuple[float, ...] = (20.0, 27.5, 38.9)) -> list[str]:
     """Lines of a Markdown table."""
     estimators = {"strip": strip} | {f"ellipse, {fit}": lambda mask, fit=fit: ellipse_width(mask, fit) for fit in ELLIPSE_FITS}
-    lines = ["| estimator | mask | lean | " + " | ".join(f"L/W {ratio:g}" for ratio in RATIOS) + " |", "|---|---|---" + "|---" * len(RATIOS) + "|"]
+    lines = [
+        "| estimator | mask | lean | " + " | ".join(f"L/W {ratio:g}" for ratio in RATIOS) + " |",
+        "|---|---|---" + "|---" * len(RATIOS) + "|",
+    ]
     for name, estimate in estimators.items():
         for soft in (True, False) if name == "strip" else (False,):
             for lean in LEANS if name == "strip" else (0.0, 20.0):

@@ -4,8 +4,9 @@
          -> one straight line through each, deaf to outliers                `strip_width`
          -> their distance across the axis, at any line                     `Strip.width`
 
-An ellipse is wider than a strip of the same pixels: its minor axis overstates the width by up to 15 %, depending on how it is fitted
-(benchmarks/strip_widths.py prints by how much). Columns and lines are pixels, with (0, 0) in the middle of the first one.
+An ellipse is wider than a strip of the same pixels: its minor axis overstates the width by up to 15 %, depending on how it is
+fitted (benchmarks/strip_widths.py prints by how much). Columns and lines are pixels, with (0, 0) in the middle of the first
+one.
 """
 
 import dataclasses
@@ -20,7 +21,9 @@ ELLIPSE_FITS: tuple[EllipseFit, ...] = ("pixels", "pixels_direct", "contour", "c
 """Ways to fit an ellipse to a blob. ``pixels``, least squares over all its pixels, is what the thesis describes."""
 
 _LEAST_LINES = 8
-_NOISE = 0.35  # pixels: how far an edge of a perfect mask lies from the line through it (0.29, the error of rounding, and some more)
+_NOISE = (
+    0.35  # pixels: how far an edge of a perfect mask lies from the line through it (0.29, the error of rounding, and some more)
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,8 +79,8 @@ def line_edges(mask: np.ndarray, threshold: float = 0.5) -> tuple[np.ndarray, np
         threshold: What belongs to the stalk.
 
     Returns:
-        Lines [N] int64, and the columns of their left and right edges [N] float64. Lines in which a run touches the image's left or
-        right side are left out: the stalk goes on there.
+        Lines [N] int64, and the columns of their left and right edges [N] float64. Lines in which a run touches the image's
+        left or right side are left out: the stalk goes on there.
     """
     soft = np.asarray(mask, np.float32)
     inside = soft >= threshold
@@ -214,8 +217,8 @@ def ellipse_width(mask: np.ndarray, fit: EllipseFit = "pixels") -> float | None:
         fit: How an ellipse is fitted; see `ELLIPSE_FITS`.
 
     Returns:
-        Pixels; None where no blob has an ellipse that makes sense. Fits that come out wider than a blob of that area and length can
-        be, which OpenCV's do for some near-straight sets of points, are left out.
+        Pixels; None where no blob has an ellipse that makes sense. Fits that come out wider than a blob of that area and length
+        can be, which OpenCV's do for some near-straight sets of points, are left out.
     """
     inside = (np.asarray(mask, np.float32) >= 0.5).astype(np.uint8)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(inside, connectivity=8)

@@ -1,9 +1,9 @@
 """The two cameras: where they are, what they see, and what their calibration says of them. NumPy only.
 
-Camera frame: x to the right of the image, y down, z forwards. The cameras look along the world's y axis and move along its x axis;
-the right one stands a baseline further along. Both are rectified: a point at (X, Y, Z) in the left camera's frame is seen at column
-centre + f X / Z in the left image and a disparity f B / Z further left in the right one, in the same line but for a small error.
-Pixel (column 0, line 0) has its middle at (0.0, 0.0).
+Camera frame: x to the right of the image, y down, z forwards. The cameras look along the world's y axis and move along its x
+axis; the right one stands a baseline further along. Both are rectified: a point at (X, Y, Z) in the left camera's frame is seen
+at column centre + f X / Z in the left image and a disparity f B / Z further left in the right one, in the same line but for a
+small error. Pixel (column 0, line 0) has its middle at (0.0, 0.0).
 """
 
 import dataclasses
@@ -17,13 +17,15 @@ from jaxrl_vis_envs.plants.field import generator
 
 @dataclasses.dataclass(frozen=True)
 class Calibration:
-    """What is known of a pair of rectified cameras. Equal images are ``width`` x ``height``.
+    """What is known of a pair of rectified cameras. Both images have the same size.
 
     Attributes:
         width, height: Pixels.
         focal: Focal length, pixels.
-        centre: Column and line of the principal point, which both cameras share.
+        centre: Column and line of the left camera's principal point.
         baseline: Distance between the cameras, m.
+        offset: Disparity of what is infinitely far away, pixels: column of the left camera's principal point less the right
+            one's.
     """
 
     width: int
@@ -31,11 +33,17 @@ class Calibration:
     focal: float
     centre: tuple[float, float]
     baseline: float
+    offset: float = 0.0
 
     def depth(self, disparity: np.ndarray) -> np.ndarray:
-        """Planar depth in m of disparities in pixels, of any shape; infinite where the disparity is not positive."""
-        with np.errstate(divide="ignore"):
-            return np.where(disparity > 0, self.focal * self.baseline / disparity, np.inf)
+        """Planar depth in m of disparities in pixels, of any shape; infinite where there is no such depth."""
+        beyond = np.asarray(disparity) - self.offset
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(beyond > 0, self.focal * self.baseline / beyond, np.inf)
+
+    def disparity(self, depth: np.ndarray) -> np.ndarray:
+        """Disparity in pixels of planar depths in m, of any shape."""
+        return self.focal * self.baseline / np.asarray(depth) + self.offset
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,7 +113,10 @@ def drive(family: Family, seed: int) -> Drive:
     scale = 1.0 + rng.choice([-1.0, 1.0]) * rng.uniform(*rig.odometry_noise)
     reported = (along - along[0]) * scale + 0.0005 * rng.normal(size=rig.frames) * (np.arange(rig.frames) > 0)
     pixels = rig.width / Rig().width
-    offset, slope = rig.rectification_error * pixels * rng.normal(), 0.5 * rig.rectification_error * pixels * rng.normal() / rig.width
+    offset, slope = (
+        rig.rectification_error * pixels * rng.normal(),
+        0.5 * rig.rectification_error * pixels * rng.normal() / rig.width,
+    )
     return Drive(true, stated, poses, along / rig.speed, reported, offset, slope)
 
 

@@ -5,8 +5,8 @@
         texture and light there                    -> colour                                `_colour`
         mean of a pixel's rays                     -> radiance, instance and depth
 
-One compiled program for every view of a size. On a CPU tiles are drawn one after the other, by as many threads as there are cores;
-on an accelerator many at a time, those with equally much in them together. Memory: the images, and one batch of tiles.
+One compiled program for every view of a size. On a CPU tiles are drawn one after the other, by as many threads as there are
+cores; on an accelerator many at a time, those with equally much in them together. Memory: the images, and one batch of tiles.
 """
 
 import concurrent.futures
@@ -39,8 +39,8 @@ class Shot(NamedTuple):
         rotation: [3, 3] from the world to the camera.
         position: [3] of the camera in the world, m.
         flash: [3] where the flash is, in the camera's frame, m.
-        light: [3] strength of the flash (1: a white surface at `reference` that faces it has radiance 1), of ambient light, and the
-            distance ``reference`` in m.
+        light: [3] strength of the flash (1: a white surface at `reference` that faces it has radiance 1), of ambient light, and
+            the distance ``reference`` in m.
     """
 
     focal: jax.Array
@@ -82,8 +82,8 @@ def draw(view: View, shot: Shot, width: int, height: int, samples: int) -> tuple
         samples: Rays a pixel, 1 or 4; instance and depth are those of a ray through the pixel's middle.
 
     Returns:
-        Radiance [height, width, 3] float32, instance [height, width] int32 and planar depth [height, width] float32 in m (infinite
-        where there is nothing).
+        Radiance [height, width, 3] float32, instance [height, width] int32 and planar depth [height, width] float32 in m
+        (infinite where there is nothing).
     """
     tables = _Tables(*(jnp.asarray(getattr(view, name)) for name in _Tables._fields))
     work = (view.cone_ranges[:, 1] - view.cone_ranges[:, 0]) + (view.triangle_ranges[:, 1] - view.triangle_ranges[:, 0])
@@ -154,9 +154,7 @@ def _tile(
     return radiance, instance, jnp.where(middle.kind > 0, middle.depth, jnp.inf)
 
 
-def _nearest(
-    tables: _Tables, shot: Shot, x: jax.Array, y: jax.Array, cone_range: jax.Array, triangle_range: jax.Array
-) -> _Hit:
+def _nearest(tables: _Tables, shot: Shot, x: jax.Array, y: jax.Array, cone_range: jax.Array, triangle_range: jax.Array) -> _Hit:
     """What the rays (x, y, 1) meet first."""
     up = shot.rotation[:, 2]
     falling = x * up[0] + y * up[1] + up[2]
@@ -228,9 +226,7 @@ def _on_cone(c: jax.Array, point: tuple[jax.Array, ...]) -> _Point:
 
 def _on_triangle(m: jax.Array, x: jax.Array, y: jax.Array, depth: jax.Array) -> _Point:
     """A point on a leaf, which is curled and has a midrib."""
-    along, across = (
-        depth * (m[..., k] * x + m[..., k + 1] * y + m[..., k + 2]) for k in (TRIANGLE_HIT, TRIANGLE_HIT + 3)
-    )
+    along, across = (depth * (m[..., k] * x + m[..., k + 1] * y + m[..., k + 2]) for k in (TRIANGLE_HIT, TRIANGLE_HIT + 3))
     normal, sideways = (tuple(m[..., TRIANGLE_HIT + k + i] for i in range(3)) for k in (6, 10))
     facing = jnp.where(normal[0] * x + normal[1] * y + normal[2] > 0.0, -1.0, 1.0)
     normal = _unit(tuple(n * facing + 0.55 * across * s for n, s in zip(normal, sideways)))
@@ -287,14 +283,21 @@ def _albedo(
     stretch = jnp.where(is_ground, 1.0, 0.03)
     fibres = 0.6 * noise(u * fibre_f, v * fibre_f * stretch, 0) + 0.4 * noise(u * fibre_f * 2.7, v * fibre_f * stretch * 2.0, 1)
     longer = jnp.where(is_ground, 1.0, 0.45)
-    blotches = 0.65 * noise(u * blotch_f, v * blotch_f * longer, 2) + 0.35 * noise(u * blotch_f * 2.9, v * blotch_f * longer * 2.9, 3)
+    blotches = 0.65 * noise(u * blotch_f, v * blotch_f * longer, 2) + 0.35 * noise(
+        u * blotch_f * 2.9, v * blotch_f * longer * 2.9, 3
+    )
     spots = noise(u * speckle_f, v * speckle_f * 0.8, 4)
     # Ragged ends: a sheath or a leaf's dry edge does not end in a line.
     cover = jnp.where(is_leaf, ramp(0.45, 0.8, at.edge * edge + 0.7 * blotches), at.over)
     cover = jnp.where(is_ground, ramp(0.5, 0.75, blotches), cover)
     spot = ramp(1.0 - 0.55 * speckles, 1.12 - 0.55 * speckles, spots)
     wave = 0.5 + 0.5 * jnp.sin(2.0 * jnp.pi * (v * band_f + 1.5 * blotches))
-    dark = (1.0 - fibre_c * fibres * 1.6) * (1.0 - blotch_c * ramp(0.35, 0.75, blotches)) * (1.0 - 0.6 * spot) * (1.0 - bands * wave)
+    dark = (
+        (1.0 - fibre_c * fibres * 1.6)
+        * (1.0 - blotch_c * ramp(0.35, 0.75, blotches))
+        * (1.0 - 0.6 * spot)
+        * (1.0 - bands * wave)
+    )
     # A node is a dark scar under a pale ring; a leaf's rib is pale.
     ring = jnp.where(is_cone, 1.0 - 0.55 * at.ring, 1.0 + 0.5 * at.ring)
     wax = jnp.where(is_cone, bloom * ramp(0.3, 0.7, noise(u * 90.0, v * 9.0, 5)) * (1.0 - at.over), 0.0)

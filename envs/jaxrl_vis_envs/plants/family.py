@@ -4,9 +4,9 @@
     shift(TRAINING, "flash", ...)   the same with some of the factors in `SHIFTS` moved; SHIFTED has them all
     read(path)                      a family from a JSON or TOML file: TRAINING, with the values of the file in its place
 
-A range (low, high) is drawn uniformly, a mean with an sd normally. Lengths are in metres and angles in degrees unless the name says
-otherwise. Sources: the thesis, section 3.3 (33 stalks on 2.134 m, 0.8 m away, 8 mm lens, 9 megapixels, 14.354 mm at 12 inches,
-0.405 mm of taper per inch), and published traits of grain sorghum for what it does not state (leaves, tillers, spread).
+A range (low, high) is drawn uniformly, a mean with an sd normally. Lengths are in metres and angles in degrees unless the name
+says otherwise. Sources: the thesis, section 3.3 (33 stalks on 2.134 m, 0.8 m away, 8 mm lens, 9 megapixels, 14.354 mm at 12
+inches, 0.405 mm of taper per inch), and published traits of grain sorghum for what it does not state (leaves, tillers, spread).
 """
 
 import dataclasses
@@ -172,7 +172,9 @@ class Rig:
     stated_spread: float = 0.0
     """Largest deviation of focal length and baseline from their nominal values, of 1; the calibration states it."""
     calibration_error: float = 0.0
-    """Size of the error of stated focal length and stated baseline, of 1; its sign is drawn, and the calibration does not state it."""
+    """Size of the error of stated focal length and stated baseline, of 1; its sign is drawn, and the calibration does not state
+    it.
+    """
     rectification_error: float = 0.2
     """Standard deviation of the vertical offset between rectified images, pixels at full width."""
     distance: float = 0.8
@@ -273,7 +275,9 @@ class Family:
         _least(self, "stalks", diameter_least=0.001, node_spacing=0.04, ovality=1.0, height=0.3)
         _least(self, "leaves", length_mean=0.05, width_mean=0.002)
         _least(self, "textures", fibre_pitch=1e-4, blotch_size=1e-3, speckle_size=2e-4, band_pitch=1e-3)
-        _least(self, "rig", width=32, height=32, focal=16.0, baseline=0.005, distance=0.3, camera_height=0.05, frames=1, speed=1e-3)
+        _least(
+            self, "rig", width=32, height=32, focal=16.0, baseline=0.005, distance=0.3, camera_height=0.05, frames=1, speed=1e-3
+        )
         _least(self, "imaging", flash=0.01, full_well=10.0)
         if self.imaging.samples not in (1, 4):
             raise ValueError(f"imaging.samples must be 1 or 4, got {self.imaging.samples}")
@@ -359,7 +363,7 @@ def read(path: Path) -> Family:
         kind = "TOML" if path.suffix.lower() == ".toml" else "JSON"
         raise ValueError(f"{path} is not {kind} (write .toml or .json): {' '.join(str(error).split())}") from error
     if not isinstance(values, dict):
-        raise ValueError(f"{path} must hold one table of a family's fields, like {{\"stalks\": {{\"lean_most\": 15}}}}")
+        raise ValueError(f'{path} must hold one table of a family\'s fields, like {{"stalks": {{"lean_most": 15}}}}')
     base = values.pop("base", TRAINING.name)
     if not isinstance(base, str) or base not in FAMILIES:
         raise ValueError(f"{path}: base must be one of {', '.join(FAMILIES)}, got {base!r}")

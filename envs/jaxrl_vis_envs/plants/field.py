@@ -159,7 +159,9 @@ def _places(rng: np.random.Generator, layout: Layout, margin: float) -> list[tup
     gaps = rng.random(mothers + 1) < layout.gaps
     held = min(gaps.sum() * layout.gap_length, 0.4 * max(free, 0.0))
     extra = extra / extra.sum() * max(free - held, 0.0) + gaps * (held / max(gaps.sum(), 1))
-    x = np.cumsum(extra)[:-1] + layout.spacing_minimum * np.arange(mothers) * min(1.0, length / (layout.spacing_minimum * mothers))
+    x = np.cumsum(extra)[:-1] + layout.spacing_minimum * np.arange(mothers) * min(
+        1.0, length / (layout.spacing_minimum * mothers)
+    )
     places = [(float(each), float(rng.normal(0.0, layout.offset_sd))) for each in x - margin]
     least = 0.75 * layout.spacing_minimum  # of a tiller, which grows out of the same root
     for _ in range(tillers):
@@ -231,9 +233,7 @@ def _bare_diameter(rng: np.random.Generator, shape: Stalks, arc: np.ndarray) -> 
     return np.maximum(at_12 - taper * (np.minimum(arc, turn) - 12 * INCH) - above, 0.25 * at_12)
 
 
-def _middle_line(
-    rng: np.random.Generator, shape: Stalks, arc: np.ndarray, nodes: np.ndarray, lean_sd: float
-) -> np.ndarray:
+def _middle_line(rng: np.random.Generator, shape: Stalks, arc: np.ndarray, nodes: np.ndarray, lean_sd: float) -> np.ndarray:
     """Points [K, 3] in m along a stalk that starts at the origin."""
     lean = np.radians(np.clip(rng.normal(0.0, lean_sd, 2), -shape.lean_most, shape.lean_most))
     curvature = rng.normal(0.0, shape.curvature_sd, 2)

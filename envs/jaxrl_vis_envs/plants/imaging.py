@@ -1,6 +1,5 @@
 """From radiance to the numbers in a file: lens, exposure, sensor noise, tone curve. Plain JAX."""
 
-import functools
 import math
 from typing import NamedTuple
 
@@ -45,11 +44,11 @@ def expose(radiance: jax.Array, exposure: Exposure) -> jax.Array:
     Returns:
         [H, W, 3] uint8, with the tone curve of sRGB.
     """
-    arrays = Exposure(*(np.float32(each) for each in exposure[:-1]), np.uint32(exposure.seed))
+    arrays = jax.tree.map(np.float32, exposure._replace(seed=0))._replace(seed=np.uint32(exposure.seed))
     return _expose(radiance, arrays)
 
 
-@functools.partial(jax.jit, donate_argnums=())
+@jax.jit
 def _expose(radiance: jax.Array, exposure: Exposure) -> jax.Array:
     height, width, _ = radiance.shape
     taps = jnp.exp(-0.5 * (jnp.arange(-_REACH, _REACH + 1) / jnp.maximum(exposure.blur, 0.05)) ** 2)

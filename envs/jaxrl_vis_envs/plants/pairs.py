@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Iterator
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxrl_vis_envs.plants import drawing, imaging, tables
@@ -97,7 +98,7 @@ class Sequence:
             _FLASH - offset,
             (flash, imaging_of.ambient, family.rig.distance),
         )
-        shot = drawing.Shot(*(np.asarray(number, np.float32) for number in numbers))
+        shot = drawing.Shot(*(jnp.asarray(number, jnp.float32) for number in numbers))
         radiance, instance, depth = drawing.draw(view, shot, true.width, true.height, imaging_of.samples)
         exposure = imaging.Exposure(
             gain=1.6 * gains[frame, side],

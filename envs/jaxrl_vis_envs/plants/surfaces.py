@@ -1,4 +1,6 @@
-"""A plot as surfaces that can be drawn: cones for stalks, triangles for leaves, and what each of them looks like. NumPy only."""
+"""A plot as surfaces that can be drawn: cones for stalks, triangles for leaves, and what each of them looks like. NumPy
+only.
+"""
 
 import colorsys
 import dataclasses
@@ -18,7 +20,9 @@ LITTER = -3
 MATERIAL = ("red", "green", "blue", "red_over", "green_over", "blue_over", "fibre_frequency", "fibre_contrast",
             "blotch_frequency", "blotch_contrast", "speckles", "speckle_frequency", "bands", "band_frequency", "bloom", "gloss",
             "place", "edge")  # fmt: skip
-"""Columns of a material. ``over`` is the colour of sheaths, or of the edges of leaves; ``place`` shifts textures between plants."""
+"""Columns of a material. ``over`` is the colour of sheaths, or of the edges of leaves; ``place`` shifts textures between
+plants.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,7 +89,10 @@ _NO_TRIANGLES = {"corners": (0, 3, 3), "along": (0, 3), "across": (0, 3), "half_
 
 def _joined(parts: list[dict[str, np.ndarray]], empty: dict[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
     if not parts:
-        return {name: np.zeros(shape, np.int32 if len(shape) == 1 and name != "half_width" else float) for name, shape in empty.items()}
+        return {
+            name: np.zeros(shape, np.int32 if len(shape) == 1 and name != "half_width" else float)
+            for name, shape in empty.items()
+        }
     return {name: np.concatenate([part[name] for part in parts]) for name in empty}
 
 

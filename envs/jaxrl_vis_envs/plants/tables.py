@@ -2,8 +2,9 @@
 
 A ray through a pixel is d = (x, y, 1) in the camera's frame, so that a distance along it is a planar depth.
 
-A cone is met where its quadratic in that depth has a root. Cross sections are ellipses; each cone has a direction u, along which
-space is compressed until they are circles. A triangle is met where d, written in its three corners, has no negative component.
+A cone is met where its quadratic in that depth has a root. Cross sections are ellipses; each cone has a direction u, along
+which space is compressed until they are circles. A triangle is met where d, written in its three corners, has no negative
+component.
 """
 
 import dataclasses
@@ -103,8 +104,9 @@ def _padded(table: np.ndarray) -> np.ndarray:
 
 
 def _boxes(points: np.ndarray, reach: np.ndarray, camera: Calibration) -> np.ndarray:
-    """Tiles [N, 4] (first column and line, last column and line) that spheres of radius ``reach`` [N] about ``points`` [N, K, 3]
-    lie in; what is too near is in none."""
+    """Tiles [N, 4] (first column and line, last column and line) that spheres of radius ``reach`` [N] about ``points`` [N, K,
+    3] lie in; what is too near is in none.
+    """
     with np.errstate(all="ignore"):
         depth = points[..., 2] - reach[:, None]
         low = points[..., :2] - reach[:, None, None]
@@ -185,5 +187,13 @@ def _triangle_table(surfaces: Surfaces, seen: np.ndarray, corners: np.ndarray, p
     along = np.einsum("tk,tkc->tc", surfaces.along[seen], inverse)
     across = np.einsum("tk,tkc->tc", surfaces.across[seen], inverse)
     sideways = surfaces.sideways[seen] @ pose.rotation.T
-    columns = [inverse.reshape(-1, 9), along, across, normal, surfaces.half_width[seen][:, None], sideways, np.zeros((len(corners), 1))]
+    columns = [
+        inverse.reshape(-1, 9),
+        along,
+        across,
+        normal,
+        surfaces.half_width[seen][:, None],
+        sideways,
+        np.zeros((len(corners), 1)),
+    ]
     return np.concatenate(columns, axis=1).astype(np.float32).reshape(-1, TRIANGLE_HIT + TRIANGLE_LOOK)

@@ -1,7 +1,7 @@
 """What is true of the stalks in one pair: boxes, how much of them is seen, and how thick they are. NumPy only.
 
-Columns and lines are those of the left image, with (0, 0) in the middle of the first pixel. A box is (left, top, right, bottom), the
-outer edges of its pixels: a box around the first pixel alone is (-0.5, -0.5, 0.5, 0.5).
+Columns and lines are those of the left image, with (0, 0) in the middle of the first pixel. A box is (left, top, right,
+bottom), the outer edges of its pixels: a box around the first pixel alone is (-0.5, -0.5, 0.5, 0.5).
 """
 
 import dataclasses
@@ -121,12 +121,12 @@ def stalks_in_view(
             points = np.stack([x, y, np.ones_like(x)], axis=1) * depth[line, column][:, None]
             height = pose.to_world(points)[:, 2]
             within = int(((height >= band[0]) & (height <= band[1])).sum())
-        seen = (column.min() - 0.5, line.min() - 0.5, column.max() + 0.5, line.max() + 0.5) if line.size else None
+        seen = _around(column, line) if line.size else None
         found.append(
             StalkInView(
                 stalk=index,
                 box=box,
-                visible_box=None if seen is None else tuple(map(float, seen)),
+                visible_box=seen,
                 visible=min(line.size / area, 1.0),
                 pixels=int(line.size),
                 band_box=None if part is None else part[0],
@@ -165,6 +165,11 @@ def _down_to_ground(box: Box, stalk: Stalk, pose: Pose, camera: Calibration) -> 
     _, y, z = pose.to_camera(foot)
     line = y / z * camera.focal + camera.centre[1]
     return (*box[:3], float(max(box[3], min(line, camera.height - 0.5))))
+
+
+def _around(column: np.ndarray, line: np.ndarray) -> Box:
+    """Box around pixels."""
+    return (float(column.min()) - 0.5, float(line.min()) - 0.5, float(column.max()) + 0.5, float(line.max()) + 0.5)
 
 
 def _pixels(box: Box, camera: Calibration) -> tuple[slice, slice]:
