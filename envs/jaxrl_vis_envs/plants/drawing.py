@@ -225,14 +225,19 @@ def _on_cone(c: jax.Array, point: tuple[jax.Array, ...]) -> _Point:
 
 
 def _on_triangle(m: jax.Array, x: jax.Array, y: jax.Array, depth: jax.Array) -> _Point:
-    """A point on a leaf, which is curled and has a midrib."""
-    along, across = (depth * (m[..., k] * x + m[..., k + 1] * y + m[..., k + 2]) for k in (TRIANGLE_HIT, TRIANGLE_HIT + 3))
-    normal, sideways = (tuple(m[..., TRIANGLE_HIT + k + i] for i in range(3)) for k in (6, 10))
+    """A point on a leaf, which has a midrib."""
+
+    def between(first: int) -> jax.Array:
+        """What is given at the corners, in between."""
+        k = TRIANGLE_HIT + first
+        return depth * (m[..., k] * x + m[..., k + 1] * y + m[..., k + 2])
+
+    along, across, offset = (between(3 * i) for i in range(3))
+    normal = tuple(between(9 + 3 * i) for i in range(3))
     facing = jnp.where(normal[0] * x + normal[1] * y + normal[2] > 0.0, -1.0, 1.0)
-    normal = _unit(tuple(n * facing + 0.55 * across * s for n, s in zip(normal, sideways)))
-    half = m[..., TRIANGLE_HIT + 9]
-    rib = ramp(0.16, 0.06, jnp.abs(across))
-    return _Point(across * half, along, normal, rib * 0.0, rib, ramp(0.55, 1.0, jnp.abs(across)))
+    normal = _unit(tuple(each * facing for each in normal))
+    rib = ramp(0.13, 0.05, jnp.abs(across))
+    return _Point(offset, along, normal, rib * 0.0, rib, ramp(0.7, 1.0, jnp.abs(across)))
 
 
 def _unit(vector: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
@@ -288,12 +293,12 @@ def _albedo(
     )
     spots = noise(u * speckle_f, v * speckle_f * 0.8, 4)
     # Ragged ends: a sheath or a leaf's dry edge does not end in a line.
-    cover = jnp.where(is_leaf, ramp(0.45, 0.8, at.edge * edge + 0.7 * blotches), at.over)
+    cover = jnp.where(is_leaf, ramp(0.75, 1.0, 0.8 * at.edge * edge + 0.75 * blotches), at.over)
     cover = jnp.where(is_ground, ramp(0.5, 0.75, blotches), cover)
     spot = ramp(1.0 - 0.55 * speckles, 1.12 - 0.55 * speckles, spots)
     wave = 0.5 + 0.5 * jnp.sin(2.0 * jnp.pi * (v * band_f + 1.5 * blotches))
     dark = (
-        (1.0 - fibre_c * fibres * 1.6)
+        (1.0 - fibre_c * fibres * jnp.where(is_cone, 1.8 + at.over, 1.6))
         * (1.0 - blotch_c * ramp(0.35, 0.75, blotches))
         * (1.0 - 0.6 * spot)
         * (1.0 - bands * wave)

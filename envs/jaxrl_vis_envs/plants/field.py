@@ -276,10 +276,10 @@ def _leaf(rng: np.random.Generator, family: Family, index: int, collar: np.ndarr
         length *= rng.uniform(0.2, 0.75)
         width *= rng.uniform(0.2, 0.55)
         bend = math.pi * rng.uniform(0.72, 1.0) - start
-        knots, early = 8, rng.uniform(0.08, 0.25)
+        knots, early = 9, rng.uniform(0.08, 0.25)
     else:
         bend = math.radians(rng.uniform(*shape.droop))
-        knots, early = 11, rng.uniform(0.6, 1.4)
+        knots, early = 13, rng.uniform(0.6, 1.4)
     along = np.linspace(0.0, 1.0, knots)
     # Angle from the vertical: a dry leaf turns down soon after its collar, a green one over its whole length.
     turned = np.tanh(along / early) / math.tanh(1.0 / early) if dry else along**early
@@ -297,7 +297,7 @@ def _leaf(rng: np.random.Generator, family: Family, index: int, collar: np.ndarr
     twist = rng.normal(0.0, 0.3 if dry else 0.08, knots).cumsum() + rng.normal(0.0, 0.5 if dry else 0.15)
     across = np.cos(twist)[:, None] * sideways + np.sin(twist)[:, None] * normal
     across /= np.linalg.norm(across, axis=1, keepdims=True)
-    profile = np.minimum(1.0, 0.45 + 2.2 * along) * np.sqrt(np.clip(1.0 - along**2.2, 0.0, 1.0))
+    profile = np.minimum(1.0, 0.22 + 2.8 * along) * np.clip(1.0 - along**1.8, 0.0, 1.0) ** 0.6
     return Leaf(index, middle, across, 0.5 * width * np.maximum(profile, 0.02), dry)
 
 

@@ -101,7 +101,7 @@ class Sequence:
         shot = drawing.Shot(*(jnp.asarray(number, jnp.float32) for number in numbers))
         radiance, instance, depth = drawing.draw(view, shot, true.width, true.height, imaging_of.samples)
         exposure = imaging.Exposure(
-            gain=1.6 * gains[frame, side],
+            gain=2.0 * gains[frame, side],
             blur=blur[side] * true.width / 3376,
             vignetting=imaging_of.vignetting,
             full_well=imaging_of.full_well,

@@ -17,6 +17,9 @@ NOTHING = -1
 LITTER = -3
 """Instance of litter; that of the leaves of stalk n is `LITTER` - 1 - n."""
 
+_GUTTER = 0.3
+"""By how much of its half width a leaf's edges are raised above its midrib."""
+
 MATERIAL = ("red", "green", "blue", "red_over", "green_over", "blue_over", "fibre_frequency", "fibre_contrast",
             "blotch_frequency", "blotch_contrast", "speckles", "speckle_frequency", "bands", "band_frequency", "bloom", "gloss",
             "place", "edge")  # fmt: skip
@@ -37,9 +40,8 @@ class Surfaces:
         oval: [C, 2] float64, greatest over least diameter, and the direction of the greatest in rad.
         cone_stalk, cone_material: [C] int32.
         corners: [T, 3, 3] float64, of each triangle.
-        along, across: [T, 3] float64, texture coordinates of each corner: m along the midrib, and -1 to 1 across it.
-        half_width: [T] float64, m.
-        sideways: [T, 3] float64, unit vector from the midrib to the edge.
+        along, across, offset: [T, 3] float64, of each corner: m along the midrib, -1 to 1 across it, and the same in m.
+        normals: [T, 3, 3] float64, unit normal of the leaf at each corner.
         triangle_instance, triangle_material: [T] int32.
         materials: [M, len(MATERIAL)] float32.
     """
@@ -56,8 +58,8 @@ class Surfaces:
     corners: np.ndarray
     along: np.ndarray
     across: np.ndarray
-    half_width: np.ndarray
-    sideways: np.ndarray
+    offset: np.ndarray
+    normals: np.ndarray
     triangle_instance: np.ndarray
     triangle_material: np.ndarray
     materials: np.ndarray
@@ -76,23 +78,20 @@ def build(plot: Plot) -> Surfaces:
     for leaf in plot.leaves:
         strips.append(_triangles(leaf, len(materials)))
         hue = textures.dry_hue if leaf.dry else textures.leaf_hue
-        saturation, value = ((0.35, 0.6), (0.16, 0.36)) if leaf.dry else ((0.55, 0.8), (0.12, 0.24))
+        saturation, value = ((0.35, 0.6), (0.14, 0.34)) if leaf.dry else ((0.5, 0.75), (0.09, 0.19))
         materials.append(_material(rng, textures, hue, textures.dry_hue, saturation, value))
     return Surfaces(**_joined(cones, _NO_CONES), **_joined(strips, _NO_TRIANGLES), materials=np.array(materials, np.float32))
 
 
 _NO_CONES = {"start": (0, 3), "end": (0, 3), "radii": (0, 2), "arcs": (0, 2), "sheath": (0, 2), "node": (0, 2), "oval": (0, 2),
              "cone_stalk": (0,), "cone_material": (0,)}  # fmt: skip
-_NO_TRIANGLES = {"corners": (0, 3, 3), "along": (0, 3), "across": (0, 3), "half_width": (0,), "sideways": (0, 3),
+_NO_TRIANGLES = {"corners": (0, 3, 3), "along": (0, 3), "across": (0, 3), "offset": (0, 3), "normals": (0, 3, 3),
                  "triangle_instance": (0,), "triangle_material": (0,)}  # fmt: skip
 
 
 def _joined(parts: list[dict[str, np.ndarray]], empty: dict[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
     if not parts:
-        return {
-            name: np.zeros(shape, np.int32 if len(shape) == 1 and name != "half_width" else float)
-            for name, shape in empty.items()
-        }
+        return {name: np.zeros(shape, np.int32 if len(shape) == 1 else float) for name, shape in empty.items()}
     return {name: np.concatenate([part[name] for part in parts]) for name in empty}
 
 
@@ -119,28 +118,35 @@ def _cones(index: int, stalk: Stalk, material: int) -> dict[str, np.ndarray]:
 
 
 def _triangles(leaf: Leaf, material: int) -> dict[str, np.ndarray]:
-    left = leaf.middle - leaf.across * leaf.half_width[:, None]
-    right = leaf.middle + leaf.across * leaf.half_width[:, None]
+    """Two strips, one on each side of the midrib, whose edges are raised: a leaf is a shallow gutter."""
+    normal = np.cross(np.gradient(leaf.middle, axis=0), leaf.across)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    half = leaf.half_width[:, None]
+    raised = _GUTTER * half * normal
+    rim = {-1.0: leaf.middle - half * leaf.across + raised, 1.0: leaf.middle + half * leaf.across + raised}
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(leaf.middle, axis=0), axis=1))])
-    quads = len(length) - 1
-    corners = np.stack([
-        np.stack([left[:-1], right[:-1], left[1:]], axis=1),
-        np.stack([right[:-1], right[1:], left[1:]], axis=1),
-    ], axis=1)  # fmt: skip
-    along = np.stack([
-        np.stack([length[:-1], length[:-1], length[1:]], axis=1),
-        np.stack([length[:-1], length[1:], length[1:]], axis=1),
-    ], axis=1)  # fmt: skip
-    across = np.tile(np.array([[-1.0, 1.0, -1.0], [1.0, 1.0, -1.0]]), (quads, 1))
+    parts: dict[str, list[np.ndarray]] = {name: [] for name in ("corners", "along", "across", "offset", "normals")}
+    for side, edge in rim.items():
+        slanted = normal - side * _GUTTER * leaf.across
+        slanted /= np.linalg.norm(slanted, axis=1, keepdims=True)
+        zero = np.zeros_like(length)
+        given = {
+            "corners": (leaf.middle, edge),
+            "along": (length, length),
+            "across": (zero, zero + side),
+            "offset": (zero, side * leaf.half_width),
+            "normals": (normal, slanted),
+        }
+        for name, (inner, outer) in given.items():
+            parts[name] += [
+                np.stack([inner[:-1], outer[:-1], inner[1:]], axis=1),
+                np.stack([outer[:-1], outer[1:], inner[1:]], axis=1),
+            ]
+    count = 4 * (len(length) - 1)
     instance = LITTER if leaf.stalk < 0 else LITTER - 1 - leaf.stalk
-    return {
-        "corners": corners.reshape(-1, 3, 3),
-        "along": along.reshape(-1, 3),
-        "across": across,
-        "half_width": np.repeat(0.5 * (leaf.half_width[1:] + leaf.half_width[:-1]), 2),
-        "sideways": np.repeat(leaf.across[:-1], 2, axis=0),
-        "triangle_instance": np.full(2 * quads, instance, np.int32),
-        "triangle_material": np.full(2 * quads, material, np.int32),
+    return {name: np.concatenate(part) for name, part in parts.items()} | {
+        "triangle_instance": np.full(count, instance, np.int32),
+        "triangle_material": np.full(count, material, np.int32),
     }
 
 

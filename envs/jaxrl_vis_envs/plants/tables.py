@@ -20,7 +20,7 @@ NEAR, FAR = 0.15, 6.0
 
 # Columns of the tables. What finds out where a ray meets a cone or triangle comes first.
 CONE_HIT, CONE_LOOK = 16, 16
-TRIANGLE_HIT, TRIANGLE_LOOK = 9, 14
+TRIANGLE_HIT, TRIANGLE_LOOK = 9, 18
 _OVERLAP = 0.06  # of a radius: how far cones reach into each other, so that a bend has no gap
 
 
@@ -182,18 +182,10 @@ def _cone_table(surfaces: Surfaces, seen: np.ndarray, start: np.ndarray, end: np
 def _triangle_table(surfaces: Surfaces, seen: np.ndarray, corners: np.ndarray, pose: Pose) -> np.ndarray:
     """Rows for the triangles that are ``seen``; their corners [T, 3, 3] in the camera's frame."""
     inverse = np.linalg.inv(np.swapaxes(corners, 1, 2)) if len(corners) else np.zeros((0, 3, 3))
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    along = np.einsum("tk,tkc->tc", surfaces.along[seen], inverse)
-    across = np.einsum("tk,tkc->tc", surfaces.across[seen], inverse)
-    sideways = surfaces.sideways[seen] @ pose.rotation.T
-    columns = [
-        inverse.reshape(-1, 9),
-        along,
-        across,
-        normal,
-        surfaces.half_width[seen][:, None],
-        sideways,
-        np.zeros((len(corners), 1)),
-    ]
+    normals = surfaces.normals[seen] @ pose.rotation.T
+    along, across, offset = (
+        np.einsum("tk,tkc->tc", values[seen], inverse) for values in (surfaces.along, surfaces.across, surfaces.offset)
+    )
+    normal = np.einsum("tkn,tkc->tnc", normals, inverse).reshape(-1, 9)
+    columns = [inverse.reshape(-1, 9), along, across, offset, normal]
     return np.concatenate(columns, axis=1).astype(np.float32).reshape(-1, TRIANGLE_HIT + TRIANGLE_LOOK)
