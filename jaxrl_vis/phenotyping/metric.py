@@ -1,7 +1,7 @@
 """From edges in pixels and a disparity to a diameter in millimetres.
 
-The two edges of a round stalk are where rays from the camera touch it. With half the angle between them a, and the distance D of its
-middle from the camera, its radius is D sin a. Stereo measures the distance of the front surface, D less the radius, so
+The two edges of a round stalk are where rays from the camera touch it. With half the angle between them a, and the distance D
+of its middle from the camera, its radius is D sin a. Stereo measures the distance of the front surface, D less the radius, so
 
     r = (distance of the front) * sin a / (1 - sin a)
 

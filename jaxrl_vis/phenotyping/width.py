@@ -229,7 +229,7 @@ def ellipse_width(mask: np.ndarray, fit: EllipseFit = "pixels") -> float | None:
             continue
         width = _minor_axis((labels == label).astype(np.uint8), fit)
         length = math.hypot(stats[label, cv2.CC_STAT_WIDTH], stats[label, cv2.CC_STAT_HEIGHT])
-        if width is not None and math.isfinite(width) and 0.0 < width < 3.0 * area / max(length / math.sqrt(2.0), 1.0):
+        if width is not None and math.isfinite(width) and 1.0 < width < 3.0 * area / max(length / math.sqrt(2.0), 1.0):
             widths.append(width)
     return max(widths, default=None)
 

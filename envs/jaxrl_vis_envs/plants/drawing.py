@@ -1,6 +1,6 @@
 """Draws what a camera sees, tile by tile: which surface each ray meets first, and what colour it has there.
 
-    tables.see -> View -> draw: for each tile of 64 x 64 pixels
+    tables.see -> View -> draw: for each tile of up to 64 x 64 pixels
         its cones, its triangles, the ground       -> depth and row of what is nearest      `_nearest`
         texture and light there                    -> colour                                `_colour`
         mean of a pixel's rays                     -> radiance, instance and depth
@@ -20,7 +20,7 @@ import numpy as np
 
 from jaxrl_vis_envs.compilation import compiler_options
 from jaxrl_vis_envs.plants.surfaces import GROUND, NOTHING
-from jaxrl_vis_envs.plants.tables import CONE_HIT, FAR, NEAR, TILE, TRIANGLE_HIT, View
+from jaxrl_vis_envs.plants.tables import CONE_HIT, FAR, NEAR, TRIANGLE_HIT, View, tile_of
 from jaxrl_vis_envs.plants.texture import noise, ramp
 
 _GROUND_FAR = 3.5  # m: what is behind is black
@@ -94,35 +94,37 @@ def draw(view: View, shot: Shot, width: int, height: int, samples: int) -> tuple
     parts = [order[start::workers] for start in range(workers)]
     share = max(map(len, parts))  # all parts have one size, so one program: a missing tile is another one again
     parts = [np.concatenate([part, np.repeat(order[:1], share - len(part))]) for part in parts]
-    program = _program(samples, at_once)
+    tile = tile_of(width)
+    program = _program(samples, tile, at_once)
     jobs = [(view.tiles[part], view.cone_ranges[part], view.triangle_ranges[part]) for part in parts]
     with concurrent.futures.ThreadPoolExecutor(workers) as pool:
         results = list(pool.map(lambda job: jax.block_until_ready(program(tables, shot, *job)), jobs))
     place = np.empty(len(order), np.int64)
     place[np.concatenate(parts)[::-1]] = np.arange(share * workers)[::-1]
-    columns, lines = -(-width // TILE), -(-height // TILE)
-    join = _joiner(columns, lines, width, height)
+    join = _joiner(tile, width, height)
     return tuple(join(jnp.asarray(place), *(result[part] for result in results)) for part in range(3))  # pyright: ignore
 
 
 @functools.cache
-def _joiner(columns: int, lines: int, width: int, height: int):
+def _joiner(tile: int, width: int, height: int):
+    columns, lines = -(-width // tile), -(-height // tile)
+
     def join(place: jax.Array, *parts: jax.Array) -> jax.Array:
         tiles = jnp.concatenate(parts)[place]
         tiles = tiles.reshape(lines, columns, *tiles.shape[1:])
-        image = jnp.moveaxis(tiles, 2, 1).reshape(lines * TILE, columns * TILE, *tiles.shape[4:])
+        image = jnp.moveaxis(tiles, 2, 1).reshape(lines * tile, columns * tile, *tiles.shape[4:])
         return image[:height, :width]
 
     return jax.jit(join)
 
 
 @functools.cache
-def _program(samples: int, at_once: int):
+def _program(samples: int, size: int, at_once: int):
     """The compiled drawing of a list of tiles."""
 
     def program(tables: _Tables, shot: Shot, tiles: jax.Array, cone_ranges: jax.Array, triangle_ranges: jax.Array):
         def one(tile: tuple[jax.Array, jax.Array, jax.Array]):
-            return _tile(tables, shot, samples, *tile)
+            return _tile(tables, shot, samples, size, *tile)
 
         return jax.lax.map(one, (tiles, cone_ranges, triangle_ranges), batch_size=None if at_once == 1 else at_once)
 
@@ -132,12 +134,12 @@ def _program(samples: int, at_once: int):
 
 
 def _tile(
-    tables: _Tables, shot: Shot, samples: int, corner: jax.Array, cone_range: jax.Array, triangle_range: jax.Array
+    tables: _Tables, shot: Shot, samples: int, size: int, corner: jax.Array, cone_range: jax.Array, triangle_range: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """One tile: radiance [TILE, TILE, 3], instance and depth [TILE, TILE]."""
+    """One tile: radiance [size, size, 3], instance and depth [size, size]."""
     offsets = np.array(_RAYS[samples] if samples == 1 else ((0.0, 0.0), *_RAYS[samples]), np.float32)
-    column = corner[0] + jnp.arange(TILE, dtype=jnp.float32)[None, None, :] + offsets[:, 0, None, None]
-    line = corner[1] + jnp.arange(TILE, dtype=jnp.float32)[None, :, None] + offsets[:, 1, None, None]
+    column = corner[0] + jnp.arange(size, dtype=jnp.float32)[None, None, :] + offsets[:, 0, None, None]
+    line = corner[1] + jnp.arange(size, dtype=jnp.float32)[None, :, None] + offsets[:, 1, None, None]
     column, line = jnp.broadcast_arrays(column, line)
     line = line - shot.lines[0] - shot.lines[1] * (column - shot.centre[0])
     x, y = (column - shot.centre[0]) / shot.focal, (line - shot.centre[1]) / shot.focal

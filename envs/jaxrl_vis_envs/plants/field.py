@@ -12,7 +12,7 @@ import numpy as np
 from jaxrl_vis_envs.plants.family import INCH, Family, Layout, Range, Stalks
 
 KNOT_SPACING = 0.04
-"""Greatest distance of knots along a stalk, m."""
+"""Greatest distance of knots along a stalk of the near row, m."""
 _NODE_HALF_LENGTH = 0.009
 
 
@@ -189,8 +189,9 @@ def _stalk(rng: np.random.Generator, shape: Stalks, row: int, place: np.ndarray,
     thickness = rng.uniform(*shape.sheath_thickness, size=nodes.size)
     swelling = rng.uniform(*shape.node_swelling, size=nodes.size)
     ends = (nodes + lengths)[kept]
-    even = np.linspace(0.0, height, math.ceil(height / KNOT_SPACING) + 1)
-    around = nodes[:, None] + _NODE_HALF_LENGTH * np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
+    spacing = KNOT_SPACING if row == 0 else 2.5 * KNOT_SPACING
+    even = np.linspace(0.0, height, math.ceil(height / spacing) + 1)
+    around = nodes[:, None] + _NODE_HALF_LENGTH * np.array([-1.0, -0.5, 0.0, 0.5, 1.0] if row == 0 else [-1.0, 0.0, 1.0])
     steps = ends[:, None] + np.array([-1.5e-3, 1.5e-3])
     arc = np.unique(np.clip(np.concatenate([even, around.ravel(), steps.ravel()]), 0.0, height))
     arc = arc[np.concatenate([[True], np.diff(arc) > 5e-4])]
@@ -230,7 +231,7 @@ def _bare_diameter(rng: np.random.Generator, shape: Stalks, arc: np.ndarray) -> 
     # The rest shrinks towards 0.55 of what it is there.
     rest = 0.45 * max(at_turn, 0.3 * at_12)
     above = rest * -np.expm1(-taper * np.maximum(arc - turn, 0.0) / rest)
-    return np.maximum(at_12 - taper * (np.minimum(arc, turn) - 12 * INCH) - above, 0.25 * at_12)
+    return np.maximum(at_12 - taper * (np.minimum(arc, turn) - 12 * INCH) - above, 0.3 * at_12)
 
 
 def _middle_line(rng: np.random.Generator, shape: Stalks, arc: np.ndarray, nodes: np.ndarray, lean_sd: float) -> np.ndarray:
@@ -262,11 +263,13 @@ def _leaves(rng: np.random.Generator, family: Family, index: int, stalk: Stalk) 
         for extra in range(count):
             azimuth = plane + math.pi * (place + extra) + rng.normal(0.0, 0.35)
             dry = rng.random() < (shape.dry if collar[2] < 0.8 else shape.dry / 3)
-            found.append(_leaf(rng, family, index, collar, azimuth, dry))
+            found.append(_leaf(rng, family, index, collar, azimuth, dry, coarse=stalk.row > 0))
     return found
 
 
-def _leaf(rng: np.random.Generator, family: Family, index: int, collar: np.ndarray, azimuth: float, dry: bool) -> Leaf:
+def _leaf(
+    rng: np.random.Generator, family: Family, index: int, collar: np.ndarray, azimuth: float, dry: bool, coarse: bool
+) -> Leaf:
     """Draws one leaf: a green one arches out and over, a dry one hangs down beside its stalk, curled and broken."""
     shape = family.leaves
     length = max(rng.normal(shape.length_mean, shape.length_sd), 0.1)
@@ -276,10 +279,10 @@ def _leaf(rng: np.random.Generator, family: Family, index: int, collar: np.ndarr
         length *= rng.uniform(0.2, 0.75)
         width *= rng.uniform(0.2, 0.55)
         bend = math.pi * rng.uniform(0.72, 1.0) - start
-        knots, early = 9, rng.uniform(0.08, 0.25)
+        knots, early = 6 if coarse else 9, rng.uniform(0.08, 0.25)
     else:
         bend = math.radians(rng.uniform(*shape.droop))
-        knots, early = 13, rng.uniform(0.6, 1.4)
+        knots, early = 8 if coarse else 13, rng.uniform(0.6, 1.4)
     along = np.linspace(0.0, 1.0, knots)
     # Angle from the vertical: a dry leaf turns down soon after its collar, a green one over its whole length.
     turned = np.tanh(along / early) / math.tanh(1.0 / early) if dry else along**early

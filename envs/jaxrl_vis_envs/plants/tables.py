@@ -14,13 +14,14 @@ import numpy as np
 from jaxrl_vis_envs.plants.cameras import Calibration, Pose
 from jaxrl_vis_envs.plants.surfaces import Surfaces
 
-TILE = 64
 NEAR, FAR = 0.15, 6.0
 """Nearest and farthest depth that is drawn, m."""
 
 # Columns of the tables. What finds out where a ray meets a cone or triangle comes first.
 CONE_HIT, CONE_LOOK = 16, 16
 TRIANGLE_HIT, TRIANGLE_LOOK = 9, 18
+# Rows of the tables: more than most plots need, so that one compiled program draws them all.
+_CONES, _TRIANGLES, _MATERIALS, _LIST = 1 << 14, 1 << 16, 1 << 13, 1 << 18
 _OVERLAP = 0.06  # of a radius: how far cones reach into each other, so that a bend has no gap
 
 
@@ -53,6 +54,11 @@ class View:
     triangle_list: np.ndarray
 
 
+def tile_of(width: int) -> int:
+    """Width and height in pixels of the tiles of an image: those of small images are small, as equally much is in sight."""
+    return 64 if width > 1500 else 32 if width > 600 else 16
+
+
 def see(surfaces: Surfaces, pose: Pose, camera: Calibration, shift: float = 0.0) -> View:
     """What a camera sees.
 
@@ -62,45 +68,59 @@ def see(surfaces: Surfaces, pose: Pose, camera: Calibration, shift: float = 0.0)
         camera: The cameras as they are.
         shift: How far to the right of the left camera this one stands, m.
     """
-    columns, lines = (-(-size // TILE) for size in (camera.width, camera.height))
+    tile = tile_of(camera.width)
+    columns, lines = (-(-size // tile) for size in (camera.width, camera.height))
     offset = np.array([shift, 0.0, 0.0])
 
-    start, end = pose.to_camera(surfaces.start) - offset, pose.to_camera(surfaces.end) - offset
-    reach = surfaces.radii.max(axis=1) * np.sqrt(surfaces.oval[:, 0]) * 1.15
+    near = np.flatnonzero(_roughly(surfaces.start, pose, camera))
+    start, end = pose.to_camera(surfaces.start[near]) - offset, pose.to_camera(surfaces.end[near]) - offset
+    reach = surfaces.radii[near].max(axis=1) * np.sqrt(surfaces.oval[near, 0]) * 1.15
     cone_boxes = _boxes(np.stack([start, end], axis=1), reach, camera)
-    seen = _in_sight(cone_boxes, columns, lines)
-    cones = _cone_table(surfaces, seen, start[seen], end[seen], pose)
+    sight = _in_sight(cone_boxes, columns, lines)
+    cone_boxes, seen = cone_boxes[sight], near[sight]
+    cones = _cone_table(surfaces, seen, start[sight], end[sight], pose)
 
-    corners = pose.to_camera(surfaces.corners) - offset
+    near = np.flatnonzero(_roughly(surfaces.corners[:, 0], pose, camera))
+    corners = pose.to_camera(surfaces.corners[near]) - offset
     triangle_boxes = _boxes(corners, np.zeros(len(corners)), camera)
-    facing = _in_sight(triangle_boxes, columns, lines)
-    with np.errstate(all="ignore"):
-        facing[facing] = np.abs(np.linalg.det(corners[facing])) > 1e-12
-    triangles = _triangle_table(surfaces, facing, corners[facing], pose)
+    sight = _in_sight(triangle_boxes, columns, lines)
+    sight[sight] = np.abs(np.linalg.det(corners[sight])) > 1e-12
+    triangle_boxes, facing = triangle_boxes[sight], near[sight]
+    triangles = _triangle_table(surfaces, facing, corners[sight], pose)
 
-    cone_list, cone_ranges = _lists(cone_boxes[seen], columns, lines)
-    triangle_list, triangle_ranges = _lists(triangle_boxes[facing], columns, lines)
+    cone_list, cone_ranges = _lists(cone_boxes, columns, lines)
+    triangle_list, triangle_ranges = _lists(triangle_boxes, columns, lines)
     line, column = np.divmod(np.arange(columns * lines), columns)
     return View(
-        cones=_padded(cones),
-        cone_instance=_padded(surfaces.cone_stalk[seen]),
-        cone_material=_padded(surfaces.cone_material[seen]),
-        triangles=_padded(triangles),
-        triangle_instance=_padded(surfaces.triangle_instance[facing]),
-        triangle_material=_padded(surfaces.triangle_material[facing]),
-        materials=_padded(surfaces.materials),
-        tiles=(TILE * np.stack([column, line], axis=1)).astype(np.int32),
+        cones=_padded(cones, _CONES),
+        cone_instance=_padded(surfaces.cone_stalk[seen], _CONES),
+        cone_material=_padded(surfaces.cone_material[seen], _CONES),
+        triangles=_padded(triangles, _TRIANGLES),
+        triangle_instance=_padded(surfaces.triangle_instance[facing], _TRIANGLES),
+        triangle_material=_padded(surfaces.triangle_material[facing], _TRIANGLES),
+        materials=_padded(surfaces.materials, _MATERIALS),
+        tiles=(tile * np.stack([column, line], axis=1)).astype(np.int32),
         cone_ranges=cone_ranges,
         triangle_ranges=triangle_ranges,
-        cone_list=_padded(cone_list),
-        triangle_list=_padded(triangle_list),
+        cone_list=_padded(cone_list, _LIST),
+        triangle_list=_padded(triangle_list, _LIST),
     )
 
 
-def _padded(table: np.ndarray) -> np.ndarray:
-    """The table with zero rows up to a power of two, so that few sizes of it are compiled."""
-    size = 1 << max(int(len(table)).bit_length(), 8)
+def _padded(table: np.ndarray, least: int) -> np.ndarray:
+    """The table with zero rows at its end, ``least`` rows in all or twice as many as often as it takes."""
+    size = least
+    while size < len(table):
+        size *= 2
     return np.concatenate([table, np.zeros((size - len(table), *table.shape[1:]), table.dtype)])
+
+
+def _roughly(points: np.ndarray, pose: Pose, camera: Calibration) -> np.ndarray:
+    """Which points [N, 3] in the world may belong to something in sight: a cheap test that spares most of the rest."""
+    away = points[:, 1] - pose.position[1] + 0.3
+    wide, high = (1.15 * size / camera.focal / 2 + 0.05 for size in (camera.width, camera.height))
+    aside, above = np.abs(points[:, 0] - pose.position[0]), np.abs(points[:, 2] - pose.position[2])
+    return (aside < wide * away + 0.35 + camera.baseline) & (above < high * away + 0.35)
 
 
 def _boxes(points: np.ndarray, reach: np.ndarray, camera: Calibration) -> np.ndarray:
@@ -115,9 +135,9 @@ def _boxes(points: np.ndarray, reach: np.ndarray, camera: Calibration) -> np.nda
         near, far = depth[..., None], points[..., 2:] + reach[:, None, None]
         least = np.minimum(low / near, low / far).min(axis=1)
         most = np.maximum(high / near, high / far).max(axis=1)
-        centre = np.array(camera.centre)
-        first = np.floor((least * camera.focal + centre - 2.0) / TILE)
-        last = np.floor((most * camera.focal + centre + 2.0) / TILE)
+        centre, tile = np.array(camera.centre), tile_of(camera.width)
+        first = np.floor((least * camera.focal + centre - 2.0) / tile)
+        last = np.floor((most * camera.focal + centre + 2.0) / tile)
         boxes = np.concatenate([first, last], axis=1)
     bad = (depth.min(axis=1) < NEAR) | (depth.max(axis=1) > FAR) | ~np.isfinite(boxes).all(axis=1)
     boxes[bad] = (0, 0, -1, -1)
