@@ -3,12 +3,15 @@
 import dataclasses
 import json
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxrl_vis import cli
+from jaxrl_vis.phenotyping.measure import measure
+from jaxrl_vis.phenotyping.stereo import grey
 from jaxrl_vis_envs import plants
-from jaxrl_vis_envs.plants import SHIFTED, SHIFTS, TRAINING
+from jaxrl_vis_envs.plants import SHIFTED, SHIFTS, TRAINING, drawing, tables
 from jaxrl_vis_envs.plants.family import INCH
 from jaxrl_vis_envs.plants.pairs import Pair, Sequence
 from jaxrl_vis_envs.plants.truth import HEIGHTS, outline, stalks_in_view
@@ -336,3 +339,44 @@ def test_a_stalk_height_of_twelve_inches(plots):
     stalk = plots[0].measured[0]
     middle, _ = stalk.at_height(12 * INCH)
     assert middle[2] == pytest.approx(12 * INCH)
+
+
+def test_tiles_drawn_side_by_side_are_those_drawn_one_by_one(sequence):
+    """What an accelerator runs draws the same image as what a CPU runs."""
+    true, pose = sequence.drive.true, sequence.drive.poses[16]
+    view = tables.see(sequence.surfaces, pose, true)
+    numbers = (true.focal, true.centre, (0.0, 0.0), pose.rotation, pose.position, (0.05, -0.1, 0.0), (1.0, 0.01, 0.8))
+    shot = drawing.Shot(*(jnp.asarray(number, jnp.float32) for number in numbers))
+    one, many = (drawing.draw(view, shot, true.width, true.height, 1, at_once) for at_once in (1, 20))
+    for left, right in zip(one, many):
+        assert np.isclose(np.asarray(left), np.asarray(right), atol=1e-4).mean() > 0.999
+
+
+@pytest.fixture(scope="module")
+def close_up() -> Sequence:
+    """The cameras of half the real size, but only the 0.31 m around 12 inches that they see."""
+    family = changed(TRAINING, layout=dict(rows_behind=1, stalks_mean=20.0, tillers=0.0), leaves=dict(density=0.3, litter=0.0))
+    return Sequence.of(plants.draw(changed(family, rig=dict(width=422, height=338, focal=1084.0)), 2))
+
+
+def test_a_pair_gives_diameters_in_millimetres(close_up):
+    """True masks, our own disparity, our own widths: what is left of the error is below the pixel, which is 0.74 mm."""
+    drive, errors = close_up.drive, []
+    for frame in (8, 13, 18, 23):
+        pair = close_up[frame]
+        instance, left, right = np.asarray(pair.instance), grey(np.asarray(pair.left)), grey(np.asarray(pair.right))
+        for index, stalk in enumerate(close_up.plot.measured):
+            line, column = np.nonzero(instance == index)
+            if line.size < 1000 or column.min() < 175 or column.max() > 400:
+                continue  # the right camera does not see it, or neither sees all of it
+            corner = (int(line.min()), int(column.min()) - 2)
+            mask = instance[corner[0] : line.max() + 1, corner[1] : column.max() + 3] == index
+            found = measure(mask, corner, left, right, drive.true)
+            assert not found.reason, found.reason
+            lines = outline(stalk, pair.pose, drive.true, np.linspace(0.1, 0.6, 501))[:, :, 1].mean(axis=1)
+            height = float(np.linspace(0.1, 0.6, 501)[np.argmin(np.abs(lines - found.line))])
+            assert found.depth == pytest.approx(-pair.pose.position[1] + stalk.at_height(height)[0][1], abs=0.02)
+            if found.confidence > 0.6 and stalk.node_distance(height) > 0.01:
+                errors.append(found.diameter_mm - 1e3 * stalk.diameter(height))
+    assert len(errors) >= 3
+    assert np.abs(errors).mean() < 0.6 and np.abs(errors).max() < 1.2

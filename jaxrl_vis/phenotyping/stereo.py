@@ -12,11 +12,14 @@ Both see a window as a whole at one depth, as a stalk nearly is, and leave windo
 """
 
 import dataclasses
+import math
 
 import cv2
 import numpy as np
 
 _LEAST_SCORE = 0.5
+_AGREEING = 0.4
+_SCATTER = 1.0  # pixels: windows that scatter by more do not see one stalk
 _UNIQUE = 0.97  # a second peak of so much of the first one's height makes a window ambiguous
 
 
@@ -40,9 +43,10 @@ class StalkDisparity:
         """Disparity in a line and its standard error, by a straight line through the windows that most agree with.
 
         Returns:
-            Pixels; None where fewer than three windows agree.
+            Pixels; None where fewer than three windows agree, or less than 0.4 of those that were tried.
         """
-        if self.lines.size < 3:
+        least = max(3, math.ceil(_AGREEING * self.tried))
+        if self.lines.size < least:
             return None
         offset = self.lines - line
         first, second = np.triu_indices(self.lines.size, k=1)
@@ -50,13 +54,14 @@ class StalkDisparity:
         rest = self.values - slope * offset
         middle = float(np.median(rest))
         spread = max(1.4826 * float(np.median(np.abs(rest - middle))), 0.05)
-        good = np.abs(rest - middle) < 3.5 * spread
-        if good.sum() < 3:
+        good = np.abs(rest - middle) < 3.5 * min(spread, _SCATTER)
+        if good.sum() < least:
             return None
         if good.sum() > 3:
-            slope, _ = np.polyfit(offset[good], self.values[good], 1)
+            slope, _ = map(float, np.polyfit(offset[good], self.values[good], 1))
         remaining = self.values[good] - slope * offset[good]
-        return float(remaining.mean()), float(max(remaining.std(), 0.02) / np.sqrt(good.sum()))
+        scatter = max(float(np.std(remaining)), 0.02)
+        return float(np.mean(remaining)), scatter / math.sqrt(int(good.sum()))
 
 
 def grey(image: np.ndarray) -> np.ndarray:

@@ -72,7 +72,9 @@ class _Hit(NamedTuple):
     kind: jax.Array
 
 
-def draw(view: View, shot: Shot, width: int, height: int, samples: int) -> tuple[jax.Array, jax.Array, jax.Array]:
+def draw(
+    view: View, shot: Shot, width: int, height: int, samples: int, at_once: int | None = None
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Draws a view.
 
     Args:
@@ -80,6 +82,7 @@ def draw(view: View, shot: Shot, width: int, height: int, samples: int) -> tuple
         shot: With what.
         width, height: Of the image, pixels.
         samples: Rays a pixel, 1 or 4; instance and depth are those of a ray through the pixel's middle.
+        at_once: Tiles that are drawn side by side; what suits the platform if not given.
 
     Returns:
         Radiance [height, width, 3] float32, instance [height, width] int32 and planar depth [height, width] float32 in m
@@ -89,7 +92,7 @@ def draw(view: View, shot: Shot, width: int, height: int, samples: int) -> tuple
     work = (view.cone_ranges[:, 1] - view.cone_ranges[:, 0]) + (view.triangle_ranges[:, 1] - view.triangle_ranges[:, 0])
     order = np.argsort(-work, kind="stable")
     on_cpu = jax.default_backend() == "cpu"
-    at_once = 1 if on_cpu else min(_TILES_AT_ONCE, len(order))
+    at_once = min(at_once or (1 if on_cpu else _TILES_AT_ONCE), len(order))
     workers = (os.cpu_count() or 1) if on_cpu else 1
     parts = [order[start::workers] for start in range(workers)]
     share = max(map(len, parts))  # all parts have one size, so one program: a missing tile is another one again
