@@ -120,6 +120,7 @@ def test_calibrations_state_the_cameras_but_for_their_error():
         ("a.json", '{"stalks": {"lean_sd": [5, 4]}}', ["stalks.lean_sd must run from low to high"]),
         ("a.json", '{"rig": {"width": 100.5}}', ["rig.width must be a whole number"]),
         ("a.json", '{"rig": {"baseline": -0.1}}', ["rig.baseline must be finite and at least 0"]),
+        ("a.json", '{"layout": {"stalks_mean": 1e9}}', ["layout.stalks_mean must be from 0 to 1000"]),
         ("a.json", '{"imaging": {"samples": 3}}', ["imaging.samples must be 1 or 4"]),
         ("a.json", '{"base": "dry"}', ["base must be one of training, shifted"]),
         ("a.json", "{", ["is not JSON"]),
@@ -325,7 +326,7 @@ def test_synth_writes_plots_and_goes_on_where_it_was(tmp_path, capsys):
         (["--seed", "-1"], "--seed must be at least 0"),
         (["--shift", "lien"], "there is no shift of 'lien'; did you mean lean"),
         (["--spec", "x.json", "--shift", "lean"], "leave out --family and --shift"),
-        (["--width", "8"], "rig.width must be at least 32"),
+        (["--width", "8"], "rig.width must be from 32 to 20000"),
         (["--format", "bmp"], "--format cannot be 'bmp'"),
     ],
 )
@@ -380,3 +381,9 @@ def test_a_pair_gives_diameters_in_millimetres(close_up):
                 errors.append(found.diameter_mm - 1e3 * stalk.diameter(height))
     assert len(errors) >= 3
     assert np.abs(errors).mean() < 0.6 and np.abs(errors).max() < 1.2
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_plots_of_few_stalks_have_them_all(count):
+    few = changed(BARE, layout=dict(stalks_mean=float(count), stalks_sd=0.0, tillers=0.9))
+    assert {len(plants.draw(few, seed).measured) for seed in range(10)} == {count}

@@ -66,7 +66,9 @@ class StalkDisparity:
 
 def grey(image: np.ndarray) -> np.ndarray:
     """An image [H, W] or [H, W, 3] of any depth as [H, W] float32."""
-    return image.astype(np.float32) if image.ndim == 2 else image.astype(np.float32) @ np.float32([0.299, 0.587, 0.114])
+    return (
+        image.astype(np.float32) if image.ndim == 2 else image.astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32)
+    )
 
 
 def match_rows(

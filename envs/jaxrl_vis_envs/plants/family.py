@@ -233,11 +233,58 @@ def _check_range(label: str, value: Any) -> None:
         raise ValueError(f"{label} must run from low to high, got {value}")
 
 
-def _least(family: Any, part: str, **bounds: float) -> None:
-    for name, bound in bounds.items():
-        value = getattr(getattr(family, part), name)
-        if (value[0] if isinstance(value, tuple) else value) < bound:
-            raise ValueError(f"{part}.{name} must be at least {bound}, got {value}")
+# What makes sense at all, and can be drawn in the memory that there is. What is not here need only be finite and at least 0.
+_BOUNDS: dict[str, tuple[float, float]] = {
+    "layout.plot_length": (0.1, 50.0),
+    "layout.stalks_mean": (0, 1000),
+    "layout.stalks_sd": (0, 500),
+    "layout.spacing_minimum": (0.005, 2.0),
+    "layout.spacing_shape": (0.1, 100.0),
+    "layout.tillers": (0, 0.9),
+    "layout.gaps": (0, 0.9),
+    "layout.row_spacing": (0.2, 5.0),
+    "layout.rows_behind": (0, 5),
+    "stalks.height": (0.3, 5.0),
+    "stalks.diameter_mean": (0.001, 0.1),
+    "stalks.diameter_least": (0.001, 0.1),
+    "stalks.lean_sd": (0, 45),
+    "stalks.lean_most": (0, 45),
+    "stalks.node_spacing": (0.04, 1.0),
+    "stalks.node_swelling": (0, 1.0),
+    "stalks.ovality": (1.0, 3.0),
+    "stalks.sheaths": (0, 1),
+    "leaves.density": (0, 20),
+    "leaves.dry": (0, 1),
+    "leaves.length_mean": (0.05, 3.0),
+    "leaves.width_mean": (0.002, 0.3),
+    "leaves.litter": (0, 2000),
+    "textures.fibre_pitch": (1e-4, 1.0),
+    "textures.fibre_contrast": (0, 1),
+    "textures.blotch_size": (1e-3, 1.0),
+    "textures.blotch_contrast": (0, 1),
+    "textures.speckles": (0, 1),
+    "textures.speckle_size": (2e-4, 1.0),
+    "textures.bands": (0, 1),
+    "textures.band_pitch": (1e-3, 1.0),
+    "textures.bloom": (0, 1),
+    "rig.width": (32, 20000),
+    "rig.height": (16, 20000),
+    "rig.focal": (8, 1e5),
+    "rig.baseline": (0.008, 2.0),
+    "rig.stated_spread": (0, 0.5),
+    "rig.calibration_error": (0, 0.2),
+    "rig.distance": (0.3, 5.0),
+    "rig.camera_height": (0.05, 3.0),
+    "rig.pitch_sd": (0, 20),
+    "rig.frames": (1, 10000),
+    "rig.speed": (1e-3, 10.0),
+    "rig.odometry_noise": (0, 0.5),
+    "imaging.flash": (0.01, 100.0),
+    "imaging.exposure_spread": (0, 2),
+    "imaging.vignetting": (0, 1),
+    "imaging.blur": (0, 3.0),
+    "imaging.full_well": (10.0, 1e7),
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -271,14 +318,12 @@ class Family:
             if dataclasses.is_dataclass(part):
                 for each in dataclasses.fields(part):
                     _check_range(f"{field.name}.{each.name}", getattr(part, each.name))
-        _least(self, "layout", plot_length=0.1, stalks_mean=0, spacing_minimum=0.005, spacing_shape=0.1, row_spacing=0.2)
-        _least(self, "stalks", diameter_least=0.001, node_spacing=0.04, ovality=1.0, height=0.3)
-        _least(self, "leaves", length_mean=0.05, width_mean=0.002)
-        _least(self, "textures", fibre_pitch=1e-4, blotch_size=1e-3, speckle_size=2e-4, band_pitch=1e-3)
-        _least(
-            self, "rig", width=32, height=32, focal=16.0, baseline=0.005, distance=0.3, camera_height=0.05, frames=1, speed=1e-3
-        )
-        _least(self, "imaging", flash=0.01, full_well=10.0)
+        for label, (low, high) in _BOUNDS.items():
+            part, name = label.split(".")
+            value = getattr(getattr(self, part), name)
+            least, most = value if isinstance(value, tuple) else (value, value)
+            if least < low or most > high:
+                raise ValueError(f"{label} must be from {low:g} to {high:g}, got {value}")
         if self.imaging.samples not in (1, 4):
             raise ValueError(f"imaging.samples must be 1 or 4, got {self.imaging.samples}")
 

@@ -150,7 +150,7 @@ def _places(rng: np.random.Generator, layout: Layout, margin: float) -> list[tup
     length = layout.plot_length + 2 * margin
     share = length / layout.plot_length
     count = max(round(share * rng.normal(layout.stalks_mean, layout.stalks_sd)), 0)
-    tillers = rng.binomial(count, layout.tillers) if count > 1 else 0
+    tillers = min(int(rng.binomial(count, layout.tillers)), max(count - 1, 0))  # somebody must be the mother
     mothers = count - tillers
     if not mothers:
         return []
