@@ -11,7 +11,7 @@ import pytest
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.phenotyping.annotations import decode_mask, encode_mask
 from jaxrl_vis.phenotyping.calibration import check_size, read_calibration, write_calibration
-from jaxrl_vis.phenotyping.images import read_image, write_image
+from jaxrl_vis.phenotyping.images import read_disparity, read_image, write_image
 from jaxrl_vis.phenotyping.metric import diameter_mm, tilt_of
 from jaxrl_vis.phenotyping.stereo import match_rows, match_sgbm
 from jaxrl_vis.phenotyping.width import ELLIPSE_FITS, ellipse_width, strip_width
@@ -288,3 +288,17 @@ def test_images_survive_files(tmp_path, suffix):
     (tmp_path / f"b{suffix}").write_bytes(b"no image")
     with pytest.raises(OSError, match=f"b{suffix} is not an image"):
         read_image(tmp_path / f"b{suffix}")
+
+
+def test_disparities_are_read_in_every_convention(tmp_path):
+    expected = np.array([[1.5, np.nan, 200.25], [3.0, 4.0, np.nan]], np.float32)
+    header = b"Pf\n3 2\n-1.0\n"  # little-endian, last line first
+    (tmp_path / "a.pfm").write_bytes(header + np.nan_to_num(expected, nan=np.inf)[::-1].astype("<f4").tobytes())
+    write_image(tmp_path / "b.png", (np.nan_to_num(expected) * 256).astype(np.uint16))
+    write_image(tmp_path / "c.tiff", (np.nan_to_num(expected) * 64).astype(np.uint16))
+    np.testing.assert_array_equal(read_disparity(tmp_path / "a.pfm"), expected)
+    np.testing.assert_array_equal(read_disparity(tmp_path / "b.png"), expected)
+    np.testing.assert_array_equal(read_disparity(tmp_path / "c.tiff", 64.0), expected)
+    write_image(tmp_path / "d.png", np.zeros((2, 3), np.uint8))
+    with pytest.raises(OSError, match="d.png holds no disparities"):
+        read_disparity(tmp_path / "d.png")

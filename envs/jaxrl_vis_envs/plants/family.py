@@ -1,8 +1,4 @@
-"""Families of fields: what is drawn for every plot, and how far it varies. Loads neither JAX nor MuJoCo.
-
-    TRAINING                        what networks learn on
-    shift(TRAINING, "flash", ...)   the same with some of the factors in `SHIFTS` moved; SHIFTED has them all
-    read(path)                      a family from a JSON or TOML file: TRAINING, with the values of the file in its place
+"""What a family of fields is: what is drawn for every plot, and how far it varies. Loads neither JAX nor MuJoCo.
 
 A range (low, high) is drawn uniformly, a mean with an sd normally. Lengths are in metres and angles in degrees unless the name
 says otherwise. Sources: the thesis, section 3.3 (33 stalks on 2.134 m, 0.8 m away, 8 mm lens, 9 megapixels, 14.354 mm at 12
@@ -10,14 +6,9 @@ inches, 0.405 mm of taper per inch), and published traits of grain sorghum for w
 """
 
 import dataclasses
-import json
 import math
 import numbers
-import tomllib
-from pathlib import Path
 from typing import Any
-
-from jaxrl_vis_envs.names import nearest
 
 Range = tuple[float, float]
 INCH = 0.0254
@@ -221,13 +212,14 @@ class Imaging:
     """Rays a pixel: 1 or 4."""
 
 
-def _is_number(value: Any) -> bool:
+def is_number(value: Any) -> bool:
+    """Whether a value is a finite number, and not true or false."""
     return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _check_range(label: str, value: Any) -> None:
     low, high = value if isinstance(value, tuple) else (value, value)
-    if not (_is_number(low) and _is_number(high)) or low < 0:
+    if not (is_number(low) and is_number(high)) or low < 0:
         raise ValueError(f"{label} must be finite and at least 0, got {value}")
     if low > high:
         raise ValueError(f"{label} must run from low to high, got {value}")
@@ -335,123 +327,4 @@ class Family:
         return dataclasses.replace(self, rig=rig)
 
 
-_UNSEEN = Textures(
-    stalk_hue=(0.045, 0.085),
-    leaf_hue=(0.155, 0.195),
-    dry_hue=(0.035, 0.065),
-    soil_hue=(0.085, 0.11),
-    fibre_pitch=(1.6e-3, 2.8e-3),
-    fibre_contrast=(0.28, 0.45),
-    blotch_size=(0.025, 0.05),
-    blotch_contrast=(0.46, 0.6),
-    speckles=(0.35, 0.6),
-    speckle_size=(1.8e-3, 3.0e-3),
-    bands=(0.18, 0.35),
-    band_pitch=(0.006, 0.015),
-    bloom=(0.0, 0.08),
-    gloss=(0.14, 0.25),
-)
-
-# Factor -> changes of the training family, by part.
-SHIFTS: dict[str, dict[str, dict[str, Any]]] = {
-    "flash": {"imaging": {"flash": (0.6, 1.6)}},
-    "lean": {"stalks": {"lean_sd": (4.0, 8.0)}},
-    "rig": {"rig": {"stated_spread": 0.05, "calibration_error": 0.005}},
-    "noise": {"imaging": {"noise": 2.0}},
-    "leaves": {"leaves": {"density": 1.3}},
-    "textures": {"textures": {each.name: getattr(_UNSEEN, each.name) for each in dataclasses.fields(_UNSEEN)}},
-}
-
 TRAINING = Family()
-
-
-def shift(family: Family, *factors: str, name: str = "", stream: int = 0) -> Family:
-    """The family with some factors moved.
-
-    Args:
-        family: Where to start from.
-        factors: Names in `SHIFTS`.
-        name: Of the result; the factors' names if not given.
-        stream: Of the result; if not given, one that depends on the factors, and is never that of ``family``.
-
-    Raises:
-        ValueError: There is no such factor.
-    """
-    for factor in factors:
-        if factor not in SHIFTS:
-            raise ValueError(f"there is no shift of {factor!r}{nearest(factor, SHIFTS)}")
-        for part, changes in SHIFTS[factor].items():
-            family = dataclasses.replace(family, **{part: dataclasses.replace(getattr(family, part), **changes)})
-    places = sum(1 << list(SHIFTS).index(factor) for factor in set(factors))
-    return dataclasses.replace(family, name=name or "+".join(factors), stream=stream or 100 + places + 1000 * family.stream)
-
-
-SHIFTED = shift(TRAINING, *SHIFTS, name="shifted", stream=2)
-FAMILIES = {family.name: family for family in (TRAINING, SHIFTED)}
-
-
-def read(path: Path) -> Family:
-    """A family from a file: the fields of `Family`, parts as tables; what is missing is as in the family called ``base``.
-
-    Args:
-        path: JSON or, by its suffix, TOML.
-
-    Raises:
-        ValueError: The file cannot be read, or holds an unknown key or a bad value. One line that says which.
-    """
-    try:
-        text = path.read_text(encoding="utf-8")
-        values = tomllib.loads(text) if path.suffix.lower() == ".toml" else json.loads(text)
-    except OSError as error:
-        raise ValueError(f"{path} cannot be read: {error.strerror}") from error
-    except (UnicodeDecodeError, ValueError) as error:
-        kind = "TOML" if path.suffix.lower() == ".toml" else "JSON"
-        raise ValueError(f"{path} is not {kind} (write .toml or .json): {' '.join(str(error).split())}") from error
-    if not isinstance(values, dict):
-        raise ValueError(f'{path} must hold one table of a family\'s fields, like {{"stalks": {{"lean_most": 15}}}}')
-    base = values.pop("base", TRAINING.name)
-    if not isinstance(base, str) or base not in FAMILIES:
-        raise ValueError(f"{path}: base must be one of {', '.join(FAMILIES)}, got {base!r}")
-    # Its own random numbers, so that a file that repeats a family's values still draws other plots.
-    name = values.get("name", path.stem)
-    start = dataclasses.replace(FAMILIES[base], name=name, stream=10_000 + sum(map(ord, str(name))))
-    try:
-        return _changed("", start, values)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
-
-
-def _changed(where: str, record: Any, values: dict[str, Any]) -> Any:
-    """A dataclass with the values of a table in place of its own."""
-    known = {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
-    changes = {}
-    for name, value in values.items():
-        label = f"{where}{name}"
-        if name not in known:
-            raise ValueError(f"unknown key {label!r}{nearest(name, known)}")
-        if dataclasses.is_dataclass(known[name]):
-            if not isinstance(value, dict):
-                raise ValueError(f"{label} must be a table, got {value!r}")
-            changes[name] = _changed(f"{label}.", known[name], value)
-        else:
-            changes[name] = _like(label, known[name], value)
-    return dataclasses.replace(record, **changes)
-
-
-def _like(label: str, example: Any, value: Any) -> Any:
-    """A value of the kind that the example is of."""
-    if isinstance(example, tuple):
-        if not isinstance(value, list | tuple) or len(value) != 2 or not all(map(_is_number, value)):
-            raise ValueError(f"{label} must be a range of two numbers, [low, high], got {value!r}")
-        return (float(value[0]), float(value[1]))
-    if isinstance(example, str):
-        if not isinstance(value, str) or not value:
-            raise ValueError(f"{label} must be a word, got {value!r}")
-        return value
-    if not _is_number(value):
-        raise ValueError(f"{label} must be a number, got {value!r}")
-    if isinstance(example, int):
-        if not float(value).is_integer():
-            raise ValueError(f"{label} must be a whole number, got {value!r}")
-        return int(value)
-    return float(value)
