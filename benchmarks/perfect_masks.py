@@ -56,6 +56,8 @@ if __name__ == "__main__":
     print("synthetic, family", family.name)
     for least in (0.0, 0.5, 0.8):
         kept = [row for row in rows if row["confidence"] >= least]
+        if not kept:
+            break
         for method in ("strip", "ellipse"):
             errors = np.array([row[method] for row in kept])
             size = np.abs(errors)

@@ -4,8 +4,7 @@
     ROS camera_info YAML    a folder with left.yaml and right.yaml, or either of them beside the other
 
 Millimetres of stalk come from the focal length and the baseline, so a file without them is refused rather than guessed. The one
-thing that files do not say is the unit of the baseline: it is metres in ROS, and whatever the chessboard was measured in for
-    OpenCV.
+thing that files do not say is the unit of the baseline: metres in ROS, and in OpenCV whatever the chessboard was measured in.
 """
 
 import dataclasses

@@ -3,8 +3,7 @@
 Only what lies in a detection is matched: matching all of a 9-megapixel pair takes 20 s on two cores, and one row of pixels in
 twenty of a stalk says as much about its distance. Two ways:
 
-    match_rows     one-dimensional: windows of a few lines, as wide as the detection, compared at every whole disparity by
-    normalised
+    match_rows     one-dimensional: windows of a few lines of the stalk, compared at every whole disparity by normalised
                    cross-correlation; then a parabola through the best and its neighbours. The default.
     match_sgbm     OpenCV's semi-global matching of the detection's strip; what the thesis used, on the whole image.
 

@@ -24,8 +24,7 @@ class Calibration:
         focal: Focal length, pixels.
         centre: Column and line of the left camera's principal point.
         baseline: Distance between the cameras, m.
-        offset: Disparity of what is infinitely far away, pixels: column of the left camera's principal point less the right
-            one's.
+        offset: Disparity of what is infinitely far away, pixels: the left principal point's column less the right one's.
     """
 
     width: int

@@ -1,6 +1,4 @@
-"""A plot as surfaces that can be drawn: cones for stalks, triangles for leaves, and what each of them looks like. NumPy
-only.
-"""
+"""A plot as surfaces that can be drawn: cones for stalks, triangles for leaves, and how each of them looks. NumPy only."""
 
 import colorsys
 import dataclasses
@@ -23,9 +21,7 @@ _GUTTER = 0.3
 MATERIAL = ("red", "green", "blue", "red_over", "green_over", "blue_over", "fibre_frequency", "fibre_contrast",
             "blotch_frequency", "blotch_contrast", "speckles", "speckle_frequency", "bands", "band_frequency", "bloom", "gloss",
             "place", "edge")  # fmt: skip
-"""Columns of a material. ``over`` is the colour of sheaths, or of the edges of leaves; ``place`` shifts textures between
-plants.
-"""
+"""Columns of a material. ``over``: colour of sheaths, or of the edges of leaves; ``place`` shifts textures between plants."""
 
 
 @dataclasses.dataclass(frozen=True)
