@@ -36,11 +36,14 @@ class Episodes(Replaceable):
         observations: [E, T+2, ...] after 0, 1, ... T steps, then the goal's.
         states: [E, T+2, G] float32, the true goal-space states of the same instants.
         actions: [E, T, A] float32, as executed (with exploration noise).
+        flow: [E, T, H, W] uint8, strength of the optical flow of each step (`auxtasks.optical_flow.to_bytes`); None where no
+            auxiliary task asks for it.
     """
 
     observations: jax.Array
     states: jax.Array
     actions: jax.Array
+    flow: jax.Array | None = None
 
 
 @jax.tree_util.register_dataclass

@@ -21,14 +21,14 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("report",),
     ("run",),
     ("studies",),
-    ("bench", "doctor"),
+    ("bench", "doctor", "phenotyping"),
     ("cli",),
     ("__main__",),
 )
 # The same for the environments.
 ENVIRONMENT_LAYERS: tuple[tuple[str, ...], ...] = (
     ("checks", "compilation", "goals", "names", "quiet_warp"),
-    ("physics", "render", "task_modules"),
+    ("physics", "plants", "render", "task_modules"),
     ("randomization",),
     ("base",),
     ("pixels", "registry"),

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jaxrl_vis
-from jaxrl_vis.cli import bench, doctor, envs, eval, figure, play, train
+from jaxrl_vis.cli import bench, doctor, envs, eval, figure, phenotype, play, train
 from jaxrl_vis.cli.parsing import PROGRAM, parse
 from jaxrl_vis.errors import NonFiniteError, RequestError, StorageError, Terminated, nearest
 
@@ -26,17 +26,20 @@ COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
     "doctor": (doctor.Doctor, doctor.run),
     "bench": (bench.Bench, bench.run),
     "figure": (figure.Figure, figure.run),
+    "phenotype synth": (phenotype.Synth, phenotype.synth),
 }
 
 # Of the errors that are told in one line.
 _STATUS: dict[type[Exception], int] = {RequestError: 2, StorageError: 1, NonFiniteError: 4}
 
 
-def overview() -> str:
-    """The help of the program as a whole."""
+def overview(group: str = "") -> str:
+    """The help of the program as a whole, or of the commands of two words that begin with ``group``."""
     lines = [f"usage: {PROGRAM} [-h] [--version] COMMAND ...", "", DESCRIPTION, "", "commands:"]
-    for name, (command, _) in COMMANDS.items():
-        lines.append(f"  {name:8} {(inspect.getdoc(command) or '').splitlines()[0]}")
+    named = {name: command for name, (command, _) in COMMANDS.items() if name.startswith(group)}
+    width = max(map(len, named))
+    for name, command in named.items():
+        lines.append(f"  {name:{width}} {(inspect.getdoc(command) or '').splitlines()[0]}")
     lines += ["", "options:", "  -h, --help  show this", "  --version   show the version"]
     return "\n".join([*lines, "", f"`{PROGRAM} COMMAND --help` lists the options of a command."])
 
@@ -79,15 +82,39 @@ def entry() -> None:
     sys.exit(status)
 
 
+def command_of(words: Sequence[str]) -> tuple[str, Sequence[str]]:
+    """Splits a command line into the command, of one word or of two, and what follows it.
+
+    Args:
+        words: At least one word.
+
+    Raises:
+        RequestError: There is no such command.
+    """
+    name, *rest = words
+    if name in COMMANDS:
+        return name, rest
+    seconds = [each.partition(" ")[2] for each in COMMANDS if each.startswith(f"{name} ")]
+    if not seconds:
+        kind = "option" if name.startswith("-") else "command"
+        raise RequestError(f"unknown {kind} {name!r}{nearest(name, dict.fromkeys(each.split()[0] for each in COMMANDS))}")
+    if not rest:
+        raise RequestError(f"{name} what? Choose one of {', '.join(seconds)} (or see {PROGRAM} {name} --help)")
+    if rest[0] not in seconds:
+        raise RequestError(f"unknown command '{name} {rest[0]}'{nearest(rest[0], seconds)}")
+    return f"{name} {rest[0]}", rest[1:]
+
+
 def _run(words: Sequence[str]) -> int:
     if not words:
-        raise RequestError(f"no command given; choose one of {', '.join(COMMANDS)} (or see {PROGRAM} --help)")
-    name, *rest = words
-    if name in ("-h", "--help", "--version"):
-        print(jaxrl_vis.__version__ if name == "--version" else overview())
+        first = dict.fromkeys(each.split()[0] for each in COMMANDS)
+        raise RequestError(f"no command given; choose one of {', '.join(first)} (or see {PROGRAM} --help)")
+    if words[0] in ("-h", "--help", "--version"):
+        print(jaxrl_vis.__version__ if words[0] == "--version" else overview())
         return 0
-    if name not in COMMANDS:
-        kind = "option" if name.startswith("-") else "command"
-        raise RequestError(f"unknown {kind} {name!r}{nearest(name, COMMANDS)}")
+    if len(words) > 1 and words[1] in ("-h", "--help") and any(each.startswith(f"{words[0]} ") for each in COMMANDS):
+        print(overview(f"{words[0]} "))
+        return 0
+    name, rest = command_of(words)
     command, run = COMMANDS[name]
-    return run(parse(command, rest))
+    return run(parse(command, rest, name))

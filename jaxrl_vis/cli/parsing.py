@@ -151,7 +151,7 @@ class _Option:
         return Annotated[list[str], *extras]
 
 
-def parse(command: type[T], words: Sequence[str]) -> T:
+def parse(command: type[T], words: Sequence[str], name: str = "") -> T:
     """One command, from the words that follow its name.
 
     Args:
@@ -159,6 +159,7 @@ def parse(command: type[T], words: Sequence[str]) -> T:
             `tyro.conf.Positional` is known by its place, one annotated with `ByPlaceToo` by either, and one annotated with
             `ChangesOf` stands for many.
         words: Of the command line.
+        name: What it is called; the dataclass's name in lower case if not given.
 
     Raises:
         RequestError: The words do not make sense.
@@ -166,7 +167,7 @@ def parse(command: type[T], words: Sequence[str]) -> T:
     """
     options = {option.key: option for option in _options_of(command)}
     _check_values(words, list(options.values()))
-    program = f"{PROGRAM} {command.__name__.lower()}"
+    program = f"{PROGRAM} {name or command.__name__.lower()}"
     given, left_over = _split(command, program, words, options)
     if left_over:
         word = left_over[0].partition("=")[0].replace("_", "-") if left_over[0].startswith("-") else left_over[0]

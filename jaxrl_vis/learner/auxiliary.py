@@ -1,7 +1,8 @@
 """Auxiliary tasks and their weighting as parts of a learner: made from a `Config`, with what each of its steps does for them.
 
-sampling   targets, from raw images
-ddpg       latents of all observations that some task reads, losses, and a weighted gradient for each encoder
+    collecting   optical flow, from raw images
+    sampling     the other targets, likewise
+    ddpg         latents of all observations that some task reads, losses, and a weighted gradient for each encoder
 """
 
 import dataclasses
@@ -12,9 +13,11 @@ import jax
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import auxtasks
-from jaxrl_vis.learner.auxtasks import AuxTask, Spec, Targets, View
+from jaxrl_vis.learner.auxtasks import AuxTask, Spec, Targets, View, optical_flow
 from jaxrl_vis.learner.weighting import MAIN, Weighting, WeightingState, make_weighting
-from jaxrl_vis.types import Batch, Params
+from jaxrl_vis.types import Batch, Episodes, Params
+
+_EPISODES_AT_ONCE = 10  # of which optical flow is computed: some 500 images fill a GPU, and more would fill its memory
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,11 +64,36 @@ class Auxiliary:
         """The weighting's state before the first update."""
         return self.weighting.init((MAIN, *self.tasks), encoder)
 
-    def targets(self, key: jax.Array, batch: Batch) -> Targets:
-        """The targets of a batch, from its raw images; ``key`` is that of its rotations."""
-        return auxtasks.make_targets(
-            key, batch.observation_t, batch.observation_tp1, self.needs, self.options, self.frame_stack
-        )
+    @property
+    def keeps_flow(self) -> bool:
+        """Whether episodes are to be collected with their optical flow.
+
+        It takes longer than all the rest of a gradient step, and a transition is sampled 5 to 20 times.
+        """
+        return "flow" in self.needs
+
+    def with_flow(self, episodes: Episodes) -> Episodes:
+        """A rollout's episodes with their optical flow, where it is kept."""
+        if not self.keeps_flow:
+            return episodes
+
+        def of_episode(images: jax.Array) -> jax.Array:
+            strength = optical_flow.flow_strength(images[:-1], images[1:], self.frame_stack, self.options.stretch)
+            return optical_flow.to_bytes(strength, self.options.stretch)
+
+        return episodes.replace(flow=jax.lax.map(of_episode, episodes.observations[:, :-1], batch_size=_EPISODES_AT_ONCE))
+
+    def targets(self, key: jax.Array, batch: Batch, flow: jax.Array | None) -> Targets:
+        """The targets of a batch.
+
+        Args:
+            key: [] a typed key, that of its rotations.
+            batch: With raw images.
+            flow: [B, H, W] uint8, as kept; None where it is not.
+        """
+        images = batch.observation_t, batch.observation_tp1
+        targets = auxtasks.make_targets(key, *images, self.needs - {"flow"}, self.options, self.frame_stack)
+        return targets if flow is None else targets.replace(flow=optical_flow.from_bytes(flow, self.options.stretch))
 
     def losses(
         self, heads: dict[str, Params], latents: jax.Array, image: jax.Array | None, batch: Batch

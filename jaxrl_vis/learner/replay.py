@@ -42,6 +42,12 @@ def unpack(observations: jax.Array) -> jax.Array:
     return jax.lax.bitcast_convert_type(observations, jnp.uint8).reshape(*shape, words * _WORD)
 
 
+def _packed(episodes: Episodes) -> Episodes:
+    """Episodes as they are stored."""
+    flow = None if episodes.flow is None else pack(episodes.flow)
+    return episodes.replace(observations=pack(episodes.observations), flow=flow)
+
+
 class Indices(NamedTuple):
     """Where B transitions lie: [B] int32 each.
 
@@ -72,32 +78,38 @@ class Replay(NamedTuple):
         """N, episodes that the ring holds."""
         return self.num_rollouts * self.num_envs
 
-    def init(self, observation: jax.ShapeDtypeStruct, goal_state_size: int, action_size: int) -> ReplayState:
+    def init(
+        self, observation: jax.ShapeDtypeStruct, goal_state_size: int, action_size: int, with_flow: bool = False
+    ) -> ReplayState:
         """An empty replay.
 
         Args:
             observation: Shape and dtype of one observation (`GoalEnv.observation_spec`).
             goal_state_size: G.
             action_size: A.
+            with_flow: Whether episodes come with their optical flow.
         """
         episodes, horizon = self.num_episodes, self.horizon
+        flow = pack(jnp.zeros((episodes, horizon, *observation.shape[-2:]), jnp.uint8)) if with_flow else None
         return ReplayState(
             episodes=Episodes(
                 observations=pack(jnp.zeros((episodes, horizon + 2, *observation.shape), observation.dtype)),
                 states=jnp.zeros((episodes, horizon + 2, goal_state_size), jnp.float32),
                 actions=jnp.zeros((episodes, horizon, action_size), jnp.float32),
+                flow=flow,
             ),
             size=jnp.zeros((), jnp.int32),
         )
 
-    def spec(self, observation: jax.ShapeDtypeStruct, goal_state_size: int, action_size: int) -> ReplayState:
+    def spec(
+        self, observation: jax.ShapeDtypeStruct, goal_state_size: int, action_size: int, with_flow: bool = False
+    ) -> ReplayState:
         """Shapes and dtypes of the storage, without allocating it; arguments as of `init`."""
-        return jax.eval_shape(lambda: self.init(observation, goal_state_size, action_size))
+        return jax.eval_shape(lambda: self.init(observation, goal_state_size, action_size, with_flow))
 
     def of_rollout(self, rollout: Episodes) -> ReplayState:
         """A replay of one rollout that holds just these E episodes."""
-        episodes = rollout.replace(observations=pack(rollout.observations))
-        return ReplayState(episodes=episodes, size=jnp.full((), self.num_envs, jnp.int32))
+        return ReplayState(episodes=_packed(rollout), size=jnp.full((), self.num_envs, jnp.int32))
 
     def insert(self, state: ReplayState, rollout: Episodes, iteration: jax.Array) -> ReplayState:
         """Writes the E episodes of a rollout, over the oldest ones once the ring is full.
@@ -108,9 +120,10 @@ class Replay(NamedTuple):
             iteration: [] int32, iterations before this one: it settles the place.
         """
         start = (iteration % self.num_rollouts) * self.num_envs
-        rollout = rollout.replace(observations=pack(rollout.observations))
         episodes = jax.tree.map(
-            lambda storage, new: jax.lax.dynamic_update_slice_in_dim(storage, new, start, axis=0), state.episodes, rollout
+            lambda storage, new: jax.lax.dynamic_update_slice_in_dim(storage, new, start, axis=0),
+            state.episodes,
+            _packed(rollout),
         )
         return ReplayState(episodes=episodes, size=jnp.minimum(state.size + self.num_envs, self.num_episodes))
 
@@ -153,6 +166,11 @@ class Replay(NamedTuple):
             state_tp1=states[episode, time + 1],
             goal_state=states[episode, goal_slot],
         )
+
+    def flow(self, state: ReplayState, indices: Indices) -> jax.Array:
+        """The optical flow of transitions, as episodes have it: [B, H, W] uint8."""
+        assert state.episodes.flow is not None
+        return unpack(state.episodes.flow[indices.episode, indices.time])
 
 
 def make_replay(transitions: int, num_envs: int, horizon: int) -> Replay:

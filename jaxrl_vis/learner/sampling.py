@@ -117,7 +117,8 @@ class Sampler:
         batch = self.replay.gather(state, choice.indices, choice.goal_slot, self.config.n_step).replace(shift=choice.shift)
         if choice.target_key is not None:
             assert self.auxiliary is not None
-            batch = batch.replace(targets=self.auxiliary.targets(choice.target_key, batch))
+            flow = self.replay.flow(state, choice.indices) if self.auxiliary.keeps_flow else None
+            batch = batch.replace(targets=self.auxiliary.targets(choice.target_key, batch, flow))
         reached = batch.observation_tp1
         if self.as_goal is not None:
             # Stacked images also show how things move, and a goal stands still; what is reached is compared in the same terms.

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 
 from jaxrl_vis.config import Config, Resolved, resolve, validate
 from jaxrl_vis.learner import normalizer
-from jaxrl_vis.learner.auxiliary import make_auxiliary
+from jaxrl_vis.learner.auxiliary import Auxiliary, make_auxiliary
 from jaxrl_vis.learner.ddpg import Algorithm, Working, make_ddpg
 from jaxrl_vis.learner.evaluate import make_evaluate
 from jaxrl_vis.learner.networks import Networks
@@ -43,7 +43,7 @@ class TrainStep:
     """The compiled program of a run and what belongs to it; see `make_train_step`.
 
     Attributes:
-        env, config, resolved, networks, replay: What it was made of.
+        env, config, resolved, networks, auxiliary, replay: What it was made of.
         init: keys [S] -> LoopState.
         train_iteration: LoopState (donated) -> (LoopState, metrics of [S] float32).
         evaluate: See `evaluate.make_evaluate`.
@@ -58,6 +58,7 @@ class TrainStep:
     config: Config
     resolved: Resolved
     networks: Networks
+    auxiliary: Auxiliary
     replay: Replay
     init: Any
     train_iteration: Any
@@ -84,7 +85,8 @@ class TrainStep:
     @property
     def replay_spec(self) -> ReplayState:
         """Shapes of one seed's replay, without allocating it."""
-        return self.replay.spec(self.env.observation_spec, self.env.goal_state_size, self.env.action_size)
+        sizes = self.env.observation_spec, self.env.goal_state_size, self.env.action_size
+        return self.replay.spec(*sizes, with_flow=self.auxiliary.keeps_flow)
 
     @property
     def replay_bytes(self) -> int:
@@ -174,7 +176,7 @@ def make_train_step(env: GoalEnv, config: Config) -> TrainStep:
     def init(key: jax.Array) -> LoopState:
         return LoopState(
             train=algorithm.init(key),
-            replay=replay.init(env.observation_spec, env.goal_state_size, env.action_size),
+            replay=replay.init(env.observation_spec, env.goal_state_size, env.action_size, auxiliary.keeps_flow),
             key=key,
             iteration=jnp.zeros((), jnp.int32),
         )
@@ -189,6 +191,7 @@ def make_train_step(env: GoalEnv, config: Config) -> TrainStep:
     def insert(
         train: TrainState, replay_state: ReplayState, episodes: Episodes, key: jax.Array, iteration: jax.Array
     ) -> tuple[TrainState, ReplayState]:
+        episodes = auxiliary.with_flow(episodes)
         replay_state = replay.insert(replay_state, episodes, iteration)
         return _see(train, episodes, jax.random.fold_in(key, _STATISTICS), config, sampler), replay_state
 
@@ -210,6 +213,7 @@ def make_train_step(env: GoalEnv, config: Config) -> TrainStep:
         config=config,
         resolved=resolved,
         networks=networks,
+        auxiliary=auxiliary,
         replay=replay,
         init=env_jit(per_seed(init, out_axes=_SEED_AXES), runs_once=True),
         train_iteration=env_jit(train_iteration, donate_argnums=0),

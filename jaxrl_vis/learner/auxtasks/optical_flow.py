@@ -35,6 +35,23 @@ def make(spec: Spec) -> AuxTask:
     )
 
 
+_BYTES_PER_PIXEL, _LARGEST_BYTE = 16.0, 255.0
+
+
+def to_bytes(strength: jax.Array, stretch: bool = False) -> jax.Array:
+    """Strengths [...] as a replay keeps them: uint8, in steps of 1/16 pixel up to 15.9; stretched masks in 255 steps."""
+    return jnp.clip(jnp.round(strength * _scale(stretch)), 0.0, _LARGEST_BYTE).astype(jnp.uint8)
+
+
+def from_bytes(kept: jax.Array, stretch: bool = False) -> jax.Array:
+    """Undoes `to_bytes` but for its rounding: [...] float32."""
+    return kept.astype(jnp.float32) / _scale(stretch)
+
+
+def _scale(stretch: bool) -> float:
+    return _LARGEST_BYTE if stretch else _BYTES_PER_PIXEL
+
+
 def flow_strength(images_t: jax.Array, images_tp1: jax.Array, frame_stack: int = 1, stretch: bool = False) -> jax.Array:
     """The length of the optical flow at every pixel: [B, H, W] float32, in pixels.
 

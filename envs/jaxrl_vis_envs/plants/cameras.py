@@ -1,0 +1,125 @@
+"""The two cameras: where they are, what they see, and what their calibration says of them. NumPy only.
+
+Camera frame: x to the right of the image, y down, z forwards. The cameras look along the world's y axis and move along its x
+axis; the right one stands a baseline further along. Both are rectified: a point at (X, Y, Z) in the left camera's frame is seen
+at column centre + f X / Z in the left image and a disparity f B / Z further left in the right one, in the same line but for a
+small error. Pixel (column 0, line 0) has its middle at (0.0, 0.0).
+"""
+
+import dataclasses
+import math
+
+import numpy as np
+
+from jaxrl_vis_envs.plants.family import Family, Rig
+from jaxrl_vis_envs.plants.field import generator
+
+
+@dataclasses.dataclass(frozen=True)
+class Calibration:
+    """What is known of a pair of rectified cameras. Both images have the same size.
+
+    Attributes:
+        width, height: Pixels.
+        focal: Focal length, pixels.
+        centre: Column and line of the left camera's principal point.
+        baseline: Distance between the cameras, m.
+        offset: Disparity of what is infinitely far away, pixels: the left principal point's column less the right one's.
+    """
+
+    width: int
+    height: int
+    focal: float
+    centre: tuple[float, float]
+    baseline: float
+    offset: float = 0.0
+
+    def depth(self, disparity: np.ndarray) -> np.ndarray:
+        """Planar depth in m of disparities in pixels, of any shape; infinite where there is no such depth."""
+        beyond = np.asarray(disparity) - self.offset
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(beyond > 0, self.focal * self.baseline / beyond, np.inf)
+
+    def disparity(self, depth: np.ndarray) -> np.ndarray:
+        """Disparity in pixels of planar depths in m, of any shape."""
+        return self.focal * self.baseline / np.asarray(depth) + self.offset
+
+
+@dataclasses.dataclass(frozen=True)
+class Pose:
+    """Where the left camera is for one pair.
+
+    Attributes:
+        position: [3] float64, in the world, m.
+        rotation: [3, 3] float64, from the world's axes to the camera's.
+    """
+
+    position: np.ndarray
+    rotation: np.ndarray
+
+    def to_camera(self, points: np.ndarray) -> np.ndarray:
+        """Points [..., 3] in the world as points in the left camera's frame, m."""
+        return (points - self.position) @ self.rotation.T
+
+    def to_world(self, points: np.ndarray) -> np.ndarray:
+        """The inverse of `to_camera`."""
+        return points @ self.rotation + self.position
+
+
+@dataclasses.dataclass(frozen=True)
+class Drive:
+    """How the cameras pass one plot.
+
+    Attributes:
+        true: The cameras as they are.
+        stated: The cameras as their calibration says.
+        poses: One per pair.
+        times: [F] float64, s.
+        odometry: [F] float64, distance along the row that the robot reports, m, from 0.
+        line_offset: By how many lines the right image lies too low.
+        line_slope: How much more per column.
+    """
+
+    true: Calibration
+    stated: Calibration
+    poses: tuple[Pose, ...]
+    times: np.ndarray
+    odometry: np.ndarray
+    line_offset: float
+    line_slope: float
+
+
+def drive(family: Family, seed: int) -> Drive:
+    """How the cameras of a family pass its plot of this seed; they see its ends from half a step inside."""
+    rig = family.rig
+    rng = generator(family, seed, "drive")
+    focal, baseline = (
+        nominal * (1.0 + rng.uniform(-rig.stated_spread, rig.stated_spread)) for nominal in (rig.focal, rig.baseline)
+    )
+    centre = ((rig.width - 1) / 2.0, (rig.height - 1) / 2.0)
+    true = Calibration(rig.width, rig.height, focal, centre, baseline)
+    errors = 1.0 + rig.calibration_error * rng.choice([-1.0, 1.0], 2)
+    stated = dataclasses.replace(true, focal=focal * errors[0], baseline=baseline * errors[1])
+
+    step = family.layout.plot_length / rig.frames
+    along = step * (np.arange(rig.frames) + 0.5)
+    height = rig.camera_height + rig.camera_height_sd * rng.normal() + rig.wobble * rng.normal(size=rig.frames)
+    away = rig.distance + rig.distance_sd * rng.normal() + rig.wobble * rng.normal(size=rig.frames)
+    pitch = math.radians(rig.pitch_sd) * (rng.normal() + 0.2 * rng.normal(size=rig.frames))
+    positions = np.stack([along - baseline / 2.0, -away, height], axis=1)
+    poses = tuple(Pose(position, _looking_along_y(angle)) for position, angle in zip(positions, pitch))
+
+    scale = 1.0 + rng.choice([-1.0, 1.0]) * rng.uniform(*rig.odometry_noise)
+    reported = (along - along[0]) * scale + 0.0005 * rng.normal(size=rig.frames) * (np.arange(rig.frames) > 0)
+    pixels = rig.width / Rig().width
+    offset, slope = (
+        rig.rectification_error * pixels * rng.normal(),
+        0.5 * rig.rectification_error * pixels * rng.normal() / rig.width,
+    )
+    return Drive(true, stated, poses, along / rig.speed, reported, offset, slope)
+
+
+def _looking_along_y(pitch: float) -> np.ndarray:
+    """Rotation [3, 3] of a camera that looks along the world's y axis, and down by ``pitch`` (rad)."""
+    sine, cosine = math.sin(pitch), math.cos(pitch)
+    return np.array([[1.0, 0.0, 0.0], [0.0, -sine, -cosine], [0.0, cosine, -sine]])

@@ -1,0 +1,316 @@
+"""Draws what a camera sees, tile by tile: which surface each ray meets first, and what colour it has there.
+
+    tables.see -> View -> draw: for each tile of up to 64 x 64 pixels
+        its cones, its triangles, the ground       -> depth and row of what is nearest      `_nearest`
+        texture and light there                    -> colour                                `_colour`
+        mean of a pixel's rays                     -> radiance, instance and depth
+
+One compiled program for every view of a size. On a CPU tiles are drawn one after the other, by as many threads as there are
+cores; on an accelerator many at a time, those with equally much in them together. Memory: the images, and one batch of tiles.
+"""
+
+import concurrent.futures
+import functools
+import os
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxrl_vis_envs.compilation import compiler_options
+from jaxrl_vis_envs.plants.surfaces import GROUND, NOTHING
+from jaxrl_vis_envs.plants.tables import CONE_HIT, FAR, NEAR, TRIANGLE_HIT, View, tile_of
+from jaxrl_vis_envs.plants.texture import noise, ramp
+
+_GROUND_FAR = 3.5  # m: what is behind is black
+# Each ray of a pixel has a column and a line of its own, so that edges of any direction are smooth.
+_RAYS = {1: ((0.0, 0.0),), 4: ((-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375))}
+_TILES_AT_ONCE = 256  # on an accelerator
+
+
+class Shot(NamedTuple):
+    """What a view is drawn with, all float32.
+
+    Attributes:
+        focal: [] pixels.
+        centre: [2] pixels.
+        lines: [2] offset and slope of the lines, see `Drive`.
+        rotation: [3, 3] from the world to the camera.
+        position: [3] of the camera in the world, m.
+        flash: [3] where the flash is, in the camera's frame, m.
+        light: [3] strength of the flash (1: a white surface at `reference` that faces it has radiance 1), of ambient light, and
+            the distance ``reference`` in m.
+    """
+
+    focal: jax.Array
+    centre: jax.Array
+    lines: jax.Array
+    rotation: jax.Array
+    position: jax.Array
+    flash: jax.Array
+    light: jax.Array
+
+
+class _Tables(NamedTuple):
+    cones: jax.Array
+    cone_instance: jax.Array
+    cone_material: jax.Array
+    triangles: jax.Array
+    triangle_instance: jax.Array
+    triangle_material: jax.Array
+    materials: jax.Array
+    cone_list: jax.Array
+    triangle_list: jax.Array
+
+
+class _Hit(NamedTuple):
+    """What rays meet: depth, row of its table, and which table (0 nothing, 1 ground, 2 cones, 3 triangles)."""
+
+    depth: jax.Array
+    row: jax.Array
+    kind: jax.Array
+
+
+def draw(
+    view: View, shot: Shot, width: int, height: int, samples: int, at_once: int | None = None
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Draws a view.
+
+    Args:
+        view: What the camera sees.
+        shot: With what.
+        width, height: Of the image, pixels.
+        samples: Rays a pixel, 1 or 4; instance and depth are those of a ray through the pixel's middle.
+        at_once: Tiles that are drawn side by side; what suits the platform if not given.
+
+    Returns:
+        Radiance [height, width, 3] float32, instance [height, width] int32 and planar depth [height, width] float32 in m
+        (infinite where there is nothing).
+    """
+    tables = _Tables(*(jnp.asarray(getattr(view, name)) for name in _Tables._fields))
+    work = (view.cone_ranges[:, 1] - view.cone_ranges[:, 0]) + (view.triangle_ranges[:, 1] - view.triangle_ranges[:, 0])
+    order = np.argsort(-work, kind="stable")
+    on_cpu = jax.default_backend() == "cpu"
+    at_once = min(at_once or (1 if on_cpu else _TILES_AT_ONCE), len(order))
+    workers = (os.cpu_count() or 1) if on_cpu else 1
+    parts = [order[start::workers] for start in range(workers)]
+    share = max(map(len, parts))  # all parts have one size, so one program: a missing tile is another one again
+    parts = [np.concatenate([part, np.repeat(order[:1], share - len(part))]) for part in parts]
+    tile = tile_of(width)
+    program = _program(samples, tile, at_once)
+    jobs = [(view.tiles[part], view.cone_ranges[part], view.triangle_ranges[part]) for part in parts]
+    with concurrent.futures.ThreadPoolExecutor(workers) as pool:
+        results = list(pool.map(lambda job: jax.block_until_ready(program(tables, shot, *job)), jobs))
+    place = np.empty(len(order), np.int64)
+    place[np.concatenate(parts)[::-1]] = np.arange(share * workers)[::-1]
+    join = _joiner(tile, width, height)
+    return tuple(join(jnp.asarray(place), *(result[part] for result in results)) for part in range(3))  # pyright: ignore
+
+
+@functools.cache
+def _joiner(tile: int, width: int, height: int):
+    columns, lines = -(-width // tile), -(-height // tile)
+
+    def join(place: jax.Array, *parts: jax.Array) -> jax.Array:
+        tiles = jnp.concatenate(parts)[place]
+        tiles = tiles.reshape(lines, columns, *tiles.shape[1:])
+        image = jnp.moveaxis(tiles, 2, 1).reshape(lines * tile, columns * tile, *tiles.shape[4:])
+        return image[:height, :width]
+
+    return jax.jit(join)
+
+
+@functools.cache
+def _program(samples: int, size: int, at_once: int):
+    """The compiled drawing of a list of tiles."""
+
+    def program(tables: _Tables, shot: Shot, tiles: jax.Array, cone_ranges: jax.Array, triangle_ranges: jax.Array):
+        def one(tile: tuple[jax.Array, jax.Array, jax.Array]):
+            return _tile(tables, shot, samples, size, *tile)
+
+        return jax.lax.map(one, (tiles, cone_ranges, triangle_ranges), batch_size=None if at_once == 1 else at_once)
+
+    options = compiler_options()
+    options.pop("xla_cpu_use_fusion_emitters", None)
+    return jax.jit(program, compiler_options=options)
+
+
+def _tile(
+    tables: _Tables, shot: Shot, samples: int, size: int, corner: jax.Array, cone_range: jax.Array, triangle_range: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """One tile: radiance [size, size, 3], instance and depth [size, size]."""
+    offsets = np.array(_RAYS[samples] if samples == 1 else ((0.0, 0.0), *_RAYS[samples]), np.float32)
+    column = corner[0] + jnp.arange(size, dtype=jnp.float32)[None, None, :] + offsets[:, 0, None, None]
+    line = corner[1] + jnp.arange(size, dtype=jnp.float32)[None, :, None] + offsets[:, 1, None, None]
+    column, line = jnp.broadcast_arrays(column, line)
+    line = line - shot.lines[0] - shot.lines[1] * (column - shot.centre[0])
+    x, y = (column - shot.centre[0]) / shot.focal, (line - shot.centre[1]) / shot.focal
+    hit = _nearest(tables, shot, x, y, cone_range, triangle_range)
+    middle = _Hit(*(part[0] for part in hit))
+    if samples > 1:
+        hit, x, y = _Hit(*(part[1:] for part in hit)), x[1:], y[1:]
+    radiance = jnp.stack([colour.mean(axis=0) for colour in _colour(tables, shot, x, y, hit)], axis=-1)
+    instance = jnp.select(
+        [middle.kind == 2, middle.kind == 3, middle.kind == 1],
+        [tables.cone_instance[middle.row], tables.triangle_instance[middle.row], GROUND],
+        NOTHING,
+    )
+    return radiance, instance, jnp.where(middle.kind > 0, middle.depth, jnp.inf)
+
+
+def _nearest(tables: _Tables, shot: Shot, x: jax.Array, y: jax.Array, cone_range: jax.Array, triangle_range: jax.Array) -> _Hit:
+    """What the rays (x, y, 1) meet first."""
+    up = shot.rotation[:, 2]
+    falling = x * up[0] + y * up[1] + up[2]
+    ground = jnp.where(falling < -1e-6, -shot.position[2] / jnp.minimum(falling, -1e-6), FAR)
+    seen = ground < _GROUND_FAR
+    start = _Hit(jnp.where(seen, ground, FAR), jnp.zeros(x.shape, jnp.int32), seen.astype(jnp.int32))
+    square = x * x + y * y + 1.0
+
+    def cone(place: jax.Array, hit: _Hit) -> _Hit:
+        row = tables.cone_list[place]
+        c = jax.lax.dynamic_index_in_dim(tables.cones, row, keepdims=False)[:CONE_HIT]
+        offset = c[0] * x + c[1] * y + c[2]
+        along = c[3] * x + c[4] * y + c[5]
+        major = c[6] * x + c[7] * y + c[8]
+        a = square + c[9] * major * major - c[11] * along * along
+        b = offset - along * c[12]
+        discriminant = b * b - a * c[13]
+        depth = (-b - jnp.sqrt(jnp.maximum(discriminant, 0.0))) / a
+        travelled = c[10] + depth * along
+        met = (discriminant > 0.0) & (travelled >= c[14]) & (travelled <= c[15]) & (depth > NEAR) & (depth < hit.depth)
+        return _Hit(jnp.where(met, depth, hit.depth), jnp.where(met, row, hit.row), jnp.where(met, 2, hit.kind))
+
+    def triangle(place: jax.Array, hit: _Hit) -> _Hit:
+        row = tables.triangle_list[place]
+        m = jax.lax.dynamic_index_in_dim(tables.triangles, row, keepdims=False)[:TRIANGLE_HIT]
+        first, second, third = (m[3 * k] * x + m[3 * k + 1] * y + m[3 * k + 2] for k in range(3))
+        depth = 1.0 / (first + second + third)
+        least = jnp.minimum(jnp.minimum(first, second), third)
+        met = (least >= 0.0) & (depth > NEAR) & (depth < hit.depth)
+        return _Hit(jnp.where(met, depth, hit.depth), jnp.where(met, row, hit.row), jnp.where(met, 3, hit.kind))
+
+    hit = jax.lax.fori_loop(cone_range[0], cone_range[1], cone, start)
+    return jax.lax.fori_loop(triangle_range[0], triangle_range[1], triangle, hit)
+
+
+class _Point(NamedTuple):
+    """Where a ray meets a surface: texture coordinates in m, unit normal, and what changes its look there (0 to 1)."""
+
+    u: jax.Array
+    v: jax.Array
+    normal: tuple[jax.Array, ...]
+    over: jax.Array
+    ring: jax.Array
+    edge: jax.Array
+
+
+def _dot(a: tuple[jax.Array, ...], b: tuple[jax.Array, ...]) -> jax.Array:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _on_cone(c: jax.Array, point: tuple[jax.Array, ...]) -> _Point:
+    """A point on a cone; ``c`` [..., columns] are the rows of the table."""
+    axis, major = (tuple(c[..., k + i] for i in range(3)) for k in (3, 6))
+    start = tuple(c[..., CONE_HIT + i] for i in range(3))
+    slope, arc, arc_rate, sheath, sheath_rate, node, node_rate, radius = (c[..., CONE_HIT + 3 + i] for i in range(8))
+    offset = tuple(p - s for p, s in zip(point, start))
+    travelled = _dot(offset, axis)
+    outward = tuple(o - travelled * a for o, a in zip(offset, axis))
+    bulge = c[..., 9] * _dot(outward, major)
+    normal = tuple(o + bulge * m for o, m in zip(outward, major))
+    length = jnp.sqrt(jnp.maximum(_dot(normal, normal), 1e-12))
+    normal = _unit(tuple(n / length - slope * a for n, a in zip(normal, axis)))
+    # An angle around the stalk that needs no arctangent: 0 in front, its seam behind.
+    turn = outward[0] / (jnp.abs(outward[0]) + jnp.abs(outward[2]) + 1e-9)
+    around = jnp.where(outward[2] < 0.0, turn, jnp.sign(turn) * (2.0 - jnp.abs(turn)))
+    over = sheath + sheath_rate * travelled
+    return _Point(1.5 * radius * around, arc + arc_rate * travelled, normal, over, node + node_rate * travelled, over * 0.0)
+
+
+def _on_triangle(m: jax.Array, x: jax.Array, y: jax.Array, depth: jax.Array) -> _Point:
+    """A point on a leaf, which has a midrib."""
+
+    def between(first: int) -> jax.Array:
+        """What is given at the corners, in between."""
+        k = TRIANGLE_HIT + first
+        return depth * (m[..., k] * x + m[..., k + 1] * y + m[..., k + 2])
+
+    along, across, offset = (between(3 * i) for i in range(3))
+    normal = tuple(between(9 + 3 * i) for i in range(3))
+    facing = jnp.where(normal[0] * x + normal[1] * y + normal[2] > 0.0, -1.0, 1.0)
+    normal = _unit(tuple(each * facing for each in normal))
+    rib = ramp(0.13, 0.05, jnp.abs(across))
+    return _Point(offset, along, normal, rib * 0.0, rib, ramp(0.7, 1.0, jnp.abs(across)))
+
+
+def _unit(vector: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+    scale = jax.lax.rsqrt(jnp.maximum(_dot(vector, vector), 1e-12))
+    return tuple(each * scale for each in vector)
+
+
+def _colour(tables: _Tables, shot: Shot, x: jax.Array, y: jax.Array, hit: _Hit) -> list[jax.Array]:
+    """Radiance towards the camera of what was hit: red, green and blue."""
+    kind, depth = hit.kind, hit.depth
+    is_cone, is_leaf, is_ground = kind == 2, kind == 3, kind == 1
+    point = (x * depth, y * depth, depth)
+    cone_row, leaf_row = jnp.where(is_cone, hit.row, 0), jnp.where(is_leaf, hit.row, 0)
+    stalk, leaf = _on_cone(tables.cones[cone_row], point), _on_triangle(tables.triangles[leaf_row], x, y, depth)
+    world = [sum(point[i] * shot.rotation[i, k] for i in range(3)) + shot.position[k] for k in range(2)]
+    flat = tuple(jnp.broadcast_to(shot.rotation[i, 2], x.shape) for i in range(3))
+    ground = _Point(world[0], world[1], flat, x * 0.0, x * 0.0, x * 0.0)
+    at = _Point(*jax.tree.map(lambda s, t, g: jnp.where(is_cone, s, jnp.where(is_leaf, t, g)), stalk, leaf, ground))
+    material = jnp.where(is_cone, tables.cone_material[cone_row], jnp.where(is_leaf, tables.triangle_material[leaf_row], 0))
+    m = tables.materials[material]
+    albedo, gloss = _albedo(m, at, is_cone, is_leaf, is_ground)
+
+    to_flash = tuple(shot.flash[i] - point[i] for i in range(3))
+    square = _dot(to_flash, to_flash)
+    to_flash = _unit(to_flash)
+    facing = jnp.maximum(_dot(at.normal, to_flash), 0.0)
+    # Rough fibres send light back even where they are seen edge on; leaves let some through.
+    rough = jnp.where(is_ground, 0.55, jnp.where(is_leaf, 0.35, 0.18))
+    to_camera = _unit((-x, -y, -jnp.ones_like(x)))
+    halfway = _unit(tuple(a + b for a, b in zip(to_flash, to_camera)))
+    shine = gloss * jnp.maximum(_dot(at.normal, halfway), 0.0) ** 24
+    strength, ambient, reference = shot.light
+    flash = strength * (reference * reference) / jnp.maximum(square, 0.02)
+    lit = flash * (rough + (1.0 - rough) * facing) + ambient
+    return [jnp.where(kind > 0, channel * lit + shine * flash * facing, 0.0) for channel in albedo]
+
+
+def _albedo(
+    m: jax.Array, at: _Point, is_cone: jax.Array, is_leaf: jax.Array, is_ground: jax.Array
+) -> tuple[list[jax.Array], jax.Array]:
+    """Reflectance of a surface: three channels, and the strength of its highlight."""
+    base, over = [m[..., k] for k in range(3)], [m[..., 3 + k] for k in range(3)]
+    fibre_f, fibre_c, blotch_f, blotch_c, speckles, speckle_f, bands, band_f, bloom, gloss, place, edge = (
+        m[..., 6 + k] for k in range(12)
+    )
+    u, v = at.u + place, at.v + place
+    # Fibres run along a stalk or leaf; the ground's grains have no direction.
+    stretch = jnp.where(is_ground, 1.0, 0.03)
+    fibres = 0.6 * noise(u * fibre_f, v * fibre_f * stretch, 0) + 0.4 * noise(u * fibre_f * 2.7, v * fibre_f * stretch * 2.0, 1)
+    longer = jnp.where(is_ground, 1.0, 0.45)
+    blotches = 0.65 * noise(u * blotch_f, v * blotch_f * longer, 2) + 0.35 * noise(
+        u * blotch_f * 2.9, v * blotch_f * longer * 2.9, 3
+    )
+    spots = noise(u * speckle_f, v * speckle_f * 0.8, 4)
+    # Ragged ends: a sheath or a leaf's dry edge does not end in a line.
+    cover = jnp.where(is_leaf, ramp(0.75, 1.0, 0.8 * at.edge * edge + 0.75 * blotches), at.over)
+    cover = jnp.where(is_ground, ramp(0.5, 0.75, blotches), cover)
+    spot = ramp(1.0 - 0.55 * speckles, 1.12 - 0.55 * speckles, spots)
+    wave = 0.5 + 0.5 * jnp.sin(2.0 * jnp.pi * (v * band_f + 1.5 * blotches))
+    dark = (
+        (1.0 - fibre_c * fibres * jnp.where(is_cone, 1.8 + at.over, 1.6))
+        * (1.0 - blotch_c * ramp(0.35, 0.75, blotches))
+        * (1.0 - 0.6 * spot)
+        * (1.0 - bands * wave)
+    )
+    # A node is a dark scar under a pale ring; a leaf's rib is pale.
+    ring = jnp.where(is_cone, 1.0 - 0.55 * at.ring, 1.0 + 0.5 * at.ring)
+    wax = jnp.where(is_cone, bloom * ramp(0.3, 0.7, noise(u * 90.0, v * 9.0, 5)) * (1.0 - at.over), 0.0)
+    scale = dark * ring
+    mixed = [(b + (o - b) * cover) * scale for b, o in zip(base, over)]
+    return [channel + (0.62 - channel) * 0.45 * wax for channel in mixed], gloss * (1.0 - 0.5 * blotches)

@@ -1,0 +1,330 @@
+"""What a family of fields is: what is drawn for every plot, and how far it varies. Loads neither JAX nor MuJoCo.
+
+A range (low, high) is drawn uniformly, a mean with an sd normally. Lengths are in metres and angles in degrees unless the name
+says otherwise. Sources: the thesis, section 3.3 (33 stalks on 2.134 m, 0.8 m away, 8 mm lens, 9 megapixels, 14.354 mm at 12
+inches, 0.405 mm of taper per inch), and published traits of grain sorghum for what it does not state (leaves, tillers, spread).
+"""
+
+import dataclasses
+import math
+import numbers
+from typing import Any
+
+Range = tuple[float, float]
+INCH = 0.0254
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """Where plants stand."""
+
+    plot_length: float = 2.134
+    """Length of a plot along the row, m; plots end at alleys, in which nothing grows."""
+    stalks_mean: float = 33.0
+    """Stalks of the near row in a plot, tillers included."""
+    stalks_sd: float = 6.0
+    """Standard deviation of their number."""
+    spacing_minimum: float = 0.028
+    """Least distance between plants, m."""
+    spacing_shape: float = 1.6
+    """Shape of the gamma distribution of what a distance has above the least."""
+    offset_sd: float = 0.025
+    """Standard deviation of the distance from the row's middle line, m."""
+    tillers: float = 0.2
+    """Share of stalks that are tillers, within `clump_radius` of their mother."""
+    clump_radius: float = 0.03
+    """Greatest distance of a tiller from its mother, m."""
+    gaps: float = 0.04
+    """Share of distances that are a missing stretch."""
+    gap_length: float = 0.25
+    """Length of a missing stretch, m."""
+    row_spacing: float = 0.762
+    """Distance between rows, m."""
+    rows_behind: int = 2
+    """Rows that stand behind the near one."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Stalks:
+    """Shape of the stalks."""
+
+    height: Range = (2.1, 2.6)
+    """Length of a stalk, m."""
+    diameter_mean: float = 0.014354
+    """Mean diameter 12 inches above the ground, m."""
+    diameter_sd: float = 0.0032
+    """Its standard deviation over stalks, m."""
+    diameter_least: float = 0.006
+    """Least diameter there, m."""
+    taper: float = 0.405e-3 / INCH
+    """Loss of diameter between 12 and 24 inches for a stalk of mean diameter, m per m."""
+    taper_spread: float = 0.25
+    """Its coefficient of variation."""
+    lean_sd: Range = (4.0, 4.0)
+    """Standard deviation of a plot's leans at the ground in both directions, degrees."""
+    lean_most: float = 20.0
+    """Greatest lean, degrees."""
+    curvature_sd: float = 0.06
+    """Standard deviation of the curvature, 1/m."""
+    zigzag: float = 0.8
+    """Standard deviation of the change of direction at a node, degrees."""
+    node_spacing: Range = (0.08, 0.20)
+    """Distance between nodes, m."""
+    node_swelling: Range = (0.05, 0.15)
+    """By how much a node is thicker than the stalk, of its diameter."""
+    ovality: Range = (1.0, 1.2)
+    """Greatest over least diameter of a cross section."""
+    sheaths: float = 0.6
+    """Share of nodes whose leaf sheath is still there, wrapped around the stalk above it."""
+    sheath_length: Range = (0.06, 0.16)
+    """Length of a sheath, m."""
+    sheath_thickness: Range = (0.2e-3, 0.6e-3)
+    """Thickness of a sheath, m; the diameter over it is larger by twice as much."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Leaves:
+    """Leaves, dry ones included."""
+
+    density: float = 1.0
+    """Multiplies the expected number of leaves."""
+    lower: float = 0.22
+    """Leaves per node below 0.3 m."""
+    middle: float = 0.34
+    """Leaves per node from 0.3 to 0.8 m."""
+    upper: float = 0.8
+    """Leaves per node above 0.8 m."""
+    dry: float = 0.75
+    """Share of dry leaves below 0.8 m; a third of it above."""
+    length_mean: float = 0.636
+    """Mean length of a green leaf, m."""
+    length_sd: float = 0.098
+    """Its standard deviation, m."""
+    width_mean: float = 0.07
+    """Mean width of a green leaf, m."""
+    width_sd: float = 0.012
+    """Its standard deviation, m."""
+    angle_mean: float = 45.0
+    """Mean angle between leaf and stalk, degrees."""
+    angle_sd: float = 10.7
+    """Its standard deviation, degrees."""
+    droop: Range = (50.0, 130.0)
+    """By how much a green leaf bends towards the ground along its length, degrees."""
+    litter: float = 60.0
+    """Pieces of dry leaf on the ground per m of row."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Textures:
+    """What surfaces look like; every plant draws its own values."""
+
+    stalk_hue: Range = (0.085, 0.19)
+    """Hue of stalks, of the colour circle: 0.08 is straw, 0.25 is green."""
+    leaf_hue: Range = (0.20, 0.27)
+    """Hue of green leaves."""
+    dry_hue: Range = (0.07, 0.11)
+    """Hue of dry leaves and sheaths."""
+    soil_hue: Range = (0.05, 0.08)
+    """Hue of the ground."""
+    fibre_pitch: Range = (0.7e-3, 1.4e-3)
+    """Distance between fibres, m."""
+    fibre_contrast: Range = (0.10, 0.25)
+    """How much darker the gaps between fibres are, of 1."""
+    blotch_size: Range = (0.006, 0.02)
+    """Size of blotches, m."""
+    blotch_contrast: Range = (0.15, 0.45)
+    """How much darker blotches are, of 1."""
+    speckles: Range = (0.0, 0.3)
+    """Share of the surface with small dark speckles."""
+    speckle_size: Range = (0.8e-3, 1.6e-3)
+    """Size of speckles, m."""
+    bands: Range = (0.0, 0.15)
+    """Contrast of bands across stalks and leaves, of 1."""
+    band_pitch: Range = (0.02, 0.05)
+    """Distance between bands, m."""
+    bloom: Range = (0.1, 0.5)
+    """Share of a stalk with a bright waxy bloom."""
+    gloss: Range = (0.03, 0.12)
+    """Strength of the highlight."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Rig:
+    """The two cameras, and how they pass the plants."""
+
+    width: int = 3376
+    """Width of an image, pixels."""
+    height: int = 2704
+    """Height of an image, pixels."""
+    focal: float = 2168.0
+    """Nominal focal length, pixels."""
+    baseline: float = 0.1
+    """Nominal distance between the cameras, m."""
+    stated_spread: float = 0.0
+    """Largest deviation of focal length and baseline from their nominal values, of 1; the calibration states it."""
+    calibration_error: float = 0.0
+    """Size of the error of stated focal length and stated baseline, of 1; its sign is drawn, and the calibration does not state
+    it.
+    """
+    rectification_error: float = 0.2
+    """Standard deviation of the vertical offset between rectified images, pixels at full width."""
+    distance: float = 0.8
+    """Mean distance from the cameras to the row, m."""
+    distance_sd: float = 0.015
+    """Its standard deviation over plots, m."""
+    camera_height: float = 0.42
+    """Mean height of the cameras, m."""
+    camera_height_sd: float = 0.015
+    """Its standard deviation over plots, m."""
+    wobble: float = 0.004
+    """Standard deviation of height and distance from image to image, m."""
+    pitch_sd: float = 0.7
+    """Standard deviation of the pitch over plots, degrees."""
+    frames: int = 34
+    """Pairs of a plot."""
+    speed: float = 0.05
+    """Speed of the robot, m/s."""
+    odometry_noise: Range = (0.01, 0.03)
+    """Error of the odometry's scale, of 1; its sign is drawn."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Imaging:
+    """Flash, lens and sensor."""
+
+    flash: Range = (0.92, 1.08)
+    """Strength of the flash."""
+    exposure_spread: float = 0.04
+    """Standard deviation of the brightness from image to image, of 1."""
+    ambient: float = 0.004
+    """Light that does not come from the flash, of what a white surface at the row's distance has from it."""
+    vignetting: float = 0.35
+    """Loss of light in the corners, of 1."""
+    blur: Range = (0.5, 1.0)
+    """Standard deviation of the point spread function, pixels at full width."""
+    full_well: float = 9000.0
+    """Electrons of a white pixel."""
+    read_noise: float = 12.0
+    """Standard deviation of the sensor's own noise, electrons."""
+    noise: float = 1.0
+    """Multiplies the standard deviation of all noise."""
+    samples: int = 4
+    """Rays a pixel: 1 or 4."""
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value is a finite number, and not true or false."""
+    return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _check_range(label: str, value: Any) -> None:
+    low, high = value if isinstance(value, tuple) else (value, value)
+    if not (is_number(low) and is_number(high)) or low < 0:
+        raise ValueError(f"{label} must be finite and at least 0, got {value}")
+    if low > high:
+        raise ValueError(f"{label} must run from low to high, got {value}")
+
+
+# What makes sense at all, and can be drawn in the memory that there is. What is not here need only be finite and at least 0.
+_BOUNDS: dict[str, tuple[float, float]] = {
+    "layout.plot_length": (0.1, 50.0),
+    "layout.stalks_mean": (0, 1000),
+    "layout.stalks_sd": (0, 500),
+    "layout.spacing_minimum": (0.005, 2.0),
+    "layout.spacing_shape": (0.1, 100.0),
+    "layout.tillers": (0, 0.9),
+    "layout.gaps": (0, 0.9),
+    "layout.row_spacing": (0.2, 5.0),
+    "layout.rows_behind": (0, 5),
+    "stalks.height": (0.3, 5.0),
+    "stalks.diameter_mean": (0.001, 0.1),
+    "stalks.diameter_least": (0.001, 0.1),
+    "stalks.lean_sd": (0, 45),
+    "stalks.lean_most": (0, 45),
+    "stalks.node_spacing": (0.04, 1.0),
+    "stalks.node_swelling": (0, 1.0),
+    "stalks.ovality": (1.0, 3.0),
+    "stalks.sheaths": (0, 1),
+    "leaves.density": (0, 20),
+    "leaves.dry": (0, 1),
+    "leaves.length_mean": (0.05, 3.0),
+    "leaves.width_mean": (0.002, 0.3),
+    "leaves.litter": (0, 2000),
+    "textures.fibre_pitch": (1e-4, 1.0),
+    "textures.fibre_contrast": (0, 1),
+    "textures.blotch_size": (1e-3, 1.0),
+    "textures.blotch_contrast": (0, 1),
+    "textures.speckles": (0, 1),
+    "textures.speckle_size": (2e-4, 1.0),
+    "textures.bands": (0, 1),
+    "textures.band_pitch": (1e-3, 1.0),
+    "textures.bloom": (0, 1),
+    "rig.width": (32, 20000),
+    "rig.height": (16, 20000),
+    "rig.focal": (8, 1e5),
+    "rig.baseline": (0.008, 2.0),
+    "rig.stated_spread": (0, 0.5),
+    "rig.calibration_error": (0, 0.2),
+    "rig.distance": (0.3, 5.0),
+    "rig.camera_height": (0.05, 3.0),
+    "rig.pitch_sd": (0, 20),
+    "rig.frames": (1, 10000),
+    "rig.speed": (1e-3, 10.0),
+    "rig.odometry_noise": (0, 0.5),
+    "imaging.flash": (0.01, 100.0),
+    "imaging.exposure_spread": (0, 2),
+    "imaging.vignetting": (0, 1),
+    "imaging.blur": (0, 3.0),
+    "imaging.full_well": (10.0, 1e7),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Family:
+    """A distribution of plots. Equal families with equal seeds give equal plots.
+
+    Raises:
+        ValueError: A value is out of range; the message names the field.
+    """
+
+    name: str = "training"
+    """What the family is called."""
+    stream: int = 1
+    """Families of different streams share no random numbers, whatever their seeds."""
+    layout: Layout = Layout()
+    """Where plants stand."""
+    stalks: Stalks = Stalks()
+    """Their stalks."""
+    leaves: Leaves = Leaves()
+    """Their leaves."""
+    textures: Textures = Textures()
+    """Their surfaces."""
+    rig: Rig = Rig()
+    """The cameras."""
+    imaging: Imaging = Imaging()
+    """Light and sensor."""
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            part = getattr(self, field.name)
+            if dataclasses.is_dataclass(part):
+                for each in dataclasses.fields(part):
+                    _check_range(f"{field.name}.{each.name}", getattr(part, each.name))
+        for label, (low, high) in _BOUNDS.items():
+            part, name = label.split(".")
+            value = getattr(getattr(self, part), name)
+            least, most = value if isinstance(value, tuple) else (value, value)
+            if least < low or most > high:
+                raise ValueError(f"{label} must be from {low:g} to {high:g}, got {value}")
+        if self.imaging.samples not in (1, 4):
+            raise ValueError(f"imaging.samples must be 1 or 4, got {self.imaging.samples}")
+
+    def at_width(self, width: int) -> "Family":
+        """The same cameras with fewer or more pixels: images ``width`` pixels wide that show the same."""
+        scale = width / self.rig.width
+        height = max(round(self.rig.height * scale), 1)
+        rig = dataclasses.replace(self.rig, width=width, height=height, focal=self.rig.focal * scale)
+        return dataclasses.replace(self, rig=rig)
+
+
+TRAINING = Family()

@@ -1,0 +1,176 @@
+"""A plot as surfaces that can be drawn: cones for stalks, triangles for leaves, and how each of them looks. NumPy only."""
+
+import colorsys
+import dataclasses
+
+import numpy as np
+
+from jaxrl_vis_envs.plants.family import Range, Textures
+from jaxrl_vis_envs.plants.field import Leaf, Plot, Stalk, generator
+
+GROUND = -2
+"""Instance of the ground in an image of instances, in which 0, 1, ... are the stalks of a plot."""
+NOTHING = -1
+"""Instance where there is nothing near enough to be drawn."""
+LITTER = -3
+"""Instance of litter; that of the leaves of stalk n is `LITTER` - 1 - n."""
+
+_GUTTER = 0.3
+"""By how much of its half width a leaf's edges are raised above its midrib."""
+
+MATERIAL = ("red", "green", "blue", "red_over", "green_over", "blue_over", "fibre_frequency", "fibre_contrast",
+            "blotch_frequency", "blotch_contrast", "speckles", "speckle_frequency", "bands", "band_frequency", "bloom", "gloss",
+            "place", "edge")  # fmt: skip
+"""Columns of a material. ``over``: colour of sheaths, or of the edges of leaves; ``place`` shifts textures between plants."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Surfaces:
+    """Cones and triangles of a plot, in the world, m. Row 0 of the materials is the ground.
+
+    Attributes:
+        start, end: [C, 3] float64, middles of the ends of each cone.
+        radii: [C, 2] float64, mean radii at both ends.
+        arcs: [C, 2] float64, length along the stalk at both ends.
+        sheath, node: [C, 2] float64, how much of a sheath or node each end is, 0 to 1.
+        oval: [C, 2] float64, greatest over least diameter, and the direction of the greatest in rad.
+        cone_stalk, cone_material: [C] int32.
+        corners: [T, 3, 3] float64, of each triangle.
+        along, across, offset: [T, 3] float64, of each corner: m along the midrib, -1 to 1 across it, and the same in m.
+        normals: [T, 3, 3] float64, unit normal of the leaf at each corner.
+        triangle_instance, triangle_material: [T] int32.
+        materials: [M, len(MATERIAL)] float32.
+    """
+
+    start: np.ndarray
+    end: np.ndarray
+    radii: np.ndarray
+    arcs: np.ndarray
+    sheath: np.ndarray
+    node: np.ndarray
+    oval: np.ndarray
+    cone_stalk: np.ndarray
+    cone_material: np.ndarray
+    corners: np.ndarray
+    along: np.ndarray
+    across: np.ndarray
+    offset: np.ndarray
+    normals: np.ndarray
+    triangle_instance: np.ndarray
+    triangle_material: np.ndarray
+    materials: np.ndarray
+
+
+def build(plot: Plot) -> Surfaces:
+    """The surfaces of a plot, with looks drawn from its family's textures."""
+    rng = generator(plot.family, plot.seed, "textures")
+    textures = plot.family.textures
+    materials = [_ground(rng, textures)]
+    cones = []
+    for index, stalk in enumerate(plot.stalks):
+        cones.append(_cones(index, stalk, len(materials)))
+        materials.append(_material(rng, textures, textures.stalk_hue, textures.dry_hue, (0.35, 0.7), (0.30, 0.5)))
+    strips = []
+    for leaf in plot.leaves:
+        strips.append(_triangles(leaf, len(materials)))
+        hue = textures.dry_hue if leaf.dry else textures.leaf_hue
+        saturation, value = ((0.35, 0.6), (0.14, 0.34)) if leaf.dry else ((0.5, 0.75), (0.09, 0.19))
+        materials.append(_material(rng, textures, hue, textures.dry_hue, saturation, value))
+    return Surfaces(**_joined(cones, _NO_CONES), **_joined(strips, _NO_TRIANGLES), materials=np.array(materials, np.float32))
+
+
+_NO_CONES = {"start": (0, 3), "end": (0, 3), "radii": (0, 2), "arcs": (0, 2), "sheath": (0, 2), "node": (0, 2), "oval": (0, 2),
+             "cone_stalk": (0,), "cone_material": (0,)}  # fmt: skip
+_NO_TRIANGLES = {"corners": (0, 3, 3), "along": (0, 3), "across": (0, 3), "offset": (0, 3), "normals": (0, 3, 3),
+                 "triangle_instance": (0,), "triangle_material": (0,)}  # fmt: skip
+
+
+def _joined(parts: list[dict[str, np.ndarray]], empty: dict[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
+    if not parts:
+        return {name: np.zeros(shape, np.int32 if len(shape) == 1 else float) for name, shape in empty.items()}
+    return {name: np.concatenate([part[name] for part in parts]) for name in empty}
+
+
+def _cones(index: int, stalk: Stalk, material: int) -> dict[str, np.ndarray]:
+    count = len(stalk.arc) - 1
+    bump = np.zeros_like(stalk.arc)
+    for node in stalk.nodes:
+        bump = np.maximum(bump, np.clip(1.0 - np.abs(stalk.arc - node) / 0.006, 0.0, 1.0))
+
+    def pairs(values: np.ndarray) -> np.ndarray:
+        return np.stack([values[:-1], values[1:]], axis=1)
+
+    return {
+        "start": stalk.points[:-1],
+        "end": stalk.points[1:],
+        "radii": pairs(stalk.radius),
+        "arcs": pairs(stalk.arc),
+        "sheath": pairs(stalk.sheath),
+        "node": pairs(bump),
+        "oval": np.tile([stalk.ovality, stalk.oval_angle], (count, 1)),
+        "cone_stalk": np.full(count, index, np.int32),
+        "cone_material": np.full(count, material, np.int32),
+    }
+
+
+def _triangles(leaf: Leaf, material: int) -> dict[str, np.ndarray]:
+    """Two strips, one on each side of the midrib, whose edges are raised: a leaf is a shallow gutter."""
+    normal = np.cross(np.gradient(leaf.middle, axis=0), leaf.across)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    half = leaf.half_width[:, None]
+    raised = _GUTTER * half * normal
+    rim = {-1.0: leaf.middle - half * leaf.across + raised, 1.0: leaf.middle + half * leaf.across + raised}
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(leaf.middle, axis=0), axis=1))])
+    parts: dict[str, list[np.ndarray]] = {name: [] for name in ("corners", "along", "across", "offset", "normals")}
+    for side, edge in rim.items():
+        slanted = normal - side * _GUTTER * leaf.across
+        slanted /= np.linalg.norm(slanted, axis=1, keepdims=True)
+        zero = np.zeros_like(length)
+        given = {
+            "corners": (leaf.middle, edge),
+            "along": (length, length),
+            "across": (zero, zero + side),
+            "offset": (zero, side * leaf.half_width),
+            "normals": (normal, slanted),
+        }
+        for name, (inner, outer) in given.items():
+            parts[name] += [
+                np.stack([inner[:-1], outer[:-1], inner[1:]], axis=1),
+                np.stack([outer[:-1], outer[1:], inner[1:]], axis=1),
+            ]
+    count = 4 * (len(length) - 1)
+    instance = LITTER if leaf.stalk < 0 else LITTER - 1 - leaf.stalk
+    return {name: np.concatenate(part) for name, part in parts.items()} | {
+        "triangle_instance": np.full(count, instance, np.int32),
+        "triangle_material": np.full(count, material, np.int32),
+    }
+
+
+def _material(
+    rng: np.random.Generator, textures: Textures, hue: Range, hue_over: Range, saturation: Range, value: Range
+) -> list[float]:
+    colour = colorsys.hsv_to_rgb(rng.uniform(*hue), rng.uniform(*saturation), rng.uniform(*value))
+    over = colorsys.hsv_to_rgb(rng.uniform(*hue_over), rng.uniform(0.25, 0.55), rng.uniform(0.25, 0.5))
+    return [
+        *colour,
+        *over,
+        1.0 / rng.uniform(*textures.fibre_pitch),
+        rng.uniform(*textures.fibre_contrast),
+        1.0 / rng.uniform(*textures.blotch_size),
+        rng.uniform(*textures.blotch_contrast),
+        rng.uniform(*textures.speckles),
+        1.0 / rng.uniform(*textures.speckle_size),
+        rng.uniform(*textures.bands),
+        1.0 / rng.uniform(*textures.band_pitch),
+        rng.uniform(*textures.bloom),
+        rng.uniform(*textures.gloss),
+        rng.uniform(0.0, 50.0),
+        rng.uniform(0.2, 1.0),
+    ]
+
+
+def _ground(rng: np.random.Generator, textures: Textures) -> list[float]:
+    colour = colorsys.hsv_to_rgb(rng.uniform(*textures.soil_hue), rng.uniform(0.3, 0.5), rng.uniform(0.12, 0.25))
+    over = colorsys.hsv_to_rgb(rng.uniform(*textures.soil_hue), rng.uniform(0.2, 0.4), rng.uniform(0.25, 0.4))
+    # Clods of 3 cm with grains of 3 mm, and small stones.
+    return [*colour, *over, 1 / 0.003, 0.5, 1 / 0.03, 0.75, 0.2, 1 / 0.006, 0.0, 10.0, 0.0, 0.0, rng.uniform(0.0, 50.0), 0.5]

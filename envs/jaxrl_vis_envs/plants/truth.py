@@ -1,0 +1,181 @@
+"""What is true of the stalks in one pair: boxes, how much of them is seen, and how thick they are. NumPy only.
+
+Columns and lines are those of the left image, with (0, 0) in the middle of the first pixel. A box is (left, top, right,
+bottom), the outer edges of its pixels: a box around the first pixel alone is (-0.5, -0.5, 0.5, 0.5).
+"""
+
+import dataclasses
+
+import numpy as np
+
+from jaxrl_vis_envs.plants.cameras import Calibration, Pose
+from jaxrl_vis_envs.plants.family import INCH
+from jaxrl_vis_envs.plants.field import Plot, Stalk
+
+HEIGHTS = (12 * INCH, 24 * INCH)
+"""Heights above the ground at which the thesis measures widths, m."""
+BAND = (12 * INCH - 0.1, 12 * INCH + 0.1)
+"""Heights that bound the band in which stalks are detected, m."""
+
+Box = tuple[float, float, float, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class StalkInView:
+    """One stalk of the near row in one left image.
+
+    Attributes:
+        stalk: Index in `Plot.stalks`; the same in all pairs.
+        box: Around all of it that the image's edges leave, seen or hidden behind others.
+        visible_box: Around the pixels that show it; None where none does.
+        visible: Share of it that is seen: of its area inside the image.
+        pixels: Number of pixels that show it.
+        band_box, band_visible: The same of the part between the heights of a band; None and 0 where that is outside the image.
+    """
+
+    stalk: int
+    box: Box
+    visible_box: Box | None
+    visible: float
+    pixels: int
+    band_box: Box | None
+    band_visible: float
+
+
+def outline(stalk: Stalk, pose: Pose, camera: Calibration, heights: np.ndarray | None = None) -> np.ndarray:
+    """Where the two edges of a stalk are seen in the left image, whether it is hidden or not.
+
+    Exact for a straight piece of stalk with parallel sides; taper moves an edge by less than a hundredth of a pixel.
+
+    Args:
+        stalk: Whose edges.
+        pose: Of the left camera.
+        camera: The cameras as they are.
+        heights: [K] above the ground, m; the stalk's own knots if not given.
+
+    Returns:
+        [K, 2, 2] float64: (left, right) x (column, line), pixels.
+    """
+    arcs = stalk.arc if heights is None else np.interp(heights, stalk.points[:, 2], stalk.arc)
+    middle = np.stack([np.interp(arcs, stalk.arc, stalk.points[:, axis]) for axis in range(3)], axis=1)
+    step = 1e-3
+    ahead, behind = (
+        np.stack([np.interp(arcs + sign * step, stalk.arc, stalk.points[:, axis]) for axis in range(3)], axis=1)
+        for sign in (1.0, -1.0)
+    )
+    axis = (ahead - behind) @ pose.rotation.T
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    major = np.array([np.cos(stalk.oval_angle), np.sin(stalk.oval_angle), 0.0]) @ pose.rotation.T
+    major = major - (axis @ major)[:, None] * axis
+    major /= np.linalg.norm(major, axis=1, keepdims=True)
+
+    def scaled(vectors: np.ndarray, factor: float) -> np.ndarray:
+        return vectors + (factor - 1.0) * (vectors * major).sum(axis=1, keepdims=True) * major
+
+    # Where space is squeezed until the stalk is round, its edges are where rays touch a circle.
+    radius = (np.interp(arcs, stalk.arc, stalk.radius) / np.sqrt(stalk.ovality))[:, None]
+    centre = scaled(pose.to_camera(middle), 1.0 / stalk.ovality)
+    away = centre - (centre * axis).sum(axis=1, keepdims=True) * axis
+    distance = np.linalg.norm(away, axis=1, keepdims=True)
+    away /= distance
+    sideways = np.cross(axis, away)
+    sine = radius / distance
+    sides = []
+    for sign in (-1.0, 1.0):
+        touched = centre + radius * (sign * np.sqrt(1.0 - sine**2) * sideways - sine * away)
+        point = scaled(touched, stalk.ovality)
+        sides.append(point[:, :2] / point[:, 2:] * camera.focal + np.array(camera.centre))
+    left, right = sides
+    swap = left[:, :1] > right[:, :1]
+    return np.stack([np.where(swap, right, left), np.where(swap, left, right)], axis=1)
+
+
+def stalks_in_view(
+    plot: Plot, pose: Pose, camera: Calibration, instance: np.ndarray, depth: np.ndarray, band: tuple[float, float] = BAND
+) -> list[StalkInView]:
+    """The stalks of the near row that one left image shows or would show if nothing hid them.
+
+    Args:
+        plot: What stands there.
+        pose: Of the left camera.
+        camera: The cameras as they are.
+        instance: [H, W] int32, of a `Pair`.
+        depth: [H, W] float32 planar depth, m.
+        band: Lowest and highest point of the band, m above the ground.
+    """
+    found = []
+    for index, stalk in enumerate(plot.measured):
+        tall = stalk.points[:, 2].max()
+        whole = _area(outline(stalk, pose, camera, np.linspace(0.0, tall, 120)), camera)
+        if whole is None:
+            continue
+        box, area = _down_to_ground(whole[0], stalk, pose, camera), whole[1]
+        rows, columns = _pixels(box, camera)
+        line, column = np.nonzero(instance[rows, columns] == index)
+        line, column = line + rows.start, column + columns.start
+        part = _area(outline(stalk, pose, camera, np.linspace(*band, 40)), camera) if band[0] < tall else None
+        within = 0
+        if part is not None and line.size:
+            x = (column - camera.centre[0]) / camera.focal
+            y = (line - camera.centre[1]) / camera.focal
+            points = np.stack([x, y, np.ones_like(x)], axis=1) * depth[line, column][:, None]
+            height = pose.to_world(points)[:, 2]
+            within = int(((height >= band[0]) & (height <= band[1])).sum())
+        seen = _around(column, line) if line.size else None
+        found.append(
+            StalkInView(
+                stalk=index,
+                box=box,
+                visible_box=seen,
+                visible=min(line.size / area, 1.0),
+                pixels=int(line.size),
+                band_box=None if part is None else part[0],
+                band_visible=0.0 if part is None else min(within / part[1], 1.0),
+            )
+        )
+    return found
+
+
+def _area(edges: np.ndarray, camera: Calibration) -> tuple[Box, float] | None:
+    """Box and area in pixels of the part of an outline [K, 2, 2] that is inside the image; None where that is nothing."""
+    middle_line = edges[:, :, 1].mean(axis=1)
+    order = np.argsort(middle_line)
+    lines = np.arange(max(int(np.ceil(middle_line.min())), 0), min(int(np.floor(middle_line.max())), camera.height - 1) + 1)
+    if not lines.size:
+        return None
+    sides = []
+    for side in (0, 1):
+        place = np.argsort(edges[:, side, 1])
+        sides.append(np.interp(lines, edges[place, side, 1], edges[place, side, 0]))
+    left, right = (np.clip(side, -0.5, camera.width - 0.5) for side in sides)
+    wide = right - left
+    inside = wide > 0
+    if wide.sum() < 1.0:
+        return None
+    top, bottom = middle_line[order[0]], middle_line[order[-1]]
+    box = (left[inside].min(), max(top, -0.5), right[inside].max(), min(bottom, camera.height - 0.5))
+    return tuple(map(float, box)), float(wide.sum())  # pyright: ignore[reportReturnType]
+
+
+def _down_to_ground(box: Box, stalk: Stalk, pose: Pose, camera: Calibration) -> Box:
+    """The box, as far down as the front of the stalk's foot, which is nearer than its edges."""
+    towards = (pose.position - stalk.points[0])[:2]
+    foot = stalk.points[0].copy()
+    foot[:2] += stalk.radius[0] * towards / np.linalg.norm(towards)
+    _, y, z = pose.to_camera(foot)
+    line = y / z * camera.focal + camera.centre[1]
+    return (*box[:3], float(max(box[3], min(line, camera.height - 0.5))))
+
+
+def _around(column: np.ndarray, line: np.ndarray) -> Box:
+    """Box around pixels."""
+    return (float(column.min()) - 0.5, float(line.min()) - 0.5, float(column.max()) + 0.5, float(line.max()) + 0.5)
+
+
+def _pixels(box: Box, camera: Calibration) -> tuple[slice, slice]:
+    """Lines and columns of an image that hold a box, and a few more."""
+    left, top, right, bottom = box
+    return (
+        slice(max(int(top) - 20, 0), min(int(bottom) + 21, camera.height)),
+        slice(max(int(left) - 20, 0), min(int(right) + 21, camera.width)),
+    )

@@ -1,0 +1,65 @@
+"""Reading and writing images of any bit depth that cameras deliver, and disparities."""
+
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+
+ImageFormat = Literal["png", "tiff", "jpeg"]
+SUFFIX: dict[str, str] = {"png": ".png", "tiff": ".tiff", "jpeg": ".jpg"}
+_OPTIONS: dict[str, list[int]] = {
+    ".png": [cv2.IMWRITE_PNG_COMPRESSION, 1],
+    ".tiff": [],
+    ".jpg": [cv2.IMWRITE_JPEG_QUALITY, 95],
+}
+
+
+def write_image(path: Path, image: np.ndarray) -> None:
+    """Writes an image: [H, W, 3] or [H, W], uint8 or uint16; the suffix says how. Nobody sees half of it.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    suffix = path.suffix.lower()
+    ordered = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    encoded, data = cv2.imencode(suffix, ordered, _OPTIONS[suffix])
+    if not encoded:
+        raise OSError(f"{path}: the image could not be encoded")
+    temporary = path.with_name(path.name + ".tmp")
+    temporary.write_bytes(data.tobytes())
+    temporary.replace(path)
+
+
+def read_image(path: Path) -> np.ndarray:
+    """An image as [H, W, 3] or [H, W], uint8 or uint16.
+
+    Raises:
+        OSError: It cannot be read, or is no whole image. One line that names it.
+    """
+    data = np.fromfile(path, np.uint8)
+    image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+    if image is None:
+        raise OSError(f"{path} is not an image, or only a part of one")
+    return image if image.ndim == 2 else cv2.cvtColor(image[..., :3], cv2.COLOR_BGR2RGB)
+
+
+def read_disparity(path: Path, scale: float = 256.0) -> np.ndarray:
+    """Disparities from a file: PFM, floating-point TIFF, or 16-bit PNG or TIFF.
+
+    Args:
+        path: The file. In a PFM, infinity says that there is none; in the others, 0 does.
+        scale: What 16-bit numbers are divided by: 256 in KITTI's files, 64 in those of ``phenotype synth``.
+
+    Returns:
+        [H, W] float32, pixels; not a number where there is none.
+
+    Raises:
+        OSError: It cannot be read, or holds no disparities. One line that names it.
+    """
+    data = np.fromfile(path, np.uint8)
+    image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+    if image is None or image.ndim != 2 or image.dtype == np.uint8:
+        raise OSError(f"{path} holds no disparities: name a PFM, or a TIFF or PNG of 16 bits or more and one channel")
+    values = image.astype(np.float32) / (1.0 if image.dtype.kind == "f" else scale)
+    return np.where(np.isfinite(values) & (values > 0), values, np.nan)

@@ -1,0 +1,304 @@
+"""Widths, disparities, calibrations and files of the phenotyping application, on images whose truth is known."""
+
+import dataclasses
+import runpy
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.phenotyping.annotations import decode_mask, encode_mask
+from jaxrl_vis.phenotyping.calibration import check_size, read_calibration, write_calibration
+from jaxrl_vis.phenotyping.images import read_disparity, read_image, write_image
+from jaxrl_vis.phenotyping.metric import diameter_mm, tilt_of
+from jaxrl_vis.phenotyping.stereo import match_rows, match_sgbm
+from jaxrl_vis.phenotyping.width import ELLIPSE_FITS, ellipse_width, strip_width
+from jaxrl_vis_envs.plants import Calibration
+
+ROOT = Path(__file__).resolve().parents[1]
+STRIPS = runpy.run_path(str(ROOT / "benchmarks" / "strip_widths.py"))
+CAMERAS = Calibration(640, 480, 500.0, (319.5, 239.5), 0.1)
+
+
+# --- widths ---
+
+
+@pytest.mark.parametrize("soft", [True, False])
+@pytest.mark.parametrize(("ratio", "bound"), [(3.0, 0.01), (6.0, 0.005)])
+@pytest.mark.parametrize("lean", [0.0, 3.0, 10.0, 20.0, -20.0])
+def test_strips_are_as_wide_as_they_are(lean, ratio, bound, soft):
+    # Of an upright strip, the pixels whose middle it covers say its width to a pixel only: the mean over places is right.
+    widths, places = ((39.0,), 4) if lean or soft else ((39.0,), 1)
+    errors = STRIPS["mean_errors"](STRIPS["strip"], ratio, lean, soft, places, widths)
+    assert np.abs(errors).max() < bound
+
+
+def test_ellipses_are_biased_as_their_mathematics_says():
+    """A strip of width w has the second moment w^2 / 12, an ellipse of that minor axis w^2 / 16: 2 / sqrt 3 too wide."""
+    mask = STRIPS["ideal_strip"](39.0, 6.0, 8.0, (0.2, 0.1), False)
+    widths = {fit: ellipse_width(mask, fit) for fit in ELLIPSE_FITS}
+    assert widths["moments"] / 39.0 == pytest.approx(2.0 / np.sqrt(3.0), rel=0.005)
+    assert widths["pixels"] / 39.0 == pytest.approx(0.963, abs=0.01)
+    assert 1.03 < widths["contour"] / 39.0 < 1.10
+
+
+def test_the_widest_ellipse_counts_and_specks_do_not():
+    mask = np.zeros((200, 120), bool)
+    mask[10:90, 20:30] = mask[110:190, 60:80] = True
+    mask[0:2, 0:2] = True
+    wide = np.zeros_like(mask)
+    wide[110:190, 60:80] = True
+    assert ellipse_width(mask) == ellipse_width(wide)
+    assert ellipse_width(np.zeros((50, 50), bool)) is None
+    assert ellipse_width(np.eye(50, dtype=bool)) is None  # a line has no width
+
+
+def test_leaves_and_nodes_do_not_change_a_strip():
+    mask = STRIPS["ideal_strip"](30.0, 10.0, 7.0, (0.0, 0.0), False)
+    clean = strip_width(mask)
+    disturbed = mask.copy()
+    half = mask.shape[0] // 2
+    for line in range(half - 60, half - 20):  # a leaf before its right half
+        columns = np.flatnonzero(mask[line])
+        disturbed[line, columns[len(columns) // 2 :]] = False
+    for line in range(half + 30, half + 45):  # a node, 10 % thicker
+        columns = np.flatnonzero(mask[line])
+        disturbed[line, columns[0] - 2 : columns[0]] = disturbed[line, columns[-1] + 1 : columns[-1] + 3] = True
+    found = strip_width(disturbed)
+    assert found.width() == pytest.approx(30.0, abs=0.2)
+    assert found.lean == pytest.approx(np.radians(7.0), abs=0.003)
+    assert found.used < clean.used - 0.1
+    assert found.confidence < clean.confidence
+
+
+def test_taper_is_followed():
+    line = np.arange(300)[:, None]
+    half = 20.0 - 0.02 * line
+    mask = np.abs(np.arange(120)[None, :] - 60.3 - 0.05 * line) < half
+    strip = strip_width(mask)
+    for where in (50, 150, 250):
+        expected = 2 * (20.0 - 0.02 * where) * np.cos(strip.lean)
+        assert strip.width(where) == pytest.approx(expected, rel=0.005)
+    assert strip.lean == pytest.approx(-np.arctan(0.05), abs=1e-3)
+
+
+@pytest.mark.parametrize("mask", [np.zeros((60, 40), bool), np.ones((60, 40), bool), np.eye(5, dtype=bool)])
+def test_what_is_no_strip_has_no_width(mask):
+    assert strip_width(mask) is None
+
+
+# --- millimetres ---
+
+
+@pytest.mark.parametrize("lean", [0.0, 0.3])
+@pytest.mark.parametrize("place", [(0.0, 0.0), (0.25, -0.1)])
+def test_diameters_are_those_of_the_cylinder_that_was_seen(lean, place):
+    """Rays that touch a cylinder, and the depth of its front, give back its diameter."""
+    radius, foot = 0.00718, np.array([*place, 0.8])
+    axis = np.array([np.sin(lean), -np.cos(lean), 0.0])
+    away = foot - (foot @ axis) * axis
+    distance = np.linalg.norm(away)
+    sideways, towards = np.cross(axis, away / distance), -away / distance
+    sine = radius / distance
+    edges = []
+    for sign in (-1.0, 1.0):
+        point = foot + radius * (sign * np.sqrt(1 - sine**2) * sideways + sine * towards)
+        edges.append(tuple(point[:2] / point[2] * CAMERAS.focal + np.array(CAMERAS.centre)))
+    edges.sort()
+    # The front is where the ray between the edges meets the cylinder.
+    ray = np.array([*((np.mean(edges, axis=0) - np.array(CAMERAS.centre)) / CAMERAS.focal), 1.0])
+    flat = ray - (ray @ axis) * axis
+    a, b, c = flat @ flat, flat @ away, away @ away - radius**2
+    depth = (b - np.sqrt(b * b - a * c)) / a
+    assert diameter_mm(CAMERAS, *edges, depth, lean) == pytest.approx(2e3 * radius, rel=2e-4)
+
+
+def test_tilt_is_read_from_the_slope_of_disparity():
+    """A stalk that leans away by 10 degrees, seen at two heights."""
+    depth = 0.8
+    higher = np.array([0.0, -0.1, depth + 0.1 * np.tan(np.radians(10.0))])
+    lines = 0.0, higher[1] / higher[2] * CAMERAS.focal
+    disparities = CAMERAS.disparity(np.array([depth, higher[2]]))
+    slope = (disparities[1] - disparities[0]) / (lines[1] - lines[0])
+    assert tilt_of(slope, disparities.mean(), CAMERAS) == pytest.approx(np.radians(10.0), rel=0.03)
+
+
+# --- disparity ---
+
+
+@pytest.fixture(scope="module")
+def shifted_pair() -> tuple[np.ndarray, np.ndarray, float]:
+    """A textured stalk 30 pixels wide before black, and the same 57.4 pixels further left and one line lower."""
+    rng = np.random.default_rng(0)
+    texture = cv2.GaussianBlur(rng.uniform(0, 255, (240, 300)).astype(np.float32), (0, 0), 1.2)
+    stalk = np.zeros_like(texture)
+    stalk[:, 200:230] = texture[:, 200:230] + 30.0
+    right = cv2.warpAffine(stalk, np.float32([[1, 0, -57.4], [0, 1, 1]]), (300, 240), flags=cv2.INTER_CUBIC)
+    noise = rng.normal(0.0, 2.0, (2, 240, 300)).astype(np.float32)
+    return stalk + noise[0], right + noise[1], 57.4
+
+
+def test_disparities_are_found_to_a_fraction_of_a_pixel(shifted_pair):
+    left, right, true = shifted_pair
+    lines = np.arange(20, 220, 10)
+    edges = np.full(lines.size, 200.0), np.full(lines.size, 229.0)
+    found = match_rows(left, right, lines, edges, (40.0, 80.0))
+    assert found.values.size > 15
+    value, error = found.at(120.0)
+    assert value == pytest.approx(true, abs=0.1) and error < 0.1
+    # Nothing is made up where there is nothing to match.
+    assert match_rows(left, right, lines, (edges[0] - 120, edges[1] - 120), (10.0, 40.0)).at(120.0) is None
+    assert match_rows(left, np.zeros_like(right), lines, edges, (40.0, 80.0)).values.size == 0
+
+
+def test_semi_global_matching_agrees(shifted_pair):
+    left, right, true = (np.clip(image, 0, 255).astype(np.uint8) for image in shifted_pair[:2]), None, shifted_pair[2]
+    left, right = left
+    found = match_sgbm(left, np.roll(right, -1, axis=0), (200, 20, 230, 220), (40.0, 80.0))
+    assert found.shape == (200, 30)
+    assert np.nanmedian(found) == pytest.approx(true, abs=0.3)
+
+
+# --- calibrations ---
+
+
+def ros(camera: Calibration, baseline: float) -> str:
+    f, (x, y) = camera.focal, camera.centre
+    return (
+        f"image_width: {camera.width}\nimage_height: {camera.height}\ncamera_name: rig\n"
+        f"camera_matrix:\n  rows: 3\n  cols: 3\n  data: [{f}, 0, {x}, 0, {f}, {y}, 0, 0, 1]\n"
+        f"projection_matrix:\n  rows: 3\n  cols: 4\n  data: [{f}, 0., {x}, {-f * baseline}, 0., {f}, {y}, 0., 0., 0., 1., 0.]\n"
+    )
+
+
+def test_calibrations_of_opencv_and_ros_are_read(tmp_path):
+    offset = dataclasses.replace(CAMERAS, offset=12.5)
+    for each in (CAMERAS, offset):
+        write_calibration(tmp_path / "rig.yaml", each)
+        found = read_calibration(tmp_path / "rig.yaml")
+        assert dataclasses.astuple(found)[:2] == (640, 480)
+        assert found.focal == each.focal and found.baseline == pytest.approx(0.1) and found.offset == pytest.approx(each.offset)
+        assert found.depth(found.disparity(np.array([0.8]))) == pytest.approx(0.8)
+    (tmp_path / "left.yaml").write_text(ros(CAMERAS, 0.0))
+    (tmp_path / "right.yaml").write_text(ros(CAMERAS, 0.1))
+    assert read_calibration(tmp_path) == read_calibration(tmp_path / "right.yaml") == CAMERAS
+    info = "width: 640\nheight: 480\nP: [500, 0, 319.5, {}, 0, 500, 239.5, 0, 0, 0, 1, 0]\n"
+    (tmp_path / "left.yaml").write_text(info.format(0))
+    (tmp_path / "right.yaml").write_text(info.format(-50))
+    assert read_calibration(tmp_path) == CAMERAS
+
+
+def matrices(
+    path: Path, baseline: float, focal: float = 500.0, unit: str = "", size: bool = True, right_focal: float = 500.0
+) -> Path:
+    store = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    if size:
+        store.write("image_width", 640)
+        store.write("image_height", 480)
+    if unit:
+        store.write("unit", unit)
+    store.write("P1", np.array([[focal, 0, 319.5, 0], [0, focal, 239.5, 0], [0, 0, 1, 0]], float))
+    store.write("P2", np.array([[right_focal, 0, 319.5, -focal * baseline], [0, focal, 239.5, 0], [0, 0, 1, 0]], float))
+    store.release()
+    return path
+
+
+def test_millimetres_are_not_taken_for_metres(tmp_path):
+    millimetres = matrices(tmp_path / "mm.yaml", 100.0)
+    with pytest.raises(RequestError, match="it seems to be in mm, so say --calibration-unit mm"):
+        read_calibration(millimetres)
+    assert read_calibration(millimetres, "mm").baseline == pytest.approx(0.1)
+    assert read_calibration(matrices(tmp_path / "said.yaml", 100.0, unit="mm")).baseline == pytest.approx(0.1)
+    with pytest.raises(RequestError, match="it seems to be in m, so say --calibration-unit m"):
+        read_calibration(matrices(tmp_path / "m.yaml", 0.1), "mm")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (dict(baseline=-0.1), "cameras swapped"),
+        (dict(baseline=0.0), "baseline of 0"),
+        (dict(baseline=0.1, right_focal=510.0), "not rectified"),
+        (dict(baseline=0.1, size=False), "add image_width and image_height"),
+        (dict(baseline=0.1, focal=5.0, right_focal=5.0), "focal length of 5 pixels"),
+        (dict(baseline=0.1, unit="inch"), "unit must be m or mm"),
+        (dict(baseline=1e5), "no stereo pair's"),
+    ],
+)
+def test_bad_calibrations_are_told_in_one_line(tmp_path, arguments, part):
+    with pytest.raises(RequestError) as error:
+        read_calibration(matrices(tmp_path / "bad.yaml", **arguments))
+    assert part in str(error.value) and "bad.yaml" in str(error.value)
+    assert len(str(error.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        (None, "there is no calibration"),
+        ("", "neither P1 and P2"),
+        ("a: [1, 2", "not a calibration"),
+        ("\x00\x01\x02", "neither P1 and P2"),
+        ("K: [1, 2, 3]", "neither P1 and P2"),
+    ],
+)
+def test_files_that_are_no_calibration(tmp_path, text, part):
+    path = tmp_path / "rig.yaml"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(RequestError) as error:
+        read_calibration(path)
+    assert part in str(error.value) and len(str(error.value).splitlines()) == 1
+
+
+def test_calibrations_are_for_images_of_one_size(tmp_path):
+    check_size(CAMERAS, 640, 480, "left.png")
+    with pytest.raises(RequestError, match="left.png has 480 x 640 pixels, but the calibration is for 640 x 480"):
+        check_size(CAMERAS, 480, 640, "left.png")
+    (tmp_path / "left.yaml").write_text(ros(dataclasses.replace(CAMERAS, width=320), 0.0))
+    (tmp_path / "right.yaml").write_text(ros(CAMERAS, 0.1))
+    with pytest.raises(RequestError, match="320 x 480"):
+        read_calibration(tmp_path)
+
+
+# --- files ---
+
+
+def test_masks_survive_coco():
+    rng = np.random.default_rng(0)
+    whole = np.zeros((40, 30), bool)
+    whole[7:20, 3:12] = rng.random((13, 9)) < 0.6
+    runs = encode_mask(whole[7:20, 3:12], (7, 3), whole.shape)
+    assert sum(runs["counts"]) == whole.size
+    assert (decode_mask(runs) == whole).all()
+    for mask in (np.zeros((4, 5), bool), np.ones((4, 5), bool)):
+        assert (decode_mask(encode_mask(mask, (0, 0), mask.shape)) == mask).all()
+    with pytest.raises(ValueError, match="do not cover"):
+        decode_mask({"size": [4, 5], "counts": [3]})
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tiff", ".jpg"])
+def test_images_survive_files(tmp_path, suffix):
+    image = np.full((20, 30, 3), (200, 100, 30), np.uint8)
+    write_image(tmp_path / f"a{suffix}", image)
+    found = read_image(tmp_path / f"a{suffix}")
+    assert found.shape == image.shape and np.abs(found.astype(int) - image).max() <= (3 if suffix == ".jpg" else 0)
+    (tmp_path / f"b{suffix}").write_bytes(b"no image")
+    with pytest.raises(OSError, match=f"b{suffix} is not an image"):
+        read_image(tmp_path / f"b{suffix}")
+
+
+def test_disparities_are_read_in_every_convention(tmp_path):
+    expected = np.array([[1.5, np.nan, 200.25], [3.0, 4.0, np.nan]], np.float32)
+    header = b"Pf\n3 2\n-1.0\n"  # little-endian, last line first
+    (tmp_path / "a.pfm").write_bytes(header + np.nan_to_num(expected, nan=np.inf)[::-1].astype("<f4").tobytes())
+    write_image(tmp_path / "b.png", (np.nan_to_num(expected) * 256).astype(np.uint16))
+    write_image(tmp_path / "c.tiff", (np.nan_to_num(expected) * 64).astype(np.uint16))
+    np.testing.assert_array_equal(read_disparity(tmp_path / "a.pfm"), expected)
+    np.testing.assert_array_equal(read_disparity(tmp_path / "b.png"), expected)
+    np.testing.assert_array_equal(read_disparity(tmp_path / "c.tiff", 64.0), expected)
+    write_image(tmp_path / "d.png", np.zeros((2, 3), np.uint8))
+    with pytest.raises(OSError, match="d.png holds no disparities"):
+        read_disparity(tmp_path / "d.png")
