@@ -200,7 +200,8 @@ from jaxrl_vis import cli
 from jaxrl_vis.cli.parsing import parse
 from jaxrl_vis.cli.train import Train, training_config
 from jaxrl_vis.config import preset, resolve, validate
-from jaxrl_vis.learner import ddpg, losses
+from jaxrl_vis.learner import ddpg
+from jaxrl_vis.learner.auxtasks import Targets
 from jaxrl_vis.learner.networks import Networks
 from jaxrl_vis.learner.sampling import Sampler
 from jaxrl_vis.methods import METHODS
@@ -216,14 +217,15 @@ batch = Batch(images, jnp.zeros((2, 2)), jnp.zeros((2, 2)), jnp.zeros((2, 2)))
 METHODS["indicator_balance"] = dataclasses.replace(METHODS["indicator_balance"], reward="nearly_equal")
 assert Sampler(config, resolved, None, 0.1).reward(batch, images[2]).tolist() == [1.0, -1.0]
 
-config = preset("debug", compute_dtype="float32")
-networks = Networks(config, jax.ShapeDtypeStruct((3,), jnp.float32), 2, 0.0)
+config = preset("debug", compute_dtype="float32", aux_tasks=("latent_size",), weighting="balance")
+networks = Networks(config, jax.ShapeDtypeStruct((1, 16, 16), jnp.uint8), 2, 0.0)
 algorithm = ddpg.make_ddpg(networks, config, resolved)
 def one_step(key):
-    batch = Batch(jnp.zeros((3, 2, 3)), jnp.zeros((2, 2)), jnp.zeros((2, 2)), jnp.zeros((2, 2)), jnp.zeros(2))
+    images = jnp.zeros((3, 2, 1, 16, 16), jnp.uint8)
+    batch = Batch(images, jnp.zeros((2, 2)), jnp.zeros((2, 2)), jnp.zeros((2, 2)), jnp.zeros(2), targets=Targets())
     gradients, metrics = algorithm.gradients(algorithm.begin(algorithm.init(key)), batch)
-    assert metrics["train/latent_size_loss"].shape == () and set(gradients.critic) == {{"main", "latent_size"}}
-    return ddpg.combine(gradients, {{"latent_size": jnp.float32(0.01)}})
+    assert metrics["train/loss/latent_size"].shape == ()
+    return gradients
 
 
 jax.eval_shape(one_step, jax.random.key(0))

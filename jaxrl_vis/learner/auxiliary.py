@@ -50,7 +50,8 @@ class Auxiliary:
 
     def init_heads(self, key: jax.Array) -> dict[str, Params]:
         """Fresh parameters of all heads, by task."""
-        return {name: task.init(jax.random.fold_in(key, number)) for number, (name, task) in enumerate(self.tasks.items())}
+        # A task's head begins alike whichever others are there.
+        return {name: task.init(jax.random.fold_in(key, auxtasks.NAMES.index(name))) for name, task in self.tasks.items()}
 
     def init_state(self, encoder: Params) -> WeightingState | None:
         """The weighting's state; None where there is nothing to weight and nothing to remember.
