@@ -207,27 +207,25 @@ from jaxrl_vis.learner.sampling import Sampler
 from jaxrl_vis.methods import METHODS
 from jaxrl_vis.types import Batch
 
-configs = [validate(training_config(parse(Train, words[2:]))) for words in {lines!r}]
-config = next(config for config in configs if config.method == "indicator_balance")
+for words in {lines!r}:
+    config = validate(training_config(parse(Train, words[2:])))
 resolved = resolve(config, 50)
-assert resolved.balance_probability == 0.5
+assert config.method == "indicator_balance" and resolved.balance_probability == 0.5
 
 images = jnp.zeros((3, 2, 1, 20, 20), jnp.uint8).at[2, :, 0, 0, 0].set(jnp.array([1, 0], jnp.uint8)).at[2, 1].set(9)
 batch = Batch(images, jnp.zeros((2, 2)), jnp.zeros((2, 2)), jnp.zeros((2, 2)))
 METHODS["indicator_balance"] = dataclasses.replace(METHODS["indicator_balance"], reward="nearly_equal")
 assert Sampler(config, resolved, None, 0.1).reward(batch, images[2]).tolist() == [1.0, -1.0]
 
-(asked,) = [config for config in configs if config.aux_tasks == ("latent_size",)]
-weights = {{name: getattr(asked, name) for name in ("aux_tasks", "weighting", "weighting_fixed")}}
-config = preset("debug", compute_dtype="float32", **weights)
-networks = Networks(config, jax.ShapeDtypeStruct((1, 20, 20), jnp.uint8), 2, 0.0)
+config = preset("debug", compute_dtype="float32", aux_tasks=("latent_size",), weighting="balance")
+networks = Networks(config, jax.ShapeDtypeStruct((1, 16, 16), jnp.uint8), 2, 0.0)
 algorithm = ddpg.make_ddpg(networks, config, resolved)
 def one_step(key):
+    images = jnp.zeros((3, 2, 1, 16, 16), jnp.uint8)
     batch = Batch(images, jnp.zeros((2, 2)), jnp.zeros((2, 2)), jnp.zeros((2, 2)), jnp.zeros(2), targets=Targets())
-    working = algorithm.begin(algorithm.init(key))
-    gradients, metrics = algorithm.gradients(working, batch, True)
+    gradients, metrics = algorithm.gradients(algorithm.begin(algorithm.init(key)), batch)
     assert metrics["train/loss/latent_size"].shape == ()
-    return algorithm.end(algorithm.apply(working, gradients))
+    return gradients
 
 
 jax.eval_shape(one_step, jax.random.key(0))

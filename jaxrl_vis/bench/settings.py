@@ -22,6 +22,7 @@ class Settings:
         seeds: Learners side by side in one program.
         repeats: Timed repeats at most; see `timing.measure`.
         peer: Another renderer, another physics, or PyTorch, to measure beside ours.
+        aux_tasks, weighting: Auxiliary losses in gradient steps, and their weighting.
         scene: A scene of `render_scenes`, or the path of an MJCF file, to draw instead of an environment.
         on_accelerator: Whether JAX runs on one; filled in by `for_this_device`.
     """
@@ -34,6 +35,8 @@ class Settings:
     seeds: int = 1
     repeats: int = 5
     peer: str | None = None
+    aux_tasks: tuple[str, ...] = ()
+    weighting: str = "none"
     scene: str | None = None
     on_accelerator: bool = False
 
@@ -77,3 +80,7 @@ class Settings:
     def seeds_config(self) -> dict[str, int]:
         """What a record says about the number of learners; nothing of one, as records from before there could be several."""
         return {"seeds": self.seeds} if self.seeds > 1 else {}
+
+    def auxiliary_config(self) -> dict[str, Any]:
+        """What a record says about auxiliary losses; nothing where there are none."""
+        return {"weighting": self.weighting, "aux_tasks": " ".join(self.aux_tasks)} if self.weighting != "none" else {}

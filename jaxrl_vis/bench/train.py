@@ -120,6 +120,7 @@ def measure(settings: Settings) -> Iterator[Measurement]:
                 "method": config.method,
                 **sizes,
                 **settings.seeds_config(),
+                **settings.auxiliary_config(),
             },
             "details": timing.details(
                 seconds["compile"],

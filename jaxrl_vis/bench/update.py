@@ -1,5 +1,6 @@
 """Gradient steps alone, including sampling from the replay and relabelling; on request, PyTorch beside ours."""
 
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -23,7 +24,7 @@ def training_config(settings: Settings, **overrides: Any) -> Config:
         overrides |= {"image_size": settings.image_size, "pixels": settings.pixels}
     if settings.batch_size is not None:
         overrides["batch_size"] = settings.batch_size
-    overrides["seeds"] = settings.seeds
+    overrides |= {"seeds": settings.seeds, "weighting": settings.weighting, "aux_tasks": settings.aux_tasks}
     return preset("fast" if settings.on_accelerator else "cpu", env=settings.env, **overrides)
 
 
@@ -94,18 +95,20 @@ def measure(settings: Settings) -> Iterator[Measurement]:
     del loop
     seconds = timing.median_s / (updates * config.seeds)
 
-    # The fewest gradient steps of one learner that a loop takes at once, compiled for their cost alone.
-    single = make_train_step(env, config.replace(updates_per_iteration=config.actor_interval, seeds=1))
+    # As few gradient steps of one learner as there can be, compiled for their cost alone: that of a turn of their loop.
+    few = math.lcm(config.actor_interval, program.auxiliary.weighting.interval)
+    single = make_train_step(env, config.replace(updates_per_iteration=few, seeds=1))
     shapes = jax.eval_shape(single.init, seed_keys(single, 0))
     arguments = shapes.train, shapes.replay, seed_keys(single, 2), shapes.iteration
     counted = roofline.compiler_cost(single.update_many.lower(*arguments).compile(), config.actor_interval)
     params = jax.tree.map(
         lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), (shapes.train.actor, shapes.train.critic)
     )
-    least = roofline.least_cost(program.networks, params, config.batch_size)
-
     dtype, device = str(program.networks.dtype), jax.devices()[0].device_kind
-    costs = {"roofline": roofline.describe(least, seconds, dtype, device)}
+    costs = {}
+    if not config.aux_tasks:
+        least = roofline.least_cost(program.networks, params, config.batch_size)
+        costs["roofline"] = roofline.describe(least, seconds, dtype, device)
     if counted is not None:
         costs["compiler"] = roofline.describe(counted, seconds, dtype, device)
     ours = Measurement(
@@ -118,6 +121,7 @@ def measure(settings: Settings) -> Iterator[Measurement]:
             "batch_size": config.batch_size,
             "dtype": dtype,
             **settings.seeds_config(),
+            **settings.auxiliary_config(),
         },
         details=timing.details(compile_s, replay_mb=round(program.replay_bytes / 1e6, 1), **costs),
     )

@@ -11,6 +11,7 @@ from jaxrl_vis.cli.parsing import ByPlaceToo
 from jaxrl_vis.config import Pixels
 from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.methods import AuxTaskName, WeightingName
 from jaxrl_vis.report.outputs import check_writable
 
 Benchmark = Literal["render", "physics", "env", "update", "train"]
@@ -43,6 +44,10 @@ class Bench:
     """Learners side by side in one program (update, train)."""
     repeats: int = 5
     """Timed repeats; the median counts."""
+    aux_tasks: tuple[AuxTaskName, ...] = ()
+    """Auxiliary tasks in the gradient steps (update, train)."""
+    weighting: WeightingName = "none"
+    """How their losses are weighted (update, train)."""
     peer: Peer | None = None
     """Measure another side by side: a renderer on the same poses (render: mujoco, warp), MuJoCo Playground's FingerTurn
     (physics: playground), or the same gradient steps in PyTorch (update: torch)."""
@@ -70,6 +75,8 @@ def run(options: Bench) -> int:
         raise RequestError("--seeds goes with `bench update` and `bench train` only")
     if options.seeds != 1 and options.peer == "torch":
         raise RequestError("--peer torch learns with one seed: leave out --seeds")
+    if (options.weighting != "none" or options.aux_tasks) and (options.benchmark not in ("update", "train") or options.peer):
+        raise RequestError("--weighting and --aux-tasks go with `bench update` and `bench train` only, without a peer")
     check_counts(seeds=options.seeds, repeats=options.repeats, image_size=options.image_size, batch_size=options.batch_size)
     for count in options.envs:
         check_counts(envs=count)

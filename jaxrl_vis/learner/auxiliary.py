@@ -1,8 +1,8 @@
 """Auxiliary tasks and their weighting as parts of a learner: made from a `Config`, with what each of its steps does for them.
 
-    collecting   optical flow, from raw images
-    sampling     the other targets, likewise
-    ddpg         latents of all observations that some task reads, losses, and a weighted gradient for each encoder
+collecting   optical flow, from raw images
+sampling     the other targets, likewise
+ddpg         latents of all observations that some task reads, losses, and a weighted gradient for each encoder
 """
 
 import dataclasses
@@ -50,7 +50,8 @@ class Auxiliary:
 
     def init_heads(self, key: jax.Array) -> dict[str, Params]:
         """Fresh parameters of all heads, by task."""
-        return {name: task.init(jax.random.fold_in(key, number)) for number, (name, task) in enumerate(self.tasks.items())}
+        # A task's head begins alike whichever others are there.
+        return {name: task.init(jax.random.fold_in(key, auxtasks.NAMES.index(name))) for name, task in self.tasks.items()}
 
     def init_state(self, encoder: Params) -> WeightingState | None:
         """The weighting's state; None where there is nothing to weight and nothing to remember.
@@ -95,28 +96,17 @@ class Auxiliary:
         targets = auxtasks.make_targets(key, *images, self.needs - {"flow"}, self.options, self.frame_stack)
         return targets if flow is None else targets.replace(flow=optical_flow.from_bytes(flow, self.options.stretch))
 
-    def losses(
-        self, heads: dict[str, Params], latents: jax.Array, image: jax.Array | None, batch: Batch
-    ) -> dict[str, jax.Array]:
+    def losses(self, heads: dict[str, Params], view: View, batch: Batch) -> dict[str, jax.Array]:
         """The loss of each task, [] float32 by name.
 
         Args:
             heads: From `init_heads`.
-            latents: [2 to 4, B, L] of ``observations``.
-            image: [B, C, H, W] what the first of them was encoded from; None if no task reads it.
+            view: Of the transitions, without those targets that the batch carries.
             batch: The transitions, with targets.
         """
         if not self.tasks:
             return {}
-        view = View(
-            latent_t=latents[0],
-            action=batch.action,
-            latent_tp1=latents[2] if self.observations > 2 else None,
-            latent_moved=latents[3] if self.observations > 3 else None,
-            motion=batch.targets.motion,
-            image=image,
-            flow=batch.targets.flow,
-        )
+        view = view.replace(motion=batch.targets.motion, flow=batch.targets.flow)
         return {name: task.loss(heads[name], view) for name, task in self.tasks.items()}
 
 

@@ -26,6 +26,7 @@ import optax
 from jaxrl_vis.config import Config, Resolved
 from jaxrl_vis.learner import diagnostics, losses, normalizer
 from jaxrl_vis.learner.auxiliary import Auxiliary, make_auxiliary
+from jaxrl_vis.learner.auxtasks import View
 from jaxrl_vis.learner.latent_reward import LatentReward, make_latent_reward
 from jaxrl_vis.learner.networks import Networks
 from jaxrl_vis.learner.weighting import MAIN, Weighted, WeightingState, weighted_grad
@@ -168,20 +169,45 @@ def _encode(networks: Networks, params: Params, inputs: jax.Array, size: int, fi
     return networks.encode(params, inputs, slice(first * size, (first + count) * size)).reshape(count, size, -1)
 
 
-def _next_latents(
-    networks: Networks, now: _ComputeCopies, inputs: jax.Array, latents: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+class _Latents(NamedTuple):
+    """Latents of a transition's observations by one online network, [B, latent] each.
+
+    Attributes:
+        pair: [2, B, latent] before and goal, as heads take them.
+        before: The first of them.
+        after, moved: None where no loss reads them.
+    """
+
+    pair: jax.Array
+    before: jax.Array
+    after: jax.Array | None = None
+    moved: jax.Array | None = None
+
+
+def _encode_online(networks: Networks, auxiliary: Auxiliary, params: Params, inputs: jax.Array, size: int) -> _Latents:
+    """Latents of all observations that losses read, with gradient.
+
+    Most auxiliary losses read two of them or one. Encoded one by one, the gradient of each loss passes through these alone.
+    """
+    if not auxiliary.tasks:
+        pair = _encode(networks, params, inputs, size, 0)
+        return _Latents(pair, pair[0])
+    before, goal, *others = (_encode(networks, params, inputs, size, n, count=1)[0] for n in range(auxiliary.observations))
+    return _Latents(jnp.stack([before, goal]), before, *others)
+
+
+def _next_latents(networks: Networks, now: _ComputeCopies, inputs: jax.Array, latents: _Latents) -> tuple[jax.Array, jax.Array]:
     """Latents [2, B, latent] of the observation after and the goal, for the target actor and for the target critic.
 
-    Heads take them in this order; observations come as (goal, after). ``latents`` are the critic's of the first two or more.
+    Heads take them in this order; observations come as (goal, after). ``latents`` are the online critic's.
     """
-    size = latents.shape[1]
+    size = latents.before.shape[0]
     if networks.config.target_encoder:
         of_critic = _encode(networks, now.target_critic, inputs, size, 1)[::-1]
-    elif latents.shape[0] > 2:
-        of_critic = latents[2:0:-1]
     else:
-        of_critic = jnp.concatenate([_encode(networks, now.critic, inputs, size, 2, count=1), latents[1:]])
+        after = latents.after
+        after = _encode(networks, now.critic, inputs, size, 2, count=1) if after is None else after[None]
+        of_critic = jnp.concatenate([after, latents.pair[1:]])
     if networks.config.encoders == "shared":
         return of_critic, of_critic
     of_actor = _encode(networks, networks.with_encoder(now.target_actor, now.actor), inputs, size, 1)[::-1]
@@ -289,17 +315,17 @@ class _Losses:
         batch: Batch,
         held: Params,
     ) -> Weighted:
-        """The critic's losses and their gradient; ``extra`` is (latents of all observations, values [B], keep [B])."""
+        """The critic's losses and their gradient; ``extra`` is (latents, values [B], keep [B])."""
         networks, weighting = self.networks, self.auxiliary.weighting
         size = batch.action.shape[0]
 
         def critic_losses(critic: Params):
             assert batch.reward is not None
-            latents = _encode(networks, critic, inputs, size, 0, self.auxiliary.observations)
+            latents = _encode_online(networks, self.auxiliary, critic, inputs, size)
             target = self._target(now, inputs, latents, batch)
-            value = networks.value(critic, latents[:2], batch.action)
+            value = networks.value(critic, latents.pair, batch.action)
             keep = losses.keep_mask(batch.reward, value, self.resolved.reward_negative, self.resolved.filter_threshold)
-            others = self.auxiliary.losses(critic.get("heads", {}), latents, image, batch)
+            others = self._auxiliary(critic, latents, image, batch)
             return {MAIN: losses.critic_loss(value, target, keep), **others}, (latents, value, keep)
 
         # Weightings that compare no gradients need one backward pass only, which the last way of finding them takes.
@@ -308,7 +334,7 @@ class _Losses:
         state = self.auxiliary.start(now.critic.get("encoder")) if state is None else state
         return find(now.critic, state, held=held) if weighting.held else find(now.critic, state)
 
-    def _target(self, now: _ComputeCopies, inputs: jax.Array, latents: jax.Array, batch: Batch) -> jax.Array:
+    def _target(self, now: _ComputeCopies, inputs: jax.Array, latents: _Latents, batch: Batch) -> jax.Array:
         assert batch.reward is not None
         networks, resolved = self.networks, self.resolved
         of_actor, of_critic = _next_latents(networks, now, inputs, jax.lax.stop_gradient(latents))
@@ -321,7 +347,7 @@ class _Losses:
         actor: Params,
         critic: Params,
         inputs: jax.Array,
-        critic_latents: jax.Array,
+        critic_latents: _Latents,
         image: jax.Array | None,
         batch: Batch,
         weights: dict[str, jax.Array],
@@ -330,10 +356,15 @@ class _Losses:
         has_encoder = self.config.encoders == "separate"
         latents, others = critic_latents, {}
         if has_encoder:
-            latents = _encode(self.networks, actor, inputs, batch.action.shape[0], 0, self.auxiliary.observations)
-            others = self.auxiliary.losses(actor.get("heads", {}), latents, image, batch)
-        action = self.networks.act(actor, latents[:2])
-        value = self.networks.value(critic, critic_latents[:2], action)
+            latents = _encode_online(self.networks, self.auxiliary, actor, inputs, batch.action.shape[0])
+            others = self._auxiliary(actor, latents, image, batch)
+        action = self.networks.act(actor, latents.pair)
+        value = self.networks.value(critic, critic_latents.pair, action)
         best = self.resolved.reward_positive / (1.0 - self.resolved.discount) if self.auxiliary.weighting.log else None
         loss = losses.actor_loss(value, action, self.config.action_penalty, best)
         return loss + self.auxiliary.weighting.objective(weights, others), action
+
+    def _auxiliary(self, params: Params, latents: _Latents, image: jax.Array | None, batch: Batch) -> dict[str, jax.Array]:
+        """Losses of the auxiliary tasks on a network's latents, by name."""
+        seen = {"latent_t": latents.before, "latent_tp1": latents.after, "latent_moved": latents.moved}
+        return self.auxiliary.losses(params.get("heads", {}), View(**seen, image=image, action=batch.action), batch)

@@ -1,0 +1,191 @@
+"""Auxiliary losses inside the learner: which parameters they reach, how they are weighted, and what is refused."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxrl_vis.config import preset, resolve, validate
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.learner import auxtasks
+from jaxrl_vis.learner.auxiliary import make_auxiliary
+from jaxrl_vis.learner.auxtasks import optical_flow
+from jaxrl_vis.learner.ddpg import make_ddpg
+from jaxrl_vis.learner.networks import Networks
+from jaxrl_vis.learner.replay import Indices, Replay
+from jaxrl_vis.learner.sampling import Choice, Sampler
+from jaxrl_vis.types import Episodes
+
+SPEC = jax.ShapeDtypeStruct((2, 16, 16), jnp.uint8)
+ACTIONS, HORIZON, EPISODES, BATCH = 2, 6, 4, 16
+ALL = auxtasks.NAMES
+
+
+def rollout() -> Episodes:
+    """Episodes of a bright spot that actions move over a fixed pattern."""
+    keys = jax.random.split(jax.random.key(0), 3)
+    actions = jax.random.uniform(keys[0], (EPISODES, HORIZON, ACTIONS), minval=-1.0, maxval=1.0)
+    places = jnp.cumsum(jnp.pad(2.0 * actions, ((0, 0), (1, 1), (0, 0))), axis=1) + 8.0
+    grid = jnp.stack(jnp.meshgrid(jnp.arange(16.0), jnp.arange(16.0), indexing="ij"))
+    distance = jnp.sum(jnp.square(grid - places[..., None, None]), axis=2)
+    spot = 200.0 * jnp.exp(-distance / 6.0)
+    images = jnp.stack([spot, jnp.broadcast_to(10.0 * grid[0], spot.shape)], axis=2)
+    return Episodes(images.astype(jnp.uint8), places.astype(jnp.float32), actions)
+
+
+def config(**overrides):
+    return validate(preset("debug", batch_size=BATCH, updates_per_iteration=10, compute_dtype="float32", **overrides))
+
+
+@functools.cache
+def learner(**overrides):
+    """The learner, one update as a compiled function, and its state and batch at the beginning."""
+    chosen = config(**overrides)
+    networks = Networks(chosen, SPEC, ACTIONS, 0.0)
+    auxiliary = make_auxiliary(chosen, SPEC, ACTIONS, 1, networks.dtype)
+    resolved = resolve(chosen, HORIZON)
+    algorithm = make_ddpg(networks, chosen, resolved, auxiliary)
+    replay = Replay(1, EPISODES, HORIZON)
+    sampler = Sampler(chosen, resolved, replay, 0.5, auxiliary=auxiliary)
+    stored = replay.of_rollout(auxiliary.with_flow(rollout()))
+    places = jax.random.randint(jax.random.key(1), (2, BATCH), 0, EPISODES)
+    choice = Choice(Indices(places[0], places[1]), jnp.full(BATCH, HORIZON + 1), target_key=jax.random.key(2))
+    if not auxiliary.tasks:
+        choice = choice._replace(target_key=None)
+    batch = sampler.batch(stored, choice)
+
+    @functools.partial(jax.jit, static_argnums=2)
+    def update(working, batch, with_actor=True):
+        gradients, metrics = algorithm.gradients(working, batch, with_actor)
+        return algorithm.apply(working, gradients), gradients, metrics
+
+    return algorithm, update, algorithm.begin(algorithm.init(jax.random.key(3))), batch
+
+
+def sizes(tree):
+    """The norm of each part."""
+    return {
+        name: float(np.sqrt(np.mean([np.mean(np.square(x)) for x in jax.tree.leaves(part)]))) for name, part in tree.items()
+    }
+
+
+def test_every_auxiliary_loss_is_learned_and_reaches_both_encoders():
+    _, update, working, batch = learner(aux_tasks=ALL, weighting="ol_aux")
+    _, gradients, first = update(working, batch)
+    for network in (gradients.critic, gradients.actor):
+        assert set(network) == {"encoder", "head", "heads"} and set(network["heads"]) == set(ALL)
+        assert all(size > 0 for size in sizes(network).values()) and all(size > 0 for size in sizes(network["heads"]).values())
+    for _ in range(60):
+        working, _, last = update(working, batch)
+    for name in ALL:
+        assert last[f"train/loss/{name}"] < 0.9 * first[f"train/loss/{name}"], name
+        assert np.isfinite(last[f"train/weight/{name}"]) and last[f"train/weight/{name}"] >= 0.0
+    assert {float(last[f"train/weight/{name}"]) for name in ALL} != {1.0}
+    assert set(working.train.target_critic) == {"encoder", "head"}
+
+
+def test_a_weighted_gradient_is_the_sum_of_the_losses_own():
+    """Of fixed weights: the gradient with two tasks is that with each of them alone, less what both have in common."""
+    found = {}
+    for tasks in ((), ("inverse_dynamics",), ("egomotion",), ("inverse_dynamics", "egomotion")):
+        weighting = {"weighting": "fixed", "weighting_fixed": 3.0} if tasks else {"weighting": "none_log"}
+        _, update, working, batch = learner(aux_tasks=tasks, **weighting)
+        _, gradients, _ = update(working, batch, False)
+        found[tasks] = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(gradients.critic["encoder"])])
+    one, other, both = found[("inverse_dynamics",)], found[("egomotion",)], found[("inverse_dynamics", "egomotion")]
+    np.testing.assert_allclose(both, one + other - found[()], rtol=1e-3, atol=1e-5 * np.abs(both).max())
+    assert np.abs(both - found[()]).max() > 0.1 * np.abs(both).max()
+
+
+def test_both_ways_to_gradients_agree():
+    settings = {"aux_tasks": ("forward_dynamics", "egomotion"), "weighting": "ol_aux"}
+    _, update, working, batch = learner(**settings)
+    _, other_update, _, _ = learner(**settings, aux_gradients="one_hot")
+    one, other = update(working, batch), other_update(working, batch)
+    for left, right in zip(jax.tree.leaves(one[1:]), jax.tree.leaves(other[1:]), strict=True):
+        np.testing.assert_allclose(left, right, rtol=2e-3, atol=1e-5)
+
+
+def test_weights_move_every_so_many_updates():
+    _, update, working, batch = learner(aux_tasks=("inverse_dynamics",), weighting="ol_aux", weighting_interval=5)
+    seen = []
+    for _ in range(11):
+        working, _, metrics = update(working, batch)
+        seen.append(float(metrics["train/weight/inverse_dynamics"]))
+    assert seen[:5] == [1.0] * 5 and seen[5] != 1.0
+    assert len(set(seen[5:10])) == 1 and seen[10] != seen[5]
+
+
+def test_the_ablation_compares_gradients_of_held_parameters():
+    settings = {"aux_tasks": ("inverse_dynamics",), "weighting_interval": 5}
+    _, update, working, batch = learner(**settings, weighting="ol_aux_ablation")
+    # On the same batch five times, its mean is the gradient at the beginning, which OL-AUX-1 has in its first update.
+    for _ in range(6):
+        working, _, metrics = update(working, batch)
+    _, one_step, start, _ = learner(
+        aux_tasks=("inverse_dynamics",), weighting="ol_aux", weighting_interval=1, weighting_beta=25.0
+    )
+    start, _, _ = one_step(start, batch)
+    _, _, expected = one_step(start, batch)
+    np.testing.assert_allclose(metrics["train/weight/inverse_dynamics"], expected["train/weight/inverse_dynamics"], rtol=1e-4)
+    assert metrics["train/weight/inverse_dynamics"] != 1.0
+
+
+def test_an_actor_that_shares_the_encoder_has_no_heads():
+    shared = {"encoders": "shared", "target_encoder": False}
+    _, update, working, batch = learner(aux_tasks=("inverse_dynamics",), weighting="balance", **shared)
+    _, gradients, metrics = update(working, batch)
+    assert set(gradients.actor) == {"head"} and set(gradients.critic) == {"encoder", "head", "heads"}
+    assert np.isfinite(metrics["train/actor_loss"])
+
+
+def test_kept_flow_is_that_of_the_images():
+    episodes = make_auxiliary(config(aux_tasks=("optical_flow",), weighting="sum"), SPEC, ACTIONS, 1, jnp.float32).with_flow(
+        rollout()
+    )
+    assert episodes.flow is not None and episodes.flow.shape == (EPISODES, HORIZON, 16, 16) and episodes.flow.dtype == jnp.uint8
+    images = episodes.observations
+    wanted = optical_flow.flow_strength(images[1, 2][None], images[1, 3][None])[0]
+    np.testing.assert_allclose(optical_flow.from_bytes(episodes.flow[1, 2]), np.clip(wanted, 0.0, 255 / 16), atol=1 / 32 + 1e-4)
+    assert wanted.max() > 0.5
+    _, _, _, batch = learner(aux_tasks=("optical_flow",), weighting="sum")
+    place = jax.random.randint(jax.random.key(1), (2, BATCH), 0, EPISODES)[:, 3]
+    np.testing.assert_array_equal(batch.targets.flow[3], optical_flow.from_bytes(episodes.flow[place[0], place[1]]))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        ({"aux_tasks": ("egomotion",)}, "weighting none learns none: choose --weighting ol_aux"),
+        ({"weighting": "ol_aux"}, "has no auxiliary tasks to weight: add --aux-tasks"),
+        (
+            {"weighting": "ol_aux", "aux_tasks": ("egomotion",), "weighting_interval": 3},
+            "weighting_interval (3) must divide updates_per_iteration (10)",
+        ),
+        ({"weighting": "balance", "aux_tasks": ("egomotion",), "random_shift": 2}, "random_shift and aux_tasks exclude"),
+        ({"weighting": "balance", "aux_tasks": ("egomotion",), "n_step": 2}, "n_step and aux_tasks exclude"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(overrides, words):
+    with pytest.raises(RequestError) as caught:
+        make_auxiliary(config(**overrides), SPEC, ACTIONS, 1, jnp.float32)
+    assert words in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_states_have_no_auxiliary_tasks():
+    state = jax.ShapeDtypeStruct((3,), jnp.float32)
+    with pytest.raises(RequestError, match="choose a task that shows images"):
+        make_auxiliary(config(aux_tasks=("egomotion",), weighting="balance"), state, ACTIONS, 1, jnp.float32)
+
+
+def test_an_actor_learns_the_logarithm_of_its_distance_from_the_best_value():
+    """Log losses are defined for any rewards: with +1/-1, values reach R+/(1 - gamma), not 0."""
+    _, update, working, batch = learner(weighting="none_log", reward_positive=1.0)
+    _, _, metrics = update(working, batch)
+    resolved = resolve(config(reward_positive=1.0), HORIZON)
+    best = resolved.reward_positive / (1.0 - resolved.discount)
+    penalty = float(metrics["train/action_size"]) ** 2
+    # The critic is fresh: all values are near 0.
+    np.testing.assert_allclose(metrics["train/actor_loss"] - penalty, np.log(best), atol=0.2)
