@@ -72,7 +72,7 @@ def sizes(tree):
 
 
 def test_every_auxiliary_loss_is_learned_and_reaches_both_encoders():
-    _, update, working, batch = learner(aux_tasks=ALL, weighting="ol_aux")
+    _, update, working, batch = learner(aux_tasks=ALL, weighting="balance")
     _, gradients, first = update(working, batch)
     for network in (gradients.critic, gradients.actor):
         assert set(network) == {"encoder", "head", "heads"} and set(network["heads"]) == set(ALL)
@@ -81,8 +81,6 @@ def test_every_auxiliary_loss_is_learned_and_reaches_both_encoders():
         working, _, last = update(working, batch)
     for name in ALL:
         assert last[f"train/loss/{name}"] < 0.9 * first[f"train/loss/{name}"], name
-        assert np.isfinite(last[f"train/weight/{name}"]) and last[f"train/weight/{name}"] >= 0.0
-    assert {float(last[f"train/weight/{name}"]) for name in ALL} != {1.0}
     assert set(working.train.target_critic) == {"encoder", "head"}
 
 
