@@ -16,7 +16,8 @@ ROOT = Path(__file__).resolve().parents[1]
 LAYERS: tuple[tuple[str, ...], ...] = (
     ("errors", "methods"),
     ("fields",),
-    ("config", "types", "provenance", "files", "devices"),
+    ("config", "types", "provenance", "files"),
+    ("devices",),
     ("learner",),
     ("report",),
     ("run",),
