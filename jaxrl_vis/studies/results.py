@@ -125,7 +125,7 @@ def reached(line: Line, level: float) -> Reached:
         return Reached(level, median, None, None, line.end)
     each = [steps_to(curve([row for row in line.rows if row["seed"] == seed], SUCCESS), level) for seed in line.seeds]
     # The quartile of numbers some of which are only known to be large: one of them, never a number between.
-    quartiles = np.percentile([np.inf if steps is None else steps for steps in each], [25, 75], method="nearest")
+    quartiles = np.percentile([np.inf if steps is None else steps for steps in each], [25, 75], method="inverted_cdf")
     low, high = (float(value) if np.isfinite(value) else None for value in quartiles)
     return Reached(level, median, low, high, line.end)
 
