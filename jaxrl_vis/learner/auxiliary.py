@@ -80,7 +80,18 @@ class Auxiliary:
         """
         if not self.tasks:
             return {}
-        view = View(
+        view = self._view(latents, image, batch)
+        return {name: task.loss(heads[name], view) for name, task in self.tasks.items()}
+
+    def predictions(
+        self, heads: dict[str, Params], latents: jax.Array, image: jax.Array | None, batch: Batch
+    ) -> dict[str, jax.Array]:
+        """What each task predicts (`AuxTask.predict`), by name; arguments as of `losses`."""
+        view = self._view(latents, image, batch)
+        return {name: task.predict(heads[name], view) for name, task in self.tasks.items()}
+
+    def _view(self, latents: jax.Array, image: jax.Array | None, batch: Batch) -> View:
+        return View(
             latent_t=latents[0],
             action=batch.action,
             latent_tp1=latents[2] if self.observations > 2 else None,
@@ -89,7 +100,6 @@ class Auxiliary:
             image=image,
             flow=batch.targets.flow,
         )
-        return {name: task.loss(heads[name], view) for name, task in self.tasks.items()}
 
 
 def make_auxiliary(

@@ -136,10 +136,11 @@ def _steps_table(lines: dict[tuple[str, str], Line], tasks: Sequence[str]):
         task: [Named(VARIANTS[variant].label, line) for (of_task, variant), line in lines.items() if of_task == task]
         for task in tasks
     }
+    ends = {task: max(each.line.end for each in found) for task, found in named.items()}
     for (task, variant), points in released_curves().items():
-        if task in named:
-            end = max(each.line.end for each in named[task])
-            rows = [{"seed": 0, "env_steps": steps, "updates": 0, SUCCESS: value} for steps, value in points if steps <= end]
+        known = [(steps, value) for steps, value in points if steps <= ends.get(task, 0)]
+        if known:
+            rows = [{"seed": 0, "env_steps": steps, "updates": 0, SUCCESS: value} for steps, value in known]
             named[task].append(Named(VARIANTS[variant].label, Line(task, variant, rows), _AUTHORS))
     return steps_table(named, LEVELS)
 
