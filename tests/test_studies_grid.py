@@ -259,3 +259,15 @@ def test_devices_are_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_devices_are_asked_for_in_a_process_of_their_own() -> None:
     assert list_devices() == [Device("the CPU", {})]
+
+
+def test_real_runs_are_trained_and_a_wrong_one_says_why(tmp_path: Path) -> None:
+    """By processes of their own, on a task that compiles in a moment."""
+    own = {"env": "point_mass:PointMass", "env_folder": str(Path(__file__).parent), "env_steps": 80, "seeds": 1}
+    cells = [make_cell("wrong", **own, batch_size=0), make_cell("right", **own)]
+    failures = run_cells(cells, tmp_path, lambda: CPU, say=lambda _: None)
+    assert len(failures) == 1 and "wrong-80: failed with exit status 2" in failures[0]
+    assert "batch_size must be at least 1, not 0" in failures[0]
+    assert not (tmp_path / cells[0].name).exists()
+    assert is_finished(cells[1], tmp_path) and (tmp_path / cells[1].name / "video.gif").exists()
+    assert "success at the end" in (tmp_path / f"{cells[1].name}.log").read_text()
