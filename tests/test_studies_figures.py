@@ -120,13 +120,13 @@ def line(values: list[list[float]], task: str = FETCH, variant: str = "ol_aux_5"
 
 def test_levels_are_reached_by_the_rule_of_three() -> None:
     found = reached(line([[0.1, 0.6, 0.4, 0.6, 0.7, 0.8]] * 3), 0.5)
-    assert found == Reached(0.5, 80_000, 80_000.0, 80_000.0, 120_000) and str(found) == "80k (80k to 80k)"
+    assert found == Reached(0.5, 80_000, 80_000.0, 80_000.0, 120_000) and str(found) == "80 k (80 k to 80 k)"
     # The last two evaluations have nothing after them.
-    assert str(reached(line([[0.1, 0.1, 0.1, 0.1, 0.9, 0.9]]), 0.5)) == "> 120k"
+    assert str(reached(line([[0.1, 0.1, 0.1, 0.1, 0.9, 0.9]]), 0.5)) == "> 120 k"
     one_never = reached(line([[0.9] * 6, [0.1, 0.9, 0.9, 0.9, 0.9, 0.9], [0.1] * 6]), 0.5)
     # Of three seeds the middle one counts, and one that never gets there is not averaged with the others.
     assert (one_never.steps, one_never.low, one_never.high) == (40_000, 20_000.0, None)
-    assert str(one_never) == "40k (20k to > 120k)"
+    assert str(one_never) == "40 k (20 k to > 120 k)"
 
 
 def test_ratios_are_numbers_or_bounds() -> None:
@@ -145,10 +145,10 @@ def test_the_table_compares_with_the_baseline_of_the_same_source() -> None:
     ]
     text, rows = steps_table({FETCH: named}, {FETCH: (0.5, 0.99)})
     body = [row for row in text if row.startswith("| ") and "---" not in row]
-    assert len(body) == 5 and "60k | 1.7" in body[2] and "(authors)" in body[4] and "60k | 1.0" in body[4]
-    assert "> 200k" in body[1] and "> 2.0" in body[2]  # of 0.99
+    assert len(body) == 5 and "60 k | 1.7" in body[2] and "(authors)" in body[4] and "60 k | 1.0" in body[4]
+    assert "> 200 k" in body[1] and "> 2.0" in body[2]  # of 0.99
     read = list(csv.DictReader(to_csv(rows).splitlines()))
-    assert len(read) == 8 and read[2]["method"] == "ol_aux_5" and read[2]["steps"] == "60000" and read[2]["ratio"] == "1.7"
+    assert len(read) == 8 and read[2]["method"] == "ol_aux_5" and read[2]["steps"] == "60000" and read[2]["speed_up"] == "1.7"
     assert read[1]["steps"] == "" and read[1]["budget"] == "200000"
 
 
@@ -189,7 +189,7 @@ def test_a_figure_shows_what_is_finished_and_lists_the_rest(tmp_path: Path, caps
     assert all(has_colour(out, VARIANTS[name].colour) for name in STUDIES["5.4"].variants)
     text = out.with_suffix(".md").read_text()
     assert "preset paper, one gradient step per 100 environment steps; seeds 0 to 4" in text
-    assert "| OL-AUX-5 | 80k (80k to 80k) | 1.8 |" in text and "### VisualHandReach" in text
+    assert "| OL-AUX-5 | 80 k (80 k to 80 k) | 1.8 |" in text and "### VisualHandReach" in text
     assert "VisualFingerTurn" not in text.partition("Not finished")[0]
     ours = [(steps, min(1.0, slope(1.0)(steps))) for steps in range(EVERY, 260_001, EVERY)]
     difference = mean_difference(ours, released_curves()[FETCH, "none"])

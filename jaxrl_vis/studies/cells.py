@@ -49,7 +49,7 @@ class Cell:
 def show_budget(steps: int) -> str:
     """``250k``, ``2.5M``; all digits where these would be rounded."""
     for size, letter in ((10**6, "M"), (10**3, "k")):
-        if steps >= size and steps % (size // 10) == 0:
+        if steps >= size and steps % (size // 100) == 0:
             return f"{steps / size:g}{letter}"
     return str(steps)
 

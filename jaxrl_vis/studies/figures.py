@@ -1,7 +1,7 @@
 """Figures 5.4 to 5.7 from the first process to the last file: trains what is missing, draws, and writes the table beside.
 
 FIGURE.png   the lines of finished cells; behind them, dashed, what the authors released
-FIGURE.md    steps to levels of success, ratios, and what the runs were
+FIGURE.md    steps to levels of success, speed-ups, and what the runs were
 FIGURE.csv   the same figures, to compute with
 """
 
@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxrl_vis.devices import list_devices
 from jaxrl_vis.files import write_atomically
+from jaxrl_vis.report.plots import show_steps
 from jaxrl_vis.studies import ol_aux
 from jaxrl_vis.studies.authors import mean_difference, released_curves
 from jaxrl_vis.studies.drawing import Curve, Panel, draw_panels
@@ -137,7 +138,9 @@ def _steps_table(lines: dict[tuple[str, str], Line], tasks: Sequence[str]):
         for task in tasks
     }
     ends = {task: max(each.line.end for each in found) for task, found in named.items()}
-    for (task, variant), points in released_curves().items():
+    released = released_curves()
+    for task, variant in sorted(released, key=lambda key: list(VARIANTS).index(key[1])):
+        points = released[task, variant]
         known = [(steps, value) for steps, value in points if steps <= ends.get(task, 0)]
         if known:
             rows = [{"seed": 0, "env_steps": steps, "updates": 0, SUCCESS: value} for steps, value in known]
@@ -165,7 +168,7 @@ def _about(request: Request, lines: Sequence[Line]) -> str:
 def _notes(request: Request, lines: dict[tuple[str, str], Line], unfinished: list[str]) -> list[str]:
     notes = [
         "Steps to a level: the evaluation there and the next two reach it, in the median over seeds; in brackets the middle "
-        "half of single seeds. Ratios refer to the run without auxiliary losses of the same source."
+        "half of single seeds. Speed-ups are the steps without auxiliary losses, of the same source, divided by these."
     ]
     if request.figure == "5.6":
         notes = ["Weights are means over training, in the median over seeds; gains are differences of mean success."]
@@ -176,7 +179,7 @@ def _notes(request: Request, lines: dict[tuple[str, str], Line], unfinished: lis
             if difference is not None:
                 notes.append(
                     f"{task} without auxiliary losses: mean absolute difference to the authors' curve {difference:.3f}, over "
-                    f"its points to {line.end / 1000:g} k steps."
+                    f"its points to {show_steps(line.end)} steps."
                 )
         if line.has_lost_replay():
             notes.append(f"{task}, {VARIANTS[variant].label}: a run went on without its replay, and is not exact.")

@@ -5,7 +5,7 @@
     5.6   weights of OL-AUX-5 over training
     5.7   OL-AUX-5, its ablation, OL-AUX-1
 
-Every figure also has a run without auxiliary losses, which its ratios refer to. Runs are shared between figures.
+Every figure also has a run without auxiliary losses, which speed-ups refer to. Runs are shared between figures.
 """
 
 import dataclasses

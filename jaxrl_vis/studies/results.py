@@ -9,9 +9,9 @@ import numpy as np
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.report.learning import curve, steps_to
-from jaxrl_vis.report.plots import gather
+from jaxrl_vis.report.plots import gather, show_steps
 from jaxrl_vis.run.folder import read_record
-from jaxrl_vis.studies.cells import Cell, folder_of, rows_of, show_budget, standing
+from jaxrl_vis.studies.cells import Cell, folder_of, rows_of, standing
 
 SUCCESS = "eval/success"
 
@@ -109,13 +109,13 @@ class Reached:
         return f"< {other.steps / self.budget:.1f}" if other.steps else "–"
 
     def __str__(self) -> str:
-        """``120k (100k to 140k)``, or ``> 250k`` where it was not reached."""
+        """``120 k (100 k to 140 k)``, or ``> 250 k`` where it was not reached."""
         if self.steps is None:
-            return f"> {show_budget(self.budget)}"
+            return f"> {show_steps(self.budget)}"
         if self.low is None:
-            return show_budget(self.steps)
-        high = "> " + show_budget(self.budget) if self.high is None else show_budget(round(self.high))
-        return f"{show_budget(self.steps)} ({show_budget(round(self.low))} to {high})"
+            return show_steps(self.steps)
+        high = "> " + show_steps(self.budget) if self.high is None else show_steps(self.high)
+        return f"{show_steps(self.steps)} ({show_steps(self.low)} to {high})"
 
 
 def reached(line: Line, level: float) -> Reached:

@@ -1,4 +1,4 @@
-"""The table beside a figure, as Markdown and as CSV: steps to levels of success, and how they compare with a baseline."""
+"""The table beside a figure, as Markdown and as CSV: steps to levels of success, and speed-ups over a baseline."""
 
 import csv
 import dataclasses
@@ -8,6 +8,7 @@ from typing import Any
 
 from scipy.stats import spearmanr
 
+from jaxrl_vis.report.plots import show_steps
 from jaxrl_vis.studies.results import Line, final_success, mean_success, mean_weight, reached
 
 BASELINE = "none"
@@ -31,7 +32,7 @@ class Named:
 def steps_table(
     lines: Mapping[str, Sequence[Named]], levels: Mapping[str, Sequence[float]]
 ) -> tuple[list[str], list[dict[str, Any]]]:
-    """Steps to each level, and ratios against the baseline of the same source.
+    """Steps to each level, and speed-ups over the baseline of the same source.
 
     Args:
         lines: Task -> its lines.
@@ -44,8 +45,8 @@ def steps_table(
     rows: list[dict[str, Any]] = []
     for task, named in lines.items():
         common = min(each.line.end for each in named)
-        heads = [part for level in levels[task] for part in (f"steps to {level:g}", "fewer than without, times")]
-        columns = ["method", *heads, f"mean success to {_thousands(common)}", "success at the end"]
+        heads = [part for level in levels[task] for part in (f"steps to {level:g}", "speed-up")]
+        columns = ["method", *heads, f"mean success to {show_steps(common)}", "success at the end"]
         text += [f"### {task}", "", _row(columns), _row(["---"] * len(columns))]
         for each in named:
             base = next((b.line for b in named if b.line.variant == BASELINE and b.source == each.source), None)
@@ -85,7 +86,7 @@ def _csv_rows(named: Named, base: Line | None, levels: Sequence[float], common: 
                 "steps_25": found.low,
                 "steps_75": found.high,
                 "budget": found.budget,
-                "ratio": "" if base is None or named.line.variant == BASELINE else found.ratio(reached(base, level)),
+                "speed_up": "" if base is None or named.line.variant == BASELINE else found.ratio(reached(base, level)),
                 "mean_success": round(mean_success(named.line, common), 4),
                 "mean_success_to": common,
                 "final_success": round(final_success(named.line)[1], 4),
@@ -151,7 +152,3 @@ def to_csv(rows: Sequence[Mapping[str, Any]]) -> str:
 
 def _row(cells: Sequence[str]) -> str:
     return "| " + " | ".join(cells) + " |"
-
-
-def _thousands(steps: int) -> str:
-    return f"{steps / 1000:g} k"
