@@ -78,11 +78,8 @@ def _draw(axes: Axes, panel: Panel, is_share: bool) -> None:
     end = max(ends, default=1)
     for curve in panel.curves:
         if curve.behind:
-            shown = curve.steps <= end
             style = {"linewidth": 1.3, "linestyle": (0, (4, 2)), "alpha": 0.75, "zorder": 1}
-            axes.plot(
-                curve.steps[shown], np.median(curve.values, axis=0)[shown], color=curve.colour, label=curve.label, **style
-            )
+            axes.plot(curve.steps, np.median(curve.values, axis=0), color=curve.colour, label=curve.label, **style)
         else:
             draw_median(axes, curve.steps, curve.values, curve.colour, curve.label)
     style_curves(axes, panel.title)

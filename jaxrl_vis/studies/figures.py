@@ -104,23 +104,18 @@ def _write(request: Request, lines: dict[tuple[str, str], Line], shown: Sequence
 
 
 def _success(lines: dict[tuple[str, str], Line], task: str, shown: Sequence[str]) -> list[Curve]:
-    authors = released_curves()
-    theirs = [
-        Curve(
-            f"{VARIANTS[variant].label} ({_AUTHORS})",
-            VARIANTS[variant].colour,
-            np.array([steps for steps, _ in authors[task, variant]]),
-            np.array([[success for _, success in authors[task, variant]]]),
-            behind=True,
-        )
-        for variant in shown
-        if (task, variant) in authors
-    ]
     ours = [
         Curve(VARIANTS[variant].label, VARIANTS[variant].colour, *lines[task, variant].values(SUCCESS))
         for variant in shown
         if (task, variant) in lines
     ]
+    end, theirs = max(lines[task, variant].end for variant in shown if (task, variant) in lines), []
+    for variant in shown:
+        points = [point for point in released_curves().get((task, variant), ()) if point[0] <= end]
+        if len(points) > 1:
+            steps, success = np.array(points).T
+            label = f"{VARIANTS[variant].label} ({_AUTHORS})"
+            theirs.append(Curve(label, VARIANTS[variant].colour, steps, success[None], behind=True))
     return theirs + ours
 
 
