@@ -149,7 +149,7 @@ class _Grid:
                 words, stdin=subprocess.DEVNULL, stdout=file, stderr=file, env=environment, start_new_session=True
             )
         self._running.append(_Running(cell, device, process, log, time.monotonic()))
-        self._say(f"{place}: {'goes on' if '--resume' in words else 'begins'} on {device.name}")
+        self._say(f"{place}: {'resumes' if '--resume' in words else 'starts'} on {device.name}")
 
     def _end(self, done: _Running) -> None:
         self._running.remove(done)
