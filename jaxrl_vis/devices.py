@@ -1,10 +1,16 @@
 """What there is to compute on: asked of JAX, or, where an answer must not wait for JAX, guessed."""
 
+import dataclasses
 import importlib.util
+import json
 import os
+import subprocess
+import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.provenance import child_environment
 
 # The packages by which JAX reaches an accelerator, and files that show that the machine has one.
 _NVIDIA = (("jax_cuda12_plugin", "jax_cuda13_plugin"), ("/dev/nvidiactl", "/dev/nvidia0", "/dev/dxg"))
@@ -28,6 +34,53 @@ def check_devices() -> None:
             raise RequestError(f"JAX finds no device to compute on: {' '.join(str(error).split())}") from error
         there = _platforms_without(asked)
         raise RequestError(f"JAX_PLATFORMS={asked}, but JAX finds no such device here, only {there}{_mend(asked)}") from error
+
+
+@dataclasses.dataclass(frozen=True)
+class Device:
+    """Where a process may run.
+
+    Attributes:
+        name: For people.
+        environment: Variables that keep a process to this device.
+    """
+
+    name: str
+    environment: Mapping[str, str]
+
+
+# Asked in a process of its own: one that has looked at a GPU holds some of its memory until it ends.
+_ASK = """
+import json, sys
+from jaxrl_vis.devices import check_devices
+from jaxrl_vis.errors import RequestError
+try:
+    check_devices()
+except RequestError as error:
+    sys.exit(str(error))
+import jax
+print(json.dumps([[device.platform, device.device_kind] for device in jax.local_devices()]))
+"""
+
+
+def list_devices() -> list[Device]:
+    """Each GPU that this process may use; or one entry that leaves everything as it is, where there is one device or no GPU.
+
+    Raises:
+        RequestError: JAX finds no device.
+    """
+    environment = child_environment() | {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+    done = subprocess.run([sys.executable, "-c", _ASK], env=environment, capture_output=True, text=True)
+    lines = (done.stdout if done.returncode == 0 else done.stderr).strip().splitlines()
+    if done.returncode or not lines:
+        raise RequestError(lines[-1] if lines else "JAX finds no device to compute on")
+    found = json.loads(lines[-1])
+    (platform, kind), count = found[0], len(found)
+    if platform not in ("gpu", "cuda") or count == 1:
+        return [Device("the CPU" if platform == "cpu" else kind, {})]
+    visible = [word.strip() for word in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if word.strip()]
+    names = visible if len(visible) == count else [str(number) for number in range(count)]
+    return [Device(f"GPU {name}", {"CUDA_VISIBLE_DEVICES": name}) for name in names]
 
 
 def guess_accelerator() -> bool:

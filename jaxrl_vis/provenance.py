@@ -60,6 +60,15 @@ def revision(digits: int = 40, folder: Path = CHECKOUT) -> str | None:
     return head[:digits] + ("-dirty" if git("status", "--porcelain", "--", *_CODE, folder=folder) else "")
 
 
+def child_environment() -> dict[str, str]:
+    """Environment variables for a process that runs this very copy of the project, wherever Python would find another one."""
+    import jaxrl_vis_envs
+
+    sources = {str(CHECKOUT), str(Path(jaxrl_vis_envs.__file__).resolve().parents[1])}
+    there = [part for part in os.environ.get("PYTHONPATH", "").split(os.pathsep) if part and part not in sources]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join([*sorted(sources), *there])}
+
+
 def install_command(extra: str) -> str:
     """The command that installs one of this project's extras here: in a clone or an installed copy, with or without pip."""
     in_clone = (CHECKOUT / "pyproject.toml").exists()

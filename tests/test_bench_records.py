@@ -18,6 +18,7 @@ from jaxrl_vis.cli.parsing import parse
 from jaxrl_vis.cli.train import Train, training_config
 from jaxrl_vis.config import preset
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.report import learning as curves
 
 CODE = '''"""A module."""
 
@@ -257,18 +258,18 @@ def test_a_run_without_evaluations_is_not_kept(tmp_path: Path) -> None:
 
 def test_a_value_is_reached_when_the_next_two_evaluations_confirm_it() -> None:
     points = [(1, 0.9), (2, 0.5), (3, 0.9), (4, 0.95), (5, 0.9), (6, 0.9)]
-    assert learning.steps_to(points, 0.9) == 3
-    assert learning.steps_to(points, 0.95) is None
+    assert curves.steps_to(points, 0.9) == 3
+    assert curves.steps_to(points, 0.95) is None
     # Of the last two evaluations nobody knows what comes after.
-    assert learning.steps_to(points[:4], 0.9) is None
-    assert learning.steps_to([(steps, -value) for steps, value in points], -0.9, least=True) == 3
+    assert curves.steps_to(points[:4], 0.9) is None
+    assert curves.steps_to([(steps, -value) for steps, value in points], -0.9, least=True) == 3
 
 
 def test_curves_are_medians_over_all_seeds() -> None:
     rows = rows_of([0.1, 0.5]) + rows_of([0.3, 0.7], seed=1) + rows_of([0.2, 0.9, 1.0], seed=2)
-    assert learning.curve(rows, "eval/success") == [(1000, 0.2), (2000, 0.7)]
+    assert curves.curve(rows, "eval/success") == [(1000, 0.2), (2000, 0.7)]
     with pytest.raises(ValueError, match="seed 1 appears twice at 1000 steps"):
-        learning.curve(rows + rows_of([0.3], seed=1), "eval/success")
+        curves.curve(rows + rows_of([0.3], seed=1), "eval/success")
 
 
 def test_a_row_says_what_its_runs_reached(tmp_path: Path) -> None:

@@ -3,29 +3,25 @@
     benchmarks/results/learning/NAME.json             schema, name, configuration, command, device, versions, revision, date
     benchmarks/results/learning/NAME.metrics.jsonl    the run's metrics.jsonl, less everything but evaluations and times
 
-`benchmarks/keep_learning.py` keeps a run. A figure "X by N steps" means that the evaluation at N and the next two all reach X,
-in the median over seeds.
+`benchmarks/keep_learning.py` keeps a run. What a figure "X by N steps" means: `jaxrl_vis.report.learning`.
 """
 
 import dataclasses
 import datetime
 import json
-import shlex
-import statistics
 from pathlib import Path
 from typing import Any
 
 from jaxrl_vis.bench.record import SCHEMA
-from jaxrl_vis.config import Config, preset
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.files import write_atomically
+from jaxrl_vis.run.command import command_of
 from jaxrl_vis.run.folder import RunFolder, read_config, read_record
 from jaxrl_vis.run.metrics import read_rows
 
 FOLDER = "learning"
 NAME = "learning"
 """What a record of a run is a record of; see `staleness.MEASURED`."""
-CONFIRMATIONS = 2  # evaluations after the first that must reach a value, too
 _COLUMNS = ("seed", "env_steps", "updates")
 _PREFIXES = ("eval/", "time/", "resume/")
 
@@ -93,56 +89,6 @@ def load(name: str, results: Path) -> Evidence | None:
         return None
     rows = [json.loads(line) for line in metrics_file.read_text(encoding="utf-8").splitlines()]
     return Evidence(json.loads(record_file.read_text(encoding="utf-8")), rows)
-
-
-def command_of(config: Config) -> str:
-    """The shortest command that trains as ``config`` says: the preset, and what differs from it."""
-    words = ["jaxrl-vis", "train", config.env, "--preset", config.preset]
-    base = preset(config.preset)
-    for field in dataclasses.fields(Config):
-        value = getattr(config, field.name)
-        if field.name in ("env", "preset") or value == getattr(base, field.name):
-            continue
-        option = "--" + field.name.replace("_", "-")
-        if isinstance(value, bool):
-            words.append(option if value else option.replace("--", "--no-", 1))
-        else:
-            words += [option, *map(str, value)] if isinstance(value, tuple) else [option, str(value)]
-    return shlex.join(words)
-
-
-def curve(rows: list[dict[str, Any]], metric: str) -> list[tuple[int, float]]:
-    """The median over seeds of a metric against environment steps, at the steps where every seed was evaluated.
-
-    Args:
-        rows: From one run or several, see `Evidence`. No seed may appear twice at the same step.
-        metric: A column, such as ``eval/success``.
-
-    Raises:
-        ValueError: A seed appears twice.
-    """
-    seeds = {row["seed"] for row in rows}
-    values: dict[int, dict[int, float]] = {}
-    for row in rows:
-        if row["seed"] in values.setdefault(row["env_steps"], {}):
-            raise ValueError(f"seed {row['seed']} appears twice at {row['env_steps']} steps: are these different runs?")
-        values[row["env_steps"]][row["seed"]] = row[metric]
-    return [(steps, statistics.median(found.values())) for steps, found in sorted(values.items()) if set(found) == seeds]
-
-
-def steps_to(points: list[tuple[int, float]], target: float, least: bool = False) -> int | None:
-    """The first step from which on this evaluation and the next `CONFIRMATIONS` all reach ``target``; None for never.
-
-    Args:
-        points: From `curve`.
-        target: What is to be reached.
-        least: Whether lower is better.
-    """
-    for index in range(len(points) - CONFIRMATIONS):
-        window = [value for _, value in points[index : index + 1 + CONFIRMATIONS]]
-        if all(value <= target if least else value >= target for value in window):
-            return points[index][0]
-    return None
 
 
 def seconds(rows: list[dict[str, Any]]) -> tuple[float, float]:

@@ -15,6 +15,8 @@ from jaxrl_vis.bench.table_rows import DEVICES, LEARNING, SPEED, Figure, Learnin
 from jaxrl_vis.config import config_from_dict
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.files import write_atomically
+from jaxrl_vis.report.learning import curve, steps_to
+from jaxrl_vis.run.command import command_of
 
 MISSING = "not measured yet"
 
@@ -88,7 +90,7 @@ def evidence_of(row: Learning, results: Path) -> list[learning.Evidence]:
         if evidence is None:
             return []
         if config_from_dict(evidence.record["config"]) != config:
-            asked = learning.command_of(config)
+            asked = command_of(config)
             raise RequestError(f"evidence {name} was made by `{evidence.record['command']}`, and the README says `{asked}`")
         found.append(evidence)
     return found
@@ -97,10 +99,10 @@ def evidence_of(row: Learning, results: Path) -> list[learning.Evidence]:
 def learning_text(row: Learning, found: list[learning.Evidence]) -> str:
     """What the runs reached, in words."""
     rows = [line for evidence in found for line in evidence.rows]
-    points = learning.curve(rows, row.metric)
+    points = curve(rows, row.metric)
     parts = []
     for target in row.targets:
-        steps = learning.steps_to(points, target, row.least)
+        steps = steps_to(points, target, row.least)
         reached = "not reached" if steps is None else f"by {short(steps)} steps"
         parts.append(row.word.format(target) + f" {reached}")
     for asked in row.steps:
@@ -134,7 +136,7 @@ def results_table(results: Path) -> str:
     lines = ["| what | machine | figure | command |", "|---|---|---|---|"]
     for row in LEARNING:
         found = evidence_of(row, results)
-        command = row.command or learning.command_of(next(iter(row.runs.values())))
+        command = row.command or command_of(next(iter(row.runs.values())))
         machine = _machine(found[0].record["device"]) if found else ""
         lines.append(f"| {row.label} | {machine} | {learning_text(row, found) if found else MISSING} | `{command}` |")
     return "\n".join(lines)

@@ -6,17 +6,25 @@ from typing import Annotated, Literal
 
 import tyro
 
+from jaxrl_vis.cli.checks import check_counts
+from jaxrl_vis.config import PRESETS
 from jaxrl_vis.devices import check_devices
-from jaxrl_vis.errors import RequestError
+from jaxrl_vis.errors import RequestError, nearest
 from jaxrl_vis.report.outputs import check_writable
 
-FigureName = Literal["quadratic"]
+FigureName = Literal["5.4", "5.5", "5.6", "5.7", "quadratic"]
 SUFFIXES = (".png", ".pdf", ".svg")
+UNFINISHED = 3
+"""Exit status: finished, with something left out."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Figure:
-    """Draw a figure: compute what it shows, and write it to a file.
+    """Draw a figure: train or compute what it shows, and write it to a file, with a table beside it.
+
+    5.4: auxiliary losses, and how they are weighted. 5.5: single auxiliary tasks. 5.6: their weights over training. 5.7: what
+    OL-AUX-5 owes to looking ahead. These train what is missing, one process a GPU, and resume what was begun, so they may be
+    interrupted and started again at any time; the exit status is 3 where something is still missing.
 
     quadratic: adaptive weights of auxiliary losses on three losses of a point in the plane.
     """
@@ -24,18 +32,98 @@ class Figure:
     figure: Annotated[FigureName, tyro.conf.Positional]
     """Which figure."""
     out: Path | None = None
-    """A .png, .pdf or .svg file; FIGURE.png in the current folder if not given."""
+    """A .png, .pdf or .svg file; figure_FIGURE.png (or quadratic.png) in the current folder if not given. Tables go beside it,
+    as .md and .csv."""
+    preset: str | None = None
+    """Preset of all runs; paper if not given."""
+    quick: bool = False
+    """A few minutes on a CPU, to see it work rather than learn: preset cpu, seed 0, VisualFetchReach, few steps."""
+    tasks: tuple[str, ...] = ()
+    """Only these environments; all of the figure's if not given."""
+    methods: tuple[str, ...] = ()
+    """These lines in the place of the figure's own, such as none sum fixed_0.1 ol_aux_5."""
+    seed: int | None = None
+    """First seed; 0 if not given."""
+    seeds: int | None = None
+    """How many seeds; 5 if not given."""
+    seeds_per_run: int | None = None
+    """At most so many seeds in one program, where memory is short; all of them if not given."""
+    env_steps: int | None = None
+    """Environment steps of every run; the figure's own budgets if not given."""
+    runs: Path | None = None
+    """Folder of all run folders and logs, shared by these figures; runs/ol_aux if not given."""
+    minutes: float | None = None
+    """Stop after so long: runs are saved, what is finished is drawn, and the next start goes on."""
+    draw_only: bool = False
+    """Train nothing: draw what is there."""
 
 
 def run(options: Figure) -> int:
-    """Draws one figure."""
-    out = options.out or Path(f"{options.figure}.png")
+    """Draws one figure; `UNFINISHED` where a run that belongs to it is not finished."""
+    is_quadratic = options.figure == "quadratic"
+    out = options.out or Path("quadratic.png" if is_quadratic else f"figure_{options.figure}.png")
     if out.suffix.lower() not in SUFFIXES:
         raise RequestError(f"--out {out}: a figure is a file that ends in {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
-    check_writable(out, "--out")
-    from jaxrl_vis.studies import quadratic
+    if is_quadratic:
+        _refuse_options_of_runs(options)
+    for file in (out,) if is_quadratic else (out, out.with_suffix(".md"), out.with_suffix(".csv")):
+        check_writable(file, "--out")
+    if is_quadratic:
+        from jaxrl_vis.studies import quadratic
 
-    check_devices()
-    quadratic.draw(out)
-    print(out)
-    return 0
+        check_devices()
+        quadratic.draw(out)
+        print(out)
+        return 0
+    # Nothing below starts JAX in this process: the accelerator's memory belongs to the runs.
+    from jaxrl_vis.studies.figures import Request, make_figure
+
+    return 0 if make_figure(Request(options.figure, out, **_request(options))) else UNFINISHED
+
+
+def _refuse_options_of_runs(options: Figure) -> None:
+    for field in dataclasses.fields(options):
+        if field.name not in ("figure", "out") and getattr(options, field.name) != field.default:
+            raise RequestError(f"--{field.name.replace('_', '-')} goes with figures of training runs, not with quadratic")
+
+
+def _request(options: Figure) -> dict:
+    """What is asked for, but for the figure and where it goes.
+
+    Raises:
+        RequestError: An option makes no sense.
+    """
+    from jaxrl_vis.studies.ol_aux import FETCH, QUICK, Scope
+
+    if options.quick and options.preset is not None:
+        raise RequestError("--quick has the preset cpu: give --quick or --preset")
+    name = "cpu" if options.quick else options.preset or "paper"
+    if name not in PRESETS:
+        raise RequestError(f"unknown preset {name!r}{nearest(name, list(PRESETS))}")
+    check_counts(seeds=options.seeds, seeds_per_run=options.seeds_per_run, env_steps=options.env_steps)
+    if options.minutes is not None and options.minutes <= 0:
+        raise RequestError(f"--minutes must be positive, not {options.minutes:g}")
+    if options.draw_only and options.minutes is not None:
+        raise RequestError("--draw-only trains nothing: leave out --minutes")
+    runs = options.runs or Path("runs") / "ol_aux"
+    if not options.draw_only:
+        check_writable(runs, "--runs", folder=True)
+    quick = dict(QUICK) if options.quick else {}
+    if options.env_steps is not None:
+        quick.pop("env_steps", None)
+    scope = Scope(
+        preset=name,
+        seed=options.seed or 0,
+        seeds=options.seeds or (1 if options.quick else 5),
+        seeds_per_run=options.seeds_per_run,
+        env_steps=options.env_steps,
+        changes=quick,
+    )
+    return {
+        "runs": runs,
+        "tasks": options.tasks or ((FETCH,) if options.quick else ()),
+        "variants": options.methods,
+        "scope": scope,
+        "draw_only": options.draw_only,
+        "seconds": None if options.minutes is None else 60.0 * options.minutes,
+    }

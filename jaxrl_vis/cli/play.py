@@ -6,6 +6,7 @@ from typing import Annotated
 
 from jaxrl_vis.cli.checks import check_counts, check_run
 from jaxrl_vis.cli.parsing import ByPlaceToo
+from jaxrl_vis.errors import RequestError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -15,9 +16,11 @@ class Play:
     run_dir: Annotated[Path, ByPlaceToo()]
     """The run folder."""
     out: Path | None = None
-    """A .gif, .mp4 or .html file; play.gif (play.html with --html) in the run folder if not given."""
+    """A .gif, .mp4 or .html file; play.gif (play.html with --html, play_aux.gif with --aux) in the run folder if not given."""
     html: bool = False
     """Show the robot and its goal in three dimensions, on a page with brax's viewer (needs brax, and the page a network)."""
+    aux: bool = False
+    """Show what auxiliary tasks predict, too: reconstruction, true and predicted optical flow, rotated image."""
     episodes: int = 6
     """Episodes to show."""
 
@@ -26,9 +29,14 @@ def run(options: Play) -> int:
     """Draws a run's episodes."""
     check_run(options.run_dir)
     check_counts(episodes=options.episodes)
-    out = options.out or options.run_dir / ("play.html" if options.html else "play.gif")
-    from jaxrl_vis.run.trained import play_run
+    if options.html and options.aux:
+        raise RequestError("--html shows the robot, --aux its images: give one of them")
+    out = options.out or options.run_dir / ("play.html" if options.html else "play_aux.gif" if options.aux else "play.gif")
+    from jaxrl_vis.run import play_auxiliary, trained
 
-    play_run(options.run_dir, out, episodes=options.episodes, three_dimensional=options.html)
+    if options.aux:
+        play_auxiliary.play_auxiliary(options.run_dir, out, episodes=options.episodes)
+    else:
+        trained.play_run(options.run_dir, out, episodes=options.episodes, three_dimensional=options.html)
     print(out)
     return 0

@@ -106,8 +106,17 @@ class Auxiliary:
         """
         if not self.tasks:
             return {}
-        view = view.replace(motion=batch.targets.motion, flow=batch.targets.flow)
+        view = _with_targets(view, batch)
         return {name: task.loss(heads[name], view) for name, task in self.tasks.items()}
+
+    def predictions(self, heads: dict[str, Params], view: View, batch: Batch) -> dict[str, jax.Array]:
+        """What each task predicts (`AuxTask.predict`), by name; arguments as of `losses`."""
+        view = _with_targets(view, batch)
+        return {name: task.predict(heads[name], view) for name, task in self.tasks.items()}
+
+
+def _with_targets(view: View, batch: Batch) -> View:
+    return view.replace(motion=batch.targets.motion, flow=batch.targets.flow)
 
 
 def make_auxiliary(

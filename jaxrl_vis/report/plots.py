@@ -1,4 +1,4 @@
-"""curve.png: success and distance to the goal at the end of an episode, against environment steps."""
+"""Learning curves. curve.png of a run: success and distance to the goal at the end of an episode, against environment steps."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -9,7 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator, PercentFormatter
 
-_INK, _FAINT = "#22252a", "#8b919a"
+INK, FAINT = "#22252a", "#8b919a"
+"""Colours of text: what is to be read, and what is beside."""
 _SUCCESS, _DISTANCE = "#0f7b6c", "#b4531f"
 
 
@@ -32,20 +33,22 @@ def gather(rows: Sequence[Mapping[str, Any]], name: str) -> tuple[np.ndarray, np
     return np.asarray(steps, np.int64), values
 
 
-def _show_steps(count: float, _: int | None = None) -> str:
+def show_steps(count: float, _: int | None = None) -> str:
+    """``250 k``, ``1.44 M``."""
     if count >= 1e6:
         return f"{count / 1e6:g} M"
     return f"{count / 1e3:g} k" if count >= 1e3 else f"{count:g}"
 
 
-def draw_curves(axes: Axes, steps: np.ndarray, values: np.ndarray, colour: str) -> float:
-    """Each seed as a thin line, the median as a thick one, the middle half of the seeds as a band.
+def draw_median(axes: Axes, steps: np.ndarray, values: np.ndarray, colour: str, label: str | None = None) -> float:
+    """The median over seeds as a thick line, the middle half of the seeds as a band.
 
     Args:
         axes: Where to draw.
         steps: [P] env_steps.
         values: [S, P], NaN for gaps.
-        colour: The colour of all of these.
+        colour: The colour of both.
+        label: What the legend says.
 
     Returns:
         The last median; NaN if there is no number at all.
@@ -58,22 +61,43 @@ def draw_curves(axes: Axes, steps: np.ndarray, values: np.ndarray, colour: str) 
     marker = "o" if steps.size == 1 else None
     if values.shape[0] > 1:
         axes.fill_between(steps, low, high, color=colour, alpha=0.16, linewidth=0)
-        for seed_values in values:
-            axes.plot(steps, seed_values, color=colour, alpha=0.4, linewidth=0.9)
-    axes.plot(steps, median, color=colour, linewidth=2.6, solid_capstyle="round", marker=marker)
-    axes.plot(steps[-1], median[-1], "o", color=colour, markersize=6.5, markeredgecolor="white", markeredgewidth=1.2)
+    axes.plot(steps, median, color=colour, linewidth=2.6, solid_capstyle="round", marker=marker, label=label)
     return float(median[-1])
 
 
-def _style(axes: Axes, title: str) -> None:
-    axes.set_title(title, loc="left", fontsize=11, color=_INK, pad=8)
+def draw_curves(axes: Axes, steps: np.ndarray, values: np.ndarray, colour: str) -> float:
+    """`draw_median`, each seed as a thin line, and a dot at the end.
+
+    Args:
+        axes: Where to draw.
+        steps: [P] env_steps.
+        values: [S, P], NaN for gaps.
+        colour: The colour of all of these.
+
+    Returns:
+        The last median; NaN if there is no number at all.
+    """
+    measured = ~np.isnan(values).all(axis=0)
+    steps, values = steps[measured], values[:, measured]
+    if values.shape[0] > 1:
+        for seed_values in values:
+            axes.plot(steps, seed_values, color=colour, alpha=0.4, linewidth=0.9)
+    last = draw_median(axes, steps, values, colour)
+    if steps.size:
+        axes.plot(steps[-1], last, "o", color=colour, markersize=6.5, markeredgecolor="white", markeredgewidth=1.2)
+    return last
+
+
+def style_curves(axes: Axes, title: str) -> None:
+    """Axes of something against environment steps."""
+    axes.set_title(title, loc="left", fontsize=11, color=INK, pad=8)
     axes.grid(axis="y", color="#e6e8eb", linewidth=0.8)
     axes.set_axisbelow(True)
     for side in ("top", "right", "left"):
         axes.spines[side].set_visible(False)
     axes.spines["bottom"].set_color("#c9cdd3")
-    axes.tick_params(colors=_FAINT, labelcolor=_INK, length=0, labelsize=9.5)
-    axes.xaxis.set_major_formatter(FuncFormatter(_show_steps))
+    axes.tick_params(colors=FAINT, labelcolor=INK, length=0, labelsize=9.5)
+    axes.xaxis.set_major_formatter(FuncFormatter(show_steps))
     axes.xaxis.set_major_locator(MaxNLocator(6))
     axes.yaxis.set_major_locator(MaxNLocator(6))
 
@@ -112,29 +136,29 @@ def plot_run(
     _, distance = gather(rows, "eval/goal_distance")
 
     last = draw_curves(success_axes, steps, success, _SUCCESS)
-    _style(success_axes, "Success at the end of an episode")
+    style_curves(success_axes, "Success at the end of an episode")
     success_axes.set_ylim(-0.02, 1.03)
     success_axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
     if np.isfinite(last):
         _label_end(success_axes, steps, last, f"{last:.0%}", _SUCCESS)
 
     last = draw_curves(distance_axes, steps, distance, _DISTANCE)
-    _style(distance_axes, f"Distance to the goal at the end of an episode ({unit})")
+    style_curves(distance_axes, f"Distance to the goal at the end of an episode ({unit})")
     finite = distance[np.isfinite(distance)]
     distance_axes.set_ylim(0.0, 1.08 * max(finite.max(initial=0.0), threshold or 0.0) or 1.0)
     if np.isfinite(last):
         _label_end(distance_axes, steps, last, f"{last:.3f}", _DISTANCE)
     if threshold is not None:
-        distance_axes.axhline(threshold, color=_FAINT, linewidth=1.1, linestyle=(0, (5, 4)))
+        distance_axes.axhline(threshold, color=FAINT, linewidth=1.1, linestyle=(0, (5, 4)))
         distance_axes.annotate(
             f"threshold {threshold:g} {unit}", (1, threshold), xycoords=("axes fraction", "data"), xytext=(-2, 4),
-            textcoords="offset points", ha="right", color=_FAINT, fontsize=9,  # curves come down from the left
+            textcoords="offset points", ha="right", color=FAINT, fontsize=9,  # curves come down from the left
         )  # fmt: skip
     for axes in (success_axes, distance_axes):
         axes.set_xlim(0, steps[-1] * 1.02 if steps[-1] > 0 else 1)
-        axes.set_xlabel("environment steps per seed", fontsize=9.5, color=_INK)
-    figure.text(0.035, 0.945, title, fontsize=14, weight="bold", color=_INK, va="center")
-    figure.text(0.035, 0.885, subtitle, fontsize=10, color=_FAINT, va="center")
+        axes.set_xlabel("environment steps per seed", fontsize=9.5, color=INK)
+    figure.text(0.035, 0.945, title, fontsize=14, weight="bold", color=INK, va="center")
+    figure.text(0.035, 0.885, subtitle, fontsize=10, color=FAINT, va="center")
     figure.subplots_adjust(left=0.065, right=0.945, bottom=0.135, top=0.755, wspace=0.27)
     figure.savefig(path)
     return True

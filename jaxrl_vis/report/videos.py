@@ -22,10 +22,10 @@ from jaxrl_vis.report.outputs import check_writable
 SUFFIXES = (".gif", ".mp4", ".html", ".png")
 
 _IMAGE_SIZE = 256  # px, about; images are enlarged by a whole factor
-_GAP, _BORDER, _HEADER, _FOOTER = 14, 5, 30, 40
-_BACKGROUND, _TEXT, _FAINT = (24, 26, 31), (232, 234, 237), (139, 145, 154)
-_REACHED, _MISSED, _PLAIN = (62, 207, 142), (226, 109, 92), (52, 56, 64)
-_HOLD = 1.0  # s, how long the last frame of an episode stays
+GAP, BORDER, HEADER, FOOTER = 14, 5, 30, 40
+BACKGROUND, TEXT, FAINT = (24, 26, 31), (232, 234, 237), (139, 145, 154)
+REACHED, MISSED, PLAIN = (62, 207, 142), (226, 109, 92), (52, 56, 64)
+HOLD = 1.0  # s, how long the last frame of an episode stays
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,14 +54,14 @@ def first_seed(images: dict[str, Any]) -> EpisodeImages:
     return EpisodeImages(first["frames"], first["goals"], first["success"])
 
 
-def _depth_range(episodes: EpisodeImages) -> tuple[float, float]:
+def range_of_depth(episodes: EpisodeImages) -> tuple[float, float]:
     """The grey levels between which the depth of all these images lies, except for a few outliers."""
     depth = np.concatenate([episodes.frames[:, ::5, -1].ravel(), episodes.goals[:, -1].ravel()])
     near, far = np.percentile(depth, [0.5, 99.5])
     return float(near), max(float(far), float(near) + 1.0)
 
 
-def _rows_of(image: np.ndarray, depth_range: tuple[float, float]) -> list[tuple[str, np.ndarray]]:
+def rows_of(image: np.ndarray, depth_range: tuple[float, float]) -> list[tuple[str, np.ndarray]]:
     """[C, H, W] -> captions and images [H, W, 3] uint8."""
     rows = []
     if image.shape[0] >= 3:
@@ -71,10 +71,11 @@ def _rows_of(image: np.ndarray, depth_range: tuple[float, float]) -> list[tuple[
     return rows
 
 
-def _enlarge(image: np.ndarray) -> Image.Image:
-    factor = max(1, round(_IMAGE_SIZE / image.shape[0]))
-    size = (image.shape[1] * factor, image.shape[0] * factor)
-    return Image.fromarray(image).resize(size, Image.Resampling.NEAREST)
+def enlarge(image: np.ndarray, size: int = _IMAGE_SIZE) -> Image.Image:
+    """[H, W, 3] uint8, enlarged by a whole factor to about ``size`` pixels."""
+    factor = max(1, round(size / image.shape[0]))
+    enlarged = (image.shape[1] * factor, image.shape[0] * factor)
+    return Image.fromarray(image).resize(enlarged, Image.Resampling.NEAREST)
 
 
 def _compose(
@@ -90,32 +91,32 @@ def _compose(
     Args:
         observation: [C, H, W] uint8.
         goal: [C, H, W] uint8.
-        depth_range: See `_depth_range`.
+        depth_range: See `range_of_depth`.
         footer: The texts at the left and at the right.
         share: The share of the episode that is over, 0 to 1.
         colour: The border's colour.
     """
-    left, right = (_rows_of(image, depth_range) for image in (observation, goal))
-    images = [(_enlarge(seen), _enlarge(wanted)) for (_, seen), (_, wanted) in zip(left, right, strict=True)]
+    left, right = (rows_of(image, depth_range) for image in (observation, goal))
+    images = [(enlarge(seen), enlarge(wanted)) for (_, seen), (_, wanted) in zip(left, right, strict=True)]
     width, height = images[0][0].size
-    cell = height + 2 * _BORDER + _GAP
-    size = (2 * (width + 2 * _BORDER) + 3 * _GAP, _HEADER + _GAP // 2 + cell * len(images) + _FOOTER)
-    canvas = Image.new("RGB", size, _BACKGROUND)
+    cell = height + 2 * BORDER + GAP
+    size = (2 * (width + 2 * BORDER) + 3 * GAP, HEADER + GAP // 2 + cell * len(images) + FOOTER)
+    canvas = Image.new("RGB", size, BACKGROUND)
     draw = ImageDraw.Draw(canvas)
     font, small = ImageFont.load_default(size=17), ImageFont.load_default(size=14)
-    columns = (_GAP, 2 * _GAP + width + 2 * _BORDER)
+    columns = (GAP, 2 * GAP + width + 2 * BORDER)
     for x, text in zip(columns, ("observation", "goal"), strict=True):
-        draw.text((x + 2, _HEADER // 2 + 4), text, font=font, fill=_TEXT, anchor="lm")
+        draw.text((x + 2, HEADER // 2 + 4), text, font=font, fill=TEXT, anchor="lm")
     for row, pair in enumerate(images):
-        y = _HEADER + _GAP // 2 + row * cell
-        for x, image, border in zip(columns, pair, (colour, _PLAIN), strict=True):
-            draw.rectangle((x, y, x + width + 2 * _BORDER - 1, y + height + 2 * _BORDER - 1), fill=border)
-            canvas.paste(image, (x + _BORDER, y + _BORDER))
-    y = size[1] - _FOOTER
-    draw.rectangle((_GAP, y, size[0] - _GAP, y + 3), fill=_PLAIN)
-    draw.rectangle((_GAP, y, _GAP + (size[0] - 2 * _GAP) * share, y + 3), fill=colour if colour != _PLAIN else _FAINT)
-    draw.text((_GAP + 2, y + 20), footer[0], font=small, fill=_FAINT, anchor="lm")
-    draw.text((size[0] - _GAP - 2, y + 20), footer[1], font=font, fill=colour if colour != _PLAIN else _FAINT, anchor="rm")
+        y = HEADER + GAP // 2 + row * cell
+        for x, image, border in zip(columns, pair, (colour, PLAIN), strict=True):
+            draw.rectangle((x, y, x + width + 2 * BORDER - 1, y + height + 2 * BORDER - 1), fill=border)
+            canvas.paste(image, (x + BORDER, y + BORDER))
+    y = size[1] - FOOTER
+    draw.rectangle((GAP, y, size[0] - GAP, y + 3), fill=PLAIN)
+    draw.rectangle((GAP, y, GAP + (size[0] - 2 * GAP) * share, y + 3), fill=colour if colour != PLAIN else FAINT)
+    draw.text((GAP + 2, y + 20), footer[0], font=small, fill=FAINT, anchor="lm")
+    draw.text((size[0] - GAP - 2, y + 20), footer[1], font=font, fill=colour if colour != PLAIN else FAINT, anchor="rm")
     return canvas
 
 
@@ -126,20 +127,20 @@ def draw_frames(episodes: EpisodeImages, frame_seconds: float, max_episodes: int
     """
     num_episodes, num_frames = episodes.frames.shape[:2]
     count = min(num_episodes, max_episodes)
-    depth_range = _depth_range(episodes)
+    depth_range = range_of_depth(episodes)
     images, seconds = [], []
     for episode in range(count):
         success = np.asarray(episodes.success[episode], bool)
         for t in range(num_frames):
             is_last = t == num_frames - 1
             reached = bool(success[t]) if success.ndim else is_last and bool(success)
-            colour = _REACHED if reached else _MISSED if is_last else _PLAIN
+            colour = REACHED if reached else MISSED if is_last else PLAIN
             verdict = "goal reached" if reached else "missed" if is_last else ""
             footer = (f"episode {episode + 1} of {count}   step {t} of {num_frames - 1}", verdict)
             share = t / max(1, num_frames - 1)
             frame, goal = episodes.frames[episode, t], episodes.goals[episode]
             images.append(_compose(frame, goal, depth_range, footer, share, colour))
-            seconds.append(_HOLD if is_last else frame_seconds)
+            seconds.append(HOLD if is_last else frame_seconds)
     return images, seconds
 
 
@@ -147,7 +148,7 @@ def _gif_bytes(images: list[Image.Image], seconds: list[float]) -> bytes:
     """An endless GIF. All frames share one palette, without dithering: nothing flickers, and equal frames compress well."""
     samples = images[:: max(1, len(images) // 16)] + images[-1:]
     # Swatches reserve places in the palette for the colours of borders and texts, however colourful the images are.
-    swatches = (_REACHED, _MISSED, _PLAIN, _BACKGROUND, _TEXT, _FAINT)
+    swatches = (REACHED, MISSED, PLAIN, BACKGROUND, TEXT, FAINT)
     height = samples[0].height
     montage = Image.new("RGB", (samples[0].width, height * len(samples) + 48 * len(swatches)))
     for i, sample in enumerate(samples):
@@ -167,24 +168,24 @@ def _gif_bytes(images: list[Image.Image], seconds: list[float]) -> bytes:
 def _strip(episodes: EpisodeImages) -> Image.Image:
     """Six steps of up to four episodes, one episode below the other, each with its goal at the right."""
     num_frames = episodes.frames.shape[1]
-    depth_range = _depth_range(episodes)
+    depth_range = range_of_depth(episodes)
     steps = sorted({round(share * (num_frames - 1)) for share in (0, 0.1, 0.2, 0.35, 0.6, 1)})
     rows = []
     for episode in range(min(4, episodes.frames.shape[0])):
         success = np.asarray(episodes.success[episode], bool)
-        border = _REACHED if bool(success if success.ndim == 0 else success[-1]) else _MISSED
-        shown = [(episodes.frames[episode, t], border if t == num_frames - 1 else _PLAIN) for t in steps]
-        shown.append((episodes.goals[episode], _PLAIN))
-        views = [([_enlarge(view).resize((128, 128)) for _, view in _rows_of(each, depth_range)], edge) for each, edge in shown]
+        border = REACHED if bool(success if success.ndim == 0 else success[-1]) else MISSED
+        shown = [(episodes.frames[episode, t], border if t == num_frames - 1 else PLAIN) for t in steps]
+        shown.append((episodes.goals[episode], PLAIN))
+        views = [([enlarge(view).resize((128, 128)) for _, view in rows_of(each, depth_range)], edge) for each, edge in shown]
         rows += [[(images[row], edge) for images, edge in views] for row in range(len(views[0][0]))]
     cell = 128 + 2 * 3 + 8
-    canvas = Image.new("RGB", (cell * len(rows[0]) + 24, cell * len(rows) + 34), _BACKGROUND)
+    canvas = Image.new("RGB", (cell * len(rows[0]) + 24, cell * len(rows) + 34), BACKGROUND)
     draw = ImageDraw.Draw(canvas)
     font = ImageFont.load_default(size=15)
     for column in range(len(rows[0])):
         is_goal = column == len(steps)
         x = 8 + column * cell + (12 if is_goal else 0)
-        draw.text((x + 3, 17), "goal" if is_goal else f"step {steps[column]}", font=font, fill=_TEXT, anchor="lm")
+        draw.text((x + 3, 17), "goal" if is_goal else f"step {steps[column]}", font=font, fill=TEXT, anchor="lm")
         for line, row in enumerate(rows):
             image, edge = row[column]
             y = 30 + line * cell
@@ -225,12 +226,24 @@ def write_video(episodes: EpisodeImages, path: Path, frame_seconds: float = 0.04
     check_output(path)
     if not shows_images(episodes.frames.shape):
         raise RequestError(f"nothing to show: observations are vectors of {episodes.frames.shape[-1]} numbers, not images")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    suffix = path.suffix.lower()
-    if suffix == ".png":
+    if path.suffix.lower() == ".png":
+        path.parent.mkdir(parents=True, exist_ok=True)
         _strip(episodes).save(path)
         return
-    images, seconds = draw_frames(episodes, frame_seconds, max_episodes)
+    write_images(*draw_frames(episodes, frame_seconds, max_episodes), path, frame_seconds)
+
+
+def write_images(images: list[Image.Image], seconds: list[float], path: Path, frame_seconds: float) -> None:
+    """Writes frames of equal size as a .gif, an .mp4 or an .html page that holds the gif.
+
+    Args:
+        images: The frames.
+        seconds: How long each is shown, s.
+        path: The suffix decides the format; its folder is made.
+        frame_seconds: How long most of them are shown, s.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    suffix = path.suffix.lower()
     if suffix == ".gif":
         path.write_bytes(_gif_bytes(images, seconds))
     elif suffix == ".html":

@@ -10,6 +10,7 @@ The files:
 import dataclasses
 import json
 import shutil
+from collections.abc import Collection
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -191,16 +192,27 @@ def read_config(path: Path) -> Config:
         raise RequestError(f"the run in {path} cannot be used: {error}") from error
 
 
-def _check_same(path: Path, saved: Config, config: Config) -> None:
-    """Raises RequestError, naming the fields, where ``config`` would not learn what ``saved`` learned."""
+def contradictions(saved: Config, config: Config, but_for: Collection[str] = MAY_CHANGE) -> list[str]:
+    """The fields in which ``config`` would not learn what ``saved`` learned, in words.
+
+    Args:
+        saved: The configuration of a run.
+        config: What is asked for.
+        but_for: Fields that do not count.
+    """
     before, asked = dataclasses.asdict(saved), dataclasses.asdict(config)
-    contradictions = [
+    return [
         f"{name} (saved {before[name]}, asked {asked[name]})"
         for name in sorted(before)
-        if name not in MAY_CHANGE and before[name] != asked[name]
+        if name not in but_for and before[name] != asked[name]
     ]
-    if contradictions:
+
+
+def _check_same(path: Path, saved: Config, config: Config) -> None:
+    """Raises RequestError, naming the fields, where ``config`` would not learn what ``saved`` learned."""
+    found = contradictions(saved, config)
+    if found:
         raise RequestError(
-            f"cannot resume {path}, its configuration is another one: {'; '.join(contradictions)}; "
+            f"cannot resume {path}, its configuration is another one: {'; '.join(found)}; "
             "ask for the saved values, or take another --run-dir"
         )

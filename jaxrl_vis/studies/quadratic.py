@@ -19,13 +19,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxrl_vis.learner.weighting import MAIN, Weighting, make_weighting, weighted_grad
+from jaxrl_vis.report.plots import FAINT, INK
 
 STARTS = ((-0.8, -1.6), (1.8, 1.0), (-1.8, 1.0), (1.0, -1.0))
 STEPS = 1000
 STEP_SIZE = 0.01  # alpha, and beta too
 AUXILIARY = ("shifted", "opposed")
 
-_INK, _FAINT = "#22252a", "#8b919a"
 _COLOURS = ("#0f7b6c", "#b4531f", "#3b5bdb", "#a61e8c")  # one a start
 _STYLES = {"shifted": "-", "opposed": (0, (4, 3))}
 
@@ -85,17 +85,17 @@ def draw(path: Path) -> None:
     _draw_paths(left, fixed, "Weights stay at 1")
     _draw_paths(middle, adaptive, "Weights adapt")
     _draw_weights(right, adaptive)
-    figure.text(0.045, 0.95, "Gradient descent on three losses", fontsize=14, weight="bold", color=_INK, va="center")
+    figure.text(0.045, 0.95, "Gradient descent on three losses", fontsize=14, weight="bold", color=INK, va="center")
     subtitle = "main $x^2 + y^2$ (contours), the same shifted to (½, ½), and its opposite; OL-AUX on the losses as they are"
-    figure.text(0.045, 0.89, subtitle, fontsize=10, color=_FAINT, va="center")
+    figure.text(0.045, 0.89, subtitle, fontsize=10, color=FAINT, va="center")
     figure.subplots_adjust(left=0.045, right=0.985, bottom=0.11, top=0.79, wspace=0.17)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
 
 
 def _style(axes: Axes, title: str) -> None:
-    axes.set_title(title, loc="left", fontsize=11, color=_INK, pad=8)
-    axes.tick_params(colors=_FAINT, labelcolor=_INK, length=0, labelsize=9)
+    axes.set_title(title, loc="left", fontsize=11, color=INK, pad=8)
+    axes.tick_params(colors=FAINT, labelcolor=INK, length=0, labelsize=9)
     for side in axes.spines.values():
         side.set_color("#c9cdd3")
 
@@ -109,10 +109,10 @@ def _draw_paths(axes: Axes, paths: Paths, title: str) -> None:
         axes.plot(*points.T, color=colour, linewidth=2)
         axes.plot(*points[0], "o", color=colour, markersize=6)
         axes.plot(*points[-1], "D", color=colour, markersize=6, markeredgecolor="white")
-    axes.plot(0, 0, "*", color=_INK, markersize=11, zorder=0)
-    axes.annotate("main", (0, 0), (-6, -11), textcoords="offset points", ha="right", fontsize=9, color=_INK)
-    axes.plot(0.5, 0.5, "*", color=_FAINT, markersize=11, zorder=0)
-    axes.annotate("shifted", (0.5, 0.5), (10, -5), textcoords="offset points", fontsize=9, color=_FAINT)
+    axes.plot(0, 0, "*", color=INK, markersize=11, zorder=0)
+    axes.annotate("main", (0, 0), (-6, -11), textcoords="offset points", ha="right", fontsize=9, color=INK)
+    axes.plot(0.5, 0.5, "*", color=FAINT, markersize=11, zorder=0)
+    axes.annotate("shifted", (0.5, 0.5), (10, -5), textcoords="offset points", fontsize=9, color=FAINT)
     axes.set(xlim=(-2.1, 2.1), ylim=(-2.1, 2.1), aspect="equal")
 
 
@@ -121,8 +121,8 @@ def _draw_weights(axes: Axes, paths: Paths) -> None:
     for name, values in paths.weights.items():
         for each, colour in zip(values, _COLOURS, strict=True):
             axes.plot(each, color=colour, linewidth=1.8, linestyle=_STYLES[name])
-        axes.plot([], [], color=_INK, linewidth=1.8, linestyle=_STYLES[name], label=name)
+        axes.plot([], [], color=INK, linewidth=1.8, linestyle=_STYLES[name], label=name)
     axes.legend(frameon=False, fontsize=9.5)
     axes.grid(axis="y", color="#e6e8eb", linewidth=0.8)
     axes.set(xlim=(0, STEPS), ylim=(0, None))
-    axes.set_xlabel("step", fontsize=9.5, color=_INK)
+    axes.set_xlabel("step", fontsize=9.5, color=INK)

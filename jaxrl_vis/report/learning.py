@@ -1,0 +1,41 @@
+"""What learning curves say. "X by N steps": the evaluation at N and the next two all reach X, in the median over seeds."""
+
+import statistics
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+CONFIRMATIONS = 2  # evaluations after the first that must reach a value, too
+
+
+def curve(rows: Sequence[Mapping[str, Any]], metric: str) -> list[tuple[int, float]]:
+    """The median over seeds of a metric against environment steps, at the steps where every seed was evaluated.
+
+    Args:
+        rows: Of metrics.jsonl, from one run or several. No seed may appear twice at the same step.
+        metric: A column, such as ``eval/success``.
+
+    Raises:
+        ValueError: A seed appears twice.
+    """
+    seeds = {row["seed"] for row in rows}
+    values: dict[int, dict[int, float]] = {}
+    for row in rows:
+        if row["seed"] in values.setdefault(row["env_steps"], {}):
+            raise ValueError(f"seed {row['seed']} appears twice at {row['env_steps']} steps: are these different runs?")
+        values[row["env_steps"]][row["seed"]] = row[metric]
+    return [(steps, statistics.median(found.values())) for steps, found in sorted(values.items()) if set(found) == seeds]
+
+
+def steps_to(points: Sequence[tuple[int, float]], target: float, least: bool = False) -> int | None:
+    """The first step from which on this evaluation and the next `CONFIRMATIONS` all reach ``target``; None for never.
+
+    Args:
+        points: From `curve`.
+        target: What is to be reached.
+        least: Whether lower is better.
+    """
+    for index in range(len(points) - CONFIRMATIONS):
+        window = [value for _, value in points[index : index + 1 + CONFIRMATIONS]]
+        if all(value <= target if least else value >= target for value in window):
+            return points[index][0]
+    return None

@@ -1,0 +1,123 @@
+"""`play --aux`: episodes of a run, with what its auxiliary tasks make of them."""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.learner import normalizer
+from jaxrl_vis.learner.auxiliary import Auxiliary
+from jaxrl_vis.learner.auxtasks import View
+from jaxrl_vis.learner.auxtasks.egomotion import MAX_ANGLE
+from jaxrl_vis.learner.networks import Networks
+from jaxrl_vis.report import auxiliary_video, videos
+from jaxrl_vis.run.folder import read_config
+from jaxrl_vis.run.programs import enable_compilation_cache
+from jaxrl_vis.run.trained import load, open_run
+from jaxrl_vis.types import Batch, Episodes, TrainState
+
+SHOWN = ("autoencoder", "optical_flow", "egomotion")
+"""The auxiliary tasks whose predictions can be drawn."""
+
+
+def play_auxiliary(run_dir: Path | str, out: Path | str, episodes: int = 6) -> None:
+    """Plays episodes with the first seed of the newest good checkpoint of a run, and draws what its auxiliary tasks predict.
+
+    Observation, goal, reconstruction, true and predicted optical flow, and the rotated image with its angle stand side by side;
+    what the run has no task for is left out. Predictions are those of the critic's heads.
+
+    Args:
+        run_dir: The run folder.
+        out: .gif, .mp4 (needs imageio-ffmpeg, the extra ``video``) or .html.
+        episodes: How many to show.
+
+    Raises:
+        RequestError: There is no run, nothing usable in it, no auxiliary task to show, or no way to write ``out``.
+    """
+    out = Path(out)
+    videos.check_output(out)
+    if out.suffix.lower() == ".png":
+        raise RequestError(f"--aux makes a video: name {out.stem}.gif, .mp4 or .html in the place of {out.name}")
+    tasks = read_config(Path(run_dir)).aux_tasks
+    if not tasks:
+        raise RequestError(f"the run in {run_dir} has no auxiliary tasks to show: train with --aux-tasks, or leave out --aux")
+    if not set(tasks) & set(SHOWN):
+        raise RequestError(
+            f"the run in {run_dir} predicts nothing that can be drawn ({', '.join(tasks)}): --aux shows {', '.join(SHOWN)}"
+        )
+    # A rollout is what it takes; its exploration is switched off.
+    trainer = open_run(run_dir, num_envs=episodes, random_action_probability=0.0, action_noise=0.0)
+    env, config, networks = trainer.env, trainer.config, trainer.program.networks
+    train = jax.tree.map(lambda leaf: jnp.asarray(leaf[:1]), load(trainer, run_dir).train)
+    enable_compilation_cache()
+    played, outcome = trainer.program.rollout(train, trainer.programs.evaluation_key[None])
+    auxiliary = trainer.program.auxiliary
+
+    def predict(train: TrainState, episodes: Episodes, key: jax.Array) -> dict[str, jax.Array]:
+        return _predict(networks, auxiliary, train, episodes, key)
+
+    first, played = jax.tree.map(lambda leaf: leaf[0], (train, played))
+    played = jax.jit(auxiliary.with_flow)(played)
+    keys = jax.random.split(jax.random.key(config.seed), episodes)
+    per_episode = jax.jit(predict)
+    found = [
+        jax.device_get(per_episode(first, jax.tree.map(lambda leaf, each=each: leaf[each], played), keys[each]))
+        for each in range(episodes)
+    ]
+    values = {name: np.stack([each[name] for each in found]) for name in found[0]}
+    channels = env.observation_spec.shape[0] // env.frame_stack
+    images = np.asarray(played.observations)[:, :, :channels]  # of stacked images, the newest
+    seen = videos.EpisodeImages(images[:, :-1], images[:, -1], np.asarray(outcome["success"][0]))
+    shown = auxiliary_video.Predictions(
+        **{name: value[:, :, :channels] if name in ("reconstruction", "rotated") else value for name, value in values.items()}
+    )
+    drawn = auxiliary_video.draw_frames(seen, shown, trainer.programs.image_seconds)
+    videos.write_images(*drawn, out, trainer.programs.image_seconds)
+
+
+def _predict(networks: Networks, auxiliary: Auxiliary, train: TrainState, episode: Episodes, key: jax.Array) -> dict[str, Any]:
+    """Fields of `auxiliary_video.Predictions` of one episode.
+
+    Args:
+        networks: What the parameters mean.
+        auxiliary: The tasks.
+        train: The learner, of one seed.
+        episode: One of `Episodes`.
+        key: Of the rotations.
+    """
+    observations, actions = episode.observations, episode.actions
+    count = actions.shape[0]
+    before, after = observations[:count], observations[1 : count + 1]
+    goals = jnp.broadcast_to(observations[-1], before.shape)
+    nothing = jnp.zeros((count, 0))  # nobody asks for true states here
+    batch = Batch(jnp.stack([before, goals, after]), actions, nothing, nothing)
+    batch = batch.replace(targets=auxiliary.targets(key, batch, episode.flow))
+    latents = networks.encode(train.critic, networks.prepare_batch(train, batch))
+    latent_t, _, latent_tp1, *moved = latents.reshape(-1, count, networks.config.latent_size)
+    image = networks.normalize(train.normalizer, before) if "image" in auxiliary.needs else None
+    view = View(latent_t, actions, latent_tp1, *moved, image=image)
+    predicted = auxiliary.predictions(train.critic["heads"], view, batch)
+    found: dict[str, Any] = {}
+    if "autoencoder" in predicted:
+        found["reconstruction"] = _as_image(networks, train, predicted["autoencoder"])
+    if "optical_flow" in predicted:
+        found |= {"flow": batch.targets.flow, "flow_predicted": predicted["optical_flow"]}
+    if "egomotion" in predicted:
+        degrees = jnp.degrees(MAX_ANGLE)
+        found |= {"rotated": batch.targets.images_moved, "angle": degrees * batch.targets.motion[:, 0]}
+        found["angle_predicted"] = degrees * predicted["egomotion"][:, 0]
+    return found
+
+
+def _as_image(networks: Networks, train: TrainState, values: jax.Array) -> jax.Array:
+    """Normalised images [T, C or 1, H, W] as grey levels, uint8."""
+    mean, scale = train.normalizer.mean, normalizer.scale(train.normalizer, networks.config.normalizer_floor)
+    height, width = values.shape[-2:]
+    if values.shape[1] == mean.shape[0]:
+        levels = values / scale[:, :height, :width] + mean[:, :height, :width]
+    else:  # one grey channel of what is normalised
+        levels = 127.5 * (1.0 + values / networks.config.normalizer_clip)
+    return jnp.clip(jnp.round(levels), 0, 255).astype(jnp.uint8)

@@ -1,0 +1,93 @@
+"""Figures of several runs: one panel a task, one line a variant."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator, PercentFormatter
+
+from jaxrl_vis.report.plots import FAINT, INK, draw_median, style_curves
+
+_WIDTH, _HEIGHT, _HEADER, _FOOTER = 4.9, 3.5, 0.85, 0.85  # inches, of a panel and of what is above and below all of them
+
+
+@dataclasses.dataclass(frozen=True)
+class Curve:
+    """One line.
+
+    Attributes:
+        label: What the legend calls it; lines of one label have one entry.
+        colour: Its colour.
+        steps: [P] environment steps.
+        values: [S, P], one row a seed, NaN for gaps.
+        behind: Whether it belongs to somebody else: thin, dashed, and behind the others.
+    """
+
+    label: str
+    colour: str
+    steps: np.ndarray
+    values: np.ndarray
+    behind: bool = False
+
+
+@dataclasses.dataclass(frozen=True)
+class Panel:
+    """The lines of one task."""
+
+    title: str
+    curves: Sequence[Curve]
+
+
+def draw_panels(path: Path, panels: Sequence[Panel], title: str, subtitle: str, is_share: bool = True) -> None:
+    """Writes a figure.
+
+    Args:
+        path: A .png, or any other format that matplotlib can write.
+        panels: Side by side.
+        title: The first line, bold.
+        subtitle: The second line.
+        is_share: Whether what is drawn lies in [0, 1] and is shown in percent.
+    """
+    width, height = max(7.5, _WIDTH * len(panels)), _HEIGHT + _HEADER + _FOOTER
+    figure = Figure(figsize=(width, height), dpi=150, facecolor="white")
+    row = figure.subplots(1, len(panels), squeeze=False)[0]
+    entries = {}
+    for axes, panel in zip(row, panels, strict=True):
+        _draw(axes, panel, is_share)
+        handles, labels = axes.get_legend_handles_labels()
+        entries |= {label: handle for label, handle in zip(labels, handles, strict=True) if label not in entries}
+    figure.text(0.35 / width, 1 - 0.22 / height, title, fontsize=14, weight="bold", color=INK, va="center")
+    figure.text(0.35 / width, 1 - 0.48 / height, subtitle, fontsize=9, color=FAINT, va="center")
+    columns = max(1, min(len(entries), int(width / 2.1)))
+    figure.legend(
+        list(entries.values()), list(entries), loc="lower center", ncols=columns, frameon=False, fontsize=9, labelcolor=INK
+    )
+    left, right = 0.6 / width, 1 - 0.2 / width
+    figure.subplots_adjust(
+        left=left, right=right, bottom=(_FOOTER + 0.15) / height, top=1 - (_HEADER + 0.2) / height, wspace=0.2
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path)
+
+
+def _draw(axes: Axes, panel: Panel, is_share: bool) -> None:
+    ends = [int(curve.steps[-1]) for curve in panel.curves if curve.steps.size and not curve.behind]
+    end = max(ends, default=1)
+    for curve in panel.curves:
+        if curve.behind:
+            style = {"linewidth": 1.3, "linestyle": (0, (4, 2)), "alpha": 0.75, "zorder": 1}
+            axes.plot(curve.steps, np.median(curve.values, axis=0), color=curve.colour, label=curve.label, **style)
+        else:
+            draw_median(axes, curve.steps, curve.values, curve.colour, curve.label)
+    style_curves(axes, panel.title)
+    axes.xaxis.set_major_locator(MaxNLocator(5))
+    axes.set_xlim(0, 1.01 * end)
+    if is_share:
+        axes.set_ylim(-0.02, 1.03)
+        axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+    else:
+        axes.set_ylim(bottom=0.0)
+    axes.set_xlabel("environment steps per seed", fontsize=9.5, color=INK)

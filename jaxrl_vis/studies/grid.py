@@ -1,0 +1,207 @@
+"""The engine of all studies: a grid of cells, each trained by a process of its own, one process a device.
+
+    cells that are not finished -> `python -m jaxrl_vis train ... [--resume]`, a free device each -> run folders (`cells`)
+
+Everything that makes a run safe is the run's own: locks, signals, checkpoints. So the engine may be interrupted, or killed, and
+started again at any time, also side by side with another one that works in the same folder. A cell that fails is told in one
+line, and the others go on.
+
+Nothing here imports JAX, see `cells`.
+"""
+
+import contextlib
+import dataclasses
+import signal
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from jaxrl_vis.devices import Device
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.provenance import child_environment
+from jaxrl_vis.run.command import options_of
+from jaxrl_vis.run.console import show_seconds
+from jaxrl_vis.run.folder import RunFolder
+from jaxrl_vis.run.signals import Interruption
+from jaxrl_vis.studies.cells import Cell, contradiction, is_finished, latest_rows, show_budget
+
+_POLL_S = 0.2
+_TELL_S = 60.0  # from one line on what is running to the next
+_HURRY_S = 20.0  # how long processes that were told twice to end have for it
+
+Command = Callable[[Cell, Path, bool], Sequence[str]]
+"""(cell, its folder, whether a run goes on there) -> the words of a command that trains it."""
+
+
+def train_command(cell: Cell, folder: Path, goes_on: bool) -> list[str]:
+    """The command that trains a cell."""
+    words = [sys.executable, "-m", "jaxrl_vis", "train", *options_of(cell.config), "--run-dir", str(folder)]
+    return [*words, "--resume"] if goes_on else words
+
+
+@dataclasses.dataclass
+class _Running:
+    cell: Cell
+    device: Device
+    process: subprocess.Popen
+    log: Path
+    started: float
+
+
+def run_cells(
+    cells: Sequence[Cell],
+    runs: Path,
+    find_devices: Callable[[], Sequence[Device]],
+    seconds: float | None = None,
+    command: Command = train_command,
+    say: Callable[[str], None] = print,
+) -> list[str]:
+    """Trains the cells that are not finished; resumes those that were begun.
+
+    Args:
+        cells: In the order in which they are to be trained.
+        runs: The folder of their folders.
+        find_devices: Asked only if something is left to do: where processes may run, one at a time on each.
+        seconds: Stop after so long, and save; None: when all is done.
+        command: What trains a cell.
+        say: Takes each line on what happens.
+
+    Returns:
+        A line for each cell that failed.
+
+    Raises:
+        RequestError: No device was found, or the folder cannot be written to.
+        KeyboardInterrupt: Ctrl-C, after all processes have saved and ended.
+        Terminated: SIGTERM, likewise.
+    """
+    missing = [cell for cell in cells if not is_finished(cell, runs)]
+    if not missing:
+        return []
+    failures = [why for why in (contradiction(cell, runs) for cell in missing) if why is not None]
+    missing = [cell for cell in missing if contradiction(cell, runs) is None]
+    for line in failures:
+        say(line)
+    if not missing:
+        return failures
+    devices = list(find_devices())
+    try:
+        runs.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RequestError(f"cannot write to {runs} ({error.strerror}): choose another --runs") from error
+    where = devices[0].name if len(devices) == 1 else f"{len(devices)} devices"
+    say(f"{len(missing)} of {len(cells)} cells to train on {where}; run folders and logs go to {runs}")
+    with Interruption() as interruption:
+        failures += _Grid(missing, runs, devices, command, say, interruption).run(seconds)
+    if interruption:
+        interruption.end()
+    return failures
+
+
+class _Grid:
+    """One call of `run_cells`."""
+
+    def __init__(
+        self,
+        cells: Sequence[Cell],
+        runs: Path,
+        devices: Sequence[Device],
+        command: Command,
+        say: Callable[[str], None],
+        interruption: Interruption,
+    ):
+        self._waiting, self._free = list(cells), list(devices)
+        self._total, self._runs, self._command, self._say = len(cells), runs, command, say
+        self._interruption = interruption
+        self._running: list[_Running] = []
+        self._failures: list[str] = []
+        self._is_stopping = False
+
+    def run(self, seconds: float | None) -> list[str]:
+        started = told = time.monotonic()
+        try:
+            while self._running or (self._waiting and not self._is_stopping):
+                late = seconds is not None and time.monotonic() - started >= seconds
+                if not self._is_stopping and (self._interruption or late):
+                    self._stop(self._interruption.name if self._interruption else "time is up")
+                while self._waiting and self._free and not self._is_stopping:
+                    self._start(self._waiting.pop(0), self._free.pop(0))
+                time.sleep(_POLL_S)
+                for each in [each for each in self._running if each.process.poll() is not None]:
+                    self._end(each)
+                if time.monotonic() - told >= _TELL_S and self._running:
+                    told = time.monotonic()
+                    self._say("  " + "; ".join(map(self._describe, self._running)))
+        finally:
+            self._end_at_once()
+        return self._failures
+
+    def _start(self, cell: Cell, device: Device) -> None:
+        folder, log = self._runs / cell.name, self._runs / f"{cell.name}.log"
+        words = self._command(cell, folder, RunFolder(folder).config.exists())
+        place = f"[{self._total - len(self._waiting)}/{self._total}] {cell.name}"
+        # In a session of its own, so that a Ctrl-C of the terminal reaches it once, from here: a second one would not wait.
+        with log.open("a", encoding="utf-8") as file:
+            environment = child_environment() | dict(device.environment)
+            process = subprocess.Popen(
+                words, stdin=subprocess.DEVNULL, stdout=file, stderr=file, env=environment, start_new_session=True
+            )
+        self._running.append(_Running(cell, device, process, log, time.monotonic()))
+        self._say(f"{place}: {'resumes' if '--resume' in words else 'starts'} on {device.name}")
+
+    def _end(self, done: _Running) -> None:
+        self._running.remove(done)
+        self._free.append(done.device)
+        status, took = done.process.returncode, show_seconds(time.monotonic() - done.started)
+        if status == 0 and is_finished(done.cell, self._runs):
+            self._say(f"{done.cell.name}: done in {took}{_success(self._runs / done.cell.name)}")
+        elif self._is_stopping and status in (130, 143, -signal.SIGTERM, -signal.SIGINT):
+            self._say(f"{done.cell.name}: stopped after {took}; starting again goes on")
+        else:
+            why = "ended before it was finished" if status == 0 else f"failed with exit status {status}"
+            line = f"{done.cell.name}: {why} after {took}: {_last_line(done.log)} (log: {done.log})"
+            self._failures.append(line)
+            self._say(line)
+
+    def _describe(self, running: _Running) -> str:
+        latest = latest_rows(self._runs / running.cell.name)
+        steps = show_budget(latest[0]["env_steps"]) if latest else "0"
+        budget = show_budget(running.cell.config.env_steps)
+        return f"{running.cell.name}: {steps} of {budget} steps{_success(self._runs / running.cell.name)}"
+
+    def _stop(self, why: str) -> None:
+        self._is_stopping = True
+        if self._running:
+            self._say(f"{why}: waiting for {len(self._running)} to save; a second Ctrl-C does not wait")
+        self._signal()
+
+    def _signal(self) -> None:
+        for each in self._running:
+            with contextlib.suppress(ProcessLookupError):
+                each.process.send_signal(signal.SIGTERM)
+
+    def _end_at_once(self) -> None:
+        """Leaves no process behind, whatever went wrong; does nothing where all have ended."""
+        self._signal()
+        deadline = time.monotonic() + _HURRY_S
+        for each in self._running:
+            try:
+                each.process.wait(max(0.0, deadline - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                each.process.kill()
+                each.process.wait()
+
+
+def _success(folder: Path) -> str:
+    found = [row["eval/success"] for row in latest_rows(folder) if row.get("eval/success") is not None]
+    return f", success {statistics.median(found):.2f}" if found else ""
+
+
+def _last_line(log: Path) -> str:
+    with contextlib.suppress(OSError):
+        lines = [line.strip() for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
+        if lines:
+            return lines[-1]
+    return "it printed nothing"

@@ -1,0 +1,154 @@
+"""The table beside a figure, as Markdown and as CSV: steps to levels of success, and speed-ups over a baseline."""
+
+import csv
+import dataclasses
+import io
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from scipy.stats import spearmanr
+
+from jaxrl_vis.report.plots import show_steps
+from jaxrl_vis.studies.results import Line, final_success, mean_success, mean_weight, reached
+
+BASELINE = "none"
+
+
+@dataclasses.dataclass(frozen=True)
+class Named:
+    """A line and what tables call it.
+
+    Attributes:
+        label: Its method.
+        line: What it says.
+        source: Whose it is: ``here``, or whoever published it.
+    """
+
+    label: str
+    line: Line
+    source: str = "here"
+
+
+def steps_table(
+    lines: Mapping[str, Sequence[Named]], levels: Mapping[str, Sequence[float]]
+) -> tuple[list[str], list[dict[str, Any]]]:
+    """Steps to each level, and speed-ups over the baseline of the same source.
+
+    Args:
+        lines: Task -> its lines.
+        levels: Task -> shares of success.
+
+    Returns:
+        Lines of Markdown, one table a task; and rows for `to_csv`.
+    """
+    text: list[str] = []
+    rows: list[dict[str, Any]] = []
+    for task, named in lines.items():
+        common = min(each.line.end for each in named)
+        heads = [part for level in levels[task] for part in (f"steps to {level:g}", "speed-up")]
+        columns = ["method", *heads, f"mean success to {show_steps(common)}", "success at the end"]
+        text += [f"### {task}", "", _row(columns), _row(["---"] * len(columns))]
+        for each in named:
+            base = next((b.line for b in named if b.line.variant == BASELINE and b.source == each.source), None)
+            text.append(_row(_cells(each, base, levels[task], common)))
+            rows += _csv_rows(each, base, levels[task], common)
+        text.append("")
+    return text, rows
+
+
+def _label(named: Named) -> str:
+    return named.label if named.source == "here" else f"{named.label} ({named.source})"
+
+
+def _cells(named: Named, base: Line | None, levels: Sequence[float], common: int) -> list[str]:
+    cells = [_label(named)]
+    for level in levels:
+        found = reached(named.line, level)
+        is_base = base is None or named.line.variant == BASELINE
+        cells += [str(found), "" if base is None or is_base else found.ratio(reached(base, level))]
+    low, median, high = final_success(named.line)
+    end = f"{median:.2f}" if len(named.line.seeds) == 1 else f"{median:.2f} ({low:.2f} to {high:.2f})"
+    return [*cells, f"{mean_success(named.line, common):.3f}", end]
+
+
+def _csv_rows(named: Named, base: Line | None, levels: Sequence[float], common: int) -> list[dict[str, Any]]:
+    rows = []
+    for level in levels:
+        found = reached(named.line, level)
+        rows.append(
+            {
+                "task": named.line.task,
+                "method": named.line.variant,
+                "source": named.source,
+                "seeds": len(named.line.seeds),
+                "level": level,
+                "steps": found.steps,
+                "steps_25": found.low,
+                "steps_75": found.high,
+                "budget": found.budget,
+                "speed_up": "" if base is None or named.line.variant == BASELINE else found.ratio(reached(base, level)),
+                "mean_success": round(mean_success(named.line, common), 4),
+                "mean_success_to": common,
+                "final_success": round(final_success(named.line)[1], 4),
+            }
+        )
+    return rows
+
+
+def weights_table(
+    weighted: Mapping[str, Line], alone: Mapping[tuple[str, str], Line], bases: Mapping[str, Line], names: Mapping[str, str]
+) -> tuple[list[str], list[dict[str, Any]]]:
+    """Mean weights of auxiliary losses beside what each gains alone, and their rank correlation (Spearman's).
+
+    A gain is the difference of mean success to that without auxiliary losses, up to the shorter run's end.
+
+    Args:
+        weighted: Task -> the run with all of them.
+        alone: (task, auxiliary loss) -> the run with that one, where there is one.
+        bases: Task -> the run without any, where there is one.
+        names: Auxiliary loss -> what to call it.
+    """
+    text: list[str] = []
+    rows: list[dict[str, Any]] = []
+    for task, line in weighted.items():
+        text += [f"### {task}", "", _row(["auxiliary loss", "mean weight", "gain alone"]), _row(["---"] * 3)]
+        weights, gains = [], []
+        for name, label in names.items():
+            weight, gain = mean_weight(line, name), _gain(alone.get((task, name)), bases.get(task))
+            text.append(_row([label, f"{weight:.3f}", "not there yet" if gain is None else f"{gain:+.3f}"]))
+            rows.append({"task": task, "auxiliary_loss": name, "mean_weight": weight, "gain_alone": gain})
+            if gain is not None:
+                weights.append(weight)
+                gains.append(gain)
+        text += ["", _correlation(weights, gains, len(names)), ""]
+    return text, rows
+
+
+def _gain(alone: Line | None, base: Line | None) -> float | None:
+    if alone is None or base is None:
+        return None
+    common = min(alone.end, base.end)
+    return mean_success(alone, common) - mean_success(base, common)
+
+
+def _correlation(weights: Sequence[float], gains: Sequence[float], wanted: int) -> str:
+    if len(gains) < wanted:
+        return "Rank correlation of mean weight and gain alone: not known before all runs of figure 5.5 are there."
+    if len(set(weights)) < 2 or len(set(gains)) < 2:
+        return "Rank correlation of mean weight and gain alone: not defined, since all are equal."
+    rho = float(spearmanr(weights, gains).statistic)
+    return f"Rank correlation of mean weight and gain alone: {rho:+.2f} (of {len(gains)} losses)."
+
+
+def to_csv(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Rows of the same keys as CSV; None is an empty field."""
+    file = io.StringIO()
+    if rows:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    return file.getvalue()
+
+
+def _row(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
