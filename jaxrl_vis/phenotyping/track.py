@@ -1,0 +1,210 @@
+"""Which sightings of several pairs are one stalk, where it stands along the row, and how thick it is.
+
+The robot says how far it has driven, to a few per cent; stereo says where a stalk stands beside it, to millimetres. A stalk's
+place along the row is their sum and stays the same from pair to pair, so a sighting belongs to the stalk that stands where it
+is. What most stalks moved by between two pairs corrects the robot's odometry.
+"""
+
+import dataclasses
+import math
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from jaxrl_vis.phenotyping.sightings import Sighting
+
+
+@dataclasses.dataclass(frozen=True)
+class Gates:
+    """What belongs together, lengths in m.
+
+    Attributes:
+        along: Greatest distance along the row between a stalk and a sighting of it.
+        depth: The same away from the cameras.
+        merge: Along the row, between two pieces of one stalk's track.
+        share: Of the pairs that should show a stalk, how many must.
+        least: How many pairs must show it, if so many can.
+        ends: How far beyond the ends of the path a stalk may stand and still count.
+    """
+
+    along: float = 0.018
+    depth: float = 0.05
+    merge: float = 0.012
+    share: float = 0.25
+    least: int = 2
+    ends: float = 0.01
+
+
+@dataclasses.dataclass(frozen=True)
+class Track:
+    """One stalk.
+
+    Attributes:
+        sightings: Pair and place in its list of each sighting.
+        position_m: Along the row, from the middle of the path's first pair.
+        depth_m: From the cameras; not a number where no pair says.
+        counted: Whether it counts: enough pairs show it, and it stands beside the path.
+        reason: Why it does not; empty where it does.
+    """
+
+    sightings: tuple[tuple[int, int], ...]
+    position_m: float
+    depth_m: float
+    counted: bool
+    reason: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Path:
+    """How the robot drove.
+
+    Attributes:
+        places: [F] float64, of each pair along the row, m: odometry, corrected by what stereo saw.
+        length: Of the row that it passed, m: half a step more at each end.
+    """
+
+    places: np.ndarray
+    length: float
+
+
+@dataclasses.dataclass
+class _Open:
+    """A track in the making."""
+
+    seen: list[tuple[int, int]]
+    along: list[float]
+    depth: list[float]
+
+    def place(self) -> tuple[float, float]:
+        depths = [each for each in self.depth[-9:] if math.isfinite(each)]
+        return float(np.median(self.along[-9:])), float(np.median(depths)) if depths else math.nan
+
+
+def follow(
+    frames: list[list[Sighting]], distances: np.ndarray, half_field: float, gates: Gates = Gates()
+) -> tuple[list[Track], Path]:
+    """Puts the sightings of a plot together.
+
+    Args:
+        frames: Of each pair, in the order in which the robot passed.
+        distances: [F] float64, how far it had driven by its odometry, m.
+        half_field: Half of what the cameras see, of the depth: half an image's width over the focal length.
+        gates: What belongs together.
+    """
+    tracks: list[_Open] = []
+    places = np.zeros(len(frames))
+    correction = 0.0
+    backwards = len(distances) > 1 and distances[-1] < distances[0]
+    driven = np.asarray(distances, float) - (distances[0] if len(distances) else 0.0)
+    driven = -driven if backwards else driven
+    for frame, sightings in enumerate(frames):
+        along, depth = _where(sightings)
+        places[frame] = driven[frame] + correction
+        pairs = _assign(tracks, along + places[frame], depth, gates)
+        if len(pairs) >= 3:
+            moved = float(np.median([tracks[track].place()[0] - along[new] - places[frame] for track, new in pairs]))
+            correction += moved
+            places[frame] += moved
+            pairs = _assign(tracks, along + places[frame], depth, gates)
+        taken = {new: track for track, new in pairs}
+        for new in range(len(sightings)):
+            if not math.isfinite(along[new]):
+                continue
+            if new not in taken:
+                tracks.append(_Open([], [], []))
+            track = tracks[taken.get(new, -1)]
+            track.seen.append((frame, new))
+            track.along.append(float(along[new] + places[frame]))
+            track.depth.append(sightings[new].depth_m if sightings[new].depth_m is not None else math.nan)  # pyright: ignore[reportArgumentType]
+    step = float(np.median(np.diff(places))) if len(places) > 1 else 0.0
+    path = Path(places, float(places[-1] - places[0]) + step if len(places) else 0.0)
+    return [_closed(each, path, step, half_field, gates) for each in _merged(tracks, gates)], path
+
+
+def _where(sightings: list[Sighting]) -> tuple[np.ndarray, np.ndarray]:
+    """Where sightings stand beside the robot [N] and how far away [N], m.
+
+    Where the right image does not show a stalk, it is taken to stand as far away as most of the others.
+    """
+    along = np.array([math.nan if each.along_m is None else each.along_m for each in sightings])
+    depth = np.array([math.nan if each.depth_m is None or each.along_m is None else each.depth_m for each in sightings])
+    known = np.isfinite(along)
+    if known.sum() >= 3 and not known.all():
+        # Columns are proportional to places at one depth.
+        columns = np.array([each.column for each in sightings])
+        slope, offset = np.polyfit(columns[known], along[known], 1)
+        misplaced = np.array([each.reason.startswith("it stands") for each in sightings])
+        along = np.where(known | misplaced, along, offset + slope * columns)
+    return along, depth
+
+
+def _assign(tracks: list[_Open], along: np.ndarray, depth: np.ndarray, gates: Gates) -> list[tuple[int, int]]:
+    """Which track each sighting goes on: pairs of indices, each at most once."""
+    if not tracks or not along.size:
+        return []
+    there = np.array([track.place() for track in tracks])
+    aside = np.abs(there[:, :1] - along[None]) / gates.along
+    away = np.nan_to_num(np.abs(there[:, 1:] - depth[None]) / gates.depth, nan=0.4)
+    cost = np.where(np.isfinite(aside) & (aside < 1.0) & (away < 1.0), np.nan_to_num(aside, nan=9.0) + 0.5 * away, 1e3)
+    rows, columns = linear_sum_assignment(cost)
+    return [(int(row), int(column)) for row, column in zip(rows, columns) if cost[row, column] < 1e3]
+
+
+def _merged(tracks: list[_Open], gates: Gates) -> list[_Open]:
+    """Tracks less those that go on where another one was lost: they stand in one place and no pair shows both."""
+    kept: list[_Open] = []
+    for track in sorted(tracks, key=lambda each: -len(each.seen)):
+        for other in kept:
+            aside = abs(float(np.median(track.along)) - float(np.median(other.along)))
+            depths = [np.array(each.depth)[np.isfinite(each.depth)] for each in (track, other)]
+            away = abs(float(np.median(depths[0]) - np.median(depths[1]))) if all(map(len, depths)) else 0.0
+            shared = {frame for frame, _ in track.seen} & {frame for frame, _ in other.seen}
+            if aside < gates.merge and away < gates.depth and not shared:
+                other.seen += track.seen
+                other.along += track.along
+                other.depth += track.depth
+                break
+        else:
+            kept.append(track)
+    return sorted(kept, key=lambda each: float(np.median(each.along)))
+
+
+def _closed(track: _Open, path: Path, step: float, half_field: float, gates: Gates) -> Track:
+    position = float(np.median(track.along))
+    depths = np.array(track.depth)[np.isfinite(track.depth)]
+    depth = float(np.median(depths)) if depths.size else math.nan
+    # The left image's field lies half a baseline to one side; what matters is how many pairs have the stalk well inside.
+    reach = 0.9 * half_field * (depth if math.isfinite(depth) else 0.8)
+    expected = int((np.abs(path.places - position) < reach).sum())
+    wanted = max(min(gates.least, expected), math.ceil(gates.share * expected), 1)
+    begin, end = path.places[0] - 0.5 * step - gates.ends, path.places[-1] + 0.5 * step + gates.ends
+    if not depths.size:
+        reason = "no pair says how far away it is"
+    elif len(track.seen) < wanted:
+        reason = f"seen in {len(track.seen)} of {expected} pairs"
+    elif not begin <= position <= end:
+        reason = "it stands beyond the ends of the path"
+    else:
+        reason = ""
+    return Track(tuple(sorted(track.seen)), position, depth, not reason, reason)
+
+
+def robust_width(sightings: list[Sighting]) -> tuple[float, float, int] | None:
+    """Diameter of one stalk by all its sightings: weighted median, its standard error in mm, and how many say so.
+
+    The standard error is that of the scatter between pairs, and at least what edges and disparity tell. What hides a stalk from
+    all sides is not in it.
+    """
+    measured = [each for each in sightings if each.diameter_mm is not None]
+    if not measured:
+        return None
+    values = np.array([each.diameter_mm for each in measured], float)
+    weights = np.array([max(each.confidence, 0.02) for each in measured])
+    order = np.argsort(values)
+    passed = np.cumsum(weights[order]) - 0.5 * weights[order]
+    median = float(np.interp(0.5 * weights.sum(), passed, values[order]))
+    enough = float(weights.sum() ** 2 / (weights**2).sum())
+    scatter = 1.4826 * float(np.median(np.abs(values - median))) * 1.2533 if len(values) > 2 else 0.0
+    stated = np.array([each.deviation_mm or 0.0 for each in measured])
+    least = math.sqrt(float((weights * stated**2).sum() / weights.sum()))
+    return median, max(scatter, least) / math.sqrt(enough), len(values)
