@@ -76,8 +76,7 @@ def score_plot(family: Family, seed: int, find: Finder | None, method: Method = 
         kept = [place for place, each in enumerate(detections) if each.score >= least_score]
         frames.append(look([detections[place] for place in kept], left, right, drive.stated, method))
         owners.append([matched[place] for place in kept])
-    half_field = 0.5 * drive.stated.width / drive.stated.focal
-    tracks, _ = follow(frames, drive.odometry, half_field)
+    tracks, _ = follow(frames, drive.odometry, drive.stated)
     widths = []
     counted = [track for track in tracks if track.counted]
     for track in counted:

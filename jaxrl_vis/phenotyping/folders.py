@@ -121,6 +121,8 @@ def read_odometry(plot: PlotFolder, speed: float | None = None) -> dict[str, flo
             raise RequestError(f"{path} needs a column distance_m, or time_s and --speed")
         if not np.isfinite(values).all():
             raise ValueError
+    except RequestError:
+        raise
     except OSError as error:
         raise RequestError(f"cannot read {path}: {error.strerror or error}") from error
     except (ValueError, TypeError) as error:

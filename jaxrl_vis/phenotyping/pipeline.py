@@ -183,13 +183,13 @@ def _finish(
     origin = Origin(plot.name, request.method, jaxrl_vis.__version__)
     calibration = request.calibrations[plot.name]
     known = driven is not None and all(pair.name in driven for pair, _ in usable)
-    if calibration is None or driven is None or not known or not usable:
-        why = "no usable pairs" if not usable else NO_CALIBRATION if calibration is None else NO_ODOMETRY
+    if calibration is None or driven is None or not known or len(usable) < 2:
+        why = _what_is_missing(len(usable), calibration)
         labels: list[list[str | None]] = [[None] * len(frame) for frame in frames]
         rows = rows_without_path(frames, skipped, origin, why)
     else:
         distances = np.array([driven[pair.name] for pair, _ in usable])
-        tracks, path = follow(frames, distances, 0.5 * calibration.width / calibration.focal)
+        tracks, path = follow(frames, distances, calibration)
         labels = labels_of(frames, tracks)
         rows = rows_of(frames, tracks, path, skipped, origin)
     folder = request.out / "overlays" / plot.name
@@ -200,6 +200,15 @@ def _finish(
             left, _ = _read(pair, calibration)
             write_image(target, draw_overlay(left, frame, names))
     return rows
+
+
+def _what_is_missing(pairs: int, calibration: Calibration | None) -> str:
+    """Why the pairs of a plot cannot be put together."""
+    if pairs == 0:
+        return "no usable pairs"
+    if calibration is None:
+        return NO_CALIBRATION
+    return "a single pair" if pairs == 1 else NO_ODOMETRY
 
 
 def labels_of(frames: list[list[Sighting]], tracks: list[Track]) -> list[list[str | None]]:

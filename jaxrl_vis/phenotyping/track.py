@@ -12,6 +12,10 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from jaxrl_vis.phenotyping.sightings import Sighting
+from jaxrl_vis_envs.plants import Calibration
+
+_USUAL_DEPTH = 0.8  # m, where no pair says
+_NEVER = 1e3  # cost of what does not belong together
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,10 +45,10 @@ class Track:
 
     Attributes:
         sightings: Pair and place in its list of each sighting.
-        position_m: Along the row, from the middle of the path's first pair.
+        position_m: Along the row, from where the robot was at the first pair.
         depth_m: From the cameras; not a number where no pair says.
         counted: Whether it counts: enough pairs show it, and it stands beside the path.
-        reason: Why it does not; empty where it does.
+        reason: Why it does not count; empty where it does.
     """
 
     sightings: tuple[tuple[int, int], ...]
@@ -81,73 +85,101 @@ class _Open:
 
 
 def follow(
-    frames: list[list[Sighting]], distances: np.ndarray, half_field: float, gates: Gates = Gates()
+    frames: list[list[Sighting]], distances: np.ndarray, calibration: Calibration, gates: Gates = Gates()
 ) -> tuple[list[Track], Path]:
     """Puts the sightings of a plot together.
 
     Args:
         frames: Of each pair, in the order in which the robot passed.
         distances: [F] float64, how far it had driven by its odometry, m.
-        half_field: Half of what the cameras see, of the depth: half an image's width over the focal length.
+        calibration: Of the cameras.
         gates: What belongs together.
     """
     tracks: list[_Open] = []
     places = np.zeros(len(frames))
     correction = 0.0
-    backwards = len(distances) > 1 and distances[-1] < distances[0]
     driven = np.asarray(distances, float) - (distances[0] if len(distances) else 0.0)
-    driven = -driven if backwards else driven
+    row = [each.depth_m for sightings in frames for each in sightings if each.depth_m is not None]
+    usual = float(np.median(row)) if row else _USUAL_DEPTH
     for frame, sightings in enumerate(frames):
-        along, depth = _where(sightings)
+        seen = _Seen.of(sightings, calibration, usual)
         places[frame] = driven[frame] + correction
-        pairs = _assign(tracks, along + places[frame], depth, gates)
-        if len(pairs) >= 3:
-            moved = float(np.median([tracks[track].place()[0] - along[new] - places[frame] for track, new in pairs]))
-            correction += moved
-            places[frame] += moved
-            pairs = _assign(tracks, along + places[frame], depth, gates)
+        pairs = _assign(tracks, seen, places[frame], gates)
+        moves = [tracks[track].place()[0] - seen.along[new] - places[frame] for track, new in pairs if seen.known[new]]
+        if len(moves) >= 3:
+            correction += float(np.median(moves))
+            places[frame] = driven[frame] + correction
+            pairs = _assign(tracks, seen, places[frame], gates)
         taken = {new: track for track, new in pairs}
-        for new in range(len(sightings)):
-            if not math.isfinite(along[new]):
-                continue
-            if new not in taken:
-                tracks.append(_Open([], [], []))
-            track = tracks[taken.get(new, -1)]
-            track.seen.append((frame, new))
-            track.along.append(float(along[new] + places[frame]))
-            track.depth.append(sightings[new].depth_m if sightings[new].depth_m is not None else math.nan)  # pyright: ignore[reportArgumentType]
+        for new in np.flatnonzero(seen.there):
+            depth = float(seen.depth[new]) if seen.known[new] else math.nan
+            if new in taken:
+                track = tracks[taken[new]]
+                along = seen.along[new] if seen.known[new] else seen.beside(track.place()[1])[new]
+            else:
+                track, along = _Open([], [], []), seen.along[new]
+                tracks.append(track)
+            track.seen.append((frame, int(new)))
+            track.along.append(float(along + places[frame]))
+            track.depth.append(depth)
     step = float(np.median(np.diff(places))) if len(places) > 1 else 0.0
-    path = Path(places, float(places[-1] - places[0]) + step if len(places) else 0.0)
-    return [_closed(each, path, step, half_field, gates) for each in _merged(tracks, gates)], path
+    path = Path(places, abs(float(places[-1] - places[0]) + step) if len(places) else 0.0)
+    half_field = 0.5 * calibration.width / calibration.focal
+    closed = [_closed(each, path, step, half_field, usual, gates) for each in _merged(tracks, gates)]
+    return sorted(closed, key=lambda each: each.position_m * (-1.0 if step < 0 else 1.0)), path
 
 
-def _where(sightings: list[Sighting]) -> tuple[np.ndarray, np.ndarray]:
-    """Where sightings stand beside the robot [N] and how far away [N], m.
+@dataclasses.dataclass(frozen=True)
+class _Seen:
+    """Where the sightings of one pair are, [N] each.
 
-    Where the right image does not show a stalk, it is taken to stand as far away as most of the others.
+    Attributes:
+        rays: Tangent of the angle at which the left camera sees a stalk.
+        along: Beside the middle between the cameras, m; taken to be as far away as most where the pair does not say.
+        depth: Of the fronts, m.
+        known: Whether the pair says how far away it is.
+        there: Whether it may be a stalk of the row.
+        half: Half the baseline, m.
+        usual: How far away most are, m.
     """
-    along = np.array([math.nan if each.along_m is None else each.along_m for each in sightings])
-    depth = np.array([math.nan if each.depth_m is None or each.along_m is None else each.depth_m for each in sightings])
-    known = np.isfinite(along)
-    if known.sum() >= 3 and not known.all():
-        # Columns are proportional to places at one depth.
-        columns = np.array([each.column for each in sightings])
-        slope, offset = np.polyfit(columns[known], along[known], 1)
-        misplaced = np.array([each.reason.startswith("it stands") for each in sightings])
-        along = np.where(known | misplaced, along, offset + slope * columns)
-    return along, depth
+
+    rays: np.ndarray
+    along: np.ndarray
+    depth: np.ndarray
+    known: np.ndarray
+    there: np.ndarray
+    half: float
+    usual: float
+
+    @classmethod
+    def of(cls, sightings: list[Sighting], calibration: Calibration, usual: float) -> "_Seen":
+        rays = np.array([(each.column - calibration.centre[0]) / calibration.focal for each in sightings])
+        along = np.array([math.nan if each.along_m is None else each.along_m for each in sightings])
+        depth = np.array([math.nan if each.depth_m is None else each.depth_m for each in sightings])
+        known = np.isfinite(along) & np.isfinite(depth)
+        # What stands elsewhere is no stalk of the row.
+        elsewhere = np.array([each.depth_m is not None and each.along_m is None for each in sightings], bool)
+        half = 0.5 * calibration.baseline
+        along = np.where(known, along, rays * usual - half)
+        return cls(rays, along, depth, known, ~elsewhere, half, usual)
+
+    def beside(self, depth: float) -> np.ndarray:
+        """Where they would stand along the row, [N], if they were so far away, m."""
+        return self.rays * (depth if math.isfinite(depth) else self.usual) - self.half
 
 
-def _assign(tracks: list[_Open], along: np.ndarray, depth: np.ndarray, gates: Gates) -> list[tuple[int, int]]:
+def _assign(tracks: list[_Open], seen: _Seen, place: float, gates: Gates) -> list[tuple[int, int]]:
     """Which track each sighting goes on: pairs of indices, each at most once."""
-    if not tracks or not along.size:
+    if not tracks or not seen.rays.size:
         return []
     there = np.array([track.place() for track in tracks])
-    aside = np.abs(there[:, :1] - along[None]) / gates.along
-    away = np.nan_to_num(np.abs(there[:, 1:] - depth[None]) / gates.depth, nan=0.4)
-    cost = np.where(np.isfinite(aside) & (aside < 1.0) & (away < 1.0), np.nan_to_num(aside, nan=9.0) + 0.5 * away, 1e3)
+    # A sighting that does not say how far away it is, is looked for where the camera would see the track's stalk.
+    along = np.where(seen.known, seen.along, [seen.beside(depth) for _, depth in there]) + place
+    aside = np.abs(there[:, :1] - along) / gates.along
+    away = np.nan_to_num(np.abs(there[:, 1:] - seen.depth[None]) / gates.depth, nan=0.4)
+    cost = np.where((aside < 1.0) & (away < 1.0) & seen.there, aside + 0.5 * away, _NEVER)
     rows, columns = linear_sum_assignment(cost)
-    return [(int(row), int(column)) for row, column in zip(rows, columns) if cost[row, column] < 1e3]
+    return [(int(row), int(column)) for row, column in zip(rows, columns) if cost[row, column] < _NEVER]
 
 
 def _merged(tracks: list[_Open], gates: Gates) -> list[_Open]:
@@ -166,23 +198,21 @@ def _merged(tracks: list[_Open], gates: Gates) -> list[_Open]:
                 break
         else:
             kept.append(track)
-    return sorted(kept, key=lambda each: float(np.median(each.along)))
+    return kept
 
 
-def _closed(track: _Open, path: Path, step: float, half_field: float, gates: Gates) -> Track:
+def _closed(track: _Open, path: Path, step: float, half_field: float, usual: float, gates: Gates) -> Track:
     position = float(np.median(track.along))
     depths = np.array(track.depth)[np.isfinite(track.depth)]
     depth = float(np.median(depths)) if depths.size else math.nan
-    # The left image's field lies half a baseline to one side; what matters is how many pairs have the stalk well inside.
-    reach = 0.9 * half_field * (depth if math.isfinite(depth) else 0.8)
+    # What matters is how many pairs have the stalk well inside.
+    reach = 0.9 * half_field * (depth if math.isfinite(depth) else usual)
     expected = int((np.abs(path.places - position) < reach).sum())
     wanted = max(min(gates.least, expected), math.ceil(gates.share * expected), 1)
-    begin, end = path.places[0] - 0.5 * step - gates.ends, path.places[-1] + 0.5 * step + gates.ends
-    if not depths.size:
-        reason = "no pair says how far away it is"
-    elif len(track.seen) < wanted:
+    begin, end = sorted((path.places[0] - 0.5 * step, path.places[-1] + 0.5 * step))
+    if len(track.seen) < wanted:
         reason = f"seen in {len(track.seen)} of {expected} pairs"
-    elif not begin <= position <= end:
+    elif not begin - gates.ends <= position <= end + gates.ends:
         reason = "it stands beyond the ends of the path"
     else:
         reason = ""

@@ -126,11 +126,11 @@ def best_proposals(
 
 def heads(
     network: Detector, params: Any, features: jax.Array, method: Literal["propose", "judge_all"]
-) -> tuple[jax.Array, ...]:
+) -> tuple[jax.Array, jax.Array]:
     """Logits and codes from one of the detector's heads."""
-    found = network.apply(params, features, method=method)
-    assert isinstance(found, tuple)
-    return found
+    logits, codes = network.apply(params, features, method=method)
+    assert isinstance(logits, jax.Array) and isinstance(codes, jax.Array)
+    return logits, codes
 
 
 def judge(network: Detector, params: Any, features: jax.Array, boxes: jax.Array, valid: jax.Array, settings: Settings) -> Found:

@@ -40,10 +40,12 @@ def write_weights(
     arrays = {"/".join(str(part.key) for part in names): np.asarray(leaf) for names, leaf in leaves}
     if half:
         arrays = {name: array.astype(np.float16) for name, array in arrays.items()}
+    path.parent.mkdir(parents=True, exist_ok=True)
     text = json.dumps({"schema": SCHEMA, "settings": dataclasses.asdict(settings), **about})
+    whole: dict[str, Any] = {_ABOUT: np.frombuffer(text.encode(), np.uint8), **arrays}
     temporary = path.with_name(path.name + ".tmp")
     with temporary.open("wb") as file:
-        np.savez_compressed(file, **{_ABOUT: np.frombuffer(text.encode(), np.uint8)}, **arrays)
+        np.savez_compressed(file, **whole)
         file.flush()
         os.fsync(file.fileno())
     temporary.replace(path)
@@ -65,9 +67,11 @@ def read_weights(path: Path) -> tuple[dict[str, Any], Settings, dict[str, Any]]:
         }
         if about.pop("schema") != SCHEMA or not values.keys() <= known:
             raise RequestError(f"{path} holds weights of another version: train them again with `jaxrl-vis phenotype train`")
+    except RequestError:
+        raise
     except OSError as error:
         raise RequestError(f"cannot read the weights {path}: {error.strerror or error}") from error
-    except (ValueError, KeyError, zipfile.BadZipFile, AttributeError) as error:
+    except (ValueError, KeyError, EOFError, zipfile.BadZipFile, AttributeError) as error:
         raise RequestError(f"{path} holds no weights: name a file that `jaxrl-vis phenotype train` wrote") from error
     params: dict[str, Any] = {}
     for name, array in arrays.items():

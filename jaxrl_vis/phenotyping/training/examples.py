@@ -172,6 +172,8 @@ def read_coco(folder: Path) -> dict[str, Any]:
         data = json.loads(path.read_text(encoding="utf-8"))
         if not data["images"] or not data["annotations"]:
             raise RequestError(f"{path} annotates nothing: name a folder with annotated images")
+    except RequestError:
+        raise
     except OSError as error:
         raise RequestError(f"there are no annotations {path}: name a folder with annotations.json of COCO") from error
     except (ValueError, KeyError, TypeError) as error:
