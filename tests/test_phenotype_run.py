@@ -15,7 +15,8 @@ from jaxrl_vis.phenotyping.detector.finder import Detection
 from jaxrl_vis.phenotyping.evaluate import PlotScore, average_precision, match, summary
 from jaxrl_vis.phenotyping.folders import find_plots, read_odometry
 from jaxrl_vis.phenotyping.images import read_image, write_image
-from jaxrl_vis.phenotyping.sightings import Sighting
+from jaxrl_vis.phenotyping.pairing import wrong_with
+from jaxrl_vis.phenotyping.sightings import Sighting, look
 from jaxrl_vis.phenotyping.track import follow, robust_width
 from jaxrl_vis_envs.plants import Calibration
 from jaxrl_vis_envs.plants.truth import StalkInView
@@ -283,6 +284,34 @@ def test_bad_files_are_listed_and_skipped(plots, tmp_path, capsys):
     assert "skipped plot_0000/000: there is no right image" in capsys.readouterr().err
 
 
+def test_swapped_and_unrectified_pairs_are_told():
+    """Six stalks with a texture; the right image as it is, exchanged, and too low."""
+    rng = np.random.default_rng(0)
+    camera = Calibration(844, 400, 542.0, (421.5, 199.5), 0.1)
+    disparity = 68
+    left, right = np.zeros((400, 844, 3), np.uint8), np.zeros((400, 844, 3), np.uint8)
+    columns = range(120, 720, 100)
+    for column in columns:
+        texture = rng.integers(60, 255, (400, 14, 1)).astype(np.uint8)
+        left[:, column : column + 14] = texture
+        right[:, column - disparity : column - disparity + 14] = texture
+
+    def told(left: np.ndarray, right: np.ndarray, offset: int = 0) -> str | None:
+        mask = np.zeros((200, 24), bool)
+        mask[:, 5:19] = True
+        finds = [
+            Detection((each, 100.0, each + 13.0, 300.0), (each + 6.5, each + 6.5), 1.0, mask, (100, each - 5))
+            for each in (column - offset for column in columns)
+        ]
+        return wrong_with(finds, look(finds, left, right, camera), left, right, camera)
+
+    assert told(left, right) is None
+    assert told(right, left, disparity) == "left and right are swapped: exchange their names"
+    assert told(left, np.roll(right, 6, axis=0)) == "the right image lies about 6 lines too low: rectify the pair"
+    assert told(left, np.roll(right, -12, axis=0)) == "the right image lies about 12 lines too high: rectify the pair"
+    assert told(left, np.zeros_like(right)) is None
+
+
 def test_without_calibration_no_millimetres_and_without_odometry_no_count(plots, tmp_path, capsys):
     plot = tmp_path / "plot_0000"
     shutil.copytree(plots / "plot_0000", plot)
@@ -332,3 +361,34 @@ def test_true_masks_are_wanted_of_what_has_none(plots, tmp_path, capsys):
     (plot / "plot.json").unlink()
     assert run(plot, tmp_path / "out") == 2
     assert "holds no true masks" in capsys.readouterr().err
+
+
+def test_eval_compares_with_the_truth(plots, tmp_path, capsys):
+    spec, out = plots.parent / "few.json", tmp_path / "eval.json"
+    words = ["--spec", str(spec), "--width", "422", "--frames", "4", "--plots", "1", "--masks", "truth", "--json", str(out)]
+    assert cli.main(["phenotype", "eval", *words]) == 0
+    figures = json.loads(out.read_text())
+    truth = json.loads((plots / "plot_0000" / "plot.json").read_text())
+    assert figures["count_true"] == truth["count"] and figures["count_mae"] == 0.0 and figures["count_r2"] is None
+    assert figures["f1"] > 0.9 and figures["width_mae_mm"] < 2.5 and figures["synthetic"] is True
+    said = capsys.readouterr().out
+    assert "synthetic plots of family" in said and "count_mae" in said
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        (["train", "weights.bin"], "ends in .npz"),
+        (["train", "weights.npz", "--minutes", "0"], "--minutes must be more than 0"),
+        (["train", "weights.npz", "--data", "images", "--width", "422"], "leave out --spec and --width"),
+        (["train", "weights.npz", "--data", "images"], "there are no annotations"),
+        (["train", "weights.npz", "--batch", "0"], "--batch"),
+        (["eval", "--seed", "-1"], "--seed must be at least 0"),
+        (["eval", "--weights", "missing.npz"], "cannot read the weights"),
+        (["eval", "--spec", "missing.toml"], "missing.toml"),
+    ],
+)
+def test_wrong_requests_of_train_and_eval(tmp_path, monkeypatch, capsys, words, part):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["phenotype", *words]) == 2
+    assert part in capsys.readouterr().err

@@ -22,8 +22,8 @@ class Eval:
     """Weights from `phenotype train`; those that are shipped if not given."""
     masks: Literal["network", "truth"] = "network"
     """What finds stalks: the networks, or the truth, to see what the rest makes of it."""
-    family: Literal["training", "shifted"] = "shifted"
-    """What plots are drawn from."""
+    family: Literal["training", "shifted"] | None = None
+    """What plots are drawn from; shifted, if no --spec says otherwise."""
     shift: tuple[str, ...] = ()
     """Shift only these factors of the family: flash, lean, rig, noise, leaves, textures."""
     spec: Path | None = None
@@ -52,7 +52,8 @@ def evaluate(options: Eval) -> int:
     check_extra()
     if options.json is not None:
         check_writable(options.json, "--json")
-    drawn = Synth(Path(), options.family, options.shift, options.spec, frames=options.frames, width=options.width)
+    drawn_from = options.family or ("shifted" if options.spec is None else "training")
+    drawn = Synth(Path(), drawn_from, options.shift, options.spec, frames=options.frames, width=options.width)
     family = family_of(drawn)
     check_devices()
     from jaxrl_vis.files import write_atomically

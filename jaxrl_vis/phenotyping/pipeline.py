@@ -26,6 +26,7 @@ from jaxrl_vis.phenotyping.folders import PairFiles, PlotFolder, read_odometry
 from jaxrl_vis.phenotyping.images import read_image, write_image
 from jaxrl_vis.phenotyping.measure import Method
 from jaxrl_vis.phenotyping.overlay import draw_overlay
+from jaxrl_vis.phenotyping.pairing import wrong_with
 from jaxrl_vis.phenotyping.results import (
     PLOT_COLUMNS,
     STALK_COLUMNS,
@@ -141,7 +142,11 @@ def _record(plot: PlotFolder, pair: PairFiles, find: Find, request: Request) -> 
         detections = find(left, plot, pair)
     except _Skip as problem:
         return {"skipped": str(problem)}
-    sightings = look(detections, left, right, request.calibrations[plot.name], request.method)
+    calibration = request.calibrations[plot.name]
+    sightings = look(detections, left, right, calibration, request.method)
+    wrong = None if calibration is None else wrong_with(detections, sightings, left, right, calibration)
+    if wrong is not None:
+        return {"skipped": wrong}
     return {"size": list(left.shape[:2]), "sightings": [dataclasses.asdict(each) for each in sightings]}
 
 

@@ -26,6 +26,7 @@ class Gates:
         along: Greatest distance along the row between a stalk and a sighting of it.
         depth: The same away from the cameras.
         merge: Along the row, between two pieces of one stalk's track.
+        astray: Share of the pairs of the shorter piece that may show both.
         share: Of the pairs that should show a stalk, how many must.
         least: How many pairs must show it, if so many can.
         ends: How far beyond the ends of the path a stalk may stand and still count.
@@ -33,8 +34,9 @@ class Gates:
 
     along: float = 0.018
     depth: float = 0.05
-    merge: float = 0.012
-    share: float = 0.25
+    merge: float = 0.015
+    astray: float = 0.34
+    share: float = 0.3
     least: int = 2
     ends: float = 0.01
 
@@ -75,9 +77,18 @@ class Path:
 class _Open:
     """A track in the making."""
 
-    seen: list[tuple[int, int]]
-    along: list[float]
-    depth: list[float]
+    seen: list[tuple[int, int]] = dataclasses.field(default_factory=list)
+    along: list[float] = dataclasses.field(default_factory=list)
+    depth: list[float] = dataclasses.field(default_factory=list)
+    rays: list[tuple[float, float]] = dataclasses.field(default_factory=list)
+
+    def depths(self) -> np.ndarray:
+        """What pairs say of how far away it is."""
+        return np.array(self.depth)[np.isfinite(self.depth)]
+
+    def at(self, depth: float) -> float:
+        """Where it would stand along the row if it were so far away, m."""
+        return float(np.median([offset + ray * depth for offset, ray in self.rays]))
 
     def place(self) -> tuple[float, float]:
         depths = [each for each in self.depth[-9:] if math.isfinite(each)]
@@ -111,17 +122,18 @@ def follow(
             places[frame] = driven[frame] + correction
             pairs = _assign(tracks, seen, places[frame], gates)
         taken = {new: track for track, new in pairs}
-        for new in np.flatnonzero(seen.there):
+        for new in map(int, np.flatnonzero(seen.there)):
             depth = float(seen.depth[new]) if seen.known[new] else math.nan
             if new in taken:
                 track = tracks[taken[new]]
                 along = seen.along[new] if seen.known[new] else seen.beside(track.place()[1])[new]
             else:
-                track, along = _Open([], [], []), seen.along[new]
+                track, along = _Open(), seen.along[new]
                 tracks.append(track)
-            track.seen.append((frame, int(new)))
+            track.seen.append((frame, new))
             track.along.append(float(along + places[frame]))
             track.depth.append(depth)
+            track.rays.append((float(places[frame]) - seen.half, float(seen.rays[new])))
     step = float(np.median(np.diff(places))) if len(places) > 1 else 0.0
     path = Path(places, abs(float(places[-1] - places[0]) + step) if len(places) else 0.0)
     half_field = 0.5 * calibration.width / calibration.focal
@@ -187,23 +199,34 @@ def _merged(tracks: list[_Open], gates: Gates) -> list[_Open]:
     kept: list[_Open] = []
     for track in sorted(tracks, key=lambda each: -len(each.seen)):
         for other in kept:
-            aside = abs(float(np.median(track.along)) - float(np.median(other.along)))
-            depths = [np.array(each.depth)[np.isfinite(each.depth)] for each in (track, other)]
-            away = abs(float(np.median(depths[0]) - np.median(depths[1]))) if all(map(len, depths)) else 0.0
+            aside, away = _apart(track, other)
             shared = {frame for frame, _ in track.seen} & {frame for frame, _ in other.seen}
-            if aside < gates.merge and away < gates.depth and not shared:
+            # A sighting that went astray may make one pair show both.
+            if aside < gates.merge and away < gates.depth and len(shared) <= gates.astray * len(track.seen):
                 other.seen += track.seen
                 other.along += track.along
                 other.depth += track.depth
+                other.rays += track.rays
                 break
         else:
             kept.append(track)
     return kept
 
 
+def _apart(track: _Open, other: _Open) -> tuple[float, float]:
+    """How far apart two tracks are along the row and away from the cameras, m."""
+    depths = track.depths(), other.depths()
+    if all(map(len, depths)) or not any(map(len, depths)):
+        aside = abs(float(np.median(track.along) - np.median(other.along)))
+        return aside, abs(float(np.median(depths[0]) - np.median(depths[1]))) if len(depths[0]) else 0.0
+    # One does not say how far away it is: it is taken to be as far away as the other.
+    depth = float(np.median(np.concatenate(depths)))
+    return abs(track.at(depth) - other.at(depth)), 0.0
+
+
 def _closed(track: _Open, path: Path, step: float, half_field: float, usual: float, gates: Gates) -> Track:
     position = float(np.median(track.along))
-    depths = np.array(track.depth)[np.isfinite(track.depth)]
+    depths = track.depths()
     depth = float(np.median(depths)) if depths.size else math.nan
     # What matters is how many pairs have the stalk well inside.
     reach = 0.9 * half_field * (depth if math.isfinite(depth) else usual)

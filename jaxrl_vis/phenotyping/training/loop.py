@@ -66,8 +66,12 @@ class _Pool:
         self._plan, self._running = plan, len(sources)
         self.examples: list[Example] = []
         self.snips: list[tuple[int, int]] = []
-        for source in sources:
-            threading.Thread(target=self._make, args=(source,), daemon=True).start()
+        # The others follow when the first one has made something, and with it compiled what makes it.
+        self._waiting = sources[1:]
+        self._start(sources[0])
+
+    def _start(self, source: Iterator[Example]) -> None:
+        threading.Thread(target=self._make, args=(source,), daemon=True).start()
 
     def _make(self, source: Iterator[Example]) -> None:
         try:
@@ -93,6 +97,8 @@ class _Pool:
                 return
             if isinstance(example, Exception):
                 raise example
+            while self._waiting:
+                self._start(self._waiting.pop())
             if example is None:
                 self._running -= 1
                 continue
