@@ -13,7 +13,19 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jaxrl_vis
-from jaxrl_vis.cli import bench, doctor, envs, eval, figure, phenotype, play, train
+from jaxrl_vis.cli import (
+    bench,
+    doctor,
+    envs,
+    eval,
+    figure,
+    phenotype,
+    phenotype_eval,
+    phenotype_run,
+    phenotype_train,
+    play,
+    train,
+)
 from jaxrl_vis.cli.parsing import PROGRAM, parse
 from jaxrl_vis.errors import NonFiniteError, RequestError, StorageError, Terminated, nearest
 
@@ -27,6 +39,9 @@ COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
     "bench": (bench.Bench, bench.run),
     "figure": (figure.Figure, figure.run),
     "phenotype synth": (phenotype.Synth, phenotype.synth),
+    "phenotype train": (phenotype_train.Train, phenotype_train.train),
+    "phenotype run": (phenotype_run.Run, phenotype_run.run),
+    "phenotype eval": (phenotype_eval.Eval, phenotype_eval.evaluate),
 }
 
 # Of the errors that are told in one line.

@@ -77,6 +77,10 @@ class Sequence:
         disparity = true.focal * true.baseline / depth
         return Pair(left, right, instance, depth, disparity, self.drive.poses[frame], frame)
 
+    def left(self, frame: int) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """The left image of one pair alone, and instance and depth in it; see `Pair`."""
+        return self._take(frame, 0)
+
     def _take(self, frame: int, side: int) -> tuple[jax.Array, jax.Array, jax.Array]:
         """One image, and instance and depth in it; side 0 is the left one."""
         family, drive = self.plot.family, self.drive

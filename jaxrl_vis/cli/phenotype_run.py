@@ -1,0 +1,120 @@
+"""``jaxrl-vis phenotype run``."""
+
+import dataclasses
+import hashlib
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+from jaxrl_vis.cli.parsing import ByPlaceToo
+from jaxrl_vis.cli.phenotype import check_extra
+from jaxrl_vis.devices import check_devices
+from jaxrl_vis.errors import RequestError, StorageError
+from jaxrl_vis.report.outputs import check_writable
+
+SKIPPED = 3
+"""Exit status where files were skipped."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """Count and measure the stalks in folders of stereo pairs: tables per stalk and per plot, and an overlay per image."""
+
+    folder: Annotated[Path, ByPlaceToo()]
+    """A plot's folder of pairs (left_000.png, right_000.png, ...), or a folder of such folders."""
+    out: Path = Path("phenotype_results")
+    """Folder for the results; a command that was stopped goes on where it was."""
+    calibration: Path | None = None
+    """Calibration of all plots (OpenCV, or ROS left.yaml and right.yaml); if not given, calibration.yaml of each plot's folder.
+    Without one there are no millimetres."""
+    calibration_unit: Literal["m", "mm"] | None = None
+    """Unit of the calibration's baseline, where the file does not say it."""
+    weights: Path | None = None
+    """Weights from `phenotype train`; those that are shipped if not given."""
+    masks: Literal["network", "truth"] = "network"
+    """What finds stalks: the networks, or the truth of synthetic plots, to see what the rest makes of it."""
+    method: Literal["strip", "ellipse"] = "strip"
+    """How widths are taken: between two edges, or by ellipses as in the thesis."""
+    least_score: float = 0.5
+    """What the networks are less sure of is no stalk, 0 to 1."""
+    speed: float | None = None
+    """Speed of the robot in m/s, for an odometry.csv that holds times only."""
+
+
+def run(options: Run) -> int:
+    """Writes tables and overlays."""
+    if not 0.0 <= options.least_score <= 1.0:
+        raise RequestError(f"--least-score must be from 0 to 1, not {options.least_score:g}")
+    if options.speed is not None and not options.speed > 0:
+        raise RequestError(f"--speed must be more than 0, not {options.speed:g}")
+    check_extra()
+    check_writable(options.out, "--out", folder=True)
+    from jaxrl_vis.phenotyping.folders import find_plots
+
+    plots = find_plots(options.folder)
+    calibrations = {plot.name: _calibration(plot.folder, options) for plot in plots}
+    check_devices()
+    from jaxrl_vis.phenotyping.pipeline import Request, run
+
+    if options.masks == "truth":
+        from jaxrl_vis.phenotyping.truth_on_disk import find_truth
+
+        find, name = find_truth, "truth"
+    else:
+        finder, name = networks(options.weights, options.least_score)
+
+        def find(image, plot, pair):
+            return finder(image)
+
+    request = Request(options.out, options.method, name, calibrations, options.speed)
+    for plot in plots:
+        if calibrations[plot.name] is None:
+            print(f"{plot.name}: no calibration, so no millimetres and no count: name one with --calibration", file=sys.stderr)
+
+    def say(plot: str, pair: int, of: int) -> None:
+        if sys.stdout.isatty():
+            print(f"\r{plot}: {pair} of {of} pairs", end="\n" if pair == of else "", flush=True)
+        elif pair == of:
+            print(f"{plot}: {of} pairs", flush=True)
+
+    try:
+        skipped = run(plots, find, request, say)
+    except OSError as error:
+        raise StorageError(
+            f"cannot write to {options.out}: {error.strerror or error}; run the command again to go on"
+        ) from error
+    for row in skipped:
+        print(f"skipped {row['plot']}/{row['pair']}: {row['why']}", file=sys.stderr)
+    print(f"{options.out}: stalks.csv, plots.csv and overlays of {len(plots)} plots, {len(skipped)} pairs skipped")
+    return SKIPPED if skipped else 0
+
+
+def networks(weights: Path | None, least_score: float):
+    """What finds stalks in an image, by networks, and its name, which changes with its weights.
+
+    Raises:
+        RequestError: The weights cannot be read.
+    """
+    from jaxrl_vis.phenotyping.detector.finder import Finder
+    from jaxrl_vis.phenotyping.detector.weights import SHIPPED, read_weights
+
+    path = SHIPPED if weights is None else weights
+    if weights is None and not path.exists():
+        raise RequestError(
+            "no weights come with this version: make some with `jaxrl-vis phenotype train`, and name them with --weights"
+        )
+    params, settings, _ = read_weights(path)
+    finder = Finder(params, settings, least_score)
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+    return finder, f"networks {digest}, least score {least_score:g}"
+
+
+def _calibration(folder: Path, options: Run):
+    """Calibration of one plot; None where there is none."""
+    from jaxrl_vis.phenotyping.calibration import read_calibration
+
+    if options.calibration is not None:
+        return read_calibration(options.calibration, options.calibration_unit)
+    own = [folder / name for name in ("calibration.yaml", "calibration.yml", "calibration.xml")]
+    found = next((path for path in own if path.exists()), None)
+    return None if found is None else read_calibration(found, options.calibration_unit)

@@ -1,0 +1,176 @@
+"""From a reduced image to stalks: proposals, their features, and the head's judgement, all of static shape."""
+
+import dataclasses
+import functools
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxrl_vis.phenotyping.detector.anchors import anchors_of, decode
+from jaxrl_vis.phenotyping.detector.boxes import band_overlap, nms, roi_align, suppress
+from jaxrl_vis.phenotyping.detector.networks import PADDING, STRIDE, Detector
+
+GRID = (14, 7)
+"""Lines and columns of a region's features."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """What is fixed with the weights, and kept beside them.
+
+    Attributes:
+        width: Pixels to which the width of an image is reduced before stalks are looked for; narrower ones stay as they are.
+        full_width: Pixels of the widest images, in which snips have `snip_lines` and `snip_columns`; of narrower ones they are
+            smaller in proportion.
+        snip_lines, snip_columns: Size of a snip.
+        band_lines: Height of the band in an image that was reduced, pixels.
+        anchor_widths: Of the boxes that are proposed, pixels there.
+        channels, hidden: Of the detector; see `networks.Detector`.
+        segmenter: Channels of the segmentation.
+        proposals: How many proposals are judged.
+        most: How many stalks an image may show.
+        proposal_threshold: Overlap of boxes above which only one is proposed.
+        threshold: Overlap of strips above which two finds are one stalk.
+        least_score: What is no find.
+    """
+
+    width: int = 844
+    full_width: int = 3376
+    snip_lines: int = 640
+    snip_columns: int = 128
+    band_lines: float = 135.0
+    anchor_widths: tuple[float, ...] = (12.0, 24.0, 48.0)
+    channels: tuple[int, int, int, int] = (24, 48, 64, 64)
+    hidden: int = 128
+    segmenter: tuple[int, ...] = (16, 32, 48, 64)
+    proposals: int = 160
+    most: int = 64
+    proposal_threshold: float = 0.7
+    threshold: float = 0.4
+    least_score: float = 0.05
+
+    def detector(self, dtype: Any = jnp.float32) -> Detector:
+        """The network that these settings describe."""
+        return Detector(self.channels, self.hidden, len(self.anchor_widths), dtype)
+
+
+@dataclasses.dataclass(frozen=True)
+class Found:
+    """Stalks in a reduced image, the best first; padded. Registered as a pytree.
+
+    Attributes:
+        stalks: [..., K, 6] float32, box and columns of the axis at its top and bottom, pixels.
+        scores: [..., K] float32, 0 to 1.
+        valid: [..., K] bool.
+    """
+
+    stalks: jax.Array
+    scores: jax.Array
+    valid: jax.Array
+
+
+jax.tree_util.register_dataclass(Found, ["stalks", "scores", "valid"], [])
+
+
+def padded_shape(shape: tuple[int, int]) -> tuple[int, int]:
+    """Lines and columns, each up to the next multiple that the networks take."""
+    lines, columns = (-(-length // PADDING) * PADDING for length in shape)
+    return lines, columns
+
+
+def normalise(images: jax.Array) -> jax.Array:
+    """Images [..., 3] uint8 around 0, with dark parts spread: flash light falls off quickly."""
+    return 2.0 * jnp.sqrt(images.astype(jnp.float32) / 255.0) - 1.0
+
+
+def around(boxes: jax.Array) -> jax.Array:
+    """Boxes [..., 4] with some of what is beside them: a head judges a stalk by its surroundings, too."""
+    size = boxes[..., 2:] - boxes[..., :2]
+    more = jnp.concatenate([0.25 * size[..., :1] + 6.0, 0.08 * size[..., 1:]], axis=-1)
+    return jnp.concatenate([boxes[..., :2] - more, boxes[..., 2:] + more], axis=-1)
+
+
+def regions_of(features: jax.Array, boxes: jax.Array) -> jax.Array:
+    """Features [R, *GRID, C] of boxes [R, 4] of an image whose features are [H, W, C]."""
+    scale = (1.0 / STRIDE[0], 1.0 / STRIDE[1])
+    return roi_align(features, around(boxes), GRID, scale, samples=2, aligned=True)
+
+
+def best_proposals(
+    logits: jax.Array, codes: jax.Array, anchors: jax.Array, settings: Settings, shape: tuple[int, int]
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The best proposals of one image that are no copies of each other.
+
+    Args:
+        logits: [K] of the anchors.
+        codes: [K, 6].
+        anchors: [K, 4].
+        settings: How many, and what is a copy.
+        shape: Lines and columns of the image; what reaches beyond it is cut off.
+
+    Returns:
+        Boxes [P, 4], scores [P] float32 and which there are [P] bool, P = settings.proposals.
+    """
+    count = min(3 * settings.proposals, logits.shape[0])
+    scores, places = jax.lax.top_k(logits, count)
+    boxes = decode(codes[places], anchors[places])[:, :4]
+    boxes = jnp.clip(boxes, 0.0, jnp.array([shape[1], shape[0], shape[1], shape[0]], jnp.float32))
+    kept = nms(boxes, scores, settings.proposal_threshold)
+    kept &= (boxes[:, 2] - boxes[:, 0] > 2.0) & (boxes[:, 3] - boxes[:, 1] > 8.0)
+    scores = jnp.where(kept, scores, -jnp.inf)
+    best, places = jax.lax.top_k(scores, min(settings.proposals, count))
+    return boxes[places], best, jnp.isfinite(best)
+
+
+def heads(
+    network: Detector, params: Any, features: jax.Array, method: Literal["propose", "judge_all"]
+) -> tuple[jax.Array, jax.Array]:
+    """Logits and codes from one of the detector's heads."""
+    logits, codes = network.apply(params, features, method=method)
+    assert isinstance(logits, jax.Array) and isinstance(codes, jax.Array)
+    return logits, codes
+
+
+def judge(network: Detector, params: Any, features: jax.Array, boxes: jax.Array, valid: jax.Array, settings: Settings) -> Found:
+    """What the head says of proposals [P, 4] of one image with features [H, W, C]: stalks, less what is found twice."""
+    logits, codes = heads(network, params, regions_of(features, boxes), "judge_all")
+    stalks, scores = decode(codes, boxes), jax.nn.sigmoid(logits)
+    valid = valid & (scores >= settings.least_score)
+    kept = suppress(band_overlap(stalks[:, :4], stalks[:, 4:]), jnp.where(valid, scores, -1.0), settings.threshold, valid)
+    best, places = jax.lax.top_k(jnp.where(kept, scores, -1.0), min(settings.most, scores.shape[0]))
+    return Found(stalks[places], jnp.maximum(best, 0.0), best > 0.0)
+
+
+@functools.partial(jax.jit, static_argnums=(2, 3))
+def detect(params: Any, image: jax.Array, settings: Settings, dtype: Any = jnp.float32) -> Found:
+    """Stalks in one image.
+
+    Args:
+        params: Of the detector.
+        image: [H, W, 3] uint8, reduced, padded to multiples of the networks' padding.
+        settings: Beside the weights.
+        dtype: In which convolutions are computed.
+    """
+    network = settings.detector(dtype)
+    shape = (image.shape[0], image.shape[1])
+    anchors = jnp.asarray(anchors_of(shape, settings.band_lines, settings.anchor_widths))
+    features = network.apply(params, normalise(image)[None], method="features")
+    assert isinstance(features, jax.Array)
+    logits, codes = heads(network, params, features, "propose")
+    boxes, _, valid = best_proposals(logits[0], codes[0], anchors, settings, shape)
+    return judge(network, params, features[0], boxes, valid, settings)
+
+
+def initial(settings: Settings, key: jax.Array) -> Any:
+    """Parameters of a detector that has learned nothing."""
+    images = jnp.zeros((1, 2 * PADDING, 2 * PADDING, 3))
+    regions = jnp.zeros((1, *GRID, settings.channels[2]))
+    return settings.detector().init(key, images, regions)
+
+
+def pad(image: np.ndarray) -> np.ndarray:
+    """An image [h, w, 3] with lines and columns added below and on the right, in which there is nothing."""
+    lines, columns = padded_shape(image.shape[:2])
+    return np.pad(image, ((0, lines - image.shape[0]), (0, columns - image.shape[1]), (0, 0)))

@@ -1,0 +1,84 @@
+"""Snips: strips of an image that follow a stalk, so that it stands upright in the middle, at full resolution.
+
+Each line of a snip is a line of the image, moved by a whole number of pixels: nothing is interpolated, edges stay where they
+are, and a mask of the snip is put back exactly.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+def snip_shape(width: int, full: tuple[int, int], full_width: int) -> tuple[int, int]:
+    """Lines and columns of snips of an image ``width`` pixels wide: multiples of 8.
+
+    Args:
+        width: Of the image.
+        full: Of the snips of an image that is ``full_width`` wide.
+        full_width: Pixels.
+    """
+    lines, columns = (max(round(length * width / full_width / 8), 2) * 8 for length in full)
+    return lines, columns
+
+
+def places_of(stalks: jax.Array, shape: tuple[int, int]) -> tuple[jax.Array, jax.Array]:
+    """Which pixels of the image snips hold.
+
+    Args:
+        stalks: [N, 6], box and columns of the axis at its top and bottom, continuous coordinates of the image.
+        shape: Lines and columns of a snip.
+
+    Returns:
+        First line of each snip [N] int32, and the first column of each of its lines [N, lines] int32; also beyond the image.
+    """
+    middle = 0.5 * (stalks[:, 1] + stalks[:, 3])
+    top = jnp.round(middle - 0.5 * shape[0]).astype(jnp.int32)
+    tall = jnp.maximum(stalks[:, 3] - stalks[:, 1], 1.0)
+    line = top[:, None] + jnp.arange(shape[0]) + 0.5
+    share = (line - stalks[:, 1:2]) / tall[:, None]
+    axis = stalks[:, 4:5] + (stalks[:, 5:6] - stalks[:, 4:5]) * share
+    return top, jnp.round(axis - 0.5 * shape[1]).astype(jnp.int32)
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def cut(image: jax.Array, stalks: jax.Array, shape: tuple[int, int]) -> jax.Array:
+    """Snips [N, lines, columns, ...] of an image [H, W, ...]; 0 beyond the image.
+
+    Args:
+        image: Of any type.
+        stalks: [N, 6]; see `places_of`.
+        shape: Lines and columns of a snip.
+    """
+    top, left = places_of(stalks, shape)
+    lines = top[:, None] + jnp.arange(shape[0])
+    columns = left[..., None] + jnp.arange(shape[1])
+    inside = ((lines >= 0) & (lines < image.shape[0]))[..., None] & (columns >= 0) & (columns < image.shape[1])
+    taken = image[jnp.clip(lines, 0, image.shape[0] - 1)[..., None], jnp.clip(columns, 0, image.shape[1] - 1)]
+    return jnp.where(inside.reshape(*inside.shape, *(1,) * (image.ndim - 2)), taken, jnp.zeros((), image.dtype))
+
+
+def put_back(snip: np.ndarray, stalk: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, tuple[int, int]]:
+    """A snip's values where they are in the image.
+
+    Args:
+        snip: [lines, columns] float32.
+        stalk: [6] of its stalk.
+        size: Height and width of the image.
+
+    Returns:
+        [h, w] float32, 0 where the snip holds nothing, and line and column of its first pixel in the image.
+    """
+    top, left = (np.asarray(each)[0] for each in places_of(jnp.asarray(stalk, jnp.float32)[None], snip.shape))  # pyright: ignore[reportArgumentType]
+    columns = snip.shape[1]
+    used = np.flatnonzero((top + np.arange(snip.shape[0]) >= 0) & (top + np.arange(snip.shape[0]) < size[0]))
+    begin, end = max(int(left.min()), 0), min(int(left.max()) + columns, size[1])
+    if not used.size or end <= begin:
+        return np.zeros((0, 0), np.float32), (0, 0)
+    place = left[used, None] + np.arange(columns)
+    line = np.broadcast_to(np.arange(used.size)[:, None], place.shape)
+    inside = (place >= begin) & (place < end)
+    whole = np.zeros((used.size, end - begin), np.float32)
+    whole[line[inside], place[inside] - begin] = snip[used][inside]
+    return whole, (int(top + used[0]), begin)

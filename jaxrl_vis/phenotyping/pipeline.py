@@ -1,0 +1,231 @@
+"""Folders of pairs to tables: `run` reads, finds, measures, follows and writes, and goes on where it was stopped.
+
+    OUT/run.json                 what was asked for: a folder holds the results of one request
+        pairs/PLOT/PAIR.json     sightings, or why the pair was skipped; what is there is not computed again
+        overlays/PLOT/PAIR.png
+        stalks.csv  plots.csv  skipped.csv
+
+Tables are always made from the files under pairs/, so they do not depend on when the command was stopped. One pair is in memory
+at a time.
+"""
+
+import csv
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import jaxrl_vis
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.files import write_atomically
+from jaxrl_vis.phenotyping.detector.finder import Detection
+from jaxrl_vis.phenotyping.folders import PairFiles, PlotFolder, read_odometry
+from jaxrl_vis.phenotyping.images import read_image, write_image
+from jaxrl_vis.phenotyping.measure import Method
+from jaxrl_vis.phenotyping.overlay import draw_overlay
+from jaxrl_vis.phenotyping.pairing import wrong_with
+from jaxrl_vis.phenotyping.results import (
+    PLOT_COLUMNS,
+    STALK_COLUMNS,
+    Origin,
+    Row,
+    rows_of,
+    rows_without_path,
+    write_rows,
+)
+from jaxrl_vis.phenotyping.sightings import NO_CALIBRATION, Sighting, look
+from jaxrl_vis.phenotyping.track import Track, follow
+from jaxrl_vis_envs.plants import Calibration
+
+Find = Callable[[np.ndarray, PlotFolder, PairFiles], list[Detection]]
+"""Finds the stalks of a left image [H, W, 3] uint8."""
+NO_ODOMETRY = "no odometry"
+SKIPPED_COLUMNS = ("plot", "pair", "why")
+
+
+@dataclasses.dataclass(frozen=True)
+class Request:
+    """What is asked for.
+
+    Attributes:
+        out: Folder of the results.
+        method: How widths are taken.
+        finder: What finds stalks, in words; results of another one are not mixed with it.
+        calibrations: Of each plot by its name; None where there is none.
+        speed: Of the robot, m/s, where only times are known.
+    """
+
+    out: Path
+    method: Method
+    finder: str
+    calibrations: dict[str, Calibration | None]
+    speed: float | None = None
+
+
+class _Skip(Exception):
+    """A pair that cannot be used. The message says why."""
+
+
+def run(
+    plots: list[PlotFolder], find: Find, request: Request, done: Callable[[str, int, int], None] = lambda plot, pair, of: None
+) -> list[Row]:
+    """Writes the results of plots.
+
+    Args:
+        plots: What to look at.
+        find: What finds stalks.
+        request: What is asked for.
+        done: Called after each pair with the plot's name, how many of its pairs are done, and how many it has.
+
+    Returns:
+        A row for each pair that was skipped: plot, pair and why.
+
+    Raises:
+        RequestError: The folder holds other results, or a plot's odometry cannot be read.
+        OSError: A file cannot be written.
+    """
+    driven = {plot.name: read_odometry(plot, request.speed) for plot in plots}
+    _claim(plots, request)
+    stalks: list[Row] = []
+    rows: list[Row] = []
+    skipped: list[Row] = []
+    for plot in plots:
+        folder = request.out / "pairs" / plot.name
+        folder.mkdir(parents=True, exist_ok=True)
+        records = []
+        for number, pair in enumerate(plot.pairs):
+            path = folder / f"{pair.name}.json"
+            if not path.exists():
+                write_atomically(path, json.dumps(_record(plot, pair, find, request)) + "\n")
+            records.append(json.loads(path.read_text(encoding="utf-8")))
+            done(plot.name, number + 1, len(plot.pairs))
+        bad = [
+            {"plot": plot.name, "pair": pair.name, "why": each["skipped"]}
+            for pair, each in zip(plot.pairs, records)
+            if "skipped" in each
+        ]
+        of_stalks, of_plot = _finish(plot, records, driven[plot.name], request)
+        stalks, rows, skipped = stalks + of_stalks, [*rows, of_plot], skipped + bad
+        write_rows(request.out / "stalks.csv", STALK_COLUMNS, stalks)
+        write_rows(request.out / "plots.csv", PLOT_COLUMNS, rows)
+        write_rows(request.out / "skipped.csv", SKIPPED_COLUMNS, skipped)
+    return skipped
+
+
+def _claim(plots: list[PlotFolder], request: Request) -> None:
+    """Writes down what is asked for, or checks that it is the same as before."""
+    about = {
+        "version": jaxrl_vis.__version__,
+        "method": request.method,
+        "finder": request.finder,
+        "speed": request.speed,
+        "calibrations": {
+            name: None if each is None else dataclasses.asdict(each) for name, each in request.calibrations.items()
+        },
+        "plots": {plot.name: str(plot.folder.resolve()) for plot in plots},
+    }
+    text = json.dumps(about, indent=2) + "\n"
+    path = request.out / "run.json"
+    if path.exists() and path.read_text(encoding="utf-8") != text:
+        raise RequestError(f"{request.out} holds the results of another request: choose another folder, or remove it")
+    request.out.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, text)
+
+
+def _record(plot: PlotFolder, pair: PairFiles, find: Find, request: Request) -> dict[str, Any]:
+    """What is kept of one pair."""
+    try:
+        left, right = _read(pair, request.calibrations[plot.name])
+        detections = find(left, plot, pair)
+    except _Skip as problem:
+        return {"skipped": str(problem)}
+    calibration = request.calibrations[plot.name]
+    sightings = look(detections, left, right, calibration, request.method)
+    wrong = None if calibration is None else wrong_with(detections, sightings, left, right, calibration)
+    if wrong is not None:
+        return {"skipped": wrong}
+    return {"size": list(left.shape[:2]), "sightings": [dataclasses.asdict(each) for each in sightings]}
+
+
+def _read(pair: PairFiles, calibration: Calibration | None) -> tuple[np.ndarray, np.ndarray]:
+    """Both images [H, W, 3] uint8.
+
+    Raises:
+        _Skip: They are not a pair of images that can be used.
+    """
+    images = []
+    for side, path in (("left", pair.left), ("right", pair.right)):
+        if path is None:
+            raise _Skip(f"there is no {side} image")
+        try:
+            image = read_image(path)
+        except OSError as error:
+            raise _Skip(f"{path.name}: {error.strerror or 'it is not an image, or only a part of one'}") from error
+        image = (image >> 8).astype(np.uint8) if image.dtype == np.uint16 else image
+        images.append(np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image)
+    left, right = images
+    if left.shape != right.shape:
+        sizes = [f"{image.shape[1]} x {image.shape[0]}" for image in images]
+        raise _Skip(f"the left image has {sizes[0]} pixels and the right one {sizes[1]}")
+    if calibration is not None and left.shape[:2] != (calibration.height, calibration.width):
+        wanted = f"{calibration.width} x {calibration.height}"
+        raise _Skip(f"the images have {left.shape[1]} x {left.shape[0]} pixels, but the calibration is for {wanted}")
+    if min(int(left.max()), int(right.max())) < 8:
+        raise _Skip(f"the {'left' if left.max() < 8 else 'right'} image is black")
+    return left, right
+
+
+def _finish(
+    plot: PlotFolder, records: list[dict[str, Any]], driven: dict[str, float] | None, request: Request
+) -> tuple[list[Row], Row]:
+    """Follows the stalks of a plot, and draws its overlays."""
+    usable = [(pair, each) for pair, each in zip(plot.pairs, records) if "sightings" in each]
+    skipped = len(records) - len(usable)
+    frames = [[Sighting.read(values) for values in each["sightings"]] for _, each in usable]
+    origin = Origin(plot.name, request.method, jaxrl_vis.__version__)
+    calibration = request.calibrations[plot.name]
+    known = driven is not None and all(pair.name in driven for pair, _ in usable)
+    if calibration is None or driven is None or not known or len(usable) < 2:
+        why = _what_is_missing(len(usable), calibration)
+        labels: list[list[str | None]] = [[None] * len(frame) for frame in frames]
+        rows = rows_without_path(frames, skipped, origin, why)
+    else:
+        distances = np.array([driven[pair.name] for pair, _ in usable])
+        tracks, path = follow(frames, distances, calibration)
+        labels = labels_of(frames, tracks)
+        rows = rows_of(frames, tracks, path, skipped, origin)
+    folder = request.out / "overlays" / plot.name
+    folder.mkdir(parents=True, exist_ok=True)
+    for (pair, _), frame, names in zip(usable, frames, labels):
+        target = folder / f"{pair.name}.png"
+        if not target.exists():
+            left, _ = _read(pair, calibration)
+            write_image(target, draw_overlay(left, frame, names))
+    return rows
+
+
+def _what_is_missing(pairs: int, calibration: Calibration | None) -> str:
+    """Why the pairs of a plot cannot be put together."""
+    if pairs == 0:
+        return "no usable pairs"
+    if calibration is None:
+        return NO_CALIBRATION
+    return "a single pair" if pairs == 1 else NO_ODOMETRY
+
+
+def labels_of(frames: list[list[Sighting]], tracks: list[Track]) -> list[list[str | None]]:
+    """The number of the stalk that each sighting shows, as in the table; None for those of stalks that do not count."""
+    labels: list[list[str | None]] = [[None] * len(frame) for frame in frames]
+    for number, track in enumerate((each for each in tracks if each.counted), start=1):
+        for frame, place in track.sightings:
+            labels[frame][place] = str(number)
+    return labels
+
+
+def read_rows(path: Path) -> list[dict[str, str]]:
+    """A table that `run` wrote."""
+    with path.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))

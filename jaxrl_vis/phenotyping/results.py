@@ -1,0 +1,154 @@
+"""What is told of plots: one row per stalk, one row per plot, tidy, with units in the header."""
+
+import csv
+import dataclasses
+import io
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxrl_vis.files import write_atomically
+from jaxrl_vis.phenotyping.sightings import Sighting
+from jaxrl_vis.phenotyping.track import Path as Driven
+from jaxrl_vis.phenotyping.track import Track, robust_width
+
+STALK_COLUMNS = (
+    "plot",
+    "stalk",
+    "position_m",
+    "depth_m",
+    "width_mm",
+    "width_se_mm",
+    "height_in",
+    "lean_deg",
+    "frames",
+    "frames_measured",
+    "confidence",
+    "flag",
+    "method",
+    "version",
+)
+PLOT_COLUMNS = (
+    "plot",
+    "pairs",
+    "pairs_skipped",
+    "length_m",
+    "stalks",
+    "stalks_per_m",
+    "width_mean_mm",
+    "width_sd_mm",
+    "width_se_mm",
+    "stalks_measured",
+    "flag",
+    "method",
+    "version",
+)
+Row = dict[str, Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class Origin:
+    """What goes into every row: plot, method of the widths and version of the software."""
+
+    plot: str
+    method: str
+    version: str
+
+
+def rows_of(
+    frames: list[list[Sighting]], tracks: list[Track], path: Driven, skipped: int, origin: Origin
+) -> tuple[list[Row], Row]:
+    """Rows of the stalks of one plot, from its beginning to its end, and the plot's own row."""
+    stalks: list[Row] = []
+    for track in tracks:
+        if not track.counted:
+            continue
+        sightings = [frames[frame][place] for frame, place in track.sightings]
+        width = robust_width(sightings)
+        leans = [each.lean_deg for each in sightings if each.lean_deg is not None]
+        confidence = float(np.median([each.confidence for each in sightings]))
+        flag = "no width" if width is None else "few frames" if width[2] < 3 else "uncertain" if confidence < 0.3 else "ok"
+        stalks.append(
+            {
+                "plot": origin.plot,
+                "stalk": len(stalks) + 1,
+                "position_m": _text(track.position_m - path.places[0], 4),
+                "depth_m": _text(track.depth_m, 4),
+                "width_mm": "" if width is None else _text(width[0], 3),
+                "width_se_mm": "" if width is None else _text(width[1], 3),
+                "height_in": 12,
+                "lean_deg": _text(float(np.median(leans)), 1) if leans else "",
+                "frames": len(sightings),
+                "frames_measured": 0 if width is None else width[2],
+                "confidence": _text(confidence, 3),
+                "flag": flag,
+                "method": origin.method,
+                "version": origin.version,
+            }
+        )
+    return stalks, _plot_row(stalks, len(frames), path.length, skipped, origin)
+
+
+def _plot_row(stalks: list[Row], pairs: int, length: float, skipped: int, origin: Origin) -> Row:
+    widths = np.array([float(row["width_mm"]) for row in stalks if row["width_mm"] != ""])
+    flag = "no stalks" if not stalks else "pairs skipped" if skipped else "ok"
+    return {
+        "plot": origin.plot,
+        "pairs": pairs,
+        "pairs_skipped": skipped,
+        "length_m": _text(length, 4),
+        "stalks": len(stalks),
+        "stalks_per_m": _text(len(stalks) / length, 3) if length > 0 else "",
+        **_widths(widths),
+        "flag": flag,
+        "method": origin.method,
+        "version": origin.version,
+    }
+
+
+def rows_without_path(frames: list[list[Sighting]], skipped: int, origin: Origin, why: str) -> tuple[list[Row], Row]:
+    """The plot's row where pairs cannot be put together: widths of finds, but no count. There are no rows of stalks."""
+    measured = [each.diameter_mm for sightings in frames for each in sightings if each.diameter_mm is not None]
+    row = {
+        "plot": origin.plot,
+        "pairs": len(frames),
+        "pairs_skipped": skipped,
+        "length_m": "",
+        "stalks": "",
+        "stalks_per_m": "",
+        **_widths(np.array(measured)),
+        "flag": why,
+        "method": origin.method,
+        "version": origin.version,
+    }
+    # The same stalk is seen many times: a standard error would claim too much.
+    return [], {**row, "width_se_mm": "", "stalks_measured": ""}
+
+
+def _widths(widths: np.ndarray) -> Row:
+    spread = float(widths.std(ddof=1)) if widths.size > 1 else math.nan
+    return {
+        "width_mean_mm": _text(float(widths.mean()), 3) if widths.size else "",
+        "width_sd_mm": _text(spread, 3),
+        "width_se_mm": _text(spread / math.sqrt(widths.size), 3) if widths.size else "",
+        "stalks_measured": widths.size,
+    }
+
+
+def _text(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}" if math.isfinite(value) else ""
+
+
+def write_rows(path: Path, columns: tuple[str, ...], rows: list[Row]) -> None:
+    """Writes a table as CSV. Nobody sees half of it.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_atomically(path, text.getvalue())

@@ -1,0 +1,131 @@
+"""What one pair says of the stalks in it: a sighting for each find, measured where the pair allows it."""
+
+import dataclasses
+import math
+from typing import Any
+
+import cv2
+import numpy as np
+
+from jaxrl_vis.phenotyping.detector.finder import Detection
+from jaxrl_vis.phenotyping.measure import Measurement, Method, measure
+from jaxrl_vis.phenotyping.width import strip_width
+from jaxrl_vis_envs.plants import Calibration
+
+NO_CALIBRATION = "no calibration"
+
+
+@dataclasses.dataclass(frozen=True)
+class Sighting:
+    """One stalk in one pair. Lengths that are not known are None.
+
+    Attributes:
+        box: Left, top, right, bottom of its part in the band, pixels of the left image; (0, 0) is the middle of the first one.
+        axis: Columns of its middle at the box's top and bottom.
+        score: Of the detector, 0 to 1.
+        line, column: Where it was measured: line, and column of its middle, pixels.
+        width_px: Across its axis there, pixels.
+        lean_deg: Against the image's vertical, degrees, positive to the right.
+        diameter_mm: Across its axis.
+        deviation_mm: Its standard error.
+        depth_m: Planar depth of its front.
+        along_m: Where it stands along the row, from the middle between the cameras.
+        confidence: 0 to 1.
+        reason: Why it was not measured; empty where it was.
+    """
+
+    box: tuple[float, float, float, float]
+    axis: tuple[float, float]
+    score: float
+    line: float
+    column: float
+    width_px: float | None = None
+    lean_deg: float | None = None
+    diameter_mm: float | None = None
+    deviation_mm: float | None = None
+    depth_m: float | None = None
+    along_m: float | None = None
+    confidence: float = 0.0
+    reason: str = ""
+
+    @classmethod
+    def read(cls, values: dict[str, Any]) -> "Sighting":
+        """From what JSON kept of `dataclasses.asdict`."""
+        return cls(**{**values, "box": tuple(values["box"]), "axis": tuple(values["axis"])})
+
+
+def grey_of(image: np.ndarray) -> np.ndarray:
+    """An image [H, W, 3] uint8 as [H, W] float32."""
+    return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+
+
+def look(
+    detections: list[Detection], left: np.ndarray, right: np.ndarray, calibration: Calibration | None, method: Method = "strip"
+) -> list[Sighting]:
+    """Measures what was found in a pair.
+
+    Args:
+        detections: In the left image.
+        left, right: [H, W, 3] uint8, rectified.
+        calibration: Of the cameras; without it there are no millimetres and no metres.
+        method: How widths are taken.
+    """
+    if calibration is None:
+        return [_in_pixels(each) for each in detections]
+    grey_left, grey_right = grey_of(left), grey_of(right)
+    found = []
+    for each in detections:
+        line = 0.5 * (each.box[1] + each.box[3])
+        got = measure(each.mask, each.corner, grey_left, grey_right, calibration, line=line, method=method)
+        found.append(_sighting(each, got, calibration))
+    return found
+
+
+def _in_pixels(detection: Detection) -> Sighting:
+    strip = strip_width(detection.mask)
+    line = 0.5 * (detection.box[1] + detection.box[3])
+    column = 0.5 * sum(detection.axis)
+    if strip is None:
+        return Sighting(detection.box, detection.axis, detection.score, line, column, reason=NO_CALIBRATION)
+    width, lean = strip.width(line - detection.corner[0]), math.degrees(strip.lean)
+    return Sighting(
+        detection.box,
+        detection.axis,
+        detection.score,
+        line,
+        column,
+        round(width, 3),
+        round(lean, 2),
+        confidence=round(strip.confidence, 4),
+        reason=NO_CALIBRATION,
+    )
+
+
+def _sighting(detection: Detection, got: Measurement, calibration: Calibration) -> Sighting:
+    """Rounded, so that what JSON keeps is what was measured."""
+    line = 0.5 * (detection.box[1] + detection.box[3])
+    column = got.column if math.isfinite(got.column) else 0.5 * sum(detection.axis)
+
+    def known(value: float | None, digits: int) -> float | None:
+        return None if value is None or not math.isfinite(value) else round(value, digits)
+
+    along = None
+    if got.diameter_mm is not None:
+        # The middle stands behind the front by half a diameter.
+        depth = got.depth + 0.5e-3 * got.diameter_mm
+        along = (column - calibration.centre[0]) / calibration.focal * depth - 0.5 * calibration.baseline
+    return Sighting(
+        box=tuple(round(each, 2) for each in detection.box),  # pyright: ignore[reportArgumentType]
+        axis=tuple(round(each, 2) for each in detection.axis),  # pyright: ignore[reportArgumentType]
+        score=round(detection.score, 4),
+        line=round(line, 2),
+        column=round(column, 2),
+        width_px=known(got.width, 3),
+        lean_deg=known(math.degrees(got.lean), 2),
+        diameter_mm=known(got.diameter_mm, 4),
+        deviation_mm=known(got.deviation_mm, 4),
+        depth_m=known(got.depth, 5),
+        along_m=known(along, 5),
+        confidence=round(got.confidence, 4),
+        reason=got.reason,
+    )

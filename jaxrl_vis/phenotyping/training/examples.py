@@ -1,0 +1,214 @@
+"""What the networks learn from: reduced images with the stalks in them, and snips at full resolution with their masks."""
+
+import dataclasses
+import functools
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.phenotyping.annotations import decode_mask
+from jaxrl_vis.phenotyping.detector.detect import Settings
+from jaxrl_vis.phenotyping.detector.finder import reduce
+from jaxrl_vis.phenotyping.detector.losses import NOTHING, STALK, UNCLEAR
+from jaxrl_vis.phenotyping.detector.snips import cut, snip_shape
+from jaxrl_vis.phenotyping.images import read_image
+from jaxrl_vis_envs.plants import Calibration, Family, draw
+from jaxrl_vis_envs.plants.cameras import Pose
+from jaxrl_vis_envs.plants.field import Plot
+from jaxrl_vis_envs.plants.pairs import Sequence
+from jaxrl_vis_envs.plants.truth import BAND, outline, stalks_in_view
+
+LEAST_VISIBLE = 0.3
+"""Share of a stalk in the band that must be seen for it to count."""
+_BARELY = 0.02  # what is seen less is not there
+_MOST = 56
+_THIN = 4
+
+
+@dataclasses.dataclass(frozen=True)
+class Example:
+    """One image.
+
+    Attributes:
+        image: [h, w, 3] uint8, reduced.
+        stalks: [T, 6] float32, box and columns of the axis at its top and bottom, pixels of the reduced image; padded.
+        kinds: [T] int32: `losses.NOTHING`, ``UNCLEAR`` or ``STALK``.
+        snips: [S, H, W, 3] uint8, at full resolution; not padded.
+        masks: [S, H, W] bool.
+    """
+
+    image: np.ndarray
+    stalks: np.ndarray
+    kinds: np.ndarray
+    snips: np.ndarray
+    masks: np.ndarray
+
+
+def synthetic_examples(family: Family, settings: Settings, seeds: Iterator[int], frames: int = 4) -> Iterator[Example]:
+    """Examples of plots of a family.
+
+    Args:
+        family: What plots are drawn from.
+        settings: Of the networks.
+        seeds: One plot each.
+        frames: How many images of each plot, spread over it.
+    """
+    for seed in seeds:
+        sequence = Sequence.of(draw(family, seed))
+        rng = np.random.default_rng([seed, 17])
+        length = len(sequence)
+        chosen = sorted({min(int((part + rng.random()) * length / frames), length - 1) for part in range(frames)})
+        for frame in chosen:
+            image, instance, depth = sequence.left(frame)
+            # What shows, and how much of it, is as well counted in every fourth pixel.
+            true = sequence.drive.true
+            thinned = np.asarray(instance[::_THIN, ::_THIN]), np.asarray(depth[::_THIN, ::_THIN])
+            stalks, kinds, indices = truth_of(sequence.plot, sequence.drive.poses[frame], true, *thinned)
+            yield _example(image, stalks, kinds, functools.partial(_mask, instance, indices), settings, rng)
+
+
+def _mask(instance: jax.Array, indices: np.ndarray, part: int) -> jax.Array:
+    return instance == int(indices[part])
+
+
+def truth_of(
+    plot: Plot, pose: Pose, camera: Calibration, instance: np.ndarray, depth: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The stalks of the near row whose part in the band one image shows, in continuous coordinates of the image.
+
+    Args:
+        plot: What stands there.
+        pose: Of the left camera.
+        camera: As it is.
+        instance, depth: [h, w], of each first of `_THIN` pixels in both directions.
+
+    Returns:
+        [N, 6] float32 boxes that may reach beyond the image, and axes; [N] int32 kinds; [N] int32 indices of the stalks.
+    """
+    centre = (camera.centre[0] / _THIN, camera.centre[1] / _THIN)
+    small = Calibration(instance.shape[1], instance.shape[0], camera.focal / _THIN, centre, camera.baseline)
+    stalks, kinds, indices = [], [], []
+    for seen in stalks_in_view(plot, pose, small, instance, depth):
+        if seen.band_box is None or seen.band_visible < _BARELY:
+            continue
+        edges = outline(plot.stalks[seen.stalk], pose, camera, np.linspace(BAND[1], BAND[0], 21)) + 0.5  # from the top
+        middle = edges.mean(axis=1)
+        (left, top), (right, bottom) = edges.min(axis=(0, 1)), edges.max(axis=(0, 1))
+        axis = np.interp([top, bottom], middle[:, 1], middle[:, 0])
+        stalks.append([left, top, right, bottom, *axis])
+        kinds.append(STALK if seen.band_visible >= LEAST_VISIBLE else UNCLEAR)
+        indices.append(seen.stalk)
+    return np.array(stalks, np.float32).reshape(-1, 6), np.array(kinds, np.int32), np.array(indices, np.int32)
+
+
+def _example(image: Any, stalks: np.ndarray, kinds: np.ndarray, mask_of: Any, settings: Settings, rng: Any) -> Example:
+    """An example of a whole image [H, W, 3]; ``mask_of`` gives the mask [H, W] of each stalk."""
+    whole = np.asarray(image)
+    reduced, scale = reduce(whole, settings.width)
+    shape = snip_shape(whole.shape[1], (settings.snip_lines, settings.snip_columns), settings.full_width)
+    clear = np.flatnonzero(kinds == STALK)
+    # A find is not exactly where the stalk is.
+    moved = stalks[clear].copy()
+    wide = 0.015 * (stalks[clear, 3] - stalks[clear, 1])[:, None]
+    moved[:, 4:] += wide * rng.normal(size=(len(clear), 2))
+    moved[:, 1::2][:, :2] += 2.0 * wide * rng.normal(size=(len(clear), 1))
+    on_device, places = jnp.asarray(image), jnp.asarray(moved)
+    snips, masks = np.zeros((0, *shape, 3), np.uint8), np.zeros((0, *shape), bool)
+    if len(clear):
+        filled = -(-len(clear) // 16) * 16  # few shapes, few programs
+        places = jnp.pad(places, ((0, filled - len(clear)), (0, 0)), mode="edge")
+        snips = np.asarray(cut(on_device, places, shape))[: len(clear)]
+        masks = np.concatenate(
+            [np.asarray(cut(jnp.asarray(mask_of(part)), places[place : place + 1], shape)) for place, part in enumerate(clear)]
+        )
+    divisor = np.array([scale[1], scale[0], scale[1], scale[0], scale[1], scale[1]], np.float32)
+    count = min(len(stalks), _MOST)
+    padded, padded_kinds = np.zeros((_MOST, 6), np.float32), np.full(_MOST, NOTHING, np.int32)
+    padded[:count], padded_kinds[:count] = (stalks / divisor)[:count], kinds[:count]
+    return Example(np.asarray(reduced), padded, padded_kinds, snips, masks)
+
+
+def annotated_examples(folder: Path, settings: Settings) -> Iterator[Example]:
+    """Examples of a folder with ``annotations.json`` of COCO: boxes, and masks as polygons or uncompressed runs.
+
+    Raises:
+        RequestError: There are no annotations, or an image is missing.
+    """
+    data = read_coco(folder)
+    of_image: dict[int, list[dict[str, Any]]] = {}
+    for annotation in data["annotations"]:
+        of_image.setdefault(annotation["image_id"], []).append(annotation)
+    for number, about in enumerate(data["images"]):
+        try:
+            image = read_image(folder / about["file_name"])
+        except OSError as error:
+            raise RequestError(f"{folder / 'annotations.json'} names an image that cannot be read: {error}") from error
+        if image.ndim == 2:
+            image = np.repeat(image[..., None], 3, axis=2)
+        if image.dtype == np.uint16:
+            image = (image >> 8).astype(np.uint8)
+        found = [_of_annotation(each, image.shape[:2]) for each in of_image.get(about["id"], [])]
+        stalks = np.array([stalk for stalk, _ in found], np.float32).reshape(-1, 6)
+        masks = [mask for _, mask in found]
+        kinds = np.full(len(found), STALK, np.int32)
+        yield _example(image, stalks, kinds, masks.__getitem__, settings, np.random.default_rng([number, 18]))
+
+
+def read_coco(folder: Path) -> dict[str, Any]:
+    """The annotations of a folder.
+
+    Raises:
+        RequestError: There are none, or they are not COCO's.
+    """
+    path = folder / "annotations.json"
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        if not data["images"] or not data["annotations"]:
+            raise RequestError(f"{path} annotates nothing: name a folder with annotated images")
+    except RequestError:
+        raise
+    except OSError as error:
+        raise RequestError(f"there are no annotations {path}: name a folder with annotations.json of COCO") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise RequestError(f"{path} is not COCO: it needs images and annotations") from error
+    return data
+
+
+def settings_for(folder: Path, settings: Settings) -> Settings:
+    """Settings whose anchors are as large as the boxes of a folder's annotations."""
+    data = read_coco(folder)
+    widths = {each["id"]: each["width"] for each in data["images"]}
+    sizes = np.array(
+        [
+            np.array(each["bbox"][2:], float) * min(settings.width / widths[each["image_id"]], 1.0)
+            for each in data["annotations"]
+        ]
+    )
+    across = tuple(round(float(each), 1) for each in np.quantile(sizes[:, 0], (0.2, 0.6, 0.95)))
+    return dataclasses.replace(settings, band_lines=round(float(np.median(sizes[:, 1])), 1), anchor_widths=across)
+
+
+def _of_annotation(annotation: dict[str, Any], size: tuple[int, int]) -> tuple[list[float], np.ndarray]:
+    """Box and axis of one annotation, and its mask [H, W] bool; all of the box where there is no mask."""
+    left, top, wide, tall = map(float, annotation["bbox"])
+    segmentation = annotation.get("segmentation")
+    mask = np.zeros(size, np.uint8)
+    if isinstance(segmentation, dict) and isinstance(segmentation.get("counts"), list):
+        mask = decode_mask(segmentation).astype(np.uint8)
+    elif isinstance(segmentation, list) and segmentation:
+        cv2.fillPoly(mask, [np.round(np.reshape(each, (-1, 2)) - 0.5).astype(np.int32) for each in segmentation], (1,))
+    else:
+        mask[round(top) : round(top + tall), round(left) : round(left + wide)] = 1
+    line, column = np.nonzero(mask)
+    axis = [left + wide / 2] * 2
+    if line.size > 50 and np.ptp(line) > 8:
+        slope, offset = np.polyfit(line + 0.5, column + 0.5, 1)
+        axis = [float(np.clip(offset + slope * each, left, left + wide)) for each in (top, top + tall)]
+    return [left, top, left + wide, top + tall, *axis], mask.astype(bool)

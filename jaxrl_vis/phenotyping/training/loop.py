@@ -1,0 +1,227 @@
+"""The optimisation of both networks, for a number of steps or of minutes, whichever ends first.
+
+Examples are made by threads while the networks already learn from those that are there, so that an accelerator does not wait.
+"""
+
+import dataclasses
+import functools
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from jaxrl_vis.errors import NonFiniteError
+from jaxrl_vis.phenotyping.detector.detect import Settings, initial, padded_shape
+from jaxrl_vis.phenotyping.detector.losses import detector_loss, segmenter_loss
+from jaxrl_vis.phenotyping.detector.networks import Segmenter
+from jaxrl_vis.phenotyping.training.augment import move, relight, vary_snips
+from jaxrl_vis.phenotyping.training.examples import Example
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """How long and how fast the networks learn.
+
+    Attributes:
+        steps: Most updates.
+        minutes: Most minutes of updates, compilation included; None for no limit.
+        images: How many images are kept to learn from.
+        first: With how many the updates begin.
+        batch: Images per update.
+        snips: Snips per update.
+        rate: Highest learning rate.
+        average: Of the weights over updates: the share of the old ones.
+        threads: How many make examples.
+        seed: Of everything random.
+    """
+
+    steps: int = 20_000
+    minutes: float | None = None
+    images: int = 800
+    first: int = 24
+    batch: int = 8
+    snips: int = 32
+    rate: float = 1e-3
+    average: float = 0.998
+    threads: int = 4
+    seed: int = 0
+
+
+Report = Callable[[int, float, int, dict[str, float], Any], None]
+"""Called now and then with the step, progress from 0 to 1, how many images there are, losses, and the weights so far."""
+
+
+class _Pool:
+    """Examples, made by threads in the background and drawn from at random."""
+
+    def __init__(self, sources: list[Iterator[Example]], plan: Plan) -> None:
+        self._queue: queue.Queue[Example | Exception | None] = queue.Queue(maxsize=16)
+        self._stop = threading.Event()
+        self._plan, self._running = plan, len(sources)
+        self.examples: list[Example] = []
+        self.snips: list[tuple[int, int]] = []
+        # The others follow when the first one has made something, and with it compiled what makes it.
+        self._waiting = sources[1:]
+        self._start(sources[0])
+
+    def _start(self, source: Iterator[Example]) -> None:
+        threading.Thread(target=self._make, args=(source,), daemon=True).start()
+
+    def _make(self, source: Iterator[Example]) -> None:
+        try:
+            for example in source:
+                while not self._stop.is_set():
+                    try:
+                        self._queue.put(example, timeout=0.2)
+                        break
+                    except queue.Full:
+                        continue
+                if self._stop.is_set():
+                    return
+            self._queue.put(None)
+        except Exception as error:  # told where the examples are wanted
+            self._queue.put(error)
+
+    def fill(self, least: int) -> None:
+        """Takes what is ready, and waits until there are so many, or no more come."""
+        while self._running and len(self.examples) < self._plan.images:
+            try:
+                example = self._queue.get(block=len(self.examples) < least)
+            except queue.Empty:
+                return
+            if isinstance(example, Exception):
+                raise example
+            while self._waiting:
+                self._start(self._waiting.pop())
+            if example is None:
+                self._running -= 1
+                continue
+            self.snips += [(len(self.examples), place) for place in range(len(example.snips))]
+            self.examples.append(example)
+        if len(self.examples) >= self._plan.images:
+            self.stop()
+
+    def stop(self) -> None:
+        """Ends the threads."""
+        self._stop.set()
+
+    def images(self, rng: np.random.Generator, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """A batch of images, padded to ``shape``, with their stalks and kinds."""
+        chosen = [self.examples[place] for place in rng.integers(len(self.examples), size=self._plan.batch)]
+        images = np.zeros((len(chosen), *shape, 3), np.uint8)
+        for image, example in zip(images, chosen):
+            image[: example.image.shape[0], : example.image.shape[1]] = example.image
+        return images, np.stack([each.stalks for each in chosen]), np.stack([each.kinds for each in chosen])
+
+    def strips(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray] | None:
+        """A batch of snips with their masks; None where there are no snips yet."""
+        if not self.snips:
+            return None
+        chosen = [self.snips[place] for place in rng.integers(len(self.snips), size=self._plan.snips)]
+        # All of one size: in a folder of images of several, those that are as large as the first one.
+        shape = self.examples[chosen[0][0]].snips.shape[1:3]
+        chosen = [each if self.examples[each[0]].snips.shape[1:3] == shape else chosen[0] for each in chosen]
+        return (
+            np.stack([self.examples[image].snips[place] for image, place in chosen]),
+            np.stack([self.examples[image].masks[place] for image, place in chosen]),
+        )
+
+
+@functools.partial(jax.jit, static_argnames=("settings", "shape", "dtype"), donate_argnums=0)
+def _update(
+    state: Any, batch: Any, key: jax.Array, rates: tuple[jax.Array, jax.Array], settings: Settings, shape: Any, dtype: Any
+):
+    """One update of both networks: parameters, their average, and the optimiser's state."""
+    params, average, moments = state
+    rate, share = rates
+    (images, stalks, kinds), (snips, masks) = batch
+    places, light, near, strips = jax.random.split(key, 4)
+    images, stalks, kinds = move(images, stalks, kinds, shape, places)
+    images = relight(images, light)
+    snips, masks = vary_snips(snips, masks, strips)
+
+    def loss(params):
+        total, parts = detector_loss(params["detector"], images, stalks, kinds, settings, dtype, near)
+        of_masks = segmenter_loss(params["segmenter"], snips, masks, settings, dtype)
+        return total + of_masks, {**parts, "masks": of_masks}
+
+    gradients, parts = jax.grad(loss, has_aux=True)(params)
+    updates, moments = _optimiser().update(gradients, moments, params)
+    params = jax.tree.map(lambda old, change: old + rate * change, params, updates)
+    average = jax.tree.map(lambda old, new: share * old + (1.0 - share) * new, average, params)
+    return (params, average, moments), parts
+
+
+def _optimiser() -> optax.GradientTransformation:
+    # The rate is applied outside, as it follows the clock.
+    return optax.chain(optax.clip_by_global_norm(5.0), optax.adamw(1.0, weight_decay=1e-4))
+
+
+def train(
+    sources: list[Iterator[Example]], settings: Settings, plan: Plan, report: Report, every: float = 30.0
+) -> tuple[Any, int]:
+    """Trains the networks.
+
+    Args:
+        sources: Where examples come from; each is read by a thread of its own.
+        settings: Of the networks.
+        plan: How long and how fast.
+        report: See `Report`.
+        every: How often, s.
+
+    Returns:
+        Parameters with ``detector`` and ``segmenter``, and the number of updates.
+
+    Raises:
+        NonFiniteError: A loss is not finite any more.
+    """
+    started = told = time.monotonic()
+    rng = np.random.default_rng(plan.seed)
+    root = jax.random.key(plan.seed)
+    dtype = jnp.bfloat16 if jax.default_backend() in ("gpu", "tpu") else jnp.float32
+    pool = _Pool(sources, plan)
+    detector_key, segmenter_key, steps_key = jax.random.split(root, 3)
+    blank = jnp.zeros((1, 32, 32, 3))
+    params = {
+        "detector": initial(settings, detector_key),
+        "segmenter": Segmenter(settings.segmenter).init(segmenter_key, blank),
+    }
+    state = params, jax.tree.map(jnp.array, params), _optimiser().init(params)
+    losses: dict[str, float] = {}
+    try:
+        pool.fill(plan.first)
+        shape = pool.examples[0].image.shape[:2]
+        whole = padded_shape(tuple(np.max([each.image.shape[:2] for each in pool.examples], axis=0)))
+        step = 0
+        while step < plan.steps:
+            pool.fill(0)
+            elapsed = (time.monotonic() - started) / 60.0
+            progress = max(step / plan.steps, elapsed / plan.minutes if plan.minutes else 0.0)
+            if progress >= 1.0:
+                break
+            strips = pool.strips(rng)
+            if strips is None:
+                pool.fill(len(pool.examples) + 1)
+                continue
+            rate = plan.rate * min((step + 1) / 200.0, 1.0) * 0.5 * (1.0 + np.cos(np.pi * progress))
+            batch = (pool.images(rng, whole), strips)
+            key = jax.random.fold_in(steps_key, step)
+            # At first the average forgets quickly, so that it holds nothing of the random start.
+            rates = jnp.float32(rate), jnp.float32(min(plan.average, (1.0 + step) / (10.0 + step)))
+            state, parts = _update(state, batch, key, rates, settings, shape, dtype)
+            step += 1
+            if step % 8 == 0 and time.monotonic() - told > every:
+                told = time.monotonic()
+                losses = {name: float(part) for name, part in parts.items()}
+                if not np.isfinite(list(losses.values())).all():
+                    raise NonFiniteError(f"a loss is not finite at step {step}: try a lower --rate")
+                report(step, progress, len(pool.examples), losses, state[1])
+    finally:
+        pool.stop()
+    return state[1], step

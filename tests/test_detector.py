@@ -1,0 +1,263 @@
+"""The networks that find and outline stalks: operators against torchvision's, codes, snips, training and files of weights."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxrl_vis.errors import NonFiniteError, RequestError
+from jaxrl_vis.phenotyping.detector.anchors import anchors_of, decode, encode
+from jaxrl_vis.phenotyping.detector.boxes import band_overlap, nms, overlap, roi_align, suppress
+from jaxrl_vis.phenotyping.detector.detect import Settings, best_proposals
+from jaxrl_vis.phenotyping.detector.finder import Finder
+from jaxrl_vis.phenotyping.detector.losses import NOTHING, STALK, UNCLEAR, assign
+from jaxrl_vis.phenotyping.detector.snips import cut, put_back, snip_shape
+from jaxrl_vis.phenotyping.detector.weights import read_weights, write_weights
+from jaxrl_vis.phenotyping.training.augment import move
+from jaxrl_vis.phenotyping.training.examples import Example, annotated_examples, settings_for
+from jaxrl_vis.phenotyping.training.loop import Plan, train
+
+RECORDED = np.load(Path(__file__).parent / "data" / "torchvision_boxes.npz")
+TINY = Settings(
+    width=64,
+    full_width=64,
+    snip_lines=32,
+    snip_columns=16,
+    band_lines=30.0,
+    anchor_widths=(6.0, 12.0),
+    channels=(8, 8, 8, 8),
+    hidden=8,
+    segmenter=(8, 8),
+    proposals=12,
+    most=8,
+)
+
+
+# --- operators ---
+
+
+@pytest.mark.parametrize("threshold", [0.3, 0.5, 0.7])
+def test_suppression_is_torchvisions(threshold):
+    kept = nms(jnp.asarray(RECORDED["boxes"]), jnp.asarray(RECORDED["scores"]), threshold)
+    np.testing.assert_array_equal(np.asarray(kept), RECORDED[f"kept_{threshold}"])
+
+
+@pytest.mark.parametrize("aligned", [False, True])
+def test_roi_align_is_torchvisions(aligned):
+    pooled = roi_align(jnp.asarray(RECORDED["features"]), jnp.asarray(RECORDED["regions"]), (5, 4), 1 / 8, 2, aligned)
+    np.testing.assert_allclose(np.asarray(pooled), RECORDED[f"pooled_{int(aligned)}"], atol=2e-5)
+
+
+def test_what_is_not_there_suppresses_nothing():
+    boxes = jnp.array([[0.0, 0, 10, 10], [1, 0, 11, 10], [40, 0, 50, 10]])
+    scores = jnp.array([0.9, 0.8, 0.7])
+    assert nms(boxes, scores, 0.5).tolist() == [True, False, True]
+    assert nms(boxes, scores, 0.5, jnp.array([False, True, True])).tolist() == [False, True, True]
+
+
+def test_parallel_stalks_that_lean_are_two():
+    """Their boxes overlap by more than half, the strips that they are do not at all; the same stalk twice does."""
+    first = [0.0, 0.0, 40.0, 135.0, 35.0, 5.0]
+    beside = [12.0, 2.0, 52.0, 137.0, 47.0, 17.0]
+    again = [1.0, 3.0, 41.0, 138.0, 36.0, 6.0]
+    stalks = jnp.array([first, beside, again])
+    overlaps = np.asarray(band_overlap(stalks[:, :4], stalks[:, 4:]))
+    assert np.asarray(overlap(stalks[:, :4], stalks[:, :4]))[0, 1] > 0.5
+    assert overlaps[0, 1] < 0.01 and overlaps[0, 2] > 0.6
+    assert suppress(jnp.asarray(overlaps), jnp.array([0.9, 0.8, 0.7]), 0.4).tolist() == [True, True, False]
+
+
+def test_codes_are_inverted():
+    rng = np.random.default_rng(0)
+    corner = rng.uniform(0, 100, (50, 2))
+    boxes = np.concatenate([corner, corner + rng.uniform(5, 50, (50, 2))], axis=1)
+    stalks = np.concatenate([boxes + rng.uniform(-2, 2, (50, 4)), rng.uniform(0, 100, (50, 2))], axis=1)
+    back = decode(encode(jnp.asarray(stalks), jnp.asarray(boxes)), jnp.asarray(boxes))
+    np.testing.assert_allclose(np.asarray(back), stalks, atol=1e-3)
+
+
+def test_proposals_are_the_best_anchors_and_no_copies():
+    shape = (64, 64)
+    anchors = jnp.asarray(anchors_of(shape, 30.0, (6.0, 12.0)))
+    logits = jnp.full(len(anchors), -5.0).at[jnp.array([40, 42, 90])].set(jnp.array([3.0, 2.0, 4.0]))
+    boxes, scores, valid = best_proposals(logits, jnp.zeros((len(anchors), 6)), anchors, TINY, shape)
+    assert boxes.shape == (12, 4) and valid.shape == (12,)
+    assert scores[0] == 4.0
+    kept = np.asarray(boxes)[np.asarray(valid)]
+    assert kept.min() >= 0 and kept.max() <= 64
+    between = np.array(overlap(jnp.asarray(kept), jnp.asarray(kept)))
+    np.fill_diagonal(between, 0)
+    assert between.max() <= TINY.proposal_threshold
+
+
+def test_boxes_on_unclear_stalks_are_neither_right_nor_wrong():
+    truth = jnp.array([[10.0, 0, 20, 60, 15, 15], [40, 0, 50, 60, 45, 45], [70, 0, 80, 60, 75, 75]])
+    kinds = jnp.array([STALK, UNCLEAR, NOTHING])
+    which, shows, none = assign(truth[:, :4], truth, kinds, 0.5, 0.3)
+    assert which[0] == 0 and shows.tolist() == [True, False, False] and none.tolist() == [False, False, True]
+
+
+# --- snips ---
+
+
+def test_a_snip_is_put_back_where_it_was():
+    rng = np.random.default_rng(1)
+    image = rng.uniform(0.1, 1, (60, 50)).astype(np.float32)
+    stalk = np.array([18.0, 5, 40, 55, 36, 20], np.float32)
+    snip = np.asarray(cut(jnp.asarray(image), jnp.asarray(stalk)[None], (48, 16)))[0]
+    back, (line, column) = put_back(snip, stalk, image.shape)
+    there = image[line : line + back.shape[0], column : column + back.shape[1]]
+    assert (back > 0).sum() == 48 * 16
+    np.testing.assert_array_equal(back[back > 0], there[back > 0])
+    # The stalk stands upright in the middle: its axis is the snip's middle column.
+    middle = 36 + (20 - 36) * (line + 0.5 - 5) / 50
+    assert np.flatnonzero(back[0])[[0, -1]].mean() + column + 0.5 == pytest.approx(middle, abs=0.6)
+
+
+def test_snips_at_the_images_edge_are_black_beyond_it():
+    image = np.ones((40, 30), np.float32)
+    stalk = np.array([-4.0, 10, 6, 40, 1, 1], np.float32)
+    snip = np.asarray(cut(jnp.asarray(image), jnp.asarray(stalk)[None], (32, 16)))[0]
+    assert snip[:, :7].max() == 0 and snip[:31, 7:].min() == 1
+    back, corner = put_back(snip, stalk, image.shape)
+    assert corner == (9, 0) and back.min() == 1
+    nowhere, _ = put_back(snip, stalk + 100, image.shape)
+    assert nowhere.size == 0
+
+
+def test_smaller_images_have_smaller_snips():
+    assert snip_shape(3376, (640, 128), 3376) == (640, 128)
+    assert snip_shape(1688, (640, 128), 3376) == (320, 64)
+
+
+# --- learning ---
+
+
+def drawing(seed: int) -> Example:
+    """A bright stalk on a dark image."""
+    rng = np.random.default_rng(seed)
+    image = rng.integers(0, 40, (60, 64, 3)).astype(np.uint8)
+    top, bottom = rng.uniform(20, 44, 2)
+    mask = np.zeros((60, 64), bool)
+    for line in range(60):
+        middle = top + (bottom - top) * (line - 15) / 30
+        begin, end = np.clip([round(middle - 3), round(middle + 3)], 0, 64)
+        image[line, begin:end] = 200
+        mask[line, begin:end] = True
+    stalk = np.array([min(top, bottom) - 3, 15, max(top, bottom) + 3, 45, top, bottom], np.float32)
+    stalks, kinds = np.zeros((4, 6), np.float32), np.zeros(4, np.int32)
+    stalks[0], kinds[0] = stalk, STALK
+    snips = np.asarray(cut(jnp.asarray(image), jnp.asarray(stalk)[None], (32, 16)))
+    masks = np.asarray(cut(jnp.asarray(mask), jnp.asarray(stalk)[None], (32, 16)))
+    return Example(image, stalks, kinds, snips, masks)
+
+
+def test_stalks_move_with_their_images():
+    """Where the image is bright after it was moved, there the stalk is."""
+    examples = [drawing(seed) for seed in range(8)]
+    images = np.zeros((8, 64, 64, 3), np.uint8)
+    images[:, :60] = [each.image for each in examples]
+    stalks, kinds = (np.stack([getattr(each, name) for each in examples]) for name in ("stalks", "kinds"))
+    moved, places, kinds = move(*map(jnp.asarray, (images, stalks, kinds)), (60, 64), jax.random.key(0))
+    assert moved.dtype == jnp.uint8
+    compared = 0
+    for image, stalk, kind in zip(np.asarray(moved), np.asarray(places)[:, 0], np.asarray(kinds)[:, 0]):
+        for line in range(int(np.ceil(stalk[1])), int(stalk[3]), 5):
+            bright = np.flatnonzero(image[line, :, 0] > 120)
+            if kind == STALK and bright.size and bright[0] > 0 and bright[-1] < 63:
+                middle = stalk[4] + (stalk[5] - stalk[4]) * (line + 0.5 - stalk[1]) / (stalk[3] - stalk[1])
+                assert bright.mean() + 0.5 == pytest.approx(middle, abs=1.2)
+                assert stalk[0] - 1.2 <= bright[0] and bright[-1] + 1 <= stalk[2] + 1.2
+                compared += 1
+    assert compared > 20
+
+
+@pytest.fixture(scope="module")
+def trained():
+    said = []
+    sources = [iter([drawing(seed) for seed in range(24)])]
+    plan = Plan(steps=160, images=24, first=24, batch=4, snips=4, rate=4e-3, average=0.9)
+    params, steps = train(sources, TINY, plan, lambda step, *rest: said.append((step, rest[2])), every=0.0)
+    return params, steps, said
+
+
+def test_networks_learn_to_find_and_outline(trained, tmp_path):
+    """One bright stalk in each image: what is found first lies on it, and the mask is nearly its mask. Also from a file."""
+    params, steps, said = trained
+    assert steps == 160 and said[0][0] == 8
+    assert np.mean([sum(losses.values()) for _, losses in said[-4:]]) < 0.6 * sum(said[0][1].values())
+    path = tmp_path / "weights.npz"
+    write_weights(path, params, TINY, {"origin": "drawings"})
+    restored, settings, about = read_weights(path)
+    assert settings == TINY and about == {"origin": "drawings"}
+    finder = Finder(restored, settings, 0.0)
+    overlaps, agreement = [], []
+    for seed in range(100, 106):
+        example = drawing(seed)
+        found = finder(example.image)
+        assert found == sorted(found, key=lambda each: sum(each.axis))
+        best = max(found, key=lambda each: each.score)
+        box = np.array(best.box)[None] + 0.5
+        overlaps.append(float(overlap(jnp.asarray(box), jnp.asarray(example.stalks[:1, :4]))[0, 0]))
+        (line, column), (tall, wide) = best.corner, best.mask.shape
+        bright = example.image[line : line + tall, column : column + wide, 0] > 120
+        agreement.append(((best.mask > 0.5) & bright).sum() / ((best.mask > 0.5) | bright).sum())
+    assert np.median(overlaps) > 0.5
+    assert np.median(agreement) > 0.5
+
+
+def test_a_loss_that_is_not_finite_stops_the_training():
+    plan = Plan(steps=40, images=2, first=2, batch=4, snips=4, rate=float("nan"))
+    with pytest.raises(NonFiniteError, match="not finite at step"):
+        train([iter([drawing(0), drawing(1)])], TINY, plan, lambda *rest: None, every=0.0)
+
+
+def test_what_fails_to_make_examples_is_told():
+    def broken():
+        yield drawing(0)
+        raise RequestError("no such image")
+
+    with pytest.raises(RequestError, match="no such image"):
+        train([broken()], TINY, Plan(first=2, images=2), lambda *rest: None)
+
+
+@pytest.mark.parametrize("text", [b"", b"no weights", b"PK\x03\x04 half of it"])
+def test_files_that_hold_no_weights(tmp_path, text):
+    path = tmp_path / "weights.npz"
+    path.write_bytes(text)
+    with pytest.raises(RequestError, match="holds no weights"):
+        read_weights(path)
+    with pytest.raises(RequestError, match="cannot read the weights"):
+        read_weights(tmp_path / "missing.npz")
+
+
+def test_annotations_of_ones_own(tmp_path):
+    """Boxes without masks, polygons: all give stalks; anchors are as large as the boxes."""
+    import json
+
+    import cv2
+
+    cv2.imwrite(str(tmp_path / "row.png"), np.full((60, 64, 3), 90, np.uint8))
+    leaning = [[10.0, 50, 16, 50, 26, 10, 20, 10]]
+    data = {
+        "images": [{"id": 1, "file_name": "row.png", "width": 64, "height": 60}],
+        "annotations": [
+            {"image_id": 1, "bbox": [10, 10, 16, 40], "segmentation": leaning},
+            {"image_id": 1, "bbox": [40, 10, 8, 40]},
+        ],
+    }
+    (tmp_path / "annotations.json").write_text(json.dumps(data))
+    settings = settings_for(tmp_path, TINY)
+    assert settings.band_lines == 40.0 and 8.0 <= settings.anchor_widths[0] < settings.anchor_widths[-1] <= 16.0
+    (example,) = annotated_examples(tmp_path, settings)
+    assert (example.kinds == STALK).sum() == 2 and example.snips.shape == (2, 32, 16, 3)
+    np.testing.assert_allclose(example.stalks[0], [10, 10, 26, 50, 23, 13], atol=1.5)
+    np.testing.assert_allclose(example.stalks[1], [40, 10, 48, 50, 44, 44], atol=0.01)
+    (tmp_path / "row.png").unlink()
+    with pytest.raises(RequestError, match="cannot be read"):
+        next(annotated_examples(tmp_path, settings))
+    (tmp_path / "annotations.json").write_text("{}")
+    with pytest.raises(RequestError, match="is not COCO"):
+        settings_for(tmp_path, TINY)

@@ -1,0 +1,394 @@
+"""From folders of pairs to tables: which images belong together, which sightings are one stalk, what becomes of bad files."""
+
+import csv
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jaxrl_vis import cli
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.phenotyping.detector.finder import Detection
+from jaxrl_vis.phenotyping.evaluate import PlotScore, average_precision, match, summary
+from jaxrl_vis.phenotyping.folders import find_plots, read_odometry
+from jaxrl_vis.phenotyping.images import read_image, write_image
+from jaxrl_vis.phenotyping.pairing import wrong_with
+from jaxrl_vis.phenotyping.sightings import Sighting, look
+from jaxrl_vis.phenotyping.track import follow, robust_width
+from jaxrl_vis_envs.plants import Calibration
+from jaxrl_vis_envs.plants.truth import StalkInView
+
+BLANK = np.full((12, 16, 3), 80, np.uint8)
+CAMERAS = Calibration(1500, 1200, 1000.0, (0.0, 600.0), 0.1)
+
+
+# --- folders ---
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("left_2.png", "right_2.png", "left_10.png", "right_10.png"),
+        ("row-2-L.JPG", "row-2-R.JPG", "row-10-L.JPG", "row-10-R.JPG"),
+        ("left/2.tif", "right/2.tif", "left/10.tif", "right/10.tif"),
+    ],
+)
+def test_pairs_are_found_by_their_names(tmp_path, names):
+    for name in names:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    (tmp_path / "left_notes.txt").touch()
+    (plot,) = find_plots(tmp_path)
+    assert [pair.name[-2:].strip("-_") for pair in plot.pairs] == ["2", "10"]
+    assert [(pair.left.name, pair.right.name) for pair in plot.pairs] == [  # pyright: ignore[reportOptionalMemberAccess]
+        (Path(names[0]).name, Path(names[1]).name),
+        (Path(names[2]).name, Path(names[3]).name),
+    ]
+
+
+def test_folders_of_folders_and_folders_of_nothing(tmp_path):
+    for plot in ("b", "a"):
+        (tmp_path / plot).mkdir()
+        (tmp_path / plot / "left_0.png").touch()
+    (tmp_path / "notes").mkdir()
+    plots = find_plots(tmp_path)
+    assert [plot.name for plot in plots] == ["a", "b"] and plots[0].pairs[0].right is None
+    with pytest.raises(RequestError, match="holds no stereo pairs"):
+        find_plots(tmp_path / "notes")
+    with pytest.raises(RequestError, match="there is no folder"):
+        find_plots(tmp_path / "missing")
+
+
+def test_odometry_by_distance_time_and_name(tmp_path):
+    for side in ("left", "right"):
+        for number in range(2):
+            (tmp_path / f"{side}_{number}.png").touch()
+    (plot,) = find_plots(tmp_path)
+    assert read_odometry(plot) is None
+    table = tmp_path / "odometry.csv"
+    table.write_text("left,distance_m\nleft_1.png,0.5\nleft_0.png,0.25\n")
+    assert read_odometry(plot) == {"0": 0.25, "1": 0.5}
+    table.write_text("time_s\n1\n3\n")
+    assert read_odometry(plot) is None
+    assert read_odometry(plot, speed=0.05) == {"0": 0.05, "1": pytest.approx(0.15)}
+    for text, part in (
+        ("distance_m\n1\nnan\n", "no number"),
+        ("distance_m\nx\n", "no number"),
+        ("metres\n1\n", "needs a column"),
+    ):
+        table.write_text(text)
+        with pytest.raises(RequestError, match=part):
+            read_odometry(plot)
+
+
+# --- following ---
+
+
+def sighting(along: float, depth: float = 0.8, **parts) -> Sighting:
+    values = dict(diameter_mm=14.0, deviation_mm=0.1, depth_m=depth, along_m=along, confidence=0.8)
+    column = 1000.0 * (along + 0.05) / depth
+    return Sighting((column - 20, 0, column + 20, 500), (column, column), 0.9, 250.0, column, **{**values, **parts})  # pyright: ignore[reportArgumentType]
+
+
+def drive(stalks: list[tuple[float, float]], steps: int = 20, scale: float = 1.0, seed: int = 0):
+    """Sightings of stalks (place along the row, depth), m, of a robot whose odometry is wrong by a factor."""
+    rng = np.random.default_rng(seed)
+    places = 0.05 + 0.1 * np.arange(steps)
+    frames = []
+    for place in places:
+        seen = [each for each in stalks if abs(each[0] - place) < 0.6]
+        frames.append([sighting(x - place + rng.normal(0, 0.001), depth + rng.normal(0, 0.003)) for x, depth in seen])
+    return frames, (places - places[0]) * scale
+
+
+STALKS = [(0.02, 0.8), (0.045, 0.82), (0.3, 0.79), (0.33, 0.8), (0.7, 0.81), (1.1, 0.8), (1.4, 0.78), (1.96, 0.8)]
+
+
+@pytest.mark.parametrize("scale", [1.0, 1.03, 0.97])
+def test_stalks_are_counted_once_although_odometry_is_wrong(scale):
+    frames, distances = drive(STALKS, scale=scale)
+    tracks, path = follow(frames, distances, CAMERAS)
+    counted = [track for track in tracks if track.counted]
+    assert len(counted) == len(STALKS)
+    places = np.array([track.position_m for track in counted]) + 0.05
+    np.testing.assert_allclose(places, [x for x, _ in STALKS], atol=0.03)
+    assert path.length == pytest.approx(2.0, rel=0.02)
+
+
+def test_a_robot_that_drives_backwards_sees_the_same():
+    frames, distances = drive(STALKS)
+    tracks, path = follow(frames[::-1], distances[::-1], CAMERAS)
+    counted = [track for track in tracks if track.counted]
+    assert len(counted) == len(STALKS) and path.length == pytest.approx(2.0, rel=0.02)
+    assert counted[0].position_m > counted[-1].position_m
+
+
+def test_stalks_that_are_missed_in_some_pairs_stay_one():
+    frames, distances = drive(STALKS)
+    rng = np.random.default_rng(3)
+    frames = [[each for each in frame if rng.random() < 0.7] for frame in frames]
+    tracks, _ = follow(frames, distances, CAMERAS)
+    assert sum(track.counted for track in tracks) == len(STALKS)
+
+
+def test_what_few_pairs_show_is_no_stalk_and_ends_are_ends():
+    frames, distances = drive([*STALKS, (2.3, 0.8)])
+    frames[8].append(sighting(0.05))  # a leaf, once
+    tracks, _ = follow(frames, distances, CAMERAS)
+    assert sum(track.counted for track in tracks) == len(STALKS)
+    reasons = " ".join(track.reason for track in tracks)
+    assert "seen in 1 of" in reasons and "beyond the ends" in reasons
+
+
+def test_a_sighting_without_disparity_still_says_where_its_stalk_is():
+    frames, distances = drive(STALKS)
+    for frame in frames:
+        for place, each in enumerate(frame):
+            if place % 3 == 1:
+                frame[place] = dataclasses.replace(each, diameter_mm=None, depth_m=None, along_m=None, reason="unclear")
+    tracks, _ = follow(frames, distances, CAMERAS)
+    assert sum(track.counted for track in tracks) == len(STALKS)
+
+
+def test_no_pairs_and_empty_fields():
+    assert follow([], np.zeros(0), CAMERAS)[0] == []
+    tracks, path = follow([[], []], np.array([0.0, 0.1]), CAMERAS)
+    assert tracks == [] and path.length == pytest.approx(0.2)
+
+
+def test_widths_are_medians_with_an_error():
+    sightings = [sighting(0.0, diameter_mm=14.0 + each) for each in (-0.2, -0.1, 0.0, 0.1, 0.2)]
+    width, error, count = robust_width([*sightings, sighting(0.0, diameter_mm=30.0)])  # pyright: ignore[reportGeneralTypeIssues]
+    assert width == pytest.approx(14.05, abs=0.06) and 0.03 < error < 0.3 and count == 6
+    assert robust_width([sighting(0.0, diameter_mm=None)]) is None
+    one = robust_width(sightings[:1])
+    assert one is not None and one[1] == pytest.approx(0.1)
+
+
+# --- evaluation ---
+
+
+def test_finds_are_matched_as_coco_matches_them():
+    clear, hidden = (StalkInView(name, (0, 0, 1, 1), None, share, 9, box, share) for name, share, box in (
+        (4, 0.9, (0.0, 0.0, 40.0, 500.0)), (5, 0.1, (100.0, 0.0, 140.0, 500.0))))  # fmt: skip
+
+    def find(left: float, score: float) -> Detection:
+        return Detection((left, 0.0, left + 40.0, 500.0), (left, left), score, np.zeros((1, 1)), (0, 0))
+
+    finds = [find(2.0, 0.6), find(1.0, 0.9), find(101.0, 0.8), find(300.0, 0.7)]
+    owners, scored = match(finds, [clear, hidden])
+    assert owners == [None, 4, 5, None]
+    assert sorted(scored) == [(0.6, 0.0), (0.7, 0.0), (0.9, 1.0)]
+
+
+def test_average_precision_and_the_figures_of_plots():
+    assert average_precision(np.array([[0.9, 1], [0.8, 1]]), 2) == 1.0
+    assert average_precision(np.array([[0.9, 0], [0.8, 1]]), 1) == pytest.approx(0.5)
+    assert average_precision(np.zeros((0, 2)), 3) == 0.0
+    scores = [
+        PlotScore(0, 30, 29, np.array([[14.0, 13.0], [12.0, 12.5]]), np.array([[0.9, 1.0], [0.2, 1.0]]), 2),
+        PlotScore(1, 40, 41, np.zeros((0, 2)), np.zeros((0, 2)), 1),
+    ]
+    figures = summary(scores)
+    assert figures["count_r2"] == pytest.approx(1.0 - 2.0 / 50.0) and figures["count_mae"] == 1.0
+    assert figures["width_mae_mm"] == pytest.approx(0.75) and figures["width_bias_mm"] == pytest.approx(0.25)
+    assert figures["precision"] == 1.0 and figures["recall"] == pytest.approx(1 / 3)
+    assert np.isnan(summary([])["f1"])
+
+
+# --- the command ---
+
+
+@pytest.fixture(scope="module")
+def plots(tmp_path_factory) -> Path:
+    """Two plots of four pairs with true masks, small."""
+    folder = tmp_path_factory.mktemp("phenotype")
+    spec = folder / "few.json"
+    spec.write_text(json.dumps({
+        "layout": {"rows_behind": 0, "stalks_mean": 5, "stalks_sd": 0, "tillers": 0, "plot_length": 0.5,
+                   "spacing_minimum": 0.06},
+        "leaves": {"density": 0.2, "litter": 0},
+        "stalks": {"diameter_mean": 0.03},
+    }))  # fmt: skip
+    words = ["phenotype", "synth", str(folder / "plots"), "--spec", str(spec), "--width", "422", "--frames", "4"]
+    assert cli.main([*words, "--plots", "2"]) == 0
+    return folder / "plots"
+
+
+def table(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def run(folder: Path, out: Path, *words: str) -> int:
+    return cli.main(["phenotype", "run", str(folder), "--out", str(out), "--masks", "truth", *words])
+
+
+@pytest.fixture(scope="module")
+def results(plots, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("results") / "out"
+    assert run(plots, out) == 0
+    return out
+
+
+def test_run_counts_and_measures(plots, results):
+    rows = table(results / "plots.csv")
+    assert [row["plot"] for row in rows] == ["plot_0000", "plot_0001"]
+    stalks = table(results / "stalks.csv")
+    for row in rows:
+        truth = json.loads((plots / row["plot"] / "plot.json").read_text())
+        assert int(row["stalks"]) == truth["count"] and row["flag"] == "ok" and row["pairs"] == "4"
+        assert float(row["stalks_per_m"]) == pytest.approx(truth["count"] / 0.5, rel=0.05)
+        own = [each for each in stalks if each["plot"] == row["plot"]]
+        assert [int(each["stalk"]) for each in own] == list(range(1, truth["count"] + 1))
+        true = [each["diameters"] if "diameters" in each else each["12in"]["diameter_mm"] for each in truth["stalks"]]
+        assert np.mean([float(each["width_mm"]) for each in own]) == pytest.approx(np.mean(true), rel=0.1)
+        assert all(float(each["width_se_mm"]) > 0 and each["method"] == "strip" for each in own)
+    overlay = read_image(results / "overlays" / "plot_0000" / "000.png")
+    assert overlay.shape == (338, 422, 3)
+    assert (results / "skipped.csv").read_text() == "plot,pair,why\n"
+
+
+def test_a_run_that_was_stopped_gives_the_same_tables(plots, results, tmp_path, capsys):
+    again = tmp_path / "out"
+    shutil.copytree(results, again)
+    (again / "pairs" / "plot_0001" / "002.json").unlink()
+    (again / "pairs" / "plot_0001" / "003.json").unlink()
+    for name in ("stalks.csv", "plots.csv"):
+        (again / name).unlink()
+    assert run(plots, again) == 0
+    for name in ("stalks.csv", "plots.csv", "skipped.csv"):
+        assert (again / name).read_bytes() == (results / name).read_bytes()
+    assert run(plots, again, "--method", "ellipse") == 2
+    assert "holds the results of another request" in capsys.readouterr().err
+
+
+def test_bad_files_are_listed_and_skipped(plots, tmp_path, capsys):
+    plot = tmp_path / "plot_0000"
+    shutil.copytree(plots / "plot_0000", plot)
+    (plot / "right_000.png").unlink()
+    (plot / "left_001.png").write_bytes((plot / "left_001.png").read_bytes()[:200])
+    assert run(plot, tmp_path / "two") == 3
+    (row,) = table(tmp_path / "two" / "plots.csv")
+    assert row["pairs_skipped"] == "2" and row["flag"] == "pairs skipped" and int(row["stalks"]) > 0
+    write_image(plot / "right_002.png", BLANK)
+    assert run(plot, tmp_path / "out") == 3
+    told = {row["pair"]: row["why"] for row in table(tmp_path / "out" / "skipped.csv")}
+    assert told.keys() == {"000", "001", "002"}
+    assert "no right image" in told["000"] and "left_001.png" in told["001"] and "16 x 12" in told["002"]
+    (row,) = table(tmp_path / "out" / "plots.csv")
+    assert row["pairs_skipped"] == "3" and row["flag"] == "a single pair"
+    assert "skipped plot_0000/000: there is no right image" in capsys.readouterr().err
+
+
+def test_swapped_and_unrectified_pairs_are_told():
+    """Six stalks with a texture; the right image as it is, exchanged, and too low."""
+    rng = np.random.default_rng(0)
+    camera = Calibration(844, 400, 542.0, (421.5, 199.5), 0.1)
+    disparity = 68
+    left, right = np.zeros((400, 844, 3), np.uint8), np.zeros((400, 844, 3), np.uint8)
+    columns = range(120, 720, 100)
+    for column in columns:
+        texture = rng.integers(60, 255, (400, 14, 1)).astype(np.uint8)
+        left[:, column : column + 14] = texture
+        right[:, column - disparity : column - disparity + 14] = texture
+
+    def told(left: np.ndarray, right: np.ndarray, offset: int = 0) -> str | None:
+        mask = np.zeros((200, 24), bool)
+        mask[:, 5:19] = True
+        finds = [
+            Detection((each, 100.0, each + 13.0, 300.0), (each + 6.5, each + 6.5), 1.0, mask, (100, each - 5))
+            for each in (column - offset for column in columns)
+        ]
+        return wrong_with(finds, look(finds, left, right, camera), left, right, camera)
+
+    assert told(left, right) is None
+    assert told(right, left, disparity) == "left and right are swapped: exchange their names"
+    assert told(left, np.roll(right, 6, axis=0)) == "the right image lies about 6 lines too low: rectify the pair"
+    assert told(left, np.roll(right, -12, axis=0)) == "the right image lies about 12 lines too high: rectify the pair"
+    assert told(left, np.zeros_like(right)) is None
+
+
+def test_without_calibration_no_millimetres_and_without_odometry_no_count(plots, tmp_path, capsys):
+    plot = tmp_path / "plot_0000"
+    shutil.copytree(plots / "plot_0000", plot)
+    (plot / "odometry.csv").unlink()
+    assert run(plot, tmp_path / "a") == 0
+    (row,) = table(tmp_path / "a" / "plots.csv")
+    assert row["flag"] == "no odometry" and row["stalks"] == row["stalks_per_m"] == "" and float(row["width_mean_mm"]) > 10
+    (plot / "calibration.yaml").unlink()
+    assert run(plot, tmp_path / "b") == 0
+    (row,) = table(tmp_path / "b" / "plots.csv")
+    assert row["flag"] == "no calibration" and row["width_mean_mm"] == row["stalks"] == ""
+    assert table(tmp_path / "b" / "stalks.csv") == []
+    assert "no millimetres" in capsys.readouterr().err
+
+
+def test_black_images_and_calibrations_of_another_size_are_told(plots, tmp_path):
+    plot = tmp_path / "plot_0000"
+    shutil.copytree(plots / "plot_0000", plot)
+    write_image(plot / "left_000.png", np.zeros((338, 422, 3), np.uint8))
+    for number in range(1, 4):
+        for side in ("left", "right"):
+            write_image(plot / f"{side}_{number:03d}.png", BLANK)
+    assert run(plot, tmp_path / "out") == 3
+    told = [row["why"] for row in table(tmp_path / "out" / "skipped.csv")]
+    assert "the left image is black" in told[0] and "calibration is for 422 x 338" in told[1]
+    (row,) = table(tmp_path / "out" / "plots.csv")
+    assert row["flag"] == "no usable pairs"
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        (["--least-score", "2"], "--least-score must be from 0 to 1"),
+        (["--speed", "0"], "--speed must be more than 0"),
+        (["--calibration", "missing.yaml"], "there is no calibration"),
+        (["--masks", "network", "--weights", "missing.npz"], "cannot read the weights"),
+    ],
+)
+def test_wrong_requests_of_run(plots, tmp_path, capsys, words, part):
+    assert run(plots, tmp_path / "out", *words) == 2
+    assert part in capsys.readouterr().err
+
+
+def test_true_masks_are_wanted_of_what_has_none(plots, tmp_path, capsys):
+    plot = tmp_path / "plot_0000"
+    shutil.copytree(plots / "plot_0000", plot)
+    (plot / "plot.json").unlink()
+    assert run(plot, tmp_path / "out") == 2
+    assert "holds no true masks" in capsys.readouterr().err
+
+
+def test_eval_compares_with_the_truth(plots, tmp_path, capsys):
+    spec, out = plots.parent / "few.json", tmp_path / "eval.json"
+    words = ["--spec", str(spec), "--width", "422", "--frames", "4", "--plots", "1", "--masks", "truth", "--json", str(out)]
+    assert cli.main(["phenotype", "eval", *words]) == 0
+    figures = json.loads(out.read_text())
+    truth = json.loads((plots / "plot_0000" / "plot.json").read_text())
+    assert figures["count_true"] == truth["count"] and figures["count_mae"] == 0.0 and figures["count_r2"] is None
+    assert figures["f1"] > 0.9 and figures["width_mae_mm"] < 2.5 and figures["synthetic"] is True
+    said = capsys.readouterr().out
+    assert "synthetic plots of family" in said and "count_mae" in said
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        (["train", "weights.bin"], "ends in .npz"),
+        (["train", "weights.npz", "--minutes", "0"], "--minutes must be more than 0"),
+        (["train", "weights.npz", "--data", "images", "--width", "422"], "leave out --spec and --width"),
+        (["train", "weights.npz", "--data", "images"], "there are no annotations"),
+        (["train", "weights.npz", "--batch", "0"], "--batch"),
+        (["eval", "--seed", "-1"], "--seed must be at least 0"),
+        (["eval", "--weights", "missing.npz"], "cannot read the weights"),
+        (["eval", "--spec", "missing.toml"], "missing.toml"),
+    ],
+)
+def test_wrong_requests_of_train_and_eval(tmp_path, monkeypatch, capsys, words, part):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["phenotype", *words]) == 2
+    assert part in capsys.readouterr().err
