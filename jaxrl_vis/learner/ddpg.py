@@ -16,6 +16,7 @@ latents, too, ``target_encoder=False`` computes targets with the online encoders
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -214,6 +215,19 @@ def _next_latents(networks: Networks, now: _ComputeCopies, inputs: jax.Array, la
     return of_actor, of_critic
 
 
+def _value_at_goals(networks: Networks, train: TrainState, goals: jax.Array) -> jax.Array:
+    """`Algorithm.value_at_goals`."""
+    statistics = (train.normalizer,) if train.goal_normalizer is None else (train.normalizer, train.goal_normalizer)
+    inputs = [networks.prepare(each, goals) for each in statistics]
+
+    def latents(params: Params) -> jax.Array:
+        encoded = [networks.encode(params, each) for each in inputs]
+        return jnp.stack([encoded[0], encoded[-1]])
+
+    action = networks.act(train.actor, latents(networks.with_encoder(train.actor, train.critic)))
+    return jnp.mean(networks.value(train.critic, latents(train.critic), action))
+
+
 def make_ddpg(networks: Networks, config: Config, resolved: Resolved, auxiliary: Auxiliary | None = None) -> Algorithm:
     """DDPG for these networks.
 
@@ -276,24 +290,13 @@ def make_ddpg(networks: Networks, config: Config, resolved: Resolved, auxiliary:
         is_new = train.weighting.updates % auxiliary.weighting.interval == 0
         return begin(train, jax.tree.map(lambda now, before: jnp.where(is_new, now, before), train.critic, working.held))
 
-    def value_at_goals(train: TrainState, goals: jax.Array) -> jax.Array:
-        statistics = (train.normalizer,) if train.goal_normalizer is None else (train.normalizer, train.goal_normalizer)
-        inputs = [networks.prepare(each, goals) for each in statistics]
-
-        def latents(params: Params) -> jax.Array:
-            encoded = [networks.encode(params, each) for each in inputs]
-            return jnp.stack([encoded[0], encoded[-1]])
-
-        action = networks.act(train.actor, latents(networks.with_encoder(train.actor, train.critic)))
-        return jnp.mean(networks.value(train.critic, latents(train.critic), action))
-
     return Algorithm(
         init=lambda key: _start(networks, auxiliary, latent_reward, optimizers, key),
         begin=lambda train: begin(train, train.critic if held else None),
         gradients=gradients,
         apply=apply,
         end=lambda working: working.train,
-        value_at_goals=value_at_goals,
+        value_at_goals=functools.partial(_value_at_goals, networks),
     )
 
 
