@@ -29,7 +29,7 @@ from jaxrl_vis_envs.plants.truth import BAND, outline, stalks_in_view
 
 LEAST_VISIBLE = 0.3
 """Share of a stalk in the band that must be seen for it to count."""
-_MasksOf = Callable[[np.ndarray, jax.Array, tuple[int, int]], np.ndarray]
+_MasksOf = Callable[[np.ndarray, np.ndarray, tuple[int, int]], np.ndarray]
 """Masks [N, h, w] bool of the snips of stalks with indices [N], from their places [N or more, 6] and the snips' shape."""
 _BARELY = 0.02  # what is seen less is not there
 _MOST = 56
@@ -97,7 +97,7 @@ def _sequence(family: Family, seed: int) -> Sequence:
 
 
 def _instance_masks(
-    instance: jax.Array, indices: np.ndarray, parts: np.ndarray, places: jax.Array, shape: tuple[int, int]
+    instance: jax.Array, indices: np.ndarray, parts: np.ndarray, places: np.ndarray, shape: tuple[int, int]
 ) -> np.ndarray:
     """Masks of the snips of some stalks, cut out of what each pixel shows."""
     cut_out = np.asarray(cut(instance + 1, places, shape))[: len(parts)]  # 0 is beyond the image
@@ -145,11 +145,11 @@ def _example(image: Any, stalks: np.ndarray, kinds: np.ndarray, masks_of: _Masks
     wide = 0.015 * (stalks[clear, 3] - stalks[clear, 1])[:, None]
     moved[:, 4:] += wide * rng.normal(size=(len(clear), 2))
     moved[:, 1::2][:, :2] += 2.0 * wide * rng.normal(size=(len(clear), 1))
-    on_device, places = jnp.asarray(image), jnp.asarray(moved)
+    on_device, places = jnp.asarray(image), moved
     snips, masks = np.zeros((0, *shape, 3), np.uint8), np.zeros((0, *shape), bool)
     if len(clear):
         filled = -(-len(clear) // 16) * 16  # few shapes, few programs
-        places = jnp.pad(places, ((0, filled - len(clear)), (0, 0)), mode="edge")
+        places = np.pad(places, ((0, filled - len(clear)), (0, 0)), mode="edge")
         snips = np.asarray(cut(on_device, places, shape))[: len(clear)]
         masks = masks_of(clear, places, shape)
     divisor = np.array([scale[1], scale[0], scale[1], scale[0], scale[1], scale[1]], np.float32)
@@ -186,7 +186,7 @@ def annotated_examples(folder: Path, settings: Settings) -> Iterator[Example]:
         yield _example(image, stalks, kinds, functools.partial(_own_masks, masks), settings, rng)
 
 
-def _own_masks(masks: list[np.ndarray], parts: np.ndarray, places: jax.Array, shape: tuple[int, int]) -> np.ndarray:
+def _own_masks(masks: list[np.ndarray], parts: np.ndarray, places: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """Masks of the snips of some stalks, cut out of the mask [H, W] bool of each: they may overlap."""
     snips = [cut(jnp.asarray(masks[part]), places[place : place + 1], shape) for place, part in enumerate(parts)]
     return np.concatenate(jax.device_get(snips))
