@@ -1,8 +1,11 @@
 """``jaxrl-vis phenotype train``."""
 
+import contextlib
 import dataclasses
 import itertools
+import multiprocessing
 import time
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Annotated
 
@@ -66,10 +69,11 @@ def train(options: Train) -> int:
     check_extra()
     check_writable(options.out, "OUT")
     check_devices()
-    return _train(options)
+    with contextlib.ExitStack() as stack:
+        return _train(options, stack)
 
 
-def _train(options: Train) -> int:
+def _train(options: Train, stack: contextlib.ExitStack) -> int:
     from jaxrl_vis import __version__
     from jaxrl_vis.phenotyping.detector.detect import Settings
     from jaxrl_vis.phenotyping.detector.weights import write_weights
@@ -89,8 +93,12 @@ def _train(options: Train) -> int:
         except ValueError as error:
             raise RequestError(str(error)) from error
         first = _FIRST_SEED * (1 + options.seed)
+        # Laying out a plot takes Python half a second, in which nothing else of this process would go on.
+        spawning = multiprocessing.get_context("spawn")
+        helpers = stack.enter_context(ProcessPoolExecutor(max(options.threads // 2, 1), mp_context=spawning))
+        stack.callback(helpers.shutdown, wait=False, cancel_futures=True)
         sources = [
-            synthetic_examples(family, settings, itertools.count(first + thread, options.threads))
+            synthetic_examples(family, settings, itertools.count(first + thread, options.threads), helpers=helpers)
             for thread in range(options.threads)
         ]
         origin = f"synthetic plots of family {family.name}"

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from jaxrl_vis.errors import NonFiniteError
+from jaxrl_vis.errors import NonFiniteError, RequestError
 from jaxrl_vis.phenotyping.detector.detect import Settings, initial, padded_shape
 from jaxrl_vis.phenotyping.detector.losses import detector_loss, segmenter_loss
 from jaxrl_vis.phenotyping.detector.networks import Segmenter
@@ -68,25 +68,30 @@ class _Pool:
         self.snips: list[tuple[int, int]] = []
         # The others follow when the first one has made something, and with it compiled what makes it.
         self._waiting = sources[1:]
+        self._threads: list[threading.Thread] = []
         self._start(sources[0])
 
     def _start(self, source: Iterator[Example]) -> None:
-        threading.Thread(target=self._make, args=(source,), daemon=True).start()
+        self._threads.append(threading.Thread(target=self._make, args=(source,), daemon=True))
+        self._threads[-1].start()
 
     def _make(self, source: Iterator[Example]) -> None:
         try:
             for example in source:
-                while not self._stop.is_set():
-                    try:
-                        self._queue.put(example, timeout=0.2)
-                        break
-                    except queue.Full:
-                        continue
+                self._hand_over(example)
                 if self._stop.is_set():
                     return
-            self._queue.put(None)
+            self._hand_over(None)
         except Exception as error:  # told where the examples are wanted
-            self._queue.put(error)
+            self._hand_over(error)
+
+    def _hand_over(self, made: Example | Exception | None) -> None:
+        while not self._stop.is_set():
+            try:
+                self._queue.put(made, timeout=0.2)
+                return
+            except queue.Full:
+                continue
 
     def fill(self, least: int) -> None:
         """Takes what is ready, and waits until there are so many, or no more come."""
@@ -108,8 +113,14 @@ class _Pool:
             self.stop()
 
     def stop(self) -> None:
-        """Ends the threads."""
+        """Tells the threads to make no more."""
         self._stop.set()
+
+    def close(self) -> None:
+        """Ends the threads: one that still computes when the program ends would make it crash."""
+        self.stop()
+        for thread in self._threads:
+            thread.join()
 
     def images(self, rng: np.random.Generator, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """A batch of images, padded to ``shape``, with their stalks and kinds."""
@@ -180,6 +191,7 @@ def train(
 
     Raises:
         NonFiniteError: A loss is not finite any more.
+        RequestError: The time was over before the first update.
     """
     started = told = time.monotonic()
     rng = np.random.default_rng(plan.seed)
@@ -194,6 +206,7 @@ def train(
     }
     state = params, jax.tree.map(jnp.array, params), _optimiser().init(params)
     losses: dict[str, float] = {}
+    before: Any = None
     try:
         pool.fill(plan.first)
         shape = pool.examples[0].image.shape[:2]
@@ -222,6 +235,11 @@ def train(
                 if not np.isfinite(list(losses.values())).all():
                     raise NonFiniteError(f"a loss is not finite at step {step}: try a lower --rate")
                 report(step, progress, len(pool.examples), losses, state[1])
+            # The device is kept one update ahead and no more: examples are drawn on it, too, and wait for what is queued.
+            jax.block_until_ready(before)
+            before = parts
     finally:
-        pool.stop()
+        pool.close()
+    if not step:
+        raise RequestError(f"{plan.minutes:g} minutes were over before the first update: allow more with --minutes")
     return state[1], step
