@@ -19,6 +19,7 @@ from jaxrl_vis.run.checkpoint import to_host
 from jaxrl_vis.run.nonfinite import broken_leaves
 from jaxrl_vis.run.signals import shield_this_thread
 from jaxrl_vis.types import LoopState, Metrics, TrainState
+from jaxrl_vis_envs.compilation import tracing_for_default_device
 
 # Evaluation draws from a key of its own, the same at every evaluation and for every seed.
 _EVALUATION_SEED = 2**31 - 1
@@ -117,7 +118,8 @@ class Programs:
             "train_iteration": (self.shapes,),
             "evaluate": (self.shapes.train, self.evaluation_key),
         }
-        return getattr(self.program, name).lower(*arguments[name])
+        with tracing_for_default_device():
+            return getattr(self.program, name).lower(*arguments[name])
 
     def compiled(self, name: str) -> Any:
         """One compiled program: ``init``, ``train_iteration``, ``evaluate`` or ``broken_leaves``."""
