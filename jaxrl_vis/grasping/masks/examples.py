@@ -1,0 +1,46 @@
+"""What the generator learns from: left images of synthetic rows, and which of their pixels show a stalk of the near row."""
+
+import dataclasses
+from collections.abc import Iterator
+
+import jax
+import numpy as np
+
+from jaxrl_vis_envs.plants import Family, Plot, draw
+from jaxrl_vis_envs.plants.pairs import Sequence
+
+
+@dataclasses.dataclass(frozen=True)
+class Example:
+    """One image.
+
+    Attributes:
+        image: [H, W, 3] uint8.
+        mask: [H, W] bool, pixels of stalks of the near row.
+    """
+
+    image: np.ndarray
+    mask: np.ndarray
+
+
+def true_mask(instance: jax.Array | np.ndarray, plot: Plot) -> np.ndarray:
+    """Pixels of the stalks of the near row: [H, W] bool, from an image of instances [H, W] int."""
+    instance = np.asarray(instance)
+    return (instance >= 0) & (instance < len(plot.measured))
+
+
+def synthetic_examples(family: Family, seeds: Iterator[int], frames: int = 2) -> Iterator[Example]:
+    """Examples of rows of a family.
+
+    Args:
+        family: What rows are drawn from.
+        seeds: One row each.
+        frames: How many images of each row; pairs that follow each other show nearly the same.
+    """
+    for seed in seeds:
+        sequence = Sequence.of(draw(family, seed))
+        length = len(sequence)
+        chosen = sorted({round(each) for each in np.linspace(0, length - 1, min(frames, length))})
+        for frame in chosen:
+            image, instance, _ = sequence.left(frame)
+            yield Example(np.asarray(image), true_mask(instance, sequence.plot))
