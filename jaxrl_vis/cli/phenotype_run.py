@@ -6,8 +6,8 @@ import sys
 from pathlib import Path
 from typing import Annotated, Literal
 
+from jaxrl_vis.cli.checks import check_extra
 from jaxrl_vis.cli.parsing import ByPlaceToo
-from jaxrl_vis.cli.phenotype import check_extra
 from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError, StorageError
 from jaxrl_vis.report.outputs import check_writable
@@ -47,7 +47,7 @@ def run(options: Run) -> int:
         raise RequestError(f"--least-score must be from 0 to 1, not {options.least_score:g}")
     if options.speed is not None and not options.speed > 0:
         raise RequestError(f"--speed must be more than 0, not {options.speed:g}")
-    check_extra()
+    check_extra("phenotype", "phenotyping")
     check_writable(options.out, "--out", folder=True)
     from jaxrl_vis.phenotyping.folders import find_plots
 

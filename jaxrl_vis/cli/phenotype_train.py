@@ -6,9 +6,8 @@ import time
 from pathlib import Path
 from typing import Annotated
 
-from jaxrl_vis.cli.checks import check_counts
+from jaxrl_vis.cli.checks import check_counts, check_extra
 from jaxrl_vis.cli.parsing import ByPlaceToo
-from jaxrl_vis.cli.phenotype import check_extra
 from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.report.outputs import check_writable
@@ -63,7 +62,7 @@ def train(options: Train) -> int:
         raise RequestError(f"--minutes must be more than 0, not {options.minutes:g}")
     if options.out.suffix != ".npz":
         raise RequestError(f"the weights go into a file that ends in .npz, not {options.out}")
-    check_extra()
+    check_extra("phenotype", "phenotyping")
     check_writable(options.out, "OUT")
     check_devices()
     return _train(options)

@@ -100,11 +100,10 @@ def _middle_depth(depth: np.ndarray, first: np.ndarray, last: np.ndarray) -> np.
     inner = np.maximum(count // 4, 0)
     begin, end = first + inner, last - inner + 1
     owner = np.repeat(np.arange(len(first)), end - begin)
-    place = np.arange(len(owner)) - np.repeat(np.cumsum(end - begin) - (end - begin), end - begin) + np.repeat(begin, end - begin)
-    values = depth[place]
+    start = np.cumsum(end - begin) - (end - begin)
+    values = depth[np.arange(len(owner)) + np.repeat(begin - start, end - begin)]
     order = np.lexsort((values, owner))  # what is not a number comes last
     valid = np.bincount(owner, np.isfinite(values), len(first)).astype(int)
-    start = np.cumsum(end - begin) - (end - begin)
     middle = values[order][np.minimum(start + valid // 2, len(values) - 1)]
     return np.where(2 * valid >= end - begin, middle, np.nan).astype(np.float64)
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxrl_vis_envs.plants import Calibration, Pose
 from jaxrl_vis_envs.plants.cameras import looking_along_y
+from jaxrl_vis_envs.plants.family import Rig
 
 RED = 0.5
 """Redness from which a pixel counts as painted: red less the greater of green and blue, of 1."""
@@ -31,6 +32,11 @@ class Mount:
     pitch: float = 15.0
     nearest: float = 0.33
     farthest: float = 0.95
+
+    @classmethod
+    def of(cls, rig: Rig) -> "Mount":
+        """As the cameras of a family are mounted, but for what varies."""
+        return cls(rig.camera_height, rig.pitch, max(rig.distance - 0.22, 0.15), rig.distance + 0.4)
 
     @property
     def pose(self) -> Pose:

@@ -1,8 +1,8 @@
 """Grasp points from a line per stalk: what several pairs agree on.
 
-Pieces of stalks give lines; chords of all pairs that lie along a line belong to it, above and below what hides the rest; a stalk
-is a line that enough chords of enough pairs support. Its grasp point lies where most of it is seen, at a height that the gripper
-works at.
+Pieces of stalks give lines; chords of all pairs that lie along a line belong to it, above and below what hides the rest; a
+stalk is a line that enough chords of enough pairs support. Its grasp point lies where most of it is seen, at a height at which
+the gripper works.
 """
 
 import dataclasses
@@ -50,11 +50,12 @@ _WINDOW = 0.10  # m: above and below the grasp point
 _APART = 0.012  # m: lines that come nearer in the heights of the gripper are one stalk
 
 
-def grasp_points(chords: Chords, heights: tuple[float, float] = HEIGHTS) -> list[GraspPoint]:
+def grasp_points(chords: Chords, least_frames: int = 2, heights: tuple[float, float] = HEIGHTS) -> list[GraspPoint]:
     """Stalks and where to grasp them, from left to right.
 
     Args:
         chords: Of all pairs, in one robot frame.
+        least_frames: How many pairs must show a stalk.
         heights: Lowest and highest grasp, m above the ground.
     """
     free = np.ones(len(chords), bool)
@@ -67,7 +68,7 @@ def grasp_points(chords: Chords, heights: tuple[float, float] = HEIGHTS) -> list
         if not len(members):
             continue
         free[members] = False
-        point = _grasp(chords, members, heights)
+        point = _grasp(chords, members, least_frames, heights)
         if point is not None:
             found.append(point)
     return sorted(_distinct(found, heights), key=lambda each: float(each.point[0]))
@@ -138,10 +139,10 @@ def _support(chords: Chords, members: np.ndarray) -> tuple[float, int]:
     return _BIN * len(seen), int((counts >= 2).sum())
 
 
-def _grasp(chords: Chords, members: np.ndarray, heights: tuple[float, float]) -> GraspPoint | None:
+def _grasp(chords: Chords, members: np.ndarray, least_frames: int, heights: tuple[float, float]) -> GraspPoint | None:
     """Where to grasp a stalk; None where too little of it is seen."""
     length, frames = _support(chords, members)
-    if length < _LEAST_SUPPORT or frames < 2:
+    if length < _LEAST_SUPPORT or frames < least_frames:
         return None
     points = chords.middle[members]
     places = np.arange(heights[0], heights[1] + 1e-9, _BIN)

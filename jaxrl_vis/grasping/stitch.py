@@ -1,9 +1,8 @@
 """Clouds of several pairs put together by iterative closest points (ICP).
 
 The thesis: from where the cloud lies, correspondences up to 0.15 m, on a grid of 3 cm. Vertical stalks some centimetres apart
-look alike, so that way settles a stalk or two aside wherever leaves do not break the symmetry. The default starts where odometry
-says, on a grid of 1 cm, and lets correspondences shrink from 0.15 to 0.05 m and on; what moves further from the odometry than
-that can be wrong is refused.
+look alike, so that this settles a stalk or two aside. The default starts where odometry says, on a grid of 1 cm, and narrows
+correspondences from 0.15 to 0.05 and 0.02 m; a result further from the odometry than its error allows is refused.
 """
 
 import dataclasses
@@ -58,22 +57,25 @@ class Method:
         voxel: Edge of the cubes of the grid, m.
         gates: Greatest distance of corresponding points, m: one after the other.
         steps: Most iterations with each gate.
+        most: About how many points of the moved cloud are used: evenly chosen.
         from_odometry: Start where odometry says, and refuse what moves too far from there; else start where the cloud lies.
     """
 
     voxel: float
     gates: tuple[float, ...]
     steps: int
+    most: int
     from_odometry: bool
 
 
-THESIS = Method(voxel=0.03, gates=(0.15,), steps=50, from_odometry=False)
-DEFAULT = Method(voxel=0.01, gates=(0.15, 0.05, 0.02), steps=15, from_odometry=True)
+THESIS = Method(voxel=0.03, gates=(0.15,), steps=50, most=1_000_000, from_odometry=False)
+DEFAULT = Method(voxel=0.01, gates=(0.15, 0.05, 0.02), steps=15, most=8_000, from_odometry=True)
 
 _ODOMETRY_SHARE = 0.05
 _WOBBLE = 0.03  # m
 _TURN = math.radians(3.0)
 _LEAST_OVERLAP = 0.2
+_STILL = 1e-4  # m, and rad: what moves less has arrived
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,6 +106,7 @@ def stitch(source: np.ndarray, target: np.ndarray, driven: float, method: Method
     prior = Motion.along(-driven)
     start = prior if method.from_odometry else Motion.along(0.0)
     thin, tree_points = thinned(source, method.voxel), thinned(target, method.voxel)
+    thin = thin[:: max(len(thin) // method.most, 1)]
     if len(thin) < 10 or len(tree_points) < 10:
         return Stitch(prior, math.nan, 0.0, "a cloud is empty")
     motion, residual, overlap = closest_points(thin, tree_points, start, method)
@@ -152,7 +155,7 @@ def closest_points(source: np.ndarray, target: np.ndarray, start: Motion, method
             weight = 1.0 / (1.0 + (distance[close] / (0.3 * gate)) ** 2) if method.from_odometry else np.ones(close.sum())
             step = rigid(moved[close], target[place[close]], weight)
             motion = step.after(motion)
-            if np.linalg.norm(step.shift) < 1e-5 and step.angle < 1e-5:
+            if np.linalg.norm(step.shift) < _STILL and step.angle < _STILL:
                 break
     return motion, residual, overlap
 

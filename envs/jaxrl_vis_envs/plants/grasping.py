@@ -1,7 +1,8 @@
 """The families for grasping: the same plants, passed by the short stereo pair of a robot that stops to take hold of them.
 
-The pair is like a MultiSense S7: 1024 x 1024 pixels, 80 degrees wide, 70 mm baseline, at a height of 1 m (the thesis, section
-4.1). Its vendor states a least range of about 0.4 m, twice what the thesis says, so the row is 0.55 m away. Five pairs are taken
+The pair is like a MultiSense S7: 1024 x 1024 pixels, 80 degrees wide, a baseline of 70 mm, 1 m above the ground (the thesis,
+section 4.1). Its vendor states a minimum range of about 0.4 m, twice what the thesis says, so the row is 0.55 m away. Where the
+pair looks is not stated; here it looks down by 15 degrees, where there are more stalks and fewer leaves. Five pairs are taken
 over 0.5 m. The row goes on at both ends of that stretch, as it does in a field.
 """
 

@@ -1,7 +1,7 @@
 """Training the generator: against a discriminator, as pix2pix, or as a plain segmentation. Same network, same data.
 
-gan             the discriminator tells true paintings from those of the generator; the generator deceives it, and keeps near the
-                true painting (100 times the mean absolute difference)
+gan             the discriminator tells true paintings from those of the generator; the generator deceives it, and stays near
+                the true painting (100 times the mean absolute difference)
 segmentation    cross entropy and Dice loss of the mask
 
 Examples are drawn by threads while the network already learns from those that are there.
@@ -90,7 +90,7 @@ def _update(state: Any, batch: Any, key: jax.Array, rates: tuple[jax.Array, jax.
     """One update: generator, its average, discriminator (None for segmentation), and the optimiser's states of both."""
     generator, average, discriminator, moments = state
     rate, share = rates
-    images, masks = vary_snips(*batch, key)
+    images, masks = vary_snips(batch[0], batch[1], key)
     network, judge, values = settings.generator(dtype), Discriminator(dtype=dtype), normalise(images)
     true = jnp.where(masks[..., None], jnp.array(_RED), values)
 

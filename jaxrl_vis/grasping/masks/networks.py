@@ -1,8 +1,9 @@
 """The networks of pix2pix (Isola et al. 2017), small: a U-Net that paints, and a PatchGAN that judges what it painted.
 
 The thesis's generator learns against a discriminator; the same generator with one output in place of three learns as a plain
-segmentation. Images are [N, H, W, C], float32 or bfloat16, around 0. Normalisation is by groups, so that one image is treated as
-many are, and there is no noise: where pix2pix drops features at random to paint differently each time, a robot wants one answer.
+segmentation. Images are [N, H, W, C], float32 or bfloat16, around 0. Normalisation is by groups, so that an image is treated
+alike alone and in a batch, and no features are dropped: pix2pix does that to paint differently each time, but a robot needs one
+answer.
 """
 
 import flax.linen as nn
