@@ -1,8 +1,8 @@
 """Grasp points as in the thesis: slices of the stitched cloud seen from above, dense spots grown into regions, their middles.
 
-The thesis states the height of a slice, 0.2 m, but neither cells, smoothing nor thresholds of the heat map. Here a cell is 1 cm,
-and a dense cell holds at least a quarter of what the densest tenth of the occupied cells hold. Points lie on the front of a
-stalk, and a region's middle is taken for the stalk's.
+The thesis states the height of a slice, 0.2 m, but nothing of the heat map's cells, smoothing and thresholds. Here a cell is
+1 cm, and a dense cell holds at least a quarter of what the densest tenth of the occupied cells hold. Points lie on the front of
+a stalk, and a region's middle is taken for the stalk's.
 """
 
 import dataclasses
