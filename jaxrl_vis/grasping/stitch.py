@@ -1,8 +1,8 @@
 """Clouds of several pairs put together by iterative closest points (ICP).
 
 The thesis: from where the cloud lies, correspondences up to 0.15 m, on a grid of 3 cm. Vertical stalks some centimetres apart
-look alike, so that this settles a stalk or two aside. The default starts where odometry says, on a grid of 1 cm, and narrows
-correspondences from 0.15 to 0.05 and 0.02 m; a result further from the odometry than its error allows is refused.
+look alike, so that this settles a stalk or two aside. The default starts where odometry says, on a grid of 5 mm, and narrows
+correspondences from 0.15 to 0.05, 0.02 and 0.01 m; a result further from the odometry than its error allows is refused.
 """
 
 import dataclasses
@@ -69,13 +69,13 @@ class Method:
 
 
 THESIS = Method(voxel=0.03, gates=(0.15,), steps=50, most=1_000_000, from_odometry=False)
-DEFAULT = Method(voxel=0.01, gates=(0.15, 0.05, 0.02), steps=15, most=8_000, from_odometry=True)
+DEFAULT = Method(voxel=0.005, gates=(0.15, 0.05, 0.02, 0.01), steps=30, most=5_000, from_odometry=True)
 
 _ODOMETRY_SHARE = 0.05
 _WOBBLE = 0.03  # m
 _TURN = math.radians(3.0)
 _LEAST_OVERLAP = 0.2
-_STILL = 1e-4  # m, and rad: what moves less has arrived
+_STILL = 0.01  # of the gate, m, and the same in rad: what moves less has arrived
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,6 +143,7 @@ def closest_points(source: np.ndarray, target: np.ndarray, start: Motion, method
     tree = cKDTree(target)
     motion, residual, overlap = start, math.nan, 0.0
     for gate in method.gates:
+        still = _STILL * gate if method.from_odometry else 1e-5
         for _ in range(method.steps):
             moved = motion(source)
             distance, place = tree.query(moved, distance_upper_bound=gate, workers=-1)
@@ -155,7 +156,7 @@ def closest_points(source: np.ndarray, target: np.ndarray, start: Motion, method
             weight = 1.0 / (1.0 + (distance[close] / (0.3 * gate)) ** 2) if method.from_odometry else np.ones(close.sum())
             step = rigid(moved[close], target[place[close]], weight)
             motion = step.after(motion)
-            if np.linalg.norm(step.shift) < _STILL and step.angle < _STILL:
+            if max(float(np.linalg.norm(step.shift)), step.angle) < still:
                 break
     return motion, residual, overlap
 
