@@ -10,6 +10,7 @@ import dataclasses
 import numpy as np
 
 from jaxrl_vis.grasping.chords import Chords
+from jaxrl_vis.grasping.sight import Sight
 
 HEIGHTS = (0.45, 1.05)
 """Heights at which stalks are grasped, m above the ground."""
@@ -47,19 +48,25 @@ _STEEPEST = 0.6  # m per m
 _BIN = 0.02  # m: heights that are counted as one
 _LEAST_SUPPORT = 0.12  # m, over all pairs
 _WINDOW = 0.10  # m: above and below the grasp point
-_APART = 0.012  # m: lines that come nearer in the heights of the gripper are one stalk
+_AROUND = 0.2  # m: above and below the grasp point pairs are asked what they show
+_LEAST_SHOWN = 4  # places, of a pair that shows it
+_LEAST_SHARE = 0.4  # of the pairs and places that show it or see through it
+_APART = 0.012  # m: lines that come nearer are one stalk
+_BEND = 0.04  # by how much more for each m between the heights at which they were seen
+_REST_WITHIN, _REST_SPREAD = 0.025, 0.003  # m
 
 
-def grasp_points(chords: Chords, least_frames: int = 2, heights: tuple[float, float] = HEIGHTS) -> list[GraspPoint]:
+def grasp_points(chords: Chords, sight: Sight, heights: tuple[float, float] = HEIGHTS) -> list[GraspPoint]:
     """Stalks and where to grasp them, from left to right.
 
     Args:
         chords: Of all pairs, in one robot frame.
-        least_frames: How many pairs must show a stalk.
+        sight: What all pairs say of a place.
         heights: Lowest and highest grasp, m above the ground.
     """
     free = np.ones(len(chords), bool)
     found: list[GraspPoint] = []
+    shown: list[int] = []
     for seed in _seeds(chords):
         members = seed[free[seed]]
         if np.ptp(chords.middle[members, 2]) < _LEAST_PIECE if len(members) else True:
@@ -68,10 +75,15 @@ def grasp_points(chords: Chords, least_frames: int = 2, heights: tuple[float, fl
         if not len(members):
             continue
         free[members] = False
-        point = _grasp(chords, members, least_frames, heights)
-        if point is not None:
+        point = _grasp(chords, members, min(2, len(sight.clouds)), heights)
+        if point is None:
+            continue
+        count = _agreed(point, sight)
+        if count:
             found.append(point)
-    return sorted(_distinct(found, heights), key=lambda each: float(each.point[0]))
+            shown.append(count)
+    order = np.argsort(-np.array(shown), kind="stable")
+    return sorted(_distinct([found[place] for place in order]), key=lambda each: float(each.point[0]))
 
 
 def _seeds(chords: Chords) -> list[np.ndarray]:
@@ -161,11 +173,28 @@ def _grasp(chords: Chords, members: np.ndarray, least_frames: int, heights: tupl
     return GraspPoint(np.array([x, y, places[best]]), direction / np.linalg.norm(direction), thickness, frames, spread)
 
 
-def _distinct(found: list[GraspPoint], heights: tuple[float, float]) -> list[GraspPoint]:
-    """Without lines that are the same stalk as one with more support."""
+def _agreed(point: GraspPoint, sight: Sight) -> int:
+    """How often pairs show the stalk along its line; 0 where fewer than two do, or too many see through it."""
+    places = point.point[2] + np.arange(-_AROUND, _AROUND, 0.5 * _BIN)
+    shown, through = sight.look(np.array([point.at_height(height) for height in places]))
+    count = int(shown.sum())
+    frames = int((shown.sum(axis=1) >= _LEAST_SHOWN).sum())
+    agreed = frames >= min(2, len(sight.clouds)) and count >= _LEAST_SHARE * (count + through.sum())
+    return count if agreed else 0
+
+
+def _distinct(found: list[GraspPoint]) -> list[GraspPoint]:
+    """Without lines that are the same stalk as one before them."""
     kept: list[GraspPoint] = []
-    for each in sorted(found, key=lambda point: -point.frames):
-        same = (np.linalg.norm((each.point - other.at_height(each.point[2]))[:2]) < _APART for other in kept)
-        if not any(same):
+    for each in found:
+        if not any(_same(each, other) for other in kept):
             kept.append(each)
     return kept
+
+
+def _same(point: GraspPoint, other: GraspPoint) -> bool:
+    """Whether a line is the same stalk as another one that is seen better."""
+    up = point.point[2] - other.point[2]
+    distance = float(np.linalg.norm((point.point - other.at_height(point.point[2]))[:2]))
+    # What is left of a stalk beside its line is near it, and scatters.
+    return distance < _APART + _BEND * abs(up) or (distance < _REST_WITHIN and point.spread > _REST_SPREAD)

@@ -14,6 +14,7 @@ import numpy as np
 from jaxrl_vis.grasping.chords import chords_of, joined
 from jaxrl_vis.grasping.cloud import Cloud, Mount, match, organised
 from jaxrl_vis.grasping.lines import GraspPoint, grasp_points
+from jaxrl_vis.grasping.sight import Sight
 from jaxrl_vis.grasping.slices import slice_points
 from jaxrl_vis.grasping.stitch import DEFAULT, THESIS, Motion, Stitch, stitch
 from jaxrl_vis_envs.plants import Calibration
@@ -113,7 +114,7 @@ def perceive(views: Iterable[View], mask: Mask, calibration: Calibration, mount:
         else:
             parts = [chords_of(cloud, calibration, mount, frame) for frame, cloud in enumerate(clouds)]
             parts = [dataclasses.replace(part, middle=motion(part.middle)) for motion, part in zip(to_last, parts)]
-            points = grasp_points(joined(parts), min(2, len(clouds)))
+            points = grasp_points(joined(parts), Sight(tuple(clouds), tuple(to_last), calibration, mount))
     if not points:
         notes.append("no stalk was found")
     return Perception(tuple(clouds), tuple(stitches), tuple(to_last), points, seconds, tuple(notes))
