@@ -21,6 +21,7 @@ from jaxrl_vis.cli import (
     figure,
     grasp,
     grasp_eval,
+    grasp_run,
     grasp_train,
     phenotype,
     phenotype_eval,
@@ -47,6 +48,7 @@ COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
     "phenotype eval": (phenotype_eval.Eval, phenotype_eval.evaluate),
     "grasp synth": (grasp.Synth, grasp.synth),
     "grasp train": (grasp_train.Train, grasp_train.train),
+    "grasp run": (grasp_run.Run, grasp_run.run),
     "grasp eval": (grasp_eval.Eval, grasp_eval.evaluate),
 }
 

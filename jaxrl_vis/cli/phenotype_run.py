@@ -4,7 +4,7 @@ import dataclasses
 import hashlib
 import sys
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Protocol
 
 from jaxrl_vis.cli.checks import check_extra
 from jaxrl_vis.cli.parsing import ByPlaceToo
@@ -52,7 +52,7 @@ def run(options: Run) -> int:
     from jaxrl_vis.phenotyping.folders import find_plots
 
     plots = find_plots(options.folder)
-    calibrations = {plot.name: _calibration(plot.folder, options) for plot in plots}
+    calibrations = {plot.name: calibration_of(plot.folder, options) for plot in plots}
     check_devices()
     from jaxrl_vis.phenotyping.pipeline import Request, run
 
@@ -109,8 +109,22 @@ def networks(weights: Path | None, least_score: float):
     return finder, f"networks {digest}, least score {least_score:g}"
 
 
-def _calibration(folder: Path, options: Run):
-    """Calibration of one plot; None where there is none."""
+class CalibrationOptions(Protocol):
+    """The options of a command that say what is known of the cameras."""
+
+    @property
+    def calibration(self) -> Path | None:
+        """File or folder."""
+        ...
+
+    @property
+    def calibration_unit(self) -> Literal["m", "mm"] | None:
+        """Of the baseline."""
+        ...
+
+
+def calibration_of(folder: Path, options: CalibrationOptions):
+    """Calibration of one folder of pairs; None where there is none."""
     from jaxrl_vis.phenotyping.calibration import read_calibration
 
     if options.calibration is not None:

@@ -96,7 +96,7 @@ def draw_scene(family: Family, seed: int) -> Scene:
     for pair in sequence:
         driven = float(sequence.drive.odometry[pair.frame])
         views.append(View(pair.frame, np.asarray(pair.left), np.asarray(pair.right), driven))
-        masks.append(true_mask(pair.instance, sequence.plot))
+        masks.append(true_mask(pair.instance, len(sequence.plot.measured)))
     return Scene(sequence.plot, sequence.drive, Mount.of(family.rig), tuple(views), np.stack(masks))
 
 

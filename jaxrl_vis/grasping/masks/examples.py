@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import jax
 import numpy as np
 
-from jaxrl_vis_envs.plants import Family, Plot, draw
+from jaxrl_vis_envs.plants import Family, draw
 from jaxrl_vis_envs.plants.pairs import Sequence
 
 
@@ -23,10 +23,15 @@ class Example:
     mask: np.ndarray
 
 
-def true_mask(instance: jax.Array | np.ndarray, plot: Plot) -> np.ndarray:
-    """Pixels of the stalks of the near row: [H, W] bool, from an image of instances [H, W] int."""
+def true_mask(instance: jax.Array | np.ndarray, count: int) -> np.ndarray:
+    """Pixels of the stalks of the near row: [H, W] bool.
+
+    Args:
+        instance: [H, W] int, which stalk each pixel shows; those of the near row come first.
+        count: Stalks of the near row.
+    """
     instance = np.asarray(instance)
-    return (instance >= 0) & (instance < len(plot.measured))
+    return (instance >= 0) & (instance < count)
 
 
 def synthetic_examples(family: Family, seeds: Iterator[int], frames: int = 2) -> Iterator[Example]:
@@ -43,4 +48,4 @@ def synthetic_examples(family: Family, seeds: Iterator[int], frames: int = 2) ->
         chosen = sorted({round(each) for each in np.linspace(0, length - 1, min(frames, length))})
         for frame in chosen:
             image, instance, _ = sequence.left(frame)
-            yield Example(np.asarray(image), true_mask(instance, sequence.plot))
+            yield Example(np.asarray(image), true_mask(instance, len(sequence.plot.measured)))
