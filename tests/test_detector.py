@@ -16,7 +16,7 @@ from jaxrl_vis.phenotyping.detector.losses import NOTHING, STALK, UNCLEAR, assig
 from jaxrl_vis.phenotyping.detector.snips import cut, put_back, snip_shape
 from jaxrl_vis.phenotyping.detector.weights import read_weights, write_weights
 from jaxrl_vis.phenotyping.training.augment import move
-from jaxrl_vis.phenotyping.training.examples import Example, annotated_examples, settings_for
+from jaxrl_vis.phenotyping.training.examples import Example, _instance_masks, annotated_examples, settings_for
 from jaxrl_vis.phenotyping.training.loop import Plan, train
 
 RECORDED = np.load(Path(__file__).parent / "data" / "torchvision_boxes.npz")
@@ -106,7 +106,7 @@ def test_a_snip_is_put_back_where_it_was():
     rng = np.random.default_rng(1)
     image = rng.uniform(0.1, 1, (60, 50)).astype(np.float32)
     stalk = np.array([18.0, 5, 40, 55, 36, 20], np.float32)
-    snip = np.asarray(cut(jnp.asarray(image), jnp.asarray(stalk)[None], (48, 16)))[0]
+    snip = np.asarray(cut(jnp.asarray(image), stalk[None], (48, 16)))[0]
     back, (line, column) = put_back(snip, stalk, image.shape)
     there = image[line : line + back.shape[0], column : column + back.shape[1]]
     assert (back > 0).sum() == 48 * 16
@@ -119,7 +119,7 @@ def test_a_snip_is_put_back_where_it_was():
 def test_snips_at_the_images_edge_are_black_beyond_it():
     image = np.ones((40, 30), np.float32)
     stalk = np.array([-4.0, 10, 6, 40, 1, 1], np.float32)
-    snip = np.asarray(cut(jnp.asarray(image), jnp.asarray(stalk)[None], (32, 16)))[0]
+    snip = np.asarray(cut(jnp.asarray(image), stalk[None], (32, 16)))[0]
     assert snip[:, :7].max() == 0 and snip[:31, 7:].min() == 1
     back, corner = put_back(snip, stalk, image.shape)
     assert corner == (9, 0) and back.min() == 1
@@ -149,8 +149,8 @@ def drawing(seed: int) -> Example:
     stalk = np.array([min(top, bottom) - 3, 15, max(top, bottom) + 3, 45, top, bottom], np.float32)
     stalks, kinds = np.zeros((4, 6), np.float32), np.zeros(4, np.int32)
     stalks[0], kinds[0] = stalk, STALK
-    snips = np.asarray(cut(jnp.asarray(image), jnp.asarray(stalk)[None], (32, 16)))
-    masks = np.asarray(cut(jnp.asarray(mask), jnp.asarray(stalk)[None], (32, 16)))
+    snips = np.asarray(cut(jnp.asarray(image), stalk[None], (32, 16)))
+    masks = np.asarray(cut(jnp.asarray(mask), stalk[None], (32, 16)))
     return Example(image, stalks, kinds, snips, masks)
 
 
@@ -212,6 +212,22 @@ def test_a_loss_that_is_not_finite_stops_the_training():
     plan = Plan(steps=40, images=2, first=2, batch=4, snips=4, rate=float("nan"))
     with pytest.raises(NonFiniteError, match="not finite at step"):
         train([iter([drawing(0), drawing(1)])], TINY, plan, lambda *rest: None, every=0.0)
+
+
+def test_a_training_without_time_for_an_update_is_told():
+    plan = Plan(minutes=1e-9, images=2, first=2, batch=4, snips=4)
+    with pytest.raises(RequestError, match="before the first update: allow more with --minutes"):
+        train([iter([drawing(0), drawing(1)])], TINY, plan, lambda *rest: None)
+
+
+def test_masks_of_snips_are_cut_out_of_what_each_pixel_shows():
+    """Also of the stalk with index 0, and at the image's edge, beyond which there is nothing."""
+    instance = jnp.asarray(np.repeat(np.arange(32) // 8 - 1, 40).reshape(32, 40).T, jnp.int32)  # [40, 32], -1 to 2
+    places = np.array([[8.0, 4, 16, 36, 10, 14], [16, 4, 24, 36, 20, 20], [24, -10, 32, 30, 30, 30]])
+    masks = _instance_masks(instance, np.array([0, 1, 2]), np.arange(3), places, (48, 16))
+    for part, mask in enumerate(masks):
+        np.testing.assert_array_equal(mask, np.asarray(cut(instance == part, places[part : part + 1], (48, 16)))[0])
+        assert mask.any()
 
 
 def test_what_fails_to_make_examples_is_told():

@@ -1,5 +1,6 @@
 """``jaxrl-vis grasp train``."""
 
+import contextlib
 import dataclasses
 import itertools
 import time
@@ -9,6 +10,7 @@ from typing import Annotated, Literal
 from jaxrl_vis.cli.checks import check_counts, check_extra
 from jaxrl_vis.cli.families import family_of
 from jaxrl_vis.cli.parsing import ByPlaceToo
+from jaxrl_vis.cli.phenotype_train import helper_processes
 from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.report.outputs import check_writable
@@ -69,7 +71,8 @@ def train(options: Train) -> int:
     check_writable(options.out, "OUT")
     family = family_of(_Drawn(options.family, options.spec, options.width), "grasping")
     check_devices()
-    return _train(options, family)
+    with contextlib.ExitStack() as stack:
+        return _train(options, family, stack)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,15 +86,17 @@ class _Drawn:
     frames: int | None = None
 
 
-def _train(options: Train, family) -> int:
+def _train(options: Train, family, stack: contextlib.ExitStack) -> int:
     from jaxrl_vis import __version__
     from jaxrl_vis.grasping.masks.examples import synthetic_examples
     from jaxrl_vis.grasping.masks.loop import Plan, train
     from jaxrl_vis.grasping.masks.painter import Settings, write_weights
 
     first = _FIRST_SEED * (1 + options.seed)
+    helpers = helper_processes(stack, options.threads)
     sources = [
-        synthetic_examples(family, itertools.count(first + thread, options.threads)) for thread in range(options.threads)
+        synthetic_examples(family, itertools.count(first + thread, options.threads), helpers=helpers)
+        for thread in range(options.threads)
     ]
     settings = Settings(options.loss)
     plan = Plan(

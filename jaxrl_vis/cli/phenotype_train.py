@@ -1,8 +1,11 @@
 """``jaxrl-vis phenotype train``."""
 
+import contextlib
 import dataclasses
 import itertools
+import multiprocessing
 import time
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Annotated
 
@@ -65,10 +68,11 @@ def train(options: Train) -> int:
     check_extra("phenotype", "phenotyping")
     check_writable(options.out, "OUT")
     check_devices()
-    return _train(options)
+    with contextlib.ExitStack() as stack:
+        return _train(options, stack)
 
 
-def _train(options: Train) -> int:
+def _train(options: Train, stack: contextlib.ExitStack) -> int:
     from jaxrl_vis import __version__
     from jaxrl_vis.phenotyping.detector.detect import Settings
     from jaxrl_vis.phenotyping.detector.weights import write_weights
@@ -88,8 +92,9 @@ def _train(options: Train) -> int:
         except ValueError as error:
             raise RequestError(str(error)) from error
         first = _FIRST_SEED * (1 + options.seed)
+        helpers = helper_processes(stack, options.threads)
         sources = [
-            synthetic_examples(family, settings, itertools.count(first + thread, options.threads))
+            synthetic_examples(family, settings, itertools.count(first + thread, options.threads), helpers=helpers)
             for thread in range(options.threads)
         ]
         origin = f"synthetic plots of family {family.name}"
@@ -118,3 +123,16 @@ def _train(options: Train) -> int:
     write_weights(options.out, params, settings, {**about, "steps": steps})
     print(f"{options.out}: {steps} updates on {origin}, {options.out.stat().st_size / 1e6:.1f} MB")
     return 0
+
+
+def helper_processes(stack: contextlib.ExitStack, threads: int) -> ProcessPoolExecutor:
+    """Processes in which plots are laid out: that takes Python half a second, in which nothing else of this one would go on.
+
+    Args:
+        stack: Ends them.
+        threads: How many threads draw what is laid out.
+    """
+    spawning = multiprocessing.get_context("spawn")
+    helpers = stack.enter_context(ProcessPoolExecutor(max(threads // 2, 1), mp_context=spawning))
+    stack.callback(helpers.shutdown, wait=False, cancel_futures=True)
+    return helpers

@@ -2,12 +2,13 @@
 
 import dataclasses
 from collections.abc import Iterator
+from concurrent.futures import Executor
 
 import jax
 import numpy as np
 
-from jaxrl_vis_envs.plants import Family, draw
-from jaxrl_vis_envs.plants.pairs import Sequence
+from jaxrl_vis.phenotyping.training.examples import sequences
+from jaxrl_vis_envs.plants import Family
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,16 +35,18 @@ def true_mask(instance: jax.Array | np.ndarray, count: int) -> np.ndarray:
     return (instance >= 0) & (instance < count)
 
 
-def synthetic_examples(family: Family, seeds: Iterator[int], frames: int = 2) -> Iterator[Example]:
+def synthetic_examples(
+    family: Family, seeds: Iterator[int], frames: int = 2, helpers: Executor | None = None
+) -> Iterator[Example]:
     """Examples of rows of a family.
 
     Args:
         family: What rows are drawn from.
         seeds: One row each.
         frames: How many images of each row; pairs that follow each other show nearly the same.
+        helpers: Processes in which rows are laid out, so that this one has time for the network; this one if not given.
     """
-    for seed in seeds:
-        sequence = Sequence.of(draw(family, seed))
+    for sequence in sequences(family, seeds, helpers):
         length = len(sequence)
         chosen = sorted({round(each) for each in np.linspace(0, length - 1, min(frames, length))})
         for frame in chosen:

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from jaxrl_vis.errors import NonFiniteError
+from jaxrl_vis.errors import NonFiniteError, RequestError
 from jaxrl_vis.grasping.masks.examples import Example
 from jaxrl_vis.grasping.masks.networks import Discriminator
 from jaxrl_vis.grasping.masks.painter import Settings, compute_dtype, normalise
@@ -162,13 +162,14 @@ def train(
 
     Raises:
         NonFiniteError: A loss is not finite any more.
+        RequestError: The time was over before the first update.
     """
     started = told = time.monotonic()
     rng = np.random.default_rng(plan.seed)
     start_key, steps_key = jax.random.split(jax.random.key(plan.seed))
     dtype = compute_dtype()
     pool = Pool(sources, plan.images)
-    step = 0
+    step, before = 0, None
     try:
         state = _initial(settings, plan.crop, start_key)
         pool.fill(plan.first)
@@ -190,6 +191,11 @@ def train(
                 if not np.isfinite(list(losses.values())).all():
                     raise NonFiniteError(f"a loss is not finite at step {step}: try a lower --rate")
                 report(step, progress, len(pool.examples), losses, state[1])
+            # The device is kept one update ahead and no more: examples are drawn on it, too, and wait for what is queued.
+            jax.block_until_ready(before)
+            before = parts
     finally:
-        pool.stop()
+        pool.close()
+    if not step:
+        raise RequestError(f"{plan.minutes:g} minutes were over before the first update: allow more with --minutes")
     return state[1], step

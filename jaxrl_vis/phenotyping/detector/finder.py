@@ -98,6 +98,6 @@ class Finder:
         for start in range(0, len(stalks), _BATCH):
             part = stalks[start : start + _BATCH]
             filled = np.pad(part, ((0, _BATCH - len(part)), (0, 0)), mode="edge")
-            snips = cut(on_device, jnp.asarray(filled), shape)
-            masks.append(_masks_of(self._params["segmenter"], snips, settings, self._dtype)[: len(part)])
-        return np.concatenate(jax.device_get(masks))
+            snips = cut(on_device, filled, shape)
+            masks.append(_masks_of(self._params["segmenter"], snips, settings, self._dtype))
+        return np.concatenate(jax.device_get(masks))[: len(stalks)]

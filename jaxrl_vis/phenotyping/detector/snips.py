@@ -23,8 +23,8 @@ def snip_shape(width: int, full: tuple[int, int], full_width: int) -> tuple[int,
     return lines, columns
 
 
-def places_of(stalks: jax.Array, shape: tuple[int, int]) -> tuple[jax.Array, jax.Array]:
-    """Which pixels of the image snips hold.
+def places_of(stalks: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Which pixels of the image snips hold. Computed on the host, once for cutting out and for putting back.
 
     Args:
         stalks: [N, 6], box and columns of the axis at its top and bottom, continuous coordinates of the image.
@@ -33,17 +33,17 @@ def places_of(stalks: jax.Array, shape: tuple[int, int]) -> tuple[jax.Array, jax
     Returns:
         First line of each snip [N] int32, and the first column of each of its lines [N, lines] int32; also beyond the image.
     """
+    stalks = np.asarray(stalks, np.float64)
     middle = 0.5 * (stalks[:, 1] + stalks[:, 3])
-    top = jnp.round(middle - 0.5 * shape[0]).astype(jnp.int32)
-    tall = jnp.maximum(stalks[:, 3] - stalks[:, 1], 1.0)
-    line = top[:, None] + jnp.arange(shape[0]) + 0.5
+    top = np.round(middle - 0.5 * shape[0]).astype(np.int32)
+    tall = np.maximum(stalks[:, 3] - stalks[:, 1], 1.0)
+    line = top[:, None] + np.arange(shape[0]) + 0.5
     share = (line - stalks[:, 1:2]) / tall[:, None]
     axis = stalks[:, 4:5] + (stalks[:, 5:6] - stalks[:, 4:5]) * share
-    return top, jnp.round(axis - 0.5 * shape[1]).astype(jnp.int32)
+    return top, np.round(axis - 0.5 * shape[1]).astype(np.int32)
 
 
-@functools.partial(jax.jit, static_argnums=2)
-def cut(image: jax.Array, stalks: jax.Array, shape: tuple[int, int]) -> jax.Array:
+def cut(image: jax.Array, stalks: np.ndarray, shape: tuple[int, int]) -> jax.Array:
     """Snips [N, lines, columns, ...] of an image [H, W, ...]; 0 beyond the image.
 
     Args:
@@ -51,9 +51,13 @@ def cut(image: jax.Array, stalks: jax.Array, shape: tuple[int, int]) -> jax.Arra
         stalks: [N, 6]; see `places_of`.
         shape: Lines and columns of a snip.
     """
-    top, left = places_of(stalks, shape)
-    lines = top[:, None] + jnp.arange(shape[0])
-    columns = left[..., None] + jnp.arange(shape[1])
+    return _cut(image, *places_of(stalks, shape), shape[1])
+
+
+@functools.partial(jax.jit, static_argnums=3)
+def _cut(image: jax.Array, top: jax.Array, left: jax.Array, across: int) -> jax.Array:
+    lines = top[:, None] + jnp.arange(left.shape[1])
+    columns = left[..., None] + jnp.arange(across)
     inside = ((lines >= 0) & (lines < image.shape[0]))[..., None] & (columns >= 0) & (columns < image.shape[1])
     taken = image[jnp.clip(lines, 0, image.shape[0] - 1)[..., None], jnp.clip(columns, 0, image.shape[1] - 1)]
     return jnp.where(inside.reshape(*inside.shape, *(1,) * (image.ndim - 2)), taken, jnp.zeros((), image.dtype))
@@ -70,7 +74,7 @@ def put_back(snip: np.ndarray, stalk: np.ndarray, size: tuple[int, int]) -> tupl
     Returns:
         [h, w] float32, 0 where the snip holds nothing, and line and column of its first pixel in the image.
     """
-    top, left = (np.asarray(each)[0] for each in places_of(jnp.asarray(stalk, jnp.float32)[None], snip.shape))  # pyright: ignore[reportArgumentType]
+    top, left = (each[0] for each in places_of(stalk[None], (snip.shape[0], snip.shape[1])))
     columns = snip.shape[1]
     used = np.flatnonzero((top + np.arange(snip.shape[0]) >= 0) & (top + np.arange(snip.shape[0]) < size[0]))
     begin, end = max(int(left.min()), 0), min(int(left.max()) + columns, size[1])

@@ -2,8 +2,10 @@
 
 import dataclasses
 import functools
+import itertools
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +29,8 @@ from jaxrl_vis_envs.plants.truth import BAND, outline, stalks_in_view
 
 LEAST_VISIBLE = 0.3
 """Share of a stalk in the band that must be seen for it to count."""
+_MasksOf = Callable[[np.ndarray, np.ndarray, tuple[int, int]], np.ndarray]
+"""Masks [N, h, w] bool of the snips of stalks with indices [N], from their places [N or more, 6] and the snips' shape."""
 _BARELY = 0.02  # what is seen less is not there
 _MOST = 56
 _THIN = 4
@@ -51,7 +55,9 @@ class Example:
     masks: np.ndarray
 
 
-def synthetic_examples(family: Family, settings: Settings, seeds: Iterator[int], frames: int = 4) -> Iterator[Example]:
+def synthetic_examples(
+    family: Family, settings: Settings, seeds: Iterable[int], frames: int = 4, helpers: Executor | None = None
+) -> Iterator[Example]:
     """Examples of plots of a family.
 
     Args:
@@ -59,10 +65,10 @@ def synthetic_examples(family: Family, settings: Settings, seeds: Iterator[int],
         settings: Of the networks.
         seeds: One plot each.
         frames: How many images of each plot, spread over it.
+        helpers: Processes in which plots are laid out, so that this one has time for the networks; this one if not given.
     """
-    for seed in seeds:
-        sequence = Sequence.of(draw(family, seed))
-        rng = np.random.default_rng([seed, 17])
+    for sequence in sequences(family, iter(seeds), helpers):
+        rng = np.random.default_rng([sequence.plot.seed, 17])
         length = len(sequence)
         chosen = sorted({min(int((part + rng.random()) * length / frames), length - 1) for part in range(frames)})
         for frame in chosen:
@@ -71,11 +77,37 @@ def synthetic_examples(family: Family, settings: Settings, seeds: Iterator[int],
             true = sequence.drive.true
             thinned = np.asarray(instance[::_THIN, ::_THIN]), np.asarray(depth[::_THIN, ::_THIN])
             stalks, kinds, indices = truth_of(sequence.plot, sequence.drive.poses[frame], true, *thinned)
-            yield _example(image, stalks, kinds, functools.partial(_mask, instance, indices), settings, rng)
+            yield _example(image, stalks, kinds, functools.partial(_instance_masks, instance, indices), settings, rng)
 
 
-def _mask(instance: jax.Array, indices: np.ndarray, part: int) -> jax.Array:
-    return instance == int(indices[part])
+def sequences(family: Family, seeds: Iterator[int], helpers: Executor | None) -> Iterator[Sequence]:
+    """What the plots of seeds show; with helpers, the next one is laid out while one is looked at.
+
+    Args:
+        family: What plots are drawn from.
+        seeds: One plot each.
+        helpers: Processes in which plots are laid out; this one if not given.
+    """
+    if helpers is None:
+        yield from (_sequence(family, seed) for seed in seeds)
+        return
+    waiting = [helpers.submit(_sequence, family, seed) for seed in itertools.islice(seeds, 2)]
+    while waiting:
+        ready = waiting.pop(0)
+        waiting += [helpers.submit(_sequence, family, seed) for seed in itertools.islice(seeds, 1)]
+        yield ready.result()
+
+
+def _sequence(family: Family, seed: int) -> Sequence:
+    return Sequence.of(draw(family, seed))
+
+
+def _instance_masks(
+    instance: jax.Array, indices: np.ndarray, parts: np.ndarray, places: np.ndarray, shape: tuple[int, int]
+) -> np.ndarray:
+    """Masks of the snips of some stalks, cut out of what each pixel shows."""
+    cut_out = np.asarray(cut(instance + 1, places, shape))[: len(parts)]  # 0 is beyond the image
+    return cut_out == indices[parts][:, None, None] + 1
 
 
 def truth_of(
@@ -108,8 +140,8 @@ def truth_of(
     return np.array(stalks, np.float32).reshape(-1, 6), np.array(kinds, np.int32), np.array(indices, np.int32)
 
 
-def _example(image: Any, stalks: np.ndarray, kinds: np.ndarray, mask_of: Any, settings: Settings, rng: Any) -> Example:
-    """An example of a whole image [H, W, 3]; ``mask_of`` gives the mask [H, W] of each stalk."""
+def _example(image: Any, stalks: np.ndarray, kinds: np.ndarray, masks_of: _MasksOf, settings: Settings, rng: Any) -> Example:
+    """An example of a whole image [H, W, 3]."""
     whole = np.asarray(image)
     reduced, scale = reduce(whole, settings.width)
     shape = snip_shape(whole.shape[1], (settings.snip_lines, settings.snip_columns), settings.full_width)
@@ -119,15 +151,13 @@ def _example(image: Any, stalks: np.ndarray, kinds: np.ndarray, mask_of: Any, se
     wide = 0.015 * (stalks[clear, 3] - stalks[clear, 1])[:, None]
     moved[:, 4:] += wide * rng.normal(size=(len(clear), 2))
     moved[:, 1::2][:, :2] += 2.0 * wide * rng.normal(size=(len(clear), 1))
-    on_device, places = jnp.asarray(image), jnp.asarray(moved)
+    on_device, places = jnp.asarray(image), moved
     snips, masks = np.zeros((0, *shape, 3), np.uint8), np.zeros((0, *shape), bool)
     if len(clear):
         filled = -(-len(clear) // 16) * 16  # few shapes, few programs
-        places = jnp.pad(places, ((0, filled - len(clear)), (0, 0)), mode="edge")
+        places = np.pad(places, ((0, filled - len(clear)), (0, 0)), mode="edge")
         snips = np.asarray(cut(on_device, places, shape))[: len(clear)]
-        masks = np.concatenate(
-            [np.asarray(cut(jnp.asarray(mask_of(part)), places[place : place + 1], shape)) for place, part in enumerate(clear)]
-        )
+        masks = masks_of(clear, places, shape)
     divisor = np.array([scale[1], scale[0], scale[1], scale[0], scale[1], scale[1]], np.float32)
     count = min(len(stalks), _MOST)
     padded, padded_kinds = np.zeros((_MOST, 6), np.float32), np.full(_MOST, NOTHING, np.int32)
@@ -158,7 +188,14 @@ def annotated_examples(folder: Path, settings: Settings) -> Iterator[Example]:
         stalks = np.array([stalk for stalk, _ in found], np.float32).reshape(-1, 6)
         masks = [mask for _, mask in found]
         kinds = np.full(len(found), STALK, np.int32)
-        yield _example(image, stalks, kinds, masks.__getitem__, settings, np.random.default_rng([number, 18]))
+        rng = np.random.default_rng([number, 18])
+        yield _example(image, stalks, kinds, functools.partial(_own_masks, masks), settings, rng)
+
+
+def _own_masks(masks: list[np.ndarray], parts: np.ndarray, places: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Masks of the snips of some stalks, cut out of the mask [H, W] bool of each: they may overlap."""
+    snips = [cut(jnp.asarray(masks[part]), places[place : place + 1], shape) for place, part in enumerate(parts)]
+    return np.concatenate(jax.device_get(snips))
 
 
 def read_coco(folder: Path) -> dict[str, Any]:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from jaxrl_vis.errors import NonFiniteError
+from jaxrl_vis.errors import NonFiniteError, RequestError
 from jaxrl_vis.phenotyping.detector.detect import Settings, initial, padded_shape
 from jaxrl_vis.phenotyping.detector.losses import detector_loss, segmenter_loss
 from jaxrl_vis.phenotyping.detector.networks import Segmenter
@@ -138,6 +138,7 @@ def train(
 
     Raises:
         NonFiniteError: A loss is not finite any more.
+        RequestError: The time was over before the first update.
     """
     started = told = time.monotonic()
     rng = np.random.default_rng(plan.seed)
@@ -152,6 +153,7 @@ def train(
     }
     state = params, jax.tree.map(jnp.array, params), _optimiser().init(params)
     losses: dict[str, float] = {}
+    before: Any = None
     try:
         pool.fill(plan.first)
         shape = pool.examples[0].image.shape[:2]
@@ -180,6 +182,11 @@ def train(
                 if not np.isfinite(list(losses.values())).all():
                     raise NonFiniteError(f"a loss is not finite at step {step}: try a lower --rate")
                 report(step, progress, len(pool.examples), losses, state[1])
+            # The device is kept one update ahead and no more: examples are drawn on it, too, and wait for what is queued.
+            jax.block_until_ready(before)
+            before = parts
     finally:
-        pool.stop()
+        pool.close()
+    if not step:
+        raise RequestError(f"{plan.minutes:g} minutes were over before the first update: allow more with --minutes")
     return state[1], step

@@ -28,25 +28,30 @@ class Pool(Generic[T]):
         self.examples: list[T] = []
         # The others follow when the first one has made something, and with it compiled what makes it.
         self._waiting = sources[1:]
+        self._threads: list[threading.Thread] = []
         self._start(sources[0])
 
     def _start(self, source: Iterator[T]) -> None:
-        threading.Thread(target=self._make, args=(source,), daemon=True).start()
+        self._threads.append(threading.Thread(target=self._make, args=(source,), daemon=True))
+        self._threads[-1].start()
 
     def _make(self, source: Iterator[T]) -> None:
         try:
             for example in source:
-                while not self._stop.is_set():
-                    try:
-                        self._queue.put(example, timeout=0.2)
-                        break
-                    except queue.Full:
-                        continue
+                self._hand_over(example)
                 if self._stop.is_set():
                     return
-            self._queue.put(None)
+            self._hand_over(None)
         except Exception as error:  # told where the examples are wanted
-            self._queue.put(error)
+            self._hand_over(error)
+
+    def _hand_over(self, made: T | Exception | None) -> None:
+        while not self._stop.is_set():
+            try:
+                self._queue.put(made, timeout=0.2)
+                return
+            except queue.Full:
+                continue
 
     def fill(self, least: int) -> None:
         """Takes what is ready, and waits until there are so many, or no more come."""
@@ -71,5 +76,11 @@ class Pool(Generic[T]):
         self.examples.append(example)
 
     def stop(self) -> None:
-        """Ends the threads."""
+        """Tells the threads to make no more."""
         self._stop.set()
+
+    def close(self) -> None:
+        """Ends the threads: one that still computes when the program ends would make it crash."""
+        self.stop()
+        for thread in self._threads:
+            thread.join()
