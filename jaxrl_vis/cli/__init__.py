@@ -19,6 +19,10 @@ from jaxrl_vis.cli import (
     envs,
     eval,
     figure,
+    grasp,
+    grasp_eval,
+    grasp_run,
+    grasp_train,
     phenotype,
     phenotype_eval,
     phenotype_run,
@@ -42,6 +46,10 @@ COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
     "phenotype train": (phenotype_train.Train, phenotype_train.train),
     "phenotype run": (phenotype_run.Run, phenotype_run.run),
     "phenotype eval": (phenotype_eval.Eval, phenotype_eval.evaluate),
+    "grasp synth": (grasp.Synth, grasp.synth),
+    "grasp train": (grasp_train.Train, grasp_train.train),
+    "grasp run": (grasp_run.Run, grasp_run.run),
+    "grasp eval": (grasp_eval.Eval, grasp_eval.evaluate),
 }
 
 # Of the errors that are told in one line.

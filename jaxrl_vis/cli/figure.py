@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from jaxrl_vis.cli.checks import check_counts
+from jaxrl_vis.cli.checks import check_counts, check_extra
 from jaxrl_vis.config import PRESETS
 from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError, nearest
@@ -15,8 +15,10 @@ from jaxrl_vis.report.outputs import check_writable
 if TYPE_CHECKING:
     from jaxrl_vis.studies.show import Request
 
-FigureName = Literal["5.1", "5.2", "estimators", "cameras", "5.4", "5.5", "5.6", "5.7", "quadratic"]
+FigureName = Literal["4.4", "5.1", "5.2", "estimators", "cameras", "5.4", "5.5", "5.6", "5.7", "quadratic"]
 SUFFIXES = (".png", ".pdf", ".svg")
+# Figures that train nothing -> options that they take.
+_DRAWN_HERE = {"4.4": ("figure", "out", "seed"), "quadratic": ("figure", "out")}
 UNFINISHED = 3
 """Exit status: finished, with something left out."""
 
@@ -25,7 +27,7 @@ UNFINISHED = 3
 class Figure:
     """Draw a figure: train or compute what it shows, and write it to a file, with a table beside it.
 
-    5.1, 5.2: rewards with and without ground truth. estimators: rewards from state estimators that err. cameras: noisy and
+    4.4: from a stereo pair to grasp points, of a synthetic run; --seed chooses it. 5.1, 5.2: rewards with and without ground truth. estimators: rewards from state estimators that err. cameras: noisy and
     varied images. 5.4: auxiliary losses, and how they are weighted. 5.5: single auxiliary tasks. 5.6: their weights over
     training. 5.7: what OL-AUX-5 owes to looking ahead. These train what is missing, one process a GPU, and resume what was
     begun, so they may be interrupted and started again at any time; the exit status is 3 where something is still missing.
@@ -67,12 +69,13 @@ class Figure:
 def run(options: Figure) -> int:
     """Draws one figure; `UNFINISHED` where a run that belongs to it is not finished."""
     is_quadratic = options.figure == "quadratic"
+    is_drawn_here = options.figure in _DRAWN_HERE
     out = options.out or Path("quadratic.png" if is_quadratic else f"figure_{options.figure}.png")
     if out.suffix.lower() not in SUFFIXES:
         raise RequestError(f"--out {out}: a figure is a file that ends in {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
-    if is_quadratic:
+    if is_drawn_here:
         _refuse_options_of_runs(options)
-    for file in (out,) if is_quadratic else (out, out.with_suffix(".md"), out.with_suffix(".csv")):
+    for file in (out,) if is_drawn_here else (out, out.with_suffix(".md"), out.with_suffix(".csv")):
         check_writable(file, "--out")
     if is_quadratic:
         from jaxrl_vis.studies import quadratic
@@ -81,6 +84,8 @@ def run(options: Figure) -> int:
         quadratic.draw(out)
         print(out)
         return 0
+    if options.figure == "4.4":
+        return _draw_grasping(out, options.seed or 0)
     # Nothing below starts JAX in this process: the accelerator's memory belongs to the runs.
     from jaxrl_vis.studies.figures import make_figure
 
@@ -89,8 +94,26 @@ def run(options: Figure) -> int:
 
 def _refuse_options_of_runs(options: Figure) -> None:
     for field in dataclasses.fields(options):
-        if field.name not in ("figure", "out") and getattr(options, field.name) != field.default:
-            raise RequestError(f"--{field.name.replace('_', '-')} goes with figures of training runs, not with quadratic")
+        if field.name not in _DRAWN_HERE[options.figure] and getattr(options, field.name) != field.default:
+            option = f"--{field.name.replace('_', '-')}"
+            raise RequestError(f"{option} goes with figures of training runs, not with {options.figure}")
+
+
+def _draw_grasping(out: Path, seed: int) -> int:
+    """Draws figure 4.4, with the masks of the networks that are shipped, or true ones."""
+    if seed < 0:
+        raise RequestError(f"--seed must be at least 0, not {seed}")
+    check_extra("figure 4.4", "grasping")
+    check_devices()
+    from jaxrl_vis.cli.grasp import painter_of
+    from jaxrl_vis.grasping.figure import draw_figure
+    from jaxrl_vis.grasping.masks.painter import SHIPPED
+    from jaxrl_vis_envs.plants.grasping import GRASPING
+
+    painter, name = painter_of(None, "gan") if SHIPPED["gan"].exists() else (None, "truth")
+    draw_figure(out, GRASPING, seed, None if painter is None else lambda image, number: painter(image), name)
+    print(out)
+    return 0
 
 
 def _request(options: Figure, out: Path) -> "Request":

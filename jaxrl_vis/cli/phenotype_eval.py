@@ -6,8 +6,8 @@ import math
 from pathlib import Path
 from typing import Literal
 
-from jaxrl_vis.cli.checks import check_counts
-from jaxrl_vis.cli.phenotype import Synth, check_extra, family_of
+from jaxrl_vis.cli.checks import check_counts, check_extra
+from jaxrl_vis.cli.families import family_of
 from jaxrl_vis.cli.phenotype_run import networks
 from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError
@@ -49,12 +49,10 @@ def evaluate(options: Eval) -> int:
     check_counts(plots=options.plots, frames=options.frames, width=options.width)
     if options.seed < 0:
         raise RequestError(f"--seed must be at least 0, not {options.seed}")
-    check_extra()
+    check_extra("phenotype", "phenotyping")
     if options.json is not None:
         check_writable(options.json, "--json")
-    drawn_from = options.family or ("shifted" if options.spec is None else "training")
-    drawn = Synth(Path(), drawn_from, options.shift, options.spec, frames=options.frames, width=options.width)
-    family = family_of(drawn)
+    family = family_of(options, "phenotyping", "shifted")
     check_devices()
     from jaxrl_vis.files import write_atomically
     from jaxrl_vis.phenotyping.evaluate import score_plot, summary

@@ -23,10 +23,11 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.files import write_atomically
 from jaxrl_vis.phenotyping.detector.finder import Detection
 from jaxrl_vis.phenotyping.folders import PairFiles, PlotFolder, read_odometry
-from jaxrl_vis.phenotyping.images import read_image, write_image
+from jaxrl_vis.phenotyping.images import write_image
 from jaxrl_vis.phenotyping.measure import Method
 from jaxrl_vis.phenotyping.overlay import draw_overlay
 from jaxrl_vis.phenotyping.pairing import wrong_with
+from jaxrl_vis.phenotyping.reading import Unusable, read_pair
 from jaxrl_vis.phenotyping.results import (
     PLOT_COLUMNS,
     STALK_COLUMNS,
@@ -63,10 +64,6 @@ class Request:
     finder: str
     calibrations: dict[str, Calibration | None]
     speed: float | None = None
-
-
-class _Skip(Exception):
-    """A pair that cannot be used. The message says why."""
 
 
 def run(
@@ -138,9 +135,9 @@ def _claim(plots: list[PlotFolder], request: Request) -> None:
 def _record(plot: PlotFolder, pair: PairFiles, find: Find, request: Request) -> dict[str, Any]:
     """What is kept of one pair."""
     try:
-        left, right = _read(pair, request.calibrations[plot.name])
+        left, right = read_pair(pair, request.calibrations[plot.name])
         detections = find(left, plot, pair)
-    except _Skip as problem:
+    except Unusable as problem:
         return {"skipped": str(problem)}
     calibration = request.calibrations[plot.name]
     sightings = look(detections, left, right, calibration, request.method)
@@ -148,34 +145,6 @@ def _record(plot: PlotFolder, pair: PairFiles, find: Find, request: Request) -> 
     if wrong is not None:
         return {"skipped": wrong}
     return {"size": list(left.shape[:2]), "sightings": [dataclasses.asdict(each) for each in sightings]}
-
-
-def _read(pair: PairFiles, calibration: Calibration | None) -> tuple[np.ndarray, np.ndarray]:
-    """Both images [H, W, 3] uint8.
-
-    Raises:
-        _Skip: They are not a pair of images that can be used.
-    """
-    images = []
-    for side, path in (("left", pair.left), ("right", pair.right)):
-        if path is None:
-            raise _Skip(f"there is no {side} image")
-        try:
-            image = read_image(path)
-        except OSError as error:
-            raise _Skip(f"{path.name}: {error.strerror or 'it is not an image, or only a part of one'}") from error
-        image = (image >> 8).astype(np.uint8) if image.dtype == np.uint16 else image
-        images.append(np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image)
-    left, right = images
-    if left.shape != right.shape:
-        sizes = [f"{image.shape[1]} x {image.shape[0]}" for image in images]
-        raise _Skip(f"the left image has {sizes[0]} pixels and the right one {sizes[1]}")
-    if calibration is not None and left.shape[:2] != (calibration.height, calibration.width):
-        wanted = f"{calibration.width} x {calibration.height}"
-        raise _Skip(f"the images have {left.shape[1]} x {left.shape[0]} pixels, but the calibration is for {wanted}")
-    if min(int(left.max()), int(right.max())) < 8:
-        raise _Skip(f"the {'left' if left.max() < 8 else 'right'} image is black")
-    return left, right
 
 
 def _finish(
@@ -202,7 +171,7 @@ def _finish(
     for (pair, _), frame, names in zip(usable, frames, labels):
         target = folder / f"{pair.name}.png"
         if not target.exists():
-            left, _ = _read(pair, calibration)
+            left, _ = read_pair(pair, calibration)
             write_image(target, draw_overlay(left, frame, names))
     return rows
 
