@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
+from jaxrl_vis import fields
 from jaxrl_vis.cli.checks import check_env
 from jaxrl_vis.cli.parsing import ByPlaceToo, ChangesOf, SayDefault
 from jaxrl_vis.config import PRESETS, Config, preset, validate
@@ -45,6 +46,9 @@ class Train:
     preset: Annotated[str, SayDefault(_default_preset)] = "auto"
     """paper, fast, cpu or debug; auto is fast on an accelerator, else cpu."""
     changes: Annotated[Mapping[str, Any], ChangesOf(Config, _defaults)] = dataclasses.field(default_factory=dict)
+    devices: str | None = None
+    """How many devices to use, or all (docs/scaling.md). Several seeds are divided among them; of one seed, each batch and the
+    environments are. One if not given."""
     run_dir: Path | None = None
     """Folder for metrics, images and checkpoints; a new one under runs/ if not given."""
     resume: bool = False
@@ -53,6 +57,23 @@ class Train:
     """Start afresh in a run folder that exists."""
     log: tuple[LoggerName, ...] = ()
     """Show the run in TensorBoard or in Weights & Biases, too; those of the run if not given with --resume."""
+
+
+def count_devices(asked: str) -> int:
+    """How many devices ``--devices`` means: a number, or all that JAX finds.
+
+    Raises:
+        RequestError: It is neither.
+    """
+    if asked.lower() != "all":
+        return fields.read("--devices", int, [asked])
+    import jax
+
+    from jaxrl_vis.run.signals import shielded_children
+
+    with shielded_children():
+        check_devices()
+        return len(jax.devices())
 
 
 def training_config(options: Train) -> Config:
@@ -64,6 +85,8 @@ def training_config(options: Train) -> Config:
         RequestError: There is no such preset, or the saved run cannot be read.
     """
     changes = dict(options.changes) | ({} if options.env is None else {"env": options.env})
+    if options.devices is not None:
+        changes["devices"] = count_devices(options.devices)
     name = options.preset
     if name not in ("auto", *PRESETS):
         raise RequestError(f"unknown preset {name!r}{nearest(name, ['auto', *PRESETS])}")

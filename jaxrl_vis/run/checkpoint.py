@@ -352,14 +352,15 @@ def _host_specs(tree: Any) -> dict[str, jax.ShapeDtypeStruct]:
 
 
 def _rebuild(template: Any, arrays: dict[str, jax.Array]) -> Any:
-    """The inverse of `to_host`: a tree like ``template``."""
+    """The inverse of `to_host`: a tree like ``template``, which also says where its arrays are to lie."""
 
     def convert(path: Any, leaf: Any) -> jax.Array:
         array = arrays[jax.tree_util.keystr(path, simple=True, separator=".")]
         if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
             # The default kind, as `Trainer.run_keys` makes them; another one has another number of words, noticed before this.
-            return jax.random.wrap_key_data(array)
-        return array
+            array = jax.random.wrap_key_data(array)
+        sharding = getattr(leaf, "sharding", None)
+        return array if sharding is None else jax.device_put(array, sharding)
 
     return jax.tree.map_with_path(convert, template)
 

@@ -198,7 +198,8 @@ class RunLoop:
         # draws); the replay starts empty, and knows that it is. Until it has filled up again, updates see fewer and newer
         # episodes than they would have: a sound run, but not the one that was interrupted.
         fresh = self._programs.init(self._programs.run_keys)
-        self._loop = fresh.replace(train=restored.train, iteration=jnp.asarray(self._done, fresh.iteration.dtype))
+        iteration = self._programs.layout.put(jnp.asarray(self._done, fresh.iteration.dtype), self._programs.layout.everywhere)
+        self._loop = fresh.replace(train=restored.train, iteration=iteration)
         if self._done < self._total:
             self._progress.replay_lost_at = self._done
         self._say(
