@@ -5,11 +5,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
-from jaxrl_vis import fields
 from jaxrl_vis.cli.checks import check_env
 from jaxrl_vis.cli.parsing import ByPlaceToo, ChangesOf, SayDefault
 from jaxrl_vis.config import PRESETS, Config, preset, validate
-from jaxrl_vis.devices import check_devices, guess_accelerator
+from jaxrl_vis.devices import check_devices, count_devices, guess_accelerator
 from jaxrl_vis.errors import RequestError, nearest
 from jaxrl_vis.report.outputs import check_writable
 from jaxrl_vis.run import loggers
@@ -59,23 +58,6 @@ class Train:
     """Show the run in TensorBoard or in Weights & Biases, too; those of the run if not given with --resume."""
 
 
-def count_devices(asked: str) -> int:
-    """How many devices ``--devices`` means: a number, or all that JAX finds.
-
-    Raises:
-        RequestError: It is neither.
-    """
-    if asked.lower() != "all":
-        return fields.read("--devices", int, [asked])
-    import jax
-
-    from jaxrl_vis.run.signals import shielded_children
-
-    with shielded_children():
-        check_devices()
-        return len(jax.devices())
-
-
 def training_config(options: Train) -> Config:
     """The configuration that a command asks for: what it gives, and the rest from a saved run or a preset.
 
@@ -86,7 +68,10 @@ def training_config(options: Train) -> Config:
     """
     changes = dict(options.changes) | ({} if options.env is None else {"env": options.env})
     if options.devices is not None:
-        changes["devices"] = count_devices(options.devices)
+        from jaxrl_vis.run.signals import shielded_children
+
+        with shielded_children():
+            changes["devices"] = count_devices(options.devices)
     name = options.preset
     if name not in ("auto", *PRESETS):
         raise RequestError(f"unknown preset {name!r}{nearest(name, ['auto', *PRESETS])}")

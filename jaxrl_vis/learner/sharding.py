@@ -50,7 +50,16 @@ class Layout:
         return 1 if self.mesh is None else self.mesh.size
 
     @property
-    def devices(self) -> list[jax.Device]:
+    def name(self) -> str:
+        """For people, such as ``2 x NVIDIA H200``."""
+        kind = jax.devices()[0].device_kind
+        if self.mesh is None:
+            return kind
+        shared = f", each learner on {self.shards.count} of them" if self.shards.count > 1 else ""
+        return f"{self.num_devices} x {kind}{shared}"
+
+    @property
+    def devices(self) -> list[Any]:
         """Those of them that belong to this process."""
         return jax.devices()[:1] if self.mesh is None else list(self.mesh.local_devices)
 

@@ -19,7 +19,7 @@ import shutil
 import sys
 import threading
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -317,6 +317,7 @@ class Checkpoints:
             raise RequestError(f"{where} is of schema {manifest['schema']}, not {SCHEMA}: use the version that wrote it")
         for name, spec in specs.items():
             _check_structure(where, manifest["items"].get(name, {}), spec)
+            specs[name] = {leaf: _as_saved(manifest["items"][name][leaf][0], expected) for leaf, expected in spec.items()}
         read = self._read(tier, iteration, {name: ocp.args.StandardRestore(spec) for name, spec in specs.items()})
         trees = {}
         for name, tree in templates.items():
@@ -339,11 +340,25 @@ class Checkpoints:
             raise _Damaged(f"{type(error).__name__}: {text}") from None
 
 
+def _is_folded(one: Sequence[int], other: Sequence[int]) -> bool:
+    """Whether two shapes are [S, rollouts, E, ...] and [S, rollouts * E, ...], of the same episodes (`sharding.Layout`)."""
+    (start, *rest), (folded_start, *folded) = sorted((tuple(one), tuple(other)), key=len)
+    return len(folded) >= 2 and start == folded_start and rest == [folded[0] * folded[1], *folded[2:]]
+
+
+def _as_saved(shape: Sequence[int], expected: jax.ShapeDtypeStruct) -> Any:
+    """What orbax is asked for: an array on the first device, or one on the host that is divided among devices later."""
+    if tuple(shape) == expected.shape and isinstance(expected.sharding, jax.sharding.SingleDeviceSharding):
+        return expected
+    return np.broadcast_to(np.zeros((), expected.dtype), tuple(shape))
+
+
 def _host_specs(tree: Any) -> dict[str, jax.ShapeDtypeStruct]:
-    """What `to_host` makes of a tree with these shapes, placed on the first device."""
-    device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    """What `to_host` makes of a tree with these shapes, placed on the first device where the shapes do not say where."""
+    first = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
 
     def convert(leaf: Any) -> jax.ShapeDtypeStruct:
+        device = getattr(leaf, "sharding", None) or first
         if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
             leaf = jax.eval_shape(jax.random.key_data, leaf)
         return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=device)
@@ -355,12 +370,15 @@ def _rebuild(template: Any, arrays: dict[str, jax.Array]) -> Any:
     """The inverse of `to_host`: a tree like ``template``, which also says where its arrays are to lie."""
 
     def convert(path: Any, leaf: Any) -> jax.Array:
-        array = arrays[jax.tree_util.keystr(path, simple=True, separator=".")]
+        array, sharding = arrays[jax.tree_util.keystr(path, simple=True, separator=".")], getattr(leaf, "sharding", None)
         if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
             # The default kind, as `Trainer.run_keys` makes them; another one has another number of words, noticed before this.
-            array = jax.random.wrap_key_data(array)
-        sharding = getattr(leaf, "sharding", None)
-        return array if sharding is None else jax.device_put(array, sharding)
+            array = jax.random.wrap_key_data(jnp.asarray(array))
+        elif array.shape != leaf.shape:
+            array = array.reshape(leaf.shape)
+        if sharding is None:
+            return jnp.asarray(array)
+        return jax.device_put(array, sharding)
 
     return jax.tree.map_with_path(convert, template)
 
@@ -371,6 +389,9 @@ def _check_structure(where: Path, saved: dict[str, list], expected: dict[str, ja
     for name in sorted(set(saved) | set(expected)):
         there = f"{saved[name][1]}{saved[name][0]}" if name in saved else "nothing"
         here = f"{expected[name].dtype}{list(expected[name].shape)}" if name in expected else "nothing"
+        if there != here and name.startswith("replay.episodes.") and name in saved and name in expected:
+            if saved[name][1] == str(expected[name].dtype) and _is_folded(saved[name][0], expected[name].shape):
+                continue
         if there != here:
             differences.append(f"{name} is {there} there and {here} here")
     if differences:

@@ -89,7 +89,8 @@ class RunLoop:
         if resume and not goes_on:
             self._say(f"nothing to resume in {self._folder.path}: starting at the beginning")
         steps = self._program.steps_per_iteration
-        memory = check_memory(self._config, self._programs.shapes, self._program.replay_bytes, steps)
+        shapes, layout = self._programs.shapes, self._programs.layout
+        memory = check_memory(self._config, shapes, self._program.replay_bytes, steps, layout)
         with self._folder.lock(), self._console:
             if goes_on and self._is_finished():
                 self._say(
@@ -154,7 +155,7 @@ class RunLoop:
     def _prepare(self, goes_on: bool, memory: str) -> dict[str, Any]:
         """Restores and compiles; the compiled programs by name. Nothing is written."""
         programs, steps = self._programs, self._program.steps_per_iteration
-        self._say(f"{self._config.env}, {self._asked}, on {jax.devices()[0].device_kind}; {memory}")
+        self._say(f"{self._config.env}, {self._asked}, on {programs.layout.name}; {memory}")
         self._say(f"{self._total} iterations of {steps:,} environment steps per seed; files go to {self._folder.path}")
         restored = self._checkpoints.restore_for_resume(programs.shapes) if goes_on else None
         if restored is not None:
@@ -172,7 +173,7 @@ class RunLoop:
     def _begin(self, compiled: dict[str, Any], goes_on: bool, overwrite: bool) -> None:
         """Asks for memory once more, the last thing that can refuse the run; then makes the folder and the state ready."""
         self._say(f"compiled in {show_seconds(self._compile_s)}")
-        check_compiled(compiled, already_there=self._loop is not None)
+        check_compiled(compiled, already_there=self._loop is not None, layout=self._programs.layout)
         self._folder.open(self._config, goes_on, overwrite, self._log)
         if goes_on:
             damaged = self._checkpoints.set_aside_after(self._done)
