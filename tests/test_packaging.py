@@ -17,7 +17,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("errors", "methods"),
     ("fields",),
     ("config", "types", "provenance", "files"),
-    ("devices",),
+    ("devices", "processes"),
     ("learner",),
     ("report",),
     ("run",),

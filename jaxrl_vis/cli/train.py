@@ -5,7 +5,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
-from jaxrl_vis.cli.checks import check_env
+from jaxrl_vis import processes
+from jaxrl_vis.cli.checks import check_counts, check_env
 from jaxrl_vis.cli.parsing import ByPlaceToo, ChangesOf, SayDefault
 from jaxrl_vis.config import PRESETS, Config, preset, validate
 from jaxrl_vis.devices import check_devices, count_devices, guess_accelerator
@@ -54,6 +55,14 @@ class Train:
     """Continue from the newest checkpoint in the run folder, which must be there."""
     overwrite: bool = False
     """Start afresh in a run folder that exists."""
+    coordinator: str | None = None
+    """Where several processes that train as one find the first of them, as HOST:PORT; not needed under srun and mpirun."""
+    num_processes: int | None = None
+    """How many such processes there are."""
+    process_id: int | None = None
+    """Which of them this is, from 0; the first writes metrics and images."""
+    start_timeout: int = processes.START_S
+    """How long they wait for each other at the start, s."""
     log: tuple[LoggerName, ...] = ()
     """Show the run in TensorBoard or in Weights & Biases, too; those of the run if not given with --resume."""
 
@@ -90,6 +99,11 @@ def training_config(options: Train) -> Config:
 
 def run(options: Train) -> int:
     """Trains; every report has already been shown and saved by the trainer."""
+    check_counts(start_timeout=options.start_timeout)
+    place = processes.find_place(options.coordinator, options.num_processes, options.process_id)
+    if place is not None:
+        processes.start(place, options.start_timeout)
+        options = dataclasses.replace(options, devices=options.devices or "all")
     if options.resume and options.overwrite:
         raise RequestError("--resume and --overwrite contradict each other; give one of them")
     loggers.check(options.log)

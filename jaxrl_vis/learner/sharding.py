@@ -16,6 +16,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as Spec
@@ -74,6 +75,11 @@ class Layout:
         return Spec(SEED, DATA)
 
     @property
+    def read_by_host(self) -> Spec:
+        """[S, ...], where the host is to read it: where seeds lie on devices of other processes, all devices get all of it."""
+        return Spec() if jax.process_count() > 1 else Spec(SEED)
+
+    @property
     def everywhere(self) -> Spec:
         """The same on all devices."""
         return Spec()
@@ -96,7 +102,9 @@ class Layout:
         place = functools.partial(NamedSharding, self.mesh)
         return jax.tree.map(place, specs, is_leaf=lambda leaf: isinstance(leaf, Spec))
 
-    def spread(self, function: Callable, in_specs: tuple, out_specs: Any, jit: Callable, **options: Any) -> Any:
+    def spread(
+        self, function: Callable, in_specs: tuple, out_specs: Any, jit: Callable, kept_as: Any = None, **options: Any
+    ) -> Any:
         """Compiles a function of one device's part so that it runs on all devices.
 
         Args:
@@ -104,13 +112,14 @@ class Layout:
             in_specs: A partition spec, or a tree of them, for each argument.
             out_specs: The same for what it returns.
             jit: Such as `jax.jit`.
+            kept_as: Partition specs of what is returned in the end; None: ``out_specs``.
             **options: Of ``jit``.
         """
         if self.mesh is None:
             return jit(function, **options)
         # Kernels and custom rules do not say along which axes their results vary, so JAX cannot check it.
         mapped = jax.shard_map(function, mesh=self.mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False)
-        shardings = {"in_shardings": self.shardings(in_specs), "out_shardings": self.shardings(out_specs)}
+        shardings = {"in_shardings": self.shardings(in_specs), "out_shardings": self.shardings(kept_as or out_specs)}
         return jit(mapped, **shardings, **options)
 
     def with_shardings(self, shapes: Any, specs: Any) -> Any:
@@ -132,7 +141,11 @@ class Layout:
         """Moves arrays to where they belong; a leaf of ``specs`` stands for a part of ``tree``."""
         if self.mesh is None:
             return tree
-        return jax.tree.map(lambda sharding, part: jax.device_put(part, sharding), self.shardings(specs), tree)
+
+        def placed(sharding: NamedSharding, part: Any) -> Any:
+            return jax.tree.map(lambda leaf: put_array(leaf, sharding), part)
+
+        return jax.tree.map(placed, self.shardings(specs), tree)
 
     def folded(self, replay: ReplayState, num_envs: int) -> ReplayState:
         """One device's part of a replay as it is between two iterations; [S, rollouts * E, ...] before.
@@ -162,6 +175,17 @@ class Layout:
         return ReplayState(episodes=jax.tree.map(join, replay.episodes), size=replay.size // count)
 
 
+def put_array(array: Any, sharding: Any) -> jax.Array:
+    """Moves an array to where it belongs, which may be devices of several processes: all call this with the same array."""
+    if sharding.is_fully_addressable or getattr(array, "sharding", None) == sharding:
+        return jax.device_put(array, sharding)
+    if jnp.issubdtype(array.dtype, jax.dtypes.prng_key):
+        words = put_array(np.asarray(jax.random.key_data(array)), sharding)
+        return jax.jit(jax.random.wrap_key_data, out_shardings=sharding)(words)
+    host = np.asarray(array)
+    return jax.make_array_from_callback(host.shape, sharding, lambda index: host[index])
+
+
 ONE_DEVICE = Layout()
 """Everything on JAX's first device."""
 
@@ -175,7 +199,7 @@ def make_layout(config: Config) -> Layout:
     Raises:
         RequestError: There are not so many devices.
     """
-    if config.devices == 1:
+    if config.devices == 1 and jax.process_count() == 1:
         return ONE_DEVICE
     there = jax.devices()
     if config.devices > len(there):

@@ -168,7 +168,9 @@ def _jitted(
     spread = functools.partial(layout.spread, jit=env_jit)
     return {
         "init": spread(init, (seeds,), loop, runs_once=True),
-        "train_iteration": spread(train_iteration, (loop,), (loop, seeds), donate_argnums=0),
+        "train_iteration": spread(
+            train_iteration, (loop,), (loop, seeds), kept_as=(loop, layout.read_by_host), donate_argnums=0
+        ),
         "rollout": spread(rollout, (seeds, seeds), (environments, environments)),
         "insert": spread(insert, (seeds, replay, environments, seeds, whole), (seeds, replay), donate_argnums=(0, 1)),
         "update_many": spread(update_many, (seeds, replay, seeds, whole), (seeds, seeds), donate_argnums=0),
@@ -176,7 +178,9 @@ def _jitted(
 
 
 def _jitted_evaluate(layout: Layout, evaluate: Callable) -> Any:
-    return layout.spread(evaluate, (layout.by_seed, layout.everywhere), (layout.by_seed, layout.by_environment), env_jit)
+    in_specs, out_specs = (layout.by_seed, layout.everywhere), (layout.by_seed, layout.by_environment)
+    kept_as = (layout.read_by_host, layout.read_by_host) if jax.process_count() > 1 else None
+    return layout.spread(evaluate, in_specs, out_specs, env_jit, kept_as)
 
 
 def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None) -> TrainStep:

@@ -27,9 +27,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
+from jax.experimental import multihost_utils
 from orbax.checkpoint.checkpoint_managers import LatestN
 
+from jaxrl_vis import processes
 from jaxrl_vis.errors import RequestError, StorageError
+from jaxrl_vis.learner.sharding import put_array
 from jaxrl_vis.types import LoopState, TrainState
 
 LIGHT, FULL = "light", "full"
@@ -97,6 +100,59 @@ def _checksum(array: np.ndarray) -> int:
 
 def _describe(arrays: Arrays) -> dict[str, list]:
     return {name: [list(array.shape), str(array.dtype), _checksum(array)] for name, array in arrays.items()}
+
+
+def _to_save(tree: Any, copy: bool) -> Arrays | dict[str, jax.Array]:
+    """The leaves of a pytree by name, as they are given to orbax: from several processes each writes what it has."""
+    if not processes.are_several():
+        return to_host(tree, copy)
+    return {
+        name: jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
+        for name, leaf in named_leaves(tree).items()
+    }
+
+
+def _describe_parts(arrays: dict[str, jax.Array]) -> dict[str, list]:
+    """`_describe`, of arrays of which each process has a part; the last number says of how many axes `_sum_of_rows` is."""
+    axes = {name: max((n + 1 for n, on in enumerate(_spec_of(array)) if on), default=0) for name, array in arrays.items()}
+    sums = np.zeros(len(arrays), np.uint32)
+    for number, (name, array) in enumerate(arrays.items()):
+        for shard in array.addressable_shards:
+            if shard.replica_id == 0:
+                start = [each.start or 0 for each in shard.index[: axes[name]]]
+                sums[number] += np.uint32(_sum_of_rows(np.asarray(shard.data), axes[name], start))
+    totals = multihost_utils.process_allgather(sums).astype(np.uint64).sum(axis=0) % 2**32
+    return {
+        name: [list(array.shape), str(array.dtype), int(total), axes[name]]
+        for (name, array), total in zip(arrays.items(), totals, strict=True)
+    }
+
+
+def _spec_of(array: jax.Array) -> Sequence[Any]:
+    return getattr(array.sharding, "spec", ())
+
+
+def _sum_of_rows(array: np.ndarray, axes: int, start: Sequence[int] = ()) -> int:
+    """A checksum that can be put together of parts: the sum of those of all rows, each beginning with where it lies.
+
+    Args:
+        array: A part of an array.
+        axes: How many of the first axes number rows.
+        start: Where the part begins in these; nothing for a whole array.
+    """
+    total = 0
+    for index in np.ndindex(array.shape[:axes]):
+        place = np.add(index, start) if len(start) else np.asarray(index)
+        total += zlib.crc32(
+            np.ascontiguousarray(array[index]).reshape(-1).view(np.uint8).data, zlib.crc32(place.astype("<i8").tobytes())
+        )
+    return total % 2**32
+
+
+def _is_intact(array: np.ndarray, described: list) -> bool:
+    """Whether an array is as its manifest describes it."""
+    _, _, checksum, *axes = described
+    return checksum == (_sum_of_rows(array, axes[0]) if axes else _checksum(array))
 
 
 def _rest(loop: LoopState) -> dict[str, Any]:
@@ -191,23 +247,24 @@ class Checkpoints:
             train: The learner, [S, ...].
             progress: Anything that JSON can hold.
         """
-        self._save(LIGHT, iteration, {"train": to_host(train, copy=True)}, progress)
+        self._save(LIGHT, iteration, {"train": _to_save(train, copy=True)}, progress)
 
     def save_full(self, iteration: int, loop: LoopState, progress: dict[str, Any]) -> None:
         """Writes everything, and returns when it is on the disk: a second copy of the replay would need memory for two."""
-        items = {"train": to_host(loop.train, copy=False), "rest": to_host(_rest(loop), copy=False)}
+        items = {"train": _to_save(loop.train, copy=False), "rest": _to_save(_rest(loop), copy=False)}
         self._save(FULL, iteration, items, progress)
         self.wait()
 
-    def _save(self, tier: str, iteration: int, items: dict[str, Arrays], progress: dict[str, Any]) -> None:
-        described = {name: _describe(arrays) for name, arrays in items.items()}
+    def _save(self, tier: str, iteration: int, items: dict[str, Any], progress: dict[str, Any]) -> None:
+        describe = _describe_parts if processes.are_several() else _describe
+        described = {name: describe(arrays) for name, arrays in items.items()}
         manifest = {"schema": SCHEMA, "iteration": iteration, "items": described, "progress": progress}
         arguments: dict[str, Any] = {name: ocp.args.StandardSave(arrays) for name, arrays in items.items()}
         arguments["manifest"] = ocp.args.JsonSave(manifest)
         with self._writing(tier):
             manager = self._manager(tier)
             manager.wait_until_finished()
-            if iteration in self.iterations(tier):  # orbax would quietly keep the old one
+            if processes.any_of(iteration in self.iterations(tier)):  # orbax would quietly keep the old one
                 manager.delete(iteration)
             if not manager.save(iteration, args=ocp.args.Composite(**arguments), force=True):
                 raise RuntimeError(f"checkpoint {tier}/{iteration} was not written")
@@ -252,7 +309,8 @@ class Checkpoints:
         for iteration in self.iterations(FULL):
             if iteration < newest:
                 self._forget(FULL)
-                shutil.rmtree(self._folder / FULL / str(iteration), ignore_errors=True)
+                if processes.is_first():
+                    shutil.rmtree(self._folder / FULL / str(iteration), ignore_errors=True)
 
     def set_aside_after(self, iteration: int) -> list[Path]:
         """Moves checkpoints after ``iteration``, from which no run can go on, to checkpoints/damaged/.
@@ -266,6 +324,8 @@ class Checkpoints:
                 if later > iteration:
                     self._forget(tier)
                     moved.append(self._folder / DAMAGED / f"{tier}-{later}")
+                    if not processes.is_first():
+                        continue
                     moved[-1].parent.mkdir(exist_ok=True)
                     shutil.rmtree(moved[-1], ignore_errors=True)
                     (self._folder / tier / str(later)).rename(moved[-1])
@@ -322,7 +382,7 @@ class Checkpoints:
         trees = {}
         for name, tree in templates.items():
             for leaf_name, array in to_host(read[name], copy=False).items():
-                if _checksum(array) != manifest["items"][name][leaf_name][2]:
+                if not _is_intact(array, manifest["items"][name][leaf_name]):
                     raise _Damaged(f"wrong checksum of {leaf_name}")
             trees[name] = _rebuild(tree, read[name])
         loop = LoopState(train=trees["train"], **trees["rest"]) if with_rest else None
@@ -378,7 +438,7 @@ def _rebuild(template: Any, arrays: dict[str, jax.Array]) -> Any:
             array = array.reshape(leaf.shape)
         if sharding is None:
             return jnp.asarray(array)
-        return jax.device_put(array, sharding)
+        return put_array(array, sharding)
 
     return jax.tree.map_with_path(convert, template)
 

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax.experimental.compilation_cache import compilation_cache
 
+from jaxrl_vis import processes
 from jaxrl_vis.config import Config
 from jaxrl_vis.files import user_cache
 from jaxrl_vis.report import videos
@@ -106,8 +107,9 @@ class Programs:
         with concurrent.futures.ThreadPoolExecutor(len(_NAMES), initializer=shield_this_thread) as pool:
             missing = [name for name in _NAMES if name not in self._compiled]
             futures = {name: pool.submit(self._lower(name).compile) for name in missing}
-            # Taking keys apart is a program, too.
-            to_host({"keys": self.run_keys, "evaluation": self.evaluation_key}, copy=True)
+            if not processes.are_several():
+                # Taking keys apart is a program, too.
+                to_host({"keys": self.run_keys, "evaluation": self.evaluation_key}, copy=True)
             self._compiled |= {name: future.result() for name, future in futures.items()}
         return dict(self._compiled)
 
