@@ -261,6 +261,8 @@ class Checkpoints:
         manifest = {"schema": SCHEMA, "iteration": iteration, "items": described, "progress": progress}
         arguments: dict[str, Any] = {name: ocp.args.StandardSave(arrays) for name, arrays in items.items()}
         arguments["manifest"] = ocp.args.JsonSave(manifest)
+        if processes.are_several():
+            self.wait()  # of two tiers that are written at the same time, processes would take one for the other
         with self._writing(tier):
             manager = self._manager(tier)
             manager.wait_until_finished()
