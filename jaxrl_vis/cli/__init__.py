@@ -26,6 +26,7 @@ from jaxrl_vis.cli import (
     phenotype_run,
     phenotype_train,
     play,
+    sweep,
     train,
 )
 from jaxrl_vis.cli.parsing import PROGRAM, parse
@@ -40,6 +41,7 @@ COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
     "doctor": (doctor.Doctor, doctor.run),
     "bench": (bench.Bench, bench.run),
     "figure": (figure.Figure, figure.run),
+    "sweep": (sweep.Sweep, sweep.run),
     "phenotype synth": (phenotype.Synth, phenotype.synth),
     "phenotype train": (phenotype_train.Train, phenotype_train.train),
     "phenotype run": (phenotype_run.Run, phenotype_run.run),

@@ -17,7 +17,7 @@ from jaxrl_vis.run.folder import check_there, default_folder, read_config
 from jaxrl_vis.run.loggers import LoggerName
 
 
-def _defaults(name: str) -> str:
+def default_of(name: str) -> str:
     """What the presets say about a field: what ``auto`` takes on this machine, and after it those that differ from that."""
     here = _auto(guess_accelerator())
     values = {each: getattr(config, name) for each, config in PRESETS.items()}
@@ -33,7 +33,8 @@ def _auto(on_accelerator: bool) -> str:
     return "fast" if on_accelerator else "cpu"
 
 
-def _default_preset() -> str:
+def default_preset() -> str:
+    """What the help says about ``--preset``."""
     return f"default: auto, which is {_auto(guess_accelerator())} on this machine; its values are the defaults shown below"
 
 
@@ -43,9 +44,9 @@ class Train:
 
     env: Annotated[str | None, ByPlaceToo()] = None
     """The environment; `jaxrl-vis envs` lists them, and module:Name is one of your own. VisualFetchReach if not given."""
-    preset: Annotated[str, SayDefault(_default_preset)] = "auto"
+    preset: Annotated[str, SayDefault(default_preset)] = "auto"
     """paper, fast, cpu or debug; auto is fast on an accelerator, else cpu."""
-    changes: Annotated[Mapping[str, Any], ChangesOf(Config, _defaults)] = dataclasses.field(default_factory=dict)
+    changes: Annotated[Mapping[str, Any], ChangesOf(Config, default_of)] = dataclasses.field(default_factory=dict)
     devices: str | None = None
     """How many devices to use, or all (docs/scaling.md). Several seeds are divided among them; of one seed, each batch and the
     environments are. One if not given."""
