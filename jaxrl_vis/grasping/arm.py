@@ -20,6 +20,7 @@ RATE = 250.0
 """Frequency of the controllers, Hz."""
 FOLDED = 0.34
 """Distance of the grip from the first joint before it moves outwards, m."""
+_ROOM_POINTS = 40
 HOME = (0.0, stalk_arm.SHOULDER[1] + FOLDED, 0.85)
 """Where the grip waits, m in the frame of a stand."""
 
@@ -53,7 +54,7 @@ class Gains(NamedTuple):
     torque: Any = (30.0, 15.0)  # N m, the most
     motor: float = 120.0  # 1/s, how fast a motor follows what it is told
     slide_proportional: float = 14.0  # 1/s
-    slide_integral: float = 12.0  # 1/s^2
+    slide_integral: float = 40.0  # 1/s^2
     slide_speed: float = 1.0  # m/s, the most
     slide_drive: float = 400.0  # N s/m
     jaw_force: float = 15.0  # N
@@ -149,3 +150,44 @@ def reachable(rail_pose: np.ndarray, target: np.ndarray) -> np.ndarray:
     far_enough = np.linalg.norm(local[..., :2] - np.array(stalk_arm.SHOULDER), axis=-1) >= FOLDED
     ahead = local[..., 1] > stalk_arm.SHOULDER[1]
     return stalk_arm.is_within(local).any(axis=-1) & far_enough & ahead
+
+
+def room(target: np.ndarray, others: np.ndarray, radii: np.ndarray, whole_way: bool = True) -> np.ndarray:
+    """How much room other stalks leave the open gripper on its way, with the elbow to either side.
+
+    Args:
+        target: [B, 3], m in the frame of the stand.
+        others: [B, M, 2], where the middles of other stalks are at the target's height, m; nan for none.
+        radii: [B, M], of these, m.
+        whole_way: From where the grip starts outwards, forearm included; if not, beside the open jaws at the target alone.
+
+    Returns:
+        [B, 2] float64, for the elbow at 1 and -1: the least distance between a stalk and the gripper, m. Negative where they
+        would overlap, infinite where there are no others.
+    """
+    target, others = np.asarray(target, float), np.asarray(others, float)
+    from_shoulder = target[:, :2] - np.array(stalk_arm.SHOULDER)
+    distance = np.linalg.norm(from_shoulder, axis=-1)
+    shares = np.linspace(0.0, 1.0, _ROOM_POINTS) if whole_way else np.ones(1)
+    radius = np.minimum(FOLDED, distance)[:, None] * (1 - shares) + distance[:, None] * shares
+    place = from_shoulder[:, None] / distance[:, None, None] * radius[..., None]
+    found = []
+    for side in (1.0, -1.0):
+        angles = stalk_arm.angles_at(place, np.full(radius.shape, side), np)
+        turn = angles.sum(axis=-1)
+        along = np.stack([-np.sin(turn), np.cos(turn)], axis=-1)[:, :, None]
+        away = (others[:, None] - np.array(stalk_arm.SHOULDER)) - place[:, :, None]  # [B, K, M, 2]
+        ahead = (away * along).sum(axis=-1)
+        aside = np.abs(away[..., 0] * along[..., 1] - away[..., 1] * along[..., 0])
+        gap = _to_box(aside, ahead, stalk_arm.OUTER_HALF_WIDTH, stalk_arm.PALM_BACK, stalk_arm.TIPS)
+        if whole_way:
+            gap = np.minimum(gap, _to_box(aside, ahead, stalk_arm.FOREARM_RADIUS, -stalk_arm.FOREARM, 0.0))
+        gap = np.where(np.isnan(gap), np.inf, gap - np.asarray(radii)[:, None])
+        found.append(gap.min(axis=(1, 2), initial=np.inf))
+    return np.stack(found, axis=-1)
+
+
+def _to_box(aside: np.ndarray, ahead: np.ndarray, half_width: float, back: float, front: float) -> np.ndarray:
+    """Distance in m of points from a rectangle: ``aside`` of its middle line, and ``ahead`` along it; negative inside."""
+    outside = np.stack([aside - half_width, np.maximum(back - ahead, ahead - front)])
+    return np.linalg.norm(np.maximum(outside, 0.0), axis=0) + np.minimum(outside.max(axis=0), 0.0)

@@ -103,6 +103,7 @@ def reach(
     wind_mm: Any = 0.0,
     timing: Timing | None = None,
     gains: Gains | None = None,
+    sides: np.ndarray | None = None,
 ) -> ReachResult:
     """Sends each arm to its target, without looking again on the way, and closes its jaws there.
 
@@ -113,6 +114,7 @@ def reach(
         wind_mm: Greatest sway of stalks one metre above the ground, mm; [] or [B], 0 to 20 in the field.
         timing: How long the parts of a reach take.
         gains: Of the controllers.
+        sides: [B], 1 or -1: which of the two solutions each arm takes (see `arm.room`). None for `arm.better_side`.
 
     Returns:
         What came of it. Arms whose target cannot be reached are not sent: they hold and touch nothing.
@@ -131,8 +133,12 @@ def reach(
         raise ValueError(f"wind_mm must be at least 0, got {wind.min():g}")
     can = arm.reachable(stands.origin, targets)
     local = np.where(can[:, None], targets - stands.origin, np.array(arm.HOME, np.float32)).astype(np.float32)
+    sides = arm.better_side(local, np) if sides is None else np.asarray(sides)
+    if sides.shape != wind.shape or not (np.abs(sides) == 1).all():
+        raise ValueError(f"sides must be 1 or -1 for each of {len(stands)} arms")
     run = _whole_reach(stands.stalk.shape[1], timing, gains)
-    found = jax.tree.map(np.asarray, run(bending.shapes(stands), local, jax.random.split(key, len(stands)), wind / 1000))
+    keys = jax.random.split(key, len(stands))
+    found = jax.tree.map(np.asarray, run(bending.shapes(stands), local, keys, wind / 1000, sides.astype(np.float32)))
     mine = can[:, None] & stands.present
     return ReachResult(
         held=found["held"] & mine,
@@ -151,14 +157,14 @@ def _whole_reach(stalks: int, timing: Timing, gains: Gains) -> Any:
     """The compiled program of B reaches."""
     arms = _arms(stalks)
 
-    def one(shape: Shape, target: jax.Array, key: jax.Array, wind: jax.Array) -> dict[str, jax.Array]:
+    def one(shape: Shape, target: jax.Array, key: jax.Array, wind: jax.Array, side: jax.Array) -> dict[str, jax.Array]:
         model = bending.fit(arms.model, arms.layout, shape)
         gusts = bending.gusts(key, wind)
-        reaching = _begin(arms, model, shape, gusts, arm.better_side(target))
-        reaching, path, taken = _go(arms, model, shape, gusts, reaching, target, timing, gains, timing.reach, closing=False)
+        reaching = _begin(arms, model, shape, gusts, side)
+        reaching, path, taken = _go(arms, model, shape, gusts, reaching, target, side, timing, gains, timing.reach, closing=False)
         error = jnp.linalg.norm(reaching.data.site_xpos[0] - target)
         reaching, rest, rest_taken = _go(
-            arms, model, shape, gusts, reaching, target, timing, gains, timing.close, closing=True
+            arms, model, shape, gusts, reaching, target, side, timing, gains, timing.close, closing=True
         )
         return {
             "held": _held(arms, reaching.data),
@@ -189,13 +195,14 @@ def _go(
     gusts: Gusts,
     reaching: Reaching,
     target: jax.Array,
+    side: jax.Array,
     timing: Timing,
     gains: Gains,
     seconds: float,
     closing: bool,
 ) -> tuple[Reaching, jax.Array, jax.Array]:
     """Some seconds of a reach: the arm then, and the planned and taken paths of the grip [T, 3] (m, frame of the stand)."""
-    side, foot = arm.better_side(target), jnp.asarray(shape.foot)
+    foot = jnp.asarray(shape.foot)
     none = jnp.zeros(model.nv - stalk_arm.JOINTS, jnp.float32)
     jaws = jnp.full(2, gains.jaw_force if closing else -gains.jaw_force, jnp.float32)
 

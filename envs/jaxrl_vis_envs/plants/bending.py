@@ -54,14 +54,16 @@ class Layout(NamedTuple):
     joints: np.ndarray
 
 
-def add_stalks(spec: mujoco.MjSpec, stalks: int, pushed_by: tuple[str, ...], gripped_by: tuple[str, ...] = ()) -> None:
+def add_stalks(spec: mujoco.MjSpec, stalks: int, pushed_by: tuple[str, ...]) -> None:
     """Adds upright stalks of mean thickness to a model, and the pairs of geoms that can touch.
+
+    There is no friction: with it the two Newton steps that a physics step can afford do not find the forces of jaws that
+    press from both sides, and stalks jump out of them.
 
     Args:
         spec: Changed in place.
         stalks: How many.
-        pushed_by: Names of geoms that push the upper pieces, without friction.
-        gripped_by: The same with friction.
+        pushed_by: Names of geoms that push the upper pieces.
     """
     for index in range(stalks):
         foot = spec.worldbody.add_body(name=f"foot_{index}", mocap=True, pos=[0.2 * index, 1.0, 0.0])
@@ -89,15 +91,9 @@ def add_stalks(spec: mujoco.MjSpec, stalks: int, pushed_by: tuple[str, ...], gri
                 conaffinity=0,
             )
             parent, length = body, reach
-        for name, dim in [*((each, 1) for each in pushed_by), *((each, 3) for each in gripped_by)]:
-            spec.add_pair(
-                geomname1=name,
-                geomname2=f"upper_{index}",
-                condim=dim,
-                friction=[0.6, 0.6, 0.005, 0.0001, 0.0001],
-                solref=[0.01, 1],
-                solimp=[0.9, 0.98, 0.001, 0.5, 2],
-            )
+        for name in pushed_by:
+            pair = spec.add_pair(geomname1=name, geomname2=f"upper_{index}", condim=1)
+            pair.solref, pair.solimp = [0.01, 1], [0.9, 0.98, 0.001, 0.5, 2]
 
 
 def layout_of(mj_model: mujoco.MjModel) -> Layout:
@@ -121,18 +117,19 @@ class Shape(NamedTuple):
 
     Attributes:
         foot, knee, top: [N, 3] float32, m.
-        radius: [N, 2] float32, m.
+        radius, bending_radius: [N, 2] float32, m.
     """
 
     foot: Any
     knee: Any
     top: Any
     radius: Any
+    bending_radius: Any
 
 
 def shapes(stands: Stands) -> Shape:
     """Shape of all stands, each array with a leading axis [B]."""
-    return Shape(stands.foot, stands.knee, stands.top, stands.radius)
+    return Shape(stands.foot, stands.knee, stands.top, stands.radius, stands.bending_radius)
 
 
 def fit(model: Any, layout: Layout, shape: Shape) -> Any:
@@ -150,7 +147,7 @@ def fit(model: Any, layout: Layout, shape: Shape) -> Any:
     changes["body_quat"] = changes["body_quat"].at[layout.upper].set(turn)
     for part in (0, 1):
         radius, length = shape.radius[:, part], lengths[:, part]
-        stiffness, damping, mass, inertia = _properties(radius, part == 1, jnp)
+        stiffness, damping, mass, inertia = _properties(shape.bending_radius[:, part], part == 1, jnp)
         around = jnp.stack([inertia, inertia, mass * radius**2], axis=-1)
         size = jnp.stack([radius, length / 2, jnp.zeros_like(radius)], axis=-1)
         for name, place, value in (

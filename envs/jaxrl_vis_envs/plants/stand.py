@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxrl_vis_envs.plants.field import Plot
+from jaxrl_vis_envs.plants.field import Plot, Stalk
 
 KNEE = 0.3
 """Height at which the two pieces of a stalk meet, m. The arm works above it."""
@@ -34,6 +34,7 @@ class Stands:
         knee: [B, N, 3] float32, where its two pieces meet.
         top: [B, N, 3] float32, where its upper piece ends. Its line passes exactly through the stalk at the arm's height.
         radius: [B, N, 2] float32, radius of the lower piece at half its height and of the upper one at the arm's height, m.
+        bending_radius: [B, N, 2] float32, radius of pieces without taper that give way as these do to the arm, m.
         origin: [B, 3] float32, what has to be subtracted from the plot's coordinates to get those of the stand, m.
     """
 
@@ -42,6 +43,7 @@ class Stands:
     knee: np.ndarray
     top: np.ndarray
     radius: np.ndarray
+    bending_radius: np.ndarray
     origin: np.ndarray
 
     @property
@@ -87,7 +89,7 @@ def stands_at(plots: Plot | Sequence[Plot], x: np.ndarray, targets: np.ndarray, 
 
 def _empty(stalks: int) -> list[np.ndarray]:
     vectors = np.zeros((0, stalks, 3))
-    return [np.zeros((0, stalks)), vectors, vectors, vectors, np.zeros((0, stalks, 2)), np.zeros((0, 3))]
+    return [np.zeros((0, stalks)), vectors, vectors, vectors, *[np.zeros((0, stalks, 2))] * 2, np.zeros((0, 3))]
 
 
 def _stand(plot: Plot, x: float, target: np.ndarray, stalks: int) -> tuple[np.ndarray, ...]:
@@ -99,7 +101,7 @@ def _stand(plot: Plot, x: float, target: np.ndarray, stalks: int) -> tuple[np.nd
     stalk[: len(order)] = order
     parked = np.stack([0.2 * np.arange(stalks), np.full(stalks, _AWAY), np.zeros(stalks)], axis=1)
     foot, knee, top = parked.copy(), parked + [0.0, 0.0, KNEE], parked + [0.0, 0.0, TOP]
-    radius = np.full((stalks, 2), 0.007)
+    radius, bending_radius = np.full((stalks, 2), 0.007), np.full((stalks, 2), 0.007)
     for place, index in enumerate(order):
         each = plot.measured[index]
         middle, below, above = (each.at_height(height + step)[0] - origin for step in (0.0, -_FIT, _FIT))
@@ -107,7 +109,17 @@ def _stand(plot: Plot, x: float, target: np.ndarray, stalks: int) -> tuple[np.nd
         foot[place] = each.points[0] - origin
         knee[place], top[place] = middle + (KNEE - height) * slope, middle + (TOP - height) * slope
         radius[place] = each.diameter(KNEE / 2) / 2, each.diameter(height) / 2
-    return stalk, foot, knee, top, radius, origin
+        bending_radius[place] = radius[place, 0], _bending_radius(each, height)
+    return stalk, foot, knee, top, radius, bending_radius, origin
+
+
+def _bending_radius(stalk: Stalk, height: float) -> float:
+    """Radius in m of a beam without taper that gives way like the stalk above the knee, pushed at a height in m."""
+    # The end of a beam moves by the integral of (height - z)^2 / (E I(z)) for a unit of force, and I is as radius^4.
+    heights = np.linspace(KNEE, height, 21)
+    bare = np.array([stalk.diameter(z, bare=True) / 2 for z in heights])
+    arms = (height - heights) ** 2
+    return float((arms.sum() / (arms / bare**4).sum()) ** 0.25)
 
 
 def _distance_to_line(points: np.ndarray, end: np.ndarray) -> np.ndarray:

@@ -27,8 +27,8 @@ SHOULDER_RANGE, ELBOW_RANGE = 2.6, 2.75
 OPENING = 0.04
 """Distance between the inner sides of the open jaws, m."""
 JAW_RADIUS = 0.0025
-PALM, TIPS = -0.016, 0.0165
-"""Front of the palm and tips of the jaws, from the middle of the grip along the forearm, m."""
+PALM_BACK, PALM, TIPS = -0.028, -0.016, 0.0165
+"""Back and front of the palm and tips of the jaws, from the middle of the grip along the forearm, m."""
 OUTER_HALF_WIDTH = OPENING / 2 + 2 * JAW_RADIUS
 """From the middle of the open jaws to their outer sides, m."""
 FOREARM_RADIUS = 0.011
@@ -40,20 +40,19 @@ JOINTS = ARM_JOINTS + len(JAWS)
 """Joints of the arm and its jaws, which come before those of the stalks."""
 
 
-def build(stalks: int, motors: bool, friction: bool = True) -> mujoco.MjModel:
+def build(stalks: int, motors: bool) -> mujoco.MjModel:
     """The model of the arm among stalks.
 
     Args:
         stalks: How many.
         motors: Whether the joints of the arm are driven by the model's position servos; if not, by whoever applies forces.
-        friction: Whether the jaws rub on stalks, which takes four rows of the constraint solver for each contact and not one.
     """
 
     def edit(spec: mujoco.MjSpec) -> None:
         if not motors:
             for actuator in list(spec.actuators):
                 spec.delete(actuator)
-        bending.add_stalks(spec, stalks, LINKS if friction else LINKS + JAWS, JAWS if friction else ())
+        bending.add_stalks(spec, stalks, JAWS + LINKS)
 
     return mjx_model.load_model("stalk_arm.xml", edit)
 
