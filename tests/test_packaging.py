@@ -22,7 +22,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("report",),
     ("run",),
     ("studies",),
-    ("bench", "doctor", "phenotyping"),
+    ("bench", "doctor", "grasping", "phenotyping"),
     ("cli",),
     ("__main__",),
 )

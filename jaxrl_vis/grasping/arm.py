@@ -21,6 +21,7 @@ RATE = 250.0
 FOLDED = 0.34
 """Distance of the grip from the first joint before it moves outwards, m."""
 _ROOM_POINTS = 40
+_FOLDED_ROOM = 0.02  # m, of the tips of the folded jaws from the middle of the nearest stalk that they reach for
 HOME = (0.0, stalk_arm.SHOULDER[1] + FOLDED, 0.85)
 """Where the grip waits, m in the frame of a stand."""
 
@@ -147,9 +148,14 @@ def reachable(rail_pose: np.ndarray, target: np.ndarray) -> np.ndarray:
         target: [..., 3], m in the plot's frame.
     """
     local = np.asarray(target, float) - np.asarray(rail_pose, float)
-    far_enough = np.linalg.norm(local[..., :2] - np.array(stalk_arm.SHOULDER), axis=-1) >= FOLDED
-    ahead = local[..., 1] > stalk_arm.SHOULDER[1]
-    return stalk_arm.is_within(local).any(axis=-1) & far_enough & ahead
+    place = local[..., :2] - np.array(stalk_arm.SHOULDER)
+    distance = np.linalg.norm(place, axis=-1)
+    # Folded, the open jaws have to be this side of the stalk.
+    far_enough = distance >= FOLDED + stalk_arm.TIPS + _FOLDED_ROOM
+    start = local.copy()
+    start[..., :2] = stalk_arm.SHOULDER + place * (FOLDED / np.maximum(distance, 1e-9))[..., None]
+    both = stalk_arm.is_within(local) & stalk_arm.is_within(start)
+    return both.any(axis=-1) & far_enough & (place[..., 1] > 0)
 
 
 def room(target: np.ndarray, others: np.ndarray, radii: np.ndarray, whole_way: bool = True) -> np.ndarray:

@@ -161,7 +161,9 @@ def _whole_reach(stalks: int, timing: Timing, gains: Gains) -> Any:
         model = bending.fit(arms.model, arms.layout, shape)
         gusts = bending.gusts(key, wind)
         reaching = _begin(arms, model, shape, gusts, side)
-        reaching, path, taken = _go(arms, model, shape, gusts, reaching, target, side, timing, gains, timing.reach, closing=False)
+        reaching, path, taken = _go(
+            arms, model, shape, gusts, reaching, target, side, timing, gains, timing.reach, closing=False
+        )
         error = jnp.linalg.norm(reaching.data.site_xpos[0] - target)
         reaching, rest, rest_taken = _go(
             arms, model, shape, gusts, reaching, target, side, timing, gains, timing.close, closing=True

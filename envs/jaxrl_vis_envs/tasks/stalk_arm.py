@@ -22,7 +22,7 @@ SHOULDER = (0.0, -MAST_DISTANCE)
 """Where the first revolute joint is, m in the frame of a stand."""
 SLIDE_RANGE = (0.4, 1.3)
 """Heights of the slide, m."""
-SHOULDER_RANGE, ELBOW_RANGE = 2.6, 2.75
+SHOULDER_RANGE, ELBOW_RANGE = 3.3, 2.75
 """Greatest turn of the revolute joints to either side, rad."""
 OPENING = 0.04
 """Distance between the inner sides of the open jaws, m."""
