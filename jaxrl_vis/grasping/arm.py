@@ -1,8 +1,8 @@
 """The arm's way to a stalk and its controllers: a straight line out of the first joint, PID and PI, springs in the joints.
 
-A reach takes two seconds. While the slide goes to the height of the target, the folded arm turns towards it. Then the grip moves
-along the straight line that the first joint and the target define, until the stalk is between the jaws. Both solutions of the
-inverse kinematics move the grip along the same line; they differ in where the forearm comes from.
+A reach takes two seconds. While the slide goes to the height of the target, the folded arm turns towards it. Then the grip
+moves along the straight line that the first joint and the target define, until the stalk is between the jaws. Both solutions
+of the inverse kinematics move the grip along the same line; they differ in where the forearm comes from.
 
 Source: section 4.2.2 of the thesis. It tuned its gains by hand and does not state them; ours are tuned by hand, too.
 """

@@ -1,8 +1,8 @@
 """How well stalks are grasped: one target, one stalk between the jaws. NumPy and SciPy only.
 
-The thesis counts stalks: 1 - |grasped - attempted| / attempted, averaged over runs. Misses and double grasps cancel there. Here an
-attempt succeeds where exactly the stalk that it was for is between the jaws at closure, whatever else goes wrong is told apart,
-and the thesis's ratio stands beside it.
+The thesis counts stalks: 1 - |grasped - attempted| / attempted, averaged over runs. Misses and double grasps cancel there.
+Here an attempt succeeds where exactly the stalk that it was for is between the jaws at closure, all that goes wrong is told
+apart, and the thesis's ratio stands beside it.
 """
 
 import dataclasses

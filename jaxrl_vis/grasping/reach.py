@@ -4,11 +4,13 @@
     result = reach(stands, targets, jax.random.key(0), wind_mm=10.0)
     result.held                                              # [B, N] bool: which stalks the jaws hold, by contact
 
-What a grasp holds comes of the contacts of the jaws with the stalks, which bend and are pushed; no rule decides it.
+What a grasp holds comes of the contacts of the jaws with the stalks, which bend and are pushed; no rule decides it. Programs are
+compiled for 8, 16, 32, ... arms, and reused for fewer.
 """
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -27,7 +29,13 @@ from jaxrl_vis_envs.plants.stand import Stands
 from jaxrl_vis_envs.tasks import stalk_arm
 
 _STEPS_A_POINT = 5  # physics steps between two points of a path
-_TOUCH = 0.0015  # m, a jaw this near to a stalk holds it: soft contacts give way by some tenths of a millimetre
+_POINTS_A_CALL = 5
+INTERVAL = _STEPS_A_POINT / arm.RATE
+"""Time between two points of a path, s."""
+LOOK = _POINTS_A_CALL * INTERVAL
+"""Time between two looks on the way, s."""
+_FEWEST = 8  # arms in a program
+_TOUCH = 0.0015  # m, a jaw this near to a stalk presses on it: soft contacts give way by some tenths of a millimetre
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,10 +46,11 @@ class ReachResult:
         held: [B, N] bool, stalks between the closed jaws.
         path: [B, T, 3] float32, where the grip should have been, m in the plot's frame.
         taken: [B, T, 3] float32, where it was.
-        touched: [B, N] bool, stalks that links other than the jaws touched; the palm may touch what is held.
-        brushed: [B, N] bool, stalks that the open jaws touched on the way.
+        touched: [B, N] bool, stalks that the arm's links touched: upper arm and forearm at any time.
+        brushed: [B, N] bool, stalks that the open jaws or the palm touched before the jaws began to close.
         reachable: [B] bool, whether the arm's geometry lets the grip be at the target.
-        error: [B] float32, distance of the grip from the target when the jaws began to close, m.
+        error: [B] float32, distance of the grip from the target when the jaws began to close, m; nan where it was not sent.
+        poses: [B, T, J] float32, positions of all joints on the way, for drawing (`video`).
         interval: Time between two points of a path, s.
     """
 
@@ -52,7 +61,22 @@ class ReachResult:
     brushed: np.ndarray
     reachable: np.ndarray
     error: np.ndarray
-    interval: float
+    poses: np.ndarray
+    interval: float = INTERVAL
+
+
+class Sight(NamedTuple):
+    """What there is to see from B arms on their way; the truth, of which a detector may make what it can.
+
+    Attributes:
+        time: Since the start, s.
+        grip: [B, 3] float32, where the grips are, m in the plot's frame.
+        stalks: [B, N, 3] float32, where the middles of the stalks are at the height of the target; nan for absent ones.
+    """
+
+    time: float
+    grip: np.ndarray
+    stalks: np.ndarray
 
 
 class Reaching(NamedTuple):
@@ -72,28 +96,37 @@ class Reaching(NamedTuple):
     brushed: jax.Array
 
 
-class _Arms(NamedTuple):
+class Scene(NamedTuple):
+    """What does not change on the way of one arm: its stalks, the wind, and the side of its elbow (1 or -1)."""
+
+    shape: Shape
+    gusts: Gusts
+    side: jax.Array
+
+
+class Arms(NamedTuple):
     """The model of an arm among N stalks, and where things are in it."""
 
     mj_model: mujoco.MjModel
     model: Any
     layout: Layout
-    home: Any
-    contacts: dict[str, np.ndarray]  # geom of the arm -> the contacts with stalks, in their order
+    rest: Any
+    contacts: dict[str, np.ndarray]  # geom of the arm -> its contacts with the stalks, in their order
 
 
 @functools.cache
-def _arms(stalks: int) -> _Arms:
+def arms_among(stalks: int) -> Arms:
+    """The model of an arm among so many stalks."""
     mj_model = stalk_arm.build(stalks, motors=False)
     layout = bending.layout_of(mj_model)
-    home = mjx_model.still_data(mj_model)
+    rest = mjx_model.still_data(mj_model)
     model = mjx.put_model(mj_model)
-    geoms = np.asarray(mjx.collision(model, home)._impl.contact.geom)
+    geoms = np.asarray(mjx.collision(model, rest)._impl.contact.geom)
     places = {}
     for name in stalk_arm.JAWS + stalk_arm.LINKS:
         pairs = [{mj_model.geom(name).id, int(geom)} for geom in layout.upper_geom]
         places[name] = np.array([next(i for i, geom in enumerate(geoms) if set(geom) == pair) for pair in pairs])
-    return _Arms(mj_model, model, layout, home, places)
+    return Arms(mj_model, model, layout, rest, places)
 
 
 def reach(
@@ -104,17 +137,20 @@ def reach(
     timing: Timing | None = None,
     gains: Gains | None = None,
     sides: np.ndarray | None = None,
+    look: Callable[[Sight], np.ndarray] | None = None,
 ) -> ReachResult:
-    """Sends each arm to its target, without looking again on the way, and closes its jaws there.
+    """Sends each arm to its target and closes its jaws there.
 
     Args:
         stands: The stalks around each of B arms.
         targets: [B, 3] float32, where the jaws should close, m in the plot's frame.
         key: [], typed: the wind.
-        wind_mm: Greatest sway of stalks one metre above the ground, mm; [] or [B], 0 to 20 in the field.
+        wind_mm: How far stalks sway (`bending.Gusts.strength`), mm; [] or [B], 0 to 20 in the field.
         timing: How long the parts of a reach take.
         gains: Of the controllers.
         sides: [B], 1 or -1: which of the two solutions each arm takes (see `arm.room`). None for `arm.better_side`.
+        look: Called every `LOOK` s on the way; returns targets [B, 3] in place of those before, nan where they stay. None: the
+            arm moves without looking again.
 
     Returns:
         What came of it. Arms whose target cannot be reached are not sent: they hold and touch nothing.
@@ -123,126 +159,148 @@ def reach(
         ValueError: Shapes differ, a target is not finite, or the wind is negative.
     """
     timing, gains = timing or Timing(), gains or Gains()
-    targets = np.asarray(targets, np.float32)
-    wind = np.broadcast_to(np.asarray(wind_mm, np.float32), len(stands))
-    if targets.shape != (len(stands), 3):
-        raise ValueError(f"targets must be [B, 3] for {len(stands)} stands, got {list(targets.shape)}")
+    count, targets = len(stands), np.array(targets, np.float32)
+    if targets.shape != (count, 3):
+        raise ValueError(f"targets must be [B, 3] for {count} stands, got {list(targets.shape)}")
     if not np.isfinite(targets).all():
         raise ValueError("targets must be finite")
-    if not (wind >= 0).all():
-        raise ValueError(f"wind_mm must be at least 0, got {wind.min():g}")
+    wind = np.asarray(wind_mm, np.float32)
+    if wind.shape not in ((), (count,)) or not (wind >= 0).all():
+        raise ValueError(f"wind_mm must be at least 0, one number or one for each of {count} arms, got {wind_mm}")
     can = arm.reachable(stands.origin, targets)
-    local = np.where(can[:, None], targets - stands.origin, np.array(arm.HOME, np.float32)).astype(np.float32)
-    sides = arm.better_side(local, np) if sides is None else np.asarray(sides)
-    if sides.shape != wind.shape or not (np.abs(sides) == 1).all():
-        raise ValueError(f"sides must be 1 or -1 for each of {len(stands)} arms")
-    run = _whole_reach(stands.stalk.shape[1], timing, gains)
-    keys = jax.random.split(key, len(stands))
-    found = jax.tree.map(np.asarray, run(bending.shapes(stands), local, keys, wind / 1000, sides.astype(np.float32)))
+    targets = np.where(can[:, None], targets, stands.origin + np.array(arm.HOME, np.float32))
+    side = np.asarray(arm.better_side(targets - stands.origin, np) if sides is None else sides, np.float32)
+    if side.shape != (count,) or not (np.abs(side) == 1).all():
+        raise ValueError(f"sides must be 1 or -1 for each of {count} arms")
+    if not count:
+        return _empty(stands, timing)
+    # The rest of the program's arms do what the first one does.
+    fill = np.concatenate([np.arange(count), np.zeros(max(_FEWEST, 1 << (count - 1).bit_length()) - count, int)])
+    start, advance = _programs(stands.stalk.shape[1], timing, gains)
+    shape = jax.tree.map(lambda part: part[fill], bending.shapes(stands))
+    winds = np.broadcast_to(wind / 1000, (count,))[fill]
+    scene, reaching = start(shape, jax.random.split(key, len(fill)), winds, side[fill])
+    parts = []
+    for call in range(_calls(timing.reach) + _calls(timing.close)):
+        if look is not None and 0 < call < _calls(timing.reach):
+            targets = _looked(look, stands, targets, can, call * LOOK, parts[-1])
+        reaching, seen = advance(scene, reaching, (targets - stands.origin)[fill])
+        parts.append(jax.tree.map(lambda part: np.asarray(part)[:count], seen))
+    paths = {name: np.concatenate([part[name] for part in parts], axis=1) for name in ("path", "taken", "poses")}
+    closing = parts[_calls(timing.reach) - 1]
+    error = np.linalg.norm(closing["taken"][:, -1] - (targets - stands.origin), axis=-1)
     mine = can[:, None] & stands.present
     return ReachResult(
-        held=found["held"] & mine,
-        path=found["path"] + stands.origin[:, None],
-        taken=found["taken"] + stands.origin[:, None],
-        touched=found["touched"] & mine,
-        brushed=found["brushed"] & mine,
+        held=parts[-1]["held"] & mine,
+        path=paths["path"] + stands.origin[:, None],
+        taken=paths["taken"] + stands.origin[:, None],
+        touched=parts[-1]["touched"] & mine,
+        brushed=parts[-1]["brushed"] & mine,
         reachable=can,
-        error=np.where(can, found["error"], np.nan).astype(np.float32),
-        interval=_STEPS_A_POINT / arm.RATE,
+        error=np.where(can, error, np.nan).astype(np.float32),
+        poses=paths["poses"],
     )
 
 
+def _looked(
+    look: Callable[[Sight], np.ndarray], stands: Stands, targets: np.ndarray, can: np.ndarray, time: float, seen: dict
+) -> np.ndarray:
+    """Targets [B, 3] after another look; those of before where there is no new one, or the arm cannot go there."""
+    places = np.where(stands.present[..., None], seen["stalks"], np.nan) + stands.origin[:, None]
+    found = np.asarray(look(Sight(time, seen["taken"][:, -1] + stands.origin, places)), np.float32)
+    if found.shape != targets.shape:
+        raise ValueError(f"a look must return targets {list(targets.shape)}, got {list(found.shape)}")
+    there = np.isfinite(found).all(axis=-1)
+    there &= can & arm.reachable(stands.origin, np.where(there[:, None], found, 0.0))
+    return np.where(there[:, None], found, targets)
+
+
+def _calls(seconds: float) -> int:
+    return max(round(seconds / LOOK), 1)
+
+
+def _empty(stands: Stands, timing: Timing) -> ReachResult:
+    """The result of no reach."""
+    points, stalks = _POINTS_A_CALL * (_calls(timing.reach) + _calls(timing.close)), stands.stalk.shape[1]
+    none, path = np.zeros((0, stalks), bool), np.zeros((0, points, 3), np.float32)
+    poses = np.zeros((0, points, arms_among(stalks).mj_model.nq), np.float32)
+    return ReachResult(none, path, path, none, none, np.zeros(0, bool), np.zeros(0, np.float32), poses)
+
+
 @functools.cache
-def _whole_reach(stalks: int, timing: Timing, gains: Gains) -> Any:
-    """The compiled program of B reaches."""
-    arms = _arms(stalks)
+def _programs(stalks: int, timing: Timing, gains: Gains) -> tuple[Any, Any]:
+    """How B arms start, and how they go on for `LOOK` s."""
+    arms = arms_among(stalks)
 
-    def one(shape: Shape, target: jax.Array, key: jax.Array, wind: jax.Array, side: jax.Array) -> dict[str, jax.Array]:
-        model = bending.fit(arms.model, arms.layout, shape)
-        gusts = bending.gusts(key, wind)
-        reaching = _begin(arms, model, shape, gusts, side)
-        reaching, path, taken = _go(
-            arms, model, shape, gusts, reaching, target, side, timing, gains, timing.reach, closing=False
-        )
-        error = jnp.linalg.norm(reaching.data.site_xpos[0] - target)
-        reaching, rest, rest_taken = _go(
-            arms, model, shape, gusts, reaching, target, side, timing, gains, timing.close, closing=True
-        )
-        return {
-            "held": _held(arms, reaching.data),
-            "path": jnp.concatenate([path, rest]),
-            "taken": jnp.concatenate([taken, rest_taken]),
-            "touched": reaching.touched,
-            "brushed": reaching.brushed,
-            "error": error,
-        }
+    def start(shape: Shape, key: jax.Array, wind: jax.Array, side: jax.Array) -> tuple[Scene, Reaching]:
+        scene = Scene(jax.tree.map(jnp.asarray, shape), bending.gusts(key, wind), side)
+        return scene, _begin(arms, scene)
 
-    return env_jit(jax.vmap(one))
+    def advance(scene: Scene, reaching: Reaching, target: jax.Array) -> tuple[Reaching, dict[str, jax.Array]]:
+        return _advance(arms, scene, reaching, target, timing, gains)
+
+    return env_jit(jax.vmap(start), runs_once=True), env_jit(jax.vmap(advance))
 
 
-def _begin(arms: _Arms, model: Any, shape: Shape, gusts: Gusts, side: jax.Array) -> Reaching:
-    """An arm at home, its elbow to one ``side``, among swaying stalks."""
-    data = bending.placed(arms.home, arms.layout, shape)
-    swayed = bending.hinge_angles(arms.layout, model.nv, bending.displacement(gusts, jnp.asarray(shape.foot), 0.0))
-    joints = stalk_arm.joints_at(jnp.asarray(arm.HOME, jnp.float32), side)
+def _begin(arms: Arms, scene: Scene) -> Reaching:
+    """An arm at home among swaying stalks."""
+    model = bending.fit(arms.model, arms.layout, scene.shape)
+    data = bending.placed(arms.rest, arms.layout, scene.shape)
+    swayed = bending.hinge_angles(arms.layout, model.nv, bending.displacement(scene.gusts, scene.shape.foot, 0.0))
+    joints = stalk_arm.joints_at(jnp.asarray(arm.HOME, jnp.float32), scene.side)
     data = mjx_model.kinematics(model, data.replace(qpos=(data.qpos + swayed).at[: stalk_arm.ARM_JOINTS].set(joints)))
     nothing = jnp.zeros(len(arms.layout.mocap), bool)
-    return Reaching(data, arm.start_drive(data.qpos[:3]), data.site_xpos[0], nothing, nothing)
+    return Reaching(data, arm.start_drive(joints), stalk_arm.grip_at(joints), nothing, nothing)
 
 
-def _go(
-    arms: _Arms,
-    model: Any,
-    shape: Shape,
-    gusts: Gusts,
-    reaching: Reaching,
-    target: jax.Array,
-    side: jax.Array,
-    timing: Timing,
-    gains: Gains,
-    seconds: float,
-    closing: bool,
-) -> tuple[Reaching, jax.Array, jax.Array]:
-    """Some seconds of a reach: the arm then, and the planned and taken paths of the grip [T, 3] (m, frame of the stand)."""
-    foot = jnp.asarray(shape.foot)
+def _advance(
+    arms: Arms, scene: Scene, reaching: Reaching, target: jax.Array, timing: Timing, gains: Gains
+) -> tuple[Reaching, dict[str, jax.Array]]:
+    """`LOOK` s of a reach to ``target`` [3] (m, frame of the stand): the arm then, and what there is to report."""
+    model = bending.fit(arms.model, arms.layout, scene.shape)
     none = jnp.zeros(model.nv - stalk_arm.JOINTS, jnp.float32)
-    jaws = jnp.full(2, gains.jaw_force if closing else -gains.jaw_force, jnp.float32)
 
     def step(reaching: Reaching, _: None) -> tuple[Reaching, None]:
         data = reaching.data
+        is_closing = data.time > timing.reach - 0.5 / arm.RATE
         point = arm.planned(target, reaching.start, data.time + 1.0 / arm.RATE, timing)
-        wanted = stalk_arm.joints_at(point, side)
-        memory, forces = arm.drive(reaching.drive, data.qpos[:3], data.qvel[:3], wanted, gains)
-        wind = bending.wind_torque(model, arms.layout, gusts, foot, data.time)
+        memory, forces = arm.drive(reaching.drive, data.qpos[:3], data.qvel[:3], stalk_arm.joints_at(point, scene.side), gains)
+        jaws = jnp.where(is_closing, gains.jaw_force, -gains.jaw_force) * jnp.ones(2, jnp.float32)
+        wind = bending.wind_torque(model, arms.layout, scene.gusts, scene.shape.foot, data.time)
         data = mjx_model.step(model, data.replace(qfrc_applied=wind + jnp.concatenate([forces, jaws, none])), False)
-        distance = {name: data._impl.contact.dist[places] for name, places in arms.contacts.items()}
-        touches = {name: each < 0 for name, each in distance.items()}
+        touches = {name: data._impl.contact.dist[places] < 0 for name, places in arms.contacts.items()}
         touched = reaching.touched | touches["forearm"] | touches["upper_arm"]
-        brushed = reaching.brushed
-        if not closing:
-            brushed |= touches["left_jaw"] | touches["right_jaw"] | touches["palm"]
+        by_gripper = touches["left_jaw"] | touches["right_jaw"] | touches["palm"]
+        brushed = reaching.brushed | (by_gripper & ~is_closing)
         return Reaching(data, memory, reaching.start, touched, brushed), None
 
-    def point(reaching: Reaching, _: None) -> tuple[Reaching, tuple[jax.Array, jax.Array]]:
+    def point(reaching: Reaching, _: None) -> tuple[Reaching, dict[str, jax.Array]]:
         reaching = jax.lax.scan(step, reaching, length=_STEPS_A_POINT)[0]
         data = reaching.data
-        return reaching, (arm.planned(target, reaching.start, data.time, timing), stalk_arm.grip_at(data.qpos[:3]))
+        path = arm.planned(target, reaching.start, data.time, timing)
+        return reaching, {"path": path, "taken": stalk_arm.grip_at(data.qpos[:3]), "poses": data.qpos}
 
-    points = round(seconds * arm.RATE / _STEPS_A_POINT)
     with jax.default_matmul_precision("highest"):
-        reaching, (path, taken) = jax.lax.scan(point, reaching, length=points)
-    return reaching._replace(data=mjx_model.kinematics(model, reaching.data)), path, taken
+        reaching, seen = jax.lax.scan(point, reaching, length=_POINTS_A_CALL)
+    data = mjx_model.kinematics(model, reaching.data)
+    seen |= {
+        "held": _held(arms, data),
+        "touched": reaching.touched,
+        "brushed": reaching.brushed,
+        "stalks": bending.at_height(data, arms.layout, target[2]),
+    }
+    return reaching._replace(data=data), seen
 
 
-def _held(arms: _Arms, data: Any) -> jax.Array:
+def _held(arms: Arms, data: Any) -> jax.Array:
     """Which stalks the closed jaws hold: [N] bool. They are between the jaws, and at least one of these presses on them."""
     across, along = stalk_arm.grip_frame(data.qpos[:3])
-    grip = data.site_xpos[0]
+    grip = stalk_arm.grip_at(data.qpos[:3])
     places = (bending.at_height(data, arms.layout, grip[2]) - grip)[:, :2]
     aside, ahead = places @ across, places @ along
-    left, right = (-stalk_arm.OPENING / 2 - stalk_arm.JAW_RADIUS + data.qpos[3], None)
-    right = stalk_arm.OPENING / 2 + stalk_arm.JAW_RADIUS - data.qpos[4]
-    between = (aside > left) & (aside < right) & (ahead > stalk_arm.PALM) & (ahead < stalk_arm.TIPS)
-    contact = data._impl.contact.dist
-    pressed = jnp.minimum(contact[arms.contacts["left_jaw"]], contact[arms.contacts["right_jaw"]]) < _TOUCH
-    return between & pressed
+    open_at = stalk_arm.OPENING / 2 + stalk_arm.JAW_RADIUS
+    is_between = (aside > data.qpos[3] - open_at) & (aside < open_at - data.qpos[4])
+    is_between &= (ahead > stalk_arm.PALM) & (ahead < stalk_arm.TIPS)
+    distance = data._impl.contact.dist
+    pressed = jnp.minimum(*(distance[arms.contacts[name]] for name in stalk_arm.JAWS)) < _TOUCH
+    return is_between & pressed

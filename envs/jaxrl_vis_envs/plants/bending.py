@@ -28,7 +28,8 @@ _LEAVES = 1.5  # mass of stalk and leaves over that of the stalk
 _DAMPING_RATIO = 0.1
 # Turn of the hinges at the ground and at the knee, in 1/m, for a bending stiffness of 1 N m^2 and a moment of 1 N m.
 _COMPLIANCE = (0.0863, 0.504)
-_SWAY_HEIGHT = 1.0  # m, where the displacement by wind is stated
+SWAY_HEIGHT = 0.7
+"""Height at which the displacement by wind is stated, m: the middle of where the arm works."""
 _GUST_FREQUENCIES = (0.1, 0.6)  # Hz
 _GUST_WAVES = 3
 _GUST_SPEED = 2.0  # m/s, at which gusts pass along the row
@@ -177,7 +178,7 @@ class Gusts(NamedTuple):
 
     Attributes:
         heading: [2] float32, unit vector along which stalks sway.
-        strength: [] float32, greatest displacement of a stalk one metre above the ground, m.
+        strength: [] float32, how far stalks sway at `SWAY_HEIGHT`, m: the amplitude of a sine wave of the same power.
         frequency: [W] float32, Hz.
         phase: [W] float32, rad.
     """
@@ -193,7 +194,7 @@ def gusts(key: jax.Array, strength: Any) -> Gusts:
 
     Args:
         key: [], typed.
-        strength: Greatest displacement of a stalk one metre above the ground, m.
+        strength: How far stalks sway at `SWAY_HEIGHT`, m: the amplitude of a sine wave of the same power.
     """
     heading_key, frequency_key, phase_key = jax.random.split(key, 3)
     angle = jax.random.uniform(heading_key, (), jnp.float32, 0.0, 2 * jnp.pi)
@@ -207,7 +208,7 @@ def gusts(key: jax.Array, strength: Any) -> Gusts:
 
 
 def displacement(wind: Gusts, foot: jax.Array, time: Any) -> jax.Array:
-    """Where wind alone would hold stalks at a time, one metre above the ground, away from rest: [N, 2] float32, m.
+    """How far from rest wind alone would hold stalks at a time, at `SWAY_HEIGHT`: [N, 2] float32, m.
 
     Args:
         wind: Over the stand.
@@ -215,12 +216,12 @@ def displacement(wind: Gusts, foot: jax.Array, time: Any) -> jax.Array:
         time: [] since the start, s.
     """
     angle = 2 * jnp.pi * wind.frequency * (time - foot[:, :1] / _GUST_SPEED) + wind.phase
-    return (wind.strength * jnp.mean(jnp.sin(angle), axis=-1))[:, None] * wind.heading
+    return (wind.strength * jnp.sum(jnp.sin(angle), axis=-1) / _GUST_WAVES**0.5)[:, None] * wind.heading
 
 
 def hinge_angles(layout: Layout, nv: int, moved: jax.Array) -> jax.Array:
-    """Angles [nv] of the hinges of stalks that are ``moved`` [N, 2] (m) one metre above the ground; 0 for all other joints."""
-    angle = moved / (_SWAY_HEIGHT + (_SWAY_HEIGHT - KNEE))  # both hinges turn alike
+    """Angles [nv] of the hinges of stalks that are ``moved`` [N, 2] (m) at `SWAY_HEIGHT`; 0 for all other joints."""
+    angle = moved / (SWAY_HEIGHT + (SWAY_HEIGHT - KNEE))  # both hinges turn alike
     about = jnp.stack([-angle[:, 1], angle[:, 0]], axis=-1)  # about x and y
     return jnp.zeros(nv, jnp.float32).at[layout.joints].set(jnp.stack([about, about], axis=1))
 

@@ -1,8 +1,8 @@
 """The grasping arm of `assets/stalk_arm.xml` among stalks: its dimensions, its model and its closed-form inverse kinematics.
 
-A prismatic joint up and down a mast and two revolute joints (PRR): at every height that the slide has, a point of the plane is
-reached in two ways, with the elbow to the left or to the right. Joints are ordered (slide, shoulder, elbow); a joint at 0 points
-at the row, positive angles turn towards negative x.
+A prismatic joint up and down a mast and two revolute joints (PRR): at every height that the slide has, there are two ways to a
+point of the plane, with the elbow to the left or to the right. Joints are ordered (slide, shoulder, elbow); a joint at 0 points at
+the row, and positive angles turn towards negative x.
 """
 
 from typing import Any
@@ -99,7 +99,7 @@ def grip_at(joints: Any, numeric: Any = jnp) -> Any:
 
 
 def is_within(target: np.ndarray) -> np.ndarray:
-    """Whether the arm's lengths and joint limits let the grip be at ``target`` [..., 3] (m): [..., 2] bool, elbow at 1 and -1."""
+    """Whether lengths and joint limits let the grip be at ``target`` [..., 3] (m): [..., 2] bool, for the elbow at 1 and -1."""
     target = np.asarray(target, float)
     distance = np.linalg.norm(target[..., :2] - np.array(SHOULDER), axis=-1)
     in_ring = (distance >= FOREARM - UPPER_ARM) & (distance <= FOREARM + UPPER_ARM)
