@@ -4,8 +4,8 @@
     result = reach(stands, targets, jax.random.key(0), wind_mm=10.0)
     result.held                                              # [B, N] bool: which stalks the jaws hold, by contact
 
-What a grasp holds comes of the contacts of the jaws with the stalks, which bend and are pushed; no rule decides it. Programs are
-compiled for 8, 16, 32, ... arms, and reused for fewer.
+What a grasp holds comes of the contacts of the jaws with the stalks, which bend and are pushed; no rule decides it. Programs
+are compiled for 8, 16, 32, ... arms, and reused for fewer.
 """
 
 import dataclasses
@@ -117,7 +117,7 @@ class Arms(NamedTuple):
 @functools.cache
 def arms_among(stalks: int) -> Arms:
     """The model of an arm among so many stalks."""
-    mj_model = stalk_arm.build(stalks, motors=False)
+    mj_model = stalk_arm.build(stalks)
     layout = bending.layout_of(mj_model)
     rest = mjx_model.still_data(mj_model)
     model = mjx.put_model(mj_model)
@@ -210,7 +210,7 @@ def _looked(
     found = np.asarray(look(Sight(time, seen["taken"][:, -1] + stands.origin, places)), np.float32)
     if found.shape != targets.shape:
         raise ValueError(f"a look must return targets {list(targets.shape)}, got {list(found.shape)}")
-    there = np.isfinite(found).all(axis=-1)
+    there = np.all(np.isfinite(found), axis=-1)
     there &= can & arm.reachable(stands.origin, np.where(there[:, None], found, 0.0))
     return np.where(there[:, None], found, targets)
 
@@ -302,5 +302,5 @@ def _held(arms: Arms, data: Any) -> jax.Array:
     is_between = (aside > data.qpos[3] - open_at) & (aside < open_at - data.qpos[4])
     is_between &= (ahead > stalk_arm.PALM) & (ahead < stalk_arm.TIPS)
     distance = data._impl.contact.dist
-    pressed = jnp.minimum(*(distance[arms.contacts[name]] for name in stalk_arm.JAWS)) < _TOUCH
+    pressed = jnp.stack([distance[arms.contacts[name]] < _TOUCH for name in stalk_arm.JAWS]).any(axis=0)
     return is_between & pressed

@@ -42,9 +42,9 @@ class Layout(NamedTuple):
 
     Attributes:
         mocap: Index of each one's mocap body among the mocap bodies.
-        lower, upper: Bodies.
-        lower_geom, upper_geom: Geoms.
-        joints: [N, 2, 2], the hinges at ground and knee, about x and y.
+        lower, upper: Bodies; the same ones where stalks have no knee.
+        lower_geom, upper_geom: Geoms, likewise.
+        joints: [N, P, 2], the hinges at ground and knee (P = 2), or at the ground alone (P = 1), about x and y.
     """
 
     mocap: np.ndarray
@@ -55,7 +55,7 @@ class Layout(NamedTuple):
     joints: np.ndarray
 
 
-def add_stalks(spec: mujoco.MjSpec, stalks: int, pushed_by: tuple[str, ...]) -> None:
+def add_stalks(spec: mujoco.MjSpec, stalks: int, pushed_by: tuple[str, ...], knees: bool = True) -> None:
     """Adds upright stalks of mean thickness to a model, and the pairs of geoms that can touch.
 
     There is no friction: with it the two Newton steps that a physics step can afford do not find the forces of jaws that
@@ -65,12 +65,16 @@ def add_stalks(spec: mujoco.MjSpec, stalks: int, pushed_by: tuple[str, ...]) -> 
         spec: Changed in place.
         stalks: How many.
         pushed_by: Names of geoms that push the upper pieces.
+        knees: Without, stalks are one straight piece that turns about its foot; half the joints, and exact for a push at
+            `SWAY_HEIGHT` alone. Not for `fit`.
     """
+    pieces = ((0, KNEE), (1, TOP - KNEE)) if knees else ((None, TOP),)
     for index in range(stalks):
         foot = spec.worldbody.add_body(name=f"foot_{index}", mocap=True, pos=[0.2 * index, 1.0, 0.0])
         parent, length = foot, 0.0
-        for part, reach in (("lower", KNEE), ("upper", TOP - KNEE)):
-            stiffness, damping, mass, inertia = (float(value) for value in _properties(_NOMINAL_RADIUS, part == "upper", np))
+        for piece, reach in pieces:
+            part = "lower" if piece == 0 else "upper"
+            stiffness, damping, mass, inertia = (float(value) for value in _properties(_NOMINAL_RADIUS, piece, np))
             body = parent.add_body(name=f"{part}_{index}", pos=[0.0, 0.0, length])
             body.mass, body.ipos = mass, [0.0, 0.0, reach / 2]
             body.inertia, body.explicitinertial = [inertia, inertia, mass * _NOMINAL_RADIUS**2], True
@@ -99,17 +103,18 @@ def add_stalks(spec: mujoco.MjSpec, stalks: int, pushed_by: tuple[str, ...]) -> 
 
 def layout_of(mj_model: mujoco.MjModel) -> Layout:
     """Where `add_stalks` has put the stalks of a model."""
-    count = sum(mj_model.body(body).name.startswith("foot_") for body in range(mj_model.nbody))
-    each = range(count)
+    names = [mj_model.body(body).name for body in range(mj_model.nbody)]
+    count = sum(name.startswith("foot_") for name in names)
+    each, parts = range(count), ("lower", "upper") if "lower_0" in names else ("upper",)
     return Layout(
         mocap=np.array([mj_model.body_mocapid[mj_model.body(f"foot_{index}").id] for index in each], int),
-        lower=np.array([mj_model.body(f"lower_{index}").id for index in each], int),
+        lower=np.array([mj_model.body(f"{parts[0]}_{index}").id for index in each], int),
         upper=np.array([mj_model.body(f"upper_{index}").id for index in each], int),
-        lower_geom=np.array([mj_model.geom(f"lower_{index}").id for index in each], int),
+        lower_geom=np.array([mj_model.geom(f"{parts[0]}_{index}").id for index in each], int),
         upper_geom=np.array([mj_model.geom(f"upper_{index}").id for index in each], int),
         joints=np.array(
-            [[[mj_model.joint(f"{part}_{i}_{axis}").id for axis in "xy"] for part in ("lower", "upper")] for i in each], int
-        ).reshape(count, 2, 2),
+            [[[mj_model.joint(f"{part}_{i}_{axis}").id for axis in "xy"] for part in parts] for i in each], int
+        ).reshape(count, len(parts), 2),
     )
 
 
@@ -148,7 +153,7 @@ def fit(model: Any, layout: Layout, shape: Shape) -> Any:
     changes["body_quat"] = changes["body_quat"].at[layout.upper].set(turn)
     for part in (0, 1):
         radius, length = shape.radius[:, part], lengths[:, part]
-        stiffness, damping, mass, inertia = _properties(shape.bending_radius[:, part], part == 1, jnp)
+        stiffness, damping, mass, inertia = _properties(shape.bending_radius[:, part], part, jnp)
         around = jnp.stack([inertia, inertia, mass * radius**2], axis=-1)
         size = jnp.stack([radius, length / 2, jnp.zeros_like(radius)], axis=-1)
         for name, place, value in (
@@ -221,9 +226,10 @@ def displacement(wind: Gusts, foot: jax.Array, time: Any) -> jax.Array:
 
 def hinge_angles(layout: Layout, nv: int, moved: jax.Array) -> jax.Array:
     """Angles [nv] of the hinges of stalks that are ``moved`` [N, 2] (m) at `SWAY_HEIGHT`; 0 for all other joints."""
-    angle = moved / (SWAY_HEIGHT + (SWAY_HEIGHT - KNEE))  # both hinges turn alike
+    pieces = layout.joints.shape[1]
+    angle = moved / (SWAY_HEIGHT + (pieces - 1) * (SWAY_HEIGHT - KNEE))  # both hinges turn alike
     about = jnp.stack([-angle[:, 1], angle[:, 0]], axis=-1)  # about x and y
-    return jnp.zeros(nv, jnp.float32).at[layout.joints].set(jnp.stack([about, about], axis=1))
+    return jnp.zeros(nv, jnp.float32).at[layout.joints].set(jnp.stack([about] * pieces, axis=1))
 
 
 def wind_torque(model: Any, layout: Layout, wind: Gusts, foot: jax.Array, time: Any) -> jax.Array:
@@ -237,14 +243,18 @@ def at_height(data: Any, layout: Layout, height: Any) -> jax.Array:
     return start + ((height - start[:, 2]) / axis[:, 2])[:, None] * axis
 
 
-def _properties(radius: Any, is_upper: bool, numeric: Any) -> tuple[Any, Any, Any, Any]:
-    """Spring N m/rad and damper N m s/rad of each hinge, mass in kg and inertia in kg m^2 of a piece of a stalk."""
-    length = TOP - KNEE if is_upper else KNEE
-    stiffness = MODULUS * 0.25 * numeric.pi * radius**4 / _COMPLIANCE[is_upper]
+def _properties(radius: Any, piece: int | None, numeric: Any) -> tuple[Any, Any, Any, Any]:
+    """Spring N m/rad and damper N m s/rad of each hinge, mass in kg and inertia in kg m^2 of a piece of a stalk.
+
+    The piece is 0 for the lower one, 1 for the upper one, None for a stalk in one piece.
+    """
+    length = TOP if piece is None else (KNEE, TOP - KNEE)[piece]
+    compliance = SWAY_HEIGHT / 3 if piece is None else _COMPLIANCE[piece]
+    stiffness = MODULUS * 0.25 * numeric.pi * radius**4 / compliance
     mass = _LEAVES * DENSITY * numeric.pi * radius**2 * length
     inertia = mass * length**2 / 12
     # The whole plant turns about the ground, what is above the knee about the knee.
-    swung = _LEAVES * DENSITY * numeric.pi * radius**2 * ((TOP - KNEE) ** 3 if is_upper else TOP**3) / 3
+    swung = _LEAVES * DENSITY * numeric.pi * radius**2 * ((TOP - KNEE) ** 3 if piece == 1 else TOP**3) / 3
     return stiffness, 2 * _DAMPING_RATIO * numeric.sqrt(stiffness * swung), mass, inertia
 
 

@@ -1,8 +1,8 @@
 """The grasping arm of `assets/stalk_arm.xml` among stalks: its dimensions, its model and its closed-form inverse kinematics.
 
-A prismatic joint up and down a mast and two revolute joints (PRR): at every height that the slide has, there are two ways to a
-point of the plane, with the elbow to the left or to the right. Joints are ordered (slide, shoulder, elbow); a joint at 0 points at
-the row, and positive angles turn towards negative x.
+A prismatic joint up and down a mast and two revolute joints (PRR): at every height that the slide has, there are two ways
+to a point of the plane, with the elbow to the left or to the right. Joints are ordered (slide, shoulder, elbow); a joint at 0
+points at the row, and positive angles turn towards negative x.
 """
 
 from typing import Any
@@ -40,19 +40,28 @@ JOINTS = ARM_JOINTS + len(JAWS)
 """Joints of the arm and its jaws, which come before those of the stalks."""
 
 
-def build(stalks: int, motors: bool) -> mujoco.MjModel:
-    """The model of the arm among stalks.
+def build(stalks: int) -> mujoco.MjModel:
+    """The model of the arm among stalks, driven by whoever applies forces to its joints."""
 
-    Args:
-        stalks: How many.
-        motors: Whether the joints of the arm are driven by the model's position servos; if not, by whoever applies forces.
+    def edit(spec: mujoco.MjSpec) -> None:
+        for actuator in list(spec.actuators):
+            spec.delete(actuator)
+        bending.add_stalks(spec, stalks, JAWS + LINKS)
+
+    return mjx_model.load_model("stalk_arm.xml", edit)
+
+
+def build_servoed(stalks: int) -> mujoco.MjModel:
+    """The model of the arm with open jaws that do not move, driven by position servos, among stalks without knees.
+
+    A mocap body called "wind" holds nothing.
     """
 
     def edit(spec: mujoco.MjSpec) -> None:
-        if not motors:
-            for actuator in list(spec.actuators):
-                spec.delete(actuator)
-        bending.add_stalks(spec, stalks, JAWS + LINKS)
+        for jaw in JAWS:
+            spec.delete(spec.joint(jaw))
+        bending.add_stalks(spec, stalks, JAWS + LINKS, knees=False)
+        spec.worldbody.add_body(name="wind", mocap=True)
 
     return mjx_model.load_model("stalk_arm.xml", edit)
 
