@@ -1,8 +1,8 @@
 """Stalk reach: bring the open jaws of a grasping arm around one of several stalks that sway in the wind.
 
 The arm of chapter 4 of the thesis before a stretch of a row: a slide and two revolute joints, by position control. An episode
-draws where the stalks stand and lean, the wind, a stalk and a height. In the goal image the air is still and the gripper is at that
-stalk; stalks bend when they are pushed. The jaws stay open: to close them around what is between them is not learned.
+draws where the stalks stand and lean, the wind, a stalk and a height. In the goal image the air is still and the gripper is at
+that stalk. Stalks bend when they are pushed. The jaws stay open: closing them around what is between them is not learned.
 
     VisualStalkReach   sees RGB-D from behind the arm's shoulder
     StalkReach         sees the grip, its displacement, and how far the stalk has moved
@@ -149,8 +149,8 @@ class StalkReach(MjxGoalEnv):
         return stalk_arm.grip_at(data.qpos[:3]) - self._moved(data)
 
     def observe_state(self, data: mjx.Data) -> jax.Array:
-        """Position of the grip relative to the moved stalk (m), its displacement in a control step at its present speed (m), how
-        far the stalk has moved along and across the row (m): [8] float32.
+        """`achieved` (m), displacement of the grip in a control step at its present speed (m), and how far the stalk of the goal
+        has moved along and across the row (m): [8] float32.
         """
         grip = stalk_arm.grip_at(data.qpos[:3])
         velocity = mjx_model.point_velocity(self.mj_model, data, self._forearm, grip).at[2].set(data.qvel[0])
