@@ -54,7 +54,7 @@ class Gains(NamedTuple):
     spring: Any = (180.0, 90.0)  # N m/rad, the elastic part of a joint
     torque: Any = (30.0, 15.0)  # N m, the most
     motor: float = 120.0  # 1/s, how fast a motor follows what it is told
-    slide_proportional: float = 14.0  # 1/s
+    slide_proportional: float = 25.0  # 1/s
     slide_integral: float = 40.0  # 1/s^2
     slide_speed: float = 1.0  # m/s, the most
     slide_drive: float = 400.0  # N s/m

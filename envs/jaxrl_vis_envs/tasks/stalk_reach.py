@@ -107,7 +107,7 @@ class StalkReach(MjxGoalEnv):
     camera = "shoulder"
     distance_unit = "m"
     control_period = _CONTROL_PERIOD
-    chance, difficulty = 0.0, 0.0  # benchmarks/task_difficulty.py StalkReach --episodes 1000
+    chance, difficulty = 0.003, 11.1  # benchmarks/task_difficulty.py StalkReach --episodes 1000
 
     def __init__(self, config: StalkReachConfig, observer: Callable[[mujoco.MjModel], Observer] | None = None):
         """Builds the model.
@@ -149,8 +149,8 @@ class StalkReach(MjxGoalEnv):
         return stalk_arm.grip_at(data.qpos[:3]) - self._moved(data)
 
     def observe_state(self, data: mjx.Data) -> jax.Array:
-        """`achieved` (m), displacement of the grip in a control step at its present speed (m), and how far the stalk of the goal
-        has moved along and across the row (m): [8] float32.
+        """`achieved` (m), displacement of the grip in a control step at its present speed (m), and how far the stalk of the
+        goal has moved along and across the row (m): [8] float32.
         """
         grip = stalk_arm.grip_at(data.qpos[:3])
         velocity = mjx_model.point_velocity(self.mj_model, data, self._forearm, grip).at[2].set(data.qvel[0])
