@@ -82,7 +82,9 @@ def test_the_model_has_the_dimensions_that_the_formulas_have():
     jaws = [data.geom(name).xpos for name in stalk_arm.JAWS]
     assert np.linalg.norm(jaws[0] - jaws[1]) == pytest.approx(stalk_arm.OPENING + 2 * stalk_arm.JAW_RADIUS)
     assert stalk_arm.OPENING >= 0.04
-    np.testing.assert_allclose(model.jnt_range[:3, 1], [stalk_arm.SLIDE_RANGE[1], stalk_arm.SHOULDER_RANGE, stalk_arm.ELBOW_RANGE])
+    np.testing.assert_allclose(
+        model.jnt_range[:3, 1], [stalk_arm.SLIDE_RANGE[1], stalk_arm.SHOULDER_RANGE, stalk_arm.ELBOW_RANGE]
+    )
 
 
 @pytest.mark.parametrize(
@@ -132,7 +134,7 @@ def test_stands_pass_through_the_stalks_of_their_plot():
     indices = np.arange(0, len(plot.measured), 5)
     targets = np.array([plot.measured[index].at_height(HEIGHT)[0] for index in indices])
     found = stands_at(plot, targets[:, 0], targets)
-    for place, (index, target) in enumerate(zip(indices, targets)):
+    for place, index in enumerate(indices):
         assert index in found.stalk[place]
         for slot, stalk in enumerate(found.stalk[place]):
             knee, top = found.knee[place, slot], found.top[place, slot]

@@ -55,7 +55,7 @@ class Gains(NamedTuple):
     torque: Any = (30.0, 15.0)  # N m, the most
     motor: float = 120.0  # 1/s, how fast a motor follows what it is told
     slide_proportional: float = 25.0  # 1/s
-    slide_integral: float = 40.0  # 1/s^2
+    slide_integral: float = 4.0  # 1/s^2
     slide_speed: float = 1.0  # m/s, the most
     slide_drive: float = 400.0  # N s/m
     jaw_force: float = 15.0  # N

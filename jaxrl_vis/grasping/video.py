@@ -1,4 +1,4 @@
-"""The arm at work, through the camera over its shoulder: as a video of reaches one after the other."""
+"""The arm at work, through a camera beside its mast, as a video of reaches one after the other."""
 
 import functools
 from collections.abc import Sequence
@@ -63,7 +63,7 @@ def reach_frames(stands: Stands, result: ReachResult, index: int, size: int) -> 
 @functools.cache
 def _program(stalks: int, size: int) -> Any:
     arms = arms_among(stalks)
-    scene = Scene.from_mjmodel(arms.mj_model, "shoulder", size, size)
+    scene = Scene.from_mjmodel(arms.mj_model, "work", size, size)
     geoms = np.concatenate([arms.layout.lower_geom, arms.layout.upper_geom])
 
     def draw(shape: Shape, pose: jax.Array) -> jax.Array:

@@ -13,6 +13,7 @@ from jaxrl_vis.report.plots import FAINT, INK
 from jaxrl_vis_envs.plants.stand import Stands
 from jaxrl_vis_envs.tasks import stalk_arm
 
+_HALF_WIDTH = 0.45  # m, of what is shown of the row
 _PLANNED, _TAKEN, _HELD, _STALK = "#2b6cb0", "#dd6b20", "#2f855a", "#a0aec0"
 
 
@@ -87,6 +88,7 @@ def _draw_plane(axes: Axes, stands: Stands, result: ReachResult, index: int, tar
     axes.plot(*np.stack([shoulder, elbow, taken[-1, :2]], axis=1), color=INK, linewidth=4, alpha=0.25, marker="o")
     axes.plot(*target[:2], "+", color=INK, markersize=9, label="target")
     axes.set_aspect("equal")
+    axes.set_xlim(origin[0] - _HALF_WIDTH, origin[0] + _HALF_WIDTH)
     axes.set_xlabel("along the row, m")
     axes.set_ylabel("across the row, m")
     axes.grid(alpha=0.25)
