@@ -27,10 +27,11 @@ TARGETS = np.array(
         [3.0, 0.0, HEIGHT],  # nothing there
         [1.0, 0.9, HEIGHT],  # out of reach
         [4.0, 0.0, HEIGHT],  # behind another one in the same line
-        [5.0, 0.0, HEIGHT],  # alone
+        [5.0, 0.0, HEIGHT],  # alone, and so thin that jaws that close fast go through it
     ]
 )
 MASTS = np.array([1.0, 1.0, 1.0, 2.0, 3.0, 1.0, 4.0, 5.0])
+THIN = 7
 FEET = [(1.0, 0.0), (1.25, 0.03), (0.8, -0.02), (1.991, 0.0), (2.009, 0.0), (4.0, 0.0), (4.0, -0.05), (5.0, 0.0)]
 ALONE = [0, 1, 2, 7]
 
@@ -44,7 +45,7 @@ def straight(x: float, y: float, radius: float = 0.006) -> Stalk:
 
 @functools.cache
 def row() -> Plot:
-    return Plot(TRAINING, 0, tuple(straight(*place) for place in FEET), ())
+    return Plot(TRAINING, 0, tuple(straight(*place, 0.003 if index == THIN else 0.006) for index, place in enumerate(FEET)), ())
 
 
 @functools.cache
@@ -129,6 +130,21 @@ def test_room_is_the_least_distance_of_the_open_gripper_from_others():
     assert beside(0.0, -0.08) > 0.005 > 0 > beside(0.0, -0.08, whole_way=True)
 
 
+def test_the_way_with_most_room_is_taken():
+    origins = np.array([origin_of(x) for x in (-0.35, 0.0, 0.35)])
+    target = np.array([0.0, 0.0, HEIGHT])
+
+    def way(*others: tuple[float, float]) -> arm.Way:
+        return arm.best_way(origins, target, np.array(others).reshape(-1, 2), np.full(len(others), 0.006))
+
+    assert way()[::2] == (1, np.inf)  # straight ahead, which is shortest
+    assert way((0.0, -0.1)).stop in (0, 2) and way((0.0, -0.1)).room > 0.005
+    assert way((0.0, -0.1), (-0.06, -0.1)).stop == 2
+    assert way((0.0, -0.1), (0.06, -0.1)).stop == 0
+    assert way((0.015, 0.0)).room < 0  # there is no room from anywhere
+    assert arm.best_way(origins, np.array([2.0, 0.0, HEIGHT]), np.zeros((0, 2)), np.zeros(0)).stop == -1
+
+
 def test_stands_pass_through_the_stalks_of_their_plot():
     plot = draw(TRAINING, 3)
     indices = np.arange(0, len(plot.measured), 5)
@@ -159,7 +175,7 @@ def test_a_stalk_gives_way_like_a_beam():
     """Pushed at several heights in C MuJoCo, against 3 EI / z^3 of a beam without taper."""
     arms, radius = arms_among(4), 0.006
     model = arms.mj_model.__copy__()
-    shape = jax.tree.map(lambda part: part[7], bending.shapes(stands()))
+    shape = jax.tree.map(lambda part: part[0], bending.shapes(stands()))
     fitted = bending.fit(arms.model, arms.layout, shape)
     for name in ("body_pos", "body_ipos", "body_mass", "body_inertia", "jnt_stiffness", "dof_damping"):
         getattr(model, name)[:] = getattr(fitted, name)

@@ -58,7 +58,7 @@ class Gains(NamedTuple):
     slide_integral: float = 4.0  # 1/s^2
     slide_speed: float = 1.0  # m/s, the most
     slide_drive: float = 400.0  # N s/m
-    jaw_force: float = 15.0  # N
+    jaw_force: float = 10.0  # N
 
 
 class Drive(NamedTuple):
@@ -191,6 +191,44 @@ def room(target: np.ndarray, others: np.ndarray, radii: np.ndarray, whole_way: b
         gap = np.where(np.isnan(gap), np.inf, gap - np.asarray(radii)[:, None])
         found.append(gap.min(axis=(1, 2), initial=np.inf))
     return np.stack(found, axis=-1)
+
+
+class Way(NamedTuple):
+    """From where, and with which solution, a stalk is reached.
+
+    Attributes:
+        stop: Index of the place of the mast; -1 where none will do.
+        side: Which solution: 1 or -1.
+        room: What other stalks leave the open gripper on the way, m; -inf where there is no way.
+    """
+
+    stop: int
+    side: int
+    room: float
+
+
+def best_way(origins: np.ndarray, target: np.ndarray, others: np.ndarray, radii: np.ndarray, enough: float = 0.02) -> Way:
+    """The way with most room from any of the places where the robot stops, the shortest of those with ``enough`` of it.
+
+    Args:
+        origins: [S, 3], `Stands.origin` of each stop, m in the plot's frame.
+        target: [3], m in the plot's frame.
+        others: [M, 2], where other stalks are at the target's height, as far as is known, m in the plot's frame.
+        radii: [M], of these, m.
+        enough: More room than this is no better, m.
+    """
+    origins, target = np.asarray(origins, float).reshape(-1, 3), np.asarray(target, float)
+    local = target - origins
+    around = np.asarray(others, float).reshape(1, -1, 2) - origins[:, None, :2]
+    rooms = room(local, around, np.broadcast_to(radii, around.shape[:2]))
+    can = reachable(origins, np.broadcast_to(target, origins.shape))
+    if not can.any():
+        return Way(-1, int(better_side(target, np)), -np.inf)
+    distance = np.linalg.norm(local[:, :2] - np.array(stalk_arm.SHOULDER), axis=-1)
+    # A millimetre of room is worth a metre of way: it only decides between equals.
+    worth = np.where(can[:, None], np.minimum(rooms, enough) - 1e-3 * distance[:, None], -np.inf)
+    stop, column = np.unravel_index(np.argmax(worth), worth.shape)
+    return Way(int(stop), (1, -1)[int(column)], float(rooms[stop, column]))
 
 
 def _to_box(aside: np.ndarray, ahead: np.ndarray, half_width: float, back: float, front: float) -> np.ndarray:

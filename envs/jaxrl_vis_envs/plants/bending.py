@@ -98,7 +98,7 @@ def add_stalks(spec: mujoco.MjSpec, stalks: int, pushed_by: tuple[str, ...], kne
             parent, length = body, reach
         for name in pushed_by:
             pair = spec.add_pair(geomname1=name, geomname2=f"upper_{index}", condim=1)
-            pair.solref, pair.solimp = [0.01, 1], [0.9, 0.98, 0.001, 0.5, 2]
+            pair.solref, pair.solimp = [0.008, 1], [0.9, 0.98, 0.001, 0.5, 2]
 
 
 def layout_of(mj_model: mujoco.MjModel) -> Layout:
