@@ -3,14 +3,17 @@
 import dataclasses
 import functools
 import types
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from PIL import Image
 
-from jaxrl_vis.grasping import arm
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.grasping import arm, video, way
 from jaxrl_vis.grasping.reach import LOOK, ReachResult, Sight, arms_among, reach
 from jaxrl_vis_envs.plants import TRAINING, bending, draw
 from jaxrl_vis_envs.plants.field import Plot, Stalk
@@ -134,14 +137,14 @@ def test_the_way_with_most_room_is_taken():
     origins = np.array([origin_of(x) for x in (-0.35, 0.0, 0.35)])
     target = np.array([0.0, 0.0, HEIGHT])
 
-    def way(*others: tuple[float, float]) -> arm.Way:
+    def best(*others: tuple[float, float]) -> arm.Way:
         return arm.best_way(origins, target, np.array(others).reshape(-1, 2), np.full(len(others), 0.006))
 
-    assert way()[::2] == (1, np.inf)  # straight ahead, which is shortest
-    assert way((0.0, -0.1)).stop in (0, 2) and way((0.0, -0.1)).room > 0.005
-    assert way((0.0, -0.1), (-0.06, -0.1)).stop == 2
-    assert way((0.0, -0.1), (0.06, -0.1)).stop == 0
-    assert way((0.015, 0.0)).room < 0  # there is no room from anywhere
+    assert best()[::2] == (1, np.inf)  # straight ahead, which is shortest
+    assert best((0.0, -0.1)).stop in (0, 2) and best((0.0, -0.1)).room > 0.005
+    assert best((0.0, -0.1), (-0.06, -0.1)).stop == 2
+    assert best((0.0, -0.1), (0.06, -0.1)).stop == 0
+    assert best((0.015, 0.0)).room < 0  # there is no room from anywhere
     assert arm.best_way(origins, np.array([2.0, 0.0, HEIGHT]), np.zeros((0, 2)), np.zeros(0)).stop == -1
 
 
@@ -281,3 +284,27 @@ def test_requests_that_make_no_sense_are_refused():
         reach(stands(), TARGETS, key, sides=np.zeros(8))
     nothing = reach(stands_at([], np.zeros(0), np.zeros((0, 3)), 4), np.zeros((0, 3)), key)
     assert nothing.held.shape == (0, 4) and nothing.path.shape == (0, 120, 3)
+
+
+def test_the_figure_and_its_table_show_both_ways(tmp_path: Path):
+    found = still_air()
+    way.draw_path(tmp_path / "new" / "way.png", stands(), TARGETS, found, 1)
+    way.draw_path(tmp_path / "unreachable.png", stands(), TARGETS, found, 5)
+    assert Image.open(tmp_path / "new" / "way.png").size[0] > 600
+    table = way.path_table(found, 1)
+    assert len(table) == found.path.shape[1] and table[-1]["time_s"] == pytest.approx(2.4)
+    apart = np.linalg.norm([table[9][f"planned_{axis}_m"] - table[9][f"taken_{axis}_m"] for axis in "xyz"])
+    assert table[9]["distance_mm"] == pytest.approx(1000 * apart, rel=1e-4)
+
+
+def test_the_video_shows_the_arm_at_work(tmp_path: Path):
+    video.write_reaches(tmp_path / "arm.gif", stands(), still_air(), [0, 1, 2, 3, -1, -1, 5, 7], [1], size=48)
+    with Image.open(tmp_path / "arm.gif") as shown:
+        assert shown.n_frames == 60 and shown.size == (48, 48 + 34)
+        frames = []
+        for index in (0, 30, 59):
+            shown.seek(index)
+            frames.append(np.asarray(shown.convert("RGB"))[34:].astype(int))
+    assert all((np.abs(one - other).max(axis=-1) > 40).sum() > 10 for one, other in zip(frames, frames[1:]))
+    with pytest.raises(RequestError, match="must end in one of"):
+        video.write_reaches(tmp_path / "arm.avi", stands(), still_air(), [0] * 8, [0])
