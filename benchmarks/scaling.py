@@ -215,16 +215,16 @@ def measure_all_reduce(figure: Figure) -> tuple[str, Measurement]:
     seconds = all_reduce_seconds(numbers, count)
     updates = figure.timed.config.updates_per_iteration
     line = (
-        f"all-reduce of {numbers:,} float32 over {count} devices: {1e6 * seconds:.1f} us, {1e3 * seconds * updates:.1f} ms in the "
-        f"{updates} updates of an iteration"
+        f"all-reduce of {numbers:,} float32 over {count} devices: {1e6 * seconds:.1f} us, "
+        f"{1e3 * seconds * updates:.1f} ms in the {updates} updates of an iteration"
     )
     described = {"devices": count, "float32": numbers}
     return line, Measurement("scaling/all_reduce", round(1 / seconds, 1), "all-reduces/s", described)
 
 
 HEAD = (
-    f"{'what':8}{'devices':>8}{'seeds':>7}{'batch':>8}{'envs':>6}{'one device':>14}{'all':>14}{'speed-up':>10}{'efficiency':>12}"
-    f"{'spread':>9}"
+    f"{'what':8}{'devices':>8}{'seeds':>7}{'batch':>8}{'envs':>6}{'one device':>14}{'all':>14}"
+    f"{'speed-up':>10}{'efficiency':>12}{'spread':>9}"
 )
 
 
