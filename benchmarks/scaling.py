@@ -38,7 +38,8 @@ from jaxrl_vis.learner.environment import make_env
 from jaxrl_vis.learner.sharding import make_layout
 from jaxrl_vis.learner.shards import DATA
 from jaxrl_vis.learner.train_step import make_train_step
-from jaxrl_vis.run.checkpoint import FULL, Checkpoints, named_leaves
+from jaxrl_vis.run.arrays import named_leaves
+from jaxrl_vis.run.checkpoint import FULL, Checkpoints
 from jaxrl_vis.run.programs import Programs, enable_compilation_cache
 
 QUICK = {
