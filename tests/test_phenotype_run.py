@@ -14,10 +14,11 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.phenotyping.detector.finder import Detection
 from jaxrl_vis.phenotyping.evaluate import PlotScore, average_precision, match, summary
 from jaxrl_vis.phenotyping.folders import find_plots, read_odometry
+from jaxrl_vis.phenotyping.heights import USUAL_TAPER, robust_width, widths_of
 from jaxrl_vis.phenotyping.images import read_image, write_image
 from jaxrl_vis.phenotyping.pairing import wrong_with
 from jaxrl_vis.phenotyping.sightings import Sighting, look
-from jaxrl_vis.phenotyping.track import follow, robust_width
+from jaxrl_vis.phenotyping.track import Track, follow
 from jaxrl_vis_envs.plants import Calibration
 from jaxrl_vis_envs.plants.truth import StalkInView
 
@@ -161,11 +162,39 @@ def test_no_pairs_and_empty_fields():
 
 def test_widths_are_medians_with_an_error():
     sightings = [sighting(0.0, diameter_mm=14.0 + each) for each in (-0.2, -0.1, 0.0, 0.1, 0.2)]
-    width, error, count = robust_width([*sightings, sighting(0.0, diameter_mm=30.0)])  # pyright: ignore[reportGeneralTypeIssues]
-    assert width == pytest.approx(14.05, abs=0.06) and 0.03 < error < 0.3 and count == 6
+    width = robust_width([*sightings, sighting(0.0, diameter_mm=30.0)])
+    assert width is not None and width.mm == pytest.approx(14.05, abs=0.06) and 0.03 < width.error < 0.3 and width.count == 6
     assert robust_width([sighting(0.0, diameter_mm=None)]) is None
     one = robust_width(sightings[:1])
-    assert one is not None and one[1] == pytest.approx(0.1)
+    assert one is not None and one.error == pytest.approx(0.1)
+
+
+def test_widths_are_those_at_12_and_24_inches():
+    """Stalks that were measured 2 inches below and above; one is hidden at 24 inches, and one shows no ground."""
+    taper, inch = 0.3, 0.0254
+
+    def seen(beside: float, **parts) -> Sighting:
+        lower, upper = 14.0 - taper * beside, 14.0 - taper * (12 + beside)
+        values = dict(diameter_mm=lower, height_m=(12 + beside) * inch, upper_mm=upper, upper_height_m=(24 + beside) * inch)
+        return sighting(0.0, **{**values, "upper_deviation_mm": 0.1, "upper_confidence": 0.8, **parts})
+
+    stalks = [[seen(2.0), seen(2.0), seen(2.2)] for _ in range(6)]
+    hidden = dict(upper_mm=None, upper_height_m=None)
+    stalks += [
+        [seen(-2.0, **hidden)] * 3,
+        [seen(0.0, height_m=None, **hidden)] * 3,
+        [seen(0.0, diameter_mm=None, **hidden)] * 3,
+    ]
+    tracks = [Track(tuple((stalk, place) for place in range(3)), 0.0, 0.8, True, "") for stalk in range(len(stalks))]
+    found = widths_of(stalks, tracks)
+    first, below, unknown, nothing = found[0], *found[6:]
+    assert first.lower.mm == pytest.approx(14.0, abs=0.01) and first.upper.mm == pytest.approx(10.4, abs=0.01)  # pyright: ignore
+    assert first.taper == pytest.approx(taper, abs=1e-3) and first.height_known and first.lower.corrected  # pyright: ignore
+    # The taper is that of the other stalks, not the usual one; and it makes the error larger.
+    assert below.lower.mm == pytest.approx(14.0, abs=0.01) and below.upper is None and below.taper is None  # pyright: ignore
+    assert USUAL_TAPER != taper and below.lower.error > 0.1  # pyright: ignore[reportOptionalMemberAccess]
+    assert unknown.lower.mm == 14.0 and not unknown.height_known  # pyright: ignore[reportOptionalMemberAccess]
+    assert nothing.lower is None
 
 
 # --- evaluation ---

@@ -55,6 +55,7 @@ def run(options: Run) -> int:
     calibrations = {plot.name: _calibration(plot.folder, options) for plot in plots}
     check_devices()
     from jaxrl_vis.phenotyping.pipeline import Request, run
+    from jaxrl_vis.phenotyping.results import NO_GROUND
 
     if options.masks == "truth":
         from jaxrl_vis.phenotyping.truth_on_disk import find_truth
@@ -78,11 +79,16 @@ def run(options: Run) -> int:
             print(f"{plot}: {of} pairs", flush=True)
 
     try:
-        skipped = run(plots, find, request, say)
+        rows, skipped = run(plots, find, request, say)
     except OSError as error:
         raise StorageError(
             f"cannot write to {options.out}: {error.strerror or error}; run the command again to go on"
         ) from error
+    for row in rows:
+        if row["flag"] == NO_GROUND:
+            print(
+                f"{row['plot']}: the ground is not seen, so nobody knows at what height the widths were taken", file=sys.stderr
+            )
     for row in skipped:
         print(f"skipped {row['plot']}/{row['pair']}: {row['why']}", file=sys.stderr)
     print(f"{options.out}: stalks.csv, plots.csv and overlays of {len(plots)} plots, {len(skipped)} pairs skipped")

@@ -11,10 +11,12 @@ from typing import Any
 import numpy as np
 
 from jaxrl_vis.phenotyping.detector.finder import Detection
+from jaxrl_vis.phenotyping.ground import find_ground
+from jaxrl_vis.phenotyping.heights import widths_of
 from jaxrl_vis.phenotyping.measure import Method
 from jaxrl_vis.phenotyping.perfect import perfect_detections
-from jaxrl_vis.phenotyping.sightings import Sighting, look
-from jaxrl_vis.phenotyping.track import follow, robust_width
+from jaxrl_vis.phenotyping.sightings import Sighting, grey_of, look
+from jaxrl_vis.phenotyping.track import follow
 from jaxrl_vis_envs.plants import Family, Stalk, draw
 from jaxrl_vis_envs.plants.pairs import Sequence
 from jaxrl_vis_envs.plants.truth import HEIGHTS, StalkInView, stalks_in_view
@@ -32,6 +34,7 @@ class PlotScore:
         seed: Of the plot.
         true, counted: Stalks.
         widths: [N, 2] float64, measured and true diameter at 12 inches of each stalk that was counted and identified, mm.
+        upper: [M, 2] float64, the same at 24 inches.
         finds: [K, 2] float64, score of each find, and 1 where it is a stalk, 0 where not; those of unclear stalks are left out.
         stalks: How many stalks finds could have shown, over all pairs.
     """
@@ -42,6 +45,7 @@ class PlotScore:
     widths: np.ndarray
     finds: np.ndarray
     stalks: int
+    upper: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 2)))
 
 
 Finder = Callable[[np.ndarray], list[Detection]]
@@ -74,26 +78,35 @@ def score_plot(family: Family, seed: int, find: Finder | None, method: Method = 
         total += sum(each.band_box is not None and each.band_visible >= LEAST_VISIBLE for each in seen)
         finds += scored
         kept = [place for place, each in enumerate(detections) if each.score >= least_score]
-        frames.append(look([detections[place] for place in kept], left, right, drive.stated, method))
+        ground = find_ground(grey_of(left), grey_of(right), drive.stated)
+        frames.append(look([detections[place] for place in kept], left, right, drive.stated, method, ground))
         owners.append([matched[place] for place in kept])
     tracks, _ = follow(frames, drive.odometry, drive.stated)
-    widths = []
+    widths, upper = [], []
     counted = [track for track in tracks if track.counted]
-    for track in counted:
+    for track, measured in zip(counted, widths_of(frames, counted)):
         names = [owners[frame][place] for frame, place in track.sightings]
         known = [name for name in names if name is not None]
-        width = robust_width([frames[frame][place] for frame, place in track.sightings])
-        if known and width is not None:
-            owner = max(sorted(set(known)), key=known.count)
-            widths.append((width[0], true_diameter(plot.stalks[owner])))
+        if not known:
+            continue
+        stalk = plot.stalks[max(sorted(set(known)), key=known.count)]
+        if measured.lower is not None:
+            widths.append((measured.lower.mm, true_diameter(stalk)))
+        if measured.upper is not None:
+            upper.append((measured.upper.mm, true_diameter(stalk, HEIGHTS[1])))
     return PlotScore(
-        seed, len(plot.measured), len(counted), np.array(widths).reshape(-1, 2), np.array(finds).reshape(-1, 2), total
+        seed,
+        len(plot.measured),
+        len(counted),
+        np.array(widths).reshape(-1, 2),
+        np.array(finds).reshape(-1, 2),
+        total,
+        np.array(upper).reshape(-1, 2),
     )
 
 
-def true_diameter(stalk: Stalk) -> float:
-    """Diameter of a stalk at 12 inches as the cameras face it, mm; beside a node, the stalk above and below it is meant."""
-    height = HEIGHTS[0]
+def true_diameter(stalk: Stalk, height: float = HEIGHTS[0]) -> float:
+    """Diameter of a stalk at a height in m as the cameras face it, mm; beside a node, the stalk above and below it is meant."""
     beside = (0.02, -0.02) if stalk.node_distance(height) < 0.01 else (0.0,)
     return 1e3 * float(np.mean([stalk.diameter(height + each) for each in beside]))
 
@@ -154,8 +167,9 @@ def summary(scores: Iterable[PlotScore], least_score: float = 0.5) -> dict[str, 
 
     Returns:
         ``count_r2`` (1 - SSE / SST against y = x), ``count_mae``, ``count_bias`` (of the true number), ``width_mae_mm``,
-        ``width_bias_mm``, ``width_mae_two_people_mm`` (against the simulated mean of two people with calipers), ``ap50``,
-        ``f1``, ``precision``, ``recall``, and how much there was of each. Not a number where there was nothing.
+        ``width_bias_mm``, ``width_mae_two_people_mm`` (against the simulated mean of two people with calipers), the same at 24
+        inches, ``ap50``, ``f1``, ``precision``, ``recall``, and how much there was of each. Not a number where there was
+        nothing.
     """
     scores = list(scores)
     true = np.array([each.true for each in scores], float)
@@ -165,6 +179,8 @@ def summary(scores: Iterable[PlotScore], least_score: float = 0.5) -> dict[str, 
     stalks = sum(each.stalks for each in scores)
     spread = float(((true - true.mean()) ** 2).sum()) if len(true) else 0.0
     error = widths[:, 0] - widths[:, 1]
+    upper = np.concatenate([each.upper for each in scores]) if scores else np.zeros((0, 2))
+    upper_error = upper[:, 0] - upper[:, 1]
     people = np.random.default_rng(0).normal(0.0, PERSON_SD, (len(error), 2)).mean(axis=1)
     kept = finds[finds[:, 0] >= least_score]
     hits = float(kept[:, 1].sum())
@@ -178,6 +194,9 @@ def summary(scores: Iterable[PlotScore], least_score: float = 0.5) -> dict[str, 
         "width_mae_mm": _mean(np.abs(error)),
         "width_bias_mm": _mean(error),
         "width_mae_two_people_mm": _mean(np.abs(error - people)),
+        "widths_24in": len(upper),
+        "width_24in_mae_mm": _mean(np.abs(upper_error)),
+        "width_24in_bias_mm": _mean(upper_error),
         "finds": len(kept),
         "stalks_in_view": stalks,
         "ap50": average_precision(finds, stalks),

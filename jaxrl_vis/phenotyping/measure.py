@@ -6,6 +6,7 @@ from typing import Literal
 
 import numpy as np
 
+from jaxrl_vis.phenotyping.ground import Ground
 from jaxrl_vis.phenotyping.metric import diameter_mm, tilt_of
 from jaxrl_vis.phenotyping.stereo import StalkDisparity, match_rows
 from jaxrl_vis.phenotyping.width import Strip, ellipse_width, strip_width
@@ -27,6 +28,7 @@ class Measurement:
         width: Across its axis, pixels.
         disparity: There, pixels.
         depth: Planar depth of its front, m.
+        height: Of the place above the ground, m; not a number where no ground is known.
         lean, tilt: Against the image's vertical and away from the camera, rad.
         confidence: 0 to 1.
         reason: Empty where the stalk was measured.
@@ -39,6 +41,7 @@ class Measurement:
     width: float = math.nan
     disparity: float = math.nan
     depth: float = math.nan
+    height: float = math.nan
     lean: float = math.nan
     tilt: float = 0.0
     confidence: float = 0.0
@@ -54,6 +57,8 @@ def measure(
     line: float | None = None,
     depths: tuple[float, float] = (0.5, 1.3),
     method: Method = "strip",
+    ground: Ground | None = None,
+    height: float | None = None,
 ) -> Measurement:
     """Measures a stalk.
 
@@ -65,12 +70,17 @@ def measure(
         line: Where to measure, a line of the image; the middle of what is seen if not given.
         depths: Least and greatest depth at which a stalk may stand, m.
         method: ``strip``, or ``ellipse`` as in the thesis, which measures the mask as a whole and not at a line.
+        ground: What heights are counted from.
+        height: Where to measure, m above the ground, if it is known: there, or as near to it as both edges are seen; ``line``
+            does not matter then.
     """
     strip = strip_width(mask)
     if strip is None:
         return Measurement(reason="too few lines show both edges")
     place = strip.reference if line is None else line - corner[0]
     matched = _disparity(strip, corner, left, right, calibration, depths)
+    if ground is not None and height is not None:
+        place = _place_at(height, strip, corner, matched, calibration, ground)
     found = matched.at(place + corner[0])
     if found is None:
         return Measurement(line=place + corner[0], lean=strip.lean, reason="the right image does not show it clearly")
@@ -98,10 +108,30 @@ def measure(
         width=pixels,
         disparity=disparity,
         depth=depth,
+        height=math.nan if ground is None else ground.height(middle + corner[1], place + corner[0], depth, calibration),
         lean=strip.lean,
         tilt=tilt,
         confidence=strip.confidence * min(matched.values.size / max(matched.tried, 1), 1.0),
     )
+
+
+def _place_at(
+    height: float, strip: Strip, corner: tuple[int, int], matched: StalkDisparity, calibration: Calibration, ground: Ground
+) -> float:
+    """Line of the mask at which a stalk is so high above the ground, m, or the nearest one in which its edges are seen."""
+    ends = np.array([strip.first, strip.last], float)
+    found = [matched.at(place + corner[0]) for place in ends]
+    known = [each[0] for each in found if each is not None]
+    if len(known) < 2 or ends[0] == ends[1]:
+        return strip.reference
+    depths = calibration.depth(np.array(known))
+    heights = [
+        ground.height(0.5 * sum(strip.edges(place)) + corner[1], place + corner[0], float(depth), calibration)
+        for place, depth in zip(ends, depths)
+    ]
+    if not heights[0] > heights[1]:
+        return strip.reference
+    return float(np.interp(-height, [-each for each in heights], ends))
 
 
 def _disparity(

@@ -23,6 +23,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.files import write_atomically
 from jaxrl_vis.phenotyping.detector.finder import Detection
 from jaxrl_vis.phenotyping.folders import PairFiles, PlotFolder, read_odometry
+from jaxrl_vis.phenotyping.ground import find_ground
 from jaxrl_vis.phenotyping.images import read_image, write_image
 from jaxrl_vis.phenotyping.measure import Method
 from jaxrl_vis.phenotyping.overlay import draw_overlay
@@ -36,7 +37,7 @@ from jaxrl_vis.phenotyping.results import (
     rows_without_path,
     write_rows,
 )
-from jaxrl_vis.phenotyping.sightings import NO_CALIBRATION, Sighting, look
+from jaxrl_vis.phenotyping.sightings import NO_CALIBRATION, Sighting, grey_of, look
 from jaxrl_vis.phenotyping.track import Track, follow
 from jaxrl_vis_envs.plants import Calibration
 
@@ -71,7 +72,7 @@ class _Skip(Exception):
 
 def run(
     plots: list[PlotFolder], find: Find, request: Request, done: Callable[[str, int, int], None] = lambda plot, pair, of: None
-) -> list[Row]:
+) -> tuple[list[Row], list[Row]]:
     """Writes the results of plots.
 
     Args:
@@ -81,7 +82,7 @@ def run(
         done: Called after each pair with the plot's name, how many of its pairs are done, and how many it has.
 
     Returns:
-        A row for each pair that was skipped: plot, pair and why.
+        The rows of plots.csv and of skipped.csv.
 
     Raises:
         RequestError: The folder holds other results, or a plot's odometry cannot be read.
@@ -112,7 +113,7 @@ def run(
         write_rows(request.out / "stalks.csv", STALK_COLUMNS, stalks)
         write_rows(request.out / "plots.csv", PLOT_COLUMNS, rows)
         write_rows(request.out / "skipped.csv", SKIPPED_COLUMNS, skipped)
-    return skipped
+    return rows, skipped
 
 
 def _claim(plots: list[PlotFolder], request: Request) -> None:
@@ -143,11 +144,17 @@ def _record(plot: PlotFolder, pair: PairFiles, find: Find, request: Request) -> 
     except _Skip as problem:
         return {"skipped": str(problem)}
     calibration = request.calibrations[plot.name]
-    sightings = look(detections, left, right, calibration, request.method)
+    ground = None if calibration is None else find_ground(grey_of(left), grey_of(right), calibration)
+    sightings = look(detections, left, right, calibration, request.method, ground)
     wrong = None if calibration is None else wrong_with(detections, sightings, left, right, calibration)
     if wrong is not None:
         return {"skipped": wrong}
-    return {"size": list(left.shape[:2]), "sightings": [dataclasses.asdict(each) for each in sightings]}
+    height = None if ground is None else round(ground.camera_height, 4)
+    return {
+        "size": list(left.shape[:2]),
+        "camera_height_m": height,
+        "sightings": [dataclasses.asdict(each) for each in sightings],
+    }
 
 
 def _read(pair: PairFiles, calibration: Calibration | None) -> tuple[np.ndarray, np.ndarray]:

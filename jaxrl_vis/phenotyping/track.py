@@ -240,24 +240,3 @@ def _closed(track: _Open, path: Path, step: float, half_field: float, usual: flo
     else:
         reason = ""
     return Track(tuple(sorted(track.seen)), position, depth, not reason, reason)
-
-
-def robust_width(sightings: list[Sighting]) -> tuple[float, float, int] | None:
-    """Diameter of one stalk by all its sightings: weighted median, its standard error in mm, and how many say so.
-
-    The standard error is that of the scatter between pairs, and at least what edges and disparity tell. What hides a stalk from
-    all sides is not in it.
-    """
-    measured = [each for each in sightings if each.diameter_mm is not None]
-    if not measured:
-        return None
-    values = np.array([each.diameter_mm for each in measured], float)
-    weights = np.array([max(each.confidence, 0.02) for each in measured])
-    order = np.argsort(values)
-    passed = np.cumsum(weights[order]) - 0.5 * weights[order]
-    median = float(np.interp(0.5 * weights.sum(), passed, values[order]))
-    enough = float(weights.sum() ** 2 / (weights**2).sum())
-    scatter = 1.4826 * float(np.median(np.abs(values - median))) * 1.2533 if len(values) > 2 else 0.0
-    stated = np.array([each.deviation_mm or 0.0 for each in measured])
-    least = math.sqrt(float((weights * stated**2).sum() / weights.sum()))
-    return median, max(scatter, least) / math.sqrt(enough), len(values)
