@@ -4,6 +4,7 @@
         pairs/PLOT/PAIR.json     sightings, or why the pair was skipped; what is there is not computed again
         overlays/PLOT/PAIR.png
         stalks.csv  plots.csv  skipped.csv
+        qc.html                  the same with pictures, and what was rejected
 
 Tables are always made from the files under pairs/, so they do not depend on when the command was stopped. One pair is in memory
 at a time.
@@ -14,7 +15,7 @@ import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -28,6 +29,7 @@ from jaxrl_vis.phenotyping.images import read_image, write_image
 from jaxrl_vis.phenotyping.measure import Method
 from jaxrl_vis.phenotyping.overlay import draw_overlay
 from jaxrl_vis.phenotyping.pairing import wrong_with
+from jaxrl_vis.phenotyping.qc import Page, PlotResult
 from jaxrl_vis.phenotyping.results import (
     PLOT_COLUMNS,
     STALK_COLUMNS,
@@ -90,6 +92,23 @@ def run(
     """
     driven = {plot.name: read_odometry(plot, request.speed) for plot in plots}
     _claim(plots, request)
+    about = [
+        f"jaxrl-vis {jaxrl_vis.__version__}; finds by {request.finder}; widths by the method {request.method}.",
+        "Tables: stalks.csv, plots.csv and skipped.csv; all pairs: overlays/.",
+    ]
+    with Page(about, request.out / "overlays", len(plots)) as page:
+        return _run(plots, find, request, driven, page, done)
+
+
+def _run(
+    plots: list[PlotFolder],
+    find: Find,
+    request: Request,
+    driven: dict[str, dict[str, float] | None],
+    page: Page,
+    done: Callable[[str, int, int], None],
+) -> tuple[list[Row], list[Row]]:
+    """Plot by plot; see `run`."""
     stalks: list[Row] = []
     rows: list[Row] = []
     skipped: list[Row] = []
@@ -108,11 +127,13 @@ def run(
             for pair, each in zip(plot.pairs, records)
             if "skipped" in each
         ]
-        of_stalks, of_plot = _finish(plot, records, driven[plot.name], request)
-        stalks, rows, skipped = stalks + of_stalks, [*rows, of_plot], skipped + bad
+        result = _finish(plot, records, driven[plot.name], request)
+        page.add(result)
+        stalks, rows, skipped = stalks + result.stalks, [*rows, result.row], skipped + bad
         write_rows(request.out / "stalks.csv", STALK_COLUMNS, stalks)
         write_rows(request.out / "plots.csv", PLOT_COLUMNS, rows)
         write_rows(request.out / "skipped.csv", SKIPPED_COLUMNS, skipped)
+    page.write(request.out / "qc.html", skipped)
     return rows, skipped
 
 
@@ -163,19 +184,9 @@ def _read(pair: PairFiles, calibration: Calibration | None) -> tuple[np.ndarray,
     Raises:
         _Skip: They are not a pair of images that can be used.
     """
-    images = []
-    for side, path in (("left", pair.left), ("right", pair.right)):
-        if path is None:
-            raise _Skip(f"there is no {side} image")
-        try:
-            image = read_image(path)
-        except OSError as error:
-            raise _Skip(f"{path.name}: {error.strerror or 'it is not an image, or only a part of one'}") from error
-        image = (image >> 8).astype(np.uint8) if image.dtype == np.uint16 else image
-        images.append(np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image)
-    left, right = images
+    left, right = (_image(pair, side) for side in ("left", "right"))
     if left.shape != right.shape:
-        sizes = [f"{image.shape[1]} x {image.shape[0]}" for image in images]
+        sizes = [f"{image.shape[1]} x {image.shape[0]}" for image in (left, right)]
         raise _Skip(f"the left image has {sizes[0]} pixels and the right one {sizes[1]}")
     if calibration is not None and left.shape[:2] != (calibration.height, calibration.width):
         wanted = f"{calibration.width} x {calibration.height}"
@@ -185,9 +196,24 @@ def _read(pair: PairFiles, calibration: Calibration | None) -> tuple[np.ndarray,
     return left, right
 
 
-def _finish(
-    plot: PlotFolder, records: list[dict[str, Any]], driven: dict[str, float] | None, request: Request
-) -> tuple[list[Row], Row]:
+def _image(pair: PairFiles, side: Literal["left", "right"]) -> np.ndarray:
+    """One image of a pair, [H, W, 3] uint8.
+
+    Raises:
+        _Skip: It cannot be used.
+    """
+    path = pair.left if side == "left" else pair.right
+    if path is None:
+        raise _Skip(f"there is no {side} image")
+    try:
+        image = read_image(path)
+    except OSError as error:
+        raise _Skip(f"{path.name}: {error.strerror or 'it is not an image, or only a part of one'}") from error
+    image = (image >> 8).astype(np.uint8) if image.dtype == np.uint16 else image
+    return np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image
+
+
+def _finish(plot: PlotFolder, records: list[dict[str, Any]], driven: dict[str, float] | None, request: Request) -> PlotResult:
     """Follows the stalks of a plot, and draws its overlays."""
     usable = [(pair, each) for pair, each in zip(plot.pairs, records) if "sightings" in each]
     skipped = len(records) - len(usable)
@@ -198,20 +224,23 @@ def _finish(
     if calibration is None or driven is None or not known or len(usable) < 2:
         why = _what_is_missing(len(usable), calibration)
         labels: list[list[str | None]] = [[None] * len(frame) for frame in frames]
-        rows = rows_without_path(frames, skipped, origin, why)
+        tracks, start = [], 0.0
+        stalks, row = rows_without_path(frames, skipped, origin, why)
     else:
         distances = np.array([driven[pair.name] for pair, _ in usable])
         tracks, path = follow(frames, distances, calibration)
         labels = labels_of(frames, tracks)
-        rows = rows_of(frames, tracks, path, skipped, origin)
+        start = float(path.places[0])
+        stalks, row = rows_of(frames, tracks, path, skipped, origin)
     folder = request.out / "overlays" / plot.name
     folder.mkdir(parents=True, exist_ok=True)
     for (pair, _), frame, names in zip(usable, frames, labels):
         target = folder / f"{pair.name}.png"
         if not target.exists():
-            left, _ = _read(pair, calibration)
-            write_image(target, draw_overlay(left, frame, names))
-    return rows
+            left = _image(pair, "left")
+            write_image(target, draw_overlay(left, frame, names, f"{plot.name} {pair.name}"))
+    width = usable[0][1]["size"][1] if usable else 0
+    return PlotResult(row, stalks, [pair.name for pair, _ in usable], frames, tracks, start, width)
 
 
 def _what_is_missing(pairs: int, calibration: Calibration | None) -> str:

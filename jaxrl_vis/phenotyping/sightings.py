@@ -36,6 +36,7 @@ class Sighting:
         height_m: Where above the ground; None where the pair shows no ground.
         upper_mm, upper_deviation_mm, upper_height_m, upper_confidence: Diameter, its standard error, height and confidence
             around 24 inches above the ground.
+        upper_place: Column, line and width in pixels of that.
         confidence: 0 to 1.
         reason: Why it was not measured; empty where it was.
     """
@@ -56,13 +57,15 @@ class Sighting:
     upper_deviation_mm: float | None = None
     upper_height_m: float | None = None
     upper_confidence: float = 0.0
+    upper_place: tuple[float, float, float] | None = None
     confidence: float = 0.0
     reason: str = ""
 
     @classmethod
     def read(cls, values: dict[str, Any]) -> "Sighting":
         """From what JSON kept of `dataclasses.asdict`."""
-        return cls(**{**values, "box": tuple(values["box"]), "axis": tuple(values["axis"])})
+        pairs = ("box", "axis", "upper_place")
+        return cls(**{name: tuple(each) if name in pairs and each else each for name, each in values.items()})
 
 
 def grey_of(image: np.ndarray) -> np.ndarray:
@@ -155,6 +158,9 @@ def _sighting(detection: Detection, got: Measurement, upper: Measurement | None,
         upper_deviation_mm=known(higher.deviation_mm, 4),
         upper_height_m=known(higher.height, 4),
         upper_confidence=round(higher.confidence, 4),
+        upper_place=None
+        if higher.diameter_mm is None
+        else tuple(round(x, 2) for x in (higher.column, higher.line, higher.width)),  # pyright: ignore[reportArgumentType]
         confidence=round(got.confidence, 4),
         reason=got.reason,
     )
