@@ -6,7 +6,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from jaxrl_vis.errors import RequestError
@@ -81,6 +81,14 @@ def list_devices() -> list[Device]:
     visible = [word.strip() for word in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if word.strip()]
     names = visible if len(visible) == count else [str(number) for number in range(count)]
     return [Device(f"GPU {name}", {"CUDA_VISIBLE_DEVICES": name}) for name in names]
+
+
+def shared(devices: Sequence[Device], processes: int) -> list[Device]:
+    """Each device so many times, for that many processes side by side on it; GPU memory is divided among them."""
+    if processes == 1:
+        return list(devices)
+    share = {"XLA_PYTHON_CLIENT_MEM_FRACTION": f"{0.9 / processes:.3f}"}
+    return [Device(device.name, {**device.environment, **share}) for _ in range(processes) for device in devices]
 
 
 def guess_accelerator() -> bool:

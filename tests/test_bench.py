@@ -82,6 +82,14 @@ def test_a_change_is_told_with_the_spread_of_the_repeats() -> None:
     assert record.describe(new, old).endswith("the same speed, no more than the spread of the repeats, 4.0 %)")
 
 
+def test_what_a_machine_is_calibrated_with_is_computed_when_it_is_measured() -> None:
+    """Constants would be computed by the compiler: for minutes on a GPU, and then never again."""
+    for work in conditions.calibrations().values():
+        bytes_of_arguments = sum(array.nbytes for array in work.arguments)
+        assert work.program.memory_analysis().argument_size_in_bytes == bytes_of_arguments > 0  # type: ignore[attr-defined]
+        assert work().shape == work.arguments[0].shape
+
+
 def test_the_machine_is_watched() -> None:
     watch = conditions.Watch()
     found = watch.conditions()

@@ -12,11 +12,14 @@ from PIL import Image
 
 from jaxrl_vis import cli
 from jaxrl_vis.run.folder import SCHEMA
+from jaxrl_vis.studies import indicator
 from jaxrl_vis.studies.authors import mean_difference, released_curves
 from jaxrl_vis.studies.cells import Cell
-from jaxrl_vis.studies.figures import Request, make_figure
-from jaxrl_vis.studies.ol_aux import AUX_TASKS, FETCH, FINGER, HAND, LEVELS, STUDIES, VARIANTS, Scope, cells_of
+from jaxrl_vis.studies.figures import make_figure
+from jaxrl_vis.studies.ol_aux import AUX_TASKS, FETCH, FINGER, HAND, LEVELS, STUDIES, VARIANTS
 from jaxrl_vis.studies.results import Line, Reached, mean_weight, reached
+from jaxrl_vis.studies.show import Request
+from jaxrl_vis.studies.study import Scope, cells_of
 from jaxrl_vis.studies.tables import Named, steps_table, to_csv, weights_table
 
 EVERY = 20_000
@@ -200,16 +203,66 @@ def test_a_figure_shows_what_is_finished_and_lists_the_rest(tmp_path: Path, caps
     assert {float(row["level"]) for row in read if row["task"] == HAND} == set(LEVELS[HAND])
 
     # Figures share runs: 5.6 needs one of these, and the other tasks alone for its correlation.
-    assert make_figure(Request("5.6", tmp_path / "w.pdf", runs, tasks=(FETCH,), draw_only=True))
+    assert make_figure(Request("5.6", STUDIES["5.6"], tmp_path / "w.pdf", runs, tasks=(FETCH,), draw_only=True))
     assert "not known before all runs" in (tmp_path / "w.md").read_text()
     for place, name in enumerate(AUX_TASKS):
         (cell,) = all_cells("5.5")[FETCH, name]
         made_up(cell, runs, slope(1.1 + place / 10))
-    assert make_figure(Request("5.6", tmp_path / "w.pdf", runs, tasks=(FETCH,), draw_only=True))
+    assert make_figure(Request("5.6", STUDIES["5.6"], tmp_path / "w.pdf", runs, tasks=(FETCH,), draw_only=True))
     assert (tmp_path / "w.pdf").read_bytes().startswith(b"%PDF")
     assert "not defined" in (tmp_path / "w.md").read_text()  # all weights were alike
-    assert make_figure(Request("5.5", tmp_path / "alone.png", runs, tasks=(FETCH,), draw_only=True))
+    assert make_figure(Request("5.5", STUDIES["5.5"], tmp_path / "alone.png", runs, tasks=(FETCH,), draw_only=True))
     assert all(has_colour(tmp_path / "alone.png", VARIANTS[name].colour) for name in AUX_TASKS)
+
+
+def test_rewards_with_and_without_ground_truth_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    runs, out = tmp_path / "runs", tmp_path / "f.png"
+    study = indicator.STUDIES["5.1"]
+    cells = cells_of(study, tuple(study.steps), study.variants, Scope("fast"))
+    assert {(cell.config.method, cell.config.image_size) for (cell,) in cells.values()} == {
+        (method, size) for method in study.variants for size in (64, 100)
+    }
+    for (task, variant), (cell,) in cells.items():
+        if (task, variant) == ("VisualReacher", "autoencoder"):
+            continue
+        made_up(cell, runs, slope({"oracle": 4.0, "indicator": 1.0}.get(variant, 2.0)))
+        file = runs / cell.name / "metrics.jsonl"
+        rows = [json.loads(row) for row in file.read_text().splitlines()]
+        drops = 0.2 if variant == "indicator_balance_filter" else 0.0
+        for place, row in enumerate(rows):
+            share = drops * (1 + place // len(cell.seeds))
+            row |= {"eval/goal_distance": 0.05 * (1 - row["eval/success"]), "train/value_at_goals": 3.0}
+            row |= {"train/positive_share": 0.5, "train/false_positive_share": 0.0, "train/false_negative_share": 0.1}
+            row |= {"train/filtered_share": share, "train/filtered_false_share": share / 4, "train/filter_precision": 0.25}
+        file.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    assert cli.main(["figure", "5.1", "--draw-only", "--runs", str(runs), "--out", str(out)]) == 3
+    printed = capsys.readouterr().out.splitlines()
+    assert printed == ["not drawn: VisualReacher-autoencoder-fast-seeds0to4-100k: not begun"] + [
+        str(tmp_path / name) for name in ("f.png", "f_rewards.png", "f.md", "f.csv")
+    ]
+    assert all(has_colour(out, study.family.variants[name].colour) for name in study.variants)
+    text = out.with_suffix(".md").read_text()
+    ours = next(row for row in text.splitlines() if row.startswith("| indicator, balanced and filtered"))
+    assert ours.split(" | ")[1:2] == ["0.800 (0.790 to 0.810)"] and ours.endswith("| 0.600 | 0.250 | 3.000 |")
+    assert next(row for row in text.splitlines() if row.startswith("| indicator | ")).endswith("| 0.000 | – | 3.000 |")
+    assert "the oracle itself" not in text  # it reaches 1.0 at 100 k steps, but for a hundredth of its slowest seed
+    read = list(csv.DictReader(out.with_suffix(".csv").read_text().splitlines()))
+    assert len(read) == 7 and float(read[0]["final_distance"]) < 0.001 and read[1]["filter_precision"] == ""
+
+
+def test_a_comparison_with_an_oracle_that_fails_does_not_count(tmp_path: Path) -> None:
+    study = indicator.STUDIES["5.2"]
+    ((cell,),) = cells_of(study, ("VisualSawyerReach",), ("oracle",), Scope("fast")).values()
+    made_up(cell, tmp_path, slope(1.0))
+    file = tmp_path / cell.name / "metrics.jsonl"
+    rows = [json.loads(row) | {"eval/goal_distance": 0.2} for row in file.read_text().splitlines()]
+    file.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    request = Request("5.2", study, tmp_path / "f.png", tmp_path, variants=("oracle",), scope=Scope("fast"), draw_only=True)
+    assert make_figure(request)
+    assert (
+        "VisualSawyerReach: the oracle itself ends at a success of 0.640, where at least 0.9 is"
+        in (tmp_path / "f.md").read_text()
+    )
 
 
 def test_a_run_that_lost_its_replay_is_owned_up_to(tmp_path: Path) -> None:
@@ -218,7 +271,7 @@ def test_a_run_that_lost_its_replay_is_owned_up_to(tmp_path: Path) -> None:
     file = tmp_path / cell.name / "metrics.jsonl"
     rows = [json.loads(row) for row in file.read_text().splitlines()]
     file.write_text("".join(json.dumps(row | {"resume/replay_lost_at": 20}) + "\n" for row in rows))
-    request = Request("5.4", tmp_path / "f.png", tmp_path, (FETCH,), ("none",), draw_only=True)
+    request = Request("5.4", STUDIES["5.4"], tmp_path / "f.png", tmp_path, (FETCH,), ("none",), draw_only=True)
     assert make_figure(request) and "went on without its replay" in (tmp_path / "f.md").read_text()
 
 
@@ -226,7 +279,7 @@ def test_seeds_of_several_runs_are_one_line(tmp_path: Path) -> None:
     scope = Scope(seeds_per_run=2)
     parts = cells_of(STUDIES["5.4"], (FETCH,), ("none",), scope)[FETCH, "none"]
     assert len(parts) == 3
-    request = Request("5.4", tmp_path / "f.png", tmp_path, (FETCH,), ("none",), scope, draw_only=True)
+    request = Request("5.4", STUDIES["5.4"], tmp_path / "f.png", tmp_path, (FETCH,), ("none",), scope, draw_only=True)
     for cell in parts[:2]:
         made_up(cell, tmp_path, slope(1.0))
     assert not make_figure(request) and not request.out.exists()
@@ -262,7 +315,7 @@ def test_runs_that_end_before_the_authors_first_evaluation_are_drawn(tmp_path: P
     scope = Scope("cpu", seeds=1, env_steps=6_400)
     ((cell,),) = cells_of(STUDIES["5.4"], (FETCH,), ("none",), scope).values()
     made_up(cell, tmp_path, slope(1.0), every=3_200)
-    request = Request("5.4", tmp_path / "f.png", tmp_path, (FETCH,), ("none",), scope)
+    request = Request("5.4", STUDIES["5.4"], tmp_path / "f.png", tmp_path, (FETCH,), ("none",), scope)
     said: list[str] = []
     assert make_figure(request, said.append)  # nothing is left to train
     assert said == [str(request.out.with_suffix(end)) for end in (".png", ".md", ".csv")]

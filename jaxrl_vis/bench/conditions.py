@@ -6,6 +6,7 @@ record keeps which machine it was, how busy it was with other programs before, a
 reason why they are not is told.
 """
 
+import dataclasses
 import hashlib
 import os
 import platform
@@ -62,15 +63,42 @@ def _busy_seconds() -> float | None:
 
 def calibrate() -> dict[str, float]:
     """How fast the device does two fixed pieces of work: products of matrices (GFLOP/s), and adding long arrays (GB/s)."""
+    return {name: round(work.amount / _seconds(work), 2) for name, work in calibrations().items()}
+
+
+@dataclasses.dataclass(frozen=True)
+class Work:
+    """A fixed piece of work.
+
+    Attributes:
+        program: Compiled.
+        arguments: Its arrays. They are no constants of the program: XLA computes what is constant while it compiles, which
+            takes minutes for a product of large matrices, and leaves nothing to measure.
+        amount: Of work in a call, in 1e9 of its unit.
+    """
+
+    program: Callable[..., jax.Array]
+    arguments: tuple[jax.Array, ...]
+    amount: float
+
+    def __call__(self) -> jax.Array:
+        """Does it, or begins to: wait for the result."""
+        return self.program(*self.arguments)
+
+
+def calibrations() -> dict[str, Work]:
+    """What `calibrate` measures, by the name of the figure."""
     on_cpu = jax.default_backend() == "cpu"
     size, length = (384, 2**22) if on_cpu else (4096, 2**27)
     matrix = jnp.ones((size, size), jnp.float32 if on_cpu else jnp.bfloat16)
     array = jnp.ones((length,), jnp.float32)
-    product = jax.jit(lambda: matrix @ matrix).lower().compile()
-    addition = jax.jit(lambda: array + 1.0).lower().compile()
+
+    def work(function: Callable[..., jax.Array], arguments: tuple[jax.Array, ...], amount: float) -> Work:
+        return Work(jax.jit(function).lower(*arguments).compile(), arguments, amount)
+
     return {
-        "gflops": round(2e-9 * size**3 / _seconds(product), 1),
-        "gbytes_per_s": round(8e-9 * length / _seconds(addition), 2),
+        "gflops": work(jnp.matmul, (matrix, matrix), 2e-9 * size**3),
+        "gbytes_per_s": work(lambda values: values + 1.0, (array,), 8e-9 * length),
     }
 
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -12,7 +12,10 @@ from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError, nearest
 from jaxrl_vis.report.outputs import check_writable
 
-FigureName = Literal["5.4", "5.5", "5.6", "5.7", "quadratic"]
+if TYPE_CHECKING:
+    from jaxrl_vis.studies.show import Request
+
+FigureName = Literal["5.1", "5.2", "estimators", "cameras", "5.4", "5.5", "5.6", "5.7", "quadratic"]
 SUFFIXES = (".png", ".pdf", ".svg")
 UNFINISHED = 3
 """Exit status: finished, with something left out."""
@@ -22,9 +25,10 @@ UNFINISHED = 3
 class Figure:
     """Draw a figure: train or compute what it shows, and write it to a file, with a table beside it.
 
-    5.4: auxiliary losses, and how they are weighted. 5.5: single auxiliary tasks. 5.6: their weights over training. 5.7: what
-    OL-AUX-5 owes to looking ahead. These train what is missing, one process a GPU, and resume what was begun, so they may be
-    interrupted and started again at any time; the exit status is 3 where something is still missing.
+    5.1, 5.2: rewards with and without ground truth. estimators: rewards from state estimators that err. cameras: noisy and
+    varied images. 5.4: auxiliary losses, and how they are weighted. 5.5: single auxiliary tasks. 5.6: their weights over
+    training. 5.7: what OL-AUX-5 owes to looking ahead. These train what is missing, one process a GPU, and resume what was
+    begun, so they may be interrupted and started again at any time; the exit status is 3 where something is still missing.
 
     quadratic: adaptive weights of auxiliary losses on three losses of a point in the plane.
     """
@@ -35,9 +39,9 @@ class Figure:
     """A .png, .pdf or .svg file; figure_FIGURE.png (or quadratic.png) in the current folder if not given. Tables go beside it,
     as .md and .csv."""
     preset: str | None = None
-    """Preset of all runs; paper if not given."""
+    """Preset of all runs; paper for figures 5.4 to 5.7 and fast for the others if not given."""
     quick: bool = False
-    """A few minutes on a CPU, to see it work rather than learn: preset cpu, seed 0, VisualFetchReach, few steps."""
+    """For a CPU: preset cpu, seed 0, VisualFetchReach. 5.4 to 5.7 take a few steps only, to see them work rather than learn."""
     tasks: tuple[str, ...] = ()
     """Only these environments; all of the figure's if not given."""
     methods: tuple[str, ...] = ()
@@ -51,9 +55,11 @@ class Figure:
     env_steps: int | None = None
     """Environment steps of every run; the figure's own budgets if not given."""
     runs: Path | None = None
-    """Folder of all run folders and logs, shared by these figures; runs/ol_aux if not given."""
+    """Folder of all run folders and logs, shared by figures of one subject; runs/ol_aux or runs/indicator if not given."""
     minutes: float | None = None
     """Stop after so long: runs are saved, what is finished is drawn, and the next start goes on."""
+    per_device: int = 1
+    """Runs side by side on each device: while one is compiled, another one computes."""
     draw_only: bool = False
     """Train nothing: draw what is there."""
 
@@ -76,9 +82,9 @@ def run(options: Figure) -> int:
         print(out)
         return 0
     # Nothing below starts JAX in this process: the accelerator's memory belongs to the runs.
-    from jaxrl_vis.studies.figures import Request, make_figure
+    from jaxrl_vis.studies.figures import make_figure
 
-    return 0 if make_figure(Request(options.figure, out, **_request(options))) else UNFINISHED
+    return 0 if make_figure(_request(options, out)) else UNFINISHED
 
 
 def _refuse_options_of_runs(options: Figure) -> None:
@@ -87,28 +93,34 @@ def _refuse_options_of_runs(options: Figure) -> None:
             raise RequestError(f"--{field.name.replace('_', '-')} goes with figures of training runs, not with quadratic")
 
 
-def _request(options: Figure) -> dict:
-    """What is asked for, but for the figure and where it goes.
+def _request(options: Figure, out: Path) -> "Request":
+    """What is asked for.
 
     Raises:
         RequestError: An option makes no sense.
     """
-    from jaxrl_vis.studies.ol_aux import FETCH, QUICK, Scope
+    from jaxrl_vis.studies.figures import STUDIES
+    from jaxrl_vis.studies.ol_aux import FETCH
+    from jaxrl_vis.studies.show import Request
+    from jaxrl_vis.studies.study import Scope
 
+    study = STUDIES[options.figure]
     if options.quick and options.preset is not None:
         raise RequestError("--quick has the preset cpu: give --quick or --preset")
-    name = "cpu" if options.quick else options.preset or "paper"
+    name = "cpu" if options.quick else options.preset or study.family.preset
     if name not in PRESETS:
         raise RequestError(f"unknown preset {name!r}{nearest(name, list(PRESETS))}")
-    check_counts(seeds=options.seeds, seeds_per_run=options.seeds_per_run, env_steps=options.env_steps)
+    check_counts(
+        seeds=options.seeds, seeds_per_run=options.seeds_per_run, env_steps=options.env_steps, per_device=options.per_device
+    )
     if options.minutes is not None and options.minutes <= 0:
         raise RequestError(f"--minutes must be positive, not {options.minutes:g}")
     if options.draw_only and options.minutes is not None:
         raise RequestError("--draw-only trains nothing: leave out --minutes")
-    runs = options.runs or Path("runs") / "ol_aux"
+    runs = options.runs or Path("runs") / study.family.name
     if not options.draw_only:
         check_writable(runs, "--runs", folder=True)
-    quick = dict(QUICK) if options.quick else {}
+    quick = dict(study.family.quick) if options.quick else {}
     if options.env_steps is not None:
         quick.pop("env_steps", None)
     scope = Scope(
@@ -119,11 +131,15 @@ def _request(options: Figure) -> dict:
         env_steps=options.env_steps,
         changes=quick,
     )
-    return {
-        "runs": runs,
-        "tasks": options.tasks or ((FETCH,) if options.quick else ()),
-        "variants": options.methods,
-        "scope": scope,
-        "draw_only": options.draw_only,
-        "seconds": None if options.minutes is None else 60.0 * options.minutes,
-    }
+    return Request(
+        figure=options.figure,
+        study=study,
+        out=out,
+        runs=runs,
+        tasks=options.tasks or ((FETCH,) if options.quick else ()),
+        variants=options.methods,
+        scope=scope,
+        draw_only=options.draw_only,
+        seconds=None if options.minutes is None else 60.0 * options.minutes,
+        per_device=options.per_device,
+    )

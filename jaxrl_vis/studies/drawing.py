@@ -1,4 +1,4 @@
-"""Figures of several runs: one panel a task, one line a variant."""
+"""Figures of several runs: one column a task, one line a variant."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -35,45 +35,70 @@ class Curve:
 
 @dataclasses.dataclass(frozen=True)
 class Panel:
-    """The lines of one task."""
+    """The lines of one task.
+
+    Attributes:
+        title: Above the panel.
+        curves: What is drawn.
+        is_share: Whether it lies in [0, 1] and is shown in percent.
+    """
 
     title: str
     curves: Sequence[Curve]
+    is_share: bool = True
 
 
-def draw_panels(path: Path, panels: Sequence[Panel], title: str, subtitle: str, is_share: bool = True) -> None:
+@dataclasses.dataclass(frozen=True)
+class Picture:
+    """One file.
+
+    Attributes:
+        suffix: What its name has after the figure's.
+        rows: Panels, row by row; all rows are of one length.
+        subtitle: What the second line says besides what the runs were.
+    """
+
+    suffix: str
+    rows: Sequence[Sequence[Panel]]
+    subtitle: str = ""
+
+
+def draw_panels(path: Path, rows: Sequence[Sequence[Panel]], title: str, subtitle: str) -> None:
     """Writes a figure.
 
     Args:
         path: A .png, or any other format that matplotlib can write.
-        panels: Side by side.
+        rows: Panels, row by row; all rows are of one length.
         title: The first line, bold.
         subtitle: The second line.
-        is_share: Whether what is drawn lies in [0, 1] and is shown in percent.
     """
-    width, height = max(7.5, _WIDTH * len(panels)), _HEIGHT + _HEADER + _FOOTER
+    width, height = max(7.5, _WIDTH * len(rows[0])), _HEIGHT * len(rows) + _HEADER + _FOOTER
     figure = Figure(figsize=(width, height), dpi=150, facecolor="white")
-    row = figure.subplots(1, len(panels), squeeze=False)[0]
+    grid = figure.subplots(len(rows), len(rows[0]), squeeze=False)
     entries = {}
-    for axes, panel in zip(row, panels, strict=True):
-        _draw(axes, panel, is_share)
+    for axes, panel in zip(grid.flat, (panel for row in rows for panel in row), strict=True):
+        _draw(axes, panel)
         handles, labels = axes.get_legend_handles_labels()
         entries |= {label: handle for label, handle in zip(labels, handles, strict=True) if label not in entries}
+    for axes in grid[-1]:
+        axes.set_xlabel("environment steps per seed", fontsize=9.5, color=INK)
     figure.text(0.35 / width, 1 - 0.22 / height, title, fontsize=14, weight="bold", color=INK, va="center")
     figure.text(0.35 / width, 1 - 0.48 / height, subtitle, fontsize=9, color=FAINT, va="center")
-    columns = max(1, min(len(entries), int(width / 2.1)))
+    longest = max((len(label) for label in entries), default=0)
+    columns = max(1, min(len(entries), int(width / max(2.1, 0.55 + 0.068 * longest))))
     figure.legend(
         list(entries.values()), list(entries), loc="lower center", ncols=columns, frameon=False, fontsize=9, labelcolor=INK
     )
     left, right = 0.6 / width, 1 - 0.2 / width
     figure.subplots_adjust(
-        left=left, right=right, bottom=(_FOOTER + 0.15) / height, top=1 - (_HEADER + 0.2) / height, wspace=0.2
+        **{"left": left, "right": right, "bottom": (_FOOTER + 0.15) / height, "top": 1 - (_HEADER + 0.2) / height},
+        **{"wspace": 0.2, "hspace": 0.3},
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
 
 
-def _draw(axes: Axes, panel: Panel, is_share: bool) -> None:
+def _draw(axes: Axes, panel: Panel) -> None:
     ends = [int(curve.steps[-1]) for curve in panel.curves if curve.steps.size and not curve.behind]
     end = max(ends, default=1)
     for curve in panel.curves:
@@ -85,9 +110,8 @@ def _draw(axes: Axes, panel: Panel, is_share: bool) -> None:
     style_curves(axes, panel.title)
     axes.xaxis.set_major_locator(MaxNLocator(5))
     axes.set_xlim(0, 1.01 * end)
-    if is_share:
+    if panel.is_share:
         axes.set_ylim(-0.02, 1.03)
         axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
     else:
         axes.set_ylim(bottom=0.0)
-    axes.set_xlabel("environment steps per seed", fontsize=9.5, color=INK)

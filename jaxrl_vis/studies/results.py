@@ -14,6 +14,7 @@ from jaxrl_vis.run.folder import read_record
 from jaxrl_vis.studies.cells import Cell, folder_of, rows_of, standing
 
 SUCCESS = "eval/success"
+DISTANCE = "eval/goal_distance"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -136,10 +137,19 @@ def mean_success(line: Line, up_to: int) -> float:
     return float(np.mean(values)) if values else 0.0
 
 
-def final_success(line: Line) -> tuple[float, float, float]:
-    """Quartiles over seeds of the success at the end: 25 %, median, 75 %."""
-    found = [row[SUCCESS] for row in line.rows if row["env_steps"] == line.end and row[SUCCESS] is not None]
-    low, median, high = np.percentile(found, [25, 50, 75])
+def final(line: Line, metric: str = SUCCESS) -> tuple[float, float, float]:
+    """Quartiles over seeds of a metric at the end: 25 %, median, 75 %."""
+    found = [row[metric] for row in line.rows if row["env_steps"] == line.end and row.get(metric) is not None]
+    return _quartiles(found)
+
+
+def area(line: Line) -> tuple[float, float, float]:
+    """Quartiles over seeds of the mean success over all evaluations, which is the area under the curve: 25 %, median, 75 %."""
+    return _quartiles([float(np.nanmean(row)) for row in line.values(SUCCESS)[1]])
+
+
+def _quartiles(values: Sequence[float]) -> tuple[float, float, float]:
+    low, median, high = np.percentile(values, [25, 50, 75])
     return float(low), float(median), float(high)
 
 

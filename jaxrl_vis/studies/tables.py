@@ -9,7 +9,7 @@ from typing import Any
 from scipy.stats import spearmanr
 
 from jaxrl_vis.report.plots import show_steps
-from jaxrl_vis.studies.results import Line, final_success, mean_success, mean_weight, reached
+from jaxrl_vis.studies.results import Line, final, mean_success, mean_weight, reached
 
 BASELINE = "none"
 
@@ -47,10 +47,10 @@ def steps_table(
         common = min(each.line.end for each in named)
         heads = [part for level in levels[task] for part in (f"steps to {level:g}", "speed-up")]
         columns = ["method", *heads, f"mean success to {show_steps(common)}", "success at the end"]
-        text += [f"### {task}", "", _row(columns), _row(["---"] * len(columns))]
+        text += [f"### {task}", "", table_row(columns), table_row(["---"] * len(columns))]
         for each in named:
             base = next((b.line for b in named if b.line.variant == BASELINE and b.source == each.source), None)
-            text.append(_row(_cells(each, base, levels[task], common)))
+            text.append(table_row(_cells(each, base, levels[task], common)))
             rows += _csv_rows(each, base, levels[task], common)
         text.append("")
     return text, rows
@@ -66,7 +66,7 @@ def _cells(named: Named, base: Line | None, levels: Sequence[float], common: int
         found = reached(named.line, level)
         is_base = base is None or named.line.variant == BASELINE
         cells += [str(found), "" if base is None or is_base else found.ratio(reached(base, level))]
-    low, median, high = final_success(named.line)
+    low, median, high = final(named.line)
     end = f"{median:.2f}" if len(named.line.seeds) == 1 else f"{median:.2f} ({low:.2f} to {high:.2f})"
     return [*cells, f"{mean_success(named.line, common):.3f}", end]
 
@@ -89,7 +89,7 @@ def _csv_rows(named: Named, base: Line | None, levels: Sequence[float], common: 
                 "speed_up": "" if base is None or named.line.variant == BASELINE else found.ratio(reached(base, level)),
                 "mean_success": round(mean_success(named.line, common), 4),
                 "mean_success_to": common,
-                "final_success": round(final_success(named.line)[1], 4),
+                "final_success": round(final(named.line)[1], 4),
             }
         )
     return rows
@@ -111,11 +111,11 @@ def weights_table(
     text: list[str] = []
     rows: list[dict[str, Any]] = []
     for task, line in weighted.items():
-        text += [f"### {task}", "", _row(["auxiliary loss", "mean weight", "gain alone"]), _row(["---"] * 3)]
+        text += [f"### {task}", "", table_row(["auxiliary loss", "mean weight", "gain alone"]), table_row(["---"] * 3)]
         weights, gains = [], []
         for name, label in names.items():
             weight, gain = mean_weight(line, name), _gain(alone.get((task, name)), bases.get(task))
-            text.append(_row([label, f"{weight:.3f}", "not there yet" if gain is None else f"{gain:+.3f}"]))
+            text.append(table_row([label, f"{weight:.3f}", "not there yet" if gain is None else f"{gain:+.3f}"]))
             rows.append({"task": task, "auxiliary_loss": name, "mean_weight": weight, "gain_alone": gain})
             if gain is not None:
                 weights.append(weight)
@@ -150,5 +150,6 @@ def to_csv(rows: Sequence[Mapping[str, Any]]) -> str:
     return file.getvalue()
 
 
-def _row(cells: Sequence[str]) -> str:
+def table_row(cells: Sequence[str]) -> str:
+    """A row of a Markdown table."""
     return "| " + " | ".join(cells) + " |"

@@ -1,0 +1,85 @@
+"""Figures 5.1 and 5.2 of the thesis, and what it claims without plotting it: which runs they are made of.
+
+    5.1          oracle, autoencoder, indicator, indicator with balancing and filtering: Reacher and FetchReach
+    5.2          the same without the autoencoder: SawyerReach
+    estimators   rewards from state estimators that err, and the indicator, which needs none
+    cameras      the indicator and the oracle with noisy images, and with cameras, lights and colours that vary
+
+Figure 5.1 can also be drawn for the two tasks from states, and for the hand and the finger, which the thesis never tried.
+"""
+
+from typing import Any
+
+from jaxrl_vis.studies.study import Family, Study, Variant
+
+_OURS: dict[str, Any] = {"method": "indicator_balance_filter"}
+_ORACLE: dict[str, Any] = {"method": "oracle"}
+_NOISE: dict[str, Any] = {"observation_noise": 5.0}
+_RANDOM: dict[str, Any] = {"randomize": ("camera", "lights", "colours")}
+
+VARIANTS: dict[str, Variant] = {
+    "oracle": Variant("oracle", _ORACLE, "#5b626c"),
+    "autoencoder": Variant("autoencoder", {"method": "autoencoder"}, "#b4531f"),
+    "indicator": Variant("indicator", {"method": "indicator"}, "#3b5bdb"),
+    "indicator_balance_filter": Variant("indicator, balanced and filtered", _OURS, "#0f7b6c"),
+    "balance_only": Variant("indicator, balanced, no filter", {"method": "indicator", "balance_probability": 0.5}, "#6b7a1f"),
+    # The ablations of the thesis (5.1.6): relabelled goals are always the next observation; no goal is the original one.
+    "all_next": Variant("p1 = 0.45, p2 = 1", _OURS | {"relabel_probability": 0.45, "balance_probability": 1.0}, "#a61e8c"),
+    "all_relabelled": Variant("p1 = 1", _OURS | {"relabel_probability": 1.0}, "#c28f00"),
+    # An estimator that errs in a cluttered quarter of the workspace, one that errs as often anywhere, and one without bias.
+    "clutter": Variant(
+        "10 % false positives, in a cluttered quarter",
+        _ORACLE | {"reward_false_positives": 0.1, "reward_clutter": 0.25},
+        "#b4531f",
+    ),
+    "false_positives": Variant("10 % false positives, anywhere", _ORACLE | {"reward_false_positives": 0.1}, "#c28f00"),
+    "false_negatives": Variant("10 % false negatives, anywhere", _ORACLE | {"reward_false_negatives": 0.1}, "#a61e8c"),
+    "state_noise": Variant("Gaussian noise of 30 mm", _ORACLE | {"reward_noise": 0.03}, "#3b5bdb"),
+    "oracle_noise": Variant("oracle, noisy images", _ORACLE | _NOISE, "#b4531f"),
+    "ours_noise": Variant("indicator, balanced and filtered, noisy images", _OURS | _NOISE, "#3b5bdb"),
+    "oracle_randomized": Variant("oracle, varied images", _ORACLE | _RANDOM, "#c28f00"),
+    "ours_randomized": Variant("indicator, balanced and filtered, varied images", _OURS | _RANDOM, "#a61e8c"),
+}
+"""Everything that a figure can show, by name."""
+
+REACHER, FETCH, SAWYER = "VisualReacher", "VisualFetchReach", "VisualSawyerReach"
+_OTHERS = {"Reacher": 100_000, "FetchReach": 100_000, "VisualHandReach": 700_000, "VisualFingerTurn": 500_000}
+
+FAMILY = Family(
+    name="indicator",
+    variants=VARIANTS,
+    tasks=(REACHER, FETCH, SAWYER, *_OTHERS),
+    preset="fast",
+    # Reacher's threshold is about a pixel of a 64x64 image.
+    of_task={("fast", REACHER): {"image_size": 100}},
+    longest={},
+    quick={},
+)
+
+STUDIES: dict[str, Study] = {
+    "5.1": Study(
+        FAMILY,
+        "Rewards with and without ground truth",
+        ("oracle", "autoencoder", "indicator", "indicator_balance_filter"),
+        {REACHER: 100_000, FETCH: 100_000},
+        others=_OTHERS,
+    ),
+    "5.2": Study(
+        FAMILY,
+        "Rewards with and without ground truth",
+        ("oracle", "indicator", "indicator_balance_filter"),
+        {SAWYER: 150_000},
+    ),
+    "estimators": Study(
+        FAMILY,
+        "Rewards from state estimators that err",
+        ("oracle", "state_noise", "false_positives", "false_negatives", "clutter", "indicator_balance_filter"),
+        {FETCH: 100_000},
+    ),
+    "cameras": Study(
+        FAMILY,
+        "Rewards with and without ground truth, with noisy and with varied images",
+        ("oracle", "oracle_noise", "oracle_randomized", "indicator_balance_filter", "ours_noise", "ours_randomized"),
+        {FETCH: 100_000},
+    ),
+}

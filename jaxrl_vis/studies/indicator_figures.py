@@ -1,0 +1,138 @@
+"""What figures 5.1 and 5.2 and their kin show: success, distance to the goal, and what rewards say about themselves."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from jaxrl_vis.studies.drawing import Curve, Panel, Picture
+from jaxrl_vis.studies.indicator import VARIANTS
+from jaxrl_vis.studies.results import DISTANCE, SUCCESS, Line, area, final
+from jaxrl_vis.studies.show import Request, Shown
+from jaxrl_vis.studies.tables import table_row
+
+_REWARDS = {
+    "train/positive_share": "positive rewards",
+    "train/filtered_share": "negatives that the filter drops",
+    "train/filter_precision": "dropped negatives that were false",
+    "train/false_negative_share": "negatives that are false",
+}
+"""Shares that are logged about rewards, and what panels call them."""
+_ACTIVE = 0.01  # share of negatives below which the filter counts as inactive
+
+# What makes the oracle itself worth comparing with: metric, and the value that it must reach.
+_ORACLE_WORKS: dict[str, tuple[str, float]] = {
+    "VisualFetchReach": (SUCCESS, 0.97),
+    "VisualSawyerReach": (SUCCESS, 0.90),
+    "VisualReacher": (DISTANCE, 0.02),
+}
+
+
+def show(_: Request, lines: Mapping[tuple[str, str], Line], tasks: Sequence[str], variants: Sequence[str]) -> Shown:
+    """What the figure shows of its lines."""
+
+    def row(metric: str, title: str, is_share: bool = True) -> list[Panel]:
+        return [Panel(f"{task}: {title}", _curves(lines, task, variants, metric), is_share) for task in tasks]
+
+    curves = Picture("", [row(SUCCESS, "success"), row(DISTANCE, "final distance to the goal", is_share=False)])
+    rewards = Picture("_rewards", [row(metric, title) for metric, title in _REWARDS.items()])
+    text, table = _tables(lines, tasks)
+    notes = [
+        "At the end: the last evaluation, in the median over seeds; in brackets the middle half of the seeds. Area: mean "
+        "success over all evaluations. Rewards: means over training, in the median over seeds. The precision of a filter that "
+        f"drops less than {_ACTIVE:.0%} of the negatives is not given: it is inactive. Distances are in the unit of the task, "
+        "see docs/tasks.md."
+    ]
+    return Shown([curves, rewards], text, table, [*notes, *_oracle_notes(lines)])
+
+
+def _curves(lines: Mapping[tuple[str, str], Line], task: str, variants: Sequence[str], metric: str) -> list[Curve]:
+    return [
+        Curve(VARIANTS[variant].label, VARIANTS[variant].colour, *lines[task, variant].values(metric))
+        for variant in variants
+        if (task, variant) in lines
+    ]
+
+
+def _tables(lines: Mapping[tuple[str, str], Line], tasks: Sequence[str]) -> tuple[list[str], list[dict[str, Any]]]:
+    text, rows = [], []
+    columns = ["method", "success at the end", "area", "distance at the end", "positive rewards", "false positives"]
+    columns += ["negatives that are false", "negatives dropped", "of them false", "value at goals"]
+    for task in tasks:
+        text += [f"### {task}", "", table_row(columns), table_row(["---"] * len(columns))]
+        for (of_task, variant), line in lines.items():
+            if of_task == task:
+                found = _figures(line)
+                text.append(table_row([VARIANTS[variant].label, *_cells(found)]))
+                names = {f"{name}{end}": value for name, values in found.items() for end, value in _csv(values)}
+                rows.append({"task": task, "method": variant, "seeds": len(line.seeds), "env_steps": line.end, **names})
+        text.append("")
+    return text, rows
+
+
+Quartiles = tuple[float, float, float]
+
+
+def _figures(line: Line) -> dict[str, Quartiles | float]:
+    """Quartiles over seeds of what evaluations say, and medians of what rewards say."""
+    filtered = _mean(line, "train/filtered_share")
+    return {
+        "final_success": final(line, SUCCESS),
+        "area": area(line),
+        "final_distance": final(line, DISTANCE),
+        "positive_share": _mean(line, "train/positive_share"),
+        "false_positive_share": _mean(line, "train/false_positive_share"),
+        "false_negative_share": _mean(line, "train/false_negative_share"),
+        "filtered_share": filtered,
+        # A quotient of means, so the share among all that was dropped.
+        "filter_precision": _mean(line, "train/filtered_false_share") / filtered if filtered >= _ACTIVE else float("nan"),
+        "value_at_goals": _last(line, "train/value_at_goals"),
+    }
+
+
+def _mean(line: Line, metric: str) -> float:
+    """The mean of a metric over training, in the median over seeds; NaN where it was never logged."""
+    _, values = line.values(metric)
+    per_seed = [float(np.nanmean(row)) for row in values if np.isfinite(row).any()]
+    return float(np.median(per_seed)) if per_seed else float("nan")
+
+
+def _last(line: Line, metric: str) -> float:
+    """The metric at the end, in the median over seeds; NaN where it was not logged."""
+    values = line.values(metric)[1][:, -1]
+    return float(np.median(values[np.isfinite(values)])) if np.isfinite(values).any() else float("nan")
+
+
+def _cells(found: Mapping[str, Quartiles | float]) -> list[str]:
+    cells = []
+    for value in found.values():
+        low, median, high = value if isinstance(value, tuple) else (value, value, value)
+        text = "–" if np.isnan(median) else f"{median:.3f}"
+        cells.append(f"{text} ({low:.3f} to {high:.3f})" if low < high else text)
+    return cells
+
+
+def _csv(value: Quartiles | float) -> list[tuple[str, float | None]]:
+    """Endings of a column's name, and what goes there."""
+    low, median, high = value if isinstance(value, tuple) else (None, value, None)
+    rounded = [
+        (end, None if each is None or np.isnan(each) else round(each, 5))
+        for end, each in (("", median), ("_25", low), ("_75", high))
+    ]
+    return rounded if isinstance(value, tuple) else rounded[:1]
+
+
+def _oracle_notes(lines: Mapping[tuple[str, str], Line]) -> list[str]:
+    """Where the oracle itself does not work, methods cannot be compared."""
+    notes = []
+    for (task, variant), line in lines.items():
+        if variant == "oracle" and task in _ORACLE_WORKS:
+            metric, wanted = _ORACLE_WORKS[task]
+            _, median, _ = final(line, metric)
+            if median < wanted if metric == SUCCESS else median > wanted:
+                what, bound = ("success", "at least") if metric == SUCCESS else ("final distance", "at most")
+                notes.append(
+                    f"{task}: the oracle itself ends at a {what} of {median:.3f}, where {bound} {wanted:g} is asked for: this "
+                    "comparison of methods does not count."
+                )
+    return notes

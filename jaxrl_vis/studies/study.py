@@ -1,0 +1,132 @@
+"""What every study is made of: variants of a configuration, on tasks, over seeds. The studies: `indicator`, `ol_aux`."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from jaxrl_vis.config import Config, preset, validate
+from jaxrl_vis.errors import RequestError, nearest
+from jaxrl_vis.studies.cells import Cell, split_seeds
+
+
+@dataclasses.dataclass(frozen=True)
+class Variant:
+    """One line of a figure.
+
+    Attributes:
+        label: What the figure calls it.
+        changes: Fields of `Config` that make it.
+        colour: Of its line.
+    """
+
+    label: str
+    changes: Mapping[str, Any]
+    colour: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Family:
+    """What studies of one subject share, and so their run folders.
+
+    Attributes:
+        name: Of the subject, and of the folder of all run folders.
+        variants: Everything that a figure can show, by name.
+        tasks: The environments that it is about.
+        preset: The preset of every run, if nobody asks for another one.
+        of_task: (preset, environment) -> fields of `Config` that differ from the preset.
+        longest: Preset -> environment -> most environment steps, where the preset needs no budget like the thesis's.
+        quick: What `figure --quick` changes in the preset ``cpu``.
+    """
+
+    name: str
+    variants: Mapping[str, Variant]
+    tasks: tuple[str, ...]
+    preset: str
+    of_task: Mapping[tuple[str, str], Mapping[str, Any]]
+    longest: Mapping[str, Mapping[str, int]]
+    quick: Mapping[str, Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class Study:
+    """What a figure shows.
+
+    Attributes:
+        family: What it is about.
+        title: The figure's first line.
+        variants: Its lines, in the order of the legend; names of `Family.variants`.
+        steps: Environment -> environment steps of each run; the tasks of the figure, if nobody asks for others.
+        shorter: (environment, variant) -> those of runs that are shorter.
+        extra: Variants that are trained for the tables, and not drawn.
+        others: Environment -> environment steps, of tasks that are shown if somebody asks for them.
+    """
+
+    family: Family
+    title: str
+    variants: tuple[str, ...]
+    steps: Mapping[str, int]
+    shorter: Mapping[tuple[str, str], int] = dataclasses.field(default_factory=dict)
+    extra: tuple[str, ...] = ()
+    others: Mapping[str, int] = dataclasses.field(default_factory=dict)
+
+
+@dataclasses.dataclass(frozen=True)
+class Scope:
+    """How a study is run.
+
+    Attributes:
+        preset: The preset of every run.
+        seed: First seed.
+        seeds: How many.
+        seeds_per_run: At most so many side by side in one program; None: all.
+        env_steps: Budget of every run, in the place of the study's own.
+        changes: Fields of `Config` to change in every run.
+    """
+
+    preset: str = "paper"
+    seed: int = 0
+    seeds: int = 5
+    seeds_per_run: int | None = None
+    env_steps: int | None = None
+    changes: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+
+Cells = dict[tuple[str, str], list[Cell]]
+"""(environment, variant) -> the cells that make it, one for each group of seeds."""
+
+# `debug` makes 4 gradient steps per iteration, which OL-AUX-5 does not divide.
+_OF_PRESET: dict[str, dict[str, Any]] = {"debug": {"updates_per_iteration": 5}}
+_LONGEST = 1_500_000  # environment steps of a task that a study has no budget for
+
+
+def cells_of(study: Study, tasks: Sequence[str], variants: Sequence[str], scope: Scope) -> Cells:
+    """The cells of a study, task after task.
+
+    Raises:
+        RequestError: There is no such task or variant, or a configuration makes no sense.
+    """
+    for task in tasks:
+        if task not in study.family.tasks:
+            raise RequestError(f"unknown task {task!r}{nearest(task, list(study.family.tasks))}")
+    for variant in variants:
+        if variant not in study.family.variants:
+            raise RequestError(f"unknown method {variant!r}{nearest(variant, list(study.family.variants))}")
+    return {(task, variant): _cells(study, task, variant, scope) for task in tasks for variant in variants}
+
+
+def _cells(study: Study, task: str, variant: str, scope: Scope) -> list[Cell]:
+    config = preset(scope.preset, env=task, seed=scope.seed, seeds=scope.seeds)
+    config = config.replace(**_OF_PRESET.get(scope.preset, {}), **study.family.of_task.get((scope.preset, task), {}))
+    config = config.replace(env_steps=_budget(study, task, variant, scope, config))
+    changed = config.replace(**study.family.variants[variant].changes).replace(**scope.changes)
+    family = f"{task}-{variant}-{scope.preset}"
+    return split_seeds(Cell(family, validate(changed)), scope.seeds_per_run or scope.seeds)
+
+
+def _budget(study: Study, task: str, variant: str, scope: Scope, config: Config) -> int:
+    if scope.env_steps is not None:
+        return scope.env_steps
+    steps = study.shorter.get((task, variant), {**study.others, **study.steps}.get(task, _LONGEST))
+    if scope.preset == study.family.preset:
+        return steps
+    return min(steps, study.family.longest.get(scope.preset, {}).get(task, config.env_steps))
