@@ -1,13 +1,12 @@
 """From folders of pairs to tables: which images belong together, which sightings are one stalk, what becomes of bad files."""
 
-import csv
 import dataclasses
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+from phenotype_plots import run, table
 
 from jaxrl_vis import cli
 from jaxrl_vis.errors import RequestError
@@ -15,9 +14,8 @@ from jaxrl_vis.phenotyping.detector.finder import Detection
 from jaxrl_vis.phenotyping.evaluate import PlotScore, average_precision, match, summary
 from jaxrl_vis.phenotyping.folders import find_plots, read_odometry
 from jaxrl_vis.phenotyping.heights import USUAL_TAPER, robust_width, widths_of
-from jaxrl_vis.phenotyping.images import read_image, write_image
-from jaxrl_vis.phenotyping.pairing import wrong_with
-from jaxrl_vis.phenotyping.sightings import Sighting, look
+from jaxrl_vis.phenotyping.images import read_image
+from jaxrl_vis.phenotyping.sightings import Sighting
 from jaxrl_vis.phenotyping.track import Track, follow
 from jaxrl_vis_envs.plants import Calibration
 from jaxrl_vis_envs.plants.truth import StalkInView
@@ -231,38 +229,6 @@ def test_average_precision_and_the_figures_of_plots():
 # --- the command ---
 
 
-@pytest.fixture(scope="module")
-def plots(tmp_path_factory) -> Path:
-    """Two plots of four pairs with true masks, small."""
-    folder = tmp_path_factory.mktemp("phenotype")
-    spec = folder / "few.json"
-    spec.write_text(json.dumps({
-        "layout": {"rows_behind": 0, "stalks_mean": 5, "stalks_sd": 0, "tillers": 0, "plot_length": 0.5,
-                   "spacing_minimum": 0.06},
-        "leaves": {"density": 0.2, "litter": 0},
-        "stalks": {"diameter_mean": 0.03},
-    }))  # fmt: skip
-    words = ["phenotype", "synth", str(folder / "plots"), "--spec", str(spec), "--width", "422", "--frames", "4"]
-    assert cli.main([*words, "--plots", "2"]) == 0
-    return folder / "plots"
-
-
-def table(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def run(folder: Path, out: Path, *words: str) -> int:
-    return cli.main(["phenotype", "run", str(folder), "--out", str(out), "--masks", "truth", *words])
-
-
-@pytest.fixture(scope="module")
-def results(plots, tmp_path_factory) -> Path:
-    out = tmp_path_factory.mktemp("results") / "out"
-    assert run(plots, out) == 0
-    return out
-
-
 def test_run_counts_and_measures(plots, results):
     rows = table(results / "plots.csv")
     assert [row["plot"] for row in rows] == ["plot_0000", "plot_0001"]
@@ -281,95 +247,6 @@ def test_run_counts_and_measures(plots, results):
     assert (results / "skipped.csv").read_text() == "plot,pair,why\n"
 
 
-def test_a_run_that_was_stopped_gives_the_same_tables(plots, results, tmp_path, capsys):
-    again = tmp_path / "out"
-    shutil.copytree(results, again)
-    (again / "pairs" / "plot_0001" / "002.json").unlink()
-    (again / "pairs" / "plot_0001" / "003.json").unlink()
-    for name in ("stalks.csv", "plots.csv"):
-        (again / name).unlink()
-    assert run(plots, again) == 0
-    for name in ("stalks.csv", "plots.csv", "skipped.csv"):
-        assert (again / name).read_bytes() == (results / name).read_bytes()
-    assert run(plots, again, "--method", "ellipse") == 2
-    assert "holds the results of another request" in capsys.readouterr().err
-
-
-def test_bad_files_are_listed_and_skipped(plots, tmp_path, capsys):
-    plot = tmp_path / "plot_0000"
-    shutil.copytree(plots / "plot_0000", plot)
-    (plot / "right_000.png").unlink()
-    (plot / "left_001.png").write_bytes((plot / "left_001.png").read_bytes()[:200])
-    assert run(plot, tmp_path / "two") == 3
-    (row,) = table(tmp_path / "two" / "plots.csv")
-    assert row["pairs_skipped"] == "2" and row["flag"] == "pairs skipped" and int(row["stalks"]) > 0
-    write_image(plot / "right_002.png", BLANK)
-    assert run(plot, tmp_path / "out") == 3
-    told = {row["pair"]: row["why"] for row in table(tmp_path / "out" / "skipped.csv")}
-    assert told.keys() == {"000", "001", "002"}
-    assert "no right image" in told["000"] and "left_001.png" in told["001"] and "16 x 12" in told["002"]
-    (row,) = table(tmp_path / "out" / "plots.csv")
-    assert row["pairs_skipped"] == "3" and row["flag"] == "a single pair"
-    assert "skipped plot_0000/000: there is no right image" in capsys.readouterr().err
-
-
-def test_swapped_and_unrectified_pairs_are_told():
-    """Six stalks with a texture; the right image as it is, exchanged, and too low."""
-    rng = np.random.default_rng(0)
-    camera = Calibration(844, 400, 542.0, (421.5, 199.5), 0.1)
-    disparity = 68
-    left, right = np.zeros((400, 844, 3), np.uint8), np.zeros((400, 844, 3), np.uint8)
-    columns = range(120, 720, 100)
-    for column in columns:
-        texture = rng.integers(60, 255, (400, 14, 1)).astype(np.uint8)
-        left[:, column : column + 14] = texture
-        right[:, column - disparity : column - disparity + 14] = texture
-
-    def told(left: np.ndarray, right: np.ndarray, offset: int = 0) -> str | None:
-        mask = np.zeros((200, 24), bool)
-        mask[:, 5:19] = True
-        finds = [
-            Detection((each, 100.0, each + 13.0, 300.0), (each + 6.5, each + 6.5), 1.0, mask, (100, each - 5))
-            for each in (column - offset for column in columns)
-        ]
-        return wrong_with(finds, look(finds, left, right, camera), left, right, camera)
-
-    assert told(left, right) is None
-    assert told(right, left, disparity) == "left and right are swapped: exchange their names"
-    assert told(left, np.roll(right, 6, axis=0)) == "the right image lies about 6 lines too low: rectify the pair"
-    assert told(left, np.roll(right, -12, axis=0)) == "the right image lies about 12 lines too high: rectify the pair"
-    assert told(left, np.zeros_like(right)) is None
-
-
-def test_without_calibration_no_millimetres_and_without_odometry_no_count(plots, tmp_path, capsys):
-    plot = tmp_path / "plot_0000"
-    shutil.copytree(plots / "plot_0000", plot)
-    (plot / "odometry.csv").unlink()
-    assert run(plot, tmp_path / "a") == 0
-    (row,) = table(tmp_path / "a" / "plots.csv")
-    assert row["flag"] == "no odometry" and row["stalks"] == row["stalks_per_m"] == "" and float(row["width_mean_mm"]) > 10
-    (plot / "calibration.yaml").unlink()
-    assert run(plot, tmp_path / "b") == 0
-    (row,) = table(tmp_path / "b" / "plots.csv")
-    assert row["flag"] == "no calibration" and row["width_mean_mm"] == row["stalks"] == ""
-    assert table(tmp_path / "b" / "stalks.csv") == []
-    assert "no millimetres" in capsys.readouterr().err
-
-
-def test_black_images_and_calibrations_of_another_size_are_told(plots, tmp_path):
-    plot = tmp_path / "plot_0000"
-    shutil.copytree(plots / "plot_0000", plot)
-    write_image(plot / "left_000.png", np.zeros((338, 422, 3), np.uint8))
-    for number in range(1, 4):
-        for side in ("left", "right"):
-            write_image(plot / f"{side}_{number:03d}.png", BLANK)
-    assert run(plot, tmp_path / "out") == 3
-    told = [row["why"] for row in table(tmp_path / "out" / "skipped.csv")]
-    assert "the left image is black" in told[0] and "calibration is for 422 x 338" in told[1]
-    (row,) = table(tmp_path / "out" / "plots.csv")
-    assert row["flag"] == "no usable pairs"
-
-
 @pytest.mark.parametrize(
     ("words", "part"),
     [
@@ -382,14 +259,6 @@ def test_black_images_and_calibrations_of_another_size_are_told(plots, tmp_path)
 def test_wrong_requests_of_run(plots, tmp_path, capsys, words, part):
     assert run(plots, tmp_path / "out", *words) == 2
     assert part in capsys.readouterr().err
-
-
-def test_true_masks_are_wanted_of_what_has_none(plots, tmp_path, capsys):
-    plot = tmp_path / "plot_0000"
-    shutil.copytree(plots / "plot_0000", plot)
-    (plot / "plot.json").unlink()
-    assert run(plot, tmp_path / "out") == 2
-    assert "holds no true masks" in capsys.readouterr().err
 
 
 def test_eval_compares_with_the_truth(plots, tmp_path, capsys):

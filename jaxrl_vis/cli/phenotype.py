@@ -2,12 +2,12 @@
 
 import dataclasses
 import importlib.util
-import sys
 from pathlib import Path
 from typing import Annotated, Literal
 
 from jaxrl_vis.cli.checks import check_counts
 from jaxrl_vis.cli.parsing import ByPlaceToo
+from jaxrl_vis.cli.progress import progress
 from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.report.outputs import check_writable
@@ -52,16 +52,14 @@ def synth(options: Synth) -> int:
     check_devices()
     from jaxrl_vis.phenotyping.synth import name_of, write_plots
 
-    def say(seed: int, pairs: int) -> None:
-        if sys.stdout.isatty():
-            print(f"\r{name_of(seed)}: {pairs} of {family.rig.frames} pairs", end="", flush=True)
-            print("" if pairs < family.rig.frames else "\n", end="", flush=True)
-        elif pairs == family.rig.frames:
-            print(f"{name_of(seed)}: {pairs} pairs", flush=True)
-
     seeds = range(options.seed, options.seed + options.plots)
     try:
-        present = write_plots(options.out, family, seeds, options.format, options.truth, say)
+        with progress("pairs") as say:
+
+            def done(seed: int, pairs: int) -> None:
+                say(name_of(seed), pairs, family.rig.frames)
+
+            present = write_plots(options.out, family, seeds, options.format, options.truth, done)
     except OSError as error:
         raise RequestError(f"cannot write to {options.out}: {error.strerror or error}") from error
     print(

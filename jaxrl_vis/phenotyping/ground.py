@@ -50,13 +50,19 @@ class Ground:
 
 
 def find_ground(
-    left: np.ndarray, right: np.ndarray, calibration: Calibration, depths: tuple[float, float] = (0.45, 3.0)
+    left: np.ndarray,
+    right: np.ndarray,
+    calibration: Calibration,
+    disparity: np.ndarray | None = None,
+    depths: tuple[float, float] = (0.45, 3.0),
 ) -> Ground | None:
     """The ground that a pair shows; None where it shows none, or too little.
 
     Args:
         left, right: [H, W] grey float32, rectified.
         calibration: Of the cameras, for images of this size.
+        disparity: [H, W] float32, disparities that are known, in place of those that are matched; pixels, not a number where
+            there is none.
         depths: Least and greatest depth at which it is looked for, m.
     """
     scale = min(_WIDTH / left.shape[1], 1.0)
@@ -64,7 +70,10 @@ def find_ground(
         size = (round(left.shape[1] * scale), round(left.shape[0] * scale))
         left, right = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (left, right))
     bounds = tuple(float(calibration.disparity(np.array(depth))) * scale for depth in reversed(depths))
-    places, values = _windows(left, right, (bounds[0], bounds[1]))
+    if disparity is None:
+        places, values = _windows(left, right, (bounds[0], bounds[1]))
+    else:
+        places, values = _samples(disparity, scale)
     if len(values) < _LEAST_WINDOWS:
         return None
     focal = calibration.focal * scale
@@ -110,6 +119,15 @@ def _windows(left: np.ndarray, right: np.ndarray, bounds: tuple[float, float]) -
             places.append((first + 0.5 * (wide - 1), top + 0.5 * (tall - 1)))
             values.append(first - (begin + column + fraction))
     return np.array(places, float).reshape(-1, 2), np.array(values, float)
+
+
+def _samples(disparity: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """Places and values as of `_windows`, out of an image of disparities."""
+    lines, columns = (np.linspace(0, size - 1, 64).astype(int) for size in disparity.shape)
+    values = disparity[np.ix_(lines, columns)]
+    line, column = np.nonzero(np.isfinite(values))
+    places = (np.stack([columns[column], lines[line]], axis=1) + 0.5) * scale - 0.5
+    return places, values[line, column] * scale
 
 
 def _plane(rays: np.ndarray, inverse: np.ndarray, tolerance: float) -> np.ndarray | None:

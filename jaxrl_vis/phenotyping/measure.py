@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxrl_vis.phenotyping.ground import Ground
 from jaxrl_vis.phenotyping.metric import diameter_mm, tilt_of
-from jaxrl_vis.phenotyping.stereo import StalkDisparity, match_rows
+from jaxrl_vis.phenotyping.stereo import StalkDisparity, match_rows, sample_rows
 from jaxrl_vis.phenotyping.width import Strip, ellipse_width, strip_width
 from jaxrl_vis_envs.plants import Calibration
 
@@ -59,6 +59,7 @@ def measure(
     method: Method = "strip",
     ground: Ground | None = None,
     height: float | None = None,
+    disparity: np.ndarray | None = None,
 ) -> Measurement:
     """Measures a stalk.
 
@@ -73,19 +74,21 @@ def measure(
         ground: What heights are counted from.
         height: Where to measure, m above the ground, if it is known: there, or as near to it as both edges are seen; ``line``
             does not matter then.
+        disparity: [H, W] float32, disparities that are known, in place of those that are matched; pixels, not a number where
+            there is none.
     """
     strip = strip_width(mask)
     if strip is None:
         return Measurement(reason="too few lines show both edges")
     place = strip.reference if line is None else line - corner[0]
-    matched = _disparity(strip, corner, left, right, calibration, depths)
+    matched = _disparity(strip, corner, left, right, calibration, depths, disparity)
     if ground is not None and height is not None:
         place = _place_at(height, strip, corner, matched, calibration, ground)
     found = matched.at(place + corner[0])
     if found is None:
         return Measurement(line=place + corner[0], lean=strip.lean, reason="the right image does not show it clearly")
-    disparity, error = found
-    depth = float(calibration.depth(np.array(disparity)))
+    beside, error = found
+    depth = float(calibration.depth(np.array(beside)))
     if not depths[0] <= depth <= depths[1]:
         return Measurement(line=place + corner[0], depth=depth, lean=strip.lean, reason=f"it stands {depth:.2f} m away")
     middle = 0.5 * sum(strip.edges(place))
@@ -94,19 +97,19 @@ def measure(
         return Measurement(line=place + corner[0], lean=strip.lean, reason="no ellipse fits the mask")
     half = 0.5 * pixels / math.cos(strip.lean)
     edges = tuple((middle + corner[1] + side * half, place + corner[0]) for side in (-1.0, 1.0))
-    tilt = _tilt(matched, disparity, calibration)
+    tilt = _tilt(matched, beside, calibration)
     diameter = diameter_mm(calibration, edges[0], edges[1], depth, strip.lean, tilt)
     # Towards the ends of what was seen, and beyond, slopes add to the error of the edges.
     span = max(strip.last - strip.first, 1)
     lever = math.sqrt(1.0 + 12.0 * ((place - strip.reference) / span) ** 2)
-    relative = math.hypot(strip.deviation * lever / pixels, error / max(disparity - calibration.offset, 1e-6))
+    relative = math.hypot(strip.deviation * lever / pixels, error / max(beside - calibration.offset, 1e-6))
     return Measurement(
         diameter_mm=diameter,
         deviation_mm=diameter * relative,
         line=place + corner[0],
         column=middle + corner[1],
         width=pixels,
-        disparity=disparity,
+        disparity=beside,
         depth=depth,
         height=math.nan if ground is None else ground.height(middle + corner[1], place + corner[0], depth, calibration),
         lean=strip.lean,
@@ -141,12 +144,15 @@ def _disparity(
     right: np.ndarray,
     calibration: Calibration,
     depths: tuple[float, float],
+    disparity: np.ndarray | None,
 ) -> StalkDisparity:
     """Disparities of windows spread over the lines in which both edges are seen."""
     half = max(round(8 * calibration.focal / 2168), 3)
     lines = np.unique(np.linspace(strip.first + half, max(strip.last - half, strip.first + half), _WINDOWS).round()).astype(int)
     edges = np.array([strip.edges(each) for each in lines]) + corner[1]
     far, near = (float(calibration.disparity(np.array(depth))) for depth in (depths[1], depths[0]))
+    if disparity is not None:
+        return sample_rows(disparity, lines + corner[0], (edges[:, 0], edges[:, 1]), (far, near))
     return match_rows(left, right, lines + corner[0], (edges[:, 0], edges[:, 1]), (far, near), half)
 
 

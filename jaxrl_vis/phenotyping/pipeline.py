@@ -25,7 +25,7 @@ from jaxrl_vis.files import write_atomically
 from jaxrl_vis.phenotyping.detector.finder import Detection
 from jaxrl_vis.phenotyping.folders import PairFiles, PlotFolder, read_odometry
 from jaxrl_vis.phenotyping.ground import find_ground
-from jaxrl_vis.phenotyping.images import read_image, write_image
+from jaxrl_vis.phenotyping.images import read_disparity, read_image, rgb8, write_image
 from jaxrl_vis.phenotyping.measure import Method
 from jaxrl_vis.phenotyping.overlay import draw_overlay
 from jaxrl_vis.phenotyping.pairing import wrong_with
@@ -59,6 +59,7 @@ class Request:
         finder: What finds stalks, in words; results of another one are not mixed with it.
         calibrations: Of each plot by its name; None where there is none.
         speed: Of the robot, m/s, where only times are known.
+        disparity_scale: What disparities in 16-bit images are divided by.
     """
 
     out: Path
@@ -66,6 +67,7 @@ class Request:
     finder: str
     calibrations: dict[str, Calibration | None]
     speed: float | None = None
+    disparity_scale: float = 256.0
 
 
 class _Skip(Exception):
@@ -144,6 +146,7 @@ def _claim(plots: list[PlotFolder], request: Request) -> None:
         "method": request.method,
         "finder": request.finder,
         "speed": request.speed,
+        "disparity_scale": request.disparity_scale,
         "calibrations": {
             name: None if each is None else dataclasses.asdict(each) for name, each in request.calibrations.items()
         },
@@ -160,14 +163,16 @@ def _claim(plots: list[PlotFolder], request: Request) -> None:
 def _record(plot: PlotFolder, pair: PairFiles, find: Find, request: Request) -> dict[str, Any]:
     """What is kept of one pair."""
     try:
-        left, right = _read(pair, request.calibrations[plot.name])
+        left, right, disparity = _read(pair, request.calibrations[plot.name], request.disparity_scale)
         detections = find(left, plot, pair)
     except _Skip as problem:
         return {"skipped": str(problem)}
     calibration = request.calibrations[plot.name]
-    ground = None if calibration is None else find_ground(grey_of(left), grey_of(right), calibration)
-    sightings = look(detections, left, right, calibration, request.method, ground)
-    wrong = None if calibration is None else wrong_with(detections, sightings, left, right, calibration)
+    ground = None if calibration is None else find_ground(grey_of(left), grey_of(right), calibration, disparity)
+    sightings = look(detections, left, right, calibration, request.method, ground, disparity)
+    wrong = (
+        None if calibration is None or disparity is not None else wrong_with(detections, sightings, left, right, calibration)
+    )
     if wrong is not None:
         return {"skipped": wrong}
     height = None if ground is None else round(ground.camera_height, 4)
@@ -178,13 +183,26 @@ def _record(plot: PlotFolder, pair: PairFiles, find: Find, request: Request) -> 
     }
 
 
-def _read(pair: PairFiles, calibration: Calibration | None) -> tuple[np.ndarray, np.ndarray]:
-    """Both images [H, W, 3] uint8.
+def _read(
+    pair: PairFiles, calibration: Calibration | None, disparity_scale: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Both images [H, W, 3] uint8, and disparities [H, W] float32 in pixels if there is a file of them.
 
     Raises:
         _Skip: They are not a pair of images that can be used.
     """
-    left, right = (_image(pair, side) for side in ("left", "right"))
+    left = _image(pair, "left")
+    disparity = None
+    if pair.disparity is not None:
+        try:
+            disparity = read_disparity(pair.disparity, disparity_scale)
+        except OSError as error:
+            raise _Skip(str(error).removeprefix(f"{pair.disparity.parent}/")) from error
+        if disparity.shape != left.shape[:2]:
+            sizes = [f"{image.shape[1]} x {image.shape[0]}" for image in (left, disparity)]
+            raise _Skip(f"the left image has {sizes[0]} pixels and its disparities {sizes[1]}")
+    # Who has disparities needs no right image.
+    right = left if disparity is not None and pair.right is None else _image(pair, "right")
     if left.shape != right.shape:
         sizes = [f"{image.shape[1]} x {image.shape[0]}" for image in (left, right)]
         raise _Skip(f"the left image has {sizes[0]} pixels and the right one {sizes[1]}")
@@ -193,7 +211,7 @@ def _read(pair: PairFiles, calibration: Calibration | None) -> tuple[np.ndarray,
         raise _Skip(f"the images have {left.shape[1]} x {left.shape[0]} pixels, but the calibration is for {wanted}")
     if min(int(left.max()), int(right.max())) < 8:
         raise _Skip(f"the {'left' if left.max() < 8 else 'right'} image is black")
-    return left, right
+    return left, right, disparity
 
 
 def _image(pair: PairFiles, side: Literal["left", "right"]) -> np.ndarray:
@@ -206,11 +224,9 @@ def _image(pair: PairFiles, side: Literal["left", "right"]) -> np.ndarray:
     if path is None:
         raise _Skip(f"there is no {side} image")
     try:
-        image = read_image(path)
+        return rgb8(read_image(path))
     except OSError as error:
         raise _Skip(f"{path.name}: {error.strerror or 'it is not an image, or only a part of one'}") from error
-    image = (image >> 8).astype(np.uint8) if image.dtype == np.uint16 else image
-    return np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image
 
 
 def _finish(plot: PlotFolder, records: list[dict[str, Any]], driven: dict[str, float] | None, request: Request) -> PlotResult:

@@ -64,8 +64,9 @@ class Sighting:
     @classmethod
     def read(cls, values: dict[str, Any]) -> "Sighting":
         """From what JSON kept of `dataclasses.asdict`."""
-        pairs = ("box", "axis", "upper_place")
-        return cls(**{name: tuple(each) if name in pairs and each else each for name, each in values.items()})
+        upper = values.get("upper_place")
+        parts = {"box": tuple(values["box"]), "axis": tuple(values["axis"]), "upper_place": upper and tuple(upper)}
+        return cls(**{**values, **parts})
 
 
 def grey_of(image: np.ndarray) -> np.ndarray:
@@ -80,6 +81,7 @@ def look(
     calibration: Calibration | None,
     method: Method = "strip",
     ground: Ground | None = None,
+    disparity: np.ndarray | None = None,
 ) -> list[Sighting]:
     """Measures what was found in a pair.
 
@@ -89,6 +91,7 @@ def look(
         calibration: Of the cameras; without it there are no millimetres and no metres.
         method: How widths are taken.
         ground: What heights are counted from; without it a stalk is measured in the middle of its box, and only there.
+        disparity: [H, W] float32, disparities that are known, pixels.
     """
     if calibration is None:
         return [_in_pixels(each) for each in detections]
@@ -97,10 +100,12 @@ def look(
     for each in detections:
         line = 0.5 * (each.box[1] + each.box[3])
         images = (grey_left, grey_right, calibration)
-        got = measure(each.mask, each.corner, *images, line=line, method=method, ground=ground, height=HEIGHTS[0])
+        got = measure(
+            each.mask, each.corner, *images, line=line, method=method, ground=ground, height=HEIGHTS[0], disparity=disparity
+        )
         upper = None
         if ground is not None and each.upper is not None:
-            upper = measure(*each.upper, *images, method=method, ground=ground, height=HEIGHTS[1])
+            upper = measure(*each.upper, *images, method=method, ground=ground, height=HEIGHTS[1], disparity=disparity)
         found.append(_sighting(each, got, upper, calibration))
     return found
 
@@ -127,7 +132,7 @@ def _in_pixels(detection: Detection) -> Sighting:
 
 def _sighting(detection: Detection, got: Measurement, upper: Measurement | None, calibration: Calibration) -> Sighting:
     """Rounded, so that what JSON keeps is what was measured."""
-    line = 0.5 * (detection.box[1] + detection.box[3])
+    line = got.line if math.isfinite(got.line) else 0.5 * (detection.box[1] + detection.box[3])
     column = got.column if math.isfinite(got.column) else 0.5 * sum(detection.axis)
 
     def known(value: float | None, digits: int) -> float | None:

@@ -1,6 +1,7 @@
 """Stalks of an image with their masks: what the rest of phenotyping asks for."""
 
 import dataclasses
+import functools
 from typing import Any
 
 import cv2
@@ -68,14 +69,17 @@ def in_image(stalks: np.ndarray, scale: tuple[float, float]) -> np.ndarray:
     return stalks * np.array([scale[1], scale[0], scale[1], scale[0], scale[1], scale[1]], np.float32)
 
 
-def masks_of(params: Any, snips: jax.Array, settings: Settings, dtype: Any) -> jax.Array:
-    """Chances [N, h, w] float32 that pixels of snips [N, h, w, 3] uint8 show the stalk in the middle."""
-    logits = Segmenter(settings.segmenter, dtype).apply(params, normalise(snips))
+@functools.partial(jax.jit, static_argnums=(2, 3, 4))
+def _masks_of(params: Any, snips: jax.Array, settings: Settings, dtype: Any, full: tuple[int, int]) -> jax.Array:
+    """Chances [N, h, w] float32 that pixels of snips [N, h, w, 3] uint8 show the stalk in the middle.
+
+    Snips of smaller images are enlarged to the ``full`` size: the network knows stalks that are as many pixels wide as there.
+    """
+    count, *shape = snips.shape[:3]
+    enlarged = jax.image.resize(normalise(snips), (count, *full, 3), "cubic")
+    logits = Segmenter(settings.segmenter, dtype).apply(params, enlarged)
     assert isinstance(logits, jax.Array)
-    return jax.nn.sigmoid(logits)
-
-
-_masks_of = jax.jit(masks_of, static_argnums=(2, 3))
+    return jax.image.resize(jax.nn.sigmoid(logits), (count, *shape), "linear")
 
 
 class Finder:
@@ -121,7 +125,8 @@ class Finder:
     def _segment(self, on_device: jax.Array, stalks: np.ndarray, lines: int) -> np.ndarray:
         """Masks [N, h, w] float32 of the snips of stalks [N, 6]."""
         settings = self._settings
-        shape = snip_shape(on_device.shape[1], (lines, settings.snip_columns), settings.full_width)
+        full = (lines, settings.snip_columns)
+        shape = snip_shape(on_device.shape[1], full, settings.full_width)
         if not len(stalks):
             return np.zeros((0, *shape), np.float32)
         masks = []
@@ -129,7 +134,7 @@ class Finder:
             part = stalks[start : start + _BATCH]
             filled = np.pad(part, ((0, _BATCH - len(part)), (0, 0)), mode="edge")
             snips = cut(on_device, filled, shape)
-            masks.append(_masks_of(self._params["segmenter"], snips, settings, self._dtype))
+            masks.append(_masks_of(self._params["segmenter"], snips, settings, self._dtype, full))
         return np.concatenate(jax.device_get(masks))[: len(stalks)]
 
 
