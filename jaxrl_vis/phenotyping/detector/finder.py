@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis.phenotyping.detector.detect import Settings, detect, normalise, pad
+from jaxrl_vis.phenotyping.detector.detect import Settings, detect, pad
 from jaxrl_vis.phenotyping.detector.networks import Segmenter
-from jaxrl_vis.phenotyping.detector.snips import cut, put_back, snip_shape
+from jaxrl_vis.phenotyping.detector.snips import cut, put_back, smoothed, snip_shape
 from jaxrl_vis.phenotyping.width import strip_width
 from jaxrl_vis_envs.plants.truth import BAND, HEIGHTS
 
@@ -76,8 +76,8 @@ def _masks_of(params: Any, snips: jax.Array, settings: Settings, dtype: Any, ful
     Snips of smaller images are enlarged to the ``full`` size: the network knows stalks that are as many pixels wide as there.
     """
     count, *shape = snips.shape[:3]
-    enlarged = jax.image.resize(normalise(snips), (count, *full, 3), "cubic")
-    logits = Segmenter(settings.segmenter, dtype).apply(params, enlarged)
+    enlarged = jax.image.resize(snips.astype(jnp.float32), (count, *full, 3), "linear")
+    logits = Segmenter(settings.segmenter, dtype).apply(params, smoothed(enlarged))
     assert isinstance(logits, jax.Array)
     return jax.image.resize(jax.nn.sigmoid(logits), (count, *shape), "linear")
 
