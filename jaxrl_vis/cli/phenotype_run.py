@@ -21,8 +21,9 @@ SKIPPED = 3
 class Run:
     """Count and measure the stalks in folders of stereo pairs: tables per stalk and per plot, and an overlay per image."""
 
-    folder: Annotated[Path, ByPlaceToo()]
-    """A plot's folder of pairs (left_000.png, right_000.png, ...), or a folder of such folders."""
+    folder: Annotated[Path | None, ByPlaceToo()] = None
+    """A plot's folder of pairs (left_000.png, right_000.png, ...), or a folder of such folders; the short synthetic row that comes
+    with the package if not given."""
     out: Path = Path("phenotype_results")
     """Folder for the results; a command that was stopped goes on where it was."""
     calibration: Path | None = None
@@ -55,9 +56,11 @@ def run(options: Run) -> int:
         raise RequestError(f"--disparity-scale must be more than 0, not {options.disparity_scale:g}")
     check_extra()
     check_writable(options.out, "--out", folder=True)
-    from jaxrl_vis.phenotyping.folders import find_plots
+    from jaxrl_vis.phenotyping.folders import SAMPLE, find_plots
 
-    plots = find_plots(options.folder)
+    plots = find_plots(options.folder or SAMPLE)
+    if options.folder is None:
+        print("no folder given: this is the short synthetic row that comes with jaxrl-vis")
     calibrations = {plot.name: _calibration(plot.folder, options) for plot in plots}
     check_devices()
     from jaxrl_vis.phenotyping.pipeline import Request, run

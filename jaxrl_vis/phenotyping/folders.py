@@ -16,6 +16,8 @@ import numpy as np
 from jaxrl_vis.errors import RequestError
 
 _IMAGES = {".png", ".jpg", ".jpeg", ".tif", ".tiff"}
+SAMPLE = Path(__file__).with_name("sample_row")
+"""A short synthetic row that comes with the package."""
 _DISPARITIES = {".pfm", ".png", ".tif", ".tiff"}
 _SIDE = re.compile(r"(?<![a-z])(left|right|l|r)(?![a-z])", re.IGNORECASE)
 
