@@ -16,6 +16,7 @@ from jaxrl_vis.phenotyping.folders import find_plots, read_odometry
 from jaxrl_vis.phenotyping.heights import USUAL_TAPER, robust_width, widths_of
 from jaxrl_vis.phenotyping.images import read_image
 from jaxrl_vis.phenotyping.sightings import Sighting
+from jaxrl_vis.phenotyping.thesis import count_by_length, mean_widths
 from jaxrl_vis.phenotyping.track import Track, follow
 from jaxrl_vis_envs.plants import Calibration
 from jaxrl_vis_envs.plants.truth import StalkInView
@@ -264,11 +265,15 @@ def test_wrong_requests_of_run(plots, tmp_path, capsys, words, part):
 def test_eval_compares_with_the_truth(plots, tmp_path, capsys):
     spec, out = plots.parent / "few.json", tmp_path / "eval.json"
     words = ["--spec", str(spec), "--width", "422", "--frames", "4", "--plots", "1", "--masks", "truth", "--json", str(out)]
+    words += ["--thesis"]
     assert cli.main(["phenotype", "eval", *words]) == 0
     figures = json.loads(out.read_text())
     truth = json.loads((plots / "plot_0000" / "plot.json").read_text())
     assert figures["count_true"] == truth["count"] and figures["count_mae"] == 0.0 and figures["count_r2"] is None
     assert figures["f1"] > 0.9 and figures["width_mae_mm"] < 2.5 and figures["synthetic"] is True
+    # The thesis's ways on the same finds: ellipses are biased, and its count depends on how many stalks an image shows.
+    assert figures["thesis_width_mae_mm"] < 5 and figures["thesis_count_mae"] >= 0 and figures["width_24in_mae_mm"] is not None
+    assert figures["each"][0]["widths_mm"] and figures["each"][0]["seconds_per_pair"] > 0
     said = capsys.readouterr().out
     assert "synthetic plots of family" in said and "count_mae" in said
 
@@ -290,3 +295,72 @@ def test_wrong_requests_of_train_and_eval(tmp_path, monkeypatch, capsys, words, 
     monkeypatch.chdir(tmp_path)
     assert cli.main(["phenotype", *words]) == 2
     assert part in capsys.readouterr().err
+
+
+# --- the thesis's ways, and figures ---
+
+
+def test_the_thesis_counts_by_length_and_takes_means():
+    frames = [[sighting(0.01 * place) for place in range(count)] for count in (10, 14)]
+    # 1500 pixels at f = 1000 and 0.8 m show 1.2 m.
+    assert count_by_length(frames, CAMERAS, 2.4) == pytest.approx(24.0)
+    assert count_by_length([[], []], CAMERAS, 2.4) == 0.0
+    found = mean_widths([[sighting(0.0), sighting(0.1, diameter_mm=None)], [sighting(0.0, diameter_mm=16.0)]], [[3, 4], [3]])
+    assert found == {3: 15.0}
+
+
+@pytest.fixture(scope="module")
+def evaluation(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("figures") / "eval.json"
+    plots = [
+        {
+            "seed": seed,
+            "true": 30 + seed,
+            "counted": 31,
+            "pairs": 34,
+            "seconds_per_pair": 0.5,
+            "widths_mm": [[14.2, 14.0 + seed]],
+        }
+        for seed in range(3)
+    ]
+    path.write_text(json.dumps({"synthetic": True, "family": "shifted", "count_r2": 0.5, "each": plots}))
+    return path
+
+
+@pytest.mark.parametrize("figure", ["3.4", "3.5", "table3.1"])
+def test_figures_of_chapter_3(evaluation, tmp_path, figure):
+    out = tmp_path / ("table.md" if figure == "table3.1" else "figure.png")
+    assert cli.main(["figure", figure, "--out", str(out), "--evaluation", str(evaluation)]) == 0
+    text, rows = out.with_suffix(".md").read_text(), table(out.with_suffix(".csv"))
+    assert "ynthetic" in text and len(rows) == 3
+    if figure == "table3.1":
+        # 34 pairs of half a second; both people's minutes are the thesis's, and say so.
+        assert rows[2]["here, measured"] == "17.0 s" and rows[2]["person 1, quoted"] == "32.33 min"
+        assert "116 times faster" in text and "quoted from Table 3.1" in text
+    else:
+        assert out.read_bytes()[1:4] == b"PNG"
+        assert "thesis" in text
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        (["3.4", "--out", "a.txt"], "3.4 is a file that ends in .png or .pdf or .svg"),
+        (["3.4", "--preset", "cpu"], "--preset goes with figures of training runs, not with 3.4"),
+        (["3.4", "--evaluation", "missing.json"], "cannot read missing.json"),
+        (["3.5", "--evaluation", "missing.json", "--plots", "2"], "leave out --plots and --quick"),
+        (["5.4", "--plots", "2"], "--plots goes with figures 3.4, 3.5 and table3.1"),
+    ],
+)
+def test_wrong_requests_of_figures(tmp_path, monkeypatch, capsys, words, part):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["figure", *words]) == 2
+    assert part in capsys.readouterr().err
+
+
+def test_what_is_no_evaluation(tmp_path, capsys):
+    path = tmp_path / "eval.json"
+    for text in ("", "{}", '{"synthetic": true, "each": [{}]}'):
+        path.write_text(text)
+        assert cli.main(["figure", "3.4", "--out", str(tmp_path / "a.png"), "--evaluation", str(path)]) == 2
+        assert "holds no evaluation" in capsys.readouterr().err

@@ -22,8 +22,8 @@ class Run:
     """Count and measure the stalks in folders of stereo pairs: tables per stalk and per plot, and an overlay per image."""
 
     folder: Annotated[Path | None, ByPlaceToo()] = None
-    """A plot's folder of pairs (left_000.png, right_000.png, ...), or a folder of such folders; the short synthetic row that comes
-    with the package if not given."""
+    """A plot's folder of pairs (left_000.png, right_000.png, ...), or a folder of such folders; the short synthetic row that
+    comes with the package if not given."""
     out: Path = Path("phenotype_results")
     """Folder for the results; a command that was stopped goes on where it was."""
     calibration: Path | None = None

@@ -5,6 +5,8 @@ plot -> pairs -> finds -> sightings -> stalks       as `pipeline.run` does, with
 """
 
 import dataclasses
+import math
+import time
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -16,6 +18,7 @@ from jaxrl_vis.phenotyping.heights import widths_of
 from jaxrl_vis.phenotyping.measure import Method
 from jaxrl_vis.phenotyping.perfect import perfect_detections
 from jaxrl_vis.phenotyping.sightings import Sighting, grey_of, look
+from jaxrl_vis.phenotyping.thesis import count_by_length, look_as_thesis, mean_widths
 from jaxrl_vis.phenotyping.track import follow
 from jaxrl_vis_envs.plants import Family, Stalk, draw
 from jaxrl_vis_envs.plants.pairs import Sequence
@@ -35,6 +38,8 @@ class PlotScore:
         true, counted: Stalks.
         widths: [N, 2] float64, measured and true diameter at 12 inches of each stalk that was counted and identified, mm.
         upper: [M, 2] float64, the same at 24 inches.
+        seconds: Of finding and measuring, for each pair, from arrays in memory; the first pair, which compiles, is left out.
+        thesis: What the thesis's ways make of the same finds.
         finds: [K, 2] float64, score of each find, and 1 where it is a stalk, 0 where not; those of unclear stalks are left out.
         stalks: How many stalks finds could have shown, over all pairs.
     """
@@ -46,12 +51,34 @@ class PlotScore:
     finds: np.ndarray
     stalks: int
     upper: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 2)))
+    seconds: float = math.nan
+    thesis: "ThesisScore | None" = None
+
+
+@dataclasses.dataclass(frozen=True)
+class ThesisScore:
+    """The same finds, as the thesis makes counts and widths of them.
+
+    Attributes:
+        counted: Stalks, by the stalks on each metre of image.
+        widths: [N, 2] float64, measured and true diameter at 12 inches, mm.
+    """
+
+    counted: float
+    widths: np.ndarray
 
 
 Finder = Callable[[np.ndarray], list[Detection]]
 
 
-def score_plot(family: Family, seed: int, find: Finder | None, method: Method = "strip", least_score: float = 0.5) -> PlotScore:
+def score_plot(
+    family: Family,
+    seed: int,
+    find: Finder | None,
+    method: Method = "strip",
+    least_score: float = 0.5,
+    with_thesis: bool = False,
+) -> PlotScore:
     """Draws a plot, runs everything on it and compares.
 
     Args:
@@ -60,26 +87,33 @@ def score_plot(family: Family, seed: int, find: Finder | None, method: Method = 
         find: What finds stalks in a left image [H, W, 3] uint8, those of low scores too; None for true boxes and masks.
         method: How widths are taken.
         least_score: What counts as a find.
+        with_thesis: Score the thesis's ways on the same finds, too.
     """
     sequence = Sequence.of(draw(family, seed))
     drive, plot = sequence.drive, sequence.plot
     frames: list[list[Sighting]] = []
     owners: list[list[int | None]] = []
     finds: list[tuple[float, float]] = []
-    total = 0
+    as_thesis: list[list[Sighting]] = []
+    total, seconds = 0, []
     for pair in sequence:
         left, right, instance = np.asarray(pair.left), np.asarray(pair.right), np.asarray(pair.instance)
         seen = stalks_in_view(plot, pair.pose, drive.true, instance, np.asarray(pair.depth))
+        started = time.monotonic()
         if find is None:
             detections = perfect_detections(map(dataclasses.asdict, seen), instance, LEAST_VISIBLE)
         else:
             detections = find(left)
+        kept = [place for place, each in enumerate(detections) if each.score >= least_score]
+        finds_kept = [detections[place] for place in kept]
+        ground = find_ground(grey_of(left), grey_of(right), drive.stated)
+        frames.append(look(finds_kept, left, right, drive.stated, method, ground))
+        seconds.append(time.monotonic() - started)
+        if with_thesis:
+            as_thesis.append(look_as_thesis(finds_kept, left, right, drive.stated))
         matched, scored = match(detections, seen)
         total += sum(each.band_box is not None and each.band_visible >= LEAST_VISIBLE for each in seen)
         finds += scored
-        kept = [place for place, each in enumerate(detections) if each.score >= least_score]
-        ground = find_ground(grey_of(left), grey_of(right), drive.stated)
-        frames.append(look([detections[place] for place in kept], left, right, drive.stated, method, ground))
         owners.append([matched[place] for place in kept])
     tracks, _ = follow(frames, drive.odometry, drive.stated)
     widths, upper = [], []
@@ -102,7 +136,16 @@ def score_plot(family: Family, seed: int, find: Finder | None, method: Method = 
         np.array(finds).reshape(-1, 2),
         total,
         np.array(upper).reshape(-1, 2),
+        float(np.mean(seconds[1:])) if len(seconds) > 1 else math.nan,
+        _thesis_score(as_thesis, owners, sequence) if with_thesis else None,
     )
+
+
+def _thesis_score(frames: list[list[Sighting]], owners: list[list[int | None]], sequence: Sequence) -> ThesisScore:
+    plot, stated = sequence.plot, sequence.drive.stated
+    widths = [(width, true_diameter(plot.stalks[name])) for name, width in mean_widths(frames, owners).items()]
+    counted = count_by_length(frames, stated, plot.family.layout.plot_length)
+    return ThesisScore(counted, np.array(widths).reshape(-1, 2))
 
 
 def true_diameter(stalk: Stalk, height: float = HEIGHTS[0]) -> float:
@@ -177,7 +220,6 @@ def summary(scores: Iterable[PlotScore], least_score: float = 0.5) -> dict[str, 
     widths = np.concatenate([each.widths for each in scores]) if scores else np.zeros((0, 2))
     finds = np.concatenate([each.finds for each in scores]) if scores else np.zeros((0, 2))
     stalks = sum(each.stalks for each in scores)
-    spread = float(((true - true.mean()) ** 2).sum()) if len(true) else 0.0
     error = widths[:, 0] - widths[:, 1]
     upper = np.concatenate([each.upper for each in scores]) if scores else np.zeros((0, 2))
     upper_error = upper[:, 0] - upper[:, 1]
@@ -187,7 +229,7 @@ def summary(scores: Iterable[PlotScore], least_score: float = 0.5) -> dict[str, 
     return {
         "plots": len(scores),
         "count_true": int(true.sum()),
-        "count_r2": 1.0 - float(((counted - true) ** 2).sum()) / spread if spread > 0 else float("nan"),
+        "count_r2": _agreement(counted, true),
         "count_mae": _mean(np.abs(counted - true)),
         "count_bias": float(counted.sum() / true.sum() - 1.0) if true.sum() else float("nan"),
         "widths": len(error),
@@ -203,7 +245,31 @@ def summary(scores: Iterable[PlotScore], least_score: float = 0.5) -> dict[str, 
         "precision": hits / len(kept) if len(kept) else float("nan"),
         "recall": hits / stalks if stalks else float("nan"),
         "f1": 2.0 * hits / (len(kept) + stalks) if len(kept) + stalks else float("nan"),
+        "seconds_per_pair": _mean(np.array([each.seconds for each in scores if math.isfinite(each.seconds)])),
+        **_thesis_summary(scores),
     }
+
+
+def _thesis_summary(scores: list[PlotScore]) -> dict[str, float]:
+    """The same figures of the thesis's ways, where all plots have them."""
+    both = [(each, each.thesis) for each in scores if each.thesis is not None]
+    if not both:
+        return {}
+    true, counted = np.array([(score.true, thesis.counted) for score, thesis in both]).T
+    widths = np.concatenate([thesis.widths for _, thesis in both])
+    return {
+        "thesis_count_r2": _agreement(counted, true),
+        "thesis_count_mae": _mean(np.abs(counted - true)),
+        "thesis_count_bias": float(counted.sum() / true.sum() - 1.0) if true.sum() else float("nan"),
+        "thesis_width_mae_mm": _mean(np.abs(widths[:, 0] - widths[:, 1])),
+        "thesis_width_bias_mm": _mean(widths[:, 0] - widths[:, 1]),
+    }
+
+
+def _agreement(counted: np.ndarray, true: np.ndarray) -> float:
+    """1 - SSE / SST against y = x; not a number where all true values are equal."""
+    spread = float(((true - true.mean()) ** 2).sum()) if len(true) else 0.0
+    return 1.0 - float(((counted - true) ** 2).sum()) / spread if spread > 0 else float("nan")
 
 
 def _mean(values: np.ndarray) -> float:
