@@ -16,13 +16,14 @@ ROOT = Path(__file__).resolve().parents[1]
 LAYERS: tuple[tuple[str, ...], ...] = (
     ("errors", "methods"),
     ("fields",),
-    ("config", "types", "provenance", "files"),
-    ("devices",),
+    ("config", "types", "provenance", "files", "parameters"),
+    ("devices", "processes"),
     ("learner",),
     ("report",),
     ("run",),
     ("studies",),
     ("bench", "doctor", "phenotyping"),
+    ("grasping",),
     ("cli",),
     ("__main__",),
 )

@@ -88,7 +88,8 @@ def read_all(folder: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
     for path in sorted(folder.rglob("*.json")):
         contents = json.loads(path.read_text(encoding="utf-8"))
         for record in contents if isinstance(contents, list) else [contents]:
-            if isinstance(record, dict) and record.get("schema") == SCHEMA:
+            # The configuration of a run has a schema, too, but neither name nor value.
+            if isinstance(record, dict) and record.get("schema") == SCHEMA and "name" in record:
                 yield path, record
 
 

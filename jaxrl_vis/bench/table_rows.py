@@ -140,12 +140,12 @@ LEARNING = (
     ),
     Learning(
         "VisualFetchReach, 64x64 RGB-D, oracle reward",
-        {"fetch_reach_oracle": preset("fast", seeds=5)},
+        {"fetch_reach_oracle": preset("fast", seeds=5, env_steps=100_000)},
         targets=(0.9, 0.97),
     ),
     Learning(
         "VisualFetchReach, 64x64 RGB-D, indicator rewards with balancing and filtering (images only)",
-        {"fetch_reach_indicator": preset("fast", seeds=5, method="indicator_balance_filter", env_steps=72_000)},
+        {"fetch_reach_indicator": preset("fast", seeds=5, method="indicator_balance_filter", env_steps=100_000)},
         targets=(0.9, 0.97),
     ),
     Learning(
@@ -155,8 +155,8 @@ LEARNING = (
         steps=(100_000, 160_000),
     ),
     Learning(
-        "VisualReacher, 64x64 RGB-D, oracle reward",
-        {"reacher_oracle": preset("fast", env="VisualReacher", seeds=5, env_steps=80_000)},
+        "VisualReacher, 100x100 RGB-D, oracle reward",
+        {"reacher_oracle": preset("fast", env="VisualReacher", image_size=100, seeds=5, env_steps=100_000)},
         metric="eval/goal_distance",
         word="mean final distance {:.3f} m",
         targets=(0.03, 0.02),

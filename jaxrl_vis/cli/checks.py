@@ -1,11 +1,33 @@
 """What several commands check before they start to work."""
 
+import importlib.util
 from pathlib import Path
 
 from jaxrl_vis.cli.parsing import PROGRAM
 from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.run.signals import shielded_children
+
+# What an extra brings: module -> package.
+_EXTRAS = {
+    "phenotyping": {"cv2": "opencv-python-headless", "scipy": "scipy", "tifffile": "tifffile", "pandas": "pandas"},
+    "grasping": {"cv2": "opencv-python-headless", "scipy": "scipy"},
+}
+
+
+def check_extra(command: str, extra: str) -> None:
+    """Checks that what a command needs beyond the base installation is there.
+
+    Args:
+        command: Its first word.
+        extra: What brings it.
+
+    Raises:
+        RequestError: It is not.
+    """
+    missing = [package for module, package in _EXTRAS[extra].items() if importlib.util.find_spec(module) is None]
+    if missing:
+        raise RequestError(f"{command} needs {', '.join(missing)}: pip install 'jaxrl-vis[{extra}]'")
 
 
 def check_env(name: str, folder: str | None = None) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from jaxrl_vis.cli.checks import check_counts
+from jaxrl_vis.cli.checks import check_counts, check_extra
 from jaxrl_vis.cli.phenotype_figure import NAMES as CHAPTER_3
 from jaxrl_vis.cli.phenotype_figure import make_figure
 from jaxrl_vis.config import PRESETS
@@ -18,8 +18,12 @@ from jaxrl_vis.report.outputs import check_writable
 if TYPE_CHECKING:
     from jaxrl_vis.studies.show import Request
 
-FigureName = Literal["3.4", "3.5", "table3.1", "5.1", "5.2", "estimators", "cameras", "5.4", "5.5", "5.6", "5.7", "quadratic"]
+FigureName = Literal[
+    "3.4", "3.5", "table3.1", "4.4", "5.1", "5.2", "estimators", "cameras", "5.4", "5.5", "5.6", "5.7", "quadratic"
+]
 SUFFIXES = (".png", ".pdf", ".svg")
+# Figures that train nothing -> options that they take.
+_DRAWN_HERE = {"4.4": ("figure", "out", "seed"), "quadratic": ("figure", "out")}
 UNFINISHED = 3
 """Exit status: finished, with something left out."""
 
@@ -29,7 +33,8 @@ class Figure:
     """Draw a figure: train or compute what it shows, and write it to a file, with a table beside it.
 
     3.4, 3.5, table3.1: counts, widths and times on synthetic plots of sorghum, beside what the thesis says of people; from
-    --evaluation, or from plots that are evaluated first.
+    --evaluation, or from plots that are evaluated first. 4.4: from a stereo pair to grasp points, of a synthetic run; --seed
+    chooses it.
 
     5.1, 5.2: rewards with and without ground truth. estimators: rewards from state estimators that err. cameras: noisy and
     varied images. 5.4: auxiliary losses, and how they are weighted. 5.5: single auxiliary tasks. 5.6: their weights over
@@ -80,12 +85,13 @@ def run(options: Figure) -> int:
         return _of_chapter_3(options)
     _refuse_options(options, ("evaluation", "plots"), "figures 3.4, 3.5 and table3.1")
     is_quadratic = options.figure == "quadratic"
+    is_drawn_here = options.figure in _DRAWN_HERE
     out = options.out or Path("quadratic.png" if is_quadratic else f"figure_{options.figure}.png")
     if out.suffix.lower() not in SUFFIXES:
         raise RequestError(f"--out {out}: a figure is a file that ends in {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
-    if is_quadratic:
-        _refuse_options_of_runs(options, "quadratic")
-    for file in (out,) if is_quadratic else (out, out.with_suffix(".md"), out.with_suffix(".csv")):
+    if is_drawn_here:
+        _refuse_options_of_runs(options, _DRAWN_HERE[options.figure])
+    for file in (out,) if is_drawn_here else (out, out.with_suffix(".md"), out.with_suffix(".csv")):
         check_writable(file, "--out")
     if is_quadratic:
         from jaxrl_vis.studies import quadratic
@@ -94,6 +100,8 @@ def run(options: Figure) -> int:
         quadratic.draw(out)
         print(out)
         return 0
+    if options.figure == "4.4":
+        return _draw_grasping(out, options.seed or 0)
     # Nothing below starts JAX in this process: the accelerator's memory belongs to the runs.
     from jaxrl_vis.studies import figures
 
@@ -106,7 +114,7 @@ def _of_chapter_3(options: Figure) -> int:
     out = options.out or Path("table_3.1.md" if is_table else f"figure_{options.figure}.png")
     if out.suffix.lower() not in suffixes:
         raise RequestError(f"--out {out}: {options.figure} is a file that ends in {' or '.join(suffixes)}")
-    _refuse_options_of_runs(options, options.figure, ("evaluation", "plots", "quick"))
+    _refuse_options_of_runs(options, ("figure", "out", "evaluation", "plots", "quick"))
     if options.evaluation is not None and (options.plots is not None or options.quick):
         raise RequestError("--evaluation is of plots that are evaluated already: leave out --plots and --quick")
     check_counts(plots=options.plots)
@@ -115,9 +123,9 @@ def _of_chapter_3(options: Figure) -> int:
     return make_figure(options.figure, out, options.evaluation, options.plots, options.quick)
 
 
-def _refuse_options_of_runs(options: Figure, figure: str, known: tuple[str, ...] = ()) -> None:
-    others = [field.name for field in dataclasses.fields(options) if field.name not in ("figure", "out", *known)]
-    _refuse_options(options, others, f"figures of training runs, not with {figure}")
+def _refuse_options_of_runs(options: Figure, known: Sequence[str]) -> None:
+    others = [field.name for field in dataclasses.fields(options) if field.name not in known]
+    _refuse_options(options, others, f"figures of training runs, not with {options.figure}")
 
 
 def _refuse_options(options: Figure, names: Sequence[str], where: str) -> None:
@@ -125,6 +133,23 @@ def _refuse_options(options: Figure, names: Sequence[str], where: str) -> None:
     for name in names:
         if getattr(options, name) != defaults[name]:
             raise RequestError(f"--{name.replace('_', '-')} goes with {where}")
+
+
+def _draw_grasping(out: Path, seed: int) -> int:
+    """Draws figure 4.4, with the masks of the networks that are shipped, or true ones."""
+    if seed < 0:
+        raise RequestError(f"--seed must be at least 0, not {seed}")
+    check_extra("figure 4.4", "grasping")
+    check_devices()
+    from jaxrl_vis.cli.grasp import painter_of
+    from jaxrl_vis.grasping.figure import draw_figure
+    from jaxrl_vis.grasping.masks.painter import SHIPPED
+    from jaxrl_vis_envs.plants.grasping import GRASPING
+
+    painter, name = painter_of(None, "gan") if SHIPPED["gan"].exists() else (None, "truth")
+    draw_figure(out, GRASPING, seed, None if painter is None else lambda image, number: painter(image), name)
+    print(out)
+    return 0
 
 
 def _request(options: Figure, out: Path) -> "Request":

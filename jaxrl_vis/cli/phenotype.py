@@ -1,18 +1,19 @@
 """``jaxrl-vis phenotype``."""
 
 import dataclasses
-import importlib.util
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from jaxrl_vis.cli.checks import check_counts
+from jaxrl_vis.cli.checks import check_counts, check_extra
+from jaxrl_vis.cli.families import family_of
 from jaxrl_vis.cli.parsing import ByPlaceToo
 from jaxrl_vis.cli.progress import progress
 from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.report.outputs import check_writable
 
-_NEEDED = {"cv2": "opencv-python-headless", "scipy": "scipy", "tifffile": "tifffile", "pandas": "pandas"}
+if TYPE_CHECKING:
+    from jaxrl_vis_envs.plants import Family
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,58 +47,46 @@ def synth(options: Synth) -> int:
     check_counts(plots=options.plots, frames=options.frames, width=options.width)
     if options.seed < 0:
         raise RequestError(f"--seed must be at least 0, not {options.seed}")
-    check_extra()
+    check_extra("phenotype", "phenotyping")
     check_writable(options.out, "--out", folder=True)
-    family = family_of(options)
+    family = family_of(options, "phenotyping")
     check_devices()
+    seeds = range(options.seed, options.seed + options.plots)
+    write_synthetic(options.out, family, seeds, options.format, options.truth, "plots")
+    return 0
+
+
+def write_synthetic(
+    out: Path,
+    family: "Family",
+    seeds: range,
+    image_format: Literal["png", "tiff", "jpeg"],
+    truth: Literal["all", "boxes", "none"],
+    word: str,
+) -> None:
+    """Writes plots and says so.
+
+    Args:
+        out: The folder to write to.
+        family: What plots are drawn from.
+        seeds: One plot each.
+        image_format: Of the cameras' images.
+        truth: What is written of it.
+        word: What plots are called.
+
+    Raises:
+        RequestError: The folder cannot be written to, or holds another family's plots.
+    """
     from jaxrl_vis.phenotyping.synth import name_of, write_plots
 
-    seeds = range(options.seed, options.seed + options.plots)
     try:
         with progress("pairs") as say:
 
             def done(seed: int, pairs: int) -> None:
                 say(name_of(seed), pairs, family.rig.frames)
 
-            present = write_plots(options.out, family, seeds, options.format, options.truth, done)
+            present = write_plots(out, family, seeds, image_format, truth, done)
     except OSError as error:
-        raise RequestError(f"cannot write to {options.out}: {error.strerror or error}") from error
-    print(
-        f"{options.out}: {options.plots} synthetic plots of family {family.name}"
-        + (f", {present} there already" if present else "")
-    )
-    return 0
-
-
-def family_of(options: Synth):
-    """The family that the options ask for.
-
-    Raises:
-        RequestError: They contradict each other, or the file of a family does not make sense.
-    """
-    from jaxrl_vis_envs.plants import FAMILIES, read, shift
-
-    if options.spec is not None and (options.shift or options.family != "training"):
-        raise RequestError("--spec describes the whole family: leave out --family and --shift")
-    try:
-        family = FAMILIES[options.family] if options.spec is None else read(options.spec)
-        if options.shift:
-            family = shift(family, *options.shift)
-        if options.width is not None:
-            family = family.at_width(options.width)
-        if options.frames is not None:
-            family = dataclasses.replace(family, rig=dataclasses.replace(family.rig, frames=options.frames))
-    except ValueError as error:
-        raise RequestError(str(error)) from error
-    return family
-
-
-def check_extra() -> None:
-    """Checks that what phenotyping needs beyond the base installation is there.
-
-    Raises:
-        RequestError: It is not.
-    """
-    missing = [package for module, package in _NEEDED.items() if importlib.util.find_spec(module) is None]
-    if missing:
-        raise RequestError(f"phenotype needs {', '.join(missing)}: pip install 'jaxrl-vis[phenotyping]'")
+        raise RequestError(f"cannot write to {out}: {error.strerror or error}") from error
+    there = f", {present} there already" if present else ""
+    print(f"{out}: {len(seeds)} synthetic {word} of family {family.name}{there}")

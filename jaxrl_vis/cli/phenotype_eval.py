@@ -6,8 +6,8 @@ import math
 from pathlib import Path
 from typing import Any, Literal
 
-from jaxrl_vis.cli.checks import check_counts
-from jaxrl_vis.cli.phenotype import Synth, check_extra, family_of
+from jaxrl_vis.cli.checks import check_counts, check_extra
+from jaxrl_vis.cli.families import family_of
 from jaxrl_vis.cli.phenotype_run import networks
 from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError
@@ -53,14 +53,12 @@ def evaluate(options: Eval) -> int:
     check_counts(plots=options.plots, frames=options.frames, width=options.width)
     if options.seed < 0:
         raise RequestError(f"--seed must be at least 0, not {options.seed}")
-    check_extra()
+    check_extra("phenotype", "phenotyping")
     if options.json is not None:
         check_writable(options.json, "--json")
     if options.each_factor and (options.family or options.shift or options.spec or options.json):
         raise RequestError("--each-factor goes through the families by itself: leave out --family, --shift, --spec and --json")
-    drawn_from = options.family or ("shifted" if options.spec is None else "training")
-    drawn = Synth(Path(), drawn_from, options.shift, options.spec, frames=options.frames, width=options.width)
-    family = family_of(drawn)
+    family = family_of(options, "phenotyping", "shifted")
     check_devices()
     find, name = (None, "truth") if options.masks == "truth" else networks(options.weights, 0.05)
     if options.each_factor:
@@ -79,11 +77,11 @@ def _factor_table(options: Eval, find: Any, name: str) -> int:
     """Prints a line of Markdown for each factor that is shifted alone."""
     from jaxrl_vis_envs.plants import SHIFTS
 
-    cases = [("none", Synth(Path())), *((factor, Synth(Path(), shift=(factor,))) for factor in SHIFTS)]
-    cases.append(("all", Synth(Path(), "shifted")))
+    alone = [(factor, dataclasses.replace(options, family="training", shift=(factor,))) for factor in SHIFTS]
+    none, all_of_them = (dataclasses.replace(options, family=name) for name in ("training", "shifted"))
     lines = []
-    for factor, drawn in cases:
-        family = family_of(dataclasses.replace(drawn, frames=options.frames, width=options.width))
+    for factor, drawn in [("none", none), *alone, ("all", all_of_them)]:
+        family = family_of(drawn, "phenotyping")
         figures = _score(options, family, find, name)
         lines.append(f"| {factor} | " + " | ".join(f"{figures[column]:.3f}" for column in _COLUMNS) + " |")
     print(f"\nsynthetic plots, {options.plots} each, {name}, {options.method}\n")

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from jaxrl_vis.cli.phenotype import check_extra
+from jaxrl_vis.cli.checks import check_extra
 from jaxrl_vis.cli.phenotype_eval import Eval, evaluate
 from jaxrl_vis.devices import check_devices
 
@@ -19,7 +19,7 @@ def make_figure(name: str, out: Path, evaluation: Path | None, plots: int | None
         plots: How many; 10 if not given.
         quick: Three small plots.
     """
-    check_extra()
+    check_extra("figures of chapter 3", "phenotyping")
     check_devices()
     import jax
 

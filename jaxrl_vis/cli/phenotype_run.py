@@ -4,10 +4,10 @@ import dataclasses
 import hashlib
 import sys
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Protocol
 
+from jaxrl_vis.cli.checks import check_extra
 from jaxrl_vis.cli.parsing import ByPlaceToo
-from jaxrl_vis.cli.phenotype import check_extra
 from jaxrl_vis.cli.progress import progress
 from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError, StorageError
@@ -54,14 +54,14 @@ def run(options: Run) -> int:
         raise RequestError(f"--speed must be more than 0, not {options.speed:g}")
     if not options.disparity_scale > 0:
         raise RequestError(f"--disparity-scale must be more than 0, not {options.disparity_scale:g}")
-    check_extra()
+    check_extra("phenotype", "phenotyping")
     check_writable(options.out, "--out", folder=True)
     from jaxrl_vis.phenotyping.folders import SAMPLE, find_plots
 
     plots = find_plots(options.folder or SAMPLE)
     if options.folder is None:
         print("no folder given: this is the short synthetic row that comes with jaxrl-vis")
-    calibrations = {plot.name: _calibration(plot.folder, options) for plot in plots}
+    calibrations = {plot.name: calibration_of(plot.folder, options) for plot in plots}
     check_devices()
     from jaxrl_vis.phenotyping.pipeline import Request, run
     from jaxrl_vis.phenotyping.results import NO_GROUND
@@ -119,8 +119,22 @@ def networks(weights: Path | None, least_score: float):
     return finder, f"networks {digest}, least score {least_score:g}"
 
 
-def _calibration(folder: Path, options: Run):
-    """Calibration of one plot; None where there is none."""
+class CalibrationOptions(Protocol):
+    """The options of a command that say what is known of the cameras."""
+
+    @property
+    def calibration(self) -> Path | None:
+        """File or folder."""
+        ...
+
+    @property
+    def calibration_unit(self) -> Literal["m", "mm"] | None:
+        """Of the baseline."""
+        ...
+
+
+def calibration_of(folder: Path, options: CalibrationOptions):
+    """Calibration of one folder of pairs; None where there is none."""
     from jaxrl_vis.phenotyping.calibration import read_calibration
 
     if options.calibration is not None:

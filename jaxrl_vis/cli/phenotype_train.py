@@ -9,9 +9,8 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Annotated
 
-from jaxrl_vis.cli.checks import check_counts
+from jaxrl_vis.cli.checks import check_counts, check_extra
 from jaxrl_vis.cli.parsing import ByPlaceToo
-from jaxrl_vis.cli.phenotype import check_extra
 from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.report.outputs import check_writable
@@ -67,7 +66,7 @@ def train(options: Train) -> int:
         raise RequestError(f"--minutes must be more than 0, not {options.minutes:g}")
     if options.out.suffix != ".npz":
         raise RequestError(f"the weights go into a file that ends in .npz, not {options.out}")
-    check_extra()
+    check_extra("phenotype", "phenotyping")
     check_writable(options.out, "OUT")
     check_devices()
     with contextlib.ExitStack() as stack:
@@ -94,10 +93,7 @@ def _train(options: Train, stack: contextlib.ExitStack) -> int:
         except ValueError as error:
             raise RequestError(str(error)) from error
         first = _FIRST_SEED * (1 + options.seed)
-        # Laying out a plot takes Python half a second, in which nothing else of this process would go on.
-        spawning = multiprocessing.get_context("spawn")
-        helpers = stack.enter_context(ProcessPoolExecutor(max(options.threads // 2, 1), mp_context=spawning))
-        stack.callback(helpers.shutdown, wait=False, cancel_futures=True)
+        helpers = helper_processes(stack, options.threads)
         sources = [
             synthetic_examples(family, settings, itertools.count(first + thread, options.threads), helpers=helpers)
             for thread in range(options.threads)
@@ -128,3 +124,16 @@ def _train(options: Train, stack: contextlib.ExitStack) -> int:
     write_weights(options.out, params, settings, {**about, "steps": steps})
     print(f"{options.out}: {steps} updates on {origin}, {options.out.stat().st_size / 1e6:.1f} MB")
     return 0
+
+
+def helper_processes(stack: contextlib.ExitStack, threads: int) -> ProcessPoolExecutor:
+    """Processes in which plots are laid out: that takes Python half a second, in which nothing else of this one would go on.
+
+    Args:
+        stack: Ends them.
+        threads: How many threads draw what is laid out.
+    """
+    spawning = multiprocessing.get_context("spawn")
+    helpers = stack.enter_context(ProcessPoolExecutor(max(threads // 2, 1), mp_context=spawning))
+    stack.callback(helpers.shutdown, wait=False, cancel_futures=True)
+    return helpers

@@ -15,7 +15,7 @@ import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -25,11 +25,12 @@ from jaxrl_vis.files import write_atomically
 from jaxrl_vis.phenotyping.detector.finder import Detection
 from jaxrl_vis.phenotyping.folders import PairFiles, PlotFolder, read_odometry
 from jaxrl_vis.phenotyping.ground import find_ground
-from jaxrl_vis.phenotyping.images import read_disparity, read_image, rgb8, write_image
+from jaxrl_vis.phenotyping.images import write_image
 from jaxrl_vis.phenotyping.measure import Method
 from jaxrl_vis.phenotyping.overlay import draw_overlay
 from jaxrl_vis.phenotyping.pairing import wrong_with
 from jaxrl_vis.phenotyping.qc import Page, PlotResult
+from jaxrl_vis.phenotyping.reading import Unusable, known_disparity, read_pair, read_side
 from jaxrl_vis.phenotyping.results import (
     PLOT_COLUMNS,
     STALK_COLUMNS,
@@ -68,10 +69,6 @@ class Request:
     calibrations: dict[str, Calibration | None]
     speed: float | None = None
     disparity_scale: float = 256.0
-
-
-class _Skip(Exception):
-    """A pair that cannot be used. The message says why."""
 
 
 def run(
@@ -163,9 +160,10 @@ def _claim(plots: list[PlotFolder], request: Request) -> None:
 def _record(plot: PlotFolder, pair: PairFiles, find: Find, request: Request) -> dict[str, Any]:
     """What is kept of one pair."""
     try:
-        left, right, disparity = _read(pair, request.calibrations[plot.name], request.disparity_scale)
+        left, right = read_pair(pair, request.calibrations[plot.name], pair.disparity is None)
+        disparity = known_disparity(pair, left, request.disparity_scale)
         detections = find(left, plot, pair)
-    except _Skip as problem:
+    except Unusable as problem:
         return {"skipped": str(problem)}
     calibration = request.calibrations[plot.name]
     ground = None if calibration is None else find_ground(grey_of(left), grey_of(right), calibration, disparity)
@@ -181,52 +179,6 @@ def _record(plot: PlotFolder, pair: PairFiles, find: Find, request: Request) -> 
         "camera_height_m": height,
         "sightings": [dataclasses.asdict(each) for each in sightings],
     }
-
-
-def _read(
-    pair: PairFiles, calibration: Calibration | None, disparity_scale: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Both images [H, W, 3] uint8, and disparities [H, W] float32 in pixels if there is a file of them.
-
-    Raises:
-        _Skip: They are not a pair of images that can be used.
-    """
-    left = _image(pair, "left")
-    disparity = None
-    if pair.disparity is not None:
-        try:
-            disparity = read_disparity(pair.disparity, disparity_scale)
-        except OSError as error:
-            raise _Skip(str(error).removeprefix(f"{pair.disparity.parent}/")) from error
-        if disparity.shape != left.shape[:2]:
-            sizes = [f"{image.shape[1]} x {image.shape[0]}" for image in (left, disparity)]
-            raise _Skip(f"the left image has {sizes[0]} pixels and its disparities {sizes[1]}")
-    # Who has disparities needs no right image.
-    right = left if disparity is not None and pair.right is None else _image(pair, "right")
-    if left.shape != right.shape:
-        sizes = [f"{image.shape[1]} x {image.shape[0]}" for image in (left, right)]
-        raise _Skip(f"the left image has {sizes[0]} pixels and the right one {sizes[1]}")
-    if calibration is not None and left.shape[:2] != (calibration.height, calibration.width):
-        wanted = f"{calibration.width} x {calibration.height}"
-        raise _Skip(f"the images have {left.shape[1]} x {left.shape[0]} pixels, but the calibration is for {wanted}")
-    if min(int(left.max()), int(right.max())) < 8:
-        raise _Skip(f"the {'left' if left.max() < 8 else 'right'} image is black")
-    return left, right, disparity
-
-
-def _image(pair: PairFiles, side: Literal["left", "right"]) -> np.ndarray:
-    """One image of a pair, [H, W, 3] uint8.
-
-    Raises:
-        _Skip: It cannot be used.
-    """
-    path = pair.left if side == "left" else pair.right
-    if path is None:
-        raise _Skip(f"there is no {side} image")
-    try:
-        return rgb8(read_image(path))
-    except OSError as error:
-        raise _Skip(f"{path.name}: {error.strerror or 'it is not an image, or only a part of one'}") from error
 
 
 def _finish(plot: PlotFolder, records: list[dict[str, Any]], driven: dict[str, float] | None, request: Request) -> PlotResult:
@@ -253,7 +205,7 @@ def _finish(plot: PlotFolder, records: list[dict[str, Any]], driven: dict[str, f
     for (pair, _), frame, names in zip(usable, frames, labels):
         target = folder / f"{pair.name}.png"
         if not target.exists():
-            left = _image(pair, "left")
+            left = read_side(pair, "left")
             write_image(target, draw_overlay(left, frame, names, f"{plot.name} {pair.name}"))
     width = usable[0][1]["size"][1] if usable else 0
     return PlotResult(row, stalks, [pair.name for pair, _ in usable], frames, tracks, start, width)

@@ -159,7 +159,13 @@ def _summary(sequence: Sequence, seen: list[dict[str, Any]]) -> dict[str, Any]:
                 "bare_diameter_mm": round(1e3 * stalk.diameter(height, bare=True), 4),
                 "node_distance_mm": round(1e3 * stalk.node_distance(height), 2),
             }
-        stalks.append({"stalk": index, "x": float(stalk.points[0, 0]), "y": float(stalk.points[0, 1]), **by_height})
+        foot = {"stalk": index, "x": float(stalk.points[0, 0]), "y": float(stalk.points[0, 1])}
+        # Height after height, 5 cm apart: x and y of its middle, and its diameter.
+        line = [
+            [*np.round(stalk.at_height(height)[0], 5).tolist(), round(1e3 * stalk.diameter(height), 3)]
+            for height in np.arange(0.0, stalk.points[:, 2].max(), 0.05)
+        ]
+        stalks.append({**foot, "middle_line_x_y_z_diameter_mm": line, **by_height})
     return {
         "schema": SCHEMA,
         "synthetic": True,

@@ -90,7 +90,7 @@ class Drive:
 
 
 def drive(family: Family, seed: int) -> Drive:
-    """How the cameras of a family pass its plot of this seed; they see its ends from half a step inside."""
+    """How the cameras of a family pass its plot of this seed; they see the ends of the drive from half a step inside."""
     rig = family.rig
     rng = generator(family, seed, "drive")
     focal, baseline = (
@@ -101,13 +101,14 @@ def drive(family: Family, seed: int) -> Drive:
     errors = 1.0 + rig.calibration_error * rng.choice([-1.0, 1.0], 2)
     stated = dataclasses.replace(true, focal=focal * errors[0], baseline=baseline * errors[1])
 
-    step = family.layout.plot_length / rig.frames
-    along = step * (np.arange(rig.frames) + 0.5)
+    length = rig.stretch or family.layout.plot_length
+    begin = 0.5 * (family.layout.plot_length - length)
+    along = begin + length / rig.frames * (np.arange(rig.frames) + 0.5)
     height = rig.camera_height + rig.camera_height_sd * rng.normal() + rig.wobble * rng.normal(size=rig.frames)
     away = rig.distance + rig.distance_sd * rng.normal() + rig.wobble * rng.normal(size=rig.frames)
-    pitch = math.radians(rig.pitch_sd) * (rng.normal() + 0.2 * rng.normal(size=rig.frames))
+    pitch = math.radians(rig.pitch) + math.radians(rig.pitch_sd) * (rng.normal() + 0.2 * rng.normal(size=rig.frames))
     positions = np.stack([along - baseline / 2.0, -away, height], axis=1)
-    poses = tuple(Pose(position, _looking_along_y(angle)) for position, angle in zip(positions, pitch))
+    poses = tuple(Pose(position, looking_along_y(angle)) for position, angle in zip(positions, pitch))
 
     scale = 1.0 + rng.choice([-1.0, 1.0]) * rng.uniform(*rig.odometry_noise)
     reported = (along - along[0]) * scale + 0.0005 * rng.normal(size=rig.frames) * (np.arange(rig.frames) > 0)
@@ -116,10 +117,10 @@ def drive(family: Family, seed: int) -> Drive:
         rig.rectification_error * pixels * rng.normal(),
         0.5 * rig.rectification_error * pixels * rng.normal() / rig.width,
     )
-    return Drive(true, stated, poses, along / rig.speed, reported, offset, slope)
+    return Drive(true, stated, poses, (along - begin) / rig.speed, reported, offset, slope)
 
 
-def _looking_along_y(pitch: float) -> np.ndarray:
+def looking_along_y(pitch: float) -> np.ndarray:
     """Rotation [3, 3] of a camera that looks along the world's y axis, and down by ``pitch`` (rad)."""
     sine, cosine = math.sin(pitch), math.cos(pitch)
     return np.array([[1.0, 0.0, 0.0], [0.0, -sine, -cosine], [0.0, cosine, -sine]])

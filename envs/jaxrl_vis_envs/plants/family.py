@@ -178,10 +178,14 @@ class Rig:
     """Its standard deviation over plots, m."""
     wobble: float = 0.004
     """Standard deviation of height and distance from image to image, m."""
+    pitch: float = 0.0
+    """By how much the cameras look down, degrees."""
     pitch_sd: float = 0.7
     """Standard deviation of the pitch over plots, degrees."""
     frames: int = 34
     """Pairs of a plot."""
+    stretch: float = 0.0
+    """Length of the drive, in the middle of the plot, m; 0 for all of the plot."""
     speed: float = 0.05
     """Speed of the robot, m/s."""
     odometry_noise: Range = (0.01, 0.03)
@@ -267,8 +271,10 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "rig.calibration_error": (0, 0.2),
     "rig.distance": (0.3, 5.0),
     "rig.camera_height": (0.05, 3.0),
+    "rig.pitch": (0, 60),
     "rig.pitch_sd": (0, 20),
     "rig.frames": (1, 10000),
+    "rig.stretch": (0, 50),
     "rig.speed": (1e-3, 10.0),
     "rig.odometry_noise": (0, 0.5),
     "imaging.flash": (0.01, 100.0),

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import tomllib
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,12 @@ from jaxrl_vis_envs.plants.family import TRAINING, Family, is_number
 from jaxrl_vis_envs.plants.shifts import FAMILIES
 
 
-def read(path: Path) -> Family:
+def read(path: Path, families: Mapping[str, Family] = FAMILIES) -> Family:
     """A family from a file: the fields of `Family`, parts as tables; what is missing is as in the family called ``base``.
 
     Args:
         path: JSON or, by its suffix, TOML.
+        families: What ``base`` may name; ``training`` if it is not there.
 
     Raises:
         ValueError: The file cannot be read, or holds an unknown key or a bad value. One line that says which.
@@ -32,11 +34,11 @@ def read(path: Path) -> Family:
     if not isinstance(values, dict):
         raise ValueError(f'{path} must hold one table of a family\'s fields, like {{"stalks": {{"lean_most": 15}}}}')
     base = values.pop("base", TRAINING.name)
-    if not isinstance(base, str) or base not in FAMILIES:
-        raise ValueError(f"{path}: base must be one of {', '.join(FAMILIES)}, got {base!r}")
+    if not isinstance(base, str) or base not in families:
+        raise ValueError(f"{path}: base must be one of {', '.join(families)}, got {base!r}")
     # Its own random numbers, so that a file that repeats a family's values still draws other plots.
     name = values.get("name", path.stem)
-    start = dataclasses.replace(FAMILIES[base], name=name, stream=10_000 + zlib.crc32(str(name).encode()))
+    start = dataclasses.replace(families[base], name=name, stream=10_000 + zlib.crc32(str(name).encode()))
     try:
         return _changed("", start, values)
     except ValueError as error:

@@ -111,6 +111,11 @@ def segmenter_loss(params: Any, snips: jax.Array, masks: jax.Array, settings: Se
     """
     logits = Segmenter(settings.segmenter, dtype).apply(params, smoothed(snips))
     assert isinstance(logits, jax.Array)
+    return mask_loss(logits, masks)
+
+
+def mask_loss(logits: jax.Array, masks: jax.Array) -> jax.Array:
+    """Cross entropy of logits [N, h, w], and 0.3 times their Dice loss, against masks [N, h, w] bool: []."""
     wanted = masks.astype(jnp.float32)
     entropy = optax.sigmoid_binary_cross_entropy(logits, wanted).mean()
     chances = jax.nn.sigmoid(logits)

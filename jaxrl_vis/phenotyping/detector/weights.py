@@ -1,24 +1,18 @@
-"""Weights in a file of plain arrays: NumPy's npz, read without pickle, with the settings and their origin beside them."""
+"""Weights of the networks that find stalks, with their settings and their origin."""
 
 import dataclasses
-import json
-import os
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
-import numpy as np
-
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.parameters import read_parameters, write_parameters
 from jaxrl_vis.phenotyping.detector.detect import Settings
 
 SHIPPED = Path(__file__).with_name("stalks.npz")
 """Weights that come with the package, trained on synthetic stalks."""
 SCHEMA = 1
-_ABOUT = "about"
+_COMMAND = "jaxrl-vis phenotype train"
 
 
 def write_weights(
@@ -36,19 +30,7 @@ def write_weights(
     Raises:
         OSError: The file cannot be written.
     """
-    leaves = jax.tree_util.tree_flatten_with_path(params)[0]
-    arrays = {"/".join(str(part.key) for part in names): np.asarray(leaf) for names, leaf in leaves}
-    if half:
-        arrays = {name: array.astype(np.float16) for name, array in arrays.items()}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    text = json.dumps({"schema": SCHEMA, "settings": dataclasses.asdict(settings), **about})
-    whole: dict[str, Any] = {_ABOUT: np.frombuffer(text.encode(), np.uint8), **arrays}
-    temporary = path.with_name(path.name + ".tmp")
-    with temporary.open("wb") as file:
-        np.savez_compressed(file, **whole)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
+    write_parameters(path, params, {"schema": SCHEMA, "settings": dataclasses.asdict(settings), **about}, half)
 
 
 def read_weights(path: Path) -> tuple[dict[str, Any], Settings, dict[str, Any]]:
@@ -57,27 +39,14 @@ def read_weights(path: Path) -> tuple[dict[str, Any], Settings, dict[str, Any]]:
     Raises:
         RequestError: There is no such file, or it holds no weights.
     """
+    params, about = read_parameters(path, _COMMAND)
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        about = json.loads(arrays.pop(_ABOUT).tobytes().decode())
         known = {field.name for field in dataclasses.fields(Settings)}
         values: dict[str, Any] = {
             name: tuple(each) if isinstance(each, list) else each for name, each in about.pop("settings").items()
         }
         if about.pop("schema") != SCHEMA or not values.keys() <= known:
-            raise RequestError(f"{path} holds weights of another version: train them again with `jaxrl-vis phenotype train`")
-    except RequestError:
-        raise
-    except OSError as error:
-        raise RequestError(f"cannot read the weights {path}: {error.strerror or error}") from error
-    except (ValueError, KeyError, EOFError, zipfile.BadZipFile, AttributeError) as error:
-        raise RequestError(f"{path} holds no weights: name a file that `jaxrl-vis phenotype train` wrote") from error
-    params: dict[str, Any] = {}
-    for name, array in arrays.items():
-        place = params
-        *folders, last = name.split("/")
-        for folder in folders:
-            place = place.setdefault(folder, {})
-        place[last] = jnp.asarray(array, jnp.float32)
-    return params, Settings(**values), about
+            raise RequestError(f"{path} holds weights of another version: train them again with `{_COMMAND}`")
+        return params, Settings(**values), about
+    except (KeyError, AttributeError) as error:
+        raise RequestError(f"{path} holds no weights: name a file that `{_COMMAND}` wrote") from error

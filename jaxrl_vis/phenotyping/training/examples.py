@@ -66,7 +66,7 @@ def synthetic_examples(
         frames: How many images of each plot, spread over it.
         helpers: Processes in which plots are laid out, so that this one has time for the networks; this one if not given.
     """
-    for sequence in _sequences(family, iter(seeds), helpers):
+    for sequence in sequences(family, iter(seeds), helpers):
         rng = np.random.default_rng([sequence.plot.seed, 17])
         length = len(sequence)
         chosen = sorted({min(int((part + rng.random()) * length / frames), length - 1) for part in range(frames)})
@@ -79,8 +79,14 @@ def synthetic_examples(
             yield _example(image, stalks, kinds, functools.partial(_instance_masks, instance, indices), settings, rng)
 
 
-def _sequences(family: Family, seeds: Iterator[int], helpers: Executor | None) -> Iterator[Sequence]:
-    """What the plots of seeds show; with helpers, the next one is laid out while one is looked at."""
+def sequences(family: Family, seeds: Iterator[int], helpers: Executor | None) -> Iterator[Sequence]:
+    """What the plots of seeds show; with helpers, the next one is laid out while one is looked at.
+
+    Args:
+        family: What plots are drawn from.
+        seeds: One plot each.
+        helpers: Processes in which plots are laid out; this one if not given.
+    """
     if helpers is None:
         yield from (_sequence(family, seed) for seed in seeds)
         return

@@ -5,8 +5,6 @@ Examples are made by threads while the networks already learn from those that ar
 
 import dataclasses
 import functools
-import queue
-import threading
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -22,6 +20,7 @@ from jaxrl_vis.phenotyping.detector.losses import detector_loss, segmenter_loss
 from jaxrl_vis.phenotyping.detector.networks import Segmenter
 from jaxrl_vis.phenotyping.training.augment import move, relight, vary_snips
 from jaxrl_vis.phenotyping.training.examples import Example
+from jaxrl_vis.phenotyping.training.pool import Pool
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,70 +56,18 @@ Report = Callable[[int, float, int, dict[str, float], Any], None]
 """Called now and then with the step, progress from 0 to 1, how many images there are, losses, and the weights so far."""
 
 
-class _Pool:
-    """Examples, made by threads in the background and drawn from at random."""
+class _Pool(Pool[Example]):
+    """Examples of images and of snips, drawn from at random."""
 
     def __init__(self, sources: list[Iterator[Example]], plan: Plan) -> None:
-        self._queue: queue.Queue[Example | Exception | None] = queue.Queue(maxsize=16)
-        self._stop = threading.Event()
-        self._plan, self._running = plan, len(sources)
-        self.examples: list[Example] = []
+        self._plan = plan
         self.snips: list[tuple[int, int]] = []
-        # The others follow when the first one has made something, and with it compiled what makes it.
-        self._waiting = sources[1:]
-        self._threads: list[threading.Thread] = []
-        self._start(sources[0])
+        super().__init__(sources, plan.images)
 
-    def _start(self, source: Iterator[Example]) -> None:
-        self._threads.append(threading.Thread(target=self._make, args=(source,), daemon=True))
-        self._threads[-1].start()
-
-    def _make(self, source: Iterator[Example]) -> None:
-        try:
-            for example in source:
-                self._hand_over(example)
-                if self._stop.is_set():
-                    return
-            self._hand_over(None)
-        except Exception as error:  # told where the examples are wanted
-            self._hand_over(error)
-
-    def _hand_over(self, made: Example | Exception | None) -> None:
-        while not self._stop.is_set():
-            try:
-                self._queue.put(made, timeout=0.2)
-                return
-            except queue.Full:
-                continue
-
-    def fill(self, least: int) -> None:
-        """Takes what is ready, and waits until there are so many, or no more come."""
-        while self._running and len(self.examples) < self._plan.images:
-            try:
-                example = self._queue.get(block=len(self.examples) < least)
-            except queue.Empty:
-                return
-            if isinstance(example, Exception):
-                raise example
-            while self._waiting:
-                self._start(self._waiting.pop())
-            if example is None:
-                self._running -= 1
-                continue
-            self.snips += [(len(self.examples), place) for place in range(len(example.snips))]
-            self.examples.append(example)
-        if len(self.examples) >= self._plan.images:
-            self.stop()
-
-    def stop(self) -> None:
-        """Tells the threads to make no more."""
-        self._stop.set()
-
-    def close(self) -> None:
-        """Ends the threads: one that still computes when the program ends would make it crash."""
-        self.stop()
-        for thread in self._threads:
-            thread.join()
+    def add(self, example: Example) -> None:
+        """Keeps an example and its snips."""
+        self.snips += [(len(self.examples), place) for place in range(len(example.snips))]
+        super().add(example)
 
     def images(self, rng: np.random.Generator, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """A batch of images, padded to ``shape``, with their stalks and kinds."""

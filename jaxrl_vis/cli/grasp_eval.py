@@ -1,0 +1,90 @@
+"""``jaxrl-vis grasp eval``."""
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+from typing import Literal
+
+from jaxrl_vis.cli.checks import check_counts, check_extra
+from jaxrl_vis.cli.families import family_of
+from jaxrl_vis.cli.grasp import painter_of
+from jaxrl_vis.devices import check_devices
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.report.outputs import check_writable
+
+
+@dataclasses.dataclass(frozen=True)
+class Eval:
+    """Compare masks, stitches and grasp points with the exact truth of synthetic runs, which are drawn for it."""
+
+    weights: Path | None = None
+    """Weights from `grasp train`; those that are shipped if not given."""
+    masks: Literal["gan", "segmentation", "truth"] = "segmentation"
+    """What finds the pixels of stalks: one of the networks that are shipped, or the truth, to see what the rest makes of it."""
+    thesis: bool = False
+    """Stitch and find grasp points as the thesis describes it."""
+    family: Literal["training", "shifted"] | None = None
+    """What rows are drawn from; training, if no --spec says otherwise."""
+    shift: tuple[str, ...] = ()
+    """Shift only these factors of the family: flash, lean, rig, noise, leaves, textures."""
+    spec: Path | None = None
+    """A JSON or TOML file with the values of a family of your own."""
+    runs: int = 10
+    """How many runs."""
+    seed: int = 0
+    """Seed of the first run; the others have the numbers that follow."""
+    frames: int | None = None
+    """Pairs of a run, in place of the family's 5."""
+    width: int | None = None
+    """Width of an image in pixels, in place of the family's 1024."""
+    json: Path | None = None
+    """A file for the figures of all runs together and of each; written after each run."""
+
+
+def evaluate(options: Eval) -> int:
+    """Prints the figures."""
+    check_counts(runs=options.runs, frames=options.frames, width=options.width)
+    if options.seed < 0:
+        raise RequestError(f"--seed must be at least 0, not {options.seed}")
+    if options.masks == "truth" and options.weights is not None:
+        raise RequestError("--masks truth uses no weights: leave out --weights")
+    check_extra("grasp", "grasping")
+    if options.json is not None:
+        check_writable(options.json, "--json")
+    family = family_of(options, "grasping")
+    check_devices()
+    from jaxrl_vis.files import write_atomically
+    from jaxrl_vis.grasping.evaluate import draw_scene, score_scene, summary
+
+    painter, name = (None, "truth") if options.masks == "truth" else painter_of(options.weights, options.masks)
+    mask = None if painter is None else lambda image, number: painter(image)
+    method = "thesis" if options.thesis else "default"
+    scores = []
+    for seed in range(options.seed, options.seed + options.runs):
+        score, _ = score_scene(draw_scene(family, seed), mask, options.thesis)
+        scores.append(score)
+        one = summary([score])
+        print(
+            f"run {seed}: {len(score.errors)} of {score.true} stalks, {score.found - len(score.errors)} false, "
+            f"grasp points {one['point_median_mm']:.1f} mm, stitches {one['stitch_median_mm']:.1f} mm"
+            + "".join(f"; {note}" for note in score.notes),
+            flush=True,
+        )
+        if options.json is not None:
+            about = {"synthetic": True, "family": family.name, "masks": name, "method": method}
+            each_run = [
+                {"seed": each.seed, "stalks": each.true, "grasp_points": each.found, "hits": len(each.errors)}
+                for each in scores
+            ]
+            text = json.dumps({**about, **_finite(summary(scores)), "each": each_run}, indent=2)
+            write_atomically(options.json, text + "\n")
+    print(f"simulated runs of family {family.name}, masks: {name}, {method}:")
+    for each, value in summary(scores).items():
+        print(f"  {each:20} {value if isinstance(value, int) else f'{value:.4f}'}")
+    return 0
+
+
+def _finite(figures: dict) -> dict:
+    """What JSON can hold: None in place of what is not a number."""
+    return {name: value if math.isfinite(value) else None for name, value in figures.items()}

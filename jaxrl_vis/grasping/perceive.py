@@ -1,0 +1,137 @@
+"""Five pairs to grasp points: match, paint, stitch, find.
+
+pair -> disparity -> organised cloud, red where the mask says so
+     -> stitched to the last pair's frame, where the robot stands when it begins to grasp
+     -> grasp points: a line per stalk, or the thesis's slices
+"""
+
+import dataclasses
+import time
+from collections.abc import Callable, Iterable
+
+import numpy as np
+
+from jaxrl_vis.grasping.chords import chords_of, joined
+from jaxrl_vis.grasping.cloud import Cloud, Mount, match, organised
+from jaxrl_vis.grasping.lines import GraspPoint, grasp_points
+from jaxrl_vis.grasping.sight import Sight
+from jaxrl_vis.grasping.slices import slice_points
+from jaxrl_vis.grasping.stitch import DEFAULT, THESIS, Motion, Stitch, stitch
+from jaxrl_vis_envs.plants import Calibration
+
+Mask = Callable[[np.ndarray, int], np.ndarray]
+"""Which pixels of a left image [H, W, 3] uint8 show a stalk of the near row: [H, W] bool. Also told which pair it is."""
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """One pair that can be used.
+
+    Attributes:
+        number: Which of the run's pairs it is.
+        left, right: [H, W, 3] uint8, rectified.
+        driven: How far the robot had driven, m; None where nothing says so.
+    """
+
+    number: int
+    left: np.ndarray
+    right: np.ndarray
+    driven: float | None
+
+
+@dataclasses.dataclass(frozen=True)
+class Perception:
+    """What is known of a run.
+
+    Attributes:
+        clouds: One for each pair that was used, in its own robot frame.
+        stitches: One for each but the last: to the pair that follows.
+        to_last: One for each cloud: to the robot frame of the last one.
+        points: Where stalks can be grasped, in the robot frame of the last pair, from left to right.
+        seconds: Time spent, by stage.
+        notes: What was not as it should be, one line each.
+    """
+
+    clouds: tuple[Cloud, ...]
+    stitches: tuple[Stitch, ...]
+    to_last: tuple[Motion, ...]
+    points: list[GraspPoint]
+    seconds: dict[str, float]
+    notes: tuple[str, ...]
+
+    def red_points(self) -> np.ndarray:
+        """[N, 3] red points of all pairs, in the robot frame of the last one, m."""
+        return np.concatenate([motion(cloud.red_points()) for motion, cloud in zip(self.to_last, self.clouds)])
+
+
+def perceive(views: Iterable[View], mask: Mask, calibration: Calibration, mount: Mount, thesis: bool = False) -> Perception:
+    """Grasp points of a run.
+
+    Args:
+        views: The pairs in the order in which they were taken; at least one.
+        mask: What finds the pixels of stalks.
+        calibration: Of the pair, as far as it is known.
+        mount: Of the pair.
+        thesis: As the thesis describes it, in place of the default.
+
+    Raises:
+        ValueError: There is no pair.
+    """
+    seconds: dict[str, float] = {name: 0.0 for name in ("match", "mask", "stitch", "points")}
+    clock = _Clock(seconds)
+    clouds: list[Cloud] = []
+    views = list(views)
+    if not views:
+        raise ValueError("there is no pair to perceive anything in")
+    notes = []
+    if not thesis and len(views) > 1 and any(view.driven is None for view in views):
+        views, notes = views[-1:], ["no odometry: only the last pair was used"]
+    for view in views:
+        with clock("match"):
+            disparity = match(view.left, view.right, calibration, mount)
+        with clock("mask"):
+            red = mask(view.left, view.number)
+        with clock("match"):
+            clouds.append(organised(disparity, red, calibration, mount))
+    with clock("stitch"):
+        stitches = []
+        whole = [cloud.all_points() for cloud in clouds]
+        for place in range(len(views) - 1):
+            here, there = views[place].driven, views[place + 1].driven
+            driven = 0.0 if here is None or there is None else there - here
+            stitches.append(stitch(whole[place], whole[place + 1], driven, THESIS if thesis else DEFAULT))
+        notes += [
+            f"pair {views[place].number} does not stitch to the next, odometry was used: {each.refused}"
+            for place, each in enumerate(stitches)
+            if each.refused
+        ]
+    to_last = [Motion.along(0.0)]
+    for each in reversed(stitches):
+        to_last.insert(0, to_last[0].after(each.motion))
+    with clock("points"):
+        if thesis:
+            points = slice_points(np.concatenate([motion(cloud.red_points()) for motion, cloud in zip(to_last, clouds)]))
+        else:
+            parts = [chords_of(cloud, calibration, mount, frame) for frame, cloud in enumerate(clouds)]
+            parts = [dataclasses.replace(part, middle=motion(part.middle)) for motion, part in zip(to_last, parts)]
+            points = grasp_points(joined(parts), Sight(tuple(clouds), tuple(to_last), calibration, mount))
+    if not points:
+        notes.append("no stalk was found")
+    return Perception(tuple(clouds), tuple(stitches), tuple(to_last), points, seconds, tuple(notes))
+
+
+class _Clock:
+    """Adds up the time that is spent under its names."""
+
+    def __init__(self, seconds: dict[str, float]) -> None:
+        self._seconds, self._name, self._start = seconds, "", 0.0
+
+    def __call__(self, name: str) -> "_Clock":
+        self._name = name
+        return self
+
+    def __enter__(self) -> None:
+        self._start = time.perf_counter()
+
+    def __exit__(self, *_: object) -> None:
+        self._seconds[self._name] += time.perf_counter() - self._start
