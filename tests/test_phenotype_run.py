@@ -323,7 +323,7 @@ def evaluation(tmp_path_factory) -> Path:
         }
         for seed in range(3)
     ]
-    path.write_text(json.dumps({"synthetic": True, "family": "shifted", "count_r2": 0.5, "each": plots}))
+    path.write_text(json.dumps({"synthetic": True, "family": "shifted", "device": "a laptop", "count_r2": 0.5, "each": plots}))
     return path
 
 
@@ -337,6 +337,7 @@ def test_figures_of_chapter_3(evaluation, tmp_path, figure):
         # 34 pairs of half a second; both people's minutes are the thesis's, and say so.
         assert rows[2]["here, measured"] == "17.0 s" and rows[2]["person 1, quoted"] == "32.33 min"
         assert "116 times faster" in text and "quoted from Table 3.1" in text
+            assert "synthetic plots of 34 pairs on a laptop" in text
     else:
         assert out.read_bytes()[1:4] == b"PNG"
         assert "thesis" in text

@@ -93,8 +93,10 @@ def _factor_table(options: Eval, find: Any, name: str) -> int:
 
 def _score(options: Eval, family: Any, find: Any, name: str) -> dict[str, Any]:
     """Figures of all plots of a family together; says something of each plot, and writes the file that was asked for."""
+    from jaxrl_vis import __version__
     from jaxrl_vis.files import write_atomically
     from jaxrl_vis.phenotyping.evaluate import score_plot, summary
+    from jaxrl_vis.provenance import device_name
 
     scores = []
     for seed in range(options.seed, options.seed + options.plots):
@@ -119,7 +121,14 @@ def _score(options: Eval, family: Any, find: Any, name: str) -> dict[str, Any]:
                 }
                 for each in scores
             ]
-            about = {"synthetic": True, "family": family.name, "finder": name, "method": options.method}
+            about = {
+                "synthetic": True,
+                "device": device_name(),
+                "version": __version__,
+                "family": family.name,
+                "finder": name,
+                "method": options.method,
+            }
             text = json.dumps({**about, **_finite(figures), "each": each_plot}, indent=2)
             write_atomically(options.json, text + "\n")
     return summary(scores, options.least_score)

@@ -21,8 +21,6 @@ def make_figure(name: str, out: Path, evaluation: Path | None, plots: int | None
     """
     check_extra("figures of chapter 3", "phenotyping")
     check_devices()
-    import jax
-
     from jaxrl_vis.phenotyping import figures
 
     path = evaluation or out.with_suffix(".json")
@@ -35,6 +33,6 @@ def make_figure(name: str, out: Path, evaluation: Path | None, plots: int | None
     elif name == "3.5":
         figures.draw_widths(data, out)
     else:
-        figures.write_times(data, out, jax.devices()[0].device_kind)
+        figures.write_times(data, out)
     print(out)
     return 0

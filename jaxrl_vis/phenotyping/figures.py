@@ -104,13 +104,12 @@ def draw_widths(data: dict[str, Any], out: Path) -> None:
     _write_tables(out, note, rows)
 
 
-def write_times(data: dict[str, Any], out: Path, device: str) -> None:
+def write_times(data: dict[str, Any], out: Path) -> None:
     """Table 3.1: minutes of two people, quoted, beside ours.
 
     Args:
         data: Of `read_evaluation`.
         out: The table, .md; the same as .csv goes beside it.
-        device: On which it was measured.
 
     Raises:
         RequestError: The evaluation holds no times.
@@ -134,7 +133,7 @@ def write_times(data: dict[str, Any], out: Path, device: str) -> None:
     people = 30.0 * (count_1 + width_1 + count_2 + width_2)
     note = (
         f"Time for one plot. People and the thesis's robot: quoted from Table 3.1 of the thesis, 33 stalks in the field. Here: "
-        f"synthetic plots of {pairs:.0f} pairs on {device}, from images in memory, counts and widths in one go: "
+        f"synthetic plots of {pairs:.0f} pairs on {data.get('device', 'a device that is not known')}, from images in memory, counts and widths in one go: "
         f"{people / seconds:.0f} times faster than people."
     )
     _write_tables(out, note, rows)
