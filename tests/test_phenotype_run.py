@@ -337,7 +337,7 @@ def test_figures_of_chapter_3(evaluation, tmp_path, figure):
         # 34 pairs of half a second; both people's minutes are the thesis's, and say so.
         assert rows[2]["here, measured"] == "17.0 s" and rows[2]["person 1, quoted"] == "32.33 min"
         assert "116 times faster" in text and "quoted from Table 3.1" in text
-            assert "synthetic plots of 34 pairs on a laptop" in text
+        assert "synthetic plots of 34 pairs on a laptop" in text
     else:
         assert out.read_bytes()[1:4] == b"PNG"
         assert "thesis" in text

@@ -130,10 +130,11 @@ def write_times(data: dict[str, Any], out: Path) -> None:
         row("total", count_1 + width_1, count_2 + width_2, f"{seconds:.1f} s", f"{THESIS_SECONDS} s"),
     ]
     pairs = float(np.mean([each["pairs"] for each in known]))
+    device = data.get("device", "a device that is not known")
     people = 30.0 * (count_1 + width_1 + count_2 + width_2)
     note = (
         f"Time for one plot. People and the thesis's robot: quoted from Table 3.1 of the thesis, 33 stalks in the field. Here: "
-        f"synthetic plots of {pairs:.0f} pairs on {data.get('device', 'a device that is not known')}, from images in memory, counts and widths in one go: "
+        f"synthetic plots of {pairs:.0f} pairs on {device}, from images in memory, counts and widths in one go: "
         f"{people / seconds:.0f} times faster than people."
     )
     _write_tables(out, note, rows)
