@@ -197,7 +197,7 @@ def test_the_page_holds_its_pictures_and_what_was_rejected(plots, results, tmp_p
     assert page.count('<img class="stalk"') >= len(stalks) and page.count('<img class="pair"') == 8
     assert "http" not in page and " src=" in page and page.count(" src=") == page.count('src="data:image/jpeg;base64,')
     for row in stalks:
-        assert f"<td>{row['width_mm']}</td>" in page
+        assert f"<td>{float(row['width_mm']):.1f}</td>" in page
     plot = tmp_path / "a<b"
     shutil.copytree(plots / "plot_0000", plot)
     (plot / "right_001.png").unlink()

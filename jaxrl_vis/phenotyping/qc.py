@@ -57,6 +57,18 @@ _PLOT_COLUMNS = {
 }
 
 
+_DIGITS = {
+    **dict.fromkeys(("position_m", "depth_m", "length_m", "width_se_mm", "taper_mm_per_in", "taper_mean_mm_per_in"), 2),
+    **dict.fromkeys(("width_mm", "width_24in_mm", "width_mean_mm", "width_sd_mm", "width_24in_mean_mm", "stalks_per_m"), 1),
+    "confidence": 2,
+}
+"""Of numbers in the page; the files have more."""
+_ERRORS = (
+    "± is the scatter between pairs. The error of the calibration, and what hides a stalk from all sides, are not in it. "
+    "Point at a picture to enlarge it."
+)
+
+
 @dataclasses.dataclass(frozen=True)
 class PlotResult:
     """What became of one plot.
@@ -132,7 +144,7 @@ class Page:
         write(f'<details id="{_safe(name)}"><summary>{_safe(name)}: {_safe(_headline(plot.row))}</summary>')
         if plot.stalks:
             write(_chart(plot, rejected))
-            write("<h3>Stalks</h3>" + table({"picture": "", **_STALK_COLUMNS}, tables))
+            write(f"<h3>Stalks</h3><p>{_ERRORS}</p>" + table({"picture": "", **_STALK_COLUMNS}, tables))
         if others:
             write("<h3>Rejected: not counted</h3>" + table({column: column for column in others[0]}, others))
         if finds:
@@ -181,7 +193,7 @@ def _safe(value: Any) -> str:
 
 def _headline(row: dict[str, Any]) -> str:
     parts = [f"{row['stalks']} stalks"] if row["stalks"] != "" else []
-    parts += [f"{row['width_mean_mm']} mm"] if row["width_mean_mm"] != "" else []
+    parts += [f"{float(row['width_mean_mm']):.1f} mm thick at 12 inches"] if row["width_mean_mm"] != "" else []
     return ", ".join([*parts, *([] if row["flag"] == "ok" else [str(row["flag"])])])
 
 
@@ -208,6 +220,8 @@ def table(columns: dict[str, str], rows: Iterable[dict[str, Any]]) -> str:
         cells = []
         for column in columns:
             value = row.get(column, "")
+            if column in _DIGITS and value != "":
+                value = f"{float(value):.{_DIGITS[column]}f}"
             kind = ' class="doubt"' if column == "flag" and value != "ok" else ""
             cells.append(f"<td{kind}>{value if isinstance(value, _Html) else _safe(value)}</td>")
         lines.append(f"<tr>{''.join(cells)}</tr>")
@@ -298,7 +312,9 @@ def _chart(plot: PlotResult, rejected: list[Track]) -> str:
     for value in range(0, int(most) + 1, step):
         marks.append(f'<line class="grid" x1="{margin}" x2="{wide - 8}" y1="{y(value):.1f}" y2="{y(value):.1f}"/>')
         marks.append(f'<text x="{margin - 6}" y="{y(value) + 4:.1f}" text-anchor="end">{value}</text>')
-    for tick in np.arange(math.ceil(low / 0.25) * 0.25, high, 0.25):
+    apart = 0.25 if high - low > 1.0 else 0.1
+    for number in range(math.ceil(low / apart), math.floor(high / apart) + 1):
+        tick = number * apart
         marks.append(f'<text x="{x(tick):.1f}" y="{tall - 12}" text-anchor="middle">{tick:.2f}</text>')
     for track in rejected:
         place = f'x="{x(track.position_m - plot.start):.1f}" y="{tall - 32}"'
