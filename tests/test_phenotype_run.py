@@ -143,6 +143,15 @@ def test_what_few_pairs_show_is_no_stalk_and_ends_are_ends():
     assert "seen in 1 of" in reasons and "beyond the ends" in reasons
 
 
+def test_two_finds_of_one_stalk_are_one_and_neighbours_that_touch_are_two():
+    frames, distances = drive([*STALKS, (0.7145, 0.81)])
+    assert sum(track.counted for track in follow(frames, distances, CAMERAS)[0]) == len(STALKS) + 1
+    for frame in frames:
+        again = [dataclasses.replace(each, along_m=each.along_m + 0.003, score=0.6) for each in frame[:3]]  # pyright: ignore
+        frame += again
+    assert sum(track.counted for track in follow(frames, distances, CAMERAS)[0]) == len(STALKS) + 1
+
+
 def test_a_sighting_without_disparity_still_says_where_its_stalk_is():
     frames, distances = drive(STALKS)
     for frame in frames:
