@@ -27,7 +27,9 @@ UNFINISHED = 3
 class Figure:
     """Draw a figure: train or compute what it shows, and write it to a file, with a table beside it.
 
-    4.4: from a stereo pair to grasp points, of a synthetic run; --seed chooses it. 5.1, 5.2: rewards with and without ground truth. estimators: rewards from state estimators that err. cameras: noisy and
+    4.4: from stereo pairs to grasp points, of the synthetic run that --seed chooses.
+
+    5.1, 5.2: rewards with and without ground truth. estimators: rewards from state estimators that err. cameras: noisy and
     varied images. 5.4: auxiliary losses, and how they are weighted. 5.5: single auxiliary tasks. 5.6: their weights over
     training. 5.7: what OL-AUX-5 owes to looking ahead. These train what is missing, one process a GPU, and resume what was
     begun, so they may be interrupted and started again at any time; the exit status is 3 where something is still missing.
