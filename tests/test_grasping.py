@@ -21,7 +21,7 @@ from jaxrl_vis.grasping.lines import grasp_points
 from jaxrl_vis.grasping.masks.examples import Example
 from jaxrl_vis.grasping.masks.loop import Plan, crops, train
 from jaxrl_vis.grasping.masks.painter import Painter, Settings, read_weights, write_weights
-from jaxrl_vis.grasping.perceive import View, perceive
+from jaxrl_vis.grasping.perceive import ORIGINAL, OURS, View, Ways, perceive
 from jaxrl_vis.grasping.pipeline import Request, run
 from jaxrl_vis.grasping.sight import Sight
 from jaxrl_vis.grasping.slices import slice_at, slice_points
@@ -424,7 +424,7 @@ def test_clouds_that_do_not_stitch_and_an_arm_that_reaches_nothing_are_told(runs
         return np.zeros(image.shape[:2], bool)
 
     request = Request(
-        tmp_path / "out", False, "nothing", {"plot_0000": calibration}, MOUNT, None, lambda points: points[:, 0] > 9
+        tmp_path / "out", OURS, "nothing", {"plot_0000": calibration}, MOUNT, None, lambda points: points[:, 0] > 9
     )
     run(find_plots(folder), find, request)
     (row,) = table(tmp_path / "out" / "runs.csv")
@@ -466,8 +466,16 @@ def test_masks_are_compared_with_the_truth_and_the_figure_is_drawn(spec, tmp_pat
     assert score.mask is not None and 0.3 < score.mask.boundary < 1.5
     assert 0.6 < 2.0 * score.mask.hits / (score.mask.painted + score.mask.true) < 0.97
     assert summary([score])["mask_f1"] < 1.0 and len(perception.clouds) == 3
-    thesis, _ = score_scene(scene, None, thesis=True)
+    thesis, _ = score_scene(scene, None, ORIGINAL)
     assert thesis.mask is None and np.median(thesis.stitches) > np.median(score.stitches)
+    mixed, _ = score_scene(scene, None, Ways(points=True))
+    np.testing.assert_allclose(mixed.stitches, score.stitches, atol=1e-9)
+    assert [str(each) for each in (OURS, ORIGINAL, Ways(True), Ways(False, True))] == [
+        "default",
+        "thesis",
+        "stitches of the thesis",
+        "grasp points of the thesis",
+    ]
     out = tmp_path / "figure.png"
     draw_figure(out, family, 0, None, "truth")
     assert out.stat().st_size > 50_000

@@ -23,7 +23,11 @@ class Eval:
     masks: Literal["gan", "segmentation", "truth"] = "segmentation"
     """What finds the pixels of stalks: one of the networks that are shipped, or the truth, to see what the rest makes of it."""
     thesis: bool = False
-    """Stitch and find grasp points as the thesis describes it."""
+    """Stitch and find grasp points as the thesis describes it: --stitch thesis --points thesis."""
+    stitch: Literal["default", "thesis"] = "default"
+    """How clouds are stitched."""
+    points: Literal["default", "thesis"] = "default"
+    """How grasp points are found."""
     family: Literal["training", "shifted"] | None = None
     """What rows are drawn from; training, if no --spec says otherwise."""
     shift: tuple[str, ...] = ()
@@ -56,13 +60,14 @@ def evaluate(options: Eval) -> int:
     check_devices()
     from jaxrl_vis.files import write_atomically
     from jaxrl_vis.grasping.evaluate import draw_scene, score_scene, summary
+    from jaxrl_vis.grasping.perceive import Ways
 
     painter, name = (None, "truth") if options.masks == "truth" else painter_of(options.weights, options.masks)
     mask = None if painter is None else lambda image, number: painter(image)
-    method = "thesis" if options.thesis else "default"
+    ways = Ways(*(options.thesis or each == "thesis" for each in (options.stitch, options.points)))
     scores = []
     for seed in range(options.seed, options.seed + options.runs):
-        score, _ = score_scene(draw_scene(family, seed), mask, options.thesis)
+        score, _ = score_scene(draw_scene(family, seed), mask, ways)
         scores.append(score)
         one = summary([score])
         print(
@@ -72,14 +77,14 @@ def evaluate(options: Eval) -> int:
             flush=True,
         )
         if options.json is not None:
-            about = {"synthetic": True, "family": family.name, "masks": name, "method": method}
+            about = {"synthetic": True, "family": family.name, "masks": name, "method": str(ways)}
             each_run = [
                 {"seed": each.seed, "stalks": each.true, "grasp_points": each.found, "hits": len(each.errors)}
                 for each in scores
             ]
             text = json.dumps({**about, **_finite(summary(scores)), "each": each_run}, indent=2)
             write_atomically(options.json, text + "\n")
-    print(f"simulated runs of family {family.name}, masks: {name}, {method}:")
+    print(f"simulated runs of family {family.name}, masks: {name}, {ways}:")
     for each, value in summary(scores).items():
         print(f"  {each:20} {value if isinstance(value, int) else f'{value:.4f}'}")
     return 0

@@ -62,6 +62,7 @@ def run(options: Run) -> int:
             raise RequestError(f"{name} has no calibration, without which there are no metres: name one with --calibration")
     check_devices()
     from jaxrl_vis.grasping.cloud import Mount
+    from jaxrl_vis.grasping.perceive import ORIGINAL, OURS
     from jaxrl_vis.grasping.pipeline import Request, run
 
     if options.masks == "truth":
@@ -73,7 +74,9 @@ def run(options: Run) -> int:
             return painter(image)
 
     known = {name: each for name, each in calibrations.items() if each is not None}
-    request = Request(options.out, options.thesis, name, known, Mount(options.height, options.pitch), options.speed)
+    request = Request(
+        options.out, ORIGINAL if options.thesis else OURS, name, known, Mount(options.height, options.pitch), options.speed
+    )
 
     def say(row) -> None:
         print(f"{row['run']}: {row['grasp_points']} grasp points in {row['pairs']} pairs: {row['flag']}", flush=True)
