@@ -19,6 +19,7 @@ import numpy as np
 
 from benchmarks import environments
 from jaxrl_vis_envs.compilation import env_jit
+from jaxrl_vis_envs.tasks import stalk_arm
 
 LEAST_SUCCESS = 0.95
 Policy = Callable[[Any, Any, Any], tuple[jax.Array, Any]]
@@ -39,6 +40,24 @@ def sawyer_reach(env: Any) -> tuple[Policy, Any]:
 
     def act(state: Any, goal: Any, memory: Any) -> tuple[jax.Array, Any]:
         return (state.goal_state - state.data.mocap_pos[0]) / env.config.action_scale, memory
+
+    return act, None
+
+
+def stalk_reach(env: Any) -> tuple[Policy, Any]:
+    """In the direction and at the height of the stalk first, as it is now, then straight out of the shoulder."""
+    shoulder = jnp.asarray(stalk_arm.SHOULDER)
+
+    def act(state: Any, goal: Any, memory: Any) -> tuple[jax.Array, Any]:
+        grip = stalk_arm.grip_at(state.data.qpos[:3])
+        there = grip + state.goal_state - state.achieved_state
+        away = there[:2] - shoulder
+        reach = jnp.linalg.norm(grip[:2] - shoulder)
+        distance = jnp.linalg.norm(away)
+        before = jnp.append(shoulder + away * (jnp.minimum(reach, distance - 0.04) / distance), there[2])
+        aside = jnp.abs((away[0] * (grip - there)[1] - away[1] * (grip - there)[0]) / distance)
+        wanted = jnp.where((aside < 0.012) | (jnp.abs(reach - distance) < 0.015), there, before)
+        return (wanted - stalk_arm.grip_at(state.data.ctrl)) / env.config.action_scale, memory
 
     return act, None
 
@@ -78,6 +97,7 @@ POLICIES: dict[str, Callable[[Any], tuple[Policy, Any]]] = {
     "HandReach": hand_reach,
     "Reacher": reacher,
     "SawyerReach": sawyer_reach,
+    "StalkReach": stalk_reach,
 }
 
 

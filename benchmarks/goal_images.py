@@ -36,6 +36,7 @@ PARTS: dict[str, dict[str, tuple[str, ...]]] = {
     "VisualHandReach": {f"{tip} tip": (f"{tip}tip",) for tip in ("ff", "mf", "rf", "lf", "th")},
     "VisualReacher": {"fingertip": ("fingertip",)},
     "VisualSawyerReach": {"gripper": ("palm", "left_finger", "right_finger"), "fingers": ("left_finger", "right_finger")},
+    "VisualStalkReach": {"gripper": ("palm", "left_jaw", "right_jaw"), "stalks": tuple(f"upper_{index}" for index in range(4))},
 }
 _NEAR = 1.5  # thresholds
 _BATCH = 25  # goals drawn at once

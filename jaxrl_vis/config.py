@@ -46,6 +46,13 @@ class Config:
     seeds: int = 1
     """How many seeds to train side by side in one program: seed, seed + 1, ..."""
 
+    # -- Where it runs (docs/scaling.md)
+    devices: int = 1
+    """How many devices to use. Several seeds are divided among them; of one seed, each batch and the environments are."""
+    data_devices: int | None = None
+    """How many devices share each learner: its environments, replay and batches. None: one, or all of them if there is one
+    seed."""
+
     # -- The environment
     pixels: Pixels = "rgbd"
     """Channels of the image."""
@@ -385,9 +392,39 @@ def validate(config: Config) -> Config:
     if config.n_step > 1 and method.filter:
         raise RequestError(f"n_step {config.n_step} with method {config.method}: the filter's band is that of one step")
     _validate_reward(config)
+    _validate_devices(config)
     if config.seed + config.seeds - 1 > _LARGEST_SEED:
         raise RequestError(f"seed {config.seed} is too large: the last of {config.seeds} must be at most {_LARGEST_SEED}")
     return config
+
+
+def data_devices_of(config: Config) -> int:
+    """How many devices share each learner, where ``data_devices`` leaves that open, too."""
+    if config.data_devices is not None:
+        return config.data_devices
+    return config.devices if config.seeds == 1 else 1
+
+
+def _validate_devices(config: Config) -> None:
+    """Raises a RequestError where the devices do not divide what is to be spread over them."""
+    devices, along_data = config.devices, data_devices_of(config)
+    if along_data < 1:
+        raise RequestError(f"data_devices must be at least 1, not {along_data}")
+    if devices % along_data:
+        raise RequestError(f"data_devices ({along_data}) must divide devices ({devices})")
+    groups = devices // along_data
+    if config.seeds % groups:
+        where = f"{groups} devices" if along_data == 1 else f"{groups} groups of {along_data} devices"
+        more = math.ceil(config.seeds / groups) * groups
+        raise RequestError(
+            f"seeds {config.seeds} cannot be divided among {where}: write --seeds {more}, or --data-devices {devices} to "
+            "divide each learner"
+        )
+    for name in ("num_envs", "batch_size", "eval_episodes"):
+        value = getattr(config, name)
+        if value % along_data:
+            option, more = f"--{name.replace('_', '-')}", math.ceil(value / along_data) * along_data
+            raise RequestError(f"{name} {value} cannot be divided among {along_data} devices: write {option} {more}")
 
 
 def _validate_reward(config: Config) -> None:

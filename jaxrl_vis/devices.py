@@ -9,6 +9,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from jaxrl_vis import fields
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.provenance import child_environment
 
@@ -34,6 +35,20 @@ def check_devices() -> None:
             raise RequestError(f"JAX finds no device to compute on: {' '.join(str(error).split())}") from error
         there = _platforms_without(asked)
         raise RequestError(f"JAX_PLATFORMS={asked}, but JAX finds no such device here, only {there}{_mend(asked)}") from error
+
+
+def count_devices(asked: str) -> int:
+    """How many devices an option means: a number, or ``all`` that JAX finds, in all processes.
+
+    Raises:
+        RequestError: It is neither.
+    """
+    if asked.lower() != "all":
+        return fields.read("--devices", int, [asked])
+    check_devices()
+    import jax
+
+    return len(jax.devices())
 
 
 @dataclasses.dataclass(frozen=True)

@@ -70,8 +70,8 @@ def straight(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any, list]
 
 # Files whose tests play a task, and the tasks, by the word that names of files and tests have in common; the one that takes
 # longest to compile first.
-TASK_TESTS = ("controllers", "envs", "finger_turn", "hand_reach", "physics_parity", "sawyer_reach")
-TASKS = ("hand", "sawyer", "fetch", "finger", "reacher")
+TASK_TESTS = ("controllers", "envs", "finger_turn", "hand_reach", "physics_parity", "sawyer_reach", "stalk_reach")
+TASKS = ("hand", "sawyer", "fetch", "finger", "stalk", "reacher")
 # At the end of a run no worker should wait for the other, so what takes longest comes first.
 FIRST = (*TASKS, "test_trainer", "test_render_parity")
 # Files that share the programs of another one: notebooks and pages train with the smallest preset, as tests of the trainer do.

@@ -16,6 +16,7 @@ import numpy as np
 
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import Terminated
+from jaxrl_vis.learner.sharding import ONE_DEVICE
 from jaxrl_vis.run import metrics
 from jaxrl_vis.run.checkpoint import Checkpoints
 from jaxrl_vis.run.trainer import Trainer
@@ -35,7 +36,7 @@ class FakeProgram:
     """See the module."""
 
     def __init__(self, config: Config, nan_at: int | None = None, break_state: bool = False, filtered_share: float = 0.1):
-        self.config, self.traces = config, 0
+        self.config, self.traces, self.layout = config, 0, ONE_DEVICE
         self.env = types.SimpleNamespace(distance_unit="m", threshold=0.05, control_period=0.04, horizon=HORIZON, frame_stack=1)
         self.steps_per_iteration = config.num_envs * HORIZON
         self.updates_per_iteration = 3

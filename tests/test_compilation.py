@@ -10,7 +10,14 @@ from small_scene import small_scene
 
 from jaxrl_vis.learner import encoder_kernel
 from jaxrl_vis_envs import compilation
-from jaxrl_vis_envs.compilation import by_platform, kernels, runs_gpu_kernels, targets_cpu, tracing_for
+from jaxrl_vis_envs.compilation import (
+    by_platform,
+    kernels,
+    runs_gpu_kernels,
+    targets_cpu,
+    tracing_for,
+    tracing_for_default_device,
+)
 from jaxrl_vis_envs.physics import newton_kernel
 from jaxrl_vis_envs.render import render_planes
 from jaxrl_vis_envs.render.gpu import kernel
@@ -125,6 +132,44 @@ def test_a_program_holds_the_branch_of_its_own_platform(gpu):
     x = jnp.arange(3.0)
     assert "exponential" in lowered(slope, "cuda", x) and "exponential" not in lowered(slope, "cpu", x)
     np.testing.assert_allclose(jax.jit(slope)(x), jnp.cos(x), rtol=1e-6)
+
+
+def test_a_function_is_traced_for_each_platform_and_choice(gpu):
+    """An inner function that was jitted and traced for one of them must not be taken for another."""
+    gpu()
+    traced = []
+
+    @jax.jit
+    def inner(x):
+        traced.append((compilation.target_platform(), runs_gpu_kernels()))
+        return x + 1.0
+
+    def outer(x):
+        return by_platform(inner, x)
+
+    lowered(lambda x: outer(x), "cpu", jnp.ones(()))
+    with kernels(False):
+        lowered(lambda x: outer(x), "cuda", jnp.ones(()))
+    assert set(traced) == {("cpu", False), ("cuda", False), ("cuda", True)}
+
+
+def test_programs_of_the_default_device_are_traced_once(gpu, monkeypatch):
+    gpu()
+    traced = []
+
+    def function(x):
+        traced.append(compilation.target_platform())
+        return x
+
+    with tracing_for_default_device():  # a CPU
+        by_platform(function, jnp.ones(()))
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    with tracing_for_default_device():
+        by_platform(function, jnp.ones(()))
+    monkeypatch.setattr(jax, "config", SimpleNamespace(jax_default_device=SimpleNamespace(platform="cpu")))
+    with tracing_for_default_device():
+        by_platform(function, jnp.ones(()))
+    assert traced == ["cpu", "cuda", "cpu"]
 
 
 def test_an_image_is_drawn_by_the_kernel_of_its_own_platform(gpu, monkeypatch):

@@ -4,7 +4,7 @@ import pytest
 
 from benchmarks import controllers
 
-EPISODES = {"FetchReach": 24, "FingerTurn": 6, "HandReach": 16, "Reacher": 64, "SawyerReach": 64}
+EPISODES = {"FetchReach": 24, "FingerTurn": 6, "HandReach": 16, "Reacher": 64, "SawyerReach": 64, "StalkReach": 64}
 
 
 def test_every_task_has_a_controller():

@@ -24,7 +24,7 @@ BATCH, STEPS = 32, 8
 SOURCES = pathlib.Path(__file__).resolve().parents[1] / "envs"
 SUBPROCESS_ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join((str(SOURCES), str(SOURCES.parent)))}
 TASKS = list(names.TASKS)
-HORIZONS = {"FetchReach": 50, "FingerTurn": 50, "HandReach": 50, "Reacher": 50, "SawyerReach": 25}
+HORIZONS = {"FetchReach": 50, "FingerTurn": 50, "HandReach": 50, "Reacher": 50, "SawyerReach": 25, "StalkReach": 50}
 
 
 EACH_TASK = pytest.mark.parametrize("name", TASKS)

@@ -113,6 +113,7 @@ SOLVERS_ON_A_CPU = {
     "HandReach": "mjx",
     "Reacher": "matrices",
     "SawyerReach": "matrices",
+    "StalkReach": "matrices",
 }
 
 

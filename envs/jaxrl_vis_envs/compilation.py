@@ -16,7 +16,6 @@ the kernels and the same functions in plain JAX: ``0`` never uses a kernel, ``1`
 
 import concurrent.futures
 import contextlib
-import contextvars
 import functools
 import os
 import sys
@@ -28,9 +27,10 @@ import jax
 KERNELS_VARIABLE = "JAXRL_VIS_KERNELS"
 _CHOICES = {"auto": None, "": None, "0": False, "1": True}
 
-# The platform of the branch of `by_platform` that is being traced, and the choice of `kernels`; None outside of them.
-_platform: contextvars.ContextVar[str | None] = contextvars.ContextVar("platform", default=None)
-_kernels: contextvars.ContextVar[bool | None] = contextvars.ContextVar("kernels", default=None)
+# The platform of the branch of `by_platform` that is being traced, and the choice of `kernels`; None outside of them. They are
+# part of what JAX knows a traced function by, so that one which was traced for a platform is traced again for another.
+_platform = jax.make_user_context(default_value=None)
+_kernels = jax.make_user_context(default_value=None)
 
 
 def compiler_options(backend: str | None = None, *, runs_once: bool = False) -> dict[str, Any]:
@@ -87,7 +87,7 @@ def by_platform(function: Callable, *arguments: Any) -> Any:
     Returns:
         Its result.
     """
-    other = accelerator() if _platform.get() is None else None
+    other = accelerator() if _platform.value is None else None
     if other is None:
         return function(*arguments)
 
@@ -105,16 +105,26 @@ def by_platform(function: Callable, *arguments: Any) -> Any:
 @contextlib.contextmanager
 def tracing_for(platform: str | None) -> Iterator[None]:
     """What is traced inside is for ``platform``; for rules of derivatives, which JAX traces after the branch they belong to."""
-    token = _platform.set(platform)
-    try:
+    with _platform(platform):
         yield
-    finally:
-        _platform.reset(token)
+
+
+@contextlib.contextmanager
+def tracing_for_default_device() -> Iterator[None]:
+    """What is traced inside is for the device that JAX uses where nobody names one.
+
+    For programs that will run there and nowhere else: functions of `by_platform` are traced once in place of twice, which
+    halves the time that a program of physics and images takes to trace.
+    """
+    device = jax.config.jax_default_device
+    platform = jax.default_backend() if device is None else getattr(device, "platform", str(device))
+    with tracing_for("cpu" if platform == "cpu" else accelerator()):
+        yield
 
 
 def target_platform() -> str:
     """The platform of the innermost `tracing_for` or branch of `by_platform`; outside of them, the default backend."""
-    return _platform.get() or jax.default_backend()
+    return _platform.value or jax.default_backend()
 
 
 def targets_cpu() -> bool:
@@ -124,15 +134,9 @@ def targets_cpu() -> bool:
 
 @contextlib.contextmanager
 def kernels(enabled: bool | None) -> Iterator[None]:
-    """What is traced inside uses kernels on NVIDIA GPUs (True), never does (False), or as the environment says (None).
-
-    A function that `jax.jit` has traced before is not traced again.
-    """
-    token = _kernels.set(enabled)
-    try:
+    """What is traced inside uses kernels on NVIDIA GPUs (True), never does (False), or as the environment says (None)."""
+    with _kernels(enabled):
         yield
-    finally:
-        _kernels.reset(token)
 
 
 def runs_gpu_kernels(probe: Callable[[], object] | None = None) -> bool:
@@ -148,7 +152,7 @@ def runs_gpu_kernels(probe: Callable[[], object] | None = None) -> bool:
     Raises:
         ValueError: The environment variable holds something else than 0, 1 or auto.
     """
-    chosen = _kernels.get()
+    chosen = _kernels.value
     if chosen is None:
         chosen = _chosen_by_environment()
     if target_platform() not in ("cuda", "gpu") or chosen is False:

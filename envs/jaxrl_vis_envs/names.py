@@ -9,6 +9,7 @@ TASKS = {
     "HandReach": "jaxrl_vis_envs.tasks.hand_reach",
     "Reacher": "jaxrl_vis_envs.tasks.reacher",
     "SawyerReach": "jaxrl_vis_envs.tasks.sawyer_reach",
+    "StalkReach": "jaxrl_vis_envs.tasks.stalk_reach",
 }
 """The module of each task. It registers two environments: one that sees the state, by this name, and one that sees images."""
 

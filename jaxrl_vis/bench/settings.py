@@ -20,6 +20,8 @@ class Settings:
         pixels: Channels: rgbd, rgb or depth.
         batch_size: Transitions in a gradient step.
         seeds: Learners side by side in one program.
+        devices: How many to use.
+        data_devices: How many of them share each learner; see `Config`.
         repeats: Timed repeats at most; see `timing.measure`.
         peer: Another renderer, another physics, or PyTorch, to measure beside ours.
         aux_tasks, weighting: Auxiliary losses in gradient steps, and their weighting.
@@ -33,6 +35,8 @@ class Settings:
     pixels: str | None = None
     batch_size: int | None = None
     seeds: int = 1
+    devices: int = 1
+    data_devices: int | None = None
     repeats: int = 5
     peer: str | None = None
     aux_tasks: tuple[str, ...] = ()
@@ -80,6 +84,12 @@ class Settings:
     def seeds_config(self) -> dict[str, int]:
         """What a record says about the number of learners; nothing of one, as records from before there could be several."""
         return {"seeds": self.seeds} if self.seeds > 1 else {}
+
+    def devices_config(self) -> dict[str, int]:
+        """What a record says about devices; nothing of one."""
+        if self.devices == 1:
+            return {}
+        return {"devices": self.devices} | ({} if self.data_devices is None else {"data_devices": self.data_devices})
 
     def auxiliary_config(self) -> dict[str, Any]:
         """What a record says about auxiliary losses; nothing where there are none."""

@@ -8,6 +8,8 @@ from typing import Any
 
 import jax
 
+from jaxrl_vis_envs.compilation import tracing_for_default_device
+
 _LEAST_SECONDS = 0.2
 
 
@@ -34,7 +36,9 @@ class Timing:
 def compile_timed(jitted: Any, *arguments: Any) -> tuple[Any, float]:
     """Compiles ahead of time: the program, and the seconds of tracing and compiling (few if a cache had it)."""
     start = time.perf_counter()
-    compiled = jitted.lower(*arguments).compile()
+    with tracing_for_default_device():
+        lowered = jitted.lower(*arguments)
+    compiled = lowered.compile()
     return compiled, time.perf_counter() - start
 
 

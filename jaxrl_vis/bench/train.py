@@ -4,6 +4,9 @@
     parts        each of the three as a program of its own, and what an iteration pays for evaluations and for the host
     promise      the time that `bench env` and `bench update` give for the same environments and the same gradient steps
 
+    efficiency   on several devices: the time of one device with its share of the seeds, or of the batch and the environments,
+                 divided by that of all of them side by side
+
 An iteration that takes longer than the promise loses time between its parts, to the policy in the rollout, or to the replay.
 """
 
@@ -11,6 +14,7 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
+import jax
 import numpy as np
 
 from jaxrl_vis.bench.env import time_episodes
@@ -19,8 +23,10 @@ from jaxrl_vis.bench.settings import Settings
 from jaxrl_vis.bench.timing import Timing, compile_timed
 from jaxrl_vis.bench.timing import measure as measure_time
 from jaxrl_vis.bench.update import seed_keys, time_updates, training_config
+from jaxrl_vis.config import Config, data_devices_of
 from jaxrl_vis.learner.train_step import TrainStep, make_train_step
 from jaxrl_vis.types import LoopState
+from jaxrl_vis_envs.base import GoalEnv
 
 _BUDGET_S = 40.0
 
@@ -69,8 +75,9 @@ def time_parts(program: TrainStep, loop: LoopState, repeats: int) -> dict[str, f
         ``rollout``, ``insert``, ``updates``, and ``evaluation``, an iteration's part of it.
     """
     keys, iteration = seed_keys(program, 3), loop.iteration
-    evaluate, _ = compile_timed(program.evaluate, loop.train, keys[0])
-    evaluation = measure_time(lambda: evaluate(loop.train, keys[0]), repeats)
+    key = program.layout.put(jax.random.key(4), program.layout.everywhere)
+    evaluate, _ = compile_timed(program.evaluate, loop.train, key)
+    evaluation = measure_time(lambda: evaluate(loop.train, key), repeats)
     play, _ = compile_timed(program.rollout, loop.train, keys)
     rollout = measure_time(lambda: play(loop.train, keys), repeats)
     episodes, _ = play(loop.train, keys)
@@ -100,6 +107,24 @@ def describe(iteration: float, parts: dict[str, float], promised: float) -> str:
     return "\n".join(lines)
 
 
+def share_of_one(config: Config) -> Config:
+    """What one of the devices of a run does, as a run of its own on one device."""
+    parts = data_devices_of(config)
+    return config.replace(
+        devices=1,
+        data_devices=None,
+        seeds=config.seeds * parts // config.devices,
+        num_envs=config.num_envs // parts,
+        batch_size=config.batch_size // parts,
+        replay_transitions=config.replay_transitions // parts,
+    )
+
+
+def _time_share(env: GoalEnv, config: Config, settings: Settings) -> float:
+    """Seconds of an iteration of `share_of_one`."""
+    return time_iterations(make_train_step(env, share_of_one(config)), settings.repeats)[1].median_s
+
+
 def measure(settings: Settings) -> Iterator[Measurement]:
     """Yields environment steps and gradient steps per second of the device's preset, of all seeds together."""
     env = settings.make_env()
@@ -109,7 +134,10 @@ def measure(settings: Settings) -> Iterator[Measurement]:
         loop, timing, seconds = time_iterations(program, settings.repeats)
         parts = {**time_parts(program, loop, settings.repeats), "host": seconds["host"]}
         del loop
-        episodes, _ = time_episodes(env, config.num_envs * config.seeds, settings.repeats)
+        efficiency = (
+            {} if config.devices == 1 else {"efficiency": round(_time_share(env, config, settings) / timing.median_s, 3)}
+        )
+        episodes, _ = time_episodes(env, config.num_envs * config.seeds // config.devices, settings.repeats)
         promised = episodes.median_s + parts["updates"]
         print(describe(timing.median_s, parts, promised), flush=True)
         sizes = {"num_envs": config.num_envs, "batch_size": config.batch_size, "updates": program.updates_per_iteration}
@@ -120,6 +148,7 @@ def measure(settings: Settings) -> Iterator[Measurement]:
                 "method": config.method,
                 **sizes,
                 **settings.seeds_config(),
+                **settings.devices_config(),
                 **settings.auxiliary_config(),
             },
             "details": timing.details(
@@ -127,6 +156,7 @@ def measure(settings: Settings) -> Iterator[Measurement]:
                 measured_s=round(time.perf_counter() - started, 1),
                 milliseconds={name: round(1e3 * part, 3) for name, part in {**parts, "env": episodes.median_s}.items()},
                 share_of_promise=round(promised / timing.median_s, 3),
+                **efficiency,
             ),
         }
         per_s = config.seeds / timing.median_s

@@ -24,6 +24,7 @@ def training_config(settings: Settings, **overrides: Any) -> Config:
         overrides |= {"image_size": settings.image_size, "pixels": settings.pixels}
     if settings.batch_size is not None:
         overrides["batch_size"] = settings.batch_size
+    overrides |= {"devices": settings.devices, "data_devices": settings.data_devices}
     overrides |= {"seeds": settings.seeds, "weighting": settings.weighting, "aux_tasks": settings.aux_tasks}
     return preset("fast" if settings.on_accelerator else "cpu", env=settings.env, **overrides)
 
@@ -49,8 +50,9 @@ def fill_replay(replay: ReplayState, key: jax.Array) -> ReplayState:
 
 
 def seed_keys(program: TrainStep, seed: int) -> jax.Array:
-    """[S] typed keys, one for each learner."""
-    return jax.random.split(jax.random.key(seed), program.config.seeds)
+    """[S] typed keys, one for each learner, where that is."""
+    keys = jax.random.split(jax.random.key(seed), program.config.seeds)
+    return program.layout.put(keys, program.layout.by_seed)
 
 
 def start(program: TrainStep) -> LoopState:

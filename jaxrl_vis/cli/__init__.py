@@ -9,10 +9,12 @@ files skipped; 4 stopped on a number that is not finite; 130 Ctrl-C and 143 SIGT
 import inspect
 import os
 import sys
+import traceback
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import jaxrl_vis
+from jaxrl_vis import processes
 from jaxrl_vis.cli import (
     bench,
     doctor,
@@ -28,6 +30,7 @@ from jaxrl_vis.cli import (
     phenotype_run,
     phenotype_train,
     play,
+    sweep,
     train,
 )
 from jaxrl_vis.cli.parsing import PROGRAM, parse
@@ -42,6 +45,7 @@ COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
     "doctor": (doctor.Doctor, doctor.run),
     "bench": (bench.Bench, bench.run),
     "figure": (figure.Figure, figure.run),
+    "sweep": (sweep.Sweep, sweep.run),
     "phenotype synth": (phenotype.Synth, phenotype.synth),
     "phenotype train": (phenotype_train.Train, phenotype_train.train),
     "phenotype run": (phenotype_run.Run, phenotype_run.run),
@@ -89,6 +93,16 @@ def main(words: Sequence[str] | None = None) -> int:
         return 130
     except Terminated as stop:
         return int(stop.code or 0)
+    except Exception:
+        if not processes.are_several():
+            raise
+        traceback.print_exc()
+        print(
+            f"{PROGRAM}: this process stops, and the others with it, unless one of them ended before. What was saved is good: "
+            "start all of them again with --resume",
+            file=sys.stderr,
+        )
+        return 1
 
 
 def entry() -> None:
@@ -100,8 +114,8 @@ def entry() -> None:
     status = main()
     sys.stdout.flush()
     sys.stderr.flush()
-    if status in (130, 143):
-        os._exit(status)
+    if status in (130, 143) or (status and processes.are_several()):
+        os._exit(status)  # of several processes that failed, none must wait for the others
     sys.exit(status)
 
 

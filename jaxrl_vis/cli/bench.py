@@ -9,7 +9,7 @@ import tyro
 from jaxrl_vis.cli.checks import check_counts, check_env
 from jaxrl_vis.cli.parsing import ByPlaceToo
 from jaxrl_vis.config import Pixels
-from jaxrl_vis.devices import check_devices
+from jaxrl_vis.devices import check_devices, count_devices
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.methods import AuxTaskName, WeightingName
 from jaxrl_vis.report.outputs import check_writable
@@ -42,6 +42,10 @@ class Bench:
     """Transitions in a gradient step (update)."""
     seeds: int = 1
     """Learners side by side in one program (update, train)."""
+    devices: str | None = None
+    """How many devices to use, or all; one device with its share of the work is measured beside them (train)."""
+    data_devices: int | None = None
+    """How many devices share each learner; all of them if there is one seed, else one (train)."""
     repeats: int = 5
     """Timed repeats; the median counts."""
     aux_tasks: tuple[AuxTaskName, ...] = ()
@@ -77,7 +81,15 @@ def run(options: Bench) -> int:
         raise RequestError("--peer torch learns with one seed: leave out --seeds")
     if (options.weighting != "none" or options.aux_tasks) and (options.benchmark not in ("update", "train") or options.peer):
         raise RequestError("--weighting and --aux-tasks go with `bench update` and `bench train` only, without a peer")
-    check_counts(seeds=options.seeds, repeats=options.repeats, image_size=options.image_size, batch_size=options.batch_size)
+    if (options.devices is not None or options.data_devices is not None) and options.benchmark != "train":
+        raise RequestError("--devices and --data-devices go with `bench train` only")
+    check_counts(
+        seeds=options.seeds,
+        repeats=options.repeats,
+        image_size=options.image_size,
+        batch_size=options.batch_size,
+        data_devices=options.data_devices,
+    )
     for count in options.envs:
         check_counts(envs=count)
     check_env(options.env)
@@ -90,6 +102,7 @@ def run(options: Bench) -> int:
     check_writable(options.results or user_folder(), "--results", folder=True)
     settings = {field.name: getattr(options, field.name) for field in dataclasses.fields(options)}
     del settings["check"], settings["tables"]
+    settings["devices"] = 1 if options.devices is None else count_devices(options.devices)
     bench.run(**settings)
     return 0
 

@@ -5,10 +5,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
-from jaxrl_vis.cli.checks import check_env
+from jaxrl_vis import processes
+from jaxrl_vis.cli.checks import check_counts, check_env
 from jaxrl_vis.cli.parsing import ByPlaceToo, ChangesOf, SayDefault
 from jaxrl_vis.config import PRESETS, Config, preset, validate
-from jaxrl_vis.devices import check_devices, guess_accelerator
+from jaxrl_vis.devices import check_devices, count_devices, guess_accelerator
 from jaxrl_vis.errors import RequestError, nearest
 from jaxrl_vis.report.outputs import check_writable
 from jaxrl_vis.run import loggers
@@ -16,7 +17,7 @@ from jaxrl_vis.run.folder import check_there, default_folder, read_config
 from jaxrl_vis.run.loggers import LoggerName
 
 
-def _defaults(name: str) -> str:
+def default_of(name: str) -> str:
     """What the presets say about a field: what ``auto`` takes on this machine, and after it those that differ from that."""
     here = _auto(guess_accelerator())
     values = {each: getattr(config, name) for each, config in PRESETS.items()}
@@ -32,7 +33,8 @@ def _auto(on_accelerator: bool) -> str:
     return "fast" if on_accelerator else "cpu"
 
 
-def _default_preset() -> str:
+def default_preset() -> str:
+    """What the help says about ``--preset``."""
     return f"default: auto, which is {_auto(guess_accelerator())} on this machine; its values are the defaults shown below"
 
 
@@ -42,15 +44,26 @@ class Train:
 
     env: Annotated[str | None, ByPlaceToo()] = None
     """The environment; `jaxrl-vis envs` lists them, and module:Name is one of your own. VisualFetchReach if not given."""
-    preset: Annotated[str, SayDefault(_default_preset)] = "auto"
+    preset: Annotated[str, SayDefault(default_preset)] = "auto"
     """paper, fast, cpu or debug; auto is fast on an accelerator, else cpu."""
-    changes: Annotated[Mapping[str, Any], ChangesOf(Config, _defaults)] = dataclasses.field(default_factory=dict)
+    changes: Annotated[Mapping[str, Any], ChangesOf(Config, default_of)] = dataclasses.field(default_factory=dict)
+    devices: str | None = None
+    """How many devices to use, or all (docs/scaling.md). Several seeds are divided among them; of one seed, each batch and the
+    environments are. One if not given."""
     run_dir: Path | None = None
     """Folder for metrics, images and checkpoints; a new one under runs/ if not given."""
     resume: bool = False
     """Continue from the newest checkpoint in the run folder, which must be there."""
     overwrite: bool = False
     """Start afresh in a run folder that exists."""
+    coordinator: str | None = None
+    """Where several processes that train as one find the first of them, as HOST:PORT; not needed under srun and mpirun."""
+    num_processes: int | None = None
+    """How many such processes there are."""
+    process_id: int | None = None
+    """Which of them this is, from 0; the first writes metrics and images."""
+    start_timeout: int = processes.START_S
+    """How long they wait for each other at the start, s."""
     log: tuple[LoggerName, ...] = ()
     """Show the run in TensorBoard or in Weights & Biases, too; those of the run if not given with --resume."""
 
@@ -64,6 +77,11 @@ def training_config(options: Train) -> Config:
         RequestError: There is no such preset, or the saved run cannot be read.
     """
     changes = dict(options.changes) | ({} if options.env is None else {"env": options.env})
+    if options.devices is not None:
+        from jaxrl_vis.run.signals import shielded_children
+
+        with shielded_children():
+            changes["devices"] = count_devices(options.devices)
     name = options.preset
     if name not in ("auto", *PRESETS):
         raise RequestError(f"unknown preset {name!r}{nearest(name, ['auto', *PRESETS])}")
@@ -82,6 +100,11 @@ def training_config(options: Train) -> Config:
 
 def run(options: Train) -> int:
     """Trains; every report has already been shown and saved by the trainer."""
+    check_counts(start_timeout=options.start_timeout)
+    place = processes.find_place(options.coordinator, options.num_processes, options.process_id)
+    if place is not None:
+        processes.start(place, options.start_timeout)
+        options = dataclasses.replace(options, devices=options.devices or "all")
     if options.resume and options.overwrite:
         raise RequestError("--resume and --overwrite contradict each other; give one of them")
     loggers.check(options.log)

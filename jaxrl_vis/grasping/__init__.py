@@ -6,4 +6,7 @@ chords      where lines of an image cross stalks                 sight       wha
 lines       grasp points from a line per stalk                   slices      grasp points as in the thesis
 perceive    pairs to grasp points                                evaluate    against the truth of synthetic rows
 pipeline    folders of pairs to tables                           figure      figure 4.4
+arm         which way the arm goes, and whether it can           reach       many arms at once, among stalks, in wind
+metric      what came of it                                      way         figure 4.5
+video       the arm at work
 """

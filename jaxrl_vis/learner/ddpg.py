@@ -17,6 +17,7 @@ latents, too, ``target_encoder=False`` computes targets with the online encoders
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -30,6 +31,7 @@ from jaxrl_vis.learner.auxiliary import Auxiliary, make_auxiliary
 from jaxrl_vis.learner.auxtasks import View
 from jaxrl_vis.learner.latent_reward import LatentReward, make_latent_reward
 from jaxrl_vis.learner.networks import Networks
+from jaxrl_vis.learner.shards import ONE, Shards
 from jaxrl_vis.learner.weighting import MAIN, Weighted, WeightingState, weighted_grad
 from jaxrl_vis.types import Batch, Metrics, Params, TrainState
 
@@ -228,7 +230,9 @@ def _value_at_goals(networks: Networks, train: TrainState, goals: jax.Array) -> 
     return jnp.mean(networks.value(train.critic, latents(train.critic), action))
 
 
-def make_ddpg(networks: Networks, config: Config, resolved: Resolved, auxiliary: Auxiliary | None = None) -> Algorithm:
+def make_ddpg(
+    networks: Networks, config: Config, resolved: Resolved, auxiliary: Auxiliary | None = None, shards: Shards = ONE
+) -> Algorithm:
     """DDPG for these networks.
 
     Args:
@@ -236,12 +240,13 @@ def make_ddpg(networks: Networks, config: Config, resolved: Resolved, auxiliary:
         config: Learning rates, target decay, action penalty.
         resolved: Discount, bounds of the targets, filter threshold.
         auxiliary: What is learned beside; None for what ``config`` asks for, without stacked images.
+        shards: Of the learner: batches are those of one part, gradients and metrics those of the whole.
     """
     if auxiliary is None:
         auxiliary = make_auxiliary(config, networks.observation_spec, networks.action_size, 1, networks.dtype)
     optimizers = _Optimizers(optax.adam(config.actor_learning_rate), optax.adam(config.critic_learning_rate))
     latent_reward = make_latent_reward(networks, config, resolved, auxiliary.frame_stack)
-    learning = _Losses(networks, config, resolved, auxiliary)
+    learning = _Losses(networks, config, resolved, auxiliary, shards)
     keeps_state, held = auxiliary.weighting.name != "none", auxiliary.weighting.held
 
     def begin(train: TrainState, held: Params = None) -> Working:
@@ -259,27 +264,35 @@ def make_ddpg(networks: Networks, config: Config, resolved: Resolved, auxiliary:
         image = networks.normalize(train.normalizer, batch.observation_t) if "image" in auxiliary.needs else None
         found = learning.of_critic(now, train.weighting, inputs, image, batch, working.held)
         latents, value, keep = found.extra
-        shares = diagnostics.of_rewards(
+        counts = diagnostics.count_rewards(
             batch.reward, keep, resolved.reward_positive, resolved.reward_negative, batch.success, rewarded is not None
         )
         metrics = {
             "train/critic_loss": found.losses[MAIN],
             "train/value": jnp.mean(value),
-            **{f"train/{name}": number for name, number in (shares | found.metrics).items()},
+            **{f"train/{name}": number for name, number in found.metrics.items()},
             **{f"train/loss/{name}": loss for name, loss in found.losses.items() if name != MAIN},
         }
-        actor_gradient = None
+        actor_gradient, mean_square = None, None
         if with_actor:
             (policy_loss, action), actor_gradient = jax.value_and_grad(learning.of_actor, has_aux=True)(
                 now.actor, now.critic, inputs, latents, image, batch, found.weights
             )
             actor_gradient = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), actor_gradient)
-            metrics["train/actor_loss"] = policy_loss
-            metrics["train/action_size"] = jnp.sqrt(jnp.mean(jnp.square(action)))
+            metrics["train/actor_loss"], mean_square = policy_loss, jnp.mean(jnp.square(action))
         if rewarded is not None:
             metrics["train/autoencoder_loss"] = rewarded.loss
-        state, of_autoencoder = found.state if keeps_state else None, rewarded.gradient if rewarded is not None else None
-        return Gradients(found.gradient, actor_gradient, state, of_autoencoder), metrics
+        of_autoencoder = rewarded.gradient if rewarded is not None else None
+        # Of a learner in several parts, this is the one thing that an update waits for the others for.
+        own_gradient = None if learning.reduces_early else found.gradient
+        own_gradient, actor_gradient, of_autoencoder, metrics, mean_square, counts = shards.mean(
+            (own_gradient, actor_gradient, of_autoencoder, metrics, mean_square, counts)
+        )
+        if mean_square is not None:
+            metrics["train/action_size"] = jnp.sqrt(mean_square)
+        metrics |= {f"train/{name}": share for name, share in diagnostics.shares(counts, shards.count).items()}
+        critic_gradient = found.gradient if own_gradient is None else own_gradient
+        return Gradients(critic_gradient, actor_gradient, found.state if keeps_state else None, of_autoencoder), metrics
 
     def apply(working: Working, chosen: Gradients) -> Working:
         train = _apply(working.train, chosen, optimizers, config)
@@ -308,6 +321,17 @@ class _Losses:
     config: Config
     resolved: Resolved
     auxiliary: Auxiliary
+    shards: Shards
+
+    @property
+    def reduces_early(self) -> bool:
+        """Whether the critic's gradients are averaged over the parts of a learner before they are weighted.
+
+        A weighting that takes logarithms of losses, or compares gradients, must see those of the whole learner. What others
+        make of them is a sum, which may be averaged afterwards, together with all else.
+        """
+        weighting = self.auxiliary.weighting
+        return self.shards.count > 1 and (weighting.needs != "losses" or weighting.log)
 
     def of_critic(
         self,
@@ -329,13 +353,20 @@ class _Losses:
             value = networks.value(critic, latents.pair, batch.action)
             keep = losses.keep_mask(batch.reward, value, self.resolved.reward_negative, self.resolved.filter_threshold)
             others = self._auxiliary(critic, latents, image, batch)
-            return {MAIN: losses.critic_loss(value, target, keep), **others}, (latents, value, keep)
+            return {MAIN: losses.critic_loss(value, target, keep, self._kept(keep)), **others}, (latents, value, keep)
 
         # Weightings that compare no gradients need one backward pass only, which the last way of finding them takes.
         way = "jvp" if weighting.needs == "losses" else self.config.aux_gradients
-        find = weighted_grad(critic_losses, weighting, lambda critic: critic["encoder"], way, has_aux=True)
+        options = {"reduce": self.shards.mean} if self.reduces_early else {}
+        find = weighted_grad(critic_losses, weighting, lambda critic: critic["encoder"], way, has_aux=True, **options)
         state = self.auxiliary.start(now.critic.get("encoder")) if state is None else state
         return find(now.critic, state, held=held) if weighting.held else find(now.critic, state)
+
+    def _kept(self, keep: jax.Array) -> jax.Array | None:
+        """Transitions that count in a part, on average over the parts, by which all divide alike; None: its own."""
+        if self.shards.count == 1 or math.isinf(self.resolved.filter_threshold):
+            return None
+        return jnp.maximum(self.shards.mean(jnp.sum(keep)), 1.0 / self.shards.count)
 
     def _target(self, now: _ComputeCopies, inputs: jax.Array, latents: _Latents, batch: Batch) -> jax.Array:
         assert batch.reward is not None
@@ -361,10 +392,12 @@ class _Losses:
         if has_encoder:
             latents = _encode_online(self.networks, self.auxiliary, actor, inputs, batch.action.shape[0])
             others = self._auxiliary(actor, latents, image, batch)
+        if self.auxiliary.weighting.log:
+            others = {name: self.shards.whole(loss) for name, loss in others.items()}
         action = self.networks.act(actor, latents.pair)
         value = self.networks.value(critic, critic_latents.pair, action)
         best = self.resolved.reward_positive / (1.0 - self.resolved.discount) if self.auxiliary.weighting.log else None
-        loss = losses.actor_loss(value, action, self.config.action_penalty, best)
+        loss = losses.actor_loss(value, action, self.config.action_penalty, best, self.shards.whole)
         return loss + self.auxiliary.weighting.objective(weights, others), action
 
     def _auxiliary(self, params: Params, latents: _Latents, image: jax.Array | None, batch: Batch) -> dict[str, jax.Array]:

@@ -4,17 +4,15 @@ Shares of one batch are means of products, so that a quotient of two of them, av
 of these batches: precision of the filter = ``filtered_false_share`` / ``filtered_share`` (see `run.metrics`).
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
 from jaxrl_vis.types import Metrics
 
 
-def _share(part: jax.Array, whole: jax.Array) -> jax.Array:
-    return jnp.sum(part) / jnp.maximum(jnp.sum(whole), 1.0)
-
-
-def of_rewards(
+def count_rewards(
     reward: jax.Array,
     keep: jax.Array,
     reward_positive: float,
@@ -22,7 +20,9 @@ def of_rewards(
     success: jax.Array | None = None,
     graded: bool = False,
 ) -> Metrics:
-    """Shares of a batch of B transitions, [] float32 by name; docs/learner.md says what each one means.
+    """What a batch of B transitions has of what, [] float32 by name; `shares` makes shares of it.
+
+    Where a batch is spread over devices, the mean of these over the devices comes in between.
 
     Args:
         reward: [B] float32.
@@ -36,11 +36,38 @@ def of_rewards(
     else:
         positive = (reward == reward_positive).astype(jnp.float32)
     negative = 1.0 - positive
-    found = {"positive_share": jnp.mean(positive), "filtered_share": _share(1.0 - keep, negative)}
+    found = {"positive_share": jnp.mean(positive), "negative": jnp.sum(negative), "filtered": jnp.sum(1.0 - keep)}
     if success is None:
         return found
     return found | {
-        "false_positive_share": _share(positive * (1.0 - success), 1.0 - success),
-        "false_negative_share": _share(negative * success, negative),
-        "filtered_false_share": _share((1.0 - keep) * success, negative),
+        "failure": jnp.sum(1.0 - success),
+        "false_positive": jnp.sum(positive * (1.0 - success)),
+        "false_negative": jnp.sum(negative * success),
+        "filtered_false": jnp.sum((1.0 - keep) * success),
+    }
+
+
+def of_rewards(*args: Any, **kwargs: Any) -> Metrics:
+    """The `shares` of a batch that is in one place; arguments as of `count_rewards`."""
+    return shares(count_rewards(*args, **kwargs))
+
+
+def shares(counts: Metrics, parts: int = 1) -> Metrics:
+    """Shares of a batch, [] float32 by name; docs/learner.md says what each one means.
+
+    Args:
+        counts: From `count_rewards`; of a batch in several parts, the mean over these.
+        parts: How many there are.
+    """
+
+    def share(part: str, whole: str) -> jax.Array:
+        return counts[part] / jnp.maximum(counts[whole], 1.0 / parts)
+
+    found = {"positive_share": counts["positive_share"], "filtered_share": share("filtered", "negative")}
+    if "failure" not in counts:
+        return found
+    return found | {
+        "false_positive_share": share("false_positive", "failure"),
+        "false_negative_share": share("false_negative", "negative"),
+        "filtered_false_share": share("filtered_false", "negative"),
     }

@@ -3,6 +3,8 @@
 Subscripts are time: ``value_t`` belongs to the state before the action, ``value_tp1`` to the one after it.
 """
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 
@@ -44,18 +46,26 @@ def keep_mask(reward_t: jax.Array, value_t: jax.Array, reward_negative: float, t
     return jax.lax.stop_gradient(1.0 - false_negative.astype(jnp.float32))
 
 
-def critic_loss(value_t: jax.Array, target: jax.Array, keep: jax.Array) -> jax.Array:
+def critic_loss(value_t: jax.Array, target: jax.Array, keep: jax.Array, kept: jax.Array | None = None) -> jax.Array:
     """Mean squared temporal-difference error over the transitions with ``keep`` 1: [] float32; 0 where there are none.
 
     Args:
         value_t: [B] float32, the online critic's values.
         target: [B] float32, from `td_target`.
         keep: [B] float32, 0 or 1, from `keep_mask`.
+        kept: [] float32, transitions to divide the sum by; None: the sum of ``keep``, at least 1.
     """
-    return jnp.sum(keep * jnp.square(value_t - target)) / jnp.maximum(jnp.sum(keep), 1.0)
+    kept = jnp.maximum(jnp.sum(keep), 1.0) if kept is None else kept
+    return jnp.sum(keep * jnp.square(value_t - target)) / kept
 
 
-def actor_loss(value_t: jax.Array, action: jax.Array, action_penalty: float, log_below: float | None = None) -> jax.Array:
+def actor_loss(
+    value_t: jax.Array,
+    action: jax.Array,
+    action_penalty: float,
+    log_below: float | None = None,
+    whole: Callable[[jax.Array], jax.Array] = lambda mean: mean,
+) -> jax.Array:
     """Minus the mean value of the policy's own actions, plus their weighted mean square: [] float32.
 
     Args:
@@ -65,7 +75,8 @@ def actor_loss(value_t: jax.Array, action: jax.Array, action_penalty: float, log
         log_below: The greatest value that there can be, R+/(1-gamma): the logarithm of the distance to it takes the place of
             minus the value, as auxiliary losses that are learned as logarithms ask for. With the rewards 0/-1 of the OL-AUX
             release, it is 0, and this is the release's log(-Q). None: no logarithm.
+        whole: Makes the mean value of the whole batch of that of these transitions, before a logarithm is taken.
     """
     value = jnp.mean(value_t)
-    loss = -value if log_below is None else jnp.log(jnp.maximum(log_below - value, LOG_FLOOR))
+    loss = -value if log_below is None else jnp.log(jnp.maximum(log_below - whole(value), LOG_FLOOR))
     return loss + action_penalty * jnp.mean(jnp.square(action))

@@ -6,6 +6,7 @@ A camera that stands still sees mostly things that never change: subtracting the
 import jax
 import jax.numpy as jnp
 
+from jaxrl_vis.learner.shards import ONE, Shards
 from jaxrl_vis.types import NormalizerState
 
 
@@ -15,21 +16,24 @@ def init(observation_spec: jax.ShapeDtypeStruct) -> NormalizerState:
     return NormalizerState(count=jnp.zeros((), jnp.float32), mean=zeros, sum_of_squares=zeros)
 
 
-def update(state: NormalizerState, observations: jax.Array, axes: tuple[int, ...] = (0, 1)) -> NormalizerState:
+def update(
+    state: NormalizerState, observations: jax.Array, axes: tuple[int, ...] = (0, 1), shards: Shards = ONE
+) -> NormalizerState:
     """Merges the statistics of ``observations`` [E, T+2, ...] into the running ones.
 
     Args:
         state: Statistics so far.
         observations: In their own dtype, with leading axes to reduce.
         axes: The leading axes.
+        shards: Of the learner; ``observations`` are those of one part.
     """
-    count = jnp.float32(1.0)
+    count = jnp.float32(shards.count)
     for axis in axes:
         count = count * observations.shape[axis]
     # Deviations are taken from the running mean, not from zero: close to it they are small, and squares keep their digits.
     centred = observations.astype(jnp.float32) - state.mean
-    shift = jnp.mean(centred, axis=axes)
-    batch_squares = jnp.sum(jnp.square(centred), axis=axes) - count * jnp.square(shift)
+    shift = shards.mean(jnp.mean(centred, axis=axes))
+    batch_squares = shards.total(jnp.sum(jnp.square(centred), axis=axes)) - count * jnp.square(shift)
     total = state.count + count
     return NormalizerState(
         count=total,

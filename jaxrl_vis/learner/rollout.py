@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxrl_vis.learner.networks import Networks
+from jaxrl_vis.learner.shards import ONE, Shards
 from jaxrl_vis.types import Episodes, Metrics, NormalizerState, TrainState
 from jaxrl_vis_envs.base import GoalEnv, State
 
@@ -45,6 +46,7 @@ def choose_actions(
     exploration: Exploration,
     key: jax.Array,
     observations: jax.Array,
+    shards: Shards = ONE,
 ) -> jax.Array:
     """The online actor, with noise where it is asked for.
 
@@ -55,6 +57,7 @@ def choose_actions(
         exploration: The noise.
         key: [] typed; draws the noise.
         observations: [E, ...].
+        shards: Of the learner; observations are those of one part.
 
     Returns:
         [E, A] float32 in [-1, 1].
@@ -63,27 +66,33 @@ def choose_actions(
     if exploration == NO_EXPLORATION:
         return action
     noise_key, choice_key, random_key = jax.random.split(key, 3)
-    action = jnp.clip(action + exploration.action_noise * jax.random.normal(noise_key, action.shape), -1.0, 1.0)
-    uniform = jax.random.uniform(random_key, action.shape, minval=-1.0, maxval=1.0)
-    choose = jax.random.bernoulli(choice_key, exploration.random_action_probability, (*action.shape[:-1], 1))
+    noise = shards.draw(lambda shape: jax.random.normal(noise_key, shape), action.shape)
+    action = jnp.clip(action + exploration.action_noise * noise, -1.0, 1.0)
+    uniform = shards.draw(lambda shape: jax.random.uniform(random_key, shape, minval=-1.0, maxval=1.0), action.shape)
+    share = exploration.random_action_probability
+    choose = shards.draw(lambda shape: jax.random.bernoulli(choice_key, share, shape), (*action.shape[:-1], 1))
     return jnp.where(choose, uniform, action)
 
 
-def split_keys(keys: jax.Array, num_envs: int) -> tuple[jax.Array, jax.Array]:
-    """Keys of a rollout: [S] typed keys -> those of all S x E resets, seed after seed, and those of the policies, [S]."""
+def split_keys(keys: jax.Array, num_envs: int, shards: Shards = ONE) -> tuple[jax.Array, jax.Array]:
+    """Keys of a rollout: [S] typed keys -> those of all S x E resets, seed after seed, and those of the policies, [S].
+
+    Of a learner in several parts, only the resets of this part.
+    """
     reset_keys, policy_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
-    return jax.vmap(lambda key: jax.random.split(key, num_envs))(reset_keys).reshape(-1), policy_keys
+    return jax.vmap(lambda key: shards.part(jax.random.split(key, num_envs)))(reset_keys).reshape(-1), policy_keys
 
 
-def add_noise(key: jax.Array, observations: jax.Array, deviation: float) -> jax.Array:
+def add_noise(key: jax.Array, observations: jax.Array, deviation: float, shards: Shards = ONE) -> jax.Array:
     """Observations [E, ...] as a noisy camera shows them: same shape and dtype; bytes are rounded and clipped.
 
     Args:
         key: [] a typed key.
         observations: uint8 images or float32 state vectors.
         deviation: Standard deviation of the noise, in the observation's unit.
+        shards: Of the learner; observations are those of one part.
     """
-    noisy = observations + deviation * jax.random.normal(key, observations.shape)
+    noisy = observations + deviation * shards.draw(lambda shape: jax.random.normal(key, shape), observations.shape)
     if observations.dtype == jnp.uint8:
         noisy = jnp.clip(jnp.round(noisy), 0.0, 255.0)
     return noisy.astype(observations.dtype)
@@ -112,6 +121,7 @@ def play(
     exploration: Exploration = NO_EXPLORATION,
     num_kept: int | None = None,
     record: Callable[[State], Any] | None = None,
+    shards: Shards = ONE,
 ) -> Rollout:
     """Plays one episode in each of E environments, for each of S learners side by side.
 
@@ -122,12 +132,14 @@ def play(
         networks: What the parameters mean.
         train: The learners, [S, ...].
         keys: [S] typed keys of this rollout.
-        num_envs: E.
+        num_envs: E, of whole learners.
         exploration: The noise.
         num_kept: K, how many of the episodes to keep (the first ones); None: all.
         record: What else to keep, a pytree made of the state of one environment after reset and after each step.
+        shards: Of each learner. In one part, E / ``shards.count`` of its environments are played.
     """
     num_seeds = keys.shape[0]
+    num_envs, num_drawn = num_envs // shards.count, num_envs
 
     def by_seed(leaf: jax.Array) -> jax.Array:
         return leaf.reshape(num_seeds, num_envs, *leaf.shape[1:])
@@ -141,13 +153,13 @@ def play(
         if not deviation:
             return observations
         noise_keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, number)
-        noisy = jax.vmap(lambda key, part: add_noise(key, part, deviation))(noise_keys, by_seed(observations))
+        noisy = jax.vmap(lambda key, part: add_noise(key, part, deviation, shards))(noise_keys, by_seed(observations))
         return noisy.reshape(observations.shape)
 
     def recorded(state: State) -> Any:
         return None if record is None else jax.tree.map(kept, jax.vmap(record)(state))
 
-    reset_keys, policy_keys = split_keys(keys, num_envs)
+    reset_keys, policy_keys = split_keys(keys, num_drawn, shards)
     state = jax.vmap(env.reset)(reset_keys)
     assert state.obs is not None
     first_observation = seen(state.obs["observation"], policy_keys, _FIRST_NOISE)
@@ -156,7 +168,7 @@ def play(
     goal_latents = jax.vmap(lambda train, goals: encode(networks, train, train.goal_statistics, goals))(train, by_seed(goal))
 
     def act(train: TrainState, goal_latents: jax.Array, key: jax.Array, observations: jax.Array) -> jax.Array:
-        return choose_actions(networks, train, goal_latents, exploration, key, observations)
+        return choose_actions(networks, train, goal_latents, exploration, key, observations, shards)
 
     def step(carry, step_keys):
         state, observation = carry

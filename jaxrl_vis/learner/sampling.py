@@ -18,6 +18,7 @@ from jaxrl_vis.learner import reward_errors
 from jaxrl_vis.learner.auxiliary import Auxiliary
 from jaxrl_vis.learner.relabel import choose_goal_slots
 from jaxrl_vis.learner.replay import Indices, Replay
+from jaxrl_vis.learner.shards import ONE, Shards
 from jaxrl_vis.methods import METHODS
 from jaxrl_vis.types import Batch, ReplayState
 from jaxrl_vis_envs import goals
@@ -55,6 +56,7 @@ class Sampler:
         threshold: Of the oracle's reward, in the unit of the true states.
         as_goal: [...] -> [...], makes a goal of an observation (`GoalEnv.as_goal`); None where an observation is one already.
         auxiliary: Whose targets batches carry.
+        shards: Of the learner. ``replay`` is one part, and so are batches; the configuration's batch size is that of all.
     """
 
     config: Config
@@ -63,9 +65,10 @@ class Sampler:
     threshold: float
     as_goal: Callable[[jax.Array], jax.Array] | None = None
     auxiliary: Auxiliary | None = None
+    shards: Shards = ONE
 
     def choose(self, state: ReplayState, key: jax.Array, iteration: jax.Array) -> Choice:
-        """Draws B transitions and their goals.
+        """Draws B transitions and their goals: all of them for every part of a learner, which then keeps its own.
 
         Args:
             state: The replay, with the rollout of ``iteration`` inserted.
@@ -82,10 +85,19 @@ class Sampler:
             most, shape = self.config.random_shift, (self.config.batch_size, 2)
             choice = choice._replace(shift=jax.random.randint(jax.random.fold_in(key, _SHIFT), shape, -most, most + 1))
         if self.config.reward_clutter < 1.0:
-            goal_states = state.episodes.states[:, -1]
-            end = reward_errors.find_clutter_end(goal_states, state.size, self.config.reward_clutter)
-            choice = choice._replace(clutter_end=end)
-        return choice._replace(target_key=jax.random.fold_in(key, _TARGETS)) if self._has_targets else choice
+            choice = choice._replace(clutter_end=self._clutter_end(state))
+        indices, goal_slot, shift = jax.tree.map(self.shards.part, (choice.indices, choice.goal_slot, choice.shift))
+        choice = choice._replace(indices=indices, goal_slot=goal_slot, shift=shift)
+        if not self._has_targets:
+            return choice
+        return choice._replace(target_key=self.shards.own_key(jax.random.fold_in(key, _TARGETS)))
+
+    def _clutter_end(self, state: ReplayState) -> jax.Array:
+        goal_states = state.episodes.states[:, -1]
+        if self.shards.count > 1:
+            # Those that are there come first in each part; in the order of the slots they do so in all parts together.
+            goal_states = jnp.moveaxis(self.shards.gather(goal_states[None]), 0, 1).reshape(-1, goal_states.shape[-1])
+        return reward_errors.find_clutter_end(goal_states, state.size * self.shards.count, self.config.reward_clutter)
 
     @property
     def _has_targets(self) -> bool:

@@ -7,12 +7,13 @@
     metrics     fixed-shape means
 
 `vmap` over the seeds' axis makes it train several learners at once. The loop state is donated, so the replay is written where
-it lies.
+it lies. On several devices (`sharding`) each runs all of this on its part of the seeds, or of one learner.
 """
 
 import dataclasses
 import functools
 import math
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -27,6 +28,7 @@ from jaxrl_vis.learner.networks import Networks
 from jaxrl_vis.learner.replay import Replay, make_replay, num_bytes
 from jaxrl_vis.learner.rollout import Exploration, play
 from jaxrl_vis.learner.sampling import Choice, Sampler
+from jaxrl_vis.learner.sharding import Layout, make_layout
 from jaxrl_vis.types import Episodes, LoopState, Metrics, ReplayState, TrainState
 from jaxrl_vis_envs.base import GoalEnv
 from jaxrl_vis_envs.compilation import env_jit
@@ -43,7 +45,9 @@ class TrainStep:
     """The compiled program of a run and what belongs to it; see `make_train_step`.
 
     Attributes:
-        env, config, resolved, networks, auxiliary, replay: What it was made of.
+        env, config, resolved, networks, auxiliary: What it was made of.
+        replay: The sizes of one device's part of a learner's replay.
+        layout: Where seeds and the parts of learners lie; all functions below take and return arrays that lie there.
         init: keys [S] -> LoopState.
         train_iteration: LoopState (donated) -> (LoopState, metrics of [S] float32).
         evaluate: See `evaluate.make_evaluate`.
@@ -60,6 +64,7 @@ class TrainStep:
     networks: Networks
     auxiliary: Auxiliary
     replay: Replay
+    layout: Layout
     init: Any
     train_iteration: Any
     evaluate: Any
@@ -84,14 +89,14 @@ class TrainStep:
 
     @property
     def replay_spec(self) -> ReplayState:
-        """Shapes of one seed's replay, without allocating it."""
+        """Shapes of one seed's replay, or of one device's part of it, without allocating it."""
         sizes = self.env.observation_spec, self.env.goal_state_size, self.env.action_size
         return self.replay.spec(*sizes, with_flow=self.auxiliary.keeps_flow)
 
     @property
     def replay_bytes(self) -> int:
         """Bytes of one seed's replay."""
-        return num_bytes(self.replay_spec)
+        return num_bytes(self.replay_spec) * self.layout.shards.count
 
 
 def _mean(values: list[jax.Array]) -> jax.Array:
@@ -143,10 +148,10 @@ def _see(train: TrainState, episodes: Episodes, key: jax.Array, config: Config, 
         if train.goal_normalizer is None:
             seen = jnp.concatenate([seen, goals])
         axes = (0,)
-    train = train.replace(normalizer=normalizer.update(train.normalizer, seen, axes))
+    train = train.replace(normalizer=normalizer.update(train.normalizer, seen, axes, sampler.shards))
     if train.goal_normalizer is None:
         return train
-    return train.replace(goal_normalizer=normalizer.update(train.goal_normalizer, goals, axes))
+    return train.replace(goal_normalizer=normalizer.update(train.goal_normalizer, goals, axes, sampler.shards))
 
 
 def _count_nonfinite(tree: Any) -> jax.Array:
@@ -154,22 +159,50 @@ def _count_nonfinite(tree: Any) -> jax.Array:
     return sum((jnp.sum(~jnp.isfinite(leaf)) for leaf in floats), jnp.zeros((), jnp.int32)).astype(jnp.float32)
 
 
-def make_train_step(env: GoalEnv, config: Config) -> TrainStep:
+def _jitted(
+    layout: Layout, init: Callable, train_iteration: Callable, rollout: Callable, insert: Callable, update_many: Callable
+) -> dict[str, Any]:
+    """The functions of one device's part as programs of all devices, by name."""
+    seeds, environments, whole = layout.by_seed, layout.by_environment, layout.everywhere
+    loop, replay = layout.loop, layout.replay
+    spread = functools.partial(layout.spread, jit=env_jit)
+    return {
+        "init": spread(init, (seeds,), loop, runs_once=True),
+        "train_iteration": spread(
+            train_iteration, (loop,), (loop, seeds), kept_as=(loop, layout.read_by_host), donate_argnums=0
+        ),
+        "rollout": spread(rollout, (seeds, seeds), (environments, environments)),
+        "insert": spread(insert, (seeds, replay, environments, seeds, whole), (seeds, replay), donate_argnums=(0, 1)),
+        "update_many": spread(update_many, (seeds, replay, seeds, whole), (seeds, seeds), donate_argnums=0),
+    }
+
+
+def _jitted_evaluate(layout: Layout, evaluate: Callable) -> Any:
+    in_specs, out_specs = (layout.by_seed, layout.everywhere), (layout.by_seed, layout.by_environment)
+    kept_as = (layout.read_by_host, layout.read_by_host) if jax.process_count() > 1 else None
+    return layout.spread(evaluate, in_specs, out_specs, env_jit, kept_as)
+
+
+def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None) -> TrainStep:
     """Builds the program of a run. Nothing is compiled or allocated yet.
 
     Args:
         env: The environment.
         config: The run; what belongs to the environment is taken from ``env``.
+        layout: Where it runs; None: as ``config`` says.
 
     Raises:
         RequestError: The configuration asks for something that cannot be.
     """
     resolved = resolve(validate(config), env.horizon)
+    layout = make_layout(config) if layout is None else layout
+    shards = layout.shards
     networks = Networks(config, env.observation_spec, env.action_size, resolved.critic_output_bias)
     auxiliary = make_auxiliary(config, env.observation_spec, env.action_size, env.frame_stack, networks.dtype)
-    algorithm = make_ddpg(networks, config, resolved, auxiliary)
+    algorithm = make_ddpg(networks, config, resolved, auxiliary, shards)
     replay = make_replay(config.replay_transitions, config.num_envs, env.horizon)
-    sampler = Sampler(config, resolved, replay, env.threshold, env.as_goal if env.frame_stack > 1 else None, auxiliary)
+    replay = replay._replace(num_envs=config.num_envs // shards.count)
+    sampler = Sampler(config, resolved, replay, env.threshold, env.as_goal if env.frame_stack > 1 else None, auxiliary, shards)
     update_many = _make_update_many(config, sampler, algorithm)
     exploration = Exploration(config.random_action_probability, config.action_noise)
 
@@ -181,11 +214,15 @@ def make_train_step(env: GoalEnv, config: Config) -> TrainStep:
             iteration=jnp.zeros((), jnp.int32),
         )
 
+    def init_seeds(keys: jax.Array) -> LoopState:
+        loop = per_seed(init, out_axes=_SEED_AXES)(keys)
+        return loop.replace(replay=layout.folded(loop.replay, replay.num_envs))
+
     def per_seed(function, in_axes: Any = 0, out_axes: Any = 0):
         return jax.vmap(function, in_axes=in_axes, out_axes=out_axes)
 
     def rollout(train: TrainState, keys: jax.Array) -> tuple[Episodes, Metrics]:
-        episodes, outcome, _ = play(env, networks, train, keys, config.num_envs, exploration)
+        episodes, outcome, _ = play(env, networks, train, keys, config.num_envs, exploration, shards=shards)
         return episodes, outcome
 
     def insert(
@@ -195,17 +232,32 @@ def make_train_step(env: GoalEnv, config: Config) -> TrainStep:
         replay_state = replay.insert(replay_state, episodes, iteration)
         return _see(train, episodes, jax.random.fold_in(key, _STATISTICS), config, sampler), replay_state
 
+    def insert_seeds(
+        train: TrainState, replay_state: ReplayState, episodes: Episodes, keys: jax.Array, iteration: jax.Array
+    ) -> tuple[TrainState, ReplayState]:
+        insert_each = per_seed(insert, (0, 0, 0, 0, None))
+        train, replay_state = insert_each(train, layout.unfolded(replay_state), episodes, keys, iteration)
+        return train, layout.folded(replay_state, replay.num_envs)
+
+    def update_seeds(
+        train: TrainState, replay_state: ReplayState, keys: jax.Array, iteration: jax.Array
+    ) -> tuple[TrainState, Metrics]:
+        return per_seed(update_many, (0, 0, 0, None))(train, layout.unfolded(replay_state), keys, iteration)
+
     def train_iteration(loop: LoopState) -> tuple[LoopState, Metrics]:
+        loop = loop.replace(replay=layout.unfolded(loop.replay))
         keys = per_seed(lambda key: jax.random.split(jax.random.fold_in(key, loop.iteration)), out_axes=1)(loop.key)
         episodes, outcome = rollout(loop.train, keys[0])
-        return per_seed(learn, (_SEED_AXES, 0, 0, 0), (_SEED_AXES, 0))(loop, episodes, outcome, keys[1])
+        loop, metrics = per_seed(learn, (_SEED_AXES, 0, 0, 0), (_SEED_AXES, 0))(loop, episodes, outcome, keys[1])
+        return loop.replace(replay=layout.folded(loop.replay, replay.num_envs)), metrics
 
     def learn(loop: LoopState, episodes: Episodes, outcome: Metrics, key: jax.Array) -> tuple[LoopState, Metrics]:
         train, replay_state = insert(loop.train, loop.replay, episodes, key, loop.iteration)
         train, metrics = update_many(train, replay_state, key, loop.iteration)
-        metrics |= {f"train/{name}": jnp.mean(values) for name, values in outcome.items()}
-        metrics["train/value_at_goals"] = algorithm.value_at_goals(train, episodes.observations[:, -1])
-        metrics["guard/nonfinite"] = _count_nonfinite((metrics, episodes.states, episodes.actions))
+        found = {f"train/{name}": jnp.mean(values) for name, values in outcome.items()}
+        found["train/value_at_goals"] = algorithm.value_at_goals(train, episodes.observations[:, -1])
+        metrics |= shards.mean(found)
+        metrics["guard/nonfinite"] = shards.total(_count_nonfinite((metrics, episodes.states, episodes.actions)))
         return LoopState(train=train, replay=replay_state, key=loop.key, iteration=loop.iteration + 1), metrics
 
     return TrainStep(
@@ -215,10 +267,7 @@ def make_train_step(env: GoalEnv, config: Config) -> TrainStep:
         networks=networks,
         auxiliary=auxiliary,
         replay=replay,
-        init=env_jit(per_seed(init, out_axes=_SEED_AXES), runs_once=True),
-        train_iteration=env_jit(train_iteration, donate_argnums=0),
-        evaluate=env_jit(make_evaluate(env, networks, config)),
-        rollout=env_jit(rollout),
-        insert=env_jit(per_seed(insert, (0, 0, 0, 0, None)), donate_argnums=(0, 1)),
-        update_many=env_jit(per_seed(update_many, (0, 0, 0, None)), donate_argnums=0),
+        layout=layout,
+        **_jitted(layout, init_seeds, train_iteration, rollout, insert_seeds, update_seeds),
+        evaluate=_jitted_evaluate(layout, make_evaluate(env, networks, config, shards)),
     )

@@ -19,7 +19,7 @@ import shutil
 import sys
 import threading
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +27,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
+from jax.experimental import multihost_utils
 from orbax.checkpoint.checkpoint_managers import LatestN
 
+from jaxrl_vis import processes
 from jaxrl_vis.errors import RequestError, StorageError
+from jaxrl_vis.learner.sharding import put_array
 from jaxrl_vis.types import LoopState, TrainState
 
 LIGHT, FULL = "light", "full"
@@ -97,6 +100,59 @@ def _checksum(array: np.ndarray) -> int:
 
 def _describe(arrays: Arrays) -> dict[str, list]:
     return {name: [list(array.shape), str(array.dtype), _checksum(array)] for name, array in arrays.items()}
+
+
+def _to_save(tree: Any, copy: bool) -> Arrays | dict[str, jax.Array]:
+    """The leaves of a pytree by name, as they are given to orbax: from several processes each writes what it has."""
+    if not processes.are_several():
+        return to_host(tree, copy)
+    return {
+        name: jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
+        for name, leaf in named_leaves(tree).items()
+    }
+
+
+def _describe_parts(arrays: dict[str, jax.Array]) -> dict[str, list]:
+    """`_describe`, of arrays of which each process has a part; the last number says of how many axes `_sum_of_rows` is."""
+    axes = {name: max((n + 1 for n, on in enumerate(_spec_of(array)) if on), default=0) for name, array in arrays.items()}
+    sums = np.zeros(len(arrays), np.uint32)
+    for number, (name, array) in enumerate(arrays.items()):
+        for shard in array.addressable_shards:
+            if shard.replica_id == 0:
+                start = [each.start or 0 for each in shard.index[: axes[name]]]
+                sums[number] += np.uint32(_sum_of_rows(np.asarray(shard.data), axes[name], start))
+    totals = multihost_utils.process_allgather(sums).astype(np.uint64).sum(axis=0) % 2**32
+    return {
+        name: [list(array.shape), str(array.dtype), int(total), axes[name]]
+        for (name, array), total in zip(arrays.items(), totals, strict=True)
+    }
+
+
+def _spec_of(array: jax.Array) -> Sequence[Any]:
+    return getattr(array.sharding, "spec", ())
+
+
+def _sum_of_rows(array: np.ndarray, axes: int, start: Sequence[int] = ()) -> int:
+    """A checksum that can be put together of parts: the sum of those of all rows, each beginning with where it lies.
+
+    Args:
+        array: A part of an array.
+        axes: How many of the first axes number rows.
+        start: Where the part begins in these; nothing for a whole array.
+    """
+    total = 0
+    for index in np.ndindex(array.shape[:axes]):
+        place = np.add(index, start) if len(start) else np.asarray(index)
+        total += zlib.crc32(
+            np.ascontiguousarray(array[index]).reshape(-1).view(np.uint8).data, zlib.crc32(place.astype("<i8").tobytes())
+        )
+    return total % 2**32
+
+
+def _is_intact(array: np.ndarray, described: list) -> bool:
+    """Whether an array is as its manifest describes it."""
+    _, _, checksum, *axes = described
+    return checksum == (_sum_of_rows(array, axes[0]) if axes else _checksum(array))
 
 
 def _rest(loop: LoopState) -> dict[str, Any]:
@@ -191,23 +247,26 @@ class Checkpoints:
             train: The learner, [S, ...].
             progress: Anything that JSON can hold.
         """
-        self._save(LIGHT, iteration, {"train": to_host(train, copy=True)}, progress)
+        self._save(LIGHT, iteration, {"train": _to_save(train, copy=True)}, progress)
 
     def save_full(self, iteration: int, loop: LoopState, progress: dict[str, Any]) -> None:
         """Writes everything, and returns when it is on the disk: a second copy of the replay would need memory for two."""
-        items = {"train": to_host(loop.train, copy=False), "rest": to_host(_rest(loop), copy=False)}
+        items = {"train": _to_save(loop.train, copy=False), "rest": _to_save(_rest(loop), copy=False)}
         self._save(FULL, iteration, items, progress)
         self.wait()
 
-    def _save(self, tier: str, iteration: int, items: dict[str, Arrays], progress: dict[str, Any]) -> None:
-        described = {name: _describe(arrays) for name, arrays in items.items()}
+    def _save(self, tier: str, iteration: int, items: dict[str, Any], progress: dict[str, Any]) -> None:
+        describe = _describe_parts if processes.are_several() else _describe
+        described = {name: describe(arrays) for name, arrays in items.items()}
         manifest = {"schema": SCHEMA, "iteration": iteration, "items": described, "progress": progress}
         arguments: dict[str, Any] = {name: ocp.args.StandardSave(arrays) for name, arrays in items.items()}
         arguments["manifest"] = ocp.args.JsonSave(manifest)
+        if processes.are_several():
+            self.wait()  # of two tiers that are written at the same time, processes would take one for the other
         with self._writing(tier):
             manager = self._manager(tier)
             manager.wait_until_finished()
-            if iteration in self.iterations(tier):  # orbax would quietly keep the old one
+            if processes.any_of(iteration in self.iterations(tier)):  # orbax would quietly keep the old one
                 manager.delete(iteration)
             if not manager.save(iteration, args=ocp.args.Composite(**arguments), force=True):
                 raise RuntimeError(f"checkpoint {tier}/{iteration} was not written")
@@ -252,7 +311,8 @@ class Checkpoints:
         for iteration in self.iterations(FULL):
             if iteration < newest:
                 self._forget(FULL)
-                shutil.rmtree(self._folder / FULL / str(iteration), ignore_errors=True)
+                if processes.is_first():
+                    shutil.rmtree(self._folder / FULL / str(iteration), ignore_errors=True)
 
     def set_aside_after(self, iteration: int) -> list[Path]:
         """Moves checkpoints after ``iteration``, from which no run can go on, to checkpoints/damaged/.
@@ -266,6 +326,8 @@ class Checkpoints:
                 if later > iteration:
                     self._forget(tier)
                     moved.append(self._folder / DAMAGED / f"{tier}-{later}")
+                    if not processes.is_first():
+                        continue
                     moved[-1].parent.mkdir(exist_ok=True)
                     shutil.rmtree(moved[-1], ignore_errors=True)
                     (self._folder / tier / str(later)).rename(moved[-1])
@@ -317,11 +379,12 @@ class Checkpoints:
             raise RequestError(f"{where} is of schema {manifest['schema']}, not {SCHEMA}: use the version that wrote it")
         for name, spec in specs.items():
             _check_structure(where, manifest["items"].get(name, {}), spec)
+            specs[name] = {leaf: _as_saved(manifest["items"][name][leaf][0], expected) for leaf, expected in spec.items()}
         read = self._read(tier, iteration, {name: ocp.args.StandardRestore(spec) for name, spec in specs.items()})
         trees = {}
         for name, tree in templates.items():
             for leaf_name, array in to_host(read[name], copy=False).items():
-                if _checksum(array) != manifest["items"][name][leaf_name][2]:
+                if not _is_intact(array, manifest["items"][name][leaf_name]):
                     raise _Damaged(f"wrong checksum of {leaf_name}")
             trees[name] = _rebuild(tree, read[name])
         loop = LoopState(train=trees["train"], **trees["rest"]) if with_rest else None
@@ -339,11 +402,25 @@ class Checkpoints:
             raise _Damaged(f"{type(error).__name__}: {text}") from None
 
 
+def _is_folded(one: Sequence[int], other: Sequence[int]) -> bool:
+    """Whether two shapes are [S, rollouts, E, ...] and [S, rollouts * E, ...], of the same episodes (`sharding.Layout`)."""
+    (start, *rest), (folded_start, *folded) = sorted((tuple(one), tuple(other)), key=len)
+    return len(folded) >= 2 and start == folded_start and rest == [folded[0] * folded[1], *folded[2:]]
+
+
+def _as_saved(shape: Sequence[int], expected: jax.ShapeDtypeStruct) -> Any:
+    """What orbax is asked for: an array on the first device, or one on the host that is divided among devices later."""
+    if tuple(shape) == expected.shape and isinstance(expected.sharding, jax.sharding.SingleDeviceSharding):
+        return expected
+    return np.broadcast_to(np.zeros((), expected.dtype), tuple(shape))
+
+
 def _host_specs(tree: Any) -> dict[str, jax.ShapeDtypeStruct]:
-    """What `to_host` makes of a tree with these shapes, placed on the first device."""
-    device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    """What `to_host` makes of a tree with these shapes, placed on the first device where the shapes do not say where."""
+    first = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
 
     def convert(leaf: Any) -> jax.ShapeDtypeStruct:
+        device = getattr(leaf, "sharding", None) or first
         if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
             leaf = jax.eval_shape(jax.random.key_data, leaf)
         return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=device)
@@ -352,14 +429,18 @@ def _host_specs(tree: Any) -> dict[str, jax.ShapeDtypeStruct]:
 
 
 def _rebuild(template: Any, arrays: dict[str, jax.Array]) -> Any:
-    """The inverse of `to_host`: a tree like ``template``."""
+    """The inverse of `to_host`: a tree like ``template``, which also says where its arrays are to lie."""
 
     def convert(path: Any, leaf: Any) -> jax.Array:
-        array = arrays[jax.tree_util.keystr(path, simple=True, separator=".")]
+        array, sharding = arrays[jax.tree_util.keystr(path, simple=True, separator=".")], getattr(leaf, "sharding", None)
         if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
             # The default kind, as `Trainer.run_keys` makes them; another one has another number of words, noticed before this.
-            return jax.random.wrap_key_data(array)
-        return array
+            array = jax.random.wrap_key_data(jnp.asarray(array))
+        elif array.shape != leaf.shape:
+            array = array.reshape(leaf.shape)
+        if sharding is None:
+            return jnp.asarray(array)
+        return put_array(array, sharding)
 
     return jax.tree.map_with_path(convert, template)
 
@@ -370,6 +451,9 @@ def _check_structure(where: Path, saved: dict[str, list], expected: dict[str, ja
     for name in sorted(set(saved) | set(expected)):
         there = f"{saved[name][1]}{saved[name][0]}" if name in saved else "nothing"
         here = f"{expected[name].dtype}{list(expected[name].shape)}" if name in expected else "nothing"
+        if there != here and name.startswith("replay.episodes.") and name in saved and name in expected:
+            if saved[name][1] == str(expected[name].dtype) and _is_folded(saved[name][0], expected[name].shape):
+                continue
         if there != here:
             differences.append(f"{name} is {there} there and {here} here")
     if differences:

@@ -29,10 +29,11 @@ LOGGER_FOLDERS, WANDB_STATE = ("tensorboard", "wandb"), "wandb.json"
 
 MAY_CHANGE = (
     *("preset", "env_folder", "env_steps"),
+    *("devices", "data_devices"),
     *("eval_interval", "eval_episodes", "checkpoint_interval", "full_checkpoint_interval"),
 )
-"""Fields that a resumed run may set anew: where its task lies now, how long to train, how often to look and save. All others
-shape what is learned."""
+"""Fields that a resumed run may set anew: where its task lies now, how long to train, on how many devices, how often to look
+and save. All others shape what is learned."""
 
 
 def default_folder(config: Config) -> Path:

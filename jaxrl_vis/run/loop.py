@@ -7,6 +7,9 @@
 Everything that can refuse a run (folder, lock, memory, checkpoints, compilation, memory again) comes before the first byte is
 written or deleted. Metrics are on the disk before the checkpoint of the same iteration is, so a checkpoint never runs ahead of
 metrics.jsonl; and nothing is saved before the iteration's metrics were read and found finite.
+
+Of several processes (`jaxrl_vis.processes`) all train, evaluate and save; the first alone writes everything else. They look for
+signals at boundaries only, where they wait for each other anyway.
 """
 
 import contextlib
@@ -14,12 +17,14 @@ import dataclasses
 import importlib
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxrl_vis import processes
 from jaxrl_vis.errors import NonFiniteError, StorageError
 from jaxrl_vis.report import videos
 from jaxrl_vis.run import metrics
@@ -69,11 +74,12 @@ class RunLoop:
     def __init__(self, programs: Programs, folder: RunFolder, log: tuple[str, ...] = ()):
         self._programs, self._folder = programs, folder
         self._config, self._program = programs.config, programs.program
-        self._console = RunConsole()
+        self._writes = processes.is_first()
+        self._console = RunConsole(quiet=not self._writes)
         self._say = self._console.say
         self._checkpoints = Checkpoints(folder.checkpoints, self._say)
         self._saver = Saver(programs, folder, self._checkpoints, self._say)
-        self._log, self._loggers = log, Loggers(log, folder.path, self._say)
+        self._log, self._loggers = log, Loggers(log if self._writes else (), folder.path, self._say)
         self._total: int = self._program.num_iterations
         self._progress = Progress()
         self._done = 0
@@ -82,6 +88,7 @@ class RunLoop:
         self._started = self._mark = time.monotonic()
         self._begun, self._begun_at = 0, self._mark
         self._marked_iteration, self._compile_s = 0, 0.0
+        self._is_left_alone = False
 
     def reports(self, resume: bool, overwrite: bool) -> Iterator[Report]:
         """The whole run; see `Trainer.run`."""
@@ -89,8 +96,10 @@ class RunLoop:
         if resume and not goes_on:
             self._say(f"nothing to resume in {self._folder.path}: starting at the beginning")
         steps = self._program.steps_per_iteration
-        memory = check_memory(self._config, self._programs.shapes, self._program.replay_bytes, steps)
-        with self._folder.lock(), self._console:
+        shapes, layout = self._programs.shapes, self._programs.layout
+        memory = check_memory(self._config, shapes, self._program.replay_bytes, steps, layout)
+        processes.meet("checked")  # before the first of them writes anything that the others would find
+        with self._folder.lock() if self._writes else contextlib.nullcontext(), self._console:
             if goes_on and self._is_finished():
                 self._say(
                     f"{self._folder.path} is finished already ({self._total} iterations): ask for more --env-steps to go on"
@@ -115,7 +124,7 @@ class RunLoop:
                 raise
             finally:
                 # What is being written becomes whole, unless somebody is in a hurry; and no error on the way hides the first.
-                if not interruption.is_urgent:
+                if not interruption.is_urgent and not self._is_left_alone:
                     with contextlib.suppress(StorageError):
                         self._checkpoints.close()
                     self._loggers.close(in_a_hurry=bool(interruption))
@@ -130,6 +139,9 @@ class RunLoop:
 
     def _rescue(self) -> None:
         self._console.stop()
+        if processes.are_several():
+            self._is_left_alone = True  # whatever went wrong, the others may have ended, and saving would wait for them
+            return
         self._saver.rescue(self._loop, self._done, self._progress_now())
 
     @property
@@ -154,7 +166,7 @@ class RunLoop:
     def _prepare(self, goes_on: bool, memory: str) -> dict[str, Any]:
         """Restores and compiles; the compiled programs by name. Nothing is written."""
         programs, steps = self._programs, self._program.steps_per_iteration
-        self._say(f"{self._config.env}, {self._asked}, on {jax.devices()[0].device_kind}; {memory}")
+        self._say(f"{self._config.env}, {self._asked}, on {programs.layout.name}; {memory}")
         self._say(f"{self._total} iterations of {steps:,} environment steps per seed; files go to {self._folder.path}")
         restored = self._checkpoints.restore_for_resume(programs.shapes) if goes_on else None
         if restored is not None:
@@ -172,20 +184,33 @@ class RunLoop:
     def _begin(self, compiled: dict[str, Any], goes_on: bool, overwrite: bool) -> None:
         """Asks for memory once more, the last thing that can refuse the run; then makes the folder and the state ready."""
         self._say(f"compiled in {show_seconds(self._compile_s)}")
-        check_compiled(compiled, already_there=self._loop is not None)
-        self._folder.open(self._config, goes_on, overwrite, self._log)
-        if goes_on:
-            damaged = self._checkpoints.set_aside_after(self._done)
-            last = self._done - self._progress.evaluation_due  # an evaluation that is due writes its rows again
-            metrics.cut_back(self._folder.metrics, last, damaged[0].parent / "metrics.jsonl" if damaged else None)
-            for path in damaged:
-                self._say(f"kept for inspection: {path}")
-        self._loggers.open(read_record(self._folder.path), self._programs.seeds, metrics.read_rows(self._folder.metrics))
+        check_compiled(compiled, already_there=self._loop is not None, layout=self._programs.layout)
+        processes.meet("compiled")
+        if self._writes:
+            self._folder.open(self._config, goes_on, overwrite, self._log)
+        damaged = self._checkpoints.set_aside_after(self._done) if goes_on else []
+        if self._writes:
+            self._begin_log(goes_on, damaged)
+        processes.meet("begun")
         if self._loop is None:
             self._loop = self._programs.init(self._programs.run_keys)
         self._console.start(self._total, self._done)
         self._set_mark()
         self._begun, self._begun_at = self._done, self._mark
+
+    def _begin_log(self, goes_on: bool, damaged: list[Path]) -> None:
+        """Cuts the metrics back to the iteration that the run goes on from, and opens the loggers.
+
+        Args:
+            goes_on: Whether it does.
+            damaged: Checkpoints that were set aside.
+        """
+        if goes_on:
+            last = self._done - self._progress.evaluation_due  # an evaluation that is due writes its rows again
+            metrics.cut_back(self._folder.metrics, last, damaged[0].parent / "metrics.jsonl" if damaged else None)
+            for path in damaged:
+                self._say(f"kept for inspection: {path}")
+        self._loggers.open(read_record(self._folder.path), self._programs.seeds, metrics.read_rows(self._folder.metrics))
 
     def _take_over(self, restored: Restored) -> None:
         self._progress = Progress.from_dict(restored.progress)
@@ -198,7 +223,8 @@ class RunLoop:
         # draws); the replay starts empty, and knows that it is. Until it has filled up again, updates see fewer and newer
         # episodes than they would have: a sound run, but not the one that was interrupted.
         fresh = self._programs.init(self._programs.run_keys)
-        self._loop = fresh.replace(train=restored.train, iteration=jnp.asarray(self._done, fresh.iteration.dtype))
+        iteration = self._programs.layout.put(jnp.asarray(self._done, fresh.iteration.dtype), self._programs.layout.everywhere)
+        self._loop = fresh.replace(train=restored.train, iteration=iteration)
         if self._done < self._total:
             self._progress.replay_lost_at = self._done
         self._say(
@@ -224,10 +250,10 @@ class RunLoop:
                 yield self._read(*before)
             evaluation = self._is_due(config.eval_interval) or self._done == self._total
             light, full = self._is_due(config.checkpoint_interval), self._is_due(config.full_checkpoint_interval)
-            if not (evaluation or light or full or interruption):
+            if not (evaluation or light or full or (interruption and not processes.are_several())):
                 continue
             report, waiting = self._read(*waiting), None
-            if interruption:
+            if processes.any_of(bool(interruption)):
                 self._save_and_end(evaluation, interruption)
             if evaluation:
                 report = self._evaluate(report)
@@ -236,7 +262,7 @@ class RunLoop:
             if full:
                 self._saver.full(self._loop, self._done, self._progress_now())
             # A signal that came during the evaluation must not wait for another iteration.
-            if interruption and self._done < self._total:
+            if self._done < self._total and processes.any_of(bool(interruption)):
                 self._save_and_end(False, interruption)
             yield report
 
@@ -285,9 +311,10 @@ class RunLoop:
         counts = {"iteration": self._done, "updates": report.updates, "env_steps": report.env_steps}
         if progress.replay_lost_at is not None:
             counts["resume/replay_lost_at"] = progress.replay_lost_at
-        rows = metrics.make_rows(self._programs.seeds, counts, values | means | rounded)
-        metrics.append_rows(self._folder.metrics, rows)
-        self._loggers.rows(rows)
+        if self._writes:
+            rows = metrics.make_rows(self._programs.seeds, counts, values | means | rounded)
+            metrics.append_rows(self._folder.metrics, rows)
+            self._loggers.rows(rows)
         progress.evaluation_due = False
         self._warn_if_filtered(means)
         # The last evaluation may come between two scheduled ones; a longer run, resumed from here, goes on with the means.
@@ -357,12 +384,18 @@ class RunLoop:
             self._saver.full(self._loop, self._done, self._progress_now())
         self._saver.finish()
         self._console.stop()
-        if interruption:
+        if processes.any_of(bool(interruption)):
             interruption.end()
+        if self._programs.shows_images and not self._recorded:
+            # Killed after the last evaluation, before this: resumed with nothing left to evaluate.
+            _, self._recorded = self._programs.evaluate(self._loop.train)
+        if self._writes:
+            self._show_results()
+
+    def _show_results(self) -> None:
+        """Draws what a finished run leaves behind, and says so."""
         self._draw_curve()
         if self._programs.shows_images:
-            if not self._recorded:  # killed after the last evaluation, before this: resumed with nothing left to evaluate
-                _, self._recorded = self._programs.evaluate(self._loop.train)
             videos.write_video(videos.first_seed(self._recorded), self._folder.video, self._programs.image_seconds)
             self._loggers.image("video", self._folder.video, self._done * self._program.steps_per_iteration)
         wall = self._progress.wall_s + time.monotonic() - self._started
@@ -374,6 +407,8 @@ class RunLoop:
         self._say(f"see {', '.join([*written, self._folder.metrics.name])} in {self._folder.path}")
 
     def _draw_curve(self) -> None:
+        if not self._writes:
+            return
         from jaxrl_vis.report import plots
 
         config, env = self._config, self._programs.env

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.learner.sharding import ONE_DEVICE, Layout
 
 # What stays unclaimed: XLA's workspaces and the allocator's gaps on an accelerator, the program and its libraries on a host.
 _SLACK_BYTES = 256 * 2**20
@@ -36,9 +37,9 @@ def tree_bytes(shapes: Any) -> int:
     return sum(size(leaf) for leaf in jax.tree.leaves(shapes))
 
 
-def available_bytes() -> int | None:
-    """Bytes that the first device can still give, or, for a CPU, that the host can; None where nobody says."""
-    device = jax.devices()[0]
+def available_bytes(device: Any = None) -> int | None:
+    """Bytes that a device (the first one) can still give, or, for a CPU, that the host can; None where nobody says."""
+    device = jax.local_devices()[0] if device is None else device
     if device.platform != "cpu":
         statistics = device.memory_stats() or {}
         if "bytes_limit" not in statistics:
@@ -75,14 +76,28 @@ def show_bytes(count: float) -> str:
     return f"{gib:.1f} GiB" if gib >= 0.1 else f"{gib:.3f} GiB" if gib >= 0.001 else "under 0.001 GiB"
 
 
-def check_memory(config: Config, loop_shapes: Any, replay_bytes: int, steps_per_iteration: int) -> str:
-    """Compares what a run needs with what there is.
+def _least_available(layout: Layout) -> int | None:
+    """Bytes that each of the run's devices can give; None where one does not say."""
+    if layout.mesh is None:
+        return available_bytes()
+    if layout.devices[0].platform == "cpu":  # the host's memory is that of all of them
+        there = available_bytes()
+        return None if there is None else there // len(layout.devices)
+    found = [available_bytes(device) for device in layout.devices]
+    return None if None in found else min(each for each in found if each is not None)
+
+
+def check_memory(
+    config: Config, loop_shapes: Any, replay_bytes: int, steps_per_iteration: int, layout: Layout = ONE_DEVICE
+) -> str:
+    """Compares what a run needs on a device with what there is.
 
     Args:
         config: The run.
         loop_shapes: The loop state's shapes, all seeds.
         replay_bytes: Of one seed's replay.
         steps_per_iteration: Environment steps of one seed in an iteration; the replay's capacity is a multiple of it.
+        layout: Where it runs.
 
     Returns:
         A line for the reader, such as ``replay 0.3 GiB of 22.0 GiB``.
@@ -91,14 +106,16 @@ def check_memory(config: Config, loop_shapes: Any, replay_bytes: int, steps_per_
         RequestError: It does not fit. Says what would.
     """
     capacity = math.ceil(config.replay_transitions / steps_per_iteration) * steps_per_iteration
-    replay = replay_bytes * config.seeds
+    parts = layout.shards.count
+    share = parts / layout.num_devices  # of the seeds, on each device
+    train = max(0, tree_bytes(loop_shapes) - replay_bytes * config.seeds) * share
+    replay = replay_bytes * config.seeds * share / parts
     bytes_per_rollout = replay * steps_per_iteration / capacity
-    train = max(0, tree_bytes(loop_shapes) - replay)
     batch = bytes_per_rollout / steps_per_iteration * config.batch_size * 4
     beside = train * (1 + _TRAIN_COPIES) + bytes_per_rollout * _ROLLOUT_COPIES + batch * _BATCH_COPIES + _SLACK_BYTES
-    there = available_bytes()
+    there, each = _least_available(layout), "" if layout.num_devices == 1 else " a device"
     if there is None:
-        return f"replay {show_bytes(replay)}"
+        return f"replay {show_bytes(replay)}{each}"
     if replay + beside > there:
         fitting = int((there - beside) // bytes_per_rollout) * steps_per_iteration
         if fitting > 0:
@@ -108,22 +125,24 @@ def check_memory(config: Config, loop_shapes: Any, replay_bytes: int, steps_per_
         seeds = "1 seed" if config.seeds == 1 else f"{config.seeds} seeds"
         raise RequestError(
             f"a replay of {config.replay_transitions} transitions for {seeds} needs "
-            f"{show_bytes(replay)}, and networks and rollouts {show_bytes(beside)} more; there are {show_bytes(there)}: {mend}"
+            f"{show_bytes(replay)}{each}, and networks and rollouts {show_bytes(beside)} more; there are "
+            f"{show_bytes(there)}{each}: {mend}"
         )
-    return f"replay {show_bytes(replay)} of {show_bytes(there)}"
+    return f"replay {show_bytes(replay)} of {show_bytes(there)}{each}"
 
 
-def check_compiled(programs: dict[str, Any], already_there: bool) -> None:
+def check_compiled(programs: dict[str, Any], already_there: bool, layout: Layout = ONE_DEVICE) -> None:
     """The same question with the compiler's own figures. Still nothing is allocated.
 
     Args:
         programs: Compiled programs by name; ``train_iteration`` among them, where a state is to be made.
         already_there: The loop state is on the device already.
+        layout: Where they run; the compiler's figures are those of one device.
 
     Raises:
         RequestError: A program's scratch memory does not fit beside the state.
     """
-    there = available_bytes()
+    there = _least_available(layout)
     if there is None:
         return
     analyses = {name: program.memory_analysis() for name, program in programs.items()}

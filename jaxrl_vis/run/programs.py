@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax.experimental.compilation_cache import compilation_cache
 
+from jaxrl_vis import processes
 from jaxrl_vis.config import Config
 from jaxrl_vis.files import user_cache
 from jaxrl_vis.report import videos
@@ -19,6 +20,7 @@ from jaxrl_vis.run.checkpoint import to_host
 from jaxrl_vis.run.nonfinite import broken_leaves
 from jaxrl_vis.run.signals import shield_this_thread
 from jaxrl_vis.types import LoopState, Metrics, TrainState
+from jaxrl_vis_envs.compilation import tracing_for_default_device
 
 # Evaluation draws from a key of its own, the same at every evaluation and for every seed.
 _EVALUATION_SEED = 2**31 - 1
@@ -55,33 +57,35 @@ class Programs:
         config: The run.
         program: The jitted functions and their sizes.
         env: The environment.
+        layout: Where seeds, and the parts of learners, lie.
         seeds: The seeds, in the order of the seed axis.
     """
 
     def __init__(self, config: Config, program: Any):
         self.config, self.program, self.env = config, program, program.env
+        self.layout = program.layout
         self.seeds = range(config.seed, config.seed + config.seeds)
         self._compiled: dict[str, Any] = {}
 
     @functools.cached_property
     def run_keys(self) -> jax.Array:
         """[S] typed keys: seed i of a run starts from ``jax.random.key(config.seed + i)``."""
-        return jnp.stack([jax.random.key(seed) for seed in self.seeds])
+        return self.layout.put(jnp.stack([jax.random.key(seed) for seed in self.seeds]), self.layout.by_seed)
 
     @functools.cached_property
     def evaluation_key(self) -> jax.Array:
         """[] the typed key that draws the episodes of every evaluation."""
-        return jax.random.key(_EVALUATION_SEED)
+        return self.layout.put(jax.random.key(_EVALUATION_SEED), self.layout.everywhere)
 
     @functools.cached_property
     def shapes(self) -> LoopState:
-        """Shapes and types of the loop state; traced, not allocated."""
-        return jax.eval_shape(self.program.init, self.run_keys)
+        """Shapes and types of the loop state, and where it lies; traced, not allocated."""
+        return self.layout.with_shardings(jax.eval_shape(self.program.init, self.run_keys), self.layout.loop)
 
     @functools.cached_property
     def shows_images(self) -> bool:
         """Whether what the robot sees can be shown in a video."""
-        _, episodes, slots, *image = self.shapes.replay.episodes.observations.shape
+        _, episodes, slots, *image = jax.eval_shape(self.layout.unfolded, self.shapes.replay).episodes.observations.shape
         if len(image) == 3:  # of stacked images the newest is shown
             image[0] //= self.env.frame_stack
         return videos.shows_images((episodes, slots, *image))
@@ -104,8 +108,9 @@ class Programs:
         with concurrent.futures.ThreadPoolExecutor(len(_NAMES), initializer=shield_this_thread) as pool:
             missing = [name for name in _NAMES if name not in self._compiled]
             futures = {name: pool.submit(self._lower(name).compile) for name in missing}
-            # Taking keys apart is a program, too.
-            to_host({"keys": self.run_keys, "evaluation": self.evaluation_key}, copy=True)
+            if not processes.are_several():
+                # Taking keys apart is a program, too.
+                to_host({"keys": self.run_keys, "evaluation": self.evaluation_key}, copy=True)
             self._compiled |= {name: future.result() for name, future in futures.items()}
         return dict(self._compiled)
 
@@ -117,7 +122,8 @@ class Programs:
             "train_iteration": (self.shapes,),
             "evaluate": (self.shapes.train, self.evaluation_key),
         }
-        return getattr(self.program, name).lower(*arguments[name])
+        with tracing_for_default_device():
+            return getattr(self.program, name).lower(*arguments[name])
 
     def compiled(self, name: str) -> Any:
         """One compiled program: ``init``, ``train_iteration``, ``evaluate`` or ``broken_leaves``."""
@@ -128,7 +134,7 @@ class Programs:
 
     def init(self, keys: jax.Array) -> LoopState:
         """A fresh learner with an empty replay, for each of the typed keys [S]."""
-        return self.compiled("init")(keys)
+        return self.compiled("init")(self.layout.put(keys, self.layout.by_seed))
 
     def train_iteration(self, loop: LoopState) -> tuple[LoopState, Metrics]:
         """One iteration; ``loop`` is donated. See `Trainer.train_iteration`."""
@@ -141,7 +147,8 @@ class Programs:
             train: The learner, [S, ...].
             key: Draws the episodes; None: always the same ones.
         """
-        return self.compiled("evaluate")(train, self.evaluation_key if key is None else key)
+        key = self.evaluation_key if key is None else self.layout.put(key, self.layout.everywhere)
+        return self.compiled("evaluate")(train, key)
 
     def broken_leaves(self, loop: LoopState) -> list[str]:
         """Names of the floating-point leaves of the loop state that hold a NaN or an infinity."""

@@ -12,6 +12,7 @@ from collections.abc import Callable
 import jax
 import numpy as np
 
+from jaxrl_vis import processes
 from jaxrl_vis.errors import NonFiniteError, StorageError
 from jaxrl_vis.run.checkpoint import FULL, LIGHT, Checkpoints
 from jaxrl_vis.run.folder import RunFolder
@@ -37,8 +38,8 @@ class Saver:
         self._keeps_full = programs.config.full_checkpoint_interval > 0
 
     def has(self, tier: str, iteration: int) -> bool:
-        """Whether there is a checkpoint of that tier and iteration."""
-        return iteration in self._checkpoints.iterations(tier)
+        """Whether there is a checkpoint of that tier and iteration; several processes agree on it."""
+        return processes.any_of(iteration in self._checkpoints.iterations(tier))
 
     def light(self, loop: LoopState, iteration: int, progress: Progress) -> None:
         """Saves the learner in the background.
@@ -112,8 +113,10 @@ class Saver:
         leaves = self._programs.broken_leaves(loop) if broken is None else broken
         leaves = [name.removeprefix("train.") for name in leaves if name.startswith("train.")]
         file = self._folder.nonfinite / f"iteration_{iteration}.npz"
-        dump(file, loop, values, leaves)
+        if not processes.are_several():
+            dump(file, loop, values, leaves)
         names = [name for name, row in values.items() if not np.isfinite(row).all()] + leaves
         shown = f" ({', '.join(names[:3])}{f' and {len(names) - 3} more' if len(names) > 3 else ''})" if names else ""
         good = "there is no checkpoint yet" if kept is None else f"the last good checkpoint is of iteration {kept}"
-        raise NonFiniteError(f"non-finite numbers in {where}{shown}: state dumped to {file}; {good}")
+        dumped = "the state lies in several processes and is not kept" if processes.are_several() else f"state dumped to {file}"
+        raise NonFiniteError(f"non-finite numbers in {where}{shown}: {dumped}; {good}")

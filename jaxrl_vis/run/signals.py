@@ -79,6 +79,6 @@ class Interruption:
 
     def end(self) -> None:
         """Raises what the signal stands for: `Terminated` or KeyboardInterrupt."""
-        if self.signal == signal.SIGTERM:
-            raise Terminated
-        raise KeyboardInterrupt
+        if self.signal == signal.SIGINT:
+            raise KeyboardInterrupt
+        raise Terminated  # which another process may have been told

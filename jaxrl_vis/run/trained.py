@@ -14,12 +14,12 @@ from jaxrl_vis.run.trainer import Trainer, make_trainer
 
 
 def open_run(run_dir: Path | str, **changes: object) -> Trainer:
-    """The trainer of a run, with fields of its configuration changed; nothing in its folder is touched.
+    """The trainer of a run, on one device, with fields of its configuration changed; nothing in its folder is touched.
 
     Raises:
         RequestError: There is no run, or it cannot be made any more.
     """
-    return make_trainer(read_config(Path(run_dir)).replace(**changes))
+    return make_trainer(read_config(Path(run_dir)).replace(devices=1, data_devices=None, **changes))
 
 
 def load(trainer: Trainer, run_dir: Path | str, checkpoint: int | None = None) -> Restored:

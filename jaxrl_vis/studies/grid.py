@@ -16,8 +16,9 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any, Protocol
 
 from jaxrl_vis.devices import Device
 from jaxrl_vis.errors import RequestError
@@ -36,6 +37,42 @@ Command = Callable[[Cell, Path, bool], Sequence[str]]
 """(cell, its folder, whether a run goes on there) -> the words of a command that trains it."""
 
 
+class Process(Protocol):
+    """What `start_process` returns, as much of `subprocess.Popen` as is used here."""
+
+    returncode: Any
+
+    def poll(self) -> int | None:
+        """The exit status; None as long as there is none."""
+        ...
+
+    def send_signal(self, sig: int, /) -> None:
+        """Tells it to end."""
+        ...
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Waits for its end."""
+        ...
+
+    def kill(self) -> None:
+        """Ends it at once."""
+        ...
+
+
+Start = Callable[[Sequence[str], Path, Mapping[str, str]], Process]
+"""(words of a command, file for what it prints, variables that keep it to its device) -> the process that runs it."""
+
+
+def start_process(words: Sequence[str], log: Path, environment: Mapping[str, str]) -> Process:
+    """Runs a command on this machine. See `cluster` for others."""
+    # In a session of its own, so that a Ctrl-C of the terminal reaches it once, from here: a second one would not wait.
+    with log.open("a", encoding="utf-8") as file:
+        variables = child_environment() | dict(environment)
+        return subprocess.Popen(
+            words, stdin=subprocess.DEVNULL, stdout=file, stderr=file, env=variables, start_new_session=True
+        )
+
+
 def train_command(cell: Cell, folder: Path, goes_on: bool) -> list[str]:
     """The command that trains a cell."""
     words = [sys.executable, "-m", "jaxrl_vis", "train", *options_of(cell.config), "--run-dir", str(folder)]
@@ -46,7 +83,7 @@ def train_command(cell: Cell, folder: Path, goes_on: bool) -> list[str]:
 class _Running:
     cell: Cell
     device: Device
-    process: subprocess.Popen
+    process: Process
     log: Path
     started: float
 
@@ -58,6 +95,7 @@ def run_cells(
     seconds: float | None = None,
     command: Command = train_command,
     say: Callable[[str], None] = print,
+    start: Start = start_process,
 ) -> list[str]:
     """Trains the cells that are not finished; resumes those that were begun.
 
@@ -68,6 +106,7 @@ def run_cells(
         seconds: Stop after so long, and save; None: when all is done.
         command: What trains a cell.
         say: Takes each line on what happens.
+        start: How a command is started.
 
     Returns:
         A line for each cell that failed.
@@ -94,7 +133,7 @@ def run_cells(
     where = devices[0].name if len(devices) == 1 else f"{len(devices)} devices"
     say(f"{len(missing)} of {len(cells)} cells to train on {where}; run folders and logs go to {runs}")
     with Interruption() as interruption:
-        failures += _Grid(missing, runs, devices, command, say, interruption).run(seconds)
+        failures += _Grid(missing, runs, devices, command, say, interruption, start).run(seconds)
     if interruption:
         interruption.end()
     return failures
@@ -111,10 +150,11 @@ class _Grid:
         command: Command,
         say: Callable[[str], None],
         interruption: Interruption,
+        start: Start,
     ):
         self._waiting, self._free = list(cells), list(devices)
         self._total, self._runs, self._command, self._say = len(cells), runs, command, say
-        self._interruption = interruption
+        self._interruption, self._start_command = interruption, start
         self._running: list[_Running] = []
         self._failures: list[str] = []
         self._is_stopping = False
@@ -142,12 +182,7 @@ class _Grid:
         folder, log = self._runs / cell.name, self._runs / f"{cell.name}.log"
         words = self._command(cell, folder, RunFolder(folder).config.exists())
         place = f"[{self._total - len(self._waiting)}/{self._total}] {cell.name}"
-        # In a session of its own, so that a Ctrl-C of the terminal reaches it once, from here: a second one would not wait.
-        with log.open("a", encoding="utf-8") as file:
-            environment = child_environment() | dict(device.environment)
-            process = subprocess.Popen(
-                words, stdin=subprocess.DEVNULL, stdout=file, stderr=file, env=environment, start_new_session=True
-            )
+        process = self._start_command(words, log, device.environment)
         self._running.append(_Running(cell, device, process, log, time.monotonic()))
         self._say(f"{place}: {'resumes' if '--resume' in words else 'starts'} on {device.name}")
 

@@ -6,8 +6,9 @@
     surfaces    the plot as cones and triangles            tables     what one camera sees of them, tile by tile
     drawing     rays to radiance, in JAX                   imaging    radiance to the numbers in a file
     pairs       pairs of images of a plot                  truth      boxes, visible shares and edges of its stalks
+    stand       the few stalks around a robot's arm        bending    these as bodies that give way, and the wind
 
-Everything is a function of a family and a seed. Importing this loads no JAX; `pairs`, `drawing` and `imaging` do.
+Everything is a function of a family and a seed. Importing this loads no JAX; `pairs`, `drawing`, `imaging` and `bending` do.
 """
 
 from jaxrl_vis_envs.plants.cameras import Calibration, Drive, Pose, drive

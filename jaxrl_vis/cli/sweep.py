@@ -1,0 +1,83 @@
+"""``jaxrl-vis sweep``."""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from jaxrl_vis.cli.checks import check_counts, check_env
+from jaxrl_vis.cli.figure import UNFINISHED
+from jaxrl_vis.cli.parsing import ChangesOf, SayDefault
+from jaxrl_vis.cli.train import default_of, default_preset
+from jaxrl_vis.config import PRESETS, Config
+from jaxrl_vis.devices import guess_accelerator
+from jaxrl_vis.errors import RequestError, nearest
+from jaxrl_vis.methods import MethodName
+from jaxrl_vis.report.outputs import check_writable
+
+
+@dataclasses.dataclass(frozen=True)
+class Sweep:
+    """Train several tasks with several methods and seeds, one run a device or one a job of a cluster, and print a table.
+
+    It may be interrupted and started again at any time: finished runs stay as they are, and those that were begun are resumed.
+    The exit status is 3 where something is still missing.
+    """
+
+    env: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """The environments; VisualFetchReach if none is given."""
+    method: tuple[MethodName, ...] = ()
+    """The methods; oracle if not given."""
+    preset: Annotated[str, SayDefault(default_preset)] = "auto"
+    """paper, fast, cpu or debug; auto is fast on an accelerator, else cpu."""
+    changes: Annotated[Mapping[str, Any], ChangesOf(Config, default_of)] = dataclasses.field(default_factory=dict)
+    seeds_per_run: int | None = None
+    """At most so many seeds in one program, to spread them over more devices; all of them if not given."""
+    runs: Path | None = None
+    """Folder of all run folders and logs; runs/sweep if not given."""
+    minutes: float | None = None
+    """Stop after so long: runs are saved, and the next start goes on."""
+    executor: Literal["local", "slurm"] | None = None
+    """Start each run as a job, with submitit: on Slurm, or on this machine in the same way. Processes, one a device, if not
+    given."""
+    jobs: int = 64
+    """At most so many jobs at a time (--executor slurm)."""
+    job_options: tuple[str, ...] = ()
+    """Parameters of submitit's executor as name=value, such as timeout_min=600 slurm_partition=gpu cpus_per_task=8."""
+
+
+def run(options: Sweep) -> int:
+    """Runs a sweep; `UNFINISHED` where a run of it is not finished."""
+    name = options.preset
+    if name not in ("auto", *PRESETS):
+        raise RequestError(f"unknown preset {name!r}{nearest(name, ['auto', *PRESETS])}")
+    if name == "auto":
+        name = "fast" if guess_accelerator() else "cpu"
+    check_counts(seeds_per_run=options.seeds_per_run, jobs=options.jobs)
+    if options.minutes is not None and options.minutes <= 0:
+        raise RequestError(f"--minutes must be positive, not {options.minutes:g}")
+    if options.job_options and options.executor is None:
+        raise RequestError("--job-options go with --executor")
+    tasks = options.env or ("VisualFetchReach",)
+    for task in tasks:
+        check_env(task, options.changes.get("env_folder"))
+    runs = options.runs or Path("runs") / "sweep"
+    check_writable(runs, "--runs", folder=True)
+    # Nothing below starts JAX in this process: the accelerator's memory belongs to the runs.
+    from jaxrl_vis.studies.sweep import Request, run_sweep
+
+    request = Request(
+        tasks=tuple(dict.fromkeys(tasks)),
+        methods=tuple(dict.fromkeys(options.method or ("oracle",))),
+        preset=name,
+        changes=options.changes,
+        runs=runs,
+        seeds_per_run=options.seeds_per_run,
+        seconds=None if options.minutes is None else 60.0 * options.minutes,
+        executor=options.executor,
+        jobs=options.jobs,
+        job_options=options.job_options,
+    )
+    return 0 if run_sweep(request) else UNFINISHED

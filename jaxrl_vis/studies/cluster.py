@@ -1,0 +1,146 @@
+"""Runs of a grid as jobs of a cluster, by submitit: on Slurm, or by its local executor, which is the same without a cluster.
+
+A job is one training command. A job that Slurm ends, because its time is over or another one goes first, has saved by then, and
+is queued again; it resumes by itself. To `grid`, a job looks like a process.
+"""
+
+import contextlib
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.provenance import child_environment, install_command
+
+ExecutorName = Literal["local", "slurm"]
+
+_FAILED = 1
+_DEFAULTS: dict[str, Any] = {"name": "jaxrl-vis", "timeout_min": 24 * 60, "gpus_per_node": 1, "cpus_per_task": 8}
+
+
+class Training:
+    """What a job does; pickled, and called on the node.
+
+    Args:
+        words: The command.
+        log: File for what it prints.
+        environment: Variables that it gets beside those of the node.
+    """
+
+    def __init__(self, words: Sequence[str], log: Path, environment: Mapping[str, str]):
+        self._words, self._log, self._environment = list(words), log.resolve(), dict(environment)
+        self._folder, self._child = Path.cwd(), None
+
+    def __call__(self) -> int:
+        """Trains; the command's exit status."""
+        words = list(self._words)
+        run_dir = self._folder / words[words.index("--run-dir") + 1] if "--run-dir" in words else None
+        if "--resume" not in words and run_dir is not None and (run_dir / "config.json").exists():
+            words.append("--resume")  # queued again
+        with self._log.open("a", encoding="utf-8") as file:
+            environment = {**os.environ, **self._environment}
+            child = subprocess.Popen(words, stdout=file, stderr=file, env=environment, cwd=self._folder)
+            self._child = child
+            try:
+                return child.wait()
+            except BaseException:  # the job is cancelled: what it has is saved first
+                self._end()
+                raise
+
+    def checkpoint(self) -> Any:
+        """Called by submitit before a job is ended and queued again."""
+        import submitit
+
+        self._end()
+        return submitit.helpers.DelayedSubmission(Training(self._words, self._log, self._environment))
+
+    def _end(self) -> None:
+        if self._child is not None and self._child.poll() is None:
+            self._child.send_signal(signal.SIGTERM)
+            self._child.wait()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_child": None}
+
+
+class Job:
+    """A submitted job, with as much of `subprocess.Popen` as `grid` uses.
+
+    Args:
+        job: Of submitit.
+    """
+
+    def __init__(self, job: Any):
+        self._job, self.returncode = job, None
+
+    def poll(self) -> int | None:
+        """The exit status; None while it is queued or running."""
+        if self.returncode is None and self._job.done():
+            self.returncode = _FAILED
+            with contextlib.suppress(Exception):  # a job that was cancelled or lost has no result
+                self.returncode = int(self._job.result())
+        return self.returncode
+
+    def send_signal(self, _: int) -> None:
+        """Cancels it: the run is told to save and to end."""
+        self._job.cancel()
+
+    def kill(self) -> None:
+        """Likewise; a cluster ends what does not end by itself."""
+        self._job.cancel()
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Waits for its end.
+
+        Raises:
+            subprocess.TimeoutExpired: It goes on.
+        """
+        end = None if timeout is None else time.monotonic() + timeout
+        while self.poll() is None:
+            if end is not None and time.monotonic() >= end:
+                raise subprocess.TimeoutExpired("a job", timeout or 0.0)
+            time.sleep(0.2)
+        return self.returncode or 0
+
+
+class Cluster:
+    """Starts runs as jobs.
+
+    Args:
+        executor: Where they run.
+        folder: For submitit's own files.
+        options: name=value: parameters of submitit's executor, such as timeout_min=600 or slurm_partition=gpu.
+
+    Raises:
+        RequestError: submitit or Slurm is missing, or an option is not known.
+    """
+
+    def __init__(self, executor: ExecutorName, folder: Path, options: Sequence[str] = ()):
+        try:
+            import submitit
+        except ImportError as error:
+            raise RequestError(f"--executor {executor} needs submitit: {install_command('cluster')}") from error
+        parameters = {**_DEFAULTS, **dict(map(_read, options))}
+        if executor == "local":
+            parameters.pop("gpus_per_node")  # each run has its device from `grid`
+        try:
+            self._executor = submitit.AutoExecutor(folder, cluster=executor)
+            self._executor.update_parameters(**parameters)
+        except Exception as error:
+            raise RequestError(f"--executor {executor} cannot be used: {' '.join(str(error).split())}") from error
+
+    def start(self, words: Sequence[str], log: Path, environment: Mapping[str, str]) -> Job:
+        """Submits a command; see `grid.start_process`."""
+        own = {name: value for name, value in child_environment().items() if name == "PYTHONPATH"}
+        return Job(self._executor.submit(Training(words, log, {**own, **environment})))
+
+
+def _read(option: str) -> tuple[str, Any]:
+    name, sign, value = option.partition("=")
+    if not (name and sign and value):
+        raise RequestError(f"--job-options are name=value, such as timeout_min=600 slurm_partition=gpu, not {option!r}")
+    return name, int(value) if value.isdigit() else value

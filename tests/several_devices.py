@@ -1,0 +1,147 @@
+"""Trains on four devices of a CPU, as a script of its own: the number of devices is settled when JAX starts.
+
+Prints a line of JSON: the name of each comparison and the largest difference found.
+"""
+
+import json
+import sys
+import tempfile
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probe_environments as probes
+
+from jaxrl_vis.config import preset
+from jaxrl_vis.learner.sharding import DATA, Layout, Shards, Spec
+from jaxrl_vis.learner.train_step import make_train_step
+from jaxrl_vis.run.checkpoint import Checkpoints, named_leaves
+from jaxrl_vis.run.programs import Programs
+
+ENV = probes.GoWhereTold()
+CONFIG = preset(
+    "debug",
+    num_envs=8,
+    updates_per_iteration=4,
+    batch_size=16,
+    replay_transitions=3 * 8 * ENV.horizon,
+    eval_episodes=8,
+    seeds=2,
+)
+COLLECTIVES = ("all-reduce", "all-gather", "all-to-all", "collective-permute", "reduce-scatter")
+
+
+class Emulated(Layout):
+    """The parts of each learner side by side on one device: the same functions, mapped by `jax.vmap`."""
+
+    def spread(self, function, in_specs, out_specs, jit, **options):
+        count = self.shards.count
+
+        def split(spec, leaf):
+            if DATA not in spec:
+                return jnp.broadcast_to(leaf, (count, *leaf.shape))
+            axis = spec.index(DATA)
+            return jnp.moveaxis(leaf.reshape(*leaf.shape[:axis], count, -1, *leaf.shape[axis + 1 :]), axis, 0)
+
+        def join(spec, leaf):
+            if DATA not in spec:
+                same = leaf if not jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else jax.random.key_data(leaf)
+                for part in same[1:]:
+                    np.testing.assert_array_equal(part, same[0])  # or else one device would not know what another does
+                return leaf[0]
+            axis = spec.index(DATA)
+            leaf = jnp.moveaxis(leaf, 0, axis)
+            return leaf.reshape(*leaf.shape[:axis], -1, *leaf.shape[axis + 2 :])
+
+        def each(change, specs, tree):
+            return jax.tree.map(
+                lambda spec, part: jax.tree.map(lambda leaf: change(spec, leaf), part),
+                specs,
+                tree,
+                is_leaf=lambda leaf: isinstance(leaf, Spec),
+            )
+
+        mapped = jax.jit(jax.vmap(function, axis_name=DATA))
+        return lambda *arguments: each(join, out_specs, mapped(*each(split, in_specs, arguments)))
+
+
+def trained(config, layout=None, iterations=3):
+    """The program, the last loop state, and the metrics of all iterations and of an evaluation."""
+    program = make_train_step(ENV, config, layout)
+    keys = jnp.stack([jax.random.key(seed) for seed in range(config.seeds)])
+    loop, found = program.init(program.layout.put(keys, program.layout.by_seed)), []
+    for _ in range(iterations):
+        loop, metrics = program.train_iteration(loop)
+        found.append(jax.device_get(metrics))
+    key = program.layout.put(jax.random.key(9), program.layout.everywhere)
+    return program, loop, [*found, jax.device_get(program.evaluate(loop.train, key)[0])]
+
+
+def plain(tree):
+    leaves = named_leaves(tree).items()
+    keys = {name for name, leaf in leaves if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)}
+    return {name: np.asarray(jax.random.key_data(leaf) if name in keys else leaf) for name, leaf in leaves}
+
+
+def difference(one, other):
+    """The largest difference between two trees, of episodes whatever their shape."""
+    one, other = plain(one), plain(other)
+    assert one.keys() == other.keys()
+    return max(float(np.max(np.abs(one[name].ravel().astype(np.float64) - other[name].ravel()))) for name in one)
+
+
+def restored_differences(loop, folder):
+    """What a checkpoint of two devices holds, restored on other numbers of them: bytes that differ."""
+    checkpoints = Checkpoints(Path(folder), say=lambda line: None)
+    checkpoints.save_full(3, loop, {})
+    found = {}
+    for devices, parts in ((1, None), (2, 1), (2, 2), (4, 2), (4, 4)):
+        config = CONFIG.replace(devices=devices, data_devices=parts)
+        programs = Programs(config, make_train_step(ENV, config))
+        restored = checkpoints.restore_for_resume(programs.shapes)
+        assert restored is not None and restored.loop is not None
+        expected, there = plain(loop), plain(restored.loop)
+        differing = [name for name in expected if expected[name].tobytes() != there[name].tobytes()]
+        places = {leaf.sharding.num_devices for leaf in jax.tree.leaves(restored.loop.replay)}
+        found[f"{devices} devices, {parts} along data"] = [differing, sorted(places)]
+    checkpoints.close()
+    return found
+
+
+def resumed(loop, folder, program):
+    """An iteration on one device, after what two devices have saved."""
+    checkpoints = Checkpoints(Path(folder), say=lambda line: None)
+    checkpoints.save_full(3, loop, {})
+    restored = checkpoints.restore_for_resume(jax.eval_shape(program.init, jnp.stack([jax.random.key(0)] * CONFIG.seeds)))
+    checkpoints.close()
+    after, metrics = program.train_iteration(restored.loop)
+    return int(after.iteration), all(np.isfinite(values).all() for values in metrics.values())
+
+
+def main() -> None:
+    found = {}
+    one, alone, of_one = trained(CONFIG)
+    program, loop, of_two = trained(CONFIG.replace(devices=2))
+    found["seeds: metrics"], found["seeds: state"] = difference(of_one, of_two), difference(alone, loop)
+    keys = program.layout.put(jnp.stack([jax.random.key(0)] * 2), program.layout.by_seed)
+    text = program.train_iteration.lower(jax.eval_shape(program.init, keys)).compile().as_text()
+    found["seeds: communication"] = [word for word in COLLECTIVES if word in text]
+
+    wide = CONFIG.replace(devices=4, data_devices=2)
+    program, loop, of_four = trained(wide)
+    _, emulated, of_parts = trained(wide, Emulated(shards=Shards(2)))
+    found["data: metrics"], found["data: state"] = difference(of_parts, of_four), difference(emulated, loop)
+    rollouts = [
+        {name: metrics[name] for name in ("train/success", "train/goal_distance")} for metrics in (of_one[0], of_four[0])
+    ]
+    found["data: first rollout"] = difference(*rollouts)
+    with tempfile.TemporaryDirectory() as folder:
+        found["restored"] = restored_differences(loop, folder)
+    with tempfile.TemporaryDirectory() as folder:
+        found["resumed on one"] = resumed(loop, folder, one)
+    print(json.dumps(found))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

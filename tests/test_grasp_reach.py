@@ -1,0 +1,310 @@
+"""Arms among stalks: kinematics, what bends, what a grasp holds, and the ways that lead there."""
+
+import dataclasses
+import functools
+import types
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from PIL import Image
+
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.grasping import arm, video, way
+from jaxrl_vis.grasping.reach import LOOK, ReachResult, Sight, arms_among, reach
+from jaxrl_vis_envs.plants import TRAINING, bending, draw
+from jaxrl_vis_envs.plants.field import Plot, Stalk
+from jaxrl_vis_envs.plants.stand import MAST_DISTANCE, Stands, origin_of, stands_at
+from jaxrl_vis_envs.tasks import stalk_arm
+
+HEIGHT = 0.7
+TARGETS = np.array(
+    [
+        [1.0, 0.0, HEIGHT],  # alone, straight ahead
+        [1.25, 0.03, 0.55],  # alone, to the right, lower
+        [0.8, -0.02, 0.95],  # alone, to the left, higher
+        [2.0, 0.0, HEIGHT],  # of two that stand 18 mm apart
+        [3.0, 0.0, HEIGHT],  # nothing there
+        [1.0, 0.9, HEIGHT],  # out of reach
+        [4.0, 0.0, HEIGHT],  # behind another one in the same line
+        [5.0, 0.0, HEIGHT],  # alone, and so thin that jaws that close fast go through it
+    ]
+)
+MASTS = np.array([1.0, 1.0, 1.0, 2.0, 3.0, 1.0, 4.0, 5.0])
+THIN = 7
+FEET = [(1.0, 0.0), (1.25, 0.03), (0.8, -0.02), (1.991, 0.0), (2.009, 0.0), (4.0, 0.0), (4.0, -0.05), (5.0, 0.0)]
+ALONE = [0, 1, 2, 7]
+
+
+def straight(x: float, y: float, radius: float = 0.006) -> Stalk:
+    heights = np.linspace(0.0, 2.4, 61)
+    points = np.stack([np.full(61, x), np.full(61, y), heights], axis=1)
+    even = np.full(61, radius)
+    return Stalk(0, points, even, even, heights, np.zeros(61), np.array([0.2]), 1.0, 0.0)
+
+
+@functools.cache
+def row() -> Plot:
+    return Plot(TRAINING, 0, tuple(straight(*place, 0.003 if index == THIN else 0.006) for index, place in enumerate(FEET)), ())
+
+
+@functools.cache
+def stands() -> Stands:
+    return stands_at(row(), MASTS, TARGETS, 4)
+
+
+@functools.cache
+def still_air() -> ReachResult:
+    return reach(stands(), TARGETS, jax.random.key(0))
+
+
+def stalks_held(result: ReachResult, index: int) -> set[int]:
+    return {int(each) for each in stands().stalk[index][result.held[index]]}
+
+
+def test_both_solutions_bring_the_grip_to_the_target():
+    rng = np.random.default_rng(0)
+    radius, bearing = rng.uniform(0.31, 0.69, 200), rng.uniform(-1.2, 1.2, 200)
+    target = np.stack([radius * np.sin(bearing), radius * np.cos(bearing) - MAST_DISTANCE, rng.uniform(0.4, 1.3, 200)], axis=1)
+    solutions = [stalk_arm.joints_at(target, np.full(200, side), np) for side in (1.0, -1.0)]
+    for side, joints in zip((1.0, -1.0), solutions):
+        np.testing.assert_allclose(stalk_arm.grip_at(joints, np), target, atol=1e-9)
+        assert (np.sign(joints[:, 2]) == side).all()
+    assert (np.abs(solutions[0] - solutions[1]).max(axis=1) > 0.01).all()
+
+
+def test_the_model_has_the_dimensions_that_the_formulas_have():
+    model = arms_among(4).mj_model
+    data = mujoco.MjData(model)
+    for target in ([0.1, -0.05, 0.6], [-0.3, 0.02, 1.1]):
+        data.qpos[:3] = stalk_arm.joints_at(np.array(target), -1.0, np)
+        mujoco.mj_forward(model, data)
+        np.testing.assert_allclose(data.site("grip").xpos, target, atol=1e-6)
+    jaws = [data.geom(name).xpos for name in stalk_arm.JAWS]
+    assert np.linalg.norm(jaws[0] - jaws[1]) == pytest.approx(stalk_arm.OPENING + 2 * stalk_arm.JAW_RADIUS)
+    assert stalk_arm.OPENING >= 0.04
+    np.testing.assert_allclose(
+        model.jnt_range[:3, 1], [stalk_arm.SLIDE_RANGE[1], stalk_arm.SHOULDER_RANGE, stalk_arm.ELBOW_RANGE]
+    )
+
+
+@pytest.mark.parametrize(
+    ("place", "can"),
+    [
+        ((0.0, 0.0, 0.7), True),
+        ((0.4, 0.0, 0.7), True),
+        ((0.45, 0.0, 0.7), False),  # further than both links
+        ((0.0, 0.16, 0.7), False),
+        ((0.0, -0.2, 0.7), False),  # the folded gripper is there already
+        ((0.0, 0.0, 1.31), False),  # above the slide's end
+        ((0.0, 0.0, 0.39), False),
+        ((0.0, -1.0, 0.7), False),  # behind the mast
+    ],
+)
+def test_what_can_be_reached_is_what_the_geometry_allows(place: tuple[float, float, float], can: bool):
+    rail = origin_of(1.7)
+    assert bool(arm.reachable(rail, rail + np.array(place))) is can
+
+
+def test_the_way_is_a_straight_line_out_of_the_shoulder():
+    timing, target = arm.Timing(), jnp.array([0.2, 0.05, 0.9])
+    times = jnp.linspace(timing.turn, timing.reach, 30)
+    way = np.asarray(jax.vmap(lambda time: arm.planned(target, jnp.asarray(arm.HOME), time, timing))(times))
+    np.testing.assert_allclose(way[-1], target, atol=1e-5)
+    away, line = way[:, :2] - stalk_arm.SHOULDER, np.asarray(target)[:2] - stalk_arm.SHOULDER
+    assert np.abs(away[:, 0] * line[1] - away[:, 1] * line[0]).max() < 1e-5
+    assert (np.diff(np.linalg.norm(away, axis=1)) > -1e-6).all()
+    np.testing.assert_allclose(way[:, 2], 0.9, atol=1e-5)
+
+
+def test_room_is_the_least_distance_of_the_open_gripper_from_others():
+    target = np.array([[0.0, 0.0, HEIGHT]])
+
+    def beside(x: float, y: float = 0.0, whole_way: bool = False) -> float:
+        return float(arm.room(target, np.array([[[x, y]]]), np.array([[0.006]]), whole_way).max())
+
+    assert beside(np.nan) == np.inf
+    assert beside(0.06) > beside(0.045) > beside(0.03)
+    assert beside(0.0) < 0 and beside(0.06) < 0.06 - 0.006 - stalk_arm.OPENING / 2
+    # One in the way is no matter beside the jaws at the target, but on the way there.
+    assert beside(0.0, -0.08) > 0.005 > 0 > beside(0.0, -0.08, whole_way=True)
+
+
+def test_the_way_with_most_room_is_taken():
+    origins = np.array([origin_of(x) for x in (-0.35, 0.0, 0.35)])
+    target = np.array([0.0, 0.0, HEIGHT])
+
+    def best(*others: tuple[float, float]) -> arm.Way:
+        return arm.best_way(origins, target, np.array(others).reshape(-1, 2), np.full(len(others), 0.006))
+
+    assert best()[::2] == (1, np.inf)  # straight ahead, which is shortest
+    assert best((0.0, -0.1)).stop in (0, 2) and best((0.0, -0.1)).room > 0.005
+    assert best((0.0, -0.1), (-0.06, -0.1)).stop == 2
+    assert best((0.0, -0.1), (0.06, -0.1)).stop == 0
+    assert best((0.015, 0.0)).room < 0  # there is no room from anywhere
+    assert arm.best_way(origins, np.array([2.0, 0.0, HEIGHT]), np.zeros((0, 2)), np.zeros(0)).stop == -1
+
+
+def test_stands_pass_through_the_stalks_of_their_plot():
+    plot = draw(TRAINING, 3)
+    indices = np.arange(0, len(plot.measured), 5)
+    targets = np.array([plot.measured[index].at_height(HEIGHT)[0] for index in indices])
+    found = stands_at(plot, targets[:, 0], targets)
+    for place, index in enumerate(indices):
+        assert index in found.stalk[place]
+        for slot, stalk in enumerate(found.stalk[place]):
+            knee, top = found.knee[place, slot], found.top[place, slot]
+            there = knee + (HEIGHT - knee[2]) / (top - knee)[2] * (top - knee) + found.origin[place]
+            np.testing.assert_allclose(there, plot.measured[stalk].at_height(HEIGHT)[0], atol=1e-5)
+            assert found.radius[place, slot, 1] == pytest.approx(plot.measured[stalk].diameter(HEIGHT) / 2)
+    assert stands().stalk[3, 0] in (3, 4) and (stands_at(row(), [1.0], TARGETS[:1], 12).stalk[0] == -1).sum() == 4
+
+
+def test_a_stand_of_nothing_is_refused_in_one_line():
+    with pytest.raises(ValueError, match=r"x \[B\] and targets \[B, 3\], got \[2\] and \[1, 3\]"):
+        stands_at(row(), np.zeros(2), np.zeros((1, 3)))
+    with pytest.raises(ValueError, match="1 reaches and 2 plots"):
+        stands_at([row(), row()], np.zeros(1), np.zeros((1, 3)))
+    with pytest.raises(ValueError, match="finite"):
+        stands_at(row(), np.zeros(1), np.full((1, 3), np.nan))
+    empty = stands_at(Plot(TRAINING, 0, (), ()), np.zeros(1), np.zeros((1, 3)))
+    assert not empty.present.any()
+
+
+def test_a_stalk_gives_way_like_a_beam():
+    """Pushed at several heights in C MuJoCo, against 3 EI / z^3 of a beam without taper."""
+    arms, radius = arms_among(4), 0.006
+    model = arms.mj_model.__copy__()
+    shape = jax.tree.map(lambda part: part[0], bending.shapes(stands()))
+    fitted = bending.fit(arms.model, arms.layout, shape)
+    for name in ("body_pos", "body_ipos", "body_mass", "body_inertia", "jnt_stiffness", "dof_damping"):
+        getattr(model, name)[:] = getattr(fitted, name)
+    rigidity = bending.MODULUS * np.pi * radius**4 / 4
+    data, upper = mujoco.MjData(model), int(arms.layout.upper[0])
+    force = np.array([0.05, 0.0, 0.0])
+    for height, tolerance in ((0.5, 0.01), (0.8, 0.07), (1.0, 0.01)):
+        mujoco.mj_resetData(model, data)
+        mujoco.mj_forward(model, data)
+        torque = np.zeros(model.nv)
+        mujoco.mj_applyFT(model, data, force, np.zeros(3), data.xpos[upper] + [0, 0, height - 0.3], upper, torque)
+        hinges = torque / model.jnt_stiffness.clip(1e-9)
+        data.qpos[5:] = hinges[5:]
+        mujoco.mj_forward(model, data)
+        moved = data.xpos[upper] + data.xmat[upper].reshape(3, 3) @ [0, 0, height - 0.3]
+        expected = force[0] * height**3 / (3 * rigidity)
+        assert moved[0] - data.mocap_pos[0][0] == pytest.approx(expected, rel=tolerance)
+
+
+def test_stalks_sway_as_far_as_they_are_said_to():
+    foot = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0]], np.float32)
+    gusts = jax.vmap(lambda key: bending.gusts(key, 0.02))(jax.random.split(jax.random.key(0), 64))
+    times = jnp.linspace(0.0, 60.0, 400)
+    sway = jax.vmap(lambda gust: jax.vmap(lambda time: bending.displacement(gust, foot, time))(times))(gusts)
+    distance = np.linalg.norm(np.asarray(sway), axis=-1)
+    np.testing.assert_allclose(np.sqrt((distance**2).mean()), 0.02 / np.sqrt(2), rtol=0.05)
+    # Where the hinges stand so, the stalk is there at the height that counts.
+    layout, rest = arms_among(4).layout, arms_among(4).rest
+    model = arms_among(4).mj_model
+    data = mujoco.MjData(model)
+    moved = np.tile(np.array([[0.01, -0.004]], np.float32), (4, 1))
+    data.qpos[:] = bending.hinge_angles(layout, model.nv, jnp.asarray(moved))
+    data.mocap_pos[:] = rest.mocap_pos
+    mujoco.mj_forward(model, data)
+    poses = types.SimpleNamespace(xpos=jnp.asarray(data.xpos), geom_xmat=jnp.asarray(data.geom_xmat.reshape(-1, 3, 3)))
+    there = bending.at_height(poses, layout, bending.SWAY_HEIGHT)
+    np.testing.assert_allclose(np.asarray(there)[:, :2] - data.mocap_pos[layout.mocap][:, :2], moved, atol=2e-4)
+
+
+def test_a_stalk_that_stands_alone_is_held_alone():
+    found = still_air()
+    for index, stalk in zip(ALONE, (0, 1, 2, 7)):
+        assert stalks_held(found, index) == {stalk}
+    assert (found.error[ALONE] < 0.002).all()
+    assert not found.touched[ALONE].any() and not found.brushed[ALONE].any()
+
+
+def test_a_grasp_holds_none_or_several_where_none_or_several_are():
+    found = still_air()
+    assert stalks_held(found, 3) == {3, 4}
+    assert stalks_held(found, 4) == set()
+    # The jaws take the one in front along.
+    assert stalks_held(found, 6) == {5, 6}
+
+
+def test_an_arm_is_not_sent_where_it_cannot_go():
+    found = still_air()
+    np.testing.assert_array_equal(found.reachable, [True, True, True, True, True, False, True, True])
+    assert np.isnan(found.error[5]) and not found.held[5].any()
+    np.testing.assert_allclose(found.taken[5], np.tile(origin_of(1.0) + arm.HOME, (found.taken.shape[1], 1)), atol=2e-3)
+
+
+def test_the_way_taken_is_the_one_planned():
+    found = still_air()
+    assert found.interval * found.path.shape[1] == pytest.approx(arm.Timing().reach + arm.Timing().close)
+    away = np.linalg.norm(found.path - found.taken, axis=-1)[ALONE]
+    end = round(arm.Timing().reach / found.interval) - 1
+    assert away.max() < 0.03 and away[:, end].max() < 0.002
+    np.testing.assert_allclose(found.path[ALONE, end], TARGETS[ALONE], atol=1e-4)
+
+
+def test_wind_moves_stalks_away_from_blind_jaws_and_looking_helps():
+    wind, key = 60.0, jax.random.key(5)
+    # Eight winds over one stalk that stands alone.
+    scenes = Stands(**{field.name: np.repeat(getattr(stands(), field.name)[:1], 8, 0) for field in dataclasses.fields(Stands)})
+    targets = np.repeat(TARGETS[:1], 8, axis=0)
+    slot = int(np.flatnonzero(scenes.stalk[0] == 0)[0])
+    blind = reach(scenes, targets, key, wind)
+    times = []
+
+    def look(sight: Sight) -> np.ndarray:
+        times.append(sight.time)
+        return sight.stalks[:, slot]
+
+    seeing = reach(scenes, targets, key, wind, look=look)
+    assert times == pytest.approx([LOOK * count for count in range(1, 20)])
+    assert seeing.held[:, slot].sum() > blind.held[:, slot].sum()
+    assert not blind.held[:, slot].all()
+    # Nothing seen, nothing changed.
+    idle = reach(scenes, targets, key, wind, look=lambda sight: np.full((8, 3), np.nan))
+    np.testing.assert_array_equal(idle.taken, blind.taken)
+
+
+def test_requests_that_make_no_sense_are_refused():
+    key = jax.random.key(0)
+    with pytest.raises(ValueError, match=r"targets must be \[B, 3\] for 8 stands"):
+        reach(stands(), TARGETS[:3], key)
+    with pytest.raises(ValueError, match="finite"):
+        reach(stands(), np.full((8, 3), np.nan), key)
+    with pytest.raises(ValueError, match="wind_mm must be at least 0"):
+        reach(stands(), TARGETS, key, -1.0)
+    with pytest.raises(ValueError, match="sides must be 1 or -1"):
+        reach(stands(), TARGETS, key, sides=np.zeros(8))
+    nothing = reach(stands_at([], np.zeros(0), np.zeros((0, 3)), 4), np.zeros((0, 3)), key)
+    assert nothing.held.shape == (0, 4) and nothing.path.shape == (0, 120, 3)
+
+
+def test_the_figure_and_its_table_show_both_ways(tmp_path: Path):
+    found = still_air()
+    way.draw_path(tmp_path / "new" / "way.png", stands(), TARGETS, found, 1)
+    way.draw_path(tmp_path / "unreachable.png", stands(), TARGETS, found, 5)
+    assert Image.open(tmp_path / "new" / "way.png").size[0] > 600
+    table = way.path_table(found, 1)
+    assert len(table) == found.path.shape[1] and table[-1]["time_s"] == pytest.approx(2.4)
+    apart = np.linalg.norm([table[9][f"planned_{axis}_m"] - table[9][f"taken_{axis}_m"] for axis in "xyz"])
+    assert table[9]["distance_mm"] == pytest.approx(1000 * apart, rel=1e-4)
+
+
+def test_the_video_shows_the_arm_at_work(tmp_path: Path):
+    video.write_reaches(tmp_path / "arm.gif", stands(), still_air(), [0, 1, 2, 3, -1, -1, 5, 7], [1], size=48)
+    with Image.open(tmp_path / "arm.gif") as shown:
+        assert shown.n_frames == 60 and shown.size == (48, 48 + 34)
+        frames = []
+        for index in (0, 30, 59):
+            shown.seek(index)
+            frames.append(np.asarray(shown.convert("RGB"))[34:].astype(int))
+    assert all((np.abs(one - other).max(axis=-1) > 40).sum() > 10 for one, other in zip(frames, frames[1:]))
+    with pytest.raises(RequestError, match="must end in one of"):
+        video.write_reaches(tmp_path / "arm.avi", stands(), still_air(), [0] * 8, [0])
