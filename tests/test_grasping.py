@@ -382,6 +382,7 @@ def test_run_finds_the_stalks_and_goes_on_where_it_was(runs, tmp_path, capsys):
     for row in rows:
         own = [each for each in points if each["run"] == row["run"]]
         assert row["flag"] == "ok" and row["pairs"] == "3" and row["stitches"] == "2"
+        assert 3 <= int(row["reachable"]) <= int(row["grasp_points"])
         assert int(row["grasp_points"]) == len(own) >= 4
         assert [int(each["point"]) for each in own] == list(range(1, len(own) + 1))
         assert all(0.35 < float(each["y_m"]) < 0.8 and 0.4 < float(each["z_m"]) < 1.1 for each in own)
@@ -424,7 +425,7 @@ def test_clouds_that_do_not_stitch_and_an_arm_that_reaches_nothing_are_told(runs
         return np.zeros(image.shape[:2], bool)
 
     request = Request(
-        tmp_path / "out", OURS, "nothing", {"plot_0000": calibration}, MOUNT, None, lambda points: points[:, 0] > 9
+        tmp_path / "out", OURS, "nothing", {"plot_0000": calibration}, MOUNT, None, lambda points, stops: points[:, 0] > 9
     )
     run(find_plots(folder), find, request)
     (row,) = table(tmp_path / "out" / "runs.csv")
@@ -444,15 +445,19 @@ def test_clouds_that_do_not_stitch_and_an_arm_that_reaches_nothing_are_told(runs
 def test_eval_of_a_row_and_of_an_empty_one(spec, tmp_path, capsys):
     out = tmp_path / "eval.json"
     words = ["grasp", "eval", "--masks", "truth", *WIDTH, "--runs", "1", "--json", str(out)]
-    assert cli.main([*words, "--spec", str(spec)]) == 0
+    assert cli.main([*words, "--spec", str(spec), "--reach", "--wind", "5"]) == 0
     figures = json.loads(out.read_text())
     assert figures["f1"] > 0.9 and figures["point_median_mm"] < 10.0 and figures["stitch_median_mm"] < 10.0
     assert figures["synthetic"] is True and figures["masks"] == "truth" and figures["stitches"] == 2
-    assert "simulated runs of family few" in capsys.readouterr().out
+    shares = figures["reach"]["shares"]
+    assert shares["all stalks"]["of"] == figures["stalks"] and shares["attempts: success"]["of"] == figures["grasp_points"]
+    assert shares["all stalks"]["count"] >= figures["stalks"] - 2 and figures["reach"]["wind_mm"] == 5.0
+    said = capsys.readouterr().out
+    assert "simulated runs of family few" in said and "the arm, with 5 mm of wind" in said
     empty = tmp_path / "empty.json"
     layout = {**FEW["layout"], "stalks_mean": 0}
     empty.write_text(json.dumps({**FEW, "layout": layout, "leaves": {"density": 0, "litter": 30}}))
-    assert cli.main([*words, "--spec", str(empty)]) == 0
+    assert cli.main([*words, "--spec", str(empty), "--reach"]) == 0
     figures = json.loads(out.read_text())
     assert figures["stalks"] == figures["grasp_points"] == 0 and figures["f1"] is None
     assert "no stalk was found" in capsys.readouterr().out
@@ -501,6 +506,7 @@ def test_a_run_without_pairs_is_a_mistake():
         (["eval", "--seed", "-1"], "--seed must be at least 0"),
         (["eval", "--weights", "missing.npz"], "cannot read the weights"),
         (["eval", "--masks", "truth", "--weights", "w.npz"], "leave out --weights"),
+        (["eval", "--wind", "5"], "--wind must be at least 0, and goes with --reach"),
         (["run", "missing"], "there is no folder"),
         (["run", ".", "--pitch", "99"], "--pitch must be from -60 to 60"),
         (["run", ".", "--height", "0"], "--height must be from 0.05 to 3"),

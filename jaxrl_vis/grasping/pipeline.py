@@ -31,8 +31,8 @@ from jaxrl_vis_envs.plants import Calibration
 
 Find = Callable[[np.ndarray, PlotFolder, PairFiles], np.ndarray]
 """Which pixels of a left image [H, W, 3] uint8 show a stalk of the near row: [H, W] bool."""
-Reachable = Callable[[np.ndarray], np.ndarray]
-"""Which of the points [B, 3] in the robot frame the arm can go to: [B] bool."""
+Reachable = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Which points [B, 3] the arm can go to from any of the stops [S, 3], all in the robot frame of the last one, m: [B] bool."""
 
 RUN_COLUMNS = (
     "run",
@@ -177,7 +177,9 @@ def _can_reach(request: Request, perception: Perception) -> np.ndarray | None:
     """[B] bool, which grasp points the arm can go to; None where nothing is known of an arm."""
     if request.reachable is None:
         return None
-    return np.asarray(request.reachable(np.array([each.point for each in perception.points]).reshape(-1, 3)), bool)
+    points = np.array([each.point for each in perception.points]).reshape(-1, 3)
+    stops = np.array([motion.shift for motion in perception.to_last])
+    return np.asarray(request.reachable(points, stops), bool)
 
 
 def _row(folder: PlotFolder, request: Request, skipped: int, perception: Perception | None, views: list[View]) -> Row:
