@@ -11,12 +11,13 @@ For each number of devices N, beside one device of the same machine:
     resume         what N devices saved, restored on one device and on others: parameters, optimisers and replay bit-equal, and
                    trained further on one
 
-Everything that one number of devices needs is traced first and compiled side by side. ``--quick`` takes small images and few
+All programs are compiled before, side by side. ``--quick`` takes small images and few
 updates, to see that it works: on a CPU with XLA_FLAGS=--xla_force_host_platform_device_count=2.
 """
 
 import argparse
 import concurrent.futures
+import dataclasses
 import math
 import statistics
 import tempfile
@@ -37,7 +38,8 @@ from jaxrl_vis.learner.environment import make_env
 from jaxrl_vis.learner.sharding import make_layout
 from jaxrl_vis.learner.shards import DATA
 from jaxrl_vis.learner.train_step import make_train_step
-from jaxrl_vis.run.checkpoint import FULL, Checkpoints, named_leaves
+from jaxrl_vis.run.arrays import named_leaves
+from jaxrl_vis.run.checkpoint import FULL, Checkpoints
 from jaxrl_vis.run.programs import Programs, enable_compilation_cache
 
 QUICK = {
@@ -50,7 +52,7 @@ QUICK = {
     "hidden_sizes": (32,),
 }
 REDUCTIONS = 100  # in one program, so that the time of its start does not count
-BATCHES = (2048, 512)
+BATCHES, SMALL_BATCHES = (2048, 512), (32, 16)
 
 
 class Timed:
@@ -97,17 +99,14 @@ class Timed:
         return seconds
 
 
-def compile_all(everything: dict[str, Timed]) -> float:
-    """Traces one by one, compiles side by side; the seconds it took."""
+def compile_all(everything: list[Timed]) -> float:
+    """Compiles all programs side by side, what takes longest first; the seconds it took."""
     start = time.perf_counter()
     with concurrent.futures.ThreadPoolExecutor(16) as pool:
-        futures = []
-        for timed in everything.values():
-            for name in timed.names:
-                lowered = timed.programs._lower(name)
-                futures.append((timed, name, pool.submit(lowered.compile)))
-        for timed, name, future in futures:
-            timed.programs._compiled[name] = future.result()
+        names = ("train_iteration", "evaluate", "init")
+        futures = [pool.submit(timed.programs.compiled, name) for name in names for timed in everything if name in timed.names]
+        for future in futures:
+            future.result()
     return time.perf_counter() - start
 
 
@@ -164,117 +163,125 @@ def check_resume(saved: Timed, others: list[Config], env: Any, single: Timed) ->
     return lines
 
 
-def table(rows: list[dict[str, Any]]) -> str:
-    """The figures, one line each."""
-    head = f"{'what':16}{'devices':>8}{'batch':>8}{'one device':>14}{'all':>14}{'speed-up':>10}{'efficiency':>12}{'spread':>9}"
-    lines = [head, "-" * len(head)]
-    for row in rows:
-        times = "".join(f"{1e3 * row[name]:11,.1f} ms" for name in ("one_s", "all_s"))
-        lines.append(
-            f"{row['what']:16}{row['devices']:8}{row['batch']:8}{times}{row['speedup']:10.3f}"
-            f"{row['speedup'] / row['devices']:12.1%}{row['spread']:9.1%}"
-        )
-    return "\n".join(lines)
+@dataclasses.dataclass(frozen=True)
+class Figure:
+    """One configuration on several devices, beside what it is compared with.
+
+    Attributes:
+        kind: seeds, weak or strong.
+        timed: It.
+        one: The same on one device.
+    """
+
+    kind: str
+    timed: Timed
+    one: Timed
+
+
+def figures_of(base: Config, env: Any, numbers: list[int], batches: tuple[int, ...], seeds: int) -> list[Figure]:
+    """Everything that is measured."""
+    one_of = {batch: Timed(base.replace(batch_size=batch), env, False) for batch in batches}
+    one_seeds, found = Timed(base.replace(seeds=seeds), env, True), []
+    for count in numbers:
+        found.append(Figure("seeds", Timed(base.replace(seeds=seeds * count, devices=count), env, True), one_seeds))
+        for batch, one in one_of.items():
+            sizes = {"batch_size": batch, "num_envs": base.num_envs, "replay_transitions": base.replay_transitions}
+            weak = base.replace(devices=count, **{name: size * count for name, size in sizes.items()})
+            strong = base.replace(devices=count, batch_size=batch)
+            found += [Figure("weak", Timed(weak, env, False), one), Figure("strong", Timed(strong, env, False), one)]
+    return found
+
+
+def measure(figure: Figure, one: list[float], cycles: int) -> tuple[str, Measurement]:
+    """A line of the table, and the record."""
+    config, seconds = figure.timed.config, figure.timed.run(cycles)
+    before, after, count = statistics.median(one), statistics.median(seconds), config.devices
+    speedup = before / after * (1 if figure.kind == "strong" else count)
+    spread = max((max(each) - min(each)) / statistics.median(each) for each in (one, seconds))
+    line = (
+        f"{figure.kind:8}{count:8}{config.seeds:7}{config.batch_size:8}{config.num_envs:6}{1e3 * before:11,.1f} ms"
+        f"{1e3 * after:11,.1f} ms{speedup:10.3f}{speedup / count:12.1%}{spread:9.1%}"
+    )
+    names = ("env", "preset", "image_size", "pixels", "num_envs", "batch_size", "seeds", "devices", "updates_per_iteration")
+    details = {"one_device_ms": 1e3 * before, "ms": 1e3 * after, "efficiency": speedup / count, "spread": spread}
+    details = {name: round(value, 4) for name, value in details.items()} | {"repeats": len(seconds)}
+    described = {name: getattr(config, name) for name in names}
+    return line, Measurement(f"scaling/{figure.kind}", round(speedup, 4), "x one device", described, details)
+
+
+def measure_all_reduce(figure: Figure) -> tuple[str, Measurement]:
+    """The time of an update's all-reduce: a line, and the record."""
+    train, count = figure.timed.programs.shapes.train, figure.timed.config.devices
+    numbers = sum(math.prod(leaf.shape[1:]) for leaf in jax.tree.leaves((train.actor, train.critic)))
+    seconds = all_reduce_seconds(numbers, count)
+    updates = figure.timed.config.updates_per_iteration
+    line = (
+        f"all-reduce of {numbers:,} float32 over {count} devices: {1e6 * seconds:.1f} us, "
+        f"{1e3 * seconds * updates:.1f} ms in the {updates} updates of an iteration"
+    )
+    described = {"devices": count, "float32": numbers}
+    return line, Measurement("scaling/all_reduce", round(1 / seconds, 1), "all-reduces/s", described)
+
+
+HEAD = (
+    f"{'what':8}{'devices':>8}{'seeds':>7}{'batch':>8}{'envs':>6}{'one device':>14}{'all':>14}"
+    f"{'speed-up':>10}{'efficiency':>12}{'spread':>9}"
+)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--devices", type=int, nargs="+", help="numbers of devices; 2, 4 and 8 if there are so many")
     parser.add_argument("--env", default="VisualFetchReach")
-    parser.add_argument("--cycles", type=int, default=6, help="timed cycles of two iterations and an evaluation")
+    parser.add_argument("--cycles", type=int, default=6, help="timed cycles of two iterations, and an evaluation for seeds")
     parser.add_argument("--seeds-per-device", type=int, default=1)
     parser.add_argument("--json", type=Path, help="also write the records here")
     parser.add_argument("--quick", action="store_true", help="small, to see that it works")
     options = parser.parse_args()
     enable_compilation_cache()
-    there = len(jax.devices())
-    numbers = [count for count in options.devices or (2, 4, 8) if count <= there]
+    began, there = time.perf_counter(), len(jax.devices())
+    numbers = [count for count in options.devices or (2, 4, 8) if 1 < count <= there]
     if not numbers:
         raise SystemExit(f"there is only {there} device")
-    batches = (32, 16) if options.quick else BATCHES
-    envs = math.ceil((8 if options.quick else 100) / max(numbers)) * max(numbers)
-    changes = {"env": options.env, "num_envs": envs, "replay_transitions": 200_000}
-    changes |= {**QUICK, "replay_transitions": 50 * envs} if options.quick else {}
-    base = preset("fast", **changes)
-    env, watch, began = make_env(base), Watch(), time.perf_counter()
-    rows, notes, records = [], [], []
+    envs = math.ceil((8 if options.quick else 100) / math.lcm(*numbers)) * math.lcm(*numbers)
+    base = preset("fast", env=options.env, num_envs=envs, replay_transitions=100_000)
+    base = base.replace(**QUICK, replay_transitions=50 * envs) if options.quick else base
+    env, watch = make_env(base), Watch()
+    figures = figures_of(base, env, numbers, SMALL_BATCHES if options.quick else BATCHES, options.seeds_per_device)
+    alone = list({id(figure.one): figure.one for figure in figures}.values())
+    lines, measurements, times = [], [], {}
 
-    def note(line: str) -> None:
-        notes.append(line)
+    def keep(line: str, measurement: Measurement | None = None) -> None:
+        lines.append(line)
+        measurements.extend([] if measurement is None else [measurement])
         print(line, flush=True)
 
-    many = options.seeds_per_device
-    single = {"seeds": Timed(base.replace(seeds=many), env, True)}
-    single |= {f"one {batch}": Timed(base.replace(batch_size=batch), env, False) for batch in batches}
-    note(f"one device: compiled in {compile_all(single):.0f} s")
-    of_one = {name: timed.run(options.cycles) for name, timed in single.items()}
-    for timed in single.values():
-        timed.loop = None  # makes room
-    for count in numbers:
-        wide = {"seeds": Timed(base.replace(seeds=many * count, devices=count), env, True)}
-        for batch in batches:
-            weak = {
-                "batch_size": batch * count,
-                "num_envs": envs * count,
-                "replay_transitions": base.replay_transitions * count,
-            }
-            wide[f"weak {batch}"] = Timed(base.replace(devices=count, **weak), env, False)
-            wide[f"strong {batch}"] = Timed(base.replace(devices=count, batch_size=batch), env, False)
-        note(f"{count} devices: compiled in {compile_all(wide):.0f} s")
-        for name, timed in wide.items():
-            what, _, batch = name.partition(" ")
-            one, seconds = of_one[f"one {batch}" if batch else "seeds"], timed.run(options.cycles)
-            middle, of_all = statistics.median(one), statistics.median(seconds)
-            speedup = middle / of_all * (1 if what == "strong" else count)
-            spread = max((max(each) - min(each)) / statistics.median(each) for each in (one, seconds))
-            size = timed.config.batch_size
-            rows.append(
-                {"what": name, "devices": count, "batch": size, "one_s": middle, "all_s": of_all}
-                | {"speedup": speedup, "spread": spread}
-            )
-            config = timed.config
-            described = {name: getattr(config, name) for name in ("env", "preset", "image_size", "pixels", "num_envs")}
-            described |= {"kind": what, "batch_size": size, "seeds": config.seeds, "devices": count}
-            details = {"one_device_ms": 1e3 * middle, "ms": 1e3 * of_all, "efficiency": speedup / count, "spread": spread}
-            details = {key: round(value, 4) for key, value in details.items()}
-            updates = config.updates_per_iteration
-            records.append(
-                to_record(
-                    Measurement(
-                        f"scaling/{what}", round(speedup, 4), "x one device", described | {"updates": updates}, details
-                    ),
-                    watch.conditions(),
-                )
-            )
-            print(table(rows[-1:]).splitlines()[-1], flush=True)
-            if name != f"strong {batches[-1]}":
-                timed.loop = None
-        numbers_reduced = sum(
-            math.prod(leaf.shape[1:])
-            for part in ("actor", "critic")
-            for leaf in jax.tree.leaves(getattr(timed.programs.shapes.train, part))
-        )
-        seconds = all_reduce_seconds(numbers_reduced, count)
-        shown = f"{numbers_reduced:,} float32 over {count} devices: {1e6 * seconds:.1f} us; an iteration has {updates}"
-        note(f"all-reduce of {shown}")
-        described = {"devices": count, "float32": numbers_reduced}
-        records.append(
-            to_record(Measurement("scaling/all_reduce", 1 / seconds, "all-reduces/s", described), watch.conditions())
-        )
-        last = wide[f"strong {batches[-1]}"]
-        smaller = [last.config.replace(devices=other) for other in (1, *(each for each in numbers if each < count))]
-        for line in check_resume(last, smaller, env, single[f"one {batches[-1]}"]):
-            note(line)
-        last.loop = single[f"one {batches[-1]}"].loop = None
-    print()
+    print(f"compiled in {compile_all([*alone, *(figure.timed for figure in figures)]):.0f} s", flush=True)
+    for one in alone:
+        times[id(one)] = one.run(options.cycles)
+        one.loop = None  # makes room
+    keep(HEAD)
+    for figure in figures:
+        keep(*measure(figure, times[id(figure.one)], options.cycles))
+        is_last = figure is [each for each in figures if each.timed.config.devices == figure.timed.config.devices][-1]
+        if is_last:  # one learner, of the smallest batch
+            keep(*measure_all_reduce(figure))
+            counts = (1, *(count for count in numbers if count < figure.timed.config.devices))
+            for line in check_resume(
+                figure.timed, [figure.timed.config.replace(devices=each) for each in counts], env, figure.one
+            ):
+                keep(line)
+            figure.one.loop = None
+        figure.timed.loop = None
+    took = time.perf_counter() - began
     print(
-        f"{options.env}, preset fast, {base.image_size}x{base.image_size} {base.pixels}, {envs} environments, on {there} x "
-        f"{jax.devices()[0].device_kind}; JAX {jax.__version__}; {time.perf_counter() - began:.0f} s"
+        f"\n{options.env}, preset fast, {base.image_size}x{base.image_size} {base.pixels}, on {there} x "
+        f"{jax.devices()[0].device_kind}, JAX {jax.__version__}, {took:.0f} s\n"
     )
-    print(table(rows))
-    print("\n".join(notes))
+    print("\n".join(lines))
     if options.json is not None:
-        write_json(options.json, records)
+        conditions = watch.conditions()
+        write_json(options.json, [to_record(each, conditions) for each in measurements])
         print(f"records: {options.json}")
 
 

@@ -16,7 +16,8 @@ import probe_environments as probes
 from jaxrl_vis.config import preset
 from jaxrl_vis.learner.sharding import DATA, Layout, Shards, Spec
 from jaxrl_vis.learner.train_step import make_train_step
-from jaxrl_vis.run.checkpoint import Checkpoints, named_leaves
+from jaxrl_vis.run.arrays import named_leaves
+from jaxrl_vis.run.checkpoint import Checkpoints
 from jaxrl_vis.run.programs import Programs
 
 ENV = probes.GoWhereTold()
@@ -35,7 +36,7 @@ COLLECTIVES = ("all-reduce", "all-gather", "all-to-all", "collective-permute", "
 class Emulated(Layout):
     """The parts of each learner side by side on one device: the same functions, mapped by `jax.vmap`."""
 
-    def spread(self, function, in_specs, out_specs, jit, **options):
+    def spread(self, function, in_specs, out_specs, jit, kept_as=None, **options):
         count = self.shards.count
 
         def split(spec, leaf):

@@ -254,6 +254,15 @@ def test_every_benchmark_keeps_records(benchmark: str, tmp_path: Path, monkeypat
         assert found[0].details["share_of_promise"] == pytest.approx((parts["env"] + parts["updates"]) / iteration, rel=0.01)
 
 
+def test_what_one_of_several_devices_does() -> None:
+    """The measure of efficiency: a run of one device with its share of the seeds, or of the learner."""
+    config = preset("debug", seeds=6, num_envs=8, batch_size=16, replay_transitions=800)
+    seeds = train.share_of_one(config.replace(devices=2))
+    assert (seeds.devices, seeds.seeds, seeds.num_envs, seeds.batch_size) == (1, 3, 8, 16)
+    parts = train.share_of_one(config.replace(devices=4, data_devices=2))
+    assert (parts.seeds, parts.num_envs, parts.batch_size, parts.replay_transitions) == (3, 4, 8, 400)
+
+
 def test_a_table_says_where_an_iteration_goes() -> None:
     parts = {"rollout": 0.25, "insert": 0.05, "updates": 0.5, "evaluation": 0.1, "host": 0.0}
     lines = {" ".join(line.split()[:-3]): line.split()[-3:] for line in train.describe(1.0, parts, 0.7).splitlines()}

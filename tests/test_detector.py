@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from jaxrl_vis.errors import NonFiniteError, RequestError
+from jaxrl_vis.phenotyping.annotations import decode_counts, read_annotations
 from jaxrl_vis.phenotyping.detector.anchors import anchors_of, decode, encode
 from jaxrl_vis.phenotyping.detector.boxes import band_overlap, nms, overlap, roi_align, suppress
 from jaxrl_vis.phenotyping.detector.detect import Settings, best_proposals
@@ -15,6 +16,7 @@ from jaxrl_vis.phenotyping.detector.finder import Finder
 from jaxrl_vis.phenotyping.detector.losses import NOTHING, STALK, UNCLEAR, assign
 from jaxrl_vis.phenotyping.detector.snips import cut, put_back, snip_shape
 from jaxrl_vis.phenotyping.detector.weights import read_weights, write_weights
+from jaxrl_vis.phenotyping.images import rgb8
 from jaxrl_vis.phenotyping.training.augment import move
 from jaxrl_vis.phenotyping.training.examples import Example, _instance_masks, annotated_examples, settings_for
 from jaxrl_vis.phenotyping.training.loop import Plan, train
@@ -277,3 +279,52 @@ def test_annotations_of_ones_own(tmp_path):
     (tmp_path / "annotations.json").write_text("{}")
     with pytest.raises(RequestError, match="is not COCO"):
         settings_for(tmp_path, TINY)
+
+
+def test_annotations_of_voc_and_labelme_are_those_of_coco(tmp_path):
+    """The same box in three formats; what is not called a stalk is left out; runs may be text."""
+    import json
+
+    (tmp_path / "voc").mkdir()
+    (tmp_path / "labelme").mkdir()
+    things = "".join(
+        f"<object><name>{name}</name><bndbox><xmin>11</xmin><ymin>5</ymin><xmax>20</xmax><ymax>44</ymax></bndbox></object>"
+        for name in ("stalk", "leaf")
+    )
+    size = "<size><width>64</width><height>60</height></size>"
+    (tmp_path / "voc" / "row.xml").write_text(f"<annotation><filename>row.png</filename>{size}{things}</annotation>")
+    shapes = [
+        {"label": "Stalk", "points": [[10, 4], [20, 44]], "shape_type": "rectangle"},
+        {"label": "leaf", "points": [[0, 0], [5, 0], [5, 5]], "shape_type": "polygon"},
+    ]
+    about = {"shapes": shapes, "imagePath": "..\\images\\row.png", "imageWidth": 64, "imageHeight": 60}
+    (tmp_path / "labelme" / "row.json").write_text(json.dumps(about))
+    for kind in ("voc", "labelme"):
+        data = read_annotations(tmp_path / kind)
+        (image,), (annotation,) = data["images"], data["annotations"]
+        assert image["file_name"] == "row.png" and (image["width"], image["height"]) == (64, 60)
+        assert annotation["bbox"] == [10, 4, 10, 40]
+    with pytest.raises(RequestError, match="there are no annotations in"):
+        read_annotations(tmp_path)
+    (tmp_path / "voc" / "row.xml").write_text("<annotation>")
+    with pytest.raises(RequestError, match="row.xml is no annotation of Pascal VOC"):
+        read_annotations(tmp_path / "voc")
+    (tmp_path / "labelme" / "row.json").write_text("{}")
+    with pytest.raises(RequestError, match="row.json is no annotation of LabelMe"):
+        read_annotations(tmp_path / "labelme")
+
+
+def test_runs_that_are_text():
+    """As pycocotools wrote those of a 2 x 3 image whose middle column is set, and of longer runs."""
+    assert decode_counts("222") == [2, 2, 2]
+    assert decode_counts("`1m1S3XNSO") == [48, 61, 99, 5, 70]
+    with pytest.raises(ValueError, match="middle of a number"):
+        decode_counts("`")
+
+
+def test_images_of_any_depth_become_eight_bits():
+    for bits in (10, 12, 14, 16):
+        image = np.linspace(0, (1 << bits) - 1, 64).astype(np.uint16).reshape(8, 8)
+        image8 = rgb8(image)
+        assert image8.shape == (8, 8, 3) and image8.dtype == np.uint8 and (image8.min(), image8.max()) == (0, 255)
+    assert rgb8(np.full((2, 2, 3), 7, np.uint8)).tolist() == np.full((2, 2, 3), 7).tolist()

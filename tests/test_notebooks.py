@@ -13,9 +13,11 @@ SHOWN = {
     "02_new_environment": (2, 1),  # start and goals; the curve
     "03_indicator_rewards": (3, 0),  # which frames count as equal; curves; diagnostics
     "04_auxiliary_losses": (1, 0),  # errors and weights
+    "05_phenotyping": (3, 0),  # a pair; its overlay; widths against the truth
     "06_grasping": (2, 0),  # a pair and its mask; stalks and grasp points from above
 }
 SAID = {
+    "05_phenotyping": ("overlays of 1 plots, 0 pairs skipped", "synthetic: 8 stalks were counted, 8 are there"),
     "01_quickstart": ("of goals reached at the end", "of 64 goals reached"),
     "02_new_environment": ("of goals reached at the end", "eval/success"),  # `eval` finds the task by what the run folder says
     "03_indicator_rewards": ("oracle  ", "indicator_balance_filter", "of goals reached"),

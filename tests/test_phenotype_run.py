@@ -1,23 +1,23 @@
 """From folders of pairs to tables: which images belong together, which sightings are one stalk, what becomes of bad files."""
 
-import csv
 import dataclasses
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+from phenotype_plots import run, table
 
 from jaxrl_vis import cli
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.phenotyping.detector.finder import Detection
 from jaxrl_vis.phenotyping.evaluate import PlotScore, average_precision, match, summary
 from jaxrl_vis.phenotyping.folders import find_plots, read_odometry
-from jaxrl_vis.phenotyping.images import read_image, write_image
-from jaxrl_vis.phenotyping.pairing import wrong_with
-from jaxrl_vis.phenotyping.sightings import Sighting, look
-from jaxrl_vis.phenotyping.track import follow, robust_width
+from jaxrl_vis.phenotyping.heights import USUAL_TAPER, robust_width, widths_of
+from jaxrl_vis.phenotyping.images import read_image
+from jaxrl_vis.phenotyping.sightings import Sighting
+from jaxrl_vis.phenotyping.thesis import count_by_length, mean_widths
+from jaxrl_vis.phenotyping.track import Track, follow
 from jaxrl_vis_envs.plants import Calibration
 from jaxrl_vis_envs.plants.truth import StalkInView
 
@@ -143,6 +143,15 @@ def test_what_few_pairs_show_is_no_stalk_and_ends_are_ends():
     assert "seen in 1 of" in reasons and "beyond the ends" in reasons
 
 
+def test_two_finds_of_one_stalk_are_one_and_neighbours_that_touch_are_two():
+    frames, distances = drive([*STALKS, (0.7145, 0.81)])
+    assert sum(track.counted for track in follow(frames, distances, CAMERAS)[0]) == len(STALKS) + 1
+    for frame in frames:
+        again = [dataclasses.replace(each, along_m=each.along_m + 0.003, score=0.6) for each in frame[:3]]  # pyright: ignore
+        frame += again
+    assert sum(track.counted for track in follow(frames, distances, CAMERAS)[0]) == len(STALKS) + 1
+
+
 def test_a_sighting_without_disparity_still_says_where_its_stalk_is():
     frames, distances = drive(STALKS)
     for frame in frames:
@@ -161,11 +170,39 @@ def test_no_pairs_and_empty_fields():
 
 def test_widths_are_medians_with_an_error():
     sightings = [sighting(0.0, diameter_mm=14.0 + each) for each in (-0.2, -0.1, 0.0, 0.1, 0.2)]
-    width, error, count = robust_width([*sightings, sighting(0.0, diameter_mm=30.0)])  # pyright: ignore[reportGeneralTypeIssues]
-    assert width == pytest.approx(14.05, abs=0.06) and 0.03 < error < 0.3 and count == 6
+    width = robust_width([*sightings, sighting(0.0, diameter_mm=30.0)])
+    assert width is not None and width.mm == pytest.approx(14.05, abs=0.06) and 0.03 < width.error < 0.3 and width.count == 6
     assert robust_width([sighting(0.0, diameter_mm=None)]) is None
     one = robust_width(sightings[:1])
-    assert one is not None and one[1] == pytest.approx(0.1)
+    assert one is not None and one.error == pytest.approx(0.1)
+
+
+def test_widths_are_those_at_12_and_24_inches():
+    """Stalks that were measured 2 inches below and above; one is hidden at 24 inches, and one shows no ground."""
+    taper, inch = 0.3, 0.0254
+
+    def seen(beside: float, **parts) -> Sighting:
+        lower, upper = 14.0 - taper * beside, 14.0 - taper * (12 + beside)
+        values = dict(diameter_mm=lower, height_m=(12 + beside) * inch, upper_mm=upper, upper_height_m=(24 + beside) * inch)
+        return sighting(0.0, **{**values, "upper_deviation_mm": 0.1, "upper_confidence": 0.8, **parts})
+
+    stalks = [[seen(2.0), seen(2.0), seen(2.2)] for _ in range(6)]
+    hidden = dict(upper_mm=None, upper_height_m=None)
+    stalks += [
+        [seen(-2.0, **hidden)] * 3,
+        [seen(0.0, height_m=None, **hidden)] * 3,
+        [seen(0.0, diameter_mm=None, **hidden)] * 3,
+    ]
+    tracks = [Track(tuple((stalk, place) for place in range(3)), 0.0, 0.8, True, "") for stalk in range(len(stalks))]
+    found = widths_of(stalks, tracks)
+    first, below, unknown, nothing = found[0], *found[6:]
+    assert first.lower.mm == pytest.approx(14.0, abs=0.01) and first.upper.mm == pytest.approx(10.4, abs=0.01)  # pyright: ignore
+    assert first.taper == pytest.approx(taper, abs=1e-3) and first.height_known and first.lower.corrected  # pyright: ignore
+    # The taper is that of the other stalks, not the usual one; and it makes the error larger.
+    assert below.lower.mm == pytest.approx(14.0, abs=0.01) and below.upper is None and below.taper is None  # pyright: ignore
+    assert USUAL_TAPER != taper and below.lower.error > 0.1  # pyright: ignore[reportOptionalMemberAccess]
+    assert unknown.lower.mm == 14.0 and not unknown.height_known  # pyright: ignore[reportOptionalMemberAccess]
+    assert nothing.lower is None
 
 
 # --- evaluation ---
@@ -202,38 +239,6 @@ def test_average_precision_and_the_figures_of_plots():
 # --- the command ---
 
 
-@pytest.fixture(scope="module")
-def plots(tmp_path_factory) -> Path:
-    """Two plots of four pairs with true masks, small."""
-    folder = tmp_path_factory.mktemp("phenotype")
-    spec = folder / "few.json"
-    spec.write_text(json.dumps({
-        "layout": {"rows_behind": 0, "stalks_mean": 5, "stalks_sd": 0, "tillers": 0, "plot_length": 0.5,
-                   "spacing_minimum": 0.06},
-        "leaves": {"density": 0.2, "litter": 0},
-        "stalks": {"diameter_mean": 0.03},
-    }))  # fmt: skip
-    words = ["phenotype", "synth", str(folder / "plots"), "--spec", str(spec), "--width", "422", "--frames", "4"]
-    assert cli.main([*words, "--plots", "2"]) == 0
-    return folder / "plots"
-
-
-def table(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def run(folder: Path, out: Path, *words: str) -> int:
-    return cli.main(["phenotype", "run", str(folder), "--out", str(out), "--masks", "truth", *words])
-
-
-@pytest.fixture(scope="module")
-def results(plots, tmp_path_factory) -> Path:
-    out = tmp_path_factory.mktemp("results") / "out"
-    assert run(plots, out) == 0
-    return out
-
-
 def test_run_counts_and_measures(plots, results):
     rows = table(results / "plots.csv")
     assert [row["plot"] for row in rows] == ["plot_0000", "plot_0001"]
@@ -252,95 +257,6 @@ def test_run_counts_and_measures(plots, results):
     assert (results / "skipped.csv").read_text() == "plot,pair,why\n"
 
 
-def test_a_run_that_was_stopped_gives_the_same_tables(plots, results, tmp_path, capsys):
-    again = tmp_path / "out"
-    shutil.copytree(results, again)
-    (again / "pairs" / "plot_0001" / "002.json").unlink()
-    (again / "pairs" / "plot_0001" / "003.json").unlink()
-    for name in ("stalks.csv", "plots.csv"):
-        (again / name).unlink()
-    assert run(plots, again) == 0
-    for name in ("stalks.csv", "plots.csv", "skipped.csv"):
-        assert (again / name).read_bytes() == (results / name).read_bytes()
-    assert run(plots, again, "--method", "ellipse") == 2
-    assert "holds the results of another request" in capsys.readouterr().err
-
-
-def test_bad_files_are_listed_and_skipped(plots, tmp_path, capsys):
-    plot = tmp_path / "plot_0000"
-    shutil.copytree(plots / "plot_0000", plot)
-    (plot / "right_000.png").unlink()
-    (plot / "left_001.png").write_bytes((plot / "left_001.png").read_bytes()[:200])
-    assert run(plot, tmp_path / "two") == 3
-    (row,) = table(tmp_path / "two" / "plots.csv")
-    assert row["pairs_skipped"] == "2" and row["flag"] == "pairs skipped" and int(row["stalks"]) > 0
-    write_image(plot / "right_002.png", BLANK)
-    assert run(plot, tmp_path / "out") == 3
-    told = {row["pair"]: row["why"] for row in table(tmp_path / "out" / "skipped.csv")}
-    assert told.keys() == {"000", "001", "002"}
-    assert "no right image" in told["000"] and "left_001.png" in told["001"] and "16 x 12" in told["002"]
-    (row,) = table(tmp_path / "out" / "plots.csv")
-    assert row["pairs_skipped"] == "3" and row["flag"] == "a single pair"
-    assert "skipped plot_0000/000: there is no right image" in capsys.readouterr().err
-
-
-def test_swapped_and_unrectified_pairs_are_told():
-    """Six stalks with a texture; the right image as it is, exchanged, and too low."""
-    rng = np.random.default_rng(0)
-    camera = Calibration(844, 400, 542.0, (421.5, 199.5), 0.1)
-    disparity = 68
-    left, right = np.zeros((400, 844, 3), np.uint8), np.zeros((400, 844, 3), np.uint8)
-    columns = range(120, 720, 100)
-    for column in columns:
-        texture = rng.integers(60, 255, (400, 14, 1)).astype(np.uint8)
-        left[:, column : column + 14] = texture
-        right[:, column - disparity : column - disparity + 14] = texture
-
-    def told(left: np.ndarray, right: np.ndarray, offset: int = 0) -> str | None:
-        mask = np.zeros((200, 24), bool)
-        mask[:, 5:19] = True
-        finds = [
-            Detection((each, 100.0, each + 13.0, 300.0), (each + 6.5, each + 6.5), 1.0, mask, (100, each - 5))
-            for each in (column - offset for column in columns)
-        ]
-        return wrong_with(finds, look(finds, left, right, camera), left, right, camera)
-
-    assert told(left, right) is None
-    assert told(right, left, disparity) == "left and right are swapped: exchange their names"
-    assert told(left, np.roll(right, 6, axis=0)) == "the right image lies about 6 lines too low: rectify the pair"
-    assert told(left, np.roll(right, -12, axis=0)) == "the right image lies about 12 lines too high: rectify the pair"
-    assert told(left, np.zeros_like(right)) is None
-
-
-def test_without_calibration_no_millimetres_and_without_odometry_no_count(plots, tmp_path, capsys):
-    plot = tmp_path / "plot_0000"
-    shutil.copytree(plots / "plot_0000", plot)
-    (plot / "odometry.csv").unlink()
-    assert run(plot, tmp_path / "a") == 0
-    (row,) = table(tmp_path / "a" / "plots.csv")
-    assert row["flag"] == "no odometry" and row["stalks"] == row["stalks_per_m"] == "" and float(row["width_mean_mm"]) > 10
-    (plot / "calibration.yaml").unlink()
-    assert run(plot, tmp_path / "b") == 0
-    (row,) = table(tmp_path / "b" / "plots.csv")
-    assert row["flag"] == "no calibration" and row["width_mean_mm"] == row["stalks"] == ""
-    assert table(tmp_path / "b" / "stalks.csv") == []
-    assert "no millimetres" in capsys.readouterr().err
-
-
-def test_black_images_and_calibrations_of_another_size_are_told(plots, tmp_path):
-    plot = tmp_path / "plot_0000"
-    shutil.copytree(plots / "plot_0000", plot)
-    write_image(plot / "left_000.png", np.zeros((338, 422, 3), np.uint8))
-    for number in range(1, 4):
-        for side in ("left", "right"):
-            write_image(plot / f"{side}_{number:03d}.png", BLANK)
-    assert run(plot, tmp_path / "out") == 3
-    told = [row["why"] for row in table(tmp_path / "out" / "skipped.csv")]
-    assert "the left image is black" in told[0] and "calibration is for 422 x 338" in told[1]
-    (row,) = table(tmp_path / "out" / "plots.csv")
-    assert row["flag"] == "no usable pairs"
-
-
 @pytest.mark.parametrize(
     ("words", "part"),
     [
@@ -355,22 +271,18 @@ def test_wrong_requests_of_run(plots, tmp_path, capsys, words, part):
     assert part in capsys.readouterr().err
 
 
-def test_true_masks_are_wanted_of_what_has_none(plots, tmp_path, capsys):
-    plot = tmp_path / "plot_0000"
-    shutil.copytree(plots / "plot_0000", plot)
-    (plot / "plot.json").unlink()
-    assert run(plot, tmp_path / "out") == 2
-    assert "holds no true masks" in capsys.readouterr().err
-
-
 def test_eval_compares_with_the_truth(plots, tmp_path, capsys):
     spec, out = plots.parent / "few.json", tmp_path / "eval.json"
     words = ["--spec", str(spec), "--width", "422", "--frames", "4", "--plots", "1", "--masks", "truth", "--json", str(out)]
+    words += ["--thesis"]
     assert cli.main(["phenotype", "eval", *words]) == 0
     figures = json.loads(out.read_text())
     truth = json.loads((plots / "plot_0000" / "plot.json").read_text())
     assert figures["count_true"] == truth["count"] and figures["count_mae"] == 0.0 and figures["count_r2"] is None
     assert figures["f1"] > 0.9 and figures["width_mae_mm"] < 2.5 and figures["synthetic"] is True
+    # The thesis's ways on the same finds: ellipses are biased, and its count depends on how many stalks an image shows.
+    assert figures["thesis_width_mae_mm"] < 5 and figures["thesis_count_mae"] >= 0 and figures["width_24in_mae_mm"] is not None
+    assert figures["each"][0]["widths_mm"] and figures["each"][0]["seconds_per_pair"] > 0
     said = capsys.readouterr().out
     assert "synthetic plots of family" in said and "count_mae" in said
 
@@ -392,3 +304,73 @@ def test_wrong_requests_of_train_and_eval(tmp_path, monkeypatch, capsys, words, 
     monkeypatch.chdir(tmp_path)
     assert cli.main(["phenotype", *words]) == 2
     assert part in capsys.readouterr().err
+
+
+# --- the thesis's ways, and figures ---
+
+
+def test_the_thesis_counts_by_length_and_takes_means():
+    frames = [[sighting(0.01 * place) for place in range(count)] for count in (10, 14)]
+    # 1500 pixels at f = 1000 and 0.8 m show 1.2 m.
+    assert count_by_length(frames, CAMERAS, 2.4) == pytest.approx(24.0)
+    assert count_by_length([[], []], CAMERAS, 2.4) == 0.0
+    found = mean_widths([[sighting(0.0), sighting(0.1, diameter_mm=None)], [sighting(0.0, diameter_mm=16.0)]], [[3, 4], [3]])
+    assert found == {3: 15.0}
+
+
+@pytest.fixture(scope="module")
+def evaluation(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("figures") / "eval.json"
+    plots = [
+        {
+            "seed": seed,
+            "true": 30 + seed,
+            "counted": 31,
+            "pairs": 34,
+            "seconds_per_pair": 0.5,
+            "widths_mm": [[14.2, 14.0 + seed]],
+        }
+        for seed in range(3)
+    ]
+    path.write_text(json.dumps({"synthetic": True, "family": "shifted", "device": "a laptop", "count_r2": 0.5, "each": plots}))
+    return path
+
+
+@pytest.mark.parametrize("figure", ["3.4", "3.5", "table3.1"])
+def test_figures_of_chapter_3(evaluation, tmp_path, figure):
+    out = tmp_path / ("table.md" if figure == "table3.1" else "figure.png")
+    assert cli.main(["figure", figure, "--out", str(out), "--evaluation", str(evaluation)]) == 0
+    text, rows = out.with_suffix(".md").read_text(), table(out.with_suffix(".csv"))
+    assert "ynthetic" in text and len(rows) == 3
+    if figure == "table3.1":
+        # 34 pairs of half a second; both people's minutes are the thesis's, and say so.
+        assert rows[2]["here, measured"] == "17.0 s" and rows[2]["person 1, quoted"] == "32.33 min"
+        assert "116 times faster" in text and "quoted from Table 3.1" in text
+        assert "synthetic plots of 34 pairs on a laptop" in text
+    else:
+        assert out.read_bytes()[1:4] == b"PNG"
+        assert "thesis" in text
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        (["3.4", "--out", "a.txt"], "3.4 is a file that ends in .png or .pdf or .svg"),
+        (["3.4", "--preset", "cpu"], "--preset goes with figures of training runs, not with 3.4"),
+        (["3.4", "--evaluation", "missing.json"], "cannot read missing.json"),
+        (["3.5", "--evaluation", "missing.json", "--plots", "2"], "leave out --plots and --quick"),
+        (["5.4", "--plots", "2"], "--plots goes with figures 3.4, 3.5 and table3.1"),
+    ],
+)
+def test_wrong_requests_of_figures(tmp_path, monkeypatch, capsys, words, part):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["figure", *words]) == 2
+    assert part in capsys.readouterr().err
+
+
+def test_what_is_no_evaluation(tmp_path, capsys):
+    path = tmp_path / "eval.json"
+    for text in ("", "{}", '{"synthetic": true, "each": [{}]}'):
+        path.write_text(text)
+        assert cli.main(["figure", "3.4", "--out", str(tmp_path / "a.png"), "--evaluation", str(path)]) == 2
+        assert "holds no evaluation" in capsys.readouterr().err

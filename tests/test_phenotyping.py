@@ -11,6 +11,7 @@ import pytest
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.phenotyping.annotations import decode_mask, encode_mask
 from jaxrl_vis.phenotyping.calibration import check_size, read_calibration, write_calibration
+from jaxrl_vis.phenotyping.ground import find_ground
 from jaxrl_vis.phenotyping.images import read_disparity, read_image, write_image
 from jaxrl_vis.phenotyping.metric import diameter_mm, tilt_of
 from jaxrl_vis.phenotyping.stereo import match_rows, match_sgbm
@@ -123,6 +124,45 @@ def test_tilt_is_read_from_the_slope_of_disparity():
     disparities = CAMERAS.disparity(np.array([depth, higher[2]]))
     slope = (disparities[1] - disparities[0]) / (lines[1] - lines[0])
     assert tilt_of(slope, disparities.mean(), CAMERAS) == pytest.approx(np.radians(10.0), rel=0.03)
+
+
+# --- the ground ---
+
+
+def over_ground(height: float | None, pitch: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """A pair over level ground, with a wall at 1 m in front of where it begins; the wall alone if no height is given, m."""
+    rng = np.random.default_rng(2)
+    left = cv2.GaussianBlur(rng.uniform(0, 255, (480, 640)).astype(np.float32), (0, 0), 1.0)
+    right = np.empty_like(left)
+    columns = np.arange(640)
+    for line in range(480):
+        wall = CAMERAS.focal * CAMERAS.baseline / 1.0
+        down = (line - CAMERAS.centre[1]) / CAMERAS.focal
+        # A ray (0, down, 1) meets the ground where its height, height - Z (down cos + sin), is 0.
+        inverse = 0.0 if height is None else (down * np.cos(pitch) + np.sin(pitch)) / height
+        disparity = max(wall, CAMERAS.focal * CAMERAS.baseline * inverse)
+        right[line] = np.interp(columns + disparity, columns, left[line])
+    return left, right
+
+
+@pytest.mark.parametrize(("height", "pitch"), [(0.3, 0.0), (0.35, 0.05), (0.25, -0.05)])
+def test_the_ground_is_found_and_heights_count_from_it(height, pitch):
+    ground = find_ground(*over_ground(height, pitch), CAMERAS)
+    assert ground is not None and ground.camera_height == pytest.approx(height, rel=0.02)
+    # A point 0.1 m above the ground, 0.7 m ahead of the camera's foot.
+    drop = height - 0.1
+    y, z = drop * np.cos(pitch) - 0.7 * np.sin(pitch), drop * np.sin(pitch) + 0.7 * np.cos(pitch)
+    line = y / z * CAMERAS.focal + CAMERAS.centre[1]
+    assert ground.height(400.0, line, z, CAMERAS) == pytest.approx(0.1, abs=0.01)
+
+
+def test_no_ground_is_invented():
+    assert find_ground(*over_ground(None), CAMERAS) is None
+    black = np.zeros((480, 640), np.float32)
+    assert find_ground(black, black, CAMERAS) is None
+    rng = np.random.default_rng(3)
+    noise = [rng.uniform(0, 255, (480, 640)).astype(np.float32) for _ in range(2)]
+    assert find_ground(noise[0], noise[1], CAMERAS) is None
 
 
 # --- disparity ---

@@ -93,53 +93,50 @@ def ended(processes: Sequence[subprocess.Popen], seconds: float = 120.0) -> list
 
 
 @pytest.fixture(scope="module")
-def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[tuple[int, str, str]]]:
-    """A run of two processes, of a device each: its folder, and how they ended."""
+def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list, list, float]:
+    """A run of two processes, of a device each, of which the second dies; and two others that go on with it.
+
+    Its folder, how the first two ended, how the others did, and the seconds from one's death to the other's end.
+    """
     run_dir = tmp_path_factory.mktemp("processes") / "pair"
-    return run_dir, ended(start(run_dir, 2, 1))
+    processes = start(run_dir, 2, 1, "die_at=3")
+    processes[1].wait(200)
+    died = time.monotonic()
+    ends = ended(processes)
+    seconds = time.monotonic() - died
+    assert Checkpoints(run_dir / "checkpoints", read_only=True).newest() == 2
+    return run_dir, ends, ended(start(run_dir, 2, 1, "resume=1")), seconds
 
 
-def test_two_processes_learn_and_save_what_one_does(pair: tuple[Path, list], tmp_path: Path) -> None:
-    run_dir, ends = pair
+def test_a_process_that_dies_ends_the_others_and_leaves_the_checkpoint(pair: tuple[Path, list, list, float]) -> None:
+    _, ((first, _, words), (second, _, _)), ends, seconds = pair
+    assert (first, second) == (1, 9), words
+    assert seconds < 60
+    assert "start all of them again with --resume" in words
     assert [status for status, _, _ in ends] == [0, 0], ends
+    assert "resumed at iteration 2 of 4, exactly" in ends[0][1]
+
+
+def test_two_processes_learn_and_save_what_one_does(pair: tuple[Path, list, list, float], tmp_path: Path) -> None:
+    run_dir, *_ = pair
     ((status, _, words),) = ended(start(tmp_path / "one", 1, 2))
     assert status == 0, words
     for ours, theirs in zip(rows_without_time(run_dir), rows_without_time(tmp_path / "one"), strict=True):
         assert ours == pytest.approx(theirs, abs=1e-5, nan_ok=True)
     config = read_config(run_dir).replace(devices=1)
     shapes = Programs(config, make_train_step(probes.GoWhereTold(), config)).shapes
-    saved = [
-        Checkpoints(path / "checkpoints", read_only=True).restore_for_resume(shapes) for path in (run_dir, tmp_path / "one")
-    ]
+    folders = [path / "checkpoints" for path in (run_dir, tmp_path / "one")]
+    saved = [Checkpoints(folder, read_only=True).restore_for_resume(shapes) for folder in folders]
     assert [each.iteration for each in saved if each is not None and each.loop is not None] == [4, 4]
     for ours, theirs in zip(*(as_plain(each.loop) for each in saved if each is not None), strict=True):
         np.testing.assert_allclose(ours, theirs, atol=1e-4)
 
 
-def test_only_the_first_process_writes_and_speaks(pair: tuple[Path, list]) -> None:
-    run_dir, ((_, first, _), (_, second, _)) = pair
+def test_only_the_first_process_writes_and_speaks(pair: tuple[Path, list, list, float]) -> None:
+    run_dir, _, ((_, first, _), (_, second, _)), _ = pair
     assert "success at the end" in first and "success" not in second
     assert [row["iteration"] for row in rows_without_time(run_dir)] == [2, 4]
     assert sorted(path.name for path in run_dir.iterdir()) == ["checkpoints", "config.json", "curve.png", "metrics.jsonl"]
-
-
-def test_two_processes_go_on_where_two_have_stopped(pair: tuple[Path, list]) -> None:
-    run_dir, _ = pair
-    ends = ended(start(run_dir, 2, 1, "resume=1", "iterations=6"))
-    assert [status for status, _, _ in ends] == [0, 0], ends
-    assert "resumed at iteration 4 of 6, exactly" in ends[0][1]
-    assert [row["iteration"] for row in rows_without_time(run_dir)] == [2, 4, 6]
-
-
-def test_a_process_that_dies_ends_the_others_and_leaves_the_checkpoint(tmp_path: Path) -> None:
-    processes = start(tmp_path / "run", 2, 1, "seeds=2", "die_at=3", "iterations=10000")
-    assert processes[1].wait(120) == 9
-    died = time.monotonic()
-    (status, _, words), _ = ended(processes, 60)
-    assert status == 1, words
-    assert time.monotonic() - died < 60
-    assert "start all of them again with --resume" in words
-    assert Checkpoints(tmp_path / "run" / "checkpoints", read_only=True).newest() == 2
 
 
 def test_a_signal_to_one_process_saves_and_ends_all(tmp_path: Path) -> None:

@@ -40,6 +40,11 @@ MEASURED: dict[str, tuple[str, ...]] = {
     "update/peer_torch": (*_TORCH, _TIMING),
     "train/env_steps": (*_PHYSICS, *_IMAGES, *_TASK, *_LEARNER, "jaxrl_vis/bench/train.py", _TIMING),
     "train/updates": (*_PHYSICS, *_IMAGES, *_TASK, *_LEARNER, "jaxrl_vis/bench/train.py", _TIMING),
+    **{
+        f"scaling/{kind}": (*_PHYSICS, *_IMAGES, *_TASK, *_LEARNER, "benchmarks/scaling.py")
+        for kind in ("seeds", "weak", "strong")
+    },
+    "scaling/all_reduce": ("jaxrl_vis/learner/shards.py", "benchmarks/scaling.py"),
     "adapters/success": (*_PHYSICS, *_TASK, f"{_ENVS}/adapters", "benchmarks/adapters.py"),
     "learning": (*_PHYSICS, *_IMAGES, *_TASK, *_LEARNER),
 }

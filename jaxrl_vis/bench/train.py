@@ -11,7 +11,7 @@ An iteration that takes longer than the promise loses time between its parts, to
 """
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -63,6 +63,13 @@ def time_iterations(program: TrainStep, repeats: int) -> tuple[LoopState, Timing
     return loop, timing, {"compile": compile_s, "host": max(0.0, timing.median_s - alone.median_s)}
 
 
+def _settled(program: TrainStep, call: Callable[[], Any]) -> Callable[[], Any]:
+    """The call; where several devices of a CPU share its threads, with its end, for two at a time could wait for each other."""
+    if program.layout.num_devices == 1 or jax.default_backend() != "cpu":
+        return call
+    return lambda: jax.block_until_ready(call())
+
+
 def time_parts(program: TrainStep, loop: LoopState, repeats: int) -> dict[str, float]:
     """Seconds of what an iteration consists of, each as a program of its own at the iteration's own sizes.
 
@@ -77,9 +84,9 @@ def time_parts(program: TrainStep, loop: LoopState, repeats: int) -> dict[str, f
     keys, iteration = seed_keys(program, 3), loop.iteration
     key = program.layout.put(jax.random.key(4), program.layout.everywhere)
     evaluate, _ = compile_timed(program.evaluate, loop.train, key)
-    evaluation = measure_time(lambda: evaluate(loop.train, key), repeats)
+    evaluation = measure_time(_settled(program, lambda: evaluate(loop.train, key)), repeats)
     play, _ = compile_timed(program.rollout, loop.train, keys)
-    rollout = measure_time(lambda: play(loop.train, keys), repeats)
+    rollout = measure_time(_settled(program, lambda: play(loop.train, keys)), repeats)
     episodes, _ = play(loop.train, keys)
     insert, _ = compile_timed(program.insert, loop.train, loop.replay, episodes, keys, iteration)
     train, replay = loop.train, loop.replay

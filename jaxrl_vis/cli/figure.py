@@ -1,12 +1,15 @@
 """``jaxrl-vis figure``."""
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from jaxrl_vis.cli.checks import check_counts, check_extra
+from jaxrl_vis.cli.phenotype_figure import NAMES as CHAPTER_3
+from jaxrl_vis.cli.phenotype_figure import make_figure
 from jaxrl_vis.config import PRESETS
 from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError, nearest
@@ -15,7 +18,9 @@ from jaxrl_vis.report.outputs import check_writable
 if TYPE_CHECKING:
     from jaxrl_vis.studies.show import Request
 
-FigureName = Literal["4.4", "5.1", "5.2", "estimators", "cameras", "5.4", "5.5", "5.6", "5.7", "quadratic"]
+FigureName = Literal[
+    "3.4", "3.5", "table3.1", "4.4", "5.1", "5.2", "estimators", "cameras", "5.4", "5.5", "5.6", "5.7", "quadratic"
+]
 SUFFIXES = (".png", ".pdf", ".svg")
 # Figures that train nothing -> options that they take.
 _DRAWN_HERE = {"4.4": ("figure", "out", "seed"), "quadratic": ("figure", "out")}
@@ -27,7 +32,9 @@ UNFINISHED = 3
 class Figure:
     """Draw a figure: train or compute what it shows, and write it to a file, with a table beside it.
 
-    4.4: from stereo pairs to grasp points, of the synthetic run that --seed chooses.
+    3.4, 3.5, table3.1: counts, widths and times on synthetic plots of sorghum, beside what the thesis says of people; from
+    --evaluation, or from plots that are evaluated first. 4.4: from a stereo pair to grasp points, of a synthetic run; --seed
+    chooses it.
 
     5.1, 5.2: rewards with and without ground truth. estimators: rewards from state estimators that err. cameras: noisy and
     varied images. 5.4: auxiliary losses, and how they are weighted. 5.5: single auxiliary tasks. 5.6: their weights over
@@ -40,8 +47,12 @@ class Figure:
     figure: Annotated[FigureName, tyro.conf.Positional]
     """Which figure."""
     out: Path | None = None
-    """A .png, .pdf or .svg file; figure_FIGURE.png (or quadratic.png) in the current folder if not given. Tables go beside it,
-    as .md and .csv."""
+    """A .png, .pdf or .svg file, and .md for table3.1; figure_FIGURE.png (or quadratic.png, or table_3.1.md) in the current
+    folder if not given. Tables go beside it, as .md and .csv."""
+    evaluation: Path | None = None
+    """For 3.4, 3.5 and table3.1: what `phenotype eval --json` wrote; if not given, plots are evaluated."""
+    plots: int | None = None
+    """For 3.4, 3.5 and table3.1: how many plots to evaluate; 10 if not given."""
     preset: str | None = None
     """Preset of all runs; paper for figures 5.4 to 5.7 and fast for the others if not given."""
     quick: bool = False
@@ -70,13 +81,16 @@ class Figure:
 
 def run(options: Figure) -> int:
     """Draws one figure; `UNFINISHED` where a run that belongs to it is not finished."""
+    if options.figure in CHAPTER_3:
+        return _of_chapter_3(options)
+    _refuse_options(options, ("evaluation", "plots"), "figures 3.4, 3.5 and table3.1")
     is_quadratic = options.figure == "quadratic"
     is_drawn_here = options.figure in _DRAWN_HERE
     out = options.out or Path("quadratic.png" if is_quadratic else f"figure_{options.figure}.png")
     if out.suffix.lower() not in SUFFIXES:
         raise RequestError(f"--out {out}: a figure is a file that ends in {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
     if is_drawn_here:
-        _refuse_options_of_runs(options)
+        _refuse_options_of_runs(options, _DRAWN_HERE[options.figure])
     for file in (out,) if is_drawn_here else (out, out.with_suffix(".md"), out.with_suffix(".csv")):
         check_writable(file, "--out")
     if is_quadratic:
@@ -89,16 +103,36 @@ def run(options: Figure) -> int:
     if options.figure == "4.4":
         return _draw_grasping(out, options.seed or 0)
     # Nothing below starts JAX in this process: the accelerator's memory belongs to the runs.
-    from jaxrl_vis.studies.figures import make_figure
+    from jaxrl_vis.studies import figures
 
-    return 0 if make_figure(_request(options, out)) else UNFINISHED
+    return 0 if figures.make_figure(_request(options, out)) else UNFINISHED
 
 
-def _refuse_options_of_runs(options: Figure) -> None:
-    for field in dataclasses.fields(options):
-        if field.name not in _DRAWN_HERE[options.figure] and getattr(options, field.name) != field.default:
-            option = f"--{field.name.replace('_', '-')}"
-            raise RequestError(f"{option} goes with figures of training runs, not with {options.figure}")
+def _of_chapter_3(options: Figure) -> int:
+    is_table = options.figure == "table3.1"
+    suffixes = (".md",) if is_table else SUFFIXES
+    out = options.out or Path("table_3.1.md" if is_table else f"figure_{options.figure}.png")
+    if out.suffix.lower() not in suffixes:
+        raise RequestError(f"--out {out}: {options.figure} is a file that ends in {' or '.join(suffixes)}")
+    _refuse_options_of_runs(options, ("figure", "out", "evaluation", "plots", "quick"))
+    if options.evaluation is not None and (options.plots is not None or options.quick):
+        raise RequestError("--evaluation is of plots that are evaluated already: leave out --plots and --quick")
+    check_counts(plots=options.plots)
+    for file in (out, out.with_suffix(".md"), out.with_suffix(".csv")):
+        check_writable(file, "--out")
+    return make_figure(options.figure, out, options.evaluation, options.plots, options.quick)
+
+
+def _refuse_options_of_runs(options: Figure, known: Sequence[str]) -> None:
+    others = [field.name for field in dataclasses.fields(options) if field.name not in known]
+    _refuse_options(options, others, f"figures of training runs, not with {options.figure}")
+
+
+def _refuse_options(options: Figure, names: Sequence[str], where: str) -> None:
+    defaults = {field.name: field.default for field in dataclasses.fields(options)}
+    for name in names:
+        if getattr(options, name) != defaults[name]:
+            raise RequestError(f"--{name.replace('_', '-')} goes with {where}")
 
 
 def _draw_grasping(out: Path, seed: int) -> int:

@@ -1,13 +1,13 @@
 """``jaxrl-vis phenotype``."""
 
 import dataclasses
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from jaxrl_vis.cli.checks import check_counts, check_extra
 from jaxrl_vis.cli.families import family_of
 from jaxrl_vis.cli.parsing import ByPlaceToo
+from jaxrl_vis.cli.progress import progress
 from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.report.outputs import check_writable
@@ -79,15 +79,13 @@ def write_synthetic(
     """
     from jaxrl_vis.phenotyping.synth import name_of, write_plots
 
-    def say(seed: int, pairs: int) -> None:
-        if sys.stdout.isatty():
-            print(f"\r{name_of(seed)}: {pairs} of {family.rig.frames} pairs", end="", flush=True)
-            print("" if pairs < family.rig.frames else "\n", end="", flush=True)
-        elif pairs == family.rig.frames:
-            print(f"{name_of(seed)}: {pairs} pairs", flush=True)
-
     try:
-        present = write_plots(out, family, seeds, image_format, truth, say)
+        with progress("pairs") as say:
+
+            def done(seed: int, pairs: int) -> None:
+                say(name_of(seed), pairs, family.rig.frames)
+
+            present = write_plots(out, family, seeds, image_format, truth, done)
     except OSError as error:
         raise RequestError(f"cannot write to {out}: {error.strerror or error}") from error
     there = f", {present} there already" if present else ""

@@ -8,6 +8,7 @@ from typing import Annotated, Literal, Protocol
 
 from jaxrl_vis.cli.checks import check_extra
 from jaxrl_vis.cli.parsing import ByPlaceToo
+from jaxrl_vis.cli.progress import progress
 from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError, StorageError
 from jaxrl_vis.report.outputs import check_writable
@@ -20,8 +21,9 @@ SKIPPED = 3
 class Run:
     """Count and measure the stalks in folders of stereo pairs: tables per stalk and per plot, and an overlay per image."""
 
-    folder: Annotated[Path, ByPlaceToo()]
-    """A plot's folder of pairs (left_000.png, right_000.png, ...), or a folder of such folders."""
+    folder: Annotated[Path | None, ByPlaceToo()] = None
+    """A plot's folder of pairs (left_000.png, right_000.png, ...), or a folder of such folders; the short synthetic row that
+    comes with the package if not given."""
     out: Path = Path("phenotype_results")
     """Folder for the results; a command that was stopped goes on where it was."""
     calibration: Path | None = None
@@ -39,6 +41,9 @@ class Run:
     """What the networks are less sure of is no stalk, 0 to 1."""
     speed: float | None = None
     """Speed of the robot in m/s, for an odometry.csv that holds times only."""
+    disparity_scale: float = 256.0
+    """What disparities in files of 16 bits (disparity_000.png beside the images) are divided by to be pixels: 256 as KITTI
+    writes them, 64 as `phenotype synth` does."""
 
 
 def run(options: Run) -> int:
@@ -47,14 +52,19 @@ def run(options: Run) -> int:
         raise RequestError(f"--least-score must be from 0 to 1, not {options.least_score:g}")
     if options.speed is not None and not options.speed > 0:
         raise RequestError(f"--speed must be more than 0, not {options.speed:g}")
+    if not options.disparity_scale > 0:
+        raise RequestError(f"--disparity-scale must be more than 0, not {options.disparity_scale:g}")
     check_extra("phenotype", "phenotyping")
     check_writable(options.out, "--out", folder=True)
-    from jaxrl_vis.phenotyping.folders import find_plots
+    from jaxrl_vis.phenotyping.folders import SAMPLE, find_plots
 
-    plots = find_plots(options.folder)
+    plots = find_plots(options.folder or SAMPLE)
+    if options.folder is None:
+        print("no folder given: this is the short synthetic row that comes with jaxrl-vis")
     calibrations = {plot.name: calibration_of(plot.folder, options) for plot in plots}
     check_devices()
     from jaxrl_vis.phenotyping.pipeline import Request, run
+    from jaxrl_vis.phenotyping.results import NO_GROUND
 
     if options.masks == "truth":
         from jaxrl_vis.phenotyping.truth_on_disk import find_truth
@@ -66,26 +76,26 @@ def run(options: Run) -> int:
         def find(image, plot, pair):
             return finder(image)
 
-    request = Request(options.out, options.method, name, calibrations, options.speed)
+    request = Request(options.out, options.method, name, calibrations, options.speed, options.disparity_scale)
     for plot in plots:
         if calibrations[plot.name] is None:
             print(f"{plot.name}: no calibration, so no millimetres and no count: name one with --calibration", file=sys.stderr)
 
-    def say(plot: str, pair: int, of: int) -> None:
-        if sys.stdout.isatty():
-            print(f"\r{plot}: {pair} of {of} pairs", end="\n" if pair == of else "", flush=True)
-        elif pair == of:
-            print(f"{plot}: {of} pairs", flush=True)
-
     try:
-        skipped = run(plots, find, request, say)
+        with progress("pairs") as done:
+            rows, skipped = run(plots, find, request, done)
     except OSError as error:
         raise StorageError(
             f"cannot write to {options.out}: {error.strerror or error}; run the command again to go on"
         ) from error
+    for row in rows:
+        if row["flag"] == NO_GROUND:
+            print(
+                f"{row['plot']}: the ground is not seen, so nobody knows at what height the widths were taken", file=sys.stderr
+            )
     for row in skipped:
         print(f"skipped {row['plot']}/{row['pair']}: {row['why']}", file=sys.stderr)
-    print(f"{options.out}: stalks.csv, plots.csv and overlays of {len(plots)} plots, {len(skipped)} pairs skipped")
+    print(f"{options.out}: stalks.csv, plots.csv, qc.html and overlays of {len(plots)} plots, {len(skipped)} pairs skipped")
     return SKIPPED if skipped else 0
 
 

@@ -26,7 +26,8 @@ class Train:
     out: Annotated[Path, ByPlaceToo()]
     """The file to write, .npz; give it to `phenotype run` as --weights."""
     data: Path | None = None
-    """A folder with annotations.json (COCO) and its images, in place of synthetic plots."""
+    """A folder of annotated images (annotations.json of COCO, or .xml of Pascal VOC or .json of LabelMe beside each image), in
+    place of synthetic plots."""
     spec: Path | None = None
     """A JSON or TOML file with the values of a synthetic family of your own."""
     minutes: float | None = None

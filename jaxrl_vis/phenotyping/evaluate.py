@@ -5,16 +5,21 @@ plot -> pairs -> finds -> sightings -> stalks       as `pipeline.run` does, with
 """
 
 import dataclasses
+import math
+import time
 from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
 
 from jaxrl_vis.phenotyping.detector.finder import Detection
+from jaxrl_vis.phenotyping.ground import find_ground
+from jaxrl_vis.phenotyping.heights import widths_of
 from jaxrl_vis.phenotyping.measure import Method
 from jaxrl_vis.phenotyping.perfect import perfect_detections
-from jaxrl_vis.phenotyping.sightings import Sighting, look
-from jaxrl_vis.phenotyping.track import follow, robust_width
+from jaxrl_vis.phenotyping.sightings import Sighting, grey_of, look
+from jaxrl_vis.phenotyping.thesis import count_by_length, look_as_thesis, mean_widths
+from jaxrl_vis.phenotyping.track import follow
 from jaxrl_vis_envs.plants import Family, Stalk, draw
 from jaxrl_vis_envs.plants.pairs import Sequence
 from jaxrl_vis_envs.plants.truth import HEIGHTS, StalkInView, stalks_in_view
@@ -32,6 +37,9 @@ class PlotScore:
         seed: Of the plot.
         true, counted: Stalks.
         widths: [N, 2] float64, measured and true diameter at 12 inches of each stalk that was counted and identified, mm.
+        upper: [M, 2] float64, the same at 24 inches.
+        seconds: Of finding and measuring, for each pair, from arrays in memory; the first pair, which compiles, is left out.
+        thesis: What the thesis's ways make of the same finds.
         finds: [K, 2] float64, score of each find, and 1 where it is a stalk, 0 where not; those of unclear stalks are left out.
         stalks: How many stalks finds could have shown, over all pairs.
     """
@@ -42,12 +50,35 @@ class PlotScore:
     widths: np.ndarray
     finds: np.ndarray
     stalks: int
+    upper: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 2)))
+    seconds: float = math.nan
+    thesis: "ThesisScore | None" = None
+
+
+@dataclasses.dataclass(frozen=True)
+class ThesisScore:
+    """The same finds, as the thesis makes counts and widths of them.
+
+    Attributes:
+        counted: Stalks, by the stalks on each metre of image.
+        widths: [N, 2] float64, measured and true diameter at 12 inches, mm.
+    """
+
+    counted: float
+    widths: np.ndarray
 
 
 Finder = Callable[[np.ndarray], list[Detection]]
 
 
-def score_plot(family: Family, seed: int, find: Finder | None, method: Method = "strip", least_score: float = 0.5) -> PlotScore:
+def score_plot(
+    family: Family,
+    seed: int,
+    find: Finder | None,
+    method: Method = "strip",
+    least_score: float = 0.5,
+    with_thesis: bool = False,
+) -> PlotScore:
     """Draws a plot, runs everything on it and compares.
 
     Args:
@@ -56,44 +87,69 @@ def score_plot(family: Family, seed: int, find: Finder | None, method: Method = 
         find: What finds stalks in a left image [H, W, 3] uint8, those of low scores too; None for true boxes and masks.
         method: How widths are taken.
         least_score: What counts as a find.
+        with_thesis: Score the thesis's ways on the same finds, too.
     """
     sequence = Sequence.of(draw(family, seed))
     drive, plot = sequence.drive, sequence.plot
     frames: list[list[Sighting]] = []
     owners: list[list[int | None]] = []
     finds: list[tuple[float, float]] = []
-    total = 0
+    as_thesis: list[list[Sighting]] = []
+    total, seconds = 0, []
     for pair in sequence:
         left, right, instance = np.asarray(pair.left), np.asarray(pair.right), np.asarray(pair.instance)
         seen = stalks_in_view(plot, pair.pose, drive.true, instance, np.asarray(pair.depth))
+        started = time.monotonic()
         if find is None:
             detections = perfect_detections(map(dataclasses.asdict, seen), instance, LEAST_VISIBLE)
         else:
             detections = find(left)
+        kept = [place for place, each in enumerate(detections) if each.score >= least_score]
+        finds_kept = [detections[place] for place in kept]
+        ground = find_ground(grey_of(left), grey_of(right), drive.stated)
+        frames.append(look(finds_kept, left, right, drive.stated, method, ground))
+        seconds.append(time.monotonic() - started)
+        if with_thesis:
+            as_thesis.append(look_as_thesis(finds_kept, left, right, drive.stated))
         matched, scored = match(detections, seen)
         total += sum(each.band_box is not None and each.band_visible >= LEAST_VISIBLE for each in seen)
         finds += scored
-        kept = [place for place, each in enumerate(detections) if each.score >= least_score]
-        frames.append(look([detections[place] for place in kept], left, right, drive.stated, method))
         owners.append([matched[place] for place in kept])
     tracks, _ = follow(frames, drive.odometry, drive.stated)
-    widths = []
+    widths, upper = [], []
     counted = [track for track in tracks if track.counted]
-    for track in counted:
+    for track, measured in zip(counted, widths_of(frames, counted)):
         names = [owners[frame][place] for frame, place in track.sightings]
         known = [name for name in names if name is not None]
-        width = robust_width([frames[frame][place] for frame, place in track.sightings])
-        if known and width is not None:
-            owner = max(sorted(set(known)), key=known.count)
-            widths.append((width[0], true_diameter(plot.stalks[owner])))
+        if not known:
+            continue
+        stalk = plot.stalks[max(sorted(set(known)), key=known.count)]
+        if measured.lower is not None:
+            widths.append((measured.lower.mm, true_diameter(stalk)))
+        if measured.upper is not None:
+            upper.append((measured.upper.mm, true_diameter(stalk, HEIGHTS[1])))
     return PlotScore(
-        seed, len(plot.measured), len(counted), np.array(widths).reshape(-1, 2), np.array(finds).reshape(-1, 2), total
+        seed,
+        len(plot.measured),
+        len(counted),
+        np.array(widths).reshape(-1, 2),
+        np.array(finds).reshape(-1, 2),
+        total,
+        np.array(upper).reshape(-1, 2),
+        float(np.mean(seconds[1:])) if len(seconds) > 1 else math.nan,
+        _thesis_score(as_thesis, owners, sequence) if with_thesis else None,
     )
 
 
-def true_diameter(stalk: Stalk) -> float:
-    """Diameter of a stalk at 12 inches as the cameras face it, mm; beside a node, the stalk above and below it is meant."""
-    height = HEIGHTS[0]
+def _thesis_score(frames: list[list[Sighting]], owners: list[list[int | None]], sequence: Sequence) -> ThesisScore:
+    plot, stated = sequence.plot, sequence.drive.stated
+    widths = [(width, true_diameter(plot.stalks[name])) for name, width in mean_widths(frames, owners).items()]
+    counted = count_by_length(frames, stated, plot.family.layout.plot_length)
+    return ThesisScore(counted, np.array(widths).reshape(-1, 2))
+
+
+def true_diameter(stalk: Stalk, height: float = HEIGHTS[0]) -> float:
+    """Diameter of a stalk at a height in m as the cameras face it, mm; beside a node, the stalk above and below it is meant."""
     beside = (0.02, -0.02) if stalk.node_distance(height) < 0.01 else (0.0,)
     return 1e3 * float(np.mean([stalk.diameter(height + each) for each in beside]))
 
@@ -154,8 +210,9 @@ def summary(scores: Iterable[PlotScore], least_score: float = 0.5) -> dict[str, 
 
     Returns:
         ``count_r2`` (1 - SSE / SST against y = x), ``count_mae``, ``count_bias`` (of the true number), ``width_mae_mm``,
-        ``width_bias_mm``, ``width_mae_two_people_mm`` (against the simulated mean of two people with calipers), ``ap50``,
-        ``f1``, ``precision``, ``recall``, and how much there was of each. Not a number where there was nothing.
+        ``width_bias_mm``, ``width_mae_two_people_mm`` (against the simulated mean of two people with calipers), the same at 24
+        inches, ``ap50``, ``f1``, ``precision``, ``recall``, and how much there was of each. Not a number where there was
+        nothing.
     """
     scores = list(scores)
     true = np.array([each.true for each in scores], float)
@@ -163,28 +220,56 @@ def summary(scores: Iterable[PlotScore], least_score: float = 0.5) -> dict[str, 
     widths = np.concatenate([each.widths for each in scores]) if scores else np.zeros((0, 2))
     finds = np.concatenate([each.finds for each in scores]) if scores else np.zeros((0, 2))
     stalks = sum(each.stalks for each in scores)
-    spread = float(((true - true.mean()) ** 2).sum()) if len(true) else 0.0
     error = widths[:, 0] - widths[:, 1]
+    upper = np.concatenate([each.upper for each in scores]) if scores else np.zeros((0, 2))
+    upper_error = upper[:, 0] - upper[:, 1]
     people = np.random.default_rng(0).normal(0.0, PERSON_SD, (len(error), 2)).mean(axis=1)
     kept = finds[finds[:, 0] >= least_score]
     hits = float(kept[:, 1].sum())
     return {
         "plots": len(scores),
         "count_true": int(true.sum()),
-        "count_r2": 1.0 - float(((counted - true) ** 2).sum()) / spread if spread > 0 else float("nan"),
+        "count_r2": _agreement(counted, true),
         "count_mae": _mean(np.abs(counted - true)),
         "count_bias": float(counted.sum() / true.sum() - 1.0) if true.sum() else float("nan"),
         "widths": len(error),
         "width_mae_mm": _mean(np.abs(error)),
         "width_bias_mm": _mean(error),
         "width_mae_two_people_mm": _mean(np.abs(error - people)),
+        "widths_24in": len(upper),
+        "width_24in_mae_mm": _mean(np.abs(upper_error)),
+        "width_24in_bias_mm": _mean(upper_error),
         "finds": len(kept),
         "stalks_in_view": stalks,
         "ap50": average_precision(finds, stalks),
         "precision": hits / len(kept) if len(kept) else float("nan"),
         "recall": hits / stalks if stalks else float("nan"),
         "f1": 2.0 * hits / (len(kept) + stalks) if len(kept) + stalks else float("nan"),
+        "seconds_per_pair": _mean(np.array([each.seconds for each in scores if math.isfinite(each.seconds)])),
+        **_thesis_summary(scores),
     }
+
+
+def _thesis_summary(scores: list[PlotScore]) -> dict[str, float]:
+    """The same figures of the thesis's ways, where all plots have them."""
+    both = [(each, each.thesis) for each in scores if each.thesis is not None]
+    if not both:
+        return {}
+    true, counted = np.array([(score.true, thesis.counted) for score, thesis in both]).T
+    widths = np.concatenate([thesis.widths for _, thesis in both])
+    return {
+        "thesis_count_r2": _agreement(counted, true),
+        "thesis_count_mae": _mean(np.abs(counted - true)),
+        "thesis_count_bias": float(counted.sum() / true.sum() - 1.0) if true.sum() else float("nan"),
+        "thesis_width_mae_mm": _mean(np.abs(widths[:, 0] - widths[:, 1])),
+        "thesis_width_bias_mm": _mean(widths[:, 0] - widths[:, 1]),
+    }
+
+
+def _agreement(counted: np.ndarray, true: np.ndarray) -> float:
+    """1 - SSE / SST against y = x; not a number where all true values are equal."""
+    spread = float(((true - true.mean()) ** 2).sum()) if len(true) else 0.0
+    return 1.0 - float(((counted - true) ** 2).sum()) / spread if spread > 0 else float("nan")
 
 
 def _mean(values: np.ndarray) -> float:

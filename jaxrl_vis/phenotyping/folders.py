@@ -2,6 +2,7 @@
 
 left_000.png  right_000.png          or  anything with left and right, or L and R, as a word of its name
 left/000.png  right/000.png          or  the same in two folders
+disparity_000.pfm, disparity/000.png optional: disparities of the left images, in place of our own
 odometry.csv                         distance_m, or time_s, with the name of the left image (left) or in order
 """
 
@@ -15,6 +16,9 @@ import numpy as np
 from jaxrl_vis.errors import RequestError
 
 _IMAGES = {".png", ".jpg", ".jpeg", ".tif", ".tiff"}
+SAMPLE = Path(__file__).with_name("sample_row")
+"""A short synthetic row that comes with the package."""
+_DISPARITIES = {".pfm", ".png", ".tif", ".tiff"}
 _SIDE = re.compile(r"(?<![a-z])(left|right|l|r)(?![a-z])", re.IGNORECASE)
 
 
@@ -25,11 +29,13 @@ class PairFiles:
     Attributes:
         name: Common to both, fit for a file name.
         left, right: The images.
+        disparity: Disparities of the left image, if somebody computed them before; they are used in place of the right image.
     """
 
     name: str
     left: Path | None
     right: Path | None
+    disparity: Path | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,12 +87,19 @@ def _pairs(folder: Path) -> tuple[PairFiles, ...]:
         if words:
             name = _SIDE.sub("", image.stem, count=1).strip("_-. ") or "pair"
             sides.setdefault(name, {})["left" if words[0].lower().startswith("l") else "right"] = image
-    found = [PairFiles(name, each.get("left"), each.get("right")) for name, each in sides.items()]
+    for path in [*_images(folder / "disparity", _DISPARITIES), *_images(folder, _DISPARITIES)]:
+        beside = path.parent == folder
+        name = re.sub("disparity", "", path.stem, flags=re.IGNORECASE).strip("_-. ") if beside else path.stem
+        if name in sides and (not beside or "disparity" in path.stem.lower()):
+            sides[name]["disparity"] = path
+    found = [PairFiles(name, each.get("left"), each.get("right"), each.get("disparity")) for name, each in sides.items()]
     return tuple(sorted(found, key=lambda pair: _natural(pair.name)))
 
 
-def _images(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() in _IMAGES and path.is_file())
+def _images(folder: Path, suffixes: set[str] = _IMAGES) -> list[Path]:
+    if not folder.is_dir():
+        return []
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() in suffixes and path.is_file())
 
 
 def _natural(name: str) -> list[tuple[int, int, str]]:

@@ -44,6 +44,18 @@ def read_image(path: Path) -> np.ndarray:
     return image if image.ndim == 2 else cv2.cvtColor(image[..., :3], cv2.COLOR_BGR2RGB)
 
 
+def rgb8(image: np.ndarray) -> np.ndarray:
+    """An image of any kind that `read_image` gives as [H, W, 3] uint8.
+
+    Cameras of 10, 12 or 14 bits write them into files of 16, with what is above them empty: the depth is taken to be the least
+    of these in which all values fit.
+    """
+    if image.dtype == np.uint16:
+        bits = next(bits for bits in (10, 12, 14, 16) if int(image.max()) < 1 << bits)
+        image = (image >> (bits - 8)).astype(np.uint8)
+    return np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image
+
+
 def read_disparity(path: Path, scale: float = 256.0) -> np.ndarray:
     """Disparities from a file: PFM, floating-point TIFF, or 16-bit PNG or TIFF.
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxrl_vis.phenotyping.detector.finder import Detection
+from jaxrl_vis.phenotyping.detector.finder import Detection, higher_up
 
 
 def perfect_detections(seen: Iterable[Mapping[str, Any]], instance: np.ndarray, least: float = 0.3) -> list[Detection]:
@@ -30,5 +30,17 @@ def perfect_detections(seen: Iterable[Mapping[str, Any]], instance: np.ndarray, 
             continue
         slope, offset = np.polyfit(line + upper, column + first, 1)
         axis = (float(offset + slope * top), float(offset + slope * bottom))
-        found.append(Detection((left, top, right, bottom), axis, 1.0, mask, (upper, first)))
+        above = _upper(np.array([left, top, right, bottom, *axis]) + 0.5, instance, each["stalk"])
+        found.append(Detection((left, top, right, bottom), axis, 1.0, mask, (upper, first), above))
     return sorted(found, key=lambda each: sum(each.axis))
+
+
+def _upper(stalk: np.ndarray, instance: np.ndarray, index: int) -> tuple[np.ndarray, tuple[int, int]] | None:
+    """True mask of a stalk's piece around the upper height, and its corner; None where the image does not show it."""
+    left, top, right, bottom = higher_up(stalk)[:4]
+    beside = right - left  # it may bend
+    first, last = max(round(left - beside), 0), min(round(right + beside), instance.shape[1])
+    if top <= 0 or last <= first:
+        return None
+    lines = slice(round(top), round(bottom))
+    return instance[lines, first:last] == index, (lines.start, first)

@@ -4,6 +4,7 @@
         pairs/PLOT/PAIR.json     sightings, or why the pair was skipped; what is there is not computed again
         overlays/PLOT/PAIR.png
         stalks.csv  plots.csv  skipped.csv
+        qc.html                  the same with pictures, and what was rejected
 
 Tables are always made from the files under pairs/, so they do not depend on when the command was stopped. One pair is in memory
 at a time.
@@ -23,11 +24,13 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.files import write_atomically
 from jaxrl_vis.phenotyping.detector.finder import Detection
 from jaxrl_vis.phenotyping.folders import PairFiles, PlotFolder, read_odometry
+from jaxrl_vis.phenotyping.ground import find_ground
 from jaxrl_vis.phenotyping.images import write_image
 from jaxrl_vis.phenotyping.measure import Method
 from jaxrl_vis.phenotyping.overlay import draw_overlay
 from jaxrl_vis.phenotyping.pairing import wrong_with
-from jaxrl_vis.phenotyping.reading import Unusable, read_pair
+from jaxrl_vis.phenotyping.qc import Page, PlotResult
+from jaxrl_vis.phenotyping.reading import Unusable, known_disparity, read_pair, read_side
 from jaxrl_vis.phenotyping.results import (
     PLOT_COLUMNS,
     STALK_COLUMNS,
@@ -37,7 +40,7 @@ from jaxrl_vis.phenotyping.results import (
     rows_without_path,
     write_rows,
 )
-from jaxrl_vis.phenotyping.sightings import NO_CALIBRATION, Sighting, look
+from jaxrl_vis.phenotyping.sightings import NO_CALIBRATION, Sighting, grey_of, look
 from jaxrl_vis.phenotyping.track import Track, follow
 from jaxrl_vis_envs.plants import Calibration
 
@@ -57,6 +60,7 @@ class Request:
         finder: What finds stalks, in words; results of another one are not mixed with it.
         calibrations: Of each plot by its name; None where there is none.
         speed: Of the robot, m/s, where only times are known.
+        disparity_scale: What disparities in 16-bit images are divided by.
     """
 
     out: Path
@@ -64,11 +68,12 @@ class Request:
     finder: str
     calibrations: dict[str, Calibration | None]
     speed: float | None = None
+    disparity_scale: float = 256.0
 
 
 def run(
     plots: list[PlotFolder], find: Find, request: Request, done: Callable[[str, int, int], None] = lambda plot, pair, of: None
-) -> list[Row]:
+) -> tuple[list[Row], list[Row]]:
     """Writes the results of plots.
 
     Args:
@@ -78,7 +83,7 @@ def run(
         done: Called after each pair with the plot's name, how many of its pairs are done, and how many it has.
 
     Returns:
-        A row for each pair that was skipped: plot, pair and why.
+        The rows of plots.csv and of skipped.csv.
 
     Raises:
         RequestError: The folder holds other results, or a plot's odometry cannot be read.
@@ -86,6 +91,23 @@ def run(
     """
     driven = {plot.name: read_odometry(plot, request.speed) for plot in plots}
     _claim(plots, request)
+    about = [
+        f"jaxrl-vis {jaxrl_vis.__version__}; finds by {request.finder}; widths by the method {request.method}.",
+        "Tables: stalks.csv, plots.csv and skipped.csv; all pairs: overlays/.",
+    ]
+    with Page(about, request.out / "overlays", len(plots)) as page:
+        return _run(plots, find, request, driven, page, done)
+
+
+def _run(
+    plots: list[PlotFolder],
+    find: Find,
+    request: Request,
+    driven: dict[str, dict[str, float] | None],
+    page: Page,
+    done: Callable[[str, int, int], None],
+) -> tuple[list[Row], list[Row]]:
+    """Plot by plot; see `run`."""
     stalks: list[Row] = []
     rows: list[Row] = []
     skipped: list[Row] = []
@@ -104,12 +126,14 @@ def run(
             for pair, each in zip(plot.pairs, records)
             if "skipped" in each
         ]
-        of_stalks, of_plot = _finish(plot, records, driven[plot.name], request)
-        stalks, rows, skipped = stalks + of_stalks, [*rows, of_plot], skipped + bad
+        result = _finish(plot, records, driven[plot.name], request)
+        page.add(result)
+        stalks, rows, skipped = stalks + result.stalks, [*rows, result.row], skipped + bad
         write_rows(request.out / "stalks.csv", STALK_COLUMNS, stalks)
         write_rows(request.out / "plots.csv", PLOT_COLUMNS, rows)
         write_rows(request.out / "skipped.csv", SKIPPED_COLUMNS, skipped)
-    return skipped
+    page.write(request.out / "qc.html", skipped)
+    return rows, skipped
 
 
 def _claim(plots: list[PlotFolder], request: Request) -> None:
@@ -119,6 +143,7 @@ def _claim(plots: list[PlotFolder], request: Request) -> None:
         "method": request.method,
         "finder": request.finder,
         "speed": request.speed,
+        "disparity_scale": request.disparity_scale,
         "calibrations": {
             name: None if each is None else dataclasses.asdict(each) for name, each in request.calibrations.items()
         },
@@ -135,21 +160,28 @@ def _claim(plots: list[PlotFolder], request: Request) -> None:
 def _record(plot: PlotFolder, pair: PairFiles, find: Find, request: Request) -> dict[str, Any]:
     """What is kept of one pair."""
     try:
-        left, right = read_pair(pair, request.calibrations[plot.name])
+        left, right = read_pair(pair, request.calibrations[plot.name], pair.disparity is None)
+        disparity = known_disparity(pair, left, request.disparity_scale)
         detections = find(left, plot, pair)
     except Unusable as problem:
         return {"skipped": str(problem)}
     calibration = request.calibrations[plot.name]
-    sightings = look(detections, left, right, calibration, request.method)
-    wrong = None if calibration is None else wrong_with(detections, sightings, left, right, calibration)
+    ground = None if calibration is None else find_ground(grey_of(left), grey_of(right), calibration, disparity)
+    sightings = look(detections, left, right, calibration, request.method, ground, disparity)
+    wrong = (
+        None if calibration is None or disparity is not None else wrong_with(detections, sightings, left, right, calibration)
+    )
     if wrong is not None:
         return {"skipped": wrong}
-    return {"size": list(left.shape[:2]), "sightings": [dataclasses.asdict(each) for each in sightings]}
+    height = None if ground is None else round(ground.camera_height, 4)
+    return {
+        "size": list(left.shape[:2]),
+        "camera_height_m": height,
+        "sightings": [dataclasses.asdict(each) for each in sightings],
+    }
 
 
-def _finish(
-    plot: PlotFolder, records: list[dict[str, Any]], driven: dict[str, float] | None, request: Request
-) -> tuple[list[Row], Row]:
+def _finish(plot: PlotFolder, records: list[dict[str, Any]], driven: dict[str, float] | None, request: Request) -> PlotResult:
     """Follows the stalks of a plot, and draws its overlays."""
     usable = [(pair, each) for pair, each in zip(plot.pairs, records) if "sightings" in each]
     skipped = len(records) - len(usable)
@@ -160,20 +192,23 @@ def _finish(
     if calibration is None or driven is None or not known or len(usable) < 2:
         why = _what_is_missing(len(usable), calibration)
         labels: list[list[str | None]] = [[None] * len(frame) for frame in frames]
-        rows = rows_without_path(frames, skipped, origin, why)
+        tracks, start = [], 0.0
+        stalks, row = rows_without_path(frames, skipped, origin, why)
     else:
         distances = np.array([driven[pair.name] for pair, _ in usable])
         tracks, path = follow(frames, distances, calibration)
         labels = labels_of(frames, tracks)
-        rows = rows_of(frames, tracks, path, skipped, origin)
+        start = float(path.places[0])
+        stalks, row = rows_of(frames, tracks, path, skipped, origin)
     folder = request.out / "overlays" / plot.name
     folder.mkdir(parents=True, exist_ok=True)
     for (pair, _), frame, names in zip(usable, frames, labels):
         target = folder / f"{pair.name}.png"
         if not target.exists():
-            left, _ = read_pair(pair, calibration)
-            write_image(target, draw_overlay(left, frame, names))
-    return rows
+            left = read_side(pair, "left")
+            write_image(target, draw_overlay(left, frame, names, f"{plot.name} {pair.name}"))
+    width = usable[0][1]["size"][1] if usable else 0
+    return PlotResult(row, stalks, [pair.name for pair, _ in usable], frames, tracks, start, width)
 
 
 def _what_is_missing(pairs: int, calibration: Calibration | None) -> str:

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from jaxrl_vis.files import write_atomically
+from jaxrl_vis.phenotyping.heights import StalkWidths, widths_of
 from jaxrl_vis.phenotyping.sightings import Sighting
 from jaxrl_vis.phenotyping.track import Path as Driven
-from jaxrl_vis.phenotyping.track import Track, robust_width
+from jaxrl_vis.phenotyping.track import Track
 
 STALK_COLUMNS = (
     "plot",
@@ -22,6 +23,9 @@ STALK_COLUMNS = (
     "width_mm",
     "width_se_mm",
     "height_in",
+    "width_24in_mm",
+    "width_24in_se_mm",
+    "taper_mm_per_in",
     "lean_deg",
     "frames",
     "frames_measured",
@@ -40,12 +44,17 @@ PLOT_COLUMNS = (
     "width_mean_mm",
     "width_sd_mm",
     "width_se_mm",
+    "width_24in_mean_mm",
+    "taper_mean_mm_per_in",
     "stalks_measured",
     "flag",
     "method",
     "version",
 )
 Row = dict[str, Any]
+_MOST_ERROR = 0.08  # of a width: what its pairs disagree about by more is no measurement
+NO_GROUND = "no visible ground"
+"""Flag of widths at a height that is not known."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,28 +71,29 @@ def rows_of(
 ) -> tuple[list[Row], Row]:
     """Rows of the stalks of one plot, from its beginning to its end, and the plot's own row."""
     stalks: list[Row] = []
-    for track in tracks:
-        if not track.counted:
-            continue
+    counted = [track for track in tracks if track.counted]
+    for track, widths in zip(counted, widths_of(frames, counted)):
         sightings = [frames[frame][place] for frame, place in track.sightings]
-        width = robust_width(sightings)
         leans = [each.lean_deg for each in sightings if each.lean_deg is not None]
         confidence = float(np.median([each.confidence for each in sightings]))
-        flag = "no width" if width is None else "few frames" if width[2] < 3 else "uncertain" if confidence < 0.3 else "ok"
+        lower, upper = widths.lower, widths.upper
         stalks.append(
             {
                 "plot": origin.plot,
                 "stalk": len(stalks) + 1,
                 "position_m": _text(track.position_m - path.places[0], 4),
                 "depth_m": _text(track.depth_m, 4),
-                "width_mm": "" if width is None else _text(width[0], 3),
-                "width_se_mm": "" if width is None else _text(width[1], 3),
-                "height_in": 12,
+                "width_mm": "" if lower is None else _text(lower.mm, 3),
+                "width_se_mm": "" if lower is None else _text(lower.error, 3),
+                "height_in": 12 if widths.height_known else "",
+                "width_24in_mm": "" if upper is None else _text(upper.mm, 3),
+                "width_24in_se_mm": "" if upper is None else _text(upper.error, 3),
+                "taper_mm_per_in": "" if widths.taper is None else _text(widths.taper, 3),
                 "lean_deg": _text(float(np.median(leans)), 1) if leans else "",
                 "frames": len(sightings),
-                "frames_measured": 0 if width is None else width[2],
+                "frames_measured": 0 if lower is None else lower.count,
                 "confidence": _text(confidence, 3),
-                "flag": flag,
+                "flag": _flag(widths, confidence),
                 "method": origin.method,
                 "version": origin.version,
             }
@@ -91,9 +101,23 @@ def rows_of(
     return stalks, _plot_row(stalks, len(frames), path.length, skipped, origin)
 
 
+def _flag(widths: StalkWidths, confidence: float) -> str:
+    """What a reader should know of a stalk's width before trusting it; ``ok`` if nothing."""
+    if widths.lower is None:
+        return "no width"
+    if not widths.height_known:
+        return NO_GROUND
+    if widths.lower.count < 3:
+        return "few frames"
+    if confidence < 0.3 or widths.lower.error > _MOST_ERROR * widths.lower.mm:
+        return "uncertain"
+    return "corrected for taper" if widths.lower.corrected else "ok"
+
+
 def _plot_row(stalks: list[Row], pairs: int, length: float, skipped: int, origin: Origin) -> Row:
     widths = np.array([float(row["width_mm"]) for row in stalks if row["width_mm"] != ""])
-    flag = "no stalks" if not stalks else "pairs skipped" if skipped else "ok"
+    unknown = [row for row in stalks if row["flag"] == NO_GROUND]
+    flag = "no stalks" if not stalks else "pairs skipped" if skipped else NO_GROUND if len(unknown) > len(stalks) / 2 else "ok"
     return {
         "plot": origin.plot,
         "pairs": pairs,
@@ -102,6 +126,7 @@ def _plot_row(stalks: list[Row], pairs: int, length: float, skipped: int, origin
         "stalks": len(stalks),
         "stalks_per_m": _text(len(stalks) / length, 3) if length > 0 else "",
         **_widths(widths),
+        **_higher(stalks),
         "flag": flag,
         "method": origin.method,
         "version": origin.version,
@@ -124,7 +149,14 @@ def rows_without_path(frames: list[list[Sighting]], skipped: int, origin: Origin
         "version": origin.version,
     }
     # The same stalk is seen many times: a standard error would claim too much.
-    return [], {**row, "width_se_mm": "", "stalks_measured": ""}
+    return [], {**row, "width_se_mm": "", "width_24in_mean_mm": "", "taper_mean_mm_per_in": "", "stalks_measured": ""}
+
+
+def _higher(stalks: list[Row]) -> Row:
+    """Means over the stalks that were measured at 24 inches, too."""
+    means = {"width_24in_mean_mm": "width_24in_mm", "taper_mean_mm_per_in": "taper_mm_per_in"}
+    values = {name: [float(row[column]) for row in stalks if row[column] != ""] for name, column in means.items()}
+    return {name: _text(float(np.mean(each)), 3) if each else "" for name, each in values.items()}
 
 
 def _widths(widths: np.ndarray) -> Row:

@@ -8,11 +8,14 @@ import cv2
 import numpy as np
 
 from jaxrl_vis.phenotyping.detector.finder import Detection
+from jaxrl_vis.phenotyping.ground import Ground
 from jaxrl_vis.phenotyping.measure import Measurement, Method, measure
 from jaxrl_vis.phenotyping.width import strip_width
 from jaxrl_vis_envs.plants import Calibration
+from jaxrl_vis_envs.plants.truth import HEIGHTS
 
 NO_CALIBRATION = "no calibration"
+_SAME_DEPTH = 0.06  # m, within 12 inches of a stalk that leans by 10 degrees
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,6 +33,10 @@ class Sighting:
         deviation_mm: Its standard error.
         depth_m: Planar depth of its front.
         along_m: Where it stands along the row, from the middle between the cameras.
+        height_m: Where above the ground; None where the pair shows no ground.
+        upper_mm, upper_deviation_mm, upper_height_m, upper_confidence: Diameter, its standard error, height and confidence
+            around 24 inches above the ground.
+        upper_place: Column, line and width in pixels of that.
         confidence: 0 to 1.
         reason: Why it was not measured; empty where it was.
     """
@@ -45,13 +52,21 @@ class Sighting:
     deviation_mm: float | None = None
     depth_m: float | None = None
     along_m: float | None = None
+    height_m: float | None = None
+    upper_mm: float | None = None
+    upper_deviation_mm: float | None = None
+    upper_height_m: float | None = None
+    upper_confidence: float = 0.0
+    upper_place: tuple[float, float, float] | None = None
     confidence: float = 0.0
     reason: str = ""
 
     @classmethod
     def read(cls, values: dict[str, Any]) -> "Sighting":
         """From what JSON kept of `dataclasses.asdict`."""
-        return cls(**{**values, "box": tuple(values["box"]), "axis": tuple(values["axis"])})
+        upper = values.get("upper_place")
+        parts = {"box": tuple(values["box"]), "axis": tuple(values["axis"]), "upper_place": upper and tuple(upper)}
+        return cls(**{**values, **parts})
 
 
 def grey_of(image: np.ndarray) -> np.ndarray:
@@ -60,7 +75,13 @@ def grey_of(image: np.ndarray) -> np.ndarray:
 
 
 def look(
-    detections: list[Detection], left: np.ndarray, right: np.ndarray, calibration: Calibration | None, method: Method = "strip"
+    detections: list[Detection],
+    left: np.ndarray,
+    right: np.ndarray,
+    calibration: Calibration | None,
+    method: Method = "strip",
+    ground: Ground | None = None,
+    disparity: np.ndarray | None = None,
 ) -> list[Sighting]:
     """Measures what was found in a pair.
 
@@ -69,6 +90,8 @@ def look(
         left, right: [H, W, 3] uint8, rectified.
         calibration: Of the cameras; without it there are no millimetres and no metres.
         method: How widths are taken.
+        ground: What heights are counted from; without it a stalk is measured in the middle of its box, and only there.
+        disparity: [H, W] float32, disparities that are known, pixels.
     """
     if calibration is None:
         return [_in_pixels(each) for each in detections]
@@ -76,8 +99,14 @@ def look(
     found = []
     for each in detections:
         line = 0.5 * (each.box[1] + each.box[3])
-        got = measure(each.mask, each.corner, grey_left, grey_right, calibration, line=line, method=method)
-        found.append(_sighting(each, got, calibration))
+        images = (grey_left, grey_right, calibration)
+        got = measure(
+            each.mask, each.corner, *images, line=line, method=method, ground=ground, height=HEIGHTS[0], disparity=disparity
+        )
+        upper = None
+        if ground is not None and each.upper is not None:
+            upper = measure(*each.upper, *images, method=method, ground=ground, height=HEIGHTS[1], disparity=disparity)
+        found.append(_sighting(each, got, upper, calibration))
     return found
 
 
@@ -101,14 +130,17 @@ def _in_pixels(detection: Detection) -> Sighting:
     )
 
 
-def _sighting(detection: Detection, got: Measurement, calibration: Calibration) -> Sighting:
+def _sighting(detection: Detection, got: Measurement, upper: Measurement | None, calibration: Calibration) -> Sighting:
     """Rounded, so that what JSON keeps is what was measured."""
-    line = 0.5 * (detection.box[1] + detection.box[3])
+    line = got.line if math.isfinite(got.line) else 0.5 * (detection.box[1] + detection.box[3])
     column = got.column if math.isfinite(got.column) else 0.5 * sum(detection.axis)
 
     def known(value: float | None, digits: int) -> float | None:
         return None if value is None or not math.isfinite(value) else round(value, digits)
 
+    # Another stalk may stand where this one's axis was followed to.
+    same = upper is not None and abs(upper.depth - got.depth) < _SAME_DEPTH
+    higher = upper if upper is not None and upper.diameter_mm is not None and same else Measurement()
     along = None
     if got.diameter_mm is not None:
         # The middle stands behind the front by half a diameter.
@@ -126,6 +158,14 @@ def _sighting(detection: Detection, got: Measurement, calibration: Calibration) 
         deviation_mm=known(got.deviation_mm, 4),
         depth_m=known(got.depth, 5),
         along_m=known(along, 5),
+        height_m=known(got.height, 4),
+        upper_mm=known(higher.diameter_mm, 4),
+        upper_deviation_mm=known(higher.deviation_mm, 4),
+        upper_height_m=known(higher.height, 4),
+        upper_confidence=round(higher.confidence, 4),
+        upper_place=None
+        if higher.diameter_mm is None
+        else tuple(round(x, 2) for x in (higher.column, higher.line, higher.width)),  # pyright: ignore[reportArgumentType]
         confidence=round(got.confidence, 4),
         reason=got.reason,
     )

@@ -1,13 +1,15 @@
 """Disparity inside detections: how far to the left the right camera sees the same stalk, to a fraction of a pixel.
 
 Only what lies in a detection is matched: matching all of a 9-megapixel pair takes 20 s on two cores, and one row of pixels in
-twenty of a stalk says as much about its distance. Two ways:
+twenty of a stalk says as much about its distance. Three ways:
 
     match_rows     one-dimensional: windows of a few lines of the stalk, compared at every whole disparity by normalised
                    cross-correlation; then a parabola through the best and its neighbours. The default.
     match_sgbm     OpenCV's semi-global matching of the detection's strip; what the thesis used, on the whole image.
+    sample_rows    takes them from an image of disparities that somebody else computed.
 
-Both see a window as a whole at one depth, as a stalk nearly is, and leave windows out that look alike elsewhere or nowhere.
+The first two see a window as a whole at one depth, as a stalk nearly is, and leave windows out that look alike elsewhere or
+nowhere.
 """
 
 import dataclasses
@@ -112,6 +114,36 @@ def match_rows(
         found.append((float(line), first - (begin_right + column), height))
     values = np.array(found, float).reshape(-1, 3)
     return StalkDisparity(values[:, 0], values[:, 1], values[:, 2], len(lines))
+
+
+def sample_rows(
+    disparity: np.ndarray,
+    lines: np.ndarray,
+    edges: tuple[np.ndarray, np.ndarray],
+    bounds: tuple[float, float],
+    core: float = 0.7,
+) -> StalkDisparity:
+    """Disparities of a stalk whose edges are known, out of an image of disparities.
+
+    Args:
+        disparity: [H, W] float32, pixels; not a number where there is none.
+        lines: [N] whole numbers.
+        edges: Columns [N] of the stalk's left and right edge in each of them.
+        bounds: Least and greatest disparity, pixels.
+        core: Share of the stalk's width that is looked at, in its middle.
+    """
+    found = []
+    for line, begin, end in zip(np.asarray(lines, int), *edges):
+        margin = 0.5 * (1.0 - core) * (end - begin)
+        first, last = max(int(np.ceil(begin + margin)), 0), int(np.floor(end - margin)) + 1
+        if not 0 <= line < disparity.shape[0] or last <= first:
+            continue
+        values = disparity[line, first:last]
+        values = values[(values >= bounds[0]) & (values <= bounds[1])]  # not a number is neither
+        if 2 * values.size >= last - first:
+            found.append((float(line), float(np.median(values))))
+    columns = np.array(found, float).reshape(-1, 2)
+    return StalkDisparity(columns[:, 0], columns[:, 1], np.ones(len(columns)), len(lines))
 
 
 def _peak(score: np.ndarray) -> tuple[float, float] | None:

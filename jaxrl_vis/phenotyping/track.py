@@ -15,6 +15,7 @@ from jaxrl_vis.phenotyping.sightings import Sighting
 from jaxrl_vis_envs.plants import Calibration
 
 _USUAL_DEPTH = 0.8  # m, where no pair says
+_SOLID = 0.6  # of the distance at which two stalks touch
 _NEVER = 1e3  # cost of what does not belong together
 
 
@@ -173,11 +174,32 @@ class _Seen:
         elsewhere = np.array([each.depth_m is not None and each.along_m is None for each in sightings], bool)
         half = 0.5 * calibration.baseline
         along = np.where(known, along, rays * usual - half)
-        return cls(rays, along, depth, known, ~elsewhere, half, usual)
+        return cls(rays, along, depth, known, ~elsewhere & _apart_in_space(sightings), half, usual)
 
     def beside(self, depth: float) -> np.ndarray:
         """Where they would stand along the row, [N], if they were so far away, m."""
         return self.rays * (depth if math.isfinite(depth) else self.usual) - self.half
+
+
+def _apart_in_space(sightings: list[Sighting]) -> np.ndarray:
+    """Which sightings of a pair may be stalks of their own, [N] bool: two solid stalks cannot stand in one place.
+
+    Of two that do, one was found twice, and the less certain one goes. Their measured diameters are taken to be too large by up
+    to 40 % together with the error of their places.
+    """
+    own = np.ones(len(sightings), bool)
+    order = sorted(range(len(sightings)), key=lambda place: -sightings[place].score * (0.1 + sightings[place].confidence))
+    kept: list[tuple[float, float, float]] = []
+    for place in order:
+        each = sightings[place]
+        if each.along_m is None or each.depth_m is None or each.diameter_mm is None:
+            continue
+        here = (each.along_m, each.depth_m, 1e-3 * each.diameter_mm)
+        if any(math.hypot(here[0] - x, here[1] - z) < _SOLID * 0.5 * (here[2] + wide) for x, z, wide in kept):
+            own[place] = False
+        else:
+            kept.append(here)
+    return own
 
 
 def _assign(tracks: list[_Open], seen: _Seen, place: float, gates: Gates) -> list[tuple[int, int]]:
@@ -240,24 +262,3 @@ def _closed(track: _Open, path: Path, step: float, half_field: float, usual: flo
     else:
         reason = ""
     return Track(tuple(sorted(track.seen)), position, depth, not reason, reason)
-
-
-def robust_width(sightings: list[Sighting]) -> tuple[float, float, int] | None:
-    """Diameter of one stalk by all its sightings: weighted median, its standard error in mm, and how many say so.
-
-    The standard error is that of the scatter between pairs, and at least what edges and disparity tell. What hides a stalk from
-    all sides is not in it.
-    """
-    measured = [each for each in sightings if each.diameter_mm is not None]
-    if not measured:
-        return None
-    values = np.array([each.diameter_mm for each in measured], float)
-    weights = np.array([max(each.confidence, 0.02) for each in measured])
-    order = np.argsort(values)
-    passed = np.cumsum(weights[order]) - 0.5 * weights[order]
-    median = float(np.interp(0.5 * weights.sum(), passed, values[order]))
-    enough = float(weights.sum() ** 2 / (weights**2).sum())
-    scatter = 1.4826 * float(np.median(np.abs(values - median))) * 1.2533 if len(values) > 2 else 0.0
-    stated = np.array([each.deviation_mm or 0.0 for each in measured])
-    least = math.sqrt(float((weights * stated**2).sum() / weights.sum()))
-    return median, max(scatter, least) / math.sqrt(enough), len(values)

@@ -18,21 +18,16 @@ import logging
 import shutil
 import sys
 import threading
-import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
-import numpy as np
 import orbax.checkpoint as ocp
-from jax.experimental import multihost_utils
 from orbax.checkpoint.checkpoint_managers import LatestN
 
 from jaxrl_vis import processes
 from jaxrl_vis.errors import RequestError, StorageError
-from jaxrl_vis.learner.sharding import put_array
+from jaxrl_vis.run.arrays import as_saved, check_structure, describe, host_specs, is_intact, rebuild, to_host, to_save
 from jaxrl_vis.types import LoopState, TrainState
 
 LIGHT, FULL = "light", "full"
@@ -40,8 +35,6 @@ SCHEMA = 2
 _READABLE = (1, 2)  # schema 1 called the progress "memo"
 _KEPT = 2
 DAMAGED = "damaged"
-
-Arrays = dict[str, np.ndarray]
 
 
 class _Damaged(Exception):
@@ -65,94 +58,6 @@ class Restored:
     train: TrainState
     loop: LoopState | None
     progress: dict[str, Any]
-
-
-def named_leaves(tree: Any) -> dict[str, Any]:
-    """The leaves of a pytree by name, such as ``actor.head.output.kernel``."""
-    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in jax.tree.leaves_with_path(tree)}
-
-
-def to_host(tree: Any, copy: bool) -> Arrays:
-    """The leaves of a pytree as numpy arrays by name; typed keys as their words.
-
-    Args:
-        tree: Arrays on a device.
-        copy: False: on a CPU, look at the device's memory itself. Only until the arrays are donated, and whoever keeps such a
-            view makes the next donation a copy.
-    """
-
-    def convert(leaf: jax.Array) -> np.ndarray:
-        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-            leaf = jax.random.key_data(leaf)
-        if copy or jax.default_backend() != "cpu":
-            return np.array(leaf)
-        try:
-            return np.from_dlpack(leaf)  # pyright: ignore[reportArgumentType]
-        except (BufferError, RuntimeError, TypeError):  # a type that numpy lacks, or several devices
-            return np.array(leaf)
-
-    return {name: convert(leaf) for name, leaf in named_leaves(tree).items()}
-
-
-def _checksum(array: np.ndarray) -> int:
-    return zlib.crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
-
-
-def _describe(arrays: Arrays) -> dict[str, list]:
-    return {name: [list(array.shape), str(array.dtype), _checksum(array)] for name, array in arrays.items()}
-
-
-def _to_save(tree: Any, copy: bool) -> Arrays | dict[str, jax.Array]:
-    """The leaves of a pytree by name, as they are given to orbax: from several processes each writes what it has."""
-    if not processes.are_several():
-        return to_host(tree, copy)
-    return {
-        name: jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
-        for name, leaf in named_leaves(tree).items()
-    }
-
-
-def _describe_parts(arrays: dict[str, jax.Array]) -> dict[str, list]:
-    """`_describe`, of arrays of which each process has a part; the last number says of how many axes `_sum_of_rows` is."""
-    axes = {name: max((n + 1 for n, on in enumerate(_spec_of(array)) if on), default=0) for name, array in arrays.items()}
-    sums = np.zeros(len(arrays), np.uint32)
-    for number, (name, array) in enumerate(arrays.items()):
-        for shard in array.addressable_shards:
-            if shard.replica_id == 0:
-                start = [each.start or 0 for each in shard.index[: axes[name]]]
-                sums[number] += np.uint32(_sum_of_rows(np.asarray(shard.data), axes[name], start))
-    totals = multihost_utils.process_allgather(sums).astype(np.uint64).sum(axis=0) % 2**32
-    return {
-        name: [list(array.shape), str(array.dtype), int(total), axes[name]]
-        for (name, array), total in zip(arrays.items(), totals, strict=True)
-    }
-
-
-def _spec_of(array: jax.Array) -> Sequence[Any]:
-    return getattr(array.sharding, "spec", ())
-
-
-def _sum_of_rows(array: np.ndarray, axes: int, start: Sequence[int] = ()) -> int:
-    """A checksum that can be put together of parts: the sum of those of all rows, each beginning with where it lies.
-
-    Args:
-        array: A part of an array.
-        axes: How many of the first axes number rows.
-        start: Where the part begins in these; nothing for a whole array.
-    """
-    total = 0
-    for index in np.ndindex(array.shape[:axes]):
-        place = np.add(index, start) if len(start) else np.asarray(index)
-        total += zlib.crc32(
-            np.ascontiguousarray(array[index]).reshape(-1).view(np.uint8).data, zlib.crc32(place.astype("<i8").tobytes())
-        )
-    return total % 2**32
-
-
-def _is_intact(array: np.ndarray, described: list) -> bool:
-    """Whether an array is as its manifest describes it."""
-    _, _, checksum, *axes = described
-    return checksum == (_sum_of_rows(array, axes[0]) if axes else _checksum(array))
 
 
 def _rest(loop: LoopState) -> dict[str, Any]:
@@ -247,16 +152,15 @@ class Checkpoints:
             train: The learner, [S, ...].
             progress: Anything that JSON can hold.
         """
-        self._save(LIGHT, iteration, {"train": _to_save(train, copy=True)}, progress)
+        self._save(LIGHT, iteration, {"train": to_save(train, copy=True)}, progress)
 
     def save_full(self, iteration: int, loop: LoopState, progress: dict[str, Any]) -> None:
         """Writes everything, and returns when it is on the disk: a second copy of the replay would need memory for two."""
-        items = {"train": _to_save(loop.train, copy=False), "rest": _to_save(_rest(loop), copy=False)}
+        items = {"train": to_save(loop.train, copy=False), "rest": to_save(_rest(loop), copy=False)}
         self._save(FULL, iteration, items, progress)
         self.wait()
 
     def _save(self, tier: str, iteration: int, items: dict[str, Any], progress: dict[str, Any]) -> None:
-        describe = _describe_parts if processes.are_several() else _describe
         described = {name: describe(arrays) for name, arrays in items.items()}
         manifest = {"schema": SCHEMA, "iteration": iteration, "items": described, "progress": progress}
         arguments: dict[str, Any] = {name: ocp.args.StandardSave(arrays) for name, arrays in items.items()}
@@ -373,20 +277,20 @@ class Checkpoints:
         if not isinstance(manifest, dict) or not {"schema", "items"} <= set(manifest):
             raise _Damaged("its manifest is incomplete")
         templates = {"train": template.train} | ({"rest": _rest(template)} if with_rest else {})
-        specs = {name: _host_specs(tree) for name, tree in templates.items()}
+        specs = {name: host_specs(tree) for name, tree in templates.items()}
         where = self._folder / tier / str(iteration)
         if manifest["schema"] not in _READABLE:
             raise RequestError(f"{where} is of schema {manifest['schema']}, not {SCHEMA}: use the version that wrote it")
         for name, spec in specs.items():
-            _check_structure(where, manifest["items"].get(name, {}), spec)
-            specs[name] = {leaf: _as_saved(manifest["items"][name][leaf][0], expected) for leaf, expected in spec.items()}
+            check_structure(where, manifest["items"].get(name, {}), spec)
+            specs[name] = {leaf: as_saved(manifest["items"][name][leaf][0], expected) for leaf, expected in spec.items()}
         read = self._read(tier, iteration, {name: ocp.args.StandardRestore(spec) for name, spec in specs.items()})
         trees = {}
         for name, tree in templates.items():
             for leaf_name, array in to_host(read[name], copy=False).items():
-                if not _is_intact(array, manifest["items"][name][leaf_name]):
+                if not is_intact(array, manifest["items"][name][leaf_name]):
                     raise _Damaged(f"wrong checksum of {leaf_name}")
-            trees[name] = _rebuild(tree, read[name])
+            trees[name] = rebuild(tree, read[name])
         loop = LoopState(train=trees["train"], **trees["rest"]) if with_rest else None
         return Restored(tier, iteration, trees["train"], loop, manifest.get("progress", manifest.get("memo", {})))
 
@@ -400,62 +304,3 @@ class Checkpoints:
             self._unsilence = _stay_silent  # as after a failed write: threads of this reading may complain later
             text = " ".join(str(error).split())[:80]
             raise _Damaged(f"{type(error).__name__}: {text}") from None
-
-
-def _is_folded(one: Sequence[int], other: Sequence[int]) -> bool:
-    """Whether two shapes are [S, rollouts, E, ...] and [S, rollouts * E, ...], of the same episodes (`sharding.Layout`)."""
-    (start, *rest), (folded_start, *folded) = sorted((tuple(one), tuple(other)), key=len)
-    return len(folded) >= 2 and start == folded_start and rest == [folded[0] * folded[1], *folded[2:]]
-
-
-def _as_saved(shape: Sequence[int], expected: jax.ShapeDtypeStruct) -> Any:
-    """What orbax is asked for: an array on the first device, or one on the host that is divided among devices later."""
-    if tuple(shape) == expected.shape and isinstance(expected.sharding, jax.sharding.SingleDeviceSharding):
-        return expected
-    return np.broadcast_to(np.zeros((), expected.dtype), tuple(shape))
-
-
-def _host_specs(tree: Any) -> dict[str, jax.ShapeDtypeStruct]:
-    """What `to_host` makes of a tree with these shapes, placed on the first device where the shapes do not say where."""
-    first = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
-
-    def convert(leaf: Any) -> jax.ShapeDtypeStruct:
-        device = getattr(leaf, "sharding", None) or first
-        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-            leaf = jax.eval_shape(jax.random.key_data, leaf)
-        return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=device)
-
-    return {name: convert(leaf) for name, leaf in named_leaves(tree).items()}
-
-
-def _rebuild(template: Any, arrays: dict[str, jax.Array]) -> Any:
-    """The inverse of `to_host`: a tree like ``template``, which also says where its arrays are to lie."""
-
-    def convert(path: Any, leaf: Any) -> jax.Array:
-        array, sharding = arrays[jax.tree_util.keystr(path, simple=True, separator=".")], getattr(leaf, "sharding", None)
-        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-            # The default kind, as `Trainer.run_keys` makes them; another one has another number of words, noticed before this.
-            array = jax.random.wrap_key_data(jnp.asarray(array))
-        elif array.shape != leaf.shape:
-            array = array.reshape(leaf.shape)
-        if sharding is None:
-            return jnp.asarray(array)
-        return put_array(array, sharding)
-
-    return jax.tree.map_with_path(convert, template)
-
-
-def _check_structure(where: Path, saved: dict[str, list], expected: dict[str, jax.ShapeDtypeStruct]) -> None:
-    """Raises RequestError, naming the first differences, where a checkpoint has other arrays than this program."""
-    differences = []
-    for name in sorted(set(saved) | set(expected)):
-        there = f"{saved[name][1]}{saved[name][0]}" if name in saved else "nothing"
-        here = f"{expected[name].dtype}{list(expected[name].shape)}" if name in expected else "nothing"
-        if there != here and name.startswith("replay.episodes.") and name in saved and name in expected:
-            if saved[name][1] == str(expected[name].dtype) and _is_folded(saved[name][0], expected[name].shape):
-                continue
-        if there != here:
-            differences.append(f"{name} is {there} there and {here} here")
-    if differences:
-        shown = "; ".join(differences[:3]) + (f"; and {len(differences) - 3} more" if len(differences) > 3 else "")
-        raise RequestError(f"{where} has another structure, so another version wrote it: {shown}; use that, or --overwrite")

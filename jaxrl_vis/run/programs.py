@@ -16,7 +16,7 @@ from jaxrl_vis import processes
 from jaxrl_vis.config import Config
 from jaxrl_vis.files import user_cache
 from jaxrl_vis.report import videos
-from jaxrl_vis.run.checkpoint import to_host
+from jaxrl_vis.run.arrays import to_host
 from jaxrl_vis.run.nonfinite import broken_leaves
 from jaxrl_vis.run.signals import shield_this_thread
 from jaxrl_vis.types import LoopState, Metrics, TrainState

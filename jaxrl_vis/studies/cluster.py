@@ -43,25 +43,27 @@ class Training:
             words.append("--resume")  # queued again
         with self._log.open("a", encoding="utf-8") as file:
             environment = {**os.environ, **self._environment}
-            child = subprocess.Popen(words, stdout=file, stderr=file, env=environment, cwd=self._folder)
-            self._child = child
+            self._child = subprocess.Popen(words, stdout=file, stderr=file, env=environment, cwd=self._folder)
+            if "SLURM_JOB_ID" in os.environ:  # Slurm itself tells every process of a job, and twice would be too often
+                return self._child.wait()
+            before = signal.signal(signal.SIGTERM, lambda *_: self._tell())
             try:
-                return child.wait()
-            except BaseException:  # the job is cancelled: what it has is saved first
-                self._end()
-                raise
+                return self._child.wait()
+            finally:
+                signal.signal(signal.SIGTERM, before)
 
     def checkpoint(self) -> Any:
         """Called by submitit before a job is ended and queued again."""
         import submitit
 
-        self._end()
+        self._tell()
+        if self._child is not None:
+            self._child.wait()
         return submitit.helpers.DelayedSubmission(Training(self._words, self._log, self._environment))
 
-    def _end(self) -> None:
+    def _tell(self) -> None:
         if self._child is not None and self._child.poll() is None:
             self._child.send_signal(signal.SIGTERM)
-            self._child.wait()
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_child": None}
@@ -72,25 +74,33 @@ class Job:
 
     Args:
         job: Of submitit.
+        is_local: Whether it runs on this machine, under a process whose id is that of the job.
     """
 
-    def __init__(self, job: Any):
-        self._job, self.returncode = job, None
+    def __init__(self, job: Any, is_local: bool = False):
+        self._job, self._is_local = job, is_local
+        self.returncode, self._is_cancelled = None, False
 
     def poll(self) -> int | None:
         """The exit status; None while it is queued or running."""
         if self.returncode is None and self._job.done():
-            self.returncode = _FAILED
+            self.returncode = -signal.SIGTERM if self._is_cancelled else _FAILED
             with contextlib.suppress(Exception):  # a job that was cancelled or lost has no result
                 self.returncode = int(self._job.result())
         return self.returncode
 
     def send_signal(self, _: int) -> None:
         """Cancels it: the run is told to save and to end."""
-        self._job.cancel()
+        self._is_cancelled = True
+        if self._is_local:  # which would be killed a second after it was cancelled
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(int(self._job.job_id), signal.SIGTERM)
+        else:
+            self._job.cancel()
 
     def kill(self) -> None:
-        """Likewise; a cluster ends what does not end by itself."""
+        """Ends it at once; a cluster does so itself."""
+        self._is_cancelled = True
         self._job.cancel()
 
     def wait(self, timeout: float | None = None) -> int:
@@ -124,8 +134,9 @@ class Cluster:
             import submitit
         except ImportError as error:
             raise RequestError(f"--executor {executor} needs submitit: {install_command('cluster')}") from error
+        self._is_local = executor == "local"
         parameters = {**_DEFAULTS, **dict(map(_read, options))}
-        if executor == "local":
+        if self._is_local:
             parameters.pop("gpus_per_node")  # each run has its device from `grid`
         try:
             self._executor = submitit.AutoExecutor(folder, cluster=executor)
@@ -136,7 +147,7 @@ class Cluster:
     def start(self, words: Sequence[str], log: Path, environment: Mapping[str, str]) -> Job:
         """Submits a command; see `grid.start_process`."""
         own = {name: value for name, value in child_environment().items() if name == "PYTHONPATH"}
-        return Job(self._executor.submit(Training(words, log, {**own, **environment})))
+        return Job(self._executor.submit(Training(words, log, {**own, **environment})), self._is_local)
 
 
 def _read(option: str) -> tuple[str, Any]:

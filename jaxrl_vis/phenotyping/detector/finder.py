@@ -1,6 +1,7 @@
 """Stalks of an image with their masks: what the rest of phenotyping asks for."""
 
 import dataclasses
+import functools
 from typing import Any
 
 import cv2
@@ -8,9 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis.phenotyping.detector.detect import Settings, detect, normalise, pad
+from jaxrl_vis.phenotyping.detector.detect import Settings, detect, pad
 from jaxrl_vis.phenotyping.detector.networks import Segmenter
-from jaxrl_vis.phenotyping.detector.snips import cut, put_back, snip_shape
+from jaxrl_vis.phenotyping.detector.snips import cut, put_back, smoothed, snip_shape
+from jaxrl_vis.phenotyping.width import strip_width
+from jaxrl_vis_envs.plants.truth import BAND, HEIGHTS
 
 _BATCH = 8
 
@@ -25,6 +28,7 @@ class Detection:
         score: 0 to 1.
         mask: [h, w] float32 from 0 to 1, or bool: what shows it, in a part of the image.
         corner: Line and column of the mask's first pixel.
+        upper: Mask and corner of a piece of it around 24 inches above the ground; None where the image does not show that.
     """
 
     box: tuple[float, float, float, float]
@@ -32,6 +36,23 @@ class Detection:
     score: float
     mask: np.ndarray
     corner: tuple[int, int]
+    upper: tuple[np.ndarray, tuple[int, int]] | None = None
+
+
+UPPER = (HEIGHTS[1] - HEIGHTS[0]) / (BAND[1] - BAND[0])
+"""How far the upper height lies above the middle of the band, in heights of the band."""
+
+
+def higher_up(stalk: np.ndarray) -> np.ndarray:
+    """Box and axis [6] of a stalk's piece around the upper height, half as tall as its band [6], where the axis goes on."""
+    left, top, right, bottom, above, below = stalk
+    tall = bottom - top
+    middle = 0.5 * (top + bottom) - UPPER * tall
+    slope = (below - above) / max(tall, 1.0)
+    first, last = middle - 0.25 * tall, middle + 0.25 * tall
+    ends = [above + slope * (line - top) for line in (first, last)]
+    half = 0.5 * max(right - left - abs(below - above), 2.0)
+    return np.array([min(ends) - half, first, max(ends) + half, last, *ends], np.float32)
 
 
 def reduce(image: np.ndarray, width: int) -> tuple[np.ndarray, tuple[float, float]]:
@@ -48,14 +69,17 @@ def in_image(stalks: np.ndarray, scale: tuple[float, float]) -> np.ndarray:
     return stalks * np.array([scale[1], scale[0], scale[1], scale[0], scale[1], scale[1]], np.float32)
 
 
-def masks_of(params: Any, snips: jax.Array, settings: Settings, dtype: Any) -> jax.Array:
-    """Chances [N, h, w] float32 that pixels of snips [N, h, w, 3] uint8 show the stalk in the middle."""
-    logits = Segmenter(settings.segmenter, dtype).apply(params, normalise(snips))
+@functools.partial(jax.jit, static_argnums=(2, 3, 4))
+def _masks_of(params: Any, snips: jax.Array, settings: Settings, dtype: Any, full: tuple[int, int]) -> jax.Array:
+    """Chances [N, h, w] float32 that pixels of snips [N, h, w, 3] uint8 show the stalk in the middle.
+
+    Snips of smaller images are enlarged to the ``full`` size: the network knows stalks that are as many pixels wide as there.
+    """
+    count, *shape = snips.shape[:3]
+    enlarged = jax.image.resize(snips.astype(jnp.float32), (count, *full, 3), "linear")
+    logits = Segmenter(settings.segmenter, dtype).apply(params, smoothed(enlarged))
     assert isinstance(logits, jax.Array)
-    return jax.nn.sigmoid(logits)
-
-
-_masks_of = jax.jit(masks_of, static_argnums=(2, 3))
+    return jax.image.resize(jax.nn.sigmoid(logits), (count, *shape), "linear")
 
 
 class Finder:
@@ -79,25 +103,47 @@ class Finder:
         found = jax.device_get(detect(self._params["detector"], pad(reduced), settings, self._dtype))
         kept = np.flatnonzero(found.valid & (found.scores >= self._least))
         stalks, scores = in_image(found.stalks[kept], scale), found.scores[kept]
-        masks = self._segment(image, stalks)
+        on_device = jnp.asarray(image)
+        pieces = self._pieces(on_device, stalks, self._settings.snip_lines)
+        higher = [_follow(stalk, *piece) for stalk, piece in zip(stalks, pieces)]
+        seen = [place for place, each in enumerate(higher) if each is not None]
+        some = np.array([higher[place] for place in seen], np.float32).reshape(-1, 6)
+        upper = dict(zip(seen, self._pieces(on_device, some, self._settings.snip_lines // 2)))
         detections = []
-        for stalk, score, snip in zip(stalks, scores, masks):
-            mask, corner = put_back(snip, stalk, image.shape[:2])
+        for place, (stalk, score, (mask, corner)) in enumerate(zip(stalks, scores, pieces)):
             if mask.size:
                 left, top, right, bottom, above, below = (float(each) - 0.5 for each in stalk)
-                detections.append(Detection((left, top, right, bottom), (above, below), float(score), mask, corner))
+                box = (left, top, right, bottom)
+                detections.append(Detection(box, (above, below), float(score), mask, corner, upper.get(place)))
         return sorted(detections, key=lambda each: sum(each.axis))
 
-    def _segment(self, image: np.ndarray, stalks: np.ndarray) -> np.ndarray:
+    def _pieces(self, image: jax.Array, stalks: np.ndarray, lines: int) -> list[tuple[np.ndarray, tuple[int, int]]]:
+        """Masks and their corners of the snips of stalks [N, 6], which have ``lines`` lines in an image of full width."""
+        snips = self._segment(image, stalks, lines)
+        return [put_back(snip, stalk, (image.shape[0], image.shape[1])) for snip, stalk in zip(snips, stalks)]
+
+    def _segment(self, on_device: jax.Array, stalks: np.ndarray, lines: int) -> np.ndarray:
         """Masks [N, h, w] float32 of the snips of stalks [N, 6]."""
         settings = self._settings
-        shape = snip_shape(image.shape[1], (settings.snip_lines, settings.snip_columns), settings.full_width)
+        full = (lines, settings.snip_columns)
+        shape = snip_shape(on_device.shape[1], full, settings.full_width)
         if not len(stalks):
             return np.zeros((0, *shape), np.float32)
-        on_device, masks = jnp.asarray(image), []
+        masks = []
         for start in range(0, len(stalks), _BATCH):
             part = stalks[start : start + _BATCH]
             filled = np.pad(part, ((0, _BATCH - len(part)), (0, 0)), mode="edge")
             snips = cut(on_device, filled, shape)
-            masks.append(_masks_of(self._params["segmenter"], snips, settings, self._dtype))
+            masks.append(_masks_of(self._params["segmenter"], snips, settings, self._dtype, full))
         return np.concatenate(jax.device_get(masks))[: len(stalks)]
+
+
+def _follow(stalk: np.ndarray, mask: np.ndarray, corner: tuple[int, int]) -> np.ndarray | None:
+    """Where a stalk's upper piece [6] is, by the edges of its mask in the band; None if that is not in the image."""
+    strip = strip_width(mask) if mask.size else None
+    if strip is None:
+        return None
+    # Half a pixel: stalks are in continuous coordinates.
+    axis = [0.5 * sum(strip.edges(line - 0.5 - corner[0])) + corner[1] + 0.5 for line in (stalk[1], stalk[3])]
+    upper = higher_up(np.array([*stalk[:4], *axis], np.float32))
+    return upper if upper[1] > 0 else None

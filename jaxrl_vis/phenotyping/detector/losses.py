@@ -10,6 +10,7 @@ from jaxrl_vis.phenotyping.detector.anchors import anchors_of, encode
 from jaxrl_vis.phenotyping.detector.boxes import overlap
 from jaxrl_vis.phenotyping.detector.detect import Settings, best_proposals, heads, normalise, regions_of
 from jaxrl_vis.phenotyping.detector.networks import Segmenter
+from jaxrl_vis.phenotyping.detector.snips import smoothed
 
 # Truth of an image is padded: what there is not has the weight NOTHING, what is too hidden to count either way UNCLEAR.
 NOTHING, UNCLEAR, STALK = 0, 1, 2
@@ -108,7 +109,7 @@ def segmenter_loss(params: Any, snips: jax.Array, masks: jax.Array, settings: Se
         settings: Of the networks.
         dtype: In which convolutions are computed.
     """
-    logits = Segmenter(settings.segmenter, dtype).apply(params, normalise(snips))
+    logits = Segmenter(settings.segmenter, dtype).apply(params, smoothed(snips))
     assert isinstance(logits, jax.Array)
     return mask_loss(logits, masks)
 

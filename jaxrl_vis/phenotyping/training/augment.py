@@ -91,9 +91,44 @@ def _sample(image: jax.Array, line: jax.Array, column: jax.Array, shape: tuple[i
 
 
 def vary_snips(snips: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Snips [N, H, W, 3] uint8 and masks [N, H, W] bool, relit, and half of them mirrored."""
-    light, side = jax.random.split(key)
+    """Snips [N, H, W, 3] uint8 and masks [N, H, W] bool: relit, with other textures and widths, and half of them mirrored."""
+    light, side, marks, size = jax.random.split(key, 4)
+    snips, masks = _stretched(snips, masks, size)
+    snips = _textured(snips, marks)
     mirror = jax.random.bernoulli(side, 0.5, (snips.shape[0],))
     snips = jnp.where(mirror[:, None, None, None], snips[:, :, ::-1], snips)
     masks = jnp.where(mirror[:, None, None], masks[:, :, ::-1], masks)
     return relight(snips, light), masks
+
+
+def _stretched(snips: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Snips and masks wider or narrower by up to a third, about their middle."""
+    count, _, width = snips.shape[:3]
+    wider = jnp.exp(jax.random.uniform(key, (count,), minval=-0.3, maxval=0.3))
+    place = (jnp.arange(width) + 0.5 - width / 2) / wider[:, None] + width / 2 - 0.5  # [N, W], where a column comes from
+    place = jnp.clip(place, 0.0, width - 1.0)
+    left = jnp.minimum(jnp.floor(place).astype(jnp.int32), width - 2)
+    share = (place - left)[:, None, :]
+
+    def columns(values: jax.Array, at: jax.Array) -> jax.Array:
+        return jnp.take_along_axis(values, at.reshape(count, 1, width, *(1,) * (values.ndim - 3)), axis=2)
+
+    values = snips.astype(jnp.float32)
+    mixed = columns(values, left) * (1 - share[..., None]) + columns(values, left + 1) * share[..., None]
+    inside = masks.astype(jnp.float32)
+    return jnp.round(mixed).astype(jnp.uint8), columns(inside, left) * (1 - share) + columns(inside, left + 1) * share >= 0.5
+
+
+def _textured(snips: jax.Array, key: jax.Array) -> jax.Array:
+    """Snips with speckles, fibres along the stalk and dark sides: the textures of a family are not all that there are."""
+    count, height, width = snips.shape[:3]
+    spots, fibres, shades, amounts = jax.random.split(key, 4)
+    amount = jax.random.uniform(amounts, (4, count, 1, 1))
+
+    def noise(key: jax.Array, lines: int, columns: int) -> jax.Array:
+        shape = (count, max(height // lines, 1), max(width // columns, 1))
+        return jax.image.resize(jax.random.normal(key, shape), (count, height, width), "linear")
+
+    dark = jnp.where(noise(spots, 6, 3) > 2.2 - 1.4 * amount[0], 1.0 - 0.6 * amount[1], 1.0)
+    grain = jnp.exp(0.25 * amount[2] * noise(fibres, 160, 2) + 0.35 * amount[3] * noise(shades, 80, 10))
+    return jnp.round(jnp.clip(snips * (dark * grain)[..., None], 0.0, 255.0)).astype(jnp.uint8)

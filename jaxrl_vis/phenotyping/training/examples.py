@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import itertools
-import json
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor
 from pathlib import Path
@@ -15,12 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.phenotyping.annotations import decode_mask
+from jaxrl_vis.phenotyping.annotations import decode_mask, read_annotations
 from jaxrl_vis.phenotyping.detector.detect import Settings
 from jaxrl_vis.phenotyping.detector.finder import reduce
 from jaxrl_vis.phenotyping.detector.losses import NOTHING, STALK, UNCLEAR
 from jaxrl_vis.phenotyping.detector.snips import cut, snip_shape
-from jaxrl_vis.phenotyping.images import read_image
+from jaxrl_vis.phenotyping.images import read_image, rgb8
 from jaxrl_vis_envs.plants import Calibration, Family, draw
 from jaxrl_vis_envs.plants.cameras import Pose
 from jaxrl_vis_envs.plants.field import Plot
@@ -166,24 +165,20 @@ def _example(image: Any, stalks: np.ndarray, kinds: np.ndarray, masks_of: _Masks
 
 
 def annotated_examples(folder: Path, settings: Settings) -> Iterator[Example]:
-    """Examples of a folder with ``annotations.json`` of COCO: boxes, and masks as polygons or uncompressed runs.
+    """Examples of a folder of annotated images; see `read_annotations`.
 
     Raises:
         RequestError: There are no annotations, or an image is missing.
     """
-    data = read_coco(folder)
+    data = read_annotations(folder)
     of_image: dict[int, list[dict[str, Any]]] = {}
     for annotation in data["annotations"]:
         of_image.setdefault(annotation["image_id"], []).append(annotation)
     for number, about in enumerate(data["images"]):
         try:
-            image = read_image(folder / about["file_name"])
+            image = rgb8(read_image(folder / about["file_name"]))
         except OSError as error:
-            raise RequestError(f"{folder / 'annotations.json'} names an image that cannot be read: {error}") from error
-        if image.ndim == 2:
-            image = np.repeat(image[..., None], 3, axis=2)
-        if image.dtype == np.uint16:
-            image = (image >> 8).astype(np.uint8)
+            raise RequestError(f"the annotations in {folder} name an image that cannot be read: {error}") from error
         found = [_of_annotation(each, image.shape[:2]) for each in of_image.get(about["id"], [])]
         stalks = np.array([stalk for stalk, _ in found], np.float32).reshape(-1, 6)
         masks = [mask for _, mask in found]
@@ -198,29 +193,9 @@ def _own_masks(masks: list[np.ndarray], parts: np.ndarray, places: np.ndarray, s
     return np.concatenate(jax.device_get(snips))
 
 
-def read_coco(folder: Path) -> dict[str, Any]:
-    """The annotations of a folder.
-
-    Raises:
-        RequestError: There are none, or they are not COCO's.
-    """
-    path = folder / "annotations.json"
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-        if not data["images"] or not data["annotations"]:
-            raise RequestError(f"{path} annotates nothing: name a folder with annotated images")
-    except RequestError:
-        raise
-    except OSError as error:
-        raise RequestError(f"there are no annotations {path}: name a folder with annotations.json of COCO") from error
-    except (ValueError, KeyError, TypeError) as error:
-        raise RequestError(f"{path} is not COCO: it needs images and annotations") from error
-    return data
-
-
 def settings_for(folder: Path, settings: Settings) -> Settings:
     """Settings whose anchors are as large as the boxes of a folder's annotations."""
-    data = read_coco(folder)
+    data = read_annotations(folder)
     widths = {each["id"]: each["width"] for each in data["images"]}
     sizes = np.array(
         [

@@ -1,0 +1,114 @@
+"""Widths of stalks at stated heights above the ground, 12 and 24 inches, and the taper between them.
+
+A stalk is measured as near to a height as its edges are seen. Where that is not quite there, taper makes up for the rest: how
+much thinner stalks become from inch to inch, by the stalks of the same plot that were measured at both heights.
+"""
+
+import dataclasses
+import math
+
+import numpy as np
+
+from jaxrl_vis.phenotyping.sightings import Sighting
+from jaxrl_vis.phenotyping.track import Track
+from jaxrl_vis_envs.plants.family import INCH
+from jaxrl_vis_envs.plants.truth import HEIGHTS
+
+LOWER, UPPER = HEIGHTS
+USUAL_TAPER = 0.405
+"""mm per inch: of the thesis, for plots with too few stalks that were measured at both heights."""
+_TAPER_SPREAD = 0.3  # of a stalk's own taper about the plot's, of 1
+_ENOUGH = 5
+_FURTHEST = 4.0 * INCH  # m: what was measured further away says nothing of a height
+_NEAR = 0.5 * INCH  # m: taper within that does not matter
+
+
+@dataclasses.dataclass(frozen=True)
+class Width:
+    """Diameter of a stalk by all its sightings.
+
+    Attributes:
+        mm: Weighted median.
+        error: Its standard error, mm: that of the scatter between pairs, and at least what edges and disparity tell. What hides
+            a stalk from all sides is not in it.
+        count: How many sightings say so.
+        corrected: Whether most of them were measured elsewhere, so that taper had to make up for it.
+    """
+
+    mm: float
+    error: float
+    count: int
+    corrected: bool = False
+
+
+@dataclasses.dataclass(frozen=True)
+class StalkWidths:
+    """One stalk.
+
+    Attributes:
+        lower: At 12 inches, or where it was seen if ``height_known`` is false.
+        upper: At 24 inches.
+        taper: Between them, mm per inch; None unless both were measured.
+        height_known: Whether a pair that shows the stalk shows the ground.
+    """
+
+    lower: Width | None
+    upper: Width | None
+    taper: float | None
+    height_known: bool
+
+
+def widths_of(frames: list[list[Sighting]], tracks: list[Track]) -> list[StalkWidths]:
+    """Widths of the stalks of a plot, in the order of their tracks."""
+    of_stalks = [[frames[frame][place] for frame, place in track.sightings] for track in tracks]
+    first = [_of_stalk(sightings, USUAL_TAPER) for sightings in of_stalks]
+    tapers = [each.taper for each in first if each.taper is not None]
+    taper = float(np.median(tapers)) if len(tapers) >= _ENOUGH else USUAL_TAPER
+    return [_of_stalk(sightings, taper) for sightings in of_stalks]
+
+
+def _of_stalk(sightings: list[Sighting], taper: float) -> StalkWidths:
+    known = [each for each in sightings if each.height_m is not None]
+    lower = _at(LOWER, [(e.diameter_mm, e.deviation_mm, e.height_m, e.confidence) for e in known], taper)
+    upper = _at(UPPER, [(e.upper_mm, e.upper_deviation_mm, e.upper_height_m, e.upper_confidence) for e in sightings], taper)
+    if lower is None:
+        return StalkWidths(robust_width(sightings), upper, None, False)
+    own = None if upper is None else (lower.mm - upper.mm) / ((UPPER - LOWER) / INCH)
+    return StalkWidths(lower, upper, own, True)
+
+
+def _at(height: float, values: list[tuple[float | None, float | None, float | None, float]], taper: float) -> Width | None:
+    """Width at a height, from diameters in mm, their standard errors, the heights in m they were taken at, and confidences."""
+    found = []
+    for diameter, deviation, where, confidence in values:
+        if diameter is None or where is None or abs(where - height) > _FURTHEST:
+            continue
+        beside = (where - height) / INCH
+        error = math.hypot(deviation or 0.0, _TAPER_SPREAD * taper * beside)
+        found.append((diameter + taper * beside, error, confidence, abs(where - height) > _NEAR))
+    width = _robust(np.array([each[:3] for each in found], float).reshape(-1, 3))
+    if width is None:
+        return None
+    return dataclasses.replace(width, corrected=2 * sum(each[3] for each in found) > len(found))
+
+
+def robust_width(sightings: list[Sighting]) -> Width | None:
+    """Diameter of a stalk wherever it was measured; None if it never was."""
+    measured = [each for each in sightings if each.diameter_mm is not None]
+    values = [(each.diameter_mm, each.deviation_mm or 0.0, each.confidence) for each in measured]
+    return _robust(np.array(values, float).reshape(-1, 3))
+
+
+def _robust(measured: np.ndarray) -> Width | None:
+    """Of diameters, standard errors and confidences [N, 3]; None where there are none."""
+    if not len(measured):
+        return None
+    values, stated, weights = measured.T
+    weights = np.maximum(weights, 0.02)
+    order = np.argsort(values)
+    passed = np.cumsum(weights[order]) - 0.5 * weights[order]
+    median = float(np.interp(0.5 * weights.sum(), passed, values[order]))
+    enough = float(weights.sum() ** 2 / (weights**2).sum())
+    scatter = 1.4826 * float(np.median(np.abs(values - median))) * 1.2533 if len(values) > 2 else 0.0
+    least = math.sqrt(float((weights * stated**2).sum() / weights.sum()))
+    return Width(median, max(scatter, least) / math.sqrt(enough), len(values))

@@ -1,0 +1,170 @@
+"""Arrays on their way into checkpoints and back: their names, their checksums, where they lie, and whether they are the same.
+
+From several processes, each writes the parts that it has, so their checksums are put together of those of parts.
+"""
+
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental import multihost_utils
+
+from jaxrl_vis import processes
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.learner.sharding import put_array
+
+Arrays = dict[str, np.ndarray]
+
+
+def named_leaves(tree: Any) -> dict[str, Any]:
+    """The leaves of a pytree by name, such as ``actor.head.output.kernel``."""
+    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in jax.tree.leaves_with_path(tree)}
+
+
+def to_host(tree: Any, copy: bool) -> Arrays:
+    """The leaves of a pytree as numpy arrays by name; typed keys as their words.
+
+    Args:
+        tree: Arrays on a device.
+        copy: False: on a CPU, look at the device's memory itself. Only until the arrays are donated, and whoever keeps such a
+            view makes the next donation a copy.
+    """
+
+    def convert(leaf: jax.Array) -> np.ndarray:
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            leaf = jax.random.key_data(leaf)
+        if copy or jax.default_backend() != "cpu":
+            return np.array(leaf)
+        try:
+            return np.from_dlpack(leaf)  # pyright: ignore[reportArgumentType]
+        except (BufferError, RuntimeError, TypeError):  # a type that numpy lacks, or several devices
+            return np.array(leaf)
+
+    return {name: convert(leaf) for name, leaf in named_leaves(tree).items()}
+
+
+def _checksum(array: np.ndarray) -> int:
+    return zlib.crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
+
+
+def describe(arrays: dict[str, Any]) -> dict[str, list]:
+    """What a manifest says of arrays that are to be saved: shape, type and checksum, by name."""
+    if processes.are_several():
+        return _describe_parts(arrays)
+    return {name: [list(array.shape), str(array.dtype), _checksum(array)] for name, array in arrays.items()}
+
+
+def to_save(tree: Any, copy: bool) -> Arrays | dict[str, jax.Array]:
+    """The leaves of a pytree by name, as they are given to orbax: from several processes each writes what it has."""
+    if not processes.are_several():
+        return to_host(tree, copy)
+    return {
+        name: jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
+        for name, leaf in named_leaves(tree).items()
+    }
+
+
+def _describe_parts(arrays: dict[str, jax.Array]) -> dict[str, list]:
+    """`describe`, of arrays of which each process has a part; the last number says of how many axes `_sum_of_rows` is."""
+    axes = {name: max((n + 1 for n, on in enumerate(_spec_of(array)) if on), default=0) for name, array in arrays.items()}
+    sums = np.zeros(len(arrays), np.uint32)
+    for number, (name, array) in enumerate(arrays.items()):
+        for shard in array.addressable_shards:
+            if shard.replica_id == 0:
+                start = [each.start or 0 for each in shard.index[: axes[name]]]
+                sums[number] += np.uint32(_sum_of_rows(np.asarray(shard.data), axes[name], start))
+    totals = multihost_utils.process_allgather(sums).astype(np.uint64).sum(axis=0) % 2**32
+    return {
+        name: [list(array.shape), str(array.dtype), int(total), axes[name]]
+        for (name, array), total in zip(arrays.items(), totals, strict=True)
+    }
+
+
+def _spec_of(array: jax.Array) -> Sequence[Any]:
+    return getattr(array.sharding, "spec", ())
+
+
+def _sum_of_rows(array: np.ndarray, axes: int, start: Sequence[int] = ()) -> int:
+    """A checksum that can be put together of parts: the sum of those of all rows, each beginning with where it lies.
+
+    Args:
+        array: A part of an array.
+        axes: How many of the first axes number rows.
+        start: Where the part begins in these; nothing for a whole array.
+    """
+    total = 0
+    for index in np.ndindex(array.shape[:axes]):
+        place = np.add(index, start) if len(start) else np.asarray(index)
+        total += zlib.crc32(
+            np.ascontiguousarray(array[index]).reshape(-1).view(np.uint8).data, zlib.crc32(place.astype("<i8").tobytes())
+        )
+    return total % 2**32
+
+
+def is_intact(array: np.ndarray, described: list) -> bool:
+    """Whether an array is as its manifest describes it."""
+    _, _, checksum, *axes = described
+    return checksum == (_sum_of_rows(array, axes[0]) if axes else _checksum(array))
+
+
+def _is_folded(one: Sequence[int], other: Sequence[int]) -> bool:
+    """Whether two shapes are [S, rollouts, E, ...] and [S, rollouts * E, ...], of the same episodes (`sharding.Layout`)."""
+    (start, *rest), (folded_start, *folded) = sorted((tuple(one), tuple(other)), key=len)
+    return len(folded) >= 2 and start == folded_start and rest == [folded[0] * folded[1], *folded[2:]]
+
+
+def as_saved(shape: Sequence[int], expected: jax.ShapeDtypeStruct) -> Any:
+    """What orbax is asked for: an array on the first device, or one on the host that is divided among devices later."""
+    if tuple(shape) == expected.shape and isinstance(expected.sharding, jax.sharding.SingleDeviceSharding):
+        return expected
+    return np.broadcast_to(np.zeros((), expected.dtype), tuple(shape))
+
+
+def host_specs(tree: Any) -> dict[str, jax.ShapeDtypeStruct]:
+    """What `to_host` makes of a tree with these shapes, placed on the first device where the shapes do not say where."""
+    first = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
+
+    def convert(leaf: Any) -> jax.ShapeDtypeStruct:
+        device = getattr(leaf, "sharding", None) or first
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            leaf = jax.eval_shape(jax.random.key_data, leaf)
+        return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=device)
+
+    return {name: convert(leaf) for name, leaf in named_leaves(tree).items()}
+
+
+def rebuild(template: Any, arrays: dict[str, jax.Array]) -> Any:
+    """The inverse of `to_host`: a tree like ``template``, which also says where its arrays are to lie."""
+
+    def convert(path: Any, leaf: Any) -> jax.Array:
+        array, sharding = arrays[jax.tree_util.keystr(path, simple=True, separator=".")], getattr(leaf, "sharding", None)
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            # The default kind, as `Trainer.run_keys` makes them; another one has another number of words, noticed before this.
+            array = jax.random.wrap_key_data(jnp.asarray(array))
+        elif array.shape != leaf.shape:
+            array = array.reshape(leaf.shape)
+        if sharding is None:
+            return jnp.asarray(array)
+        return put_array(array, sharding)
+
+    return jax.tree.map_with_path(convert, template)
+
+
+def check_structure(where: Path, saved: dict[str, list], expected: dict[str, jax.ShapeDtypeStruct]) -> None:
+    """Raises RequestError, naming the first differences, where a checkpoint has other arrays than this program."""
+    differences = []
+    for name in sorted(set(saved) | set(expected)):
+        there = f"{saved[name][1]}{saved[name][0]}" if name in saved else "nothing"
+        here = f"{expected[name].dtype}{list(expected[name].shape)}" if name in expected else "nothing"
+        if there != here and name.startswith("replay.episodes.") and name in saved and name in expected:
+            if saved[name][1] == str(expected[name].dtype) and _is_folded(saved[name][0], expected[name].shape):
+                continue
+        if there != here:
+            differences.append(f"{name} is {there} there and {here} here")
+    if differences:
+        shown = "; ".join(differences[:3]) + (f"; and {len(differences) - 3} more" if len(differences) > 3 else "")
+        raise RequestError(f"{where} has another structure, so another version wrote it: {shown}; use that, or --overwrite")
