@@ -23,7 +23,11 @@ class Eval:
     masks: Literal["gan", "segmentation", "truth"] = "segmentation"
     """What finds the pixels of stalks: one of the networks that are shipped, or the truth, to see what the rest makes of it."""
     thesis: bool = False
-    """Stitch and find grasp points as the thesis describes it."""
+    """Stitch and find grasp points as the thesis describes it: --stitch thesis --points thesis."""
+    stitch: Literal["default", "thesis"] = "default"
+    """How clouds are stitched."""
+    points: Literal["default", "thesis"] = "default"
+    """How grasp points are found."""
     family: Literal["training", "shifted"] | None = None
     """What rows are drawn from; training, if no --spec says otherwise."""
     shift: tuple[str, ...] = ()
@@ -38,6 +42,10 @@ class Eval:
     """Pairs of a run, in place of the family's 5."""
     width: int | None = None
     """Width of an image in pixels, in place of the family's 1024."""
+    reach: bool = False
+    """Send the simulated arm to every grasp point, too, and say what its jaws hold."""
+    wind: float = 0.0
+    """With --reach: how far stalks sway in the wind, mm."""
     json: Path | None = None
     """A file for the figures of all runs together and of each; written after each run."""
 
@@ -49,21 +57,29 @@ def evaluate(options: Eval) -> int:
         raise RequestError(f"--seed must be at least 0, not {options.seed}")
     if options.masks == "truth" and options.weights is not None:
         raise RequestError("--masks truth uses no weights: leave out --weights")
+    if options.wind < 0 or (options.wind and not options.reach):
+        raise RequestError(f"--wind must be at least 0, and goes with --reach, not {options.wind:g}")
     check_extra("grasp", "grasping")
     if options.json is not None:
         check_writable(options.json, "--json")
     family = family_of(options, "grasping")
     check_devices()
     from jaxrl_vis.files import write_atomically
+    from jaxrl_vis.grasping.attempts import carry_out, plan
     from jaxrl_vis.grasping.evaluate import draw_scene, score_scene, summary
+    from jaxrl_vis.grasping.metric import score as score_grasps
+    from jaxrl_vis.grasping.perceive import Ways
 
     painter, name = (None, "truth") if options.masks == "truth" else painter_of(options.weights, options.masks)
     mask = None if painter is None else lambda image, number: painter(image)
-    method = "thesis" if options.thesis else "default"
-    scores = []
+    ways = Ways(*(options.thesis or each == "thesis" for each in (options.stitch, options.points)))
+    scores, plans = [], []
     for seed in range(options.seed, options.seed + options.runs):
-        score, _ = score_scene(draw_scene(family, seed), mask, options.thesis)
+        scene = draw_scene(family, seed)
+        score, perception = score_scene(scene, mask, ways)
         scores.append(score)
+        if options.reach:
+            plans.append(plan(scene, perception, len(plans)))
         one = summary([score])
         print(
             f"run {seed}: {len(score.errors)} of {score.true} stalks, {score.found - len(score.errors)} false, "
@@ -72,16 +88,27 @@ def evaluate(options: Eval) -> int:
             flush=True,
         )
         if options.json is not None:
-            about = {"synthetic": True, "family": family.name, "masks": name, "method": method}
+            about = {"synthetic": True, "family": family.name, "masks": name, "method": str(ways)}
             each_run = [
                 {"seed": each.seed, "stalks": each.true, "grasp_points": each.found, "hits": len(each.errors)}
                 for each in scores
             ]
             text = json.dumps({**about, **_finite(summary(scores)), "each": each_run}, indent=2)
             write_atomically(options.json, text + "\n")
-    print(f"simulated runs of family {family.name}, masks: {name}, {method}:")
+    print(f"simulated runs of family {family.name}, masks: {name}, {ways}:")
     for each, value in summary(scores).items():
         print(f"  {each:20} {value if isinstance(value, int) else f'{value:.4f}'}")
+    if options.reach:
+        grasps = score_grasps(carry_out(plans, options.wind), [each for one in plans for each in one.standing])
+        print(f"the arm, with {options.wind:g} mm of wind:")
+        for share in grasps.shares:
+            print(f"  {share}")
+        print(f"  the thesis's ratio: {grasps.thesis_ratio:.4f}")
+        if options.json is not None:
+            record = json.loads(options.json.read_text(encoding="utf-8"))
+            shares = {each.name: {"count": each.count, "of": each.of, "interval": each.interval} for each in grasps.shares}
+            record["reach"] = {"wind_mm": options.wind, **_finite({"thesis_ratio": grasps.thesis_ratio}), "shares": shares}
+            write_atomically(options.json, json.dumps(record, indent=2).replace("NaN", "null") + "\n")
     return 0
 
 

@@ -61,7 +61,9 @@ def run(options: Run) -> int:
         if each is None:
             raise RequestError(f"{name} has no calibration, without which there are no metres: name one with --calibration")
     check_devices()
+    from jaxrl_vis.grasping.attempts import from_any_stop
     from jaxrl_vis.grasping.cloud import Mount
+    from jaxrl_vis.grasping.perceive import ORIGINAL, OURS
     from jaxrl_vis.grasping.pipeline import Request, run
 
     if options.masks == "truth":
@@ -73,7 +75,8 @@ def run(options: Run) -> int:
             return painter(image)
 
     known = {name: each for name, each in calibrations.items() if each is not None}
-    request = Request(options.out, options.thesis, name, known, Mount(options.height, options.pitch), options.speed)
+    ways, mount = ORIGINAL if options.thesis else OURS, Mount(options.height, options.pitch)
+    request = Request(options.out, ways, name, known, mount, options.speed, from_any_stop)
 
     def say(row) -> None:
         print(f"{row['run']}: {row['grasp_points']} grasp points in {row['pairs']} pairs: {row['flag']}", flush=True)

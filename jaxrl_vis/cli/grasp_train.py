@@ -19,6 +19,9 @@ _FIRST_SEED = 100_000
 """Of the rows that networks learn from: evaluations use the seeds below."""
 
 
+_RATES = {"segmentation": 1e-3, "gan": 4e-4}
+
+
 @dataclasses.dataclass(frozen=True)
 class Train:
     """Train the network that paints stalks red, on synthetic rows: against a discriminator, or as a plain segmentation."""
@@ -41,8 +44,8 @@ class Train:
     """Crops per update."""
     crop: int = 384
     """Height and width of a crop, pixels: a multiple of 64."""
-    rate: float = 1e-3
-    """Highest learning rate."""
+    rate: float | None = None
+    """Highest learning rate; 0.001 for segmentation and 0.0004 for gan if not given."""
     threads: int = 4
     """How many threads draw images while the network learns."""
     width: int | None = None
@@ -63,6 +66,8 @@ def train(options: Train) -> int:
     )
     if options.minutes is not None and not options.minutes > 0:
         raise RequestError(f"--minutes must be more than 0, not {options.minutes:g}")
+    if options.rate is not None and not options.rate > 0:
+        raise RequestError(f"--rate must be more than 0, not {options.rate:g}")
     if options.crop % 64:
         raise RequestError(f"--crop must be a multiple of 64, not {options.crop}")
     if options.out.suffix != ".npz":
@@ -106,7 +111,7 @@ def _train(options: Train, family, stack: contextlib.ExitStack) -> int:
         first=min(16, options.images),
         batch=options.batch,
         crop=options.crop,
-        rate=options.rate,
+        rate=options.rate or _RATES[options.loss],
         seed=options.seed,
     )
     about = {"version": __version__, "origin": f"synthetic rows of family {family.name}", "seed": options.seed}

@@ -7,6 +7,7 @@ lines       grasp points from a line per stalk                   slices      gra
 perceive    pairs to grasp points                                evaluate    against the truth of synthetic rows
 pipeline    folders of pairs to tables                           figure      figure 4.4
 arm         which way the arm goes, and whether it can           reach       many arms at once, among stalks, in wind
+attempts    grasp points to attempts of the arm
 metric      what came of it                                      way         figure 4.5
 video       the arm at work
 """

@@ -19,7 +19,7 @@ from scipy.optimize import linear_sum_assignment
 from jaxrl_vis.grasping.cloud import Mount
 from jaxrl_vis.grasping.lines import PREFERRED
 from jaxrl_vis.grasping.masks.examples import true_mask
-from jaxrl_vis.grasping.perceive import Mask, Perception, View, perceive
+from jaxrl_vis.grasping.perceive import OURS, Mask, Perception, View, Ways, perceive
 from jaxrl_vis.grasping.stitch import Motion
 from jaxrl_vis_envs.plants import Drive, Family, Plot, Pose, draw
 from jaxrl_vis_envs.plants.pairs import Sequence
@@ -100,13 +100,13 @@ def draw_scene(family: Family, seed: int) -> Scene:
     return Scene(sequence.plot, sequence.drive, Mount.of(family.rig), tuple(views), np.stack(masks))
 
 
-def score_scene(scene: Scene, mask: Mask | None = None, thesis: bool = False) -> tuple[RunScore, Perception]:
+def score_scene(scene: Scene, mask: Mask | None = None, ways: Ways = OURS) -> tuple[RunScore, Perception]:
     """Runs everything on a scene and compares.
 
     Args:
         scene: What is seen.
         mask: What finds the pixels of stalks; None for true masks.
-        thesis: As the thesis describes it, in place of the default.
+        ways: Which steps go as in the thesis.
     """
     painted: dict[int, np.ndarray] = {}
 
@@ -114,7 +114,7 @@ def score_scene(scene: Scene, mask: Mask | None = None, thesis: bool = False) ->
         painted[number] = scene.masks[number] if mask is None else mask(image, number)
         return painted[number]
 
-    perception = perceive(scene.views, remembered, scene.drive.stated, scene.mount, thesis)
+    perception = perceive(scene.views, remembered, scene.drive.stated, scene.mount, ways)
     targets = in_world(perception, scene)
     true, found, errors = match_stalks(targets, scene.plot)
     poses = scene.drive.poses

@@ -13,6 +13,7 @@ from jaxrl_vis.grasping.slices import CELL, THICKNESS, slice_at
 from jaxrl_vis_envs.plants import Family
 
 _MOST = 20_000  # points that are drawn
+_LOW, _HIGH = (-0.95, 0.3, 0.2), (0.55, 0.95, 1.4)  # m: corners of what is drawn
 _INK = "#333333"
 
 
@@ -57,18 +58,26 @@ def _image(axes: Any, scene: Scene, perception: Perception) -> None:
 def _cloud(axes: Any, whole: np.ndarray | None, red: np.ndarray, title: str, perception: Perception | None = None) -> None:
     rng = np.random.default_rng(0)
     if whole is not None:
-        x, y, z = whole[rng.integers(len(whole), size=min(_MOST, len(whole)))].T
-        axes.scatter(x, y, z, s=0.3, c="#7a8f6a", alpha=0.4, linewidths=0)
+        x, y, z = _shown(whole)[rng.integers(len(_shown(whole)), size=_MOST)].T
+        axes.scatter(x, y, z, s=0.8, c="#6f8f5a", alpha=0.5, linewidths=0)
     if len(red):
-        x, y, z = red[rng.integers(len(red), size=min(_MOST, len(red)))].T
+        x, y, z = _shown(red)[rng.integers(len(_shown(red)), size=_MOST)].T
         pale = perception is not None
-        axes.scatter(x, y, z, s=0.3, c="#e8b0b0" if pale else "#d62728", linewidths=0)
+        axes.scatter(x, y, z, s=0.6, c="#e8b0b0" if pale else "#d62728", linewidths=0)
     if perception is not None and perception.points:
         x, y, z = np.array([each.point for each in perception.points]).T
         axes.scatter(x, y, z, s=40, c="#b01010", depthshade=False)
-    axes.set(xlabel="along the row, m", ylabel="away, m", zlabel="height, m", title=title, zlim=(0.2, 1.4))
-    axes.set_box_aspect((1.2, 0.6, 1.2))
+    limits = dict(zip(("xlim", "ylim", "zlim"), zip(_LOW, _HIGH)))
+    axes.set(xlabel="along the row, m", ylabel="away, m", title=title, **limits)
+    axes.set_zlabel("height, m", labelpad=-2)
+    axes.set(xticks=(-0.8, -0.4, 0.0, 0.4), yticks=(0.4, 0.8), zticks=(0.4, 0.8, 1.2))
+    axes.set_box_aspect((1.5, 0.65, 1.2), zoom=1.1)
     axes.view_init(elev=12, azim=-75)
+
+
+def _shown(points: np.ndarray) -> np.ndarray:
+    """Points within the limits of the axes."""
+    return points[((points > _LOW) & (points < _HIGH)).all(axis=1)]
 
 
 def _slice(above: Any, below: Any, red: np.ndarray, scene: Scene, perception: Perception) -> None:

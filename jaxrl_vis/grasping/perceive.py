@@ -64,7 +64,28 @@ class Perception:
         return np.concatenate([motion(cloud.red_points()) for motion, cloud in zip(self.to_last, self.clouds)])
 
 
-def perceive(views: Iterable[View], mask: Mask, calibration: Calibration, mount: Mount, thesis: bool = False) -> Perception:
+@dataclasses.dataclass(frozen=True)
+class Ways:
+    """Which steps go as the thesis describes them, in place of the default.
+
+    Attributes:
+        stitch: The stitching of clouds.
+        points: The finding of grasp points.
+    """
+
+    stitch: bool = False
+    points: bool = False
+
+    def __str__(self) -> str:
+        if self.stitch == self.points:
+            return "thesis" if self.stitch else "default"
+        return f"{'stitches' if self.stitch else 'grasp points'} of the thesis"
+
+
+OURS, ORIGINAL = Ways(), Ways(True, True)
+
+
+def perceive(views: Iterable[View], mask: Mask, calibration: Calibration, mount: Mount, ways: Ways = OURS) -> Perception:
     """Grasp points of a run.
 
     Args:
@@ -72,7 +93,7 @@ def perceive(views: Iterable[View], mask: Mask, calibration: Calibration, mount:
         mask: What finds the pixels of stalks.
         calibration: Of the pair, as far as it is known.
         mount: Of the pair.
-        thesis: As the thesis describes it, in place of the default.
+        ways: Which steps go as in the thesis.
 
     Raises:
         ValueError: There is no pair.
@@ -84,7 +105,7 @@ def perceive(views: Iterable[View], mask: Mask, calibration: Calibration, mount:
     if not views:
         raise ValueError("there is no pair to perceive anything in")
     notes = []
-    if not thesis and len(views) > 1 and any(view.driven is None for view in views):
+    if not ways.stitch and len(views) > 1 and any(view.driven is None for view in views):
         views, notes = views[-1:], ["no odometry: only the last pair was used"]
     for view in views:
         with clock("match"):
@@ -99,7 +120,7 @@ def perceive(views: Iterable[View], mask: Mask, calibration: Calibration, mount:
         for place in range(len(views) - 1):
             here, there = views[place].driven, views[place + 1].driven
             driven = 0.0 if here is None or there is None else there - here
-            stitches.append(stitch(whole[place], whole[place + 1], driven, THESIS if thesis else DEFAULT))
+            stitches.append(stitch(whole[place], whole[place + 1], driven, THESIS if ways.stitch else DEFAULT))
         notes += [
             f"pair {views[place].number} does not stitch to the next, odometry was used: {each.refused}"
             for place, each in enumerate(stitches)
@@ -109,7 +130,7 @@ def perceive(views: Iterable[View], mask: Mask, calibration: Calibration, mount:
     for each in reversed(stitches):
         to_last.insert(0, to_last[0].after(each.motion))
     with clock("points"):
-        if thesis:
+        if ways.points:
             points = slice_points(np.concatenate([motion(cloud.red_points()) for motion, cloud in zip(to_last, clouds)]))
         else:
             parts = [chords_of(cloud, calibration, mount, frame) for frame, cloud in enumerate(clouds)]

@@ -22,7 +22,7 @@ import jaxrl_vis
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.files import write_atomically
 from jaxrl_vis.grasping.cloud import Mount
-from jaxrl_vis.grasping.perceive import Perception, View, perceive
+from jaxrl_vis.grasping.perceive import Perception, View, Ways, perceive
 from jaxrl_vis.phenotyping.folders import PairFiles, PlotFolder, read_odometry
 from jaxrl_vis.phenotyping.images import write_image
 from jaxrl_vis.phenotyping.reading import Unusable, read_pair
@@ -31,8 +31,8 @@ from jaxrl_vis_envs.plants import Calibration
 
 Find = Callable[[np.ndarray, PlotFolder, PairFiles], np.ndarray]
 """Which pixels of a left image [H, W, 3] uint8 show a stalk of the near row: [H, W] bool."""
-Reachable = Callable[[np.ndarray], np.ndarray]
-"""Which of the points [B, 3] in the robot frame the arm can go to: [B] bool."""
+Reachable = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Which points [B, 3] the arm can go to from any of the stops [S, 3], all in the robot frame of the last one, m: [B] bool."""
 
 RUN_COLUMNS = (
     "run",
@@ -72,7 +72,7 @@ class Request:
 
     Attributes:
         out: Folder of the results.
-        thesis: As the thesis describes it, in place of the default.
+        ways: Which steps go as in the thesis.
         finder: What finds the pixels of stalks, in words; results of another one are not mixed with it.
         calibrations: Of each run by its name.
         mount: How the pair is mounted.
@@ -81,7 +81,7 @@ class Request:
     """
 
     out: Path
-    thesis: bool
+    ways: Ways
     finder: str
     calibrations: dict[str, Calibration]
     mount: Mount
@@ -91,7 +91,7 @@ class Request:
     @property
     def method(self) -> str:
         """In the tables."""
-        return "thesis" if self.thesis else "default"
+        return str(self.ways)
 
 
 def run(runs: list[PlotFolder], find: Find, request: Request, done: Callable[[Row], None] = lambda row: None) -> list[Row]:
@@ -164,7 +164,7 @@ def _record(folder: PlotFolder, driven: dict[str, float] | None, find: Find, req
     if not views:
         return {"row": _row(folder, request, len(skipped), None, views), "points": [], "skipped": skipped}
     perception = perceive(
-        views, lambda image, number: find(image, folder, folder.pairs[number]), calibration, request.mount, request.thesis
+        views, lambda image, number: find(image, folder, folder.pairs[number]), calibration, request.mount, request.ways
     )
     (request.out / "overlays").mkdir(exist_ok=True)
     overlay = draw_points(views[-1].left, perception, calibration, request.mount)
@@ -177,7 +177,9 @@ def _can_reach(request: Request, perception: Perception) -> np.ndarray | None:
     """[B] bool, which grasp points the arm can go to; None where nothing is known of an arm."""
     if request.reachable is None:
         return None
-    return np.asarray(request.reachable(np.array([each.point for each in perception.points]).reshape(-1, 3)), bool)
+    points = np.array([each.point for each in perception.points]).reshape(-1, 3)
+    stops = np.array([motion.shift for motion in perception.to_last])
+    return np.asarray(request.reachable(points, stops), bool)
 
 
 def _row(folder: PlotFolder, request: Request, skipped: int, perception: Perception | None, views: list[View]) -> Row:

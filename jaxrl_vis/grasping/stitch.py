@@ -111,6 +111,11 @@ def stitch(source: np.ndarray, target: np.ndarray, driven: float, method: Method
         return Stitch(prior, math.nan, 0.0, "a cloud is empty")
     motion, residual, overlap = closest_points(thin, tree_points, start, method)
     refused = _why_refused(motion, prior, driven, overlap) if method.from_odometry else ""
+    if refused and len(method.gates) > 1:
+        # Where little overlaps, what one pair alone sees drags a wide gate aside; odometry may be near enough for the next one.
+        narrower = dataclasses.replace(method, gates=method.gates[1:])
+        motion, residual, overlap = closest_points(thin, tree_points, start, narrower)
+        refused = _why_refused(motion, prior, driven, overlap)
     return Stitch(prior if refused else motion, residual, overlap, refused)
 
 
