@@ -230,6 +230,7 @@ HEAD = (
 
 
 def main() -> None:
+    """Reads the command line, measures, prints a table, and keeps records."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--devices", type=int, nargs="+", help="numbers of devices; 2, 4 and 8 if there are so many")
     parser.add_argument("--env", default="VisualFetchReach")

@@ -35,7 +35,8 @@ def draw_figure(out: Path, family: Family, seed: int, mask: Mask | None, name: s
     perception = perceive(scene.views, find, scene.drive.stated, scene.mount)
     figure = Figure(figsize=(13.0, 8.6), facecolor="white", layout="constrained")
     figure.suptitle(f"From a stereo pair to grasp points (simulated; family {family.name}, seed {seed}, masks: {name})")
-    grid = figure.add_gridspec(2, 3, width_ratios=(1.0, 1.0, 1.25))
+    # The layout does not know the labels of axes in three dimensions, so it leaves room for them.
+    grid = figure.add_gridspec(2, 3, width_ratios=(1.0, 1.0, 1.25), wspace=0.1)
     _image(figure.add_subplot(grid[0, 0]), scene, perception)
     whole = np.concatenate([motion(cloud.all_points()) for motion, cloud in zip(perception.to_last, perception.clouds)])
     red = perception.red_points()
@@ -71,7 +72,7 @@ def _cloud(axes: Any, whole: np.ndarray | None, red: np.ndarray, title: str, per
     axes.set(xlabel="along the row, m", ylabel="away, m", title=title, **limits)
     axes.set_zlabel("height, m", labelpad=-2)
     axes.set(xticks=(-0.8, -0.4, 0.0, 0.4), yticks=(0.4, 0.8), zticks=(0.4, 0.8, 1.2))
-    axes.set_box_aspect((1.5, 0.65, 1.2), zoom=1.1)
+    axes.set_box_aspect((1.5, 0.65, 1.2), zoom=0.95)
     axes.view_init(elev=12, azim=-75)
 
 

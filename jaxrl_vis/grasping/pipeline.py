@@ -19,11 +19,10 @@ import cv2
 import numpy as np
 
 import jaxrl_vis
-from jaxrl_vis.errors import RequestError
 from jaxrl_vis.files import write_atomically
 from jaxrl_vis.grasping.cloud import Mount
 from jaxrl_vis.grasping.perceive import Perception, View, Ways, perceive
-from jaxrl_vis.phenotyping.folders import PairFiles, PlotFolder, read_odometry
+from jaxrl_vis.phenotyping.folders import PairFiles, PlotFolder, claim, read_odometry
 from jaxrl_vis.phenotyping.images import write_image
 from jaxrl_vis.phenotyping.reading import Unusable, read_pair
 from jaxrl_vis.phenotyping.results import Row, write_rows
@@ -141,12 +140,7 @@ def _claim(runs: list[PlotFolder], request: Request) -> None:
         "calibrations": {name: dataclasses.asdict(each) for name, each in request.calibrations.items()},
         "runs": {each.name: str(each.folder.resolve()) for each in runs},
     }
-    text = json.dumps(about, indent=2) + "\n"
-    path = request.out / "run.json"
-    if path.exists() and path.read_text(encoding="utf-8") != text:
-        raise RequestError(f"{request.out} holds the results of another request: choose another folder, or remove it")
-    request.out.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, text)
+    claim(request.out, about)
 
 
 def _record(folder: PlotFolder, driven: dict[str, float] | None, find: Find, request: Request) -> dict[str, Any]:

@@ -8,12 +8,16 @@ odometry.csv                         distance_m, or time_s, with the name of the
 
 import csv
 import dataclasses
+import json
 import re
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.files import write_atomically
 
 _IMAGES = {".png", ".jpg", ".jpeg", ".tif", ".tiff"}
 SAMPLE = Path(__file__).with_name("sample_row")
@@ -144,3 +148,17 @@ def read_odometry(plot: PlotFolder, speed: float | None = None) -> dict[str, flo
         of_file = {row["left"]: value for row, value in zip(rows, values)}
         return {pair.name: of_file[pair.left.name] for pair in plot.pairs if pair.left and pair.left.name in of_file}
     return {pair.name: value for pair, value in zip(plot.pairs, values)}
+
+
+def claim(out: Path, about: Mapping[str, Any]) -> None:
+    """Writes down in a folder of results what they are results of, or checks that it is the same as before.
+
+    Raises:
+        RequestError: The folder holds the results of another request.
+    """
+    text = json.dumps(about, indent=2) + "\n"
+    path = out / "run.json"
+    if path.exists() and path.read_text(encoding="utf-8") != text:
+        raise RequestError(f"{out} holds the results of another request: choose another folder, or remove it")
+    out.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, text)

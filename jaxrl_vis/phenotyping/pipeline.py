@@ -20,10 +20,9 @@ from typing import Any
 import numpy as np
 
 import jaxrl_vis
-from jaxrl_vis.errors import RequestError
 from jaxrl_vis.files import write_atomically
 from jaxrl_vis.phenotyping.detector.finder import Detection
-from jaxrl_vis.phenotyping.folders import PairFiles, PlotFolder, read_odometry
+from jaxrl_vis.phenotyping.folders import PairFiles, PlotFolder, claim, read_odometry
 from jaxrl_vis.phenotyping.ground import find_ground
 from jaxrl_vis.phenotyping.images import write_image
 from jaxrl_vis.phenotyping.measure import Method
@@ -149,12 +148,7 @@ def _claim(plots: list[PlotFolder], request: Request) -> None:
         },
         "plots": {plot.name: str(plot.folder.resolve()) for plot in plots},
     }
-    text = json.dumps(about, indent=2) + "\n"
-    path = request.out / "run.json"
-    if path.exists() and path.read_text(encoding="utf-8") != text:
-        raise RequestError(f"{request.out} holds the results of another request: choose another folder, or remove it")
-    request.out.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, text)
+    claim(request.out, about)
 
 
 def _record(plot: PlotFolder, pair: PairFiles, find: Find, request: Request) -> dict[str, Any]:
