@@ -10,7 +10,7 @@ Examples are drawn by threads while the network already learns from those that a
 import dataclasses
 import functools
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -18,13 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from jaxrl_vis.errors import NonFiniteError, RequestError
 from jaxrl_vis.grasping.masks.examples import Example
 from jaxrl_vis.grasping.masks.networks import Discriminator
 from jaxrl_vis.grasping.masks.painter import Settings, compute_dtype, normalise
 from jaxrl_vis.phenotyping.detector.losses import mask_loss
 from jaxrl_vis.phenotyping.training.augment import vary_snips
 from jaxrl_vis.phenotyping.training.pool import Pool
+from jaxrl_vis.phenotyping.training.updates import Report, repeat
 
 _NEAR_TRUTH = 100.0
 """Weight of the mean absolute difference, pix2pix's own."""
@@ -56,10 +56,6 @@ class Plan:
     rate: float = 1e-3
     average: float = 0.998
     seed: int = 0
-
-
-Report = Callable[[int, float, int, dict[str, float], Any], None]
-"""Called now and then with the step, progress from 0 to 1, how many images there are, losses, and the generator so far."""
 
 
 def crops(examples: list[Example], rng: np.random.Generator, count: int, size: int) -> tuple[np.ndarray, np.ndarray]:
@@ -164,38 +160,23 @@ def train(
         NonFiniteError: A loss is not finite any more.
         RequestError: The time was over before the first update.
     """
-    started = told = time.monotonic()
+    started = time.monotonic()
     rng = np.random.default_rng(plan.seed)
     start_key, steps_key = jax.random.split(jax.random.key(plan.seed))
     dtype = compute_dtype()
     pool = Pool(sources, plan.images)
-    step, before = 0, None
+    state: Any = None
+
+    def update(step: int, rates: tuple[jax.Array, jax.Array]) -> tuple[dict[str, jax.Array], Any]:
+        nonlocal state
+        batch = crops(pool.examples, rng, plan.batch, plan.crop)
+        state, parts = _update(state, batch, jax.random.fold_in(steps_key, step), rates, settings, dtype)
+        return parts, state[1]
+
     try:
         state = _initial(settings, plan.crop, start_key)
         pool.fill(plan.first)
-        while step < plan.steps:
-            pool.fill(0)
-            elapsed = (time.monotonic() - started) / 60.0
-            progress = max(step / plan.steps, elapsed / plan.minutes if plan.minutes else 0.0)
-            if progress >= 1.0:
-                break
-            rate = plan.rate * min((step + 1) / 200.0, 1.0) * 0.5 * (1.0 + np.cos(np.pi * progress))
-            # At first the average forgets quickly, so that it holds nothing of the random start.
-            rates = jnp.float32(rate), jnp.float32(min(plan.average, (1.0 + step) / (10.0 + step)))
-            batch = crops(pool.examples, rng, plan.batch, plan.crop)
-            state, parts = _update(state, batch, jax.random.fold_in(steps_key, step), rates, settings, dtype)
-            step += 1
-            if step % 8 == 0 and time.monotonic() - told > every:
-                told = time.monotonic()
-                losses = {name: float(part) for name, part in parts.items()}
-                if not np.isfinite(list(losses.values())).all():
-                    raise NonFiniteError(f"a loss is not finite at step {step}: try a lower --rate")
-                report(step, progress, len(pool.examples), losses, state[1])
-            # The device is kept one update ahead and no more: examples are drawn on it, too, and wait for what is queued.
-            jax.block_until_ready(before)
-            before = parts
+        step = repeat(update, pool, plan, started, report, every)
     finally:
         pool.close()
-    if not step:
-        raise RequestError(f"{plan.minutes:g} minutes were over before the first update: allow more with --minutes")
     return state[1], step

@@ -6,7 +6,7 @@ Examples are made by threads while the networks already learn from those that ar
 import dataclasses
 import functools
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -14,13 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from jaxrl_vis.errors import NonFiniteError, RequestError
 from jaxrl_vis.phenotyping.detector.detect import Settings, initial, padded_shape
 from jaxrl_vis.phenotyping.detector.losses import detector_loss, segmenter_loss
 from jaxrl_vis.phenotyping.detector.networks import Segmenter
 from jaxrl_vis.phenotyping.training.augment import move, relight, vary_snips
 from jaxrl_vis.phenotyping.training.examples import Example
 from jaxrl_vis.phenotyping.training.pool import Pool
+from jaxrl_vis.phenotyping.training.updates import Report, repeat
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,10 +50,6 @@ class Plan:
     average: float = 0.998
     threads: int = 4
     seed: int = 0
-
-
-Report = Callable[[int, float, int, dict[str, float], Any], None]
-"""Called now and then with the step, progress from 0 to 1, how many images there are, losses, and the weights so far."""
 
 
 class _Pool(Pool[Example]):
@@ -140,7 +136,7 @@ def train(
         NonFiniteError: A loss is not finite any more.
         RequestError: The time was over before the first update.
     """
-    started = told = time.monotonic()
+    started = time.monotonic()
     rng = np.random.default_rng(plan.seed)
     root = jax.random.key(plan.seed)
     dtype = jnp.bfloat16 if jax.default_backend() in ("gpu", "tpu") else jnp.float32
@@ -152,41 +148,21 @@ def train(
         "segmenter": Segmenter(settings.segmenter).init(segmenter_key, blank),
     }
     state = params, jax.tree.map(jnp.array, params), _optimiser().init(params)
-    losses: dict[str, float] = {}
-    before: Any = None
+
+    def update(step: int, rates: tuple[jax.Array, jax.Array]) -> tuple[dict[str, jax.Array], Any] | None:
+        nonlocal state
+        strips = pool.strips(rng)
+        if strips is None:
+            return None
+        batch, key = (pool.images(rng, whole), strips), jax.random.fold_in(steps_key, step)
+        state, parts = _update(state, batch, key, rates, settings, shape, dtype)
+        return parts, state[1]
+
     try:
         pool.fill(plan.first)
         shape = pool.examples[0].image.shape[:2]
         whole = padded_shape(tuple(np.max([each.image.shape[:2] for each in pool.examples], axis=0)))
-        step = 0
-        while step < plan.steps:
-            pool.fill(0)
-            elapsed = (time.monotonic() - started) / 60.0
-            progress = max(step / plan.steps, elapsed / plan.minutes if plan.minutes else 0.0)
-            if progress >= 1.0:
-                break
-            strips = pool.strips(rng)
-            if strips is None:
-                pool.fill(len(pool.examples) + 1)
-                continue
-            rate = plan.rate * min((step + 1) / 200.0, 1.0) * 0.5 * (1.0 + np.cos(np.pi * progress))
-            batch = (pool.images(rng, whole), strips)
-            key = jax.random.fold_in(steps_key, step)
-            # At first the average forgets quickly, so that it holds nothing of the random start.
-            rates = jnp.float32(rate), jnp.float32(min(plan.average, (1.0 + step) / (10.0 + step)))
-            state, parts = _update(state, batch, key, rates, settings, shape, dtype)
-            step += 1
-            if step % 8 == 0 and time.monotonic() - told > every:
-                told = time.monotonic()
-                losses = {name: float(part) for name, part in parts.items()}
-                if not np.isfinite(list(losses.values())).all():
-                    raise NonFiniteError(f"a loss is not finite at step {step}: try a lower --rate")
-                report(step, progress, len(pool.examples), losses, state[1])
-            # The device is kept one update ahead and no more: examples are drawn on it, too, and wait for what is queued.
-            jax.block_until_ready(before)
-            before = parts
+        step = repeat(update, pool, plan, started, report, every)
     finally:
         pool.close()
-    if not step:
-        raise RequestError(f"{plan.minutes:g} minutes were over before the first update: allow more with --minutes")
     return state[1], step
