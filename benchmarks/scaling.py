@@ -11,15 +11,18 @@ For each number of devices N, beside one device of the same machine:
     resume         what N devices saved, restored on one device and on others: parameters, optimisers and replay bit-equal, and
                    trained further on one
 
-All programs are compiled before, side by side. ``--quick`` takes small images and few
-updates, to see that it works: on a CPU with XLA_FLAGS=--xla_force_host_platform_device_count=2.
+All programs are compiled before, by processes of their own side by side, which leave them in the compile cache: with 16
+threads of one process that sees two GPUs, XLA (jaxlib 0.11) dies of a segmentation fault. ``--quick`` takes small images and
+few updates, to see that it works: on a CPU with XLA_FLAGS=--xla_force_host_platform_device_count=2.
 """
 
 import argparse
-import concurrent.futures
 import dataclasses
 import math
+import os
 import statistics
+import subprocess
+import sys
 import tempfile
 import time
 from pathlib import Path
@@ -99,14 +102,29 @@ class Timed:
         return seconds
 
 
+    def compile(self) -> None:
+        """Compiles its programs, or finds them in the compile cache."""
+        for name in self.names:
+            self.programs.compiled(name)
+
+
 def compile_all(everything: list[Timed]) -> float:
-    """Compiles all programs side by side, what takes longest first; the seconds it took."""
+    """Fills the compile cache by a process for each configuration, side by side, and reads it; the seconds it took.
+
+    Raises:
+        SystemExit: One of the processes failed; what it printed stands before.
+    """
     start = time.perf_counter()
-    with concurrent.futures.ThreadPoolExecutor(16) as pool:
-        names = ("train_iteration", "evaluate", "init")
-        futures = [pool.submit(timed.programs.compiled, name) for name in names for timed in everything if name in timed.names]
-        for future in futures:
-            future.result()
+    sharing = os.environ | {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+    children = [
+        subprocess.Popen([sys.executable, *sys.argv, "--compile-only", str(number)], env=sharing)
+        for number in range(len(everything))
+    ]
+    failed = [str(number) for number, child in enumerate(children) if child.wait()]
+    if failed:
+        raise SystemExit(f"these of {len(children)} configurations were not compiled: {', '.join(failed)}")
+    for timed in everything:
+        timed.compile()
     return time.perf_counter() - start
 
 
@@ -238,6 +256,7 @@ def main() -> None:
     parser.add_argument("--seeds-per-device", type=int, default=1)
     parser.add_argument("--json", type=Path, help="also write the records here")
     parser.add_argument("--quick", action="store_true", help="small, to see that it works")
+    parser.add_argument("--compile-only", type=int, metavar="N", help="fill the compile cache for the N-th configuration")
     options = parser.parse_args()
     enable_compilation_cache()
     began, there = time.perf_counter(), len(jax.devices())
@@ -250,6 +269,10 @@ def main() -> None:
     env, watch = make_env(base), Watch()
     figures = figures_of(base, env, numbers, SMALL_BATCHES if options.quick else BATCHES, options.seeds_per_device)
     alone = list({id(figure.one): figure.one for figure in figures}.values())
+    everything = [*alone, *(figure.timed for figure in figures)]
+    if options.compile_only is not None:
+        everything[options.compile_only].compile()
+        return
     lines, measurements, times = [], [], {}
 
     def keep(line: str, measurement: Measurement | None = None) -> None:
@@ -257,7 +280,7 @@ def main() -> None:
         measurements.extend([] if measurement is None else [measurement])
         print(line, flush=True)
 
-    print(f"compiled in {compile_all([*alone, *(figure.timed for figure in figures)]):.0f} s", flush=True)
+    print(f"compiled in {compile_all(everything):.0f} s", flush=True)
     for one in alone:
         times[id(one)] = one.run(options.cycles)
         one.loop = None  # makes room
