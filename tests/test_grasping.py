@@ -8,11 +8,15 @@ import shutil
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxrl_vis import cli
+from jaxrl_vis.cli.families import family_of
+from jaxrl_vis.cli.grasp_train import _Drawn as Drawn
 from jaxrl_vis.errors import NonFiniteError, RequestError
+from jaxrl_vis.evaluation_pool import finite
 from jaxrl_vis.grasping.chords import chords_of, joined
 from jaxrl_vis.grasping.cloud import Cloud, Mount, match, organised, redness, thinned
 from jaxrl_vis.grasping.evaluate import RunScore, draw_scene, match_stalks, score_scene, stitch_error, summary, true_motion
@@ -21,8 +25,10 @@ from jaxrl_vis.grasping.lines import grasp_points
 from jaxrl_vis.grasping.masks.examples import Example
 from jaxrl_vis.grasping.masks.loop import Plan, crops, train
 from jaxrl_vis.grasping.masks.painter import Painter, Settings, read_weights, write_weights
+from jaxrl_vis.grasping.masks.variation import vary
 from jaxrl_vis.grasping.perceive import ORIGINAL, OURS, View, Ways, perceive
 from jaxrl_vis.grasping.pipeline import Request, run
+from jaxrl_vis.grasping.records import Conditions, evaluate_run
 from jaxrl_vis.grasping.sight import Sight
 from jaxrl_vis.grasping.slices import slice_at, slice_points
 from jaxrl_vis.grasping.stitch import DEFAULT, THESIS, Motion, rigid, stitch
@@ -291,6 +297,25 @@ def test_crops_are_parts_of_images_with_their_masks():
         assert (mask.sum() == 400 and not image[20:].any()) if is_small else ((image[..., 0] > 125) == mask).all()
 
 
+def test_varied_crops_keep_their_masks():
+    masks = np.zeros((16, 64, 64), bool)
+    masks[:, :, 20:30] = True
+    images = np.where(masks[..., None], 140, np.full(3, 40)).astype(np.uint8)
+    varied, moved = (np.asarray(each) for each in vary(jnp.asarray(images), jnp.asarray(masks), jax.random.key(0)))
+    assert varied.dtype == np.uint8 and varied.shape == images.shape and moved.dtype == bool
+    kept = [(varied[each] == images[each]).all() or (varied[each] == images[each, :, ::-1]).all() for each in range(16)]
+    assert 0 < sum(kept) < 8
+    grey = varied.mean(axis=-1)
+    # What was brighter still is, wherever it has gone.
+    for one, mask in zip(grey, moved):
+        assert 0.05 < mask.mean() < 0.3
+        assert one[mask].mean() > one[~mask].mean()
+    assert len({round(float(each.mean())) for each in varied}) > 5
+    assert len({int(np.flatnonzero(each[32]).mean()) for each in moved}) > 2
+    other, _ = vary(jnp.asarray(images), jnp.asarray(masks), jax.random.key(1))
+    assert (np.asarray(other) != varied).any()
+
+
 @pytest.mark.parametrize("loss", ["segmentation", "gan"])
 def test_generators_learn_to_paint_stripes(loss, tmp_path):
     settings = Settings(loss, (8, 16))
@@ -442,23 +467,37 @@ def test_clouds_that_do_not_stitch_and_an_arm_that_reaches_nothing_are_told(runs
     assert row["flag"] == "no stalk is within reach" and row["reachable"] == "0" and int(row["grasp_points"]) > 2
 
 
-def test_eval_of_a_row_and_of_an_empty_one(spec, tmp_path, capsys):
+def test_eval_of_rows_and_of_an_empty_one(spec, tmp_path, capsys):
     out = tmp_path / "eval.json"
-    words = ["grasp", "eval", "--masks", "truth", *WIDTH, "--runs", "1", "--json", str(out)]
-    assert cli.main([*words, "--spec", str(spec), "--reach", "--wind", "5"]) == 0
+    words = ["grasp", "eval", "--masks", "truth", *WIDTH, "--runs", "2", "--reach"]
+    assert cli.main([*words, "--json", str(out), "--spec", str(spec), "--workers", "2", "--wind", "0", "5"]) == 0
     figures = json.loads(out.read_text())
     assert figures["f1"] > 0.9 and figures["point_median_mm"] < 10.0 and figures["stitch_median_mm"] < 10.0
-    assert figures["synthetic"] is True and figures["masks"] == "truth" and figures["stitches"] == 2
-    shares = figures["reach"]["shares"]
-    assert shares["all stalks"]["of"] == figures["stalks"] and shares["attempts: success"]["of"] == figures["grasp_points"]
-    assert shares["all stalks"]["count"] >= figures["stalks"] - 2 and figures["reach"]["wind_mm"] == 5.0
+    assert figures["synthetic"] is True and figures["masks"] == "truth" and figures["stitches"] == 4
+    for wind in ("0", "5"):
+        shares = figures["reaches"][wind]["shares"]
+        assert shares["all stalks"]["of"] == figures["stalks"] and shares["attempts: success"]["of"] == figures["grasp_points"]
+        assert shares["all stalks"]["count"] >= figures["stalks"] - 2
     said = capsys.readouterr().out
     assert "simulated runs of family few" in said and "the arm, with 5 mm of wind" in said
+    # A run is the same in this process, and is not evaluated again.
+    family = family_of(Drawn("training", spec, 256, (), 3), "grasping")
+    here = json.loads(json.dumps(finite(evaluate_run(Conditions(family), 1))))
+    there = figures["each"][1]
+    assert here["plan"]["stalks"] == there["plan"]["stalks"] and here["hits"] == there["hits"]
+    np.testing.assert_allclose(here["plan"]["targets"], there["plan"]["targets"], atol=2e-6)
+    before = out.stat().st_mtime_ns
+    assert cli.main([*words, "--json", str(out), "--spec", str(spec), "--wind", "5"]) == 0
+    said = capsys.readouterr().out
+    assert "2 runs were evaluated before" in said and "run 1" not in said
+    assert json.loads(out.read_text()) == figures and out.stat().st_mtime_ns >= before
+    assert cli.main([*words, "--json", str(out), "--spec", str(spec), "--thesis"]) == 2
+    assert 'another evaluation (method: "default", not "thesis")' in capsys.readouterr().err
     empty = tmp_path / "empty.json"
     layout = {**FEW["layout"], "stalks_mean": 0}
     empty.write_text(json.dumps({**FEW, "layout": layout, "leaves": {"density": 0, "litter": 30}}))
-    assert cli.main([*words, "--spec", str(empty), "--reach"]) == 0
-    figures = json.loads(out.read_text())
+    assert cli.main([*words, "--json", str(tmp_path / "none.json"), "--spec", str(empty), "--runs", "1"]) == 0
+    figures = json.loads((tmp_path / "none.json").read_text())
     assert figures["stalks"] == figures["grasp_points"] == 0 and figures["f1"] is None
     assert "no stalk was found" in capsys.readouterr().out
 
@@ -506,7 +545,9 @@ def test_a_run_without_pairs_is_a_mistake():
         (["eval", "--seed", "-1"], "--seed must be at least 0"),
         (["eval", "--weights", "missing.npz"], "cannot read the weights"),
         (["eval", "--masks", "truth", "--weights", "w.npz"], "leave out --weights"),
-        (["eval", "--wind", "5"], "--wind must be at least 0, and goes with --reach"),
+        (["eval", "--wind", "5"], "--wind goes with --reach"),
+        (["eval", "--reach", "--wind", "0", "-5"], "--wind must be from 0 to 100 mm, not -5"),
+        (["eval", "--workers", "0"], "--workers must be at least 1"),
         (["run", "missing"], "there is no folder"),
         (["run", ".", "--pitch", "99"], "--pitch must be from -60 to 60"),
         (["run", ".", "--height", "0"], "--height must be from 0.05 to 3"),

@@ -18,7 +18,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("fields",),
     ("config", "types", "provenance", "files", "parameters"),
     ("devices", "processes"),
-    ("learner",),
+    ("evaluation_pool", "learner"),
     ("report",),
     ("run",),
     ("studies",),

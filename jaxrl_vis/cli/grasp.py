@@ -54,8 +54,8 @@ def synth(options: Synth) -> int:
     return 0
 
 
-def painter_of(weights: Path | None, loss: Literal["gan", "segmentation"]) -> "tuple[Painter, str]":
-    """What finds the pixels of stalks, and its name, which changes with its weights.
+def weights_of(weights: Path | None, loss: Literal["gan", "segmentation"]) -> tuple[Path, str]:
+    """The file of what finds the pixels of stalks, and its name, which changes with what is in it.
 
     Args:
         weights: From ``grasp train``; those that are shipped if not given.
@@ -66,13 +66,22 @@ def painter_of(weights: Path | None, loss: Literal["gan", "segmentation"]) -> "t
     """
     import hashlib
 
-    from jaxrl_vis.grasping.masks.painter import SHIPPED, Painter, read_weights
+    from jaxrl_vis.grasping.masks.painter import SHIPPED, read_weights
 
     path = SHIPPED[loss] if weights is None else weights
     if weights is None and not path.exists():
         raise RequestError(
             "no weights of masks come with this version: make some with `jaxrl-vis grasp train`, and name them with --weights"
         )
-    params, settings, _ = read_weights(path)
+    _, settings, _ = read_weights(path)
     digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
-    return Painter(params, settings), f"{settings.loss} {digest}"
+    return path, f"{settings.loss} {digest}"
+
+
+def painter_of(weights: Path | None, loss: Literal["gan", "segmentation"]) -> "tuple[Painter, str]":
+    """What finds the pixels of stalks, and its name; see `weights_of`."""
+    from jaxrl_vis.grasping.masks.painter import Painter, read_weights
+
+    path, name = weights_of(weights, loss)
+    params, settings, _ = read_weights(path)
+    return Painter(params, settings), name

@@ -1,17 +1,21 @@
 """``jaxrl-vis grasp eval``."""
 
 import dataclasses
-import json
-import math
+import functools
+import hashlib
 from pathlib import Path
 from typing import Literal
 
+from jaxrl_vis import __version__
 from jaxrl_vis.cli.checks import check_counts, check_extra
 from jaxrl_vis.cli.families import family_of
-from jaxrl_vis.cli.grasp import painter_of
+from jaxrl_vis.cli.grasp import weights_of
 from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.evaluation_pool import Kept, Record, evaluate_each, share_accelerator
 from jaxrl_vis.report.outputs import check_writable
+
+_MOST_WIND = 100.0  # mm
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,74 +48,84 @@ class Eval:
     """Width of an image in pixels, in place of the family's 1024."""
     reach: bool = False
     """Send the simulated arm to every grasp point, too, and say what its jaws hold."""
-    wind: float = 0.0
-    """With --reach: how far stalks sway in the wind, mm."""
+    wind: tuple[float, ...] = ()
+    """With --reach: how far stalks sway in the wind, mm; 0 if not given. Several, such as 0 10 20, share what was seen."""
+    workers: int = 1
+    """How many processes look at runs side by side; they share GPUs and cores, so that a pair takes longer."""
     json: Path | None = None
-    """A file for the figures of all runs together and of each; written after each run."""
+    """A file for the figures of all runs together and of each, written after each run. If it is there already, and about the
+    same, the runs that it holds are not evaluated again."""
 
 
 def evaluate(options: Eval) -> int:
     """Prints the figures."""
-    check_counts(runs=options.runs, frames=options.frames, width=options.width)
+    check_counts(runs=options.runs, frames=options.frames, width=options.width, workers=options.workers)
     if options.seed < 0:
         raise RequestError(f"--seed must be at least 0, not {options.seed}")
     if options.masks == "truth" and options.weights is not None:
         raise RequestError("--masks truth uses no weights: leave out --weights")
-    if options.wind < 0 or (options.wind and not options.reach):
-        raise RequestError(f"--wind must be at least 0, and goes with --reach, not {options.wind:g}")
+    for wind in options.wind:
+        if not 0 <= wind <= _MOST_WIND:
+            raise RequestError(f"--wind must be from 0 to {_MOST_WIND:g} mm, not {wind:g}")
+    if options.wind and not options.reach:
+        raise RequestError("--wind goes with --reach")
     check_extra("grasp", "grasping")
     if options.json is not None:
         check_writable(options.json, "--json")
     family = family_of(options, "grasping")
+    if options.workers > 1:
+        share_accelerator()
     check_devices()
-    from jaxrl_vis.files import write_atomically
-    from jaxrl_vis.grasping.attempts import carry_out, plan
-    from jaxrl_vis.grasping.evaluate import draw_scene, score_scene, summary
-    from jaxrl_vis.grasping.metric import score as score_grasps
+    from jaxrl_vis.grasping import records
     from jaxrl_vis.grasping.perceive import Ways
 
-    painter, name = (None, "truth") if options.masks == "truth" else painter_of(options.weights, options.masks)
-    mask = None if painter is None else lambda image, number: painter(image)
+    weights, name = (None, "truth") if options.masks == "truth" else weights_of(options.weights, options.masks)
     ways = Ways(*(options.thesis or each == "thesis" for each in (options.stitch, options.points)))
-    scores, plans = [], []
-    for seed in range(options.seed, options.seed + options.runs):
-        scene = draw_scene(family, seed)
-        score, perception = score_scene(scene, mask, ways)
-        scores.append(score)
-        if options.reach:
-            plans.append(plan(scene, perception, len(plans)))
-        one = summary([score])
-        print(
-            f"run {seed}: {len(score.errors)} of {score.true} stalks, {score.found - len(score.errors)} false, "
-            f"grasp points {one['point_median_mm']:.1f} mm, stitches {one['stitch_median_mm']:.1f} mm"
-            + "".join(f"; {note}" for note in score.notes),
-            flush=True,
-        )
-        if options.json is not None:
-            about = {"synthetic": True, "family": family.name, "masks": name, "method": str(ways)}
-            each_run = [
-                {"seed": each.seed, "stalks": each.true, "grasp_points": each.found, "hits": len(each.errors)}
-                for each in scores
-            ]
-            text = json.dumps({**about, **_finite(summary(scores)), "each": each_run}, indent=2)
-            write_atomically(options.json, text + "\n")
+    about = {
+        "synthetic": True,
+        "version": __version__,
+        "schema": records.SCHEMA,
+        "family": family.name,
+        "family_digest": hashlib.sha256(repr(family).encode()).hexdigest()[:12],
+        "masks": name,
+        "method": str(ways),
+    }
+    kept = Kept(options.json, about, records.summary_of)
+    numbers = range(options.seed, options.seed + options.runs)
+
+    def done(number: int, record: Record) -> None:
+        kept.add(number, record)
+        _print_run(number, kept.records[number])
+
+    conditions = records.Conditions(family, weights, ways, options.workers)
+    missing = [number for number in numbers if number not in kept]
+    if len(missing) < len(numbers):
+        print(f"{len(numbers) - len(missing)} runs were evaluated before: {options.json}")
+    evaluate_each(functools.partial(records.evaluate_run, conditions), missing, options.workers, done)
+    asked = [kept.records[number] for number in numbers]
     print(f"simulated runs of family {family.name}, masks: {name}, {ways}:")
-    for each, value in summary(scores).items():
-        print(f"  {each:20} {value if isinstance(value, int) else f'{value:.4f}'}")
-    if options.reach:
-        grasps = score_grasps(carry_out(plans, options.wind), [each for one in plans for each in one.standing])
-        print(f"the arm, with {options.wind:g} mm of wind:")
+    for each, value in records.summary_of([{**record, "reaches": {}} for record in asked]).items():
+        print(f"  {each:20} {f'{value:.4f}' if isinstance(value, float) else value}")
+    for wind in (options.wind or (0.0,)) if options.reach else ():
+        records.reach_all(kept, numbers, wind)
+        grasps = records.grasp_score([kept.records[number] for number in numbers], f"{wind:g}")
+        print(f"the arm, with {wind:g} mm of wind:")
         for share in grasps.shares:
             print(f"  {share}")
         print(f"  the thesis's ratio: {grasps.thesis_ratio:.4f}")
-        if options.json is not None:
-            record = json.loads(options.json.read_text(encoding="utf-8"))
-            shares = {each.name: {"count": each.count, "of": each.of, "interval": each.interval} for each in grasps.shares}
-            record["reach"] = {"wind_mm": options.wind, **_finite({"thesis_ratio": grasps.thesis_ratio}), "shares": shares}
-            write_atomically(options.json, json.dumps(record, indent=2).replace("NaN", "null") + "\n")
     return 0
 
 
-def _finite(figures: dict) -> dict:
-    """What JSON can hold: None in place of what is not a number."""
-    return {name: value if math.isfinite(value) else None for name, value in figures.items()}
+def _print_run(number: int, record: Record) -> None:
+    """A line for one run."""
+    from jaxrl_vis.grasping import records
+    from jaxrl_vis.grasping.evaluate import summary
+
+    score = records.score_of(record)
+    one = summary([score])
+    print(
+        f"run {number}: {len(score.errors)} of {score.true} stalks, {score.found - len(score.errors)} false, "
+        f"grasp points {one['point_median_mm']:.1f} mm, stitches {one['stitch_median_mm']:.1f} mm"
+        + "".join(f"; {note}" for note in score.notes),
+        flush=True,
+    )

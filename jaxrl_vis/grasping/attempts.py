@@ -6,7 +6,7 @@ jaws hold, and what they could have held.
 """
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 import jax
 import numpy as np
@@ -18,7 +18,7 @@ from jaxrl_vis.grasping.metric import Attempt, Standing, match
 from jaxrl_vis.grasping.perceive import Perception
 from jaxrl_vis.grasping.reach import reach
 from jaxrl_vis_envs.plants import Plot
-from jaxrl_vis_envs.plants.stand import MAST_DISTANCE, origin_of, stands_at
+from jaxrl_vis_envs.plants.stand import MAST_DISTANCE, Stands, concatenated, origin_of, stands_at
 
 _USUAL = 0.007  # m: radius of a stalk whose thickness is not known
 
@@ -28,21 +28,21 @@ class Plan:
     """The attempts of one run, before the arm moves.
 
     Attributes:
-        plot: What stands there.
+        run: Its number.
         targets: [B, 3] float64, m in the plot's frame.
         stalks: [B] int, the stalk that each is matched with; -1 for none.
         errors: [B] float64, horizontal distance from that stalk, m; nan for none.
-        masts: [B] float64, where the mast stands along the row, m.
         sides: [B] float64, 1 or -1: which solution the arm takes.
+        stands: The true stalks around the arm, from where it tries each.
         standing: The stalks of the stretch.
     """
 
-    plot: Plot
+    run: int
     targets: np.ndarray
     stalks: np.ndarray
     errors: np.ndarray
-    masts: np.ndarray
     sides: np.ndarray
+    stands: Stands
     standing: tuple[Standing, ...]
 
 
@@ -84,12 +84,12 @@ def plan(scene: Scene, perception: Perception, number: int) -> Plan:
     ]
     off = [np.linalg.norm(targets[each, :2] - places[each, stalks[each]]) if stalks[each] >= 0 else np.nan for each in kept]
     return Plan(
-        plot=plot,
+        run=number,
         targets=targets[kept],
         stalks=stalks[kept],
         errors=np.array(off, float),
-        masts=origins[np.array(chosen, int)[kept], 0],
         sides=np.array(sides, float)[kept],
+        stands=stands_at(plot, origins[np.array(chosen, int)[kept], 0], targets[kept]),
         standing=standing,
     )
 
@@ -124,36 +124,53 @@ def _standing(plot: Plot, origins: np.ndarray, number: int) -> tuple[Standing, .
     return tuple(found)
 
 
+_MOST = 1024  # arms in a program
+
+
 def carry_out(plans: Iterable[Plan], wind_mm: float, seed: int = 0) -> list[Attempt]:
     """Sends an arm to each target of all runs, side by side.
 
     Args:
-        plans: One for each run, numbered in this order.
-        wind_mm: How far stalks sway, mm.
+        plans: One for each run.
+        wind_mm: How far stalks sway, mm. What wind an arm meets does not depend on other runs.
         seed: Of the wind.
     """
-    plans = list(plans)
-    targets = np.concatenate([each.targets for each in plans] or [np.zeros((0, 3))])
-    if not len(targets):
-        return []
-    plots = [each.plot for each in plans for _ in each.targets]
-    masts, sides = (np.concatenate([getattr(each, name) for each in plans]) for name in ("masts", "sides"))
-    stands = stands_at(plots, masts, targets)
-    result = reach(stands, targets, jax.random.key(seed), wind_mm, sides=sides)
-    attempts = []
-    numbers = np.repeat(np.arange(len(plans)), [len(each.targets) for each in plans])
-    stalks, errors = (np.concatenate([getattr(each, name) for each in plans]) for name in ("stalks", "errors"))
-    for place, (number, stalk, error) in enumerate(zip(numbers, stalks, errors)):
-        others = stands.stalk[place] != stalk
-        attempts.append(
-            Attempt(
-                run=int(number),
-                stalk=int(stalk) if stalk >= 0 else None,
-                held=frozenset(stands.stalk[place][result.held[place]].tolist()),
-                reachable=bool(result.reachable[place]),
-                collided=bool((result.touched[place] & others).any()),
-                brushed=bool((result.brushed[place] & others).any()),
-                aim_error=float(error),
-            )
+    attempts: list[Attempt] = []
+    for block in _blocks(list(plans)):
+        runs = np.repeat([each.run for each in block], [len(each.targets) for each in block])
+        places = np.concatenate([np.arange(len(each.targets)) for each in block])
+        winds = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(seed), runs)
+        keys = jax.vmap(jax.random.fold_in)(winds, places)
+        targets, stalks, errors, sides = (
+            np.concatenate([getattr(each, name) for each in block]) for name in ("targets", "stalks", "errors", "sides")
         )
+        stands = concatenated([each.stands for each in block])
+        result = reach(stands, targets, keys, wind_mm, sides=sides)
+        for place, (run, stalk, error) in enumerate(zip(runs, stalks, errors)):
+            others = stands.stalk[place] != stalk
+            attempts.append(
+                Attempt(
+                    run=int(run),
+                    stalk=int(stalk) if stalk >= 0 else None,
+                    held=frozenset(stands.stalk[place][result.held[place]].tolist()),
+                    reachable=bool(result.reachable[place]),
+                    collided=bool((result.touched[place] & others).any()),
+                    brushed=bool((result.brushed[place] & others).any()),
+                    aim_error=float(error),
+                )
+            )
     return attempts
+
+
+def _blocks(plans: list[Plan]) -> Iterator[list[Plan]]:
+    """Plans that are carried out together: as many as have at most `_MOST` targets, but at least one."""
+    block: list[Plan] = []
+    for each in plans:
+        if not len(each.targets):
+            continue
+        if block and sum(len(other.targets) for other in block) + len(each.targets) > _MOST:
+            yield block
+            block = []
+        block.append(each)
+    if block:
+        yield block

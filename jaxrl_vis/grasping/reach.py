@@ -144,7 +144,7 @@ def reach(
     Args:
         stands: The stalks around each of B arms.
         targets: [B, 3] float32, where the jaws should close, m in the plot's frame.
-        key: [], typed: the wind.
+        key: [] or [B], typed: the wind; one for all arms, or one each, so that an arm's wind is the same in any company.
         wind_mm: How far stalks sway (`bending.Gusts.strength`), mm; [] or [B], 0 to 20 in the field.
         timing: How long the parts of a reach take.
         gains: Of the controllers.
@@ -172,6 +172,8 @@ def reach(
     side = np.asarray(arm.better_side(targets - stands.origin, np) if sides is None else sides, np.float32)
     if side.shape != (count,) or not (np.abs(side) == 1).all():
         raise ValueError(f"sides must be 1 or -1 for each of {count} arms")
+    if key.shape not in ((), (count,)):
+        raise ValueError(f"there must be one key, or one for each of {count} arms, got {list(key.shape)}")
     if not count:
         return _empty(stands, timing)
     # The rest of the program's arms do what the first one does.
@@ -179,7 +181,8 @@ def reach(
     start, advance = _programs(stands.stalk.shape[1], timing, gains)
     shape = jax.tree.map(lambda part: part[fill], bending.shapes(stands))
     winds = np.broadcast_to(wind / 1000, (count,))[fill]
-    scene, reaching = start(shape, jax.random.split(key, len(fill)), winds, side[fill])
+    keys = key[fill] if key.shape else jax.random.split(key, len(fill))
+    scene, reaching = start(shape, keys, winds, side[fill])
     parts = []
     for call in range(_calls(timing.reach) + _calls(timing.close)):
         if look is not None and 0 < call < _calls(timing.reach):

@@ -87,6 +87,12 @@ def stands_at(plots: Plot | Sequence[Plot], x: np.ndarray, targets: np.ndarray, 
     return Stands(arrays[0].astype(np.int32), *(part.astype(np.float32) for part in arrays[1:]))
 
 
+def concatenated(parts: Sequence[Stands]) -> Stands:
+    """All stands of several, which have as many stalks each, in their order; at least one."""
+    names = [field.name for field in dataclasses.fields(Stands)]
+    return Stands(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
 def _empty(stalks: int) -> list[np.ndarray]:
     vectors = np.zeros((0, stalks, 3))
     return [np.zeros((0, stalks)), vectors, vectors, vectors, *[np.zeros((0, stalks, 2))] * 2, np.zeros((0, 3))]

@@ -21,8 +21,8 @@ import optax
 from jaxrl_vis.grasping.masks.examples import Example
 from jaxrl_vis.grasping.masks.networks import Discriminator
 from jaxrl_vis.grasping.masks.painter import Settings, compute_dtype, normalise
+from jaxrl_vis.grasping.masks.variation import vary
 from jaxrl_vis.phenotyping.detector.losses import mask_loss
-from jaxrl_vis.phenotyping.training.augment import vary_snips
 from jaxrl_vis.phenotyping.training.pool import Pool
 from jaxrl_vis.phenotyping.training.updates import Report, repeat
 
@@ -86,7 +86,7 @@ def _update(state: Any, batch: Any, key: jax.Array, rates: tuple[jax.Array, jax.
     """One update: generator, its average, discriminator (None for segmentation), and the optimiser's states of both."""
     generator, average, discriminator, moments = state
     rate, share = rates
-    images, masks = vary_snips(batch[0], batch[1], key)
+    images, masks = vary(batch[0], batch[1], key)
     network, judge, values = settings.generator(dtype), Discriminator(dtype=dtype), normalise(images)
     true = jnp.where(masks[..., None], jnp.array(_RED), values)
 

@@ -1,0 +1,195 @@
+"""Many numbered things, such as synthetic plots, evaluated in processes side by side; what is evaluated already is left out.
+
+    kept = Kept(path, about, summary)                     # the file goes on where it was, if it is about the same
+    missing = [number for number in numbers if number not in kept]
+    evaluate_each(function, missing, workers, kept.add)   # function(number) -> record; kept.add writes the file
+
+Records are what JSON can hold. What one says must depend on its number alone: then it is the same with any number of workers.
+"""
+
+import json
+import math
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import Any
+
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.files import write_atomically
+
+Record = dict[str, Any]
+"""What is kept of one number."""
+
+# What limits the threads of NumPy, SciPy, OpenCV and XLA in a process.
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPROC")
+
+
+def evaluate_each(
+    evaluate: Callable[[int], Record], numbers: Iterable[int], workers: int, done: Callable[[int, Record], None]
+) -> None:
+    """Evaluates numbers, in this process or in several.
+
+    Args:
+        evaluate: From a number to its record. With more than one worker it is pickled: a function of a module, or a
+            `functools.partial` of one.
+        numbers: What to evaluate.
+        workers: How many processes; 1 for this one. They share the GPUs and the cores of the machine.
+        done: Called in this process with each number and its record, in the order in which they are finished.
+
+    Raises:
+        RequestError: A process was ended from outside, most likely as the memory was used up.
+    """
+    numbers = list(numbers)
+    if workers == 1 or len(numbers) < 2:
+        for number in numbers:
+            done(number, evaluate(number))
+        return
+    workers = min(workers, len(numbers))
+    spawning = multiprocessing.get_context("spawn")
+    others = set(multiprocessing.active_children())
+    pool = ProcessPoolExecutor(
+        workers, mp_context=spawning, initializer=_prepare, initargs=(spawning.Value("i", 0), _environments(workers))
+    )
+    try:
+        waiting = {pool.submit(evaluate, number): number for number in numbers}
+        for each in as_completed(waiting):
+            done(waiting[each], each.result())
+    except BrokenProcessPool as error:
+        raise RequestError(
+            f"one of {workers} processes was ended from outside, most likely for want of memory: use fewer --workers, and the "
+            "same command goes on where it was"
+        ) from error
+    except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for child in set(multiprocessing.active_children()) - others:
+            child.terminate()
+        raise
+    pool.shutdown()
+
+
+def share_accelerator() -> None:
+    """Lets this process take memory of a GPU as it needs it, so that others find some; to be called before JAX is used."""
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+
+
+def _environments(workers: int) -> list[dict[str, str]]:
+    """Variables of each worker: its GPU, if there are several, and how many threads it may have."""
+    from jaxrl_vis.devices import list_devices
+
+    devices = list_devices()
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    threads = dict.fromkeys(_THREADS, str(max(cores // workers, 1)))
+    share = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+    return [{**threads, **share, **devices[index % len(devices)].environment} for index in range(workers)]
+
+
+def _prepare(counter: Any, environments: list[dict[str, str]]) -> None:
+    """Makes a new process one of several."""
+    # The one that started it ends it: both would otherwise be interrupted at once.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with counter.get_lock():
+        index = counter.value
+        counter.value += 1
+    variables = environments[index % len(environments)]
+    os.environ.update(variables)
+    try:
+        import cv2
+    except ImportError:
+        return
+    cv2.setNumThreads(int(variables[_THREADS[0]]))
+
+
+class Kept:
+    """A JSON file of records: what they are about, what they say together, and a line for each number.
+
+    Attributes:
+        records: Of each number.
+    """
+
+    def __init__(self, path: Path | None, about: Mapping[str, Any], summary: Callable[[list[Record]], Mapping[str, Any]]):
+        """Reads the file, if there is one that is about the same.
+
+        Args:
+            path: The file; None to keep records in memory alone.
+            about: Under what conditions numbers are evaluated.
+            summary: What records, in the order of their numbers, say together.
+
+        Raises:
+            RequestError: The file is about something else, or cannot be read.
+        """
+        self.records: dict[int, Record] = {}
+        self._path, self._about, self._summary = path, json.loads(json.dumps(finite(about))), summary
+        self._lines: dict[int, str] = {}
+        if path is not None and path.exists():
+            for record in _read(path, self._about):
+                self._keep(int(record["number"]), record)
+
+    def __contains__(self, number: int) -> bool:
+        return number in self.records
+
+    def add(self, number: int, record: Record) -> None:
+        """Keeps what came of a number, and writes the file."""
+        self.add_all({number: record})
+
+    def add_all(self, records: Mapping[int, Record]) -> None:
+        """Keeps what came of several numbers, and writes the file once."""
+        for number, record in records.items():
+            self._keep(number, {"number": number, **record})
+        self.write()
+
+    def write(self) -> None:
+        """Writes the file."""
+        if self._path is None:
+            return
+        ordered = sorted(self.records)
+        figures = finite({**self._about, **self._summary([self.records[number] for number in ordered])})
+        head = json.dumps(figures, indent=2)
+        lines = ",\n".join(f"    {self._lines[number]}" for number in ordered)
+        write_atomically(self._path, f'{head[:-2]},\n  "each": [\n{lines}\n  ]\n}}\n')
+
+    def _keep(self, number: int, record: Record) -> None:
+        record = finite(record)
+        # What is computed from a record must not depend on whether it was read from the file.
+        line = json.dumps(record, allow_nan=False)
+        self.records[number], self._lines[number] = json.loads(line), line
+
+
+def finite(value: Any) -> Any:
+    """What JSON can hold: None in place of what is not a number, however deep."""
+    if isinstance(value, Mapping):
+        return {name: finite(each) for name, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [finite(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _read(path: Path, about: Mapping[str, Any]) -> list[Record]:
+    """The records of a file.
+
+    Raises:
+        RequestError: It is about something else, or cannot be read.
+    """
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        records = found["each"]
+        numbers = [each["number"] for each in records]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise RequestError(f"{path} holds no records to go on with: delete it, or name another file with --json") from error
+    other = [name for name, value in about.items() if found.get(name) != value]
+    if other:
+        name = other[0]
+        raise RequestError(
+            f"{path} holds records of another evaluation ({name}: {_short(found.get(name))}, not {_short(about[name])}): "
+            "name another file with --json"
+        )
+    assert len(set(numbers)) == len(numbers)
+    return records
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) < 60 else f"{text[:57]}..."

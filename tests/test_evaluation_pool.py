@@ -1,0 +1,74 @@
+"""Numbers evaluated in processes side by side, and the file that keeps what came of them."""
+
+import functools
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.evaluation_pool import Kept, Record, evaluate_each
+
+
+def squared(offset: int, number: int) -> Record:
+    return {"square": number * number + offset, "process": os.getpid(), "threads": os.environ.get("OMP_NUM_THREADS")}
+
+
+def broken(number: int) -> Record:
+    if number == 2:
+        raise ValueError(f"number {number} is broken")
+    return {"square": number * number}
+
+
+def killed(number: int) -> Record:
+    os._exit(9)
+
+
+def total(records: list[Record]) -> Record:
+    return {"total": sum(record["square"] for record in records), "nothing": float("nan")}
+
+
+def test_results_are_the_same_in_one_process_and_in_several():
+    found: list[dict[int, Record]] = [{}, {}]
+    for workers, into in zip((1, 2), found):
+        evaluate_each(functools.partial(squared, 7), range(6), workers, into.__setitem__)
+    one, two = found
+    assert {number: record["square"] for number, record in one.items()} == {number: number**2 + 7 for number in range(6)}
+    assert {number: record["square"] for number, record in two.items()} == {number: number**2 + 7 for number in range(6)}
+    assert {record["process"] for record in one.values()} == {os.getpid()}
+    assert os.getpid() not in {record["process"] for record in two.values()}
+    assert all(int(record["threads"]) >= 1 for record in two.values())
+
+
+def test_what_goes_wrong_in_a_process_is_told():
+    found: dict[int, Record] = {}
+    with pytest.raises(ValueError, match="number 2 is broken"):
+        evaluate_each(broken, range(3), 2, found.__setitem__)
+    with pytest.raises(RequestError, match="was ended from outside"):
+        evaluate_each(killed, range(3), 2, found.__setitem__)
+
+
+def test_a_file_goes_on_where_it_was_and_holds_one_evaluation(tmp_path: Path):
+    path, about = tmp_path / "kept.json", {"family": "training", "method": "default"}
+    kept = Kept(path, about, total)
+    kept.add(3, {"square": 9, "room": float("inf")})
+    kept.add(1, {"square": 1, "room": 0.5})
+    again = Kept(path, about, total)
+    assert (
+        again.records
+        == kept.records
+        == {1: {"number": 1, "square": 1, "room": 0.5}, 3: {"number": 3, "square": 9, "room": None}}
+    )
+    again.add_all({2: {"square": 4}})
+    found = json.loads(path.read_text())
+    assert found["total"] == 14 and found["nothing"] is None and found["family"] == "training"
+    assert [each["number"] for each in found["each"]] == [1, 2, 3]
+    with pytest.raises(RequestError, match='another evaluation \\(method: "default", not "thesis"\\)'):
+        Kept(path, {**about, "method": "thesis"}, total)
+    path.write_text("{}")
+    with pytest.raises(RequestError, match="holds no records to go on with"):
+        Kept(path, about, total)
+    in_memory = Kept(None, about, total)
+    in_memory.add(1, {"square": 1})
+    assert 1 in in_memory and 2 not in in_memory
