@@ -145,7 +145,8 @@ def _count_and_index() -> tuple[int, int]:
         return 1, 0
     import jax
 
-    return jax.process_count(), jax.process_index()
+    # Without `start` there is no company, and JAX is not made to look for devices, which may not be there.
+    return (jax.process_count(), jax.process_index()) if jax.distributed.is_initialized() else (1, 0)
 
 
 def meet(name: str) -> None:

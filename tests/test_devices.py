@@ -14,11 +14,15 @@ _PROGRAM = """
 import contextlib, io, json, sys
 from jaxrl_vis import cli
 told = []
-for words in json.loads(sys.argv[1]):
+commands = json.loads(sys.argv[1])
+for words in commands:
     out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        status = cli.main(words)
-    told.append([status, out.getvalue(), err.getvalue()])
+    sys.argv = ["jaxrl-vis", *words]
+    try:
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            cli.entry()  # whole, as its end must not look for devices either
+    except SystemExit as end:
+        told.append([end.code, out.getvalue(), err.getvalue()])
 print(json.dumps(told))
 """
 
