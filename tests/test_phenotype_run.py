@@ -287,6 +287,34 @@ def test_eval_compares_with_the_truth(plots, tmp_path, capsys):
     assert "synthetic plots of family" in said and "count_mae" in said
 
 
+def test_eval_in_two_processes_and_after_a_stop_is_the_same(plots, tmp_path, capsys):
+    small = ["--spec", str(plots.parent / "few.json"), "--width", "211", "--frames", "2", "--masks", "truth"]
+
+    def evaluate(name: str, *words: str) -> dict:
+        assert cli.main(["phenotype", "eval", *small, "--json", str(tmp_path / name), *words]) == 0
+        data = json.loads((tmp_path / name).read_text())
+        for each in (data, *data["each"]):  # times are no figures
+            each.pop("seconds_per_pair")
+        data.pop("workers")
+        return data
+
+    both = evaluate("both.json", "--plots", "3", "--workers", "2")
+    assert [each["seed"] for each in both["each"]] == [0, 1, 2] and both["finds"] > 0
+    first = evaluate("one.json", "--plots", "1")
+    assert first["plots"] == 1
+    capsys.readouterr()
+    assert evaluate("one.json", "--plots", "3") == both
+    said = capsys.readouterr().out
+    assert "1 plots are there already" in said and "plot 0:" not in said and "plot 2:" in said
+    # What was evaluated under other conditions is neither mixed with nor lost.
+    for words in (["--method", "ellipse"], ["--frames", "3"]):
+        assert cli.main(["phenotype", "eval", *small, "--json", str(tmp_path / "one.json"), *words]) == 2
+        assert "with another" in capsys.readouterr().err
+    (tmp_path / "other.json").write_text("[]")
+    assert cli.main(["phenotype", "eval", *small, "--json", str(tmp_path / "other.json")]) == 2
+    assert "holds no evaluation to go on with" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("words", "part"),
     [
@@ -296,6 +324,8 @@ def test_eval_compares_with_the_truth(plots, tmp_path, capsys):
         (["train", "weights.npz", "--data", "images"], "there are no annotations"),
         (["train", "weights.npz", "--batch", "0"], "--batch"),
         (["eval", "--seed", "-1"], "--seed must be at least 0"),
+        (["eval", "--workers", "0"], "--workers"),
+        (["eval", "--least-score", "2"], "--least-score must be from 0 to 1"),
         (["eval", "--weights", "missing.npz"], "cannot read the weights"),
         (["eval", "--spec", "missing.toml"], "missing.toml"),
     ],

@@ -93,7 +93,7 @@ def draw(
     order = np.argsort(-work, kind="stable")
     on_cpu = jax.default_backend() == "cpu"
     at_once = min(at_once or (1 if on_cpu else _TILES_AT_ONCE), len(order))
-    workers = (os.cpu_count() or 1) if on_cpu else 1
+    workers = _cores() if on_cpu else 1
     parts = [order[start::workers] for start in range(workers)]
     share = max(map(len, parts))  # all parts have one size, so one program: a missing tile is another one again
     parts = [np.concatenate([part, np.repeat(order[:1], share - len(part))]) for part in parts]
@@ -106,6 +106,11 @@ def draw(
     place[np.concatenate(parts)[::-1]] = np.arange(share * workers)[::-1]
     join = _joiner(tile, width, height)
     return tuple(join(jnp.asarray(place), *(result[part] for result in results)) for part in range(3))  # pyright: ignore
+
+
+def _cores() -> int:
+    """How many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @functools.cache
