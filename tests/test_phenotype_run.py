@@ -15,7 +15,8 @@ from jaxrl_vis.phenotyping.evaluate import PlotScore, average_precision, match, 
 from jaxrl_vis.phenotyping.folders import find_plots, read_odometry
 from jaxrl_vis.phenotyping.heights import USUAL_TAPER, robust_width, widths_of
 from jaxrl_vis.phenotyping.images import read_image
-from jaxrl_vis.phenotyping.sightings import Sighting
+from jaxrl_vis.phenotyping.measure import Measurement
+from jaxrl_vis.phenotyping.sightings import Sighting, _hidden_edges
 from jaxrl_vis.phenotyping.thesis import count_by_length, mean_widths
 from jaxrl_vis.phenotyping.track import Track, follow
 from jaxrl_vis_envs.plants import Calibration
@@ -203,6 +204,23 @@ def test_widths_are_those_at_12_and_24_inches():
     assert USUAL_TAPER != taper and below.lower.error > 0.1  # pyright: ignore[reportOptionalMemberAccess]
     assert unknown.lower.mm == 14.0 and not unknown.height_known  # pyright: ignore[reportOptionalMemberAccess]
     assert nothing.lower is None
+
+
+def test_a_stalk_counts_from_where_it_faces_the_camera():
+    """An oval stalk looks thinner from aside."""
+    stalk = [sighting(0.0, diameter_mm=14.0 - 0.05 * abs(ray), ray_deg=ray) for ray in (-36.0, -24.0, 0.0, 2.0, 24.0, 36.0)]
+    alike = [dataclasses.replace(each, ray_deg=None) for each in stalk]
+    assert robust_width(stalk).mm > 13.5 > robust_width(alike).mm  # pyright: ignore[reportOptionalMemberAccess]
+
+
+def test_an_edge_that_another_stalk_hides_is_not_its_own():
+    def stalk(column: float, depth: float) -> Measurement:
+        return Measurement(14.0, 0.1, line=600.0, column=column, width=40.0, depth=depth, lean=0.1, confidence=0.8)
+
+    # The second stands before the right edge of the first; the third touches nothing, nor does the one that was not measured.
+    found = [stalk(100.0, 0.80), stalk(130.0, 0.77), stalk(300.0, 0.80), Measurement(line=600.0)]
+    assert _hidden_edges(found) == [True, False, False, False]
+    assert _hidden_edges([found[0], dataclasses.replace(found[1], depth=0.799)]) == [False, False]
 
 
 # --- evaluation ---

@@ -21,6 +21,7 @@ ELLIPSE_FITS: tuple[EllipseFit, ...] = ("pixels", "pixels_direct", "contour", "c
 
 _LEAST_LINES = 8
 _SWELLING = 0.12  # of the width: by how much an edge may lie beside that of the rest of a stalk
+_STEP = 1.5  # pixels: an edge that lies further beside the others of its neighbourhood belongs to something else
 _NOISE = (
     0.35  # pixels: how far an edge of a perfect mask lies from the line through it (0.29, the error of rounding, and some more)
 )
@@ -123,7 +124,9 @@ def strip_width(mask: np.ndarray, threshold: float = 0.5) -> Strip | None:
 
 
 def strip_near(mask: np.ndarray, strip: Strip, line: float, reach: float, threshold: float = 0.5) -> Strip | None:
-    """The edges of a stalk near a line, as two straight lines: what it is like there, and not where a sheath covers it.
+    """The edges of a stalk near a line: what it is like there, and not where a sheath covers it.
+
+    Slopes are those of the whole strip, which many more lines tell.
 
     Args:
         mask: As of `strip_width`.
@@ -139,12 +142,29 @@ def strip_near(mask: np.ndarray, strip: Strip, line: float, reach: float, thresh
     if last - first < _LEAST_LINES:
         return None
     place, left, right = line_edges(mask[first:last], threshold)
-    near = fit_edges(place + first, left, right)
-    if near is None or near.used * place.size < 0.5 * (last - first) or not near.first <= line <= near.last:
-        return None
+    place = place + first
+    offset = place - strip.reference
+    beside = [edge - fit[0] - fit[1] * offset for edge, fit in zip((left, right), (strip.left, strip.right))]
     tolerance = max(3.0, _SWELLING * strip.width(line))
-    aside = np.subtract(near.edges(line), strip.edges(line))
-    return near if bool((np.abs(aside) < tolerance).all()) else None
+    good = np.logical_and(*(np.abs(each) < tolerance for each in beside))
+    for each in beside:
+        good &= np.abs(each - _mode(each[good])) < _STEP if good.any() else False
+    count = int(good.sum())
+    if count < max(_LEAST_LINES, 0.5 * (last - first)) or not place[good].min() <= line <= place[good].max():
+        return None
+    moved = [float(each[good].mean()) for each in beside]
+    rms = float(np.sqrt(np.mean([np.var(each[good]) for each in beside])))
+    edges = [(edge + shift, fit[1]) for edge, shift, fit in zip(strip.edges(line), moved, (strip.left, strip.right))]
+    return Strip(
+        reference=line,
+        left=edges[0],
+        right=edges[1],
+        first=int(place[good].min()),
+        last=int(place[good].max()),
+        used=count / (last - first),
+        residual=rms,
+        deviation=math.sqrt(2.0) * max(rms, 0.05) / math.sqrt(count),
+    )
 
 
 def fit_edges(line: np.ndarray, left: np.ndarray, right: np.ndarray) -> Strip | None:
