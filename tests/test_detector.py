@@ -1,5 +1,6 @@
 """The networks that find and outline stalks: operators against torchvision's, codes, snips, training and files of weights."""
 
+import dataclasses
 from pathlib import Path
 
 import jax
@@ -17,9 +18,16 @@ from jaxrl_vis.phenotyping.detector.losses import NOTHING, STALK, UNCLEAR, assig
 from jaxrl_vis.phenotyping.detector.snips import cut, put_back, snip_shape
 from jaxrl_vis.phenotyping.detector.weights import read_weights, write_weights
 from jaxrl_vis.phenotyping.images import rgb8
-from jaxrl_vis.phenotyping.training.augment import move
-from jaxrl_vis.phenotyping.training.examples import Example, _instance_masks, annotated_examples, settings_for
+from jaxrl_vis.phenotyping.training.augment import move, vary_snips
+from jaxrl_vis.phenotyping.training.examples import (
+    Example,
+    _instance_masks,
+    annotated_examples,
+    settings_for,
+    synthetic_examples,
+)
 from jaxrl_vis.phenotyping.training.loop import Plan, train
+from jaxrl_vis_envs.plants import family
 
 RECORDED = np.load(Path(__file__).parent / "data" / "torchvision_boxes.npz")
 TINY = Settings(
@@ -230,6 +238,32 @@ def test_masks_of_snips_are_cut_out_of_what_each_pixel_shows():
     for part, mask in enumerate(masks):
         np.testing.assert_array_equal(mask, np.asarray(cut(instance == part, places[part : part + 1], (48, 16)))[0])
         assert mask.any()
+
+
+def test_synthetic_examples_hold_snips_around_both_heights():
+    layout = family.Layout(rows_behind=0, stalks_mean=12, stalks_sd=0, tillers=0.0, plot_length=0.8)
+    stalks = family.Stalks(diameter_mean=0.03, lean_sd=(0.0, 0.0))
+    few = dataclasses.replace(family.TRAINING, layout=layout, stalks=stalks).at_width(211)
+    (example,) = synthetic_examples(few, Settings(), [3], frames=1)
+    clear = int((example.kinds == STALK).sum())
+    assert clear < len(example.snips) <= 2 * clear and example.snips.shape[1:] == (40, 16, 3)
+    assert example.masks.shape == example.snips.shape[:3]
+    # The stalk stands in the middle of its snip, at the upper height, too.
+    middle = example.masks[:, 10:30, 7:9].mean(axis=(1, 2))
+    assert np.median(middle[:clear]) > 0.6 and np.median(middle[clear:]) > 0.6
+
+
+def test_snips_are_varied_and_their_masks_stay_with_them():
+    """A bright strip on black ground: whatever is done to it, it is where its mask is, and the ground stays dark."""
+    snips, masks = np.zeros((24, 64, 48, 3), np.uint8), np.zeros((24, 64, 48), bool)
+    snips[:, :, 14:30], masks[:, :, 14:30] = 150, True
+    varied, moved = map(np.asarray, vary_snips(jnp.asarray(snips), jnp.asarray(masks), jax.random.key(0)))
+    assert moved.shape == masks.shape and varied.dtype == np.uint8
+    inside = np.array([image[mask].mean() for image, mask in zip(varied, moved)])
+    outside = np.array([image[~mask].mean() for image, mask in zip(varied, moved)])
+    assert (inside > 2.0 * outside).all() and inside.max() > 2.0 * inside.min()
+    widths = moved[:, 32].sum(axis=-1)
+    assert widths.min() < 14 and widths.max() > 18
 
 
 def test_what_fails_to_make_examples_is_told():

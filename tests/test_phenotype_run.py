@@ -15,7 +15,8 @@ from jaxrl_vis.phenotyping.evaluate import PlotScore, average_precision, match, 
 from jaxrl_vis.phenotyping.folders import find_plots, read_odometry
 from jaxrl_vis.phenotyping.heights import USUAL_TAPER, robust_width, widths_of
 from jaxrl_vis.phenotyping.images import read_image
-from jaxrl_vis.phenotyping.sightings import Sighting
+from jaxrl_vis.phenotyping.measure import Measurement
+from jaxrl_vis.phenotyping.sightings import Sighting, _hidden_edges
 from jaxrl_vis.phenotyping.thesis import count_by_length, mean_widths
 from jaxrl_vis.phenotyping.track import Track, follow
 from jaxrl_vis_envs.plants import Calibration
@@ -205,6 +206,23 @@ def test_widths_are_those_at_12_and_24_inches():
     assert nothing.lower is None
 
 
+def test_a_stalk_counts_from_where_it_faces_the_camera():
+    """An oval stalk looks thinner from aside."""
+    stalk = [sighting(0.0, diameter_mm=14.0 - 0.05 * abs(ray), ray_deg=ray) for ray in (-36.0, -24.0, 0.0, 2.0, 24.0, 36.0)]
+    alike = [dataclasses.replace(each, ray_deg=None) for each in stalk]
+    assert robust_width(stalk).mm > 13.5 > robust_width(alike).mm  # pyright: ignore[reportOptionalMemberAccess]
+
+
+def test_an_edge_that_another_stalk_hides_is_not_its_own():
+    def stalk(column: float, depth: float) -> Measurement:
+        return Measurement(14.0, 0.1, line=600.0, column=column, width=40.0, depth=depth, lean=0.1, confidence=0.8)
+
+    # The second stands before the right edge of the first; the third touches nothing, nor does the one that was not measured.
+    found = [stalk(100.0, 0.80), stalk(130.0, 0.77), stalk(300.0, 0.80), Measurement(line=600.0)]
+    assert _hidden_edges(found) == [True, False, False, False]
+    assert _hidden_edges([found[0], dataclasses.replace(found[1], depth=0.799)]) == [False, False]
+
+
 # --- evaluation ---
 
 
@@ -287,6 +305,34 @@ def test_eval_compares_with_the_truth(plots, tmp_path, capsys):
     assert "synthetic plots of family" in said and "count_mae" in said
 
 
+def test_eval_in_two_processes_and_after_a_stop_is_the_same(plots, tmp_path, capsys):
+    small = ["--spec", str(plots.parent / "few.json"), "--width", "211", "--frames", "2", "--masks", "truth"]
+
+    def evaluate(name: str, *words: str) -> dict:
+        assert cli.main(["phenotype", "eval", *small, "--json", str(tmp_path / name), *words]) == 0
+        data = json.loads((tmp_path / name).read_text())
+        for each in (data, *data["each"]):  # times are no figures
+            each.pop("seconds_per_pair")
+        data.pop("workers")
+        return data
+
+    both = evaluate("both.json", "--plots", "3", "--workers", "2")
+    assert [each["seed"] for each in both["each"]] == [0, 1, 2] and both["finds"] > 0
+    first = evaluate("one.json", "--plots", "1")
+    assert first["plots"] == 1
+    capsys.readouterr()
+    assert evaluate("one.json", "--plots", "3") == both
+    said = capsys.readouterr().out
+    assert "1 plots are there already" in said and "plot 0:" not in said and "plot 2:" in said
+    # What was evaluated under other conditions is neither mixed with nor lost.
+    for words in (["--method", "ellipse"], ["--frames", "3"]):
+        assert cli.main(["phenotype", "eval", *small, "--json", str(tmp_path / "one.json"), *words]) == 2
+        assert "with another" in capsys.readouterr().err
+    (tmp_path / "other.json").write_text("[]")
+    assert cli.main(["phenotype", "eval", *small, "--json", str(tmp_path / "other.json")]) == 2
+    assert "holds no evaluation to go on with" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("words", "part"),
     [
@@ -296,6 +342,8 @@ def test_eval_compares_with_the_truth(plots, tmp_path, capsys):
         (["train", "weights.npz", "--data", "images"], "there are no annotations"),
         (["train", "weights.npz", "--batch", "0"], "--batch"),
         (["eval", "--seed", "-1"], "--seed must be at least 0"),
+        (["eval", "--workers", "0"], "--workers"),
+        (["eval", "--least-score", "2"], "--least-score must be from 0 to 1"),
         (["eval", "--weights", "missing.npz"], "cannot read the weights"),
         (["eval", "--spec", "missing.toml"], "missing.toml"),
     ],

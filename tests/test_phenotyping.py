@@ -15,7 +15,7 @@ from jaxrl_vis.phenotyping.ground import find_ground
 from jaxrl_vis.phenotyping.images import read_disparity, read_image, write_image
 from jaxrl_vis.phenotyping.metric import diameter_mm, tilt_of
 from jaxrl_vis.phenotyping.stereo import match_rows, match_sgbm
-from jaxrl_vis.phenotyping.width import ELLIPSE_FITS, ellipse_width, strip_width
+from jaxrl_vis.phenotyping.width import ELLIPSE_FITS, ellipse_width, strip_near, strip_width
 from jaxrl_vis_envs.plants import Calibration
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -72,6 +72,21 @@ def test_leaves_and_nodes_do_not_change_a_strip():
     assert found.lean == pytest.approx(np.radians(7.0), abs=0.003)
     assert found.used < clean.used - 0.1
     assert found.confidence < clean.confidence
+
+
+def test_a_sheath_elsewhere_does_not_matter_where_a_width_is_taken():
+    """A sheath of 1.5 pixels on either side from line 120 to 240; from line 330 on, a leaf hides one edge."""
+    line = np.arange(400)[:, None]
+    half = np.where((line >= 120) & (line < 240), 21.5, 20.0)
+    mask = np.abs(np.arange(120)[None, :] - 60.3 - 0.05 * line) < half
+    mask[330:] &= np.arange(120) < 75
+    strip = strip_width(mask)
+    across = np.cos(strip.lean)
+    for place, true in ((180.0, 43.0), (60.0, 40.0), (270.0, 40.0)):
+        assert strip_near(mask, strip, place, 45.0).width(place) == pytest.approx(true * across, abs=0.3)
+    assert abs(strip.width(180.0) - 43.0) > 1.0  # as a whole, it is bare
+    assert strip_near(mask, strip, 390.0, 50.0) is None  # one edge is that of what hides the other
+    assert strip_near(mask, strip, 600.0, 50.0) is None  # beyond the mask
 
 
 def test_taper_is_followed():

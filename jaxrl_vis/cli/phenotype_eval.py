@@ -4,14 +4,18 @@ import dataclasses
 import json
 import math
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from jaxrl_vis.cli.checks import check_counts, check_extra
 from jaxrl_vis.cli.families import family_of
-from jaxrl_vis.cli.phenotype_run import networks
+from jaxrl_vis.cli.phenotype_run import networks, weights_of
 from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.report.outputs import check_writable
+
+if TYPE_CHECKING:
+    from jaxrl_vis.phenotyping.evaluation import Scorers
+    from jaxrl_vis_envs.plants import Family
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,26 +48,40 @@ class Eval:
     """Also what the thesis's ways (ellipses, semi-global matching, stalks per metre of image) make of the same finds."""
     each_factor: bool = False
     """A table: the training family, each factor of the world shifted alone, and all of them; --plots of each."""
+    workers: int = 1
+    """How many processes score plots, each a plot of its own; they share the GPUs that there are. About one for each core, if
+    there is memory: 2 GB each. Figures do not depend on it, times do."""
     json: Path | None = None
-    """A file for the figures of all plots together and of each; written after each plot."""
+    """A file for the figures of all plots together and of each; written after each plot. Plots that it holds already, of the
+    same conditions, are not scored again. With --each-factor, the table; the files of the factors go beside it."""
 
 
 def evaluate(options: Eval) -> int:
     """Prints the figures."""
-    check_counts(plots=options.plots, frames=options.frames, width=options.width)
+    check_counts(plots=options.plots, frames=options.frames, width=options.width, workers=options.workers)
     if options.seed < 0:
         raise RequestError(f"--seed must be at least 0, not {options.seed}")
+    if not 0.0 <= options.least_score <= 1.0:
+        raise RequestError(f"--least-score must be from 0 to 1, not {options.least_score:g}")
     check_extra("phenotype", "phenotyping")
     if options.json is not None:
         check_writable(options.json, "--json")
-    if options.each_factor and (options.family or options.shift or options.spec or options.json):
-        raise RequestError("--each-factor goes through the families by itself: leave out --family, --shift, --spec and --json")
+    if options.each_factor and (options.family or options.shift or options.spec):
+        raise RequestError("--each-factor goes through the families by itself: leave out --family, --shift and --spec")
     family = family_of(options, "phenotyping", "shifted")
+    from jaxrl_vis.phenotyping.evaluation import Scorers, share_devices
+
+    if options.workers > 1:
+        share_devices()
     check_devices()
-    find, name = (None, "truth") if options.masks == "truth" else networks(options.weights, 0.05)
-    if options.each_factor:
-        return _factor_table(options, find, name)
-    figures = _score(options, family, find, name)
+    weights, name = None, "truth"
+    if options.masks == "network":
+        networks(options.weights, options.least_score)  # says what is wrong with the weights
+        weights, name = weights_of(options.weights)
+    with Scorers(options.workers) as scorers:
+        if options.each_factor:
+            return _factor_table(options, weights, name, scorers)
+        figures = _score(options, family, weights, name, scorers, options.json)
     print(f"synthetic plots of family {family.name}, {name}, {options.method}:")
     for each, value in figures.items():
         print(f"  {each:24} {value if isinstance(value, int) else f'{value:.4f}'}")
@@ -73,17 +91,22 @@ def evaluate(options: Eval) -> int:
 _COLUMNS = ("count_r2", "count_mae", "count_bias", "width_mae_mm", "width_bias_mm", "ap50", "f1")
 
 
-def _factor_table(options: Eval, find: Any, name: str) -> int:
+def _factor_table(options: Eval, weights: Path | None, name: str, scorers: "Scorers") -> int:
     """Prints a line of Markdown for each factor that is shifted alone."""
+    from jaxrl_vis.files import write_atomically
     from jaxrl_vis_envs.plants import SHIFTS
 
     alone = [(factor, dataclasses.replace(options, family="training", shift=(factor,))) for factor in SHIFTS]
     none, all_of_them = (dataclasses.replace(options, family=name) for name in ("training", "shifted"))
-    lines = []
+    lines, table = [], {}
     for factor, drawn in [("none", none), *alone, ("all", all_of_them)]:
-        family = family_of(drawn, "phenotyping")
-        figures = _score(options, family, find, name)
+        path = options.json and options.json.with_name(f"{options.json.stem}-{factor}.json")
+        figures = _score(options, family_of(drawn, "phenotyping"), weights, name, scorers, path)
         lines.append(f"| {factor} | " + " | ".join(f"{figures[column]:.3f}" for column in _COLUMNS) + " |")
+        table[factor] = {column: value if math.isfinite(value) else None for column, value in figures.items()}
+        if options.json is not None:
+            about = {"synthetic": True, "finder": name, "method": options.method, "factors": table}
+            write_atomically(options.json, json.dumps(about, indent=2) + "\n")
     print(f"\nsynthetic plots, {options.plots} each, {name}, {options.method}\n")
     print("| shifted | " + " | ".join(_COLUMNS) + " |")
     print("|---|" + "---|" * len(_COLUMNS))
@@ -91,49 +114,38 @@ def _factor_table(options: Eval, find: Any, name: str) -> int:
     return 0
 
 
-def _score(options: Eval, family: Any, find: Any, name: str) -> dict[str, Any]:
-    """Figures of all plots of a family together; says something of each plot, and writes the file that was asked for."""
+def _score(
+    options: Eval, family: "Family", weights: Path | None, name: str, scorers: "Scorers", path: Path | None
+) -> dict[str, Any]:
+    """Figures of all plots of a family together; says something of each plot, and keeps the file at ``path``."""
     from jaxrl_vis import __version__
-    from jaxrl_vis.files import write_atomically
-    from jaxrl_vis.phenotyping.evaluate import score_plot, summary
-    from jaxrl_vis.provenance import device_name
+    from jaxrl_vis.phenotyping.evaluate import summary
+    from jaxrl_vis.phenotyping.evaluation import Task, conditions, read_scores, write_evaluation
+    from jaxrl_vis.provenance import device_name, revision
 
-    scores = []
-    for seed in range(options.seed, options.seed + options.plots):
-        score = score_plot(family, seed, find, options.method, options.least_score, options.thesis)
-        scores.append(score)
+    task = Task(family, weights, options.method, options.least_score, options.thesis)
+    same = conditions(task)
+    about = {
+        "device": device_name(),
+        "workers": options.workers,
+        "version": __version__,
+        "revision": revision(),
+        "finder": name,
+        "method": options.method,
+    }
+    scores = [] if path is None else read_scores(path, same)
+    wanted = range(options.seed, options.seed + options.plots)
+    there = {each.seed for each in scores}
+    if there:
+        print(f"{path}: {len(there)} plots are there already", flush=True)
+    for score in scorers.scores(task, [seed for seed in wanted if seed not in there]):
+        scores = sorted([*scores, score], key=lambda each: each.seed)
         one = summary([score], options.least_score)
         print(
-            f"plot {seed}: {score.counted} of {score.true} stalks, "
+            f"plot {score.seed}: {score.counted} of {score.true} stalks, "
             f"width error {one['width_mae_mm']:.2f} mm, F1 {one['f1']:.3f}",
             flush=True,
         )
-        if options.json is not None:
-            figures = summary(scores, options.least_score)
-            each_plot = [
-                {
-                    "seed": each.seed,
-                    "true": each.true,
-                    "counted": each.counted,
-                    "widths_mm": each.widths.round(4).tolist(),
-                    "seconds_per_pair": None if math.isnan(each.seconds) else round(each.seconds, 4),
-                    "pairs": family.rig.frames,
-                }
-                for each in scores
-            ]
-            about = {
-                "synthetic": True,
-                "device": device_name(),
-                "version": __version__,
-                "family": family.name,
-                "finder": name,
-                "method": options.method,
-            }
-            text = json.dumps({**about, **_finite(figures), "each": each_plot}, indent=2)
-            write_atomically(options.json, text + "\n")
+        if path is not None:
+            write_evaluation(path, about, same, scores, task)
     return summary(scores, options.least_score)
-
-
-def _finite(figures: dict) -> dict:
-    """What JSON can hold: None in place of what is not a number."""
-    return {name: value if math.isfinite(value) else None for name, value in figures.items()}

@@ -106,17 +106,29 @@ def networks(weights: Path | None, least_score: float):
         RequestError: The weights cannot be read.
     """
     from jaxrl_vis.phenotyping.detector.finder import Finder
-    from jaxrl_vis.phenotyping.detector.weights import SHIPPED, read_weights
+    from jaxrl_vis.phenotyping.detector.weights import read_weights
+
+    path, name = weights_of(weights)
+    params, settings, _ = read_weights(path)
+    return Finder(params, settings, least_score), f"{name}, least score {least_score:g}"
+
+
+def weights_of(weights: Path | None) -> tuple[Path, str]:
+    """The file of the networks' weights, the shipped one if none is named, and what tells the networks apart.
+
+    Raises:
+        RequestError: There is no such file.
+    """
+    from jaxrl_vis.phenotyping.detector.weights import SHIPPED
 
     path = SHIPPED if weights is None else weights
     if weights is None and not path.exists():
         raise RequestError(
             "no weights come with this version: make some with `jaxrl-vis phenotype train`, and name them with --weights"
         )
-    params, settings, _ = read_weights(path)
-    finder = Finder(params, settings, least_score)
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
-    return finder, f"networks {digest}, least score {least_score:g}"
+    if not path.is_file():
+        raise RequestError(f"cannot read the weights {path}: no such file")
+    return path, f"networks {hashlib.sha256(path.read_bytes()).hexdigest()[:12]}"
 
 
 class CalibrationOptions(Protocol):

@@ -21,6 +21,9 @@ _TAPER_SPREAD = 0.3  # of a stalk's own taper about the plot's, of 1
 _ENOUGH = 5
 _FURTHEST = 4.0 * INCH  # m: what was measured further away says nothing of a height
 _NEAR = 0.5 * INCH  # m: taper within that does not matter
+_ASIDE = (
+    20.0  # degrees beside the cameras' axis: from there another side of an oval stalk is seen than the one that faces the row
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,12 +72,18 @@ def widths_of(frames: list[list[Sighting]], tracks: list[Track]) -> list[StalkWi
 
 def _of_stalk(sightings: list[Sighting], taper: float) -> StalkWidths:
     known = [each for each in sightings if each.height_m is not None]
-    lower = _at(LOWER, [(e.diameter_mm, e.deviation_mm, e.height_m, e.confidence) for e in known], taper)
-    upper = _at(UPPER, [(e.upper_mm, e.upper_deviation_mm, e.upper_height_m, e.upper_confidence) for e in sightings], taper)
+    lower = _at(LOWER, [(e.diameter_mm, e.deviation_mm, e.height_m, e.confidence * _facing(e)) for e in known], taper)
+    above = [(e.upper_mm, e.upper_deviation_mm, e.upper_height_m, e.upper_confidence * _facing(e)) for e in sightings]
+    upper = _at(UPPER, above, taper)
     if lower is None:
         return StalkWidths(robust_width(sightings), upper, None, False)
     own = None if upper is None else (lower.mm - upper.mm) / ((UPPER - LOWER) / INCH)
     return StalkWidths(lower, upper, own, True)
+
+
+def _facing(sighting: Sighting) -> float:
+    """How much a sighting says of the side of a stalk that faces the row, 0 to 1."""
+    return 1.0 if sighting.ray_deg is None else math.exp(-((sighting.ray_deg / _ASIDE) ** 2))
 
 
 def _at(height: float, values: list[tuple[float | None, float | None, float | None, float]], taper: float) -> Width | None:
@@ -95,7 +104,7 @@ def _at(height: float, values: list[tuple[float | None, float | None, float | No
 def robust_width(sightings: list[Sighting]) -> Width | None:
     """Diameter of a stalk wherever it was measured; None if it never was."""
     measured = [each for each in sightings if each.diameter_mm is not None]
-    values = [(each.diameter_mm, each.deviation_mm or 0.0, each.confidence) for each in measured]
+    values = [(each.diameter_mm, each.deviation_mm or 0.0, each.confidence * _facing(each)) for each in measured]
     return _robust(np.array(values, float).reshape(-1, 3))
 
 

@@ -9,11 +9,12 @@ import numpy as np
 from jaxrl_vis.phenotyping.ground import Ground
 from jaxrl_vis.phenotyping.metric import diameter_mm, tilt_of
 from jaxrl_vis.phenotyping.stereo import StalkDisparity, match_rows, sample_rows
-from jaxrl_vis.phenotyping.width import Strip, ellipse_width, strip_width
+from jaxrl_vis.phenotyping.width import Strip, ellipse_width, strip_near, strip_width
 from jaxrl_vis_envs.plants import Calibration
 
 Method = Literal["strip", "ellipse"]
 _WINDOWS = 16
+_REACH = 0.025  # m along a stalk: sheaths and nodes further away do not matter
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,6 +81,7 @@ def measure(
     strip = strip_width(mask)
     if strip is None:
         return Measurement(reason="too few lines show both edges")
+    confidence = strip.confidence
     place = strip.reference if line is None else line - corner[0]
     matched = _disparity(strip, corner, left, right, calibration, depths, disparity)
     if ground is not None and height is not None:
@@ -91,6 +93,7 @@ def measure(
     depth = float(calibration.depth(np.array(beside)))
     if not depths[0] <= depth <= depths[1]:
         return Measurement(line=place + corner[0], depth=depth, lean=strip.lean, reason=f"it stands {depth:.2f} m away")
+    strip = strip_near(mask, strip, place, _REACH * calibration.focal / depth) or strip
     middle = 0.5 * sum(strip.edges(place))
     pixels = strip.width(place) if method == "strip" else ellipse_width(mask)
     if pixels is None:
@@ -114,7 +117,7 @@ def measure(
         height=math.nan if ground is None else ground.height(middle + corner[1], place + corner[0], depth, calibration),
         lean=strip.lean,
         tilt=tilt,
-        confidence=strip.confidence * min(matched.values.size / max(matched.tried, 1), 1.0),
+        confidence=confidence * min(matched.values.size / max(matched.tried, 1), 1.0),
     )
 
 

@@ -15,6 +15,9 @@ from jaxrl_vis_envs.plants import Calibration
 from jaxrl_vis_envs.plants.truth import HEIGHTS
 
 NO_CALIBRATION = "no calibration"
+_HIDDEN = 0.1  # of its confidence that a sighting keeps if another stalk hides one of its edges
+_IN_FRONT = 0.003  # m
+_TOUCHING = 0.1  # of half a stalk's width: edges so near are one
 _SAME_DEPTH = 0.06  # m, within 12 inches of a stalk that leans by 10 degrees
 
 
@@ -38,6 +41,7 @@ class Sighting:
             around 24 inches above the ground.
         upper_place: Column, line and width in pixels of that.
         confidence: 0 to 1.
+        ray_deg: Angle between the left camera's axis and the ray to it, degrees, positive to the right.
         reason: Why it was not measured; empty where it was.
     """
 
@@ -59,6 +63,7 @@ class Sighting:
     upper_confidence: float = 0.0
     upper_place: tuple[float, float, float] | None = None
     confidence: float = 0.0
+    ray_deg: float | None = None
     reason: str = ""
 
     @classmethod
@@ -96,7 +101,7 @@ def look(
     if calibration is None:
         return [_in_pixels(each) for each in detections]
     grey_left, grey_right = grey_of(left), grey_of(right)
-    found = []
+    measured: list[tuple[Measurement, Measurement | None]] = []
     for each in detections:
         line = 0.5 * (each.box[1] + each.box[3])
         images = (grey_left, grey_right, calibration)
@@ -106,8 +111,27 @@ def look(
         upper = None
         if ground is not None and each.upper is not None:
             upper = measure(*each.upper, *images, method=method, ground=ground, height=HEIGHTS[1], disparity=disparity)
-        found.append(_sighting(each, got, upper, calibration))
-    return found
+        measured.append((got, upper))
+    hidden = _hidden_edges([got for got, _ in measured])
+    return [
+        _sighting(each, dataclasses.replace(got, confidence=got.confidence * (_HIDDEN if behind else 1.0)), upper, calibration)
+        for each, (got, upper), behind in zip(detections, measured, hidden)
+    ]
+
+
+def _hidden_edges(found: list[Measurement]) -> list[bool]:
+    """Which stalks have an edge where another one stands in front: it is the other one's edge, and they look too thin."""
+    hidden = []
+    for each in found:
+        half = 0.5 * each.width / math.cos(each.lean) if each.diameter_mm is not None else math.nan
+        hidden.append(False)
+        for other in found:
+            if each.diameter_mm is None or other.diameter_mm is None or not other.depth < each.depth - _IN_FRONT:
+                continue
+            middle = other.column + math.tan(other.lean) * (other.line - each.line)
+            reach = 0.5 * other.width / math.cos(other.lean) + _TOUCHING * half
+            hidden[-1] |= any(abs(each.column + side * half - middle) < reach for side in (-1.0, 1.0))
+    return hidden
 
 
 def _in_pixels(detection: Detection) -> Sighting:
@@ -167,5 +191,6 @@ def _sighting(detection: Detection, got: Measurement, upper: Measurement | None,
         if higher.diameter_mm is None
         else tuple(round(x, 2) for x in (higher.column, higher.line, higher.width)),  # pyright: ignore[reportArgumentType]
         confidence=round(got.confidence, 4),
+        ray_deg=round(math.degrees(math.atan((column - calibration.centre[0]) / calibration.focal)), 2),
         reason=got.reason,
     )

@@ -1,7 +1,7 @@
 """Width of a stalk's mask in pixels, across its axis: by its two edges (`strip_width`), or by ellipses as in the thesis.
 
     mask -> left and right edge in each line, to a fraction of a pixel      `line_edges`
-         -> one straight line through each, deaf to outliers                `strip_width`
+         -> one straight line through each, deaf to outliers                `strip_width`, near one line `strip_near`
          -> their distance across the axis, at any line                     `Strip.width`
 
 An ellipse is no strip: its minor axis misses the width of one by -19 to +16 %, depending on how it is fitted
@@ -20,6 +20,8 @@ ELLIPSE_FITS: tuple[EllipseFit, ...] = ("pixels", "pixels_direct", "contour", "c
 """Ways to fit an ellipse to a blob. ``pixels``, least squares over all its pixels, is what the thesis describes."""
 
 _LEAST_LINES = 8
+_SWELLING = 0.12  # of the width: by how much an edge may lie beside that of the rest of a stalk
+_STEP = 1.5  # pixels: an edge that lies further beside the others of its neighbourhood belongs to something else
 _NOISE = (
     0.35  # pixels: how far an edge of a perfect mask lies from the line through it (0.29, the error of rounding, and some more)
 )
@@ -119,6 +121,50 @@ def strip_width(mask: np.ndarray, threshold: float = 0.5) -> Strip | None:
         The strip; None where fewer than eight lines agree.
     """
     return fit_edges(*line_edges(mask, threshold))
+
+
+def strip_near(mask: np.ndarray, strip: Strip, line: float, reach: float, threshold: float = 0.5) -> Strip | None:
+    """The edges of a stalk near a line: what it is like there, and not where a sheath covers it.
+
+    Slopes are those of the whole strip, which many more lines tell.
+
+    Args:
+        mask: As of `strip_width`.
+        strip: What that made of the whole mask.
+        line: Of the mask.
+        reach: How far above and below the line edges are looked at, pixels.
+        threshold: What belongs to the stalk.
+
+    Returns:
+        The strip; None where less than half of the lines there agree, or they do not go with the rest of the stalk.
+    """
+    first, last = max(math.floor(line - reach), 0), min(math.ceil(line + reach) + 1, mask.shape[0])
+    if last - first < _LEAST_LINES:
+        return None
+    place, left, right = line_edges(mask[first:last], threshold)
+    place = place + first
+    offset = place - strip.reference
+    beside = [edge - fit[0] - fit[1] * offset for edge, fit in zip((left, right), (strip.left, strip.right))]
+    tolerance = max(3.0, _SWELLING * strip.width(line))
+    good = np.logical_and(*(np.abs(each) < tolerance for each in beside))
+    for each in beside:
+        good &= np.abs(each - _mode(each[good])) < _STEP if good.any() else False
+    count = int(good.sum())
+    if count < max(_LEAST_LINES, 0.5 * (last - first)) or not place[good].min() <= line <= place[good].max():
+        return None
+    moved = [float(each[good].mean()) for each in beside]
+    rms = float(np.sqrt(np.mean([np.var(each[good]) for each in beside])))
+    edges = [(edge + shift, fit[1]) for edge, shift, fit in zip(strip.edges(line), moved, (strip.left, strip.right))]
+    return Strip(
+        reference=line,
+        left=edges[0],
+        right=edges[1],
+        first=int(place[good].min()),
+        last=int(place[good].max()),
+        used=count / (last - first),
+        residual=rms,
+        deviation=math.sqrt(2.0) * max(rms, 0.05) / math.sqrt(count),
+    )
 
 
 def fit_edges(line: np.ndarray, left: np.ndarray, right: np.ndarray) -> Strip | None:

@@ -12,6 +12,7 @@ cores; on an accelerator many at a time, those with equally much in them togethe
 import concurrent.futures
 import functools
 import os
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -27,6 +28,9 @@ _GROUND_FAR = 3.5  # m: what is behind is black
 # Each ray of a pixel has a column and a line of its own, so that edges of any direction are smooth.
 _RAYS = {1: ((0.0, 0.0),), 4: ((-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375))}
 _TILES_AT_ONCE = 256  # on an accelerator
+# Surfaces that are tried in one step of the loop over them. On an accelerator, what rays have met so far is read and written in
+# each step, which takes longer than trying a surface does.
+_SURFACES_AT_ONCE = 8
 
 
 class Shot(NamedTuple):
@@ -93,12 +97,12 @@ def draw(
     order = np.argsort(-work, kind="stable")
     on_cpu = jax.default_backend() == "cpu"
     at_once = min(at_once or (1 if on_cpu else _TILES_AT_ONCE), len(order))
-    workers = (os.cpu_count() or 1) if on_cpu else 1
+    workers = _cores() if on_cpu else 1
     parts = [order[start::workers] for start in range(workers)]
     share = max(map(len, parts))  # all parts have one size, so one program: a missing tile is another one again
     parts = [np.concatenate([part, np.repeat(order[:1], share - len(part))]) for part in parts]
     tile = tile_of(width)
-    program = _program(samples, tile, at_once)
+    program = _program(samples, tile, at_once, 1 if on_cpu else _SURFACES_AT_ONCE)
     jobs = [(view.tiles[part], view.cone_ranges[part], view.triangle_ranges[part]) for part in parts]
     with concurrent.futures.ThreadPoolExecutor(workers) as pool:
         results = list(pool.map(lambda job: jax.block_until_ready(program(tables, shot, *job)), jobs))
@@ -106,6 +110,11 @@ def draw(
     place[np.concatenate(parts)[::-1]] = np.arange(share * workers)[::-1]
     join = _joiner(tile, width, height)
     return tuple(join(jnp.asarray(place), *(result[part] for result in results)) for part in range(3))  # pyright: ignore
+
+
+def _cores() -> int:
+    """How many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @functools.cache
@@ -122,12 +131,12 @@ def _joiner(tile: int, width: int, height: int):
 
 
 @functools.cache
-def _program(samples: int, size: int, at_once: int):
+def _program(samples: int, size: int, at_once: int, surfaces: int):
     """The compiled drawing of a list of tiles."""
 
     def program(tables: _Tables, shot: Shot, tiles: jax.Array, cone_ranges: jax.Array, triangle_ranges: jax.Array):
         def one(tile: tuple[jax.Array, jax.Array, jax.Array]):
-            return _tile(tables, shot, samples, size, *tile)
+            return _tile(tables, shot, samples, size, surfaces, *tile)
 
         return jax.lax.map(one, (tiles, cone_ranges, triangle_ranges), batch_size=None if at_once == 1 else at_once)
 
@@ -137,7 +146,14 @@ def _program(samples: int, size: int, at_once: int):
 
 
 def _tile(
-    tables: _Tables, shot: Shot, samples: int, size: int, corner: jax.Array, cone_range: jax.Array, triangle_range: jax.Array
+    tables: _Tables,
+    shot: Shot,
+    samples: int,
+    size: int,
+    surfaces: int,
+    corner: jax.Array,
+    cone_range: jax.Array,
+    triangle_range: jax.Array,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """One tile: radiance [size, size, 3], instance and depth [size, size]."""
     offsets = np.array(_RAYS[samples] if samples == 1 else ((0.0, 0.0), *_RAYS[samples]), np.float32)
@@ -146,7 +162,7 @@ def _tile(
     column, line = jnp.broadcast_arrays(column, line)
     line = line - shot.lines[0] - shot.lines[1] * (column - shot.centre[0])
     x, y = (column - shot.centre[0]) / shot.focal, (line - shot.centre[1]) / shot.focal
-    hit = _nearest(tables, shot, x, y, cone_range, triangle_range)
+    hit = _nearest(tables, shot, x, y, surfaces, cone_range, triangle_range)
     middle = _Hit(*(part[0] for part in hit))
     if samples > 1:
         hit, x, y = _Hit(*(part[1:] for part in hit)), x[1:], y[1:]
@@ -159,8 +175,16 @@ def _tile(
     return radiance, instance, jnp.where(middle.kind > 0, middle.depth, jnp.inf)
 
 
-def _nearest(tables: _Tables, shot: Shot, x: jax.Array, y: jax.Array, cone_range: jax.Array, triangle_range: jax.Array) -> _Hit:
-    """What the rays (x, y, 1) meet first."""
+def _nearest(
+    tables: _Tables,
+    shot: Shot,
+    x: jax.Array,
+    y: jax.Array,
+    surfaces: int,
+    cone_range: jax.Array,
+    triangle_range: jax.Array,
+) -> _Hit:
+    """What the rays (x, y, 1) meet first; so many ``surfaces`` are tried in one step."""
     up = shot.rotation[:, 2]
     falling = x * up[0] + y * up[1] + up[2]
     ground = jnp.where(falling < -1e-6, -shot.position[2] / jnp.minimum(falling, -1e-6), FAR)
@@ -168,7 +192,7 @@ def _nearest(tables: _Tables, shot: Shot, x: jax.Array, y: jax.Array, cone_range
     start = _Hit(jnp.where(seen, ground, FAR), jnp.zeros(x.shape, jnp.int32), seen.astype(jnp.int32))
     square = x * x + y * y + 1.0
 
-    def cone(place: jax.Array, hit: _Hit) -> _Hit:
+    def cone(place: jax.Array, there: jax.Array, hit: _Hit) -> _Hit:
         row = tables.cone_list[place]
         c = jax.lax.dynamic_index_in_dim(tables.cones, row, keepdims=False)[:CONE_HIT]
         offset = c[0] * x + c[1] * y + c[2]
@@ -179,20 +203,30 @@ def _nearest(tables: _Tables, shot: Shot, x: jax.Array, y: jax.Array, cone_range
         discriminant = b * b - a * c[13]
         depth = (-b - jnp.sqrt(jnp.maximum(discriminant, 0.0))) / a
         travelled = c[10] + depth * along
-        met = (discriminant > 0.0) & (travelled >= c[14]) & (travelled <= c[15]) & (depth > NEAR) & (depth < hit.depth)
+        met = there & (discriminant > 0.0) & (travelled >= c[14]) & (travelled <= c[15]) & (depth > NEAR) & (depth < hit.depth)
         return _Hit(jnp.where(met, depth, hit.depth), jnp.where(met, row, hit.row), jnp.where(met, 2, hit.kind))
 
-    def triangle(place: jax.Array, hit: _Hit) -> _Hit:
+    def triangle(place: jax.Array, there: jax.Array, hit: _Hit) -> _Hit:
         row = tables.triangle_list[place]
         m = jax.lax.dynamic_index_in_dim(tables.triangles, row, keepdims=False)[:TRIANGLE_HIT]
         first, second, third = (m[3 * k] * x + m[3 * k + 1] * y + m[3 * k + 2] for k in range(3))
         depth = 1.0 / (first + second + third)
         least = jnp.minimum(jnp.minimum(first, second), third)
-        met = (least >= 0.0) & (depth > NEAR) & (depth < hit.depth)
+        met = there & (least >= 0.0) & (depth > NEAR) & (depth < hit.depth)
         return _Hit(jnp.where(met, depth, hit.depth), jnp.where(met, row, hit.row), jnp.where(met, 3, hit.kind))
 
-    hit = jax.lax.fori_loop(cone_range[0], cone_range[1], cone, start)
-    return jax.lax.fori_loop(triangle_range[0], triangle_range[1], triangle, hit)
+    def all_of(surface: Callable[[jax.Array, jax.Array, _Hit], _Hit], places: jax.Array, hit: _Hit) -> _Hit:
+        first, last = places[0], places[1]
+
+        def step(number: jax.Array, hit: _Hit) -> _Hit:
+            for each in range(surfaces):
+                place = first + number * surfaces + each
+                hit = surface(jnp.minimum(place, last - 1), place < last, hit)
+            return hit
+
+        return jax.lax.fori_loop(0, (last - first + surfaces - 1) // surfaces, step, hit)
+
+    return all_of(triangle, triangle_range, all_of(cone, cone_range, start))
 
 
 class _Point(NamedTuple):

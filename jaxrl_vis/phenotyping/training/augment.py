@@ -5,25 +5,48 @@ import jax.numpy as jnp
 
 from jaxrl_vis.phenotyping.detector.losses import NOTHING
 
+_WELL = 94.9  # square root of the electrons of a white pixel of the synthetic cameras
+_DARK = 0.016  # light that makes as much noise as the sensor does by itself, of white
+_TAPS = 3  # pixels: reach of the blur
+
 
 def relight(images: jax.Array, key: jax.Array) -> jax.Array:
-    """Images [N, H, W, 3] uint8 with other exposure, contrast, colours and noise, uint8."""
-    keys = dict(zip(("gain", "gamma", "colour", "grey", "noise", "read", "blotch"), jax.random.split(key, 7)))
+    """Images [N, H, W, 3] uint8 as taken with other light, lens, sensor and tone curve, uint8.
+
+    Light, blur and noise act where they do in a camera: on linear values, before what is negative or beyond white is cut off.
+    """
+    names = ("gain", "gamma", "colour", "grey", "noise", "level", "blotch", "strength", "blur", "sharp")
+    keys: dict[str, jax.Array] = dict(zip(names, jax.random.split(key, len(names))))
     count = images.shape[0]
-    values = images.astype(jnp.float32) / 255.0
-    values = values ** jnp.exp(0.15 * jax.random.normal(keys["gamma"], (count, 1, 1, 1)))
+
+    def each(name: str, low: float, high: float) -> jax.Array:
+        return jax.random.uniform(keys[name], (count, 1, 1, 1), minval=low, maxval=high)
+
+    values = (images.astype(jnp.float32) / 255.0) ** 2.2
     grey = values.mean(axis=-1, keepdims=True)
-    values = grey + (values - grey) * jax.random.uniform(keys["grey"], (count, 1, 1, 1), minval=0.2, maxval=1.5)
-    gain = jnp.exp(jax.random.uniform(keys["gain"], (count, 1, 1, 1), minval=-0.75, maxval=0.65))
-    gain = gain * jnp.exp(0.12 * jax.random.normal(keys["colour"], (count, 1, 1, 3)))
+    values = jnp.maximum(grey + (values - grey) * each("grey", 0.2, 1.5), 0.0)
+    gain = jnp.exp(each("gain", -1.2, 1.0)) * jnp.exp(0.2 * jax.random.normal(keys["colour"], (count, 1, 1, 3)))
     # Blotches of brightness, as of other textures, a few pixels to a tenth of the image large.
     coarse = jax.random.normal(keys["blotch"], (count, 24, 24, 1))
-    strength = jax.random.uniform(keys["read"], (count, 1, 1, 1), maxval=0.15)
-    gain = gain * jnp.exp(strength * jax.image.resize(coarse, (*images.shape[:3], 1), "linear"))
-    values = values * gain
-    level = jax.random.uniform(jax.random.fold_in(keys["noise"], 1), (count, 1, 1, 1), maxval=0.03)
-    values = values + level * jnp.sqrt(jnp.maximum(values, 0.02)) * jax.random.normal(keys["noise"], values.shape)
-    return jnp.round(255.0 * jnp.clip(values, 0.0, 1.0)).astype(jnp.uint8)
+    gain = gain * jnp.exp(each("strength", 0.0, 0.3) * jax.image.resize(coarse, (*images.shape[:3], 1), "linear"))
+    values = _blurred(values * gain, jnp.where(each("sharp", 0.0, 1.0) > 0.5, each("blur", 0.3, 1.3), 0.05))
+    # Up to three times the shot and read noise that is there already, less where the image is reduced.
+    level = 3.0 * each("level", 0.0, 1.0) ** 2 / _WELL
+    values = values + level * jnp.sqrt(values + _DARK) * jax.random.normal(keys["noise"], values.shape)
+    curve = jnp.exp(0.15 * jax.random.normal(keys["gamma"], (count, 1, 1, 1))) / 2.2
+    return jnp.round(255.0 * jnp.clip(values, 0.0, 1.0) ** curve).astype(jnp.uint8)
+
+
+def _blurred(values: jax.Array, deviation: jax.Array) -> jax.Array:
+    """Values [N, H, W, C] seen through a lens whose point spread is a normal one, ``deviation`` [N, 1, 1, 1] pixels wide."""
+    taps = jnp.exp(-0.5 * (jnp.arange(-_TAPS, _TAPS + 1) / deviation) ** 2)  # [N, 1, 1, taps]
+    taps = taps / taps.sum(axis=-1, keepdims=True)
+    for axis in (1, 2):
+        padding = [(_TAPS, _TAPS) if place == axis else (0, 0) for place in range(4)]
+        padded, size = jnp.pad(values, padding, mode="edge"), values.shape[axis]
+        parts = [jax.lax.slice_in_dim(padded, k, k + size, axis=axis) * taps[..., k : k + 1] for k in range(2 * _TAPS + 1)]
+        values = sum(parts[1:], parts[0])
+    return values
 
 
 def move(
@@ -47,7 +70,8 @@ def _moved(image: jax.Array, stalks: jax.Array, kinds: jax.Array, shape: tuple[i
     height, width = shape
     still = drawn[0] > 0.5
     wide, tall = (jnp.where(still, 1.0, jnp.exp(0.12 * each)) for each in drawn[1:3])
-    shear = jnp.where(still, 0.0, 0.14 * drawn[3])
+    # Stalks of other fields lean by up to 20 degrees.
+    shear = jnp.where(still, 0.0, 0.3 * drawn[3])
     over, down = jnp.where(still, 0.0, 0.04 * width * drawn[4]), jnp.where(still, 0.0, 0.04 * height * drawn[5])
     mirror = drawn[6] > 0.0
     # x' = wide (x - w/2) + shear (y - h/2) + w/2 + over, and then mirrored; y' = tall (y - h/2) + h/2 + down.
@@ -92,9 +116,9 @@ def _sample(image: jax.Array, line: jax.Array, column: jax.Array, shape: tuple[i
 
 def vary_snips(snips: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Snips [N, H, W, 3] uint8 and masks [N, H, W] bool: relit, with other textures and widths, and half of them mirrored."""
-    light, side, marks, size = jax.random.split(key, 4)
+    light, side, marks, size, contrast = jax.random.split(key, 5)
     snips, masks = _stretched(snips, masks, size)
-    snips = _textured(snips, marks)
+    snips = _set_off(_textured(snips, marks), masks, contrast)
     mirror = jax.random.bernoulli(side, 0.5, (snips.shape[0],))
     snips = jnp.where(mirror[:, None, None, None], snips[:, :, ::-1], snips)
     masks = jnp.where(mirror[:, None, None], masks[:, :, ::-1], masks)
@@ -132,3 +156,29 @@ def _textured(snips: jax.Array, key: jax.Array) -> jax.Array:
     dark = jnp.where(noise(spots, 6, 3) > 2.2 - 1.4 * amount[0], 1.0 - 0.6 * amount[1], 1.0)
     grain = jnp.exp(0.25 * amount[2] * noise(fibres, 160, 2) + 0.35 * amount[3] * noise(shades, 80, 10))
     return jnp.round(jnp.clip(snips * (dark * grain)[..., None], 0.0, 255.0)).astype(jnp.uint8)
+
+
+def _set_off(snips: jax.Array, masks: jax.Array, key: jax.Array) -> jax.Array:
+    """Snips whose stalks differ more or less from what is behind them, and are darker towards their edges.
+
+    How quickly a round stalk darkens towards its edges depends on its surface and on the light. A network that learns it by
+    heart puts the edges of other stalks too far in or out. What is black stays black: no edge is drawn where none is seen.
+    """
+    count, _, width = snips.shape[:3]
+    keys = jax.random.split(key, 6)
+    inside = masks.astype(jnp.float32)
+    own = jnp.exp(0.3 * jax.random.normal(keys[0], (count, 1, 1, 1)) + 0.15 * jax.random.normal(keys[1], (count, 1, 1, 3)))
+    # Share of the stalk in what lies beside each pixel of it: 1 in its middle, about a half at its edges.
+    share = jnp.zeros_like(inside)
+    weights = jax.nn.softmax(2.0 * jax.random.normal(keys[2], (3, count)), axis=0)
+    for reach, weight in zip((4, 8, 16), weights):
+        reach = min(reach, (width - 1) // 2)
+        sums = jax.lax.reduce_window(inside, 0.0, jax.lax.add, (1, 1, 2 * reach + 1), (1, 1, 1), "SAME")
+        share += weight[:, None, None] * sums / (2 * reach + 1)
+    amount = jax.random.uniform(keys[3], (count, 1, 1), minval=-0.3, maxval=0.8)
+    power = jnp.exp(0.4 * jax.random.normal(keys[4], (count, 1, 1)))
+    shade = 1.0 - amount * jnp.clip(2.0 * (1.0 - share), 0.0, 1.0) ** power
+    # Half of them stay as they are: their own contrast is all that a network has to go by elsewhere.
+    changed = jax.random.bernoulli(keys[5], 0.5, (count, 1, 1, 1)) & masks[..., None]
+    factor = jnp.where(changed, own * shade[..., None], 1.0)
+    return jnp.round(jnp.clip(snips * factor, 0.0, 255.0)).astype(jnp.uint8)

@@ -16,7 +16,7 @@ import numpy as np
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.phenotyping.annotations import decode_mask, read_annotations
 from jaxrl_vis.phenotyping.detector.detect import Settings
-from jaxrl_vis.phenotyping.detector.finder import reduce
+from jaxrl_vis.phenotyping.detector.finder import higher_up, reduce
 from jaxrl_vis.phenotyping.detector.losses import NOTHING, STALK, UNCLEAR
 from jaxrl_vis.phenotyping.detector.snips import cut, snip_shape
 from jaxrl_vis.phenotyping.images import read_image, rgb8
@@ -33,6 +33,7 @@ _MasksOf = Callable[[np.ndarray, np.ndarray, tuple[int, int]], np.ndarray]
 _BARELY = 0.02  # what is seen less is not there
 _MOST = 56
 _THIN = 4
+_HIGHER = 0.3  # share of the stalks of which the networks also learn the piece around the upper height
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,7 +77,8 @@ def synthetic_examples(
             true = sequence.drive.true
             thinned = np.asarray(instance[::_THIN, ::_THIN]), np.asarray(depth[::_THIN, ::_THIN])
             stalks, kinds, indices = truth_of(sequence.plot, sequence.drive.poses[frame], true, *thinned)
-            yield _example(image, stalks, kinds, functools.partial(_instance_masks, instance, indices), settings, rng)
+            masks_of = functools.partial(_instance_masks, instance, indices)
+            yield _example(image, stalks, kinds, masks_of, settings, rng, _HIGHER)
 
 
 def sequences(family: Family, seeds: Iterator[int], helpers: Executor | None) -> Iterator[Sequence]:
@@ -139,8 +141,16 @@ def truth_of(
     return np.array(stalks, np.float32).reshape(-1, 6), np.array(kinds, np.int32), np.array(indices, np.int32)
 
 
-def _example(image: Any, stalks: np.ndarray, kinds: np.ndarray, masks_of: _MasksOf, settings: Settings, rng: Any) -> Example:
-    """An example of a whole image [H, W, 3]."""
+def _example(
+    image: Any,
+    stalks: np.ndarray,
+    kinds: np.ndarray,
+    masks_of: _MasksOf,
+    settings: Settings,
+    rng: Any,
+    higher: float = 0.0,
+) -> Example:
+    """An example of a whole image [H, W, 3]; of a share of its stalks, there are snips around the upper height, too."""
     whole = np.asarray(image)
     reduced, scale = reduce(whole, settings.width)
     shape = snip_shape(whole.shape[1], (settings.snip_lines, settings.snip_columns), settings.full_width)
@@ -150,6 +160,10 @@ def _example(image: Any, stalks: np.ndarray, kinds: np.ndarray, masks_of: _Masks
     wide = 0.015 * (stalks[clear, 3] - stalks[clear, 1])[:, None]
     moved[:, 4:] += wide * rng.normal(size=(len(clear), 2))
     moved[:, 1::2][:, :2] += 2.0 * wide * rng.normal(size=(len(clear), 1))
+    drawn = rng.random(len(clear)) < higher
+    above = np.array([higher_up(each) for each in moved[drawn]], np.float32).reshape(-1, 6)
+    seen = above[:, 1] > 0
+    clear, moved = np.concatenate([clear, clear[drawn][seen]]), np.concatenate([moved, above[seen]])
     on_device, places = jnp.asarray(image), moved
     snips, masks = np.zeros((0, *shape, 3), np.uint8), np.zeros((0, *shape), bool)
     if len(clear):
