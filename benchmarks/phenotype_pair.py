@@ -1,46 +1,85 @@
 """Time and memory for one pair of 9 megapixels, from arrays in memory: `python benchmarks/phenotype_pair.py`.
 
-Finding, outlining, disparity, ground and widths; a synthetic pair of the shifted family; decoding of files is not in it.
+Finding, outlining, disparity, ground and widths; a synthetic pair of the shifted family; decoding of files is not in it. Parts
+are timed one after the other in repeats of their own; in the whole, the ground is found while the networks compute.
 """
 
 import argparse
 import resource
 import time
+from collections.abc import Callable
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis.phenotyping.detector.finder import Finder
+from jaxrl_vis.phenotyping.detector.detect import detect, pad
+from jaxrl_vis.phenotyping.detector.finder import Finder, reduce
 from jaxrl_vis.phenotyping.detector.weights import SHIPPED, read_weights
 from jaxrl_vis.phenotyping.ground import find_ground
-from jaxrl_vis.phenotyping.sightings import grey_of, look
+from jaxrl_vis.phenotyping.sightings import find_with_ground, grey_of, look
+from jaxrl_vis.provenance import device_name
 from jaxrl_vis_envs.plants import SHIFTED, draw
 from jaxrl_vis_envs.plants.pairs import Sequence
+from jaxrl_vis_envs.plants.truth import stalks_in_view
+
+
+def timed(run: Callable[[], Any], repeats: int) -> list[float]:
+    """Seconds of each repeat, after one that compiles."""
+    run()
+    times = []
+    for _ in range(repeats):
+        started = time.perf_counter()
+        run()
+        times.append(time.perf_counter() - started)
+    return times
+
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="Time and memory for one synthetic pair.")
     parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--width", type=int, default=3376, help="of an image, pixels")
     options = parser.parse_args()
-    sequence = Sequence.of(draw(SHIFTED, 3))
+    family = SHIFTED.at_width(options.width)
+    sequence = Sequence.of(draw(family, 3))
     pair = sequence[15]
     left, right, stated = np.asarray(pair.left), np.asarray(pair.right), sequence.drive.stated
     params, settings, _ = read_weights(SHIPPED)
     finder = Finder(params, settings)
 
-    def once() -> int:
-        """Finds and measures; how many stalks were measured."""
-        detections = finder(left)
-        ground = find_ground(grey_of(left), grey_of(right), stated)
-        return sum(each.diameter_mm is not None for each in look(detections, left, right, stated, ground=ground))
+    def once() -> tuple[Any, Any, list[Any]]:
+        """What a pair says: finds, ground and sightings."""
+        detections, ground = find_with_ground(finder, left, right, stated)
+        return detections, ground, look(detections, left, right, stated, ground=ground)
 
     started = time.perf_counter()
-    measured = once()
+    detections, ground, sightings = once()
     first = time.perf_counter() - started
-    times = []
-    for _ in range(options.repeats):
-        started = time.perf_counter()
-        once()
-        times.append(time.perf_counter() - started)
-    print(f"{left.shape[1]} x {left.shape[0]}, {measured} stalks measured, on {jax.devices()[0].device_kind}")
-    print(f"{np.median(times):.3f} s a pair (least {min(times):.3f}); the first one, which compiles, {first:.1f} s")
+    measured = sum(each.diameter_mm is not None for each in sightings)
+    whole = timed(once, options.repeats)
+    print(f"{left.shape[1]} x {left.shape[0]}, {len(detections)} finds, {measured} measured, on {device_name()}")
+    print(f"{np.median(whole):.3f} s a pair (least {min(whole):.3f}); the first one, which compiles, {first:.1f} s")
+    small = pad(reduce(left, settings.width)[0])
+    dtype = finder.dtype
+    parts = {
+        "image to the device": lambda: jax.block_until_ready(jax.device_put(left)),
+        "reduced image": lambda: reduce(left, settings.width),
+        "detector": lambda: jax.block_until_ready(detect(params["detector"], small, settings, dtype)),
+        "all of finding, with masks and edges": lambda: finder(left),
+        "ground, beside that": lambda: find_ground(grey_of(left), grey_of(right), stated),
+        "disparities and widths": lambda: look(detections, left, right, stated, ground=ground),
+    }
+    for name, part in parts.items():
+        print(f"  {np.median(timed(part, options.repeats)):.4f} s  {name}")
+    print("what an evaluated pair costs besides:")
+    on_device = (pair.left, pair.right, pair.instance, pair.depth)
+    truth = np.asarray(pair.instance), np.asarray(pair.depth)
+    others = {
+        "drawing both images, with their truth": lambda: jax.block_until_ready((sequence[15].left, sequence[15].right)),
+        "images and truth to the host": lambda: jax.device_get([jnp.copy(each) for each in on_device]),
+        "truth of the stalks": lambda: stalks_in_view(sequence.plot, pair.pose, sequence.drive.true, *truth),
+    }
+    for name, part in others.items():
+        print(f"  {np.median(timed(part, min(options.repeats, 3))):.4f} s  {name}")
     print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6:.2f} GB, drawing the pair included")

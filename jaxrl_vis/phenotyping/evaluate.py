@@ -5,6 +5,7 @@ plot -> pairs -> finds -> sightings -> stalks       as `pipeline.run` does, with
 """
 
 import dataclasses
+import functools
 import math
 import time
 from collections.abc import Callable, Iterable
@@ -13,11 +14,10 @@ from typing import Any
 import numpy as np
 
 from jaxrl_vis.phenotyping.detector.finder import Detection
-from jaxrl_vis.phenotyping.ground import find_ground
 from jaxrl_vis.phenotyping.heights import widths_of
 from jaxrl_vis.phenotyping.measure import Method
 from jaxrl_vis.phenotyping.perfect import perfect_detections
-from jaxrl_vis.phenotyping.sightings import Sighting, grey_of, look
+from jaxrl_vis.phenotyping.sightings import Sighting, find_with_ground, look
 from jaxrl_vis.phenotyping.thesis import count_by_length, look_as_thesis, mean_widths
 from jaxrl_vis.phenotyping.track import follow
 from jaxrl_vis_envs.plants import Family, Stalk, draw
@@ -100,13 +100,10 @@ def score_plot(
         left, right, instance = np.asarray(pair.left), np.asarray(pair.right), np.asarray(pair.instance)
         seen = stalks_in_view(plot, pair.pose, drive.true, instance, np.asarray(pair.depth))
         started = time.monotonic()
-        if find is None:
-            detections = perfect_detections(map(dataclasses.asdict, seen), instance, LEAST_VISIBLE)
-        else:
-            detections = find(left)
+        finder = find or functools.partial(_perfectly, seen, instance)
+        detections, ground = find_with_ground(finder, left, right, drive.stated)
         kept = [place for place, each in enumerate(detections) if each.score >= least_score]
         finds_kept = [detections[place] for place in kept]
-        ground = find_ground(grey_of(left), grey_of(right), drive.stated)
         frames.append(look(finds_kept, left, right, drive.stated, method, ground))
         seconds.append(time.monotonic() - started)
         if with_thesis:
@@ -139,6 +136,11 @@ def score_plot(
         float(np.mean(seconds[1:])) if len(seconds) > 1 else math.nan,
         _thesis_score(as_thesis, owners, sequence) if with_thesis else None,
     )
+
+
+def _perfectly(seen: list[StalkInView], instance: np.ndarray, image: np.ndarray) -> list[Detection]:
+    """True boxes and masks, as a finder that needs no image."""
+    return perfect_detections(map(dataclasses.asdict, seen), instance, LEAST_VISIBLE)
 
 
 def _thesis_score(frames: list[list[Sighting]], owners: list[list[int | None]], sequence: Sequence) -> ThesisScore:

@@ -59,7 +59,7 @@ def find_ground(
     """The ground that a pair shows; None where it shows none, or too little.
 
     Args:
-        left, right: [H, W] grey float32, rectified.
+        left, right: [H, W] grey, uint8 or float32, rectified.
         calibration: Of the cameras, for images of this size.
         disparity: [H, W] float32, disparities that are known, in place of those that are matched; pixels, not a number where
             there is none.

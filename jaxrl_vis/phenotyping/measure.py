@@ -9,7 +9,7 @@ import numpy as np
 from jaxrl_vis.phenotyping.ground import Ground
 from jaxrl_vis.phenotyping.metric import diameter_mm, tilt_of
 from jaxrl_vis.phenotyping.stereo import StalkDisparity, match_rows, sample_rows
-from jaxrl_vis.phenotyping.width import Strip, ellipse_width, strip_near, strip_width
+from jaxrl_vis.phenotyping.width import Strip, ellipse_width, median, pairs_of, strip_near, strip_width
 from jaxrl_vis_envs.plants import Calibration
 
 Method = Literal["strip", "ellipse"]
@@ -61,13 +61,14 @@ def measure(
     ground: Ground | None = None,
     height: float | None = None,
     disparity: np.ndarray | None = None,
+    strip: Strip | None = None,
 ) -> Measurement:
     """Measures a stalk.
 
     Args:
         mask: [h, w] bool, or float32 from 0 to 1: of the stalk, in a part of the left image.
         corner: Line and column of the mask's first pixel in the image.
-        left, right: [H, W] grey float32, rectified.
+        left, right: [H, W] grey, uint8 or float32, rectified.
         calibration: Of the cameras, for images of this size.
         line: Where to measure, a line of the image; the middle of what is seen if not given.
         depths: Least and greatest depth at which a stalk may stand, m.
@@ -77,8 +78,9 @@ def measure(
             does not matter then.
         disparity: [H, W] float32, disparities that are known, in place of those that are matched; pixels, not a number where
             there is none.
+        strip: The mask's edges, if they are known.
     """
-    strip = strip_width(mask)
+    strip = strip_width(mask) if strip is None else strip
     if strip is None:
         return Measurement(reason="too few lines show both edges")
     confidence = strip.confidence
@@ -163,7 +165,7 @@ def _tilt(matched: StalkDisparity, disparity: float, calibration: Calibration) -
     """How much the stalk leans away from the camera; 0 where too short a piece of it was matched to tell."""
     if matched.lines.size < 6 or np.ptp(matched.lines) < 0.03 * calibration.focal:
         return 0.0
-    first, second = np.triu_indices(matched.lines.size, k=3)
+    first, second = pairs_of(matched.lines.size, 3)
     slopes = (matched.values[second] - matched.values[first]) / (matched.lines[second] - matched.lines[first])
-    tilt = tilt_of(float(np.median(slopes)), disparity, calibration)
+    tilt = tilt_of(median(slopes), disparity, calibration)
     return tilt if abs(tilt) < math.radians(30.0) else 0.0

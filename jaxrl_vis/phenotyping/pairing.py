@@ -33,7 +33,10 @@ def wrong_with(
     mirror = dataclasses.replace(calibration, centre=(calibration.width - 1 - calibration.centre[0], calibration.centre[1]))
     turned = [
         dataclasses.replace(
-            each, mask=each.mask[:, ::-1], corner=(each.corner[0], left.shape[1] - each.corner[1] - each.mask.shape[1])
+            each,
+            mask=each.mask[:, ::-1],
+            corner=(each.corner[0], left.shape[1] - each.corner[1] - each.mask.shape[1]),
+            strip=None,
         )
         for each in detections
     ]

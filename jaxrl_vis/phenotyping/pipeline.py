@@ -23,7 +23,6 @@ import jaxrl_vis
 from jaxrl_vis.files import write_atomically
 from jaxrl_vis.phenotyping.detector.finder import Detection
 from jaxrl_vis.phenotyping.folders import PairFiles, PlotFolder, claim, read_odometry
-from jaxrl_vis.phenotyping.ground import find_ground
 from jaxrl_vis.phenotyping.images import write_image
 from jaxrl_vis.phenotyping.measure import Method
 from jaxrl_vis.phenotyping.overlay import draw_overlay
@@ -39,7 +38,7 @@ from jaxrl_vis.phenotyping.results import (
     rows_without_path,
     write_rows,
 )
-from jaxrl_vis.phenotyping.sightings import NO_CALIBRATION, Sighting, grey_of, look
+from jaxrl_vis.phenotyping.sightings import NO_CALIBRATION, Sighting, find_with_ground, look
 from jaxrl_vis.phenotyping.track import Track, follow
 from jaxrl_vis_envs.plants import Calibration
 
@@ -156,11 +155,10 @@ def _record(plot: PlotFolder, pair: PairFiles, find: Find, request: Request) -> 
     try:
         left, right = read_pair(pair, request.calibrations[plot.name], pair.disparity is None)
         disparity = known_disparity(pair, left, request.disparity_scale)
-        detections = find(left, plot, pair)
+        calibration = request.calibrations[plot.name]
+        detections, ground = find_with_ground(lambda image: find(image, plot, pair), left, right, calibration, disparity)
     except Unusable as problem:
         return {"skipped": str(problem)}
-    calibration = request.calibrations[plot.name]
-    ground = None if calibration is None else find_ground(grey_of(left), grey_of(right), calibration, disparity)
     sightings = look(detections, left, right, calibration, request.method, ground, disparity)
     wrong = (
         None if calibration is None or disparity is not None else wrong_with(detections, sightings, left, right, calibration)

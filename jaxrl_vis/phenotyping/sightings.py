@@ -2,13 +2,15 @@
 
 import dataclasses
 import math
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import cv2
 import numpy as np
 
 from jaxrl_vis.phenotyping.detector.finder import Detection
-from jaxrl_vis.phenotyping.ground import Ground
+from jaxrl_vis.phenotyping.ground import Ground, find_ground
 from jaxrl_vis.phenotyping.measure import Measurement, Method, measure
 from jaxrl_vis.phenotyping.width import strip_width
 from jaxrl_vis_envs.plants import Calibration
@@ -75,8 +77,30 @@ class Sighting:
 
 
 def grey_of(image: np.ndarray) -> np.ndarray:
-    """An image [H, W, 3] uint8 as [H, W] float32."""
-    return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    """An image [H, W, 3] uint8 as [H, W] uint8."""
+    return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+
+
+def find_with_ground(
+    find: Callable[[np.ndarray], list[Detection]],
+    left: np.ndarray,
+    right: np.ndarray,
+    calibration: Calibration | None,
+    disparity: np.ndarray | None = None,
+) -> tuple[list[Detection], Ground | None]:
+    """The stalks and the ground of a pair, looked for at the same time: an accelerator finds the one and the host the other.
+
+    Args:
+        find: What finds stalks in a left image.
+        left, right: [H, W, 3] uint8, rectified.
+        calibration: Of the cameras; without it, no ground is looked for.
+        disparity: See `find_ground`.
+    """
+    if calibration is None:
+        return find(left), None
+    with ThreadPoolExecutor(1) as aside:
+        ground = aside.submit(lambda: find_ground(grey_of(left), grey_of(right), calibration, disparity))
+        return find(left), ground.result()
 
 
 def look(
@@ -105,12 +129,11 @@ def look(
     for each in detections:
         line = 0.5 * (each.box[1] + each.box[3])
         images = (grey_left, grey_right, calibration)
-        got = measure(
-            each.mask, each.corner, *images, line=line, method=method, ground=ground, height=HEIGHTS[0], disparity=disparity
-        )
+        how = {"method": method, "ground": ground, "disparity": disparity}
+        got = measure(each.mask, each.corner, *images, line=line, height=HEIGHTS[0], strip=each.strip, **how)
         upper = None
         if ground is not None and each.upper is not None:
-            upper = measure(*each.upper, *images, method=method, ground=ground, height=HEIGHTS[1], disparity=disparity)
+            upper = measure(*each.upper, *images, height=HEIGHTS[1], **how)
         measured.append((got, upper))
     hidden = _hidden_edges([got for got, _ in measured])
     return [
@@ -135,7 +158,7 @@ def _hidden_edges(found: list[Measurement]) -> list[bool]:
 
 
 def _in_pixels(detection: Detection) -> Sighting:
-    strip = strip_width(detection.mask)
+    strip = detection.strip or strip_width(detection.mask)
     line = 0.5 * (detection.box[1] + detection.box[3])
     column = 0.5 * sum(detection.axis)
     if strip is None:

@@ -18,9 +18,13 @@ import math
 import cv2
 import numpy as np
 
+from jaxrl_vis.phenotyping.width import median, pairs_of
+
 _LEAST_SCORE = 0.5
 _AGREEING = 0.4
 _SCATTER = 1.0  # pixels: windows that scatter by more do not see one stalk
+_FIRST = 6  # windows of a stalk that are looked for at every disparity
+_BESIDE = 12  # pixels: how far beside what they say the others are looked for
 _UNIQUE = 0.97  # a second peak of so much of the first one's height makes a window ambiguous
 
 
@@ -50,19 +54,23 @@ class StalkDisparity:
         if self.lines.size < least:
             return None
         offset = self.lines - line
-        first, second = np.triu_indices(self.lines.size, k=1)
-        slope = float(np.median((self.values[second] - self.values[first]) / (self.lines[second] - self.lines[first])))
+        first, second = pairs_of(self.lines.size)
+        slope = median((self.values[second] - self.values[first]) / (self.lines[second] - self.lines[first]))
         rest = self.values - slope * offset
-        middle = float(np.median(rest))
-        spread = max(1.4826 * float(np.median(np.abs(rest - middle))), 0.05)
+        middle = median(rest)
+        spread = max(1.4826 * median(np.abs(rest - middle)), 0.05)
         good = np.abs(rest - middle) < 3.5 * min(spread, _SCATTER)
-        if good.sum() < least:
+        count = np.count_nonzero(good)
+        if count < least:
             return None
-        if good.sum() > 3:
-            slope, _ = map(float, np.polyfit(offset[good], self.values[good], 1))
-        remaining = self.values[good] - slope * offset[good]
-        scatter = max(float(np.std(remaining)), 0.02)
-        return float(np.mean(remaining)), scatter / math.sqrt(int(good.sum()))
+        where, value = offset[good], self.values[good]
+        if count > 3:
+            beside = where - where.sum() / count
+            slope = float(beside @ value) / float(beside @ beside)
+        remaining = value - slope * where
+        mean = float(remaining.sum()) / count
+        scatter = max(math.sqrt(float(((remaining - mean) ** 2).sum()) / count), 0.02)
+        return mean, scatter / math.sqrt(count)
 
 
 def grey(image: np.ndarray) -> np.ndarray:
@@ -85,7 +93,7 @@ def match_rows(
     """Disparities of a stalk whose edges are known, window by window.
 
     Args:
-        left, right: [H, W] grey float32, rectified; only the lines around ``lines`` are looked at.
+        left, right: [H, W] grey, uint8 or float32, rectified; only the lines around ``lines`` are looked at.
         lines: [N] middle line of each window, whole numbers.
         edges: Columns [N] of the stalk's left and right edge in each of them.
         bounds: Least and greatest disparity, pixels.
@@ -93,27 +101,72 @@ def match_rows(
         core: Share of the stalk's width that a window spans, in its middle: towards its edges a stalk is further away.
         spread: How many lines the right image may lie too low or too high.
     """
-    found: list[tuple[float, float, float]] = []
-    low, high = int(np.floor(bounds[0])), int(np.ceil(bounds[1]))
-    for line, begin, end in zip(np.asarray(lines, int), *edges):
-        margin = 0.5 * (1.0 - core) * (end - begin)
-        first, last = int(np.ceil(begin + margin)), int(np.floor(end - margin)) + 1
-        top, bottom = line - half_height, line + half_height + 1
-        if last - first < 6 or top - spread < 0 or bottom + spread > left.shape[0] or first < 0 or last > left.shape[1]:
+    wanted = [
+        _Window(
+            line,
+            int(np.ceil(begin + 0.5 * (1.0 - core) * (end - begin))),
+            int(np.floor(end - 0.5 * (1.0 - core) * (end - begin))) + 1,
+        )
+        for line, begin, end in zip(np.asarray(lines, int), *edges)
+    ]
+    wanted = [each for each in wanted if each.inside(left.shape, half_height, spread)]
+    # A few windows are looked for wherever they may be. Where they agree, the others are looked for near to where that says.
+    first = sorted(set(np.linspace(0, len(wanted) - 1, min(_FIRST, len(wanted))).round().astype(int)))
+    whole = int(np.floor(bounds[0])), int(np.ceil(bounds[1]))
+    found = {place: _match(left, right, wanted[place], whole, half_height, spread) for place in first}
+    expected = _agreed([(wanted[place].line, each[0]) for place, each in found.items() if each is not None])
+    for place, window in enumerate(wanted):
+        if place in found:
             continue
-        begin_right, end_right = max(first - high - 1, 0), min(last - low + 1, right.shape[1])
-        if end_right - begin_right < last - first + 2:
-            continue
-        window = np.ascontiguousarray(left[top:bottom, first:last])
-        searched = np.ascontiguousarray(right[top - spread : bottom + spread, begin_right:end_right])
-        score = cv2.matchTemplate(searched, window, cv2.TM_CCOEFF_NORMED)
-        best = _peak(score)
-        if best is None:
-            continue
-        column, height = best
-        found.append((float(line), first - (begin_right + column), height))
-    values = np.array(found, float).reshape(-1, 3)
-    return StalkDisparity(values[:, 0], values[:, 1], values[:, 2], len(lines))
+        within = whole
+        if expected is not None:
+            middle = expected[0] + expected[1] * window.line
+            within = max(math.floor(middle) - _BESIDE, whole[0]), min(math.ceil(middle) + _BESIDE, whole[1])
+        found[place] = _match(left, right, window, within, half_height, spread) if within[0] < within[1] else None
+    values = [(float(wanted[place].line), *each) for place, each in sorted(found.items()) if each is not None]
+    matched = np.array(values, float).reshape(-1, 3)
+    return StalkDisparity(matched[:, 0], matched[:, 1], matched[:, 2], len(lines))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Window:
+    """A piece of a stalk: its middle line, its first column and the one past its last."""
+
+    line: int
+    first: int
+    last: int
+
+    def inside(self, shape: tuple[int, ...], half_height: int, spread: int) -> bool:
+        """Whether it is wide enough, and the image holds it and the lines above and below that the right image may need."""
+        reach = half_height + spread
+        tall = reach <= self.line and self.line + reach + 1 <= shape[0]
+        return tall and self.last - self.first >= 6 and self.first >= 0 and self.last <= shape[1]
+
+
+def _match(
+    left: np.ndarray, right: np.ndarray, window: _Window, within: tuple[int, int], half_height: int, spread: int
+) -> tuple[float, float] | None:
+    """Disparity of a window and how alike both sides are; None where nothing within the bounds is alike, or too much."""
+    top, bottom = window.line - half_height, window.line + half_height + 1
+    begin, end = max(window.first - within[1] - 1, 0), min(window.last - within[0] + 1, right.shape[1])
+    if end - begin < window.last - window.first + 2:
+        return None
+    piece = np.ascontiguousarray(left[top:bottom, window.first : window.last])
+    searched = np.ascontiguousarray(right[top - spread : bottom + spread, begin:end])
+    best = _peak(cv2.matchTemplate(searched, piece, cv2.TM_CCOEFF_NORMED))
+    return None if best is None else (window.first - (begin + best[0]), best[1])
+
+
+def _agreed(found: list[tuple[int, float]]) -> tuple[float, float] | None:
+    """Offset and slope of the line through most of some (line, disparity); None unless at least three agree."""
+    if len(found) < 3:
+        return None
+    line, value = np.array(found, float).T
+    first, second = pairs_of(len(line))
+    slope = median((value[second] - value[first]) / (line[second] - line[first]))
+    rest = value - slope * line
+    offset = median(rest)
+    return (offset, slope) if (np.abs(rest - offset) < _SCATTER).sum() >= max(3, len(line) - 1) else None
 
 
 def sample_rows(
@@ -148,18 +201,18 @@ def sample_rows(
 
 def _peak(score: np.ndarray) -> tuple[float, float] | None:
     """Column to a fraction of a pixel, and height of the one clear peak of a correlation; None where there is none."""
-    row, column = np.unravel_index(int(np.nanargmax(score)), score.shape)
+    row, column = divmod(int(score.argmax()), score.shape[1])
     height = float(score[row, column])
     if not height >= _LEAST_SCORE or column in (0, score.shape[1] - 1):
         return None
     best = score.max(axis=0)
-    away = np.abs(np.arange(best.size) - column) > 4
-    if away.any() and float(best[away].max()) > _UNIQUE * height:
+    elsewhere = max(best[: max(column - 4, 0)].max(initial=-1.0), best[column + 5 :].max(initial=-1.0))
+    if elsewhere > _UNIQUE * height:
         return None
     before, after = float(score[row, column - 1]), float(score[row, column + 1])
     bend = before - 2.0 * height + after
     fraction = 0.0 if bend >= 0.0 else 0.5 * (before - after) / bend
-    return float(column + np.clip(fraction, -0.5, 0.5)), height
+    return column + min(max(fraction, -0.5), 0.5), height
 
 
 def match_sgbm(left: np.ndarray, right: np.ndarray, box: tuple[int, int, int, int], bounds: tuple[float, float]) -> np.ndarray:

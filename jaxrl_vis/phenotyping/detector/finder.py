@@ -12,10 +12,10 @@ import numpy as np
 from jaxrl_vis.phenotyping.detector.detect import Settings, detect, pad
 from jaxrl_vis.phenotyping.detector.networks import Segmenter
 from jaxrl_vis.phenotyping.detector.snips import cut, put_back, smoothed, snip_shape
-from jaxrl_vis.phenotyping.width import strip_width
+from jaxrl_vis.phenotyping.width import Strip, strip_width
 from jaxrl_vis_envs.plants.truth import BAND, HEIGHTS
 
-_BATCH = 8
+_BATCH, _BATCH_ON_ACCELERATOR = 8, 32  # snips that go through the network together
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,6 +29,7 @@ class Detection:
         mask: [h, w] float32 from 0 to 1, or bool: what shows it, in a part of the image.
         corner: Line and column of the mask's first pixel.
         upper: Mask and corner of a piece of it around 24 inches above the ground; None where the image does not show that.
+        strip: The edges of the mask; None where they are not known yet.
     """
 
     box: tuple[float, float, float, float]
@@ -37,6 +38,7 @@ class Detection:
     mask: np.ndarray
     corner: tuple[int, int]
     upper: tuple[np.ndarray, tuple[int, int]] | None = None
+    strip: Strip | None = None
 
 
 UPPER = (HEIGHTS[1] - HEIGHTS[0]) / (BAND[1] - BAND[0])
@@ -89,23 +91,28 @@ class Finder:
         params: With ``detector`` and ``segmenter``.
         settings: Beside the weights.
         least_score: What is no find; 0.5 balances what is missed against what is made up.
+
+    Attributes:
+        dtype: In which convolutions are computed.
     """
 
     def __init__(self, params: Any, settings: Settings, least_score: float = 0.5) -> None:
         self._params, self._settings, self._least = params, settings, least_score
         accelerated = jax.default_backend() in ("gpu", "tpu")
-        self._dtype = jnp.bfloat16 if accelerated else jnp.float32
+        self.dtype = jnp.bfloat16 if accelerated else jnp.float32
+        self._batch = _BATCH_ON_ACCELERATOR if accelerated else _BATCH
 
     def __call__(self, image: np.ndarray) -> list[Detection]:
         """Stalks of an image [H, W, 3] uint8, from left to right."""
         settings = self._settings
         reduced, scale = reduce(image, settings.width)
-        found = jax.device_get(detect(self._params["detector"], pad(reduced), settings, self._dtype))
+        found = jax.device_get(detect(self._params["detector"], pad(reduced), settings, self.dtype))
         kept = np.flatnonzero(found.valid & (found.scores >= self._least))
         stalks, scores = in_image(found.stalks[kept], scale), found.scores[kept]
         on_device = jnp.asarray(image)
         pieces = self._pieces(on_device, stalks, self._settings.snip_lines)
-        higher = [_follow(stalk, *piece) for stalk, piece in zip(stalks, pieces)]
+        strips = [strip_width(mask) if mask.size else None for mask, _ in pieces]
+        higher = [_follow(stalk, strip, corner) for stalk, strip, (_, corner) in zip(stalks, strips, pieces)]
         seen = [place for place, each in enumerate(higher) if each is not None]
         some = np.array([higher[place] for place in seen], np.float32).reshape(-1, 6)
         upper = dict(zip(seen, self._pieces(on_device, some, self._settings.snip_lines // 2)))
@@ -114,7 +121,8 @@ class Finder:
             if mask.size:
                 left, top, right, bottom, above, below = (float(each) - 0.5 for each in stalk)
                 box = (left, top, right, bottom)
-                detections.append(Detection(box, (above, below), float(score), mask, corner, upper.get(place)))
+                axis = (above, below)
+                detections.append(Detection(box, axis, float(score), mask, corner, upper.get(place), strips[place]))
         return sorted(detections, key=lambda each: sum(each.axis))
 
     def _pieces(self, image: jax.Array, stalks: np.ndarray, lines: int) -> list[tuple[np.ndarray, tuple[int, int]]]:
@@ -130,17 +138,16 @@ class Finder:
         if not len(stalks):
             return np.zeros((0, *shape), np.float32)
         masks = []
-        for start in range(0, len(stalks), _BATCH):
-            part = stalks[start : start + _BATCH]
-            filled = np.pad(part, ((0, _BATCH - len(part)), (0, 0)), mode="edge")
+        for start in range(0, len(stalks), self._batch):
+            part = stalks[start : start + self._batch]
+            filled = np.pad(part, ((0, self._batch - len(part)), (0, 0)), mode="edge")
             snips = cut(on_device, filled, shape)
-            masks.append(_masks_of(self._params["segmenter"], snips, settings, self._dtype, full))
+            masks.append(_masks_of(self._params["segmenter"], snips, settings, self.dtype, full))
         return np.concatenate(jax.device_get(masks))[: len(stalks)]
 
 
-def _follow(stalk: np.ndarray, mask: np.ndarray, corner: tuple[int, int]) -> np.ndarray | None:
+def _follow(stalk: np.ndarray, strip: Strip | None, corner: tuple[int, int]) -> np.ndarray | None:
     """Where a stalk's upper piece [6] is, by the edges of its mask in the band; None if that is not in the image."""
-    strip = strip_width(mask) if mask.size else None
     if strip is None:
         return None
     # Half a pixel: stalks are in continuous coordinates.
