@@ -210,6 +210,8 @@ def clone(shell: Shell, python: Path) -> None:
     shell.type(f"make train {tiny_run} ARGS='--env-steps 400' && ls runs/first", shows="video.gif")
     shell.type(".venv/bin/python --version", shows=f"Python {python.name.removeprefix('python')}")
     shell.activate(shell.folder / ".venv")
+    # What the README says next to the commands that need it.
+    shell.type(".uv/bin/uv pip install --quiet '.[tensorboard,wandb]'")
     for line in readme_commands():
         shell.type(tiny(line))
     untracked = shell.type("git status --porcelain")
