@@ -7,7 +7,7 @@ import probe_environments as probes
 import pytest
 from test_ddpg import DISCOUNT, trained
 
-from jaxrl_vis.config import preset, resolve, validate
+from jaxrl_vis.config import preset, resolve
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import diagnostics, normalizer, reward_errors
 from jaxrl_vis.learner.latent_reward import cosine_reward, make_latent_reward
@@ -16,6 +16,7 @@ from jaxrl_vis.learner.sampling import Choice, Sampler
 from jaxrl_vis.learner.train_step import make_train_step
 from jaxrl_vis.run.metrics import with_precision
 from jaxrl_vis.types import Batch
+from jaxrl_vis.validation import validate
 from jaxrl_vis_envs import goals
 
 BEST = 1.0 / (1.0 - DISCOUNT)
