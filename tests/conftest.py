@@ -15,6 +15,8 @@ os.environ["JAX_PLATFORMS"] = "cpu"
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(tempfile.gettempdir()) / f"jaxrl-vis-tests-{getpass.getuser()}"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
 os.environ.setdefault("MPLBACKEND", "Agg")
+# Where each operation was called from, all the way up, is a twentieth of what there is to compile.
+os.environ.setdefault("JAX_INCLUDE_FULL_TRACEBACKS_IN_LOCATIONS", "0")
 # Programs of tests run for a moment: optimising their machine code takes longer. What XLA makes of them before is the same.
 # Both cores are busy with tests, so a program is not split into parts that could be compiled side by side either.
 # Fusion emitters take as long to compile as all the rest, and programs of environments do without them anyway, see

@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import os
 import re
 import subprocess
 import sys
@@ -34,21 +35,37 @@ def one_line(capsys: pytest.CaptureFixture[str], status: int) -> str:
     return lines[0]
 
 
-@pytest.mark.parametrize("command", [[], ["phenotype"], *(name.split() for name in cli.COMMANDS)])
-def test_help_imports_nothing_heavy(command: list[str], clean_environment: dict[str, str]) -> None:
+ROOT = Path(__file__).resolve().parents[1]
+HELP = [[], ["phenotype"], *(name.split() for name in cli.COMMANDS)]
+
+
+@pytest.fixture(scope="module")
+def helped() -> list[tuple[list[str], str]]:
+    """For each command of `HELP`, what of the heavy packages is imported after it, and what it prints: one process for all."""
     code = f"""
-import sys
+import contextlib, io, json, sys
 from jaxrl_vis import cli
-try:
-    cli.main({[*command, "--help"]!r})
-except SystemExit as stop:
-    assert stop.code in (0, None)
-heavy = {{"jax", "jaxlib", "flax", "mujoco", "numpy", "matplotlib"}} & set(sys.modules)
-assert not heavy, heavy
+found = []
+for command in {HELP!r}:
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        try:
+            cli.main([*command, "--help"])
+        except SystemExit as stop:
+            assert stop.code in (0, None)
+    found.append((sorted({{"jax", "jaxlib", "flax", "mujoco", "numpy", "matplotlib"}} & set(sys.modules)), printed.getvalue()))
+print(json.dumps(found))
 """
-    done = subprocess.run([sys.executable, "-c", code], env=clean_environment, capture_output=True, text=True)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (ROOT, ROOT / "envs")))}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert "usage: jaxrl-vis" in done.stdout
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize("index", range(len(HELP)), ids=lambda index: " ".join(HELP[index]) or "jaxrl-vis")
+def test_help_imports_nothing_heavy(index: int, helped: list[tuple[list[str], str]]) -> None:
+    heavy, printed = helped[index]
+    assert not heavy
+    assert "usage: jaxrl-vis" in printed
 
 
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:

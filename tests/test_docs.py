@@ -29,10 +29,11 @@ from jaxrl_vis import cli, config
 from jaxrl_vis.cli.checks import check_env
 from jaxrl_vis.cli.parsing import parse
 from jaxrl_vis.cli.train import Train, training_config
-from jaxrl_vis.config import Config, validate
+from jaxrl_vis.config import Config
 from jaxrl_vis.learner.environment import make_env
 from jaxrl_vis.run import metrics, trainer
 from jaxrl_vis.run.folder import MAY_CHANGE
+from jaxrl_vis.validation import validate
 from jaxrl_vis_envs import registry
 from jaxrl_vis_envs.names import TASKS
 
@@ -199,13 +200,14 @@ import jax, jax.numpy as jnp
 from jaxrl_vis import cli
 from jaxrl_vis.cli.parsing import parse
 from jaxrl_vis.cli.train import Train, training_config
-from jaxrl_vis.config import preset, resolve, validate
+from jaxrl_vis.config import preset, resolve
 from jaxrl_vis.learner import ddpg
 from jaxrl_vis.learner.auxtasks import Targets
 from jaxrl_vis.learner.networks import Networks
 from jaxrl_vis.learner.sampling import Sampler
 from jaxrl_vis.methods import METHODS
 from jaxrl_vis.types import Batch
+from jaxrl_vis.validation import validate
 
 for words in {lines!r}:
     config = validate(training_config(parse(Train, words[2:])))

@@ -146,8 +146,12 @@ def test_images_show_goals_and_movement(name: str) -> None:
     assert (end != start).any(axis=(1, 2, 3)).mean() > 0.95
 
 
-def play_images(env: GoalEnv, keys: jax.Array, actions: jax.Array) -> tuple[State, State]:
-    """Episodes at their start [N, ...], and after each action [STEPS, N, ...], played as one program."""
+@functools.cache
+def seen_episodes(frame_stack: int = 1) -> tuple[GoalEnv, State, State]:
+    """Four episodes of a visual task, played as one program: the task, their starts, their states [STEPS, 4] after actions."""
+    env = PointMass(PointMassConfig(image_size=16, frame_stack=frame_stack))
+    actions = jax.random.uniform(jax.random.key(1), (STEPS, 4, 2), minval=-1.0)
+    actions = actions.at[:3, 0].set(jnp.array([[1.0], [-0.5], [0.8]]))  # so that no two of the first images are alike
 
     def play(keys: jax.Array, actions: jax.Array) -> tuple[State, State]:
         def step(state: State, action: jax.Array) -> tuple[State, State]:
@@ -157,15 +161,13 @@ def play_images(env: GoalEnv, keys: jax.Array, actions: jax.Array) -> tuple[Stat
         start = jax.vmap(env.reset)(keys)
         return start, jax.lax.scan(step, start, actions)[1]
 
-    return env_jit(play)(keys, actions)
+    return env, *jax.device_get(env_jit(play)(jax.random.split(jax.random.key(0), 4), actions))
 
 
 def test_a_visual_task_resets_and_steps_as_its_parts_say() -> None:
     """`reset` and `step` put together what the other tests see one by one."""
-    env = PointMass(PointMassConfig(image_size=16))
+    env, start, steps = seen_episodes()
     keys = jax.random.split(jax.random.key(0), 4)
-    start, steps = play_images(env, keys, jax.random.uniform(jax.random.key(1), (STEPS, 4, 2), minval=-1.0))
-    start, steps = jax.device_get((start, steps))
     assert start.obs is not None and steps.obs is not None
     nowhere = jnp.zeros(2)
     observe = env_jit(jax.vmap(lambda data: env.observe(env.state_at(data, nowhere))))
@@ -208,13 +210,10 @@ def test_sanitize_action():
 
 def test_images_stack_newest_first():
     """Against an environment that shows one image, from the same key, under the same actions."""
-    keys = jax.random.split(jax.random.key(0), 1)
-    actions = jnp.ones((3, 1, 2)) * jnp.array([1.0, -0.5, 0.8])[:, None, None]
-    env, env_1 = (PointMass(PointMassConfig(image_size=16, frame_stack=frames)) for frames in (3, 1))
-    (start, steps), (start_1, steps_1) = (
-        tuple(state.obs for state in play_images(each, keys, actions)) for each in (env, env_1)
-    )
-    one = [start_1["observation"][0], *steps_1["observation"][:, 0]]
+    (env, *states), (_, *states_1) = seen_episodes(3), seen_episodes()
+    (start, steps), (start_1, steps_1) = ([state.obs for state in each] for each in (states, states_1))
+    assert start is not None and steps is not None and start_1 is not None and steps_1 is not None
+    one = [start_1["observation"][0], *steps_1["observation"][:3, 0]]
     assert len({np.asarray(image).tobytes() for image in one}) == 4
     assert env.frame_stack == 3 and env.observation_spec.shape == (12, 16, 16)
     np.testing.assert_array_equal(start["observation"][0], np.concatenate([one[0], one[0], one[0]]))

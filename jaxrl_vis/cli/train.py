@@ -8,13 +8,14 @@ from typing import Annotated, Any
 from jaxrl_vis import processes
 from jaxrl_vis.cli.checks import check_counts, check_env
 from jaxrl_vis.cli.parsing import ByPlaceToo, ChangesOf, SayDefault
-from jaxrl_vis.config import PRESETS, Config, preset, validate
+from jaxrl_vis.config import PRESETS, Config, preset
 from jaxrl_vis.devices import check_devices, count_devices, guess_accelerator
 from jaxrl_vis.errors import RequestError, nearest
 from jaxrl_vis.report.outputs import check_writable
 from jaxrl_vis.run import loggers
 from jaxrl_vis.run.folder import check_there, default_folder, read_config
 from jaxrl_vis.run.loggers import LoggerName
+from jaxrl_vis.validation import validate
 
 
 def default_of(name: str) -> str:

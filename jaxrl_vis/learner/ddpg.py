@@ -3,21 +3,13 @@
     gradients    losses of a batch, main and auxiliary, and one weighted gradient for each network
     apply        optimisers, then target networks
 
-Four networks read three observations (before, goal, after). Each is normalised and ordered once, and each network encodes what
-it needs in one pass:
-
-    critic, actor (online, with gradient)   before, goal, and for auxiliary tasks after, moved
-    their targets                           goal, after
-
-The actor's loss values its actions with the critic's latents from the critic's own forward pass: the actor cannot change them.
+What the gradients are of is in `objectives`.
 
 Encoding images is most of the work, and `Config` can save some of it: ``encoders="shared"`` lets the actor act on the critic's
 latents, too, ``target_encoder=False`` computes targets with the online encoders, and ``actor_interval`` spares the actor steps.
 """
 
-import dataclasses
 import functools
-import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -26,28 +18,19 @@ import jax.numpy as jnp
 import optax
 
 from jaxrl_vis.config import Config, Resolved
-from jaxrl_vis.learner import diagnostics, losses, normalizer
+from jaxrl_vis.learner import diagnostics, normalizer
 from jaxrl_vis.learner.auxiliary import Auxiliary, make_auxiliary
-from jaxrl_vis.learner.auxtasks import View
 from jaxrl_vis.learner.latent_reward import LatentReward, make_latent_reward
 from jaxrl_vis.learner.networks import Networks
+from jaxrl_vis.learner.objectives import ComputeCopies, Objectives
 from jaxrl_vis.learner.shards import ONE, Shards
-from jaxrl_vis.learner.weighting import MAIN, Weighted, WeightingState, weighted_grad
+from jaxrl_vis.learner.weighting import MAIN, Weighted, WeightingState
 from jaxrl_vis.types import Batch, Metrics, Params, TrainState
 
 # Folded into the networks' keys for the heads of auxiliary tasks, so that these change nothing else.
 _HEADS = 0x686473
 # The same for the autoencoder that makes rewards.
 _AUTOENCODER = 0x617574
-
-
-class _ComputeCopies(NamedTuple):
-    """Networks of a `TrainState` in the dtype that they are computed with (`Networks.compute_copy`)."""
-
-    actor: Params
-    critic: Params
-    target_actor: Params
-    target_critic: Params
 
 
 class Working(NamedTuple):
@@ -60,7 +43,7 @@ class Working(NamedTuple):
     """
 
     train: TrainState
-    copies: _ComputeCopies
+    copies: ComputeCopies
     held: Params = None
 
 
@@ -101,7 +84,7 @@ class Algorithm(NamedTuple):
 
 
 def _networks_of(state: TrainState) -> tuple[Params, ...]:
-    """The four networks' parameters, in the order of `_ComputeCopies`."""
+    """The four networks' parameters, in the order of `ComputeCopies`."""
     return state.actor, state.critic, state.target_actor, state.target_critic
 
 
@@ -167,56 +150,6 @@ def _step(optimizer: optax.GradientTransformation, params: Params, gradient: Par
     return optax.apply_updates(params, change), moments
 
 
-def _encode(networks: Networks, params: Params, inputs: jax.Array, size: int, first: int, count: int = 2) -> jax.Array:
-    """Latents [count, B, latent] of observations ``first``, ``first`` + 1, ... of those of a batch of ``size`` transitions."""
-    return networks.encode(params, inputs, slice(first * size, (first + count) * size)).reshape(count, size, -1)
-
-
-class _Latents(NamedTuple):
-    """Latents of a transition's observations by one online network, [B, latent] each.
-
-    Attributes:
-        pair: [2, B, latent] before and goal, as heads take them.
-        before: The first of them.
-        after, moved: None where no loss reads them.
-    """
-
-    pair: jax.Array
-    before: jax.Array
-    after: jax.Array | None = None
-    moved: jax.Array | None = None
-
-
-def _encode_online(networks: Networks, auxiliary: Auxiliary, params: Params, inputs: jax.Array, size: int) -> _Latents:
-    """Latents of all observations that losses read, with gradient.
-
-    Most auxiliary losses read two of them or one. Encoded one by one, the gradient of each loss passes through these alone.
-    """
-    if not auxiliary.tasks:
-        pair = _encode(networks, params, inputs, size, 0)
-        return _Latents(pair, pair[0])
-    before, goal, *others = (_encode(networks, params, inputs, size, n, count=1)[0] for n in range(auxiliary.observations))
-    return _Latents(jnp.stack([before, goal]), before, *others)
-
-
-def _next_latents(networks: Networks, now: _ComputeCopies, inputs: jax.Array, latents: _Latents) -> tuple[jax.Array, jax.Array]:
-    """Latents [2, B, latent] of the observation after and the goal, for the target actor and for the target critic.
-
-    Heads take them in this order; observations come as (goal, after). ``latents`` are the online critic's.
-    """
-    size = latents.before.shape[0]
-    if networks.config.target_encoder:
-        of_critic = _encode(networks, now.target_critic, inputs, size, 1)[::-1]
-    else:
-        after = latents.after
-        after = _encode(networks, now.critic, inputs, size, 2, count=1) if after is None else after[None]
-        of_critic = jnp.concatenate([after, latents.pair[1:]])
-    if networks.config.encoders == "shared":
-        return of_critic, of_critic
-    of_actor = _encode(networks, networks.with_encoder(now.target_actor, now.actor), inputs, size, 1)[::-1]
-    return of_actor, of_critic
-
-
 def _value_at_goals(networks: Networks, train: TrainState, goals: jax.Array) -> jax.Array:
     """`Algorithm.value_at_goals`."""
     statistics = (train.normalizer,) if train.goal_normalizer is None else (train.normalizer, train.goal_normalizer)
@@ -228,6 +161,16 @@ def _value_at_goals(networks: Networks, train: TrainState, goals: jax.Array) -> 
 
     action = networks.act(train.actor, latents(networks.with_encoder(train.actor, train.critic)))
     return jnp.mean(networks.value(train.critic, latents(train.critic), action))
+
+
+def _metrics_of(found: Weighted, value: jax.Array) -> Metrics:
+    """What the critic's losses and their weighting say, and the mean of its values [B]."""
+    return {
+        "train/critic_loss": found.losses[MAIN],
+        "train/value": jnp.mean(value),
+        **{f"train/{name}": number for name, number in found.metrics.items()},
+        **{f"train/loss/{name}": loss for name, loss in found.losses.items() if name != MAIN},
+    }
 
 
 def make_ddpg(
@@ -246,15 +189,15 @@ def make_ddpg(
         auxiliary = make_auxiliary(config, networks.observation_spec, networks.action_size, 1, networks.dtype)
     optimizers = _Optimizers(optax.adam(config.actor_learning_rate), optax.adam(config.critic_learning_rate))
     latent_reward = make_latent_reward(networks, config, resolved, auxiliary.frame_stack)
-    learning = _Losses(networks, config, resolved, auxiliary, shards)
+    learning = Objectives(networks, config, resolved, auxiliary, shards)
     keeps_state, held = auxiliary.weighting.name != "none", auxiliary.weighting.held
 
     def begin(train: TrainState, held: Params = None) -> Working:
-        return Working(train, _ComputeCopies(*map(networks.compute_copy, _networks_of(train))), held)
+        return Working(train, ComputeCopies(*map(networks.compute_copy, _networks_of(train))), held)
 
     def gradients(working: Working, batch: Batch, with_actor: bool = True) -> tuple[Gradients, Metrics]:
         train = working.train
-        now = _ComputeCopies(*map(networks.with_compute_copy, _networks_of(train), working.copies))
+        now = ComputeCopies(*map(networks.with_compute_copy, _networks_of(train), working.copies))
         # Before, goal, after, moved: the online networks read the first two, their targets the second and third.
         inputs = networks.prepare_batch(train, batch)
         rewarded = None if latent_reward is None else latent_reward.of_batch(train, inputs, batch)
@@ -267,12 +210,7 @@ def make_ddpg(
         counts = diagnostics.count_rewards(
             batch.reward, keep, resolved.reward_positive, resolved.reward_negative, batch.success, rewarded is not None
         )
-        metrics = {
-            "train/critic_loss": found.losses[MAIN],
-            "train/value": jnp.mean(value),
-            **{f"train/{name}": number for name, number in found.metrics.items()},
-            **{f"train/loss/{name}": loss for name, loss in found.losses.items() if name != MAIN},
-        }
+        metrics = _metrics_of(found, value)
         actor_gradient, mean_square = None, None
         if with_actor:
             (policy_loss, action), actor_gradient = jax.value_and_grad(learning.of_actor, has_aux=True)(
@@ -311,96 +249,3 @@ def make_ddpg(
         end=lambda working: working.train,
         value_at_goals=functools.partial(_value_at_goals, networks),
     )
-
-
-@dataclasses.dataclass(frozen=True)
-class _Losses:
-    """The losses of both networks and their weighted gradients, for one configuration."""
-
-    networks: Networks
-    config: Config
-    resolved: Resolved
-    auxiliary: Auxiliary
-    shards: Shards
-
-    @property
-    def reduces_early(self) -> bool:
-        """Whether the critic's gradients are averaged over the parts of a learner before they are weighted.
-
-        A weighting that takes logarithms of losses, or compares gradients, must see those of the whole learner. What others
-        make of them is a sum, which may be averaged afterwards, together with all else.
-        """
-        weighting = self.auxiliary.weighting
-        return self.shards.count > 1 and (weighting.needs != "losses" or weighting.log)
-
-    def of_critic(
-        self,
-        now: _ComputeCopies,
-        state: WeightingState | None,
-        inputs: jax.Array,
-        image: jax.Array | None,
-        batch: Batch,
-        held: Params,
-    ) -> Weighted:
-        """The critic's losses and their gradient; ``extra`` is (latents, values [B], keep [B])."""
-        networks, weighting = self.networks, self.auxiliary.weighting
-        size = batch.action.shape[0]
-
-        def critic_losses(critic: Params):
-            assert batch.reward is not None
-            latents = _encode_online(networks, self.auxiliary, critic, inputs, size)
-            target = self._target(now, inputs, latents, batch)
-            value = networks.value(critic, latents.pair, batch.action)
-            keep = losses.keep_mask(batch.reward, value, self.resolved.reward_negative, self.resolved.filter_threshold)
-            others = self._auxiliary(critic, latents, image, batch)
-            return {MAIN: losses.critic_loss(value, target, keep, self._kept(keep)), **others}, (latents, value, keep)
-
-        # Weightings that compare no gradients need one backward pass only, which the last way of finding them takes.
-        way = "jvp" if weighting.needs == "losses" else self.config.aux_gradients
-        options = {"reduce": self.shards.mean} if self.reduces_early else {}
-        find = weighted_grad(critic_losses, weighting, lambda critic: critic["encoder"], way, has_aux=True, **options)
-        state = self.auxiliary.start(now.critic.get("encoder")) if state is None else state
-        return find(now.critic, state, held=held) if weighting.held else find(now.critic, state)
-
-    def _kept(self, keep: jax.Array) -> jax.Array | None:
-        """Transitions that count in a part, on average over the parts, by which all divide alike; None: its own."""
-        if self.shards.count == 1 or math.isinf(self.resolved.filter_threshold):
-            return None
-        return jnp.maximum(self.shards.mean(jnp.sum(keep)), 1.0 / self.shards.count)
-
-    def _target(self, now: _ComputeCopies, inputs: jax.Array, latents: _Latents, batch: Batch) -> jax.Array:
-        assert batch.reward is not None
-        networks, resolved = self.networks, self.resolved
-        of_actor, of_critic = _next_latents(networks, now, inputs, jax.lax.stop_gradient(latents))
-        value_tp1 = networks.value(now.target_critic, of_critic, networks.act(now.target_actor, of_actor))
-        discount = resolved.discount if batch.discount is None else batch.discount
-        return losses.td_target(batch.reward, value_tp1, discount, resolved.target_minimum, resolved.target_maximum)
-
-    def of_actor(
-        self,
-        actor: Params,
-        critic: Params,
-        inputs: jax.Array,
-        critic_latents: _Latents,
-        image: jax.Array | None,
-        batch: Batch,
-        weights: dict[str, jax.Array],
-    ) -> tuple[jax.Array, jax.Array]:
-        """The actor's loss, those of its auxiliary tasks with the critic's weights added, and its actions [B, A]."""
-        has_encoder = self.config.encoders == "separate"
-        latents, others = critic_latents, {}
-        if has_encoder:
-            latents = _encode_online(self.networks, self.auxiliary, actor, inputs, batch.action.shape[0])
-            others = self._auxiliary(actor, latents, image, batch)
-        if self.auxiliary.weighting.log:
-            others = {name: self.shards.whole(loss) for name, loss in others.items()}
-        action = self.networks.act(actor, latents.pair)
-        value = self.networks.value(critic, critic_latents.pair, action)
-        best = self.resolved.reward_positive / (1.0 - self.resolved.discount) if self.auxiliary.weighting.log else None
-        loss = losses.actor_loss(value, action, self.config.action_penalty, best, self.shards.whole)
-        return loss + self.auxiliary.weighting.objective(weights, others), action
-
-    def _auxiliary(self, params: Params, latents: _Latents, image: jax.Array | None, batch: Batch) -> dict[str, jax.Array]:
-        """Losses of the auxiliary tasks on a network's latents, by name."""
-        seen = {"latent_t": latents.before, "latent_tp1": latents.after, "latent_moved": latents.moved}
-        return self.auxiliary.losses(params.get("heads", {}), View(**seen, image=image, action=batch.action), batch)

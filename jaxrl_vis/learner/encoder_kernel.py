@@ -1,7 +1,7 @@
-"""The encoder's first three layers as one GPU kernel each way (Pallas, by Triton), and images in the order that it reads.
+"""The encoder's first three layers as one GPU kernel each way (Pallas, by Triton).
 
 Windows of 2x2 pixels with stride 2 never overlap, so three layers see a *patch* of 8x8 pixels at a time and nothing else. A
-tile of R patches passes through all three without leaving the chip:
+tile of R patches (`encoder_kernel_patches` makes them) passes through all three without leaving the chip:
 
     4 R quarters of 4x4 pixels  [4 R, 16 C]   @ [16 C, 4 F1]   layer 1, its four windows at once: block-diagonal
                                 [4 R, 4 F1]   @ [4 F1, F2]     layer 2
@@ -27,18 +27,14 @@ import jax.numpy as jnp
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
 
+from jaxrl_vis.learner.encoder_kernel_patches import LEVELS, WORD, divisor, padded_channels, prepare_on_gpu, prepare_plainly
 from jaxrl_vis_envs.compilation import accelerator, by_platform, runs_gpu_kernels, tracing_for
 
-LEVELS = 3
-"""Layers in the kernel."""
-WORD = 4
-"""Pixels that are read at a time: four neighbours in a row, one byte each."""
 _MOST_CHANNELS = 4  # beyond, the weights' gradients no longer fit into registers
 _LEAST_ROWS = 16  # of a product
 # Measured on an H200: patches in a tile, tiles that one program works through, and how they are run.
 _FORWARD_PATCHES, _FORWARD_TILES, _FORWARD = 16, 8, plgpu.CompilerParams(num_warps=4, num_stages=3)
 _BACKWARD_PATCHES, _BACKWARD_TILES, _BACKWARD = 16, 16, plgpu.CompilerParams(num_warps=4, num_stages=1)
-_PREPARE_PATCHES, _PREPARE_IMAGES, _PREPARE = 16, 16, plgpu.CompilerParams(num_warps=8, num_stages=2)
 
 
 class Weights(NamedTuple):
@@ -91,7 +87,7 @@ def probe_program() -> Any:
     biases = {f"bias_{level}": jnp.zeros(outputs) for level, _, outputs in layers}
 
     def all_three(images: jax.Array, mean: jax.Array, scale: jax.Array, weights: Weights) -> Weights:
-        patches = _prepare_on_gpu(images, mean, scale, LEVELS, 5.0, jnp.bfloat16)[:, 0]
+        patches = prepare_on_gpu(images, mean, scale, LEVELS, 5.0, jnp.bfloat16)[:, 0]
         out = _apply_on_gpu(patches, weights, 0, patches.shape[0])
         return _backward_on_gpu(patches, weights, out, out, 0, patches.shape[0])
 
@@ -106,26 +102,17 @@ def _dispatch(on_gpu: Any, plain: Any, *arguments: Any, interpret: bool) -> Any:
     return by_platform(lambda *given: (on_gpu if runs_gpu_kernels(probe) else plain)(*given), *arguments)
 
 
-def _padded(channels: int) -> int:
-    return pl.next_power_of_2(channels)
-
-
-def _divisor(number: int, limit: int) -> int:
-    """The largest power of two that divides ``number``, at most ``limit``."""
-    return math.gcd(number, limit)
-
-
 def make_weights(params: dict[str, Any], channels: int) -> Weights:
     """The first three layers of an encoder (`networks`) for images of ``channels`` channels."""
     window = params["kernel_0"].reshape(2, 2, channels, -1)  # row, column, channel, filter
-    window = jnp.pad(window, [(0, 0), (0, 0), (0, _padded(channels) - channels), (0, 0)])
+    window = jnp.pad(window, [(0, 0), (0, 0), (0, padded_channels(channels) - channels), (0, 0)])
     # From (channel, window's row, row, window's column, column) to (window's row, window's column, filter), where a window only
     # sees itself. Written as a product by zeros and ones, which XLA makes one pass of.
     same = jnp.eye(2, dtype=window.dtype)
     same = same[:, None, None, None, :, None, None] * same[:, None, None, :, None]
     quarter = window.transpose(2, 0, 1, 3)[:, None, :, None, :, None, None, :] * same
     return Weights(
-        kernel_1=quarter.reshape(16 * _padded(channels), -1),
+        kernel_1=quarter.reshape(16 * padded_channels(channels), -1),
         bias_1=jnp.tile(params["bias_0"], 4),
         kernel_2=params["kernel_1"],
         bias_2=params["bias_1"],
@@ -135,55 +122,6 @@ def make_weights(params: dict[str, Any], channels: int) -> Weights:
 
 
 # -- Images
-
-
-def _word_offsets(first_patch: Any, patches: int, shape: tuple[int, int, int], levels: int) -> tuple[jax.Array, jax.Array]:
-    """Where the words of some patches lie in a planar image, and whether they are there: [patches, 16 C'] int32 and bool.
-
-    Patches run over the 2^levels blocks of the image, row by row, and within a block over its halves of halves (as
-    `blocks.to_blocks`), so that the next layers find their windows side by side. Words of a patch run over (quarter's row,
-    quarter's column, channel, row).
-    """
-    channels, height, width = shape
-    columns, padded = width >> levels, _padded(channels)
-    size = (patches, 16 * padded)
-    # Non-negative throughout: lax.div and lax.rem, unlike // and %, then compile to shifts and masks.
-    div, rem = lambda a, b: jax.lax.div(a, jnp.int32(b)), lambda a, b: jax.lax.rem(a, jnp.int32(b))
-    patch = first_patch + jax.lax.broadcasted_iota(jnp.int32, size, 0)
-    word = jax.lax.broadcasted_iota(jnp.int32, size, 1)
-
-    finer = levels - LEVELS
-    block = div(patch, 4**finer)
-    row, column = div(block, columns), rem(block, columns)
-    for level in reversed(range(finer)):
-        quarter = rem(div(patch, 4**level), 4)
-        row, column = 2 * row + div(quarter, 2), 2 * column + rem(quarter, 2)
-
-    row = 8 * row + 4 * div(word, 8 * padded) + rem(word, 4)
-    column = 2 * column + rem(div(word, 4 * padded), 2)
-    channel = rem(div(word, 4), padded)
-    return channel * (height * width // WORD) + row * (width // WORD) + column, channel < channels
-
-
-def _prepare_kernel(words_ref, mean_ref, scale_ref, out_ref, *, shape, levels, limit):
-    images, patches, size = out_ref.shape
-    offsets, there = _word_offsets(pl.program_id(0) * patches, patches, shape, levels)
-    pixels = (patches, size // WORD, WORD)
-    byte = jax.lax.broadcasted_iota(jnp.int32, pixels, 2)
-    inside = jnp.broadcast_to(there[:, :, None], pixels)
-    places = offsets[:, :, None] * WORD + byte
-    # The same pixels of every image: their statistics stay in registers.
-    mean = plgpu.load(mean_ref.at[places], mask=inside, other=0.0)
-    scale = plgpu.load(scale_ref.at[places], mask=inside, other=0.0)
-    shift = (8 * byte).astype(jnp.uint32)
-
-    def one_image(image, _):
-        words = plgpu.load(words_ref.at[image, offsets], mask=there, other=0)
-        values = (jax.lax.shift_right_logical(jnp.broadcast_to(words[:, :, None], pixels), shift) & 255).astype(jnp.float32)
-        values = jnp.clip((values - mean) * scale, -limit, limit)
-        out_ref[image] = values.astype(out_ref.dtype).reshape(patches, size)
-
-    jax.lax.fori_loop(0, images, one_image, None)
 
 
 def prepare(
@@ -200,52 +138,8 @@ def prepare(
         interpret: Run the kernel without a GPU, slowly.
     """
     settings = {"levels": levels, "limit": limit, "dtype": dtype}
-    on_gpu = functools.partial(_prepare_on_gpu, **settings, interpret=interpret)
-    return _dispatch(on_gpu, functools.partial(_prepare_plainly, **settings), images, mean, scale, interpret=interpret)
-
-
-def _prepare_on_gpu(
-    images: jax.Array, mean: jax.Array, scale: jax.Array, levels: int, limit: float, dtype: Any, interpret: bool = False
-) -> jax.Array:
-    batch, *shape = images.shape
-    channels, height, width = shape
-    patches = (height >> levels) * (width >> levels) * 4 ** (levels - LEVELS)
-    size = 64 * _padded(channels)
-    tile, together = _divisor(patches, _PREPARE_PATCHES), _divisor(batch, _PREPARE_IMAGES)
-    pixels = math.prod(shape)
-    words = jax.lax.bitcast_convert_type(images.reshape(batch, pixels // WORD, WORD), jnp.uint32)
-    whole = pl.BlockSpec((pixels,), lambda patch, image: (0,))
-    return pl.pallas_call(
-        functools.partial(_prepare_kernel, shape=tuple(shape), levels=levels, limit=limit),
-        out_shape=jax.ShapeDtypeStruct((batch, patches, size), dtype),
-        grid=(patches // tile, batch // together),
-        in_specs=[pl.BlockSpec((together, pixels // WORD), lambda patch, image: (image, 0)), whole, whole],
-        out_specs=pl.BlockSpec((together, tile, size), lambda patch, image: (image, patch, 0)),
-        compiler_params=_PREPARE,
-        interpret=interpret,
-        name="prepare_patches",
-    )(words, mean.reshape(pixels), scale.reshape(pixels))
-
-
-def _prepare_plainly(images: jax.Array, mean: jax.Array, scale: jax.Array, levels: int, limit: float, dtype: Any) -> jax.Array:
-    patches, mean, scale = (_to_patches(array, levels) for array in (images, mean, scale))
-    return jnp.clip((patches.astype(jnp.float32) - mean) * scale, -limit, limit).astype(dtype)
-
-
-def _to_patches(images: jax.Array, levels: int) -> jax.Array:
-    """[..., C, H, W] -> [..., patches, 64 C'], in the order of `_word_offsets`; channels that are padding hold zeros."""
-    *batch, channels, height, width = images.shape
-    rows, columns, finer = height >> levels, width >> levels, (2,) * (levels - LEVELS)
-    images = images[..., : rows << levels, : columns << levels]
-    images = images.reshape(*batch, channels, rows, *finer, 2, WORD, columns, *finer, 2, WORD)
-    first, along = len(batch), levels - LEVELS + 3  # axes before the channels', and those of a side
-    row_axis, column_axis = first + 1, first + 1 + along
-    # Coarse to fine; within a quarter of a patch: channel, row, column.
-    pairs = [axis for level in range(along - 1) for axis in (row_axis + level, column_axis + level)]
-    images = images.transpose(*range(first), *pairs, first, row_axis + along - 1, column_axis + along - 1)
-    images = images.reshape(*batch, -1, 4, channels, WORD * WORD)
-    images = jnp.pad(images, [(0, 0)] * (first + 2) + [(0, _padded(channels) - channels), (0, 0)])
-    return images.reshape(*batch, -1, 64 * _padded(channels))
+    on_gpu = functools.partial(prepare_on_gpu, **settings, interpret=interpret)
+    return _dispatch(on_gpu, functools.partial(prepare_plainly, **settings), images, mean, scale, interpret=interpret)
 
 
 # -- Layers
@@ -347,8 +241,8 @@ def apply(patches: jax.Array, weights: Weights, first: int, count: int, interpre
 
 def _apply_on_gpu(patches: jax.Array, weights: Weights, first: int, count: int, interpret: bool = False) -> jax.Array:
     size, outputs = patches.shape[1], weights.bias_3.shape[0]
-    tile = _divisor(math.gcd(first, count), _FORWARD_PATCHES)
-    block = tile * _divisor(math.gcd(first, count) // tile, _FORWARD_TILES)
+    tile = divisor(math.gcd(first, count), _FORWARD_PATCHES)
+    block = tile * divisor(math.gcd(first, count) // tile, _FORWARD_TILES)
     cast = _cast(weights, patches.dtype)
     return pl.pallas_call(
         functools.partial(_forward_kernel, patches=tile),
@@ -387,8 +281,8 @@ def _backward_on_gpu(
 ) -> Weights:
     """Gradients of the weights, float32."""
     size, outputs = patches.shape[1], out.shape[1]
-    tile = _divisor(math.gcd(first, count), _BACKWARD_PATCHES)
-    block = tile * _divisor(math.gcd(first, count) // tile, _BACKWARD_TILES)
+    tile = divisor(math.gcd(first, count), _BACKWARD_PATCHES)
+    block = tile * divisor(math.gcd(first, count) // tile, _BACKWARD_TILES)
     programs = count // block
     cast = _cast(weights, patches.dtype)
     total = sum(array.size for array in weights)

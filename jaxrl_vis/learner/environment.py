@@ -5,8 +5,9 @@ from typing import Any
 
 import jaxrl_vis_envs
 from jaxrl_vis import fields
-from jaxrl_vis.config import Config, validate
+from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError, nearest
+from jaxrl_vis.validation import validate
 from jaxrl_vis_envs.base import GoalEnv
 from jaxrl_vis_envs.randomization import typical
 from jaxrl_vis_envs.registry import config_class, load

@@ -112,6 +112,11 @@ class Rollout(NamedTuple):
     record: Any
 
 
+def _episode_major(*parts: jax.Array) -> jax.Array:
+    """Steps [T, S, K, ...] one after the other, as episodes: [S, K, T, ...]."""
+    return jnp.moveaxis(jnp.concatenate(parts), 0, 2)
+
+
 def play(
     env: GoalEnv,
     networks: Networks,
@@ -183,13 +188,10 @@ def play(
     (state, _), ((observations, states, actions), records) = jax.lax.scan(step, carry, step_keys)
     outcome = {name: by_seed(state.metrics[name]) for name in ("success", "goal_distance")}
 
-    def episode_major(*parts: jax.Array) -> jax.Array:
-        return jnp.moveaxis(jnp.concatenate(parts), 0, 2)
-
     episodes = Episodes(
-        observations=episode_major(kept(first_observation)[None], observations, kept(goal)[None]),
-        states=episode_major(kept(first_state)[None], states, kept(state.goal_state)[None]),
+        observations=_episode_major(kept(first_observation)[None], observations, kept(goal)[None]),
+        states=_episode_major(kept(first_state)[None], states, kept(state.goal_state)[None]),
         actions=jnp.moveaxis(actions, 0, 2),
     )
-    record_of_all = jax.tree.map(lambda first, rest: episode_major(first[None], rest), first_record, records)
+    record_of_all = jax.tree.map(lambda first, rest: _episode_major(first[None], rest), first_record, records)
     return Rollout(episodes, outcome, record_of_all)

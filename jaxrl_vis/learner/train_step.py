@@ -19,7 +19,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxrl_vis.config import Config, Resolved, resolve, validate
+from jaxrl_vis.config import Config, Resolved, resolve
 from jaxrl_vis.learner import normalizer
 from jaxrl_vis.learner.auxiliary import Auxiliary, make_auxiliary
 from jaxrl_vis.learner.ddpg import Algorithm, Working, make_ddpg
@@ -29,7 +29,9 @@ from jaxrl_vis.learner.replay import Replay, make_replay, num_bytes
 from jaxrl_vis.learner.rollout import Exploration, play
 from jaxrl_vis.learner.sampling import Choice, Sampler
 from jaxrl_vis.learner.sharding import Layout, make_layout
+from jaxrl_vis.learner.shards import Shards
 from jaxrl_vis.types import Episodes, LoopState, Metrics, ReplayState, TrainState
+from jaxrl_vis.validation import validate
 from jaxrl_vis_envs.base import GoalEnv
 from jaxrl_vis_envs.compilation import env_jit
 
@@ -154,6 +156,34 @@ def _see(train: TrainState, episodes: Episodes, key: jax.Array, config: Config, 
     return train.replace(goal_normalizer=normalizer.update(train.goal_normalizer, goals, axes, sampler.shards))
 
 
+def _make_insert(config: Config, sampler: Sampler, auxiliary: Auxiliary) -> Callable:
+    """What takes a rollout of one seed into its replay and its statistics."""
+
+    def insert(
+        train: TrainState, replay_state: ReplayState, episodes: Episodes, key: jax.Array, iteration: jax.Array
+    ) -> tuple[TrainState, ReplayState]:
+        episodes = auxiliary.with_flow(episodes)
+        replay_state = sampler.replay.insert(replay_state, episodes, iteration)
+        return _see(train, episodes, jax.random.fold_in(key, _STATISTICS), config, sampler), replay_state
+
+    return insert
+
+
+def _make_learn(insert: Callable, update_many: Callable, algorithm: Algorithm, shards: Shards) -> Callable:
+    """What comes after a rollout of one seed: insertion, updates, metrics."""
+
+    def learn(loop: LoopState, episodes: Episodes, outcome: Metrics, key: jax.Array) -> tuple[LoopState, Metrics]:
+        train, replay_state = insert(loop.train, loop.replay, episodes, key, loop.iteration)
+        train, metrics = update_many(train, replay_state, key, loop.iteration)
+        found = {f"train/{name}": jnp.mean(values) for name, values in outcome.items()}
+        found["train/value_at_goals"] = algorithm.value_at_goals(train, episodes.observations[:, -1])
+        metrics |= shards.mean(found)
+        metrics["guard/nonfinite"] = shards.total(_count_nonfinite((metrics, episodes.states, episodes.actions)))
+        return LoopState(train=train, replay=replay_state, key=loop.key, iteration=loop.iteration + 1), metrics
+
+    return learn
+
+
 def _count_nonfinite(tree: Any) -> jax.Array:
     floats = [leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating)]
     return sum((jnp.sum(~jnp.isfinite(leaf)) for leaf in floats), jnp.zeros((), jnp.int32)).astype(jnp.float32)
@@ -203,7 +233,9 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None) 
     replay = make_replay(config.replay_transitions, config.num_envs, env.horizon)
     replay = replay._replace(num_envs=config.num_envs // shards.count)
     sampler = Sampler(config, resolved, replay, env.threshold, env.as_goal if env.frame_stack > 1 else None, auxiliary, shards)
+    insert = _make_insert(config, sampler, auxiliary)
     update_many = _make_update_many(config, sampler, algorithm)
+    learn = _make_learn(insert, update_many, algorithm, shards)
     exploration = Exploration(config.random_action_probability, config.action_noise)
 
     def init(key: jax.Array) -> LoopState:
@@ -225,13 +257,6 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None) 
         episodes, outcome, _ = play(env, networks, train, keys, config.num_envs, exploration, shards=shards)
         return episodes, outcome
 
-    def insert(
-        train: TrainState, replay_state: ReplayState, episodes: Episodes, key: jax.Array, iteration: jax.Array
-    ) -> tuple[TrainState, ReplayState]:
-        episodes = auxiliary.with_flow(episodes)
-        replay_state = replay.insert(replay_state, episodes, iteration)
-        return _see(train, episodes, jax.random.fold_in(key, _STATISTICS), config, sampler), replay_state
-
     def insert_seeds(
         train: TrainState, replay_state: ReplayState, episodes: Episodes, keys: jax.Array, iteration: jax.Array
     ) -> tuple[TrainState, ReplayState]:
@@ -250,15 +275,6 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None) 
         episodes, outcome = rollout(loop.train, keys[0])
         loop, metrics = per_seed(learn, (_SEED_AXES, 0, 0, 0), (_SEED_AXES, 0))(loop, episodes, outcome, keys[1])
         return loop.replace(replay=layout.folded(loop.replay, replay.num_envs)), metrics
-
-    def learn(loop: LoopState, episodes: Episodes, outcome: Metrics, key: jax.Array) -> tuple[LoopState, Metrics]:
-        train, replay_state = insert(loop.train, loop.replay, episodes, key, loop.iteration)
-        train, metrics = update_many(train, replay_state, key, loop.iteration)
-        found = {f"train/{name}": jnp.mean(values) for name, values in outcome.items()}
-        found["train/value_at_goals"] = algorithm.value_at_goals(train, episodes.observations[:, -1])
-        metrics |= shards.mean(found)
-        metrics["guard/nonfinite"] = shards.total(_count_nonfinite((metrics, episodes.states, episodes.actions)))
-        return LoopState(train=train, replay=replay_state, key=loop.key, iteration=loop.iteration + 1), metrics
 
     return TrainStep(
         env=env,

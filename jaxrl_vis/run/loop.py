@@ -26,7 +26,6 @@ import numpy as np
 
 from jaxrl_vis import processes
 from jaxrl_vis.errors import NonFiniteError, StorageError
-from jaxrl_vis.report import videos
 from jaxrl_vis.run import metrics
 from jaxrl_vis.run.checkpoint import FULL, LIGHT, Checkpoints, Restored
 from jaxrl_vis.run.console import RunConsole, show_seconds, show_shares
@@ -36,6 +35,7 @@ from jaxrl_vis.run.memory import check_compiled, check_memory
 from jaxrl_vis.run.metrics import PerSeed
 from jaxrl_vis.run.programs import Programs
 from jaxrl_vis.run.progress import Progress
+from jaxrl_vis.run.results import Results, describe
 from jaxrl_vis.run.saving import Saver
 from jaxrl_vis.run.signals import Interruption
 from jaxrl_vis.types import LoopState
@@ -80,6 +80,7 @@ class RunLoop:
         self._checkpoints = Checkpoints(folder.checkpoints, self._say)
         self._saver = Saver(programs, folder, self._checkpoints, self._say)
         self._log, self._loggers = log, Loggers(log if self._writes else (), folder.path, self._say)
+        self._results = Results(programs, folder, self._loggers, self._say)
         self._total: int = self._program.num_iterations
         self._progress = Progress()
         self._done = 0
@@ -144,12 +145,6 @@ class RunLoop:
             return
         self._saver.rescue(self._loop, self._done, self._progress_now())
 
-    @property
-    def _asked(self) -> str:
-        config = self._config
-        seeds = f"seed {config.seed}" if config.seeds == 1 else f"seeds {config.seed} to {config.seed + config.seeds - 1}"
-        return f"{config.method}, preset {config.preset}, {seeds}"
-
     # -- Before
 
     def _is_finished(self) -> bool:
@@ -166,7 +161,7 @@ class RunLoop:
     def _prepare(self, goes_on: bool, memory: str) -> dict[str, Any]:
         """Restores and compiles; the compiled programs by name. Nothing is written."""
         programs, steps = self._programs, self._program.steps_per_iteration
-        self._say(f"{self._config.env}, {self._asked}, on {programs.layout.name}; {memory}")
+        self._say(f"{self._config.env}, {describe(self._config)}, on {programs.layout.name}; {memory}")
         self._say(f"{self._total} iterations of {steps:,} environment steps per seed; files go to {self._folder.path}")
         restored = self._checkpoints.restore_for_resume(programs.shapes) if goes_on else None
         if restored is not None:
@@ -365,7 +360,8 @@ class RunLoop:
         self._progress.evaluation_due = evaluation_due
         self._saver.on_signal(self._loop, self._done, self._progress_now(), interruption.name)
         with contextlib.suppress(OSError):
-            self._draw_curve()
+            if self._writes:
+                self._results.draw_curve(self._done)
         interruption.end()
 
     def _stop_nonfinite(self, where: str, values: PerSeed) -> None:
@@ -390,35 +386,4 @@ class RunLoop:
             # Killed after the last evaluation, before this: resumed with nothing left to evaluate.
             _, self._recorded = self._programs.evaluate(self._loop.train)
         if self._writes:
-            self._show_results()
-
-    def _show_results(self) -> None:
-        """Draws what a finished run leaves behind, and says so."""
-        self._draw_curve()
-        if self._programs.shows_images:
-            videos.write_video(videos.first_seed(self._recorded), self._folder.video, self._programs.image_seconds)
-            self._loggers.image("video", self._folder.video, self._done * self._program.steps_per_iteration)
-        wall = self._progress.wall_s + time.monotonic() - self._started
-        rows = [row for row in metrics.read_rows(self._folder.metrics) if row["iteration"] == self._done]
-        success = ", ".join(f"seed {row['seed']}: {row['eval/success']:.3f}" for row in rows)
-        written = [file.name for file in (self._folder.curve, self._folder.video) if file.exists()]
-        compiling = show_seconds(self._progress.compile_s)
-        self._say(f"success at the end: {success}; {show_seconds(wall)}, of which {compiling} compiling")
-        self._say(f"see {', '.join([*written, self._folder.metrics.name])} in {self._folder.path}")
-
-    def _draw_curve(self) -> None:
-        if not self._writes:
-            return
-        from jaxrl_vis.report import plots
-
-        config, env = self._config, self._programs.env
-        plots.plot_run(
-            metrics.read_rows(self._folder.metrics),
-            self._folder.curve,
-            title=config.env,
-            subtitle=f"{self._asked}, {config.eval_episodes} episodes per evaluation"
-            + ("; thick: median, band: middle half" if config.seeds > 1 else ""),
-            unit=env.distance_unit,
-            threshold=env.threshold,
-        )
-        self._loggers.image("curve", self._folder.curve, self._done * self._program.steps_per_iteration)
+            self._results.show(self._done, self._progress_now, self._recorded)

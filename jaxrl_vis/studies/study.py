@@ -4,9 +4,10 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from jaxrl_vis.config import Config, preset, validate
+from jaxrl_vis.config import Config, preset
 from jaxrl_vis.errors import RequestError, nearest
 from jaxrl_vis.studies.cells import Cell, split_seeds
+from jaxrl_vis.validation import validate
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,12 +6,13 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxrl_vis.config import preset, validate
+from jaxrl_vis.config import preset
 from jaxrl_vis.devices import Device, list_devices
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.studies.cells import Cell, rows_of, show_budget, split_seeds, standing
 from jaxrl_vis.studies.cluster import Cluster, ExecutorName
 from jaxrl_vis.studies.grid import run_cells, start_process
+from jaxrl_vis.validation import validate
 
 SUBMITTED = "submitit"
 """Folder of submitit's own files, within that of the runs."""

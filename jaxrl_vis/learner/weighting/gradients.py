@@ -129,12 +129,7 @@ def weighted_grad(
         RequestError: There is no such way, or it does not find what the weighting needs; from the function returned: the losses
             are not those that the state began with, ``held`` is missing, or given without need.
     """
-    if way not in get_args(Way):
-        raise RequestError(f"unknown way to find gradients {way!r}{nearest(way, get_args(Way))}")
-    if way == "jvp" and weighting.needs == "gradients":
-        raise RequestError(
-            f"weighting {weighting.name} needs whole gradients, which jvp does not find; use one_hot or per_loss"
-        )
+    _check_way(way, weighting)
 
     def by_gradients(params: Params, state: WeightingState, *args: Any, held: Params = None) -> Weighted:
         losses, gradients, extra = loss_gradients(losses_fn, params, *args, way=way, has_aux=has_aux)
@@ -180,6 +175,15 @@ def weighted_grad(
         return by_jvp(params, state, *args) if way == "jvp" else by_gradients(params, state, *args, held=held)
 
     return gradient
+
+
+def _check_way(way: str, weighting: Weighting) -> None:
+    if way not in get_args(Way):
+        raise RequestError(f"unknown way to find gradients {way!r}{nearest(way, get_args(Way))}")
+    if way == "jvp" and weighting.needs == "gradients":
+        raise RequestError(
+            f"weighting {weighting.name} needs whole gradients, which jvp does not find; use one_hot or per_loss"
+        )
 
 
 def _check_names(losses: Losses, state: WeightingState) -> None:

@@ -75,48 +75,16 @@ def ol_aux(
 
     def init(names: Iterable[str], shared: Params = None) -> WeightingState:
         others = auxiliary_names(label, names)
-        state = start(others, dict.fromkeys(others, 1.0))
         if keeps_gradients and shared is None:
             raise RequestError(f"weighting {label} keeps gradients: give init the shared parameters, too")
-        sums = {name: jnp.zeros(()) for name in others}
-        if held:
-            return state.replace(sums={"losses": {MAIN: jnp.zeros(()), **sums}, "gradients": _zeros((MAIN, *others), shared)})
-        return state.replace(sums=sums, window=_zeros((MAIN, *others), shared, window) if window > 1 else None)
-
-    def learned(losses: Losses, gradients: Mapping[str, Params]) -> dict[str, Params]:
-        """Gradients of the losses as those of what is learned."""
-        return {name: scaled(gradients[name], slope) for name, slope in weighting.slopes(losses).items()}
-
-    def direction(gradients: Mapping[str, Params], weights: Weights) -> Params:
-        """What the others are compared with, of gradients of what is learned."""
-        return gradients[MAIN] if main_grad == "main" else weighted_sum(gradients, weights)
-
-    def dots_of(losses: Losses, statistics: Any, state: WeightingState) -> tuple[dict[str, jax.Array], Any]:
-        """The dots of one update, of what is learned, and the new window."""
-        if window == 1:
-            slopes = weighting.slopes(losses)
-            of_main = slopes[MAIN] if main_grad == "main" else 1.0  # the combined gradient is one of what is learned already
-            return {name: of_main * slopes[name] * statistics[name] for name in state.sums}, None
-        latest = learned(losses, statistics)
-        latest[MAIN] = direction(latest, state.weights)
-        kept = jax.tree.map(lambda old, new: jnp.concatenate([old[1:], new[None]]), state.window, latest)
-        count = jnp.minimum(state.updates + 1, window)  # the window begins with zeros
-        mean = jax.tree.map(lambda leaf: jnp.sum(leaf, axis=0) / count, kept)
-        return {name: dot(mean[MAIN], mean[name]) for name in state.sums}, kept
-
-    def dots_of_held(sums: Any, state: WeightingState) -> dict[str, jax.Array]:
-        """Dots of the gradients of all minibatches since the weights last moved, as of one large minibatch."""
-        mean = scaled(sums, 1.0 / (state.updates % interval + 1))
-        gradients = learned(mean["losses"], mean["gradients"])
-        main = direction(gradients, state.weights)
-        return {name: dot(main, gradient) for name, gradient in gradients.items() if name != MAIN}
+        return _begin(others, shared, window, held)
 
     def update(losses: Losses, statistics: Any, state: WeightingState) -> tuple[Weights, WeightingState, Metrics]:
         if held:
             kept, sums = None, jax.tree.map(jnp.add, state.sums, {"losses": dict(losses), "gradients": dict(statistics)})
-            mean = dots = dots_of_held(sums, state)
+            mean = dots = _dots_of_held(weighting, sums, state)
         else:
-            dots, kept = dots_of(losses, statistics, state)
+            dots, kept = _dots_of(weighting, window, losses, statistics, state)
             sums = jax.tree.map(jnp.add, state.sums, dots)
             mean = scaled(sums, 1.0 / interval)
         due = (state.updates + 1) % interval == 0
@@ -159,6 +127,50 @@ def ol_aux_ablation(interval: int = 5, **options: Any) -> Weighting:
         options: Those of `ol_aux`.
     """
     return ol_aux(interval, held=True, **options)
+
+
+def _begin(others: tuple[str, ...], shared: Params, window: int, held: bool) -> WeightingState:
+    """The state of `ol_aux` before its first update, with these auxiliary losses."""
+    state = start(others, dict.fromkeys(others, 1.0))
+    sums = {name: jnp.zeros(()) for name in others}
+    if held:
+        return state.replace(sums={"losses": {MAIN: jnp.zeros(()), **sums}, "gradients": _zeros((MAIN, *others), shared)})
+    return state.replace(sums=sums, window=_zeros((MAIN, *others), shared, window) if window > 1 else None)
+
+
+def _learned(weighting: Weighting, losses: Losses, gradients: Mapping[str, Params]) -> dict[str, Params]:
+    """Gradients of the losses as those of what is learned."""
+    return {name: scaled(gradients[name], slope) for name, slope in weighting.slopes(losses).items()}
+
+
+def _direction(weighting: Weighting, gradients: Mapping[str, Params], weights: Weights) -> Params:
+    """What the others are compared with, of gradients of what is learned."""
+    return gradients[MAIN] if weighting.main_grad == "main" else weighted_sum(gradients, weights)
+
+
+def _dots_of(
+    weighting: Weighting, window: int, losses: Losses, statistics: Any, state: WeightingState
+) -> tuple[dict[str, jax.Array], Any]:
+    """The dots of one update, of what is learned, and the new window."""
+    if window == 1:
+        slopes = weighting.slopes(losses)
+        # The combined gradient is one of what is learned already.
+        of_main = slopes[MAIN] if weighting.main_grad == "main" else 1.0
+        return {name: of_main * slopes[name] * statistics[name] for name in state.sums}, None
+    latest = _learned(weighting, losses, statistics)
+    latest[MAIN] = _direction(weighting, latest, state.weights)
+    kept = jax.tree.map(lambda old, new: jnp.concatenate([old[1:], new[None]]), state.window, latest)
+    count = jnp.minimum(state.updates + 1, window)  # the window begins with zeros
+    mean = jax.tree.map(lambda leaf: jnp.sum(leaf, axis=0) / count, kept)
+    return {name: dot(mean[MAIN], mean[name]) for name in state.sums}, kept
+
+
+def _dots_of_held(weighting: Weighting, sums: Any, state: WeightingState) -> dict[str, jax.Array]:
+    """Dots of the gradients of all minibatches since the weights last moved, as of one large minibatch."""
+    mean = scaled(sums, 1.0 / (state.updates % weighting.interval + 1))
+    gradients = _learned(weighting, mean["losses"], mean["gradients"])
+    main = _direction(weighting, gradients, state.weights)
+    return {name: dot(main, gradient) for name, gradient in gradients.items() if name != MAIN}
 
 
 def _zeros(names: Iterable[str], shared: Params, *leading: int) -> dict[str, Params]:

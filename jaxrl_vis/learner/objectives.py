@@ -1,0 +1,178 @@
+"""What the critic and the actor learn from a batch: their losses, auxiliary ones included, and one weighted gradient for each.
+
+Four networks read three observations (before, goal, after). Each is normalised and ordered once, and each network encodes what
+it needs in one pass:
+
+    critic, actor (online, with gradient)   before, goal, and for auxiliary tasks after, moved
+    their targets                           goal, after
+
+The actor's loss values its actions with the critic's latents from the critic's own forward pass: the actor cannot change them.
+"""
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxrl_vis.config import Config, Resolved
+from jaxrl_vis.learner import losses
+from jaxrl_vis.learner.auxiliary import Auxiliary
+from jaxrl_vis.learner.auxtasks import View
+from jaxrl_vis.learner.networks import Networks
+from jaxrl_vis.learner.shards import Shards
+from jaxrl_vis.learner.weighting import MAIN, Weighted, WeightingState, weighted_grad
+from jaxrl_vis.types import Batch, Params
+
+
+class ComputeCopies(NamedTuple):
+    """Networks of a `TrainState` in the dtype that they are computed with (`Networks.compute_copy`)."""
+
+    actor: Params
+    critic: Params
+    target_actor: Params
+    target_critic: Params
+
+
+def _encode(networks: Networks, params: Params, inputs: jax.Array, size: int, first: int, count: int = 2) -> jax.Array:
+    """Latents [count, B, latent] of observations ``first``, ``first`` + 1, ... of those of a batch of ``size`` transitions."""
+    return networks.encode(params, inputs, slice(first * size, (first + count) * size)).reshape(count, size, -1)
+
+
+class Latents(NamedTuple):
+    """Latents of a transition's observations by one online network, [B, latent] each.
+
+    Attributes:
+        pair: [2, B, latent] before and goal, as heads take them.
+        before: The first of them.
+        after, moved: None where no loss reads them.
+    """
+
+    pair: jax.Array
+    before: jax.Array
+    after: jax.Array | None = None
+    moved: jax.Array | None = None
+
+
+def _encode_online(networks: Networks, auxiliary: Auxiliary, params: Params, inputs: jax.Array, size: int) -> Latents:
+    """Latents of all observations that losses read, with gradient.
+
+    Most auxiliary losses read two of them or one. Encoded one by one, the gradient of each loss passes through these alone.
+    """
+    if not auxiliary.tasks:
+        pair = _encode(networks, params, inputs, size, 0)
+        return Latents(pair, pair[0])
+    before, goal, *others = (_encode(networks, params, inputs, size, n, count=1)[0] for n in range(auxiliary.observations))
+    return Latents(jnp.stack([before, goal]), before, *others)
+
+
+def _next_latents(networks: Networks, now: ComputeCopies, inputs: jax.Array, latents: Latents) -> tuple[jax.Array, jax.Array]:
+    """Latents [2, B, latent] of the observation after and the goal, for the target actor and for the target critic.
+
+    Heads take them in this order; observations come as (goal, after). ``latents`` are the online critic's.
+    """
+    size = latents.before.shape[0]
+    if networks.config.target_encoder:
+        of_critic = _encode(networks, now.target_critic, inputs, size, 1)[::-1]
+    else:
+        after = latents.after
+        after = _encode(networks, now.critic, inputs, size, 2, count=1) if after is None else after[None]
+        of_critic = jnp.concatenate([after, latents.pair[1:]])
+    if networks.config.encoders == "shared":
+        return of_critic, of_critic
+    of_actor = _encode(networks, networks.with_encoder(now.target_actor, now.actor), inputs, size, 1)[::-1]
+    return of_actor, of_critic
+
+
+@dataclasses.dataclass(frozen=True)
+class Objectives:
+    """The losses of both networks and their weighted gradients, for one configuration."""
+
+    networks: Networks
+    config: Config
+    resolved: Resolved
+    auxiliary: Auxiliary
+    shards: Shards
+
+    @property
+    def reduces_early(self) -> bool:
+        """Whether the critic's gradients are averaged over the parts of a learner before they are weighted.
+
+        A weighting that takes logarithms of losses, or compares gradients, must see those of the whole learner. What others
+        make of them is a sum, which may be averaged afterwards, together with all else.
+        """
+        weighting = self.auxiliary.weighting
+        return self.shards.count > 1 and (weighting.needs != "losses" or weighting.log)
+
+    def of_critic(
+        self,
+        now: ComputeCopies,
+        state: WeightingState | None,
+        inputs: jax.Array,
+        image: jax.Array | None,
+        batch: Batch,
+        held: Params,
+    ) -> Weighted:
+        """The critic's losses and their gradient; ``extra`` is (latents, values [B], keep [B])."""
+        networks, weighting = self.networks, self.auxiliary.weighting
+        size = batch.action.shape[0]
+
+        def critic_losses(critic: Params):
+            assert batch.reward is not None
+            latents = _encode_online(networks, self.auxiliary, critic, inputs, size)
+            target = self._target(now, inputs, latents, batch)
+            value = networks.value(critic, latents.pair, batch.action)
+            keep = losses.keep_mask(batch.reward, value, self.resolved.reward_negative, self.resolved.filter_threshold)
+            others = self._auxiliary(critic, latents, image, batch)
+            return {MAIN: losses.critic_loss(value, target, keep, self._kept(keep)), **others}, (latents, value, keep)
+
+        # Weightings that compare no gradients need one backward pass only, which the last way of finding them takes.
+        way = "jvp" if weighting.needs == "losses" else self.config.aux_gradients
+        options = {"reduce": self.shards.mean} if self.reduces_early else {}
+        find = weighted_grad(critic_losses, weighting, lambda critic: critic["encoder"], way, has_aux=True, **options)
+        state = self.auxiliary.start(now.critic.get("encoder")) if state is None else state
+        return find(now.critic, state, held=held) if weighting.held else find(now.critic, state)
+
+    def _kept(self, keep: jax.Array) -> jax.Array | None:
+        """Transitions that count in a part, on average over the parts, by which all divide alike; None: its own."""
+        if self.shards.count == 1 or math.isinf(self.resolved.filter_threshold):
+            return None
+        return jnp.maximum(self.shards.mean(jnp.sum(keep)), 1.0 / self.shards.count)
+
+    def _target(self, now: ComputeCopies, inputs: jax.Array, latents: Latents, batch: Batch) -> jax.Array:
+        assert batch.reward is not None
+        networks, resolved = self.networks, self.resolved
+        of_actor, of_critic = _next_latents(networks, now, inputs, jax.lax.stop_gradient(latents))
+        value_tp1 = networks.value(now.target_critic, of_critic, networks.act(now.target_actor, of_actor))
+        discount = resolved.discount if batch.discount is None else batch.discount
+        return losses.td_target(batch.reward, value_tp1, discount, resolved.target_minimum, resolved.target_maximum)
+
+    def of_actor(
+        self,
+        actor: Params,
+        critic: Params,
+        inputs: jax.Array,
+        critic_latents: Latents,
+        image: jax.Array | None,
+        batch: Batch,
+        weights: dict[str, jax.Array],
+    ) -> tuple[jax.Array, jax.Array]:
+        """The actor's loss, those of its auxiliary tasks with the critic's weights added, and its actions [B, A]."""
+        has_encoder = self.config.encoders == "separate"
+        latents, others = critic_latents, {}
+        if has_encoder:
+            latents = _encode_online(self.networks, self.auxiliary, actor, inputs, batch.action.shape[0])
+            others = self._auxiliary(actor, latents, image, batch)
+        if self.auxiliary.weighting.log:
+            others = {name: self.shards.whole(loss) for name, loss in others.items()}
+        action = self.networks.act(actor, latents.pair)
+        value = self.networks.value(critic, critic_latents.pair, action)
+        best = self.resolved.reward_positive / (1.0 - self.resolved.discount) if self.auxiliary.weighting.log else None
+        loss = losses.actor_loss(value, action, self.config.action_penalty, best, self.shards.whole)
+        return loss + self.auxiliary.weighting.objective(weights, others), action
+
+    def _auxiliary(self, params: Params, latents: Latents, image: jax.Array | None, batch: Batch) -> dict[str, jax.Array]:
+        """Losses of the auxiliary tasks on a network's latents, by name."""
+        seen = {"latent_t": latents.before, "latent_tp1": latents.after, "latent_moved": latents.moved}
+        return self.auxiliary.losses(params.get("heads", {}), View(**seen, image=image, action=batch.action), batch)

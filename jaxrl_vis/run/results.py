@@ -1,0 +1,72 @@
+"""What a run shows of itself: its curve, and at its end the video and a summary in words. Only the first process makes them."""
+
+from collections.abc import Callable
+from typing import Any
+
+from jaxrl_vis.config import Config
+from jaxrl_vis.report import videos
+from jaxrl_vis.run import metrics
+from jaxrl_vis.run.console import show_seconds
+from jaxrl_vis.run.folder import RunFolder
+from jaxrl_vis.run.loggers import Loggers
+from jaxrl_vis.run.programs import Programs
+from jaxrl_vis.run.progress import Progress
+
+
+def describe(config: Config) -> str:
+    """What was asked for, in a few words: method, preset and seeds."""
+    seeds = f"seed {config.seed}" if config.seeds == 1 else f"seeds {config.seed} to {config.seed + config.seeds - 1}"
+    return f"{config.method}, preset {config.preset}, {seeds}"
+
+
+class Results:
+    """The files that a run leaves beside its metrics and checkpoints.
+
+    Args:
+        programs: What was run.
+        folder: Where the files go.
+        loggers: What else is given the images.
+        say: Prints a line.
+    """
+
+    def __init__(self, programs: Programs, folder: RunFolder, loggers: Loggers, say: Callable[[str], None]):
+        self._programs, self._folder, self._loggers, self._say = programs, folder, loggers, say
+
+    def show(self, done: int, progress_now: Callable[[], Progress], recorded: dict[str, Any]) -> None:
+        """Draws what a finished run leaves behind, and says so.
+
+        Args:
+            done: Iterations done.
+            progress_now: Its seconds count to the moment of the call.
+            recorded: Images of the last evaluation, see `evaluate.make_evaluate`; not read where there are none.
+        """
+        self.draw_curve(done)
+        if self._programs.shows_images:
+            videos.write_video(videos.first_seed(recorded), self._folder.video, self._programs.image_seconds)
+            self._loggers.image("video", self._folder.video, self._env_steps(done))
+        rows = [row for row in metrics.read_rows(self._folder.metrics) if row["iteration"] == done]
+        success = ", ".join(f"seed {row['seed']}: {row['eval/success']:.3f}" for row in rows)
+        written = [file.name for file in (self._folder.curve, self._folder.video) if file.exists()]
+        progress = progress_now()
+        compiling = show_seconds(progress.compile_s)
+        self._say(f"success at the end: {success}; {show_seconds(progress.wall_s)}, of which {compiling} compiling")
+        self._say(f"see {', '.join([*written, self._folder.metrics.name])} in {self._folder.path}")
+
+    def draw_curve(self, done: int) -> None:
+        """Draws the evaluations so far, after ``done`` iterations."""
+        from jaxrl_vis.report import plots
+
+        config, env = self._programs.config, self._programs.env
+        plots.plot_run(
+            metrics.read_rows(self._folder.metrics),
+            self._folder.curve,
+            title=config.env,
+            subtitle=f"{describe(config)}, {config.eval_episodes} episodes per evaluation"
+            + ("; thick: median, band: middle half" if config.seeds > 1 else ""),
+            unit=env.distance_unit,
+            threshold=env.threshold,
+        )
+        self._loggers.image("curve", self._folder.curve, self._env_steps(done))
+
+    def _env_steps(self, done: int) -> int:
+        return done * self._programs.program.steps_per_iteration

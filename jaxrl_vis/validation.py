@@ -1,0 +1,111 @@
+"""Whether a configuration makes sense in itself: checks that say in one line what is wrong, and how to mend it.
+
+Imports no JAX, so that the command line can refuse a request at once.
+"""
+
+import dataclasses
+import math
+
+from jaxrl_vis import fields
+from jaxrl_vis.config import Config, data_devices_of
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.methods import METHODS
+
+_LARGEST_SEED = 2**32 - 1  # a random key is made of 32 bits of it: larger seeds would repeat smaller ones
+_LARGEST_COUNT = 2**31 - 1  # arrays are indexed by int32; environment steps are counted on the host, without a bound
+
+_FALSE_REWARDS = ("reward_false_positives", "reward_false_negatives")
+_SHARES = (
+    *("relabel_probability", "balance_probability", "trivial_goals", "random_action_probability", "target_decay"),
+    *(*_FALSE_REWARDS, "reward_clutter"),
+)
+
+
+def validate(config: Config) -> Config:
+    """Returns ``config`` if it makes sense in itself; what depends on the environment is checked where that is known.
+
+    Raises:
+        RequestError: A field is of the wrong type or out of range. The message names the field and its value.
+    """
+    for name, hint in fields.hints(Config).items():
+        fields.check(name, hint, getattr(config, name))
+    for field in dataclasses.fields(Config):
+        value = getattr(config, field.name)
+        if field.type is int and field.name not in ("seed", "full_checkpoint_interval", "random_shift") and value < 1:
+            raise RequestError(f"{field.name} must be at least 1, not {value}")
+        if field.type is int and field.name not in ("seed", "env_steps") and value > _LARGEST_COUNT:
+            raise RequestError(f"{field.name} must be at most {_LARGEST_COUNT}, not {value}")
+    if config.frame_stack is not None and config.frame_stack < 1:
+        raise RequestError(f"frame_stack must be at least 1, not {config.frame_stack}")
+    for name in ("encoder_filters", "hidden_sizes"):
+        if any(size < 1 for size in getattr(config, name)):
+            raise RequestError(f"{name} must all be at least 1, not {' '.join(map(str, getattr(config, name)))}")
+    for name in _SHARES:
+        value = getattr(config, name)
+        if value is not None and not 0.0 <= value <= 1.0:
+            raise RequestError(f"{name} is a share and must lie in [0, 1], not {value}")
+    for name in ("actor_learning_rate", "critic_learning_rate", "normalizer_floor", "normalizer_clip", "randomize_strength"):
+        if not getattr(config, name) > 0.0:
+            raise RequestError(f"{name} must be positive, not {getattr(config, name)}")
+    for name in ("seed", "full_checkpoint_interval", "action_noise", "observation_noise", "reward_noise", "random_shift"):
+        if getattr(config, name) < 0:
+            raise RequestError(f"{name} must be at least 0, not {getattr(config, name)}")
+    if config.updates_per_iteration % config.actor_interval:
+        raise RequestError(
+            f"actor_interval ({config.actor_interval}) must divide updates_per_iteration ({config.updates_per_iteration})"
+        )
+    method = METHODS[config.method]
+    if config.n_step > 1 and method.filter:
+        raise RequestError(f"n_step {config.n_step} with method {config.method}: the filter's band is that of one step")
+    _validate_reward(config)
+    _validate_devices(config)
+    if config.seed + config.seeds - 1 > _LARGEST_SEED:
+        raise RequestError(f"seed {config.seed} is too large: the last of {config.seeds} must be at most {_LARGEST_SEED}")
+    return config
+
+
+def _validate_devices(config: Config) -> None:
+    """Raises a RequestError where the devices do not divide what is to be spread over them."""
+    devices, along_data = config.devices, data_devices_of(config)
+    if along_data < 1:
+        raise RequestError(f"data_devices must be at least 1, not {along_data}")
+    if devices % along_data:
+        raise RequestError(f"data_devices ({along_data}) must divide devices ({devices})")
+    groups = devices // along_data
+    if config.seeds % groups:
+        where = f"{groups} devices" if along_data == 1 else f"{groups} groups of {along_data} devices"
+        more = math.ceil(config.seeds / groups) * groups
+        raise RequestError(
+            f"seeds {config.seeds} cannot be divided among {where}: write --seeds {more}, or --data-devices {devices} to "
+            "divide each learner"
+        )
+    for name in ("num_envs", "batch_size", "eval_episodes"):
+        value = getattr(config, name)
+        if value % along_data:
+            option, more = f"--{name.replace('_', '-')}", math.ceil(value / along_data) * along_data
+            raise RequestError(f"{name} {value} cannot be divided among {along_data} devices: write {option} {more}")
+
+
+def _validate_reward(config: Config) -> None:
+    """Raises a RequestError where options of a reward are given to a method with another one, or contradict each other."""
+    kind = METHODS[config.method].reward
+    errors = {name: getattr(config, name) > 0.0 for name in ("reward_noise", *_FALSE_REWARDS)}
+    reads_states = {"n_step": config.n_step > 1, "trivial_goals": config.trivial_goals < 1.0, **errors}
+    for name, is_set in reads_states.items():
+        if is_set and kind != "oracle":
+            raise RequestError(f"{name} reads true states, which method {config.method} does without; use --method oracle")
+        if is_set and name in errors and config.n_step > 1:
+            raise RequestError(f"n_step {config.n_step} and {name} exclude each other: errors are those of single rewards")
+    if config.reward_clutter < 1.0 and not any(getattr(config, name) for name in _FALSE_REWARDS):
+        raise RequestError(
+            f"reward_clutter is where false rewards occur, and there are none: set {' or '.join(_FALSE_REWARDS)}"
+        )
+    for name in _FALSE_REWARDS:
+        if getattr(config, name) > config.reward_clutter:
+            raise RequestError(
+                f"{name} ({getattr(config, name)}) is a share of the whole workspace and cannot exceed reward_clutter "
+                f"({config.reward_clutter}), the share of it where false rewards occur"
+            )
+    for name, is_set in (("random_shift", config.random_shift > 0), ("normalizers separate", config.normalizers == "separate")):
+        if is_set and kind == "autoencoder":
+            raise RequestError(f"{name} and method {config.method} exclude each other: it compares images as they were seen")
