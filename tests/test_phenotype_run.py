@@ -163,6 +163,44 @@ def test_a_sighting_without_disparity_still_says_where_its_stalk_is():
     assert sum(track.counted for track in tracks) == len(STALKS)
 
 
+def test_a_stalk_that_leans_out_of_the_plot_stands_in_it():
+    """Its foot counts: 40 mm inside where it was measured at 12 inches, 13 mm beyond the end."""
+    frames, distances = drive([*STALKS, (2.04, 0.8)])
+    assert sum(track.counted for track in follow(frames, distances, CAMERAS)[0]) == len(STALKS)
+    for lean, more in ((10.0, 1), (-10.0, 0)):
+        leaning = [[dataclasses.replace(each, height_m=0.3048, lean_deg=lean) for each in frame] for frame in frames]
+        counted = [track for track in follow(leaning, distances, CAMERAS)[0] if track.counted]
+        assert any(track.position_m > 1.97 for track in counted) == bool(more)
+
+
+def test_a_stalk_whose_depth_went_astray_is_no_other_one():
+    """In some pairs it is taken to stand 6 cm further away; the cameras see it where they would see the first one."""
+    frames, distances = drive([(0.6, 0.8), (1.4, 0.8)])
+    for frame in frames[3:7]:
+        each, far = frame[0], 0.86
+        frame[0] = dataclasses.replace(each, depth_m=far, along_m=each.column / 1000.0 * far - 0.05)
+    tracks, _ = follow(frames, distances, CAMERAS)
+    assert sum(track.counted for track in tracks) == 2
+    # One that does stand behind is seen beside it as the cameras move on.
+    frames, distances = drive([(0.6, 0.8), (1.4, 0.8), (0.6, 0.88)])
+    assert sum(track.counted for track in follow(frames, distances, CAMERAS)[0]) == 3
+
+
+def test_what_stands_before_the_row_or_has_no_place_counts_less():
+    frames, distances = drive([*STALKS, (1.0, 0.55)])
+    tracks, _ = follow(frames, distances, CAMERAS)
+    assert sum(track.counted for track in tracks) == len(STALKS)
+    assert any("before the row" in track.reason for track in tracks)
+    for count, more in ((5, 0), (9, 1)):  # of the 14 pairs that have it in view
+        frames, distances = drive([*STALKS, (0.9, 0.8)])
+        for number, frame in enumerate(frames):
+            for place in [place for place, each in enumerate(frame) if abs(each.along_m + 0.1 * number - 0.85) < 0.01][::-1]:  # pyright: ignore
+                each = frame.pop(place)
+                if 4 <= number < 4 + count:
+                    frame.append(dataclasses.replace(each, diameter_mm=None, depth_m=None, along_m=None, reason="unclear"))
+        assert sum(track.counted for track in follow(frames, distances, CAMERAS)[0]) == len(STALKS) + more
+
+
 def test_no_pairs_and_empty_fields():
     assert follow([], np.zeros(0), CAMERAS)[0] == []
     tracks, path = follow([[], []], np.array([0.0, 0.1]), CAMERAS)
