@@ -289,6 +289,8 @@ def test_average_precision_and_the_figures_of_plots():
     assert figures["count_r2"] == pytest.approx(1.0 - 2.0 / 50.0) and figures["count_mae"] == 1.0
     assert figures["width_mae_mm"] == pytest.approx(0.75) and figures["width_bias_mm"] == pytest.approx(0.25)
     assert figures["precision"] == 1.0 and figures["recall"] == pytest.approx(1 / 3)
+    # Both finds, of scores .9 and .2, are right; one stalk of three is found by none.
+    assert figures["f1_best"] == pytest.approx(0.8) and figures["f1_best_least_score"] == 0.2
     assert np.isnan(summary([])["f1"])
 
 
