@@ -83,10 +83,10 @@ def test_a_sheath_elsewhere_does_not_matter_where_a_width_is_taken():
     strip = strip_width(mask)
     across = np.cos(strip.lean)
     for place, true in ((180.0, 43.0), (60.0, 40.0), (270.0, 40.0)):
-        assert strip_near(mask, strip, place, 45.0).width(place) == pytest.approx(true * across, abs=0.3)
+        assert strip_near(strip, place, 45.0, 400).width(place) == pytest.approx(true * across, abs=0.3)
     assert abs(strip.width(180.0) - 43.0) > 1.0  # as a whole, it is bare
-    assert strip_near(mask, strip, 390.0, 50.0) is None  # one edge is that of what hides the other
-    assert strip_near(mask, strip, 600.0, 50.0) is None  # beyond the mask
+    assert strip_near(strip, 390.0, 50.0, 400) is None  # one edge is that of what hides the other
+    assert strip_near(strip, 600.0, 50.0, 400) is None  # beyond the mask
 
 
 def test_taper_is_followed():
