@@ -258,7 +258,20 @@ def test_an_edge_that_another_stalk_hides_is_not_its_own():
     # The second stands before the right edge of the first; the third touches nothing, nor does the one that was not measured.
     found = [stalk(100.0, 0.80), stalk(130.0, 0.77), stalk(300.0, 0.80), Measurement(line=600.0)]
     assert _hidden_edges(found) == [True, False, False, False]
-    assert _hidden_edges([found[0], dataclasses.replace(found[1], depth=0.799)]) == [False, False]
+    # Of two that stand equally far away, either may hide the other's edge.
+    assert _hidden_edges([found[0], dataclasses.replace(found[1], depth=0.799)]) == [True, True]
+    assert _hidden_edges([found[0], dataclasses.replace(found[1], depth=0.83)]) == [False, True]
+
+
+def test_a_stalk_that_is_partly_hidden_is_at_least_as_thick_as_it_looks():
+    hidden = [sighting(0.0, diameter_mm=each, hidden=True) for each in (8.0, 10.0, 12.0, 13.0, 13.8, 14.0)]
+    clear = [sighting(0.0, diameter_mm=14.0 + each) for each in (-0.1, 0.0, 0.1)]
+    assert robust_width([*hidden, *clear]).mm == pytest.approx(14.0, abs=0.01)  # pyright: ignore[reportOptionalMemberAccess]
+    assert robust_width(hidden).mm == pytest.approx(13.7, abs=0.31)  # pyright: ignore[reportOptionalMemberAccess]
+    above = [dataclasses.replace(each, upper_mm=each.diameter_mm, upper_hidden=each.hidden, hidden=False) for each in hidden]
+    heights = [dataclasses.replace(each, height_m=12 * 0.0254, upper_height_m=24 * 0.0254) for each in above]
+    (found,) = widths_of([heights], [Track(tuple((0, place) for place in range(6)), 0.0, 0.8, True, "")])
+    assert found.lower.mm < 13.0 < found.upper.mm  # pyright: ignore[reportOptionalMemberAccess]
 
 
 # --- evaluation ---
