@@ -163,6 +163,44 @@ def test_a_sighting_without_disparity_still_says_where_its_stalk_is():
     assert sum(track.counted for track in tracks) == len(STALKS)
 
 
+def test_a_stalk_that_leans_out_of_the_plot_stands_in_it():
+    """Its foot counts: 40 mm inside where it was measured at 12 inches, 13 mm beyond the end."""
+    frames, distances = drive([*STALKS, (2.04, 0.8)])
+    assert sum(track.counted for track in follow(frames, distances, CAMERAS)[0]) == len(STALKS)
+    for lean, more in ((10.0, 1), (-10.0, 0)):
+        leaning = [[dataclasses.replace(each, height_m=0.3048, lean_deg=lean) for each in frame] for frame in frames]
+        counted = [track for track in follow(leaning, distances, CAMERAS)[0] if track.counted]
+        assert any(track.position_m > 1.97 for track in counted) == bool(more)
+
+
+def test_a_stalk_whose_depth_went_astray_is_no_other_one():
+    """In some pairs it is taken to stand 6 cm further away; the cameras see it where they would see the first one."""
+    frames, distances = drive([(0.6, 0.8), (1.4, 0.8)])
+    for frame in frames[3:7]:
+        each, far = frame[0], 0.86
+        frame[0] = dataclasses.replace(each, depth_m=far, along_m=each.column / 1000.0 * far - 0.05)
+    tracks, _ = follow(frames, distances, CAMERAS)
+    assert sum(track.counted for track in tracks) == 2
+    # One that does stand behind is seen beside it as the cameras move on.
+    frames, distances = drive([(0.6, 0.8), (1.4, 0.8), (0.6, 0.88)])
+    assert sum(track.counted for track in follow(frames, distances, CAMERAS)[0]) == 3
+
+
+def test_what_stands_before_the_row_or_has_no_place_counts_less():
+    frames, distances = drive([*STALKS, (1.0, 0.55)])
+    tracks, _ = follow(frames, distances, CAMERAS)
+    assert sum(track.counted for track in tracks) == len(STALKS)
+    assert any("before the row" in track.reason for track in tracks)
+    for count, more in ((5, 0), (9, 1)):  # of the 14 pairs that have it in view
+        frames, distances = drive([*STALKS, (0.9, 0.8)])
+        for number, frame in enumerate(frames):
+            for place in [place for place, each in enumerate(frame) if abs(each.along_m + 0.1 * number - 0.85) < 0.01][::-1]:  # pyright: ignore
+                each = frame.pop(place)
+                if 4 <= number < 4 + count:
+                    frame.append(dataclasses.replace(each, diameter_mm=None, depth_m=None, along_m=None, reason="unclear"))
+        assert sum(track.counted for track in follow(frames, distances, CAMERAS)[0]) == len(STALKS) + more
+
+
 def test_no_pairs_and_empty_fields():
     assert follow([], np.zeros(0), CAMERAS)[0] == []
     tracks, path = follow([[], []], np.array([0.0, 0.1]), CAMERAS)
@@ -220,7 +258,20 @@ def test_an_edge_that_another_stalk_hides_is_not_its_own():
     # The second stands before the right edge of the first; the third touches nothing, nor does the one that was not measured.
     found = [stalk(100.0, 0.80), stalk(130.0, 0.77), stalk(300.0, 0.80), Measurement(line=600.0)]
     assert _hidden_edges(found) == [True, False, False, False]
-    assert _hidden_edges([found[0], dataclasses.replace(found[1], depth=0.799)]) == [False, False]
+    # Of two that stand equally far away, either may hide the other's edge.
+    assert _hidden_edges([found[0], dataclasses.replace(found[1], depth=0.799)]) == [True, True]
+    assert _hidden_edges([found[0], dataclasses.replace(found[1], depth=0.83)]) == [False, True]
+
+
+def test_a_stalk_that_is_partly_hidden_is_at_least_as_thick_as_it_looks():
+    hidden = [sighting(0.0, diameter_mm=each, hidden=True) for each in (8.0, 10.0, 12.0, 13.0, 13.8, 14.0)]
+    clear = [sighting(0.0, diameter_mm=14.0 + each) for each in (-0.1, 0.0, 0.1)]
+    assert robust_width([*hidden, *clear]).mm == pytest.approx(14.0, abs=0.01)  # pyright: ignore[reportOptionalMemberAccess]
+    assert robust_width(hidden).mm == pytest.approx(13.7, abs=0.31)  # pyright: ignore[reportOptionalMemberAccess]
+    above = [dataclasses.replace(each, upper_mm=each.diameter_mm, upper_hidden=each.hidden, hidden=False) for each in hidden]
+    heights = [dataclasses.replace(each, height_m=12 * 0.0254, upper_height_m=24 * 0.0254) for each in above]
+    (found,) = widths_of([heights], [Track(tuple((0, place) for place in range(6)), 0.0, 0.8, True, "")])
+    assert found.lower.mm < 13.0 < found.upper.mm  # pyright: ignore[reportOptionalMemberAccess]
 
 
 # --- evaluation ---
@@ -251,6 +302,8 @@ def test_average_precision_and_the_figures_of_plots():
     assert figures["count_r2"] == pytest.approx(1.0 - 2.0 / 50.0) and figures["count_mae"] == 1.0
     assert figures["width_mae_mm"] == pytest.approx(0.75) and figures["width_bias_mm"] == pytest.approx(0.25)
     assert figures["precision"] == 1.0 and figures["recall"] == pytest.approx(1 / 3)
+    # Both finds, of scores .9 and .2, are right; one stalk of three is found by none.
+    assert figures["f1_best"] == pytest.approx(0.8) and figures["f1_best_least_score"] == 0.2
     assert np.isnan(summary([])["f1"])
 
 

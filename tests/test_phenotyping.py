@@ -11,7 +11,7 @@ import pytest
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.phenotyping.annotations import decode_mask, encode_mask
 from jaxrl_vis.phenotyping.calibration import check_size, read_calibration, write_calibration
-from jaxrl_vis.phenotyping.ground import find_ground
+from jaxrl_vis.phenotyping.ground import _plane, find_ground
 from jaxrl_vis.phenotyping.images import read_disparity, read_image, write_image
 from jaxrl_vis.phenotyping.metric import diameter_mm, tilt_of
 from jaxrl_vis.phenotyping.stereo import match_rows, match_sgbm
@@ -83,10 +83,10 @@ def test_a_sheath_elsewhere_does_not_matter_where_a_width_is_taken():
     strip = strip_width(mask)
     across = np.cos(strip.lean)
     for place, true in ((180.0, 43.0), (60.0, 40.0), (270.0, 40.0)):
-        assert strip_near(mask, strip, place, 45.0).width(place) == pytest.approx(true * across, abs=0.3)
+        assert strip_near(strip, place, 45.0, 400).width(place) == pytest.approx(true * across, abs=0.3)
     assert abs(strip.width(180.0) - 43.0) > 1.0  # as a whole, it is bare
-    assert strip_near(mask, strip, 390.0, 50.0) is None  # one edge is that of what hides the other
-    assert strip_near(mask, strip, 600.0, 50.0) is None  # beyond the mask
+    assert strip_near(strip, 390.0, 50.0, 400) is None  # one edge is that of what hides the other
+    assert strip_near(strip, 600.0, 50.0, 400) is None  # beyond the mask
 
 
 def test_taper_is_followed():
@@ -178,6 +178,20 @@ def test_no_ground_is_invented():
     rng = np.random.default_rng(3)
     noise = [rng.uniform(0, 255, (480, 640)).astype(np.float32) for _ in range(2)]
     assert find_ground(noise[0], noise[1], CAMERAS) is None
+
+
+def test_a_ground_that_is_mostly_hidden_is_found():
+    """A tenth of all windows show it, a third of those low in the image; the others show leaves and stalks at any distance."""
+    true = np.array([0.02, 2.3, 0.05])
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        rays = np.stack([rng.uniform(-0.7, 0.7, 700), rng.uniform(-0.6, 0.6, 700), np.ones(700)], axis=1)
+        inverse = rng.uniform(0.4, 2.0, 700)
+        seen = np.flatnonzero(rays[:, 1] > 0.25)[:70]
+        inverse[seen] = rays[seen] @ true + rng.normal(0.0, 1e-3, len(seen))
+        found = _plane(rays, inverse, 6e-3)
+        assert found is not None
+        np.testing.assert_allclose(found, true, atol=0.03)
 
 
 # --- disparity ---

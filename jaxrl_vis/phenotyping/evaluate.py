@@ -213,8 +213,8 @@ def summary(scores: Iterable[PlotScore], least_score: float = 0.5) -> dict[str, 
     Returns:
         ``count_r2`` (1 - SSE / SST against y = x), ``count_mae``, ``count_bias`` (of the true number), ``width_mae_mm``,
         ``width_bias_mm``, ``width_mae_two_people_mm`` (against the simulated mean of two people with calipers), the same at 24
-        inches, ``ap50``, ``f1``, ``precision``, ``recall``, and how much there was of each. Not a number where there was
-        nothing.
+        inches, ``ap50``, ``f1``, ``precision``, ``recall``, the best F1 and the least score that gives it, and how much there
+        was of each. Not a number where there was nothing.
     """
     scores = list(scores)
     true = np.array([each.true for each in scores], float)
@@ -228,6 +228,7 @@ def summary(scores: Iterable[PlotScore], least_score: float = 0.5) -> dict[str, 
     people = np.random.default_rng(0).normal(0.0, PERSON_SD, (len(error), 2)).mean(axis=1)
     kept = finds[finds[:, 0] >= least_score]
     hits = float(kept[:, 1].sum())
+    best, best_score = _best_f1(finds, stalks)
     return {
         "plots": len(scores),
         "count_true": int(true.sum()),
@@ -247,9 +248,22 @@ def summary(scores: Iterable[PlotScore], least_score: float = 0.5) -> dict[str, 
         "precision": hits / len(kept) if len(kept) else float("nan"),
         "recall": hits / stalks if stalks else float("nan"),
         "f1": 2.0 * hits / (len(kept) + stalks) if len(kept) + stalks else float("nan"),
+        "f1_best": best,
+        "f1_best_least_score": best_score,
         "seconds_per_pair": _mean(np.array([each.seconds for each in scores if math.isfinite(each.seconds)])),
         **_thesis_summary(scores),
     }
+
+
+def _best_f1(finds: np.ndarray, stalks: int) -> tuple[float, float]:
+    """The best F1 that any least score gives, and that score; finds [K, 2] as of `PlotScore`."""
+    if not len(finds) or not stalks:
+        return float("nan"), float("nan")
+    order = np.argsort(-finds[:, 0], kind="stable")
+    hits = np.cumsum(finds[order, 1])
+    f1 = 2.0 * hits / (np.arange(1, len(hits) + 1) + stalks)
+    best = int(np.argmax(f1))
+    return float(f1[best]), float(finds[order[best], 0])
 
 
 def _thesis_summary(scores: list[PlotScore]) -> dict[str, float]:

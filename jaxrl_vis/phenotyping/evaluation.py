@@ -13,6 +13,7 @@ import json
 import math
 import multiprocessing
 import os
+import tempfile
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
@@ -77,8 +78,12 @@ class Scorers:
         if self._workers == 1:
             yield from (_score(task, seed) for seed in seeds)
             return
+        seeds = list(seeds)
         if self._pool is None:
             self._pool = self._start()
+            if seeds:
+                # One process compiles; the others read what it compiled, so that all run the same programs, and sooner.
+                self._pool.submit(_score, _short(task), seeds[0]).result()
         waiting = [self._pool.submit(_score, task, seed) for seed in seeds]
         try:
             for done in as_completed(waiting):
@@ -94,7 +99,9 @@ class Scorers:
         spawning = multiprocessing.get_context("spawn")
         number = spawning.Value("i", 0)
         pins = jax.default_backend() == "cpu"
-        pool = ProcessPoolExecutor(self._workers, spawning, _prepare, (number, self._workers, devices, pins))
+        compiled = jax.config.jax_compilation_cache_dir or self._stack.enter_context(tempfile.TemporaryDirectory())
+        about = (number, self._workers, devices, pins, compiled)
+        pool = ProcessPoolExecutor(self._workers, spawning, _prepare, about)
         self._stack.callback(pool.shutdown, wait=True, cancel_futures=True)
         return pool
 
@@ -104,8 +111,22 @@ def share_devices() -> None:
     os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
 
 
-def _prepare(number: Any, workers: int, devices: list[dict[str, str]], pins: bool) -> None:
-    """In a new process: a device of its own where there are several, and no more threads than its share of the cores."""
+def _short(task: Task) -> Task:
+    """The same with two pairs a plot: it needs all programs, and takes little more than their compilation."""
+    rig = dataclasses.replace(task.family.rig, frames=min(task.family.rig.frames, 2))
+    return dataclasses.replace(task, family=dataclasses.replace(task.family, rig=rig))
+
+
+def _prepare(number: Any, workers: int, devices: list[dict[str, str]], pins: bool, compiled: str) -> None:
+    """In a new process: a device of its own where there are several, and no more threads than its share of the cores.
+
+    Args:
+        number: Counts the processes.
+        workers: How many there will be.
+        devices: Environment variables that name each device.
+        pins: Whether the cores are divided among the processes.
+        compiled: Folder in which they share compiled programs.
+    """
     with number.get_lock():
         own, number.value = number.value, number.value + 1
     share_devices()
@@ -117,8 +138,11 @@ def _prepare(number: Any, workers: int, devices: list[dict[str, str]], pins: boo
         cores = sorted(os.sched_getaffinity(0))
         os.sched_setaffinity(0, cores[own % len(cores) :: workers])
     import cv2
+    import jax
 
     cv2.setNumThreads(1)
+    jax.config.update("jax_compilation_cache_dir", compiled)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 
 
 _FINDERS: dict[tuple[Path, str], Any] = {}

@@ -51,8 +51,14 @@ def draw_counts(data: dict[str, Any], out: Path) -> None:
     counted = np.array([each["counted"] for each in data["each"]], float)
     low, high = min(true.min(), counted.min()) - 2, max(true.max(), counted.max()) + 2
     figure, axis = plt.subplots(figsize=(5.2, 5.0), layout="constrained")
-    axis.plot([low, high], [low, high], color=_GREY, linewidth=1, label="as many as there are")
+    axis.axline((0, 0), slope=1, color=_GREY, linewidth=1, label="as many as there are")
     axis.plot(true, counted, "o", color=_GREEN, alpha=0.7, label=f"{len(true)} plots")
+    if all(each.get("thesis") for each in data["each"]):
+        thesis = np.array([each["thesis"]["counted"] for each in data["each"]], float)
+        low, high = min(low, thesis.min() - 2), max(high, thesis.max() + 2)
+        axis.plot(
+            true, thesis, "s", color=_ORANGE, alpha=0.5, markerfacecolor="none", label="the same, counted as in the thesis"
+        )
     r2 = data.get("count_r2")
     text = f"mean absolute error {np.abs(counted - true).mean():.2f} stalks"
     text = text if r2 is None else f"$R^2$ = {r2:.3f} against y = x, {text}"
@@ -131,10 +137,12 @@ def write_times(data: dict[str, Any], out: Path) -> None:
     ]
     pairs = float(np.mean([each["pairs"] for each in known]))
     device = data.get("device", "a device that is not known")
+    side_by_side = data.get("workers") or 1
+    shared = f", {side_by_side} plots at a time, which makes each slower" if side_by_side > 1 else ""
     people = 30.0 * (count_1 + width_1 + count_2 + width_2)
     note = (
         f"Time for one plot. People and the thesis's robot: quoted from Table 3.1 of the thesis, 33 stalks in the field. Here: "
-        f"synthetic plots of {pairs:.0f} pairs on {device}, from images in memory, counts and widths in one go: "
+        f"synthetic plots of {pairs:.0f} pairs on {device}{shared}, from images in memory, counts and widths in one go: "
         f"{people / seconds:.0f} times faster than people."
     )
     _write_tables(out, note, rows)

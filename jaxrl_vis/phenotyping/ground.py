@@ -133,7 +133,9 @@ def _samples(disparity: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarra
 def _plane(rays: np.ndarray, inverse: np.ndarray, tolerance: float) -> np.ndarray | None:
     """The plane [3] that could be ground and that most points agree with; None if there is none."""
     rng = np.random.default_rng(0)
-    triples = rng.integers(len(rays), size=(_TRIES, 3))
+    # Most of what an image shows is no ground; most of what its lower third shows is.
+    low = np.flatnonzero(rays[:, 1] >= np.quantile(rays[:, 1], 2 / 3))
+    triples = np.concatenate([rng.integers(len(rays), size=(_TRIES // 2, 3)), rng.choice(low, (_TRIES // 2, 3))])
     corners = rays[triples]
     good = np.abs(np.linalg.det(corners)) > 1e-4
     planes = np.linalg.solve(corners[good], inverse[triples[good]][..., None])[..., 0]

@@ -19,6 +19,8 @@ USUAL_TAPER = 0.405
 """mm per inch: of the thesis, for plots with too few stalks that were measured at both heights."""
 _TAPER_SPREAD = 0.3  # of a stalk's own taper about the plot's, of 1
 _ENOUGH = 5
+_CLEAR = 3  # sightings without a hidden edge that make others unnecessary
+_LOWER_BOUNDS = 0.85
 _FURTHEST = 4.0 * INCH  # m: what was measured further away says nothing of a height
 _NEAR = 0.5 * INCH  # m: taper within that does not matter
 _ASIDE = (
@@ -70,11 +72,29 @@ def widths_of(frames: list[list[Sighting]], tracks: list[Track]) -> list[StalkWi
     return [_of_stalk(sightings, taper) for sightings in of_stalks]
 
 
+@dataclasses.dataclass(frozen=True)
+class _Value:
+    """What one pair says: diameter and its standard error, mm, the height where, m, and whether an edge may be hidden."""
+
+    mm: float
+    deviation: float | None
+    height: float
+    confidence: float
+    hidden: bool
+
+
 def _of_stalk(sightings: list[Sighting], taper: float) -> StalkWidths:
-    known = [each for each in sightings if each.height_m is not None]
-    lower = _at(LOWER, [(e.diameter_mm, e.deviation_mm, e.height_m, e.confidence * _facing(e)) for e in known], taper)
-    above = [(e.upper_mm, e.upper_deviation_mm, e.upper_height_m, e.upper_confidence * _facing(e)) for e in sightings]
-    upper = _at(UPPER, above, taper)
+    known = [
+        _Value(e.diameter_mm, e.deviation_mm, e.height_m, e.confidence * _facing(e), e.hidden)
+        for e in sightings
+        if e.diameter_mm is not None and e.height_m is not None
+    ]
+    above = [
+        _Value(e.upper_mm, e.upper_deviation_mm, e.upper_height_m, e.upper_confidence * _facing(e), e.upper_hidden)
+        for e in sightings
+        if e.upper_mm is not None and e.upper_height_m is not None
+    ]
+    lower, upper = _at(LOWER, known, taper), _at(UPPER, above, taper)
     if lower is None:
         return StalkWidths(robust_width(sightings), upper, None, False)
     own = None if upper is None else (lower.mm - upper.mm) / ((UPPER - LOWER) / INCH)
@@ -86,38 +106,41 @@ def _facing(sighting: Sighting) -> float:
     return 1.0 if sighting.ray_deg is None else math.exp(-((sighting.ray_deg / _ASIDE) ** 2))
 
 
-def _at(height: float, values: list[tuple[float | None, float | None, float | None, float]], taper: float) -> Width | None:
-    """Width at a height, from diameters in mm, their standard errors, the heights in m they were taken at, and confidences."""
-    found = []
-    for diameter, deviation, where, confidence in values:
-        if diameter is None or where is None or abs(where - height) > _FURTHEST:
+def _at(height: float, values: list[_Value], taper: float) -> Width | None:
+    """Width at a height in m."""
+    found, far = [], 0
+    for each in values:
+        beside = (each.height - height) / INCH
+        if abs(each.height - height) > _FURTHEST:
             continue
-        beside = (where - height) / INCH
-        error = math.hypot(deviation or 0.0, _TAPER_SPREAD * taper * beside)
-        found.append((diameter + taper * beside, error, confidence, abs(where - height) > _NEAR))
-    width = _robust(np.array([each[:3] for each in found], float).reshape(-1, 3))
-    if width is None:
-        return None
-    return dataclasses.replace(width, corrected=2 * sum(each[3] for each in found) > len(found))
+        error = math.hypot(each.deviation or 0.0, _TAPER_SPREAD * taper * beside)
+        found.append(dataclasses.replace(each, mm=each.mm + taper * beside, deviation=error))
+        far += abs(each.height - height) > _NEAR
+    width = _robust(found)
+    return None if width is None else dataclasses.replace(width, corrected=2 * far > len(found))
 
 
 def robust_width(sightings: list[Sighting]) -> Width | None:
     """Diameter of a stalk wherever it was measured; None if it never was."""
     measured = [each for each in sightings if each.diameter_mm is not None]
-    values = [(each.diameter_mm, each.deviation_mm or 0.0, each.confidence * _facing(each)) for each in measured]
-    return _robust(np.array(values, float).reshape(-1, 3))
+    return _robust([_Value(e.diameter_mm, e.deviation_mm, 0.0, e.confidence * _facing(e), e.hidden) for e in measured])  # pyright: ignore[reportArgumentType]
 
 
-def _robust(measured: np.ndarray) -> Width | None:
-    """Of diameters, standard errors and confidences [N, 3]; None where there are none."""
-    if not len(measured):
+def _robust(found: list[_Value]) -> Width | None:
+    """The median of what shows both edges; None where there is nothing.
+
+    Where too little does, a stalk is at least as thick as it looks, and most of what is said of it is too thin.
+    """
+    clear = [each for each in found if not each.hidden]
+    some, share = (clear, 0.5) if len(clear) >= _CLEAR or len(clear) == len(found) else (found, _LOWER_BOUNDS)
+    if not some:
         return None
-    values, stated, weights = measured.T
+    values, stated, weights = np.array([(each.mm, each.deviation or 0.0, each.confidence) for each in some]).T
     weights = np.maximum(weights, 0.02)
     order = np.argsort(values)
     passed = np.cumsum(weights[order]) - 0.5 * weights[order]
-    median = float(np.interp(0.5 * weights.sum(), passed, values[order]))
+    middle = float(np.interp(share * weights.sum(), passed, values[order]))
     enough = float(weights.sum() ** 2 / (weights**2).sum())
-    scatter = 1.4826 * float(np.median(np.abs(values - median))) * 1.2533 if len(values) > 2 else 0.0
+    scatter = 1.4826 * float(np.median(np.abs(values - middle))) * 1.2533 if len(values) > 2 else 0.0
     least = math.sqrt(float((weights * stated**2).sum() / weights.sum()))
-    return Width(median, max(scatter, least) / math.sqrt(enough), len(values))
+    return Width(middle, max(scatter, least) / math.sqrt(enough), len(values))

@@ -95,7 +95,7 @@ def measure(
     depth = float(calibration.depth(np.array(beside)))
     if not depths[0] <= depth <= depths[1]:
         return Measurement(line=place + corner[0], depth=depth, lean=strip.lean, reason=f"it stands {depth:.2f} m away")
-    strip = strip_near(mask, strip, place, _REACH * calibration.focal / depth) or strip
+    strip = strip_near(strip, place, _REACH * calibration.focal / depth, mask.shape[0]) or strip
     middle = 0.5 * sum(strip.edges(place))
     pixels = strip.width(place) if method == "strip" else ellipse_width(mask)
     if pixels is None:

@@ -18,7 +18,7 @@ from jaxrl_vis_envs.plants.truth import HEIGHTS
 
 NO_CALIBRATION = "no calibration"
 _HIDDEN = 0.1  # of its confidence that a sighting keeps if another stalk hides one of its edges
-_IN_FRONT = 0.003  # m
+_BEHIND = 0.003  # m: what stands so much further away hides nothing
 _TOUCHING = 0.1  # of half a stalk's width: edges so near are one
 _SAME_DEPTH = 0.06  # m, within 12 inches of a stalk that leans by 10 degrees
 
@@ -43,6 +43,7 @@ class Sighting:
             around 24 inches above the ground.
         upper_place: Column, line and width in pixels of that.
         confidence: 0 to 1.
+        hidden, upper_hidden: Whether another stalk may hide one of its edges, so that it is at least so thick.
         ray_deg: Angle between the left camera's axis and the ray to it, degrees, positive to the right.
         reason: Why it was not measured; empty where it was.
     """
@@ -65,6 +66,8 @@ class Sighting:
     upper_confidence: float = 0.0
     upper_place: tuple[float, float, float] | None = None
     confidence: float = 0.0
+    hidden: bool = False
+    upper_hidden: bool = False
     ray_deg: float | None = None
     reason: str = ""
 
@@ -136,20 +139,25 @@ def look(
             upper = measure(*each.upper, *images, height=HEIGHTS[1], **how)
         measured.append((got, upper))
     hidden = _hidden_edges([got for got, _ in measured])
-    return [
-        _sighting(each, dataclasses.replace(got, confidence=got.confidence * (_HIDDEN if behind else 1.0)), upper, calibration)
-        for each, (got, upper), behind in zip(detections, measured, hidden)
-    ]
+    above = _hidden_edges([upper or Measurement() for _, upper in measured])
+    sightings = []
+    for each, (got, upper), *behind in zip(detections, measured, hidden, above):
+        less = dataclasses.replace(got, confidence=got.confidence * _HIDDEN) if behind[0] else got
+        sighting = _sighting(each, less, upper, calibration)
+        sightings.append(dataclasses.replace(sighting, hidden=behind[0], upper_hidden=behind[1]))
+    return sightings
 
 
 def _hidden_edges(found: list[Measurement]) -> list[bool]:
-    """Which stalks have an edge where another one stands in front: it is the other one's edge, and they look too thin."""
+    """Which stalks have an edge where another one stands that is not behind them: it may be the other one's, and they look too
+    thin.
+    """
     hidden = []
     for each in found:
         half = 0.5 * each.width / math.cos(each.lean) if each.diameter_mm is not None else math.nan
         hidden.append(False)
         for other in found:
-            if each.diameter_mm is None or other.diameter_mm is None or not other.depth < each.depth - _IN_FRONT:
+            if each.diameter_mm is None or other.diameter_mm is None or other is each or other.depth > each.depth + _BEHIND:
                 continue
             middle = other.column + math.tan(other.lean) * (other.line - each.line)
             reach = 0.5 * other.width / math.cos(other.lean) + _TOUCHING * half

@@ -16,6 +16,7 @@ from jaxrl_vis_envs.plants import Calibration
 
 _USUAL_DEPTH = 0.8  # m, where no pair says
 _SOLID = 0.6  # of the distance at which two stalks touch
+_MOST_LEAN = 25.0  # degrees: what leans further was measured wrongly
 _NEVER = 1e3  # cost of what does not belong together
 
 
@@ -27,16 +28,20 @@ class Gates:
         along: Greatest distance along the row between a stalk and a sighting of it.
         depth: The same away from the cameras.
         merge: Along the row, between two pieces of one stalk's track.
+        behind: The same, of pieces of which one has another depth, if it had not.
         astray: Share of the pairs of the shorter piece that may show both.
+        row: Away from the cameras, between a stalk of the row and most others.
         share: Of the pairs that should show a stalk, how many must.
         least: How many pairs must show it, if so many can.
-        ends: How far beyond the ends of the path a stalk may stand and still count.
+        ends: How far beyond the ends of the path a stalk's foot may stand and still count.
     """
 
     along: float = 0.018
     depth: float = 0.05
     merge: float = 0.015
+    behind: float = 0.005
     astray: float = 0.34
+    row: float = 0.2
     share: float = 0.3
     least: int = 2
     ends: float = 0.01
@@ -82,6 +87,7 @@ class _Open:
     along: list[float] = dataclasses.field(default_factory=list)
     depth: list[float] = dataclasses.field(default_factory=list)
     rays: list[tuple[float, float]] = dataclasses.field(default_factory=list)
+    feet: list[float] = dataclasses.field(default_factory=list)
 
     def depths(self) -> np.ndarray:
         """What pairs say of how far away it is."""
@@ -135,6 +141,7 @@ def follow(
             track.along.append(float(along + places[frame]))
             track.depth.append(depth)
             track.rays.append((float(places[frame]) - seen.half, float(seen.rays[new])))
+            track.feet.append(float(along + places[frame] - seen.over[new]))
     step = float(np.median(np.diff(places))) if len(places) > 1 else 0.0
     path = Path(places, abs(float(places[-1] - places[0]) + step) if len(places) else 0.0)
     half_field = 0.5 * calibration.width / calibration.focal
@@ -152,6 +159,7 @@ class _Seen:
         depth: Of the fronts, m.
         known: Whether the pair says how far away it is.
         there: Whether it may be a stalk of the row.
+        over: How far along the row it leans over its foot where it was measured, m; 0 where its height is not known.
         half: Half the baseline, m.
         usual: How far away most are, m.
     """
@@ -161,6 +169,7 @@ class _Seen:
     depth: np.ndarray
     known: np.ndarray
     there: np.ndarray
+    over: np.ndarray
     half: float
     usual: float
 
@@ -172,13 +181,21 @@ class _Seen:
         known = np.isfinite(along) & np.isfinite(depth)
         # What stands elsewhere is no stalk of the row.
         elsewhere = np.array([each.depth_m is not None and each.along_m is None for each in sightings], bool)
+        over = np.array([_over(each) for each in sightings])
         half = 0.5 * calibration.baseline
         along = np.where(known, along, rays * usual - half)
-        return cls(rays, along, depth, known, ~elsewhere & _apart_in_space(sightings), half, usual)
+        return cls(rays, along, depth, known, ~elsewhere & _apart_in_space(sightings), over, half, usual)
 
     def beside(self, depth: float) -> np.ndarray:
         """Where they would stand along the row, [N], if they were so far away, m."""
         return self.rays * (depth if math.isfinite(depth) else self.usual) - self.half
+
+
+def _over(sighting: Sighting) -> float:
+    """How far along the row a stalk leans over its foot where it was measured, m."""
+    if sighting.height_m is None or sighting.lean_deg is None or abs(sighting.lean_deg) > _MOST_LEAN:
+        return 0.0
+    return sighting.height_m * math.tan(math.radians(sighting.lean_deg))
 
 
 def _apart_in_space(sightings: list[Sighting]) -> np.ndarray:
@@ -217,22 +234,38 @@ def _assign(tracks: list[_Open], seen: _Seen, place: float, gates: Gates) -> lis
 
 
 def _merged(tracks: list[_Open], gates: Gates) -> list[_Open]:
-    """Tracks less those that go on where another one was lost: they stand in one place and no pair shows both."""
+    """Tracks less those that go on where another one was lost: they stand in one place and no pair shows both.
+
+    Or they are seen in one place, always, and one depth is wrong: of two solid stalks that stand behind each other, the cameras
+    would see both as soon as they have moved on.
+    """
     kept: list[_Open] = []
     for track in sorted(tracks, key=lambda each: -len(each.seen)):
         for other in kept:
             aside, away = _apart(track, other)
             shared = {frame for frame, _ in track.seen} & {frame for frame, _ in other.seen}
             # A sighting that went astray may make one pair show both.
-            if aside < gates.merge and away < gates.depth and len(shared) <= gates.astray * len(track.seen):
+            near = aside < gates.merge and away < gates.depth
+            if (near or _one_behind(track, other) < gates.behind) and len(shared) <= gates.astray * len(track.seen):
                 other.seen += track.seen
                 other.along += track.along
                 other.depth += track.depth
                 other.rays += track.rays
+                other.feet += track.feet
                 break
         else:
             kept.append(track)
     return kept
+
+
+def _one_behind(track: _Open, other: _Open) -> float:
+    """How far beside another track's stalk a track would be seen, m along the row, if it were as far away."""
+    depths = other.depths()
+    if len(track.seen) < 2 or not len(depths):
+        return math.inf
+    depth = float(np.median(depths))
+    beside = np.array([offset + ray * depth for offset, ray in track.rays]) - float(np.median(other.along))
+    return float(np.median(np.abs(beside)))
 
 
 def _apart(track: _Open, other: _Open) -> tuple[float, float]:
@@ -253,11 +286,15 @@ def _closed(track: _Open, path: Path, step: float, half_field: float, usual: flo
     # What matters is how many pairs have the stalk well inside.
     reach = 0.9 * half_field * (depth if math.isfinite(depth) else usual)
     expected = int((np.abs(path.places - position) < reach).sum())
-    wanted = max(min(gates.least, expected), math.ceil(gates.share * expected), 1)
+    known = math.isfinite(depth)
+    # What no pair says the distance of must be seen the more often.
+    wanted = max(min(gates.least, expected), math.ceil((1.0 if known else 2.0) * gates.share * expected), 1)
     begin, end = sorted((path.places[0] - 0.5 * step, path.places[-1] + 0.5 * step))
     if len(track.seen) < wanted:
         reason = f"seen in {len(track.seen)} of {expected} pairs"
-    elif not begin - gates.ends <= position <= end + gates.ends:
+    elif known and abs(depth - usual) > gates.row:
+        reason = f"it stands {abs(depth - usual):.2f} m {'behind' if depth > usual else 'before'} the row"
+    elif not begin - gates.ends <= float(np.median(track.feet)) <= end + gates.ends:
         reason = "it stands beyond the ends of the path"
     else:
         reason = ""

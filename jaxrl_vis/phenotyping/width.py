@@ -40,6 +40,7 @@ class Strip:
         used: Share of the mask's lines whose two edges both lie on the fitted ones; what is missing is hidden, or a node.
         residual: Root mean square distance of used edges from the fitted ones, pixels.
         deviation: Standard error of the width at the reference line, pixels.
+        points: Lines [N] and columns of the left and right edge in each [N], which all of it was made of.
     """
 
     reference: float
@@ -50,6 +51,7 @@ class Strip:
     used: float
     residual: float
     deviation: float
+    points: tuple[np.ndarray, np.ndarray, np.ndarray] = dataclasses.field(repr=False, compare=False)
 
     @property
     def lean(self) -> float:
@@ -125,26 +127,25 @@ def strip_width(mask: np.ndarray, threshold: float = 0.5) -> Strip | None:
     return fit_edges(*line_edges(mask, threshold))
 
 
-def strip_near(mask: np.ndarray, strip: Strip, line: float, reach: float, threshold: float = 0.5) -> Strip | None:
+def strip_near(strip: Strip, line: float, reach: float, lines: int) -> Strip | None:
     """The edges of a stalk near a line: what it is like there, and not where a sheath covers it.
 
     Slopes are those of the whole strip, which many more lines tell.
 
     Args:
-        mask: As of `strip_width`.
-        strip: What that made of the whole mask.
+        strip: Of a whole mask.
         line: Of the mask.
         reach: How far above and below the line edges are looked at, pixels.
-        threshold: What belongs to the stalk.
+        lines: How many the mask has.
 
     Returns:
         The strip; None where less than half of the lines there agree, or they do not go with the rest of the stalk.
     """
-    first, last = max(math.floor(line - reach), 0), min(math.ceil(line + reach) + 1, mask.shape[0])
+    first, last = max(math.floor(line - reach), 0), min(math.ceil(line + reach) + 1, lines)
     if last - first < _LEAST_LINES:
         return None
-    place, left, right = line_edges(mask[first:last], threshold)
-    place = place + first
+    begin, end = np.searchsorted(strip.points[0], (first, last))
+    place, left, right = (each[begin:end] for each in strip.points)
     offset = place - strip.reference
     beside = [edge - fit[0] - fit[1] * offset for edge, fit in zip((left, right), (strip.left, strip.right))]
     tolerance = max(3.0, _SWELLING * strip.width(line))
@@ -166,6 +167,7 @@ def strip_near(mask: np.ndarray, strip: Strip, line: float, reach: float, thresh
         used=count / (last - first),
         residual=rms,
         deviation=math.sqrt(2.0) * max(rms, 0.05) / math.sqrt(count),
+        points=(place, left, right),
     )
 
 
@@ -181,7 +183,7 @@ def fit_edges(line: np.ndarray, left: np.ndarray, right: np.ndarray) -> Strip | 
     """
     if line.size < _LEAST_LINES:
         return None
-    total = line.size
+    points, total = (line, left, right), line.size
     slope = _common_slope(line, left, right)
     # A strip that ends across its axis has lines at both ends in which one edge is that of the end. They lie within a width's
     # projection of the first and last line.
@@ -228,6 +230,7 @@ def fit_edges(line: np.ndarray, left: np.ndarray, right: np.ndarray) -> Strip | 
         used=float(good.sum()) / total,
         residual=rms,
         deviation=math.sqrt(2.0) * max(rms, 0.05) / math.sqrt(good.sum()),
+        points=points,
     )
 
 

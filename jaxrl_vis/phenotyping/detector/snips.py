@@ -5,6 +5,7 @@ are, and a mask of the snip is put back exactly.
 """
 
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -95,9 +96,13 @@ def put_back(snip: np.ndarray, stalk: np.ndarray, size: tuple[int, int]) -> tupl
     begin, end = max(int(left.min()), 0), min(int(left.max()) + columns, size[1])
     if not used.size or end <= begin:
         return np.zeros((0, 0), np.float32), (0, 0)
-    place = left[used, None] + np.arange(columns)
-    line = np.broadcast_to(np.arange(used.size)[:, None], place.shape)
-    inside = (place >= begin) & (place < end)
     whole = np.zeros((used.size, end - begin), np.float32)
-    whole[line[inside], place[inside] - begin] = snip[used][inside]
+    # Lines that lie equally far to the right go together.
+    places = left[used] - begin
+    breaks = [0, *(np.flatnonzero(np.diff(places)) + 1).tolist(), used.size]
+    for first, last in itertools.pairwise(breaks):
+        place = int(places[first])
+        low, high = max(place, 0), min(place + columns, end - begin)
+        if high > low:
+            whole[first:last, low:high] = snip[used[first] : used[last - 1] + 1, low - place : high - place]
     return whole, (int(top + used[0]), begin)
