@@ -190,6 +190,16 @@ ONE_DEVICE = Layout()
 """Everything on JAX's first device."""
 
 
+def _avoid_shardy() -> None:
+    """Lets XLA partition programs by GSPMD where Shardy would end the process.
+
+    In jaxlib 0.11 a pass of Shardy reads past the end of a list, and so dies of a segmentation fault, where constants that a
+    `jax.shard_map` closes over turn out to be unused (`ManualComputationUnusedInputsPattern`); physics models are full of them.
+    """
+    if jax.__version_info__ >= (0, 11):
+        jax.config.update("jax_use_shardy_partitioner", False)
+
+
 def make_layout(config: Config) -> Layout:
     """Where the seeds of a run go, and the parts of each learner.
 
@@ -210,6 +220,7 @@ def make_layout(config: Config) -> Layout:
             f"devices {config.devices} would leave some of the {len(there)} devices of {jax.process_count()} processes without "
             "work: write --devices all, or start fewer processes"
         )
+    _avoid_shardy()
     along_data = data_devices_of(config)
     devices = np.asarray(there[: config.devices], dtype=object).reshape(-1, along_data)
     return Layout(Mesh(devices, (SEED, DATA)), Shards(along_data))
