@@ -475,11 +475,11 @@ def test_eval_of_rows_and_of_an_empty_one(spec, tmp_path, capsys):
     assert figures["f1"] > 0.9 and figures["point_median_mm"] < 10.0 and figures["stitch_median_mm"] < 10.0
     assert figures["synthetic"] is True and figures["masks"] == "truth" and figures["stitches"] == 4
     for wind in ("0", "5"):
-        shares = figures["reaches"][wind]["shares"]
+        shares = figures["reaches"][f"again, wind {wind} mm"]["shares"]
         assert shares["all stalks"]["of"] == figures["stalks"] and shares["attempts: success"]["of"] == figures["grasp_points"]
         assert shares["all stalks"]["count"] >= figures["stalks"] - 2
     said = capsys.readouterr().out
-    assert "simulated runs of family few" in said and "the arm, with 5 mm of wind" in said
+    assert "simulated runs of family few" in said and "the arm, again, wind 5 mm:" in said
     # A run is the same in this process, and is not evaluated again.
     family = family_of(Drawn("training", spec, 256, (), 3), "grasping")
     here = json.loads(json.dumps(finite(evaluate_run(Conditions(family), 1))))
