@@ -143,6 +143,8 @@ def _found_again(choice: Choice, point: GraspPoint, perception: Perception, chor
 
     Axes are those of the robot at the last pair, from which those at other stops and of the plot differ by little.
     """
+    if choice.stop < 0:
+        return np.full(2, np.nan)
     motion: Motion = perception.to_last[choice.stop]
     seen = motion(chords[choice.stop].middle)
     heights = seen[:, 2] - point.point[2]

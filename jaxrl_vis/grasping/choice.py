@@ -13,10 +13,11 @@ import numpy as np
 from jaxrl_vis.grasping import arm
 from jaxrl_vis.grasping.lines import HEIGHTS, GraspPoint
 
-LEAST_ROOM = 0.006
+LEAST_ROOM = 0.0045
 """Room in m beside the open gripper, on its whole way, with less of which the arm is not sent."""
 _ENOUGH = 0.02  # m: more room is no better
-_STEPS = (0.0, -0.1, 0.1, -0.2, 0.2)  # m, from the height of the grasp point: further away the line is not believed
+_STEPS = tuple(sign * step for step in np.arange(0.0, 0.31, 0.05) for sign in (-1.0, 1.0))
+# m, from the height of the grasp point: further away the line is not believed
 _UNSURE = 0.015  # m per m: how much less is known of a stalk away from the height of its grasp point
 _USUAL = 0.007  # m: radius of a stalk whose thickness is not known
 
