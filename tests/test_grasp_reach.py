@@ -297,13 +297,13 @@ def test_what_is_found_again_is_late_wrong_by_as_much_and_expected_to_go_on():
     found = []
     for time in range(4):
         stalks = np.zeros((3, 4, 3))
-        stalks[0, slots[0]] = [0.01 * time, 0.0, HEIGHT]
+        stalks[0, slots[0]] = [0.01 * time, 0.0, HEIGHT + 0.001 * time]
         stalks[2] = 1.0
         found.append(look(Sight(0.1 * time, np.zeros((3, 3)), stalks)))
     assert np.isnan(found[0]).all() and np.isnan(found[1]).all()
     # In the third look the second is known: 10 mm, going on by 10 mm a look for a look and a half.
-    np.testing.assert_allclose(found[2][0], [0.010 + 0.015 + 0.002, 0.0, HEIGHT], atol=1e-9)
-    np.testing.assert_allclose(found[3][0], [0.020 + 0.015 + 0.002, 0.0, HEIGHT], atol=1e-9)
+    np.testing.assert_allclose(found[2][0], [0.010 + 0.015 + 0.002, 0.0, HEIGHT + 0.001], atol=1e-9)
+    np.testing.assert_allclose(found[3][0], [0.020 + 0.015 + 0.002, 0.0, HEIGHT + 0.002], atol=1e-9)
     assert np.isnan(found[3][1:, :2]).all()
 
 

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from PIL import Image
 
 from jaxrl_vis import cli
 from jaxrl_vis.cli.families import family_of
@@ -28,6 +29,7 @@ from jaxrl_vis.grasping.masks.painter import Painter, Settings, read_weights, wr
 from jaxrl_vis.grasping.masks.variation import vary
 from jaxrl_vis.grasping.perceive import ORIGINAL, OURS, View, Ways, perceive
 from jaxrl_vis.grasping.pipeline import Request, run
+from jaxrl_vis.grasping.reach_figures import draw_reach
 from jaxrl_vis.grasping.records import Conditions, evaluate_run
 from jaxrl_vis.grasping.sight import Sight
 from jaxrl_vis.grasping.slices import slice_at, slice_points
@@ -492,6 +494,10 @@ def test_eval_of_rows_and_of_an_empty_one(spec, tmp_path, capsys):
     said = capsys.readouterr().out
     assert "2 runs were evaluated before" in said and "run 1" not in said
     assert json.loads(out.read_text()) == figures and out.stat().st_mtime_ns >= before
+    figure = ["figure", "4.6", "--evaluation", str(out), "--out", str(tmp_path / "figure.png")]
+    assert cli.main([*figure, "--wind", "5"]) == 0 and (tmp_path / "figure.png").stat().st_size > 20_000
+    assert cli.main([*figure, "--wind", "7"]) == 2
+    assert "holds no reaches of the kind `again, wind 7 mm`" in capsys.readouterr().err
     assert cli.main([*words, "--json", str(out), "--spec", str(spec), "--thesis"]) == 2
     assert 'another evaluation (method: "default", not "thesis")' in capsys.readouterr().err
     empty = tmp_path / "empty.json"
@@ -524,6 +530,10 @@ def test_masks_are_compared_with_the_truth_and_the_figure_is_drawn(spec, tmp_pat
     out = tmp_path / "figure.png"
     draw_figure(out, family, 0, None, "truth")
     assert out.stat().st_size > 50_000
+    draw_reach(tmp_path / "reach.png", family, 0, None, 5.0, tmp_path / "arm.gif")
+    assert (tmp_path / "reach.png").stat().st_size > 20_000
+    with Image.open(tmp_path / "arm.gif") as shown:
+        assert shown.n_frames % 60 == 0 and shown.n_frames > 60
 
 
 def test_a_run_without_pairs_is_a_mistake():

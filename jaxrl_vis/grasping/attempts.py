@@ -276,7 +276,9 @@ def follow(stands: Stands, stalks: np.ndarray, again: np.ndarray) -> Callable[[S
         if len(seen) < 3:
             return np.full_like(place, np.nan)
         before, last = seen[-3:-1]
-        return last + _AHEAD * (last - before)
+        ahead = _AHEAD * (last - before)
+        ahead[:, 2] = 0.0  # the height of the grasp stays what it was chosen to be
+        return last + ahead
 
     return look
 

@@ -143,7 +143,7 @@ def grasp_score(records: Iterable[Record], name: str) -> Score:
     attempts, standing = [], []
     for record in records:
         number, found = int(record["number"]), record["reaches"][name]
-        attempts += [_attempt_of(number, each) for each in found["attempts"]]
+        attempts += attempts_in(record, name)
         standing += plan_of(number, record, found["plan"]).standing
     return score(attempts, standing)
 
@@ -228,6 +228,11 @@ def _attempt_record(each: Attempt) -> Record:
     values = dataclasses.asdict(each)
     del values["run"]
     return {**values, "held": sorted(each.held)}
+
+
+def attempts_in(record: Record, name: str) -> list[Attempt]:
+    """What came of the reaches of one kind in a run."""
+    return [_attempt_of(int(record["number"]), each) for each in record["reaches"][name]["attempts"]]
 
 
 def _attempt_of(number: int, values: Record) -> Attempt:
