@@ -37,6 +37,7 @@ def test_wilson_is_that_of_scipy():
         (Attempt(0, 3, held(3, 4)), "several"),
         (Attempt(0, 3, held(4, 5)), "several"),
         (Attempt(0, 3, held(), reachable=False), "unreachable"),
+        (Attempt(0, 3, held(), refused=True), "refused"),
     ],
 )
 def test_only_the_target_alone_is_a_success(attempt: Attempt, outcome: str):
@@ -54,7 +55,8 @@ def test_errors_that_cancel_in_the_count_are_counted_here():
     assert outcomes["attempts: miss"] == 1 and outcomes["attempts: several"] == 1
     stages = {each.name.removeprefix("reachable stalks: "): each.count for each in found.stages}
     assert stages == {
-        "grasped": 1, "not detected": 1, "aimed beside": 0, "out of reach": 0, "not held": 1, "several held": 1,
+        "grasped": 1, "not detected": 1, "aimed beside": 0, "out of reach": 0, "refused": 0, "not held": 1,
+        "several held": 1,
     }  # fmt: skip
 
 
@@ -85,14 +87,29 @@ def test_the_failing_stage_is_the_first():
         Attempt(0, 1, held(), reachable=False, aim_error=0.03),
         Attempt(0, 2, held(), aim_error=0.002),
         Attempt(0, 3, held(3), aim_error=0.03),
+        Attempt(0, 5, held(), refused=True, aim_error=0.03),
     ]
-    found = score(attempts, [stand(index) for index in range(5)])
+    found = score(attempts, [stand(index) for index in range(6)])
     stages = {each.name.removeprefix("reachable stalks: "): each.count for each in found.stages}
     assert stages == {
-        "grasped": 1, "not detected": 1, "aimed beside": 1, "out of reach": 1, "not held": 1, "several held": 0,
+        "grasped": 1, "not detected": 1, "aimed beside": 1, "out of reach": 1, "refused": 1, "not held": 1,
+        "several held": 0,
     }  # fmt: skip
-    assert sum(stages.values()) == 5
-    np.testing.assert_allclose(found.aim_errors, [0.03, 0.03, 0.002, 0.03])
+    assert sum(stages.values()) == 6
+    np.testing.assert_allclose(found.aim_errors, [0.03, 0.03, 0.002, 0.03, 0.03])
+
+
+def test_what_is_refused_fails_in_every_total_and_is_no_reach():
+    attempts = [
+        Attempt(0, 0, held(0)),
+        Attempt(0, 1, held(), refused=True),
+        Attempt(0, 2, held(2), collided=True, brushed=True),
+    ]
+    found = score(attempts, [stand(index) for index in range(3)])
+    assert (found.of_reachable.count, found.of_reachable.of) == (2, 3) and (found.of_all.count, found.of_all.of) == (2, 3)
+    assert (found.of_sent.count, found.of_sent.of) == (2, 2) and (found.touches.count, found.touches.of) == (1, 2)
+    assert {each.name: each.count for each in found.outcomes}["attempts: refused"] == 1
+    assert thesis_ratio(attempts) == (1.0, 1)
 
 
 def test_collisions_and_false_targets_are_told_apart_from_success():

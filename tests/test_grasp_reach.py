@@ -12,13 +12,19 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import jaxrl_vis_envs
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.grasping import arm, video, way
+from jaxrl_vis.grasping.attempts import follow, wind_keys
+from jaxrl_vis.grasping.choice import LEAST_ROOM, choose, choose_nearest
+from jaxrl_vis.grasping.lines import GraspPoint
+from jaxrl_vis.grasping.policy_loop import STALKS, check_policy, reach_by_policy
 from jaxrl_vis.grasping.reach import LOOK, ReachResult, Sight, arms_among, reach
 from jaxrl_vis_envs.plants import TRAINING, bending, draw
 from jaxrl_vis_envs.plants.field import Plot, Stalk
-from jaxrl_vis_envs.plants.stand import MAST_DISTANCE, Stands, origin_of, stands_at
+from jaxrl_vis_envs.plants.stand import KNEE, MAST_DISTANCE, Stands, origin_of, stand_of_lines, stands_at
 from jaxrl_vis_envs.tasks import stalk_arm
+from jaxrl_vis_envs.tasks.stalk_reach import StalkReach
 
 HEIGHT = 0.7
 TARGETS = np.array(
@@ -264,12 +270,108 @@ def test_wind_moves_stalks_away_from_blind_jaws_and_looking_helps():
         return sight.stalks[:, slot]
 
     seeing = reach(scenes, targets, key, wind, look=look)
-    assert times == pytest.approx([LOOK * count for count in range(1, 20)])
+    assert times == pytest.approx([LOOK * count for count in range(1, 24)])
     assert seeing.held[:, slot].sum() > blind.held[:, slot].sum()
     assert not blind.held[:, slot].all()
     # Nothing seen, nothing changed.
     idle = reach(scenes, targets, key, wind, look=lambda sight: np.full((8, 3), np.nan))
     np.testing.assert_array_equal(idle.taken, blind.taken)
+
+
+def test_an_arm_meets_the_same_wind_in_any_company():
+    keys = wind_keys(np.array([4, 4, 9]), np.array([0, 1, 0]))
+    alone = wind_keys(np.array([9]), np.array([0]))
+    assert jax.random.key_data(keys[2]).tolist() == jax.random.key_data(alone[0]).tolist()
+    assert len({tuple(each) for each in np.asarray(jax.random.key_data(keys)).tolist()}) == 3
+    order = np.array([1, 0, 2, 3, 4, 5, 6, 7])
+    each = jax.random.split(jax.random.key(1), 8)
+    scenes = Stands(**{field.name: getattr(stands(), field.name)[order] for field in dataclasses.fields(Stands)})
+    one, other = reach(stands(), TARGETS, each, 20.0), reach(scenes, TARGETS[order], each[order], 20.0)
+    np.testing.assert_allclose(one.taken[order], other.taken, atol=1e-5)
+
+
+def test_what_is_found_again_is_late_wrong_by_as_much_and_expected_to_go_on():
+    scenes = Stands(**{field.name: getattr(stands(), field.name)[:3] for field in dataclasses.fields(Stands)})
+    slots = [int(np.flatnonzero(scenes.stalk[each] == each)[0]) for each in (0, 1)]
+    look = follow(scenes, np.array([0, 1, -1]), np.array([[0.002, 0.0], [np.nan, np.nan], [0.0, 0.0]]))
+    found = []
+    for time in range(4):
+        stalks = np.zeros((3, 4, 3))
+        stalks[0, slots[0]] = [0.01 * time, 0.0, HEIGHT + 0.001 * time]
+        stalks[2] = 1.0
+        found.append(look(Sight(0.1 * time, np.zeros((3, 3)), stalks)))
+    assert np.isnan(found[0]).all() and np.isnan(found[1]).all()
+    # In the third look the second is known: 10 mm, going on by 10 mm a look for a look and a half.
+    np.testing.assert_allclose(found[2][0], [0.010 + 0.015 + 0.002, 0.0, HEIGHT + 0.001], atol=1e-9)
+    np.testing.assert_allclose(found[3][0], [0.020 + 0.015 + 0.002, 0.0, HEIGHT + 0.002], atol=1e-9)
+    assert np.isnan(found[3][1:, :2]).all()
+
+
+def line(x: float, y: float, slope: float = 0.0) -> GraspPoint:
+    direction = np.array([slope, 0.0, 1.0])
+    return GraspPoint(np.array([x, y, HEIGHT]), direction / np.linalg.norm(direction), 0.012, 2, 0.001)
+
+
+def test_the_height_with_most_room_is_taken_and_what_is_blocked_is_refused():
+    stops = np.array([origin_of(x) for x in (-0.1, 0.0, 0.1)])
+    (alone,) = choose([line(0.0, 0.0)], stops)
+    assert not alone.is_blocked and alone.point[2] == HEIGHT and alone.room == np.inf
+    # A neighbour that leans over the target at its height, and away from it below.
+    leaning, other = choose([line(0.0, 0.0), line(0.02, -0.03, -0.3)], stops)
+    assert leaning.point[2] < HEIGHT and leaning.room > LEAST_ROOM
+    # Two that stand as near at every height.
+    assert all(each.is_blocked for each in choose([line(0.0, 0.0), line(0.015, 0.0)], stops))
+    # What is out of reach is not blocked.
+    (far,) = choose([line(2.0, 0.0)], stops)
+    assert far.stop == -1 and not far.is_blocked
+    near = choose_nearest([line(0.08, 0.0), line(2.0, 0.0)], stops, (0.75, 0.9))
+    assert near[0].stop == 2 and near[0].point[2] == 0.75 and near[1].stop == -1
+
+
+def test_stalks_as_found_are_a_stand():
+    target = np.array([1.0, 0.0, HEIGHT])
+    points = np.array([[1.0, 0.0, 0.9], [1.05, 0.02, 0.6], [3.0, 0.0, 0.7]])
+    directions = np.array([[0.1, 0.0, 1.0], [0.0, 0.0, 2.0], [0.0, 0.0, 1.0]])
+    found = stand_of_lines(points, directions, np.array([0.005, 0.006, 0.007]), 1.02, target, 2)
+    assert sorted(found.stalk[0].tolist()) == [0, 1] and len(found) == 1
+    slot = int(np.flatnonzero(found.stalk[0] == 0)[0])
+    knee, top = found.knee[0, slot], found.top[0, slot]
+    there = knee + (0.9 - knee[2]) / (top - knee)[2] * (top - knee) + found.origin[0]
+    np.testing.assert_allclose(there, points[0], atol=1e-6)
+    assert found.radius[0, slot, 1] == pytest.approx(0.005) and knee[2] == pytest.approx(KNEE)
+    assert (stand_of_lines(points[:1], directions[:1], np.array([0.005]), 1.02, target, 2).stalk == [[0, -1]]).all()
+
+
+def test_a_policy_drives_the_arm_and_its_goals_are_of_what_was_found():
+    seen = []
+
+    @dataclasses.dataclass(frozen=True, eq=False)
+    class Onwards:
+        """Drives straight ahead, to the end of where the grip may be driven, and keeps its goal."""
+
+        env: StalkReach
+
+        def __call__(self, observation: jax.Array, goal: jax.Array) -> jax.Array:
+            jax.debug.callback(lambda *images: seen.append(images), observation, goal)
+            return jnp.array([0.0, 0.6, 0.0])
+
+    policy = Onwards(jaxrl_vis_envs.make("VisualStalkReach", image_size=16))
+    plot = Plot(TRAINING, 0, (straight(1.0, 0.137), straight(1.12, 0.1)), ())
+    targets = np.array([[1.0, 0.137, 0.75]])
+    truth = stands_at(plot, np.array([1.0]), targets, STALKS)
+    lines = np.array([[1.0, 0.137, 0.75]]), np.array([[0.0, 0.0, 1.0]])
+    found = stand_of_lines(*lines, np.array([0.006]), 1.0, targets[0], STALKS)
+    result = reach_by_policy(truth, found, targets, policy, wind_keys(np.zeros(1, int), np.zeros(1, int)), 0.0)
+    jax.effects_barrier()
+    assert {int(each) for each in truth.stalk[0][result.held[0]]} == {0}
+    assert result.taken.shape == (1, 60, 3) and result.error[0] < 0.005
+    assert not result.touched[0, truth.stalk[0] == 1].any()
+    observation, goal = (np.asarray(each) for each in seen[-1])
+    assert observation.shape == goal.shape == (4, 16, 16)
+    # The second stalk was not found: it is in what the policy sees, and not in its goal.
+    assert (np.abs(observation[3].astype(int) - goal[3]) > 40).sum() > 4
+    with pytest.raises(RequestError, match="must be a run of VisualStalkReach"):
+        check_policy(types.SimpleNamespace(env=None, env_name="VisualFetchReach"))
 
 
 def test_requests_that_make_no_sense_are_refused():

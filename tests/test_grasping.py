@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from PIL import Image
 
 from jaxrl_vis import cli
 from jaxrl_vis.cli.families import family_of
@@ -28,10 +29,11 @@ from jaxrl_vis.grasping.masks.painter import Painter, Settings, read_weights, wr
 from jaxrl_vis.grasping.masks.variation import vary
 from jaxrl_vis.grasping.perceive import ORIGINAL, OURS, View, Ways, perceive
 from jaxrl_vis.grasping.pipeline import Request, run
+from jaxrl_vis.grasping.reach_figures import draw_reach
 from jaxrl_vis.grasping.records import Conditions, evaluate_run
 from jaxrl_vis.grasping.sight import Sight
 from jaxrl_vis.grasping.slices import slice_at, slice_points
-from jaxrl_vis.grasping.stitch import DEFAULT, THESIS, Motion, rigid, stitch
+from jaxrl_vis.grasping.stitch import DEFAULT, THESIS, Motion, Thinned, rigid, stitch
 from jaxrl_vis.phenotyping.calibration import read_calibration
 from jaxrl_vis.phenotyping.folders import find_plots
 from jaxrl_vis_envs.plants import Calibration, Pose, draw, drive, read
@@ -143,19 +145,19 @@ def test_odometry_and_a_narrow_gate_find_the_motion_and_the_thesis_does_not():
     here, there = (part + rng.normal(0, 0.001, part.shape) for part in (here, there))
     here, there = (part[np.abs(part[:, 0]) < 0.4] for part in (here, there))  # each pair sees its own part of the row
     place = np.array([0.0, 0.55, 0.75])
-    found = stitch(here, there, 0.103)
+    found = stitch(Thinned(here), Thinned(there), 0.103)
     assert not found.refused and found.overlap > 0.6 and found.residual < 0.004
     assert np.linalg.norm((found.motion(place) - motion(place))[:2]) < 0.002
-    blind = stitch(here, there, 0.103, THESIS)
+    blind = stitch(Thinned(here, THESIS), Thinned(there, THESIS), 0.103, THESIS)
     assert np.linalg.norm((blind.motion(place) - motion(place))[:2]) > 0.006
 
 
 def test_what_odometry_rules_out_is_refused():
-    whole = thicket()
+    whole = Thinned(thicket())
     found = stitch(whole, whole, 0.2)  # odometry says that the robot moved; it did not
     assert found.refused and np.allclose(found.motion.shift, [-0.2, 0, 0])
     assert "overlap" in found.refused or "moved" in found.refused
-    assert stitch(whole, np.zeros((0, 3)), 0.1).refused == "a cloud is empty"
+    assert stitch(whole, Thinned(np.zeros((0, 3))), 0.1).refused == "a cloud is empty"
     assert not stitch(whole, whole, 0.2, THESIS).refused
 
 
@@ -475,11 +477,12 @@ def test_eval_of_rows_and_of_an_empty_one(spec, tmp_path, capsys):
     assert figures["f1"] > 0.9 and figures["point_median_mm"] < 10.0 and figures["stitch_median_mm"] < 10.0
     assert figures["synthetic"] is True and figures["masks"] == "truth" and figures["stitches"] == 4
     for wind in ("0", "5"):
-        shares = figures["reaches"][wind]["shares"]
-        assert shares["all stalks"]["of"] == figures["stalks"] and shares["attempts: success"]["of"] == figures["grasp_points"]
+        shares = figures["reaches"][f"again, wind {wind} mm"]["shares"]
+        targets = sum(len(each["plan"]["targets"]) for each in figures["each"])
+        assert shares["all stalks"]["of"] == figures["stalks"] and shares["attempts: success"]["of"] == targets
         assert shares["all stalks"]["count"] >= figures["stalks"] - 2
     said = capsys.readouterr().out
-    assert "simulated runs of family few" in said and "the arm, with 5 mm of wind" in said
+    assert "simulated runs of family few" in said and "the arm, again, wind 5 mm:" in said
     # A run is the same in this process, and is not evaluated again.
     family = family_of(Drawn("training", spec, 256, (), 3), "grasping")
     here = json.loads(json.dumps(finite(evaluate_run(Conditions(family), 1))))
@@ -491,6 +494,10 @@ def test_eval_of_rows_and_of_an_empty_one(spec, tmp_path, capsys):
     said = capsys.readouterr().out
     assert "2 runs were evaluated before" in said and "run 1" not in said
     assert json.loads(out.read_text()) == figures and out.stat().st_mtime_ns >= before
+    figure = ["figure", "4.6", "--evaluation", str(out), "--out", str(tmp_path / "figure.png")]
+    assert cli.main([*figure, "--wind", "5"]) == 0 and (tmp_path / "figure.png").stat().st_size > 20_000
+    assert cli.main([*figure, "--wind", "7"]) == 2
+    assert "holds no reaches of the kind `again, wind 7 mm`" in capsys.readouterr().err
     assert cli.main([*words, "--json", str(out), "--spec", str(spec), "--thesis"]) == 2
     assert 'another evaluation (method: "default", not "thesis")' in capsys.readouterr().err
     empty = tmp_path / "empty.json"
@@ -523,6 +530,10 @@ def test_masks_are_compared_with_the_truth_and_the_figure_is_drawn(spec, tmp_pat
     out = tmp_path / "figure.png"
     draw_figure(out, family, 0, None, "truth")
     assert out.stat().st_size > 50_000
+    draw_reach(tmp_path / "reach.png", family, 0, None, 5.0, tmp_path / "arm.gif")
+    assert (tmp_path / "reach.png").stat().st_size > 20_000
+    with Image.open(tmp_path / "arm.gif") as shown:
+        assert shown.n_frames % 60 == 0 and shown.n_frames > 60
 
 
 def test_a_run_without_pairs_is_a_mistake():

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from jaxrl_vis.cli.checks import check_counts, check_extra
+from jaxrl_vis.cli import grasp_figure
+from jaxrl_vis.cli.checks import check_counts
 from jaxrl_vis.cli.phenotype_figure import NAMES as CHAPTER_3
 from jaxrl_vis.cli.phenotype_figure import make_figure
 from jaxrl_vis.config import PRESETS
@@ -18,12 +19,15 @@ from jaxrl_vis.report.outputs import check_writable
 if TYPE_CHECKING:
     from jaxrl_vis.studies.show import Request
 
-FigureName = Literal[
-    "3.4", "3.5", "table3.1", "4.4", "5.1", "5.2", "estimators", "cameras", "5.4", "5.5", "5.6", "5.7", "quadratic"
-]
+_OfPlants = Literal["3.4", "3.5", "table3.1", "4.4", "4.5", "4.6"]
+_OfLearners = Literal["5.1", "5.2", "estimators", "cameras", "5.4", "5.5", "5.6", "5.7", "quadratic"]
+FigureName = Literal[_OfPlants, _OfLearners]
 SUFFIXES = (".png", ".pdf", ".svg")
 # Figures that train nothing -> options that they take.
-_DRAWN_HERE = {"4.4": ("figure", "out", "seed"), "quadratic": ("figure", "out")}
+_DRAWN_HERE = {
+    **dict.fromkeys(grasp_figure.NAMES, ("figure", "out", "seed", *grasp_figure.OPTIONS)),
+    "quadratic": ("figure", "out"),
+}
 UNFINISHED = 3
 """Exit status: finished, with something left out."""
 
@@ -34,7 +38,8 @@ class Figure:
 
     3.4, 3.5, table3.1: counts, widths and times on synthetic plots of sorghum, beside what the thesis says of people; from
     --evaluation, or from plots that are evaluated first. 4.4: from a stereo pair to grasp points, of a synthetic run; --seed
-    chooses it.
+    chooses it. 4.5: the path that the arm should take to a stalk of that run, and the one that it takes; --video shows all of
+    its reaches. 4.6: attempts and grasps of 16 runs of half a metre; from --evaluation, or from runs that are evaluated first.
 
     5.1, 5.2: rewards with and without ground truth. estimators: rewards from state estimators that err. cameras: noisy and
     varied images. 5.4: auxiliary losses, and how they are weighted. 5.5: single auxiliary tasks. 5.6: their weights over
@@ -50,7 +55,12 @@ class Figure:
     """A .png, .pdf or .svg file, and .md for table3.1; figure_FIGURE.png (or quadratic.png, or table_3.1.md) in the current
     folder if not given. Tables go beside it, as .md and .csv."""
     evaluation: Path | None = None
-    """For 3.4, 3.5 and table3.1: what `phenotype eval --json` wrote; if not given, plots are evaluated."""
+    """For 3.4, 3.5 and table3.1: what `phenotype eval --json` wrote; for 4.6: what `grasp eval --reach --json` wrote. If not
+    given, plots or runs are evaluated."""
+    wind: float = 10.0
+    """For 4.5 and 4.6: how far stalks sway in the wind, mm."""
+    video: Path | None = None
+    """For 4.5: a .gif, .mp4 or .html file of the arm at work."""
     plots: int | None = None
     """For 3.4, 3.5 and table3.1: how many plots to evaluate; 10 if not given."""
     preset: str | None = None
@@ -83,7 +93,13 @@ def run(options: Figure) -> int:
     """Draws one figure; `UNFINISHED` where a run that belongs to it is not finished."""
     if options.figure in CHAPTER_3:
         return _of_chapter_3(options)
-    _refuse_options(options, ("evaluation", "plots"), "figures 3.4, 3.5 and table3.1")
+    if options.figure != "4.6":
+        _refuse_options(options, ("evaluation",), "figures 3.4, 3.5, 4.6 and table3.1")
+    _refuse_options(options, ("plots",), "figures 3.4, 3.5 and table3.1")
+    if options.figure != "4.5":
+        _refuse_options(options, ("video",), "figure 4.5")
+    if options.figure not in ("4.5", "4.6"):
+        _refuse_options(options, ("wind",), "figures 4.5 and 4.6")
     is_quadratic = options.figure == "quadratic"
     is_drawn_here = options.figure in _DRAWN_HERE
     out = options.out or Path("quadratic.png" if is_quadratic else f"figure_{options.figure}.png")
@@ -100,8 +116,8 @@ def run(options: Figure) -> int:
         quadratic.draw(out)
         print(out)
         return 0
-    if options.figure == "4.4":
-        return _draw_grasping(out, options.seed or 0)
+    if options.figure in grasp_figure.NAMES:
+        return grasp_figure.make_figure(options.figure, out, options)
     # Nothing below starts JAX in this process: the accelerator's memory belongs to the runs.
     from jaxrl_vis.studies import figures
 
@@ -133,23 +149,6 @@ def _refuse_options(options: Figure, names: Sequence[str], where: str) -> None:
     for name in names:
         if getattr(options, name) != defaults[name]:
             raise RequestError(f"--{name.replace('_', '-')} goes with {where}")
-
-
-def _draw_grasping(out: Path, seed: int) -> int:
-    """Draws figure 4.4, with the masks of the networks that are shipped, or true ones."""
-    if seed < 0:
-        raise RequestError(f"--seed must be at least 0, not {seed}")
-    check_extra("figure 4.4", "grasping")
-    check_devices()
-    from jaxrl_vis.cli.grasp import painter_of
-    from jaxrl_vis.grasping.figure import draw_figure
-    from jaxrl_vis.grasping.masks.painter import SHIPPED
-    from jaxrl_vis_envs.plants.grasping import GRASPING
-
-    painter, name = painter_of(None, "gan") if SHIPPED["gan"].exists() else (None, "truth")
-    draw_figure(out, GRASPING, seed, None if painter is None else lambda image, number: painter(image), name)
-    print(out)
-    return 0
 
 
 def _request(options: Figure, out: Path) -> "Request":

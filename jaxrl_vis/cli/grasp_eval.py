@@ -4,16 +4,19 @@ import dataclasses
 import functools
 import hashlib
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from jaxrl_vis import __version__
-from jaxrl_vis.cli.checks import check_counts, check_extra
+from jaxrl_vis.cli.checks import check_counts, check_extra, check_run
 from jaxrl_vis.cli.families import family_of
 from jaxrl_vis.cli.grasp import weights_of
 from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.evaluation_pool import Kept, Record, evaluate_each, share_accelerator
 from jaxrl_vis.report.outputs import check_writable
+
+if TYPE_CHECKING:
+    from jaxrl_vis.run.policy import Policy
 
 _MOST_WIND = 100.0  # mm
 
@@ -50,6 +53,13 @@ class Eval:
     """Send the simulated arm to every grasp point, too, and say what its jaws hold."""
     wind: tuple[float, ...] = ()
     """With --reach: how far stalks sway in the wind, mm; 0 if not given. Several, such as 0 10 20, share what was seen."""
+    loops: tuple[Literal["open", "again", "policy"], ...] = ("again",)
+    """With --reach: whether the arm goes to where a stalk was seen (open), finds it again on the way (again), or is brought
+    there by a policy of VisualStalkReach (policy). With policy, all loops are compared on scenes like those of its task."""
+    policy: Path | None = None
+    """The run folder of that policy."""
+    policy_seed: int | None = None
+    """Which of the run's seeds; the first if not given."""
     workers: int = 1
     """How many processes look at runs side by side; they share GPUs and cores, so that a pair takes longer."""
     json: Path | None = None
@@ -67,8 +77,14 @@ def evaluate(options: Eval) -> int:
     for wind in options.wind:
         if not 0 <= wind <= _MOST_WIND:
             raise RequestError(f"--wind must be from 0 to {_MOST_WIND:g} mm, not {wind:g}")
-    if options.wind and not options.reach:
-        raise RequestError("--wind goes with --reach")
+    if not options.reach and (options.wind or options.policy is not None):
+        raise RequestError(f"--{'wind' if options.wind else 'policy'} goes with --reach")
+    if not options.loops or len(set(options.loops)) < len(options.loops):
+        raise RequestError("--loops must name each of some of open, again and policy once")
+    if ("policy" in options.loops) != (options.policy is not None):
+        raise RequestError("--loops policy goes with --policy RUN, a run of VisualStalkReach")
+    if options.policy is not None:
+        check_run(options.policy)
     check_extra("grasp", "grasping")
     if options.json is not None:
         check_writable(options.json, "--json")
@@ -106,14 +122,46 @@ def evaluate(options: Eval) -> int:
     print(f"simulated runs of family {family.name}, masks: {name}, {ways}:")
     for each, value in records.summary_of([{**record, "reaches": {}} for record in asked]).items():
         print(f"  {each:20} {f'{value:.4f}' if isinstance(value, float) else value}")
-    for wind in (options.wind or (0.0,)) if options.reach else ():
-        records.reach_all(kept, numbers, wind)
-        grasps = records.grasp_score([kept.records[number] for number in numbers], f"{wind:g}")
-        print(f"the arm, with {wind:g} mm of wind:")
-        for share in grasps.shares:
-            print(f"  {share}")
-        print(f"  the thesis's ratio: {grasps.thesis_ratio:.4f}")
+    if options.reach:
+        _reach(options, kept, numbers)
     return 0
+
+
+def _reach(options: Eval, kept: Kept, numbers: range) -> None:
+    """Sends the arm, and prints what came of it."""
+    from jaxrl_vis.grasping import records
+
+    policy, name = _policy(options)
+    loops, winds = options.loops, options.wind or (0.0,)
+    asked = [records.Reaches(loop, wind, "policy" in loops, policy, name) for loop in loops for wind in winds]
+    scores = []
+    for each in asked:
+        records.reach_all(kept, numbers, each)
+        scores.append(records.grasp_score([kept.records[number] for number in numbers], str(each)))
+        print(f"the arm, {each}:")
+        for share in scores[-1].shares:
+            print(f"  {share}")
+        print(f"  the thesis's ratio: {scores[-1].thesis_ratio:.4f}", flush=True)
+    if len(asked) > 1:
+        width = max(len(str(each)) for each in asked)
+        print(f"{'':{width}}  with room  crowded  reachable  touched another")
+        for each, score in zip(asked, scores):
+            shares = (score.with_room, score.crowded, score.of_reachable, score.touches)
+            print(
+                f"{str(each):{width}}  " + "  ".join(f"{share.share:9.1%}" if share.of else f"{'none':>9}" for share in shares)
+            )
+
+
+def _policy(options: Eval) -> "tuple[Policy | None, str]":
+    """The policy of the loop that has one, and its name."""
+    if options.policy is None:
+        return None, ""
+    from jaxrl_vis.grasping.policy_loop import check_policy
+    from jaxrl_vis.run.policy import load_policy
+
+    policy = load_policy(options.policy, options.policy_seed)
+    check_policy(policy)
+    return policy, f"{options.policy.resolve().name} seed {policy.seed} iteration {policy.iteration}"
 
 
 def _print_run(number: int, record: Record) -> None:

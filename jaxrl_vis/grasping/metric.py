@@ -17,8 +17,8 @@ ROOM = 0.005
 """Room in m beside the open jaws with less of which a stalk is crowded: the jaws cannot take it alone."""
 NEIGHBOUR_EDGES = (0.0, 0.03, 0.04, 0.05, 0.065, 0.1, math.inf)
 """Bounds of the classes of distances to the nearest neighbour, m, middle to middle."""
-OUTCOMES = ("success", "miss", "wrong stalk", "several", "unreachable")
-STAGES = ("grasped", "not detected", "aimed beside", "out of reach", "not held", "several held")
+OUTCOMES = ("success", "miss", "wrong stalk", "several", "unreachable", "refused")
+STAGES = ("grasped", "not detected", "aimed beside", "out of reach", "refused", "not held", "several held")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,6 +30,7 @@ class Attempt:
         stalk: Index of the stalk that the grasp point is matched to (`match`); None where no stalk is there.
         held: Indices of the stalks between the closed jaws.
         reachable: Whether the arm could go there; if not, nothing is held.
+        refused: Whether it could, and was not sent: other stalks were in its way, as far as was known. Then nothing is held.
         collided: Whether links other than the jaws touched a stalk that the attempt was not for.
         brushed: The same for the open jaws.
         aim_error: Horizontal distance of the grasp point from the middle of the stalk, m; nan without one.
@@ -39,15 +40,23 @@ class Attempt:
     stalk: int | None
     held: frozenset[int]
     reachable: bool = True
+    refused: bool = False
     collided: bool = False
     brushed: bool = False
     aim_error: float = math.nan
+
+    @property
+    def sent(self) -> bool:
+        """Whether the arm moved."""
+        return self.reachable and not self.refused
 
     @property
     def outcome(self) -> str:
         """One of `OUTCOMES`."""
         if not self.reachable:
             return "unreachable"
+        if self.refused:
+            return "refused"
         if len(self.held) > 1:
             return "several"
         if not self.held:
@@ -115,7 +124,7 @@ class Score:
     """What came of all runs.
 
     Attributes:
-        of_sent: Successes, of the attempts that the arm could go to.
+        of_sent: Successes, of the attempts for which the arm moved.
         with_room: Stalks grasped alone, of those that can be reached and leave the open jaws room.
         crowded: The same of those that can be reached and do not.
         of_reachable: The same of all that can be reached: with room and crowded.
@@ -125,6 +134,7 @@ class Score:
         false_targets: Attempts at places without a stalk, of all attempts.
         collisions: Attempts sent whose links touched another stalk, of those sent.
         brushes: Attempts sent whose open jaws touched another stalk, of those sent.
+        touches: Attempts sent of which either did, of those sent.
         by_neighbour: Stalks grasped alone, of those that can be reached, by distance to the nearest neighbour.
         thesis_ratio: The thesis's metric, mean over runs with attempts; nan without any.
         runs: Runs with attempts.
@@ -141,6 +151,7 @@ class Score:
     false_targets: Share
     collisions: Share
     brushes: Share
+    touches: Share
     by_neighbour: tuple[Share, ...]
     thesis_ratio: float
     runs: int
@@ -150,7 +161,16 @@ class Score:
     def shares(self) -> tuple[Share, ...]:
         """All rows, in the order of a table."""
         first = (self.of_sent, self.with_room, self.crowded, self.of_reachable, self.of_all)
-        return (*first, *self.outcomes, self.false_targets, self.collisions, self.brushes, *self.stages, *self.by_neighbour)
+        return (
+            *first,
+            *self.outcomes,
+            self.false_targets,
+            self.collisions,
+            self.brushes,
+            self.touches,
+            *self.stages,
+            *self.by_neighbour,
+        )
 
 
 def wilson(count: int, of: int, z: float = 1.959964) -> tuple[float, float]:
@@ -215,7 +235,7 @@ def score(attempts: Iterable[Attempt], stalks: Iterable[Standing], tolerance: fl
     by_place = {(each.run, each.stalk): each for each in attempts if each.stalk is not None}
     stage_of = [_stage(by_place.get((each.run, each.stalk)), tolerance) for each in stalks]
     reachable = [(each, stage) for each, stage in zip(stalks, stage_of) if each.reachable]
-    sent = [each for each in attempts if each.reachable]
+    sent = [each for each in attempts if each.sent]
 
     def grasped(name: str, chosen: Sequence[str]) -> Share:
         return Share(name, sum(stage == "grasped" for stage in chosen), len(chosen))
@@ -234,6 +254,7 @@ def score(attempts: Iterable[Attempt], stalks: Iterable[Standing], tolerance: fl
         false_targets=Share("attempts: no stalk there", sum(each.stalk is None for each in attempts), len(attempts)),
         collisions=Share("attempts: links touched another stalk", sum(each.collided for each in sent), len(sent)),
         brushes=Share("attempts: jaws touched another stalk", sum(each.brushed for each in sent), len(sent)),
+        touches=Share("attempts: links or jaws did", sum(each.collided or each.brushed for each in sent), len(sent)),
         by_neighbour=tuple(
             grasped(
                 _class_name(low, high),
@@ -252,7 +273,7 @@ def thesis_ratio(attempts: Iterable[Attempt]) -> tuple[float, int]:
     sent: Counter[int] = Counter()
     held: Counter[int] = Counter()
     for each in attempts:
-        if each.reachable:
+        if each.sent:
             sent[each.run] += 1
             held[each.run] += len(each.held)
     ratios = [1 - abs(held[run] - count) / count for run, count in sent.items()]
@@ -267,6 +288,8 @@ def _stage(attempt: Attempt | None, tolerance: float) -> str:
         return "grasped"
     if not attempt.reachable:
         return "out of reach"
+    if attempt.refused:
+        return "refused"
     if attempt.aim_error > tolerance:
         return "aimed beside"
     return "several held" if attempt.outcome == "several" else "not held"

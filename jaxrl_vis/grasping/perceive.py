@@ -16,7 +16,7 @@ from jaxrl_vis.grasping.cloud import Cloud, Mount, match, organised
 from jaxrl_vis.grasping.lines import GraspPoint, grasp_points
 from jaxrl_vis.grasping.sight import Sight
 from jaxrl_vis.grasping.slices import slice_points
-from jaxrl_vis.grasping.stitch import DEFAULT, THESIS, Motion, Stitch, stitch
+from jaxrl_vis.grasping.stitch import DEFAULT, THESIS, Motion, Stitch, Thinned, stitch
 from jaxrl_vis_envs.plants import Calibration
 
 Mask = Callable[[np.ndarray, int], np.ndarray]
@@ -116,11 +116,12 @@ def perceive(views: Iterable[View], mask: Mask, calibration: Calibration, mount:
             clouds.append(organised(disparity, red, calibration, mount))
     with clock("stitch"):
         stitches = []
-        whole = [cloud.all_points() for cloud in clouds]
+        method = THESIS if ways.stitch else DEFAULT
+        whole = [Thinned.of(cloud, method) for cloud in clouds]
         for place in range(len(views) - 1):
             here, there = views[place].driven, views[place + 1].driven
             driven = 0.0 if here is None or there is None else there - here
-            stitches.append(stitch(whole[place], whole[place + 1], driven, THESIS if ways.stitch else DEFAULT))
+            stitches.append(stitch(whole[place], whole[place + 1], driven, method))
         notes += [
             f"pair {views[place].number} does not stitch to the next, odometry was used: {each.refused}"
             for place, each in enumerate(stitches)

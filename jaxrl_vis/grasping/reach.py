@@ -149,8 +149,8 @@ def reach(
         timing: How long the parts of a reach take.
         gains: Of the controllers.
         sides: [B], 1 or -1: which of the two solutions each arm takes (see `arm.room`). None for `arm.better_side`.
-        look: Called every `LOOK` s on the way; returns targets [B, 3] in place of those before, nan where they stay. None: the
-            arm moves without looking again.
+        look: Called every `LOOK` s on the way and while the jaws close; returns targets [B, 3] in place of those before, nan
+            where they stay. None: the arm moves without looking again.
 
     Returns:
         What came of it. Arms whose target cannot be reached are not sent: they hold and touch nothing.
@@ -183,15 +183,17 @@ def reach(
     winds = np.broadcast_to(wind / 1000, (count,))[fill]
     keys = key[fill] if key.shape else jax.random.split(key, len(fill))
     scene, reaching = start(shape, keys, winds, side[fill])
-    parts = []
+    parts, aimed_at = [], targets
     for call in range(_calls(timing.reach) + _calls(timing.close)):
-        if look is not None and 0 < call < _calls(timing.reach):
+        if look is not None and call:
             targets = _looked(look, stands, targets, can, call * LOOK, parts[-1])
+        if call < _calls(timing.reach):
+            aimed_at = targets
         reaching, seen = advance(scene, reaching, (targets - stands.origin)[fill])
         parts.append(jax.tree.map(lambda part: np.asarray(part)[:count], seen))
     paths = {name: np.concatenate([part[name] for part in parts], axis=1) for name in ("path", "taken", "poses")}
     closing = parts[_calls(timing.reach) - 1]
-    error = np.linalg.norm(closing["taken"][:, -1] - (targets - stands.origin), axis=-1)
+    error = np.linalg.norm(closing["taken"][:, -1] - (aimed_at - stands.origin), axis=-1)
     mine = can[:, None] & stands.present
     return ReachResult(
         held=parts[-1]["held"] & mine,
@@ -237,7 +239,7 @@ def _programs(stalks: int, timing: Timing, gains: Gains) -> tuple[Any, Any]:
 
     def start(shape: Shape, key: jax.Array, wind: jax.Array, side: jax.Array) -> tuple[Scene, Reaching]:
         scene = Scene(jax.tree.map(jnp.asarray, shape), bending.gusts(key, wind), side)
-        return scene, _begin(arms, scene)
+        return scene, begin(arms, scene)
 
     def advance(scene: Scene, reaching: Reaching, target: jax.Array) -> tuple[Reaching, dict[str, jax.Array]]:
         return _advance(arms, scene, reaching, target, timing, gains)
@@ -245,12 +247,12 @@ def _programs(stalks: int, timing: Timing, gains: Gains) -> tuple[Any, Any]:
     return env_jit(jax.vmap(start), runs_once=True), env_jit(jax.vmap(advance))
 
 
-def _begin(arms: Arms, scene: Scene) -> Reaching:
-    """An arm at home among swaying stalks."""
+def begin(arms: Arms, scene: Scene, home: tuple[float, float, float] = arm.HOME) -> Reaching:
+    """An arm with its grip at ``home`` (m, frame of the stand) among swaying stalks."""
     model = bending.fit(arms.model, arms.layout, scene.shape)
     data = bending.placed(arms.rest, arms.layout, scene.shape)
     swayed = bending.hinge_angles(arms.layout, model.nv, bending.displacement(scene.gusts, scene.shape.foot, 0.0))
-    joints = stalk_arm.joints_at(jnp.asarray(arm.HOME, jnp.float32), scene.side)
+    joints = stalk_arm.joints_at(jnp.asarray(home, jnp.float32), scene.side)
     data = mjx_model.kinematics(model, data.replace(qpos=(data.qpos + swayed).at[: stalk_arm.ARM_JOINTS].set(joints)))
     nothing = jnp.zeros(len(arms.layout.mocap), bool)
     return Reaching(data, arm.start_drive(joints), stalk_arm.grip_at(joints), nothing, nothing)
@@ -261,21 +263,11 @@ def _advance(
 ) -> tuple[Reaching, dict[str, jax.Array]]:
     """`LOOK` s of a reach to ``target`` [3] (m, frame of the stand): the arm then, and what there is to report."""
     model = bending.fit(arms.model, arms.layout, scene.shape)
-    none = jnp.zeros(model.nv - stalk_arm.JOINTS, jnp.float32)
 
     def step(reaching: Reaching, _: None) -> tuple[Reaching, None]:
-        data = reaching.data
-        is_closing = data.time > timing.reach - 0.5 / arm.RATE
-        point = arm.planned(target, reaching.start, data.time + 1.0 / arm.RATE, timing)
-        memory, forces = arm.drive(reaching.drive, data.qpos[:3], data.qvel[:3], stalk_arm.joints_at(point, scene.side), gains)
-        jaws = jnp.where(is_closing, gains.jaw_force, -gains.jaw_force) * jnp.ones(2, jnp.float32)
-        wind = bending.wind_torque(model, arms.layout, scene.gusts, scene.shape.foot, data.time)
-        data = mjx_model.step(model, data.replace(qfrc_applied=wind + jnp.concatenate([forces, jaws, none])), False)
-        touches = {name: data._impl.contact.dist[places] < 0 for name, places in arms.contacts.items()}
-        touched = reaching.touched | touches["forearm"] | touches["upper_arm"]
-        by_gripper = touches["left_jaw"] | touches["right_jaw"] | touches["palm"]
-        brushed = reaching.brushed | (by_gripper & ~is_closing)
-        return Reaching(data, memory, reaching.start, touched, brushed), None
+        time = reaching.data.time
+        wanted = arm.planned(target, reaching.start, time + 1.0 / arm.RATE, timing)
+        return period(arms, model, scene, reaching, wanted, time > timing.reach - 0.5 / arm.RATE, gains), None
 
     def point(reaching: Reaching, _: None) -> tuple[Reaching, dict[str, jax.Array]]:
         reaching = jax.lax.scan(step, reaching, length=_STEPS_A_POINT)[0]
@@ -287,7 +279,7 @@ def _advance(
         reaching, seen = jax.lax.scan(point, reaching, length=_POINTS_A_CALL)
     data = mjx_model.kinematics(model, reaching.data)
     seen |= {
-        "held": _held(arms, data),
+        "held": held_by(arms, data),
         "touched": reaching.touched,
         "brushed": reaching.brushed,
         "stalks": bending.at_height(data, arms.layout, target[2]),
@@ -295,7 +287,33 @@ def _advance(
     return reaching._replace(data=data), seen
 
 
-def _held(arms: Arms, data: Any) -> jax.Array:
+def period(
+    arms: Arms, model: Any, scene: Scene, reaching: Reaching, wanted: jax.Array, is_closing: jax.Array, gains: Gains
+) -> Reaching:
+    """One period of the controllers, and of the physics.
+
+    Args:
+        arms: The model at rest.
+        model: The same with the stalks of the scene (`bending.fit`).
+        scene: What does not change.
+        reaching: The arm.
+        wanted: [3], where the grip should be, m in the frame of the stand.
+        is_closing: [] bool, whether the jaws close.
+        gains: Of the controllers.
+    """
+    data = reaching.data
+    memory, forces = arm.drive(reaching.drive, data.qpos[:3], data.qvel[:3], stalk_arm.joints_at(wanted, scene.side), gains)
+    jaws = jnp.where(is_closing, gains.jaw_force, -gains.jaw_force) * jnp.ones(2, jnp.float32)
+    wind = bending.wind_torque(model, arms.layout, scene.gusts, scene.shape.foot, data.time)
+    none = jnp.zeros(model.nv - stalk_arm.JOINTS, jnp.float32)
+    data = mjx_model.step(model, data.replace(qfrc_applied=wind + jnp.concatenate([forces, jaws, none])), False)
+    touches = {name: data._impl.contact.dist[places] < 0 for name, places in arms.contacts.items()}
+    touched = reaching.touched | touches["forearm"] | touches["upper_arm"]
+    by_gripper = touches["left_jaw"] | touches["right_jaw"] | touches["palm"]
+    return Reaching(data, memory, reaching.start, touched, reaching.brushed | (by_gripper & ~is_closing))
+
+
+def held_by(arms: Arms, data: Any) -> jax.Array:
     """Which stalks the closed jaws hold: [N] bool. They are between the jaws, and at least one of these presses on them."""
     across, along = stalk_arm.grip_frame(data.qpos[:3])
     grip = stalk_arm.grip_at(data.qpos[:3])

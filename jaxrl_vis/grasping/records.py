@@ -12,16 +12,17 @@ from typing import Any
 import numpy as np
 
 from jaxrl_vis.evaluation_pool import Kept, Record
-from jaxrl_vis.grasping.attempts import Plan, carry_out, plan
+from jaxrl_vis.grasping.attempts import Loop, Plan, carry_out, plan
 from jaxrl_vis.grasping.evaluate import MaskScore, RunScore, draw_scene, score_scene, summary
 from jaxrl_vis.grasping.masks.painter import Painter, read_weights
 from jaxrl_vis.grasping.metric import Attempt, Score, Standing, score
 from jaxrl_vis.grasping.perceive import Ways
 from jaxrl_vis.provenance import device_name
+from jaxrl_vis.run.policy import Policy
 from jaxrl_vis_envs.plants import Family
-from jaxrl_vis_envs.plants.stand import STALKS, Stands
+from jaxrl_vis_envs.plants.stand import Stands
 
-SCHEMA = 1
+SCHEMA = 2
 """Of the records: those of another one cannot be gone on with."""
 _DIGITS = 6  # of lengths in m
 
@@ -61,6 +62,7 @@ def evaluate_run(conditions: Conditions, number: int) -> Record:
         "workers": conditions.workers,
         "score": _score_record(found),
         "plan": _plan_record(plan(scene, perception, number)),
+        "plan_for_policy": _plan_record(plan(scene, perception, number, for_policy=True)),
     }
 
 
@@ -74,11 +76,11 @@ def _painter(weights: Path) -> Painter:
 def summary_of(records: Sequence[Record]) -> dict[str, Any]:
     """What the records of runs say together: the figures of `evaluate.summary`, and of all reaches that all of them have."""
     figures: dict[str, Any] = summary([score_of(record) for record in records])
-    for name in ("device", "workers"):
-        figures[f"{name}s" if name == "device" else name] = sorted({record[name] for record in records})
-    winds = [set(record.get("reaches", {})) for record in records]
-    if winds and (everywhere := set.intersection(*winds)):
-        figures["reaches"] = {wind: figures_of(grasp_score(records, wind)) for wind in sorted(everywhere, key=float)}
+    figures["devices"] = sorted({record["device"] for record in records})
+    figures["workers"] = sorted({record["workers"] for record in records})
+    known = [set(record.get("reaches", {})) for record in records]
+    if known and (everywhere := set.intersection(*known)):
+        figures["reaches"] = {name: figures_of(grasp_score(records, name)) for name in sorted(everywhere)}
     return figures
 
 
@@ -88,32 +90,61 @@ def figures_of(found: Score) -> dict[str, Any]:
     return {"thesis_ratio": found.thesis_ratio, "shares": shares}
 
 
-def reach_all(kept: Kept, numbers: Iterable[int], wind_mm: float) -> None:
-    """Sends the arm to all targets of the runs that were not carried out in this wind yet, and keeps what came of it.
+@dataclasses.dataclass(frozen=True)
+class Reaches:
+    """How all targets are gone to.
+
+    Attributes:
+        loop: Whether the arm looks again.
+        wind_mm: How far stalks sway, mm.
+        for_policy: Whether all loops have the scenes of the policy's task; see `attempts.plan`.
+        policy: For that loop.
+        policy_name: Of it.
+    """
+
+    loop: Loop
+    wind_mm: float
+    for_policy: bool = False
+    policy: Policy | None = None
+    policy_name: str = ""
+
+    def __str__(self) -> str:
+        scenes = ", nearest stop" if self.for_policy else ""
+        return f"{self.loop}{' ' + self.policy_name if self.loop == 'policy' else ''}, wind {self.wind_mm:g} mm{scenes}"
+
+    @property
+    def plan(self) -> str:
+        """Under what name its plan is kept."""
+        return "plan_for_policy" if self.for_policy else "plan"
+
+
+def reach_all(kept: Kept, numbers: Iterable[int], reaches: Reaches) -> None:
+    """Sends the arm to all targets of the runs that were not carried out in this way yet, and keeps what came of it.
 
     Args:
         kept: The records of all runs.
         numbers: Which runs.
-        wind_mm: How far stalks sway, mm.
+        reaches: How.
     """
-    wind = f"{wind_mm:g}"
-    missing = [number for number in numbers if wind not in kept.records[number].get("reaches", {})]
-    attempts = carry_out([plan_of(number, kept.records[number]) for number in missing], wind_mm)
+    name = str(reaches)
+    missing = [number for number in numbers if name not in kept.records[number].get("reaches", {})]
+    plans = [plan_of(number, kept.records[number], reaches.plan) for number in missing]
+    attempts = carry_out(plans, reaches.wind_mm, reaches.loop, reaches.policy)
     changed = {}
     for number in missing:
         record = kept.records[number]
-        mine = [_attempt_record(each) for each in attempts if each.run == number]
-        changed[number] = {**record, "reaches": {**record.get("reaches", {}), wind: mine}}
+        mine = {"plan": reaches.plan, "attempts": [_attempt_record(each) for each in attempts if each.run == number]}
+        changed[number] = {**record, "reaches": {**record.get("reaches", {}), name: mine}}
     kept.add_all(changed)
 
 
-def grasp_score(records: Iterable[Record], wind: str) -> Score:
-    """The score of what came of all reaches in a wind, mm."""
+def grasp_score(records: Iterable[Record], name: str) -> Score:
+    """The score of what came of all reaches of one kind, named as `Reaches` are."""
     attempts, standing = [], []
     for record in records:
-        number = int(record["number"])
-        attempts += [_attempt_of(number, each) for each in record["reaches"][wind]]
-        standing += plan_of(number, record).standing
+        number, found = int(record["number"]), record["reaches"][name]
+        attempts += attempts_in(record, name)
+        standing += plan_of(number, record, found["plan"]).standing
     return score(attempts, standing)
 
 
@@ -138,50 +169,70 @@ def score_of(record: Record) -> RunScore:
     )
 
 
+def _stands_record(stands: Stands) -> Record:
+    arrays = {field.name: getattr(stands, field.name) for field in dataclasses.fields(Stands)}
+    return {name: each.astype(float).round(_DIGITS).tolist() for name, each in arrays.items()}
+
+
 def _plan_record(made: Plan) -> Record:
-    stands = {field.name: getattr(made.stands, field.name) for field in dataclasses.fields(Stands)}
     return {
         "targets": made.targets.round(_DIGITS).tolist(),
         "stalks": made.stalks.tolist(),
         "errors": made.errors.round(_DIGITS).tolist(),
         "sides": made.sides.tolist(),
-        "stands": {name: each.astype(float).round(_DIGITS).tolist() for name, each in stands.items()},
+        "refused": made.refused.tolist(),
+        "again": made.again.round(_DIGITS).tolist(),
+        "stands": _stands_record(made.stands),
+        "seen": None if made.seen is None else _stands_record(made.seen),
         "standing": [
             [each.stalk, each.reachable, round(each.room, _DIGITS), round(each.neighbour, _DIGITS)] for each in made.standing
         ],
     }
 
 
-def plan_of(number: int, record: Record) -> Plan:
-    """The plan of a run.
+def plan_of(number: int, record: Record, name: str = "plan") -> Plan:
+    """A plan of a run.
 
     Args:
         number: Of the run.
         record: What was kept of it.
+        name: Which plan.
     """
-    values = record["plan"]
-    shapes = {"foot": (3,), "knee": (3,), "top": (3,), "radius": (2,), "bending_radius": (2,)}
-    stands = values["stands"]
-    arrays = {name: np.array(stands[name], np.float32).reshape(-1, STALKS, *shape) for name, shape in shapes.items()}
-    stalk = np.array(stands["stalk"], np.int32).reshape(-1, STALKS)
+    values = record[name]
     return Plan(
         run=number,
         targets=np.array(values["targets"], float).reshape(-1, 3),
         stalks=np.array(values["stalks"], int),
         errors=np.array(values["errors"], float),  # not a number where there is None
         sides=np.array(values["sides"], float),
-        stands=Stands(stalk=stalk, **arrays, origin=np.array(stands["origin"], np.float32).reshape(-1, 3)),
+        refused=np.array(values["refused"], bool),
+        again=np.array(values["again"], float).reshape(-1, 2),
+        stands=_stands_of(values["stands"]),
         standing=tuple(
             Standing(number, stalk, reachable, *(np.inf if each is None else each for each in (room, neighbour)))
             for stalk, reachable, room, neighbour in values["standing"]
         ),
+        seen=None if values["seen"] is None else _stands_of(values["seen"]),
     )
+
+
+def _stands_of(values: Record) -> Stands:
+    shapes = {"foot": (3,), "knee": (3,), "top": (3,), "radius": (2,), "bending_radius": (2,)}
+    stalk = np.array(values["stalk"], np.int32)
+    stalk = stalk.reshape(len(stalk), -1 if len(stalk) else 0)
+    arrays = {name: np.array(values[name], np.float32).reshape(*stalk.shape, *shape) for name, shape in shapes.items()}
+    return Stands(stalk=stalk, **arrays, origin=np.array(values["origin"], np.float32).reshape(-1, 3))
 
 
 def _attempt_record(each: Attempt) -> Record:
     values = dataclasses.asdict(each)
     del values["run"]
     return {**values, "held": sorted(each.held)}
+
+
+def attempts_in(record: Record, name: str) -> list[Attempt]:
+    """What came of the reaches of one kind in a run."""
+    return [_attempt_of(int(record["number"]), each) for each in record["reaches"][name]["attempts"]]
 
 
 def _attempt_of(number: int, values: Record) -> Attempt:

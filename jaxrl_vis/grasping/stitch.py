@@ -6,12 +6,13 @@ correspondences from 0.15 to 0.05, 0.02 and 0.01 m; a result further from the od
 """
 
 import dataclasses
+import functools
 import math
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from jaxrl_vis.grasping.cloud import thinned
+from jaxrl_vis.grasping.cloud import Cloud, thinned
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,19 +58,33 @@ class Method:
         voxel: Edge of the cubes of the grid, m.
         gates: Greatest distance of corresponding points, m: one after the other.
         steps: Most iterations with each gate.
-        most: About how many points of the moved cloud are used: evenly chosen.
+        most: About how many points of the moved cloud are used with each gate: evenly chosen.
         from_odometry: Start where odometry says, and refuse what moves too far from there; else start where the cloud lies.
+        pixels: About how many pixels of a larger image are looked at: evenly chosen.
     """
 
     voxel: float
     gates: tuple[float, ...]
     steps: int
-    most: int
+    most: tuple[int, ...]
     from_odometry: bool
+    pixels: int = 1_000_000_000
+
+    def after_first_gate(self) -> "Method":
+        """The same without its widest gate."""
+        return dataclasses.replace(self, gates=self.gates[1:], most=self.most[1:])
 
 
-THESIS = Method(voxel=0.03, gates=(0.15,), steps=50, most=1_000_000, from_odometry=False)
-DEFAULT = Method(voxel=0.005, gates=(0.15, 0.05, 0.02, 0.01), steps=30, most=5_000, from_odometry=True)
+THESIS = Method(voxel=0.03, gates=(0.15,), steps=50, most=(1_000_000,), from_odometry=False)
+# Wide gates only bring the clouds near enough for the next one: few points do.
+DEFAULT = Method(
+    voxel=0.005,
+    gates=(0.15, 0.05, 0.02, 0.01),
+    steps=30,
+    most=(1000, 1500, 3000, 5000),
+    from_odometry=True,
+    pixels=512 * 512,
+)
 
 _ODOMETRY_SHARE = 0.05
 _WOBBLE = 0.03  # m
@@ -95,26 +110,46 @@ class Stitch:
     refused: str = ""
 
 
-def stitch(source: np.ndarray, target: np.ndarray, driven: float, method: Method = DEFAULT) -> Stitch:
+class Thinned:
+    """A cloud on the grid of a method.
+
+    Attributes:
+        points: [N, 3], m.
+    """
+
+    def __init__(self, points: np.ndarray, method: Method = DEFAULT) -> None:
+        """Args: points [N, 3], m, and how they are to be stitched."""
+        self.points = thinned(points, method.voxel)
+
+    @classmethod
+    def of(cls, cloud: Cloud, method: Method = DEFAULT) -> "Thinned":
+        """That of an organised cloud."""
+        part = slice(None, None, max(math.isqrt(cloud.depth.size // method.pixels), 1))
+        return cls(cloud.points[part, part][np.isfinite(cloud.depth[part, part])], method)
+
+    @functools.cached_property
+    def tree(self) -> cKDTree:
+        """For the nearest neighbours. Points on a grid need no balance, which takes longer than it saves."""
+        return cKDTree(self.points, balanced_tree=False, compact_nodes=False)
+
+
+def stitch(source: Thinned, target: Thinned, driven: float, method: Method = DEFAULT) -> Stitch:
     """Lays the cloud of one pair on the cloud of the next.
 
     Args:
-        source, target: [N, 3] and [M, 3] points in the robot frame of their own pair, m.
+        source, target: Points in the robot frame of their own pair.
         driven: How far the robot moved along the row in between, m, as its odometry says.
         method: How.
     """
     prior = Motion.along(-driven)
     start = prior if method.from_odometry else Motion.along(0.0)
-    thin, tree_points = thinned(source, method.voxel), thinned(target, method.voxel)
-    thin = thin[:: max(len(thin) // method.most, 1)]
-    if len(thin) < 10 or len(tree_points) < 10:
+    if len(source.points) < 10 or len(target.points) < 10:
         return Stitch(prior, math.nan, 0.0, "a cloud is empty")
-    motion, residual, overlap = closest_points(thin, tree_points, start, method)
+    motion, residual, overlap = closest_points(source.points, target, start, method)
     refused = _why_refused(motion, prior, driven, overlap) if method.from_odometry else ""
     if refused and len(method.gates) > 1:
         # Where little overlaps, what one pair alone sees drags a wide gate aside; odometry may be near enough for the next one.
-        narrower = dataclasses.replace(method, gates=method.gates[1:])
-        motion, residual, overlap = closest_points(thin, tree_points, start, narrower)
+        motion, residual, overlap = closest_points(source.points, target, start, method.after_first_gate())
         refused = _why_refused(motion, prior, driven, overlap)
     return Stitch(prior if refused else motion, residual, overlap, refused)
 
@@ -134,24 +169,25 @@ def _why_refused(motion: Motion, prior: Motion, driven: float, overlap: float) -
     return ""
 
 
-def closest_points(source: np.ndarray, target: np.ndarray, start: Motion, method: Method) -> tuple[Motion, float, float]:
+def closest_points(source: np.ndarray, target: Thinned, start: Motion, method: Method) -> tuple[Motion, float, float]:
     """Iterative closest points.
 
     Args:
-        source, target: [N, 3] and [M, 3], m.
+        source: [N, 3], m.
+        target: What they are laid on.
         start: Where to begin.
         method: Gates and steps.
 
     Returns:
         The motion, the root mean square distance of corresponding points in m, and the share of points that have one.
     """
-    tree = cKDTree(target)
     motion, residual, overlap = start, math.nan, 0.0
-    for gate in method.gates:
+    for gate, most in zip(method.gates, method.most):
+        chosen = source[:: max(len(source) // most, 1)]
         still = _STILL * gate if method.from_odometry else 1e-5
         for _ in range(method.steps):
-            moved = motion(source)
-            distance, place = tree.query(moved, distance_upper_bound=gate, workers=-1)
+            moved = motion(chosen)
+            distance, place = target.tree.query(moved, distance_upper_bound=gate)
             close = np.isfinite(distance)
             overlap = float(close.mean())
             if close.sum() < 6:
@@ -159,7 +195,7 @@ def closest_points(source: np.ndarray, target: np.ndarray, start: Motion, method
             residual = math.sqrt(float(np.mean(distance[close] ** 2)))
             # What lies farther away than most weighs less: it is seen in one of the two pairs only.
             weight = 1.0 / (1.0 + (distance[close] / (0.3 * gate)) ** 2) if method.from_odometry else np.ones(close.sum())
-            step = rigid(moved[close], target[place[close]], weight)
+            step = rigid(moved[close], target.points[place[close]], weight)
             motion = step.after(motion)
             if max(float(np.linalg.norm(step.shift)), step.angle) < still:
                 break

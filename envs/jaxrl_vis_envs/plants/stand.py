@@ -87,6 +87,42 @@ def stands_at(plots: Plot | Sequence[Plot], x: np.ndarray, targets: np.ndarray, 
     return Stands(arrays[0].astype(np.int32), *(part.astype(np.float32) for part in arrays[1:]))
 
 
+def stand_of_lines(
+    points: np.ndarray, directions: np.ndarray, radii: np.ndarray, x: float, target: np.ndarray, stalks: int
+) -> Stands:
+    """One stand, of straight stalks as somebody has found them.
+
+    Args:
+        points: [K, 3] on the stalks, m in the plot's frame.
+        directions: [K, 3], along them; not horizontal.
+        radii: [K], m.
+        x: How far along the row the mast stands, m.
+        target: [3], where the gripper is sent, m in the plot's frame.
+        stalks: How many of them the stand has: those nearest to the line from the arm's first joint to the target.
+
+    Returns:
+        One stand; `Stands.stalk` are indices of the K stalks.
+    """
+    origin = origin_of(x)
+    slopes = directions / directions[:, 2:]
+    places = points - origin
+
+    def at(height: float) -> np.ndarray:
+        return places + (height - places[:, 2:]) * slopes
+
+    order = np.argsort(_distance_to_line(at(target[2])[:, :2], (target - origin)[:2]), kind="stable")[:stalks]
+    stalk = np.full(stalks, -1)
+    stalk[: len(order)] = order
+    parked = np.stack([0.2 * np.arange(stalks), np.full(stalks, _AWAY), np.zeros(stalks)], axis=1)
+    ends = [parked + [0.0, 0.0, height] for height in (0.0, KNEE, TOP)]
+    for end, height in zip(ends, (0.0, KNEE, TOP)):
+        end[: len(order)] = at(height)[order]
+    radius = np.full((stalks, 2), 0.007)
+    radius[: len(order)] = radii[order, None]
+    arrays = [np.asarray(each, np.float32)[None] for each in (*ends, radius, radius, origin)]
+    return Stands(stalk.astype(np.int32)[None], *arrays)
+
+
 def concatenated(parts: Sequence[Stands]) -> Stands:
     """All stands of several, which have as many stalks each, in their order; at least one."""
     names = [field.name for field in dataclasses.fields(Stands)]

@@ -32,7 +32,8 @@ from jaxrl_vis_envs.tasks.config import TaskConfig
 from jaxrl_vis_envs.tasks.mjx_env import MjxGoalEnv, register_task
 
 _CONTROL_PERIOD = 0.04  # s
-_HOME = (0.0, stalk_arm.SHOULDER[1] + 0.36, 0.75)
+HOME = (0.0, stalk_arm.SHOULDER[1] + 0.36, 0.75)
+"""Where the grip is when an episode starts, m in the world."""
 _HEIGHTS = (0.45, 1.05)  # m, between which the grip may be driven
 _RADII, _MOST_BEARING = (0.35, 0.69), 0.7  # m and rad, the same in the plane
 _GUST_FREQUENCIES = (0.17, 0.29, 0.53)  # Hz
@@ -128,7 +129,7 @@ class StalkReach(MjxGoalEnv):
     def sample_start(self, key: jax.Array) -> mjx.Data:
         draw = self._sample(key)
         moved = bending.displacement(self._gusts(draw.wind), draw.foot, 0.0)
-        data = self.configuration(draw, jnp.asarray(_HOME, jnp.float32), moved)
+        data = self.configuration(draw, jnp.asarray(HOME, jnp.float32), moved)
         return data.replace(ctrl=data.qpos[:3])
 
     def sample_goal(self, key: jax.Array) -> mjx.Data:
@@ -138,7 +139,7 @@ class StalkReach(MjxGoalEnv):
         return self.configuration(draw, place, still)
 
     def act(self, data: mjx.Data, action: jax.Array) -> mjx.Data:
-        place = _within_reach(stalk_arm.grip_at(data.ctrl) + self.config.action_scale * action)
+        place = within_reach(stalk_arm.grip_at(data.ctrl) + self.config.action_scale * action)
         gusts = self._gusts(data.mocap_pos[self._wind])
         foot = data.mocap_pos[self._layout.mocap]
         wind = bending.wind_torque(self._model, self._layout, gusts, foot, data.time)
@@ -212,7 +213,7 @@ def _along(foot: jax.Array, turn: jax.Array, height: jax.Array | float) -> jax.A
     return foot + height / axis[:, 2:] * axis
 
 
-def _within_reach(place: jax.Array) -> jax.Array:
+def within_reach(place: jax.Array) -> jax.Array:
     """The nearest place [3] (m, world), along the arm's own coordinates, to which the grip may be driven."""
     shoulder = jnp.asarray(stalk_arm.SHOULDER, jnp.float32)
     away = place[:2] - shoulder

@@ -1,0 +1,94 @@
+"""Which way the arm goes to a stalk: from which stop, with which solution of its kinematics, at which height; or none at all.
+
+Stalks lean, so that what is in the way at one height is not at another one. Of all stops, both solutions and the heights around
+the grasp point, the way is chosen on which the other stalks leave most room, as far as is known of them. Where that is too
+little, the arm is not sent: it would push other stalks, or hold two of them. Refused targets are counted as such.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxrl_vis.grasping import arm
+from jaxrl_vis.grasping.lines import HEIGHTS, GraspPoint
+
+LEAST_ROOM = 0.0045
+"""Room in m beside the open gripper, on its whole way, with less of which the arm is not sent."""
+_ENOUGH = 0.02  # m: more room is no better
+_STEPS = tuple(sign * step for step in np.arange(0.0, 0.31, 0.05) for sign in (-1.0, 1.0))
+# m, from the height of the grasp point: further away the line is not believed
+_UNSURE = 0.015  # m per m: how much less is known of a stalk away from the height of its grasp point
+_USUAL = 0.007  # m: radius of a stalk whose thickness is not known
+
+
+class Choice(NamedTuple):
+    """How a stalk is gone to.
+
+    Attributes:
+        stop: Index of the stop; -1 where the arm's geometry does not let it be reached from any.
+        side: Which solution: 1 or -1.
+        room: What other stalks leave the open gripper on the way, m; -inf where there is no way.
+        point: [3] float64, where the jaws are to close, m.
+    """
+
+    stop: int
+    side: int
+    room: float
+    point: np.ndarray
+
+    @property
+    def is_blocked(self) -> bool:
+        """Whether it could be reached, but other stalks are in the way."""
+        return self.stop >= 0 and self.room < LEAST_ROOM
+
+
+def choose(points: Sequence[GraspPoint], stops: np.ndarray, heights: tuple[float, float] = HEIGHTS) -> list[Choice]:
+    """Chooses a way to each of the stalks that were found.
+
+    Args:
+        points: Where they are, in one robot frame.
+        stops: [S, 3], `Stands.origin` of each place where the robot may stop, in the same frame, m.
+        heights: Lowest and highest grasp, m above the ground.
+    """
+    radii = radii_of(points)
+    chosen = []
+    for place, each in enumerate(points):
+        others = [other for other in range(len(points)) if other != place]
+        best, worth = Choice(-1, 1, -np.inf, each.point), -np.inf
+        for step in _STEPS:
+            height = float(np.clip(each.point[2] + step, *heights))
+            target = each.at_height(height)
+            beside = np.array([points[other].at_height(height) for other in others]).reshape(-1, 3)
+            way = arm.best_way(stops, target, beside[:, :2], radii[others], _ENOUGH)
+            if way.stop < 0:
+                continue
+            value = min(way.room, _ENOUGH) - _UNSURE * abs(height - each.point[2])
+            if value > worth:
+                best, worth = Choice(way.stop, way.side, way.room, target), value
+        chosen.append(best)
+    return chosen
+
+
+def choose_nearest(points: Sequence[GraspPoint], stops: np.ndarray, heights: tuple[float, float]) -> list[Choice]:
+    """The stop that is nearest along the row for each stalk, and the height between two that is nearest to its grasp point.
+
+    Args:
+        points, stops, heights: See `choose`.
+    """
+    radii = radii_of(points)
+    chosen = []
+    for place, each in enumerate(points):
+        target = each.at_height(float(np.clip(each.point[2], *heights)))
+        others = [other for other in range(len(points)) if other != place]
+        beside = np.array([points[other].at_height(float(target[2])) for other in others]).reshape(-1, 3)
+        stop = int(np.argmin(np.abs(stops[:, 0] - target[0])))
+        way = arm.best_way(stops[stop : stop + 1], target, beside[:, :2], radii[others], _ENOUGH)
+        chosen.append(Choice(stop if way.stop >= 0 else -1, way.side, way.room, target))
+    return chosen
+
+
+def radii_of(points: Sequence[GraspPoint]) -> np.ndarray:
+    """Radii [B] of stalks, m: a usual one where a thickness is not known."""
+    radii = np.array([0.5 * each.thickness for each in points])
+    return np.where(np.isfinite(radii), radii, _USUAL)
