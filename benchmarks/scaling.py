@@ -11,9 +11,9 @@ For each number of devices N, beside one device of the same machine:
     resume         what N devices saved, restored on one device and on others: parameters, optimisers and replay bit-equal, and
                    trained further on one
 
-All programs are compiled before, by processes of their own side by side, which leave them in the compile cache: with 16
-threads of one process that sees two GPUs, XLA (jaxlib 0.11) dies of a segmentation fault. ``--quick`` takes small images and
-few updates, to see that it works: on a CPU with XLA_FLAGS=--xla_force_host_platform_device_count=2.
+All programs are compiled before, by processes of their own side by side, which leave them in the compile cache: tracing is
+Python, and goes one by one in a process. ``--quick`` takes small images and few updates, to see that it works: on a CPU with
+XLA_FLAGS=--xla_force_host_platform_device_count=2.
 """
 
 import argparse
@@ -101,7 +101,6 @@ class Timed:
         self.loop = loop
         return seconds
 
-
     def compile(self) -> None:
         """Compiles its programs, or finds them in the compile cache."""
         for name in self.names:
@@ -115,10 +114,8 @@ def compile_all(everything: list[Timed]) -> float:
         SystemExit: One of the processes failed; what it printed stands before.
     """
     start = time.perf_counter()
-    sharing = os.environ | {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
     children = [
-        subprocess.Popen([sys.executable, *sys.argv, "--compile-only", str(number)], env=sharing)
-        for number in range(len(everything))
+        subprocess.Popen([sys.executable, *sys.argv, "--compile-only", str(number)]) for number in range(len(everything))
     ]
     failed = [str(number) for number, child in enumerate(children) if child.wait()]
     if failed:
@@ -258,6 +255,8 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="small, to see that it works")
     parser.add_argument("--compile-only", type=int, metavar="N", help="fill the compile cache for the N-th configuration")
     options = parser.parse_args()
+    # Processes that compile share the devices' memory with this one.
+    os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
     enable_compilation_cache()
     began, there = time.perf_counter(), len(jax.devices())
     numbers = [count for count in options.devices or (2, 4, 8) if 1 < count <= there]
@@ -266,13 +265,14 @@ def main() -> None:
     envs = math.ceil((8 if options.quick else 100) / math.lcm(*numbers)) * math.lcm(*numbers)
     base = preset("fast", env=options.env, num_envs=envs, replay_transitions=100_000)
     base = base.replace(**QUICK, replay_transitions=50 * envs) if options.quick else base
-    env, watch = make_env(base), Watch()
+    env = make_env(base)
     figures = figures_of(base, env, numbers, SMALL_BATCHES if options.quick else BATCHES, options.seeds_per_device)
     alone = list({id(figure.one): figure.one for figure in figures}.values())
     everything = [*alone, *(figure.timed for figure in figures)]
     if options.compile_only is not None:
         everything[options.compile_only].compile()
         return
+    watch = Watch()
     lines, measurements, times = [], [], {}
 
     def keep(line: str, measurement: Measurement | None = None) -> None:
