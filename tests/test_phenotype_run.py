@@ -366,7 +366,7 @@ def test_eval_in_two_processes_and_after_a_stop_is_the_same(plots, tmp_path, cap
         data = json.loads((tmp_path / name).read_text())
         for each in (data, *data["each"]):  # times are no figures
             each.pop("seconds_per_pair")
-        data.pop("workers")
+            each.pop("workers", None)
         return data
 
     both = evaluate("both.json", "--plots", "3", "--workers", "2")
@@ -376,14 +376,14 @@ def test_eval_in_two_processes_and_after_a_stop_is_the_same(plots, tmp_path, cap
     capsys.readouterr()
     assert evaluate("one.json", "--plots", "3") == both
     said = capsys.readouterr().out
-    assert "1 plots are there already" in said and "plot 0:" not in said and "plot 2:" in said
+    assert "1 plots were evaluated before" in said and "plot 0:" not in said and "plot 2:" in said
     # What was evaluated under other conditions is neither mixed with nor lost.
     for words in (["--method", "ellipse"], ["--frames", "3"]):
         assert cli.main(["phenotype", "eval", *small, "--json", str(tmp_path / "one.json"), *words]) == 2
-        assert "with another" in capsys.readouterr().err
+        assert "holds records of another evaluation" in capsys.readouterr().err
     (tmp_path / "other.json").write_text("[]")
     assert cli.main(["phenotype", "eval", *small, "--json", str(tmp_path / "other.json")]) == 2
-    assert "holds no evaluation to go on with" in capsys.readouterr().err
+    assert "holds no records to go on with" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -428,12 +428,13 @@ def evaluation(tmp_path_factory) -> Path:
             "true": 30 + seed,
             "counted": 31,
             "pairs": 34,
+            "device": "a laptop",
             "seconds_per_pair": 0.5,
             "widths_mm": [[14.2, 14.0 + seed]],
         }
         for seed in range(3)
     ]
-    path.write_text(json.dumps({"synthetic": True, "family": "shifted", "device": "a laptop", "count_r2": 0.5, "each": plots}))
+    path.write_text(json.dumps({"synthetic": True, "family": "shifted", "count_r2": 0.5, "each": plots}))
     return path
 
 

@@ -1,8 +1,9 @@
 """``jaxrl-vis phenotype eval``."""
 
 import dataclasses
+import functools
 import json
-import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -11,10 +12,11 @@ from jaxrl_vis.cli.families import family_of
 from jaxrl_vis.cli.phenotype_run import networks, weights_of
 from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.evaluation_pool import Kept, Record, evaluate_each, finite, share_accelerator
 from jaxrl_vis.report.outputs import check_writable
 
 if TYPE_CHECKING:
-    from jaxrl_vis.phenotyping.evaluation import Scorers
+    from jaxrl_vis.phenotyping.evaluation import Task
     from jaxrl_vis_envs.plants import Family
 
 
@@ -69,83 +71,88 @@ def evaluate(options: Eval) -> int:
     if options.each_factor and (options.family or options.shift or options.spec):
         raise RequestError("--each-factor goes through the families by itself: leave out --family, --shift and --spec")
     family = family_of(options, "phenotyping", "shifted")
-    from jaxrl_vis.phenotyping.evaluation import Scorers, share_devices
-
     if options.workers > 1:
-        share_devices()
+        share_accelerator()
     check_devices()
     weights, name = None, "truth"
     if options.masks == "network":
         networks(options.weights, options.least_score)  # says what is wrong with the weights
         weights, name = weights_of(options.weights)
-    with Scorers(options.workers) as scorers:
-        if options.each_factor:
-            return _factor_table(options, weights, name, scorers)
-        figures = _score(options, family, weights, name, scorers, options.json)
+    from jaxrl_vis.phenotyping.evaluation import Task
+
+    families = _factors(options) if options.each_factor else {"": family}
+    tasks = {
+        factor: Task(each, weights, options.method, options.least_score, options.thesis, options.workers)
+        for factor, each in families.items()
+    }
+    figures = _evaluate(options, tasks, name)
+    if options.each_factor:
+        _write_table(options, name, figures)
+        return 0
     print(f"synthetic plots of family {family.name}, {name}, {options.method}:")
-    for each, value in figures.items():
+    for each, value in figures[""].items():
         print(f"  {each:24} {value if isinstance(value, int) else f'{value:.4f}'}")
     return 0
+
+
+def _factors(options: Eval) -> "dict[str, Family]":
+    """The training family, each factor shifted alone, and all of them, by name."""
+    from jaxrl_vis_envs.plants import SHIFTS
+
+    alone = {factor: dataclasses.replace(options, family="training", shift=(factor,)) for factor in SHIFTS}
+    none, all_of_them = (dataclasses.replace(options, family=name) for name in ("training", "shifted"))
+    return {factor: family_of(drawn, "phenotyping") for factor, drawn in {"none": none, **alone, "all": all_of_them}.items()}
+
+
+def _evaluate(options: Eval, tasks: "Mapping[str, Task]", name: str) -> dict[str, dict[str, Any]]:
+    """Figures of all plots of each task together; says something of each plot, and keeps the files."""
+    from jaxrl_vis.phenotyping import evaluation
+
+    summary_of = functools.partial(evaluation.summary_of, options.least_score)
+    wanted = range(options.seed, options.seed + options.plots)
+    kept = {
+        factor: Kept(_path(options.json, factor), {**evaluation.conditions(task), "finder": name}, summary_of)
+        for factor, task in tasks.items()
+    }
+    there = sum(seed in each for each in kept.values() for seed in wanted)
+    if there:
+        print(f"{there} plots were evaluated before: {options.json}", flush=True)
+    factors = list(tasks)
+    jobs = [(place, seed) for place, factor in enumerate(factors) for seed in wanted if seed not in kept[factor]]
+
+    def done(number: int, record: Record) -> None:
+        place, seed = jobs[number]
+        kept[factors[place]].add(seed, record)
+        one = summary_of([kept[factors[place]].records[seed]])
+        print(
+            f"{factors[place]} plot {seed}: {record['counted']} of {record['true']} stalks, ".lstrip()
+            + f"width error {one['width_mae_mm']:.2f} mm, F1 {one['f1']:.3f}",
+            flush=True,
+        )
+
+    evaluate_each(
+        functools.partial(evaluation.evaluate_job, list(tasks.values()), jobs), range(len(jobs)), options.workers, done
+    )
+    return {factor: summary_of([each.records[seed] for seed in wanted]) for factor, each in kept.items()}
+
+
+def _path(path: Path | None, factor: str) -> Path | None:
+    """The file of one factor: beside that of the table."""
+    return path.with_name(f"{path.stem}-{factor}.json") if path and factor else path
 
 
 _COLUMNS = ("count_r2", "count_mae", "count_bias", "width_mae_mm", "width_bias_mm", "ap50", "f1")
 
 
-def _factor_table(options: Eval, weights: Path | None, name: str, scorers: "Scorers") -> int:
-    """Prints a line of Markdown for each factor that is shifted alone."""
+def _write_table(options: Eval, name: str, figures: Mapping[str, dict[str, Any]]) -> None:
+    """Prints a line of Markdown for each factor that is shifted alone, and writes the file."""
     from jaxrl_vis.files import write_atomically
-    from jaxrl_vis_envs.plants import SHIFTS
 
-    alone = [(factor, dataclasses.replace(options, family="training", shift=(factor,))) for factor in SHIFTS]
-    none, all_of_them = (dataclasses.replace(options, family=name) for name in ("training", "shifted"))
-    lines, table = [], {}
-    for factor, drawn in [("none", none), *alone, ("all", all_of_them)]:
-        path = options.json and options.json.with_name(f"{options.json.stem}-{factor}.json")
-        figures = _score(options, family_of(drawn, "phenotyping"), weights, name, scorers, path)
-        lines.append(f"| {factor} | " + " | ".join(f"{figures[column]:.3f}" for column in _COLUMNS) + " |")
-        table[factor] = {column: value if math.isfinite(value) else None for column, value in figures.items()}
-        if options.json is not None:
-            about = {"synthetic": True, "finder": name, "method": options.method, "factors": table}
-            write_atomically(options.json, json.dumps(about, indent=2) + "\n")
+    if options.json is not None:
+        about = {"synthetic": True, "finder": name, "method": options.method, "factors": finite(figures)}
+        write_atomically(options.json, json.dumps(about, indent=2) + "\n")
     print(f"\nsynthetic plots, {options.plots} each, {name}, {options.method}\n")
     print("| shifted | " + " | ".join(_COLUMNS) + " |")
     print("|---|" + "---|" * len(_COLUMNS))
-    print("\n".join(lines))
-    return 0
-
-
-def _score(
-    options: Eval, family: "Family", weights: Path | None, name: str, scorers: "Scorers", path: Path | None
-) -> dict[str, Any]:
-    """Figures of all plots of a family together; says something of each plot, and keeps the file at ``path``."""
-    from jaxrl_vis import __version__
-    from jaxrl_vis.phenotyping.evaluate import summary
-    from jaxrl_vis.phenotyping.evaluation import Task, conditions, read_scores, write_evaluation
-    from jaxrl_vis.provenance import device_name, revision
-
-    task = Task(family, weights, options.method, options.least_score, options.thesis)
-    same = conditions(task)
-    about = {
-        "device": device_name(),
-        "workers": options.workers,
-        "version": __version__,
-        "revision": revision(),
-        "finder": name,
-        "method": options.method,
-    }
-    scores = [] if path is None else read_scores(path, same)
-    wanted = range(options.seed, options.seed + options.plots)
-    there = {each.seed for each in scores}
-    if there:
-        print(f"{path}: {len(there)} plots are there already", flush=True)
-    for score in scorers.scores(task, [seed for seed in wanted if seed not in there]):
-        scores = sorted([*scores, score], key=lambda each: each.seed)
-        one = summary([score], options.least_score)
-        print(
-            f"plot {score.seed}: {score.counted} of {score.true} stalks, "
-            f"width error {one['width_mae_mm']:.2f} mm, F1 {one['f1']:.3f}",
-            flush=True,
-        )
-        if path is not None:
-            write_evaluation(path, about, same, scores, task)
-    return summary(scores, options.least_score)
+    for factor, values in figures.items():
+        print(f"| {factor} | " + " | ".join(f"{values[column]:.3f}" for column in _COLUMNS) + " |")

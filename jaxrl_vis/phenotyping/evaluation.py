@@ -1,21 +1,15 @@
-"""An evaluation of many plots: side by side in processes of their own, and kept in a file from which it goes on.
+"""An evaluation of many plots, as `evaluation_pool` goes through them: what is done with one, and what is kept of it.
 
-    Task -> score_plots: one plot after the other, or several at a time        -> PlotScore of each
-         -> conditions, write_evaluation: the file, written after each plot     <- read_scores
+    Task, seed -> evaluate_plot -> record -> `Kept`: the file, written after each plot -> scores_of -> summary
 
 A score is rounded when it is made, so that what the file keeps is what was scored. Which process scores a plot does not matter.
 """
 
-import contextlib
 import dataclasses
 import hashlib
 import json
 import math
-import multiprocessing
-import os
-import tempfile
-from collections.abc import Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,14 +17,13 @@ import numpy as np
 
 import jaxrl_vis
 import jaxrl_vis_envs.plants
-from jaxrl_vis.devices import list_devices
-from jaxrl_vis.errors import RequestError
-from jaxrl_vis.files import write_atomically
+from jaxrl_vis.evaluation_pool import Record
 from jaxrl_vis.phenotyping.evaluate import PlotScore, ThesisScore, score_plot, summary
 from jaxrl_vis.phenotyping.measure import Method
+from jaxrl_vis.provenance import device_name, revision
 from jaxrl_vis_envs.plants import Family
 
-SCHEMA = 1
+SCHEMA = 2
 KEPT_SCORE = 0.05
 """Finds of lower scores are not kept: they matter for nothing but the far end of the precision curve."""
 
@@ -45,6 +38,7 @@ class Task:
         method: How widths are taken.
         least_score: What counts as a find.
         thesis: Score the thesis's ways on the same finds, too.
+        workers: How many processes share the machine; what is kept says so, as it bears on the time that a pair takes.
     """
 
     family: Family
@@ -52,104 +46,19 @@ class Task:
     method: Method = "strip"
     least_score: float = 0.5
     thesis: bool = False
-
-
-class Scorers:
-    """Scores plots: in this process, or in several that share the devices. A context manager; processes end with it."""
-
-    def __init__(self, workers: int = 1) -> None:
-        """Starts no process yet.
-
-        Args:
-            workers: How many processes; with 1, all is done in this one.
-        """
-        self._workers = workers
-        self._pool: ProcessPoolExecutor | None = None
-        self._stack = contextlib.ExitStack()
-
-    def __enter__(self) -> "Scorers":
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._stack.close()
-
-    def scores(self, task: Task, seeds: Iterable[int]) -> Iterator[PlotScore]:
-        """Scores of plots with these seeds, in the order in which they are ready."""
-        if self._workers == 1:
-            yield from (_score(task, seed) for seed in seeds)
-            return
-        seeds = list(seeds)
-        if self._pool is None:
-            self._pool = self._start()
-            if seeds:
-                # One process compiles; the others read what it compiled, so that all run the same programs, and sooner.
-                self._pool.submit(_score, _short(task), seeds[0]).result()
-        waiting = [self._pool.submit(_score, task, seed) for seed in seeds]
-        try:
-            for done in as_completed(waiting):
-                yield done.result()
-        finally:
-            for each in waiting:
-                each.cancel()
-
-    def _start(self) -> ProcessPoolExecutor:
-        import jax
-
-        devices = [dict(each.environment) for each in list_devices()]
-        spawning = multiprocessing.get_context("spawn")
-        number = spawning.Value("i", 0)
-        pins = jax.default_backend() == "cpu"
-        compiled = jax.config.jax_compilation_cache_dir or self._stack.enter_context(tempfile.TemporaryDirectory())
-        about = (number, self._workers, devices, pins, compiled)
-        pool = ProcessPoolExecutor(self._workers, spawning, _prepare, about)
-        self._stack.callback(pool.shutdown, wait=True, cancel_futures=True)
-        return pool
-
-
-def share_devices() -> None:
-    """Makes this process leave the memory of its devices to others; to be called before JAX starts."""
-    os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
-
-
-def _short(task: Task) -> Task:
-    """The same with two pairs a plot: it needs all programs, and takes little more than their compilation."""
-    rig = dataclasses.replace(task.family.rig, frames=min(task.family.rig.frames, 2))
-    return dataclasses.replace(task, family=dataclasses.replace(task.family, rig=rig))
-
-
-def _prepare(number: Any, workers: int, devices: list[dict[str, str]], pins: bool, compiled: str) -> None:
-    """In a new process: a device of its own where there are several, and no more threads than its share of the cores.
-
-    Args:
-        number: Counts the processes.
-        workers: How many there will be.
-        devices: Environment variables that name each device.
-        pins: Whether the cores are divided among the processes.
-        compiled: Folder in which they share compiled programs.
-    """
-    with number.get_lock():
-        own, number.value = number.value, number.value + 1
-    share_devices()
-    os.environ.update(devices[own % len(devices)])
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ[name] = "1"
-    if pins and hasattr(os, "sched_setaffinity"):
-        # What computes on a CPU takes as many threads as it may use cores.
-        cores = sorted(os.sched_getaffinity(0))
-        os.sched_setaffinity(0, cores[own % len(cores) :: workers])
-    import cv2
-    import jax
-
-    cv2.setNumThreads(1)
-    jax.config.update("jax_compilation_cache_dir", compiled)
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+    workers: int = 1
 
 
 _FINDERS: dict[tuple[Path, str], Any] = {}
 
 
-def _score(task: Task, seed: int) -> PlotScore:
-    """One plot; networks are read once in each process."""
+def evaluate_plot(task: Task, seed: int) -> Record:
+    """What is kept of one plot; networks are read once in each process.
+
+    Args:
+        task: For all plots.
+        seed: Of the plot.
+    """
     find = None
     if task.weights is not None:
         from jaxrl_vis.phenotyping.detector.finder import Finder
@@ -161,7 +70,14 @@ def _score(task: Task, seed: int) -> PlotScore:
             _FINDERS[key] = Finder(params, settings, KEPT_SCORE)
         find = _FINDERS[key]
     score = score_plot(task.family, seed, find, task.method, task.least_score, task.thesis)
-    return _read(_record(score, task.family.rig.frames))
+    where = {"device": device_name(), "workers": task.workers, "revision": revision()}
+    return {**where, **_record(score, task.family.rig.frames)}
+
+
+def evaluate_job(tasks: Sequence[Task], jobs: Sequence[tuple[int, int]], number: int) -> Record:
+    """The same for one of several evaluations: job ``number`` is a task and a seed."""
+    task, seed = jobs[number]
+    return evaluate_plot(tasks[task], seed)
 
 
 def fingerprint(weights: Path) -> str:
@@ -174,11 +90,13 @@ def conditions(task: Task) -> dict[str, Any]:
     import jax
 
     return {
+        "synthetic": True,
+        "family": task.family.name,
         "schema": SCHEMA,
         "version": jaxrl_vis.__version__,
         "code": _code(),
         "platform": jax.default_backend(),
-        "family": hashlib.sha256(json.dumps(dataclasses.asdict(task.family), sort_keys=True).encode()).hexdigest()[:12],
+        "family_digest": hashlib.sha256(json.dumps(dataclasses.asdict(task.family), sort_keys=True).encode()).hexdigest()[:12],
         "weights": None if task.weights is None else fingerprint(task.weights),
         "method": task.method,
         "least_score": task.least_score,
@@ -198,51 +116,17 @@ def _code() -> str:
     return digest.hexdigest()[:12]
 
 
-def read_scores(path: Path, same: dict[str, Any]) -> list[PlotScore]:
-    """Scores that a file holds; none if there is no such file.
-
-    Args:
-        path: Of `write_evaluation`.
-        same: Of `conditions`.
-
-    Raises:
-        RequestError: The file holds something else, or an evaluation under other conditions.
-    """
-    if not path.exists():
-        return []
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-        there = data["conditions"]
-        differ = sorted(name for name in {*same, *there} if same.get(name) != there.get(name))
-        scores = [] if differ else [_read(each) for each in data["each"]]
-    except OSError as error:
-        raise RequestError(f"cannot read {path}: {error.strerror or error}") from error
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise RequestError(f"{path} is there and holds no evaluation to go on with: name another file with --json") from error
-    if differ:
-        raise RequestError(
-            f"{path} holds an evaluation with another {', '.join(differ)}: name another file with --json, or remove that one"
-        )
-    return scores
+def scores_of(records: Iterable[Record]) -> list[PlotScore]:
+    """The scores that records hold."""
+    return [_read(each) for each in records]
 
 
-def write_evaluation(path: Path, about: dict[str, Any], same: dict[str, Any], scores: list[PlotScore], task: Task) -> None:
-    """Writes the figures of all plots together and what is known of each; a line for each plot.
-
-    Args:
-        path: The file, .json.
-        about: What else it says.
-        same: Of `conditions`.
-        scores: Of the plots.
-        task: What was scored.
-    """
-    figures = {name: value if math.isfinite(value) else None for name, value in summary(scores, task.least_score).items()}
-    head = json.dumps({"synthetic": True, **about, "family": task.family.name, **figures, "conditions": same}, indent=2)
-    rows = ",\n".join("    " + json.dumps(_record(each, task.family.rig.frames)) for each in scores)
-    write_atomically(path, head[: head.rindex("\n")] + f',\n  "each": [\n{rows}\n  ]\n}}\n')
+def summary_of(least_score: float, records: Iterable[Record]) -> dict[str, Any]:
+    """What the records of plots say together, see `summary`."""
+    return summary(scores_of(records), least_score)
 
 
-def _record(score: PlotScore, pairs: int) -> dict[str, Any]:
+def _record(score: PlotScore, pairs: int) -> Record:
     """What JSON keeps of a plot."""
     thesis = score.thesis
     return {
@@ -260,7 +144,7 @@ def _record(score: PlotScore, pairs: int) -> dict[str, Any]:
     }
 
 
-def _read(record: dict[str, Any]) -> PlotScore:
+def _read(record: Record) -> PlotScore:
     """The inverse of `_record`."""
 
     def pairs(values: list[list[float]]) -> np.ndarray:

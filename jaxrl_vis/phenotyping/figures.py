@@ -136,8 +136,8 @@ def write_times(data: dict[str, Any], out: Path) -> None:
         row("total", count_1 + width_1, count_2 + width_2, f"{seconds:.1f} s", f"{THESIS_SECONDS} s"),
     ]
     pairs = float(np.mean([each["pairs"] for each in known]))
-    device = data.get("device", "a device that is not known")
-    side_by_side = data.get("workers") or 1
+    device = known[0].get("device", "a device that is not known")
+    side_by_side = max(each.get("workers", 1) for each in known)
     shared = f", {side_by_side} plots at a time, which makes each slower" if side_by_side > 1 else ""
     people = 30.0 * (count_1 + width_1 + count_2 + width_2)
     note = (
