@@ -430,7 +430,7 @@ def test_missing_pairs_and_missing_odometry_are_told_and_the_run_goes_on(runs, t
     (folder / "plot_0001" / "odometry.csv").unlink()
     assert grasp(folder, tmp_path / "out") == 3
     first, second = table(tmp_path / "out" / "runs.csv")
-    assert first["pairs_skipped"] == "1" and "1 pairs skipped" in first["flag"] and int(first["grasp_points"]) > 2
+    assert first["pairs_skipped"] == "1" and "pairs skipped: 1" in first["flag"] and int(first["grasp_points"]) > 2
     assert second["flag"] == "no odometry: only the last pair was used" and int(second["grasp_points"]) > 2
     assert "skipped plot_0000/001: there is no right image" in capsys.readouterr().err
     for number in range(3):
@@ -492,7 +492,7 @@ def test_eval_of_rows_and_of_an_empty_one(spec, tmp_path, capsys):
     before = out.stat().st_mtime_ns
     assert cli.main([*words, "--json", str(out), "--spec", str(spec), "--wind", "5"]) == 0
     said = capsys.readouterr().out
-    assert "2 runs were evaluated before" in said and "run 1" not in said
+    assert "evaluated before: 2 of 2 runs" in said and "run 1" not in said
     assert json.loads(out.read_text()) == figures and out.stat().st_mtime_ns >= before
     figure = ["figure", "4.6", "--evaluation", str(out), "--out", str(tmp_path / "figure.png")]
     assert cli.main([*figure, "--wind", "5"]) == 0 and (tmp_path / "figure.png").stat().st_size > 20_000

@@ -17,7 +17,7 @@ SHOWN = {
     "06_grasping": (2, 0),  # a pair and its mask; stalks and grasp points from above
 }
 SAID = {
-    "05_phenotyping": ("overlays of 1 plots, 0 pairs skipped", "synthetic: 8 stalks were counted, 8 are there"),
+    "05_phenotyping": ("overlays (plots: 1, pairs skipped: 0)", "synthetic: 8 stalks were counted, 8 are there"),
     "01_quickstart": ("of goals reached at the end", "of 64 goals reached"),
     "02_new_environment": ("of goals reached at the end", "eval/success"),  # `eval` finds the task by what the run folder says
     "03_indicator_rewards": ("oracle  ", "indicator_balance_filter", "of goals reached"),

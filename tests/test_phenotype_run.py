@@ -376,7 +376,7 @@ def test_eval_in_two_processes_and_after_a_stop_is_the_same(plots, tmp_path, cap
     capsys.readouterr()
     assert evaluate("one.json", "--plots", "3") == both
     said = capsys.readouterr().out
-    assert "1 plots were evaluated before" in said and "plot 0:" not in said and "plot 2:" in said
+    assert "evaluated before: 1 of 3 plots" in said and "plot 0:" not in said and "plot 2:" in said
     # What was evaluated under other conditions is neither mixed with nor lost.
     for words in (["--method", "ellipse"], ["--frames", "3"]):
         assert cli.main(["phenotype", "eval", *small, "--json", str(tmp_path / "one.json"), *words]) == 2

@@ -116,7 +116,7 @@ def evaluate(options: Eval) -> int:
     conditions = records.Conditions(family, weights, ways, options.workers)
     missing = [number for number in numbers if number not in kept]
     if len(missing) < len(numbers):
-        print(f"{len(numbers) - len(missing)} runs were evaluated before: {options.json}")
+        print(f"evaluated before: {len(numbers) - len(missing)} of {len(numbers)} runs, in {options.json}")
     evaluate_each(functools.partial(records.evaluate_run, conditions), missing, options.workers, done)
     asked = [kept.records[number] for number in numbers]
     print(f"simulated runs of family {family.name}, masks: {name}, {ways}:")

@@ -89,7 +89,7 @@ def run(options: Run) -> int:
         ) from error
     for row in skipped:
         print(f"skipped {row['run']}/{row['pair']}: {row['why']}", file=sys.stderr)
-    print(f"{options.out}: points.csv, runs.csv and overlays of {len(runs)} runs, {len(skipped)} pairs skipped")
+    print(f"{options.out}: points.csv, runs.csv and overlays (runs: {len(runs)}, pairs skipped: {len(skipped)})")
     return SKIPPED if skipped else 0
 
 

@@ -116,7 +116,7 @@ def _evaluate(options: Eval, tasks: "Mapping[str, Task]", name: str) -> dict[str
     }
     there = sum(seed in each for each in kept.values() for seed in wanted)
     if there:
-        print(f"{there} plots were evaluated before: {options.json}", flush=True)
+        print(f"evaluated before: {there} of {len(tasks) * len(wanted)} plots, in {options.json}", flush=True)
     factors = list(tasks)
     jobs = [(place, seed) for place, factor in enumerate(factors) for seed in wanted if seed not in kept[factor]]
 

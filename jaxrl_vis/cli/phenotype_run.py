@@ -95,7 +95,7 @@ def run(options: Run) -> int:
             )
     for row in skipped:
         print(f"skipped {row['plot']}/{row['pair']}: {row['why']}", file=sys.stderr)
-    print(f"{options.out}: stalks.csv, plots.csv, qc.html and overlays of {len(plots)} plots, {len(skipped)} pairs skipped")
+    print(f"{options.out}: stalks.csv, plots.csv, qc.html and overlays (plots: {len(plots)}, pairs skipped: {len(skipped)})")
     return SKIPPED if skipped else 0
 
 

@@ -186,7 +186,7 @@ def _row(folder: PlotFolder, request: Request, skipped: int, perception: Percept
     known = [view.driven for view in views if view.driven is not None]
     residuals = [each.residual for each in perception.stitches if math.isfinite(each.residual)]
     can = _can_reach(request, perception)
-    notes = ([f"{skipped} pairs skipped"] if skipped else []) + list(perception.notes)
+    notes = ([f"pairs skipped: {skipped}"] if skipped else []) + list(perception.notes)
     if can is not None and len(can) and not can.any():
         notes.append("no stalk is within reach")
     return row | {
