@@ -166,9 +166,14 @@ def strip_near(strip: Strip, line: float, reach: float, lines: int) -> Strip | N
         last=int(place[good].max()),
         used=count / (last - first),
         residual=rms,
-        deviation=math.sqrt(2.0) * max(rms, 0.05) / math.sqrt(count),
+        deviation=_deviation(rms, count),
         points=(place, left, right),
     )
+
+
+def _deviation(rms: float, count: int) -> float:
+    """Standard deviation of a width, pixels: of two edges that so many lines agree on, each no better than a twentieth."""
+    return math.sqrt(2.0) * max(rms, 0.05) / math.sqrt(count)
 
 
 def fit_edges(line: np.ndarray, left: np.ndarray, right: np.ndarray) -> Strip | None:
@@ -229,7 +234,7 @@ def fit_edges(line: np.ndarray, left: np.ndarray, right: np.ndarray) -> Strip | 
         last=int(line[good].max()),
         used=float(good.sum()) / total,
         residual=rms,
-        deviation=math.sqrt(2.0) * max(rms, 0.05) / math.sqrt(good.sum()),
+        deviation=_deviation(rms, int(good.sum())),
         points=points,
     )
 
