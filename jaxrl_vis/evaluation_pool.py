@@ -7,6 +7,7 @@
 Records are what JSON can hold. What one says must depend on its number alone: then it is the same with any number of workers.
 """
 
+import hashlib
 import json
 import math
 import multiprocessing
@@ -16,6 +17,7 @@ from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from jaxrl_vis.errors import RequestError
@@ -101,6 +103,23 @@ def _prepare(counter: Any, environments: list[dict[str, str]]) -> None:
     except ImportError:
         return
     cv2.setNumThreads(int(variables[_THREADS[0]]))
+
+
+def code_of(*packages: ModuleType, leave_out: tuple[str, ...] = ()) -> str:
+    """What tells apart versions of the code that records come from: 12 hexadecimal digits.
+
+    Args:
+        packages: Whose files count.
+        leave_out: Names of files, and of folders, that change no record.
+    """
+    digest = hashlib.sha256()
+    for package in packages:
+        folder = Path(str(package.__file__)).parent
+        for path in sorted(folder.rglob("*.py")):
+            name = path.relative_to(folder)
+            if not set(leave_out) & set(name.parts):
+                digest.update(name.as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:12]
 
 
 class Kept:

@@ -4,11 +4,12 @@ import functools
 import json
 import os
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.evaluation_pool import Kept, Record, evaluate_each
+from jaxrl_vis.evaluation_pool import Kept, Record, code_of, evaluate_each
 
 
 def squared(offset: int, number: int) -> Record:
@@ -72,3 +73,16 @@ def test_a_file_goes_on_where_it_was_and_holds_one_evaluation(tmp_path: Path):
     in_memory = Kept(None, about, total)
     in_memory.add(1, {"square": 1})
     assert 1 in in_memory and 2 not in in_memory
+
+
+def test_other_code_is_told_apart(tmp_path: Path):
+    package = ModuleType("package")
+    package.__file__ = str(tmp_path / "__init__.py")
+    (tmp_path / "training").mkdir()
+    for name in ("__init__.py", "look.py", "training/fit.py"):
+        (tmp_path / name).write_text("1")
+    before = code_of(package, leave_out=("training",))
+    (tmp_path / "training/fit.py").write_text("2")
+    assert code_of(package, leave_out=("training",)) == before != code_of(package)
+    (tmp_path / "look.py").write_text("2")
+    assert code_of(package, leave_out=("training",)) != before

@@ -12,13 +12,17 @@ from jaxrl_vis.cli.families import family_of
 from jaxrl_vis.cli.grasp import weights_of
 from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.evaluation_pool import Kept, Record, evaluate_each, share_accelerator
+from jaxrl_vis.evaluation_pool import Kept, Record, code_of, evaluate_each, share_accelerator
 from jaxrl_vis.report.outputs import check_writable
 
 if TYPE_CHECKING:
     from jaxrl_vis.run.policy import Policy
 
 _MOST_WIND = 100.0  # mm
+
+
+# What trains networks and draws figures and videos.
+_CHANGES_NO_RECORD = ("examples.py", "loop.py", "variation.py", "figure.py", "reach_figures.py", "video.py")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,6 +96,8 @@ def evaluate(options: Eval) -> int:
     if options.workers > 1:
         share_accelerator()
     check_devices()
+    import jaxrl_vis.grasping
+    import jaxrl_vis_envs.plants
     from jaxrl_vis.grasping import records
     from jaxrl_vis.grasping.perceive import Ways
 
@@ -101,6 +107,7 @@ def evaluate(options: Eval) -> int:
         "synthetic": True,
         "version": __version__,
         "schema": records.SCHEMA,
+        "code": code_of(jaxrl_vis_envs.plants, jaxrl_vis.grasping, leave_out=_CHANGES_NO_RECORD),
         "family": family.name,
         "family_digest": hashlib.sha256(repr(family).encode()).hexdigest()[:12],
         "masks": name,

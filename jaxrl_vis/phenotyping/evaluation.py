@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 
 import jaxrl_vis
+import jaxrl_vis.phenotyping
 import jaxrl_vis_envs.plants
-from jaxrl_vis.evaluation_pool import Record
+from jaxrl_vis.evaluation_pool import Record, code_of
 from jaxrl_vis.phenotyping.evaluate import PlotScore, ThesisScore, score_plot, summary
 from jaxrl_vis.phenotyping.measure import Method
 from jaxrl_vis.provenance import device_name, revision
@@ -94,7 +95,8 @@ def conditions(task: Task) -> dict[str, Any]:
         "family": task.family.name,
         "schema": SCHEMA,
         "version": jaxrl_vis.__version__,
-        "code": _code(),
+        # What trains networks and draws figures changes no score.
+        "code": code_of(jaxrl_vis_envs.plants, jaxrl_vis.phenotyping, leave_out=("training", "figures.py")),
         "platform": jax.default_backend(),
         "family_digest": hashlib.sha256(json.dumps(dataclasses.asdict(task.family), sort_keys=True).encode()).hexdigest()[:12],
         "weights": None if task.weights is None else fingerprint(task.weights),
@@ -102,18 +104,6 @@ def conditions(task: Task) -> dict[str, Any]:
         "least_score": task.least_score,
         "thesis": task.thesis,
     }
-
-
-def _code() -> str:
-    """What tells apart versions of the code that draws, finds and measures: 12 hexadecimal digits."""
-    digest = hashlib.sha256()
-    for module in (jaxrl_vis_envs.plants, jaxrl_vis.phenotyping):
-        folder = Path(str(module.__file__)).parent
-        for path in sorted(folder.rglob("*.py")):
-            # What trains networks and draws figures changes no score.
-            if "training" not in path.parts and path.name != "figures.py":
-                digest.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
-    return digest.hexdigest()[:12]
 
 
 def scores_of(records: Iterable[Record]) -> list[PlotScore]:
