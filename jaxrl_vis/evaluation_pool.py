@@ -7,24 +7,27 @@
 Records are what JSON can hold. What one says must depend on its number alone: then it is the same with any number of workers.
 """
 
+import contextlib
 import hashlib
+import itertools
 import json
 import math
 import multiprocessing
 import os
 import signal
-from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, as_completed, wait
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeVar
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.files import write_atomically
 
 Record = dict[str, Any]
 """What is kept of one number."""
+T = TypeVar("T")
 
 # What limits the threads of NumPy, SciPy, OpenCV and XLA in a process.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPROC")
@@ -50,20 +53,57 @@ def evaluate_each(
         for number in numbers:
             done(number, evaluate(number))
         return
-    workers = min(workers, len(numbers))
+    with _processes(min(workers, len(numbers))) as pool:
+        waiting = {pool.submit(evaluate, number): number for number in numbers}
+        for each in as_completed(waiting):
+            done(waiting[each], each.result())
+
+
+def results_of(function: Callable[[int], T], numbers: Iterable[int], workers: int) -> Iterator[T]:
+    """Results of numbers, of which there may be no end, in the order in which they are finished.
+
+    Args:
+        function: As for `evaluate_each`.
+        numbers: What to call it with.
+        workers: How many processes; 1 for this one. They are ended with the iterator.
+
+    Raises:
+        RequestError: A process was ended from outside, most likely as the memory was used up.
+    """
+    if workers == 1:
+        yield from map(function, numbers)
+        return
+    numbers = iter(numbers)
+    with _processes(workers) as pool:
+        try:
+            # Two each, so that none waits for this process.
+            waiting = {pool.submit(function, number) for number in itertools.islice(numbers, 2 * workers)}
+            while waiting:
+                ready, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+                waiting |= {pool.submit(function, number) for number in itertools.islice(numbers, len(ready))}
+                for each in ready:
+                    yield each.result()
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+@contextlib.contextmanager
+def _processes(workers: int) -> Iterator[ProcessPoolExecutor]:
+    """Processes that share the GPUs and cores; after an error they are ended at once.
+
+    Raises:
+        RequestError: One was ended from outside.
+    """
     spawning = multiprocessing.get_context("spawn")
     others = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(
         workers, mp_context=spawning, initializer=_prepare, initargs=(spawning.Value("i", 0), _environments(workers))
     )
     try:
-        waiting = {pool.submit(evaluate, number): number for number in numbers}
-        for each in as_completed(waiting):
-            done(waiting[each], each.result())
+        yield pool
     except BrokenProcessPool as error:
         raise RequestError(
-            f"one of {workers} processes was ended from outside, most likely for want of memory: use fewer --workers, and the "
-            "same command goes on where it was"
+            f"one of {workers} processes was ended from outside, most likely for want of memory: use fewer --workers"
         ) from error
     except BaseException:
         pool.shutdown(wait=False, cancel_futures=True)

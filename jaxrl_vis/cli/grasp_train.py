@@ -1,18 +1,19 @@
 """``jaxrl-vis grasp train``."""
 
-import contextlib
 import dataclasses
+import functools
 import itertools
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Literal
 
 from jaxrl_vis.cli.checks import check_counts, check_extra
 from jaxrl_vis.cli.families import family_of
 from jaxrl_vis.cli.parsing import ByPlaceToo
-from jaxrl_vis.cli.phenotype_train import helper_processes
 from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.evaluation_pool import results_of, share_accelerator
 from jaxrl_vis.report.outputs import check_writable
 
 _FIRST_SEED = 100_000
@@ -46,8 +47,8 @@ class Train:
     """Height and width of a crop, pixels: a multiple of 64."""
     rate: float | None = None
     """Highest learning rate; 0.001 for segmentation and 0.0004 for gan if not given."""
-    threads: int = 4
-    """How many threads draw images while the network learns."""
+    workers: int = 4
+    """How many processes draw rows while the network learns; 1: a thread of this one."""
     width: int | None = None
     """Width of a synthetic image in pixels, in place of the family's 1024; what is seen stays the same."""
     seed: int = 0
@@ -61,7 +62,7 @@ def train(options: Train) -> int:
         images=options.images,
         batch=options.batch,
         crop=options.crop,
-        threads=options.threads,
+        workers=options.workers,
         width=options.width,
     )
     if options.minutes is not None and not options.minutes > 0:
@@ -75,9 +76,10 @@ def train(options: Train) -> int:
     check_extra("grasp", "grasping")
     check_writable(options.out, "OUT")
     family = family_of(_Drawn(options.family, options.spec, options.width), "grasping")
+    if options.workers > 1:
+        share_accelerator()
     check_devices()
-    with contextlib.ExitStack() as stack:
-        return _train(options, family, stack)
+    return _train(options, family)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,17 +93,16 @@ class _Drawn:
     frames: int | None = None
 
 
-def _train(options: Train, family, stack: contextlib.ExitStack) -> int:
+def _train(options: Train, family) -> int:
     from jaxrl_vis import __version__
-    from jaxrl_vis.grasping.masks.examples import synthetic_examples
+    from jaxrl_vis.grasping.masks.examples import Example, synthetic_examples
     from jaxrl_vis.grasping.masks.loop import Plan, train
     from jaxrl_vis.grasping.masks.painter import Settings, write_weights
 
     first = _FIRST_SEED * (1 + options.seed)
-    helpers = helper_processes(stack, options.threads)
-    sources = [
-        synthetic_examples(family, itertools.count(first + thread, options.threads), helpers=helpers)
-        for thread in range(options.threads)
+    draw = functools.partial(synthetic_examples, family)
+    sources: list[Iterator[Example]] = [
+        itertools.chain.from_iterable(results_of(draw, itertools.count(first), options.workers))
     ]
     settings = Settings(options.loss)
     plan = Plan(

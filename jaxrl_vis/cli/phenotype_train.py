@@ -1,11 +1,10 @@
 """``jaxrl-vis phenotype train``."""
 
-import contextlib
 import dataclasses
+import functools
 import itertools
-import multiprocessing
 import time
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
@@ -13,6 +12,7 @@ from jaxrl_vis.cli.checks import check_counts, check_extra
 from jaxrl_vis.cli.parsing import ByPlaceToo
 from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.evaluation_pool import results_of, share_accelerator
 from jaxrl_vis.report.outputs import check_writable
 
 _FIRST_SEED = 100_000
@@ -42,8 +42,8 @@ class Train:
     """Strips at full resolution per update, for the masks."""
     rate: float = 1e-3
     """Highest learning rate."""
-    threads: int = 4
-    """How many threads draw or read images while the networks learn."""
+    workers: int = 4
+    """How many processes draw synthetic plots while the networks learn; 1: a thread of this one."""
     width: int | None = None
     """Width of a synthetic image in pixels, in place of the family's 3376; what is seen stays the same."""
     seed: int = 0
@@ -57,7 +57,7 @@ def train(options: Train) -> int:
         images=options.images,
         batch=options.batch,
         snips=options.snips,
-        threads=options.threads,
+        workers=options.workers,
         width=options.width,
     )
     if options.data is not None and (options.spec is not None or options.width is not None):
@@ -68,20 +68,22 @@ def train(options: Train) -> int:
         raise RequestError(f"the weights go into a file that ends in .npz, not {options.out}")
     check_extra("phenotype", "phenotyping")
     check_writable(options.out, "OUT")
+    if options.workers > 1:
+        share_accelerator()
     check_devices()
-    with contextlib.ExitStack() as stack:
-        return _train(options, stack)
+    return _train(options)
 
 
-def _train(options: Train, stack: contextlib.ExitStack) -> int:
+def _train(options: Train) -> int:
     from jaxrl_vis import __version__
     from jaxrl_vis.phenotyping.detector.detect import Settings
     from jaxrl_vis.phenotyping.detector.weights import write_weights
-    from jaxrl_vis.phenotyping.training.examples import annotated_examples, settings_for, synthetic_examples
+    from jaxrl_vis.phenotyping.training.examples import Example, annotated_examples, settings_for, synthetic_examples
     from jaxrl_vis.phenotyping.training.loop import Plan, train
     from jaxrl_vis_envs.plants import TRAINING, read
 
     settings = Settings()
+    sources: list[Iterator[Example]]
     if options.data is not None:
         settings = settings_for(options.data, settings)
         sources = [annotated_examples(options.data, settings)]
@@ -93,11 +95,8 @@ def _train(options: Train, stack: contextlib.ExitStack) -> int:
         except ValueError as error:
             raise RequestError(str(error)) from error
         first = _FIRST_SEED * (1 + options.seed)
-        helpers = helper_processes(stack, options.threads)
-        sources = [
-            synthetic_examples(family, settings, itertools.count(first + thread, options.threads), helpers=helpers)
-            for thread in range(options.threads)
-        ]
+        draw = functools.partial(synthetic_examples, family, settings)
+        sources = [itertools.chain.from_iterable(results_of(draw, itertools.count(first), options.workers))]
         origin = f"synthetic plots of family {family.name}"
     plan = Plan(
         steps=options.steps,
@@ -107,7 +106,6 @@ def _train(options: Train, stack: contextlib.ExitStack) -> int:
         batch=options.batch,
         snips=options.snips,
         rate=options.rate,
-        threads=options.threads,
         seed=options.seed,
     )
     about = {"version": __version__, "origin": origin, "steps": 0, "seed": options.seed}
@@ -124,16 +122,3 @@ def _train(options: Train, stack: contextlib.ExitStack) -> int:
     write_weights(options.out, params, settings, {**about, "steps": steps})
     print(f"{options.out}: {steps} updates on {origin}, {options.out.stat().st_size / 1e6:.1f} MB")
     return 0
-
-
-def helper_processes(stack: contextlib.ExitStack, threads: int) -> ProcessPoolExecutor:
-    """Processes in which plots are laid out: that takes Python half a second, in which nothing else of this one would go on.
-
-    Args:
-        stack: Ends them.
-        threads: How many threads draw what is laid out.
-    """
-    spawning = multiprocessing.get_context("spawn")
-    helpers = stack.enter_context(ProcessPoolExecutor(max(threads // 2, 1), mp_context=spawning))
-    stack.callback(helpers.shutdown, wait=False, cancel_futures=True)
-    return helpers

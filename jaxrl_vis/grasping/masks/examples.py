@@ -1,14 +1,12 @@
 """What the generator learns from: left images of synthetic rows, and which of their pixels show a stalk of the near row."""
 
 import dataclasses
-from collections.abc import Iterator
-from concurrent.futures import Executor
 
 import jax
 import numpy as np
 
-from jaxrl_vis.phenotyping.training.examples import sequences
-from jaxrl_vis_envs.plants import Family
+from jaxrl_vis_envs.plants import Family, draw
+from jaxrl_vis_envs.plants.pairs import Sequence
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,20 +33,18 @@ def true_mask(instance: jax.Array | np.ndarray, count: int) -> np.ndarray:
     return (instance >= 0) & (instance < count)
 
 
-def synthetic_examples(
-    family: Family, seeds: Iterator[int], frames: int = 2, helpers: Executor | None = None
-) -> Iterator[Example]:
-    """Examples of rows of a family.
+def synthetic_examples(family: Family, seed: int, frames: int = 2) -> list[Example]:
+    """Examples of one row of a family.
 
     Args:
-        family: What rows are drawn from.
-        seeds: One row each.
-        frames: How many images of each row; pairs that follow each other show nearly the same.
-        helpers: Processes in which rows are laid out, so that this one has time for the network; this one if not given.
+        family: What the row is drawn from.
+        seed: Of the row.
+        frames: How many images of it; pairs that follow each other show nearly the same.
     """
-    for sequence in sequences(family, seeds, helpers):
-        length = len(sequence)
-        chosen = sorted({round(each) for each in np.linspace(0, length - 1, min(frames, length))})
-        for frame in chosen:
-            image, instance, _ = sequence.left(frame)
-            yield Example(np.asarray(image), true_mask(instance, len(sequence.plot.measured)))
+    sequence = Sequence.of(draw(family, seed))
+    length = len(sequence)
+    examples = []
+    for frame in sorted({round(each) for each in np.linspace(0, length - 1, min(frames, length))}):
+        image, instance, _ = sequence.left(frame)
+        examples.append(Example(np.asarray(image), true_mask(instance, len(sequence.plot.measured))))
+    return examples

@@ -116,9 +116,9 @@ def _sample(image: jax.Array, line: jax.Array, column: jax.Array, shape: tuple[i
 
 def vary_snips(snips: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Snips [N, H, W, 3] uint8 and masks [N, H, W] bool: relit, with other textures and widths, and half of them mirrored."""
-    light, side, marks, size, contrast = jax.random.split(key, 5)
+    light, side, marks, size, contrast, along = jax.random.split(key, 6)
     snips, masks = _stretched(snips, masks, size)
-    snips = _set_off(_textured(snips, marks), masks, contrast)
+    snips = _striped(_set_off(_textured(snips, marks), masks, contrast), masks, along)
     mirror = jax.random.bernoulli(side, 0.5, (snips.shape[0],))
     snips = jnp.where(mirror[:, None, None, None], snips[:, :, ::-1], snips)
     masks = jnp.where(mirror[:, None, None], masks[:, :, ::-1], masks)
@@ -156,6 +156,23 @@ def _textured(snips: jax.Array, key: jax.Array) -> jax.Array:
     dark = jnp.where(noise(spots, 6, 3) > 2.2 - 1.4 * amount[0], 1.0 - 0.6 * amount[1], 1.0)
     grain = jnp.exp(0.25 * amount[2] * noise(fibres, 160, 2) + 0.35 * amount[3] * noise(shades, 80, 10))
     return jnp.round(jnp.clip(snips * (dark * grain)[..., None], 0.0, 255.0)).astype(jnp.uint8)
+
+
+def _striped(snips: jax.Array, masks: jax.Array, key: jax.Array) -> jax.Array:
+    """Snips of which half have stalks with lighter and darker stripes along them, such as ribs and sheaths that are folded.
+
+    A dark stripe looks like a gap between two stalks, and what lies beyond it like another one; but it ends with the stalk.
+    """
+    count, height, width = snips.shape[:3]
+    keys = jax.random.split(key, 4)
+    stripes = jnp.zeros(masks.shape)
+    weights = jax.nn.softmax(2.0 * jax.random.normal(keys[0], (2, count)), axis=0)
+    for place, (columns, weight) in enumerate(zip((5, 12), weights)):
+        shape = (count, max(height // 200, 2), max(width // columns, 2))
+        stripes += weight[:, None, None] * jax.image.resize(jax.random.normal(keys[1 + place], shape), masks.shape, "linear")
+    amount, drawn = jax.random.uniform(keys[3], (2, count, 1, 1))
+    factor = jnp.where(masks & (drawn < 0.5), jnp.exp(0.7 * amount * jnp.tanh(4.0 * stripes)), 1.0)
+    return jnp.round(jnp.clip(snips * factor[..., None], 0.0, 255.0)).astype(jnp.uint8)
 
 
 def _set_off(snips: jax.Array, masks: jax.Array, key: jax.Array) -> jax.Array:

@@ -2,9 +2,7 @@
 
 import dataclasses
 import functools
-import itertools
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Executor
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -55,52 +53,29 @@ class Example:
     masks: np.ndarray
 
 
-def synthetic_examples(
-    family: Family, settings: Settings, seeds: Iterable[int], frames: int = 4, helpers: Executor | None = None
-) -> Iterator[Example]:
-    """Examples of plots of a family.
+def synthetic_examples(family: Family, settings: Settings, seed: int, frames: int = 4) -> list[Example]:
+    """Examples of one plot of a family.
 
     Args:
-        family: What plots are drawn from.
+        family: What the plot is drawn from.
         settings: Of the networks.
-        seeds: One plot each.
-        frames: How many images of each plot, spread over it.
-        helpers: Processes in which plots are laid out, so that this one has time for the networks; this one if not given.
+        seed: Of the plot.
+        frames: How many images of it, spread over it.
     """
-    for sequence in sequences(family, iter(seeds), helpers):
-        rng = np.random.default_rng([sequence.plot.seed, 17])
-        length = len(sequence)
-        chosen = sorted({min(int((part + rng.random()) * length / frames), length - 1) for part in range(frames)})
-        for frame in chosen:
-            image, instance, depth = sequence.left(frame)
-            # What shows, and how much of it, is as well counted in every fourth pixel.
-            true = sequence.drive.true
-            thinned = np.asarray(instance[::_THIN, ::_THIN]), np.asarray(depth[::_THIN, ::_THIN])
-            stalks, kinds, indices = truth_of(sequence.plot, sequence.drive.poses[frame], true, *thinned)
-            masks_of = functools.partial(_instance_masks, instance, indices)
-            yield _example(image, stalks, kinds, masks_of, settings, rng, _HIGHER)
-
-
-def sequences(family: Family, seeds: Iterator[int], helpers: Executor | None) -> Iterator[Sequence]:
-    """What the plots of seeds show; with helpers, the next one is laid out while one is looked at.
-
-    Args:
-        family: What plots are drawn from.
-        seeds: One plot each.
-        helpers: Processes in which plots are laid out; this one if not given.
-    """
-    if helpers is None:
-        yield from (_sequence(family, seed) for seed in seeds)
-        return
-    waiting = [helpers.submit(_sequence, family, seed) for seed in itertools.islice(seeds, 2)]
-    while waiting:
-        ready = waiting.pop(0)
-        waiting += [helpers.submit(_sequence, family, seed) for seed in itertools.islice(seeds, 1)]
-        yield ready.result()
-
-
-def _sequence(family: Family, seed: int) -> Sequence:
-    return Sequence.of(draw(family, seed))
+    sequence = Sequence.of(draw(family, seed))
+    rng = np.random.default_rng([seed, 17])
+    length = len(sequence)
+    chosen = sorted({min(int((part + rng.random()) * length / frames), length - 1) for part in range(frames)})
+    examples = []
+    for frame in chosen:
+        image, instance, depth = sequence.left(frame)
+        # What shows, and how much of it, is as well counted in every fourth pixel.
+        true = sequence.drive.true
+        thinned = np.asarray(instance[::_THIN, ::_THIN]), np.asarray(depth[::_THIN, ::_THIN])
+        stalks, kinds, indices = truth_of(sequence.plot, sequence.drive.poses[frame], true, *thinned)
+        masks_of = functools.partial(_instance_masks, instance, indices)
+        examples.append(_example(image, stalks, kinds, masks_of, settings, rng, _HIGHER))
+    return examples
 
 
 def _instance_masks(

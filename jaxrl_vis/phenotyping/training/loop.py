@@ -36,7 +36,6 @@ class Plan:
         snips: Snips per update.
         rate: Highest learning rate.
         average: Of the weights over updates: the share of the old ones.
-        threads: How many make examples.
         seed: Of everything random.
     """
 
@@ -48,7 +47,6 @@ class Plan:
     snips: int = 32
     rate: float = 1e-3
     average: float = 0.998
-    threads: int = 4
     seed: int = 0
 
 
