@@ -15,7 +15,7 @@ import math
 import multiprocessing
 import os
 import signal
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, as_completed, wait
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
@@ -59,7 +59,7 @@ def evaluate_each(
             done(waiting[each], each.result())
 
 
-def results_of(function: Callable[[int], T], numbers: Iterable[int], workers: int) -> Iterator[T]:
+def results_of(function: Callable[[int], T], numbers: Iterable[int], workers: int) -> Generator[T]:
     """Results of numbers, of which there may be no end, in the order in which they are finished.
 
     Args:
@@ -75,16 +75,13 @@ def results_of(function: Callable[[int], T], numbers: Iterable[int], workers: in
         return
     numbers = iter(numbers)
     with _processes(workers) as pool:
-        try:
-            # Two each, so that none waits for this process.
-            waiting = {pool.submit(function, number) for number in itertools.islice(numbers, 2 * workers)}
-            while waiting:
-                ready, waiting = wait(waiting, return_when=FIRST_COMPLETED)
-                waiting |= {pool.submit(function, number) for number in itertools.islice(numbers, len(ready))}
-                for each in ready:
-                    yield each.result()
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+        # Two each, so that none waits for this process.
+        waiting = {pool.submit(function, number) for number in itertools.islice(numbers, 2 * workers)}
+        while waiting:
+            ready, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+            waiting |= {pool.submit(function, number) for number in itertools.islice(numbers, len(ready))}
+            for each in ready:
+                yield each.result()
 
 
 @contextlib.contextmanager
@@ -107,8 +104,11 @@ def _processes(workers: int) -> Iterator[ProcessPoolExecutor]:
         ) from error
     except BaseException:
         pool.shutdown(wait=False, cancel_futures=True)
-        for child in set(multiprocessing.active_children()) - others:
+        children = set(multiprocessing.active_children()) - others
+        for child in children:
             child.terminate()
+        for child in children:
+            child.join(5.0)
         raise
     pool.shutdown()
 

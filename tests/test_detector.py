@@ -244,7 +244,7 @@ def test_synthetic_examples_hold_snips_around_both_heights():
     layout = family.Layout(rows_behind=0, stalks_mean=12, stalks_sd=0, tillers=0.0, plot_length=0.8)
     stalks = family.Stalks(diameter_mean=0.03, lean_sd=(0.0, 0.0))
     few = dataclasses.replace(family.TRAINING, layout=layout, stalks=stalks).at_width(211)
-    (example,) = synthetic_examples(few, Settings(), [3], frames=1)
+    (example,) = synthetic_examples(few, Settings(), 3, frames=1)
     clear = int((example.kinds == STALK).sum())
     assert clear < len(example.snips) <= 2 * clear and example.snips.shape[1:] == (40, 16, 3)
     assert example.masks.shape == example.snips.shape[:3]

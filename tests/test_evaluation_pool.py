@@ -1,7 +1,9 @@
 """Numbers evaluated in processes side by side, and the file that keeps what came of them."""
 
 import functools
+import itertools
 import json
+import multiprocessing
 import os
 from pathlib import Path
 from types import ModuleType
@@ -9,7 +11,7 @@ from types import ModuleType
 import pytest
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.evaluation_pool import Kept, Record, code_of, evaluate_each
+from jaxrl_vis.evaluation_pool import Kept, Record, code_of, evaluate_each, results_of
 
 
 def squared(offset: int, number: int) -> Record:
@@ -48,6 +50,24 @@ def test_what_goes_wrong_in_a_process_is_told():
         evaluate_each(broken, range(3), 2, found.__setitem__)
     with pytest.raises(RequestError, match="was ended from outside"):
         evaluate_each(killed, range(3), 2, found.__setitem__)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_endless_numbers_are_taken_as_they_are_needed(workers: int):
+    before = set(multiprocessing.active_children())
+    results = results_of(functools.partial(squared, 1), itertools.count(), workers)
+    some = [record["square"] for record in itertools.islice(results, 5)]
+    results.close()
+    assert set(some) <= {number**2 + 1 for number in range(12)} and len(set(some)) == 5
+    assert workers == 2 or some == [1, 2, 5, 10, 17]
+    assert not set(multiprocessing.active_children()) - before
+
+
+def test_what_goes_wrong_with_endless_numbers_is_told():
+    with pytest.raises(ValueError, match="number 2 is broken"):
+        list(results_of(broken, itertools.count(), 2))
+    with pytest.raises(RequestError, match="was ended from outside"):
+        list(results_of(killed, itertools.count(), 2))
 
 
 def test_a_file_goes_on_where_it_was_and_holds_one_evaluation(tmp_path: Path):

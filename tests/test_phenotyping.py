@@ -11,6 +11,7 @@ import pytest
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.phenotyping.annotations import decode_mask, encode_mask
 from jaxrl_vis.phenotyping.calibration import check_size, read_calibration, write_calibration
+from jaxrl_vis.phenotyping.contrast import settle
 from jaxrl_vis.phenotyping.ground import _plane, find_ground
 from jaxrl_vis.phenotyping.images import read_disparity, read_image, write_image
 from jaxrl_vis.phenotyping.metric import diameter_mm, tilt_of
@@ -87,6 +88,39 @@ def test_a_sheath_elsewhere_does_not_matter_where_a_width_is_taken():
     assert abs(strip.width(180.0) - 43.0) > 1.0  # as a whole, it is bare
     assert strip_near(strip, 390.0, 50.0, 400) is None  # one edge is that of what hides the other
     assert strip_near(strip, 600.0, 50.0, 400) is None  # beyond the mask
+
+
+def blurred_stalk(left: float, right: float, texture: float = 0.0) -> np.ndarray:
+    """[200, 120] grey: a bright upright strip between two columns, seen through a lens, with noise."""
+    column = np.arange(120)[None] + np.zeros((200, 1))
+    image = np.where((column > left) & (column < right), 150.0, 30.0)
+    image += texture * np.random.default_rng(0).normal(size=image.shape)
+    return cv2.GaussianBlur(image, (0, 0), 1.2).astype(np.float32)
+
+
+@pytest.mark.parametrize("wrong", [-1.6, -0.7, 0.0, 1.3])
+def test_edges_settle_where_the_image_changes(wrong):
+    """A mask that is too narrow or too wide on both sides, beside what is truly there; in a part of the image."""
+    image = blurred_stalk(40.5, 79.5, 20.0)
+    mask = np.zeros((160, 80), bool)
+    strip = strip_width(mask | ((np.arange(80) > 20.5) & (np.arange(80) < 59.5)))
+    assert strip is not None
+    off = dataclasses.replace(strip, left=(strip.left[0] - wrong, 0.0), right=(strip.right[0] + wrong, 0.0))
+    settled = settle(off, image, (20, 20), 80.0, 60.0)
+    assert abs(settled.edges(80.0)[0] + 20 - 40.0) < 0.6 and abs(settled.width() - 39.0) < 0.3
+    assert abs(off.width() - 39.0) == pytest.approx(2 * abs(wrong), abs=0.01)
+
+
+def test_edges_stay_where_the_image_shows_none():
+    """Nothing but noise, and a change that is too far away to be meant."""
+    mask = np.zeros((160, 80), bool)
+    strip = strip_width(mask | ((np.arange(80) > 20.5) & (np.arange(80) < 59.5)))
+    assert strip is not None
+    noise = np.random.default_rng(1).normal(100.0, 10.0, (200, 120)).astype(np.float32)
+    for image in (np.full((200, 120), 60.0, np.float32), blurred_stalk(28.5, 91.5)):
+        assert settle(strip, image, (20, 20), 80.0, 60.0) == strip
+    assert abs(settle(strip, noise, (20, 20), 80.0, 60.0).width() - strip.width()) < 5.1
+    assert settle(strip, noise[:24], (20, 20), 2.0, 3.0) == strip
 
 
 def test_taper_is_followed():

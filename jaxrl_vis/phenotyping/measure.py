@@ -6,6 +6,7 @@ from typing import Literal
 
 import numpy as np
 
+from jaxrl_vis.phenotyping.contrast import settle
 from jaxrl_vis.phenotyping.ground import Ground
 from jaxrl_vis.phenotyping.metric import diameter_mm, tilt_of
 from jaxrl_vis.phenotyping.stereo import StalkDisparity, match_rows, sample_rows
@@ -95,7 +96,8 @@ def measure(
     depth = float(calibration.depth(np.array(beside)))
     if not depths[0] <= depth <= depths[1]:
         return Measurement(line=place + corner[0], depth=depth, lean=strip.lean, reason=f"it stands {depth:.2f} m away")
-    strip = strip_near(strip, place, _REACH * calibration.focal / depth, mask.shape[0]) or strip
+    reach = _REACH * calibration.focal / depth
+    strip = settle(strip_near(strip, place, reach, mask.shape[0]) or strip, left, corner, place, reach)
     middle = 0.5 * sum(strip.edges(place))
     pixels = strip.width(place) if method == "strip" else ellipse_width(mask)
     if pixels is None:

@@ -159,19 +159,24 @@ def _textured(snips: jax.Array, key: jax.Array) -> jax.Array:
 
 
 def _striped(snips: jax.Array, masks: jax.Array, key: jax.Array) -> jax.Array:
-    """Snips of which half have stalks with lighter and darker stripes along them, such as ribs and sheaths that are folded.
+    """Snips of which most have stalks with lighter and darker stripes along them, as of ribs and folded sheaths, which change
+    from node to node.
 
     A dark stripe looks like a gap between two stalks, and what lies beyond it like another one; but it ends with the stalk.
     """
     count, height, width = snips.shape[:3]
-    keys = jax.random.split(key, 4)
+    keys = jax.random.split(key, 5)
+    # Internodes: which of four each line belongs to.
+    nodes = jnp.sort(jax.random.uniform(keys[0], (3, count)), axis=0) * height
+    internode = (jnp.arange(height) > nodes[..., None]).sum(axis=0)  # [N, lines]
     stripes = jnp.zeros(masks.shape)
-    weights = jax.nn.softmax(2.0 * jax.random.normal(keys[0], (2, count)), axis=0)
+    weights = jax.nn.softmax(2.0 * jax.random.normal(keys[1], (2, count)), axis=0)
     for place, (columns, weight) in enumerate(zip((5, 12), weights)):
-        shape = (count, max(height // 200, 2), max(width // columns, 2))
-        stripes += weight[:, None, None] * jax.image.resize(jax.random.normal(keys[1 + place], shape), masks.shape, "linear")
-    amount, drawn = jax.random.uniform(keys[3], (2, count, 1, 1))
-    factor = jnp.where(masks & (drawn < 0.5), jnp.exp(0.7 * amount * jnp.tanh(4.0 * stripes)), 1.0)
+        drawn = jax.random.normal(keys[2 + place], (count, 4, max(width // columns, 2)))
+        across = jax.image.resize(drawn, (count, 4, width), "linear")
+        stripes += weight[:, None, None] * jnp.take_along_axis(across, internode[..., None], axis=1)
+    amount, chance = jax.random.uniform(keys[4], (2, count, 1, 1))
+    factor = jnp.where(masks & (chance < 0.7), jnp.exp(amount * jnp.tanh(4.0 * stripes)), 1.0)
     return jnp.round(jnp.clip(snips * factor[..., None], 0.0, 255.0)).astype(jnp.uint8)
 
 
