@@ -530,7 +530,7 @@ def test_masks_are_compared_with_the_truth_and_the_figure_is_drawn(spec, tmp_pat
     out = tmp_path / "figure.png"
     draw_figure(out, family, 0, None, "truth")
     assert out.stat().st_size > 50_000
-    draw_reach(tmp_path / "reach.png", family, 0, None, 5.0, tmp_path / "arm.gif")
+    draw_reach(tmp_path / "reach.png", family, 0, None, 5.0, tmp_path / "arm.gif", size=48)
     assert (tmp_path / "reach.png").stat().st_size > 20_000
     with Image.open(tmp_path / "arm.gif") as shown:
         assert shown.n_frames % 60 == 0 and shown.n_frames > 60

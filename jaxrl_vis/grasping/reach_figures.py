@@ -27,7 +27,9 @@ RUNS = 16
 _HELD, _OTHER, _LOST = "#2f855a", "#dd6b20", "#cbd5e0"
 
 
-def draw_reach(out: Path, family: Family, seed: int, mask: Mask | None, wind_mm: float, video: Path | None = None) -> None:
+def draw_reach(
+    out: Path, family: Family, seed: int, mask: Mask | None, wind_mm: float, video: Path | None = None, size: int = 320
+) -> None:
     """Figure 4.5: the first attempt of a run that the arm is sent to; with ``video`` all of them, as the camera sees them.
 
     Args:
@@ -37,6 +39,7 @@ def draw_reach(out: Path, family: Family, seed: int, mask: Mask | None, wind_mm:
         mask: What finds the pixels of stalks; None for true masks.
         wind_mm: How far stalks sway, mm.
         video: A .gif, .mp4 or .html file.
+        size: Height and width of its images, px.
 
     Raises:
         RequestError: The video cannot be written, or the arm is not sent anywhere.
@@ -53,7 +56,7 @@ def draw_reach(out: Path, family: Family, seed: int, mask: Mask | None, wind_mm:
     result = reach(made.stands, made.targets, keys, wind_mm, sides=made.sides, look=look)
     draw_path(out, made.stands, made.targets, result, int(sent[len(sent) // 2]))
     if video is not None:
-        write_reaches(video, made.stands, result, made.stalks.tolist(), sent.tolist())
+        write_reaches(video, made.stands, result, made.stalks.tolist(), sent.tolist(), size)
 
 
 def draw_grasps(out: Path, records: Sequence[Record], name: str, score: Score, title: str) -> None:
