@@ -5,10 +5,15 @@ pair -> disparity -> organised cloud, red where the mask says so
      -> grasp points: a line per stalk, or the thesis's slices
 """
 
+import contextlib
 import dataclasses
+import itertools
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
+import cv2
 import numpy as np
 
 from jaxrl_vis.grasping.chords import chords_of, joined
@@ -100,60 +105,83 @@ def perceive(views: Iterable[View], mask: Mask, calibration: Calibration, mount:
     """
     seconds: dict[str, float] = {name: 0.0 for name in ("match", "mask", "stitch", "points")}
     clock = _Clock(seconds)
-    clouds: list[Cloud] = []
     views = list(views)
     if not views:
         raise ValueError("there is no pair to perceive anything in")
     notes = []
     if not ways.stitch and len(views) > 1 and any(view.driven is None for view in views):
         views, notes = views[-1:], ["no odometry: only the last pair was used"]
-    for view in views:
+    with _threads(len(views)) as side_by_side:
         with clock("match"):
-            disparity = match(view.left, view.right, calibration, mount)
-        with clock("mask"):
-            red = mask(view.left, view.number)
-        with clock("match"):
-            clouds.append(organised(disparity, red, calibration, mount))
-    with clock("stitch"):
-        stitches = []
-        method = THESIS if ways.stitch else DEFAULT
-        whole = [Thinned.of(cloud, method) for cloud in clouds]
-        for place in range(len(views) - 1):
-            here, there = views[place].driven, views[place + 1].driven
-            driven = 0.0 if here is None or there is None else there - here
-            stitches.append(stitch(whole[place], whole[place + 1], driven, method))
+            matched = side_by_side(lambda view: match(view.left, view.right, calibration, mount), views)
+            # A network on an accelerator paints meanwhile.
+            with clock("mask"):
+                painted = [mask(view.left, view.number) for view in views]
+            clouds = list(side_by_side(lambda disparity, red: organised(disparity, red, calibration, mount), matched, painted))
+        with clock("stitch"):
+            method = THESIS if ways.stitch else DEFAULT
+            whole = list(side_by_side(lambda cloud: Thinned.of(cloud, method), clouds))
+            driven = [_driven(*each) for each in itertools.pairwise(views)]
+            stitches = list(
+                side_by_side(lambda here, there, far: stitch(here, there, far, method), whole[:-1], whole[1:], driven)
+            )
         notes += [
             f"pair {views[place].number} does not stitch to the next, odometry was used: {each.refused}"
             for place, each in enumerate(stitches)
             if each.refused
         ]
-    to_last = [Motion.along(0.0)]
-    for each in reversed(stitches):
-        to_last.insert(0, to_last[0].after(each.motion))
-    with clock("points"):
-        if ways.points:
-            points = slice_points(np.concatenate([motion(cloud.red_points()) for motion, cloud in zip(to_last, clouds)]))
-        else:
-            parts = [chords_of(cloud, calibration, mount, frame) for frame, cloud in enumerate(clouds)]
-            parts = [dataclasses.replace(part, middle=motion(part.middle)) for motion, part in zip(to_last, parts)]
-            points = grasp_points(joined(parts), Sight(tuple(clouds), tuple(to_last), calibration, mount))
+        to_last = [Motion.along(0.0)]
+        for each in reversed(stitches):
+            to_last.insert(0, to_last[0].after(each.motion))
+        with clock("points"):
+            if ways.points:
+                points = slice_points(np.concatenate([motion(cloud.red_points()) for motion, cloud in zip(to_last, clouds)]))
+            else:
+                found = side_by_side(
+                    lambda cloud, frame: chords_of(cloud, calibration, mount, frame), clouds, range(len(clouds))
+                )
+                parts = [dataclasses.replace(part, middle=motion(part.middle)) for motion, part in zip(to_last, found)]
+                points = grasp_points(joined(parts), Sight(tuple(clouds), tuple(to_last), calibration, mount))
     if not points:
         notes.append("no stalk was found")
     return Perception(tuple(clouds), tuple(stitches), tuple(to_last), points, seconds, tuple(notes))
 
 
+def _driven(here: View, there: View) -> float:
+    """How far the robot drove between two pairs, m; 0 where nothing says so."""
+    return 0.0 if here.driven is None or there.driven is None else there.driven - here.driven
+
+
+@contextlib.contextmanager
+def _threads(pairs: int) -> Iterator[Callable[..., Iterator[Any]]]:
+    """`map` for so many pairs, in threads that begin at once: as many as OpenCV may use, or none where that is one."""
+    threads = min(cv2.getNumThreads(), pairs)
+    if threads < 2:
+        yield map
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        yield pool.map
+
+
 class _Clock:
-    """Adds up the time that is spent under its names."""
+    """Adds up the time that is spent under its names; what is spent under an inner one does not count for the outer one."""
 
     def __init__(self, seconds: dict[str, float]) -> None:
-        self._seconds, self._name, self._start = seconds, "", 0.0
+        self._seconds, self._last = seconds, 0.0
+        self._names: list[str] = []
 
-    def __call__(self, name: str) -> "_Clock":
-        self._name = name
-        return self
+    @contextlib.contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        self._turn()
+        self._names.append(name)
+        try:
+            yield
+        finally:
+            self._turn()
+            self._names.pop()
 
-    def __enter__(self) -> None:
-        self._start = time.perf_counter()
-
-    def __exit__(self, *_: object) -> None:
-        self._seconds[self._name] += time.perf_counter() - self._start
+    def _turn(self) -> None:
+        now = time.perf_counter()
+        if self._names:
+            self._seconds[self._names[-1]] += now - self._last
+        self._last = now
