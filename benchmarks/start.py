@@ -56,9 +56,10 @@ def imported(clock: Clock, options: argparse.Namespace) -> Any:
     jax.devices()
     clock.lap("device")
     from jaxrl_vis import preset
+    from jaxrl_vis.devices import enable_compilation_cache
     from jaxrl_vis.learner.environment import make_env
     from jaxrl_vis.learner.train_step import make_train_step
-    from jaxrl_vis.run.programs import Programs, enable_compilation_cache
+    from jaxrl_vis.run.programs import Programs
 
     name = options.preset or ("cpu" if jax.default_backend() == "cpu" else "fast")
     config = preset(name, env=options.env, seeds=options.seeds)

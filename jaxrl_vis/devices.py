@@ -11,6 +11,7 @@ from pathlib import Path
 
 from jaxrl_vis import fields
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.files import user_cache
 from jaxrl_vis.provenance import child_environment
 
 # The packages by which JAX reaches an accelerator, and files that show that the machine has one.
@@ -35,6 +36,27 @@ def check_devices() -> None:
             raise RequestError(f"JAX finds no device to compute on: {' '.join(str(error).split())}") from error
         there = _platforms_without(asked)
         raise RequestError(f"JAX_PLATFORMS={asked}, but JAX finds no such device here, only {there}{_mend(asked)}") from error
+
+
+def enable_compilation_cache() -> str:
+    """Keeps compiled programs in a folder, so that the second start takes seconds.
+
+    A folder that was chosen already (JAX_COMPILATION_CACHE_DIR, or jax.config) is left as it is; otherwise it is
+    ``jaxrl-vis/xla`` in the user's cache folder.
+
+    Returns:
+        The folder.
+    """
+    import jax
+    from jax.experimental.compilation_cache import compilation_cache
+
+    if not jax.config.jax_compilation_cache_dir:
+        jax.config.update("jax_compilation_cache_dir", str(user_cache() / "xla"))
+        # JAX decides at its first compilation whether it has a cache, and a notebook has compiled something by now.
+        compilation_cache.reset_cache()
+    if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+    return str(jax.config.jax_compilation_cache_dir)
 
 
 def count_devices(asked: str) -> int:
@@ -69,6 +91,7 @@ _ASK = """
 import json, sys
 from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.files import user_cache
 try:
     check_devices()
 except RequestError as error:

@@ -8,6 +8,7 @@ Records are what JSON can hold. What one says must depend on its number alone: t
 """
 
 import contextlib
+import functools
 import hashlib
 import itertools
 import json
@@ -16,17 +17,18 @@ import multiprocessing
 import os
 import signal
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, as_completed, wait
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from types import ModuleType
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.files import write_atomically
 
 Record = dict[str, Any]
 """What is kept of one number."""
+A = TypeVar("A")
 T = TypeVar("T")
 
 # What limits the threads of NumPy, SciPy, OpenCV and XLA in a process.
@@ -49,55 +51,67 @@ def evaluate_each(
         RequestError: A process was ended from outside, most likely as the memory was used up.
     """
     numbers = list(numbers)
-    if workers == 1 or len(numbers) < 2:
-        for number in numbers:
-            done(number, evaluate(number))
-        return
-    with _processes(min(workers, len(numbers))) as pool:
-        waiting = {pool.submit(evaluate, number): number for number in numbers}
-        for each in as_completed(waiting):
-            done(waiting[each], each.result())
+    with processes(min(workers, len(numbers))) as each:
+        for number, record in each(functools.partial(_numbered, evaluate), numbers):
+            done(number, record)
 
 
-def results_of(function: Callable[[int], T], numbers: Iterable[int], workers: int) -> Generator[T]:
-    """Results of numbers, of which there may be no end, in the order in which they are finished.
+def _numbered(evaluate: Callable[[int], Record], number: int) -> tuple[int, Record]:
+    return number, evaluate(number)
+
+
+def results_of(function: Callable[[A], T], arguments: Iterable[A], workers: int) -> Generator[T]:
+    """Results of arguments, of which there may be no end, in the order in which they are finished.
 
     Args:
-        function: As for `evaluate_each`.
-        numbers: What to call it with.
+        function: From an argument to its result. With more than one worker both are pickled.
+        arguments: What to call it with.
         workers: How many processes; 1 for this one. They are ended with the iterator.
 
     Raises:
         RequestError: A process was ended from outside, most likely as the memory was used up.
     """
-    if workers == 1:
-        yield from map(function, numbers)
-        return
-    numbers = iter(numbers)
-    with _processes(workers) as pool:
-        # Two each, so that none waits for this process.
-        waiting = {pool.submit(function, number) for number in itertools.islice(numbers, 2 * workers)}
-        while waiting:
-            ready, waiting = wait(waiting, return_when=FIRST_COMPLETED)
-            waiting |= {pool.submit(function, number) for number in itertools.islice(numbers, len(ready))}
-            for each in ready:
-                yield each.result()
+    with processes(workers) as each:
+        yield from each(function, arguments)
+
+
+class Each(Protocol):
+    """Calls a function with arguments, in several processes or in this one; results come as they are finished."""
+
+    def __call__(self, function: Callable[[A], T], arguments: Iterable[A]) -> Iterator[T]: ...  # noqa: D102
 
 
 @contextlib.contextmanager
-def _processes(workers: int) -> Iterator[ProcessPoolExecutor]:
+def processes(workers: int) -> Iterator[Each]:
     """Processes that share the GPUs and cores; after an error they are ended at once.
 
+    Args:
+        workers: How many; 1 or less for this one.
+
     Raises:
-        RequestError: One was ended from outside.
+        RequestError: One was ended from outside, most likely as the memory was used up.
     """
+    if workers < 2:
+        yield lambda function, arguments: map(function, arguments)
+        return
     spawning = multiprocessing.get_context("spawn")
     others = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(
         workers, mp_context=spawning, initializer=_prepare, initargs=(spawning.Value("i", 0), _environments(workers))
     )
+
+    def each(function: Callable[[A], T], arguments: Iterable[A]) -> Iterator[T]:
+        arguments = iter(arguments)
+        # Two each, so that none waits for this process.
+        waiting = {pool.submit(function, argument) for argument in itertools.islice(arguments, 2 * workers)}
+        while waiting:
+            ready, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+            waiting |= {pool.submit(function, argument) for argument in itertools.islice(arguments, len(ready))}
+            for result in ready:
+                yield result.result()
+
     try:
-        yield pool
+        yield each
     except BrokenProcessPool as error:
         raise RequestError(
             f"one of {workers} processes was ended from outside, most likely for want of memory: use fewer --workers"
@@ -120,12 +134,16 @@ def share_accelerator() -> None:
 
 def _environments(workers: int) -> list[dict[str, str]]:
     """Variables of each worker: its GPU, if there are several, and how many threads it may have."""
+    import jax
+
     from jaxrl_vis.devices import list_devices
 
     devices = list_devices()
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     threads = dict.fromkeys(_THREADS, str(max(cores // workers, 1)))
     share = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+    if cache := jax.config.jax_compilation_cache_dir:  # one compiles for all
+        share["JAX_COMPILATION_CACHE_DIR"] = cache
     return [{**threads, **share, **devices[index % len(devices)].environment} for index in range(workers)]
 
 

@@ -328,9 +328,24 @@ def test_run_counts_and_measures(plots, results):
     assert (results / "skipped.csv").read_text() == "plot,pair,why\n"
 
 
+def test_several_processes_write_the_same(plots, results, tmp_path):
+    """However many look at pairs, and whichever pairs had been looked at before."""
+    out = tmp_path / "out"
+    assert run(plots, out, "--workers", "2") == 0
+    written = sorted(path.relative_to(results) for path in results.rglob("*") if path.is_file())
+    assert written == sorted(path.relative_to(out) for path in out.rglob("*") if path.is_file())
+    same = [path for path in written if path.suffix in (".csv", ".json", ".png")]
+    assert all((out / path).read_bytes() == (results / path).read_bytes() for path in same) and len(same) > 16
+    for lost in ("pairs/plot_0000/001.json", "overlays/plot_0001/002.png", "stalks.csv"):
+        (out / lost).unlink()
+    assert run(plots, out, "--workers", "2") == 0
+    assert all((out / path).read_bytes() == (results / path).read_bytes() for path in same)
+
+
 @pytest.mark.parametrize(
     ("words", "part"),
     [
+        (["--workers", "0"], "--workers must be at least 1"),
         (["--least-score", "2"], "--least-score must be from 0 to 1"),
         (["--speed", "0"], "--speed must be more than 0"),
         (["--calibration", "missing.yaml"], "there is no calibration"),

@@ -10,7 +10,7 @@ from jaxrl_vis import __version__
 from jaxrl_vis.cli.checks import check_counts, check_extra, check_run
 from jaxrl_vis.cli.families import family_of
 from jaxrl_vis.cli.grasp import weights_of
-from jaxrl_vis.devices import check_devices
+from jaxrl_vis.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.evaluation_pool import Kept, Record, code_of, evaluate_each, share_accelerator
 from jaxrl_vis.report.outputs import check_writable
@@ -96,6 +96,7 @@ def evaluate(options: Eval) -> int:
     if options.workers > 1:
         share_accelerator()
     check_devices()
+    enable_compilation_cache()
     import jaxrl_vis.grasping
     import jaxrl_vis_envs.plants
     from jaxrl_vis.grasping import records

@@ -10,7 +10,7 @@ from jaxrl_vis.cli.checks import check_extra
 from jaxrl_vis.cli.grasp import painter_of
 from jaxrl_vis.cli.parsing import ByPlaceToo
 from jaxrl_vis.cli.phenotype_run import SKIPPED, calibration_of
-from jaxrl_vis.devices import check_devices
+from jaxrl_vis.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.errors import RequestError, StorageError
 from jaxrl_vis.report.outputs import check_writable
 
@@ -61,6 +61,7 @@ def run(options: Run) -> int:
         if each is None:
             raise RequestError(f"{name} has no calibration, without which there are no metres: name one with --calibration")
     check_devices()
+    enable_compilation_cache()
     from jaxrl_vis.grasping.attempts import from_any_stop
     from jaxrl_vis.grasping.cloud import Mount
     from jaxrl_vis.grasping.perceive import ORIGINAL, OURS

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from jaxrl_vis.cli.checks import check_counts, check_extra
 from jaxrl_vis.cli.families import family_of
 from jaxrl_vis.cli.phenotype_run import networks, weights_of
-from jaxrl_vis.devices import check_devices
+from jaxrl_vis.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.evaluation_pool import Kept, Record, evaluate_each, finite, share_accelerator
 from jaxrl_vis.report.outputs import check_writable
@@ -74,6 +74,7 @@ def evaluate(options: Eval) -> int:
     if options.workers > 1:
         share_accelerator()
     check_devices()
+    enable_compilation_cache()
     weights, name = None, "truth"
     if options.masks == "network":
         networks(options.weights, options.least_score)  # says what is wrong with the weights

@@ -1,16 +1,18 @@
 """``jaxrl-vis phenotype run``."""
 
 import dataclasses
+import functools
 import hashlib
 import sys
 from pathlib import Path
 from typing import Annotated, Literal, Protocol
 
-from jaxrl_vis.cli.checks import check_extra
+from jaxrl_vis.cli.checks import check_counts, check_extra
 from jaxrl_vis.cli.parsing import ByPlaceToo
 from jaxrl_vis.cli.progress import progress
-from jaxrl_vis.devices import check_devices
+from jaxrl_vis.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.errors import RequestError, StorageError
+from jaxrl_vis.evaluation_pool import share_accelerator
 from jaxrl_vis.report.outputs import check_writable
 
 SKIPPED = 3
@@ -44,6 +46,8 @@ class Run:
     disparity_scale: float = 256.0
     """What disparities in files of 16 bits (disparity_000.png beside the images) are divided by to be pixels: 256 as KITTI
     writes them, 64 as `phenotype synth` does."""
+    workers: int = 1
+    """How many processes look at pairs side by side; they share the GPUs and cores that there are. 1 to 2 GB each."""
 
 
 def run(options: Run) -> int:
@@ -54,6 +58,7 @@ def run(options: Run) -> int:
         raise RequestError(f"--speed must be more than 0, not {options.speed:g}")
     if not options.disparity_scale > 0:
         raise RequestError(f"--disparity-scale must be more than 0, not {options.disparity_scale:g}")
+    check_counts(workers=options.workers)
     check_extra("phenotype", "phenotyping")
     check_writable(options.out, "--out", folder=True)
     from jaxrl_vis.phenotyping.folders import SAMPLE, find_plots
@@ -62,7 +67,10 @@ def run(options: Run) -> int:
     if options.folder is None:
         print("no folder given: this is the short synthetic row that comes with jaxrl-vis")
     calibrations = {plot.name: calibration_of(plot.folder, options) for plot in plots}
+    if options.workers > 1:
+        share_accelerator()
     check_devices()
+    enable_compilation_cache()
     from jaxrl_vis.phenotyping.pipeline import Request, run
     from jaxrl_vis.phenotyping.results import NO_GROUND
 
@@ -71,10 +79,8 @@ def run(options: Run) -> int:
 
         find, name = find_truth, "truth"
     else:
-        finder, name = networks(options.weights, options.least_score)
-
-        def find(image, plot, pair):
-            return finder(image)
+        _, name = networks(options.weights, options.least_score)  # says what is wrong with the weights
+        find = functools.partial(_find, weights_of(options.weights)[0], options.least_score)
 
     request = Request(options.out, options.method, name, calibrations, options.speed, options.disparity_scale)
     for plot in plots:
@@ -83,7 +89,7 @@ def run(options: Run) -> int:
 
     try:
         with progress("pairs") as done:
-            rows, skipped = run(plots, find, request, done)
+            rows, skipped = run(plots, find, request, done, options.workers)
     except OSError as error:
         raise StorageError(
             f"cannot write to {options.out}: {error.strerror or error}; run the command again to go on"
@@ -97,6 +103,16 @@ def run(options: Run) -> int:
         print(f"skipped {row['plot']}/{row['pair']}: {row['why']}", file=sys.stderr)
     print(f"{options.out}: stalks.csv, plots.csv, qc.html and overlays (plots: {len(plots)}, pairs skipped: {len(skipped)})")
     return SKIPPED if skipped else 0
+
+
+def _find(weights: Path, least_score: float, image, plot, pair):
+    """Finds the stalks of an image, in any process."""
+    return _finder(weights, least_score)(image)
+
+
+@functools.cache
+def _finder(weights: Path, least_score: float):
+    return networks(weights, least_score)[0]
 
 
 def networks(weights: Path | None, least_score: float):

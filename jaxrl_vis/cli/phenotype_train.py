@@ -10,7 +10,7 @@ from typing import Annotated
 
 from jaxrl_vis.cli.checks import check_counts, check_extra
 from jaxrl_vis.cli.parsing import ByPlaceToo
-from jaxrl_vis.devices import check_devices
+from jaxrl_vis.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.evaluation_pool import results_of, share_accelerator
 from jaxrl_vis.report.outputs import check_writable
@@ -71,6 +71,7 @@ def train(options: Train) -> int:
     if options.workers > 1:
         share_accelerator()
     check_devices()
+    enable_compilation_cache()
     return _train(options)
 
 

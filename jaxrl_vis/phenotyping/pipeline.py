@@ -6,12 +6,13 @@
         stalks.csv  plots.csv  skipped.csv
         qc.html                  the same with pictures, and what was rejected
 
-Tables are always made from the files under pairs/, so they do not depend on when the command was stopped. One pair is in memory
-at a time.
+Tables are always made from the files under pairs/, so they do not depend on when the command was stopped, nor on how many
+processes look at pairs. Each of them has one pair in memory at a time.
 """
 
 import csv
 import dataclasses
+import functools
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -20,6 +21,7 @@ from typing import Any
 import numpy as np
 
 import jaxrl_vis
+from jaxrl_vis.evaluation_pool import Each, processes
 from jaxrl_vis.files import write_atomically
 from jaxrl_vis.phenotyping.detector.finder import Detection
 from jaxrl_vis.phenotyping.folders import PairFiles, PlotFolder, claim, read_odometry
@@ -70,15 +72,20 @@ class Request:
 
 
 def run(
-    plots: list[PlotFolder], find: Find, request: Request, done: Callable[[str, int, int], None] = lambda plot, pair, of: None
+    plots: list[PlotFolder],
+    find: Find,
+    request: Request,
+    done: Callable[[str, int, int], None] = lambda plot, pair, of: None,
+    workers: int = 1,
 ) -> tuple[list[Row], list[Row]]:
     """Writes the results of plots.
 
     Args:
         plots: What to look at.
-        find: What finds stalks.
+        find: What finds stalks; with more than one worker it is pickled.
         request: What is asked for.
         done: Called after each pair with the plot's name, how many of its pairs are done, and how many it has.
+        workers: How many processes look at pairs and draw overlays; 1 for this one.
 
     Returns:
         The rows of plots.csv and of skipped.csv.
@@ -93,8 +100,8 @@ def run(
         f"jaxrl-vis {jaxrl_vis.__version__}; finds by {request.finder}; widths by the method {request.method}.",
         "Tables: stalks.csv, plots.csv and skipped.csv; all pairs: overlays/.",
     ]
-    with Page(about, request.out / "overlays", len(plots)) as page:
-        return _run(plots, find, request, driven, page, done)
+    with processes(workers) as each, Page(about, request.out / "overlays", len(plots)) as page:
+        return _run(plots, find, request, driven, page, done, each)
 
 
 def _run(
@@ -104,6 +111,7 @@ def _run(
     driven: dict[str, dict[str, float] | None],
     page: Page,
     done: Callable[[str, int, int], None],
+    each: Each,
 ) -> tuple[list[Row], list[Row]]:
     """Plot by plot; see `run`."""
     stalks: list[Row] = []
@@ -112,19 +120,20 @@ def _run(
     for plot in plots:
         folder = request.out / "pairs" / plot.name
         folder.mkdir(parents=True, exist_ok=True)
-        records = []
-        for number, pair in enumerate(plot.pairs):
-            path = folder / f"{pair.name}.json"
-            if not path.exists():
-                write_atomically(path, json.dumps(_record(plot, pair, find, request)) + "\n")
-            records.append(json.loads(path.read_text(encoding="utf-8")))
-            done(plot.name, number + 1, len(plot.pairs))
+        paths = {pair.name: folder / f"{pair.name}.json" for pair in plot.pairs}
+        missing = [pair for pair in plot.pairs if not paths[pair.name].exists()]
+        for number in range(1, len(plot.pairs) - len(missing) + 1):
+            done(plot.name, number, len(plot.pairs))
+        for number, (name, record) in enumerate(each(functools.partial(_record, plot, find, request), missing), start=1):
+            write_atomically(paths[name], json.dumps(record) + "\n")
+            done(plot.name, len(plot.pairs) - len(missing) + number, len(plot.pairs))
+        records = [json.loads(paths[pair.name].read_text(encoding="utf-8")) for pair in plot.pairs]
         bad = [
-            {"plot": plot.name, "pair": pair.name, "why": each["skipped"]}
-            for pair, each in zip(plot.pairs, records)
-            if "skipped" in each
+            {"plot": plot.name, "pair": pair.name, "why": record["skipped"]}
+            for pair, record in zip(plot.pairs, records)
+            if "skipped" in record
         ]
-        result = _finish(plot, records, driven[plot.name], request)
+        result = _finish(plot, records, driven[plot.name], request, each)
         page.add(result)
         stalks, rows, skipped = stalks + result.stalks, [*rows, result.row], skipped + bad
         write_rows(request.out / "stalks.csv", STALK_COLUMNS, stalks)
@@ -150,34 +159,35 @@ def _claim(plots: list[PlotFolder], request: Request) -> None:
     claim(request.out, about)
 
 
-def _record(plot: PlotFolder, pair: PairFiles, find: Find, request: Request) -> dict[str, Any]:
-    """What is kept of one pair."""
+def _record(plot: PlotFolder, find: Find, request: Request, pair: PairFiles) -> tuple[str, dict[str, Any]]:
+    """The name of a pair, and what is kept of it."""
+    calibration = request.calibrations[plot.name]
     try:
-        left, right = read_pair(pair, request.calibrations[plot.name], pair.disparity is None)
+        left, right = read_pair(pair, calibration, pair.disparity is None)
         disparity = known_disparity(pair, left, request.disparity_scale)
-        calibration = request.calibrations[plot.name]
         detections, ground = find_with_ground(lambda image: find(image, plot, pair), left, right, calibration, disparity)
     except Unusable as problem:
-        return {"skipped": str(problem)}
+        return pair.name, {"skipped": str(problem)}
     sightings = look(detections, left, right, calibration, request.method, ground, disparity)
     wrong = (
         None if calibration is None or disparity is not None else wrong_with(detections, sightings, left, right, calibration)
     )
     if wrong is not None:
-        return {"skipped": wrong}
-    height = None if ground is None else round(ground.camera_height, 4)
-    return {
+        return pair.name, {"skipped": wrong}
+    return pair.name, {
         "size": list(left.shape[:2]),
-        "camera_height_m": height,
+        "camera_height_m": None if ground is None else round(ground.camera_height, 4),
         "sightings": [dataclasses.asdict(each) for each in sightings],
     }
 
 
-def _finish(plot: PlotFolder, records: list[dict[str, Any]], driven: dict[str, float] | None, request: Request) -> PlotResult:
+def _finish(
+    plot: PlotFolder, records: list[dict[str, Any]], driven: dict[str, float] | None, request: Request, each: Each
+) -> PlotResult:
     """Follows the stalks of a plot, and draws its overlays."""
-    usable = [(pair, each) for pair, each in zip(plot.pairs, records) if "sightings" in each]
+    usable = [(pair, record) for pair, record in zip(plot.pairs, records) if "sightings" in record]
     skipped = len(records) - len(usable)
-    frames = [[Sighting.read(values) for values in each["sightings"]] for _, each in usable]
+    frames = [[Sighting.read(values) for values in record["sightings"]] for _, record in usable]
     origin = Origin(plot.name, request.method, jaxrl_vis.__version__)
     calibration = request.calibrations[plot.name]
     known = driven is not None and all(pair.name in driven for pair, _ in usable)
@@ -194,13 +204,22 @@ def _finish(plot: PlotFolder, records: list[dict[str, Any]], driven: dict[str, f
         stalks, row = rows_of(frames, tracks, path, skipped, origin)
     folder = request.out / "overlays" / plot.name
     folder.mkdir(parents=True, exist_ok=True)
-    for (pair, _), frame, names in zip(usable, frames, labels):
-        target = folder / f"{pair.name}.png"
-        if not target.exists():
-            left = read_side(pair, "left")
-            write_image(target, draw_overlay(left, frame, names, f"{plot.name} {pair.name}"))
+    targets = [folder / f"{pair.name}.png" for pair, _ in usable]
+    missing = [
+        (target, pair, frame, names)
+        for target, (pair, _), frame, names in zip(targets, usable, frames, labels)
+        if not target.exists()
+    ]
+    for _ in each(functools.partial(_draw_overlay, plot.name), missing):
+        pass
     width = usable[0][1]["size"][1] if usable else 0
     return PlotResult(row, stalks, [pair.name for pair, _ in usable], frames, tracks, start, width)
+
+
+def _draw_overlay(plot: str, asked: tuple[Path, PairFiles, list[Sighting], list[str | None]]) -> None:
+    """Writes the overlay of one pair."""
+    target, pair, frame, names = asked
+    write_image(target, draw_overlay(read_side(pair, "left"), frame, names, f"{plot} {pair.name}"))
 
 
 def _what_is_missing(pairs: int, calibration: Calibration | None) -> str:

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxrl_vis.devices import enable_compilation_cache
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import normalizer
 from jaxrl_vis.learner.auxiliary import Auxiliary
@@ -15,7 +16,6 @@ from jaxrl_vis.learner.auxtasks.egomotion import MAX_ANGLE
 from jaxrl_vis.learner.networks import Networks
 from jaxrl_vis.report import auxiliary_video, videos
 from jaxrl_vis.run.folder import read_config
-from jaxrl_vis.run.programs import enable_compilation_cache
 from jaxrl_vis.run.trained import load, open_run
 from jaxrl_vis.types import Batch, Episodes, TrainState
 

@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxrl_vis.config import Config
+from jaxrl_vis.devices import enable_compilation_cache
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.networks import Networks
-from jaxrl_vis.run.programs import enable_compilation_cache
 from jaxrl_vis.run.trained import load, open_run
 from jaxrl_vis.types import NormalizerState, Params
 from jaxrl_vis_envs.base import GoalEnv

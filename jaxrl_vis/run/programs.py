@@ -5,16 +5,14 @@ All of it is compiled before training starts, so that the end of a run, where si
 
 import concurrent.futures
 import functools
-import os
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.experimental.compilation_cache import compilation_cache
 
 from jaxrl_vis import processes
 from jaxrl_vis.config import Config
-from jaxrl_vis.files import user_cache
+from jaxrl_vis.devices import enable_compilation_cache
 from jaxrl_vis.report import videos
 from jaxrl_vis.run.arrays import to_host
 from jaxrl_vis.run.nonfinite import broken_leaves
@@ -26,24 +24,6 @@ from jaxrl_vis_envs.compilation import tracing_for_default_device
 _EVALUATION_SEED = 2**31 - 1
 # What takes longest to compile comes first: it compiles while the others are traced.
 _NAMES = ("train_iteration", "evaluate", "init", "broken_leaves")
-
-
-def enable_compilation_cache() -> str:
-    """Keeps compiled programs in a folder, so that the second start takes seconds.
-
-    A folder that was chosen already (JAX_COMPILATION_CACHE_DIR, or jax.config) is left as it is; otherwise it is
-    ``jaxrl-vis/xla`` in the user's cache folder.
-
-    Returns:
-        The folder.
-    """
-    if not jax.config.jax_compilation_cache_dir:
-        jax.config.update("jax_compilation_cache_dir", str(user_cache() / "xla"))
-        # JAX decides at its first compilation whether it has a cache, and a notebook has compiled something by now.
-        compilation_cache.reset_cache()
-    if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
-    return str(jax.config.jax_compilation_cache_dir)
 
 
 class Programs:

@@ -16,14 +16,14 @@ import jax
 import jax.numpy as jnp
 
 from jaxrl_vis.config import Config
-from jaxrl_vis.devices import check_devices
+from jaxrl_vis.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.errors import NonFiniteError, RequestError, Terminated
 from jaxrl_vis.learner.environment import locate_env, make_env
 from jaxrl_vis.learner.train_step import make_train_step
 from jaxrl_vis.run import loggers
 from jaxrl_vis.run.folder import RunFolder, default_folder, read_log
 from jaxrl_vis.run.loop import Report, RunLoop
-from jaxrl_vis.run.programs import Programs, enable_compilation_cache
+from jaxrl_vis.run.programs import Programs
 from jaxrl_vis.run.signals import shielded_children
 from jaxrl_vis.types import LoopState, Metrics, TrainState
 
