@@ -2,25 +2,30 @@
 
 Finding, outlining, disparity, ground and widths; a synthetic pair of the shifted family; decoding of files is not in it. Parts
 are timed one after the other in repeats of their own; in the whole, the ground is found while the networks compute.
+``--workers 1 8 14`` says how long a pair takes where so many processes look at pairs, as with `phenotype run --workers`.
 """
 
 import argparse
+import functools
 import resource
+import tempfile
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxrl_vis.evaluation_pool import processes, share_accelerator
 from jaxrl_vis.phenotyping.detector.detect import detect, pad
 from jaxrl_vis.phenotyping.detector.finder import Finder, reduce
 from jaxrl_vis.phenotyping.detector.weights import SHIPPED, read_weights
 from jaxrl_vis.phenotyping.ground import find_ground
 from jaxrl_vis.phenotyping.sightings import find_with_ground, grey_of, look
 from jaxrl_vis.provenance import device_name
-from jaxrl_vis_envs.plants import SHIFTED, draw
+from jaxrl_vis_envs.plants import SHIFTED, Calibration, draw
 from jaxrl_vis_envs.plants.pairs import Sequence
 from jaxrl_vis_envs.plants.truth import stalks_in_view
 
@@ -36,11 +41,54 @@ def timed(run: Callable[[], Any], repeats: int) -> list[float]:
     return times
 
 
+def pairs_a_second(workers: int, seconds: float, pairs: list[tuple[np.ndarray, np.ndarray]], stated: Calibration) -> None:
+    """Prints how long a pair takes where so many processes look at pairs side by side, each at one of its own."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder)
+        np.savez(path / "pairs.npz", *[image for pair in pairs for image in pair])
+        with processes(workers) as each:
+            work = functools.partial(_work, path, workers, seconds, stated)
+            counts = list(each(work, range(workers)))
+    total, finds = sum(count for count, _ in counts), [found for _, found in counts]
+    assert len({tuple(each) for each in finds}) > 1 or workers < 2, "all pairs gave the same"
+    print(f"{workers} processes: {seconds / total:.4f} s a pair ({total} pairs in {seconds:.0f} s)")
+
+
+def _work(folder: Path, workers: int, seconds: float, stated: Calibration, index: int) -> tuple[int, list[float]]:
+    """What one process does: pairs from arrays in memory, once all are ready; how many, and the widths of the last one."""
+    images = list(np.load(folder / "pairs.npz").values())
+    pairs = list(zip(images[::2], images[1::2]))
+    params, settings, _ = read_weights(SHIPPED)
+    finder, widths = Finder(params, settings), []
+
+    def once(number: int) -> list[float]:
+        left, right = pairs[(index + number) % len(pairs)]
+        detections, ground = find_with_ground(finder, left, right, stated)
+        return [each.diameter_mm or 0.0 for each in look(detections, left, right, stated, ground=ground)]
+
+    for number in range(len(pairs)):
+        once(number)
+    (folder / f"ready_{index}").touch()
+    while len(list(folder.glob("ready_*"))) < workers:
+        time.sleep(0.01)
+    count, started = 0, time.perf_counter()
+    while time.perf_counter() - started < seconds:
+        widths = once(count)
+        count += 1
+    return count, widths
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="Time and memory for one synthetic pair.")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--width", type=int, default=3376, help="of an image, pixels")
+    parser.add_argument(
+        "--workers", type=int, nargs="*", default=[], help="processes side by side; several numbers, one by one"
+    )
+    parser.add_argument("--seconds", type=float, default=10.0, help="how long each number of them is timed")
     options = parser.parse_args()
+    if options.workers:
+        share_accelerator()
     family = SHIFTED.at_width(options.width)
     sequence = Sequence.of(draw(family, 3))
     pair = sequence[15]
@@ -83,3 +131,8 @@ if __name__ == "__main__":
     for name, part in others.items():
         print(f"  {np.median(timed(part, min(options.repeats, 3))):.4f} s  {name}")
     print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6:.2f} GB, drawing the pair included")
+    if options.workers:
+        some = [sequence[frame] for frame in (5, 12, 19, 26)]
+        images = [(np.asarray(each.left), np.asarray(each.right)) for each in some]
+        for workers in options.workers:
+            pairs_a_second(workers, options.seconds, images, stated)
