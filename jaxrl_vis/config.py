@@ -136,8 +136,9 @@ class Config:
     """Whether weighting cosine learns logarithms of the losses."""
     aux_form: Literal["thesis", "release"] = "thesis"
     """Whose targets the auxiliary tasks have, where the thesis and the authors' release differ (`auxtasks.Options`)."""
-    aux_gradients: Literal["per_loss", "one_hot"] = "per_loss"
-    """How the gradient of each loss is found, for weightings that compare them; both agree (`learner.weighting.gradients`)."""
+    aux_gradients: Literal["per_loss", "one_hot", "jvp"] = "per_loss"
+    """How gradients of losses are found and compared, for weightings that compare them; all ways agree
+    (`learner.weighting.gradients`)."""
 
     # -- Networks
     encoder_filters: tuple[int, ...] = (16, 32, 64, 64)

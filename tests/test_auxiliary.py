@@ -98,10 +98,11 @@ def test_a_weighted_gradient_is_the_sum_of_the_losses_own():
     assert np.abs(both - found[()]).max() > 0.1 * np.abs(both).max()
 
 
-def test_both_ways_to_gradients_agree():
+@pytest.mark.parametrize("way", ["one_hot", "jvp"])
+def test_all_ways_to_gradients_agree(way):
     settings = {"aux_tasks": ("forward_dynamics", "egomotion"), "weighting": "ol_aux"}
     _, update, working, batch = learner(**settings)
-    _, other_update, _, _ = learner(**settings, aux_gradients="one_hot")
+    _, other_update, _, _ = learner(**settings, aux_gradients=way)
     one, other = update(working, batch), other_update(working, batch)
     for left, right in zip(jax.tree.leaves(one[1:]), jax.tree.leaves(other[1:]), strict=True):
         np.testing.assert_allclose(left, right, rtol=2e-3, atol=1e-5)
@@ -159,6 +160,10 @@ def test_kept_flow_is_that_of_the_images():
     [
         ({"aux_tasks": ("egomotion",)}, "weighting none learns none: choose --weighting ol_aux"),
         ({"weighting": "ol_aux"}, "has no auxiliary tasks to weight: add --aux-tasks"),
+        (
+            {"weighting": "ol_aux_ablation", "aux_tasks": ("egomotion",), "aux_gradients": "jvp"},
+            "keeps whole gradients here, which --aux-gradients jvp does not find",
+        ),
         (
             {"weighting": "ol_aux", "aux_tasks": ("egomotion",), "weighting_interval": 3},
             "weighting_interval (3) must divide updates_per_iteration (10)",

@@ -10,7 +10,7 @@ import pytest
 
 from jaxrl_vis.config import preset
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner import encoder_kernel, losses, normalizer
+from jaxrl_vis.learner import encoder_kernel, losses, normalizer, tangents
 from jaxrl_vis.learner.blocks import from_blocks, to_blocks
 from jaxrl_vis.learner.networks import Networks
 
@@ -97,6 +97,31 @@ def test_the_gpu_kernel_computes_and_differentiates_the_same_function(shape, bat
         np.testing.assert_allclose(latent, expected, rtol=1e-4, atol=1e-4)
         for (path, ours), theirs in zip(jax.tree.leaves_with_path(gradient), jax.tree.leaves(expected_gradient), strict=True):
             np.testing.assert_allclose(ours, theirs, rtol=1e-3, atol=1e-4 * np.abs(theirs).max(), err_msg=str(path))
+
+
+@pytest.mark.parametrize("implementation", ["products", "kernel", "plain"])
+def test_encoders_are_differentiated_forwards_where_tangents_are_wanted(implementation, monkeypatch):
+    """A tangent is the gradient's product with its direction, whichever implementation makes the gradient."""
+    case = EncoderCase((3, 40, 36), 6, slice(2, 6), "float32")
+    _, gradient = case.latents_and_gradient(monkeypatch, implementation)
+    if implementation != "products":
+        monkeypatch.setattr(Networks, "uses_kernel", True)
+    inputs = jax.jit(case.networks.prepare)(case.statistics, case.images)
+    along = jax.tree.map(lambda leaf: jax.random.normal(jax.random.key(leaf.size), leaf.shape), case.params)
+
+    def loss(params):
+        latent = case.networks.encode({"encoder": params}, inputs, case.which)
+        return jnp.sum(latent.astype(jnp.float32) * case.probe)
+
+    def with_rules(params):
+        with tangents.with_tangents():
+            return loss(params)
+
+    tangent = jax.jit(lambda params: jax.jvp(with_rules, (params,), (along,))[1])(case.params)
+    expected = sum(jnp.vdot(left, right) for left, right in zip(jax.tree.leaves(gradient), jax.tree.leaves(along), strict=True))
+    np.testing.assert_allclose(tangent, expected, rtol=1e-3)
+    with pytest.raises(TypeError, match="custom_vjp"):
+        jax.jvp(loss, (case.params,), (along,))
 
 
 def test_in_bfloat16_the_gpu_kernel_is_as_near_to_float32_as_plain_products_are(monkeypatch):

@@ -26,6 +26,7 @@ def training_config(settings: Settings, **overrides: Any) -> Config:
         overrides["batch_size"] = settings.batch_size
     overrides |= {"devices": settings.devices, "data_devices": settings.data_devices}
     overrides |= {"seeds": settings.seeds, "weighting": settings.weighting, "aux_tasks": settings.aux_tasks}
+    overrides["aux_gradients"] = settings.aux_gradients
     return preset("fast" if settings.on_accelerator else "cpu", env=settings.env, **overrides)
 
 

@@ -27,6 +27,7 @@ import jax.numpy as jnp
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
 
+from jaxrl_vis.learner import tangents
 from jaxrl_vis.learner.encoder_kernel_patches import LEVELS, WORD, divisor, padded_channels, prepare_on_gpu, prepare_plainly
 from jaxrl_vis_envs.compilation import accelerator, by_platform, runs_gpu_kernels, tracing_for
 
@@ -327,5 +328,8 @@ def encode(patches: jax.Array, weights: Weights, which: slice = slice(None), int
     if math.gcd(first, count) % _LEAST_ROWS:  # a few small images
         patches = jnp.pad(patches[which], ((0, -len(images) % _LEAST_ROWS), (0, 0), (0, 0)))
         first, rows = 0, patches.shape[0] * per_image
-    out: jax.Array = apply(patches.reshape(-1, size), weights, first, rows, interpret)  # type: ignore[assignment]
+    if tangents.are_wanted():
+        out = _apply_plainly(patches.reshape(-1, size), weights, first, rows)
+    else:
+        out: jax.Array = apply(patches.reshape(-1, size), weights, first, rows, interpret)  # type: ignore[assignment]
     return out[:count].reshape(-1, per_image, out.shape[-1])

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner import encoder_kernel, normalizer
+from jaxrl_vis.learner import encoder_kernel, normalizer, tangents
 from jaxrl_vis.learner.blocks import to_blocks
 from jaxrl_vis.types import Batch, NormalizerState, Params, TrainState
 
@@ -32,9 +32,13 @@ _glorot = nn.initializers.glorot_uniform()
 _NARROW = 16
 
 
-@jax.custom_vjp
 def _product(values: jax.Array, kernel: jax.Array) -> jax.Array:
     """``values @ kernel``, [..., M, K] and [..., K, N]."""
+    return values @ kernel if tangents.are_wanted() else _product_with_rule(values, kernel)
+
+
+@jax.custom_vjp
+def _product_with_rule(values: jax.Array, kernel: jax.Array) -> jax.Array:
     return values @ kernel
 
 
@@ -47,7 +51,7 @@ def _product_backward(residuals: tuple[jax.Array, jax.Array], gradient: jax.Arra
     return jax.lax.dot_general(gradient, kernel, (((columns,), (columns,)), (batch, batch))), kernel_gradient
 
 
-_product.defvjp(lambda values, kernel: (values @ kernel, (values, kernel)), _product_backward)
+_product_with_rule.defvjp(lambda values, kernel: (values @ kernel, (values, kernel)), _product_backward)
 
 
 class _Encoder(nn.Module):

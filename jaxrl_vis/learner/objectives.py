@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxrl_vis.config import Config, Resolved
-from jaxrl_vis.learner import losses
+from jaxrl_vis.learner import losses, tangents
 from jaxrl_vis.learner.auxiliary import Auxiliary
 from jaxrl_vis.learner.auxtasks import View
 from jaxrl_vis.learner.networks import Networks
@@ -127,9 +127,13 @@ class Objectives:
             others = self._auxiliary(critic, latents, image, batch)
             return {MAIN: losses.critic_loss(value, target, keep, self._kept(keep)), **others}, (latents, value, keep)
 
+        def with_tangent_rules(critic: Params):
+            with tangents.with_tangents():
+                return critic_losses(critic)
+
         # Weightings that compare no gradients need one backward pass only, which the last way of finding them takes.
         way = "jvp" if weighting.needs == "losses" else self.config.aux_gradients
-        options = {"reduce": self.shards.mean} if self.reduces_early else {}
+        options = {"forwards": with_tangent_rules, **({"reduce": self.shards.mean} if self.reduces_early else {})}
         find = weighted_grad(critic_losses, weighting, lambda critic: critic["encoder"], way, has_aux=True, **options)
         state = self.auxiliary.start(now.critic.get("encoder")) if state is None else state
         return find(now.critic, state, held=held) if weighting.held else find(now.critic, state)

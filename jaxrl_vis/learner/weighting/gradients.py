@@ -10,7 +10,7 @@ agree up to rounding:
                pass for the weighted sum; with weightings that need losses, the last alone     losses, dots
 
 On the right are the `Weighting.needs` that each can serve. The third makes as many passes for ten losses as for two, but every
-operation must have a tangent rule, which those of `jax.custom_vjp` lack.
+operation must have a tangent rule, which those of `jax.custom_vjp` lack: ``forwards`` may be the same losses without them.
 """
 
 from collections.abc import Callable, Mapping
@@ -106,6 +106,7 @@ def weighted_grad(
     way: Way = "per_loss",
     has_aux: bool = False,
     reduce: Selector = everything,
+    forwards: LossesFunction | None = None,
 ) -> Callable[..., Weighted]:
     """The gradient of a dictionary of losses, weighted.
 
@@ -119,6 +120,8 @@ def weighted_grad(
         has_aux: See ``losses_fn``.
         reduce: Applied to losses, gradients and dots before the weighting sees them, where each device has its own part of the
             data and the losses are means: ``lambda tree: jax.lax.pmean(tree, axis)``.
+        forwards: For ``way`` jvp: what computes the same as ``losses_fn`` by operations that have tangent rules; that itself if
+            not given.
 
     Returns:
         (params, state, *args) -> `Weighted`, with state from ``weighting.init(names, shared(params))``. A weighting with
@@ -144,7 +147,7 @@ def weighted_grad(
         return Weighted(combined, state, losses, metrics, weights, extra)
 
     def by_jvp(params: Params, state: WeightingState, *args: Any) -> Weighted:
-        whole = _in_float32(losses_fn, has_aux)
+        whole, forward = (_in_float32(each, has_aux) for each in (losses_fn, forwards or losses_fn))
         local, pullback, extra = jax.vjp(lambda params: whole(params, *args), params, has_aux=True)
         _check_names(local, state)
         losses = reduce(local)
@@ -160,7 +163,7 @@ def weighted_grad(
             else:
                 direction = backward({name: jnp.full_like(loss, name == MAIN) for name, loss in losses.items()})
             along = _embed(shared, params, direction)
-            _, tangents = jax.jvp(lambda params: whole(params, *args)[0], (params,), (along,))
+            _, tangents = jax.jvp(lambda params: forward(params, *args)[0], (params,), (along,))
             statistics = reduce({name: tangent for name, tangent in tangents.items() if name != MAIN})
         weights, state, metrics = weighting.update(losses, statistics, state)
         if combined is None:
