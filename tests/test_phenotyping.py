@@ -14,6 +14,7 @@ from jaxrl_vis.phenotyping.calibration import check_size, read_calibration, writ
 from jaxrl_vis.phenotyping.contrast import settle
 from jaxrl_vis.phenotyping.ground import _plane, find_ground
 from jaxrl_vis.phenotyping.images import read_disparity, read_image, write_image
+from jaxrl_vis.phenotyping.measure import measure
 from jaxrl_vis.phenotyping.metric import diameter_mm, tilt_of
 from jaxrl_vis.phenotyping.stereo import match_rows, match_sgbm
 from jaxrl_vis.phenotyping.width import ELLIPSE_FITS, ellipse_width, strip_near, strip_width
@@ -121,6 +122,22 @@ def test_edges_stay_where_the_image_shows_none():
         assert settle(strip, image, (20, 20), 80.0, 60.0) == strip
     assert abs(settle(strip, noise, (20, 20), 80.0, 60.0).width() - strip.width()) < 5.1
     assert settle(strip, noise[:24], (20, 20), 2.0, 3.0) == strip
+
+
+def test_a_width_that_was_not_seen_where_it_is_asked_for_is_a_lower_bound():
+    """Most of a stalk's mask is as wide as the stalk; where something hides a part of it, the measurement says so."""
+    cameras = Calibration(240, 400, 1000.0, (120.0, 200.0), 0.1)
+    mask = np.zeros((360, 80), bool)
+    mask[:, 20:60] = True
+    mask[:130, 38:60] = False
+    image, known = np.full((400, 240), 90.0, np.float32), np.full((400, 240), 125.0, np.float32)
+
+    def measured(line: float):
+        return measure(mask, (20, 80), image, image, cameras, line=line, disparity=known)
+
+    seen, hidden = measured(300.0), measured(90.0)
+    assert seen.here and seen.width == pytest.approx(40.0, abs=0.1)
+    assert hidden.diameter_mm is not None and not hidden.here
 
 
 def test_taper_is_followed():

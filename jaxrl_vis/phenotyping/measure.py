@@ -33,6 +33,8 @@ class Measurement:
         height: Of the place above the ground, m; not a number where no ground is known.
         lean, tilt: Against the image's vertical and away from the camera, rad.
         confidence: 0 to 1.
+        here: Whether both edges are seen around that line; where they are not, they are those of the rest of the stalk, which
+            is mostly partly hidden then.
         reason: Empty where the stalk was measured.
     """
 
@@ -47,6 +49,7 @@ class Measurement:
     lean: float = math.nan
     tilt: float = 0.0
     confidence: float = 0.0
+    here: bool = True
     reason: str = ""
 
 
@@ -97,7 +100,8 @@ def measure(
     if not depths[0] <= depth <= depths[1]:
         return Measurement(line=place + corner[0], depth=depth, lean=strip.lean, reason=f"it stands {depth:.2f} m away")
     reach = _REACH * calibration.focal / depth
-    strip = settle(strip_near(strip, place, reach, mask.shape[0]) or strip, left, corner, place, reach)
+    near = strip_near(strip, place, reach, mask.shape[0])
+    strip = settle(near or strip, left, corner, place, reach)
     middle = 0.5 * sum(strip.edges(place))
     pixels = strip.width(place) if method == "strip" else ellipse_width(mask)
     if pixels is None:
@@ -122,6 +126,7 @@ def measure(
         lean=strip.lean,
         tilt=tilt,
         confidence=confidence * min(matched.values.size / max(matched.tried, 1), 1.0),
+        here=near is not None or method == "ellipse",
     )
 
 

@@ -17,7 +17,7 @@ from jaxrl_vis_envs.plants import Calibration
 from jaxrl_vis_envs.plants.truth import HEIGHTS
 
 NO_CALIBRATION = "no calibration"
-_HIDDEN = 0.1  # of its confidence that a sighting keeps if another stalk hides one of its edges
+_HIDDEN = 0.1  # of its confidence that a sighting keeps if one of its edges may be hidden
 _BEHIND = 0.003  # m: what stands so much further away hides nothing
 _TOUCHING = 0.1  # of half a stalk's width: edges so near are one
 _SAME_DEPTH = 0.06  # m, within 12 inches of a stalk that leans by 10 degrees
@@ -43,7 +43,8 @@ class Sighting:
             around 24 inches above the ground.
         upper_place: Column, line and width in pixels of that.
         confidence: 0 to 1.
-        hidden, upper_hidden: Whether another stalk may hide one of its edges, so that it is at least so thick.
+        hidden, upper_hidden: Whether one of its edges may be hidden, so that it is at least so thick: another stalk stands
+            there, or the edges were not seen around the height itself.
         ray_deg: Angle between the left camera's axis and the ray to it, degrees, positive to the right.
         reason: Why it was not measured; empty where it was.
     """
@@ -140,6 +141,8 @@ def look(
         measured.append((got, upper))
     hidden = _hidden_edges([got for got, _ in measured])
     above = _hidden_edges([upper or Measurement() for _, upper in measured])
+    hidden = [behind or not got.here for behind, (got, _) in zip(hidden, measured)]
+    above = [behind or not (upper is None or upper.here) for behind, (_, upper) in zip(above, measured)]
     sightings = []
     for each, (got, upper), *behind in zip(detections, measured, hidden, above):
         less = dataclasses.replace(got, confidence=got.confidence * _HIDDEN) if behind[0] else got
