@@ -44,7 +44,8 @@ class Sighting:
         upper_place: Column, line and width in pixels of that.
         confidence: 0 to 1.
         hidden, upper_hidden: Whether one of its edges may be hidden, so that it is at least so thick: another stalk stands
-            there, or the edges were not seen around the height itself.
+            there, or, of the lower one, the edges were not seen around the height itself. All of the upper piece is near its
+            height.
         ray_deg: Angle between the left camera's axis and the ray to it, degrees, positive to the right.
         reason: Why it was not measured; empty where it was.
     """
@@ -142,7 +143,6 @@ def look(
     hidden = _hidden_edges([got for got, _ in measured])
     above = _hidden_edges([upper or Measurement() for _, upper in measured])
     hidden = [behind or not got.here for behind, (got, _) in zip(hidden, measured)]
-    above = [behind or not (upper is None or upper.here) for behind, (_, upper) in zip(above, measured)]
     sightings = []
     for each, (got, upper), *behind in zip(detections, measured, hidden, above):
         less = dataclasses.replace(got, confidence=got.confidence * _HIDDEN) if behind[0] else got
