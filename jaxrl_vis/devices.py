@@ -91,7 +91,6 @@ _ASK = """
 import json, sys
 from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.files import user_cache
 try:
     check_devices()
 except RequestError as error:

@@ -102,6 +102,7 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
         (["bench", "physics", "--peer", "playground"], ["--env FingerTurn"]),
         (["bench", "train", "--peer", "torch"], ["bench update"]),
         (["bench", "update", "--peer", "torch", "--seeds", "2"], ["--seeds"]),
+        (["bench", "update", "--aux-gradients", "jvp"], ["--weighting and --aux-tasks"]),
         (["bench", "env", "--seeds", "2"], ["bench update", "bench train"]),
         (["bench", "render", "--peer", "mujocco"], ["--peer cannot be 'mujocco'", "mujoco"]),
         (["bench", "physics", "--envs", "0"], ["--envs", "at least 1"]),

@@ -83,6 +83,8 @@ def run(options: Bench) -> int:
         raise RequestError("--peer torch learns with one seed: leave out --seeds")
     if (options.weighting != "none" or options.aux_tasks) and (options.benchmark not in ("update", "train") or options.peer):
         raise RequestError("--weighting and --aux-tasks go with `bench update` and `bench train` only, without a peer")
+    if options.aux_gradients != "per_loss" and options.weighting == "none":
+        raise RequestError("--aux-gradients goes with --weighting and --aux-tasks, whose gradients it compares")
     if (options.devices is not None or options.data_devices is not None) and options.benchmark != "train":
         raise RequestError("--devices and --data-devices go with `bench train` only")
     check_counts(
