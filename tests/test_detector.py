@@ -13,6 +13,7 @@ from jaxrl_vis.phenotyping.annotations import decode_counts, read_annotations
 from jaxrl_vis.phenotyping.detector.anchors import anchors_of, decode, encode
 from jaxrl_vis.phenotyping.detector.boxes import band_overlap, nms, overlap, roi_align, suppress
 from jaxrl_vis.phenotyping.detector.detect import Settings, best_proposals
+from jaxrl_vis.phenotyping.detector.doubles import found_once
 from jaxrl_vis.phenotyping.detector.finder import Finder
 from jaxrl_vis.phenotyping.detector.losses import NOTHING, STALK, UNCLEAR, assign
 from jaxrl_vis.phenotyping.detector.snips import cut, put_back, snip_shape
@@ -77,6 +78,32 @@ def test_parallel_stalks_that_lean_are_two():
     assert np.asarray(overlap(stalks[:, :4], stalks[:, :4]))[0, 1] > 0.5
     assert overlaps[0, 1] < 0.01 and overlaps[0, 2] > 0.6
     assert suppress(jnp.asarray(overlaps), jnp.array([0.9, 0.8, 0.7]), 0.4).tolist() == [True, True, False]
+
+
+def test_a_stalk_that_two_finds_outline_is_one():
+    """Whatever their masks have around them; what was taken away takes nothing away, and stalks that cross are two."""
+    image = np.zeros((120, 100), np.float32)
+
+    def piece(top, left, mask):
+        return mask, (top, left)
+
+    upright, crossing = image.copy(), image.copy()
+    upright[:, 40:60] = 0.9
+    for line in range(120):
+        crossing[line, line // 2 + 10 : line // 2 + 30] = 0.9
+    upright[crossing > 0.5] = 0.2  # it is behind the other one
+    part = crossing[20:120, 30:100]
+    half = np.where(np.arange(120)[:, None] < 55, crossing, upright)  # the first of one and the rest of the other
+    pieces = [piece(0, 0, upright), piece(0, 0, crossing), piece(20, 30, part), piece(0, 0, half), piece(0, 0, image[:0, :0])]
+    scores = np.array([0.8, 0.9, 0.7, 0.5, 0.4])
+    assert found_once(pieces, scores).tolist() == [True, True, False, True, True]
+    assert found_once(pieces, scores[[0, 2, 1, 3, 4]]).tolist() == [True, False, True, True, True]
+    assert found_once(pieces, scores, most_shared=0.4).tolist() == [True, True, False, False, True]
+    # Of three in a row that each share most of their neighbour's mask, the first and the last are two.
+    chain = [piece(0, left, np.ones((50, 20), bool)) for left in (0, 7, 14)]
+    assert found_once(chain, np.array([0.9, 0.8, 0.7])).tolist() == [True, False, True]
+    assert found_once(chain, np.array([0.8, 0.9, 0.7])).tolist() == [False, True, False]
+    assert found_once([], np.zeros(0)).tolist() == []
 
 
 def test_codes_are_inverted():

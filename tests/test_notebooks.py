@@ -42,6 +42,9 @@ def test_notebook_runs(path: Path, tmp_path: Path, clean_environment: dict[str, 
     monkeypatch.setenv("PYTHONPATH", clean_environment["PYTHONPATH"])
     monkeypatch.setenv("JAXRL_VIS_NOTEBOOK_FAST", "1")
     monkeypatch.setenv("IPYTHONDIR", str(tmp_path / "ipython"))
+    startup = tmp_path / "ipython/profile_default/startup"
+    startup.mkdir(parents=True)
+    (startup / "garbage.py").write_text("import gc\ngc.set_threshold(100_000, 20, 20)\n")  # as in conftest.py
     monkeypatch.delenv("MPLBACKEND", raising=False)  # the kernel shows figures in the notebook
     assert os.environ["JAX_PLATFORMS"] == "cpu"
     notebook = nbformat.read(path, as_version=4)

@@ -12,7 +12,8 @@ from jaxrl_vis_envs.compilation import env_jit
 from jaxrl_vis_envs.render import camera, render_planes
 from jaxrl_vis_envs.render.cpu import passes, tiles
 from jaxrl_vis_envs.render.outputs import Outputs
-from jaxrl_vis_envs.render.pixel import arithmetic, shapes
+from jaxrl_vis_envs.render.pixel import arithmetic
+from jaxrl_vis_envs.render.pixel.prepare import prepare
 
 
 @pytest.fixture
@@ -80,9 +81,7 @@ def test_tiles_see_what_is_in_them():
     scene, poses = small_scene(height=64, width=64)
     layout = tiles.layout(scene)
     rays = camera.pixel_rays(scene, layout.rows, layout.columns)
-    position, rotation, finite = camera.camera_pose(scene, poses)
-    unit = shapes.unit_shapes(scene, poses, position, rotation, finite)
-    seen = np.asarray(tiles.seen_in_tiles(scene, unit, rays))
+    seen = np.asarray(tiles.seen_in_tiles(scene, prepare(scene, poses).unit, rays))
     labels = np.asarray(render_planes(scene, poses, rgb=False, segmentation=True).segmentation)
     for tile, (rows, columns) in enumerate(zip(layout.rows, layout.columns, strict=True)):
         shown = set(labels[rows, columns].tolist()) - {-1}

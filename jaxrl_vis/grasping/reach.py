@@ -121,7 +121,7 @@ def arms_among(stalks: int) -> Arms:
     layout = bending.layout_of(mj_model)
     rest = mjx_model.still_data(mj_model)
     model = mjx.put_model(mj_model)
-    geoms = np.asarray(mjx.collision(model, rest)._impl.contact.geom)
+    geoms = np.asarray(jax.jit(mjx.collision)(model, rest)._impl.contact.geom)
     places = {}
     for name in stalk_arm.JAWS + stalk_arm.LINKS:
         pairs = [{mj_model.geom(name).id, int(geom)} for geom in layout.upper_geom]

@@ -21,6 +21,7 @@ from jaxrl_vis_envs.render.cpu import passes
 from jaxrl_vis_envs.render.gpu import kernel
 from jaxrl_vis_envs.render.outputs import Frame, Outputs, Planes
 from jaxrl_vis_envs.render.pixel import blocks, lights, lookup, raycast, shade, shapes, surface, transparent
+from jaxrl_vis_envs.render.pixel.prepare import prepare
 from jaxrl_vis_envs.render.scene import Scene
 
 
@@ -71,14 +72,11 @@ def render_planes(
     scene = _in_32_bits(scene)
     if not scene.object_ids:
         return _quantized(outputs, _draw_nothing(scene, data, outputs))
-    position, rotation, finite = camera.camera_pose(scene, data)
-    unit = shapes.unit_shapes(scene, data, position, rotation, finite)
-    light_table = lights.pack(lights.camera_lights(scene, data, position, rotation) if rgb else [])
 
     def draw(scene: Scene, *prepared: Any) -> Planes:
         return _drawn(_Path(_fast(scene, outputs), target_platform()), outputs, scene, *prepared)
 
-    return by_platform(draw, scene, rotation, unit, light_table)
+    return by_platform(draw, scene, *prepare(scene, data, rgb))
 
 
 def _in_32_bits(scene: Scene) -> Scene:

@@ -208,7 +208,7 @@ class Scene:
         clear = np.where(seen_through[ids], reading.CLEAR_FROM_BEHIND, 0)
         clear = np.where(appearance["rgba"][ids, 3] < reading.OPAQUE, reading.CLEAR, clear)
         return cls(
-            **{name: jnp.asarray(value, jnp.float32) for name, value in leaves.items()},
+            **{name: jnp.asarray(np.asarray(value, np.float32)) for name, value in leaves.items()},
             texels=jnp.asarray(texels),
             **{name: jnp.asarray(value) for name, value in meshes.build_triangles(mj_model, ids).items()},
             object_ids=tuple(ids.tolist()),

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxrl_vis.phenotyping.detector.detect import Settings, detect, pad
+from jaxrl_vis.phenotyping.detector.doubles import found_once
 from jaxrl_vis.phenotyping.detector.networks import Segmenter
 from jaxrl_vis.phenotyping.detector.snips import cut, put_back, smoothed, snip_shape
 from jaxrl_vis.phenotyping.width import Strip, strip_width
@@ -103,7 +104,7 @@ class Finder:
         self._batch = _BATCH_ON_ACCELERATOR if accelerated else _BATCH
 
     def __call__(self, image: np.ndarray) -> list[Detection]:
-        """Stalks of an image [H, W, 3] uint8, from left to right."""
+        """Stalks of an image [H, W, 3] uint8, from left to right, each of them once."""
         settings = self._settings
         reduced, scale = reduce(image, settings.width)
         found = jax.device_get(detect(self._params["detector"], pad(reduced), settings, self.dtype))
@@ -111,6 +112,8 @@ class Finder:
         stalks, scores = in_image(found.stalks[kept], scale), found.scores[kept]
         on_device = jnp.asarray(image)
         pieces = self._pieces(on_device, stalks, self._settings.snip_lines)
+        once = np.flatnonzero(found_once(pieces, scores))
+        stalks, scores, pieces = stalks[once], scores[once], [pieces[place] for place in once]
         strips = [strip_width(mask) if mask.size else None for mask, _ in pieces]
         higher = [_follow(stalk, strip, corner) for stalk, strip, (_, corner) in zip(stalks, strips, pieces)]
         seen = [place for place, each in enumerate(higher) if each is not None]

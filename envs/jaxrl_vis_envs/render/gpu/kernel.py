@@ -21,6 +21,7 @@ from jaxrl_vis_envs.render import camera
 from jaxrl_vis_envs.render.camera import Rays
 from jaxrl_vis_envs.render.outputs import Outputs, Planes
 from jaxrl_vis_envs.render.pixel import lights, lookup, raycast, shade, shapes, surface
+from jaxrl_vis_envs.render.pixel.prepare import prepare
 from jaxrl_vis_envs.render.scene import Scene
 
 # Measured on an H200: pixels of a tile (a power of two, of which a few may be idle), and how a program is run.
@@ -370,12 +371,10 @@ def probe_program() -> Any:
     mj_data = mujoco.MjData(mj_model)
     mujoco.mj_forward(mj_model, mj_data)
     scene = Scene.from_mjmodel(mj_model, 0, 8, 8)
-    position, rotation, finite = camera.camera_pose(scene, mj_data)
-    unit = shapes.unit_shapes(scene, mj_data, position, rotation, finite)
-    table = lights.pack(lights.camera_lights(scene, mj_data, position, rotation))
+    prepared = jax.eval_shape(lambda scene: prepare(scene, mj_data), scene)  # nothing is compiled for it
     outputs = Outputs(rgb=True, depth=True, segmentation=True, quantized=True)
     assert supports(scene)
-    return jax.jit(functools.partial(draw, outputs)).trace(scene, rotation, unit, table)
+    return jax.jit(functools.partial(draw, outputs)).trace(scene, *prepared)
 
 
 def _whole(shape: tuple[int, ...]) -> pl.BlockSpec:

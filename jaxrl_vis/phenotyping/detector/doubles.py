@@ -1,0 +1,53 @@
+"""Stalks that were found twice, told by their masks.
+
+In a clump the boxes of two finds of one stalk can be as different as those of two stalks that cross, so the detector keeps
+both. Their masks are not: both are of the one stalk that is there. Masks of two stalks share little, as a mask is of what can
+be seen.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+MOST_SHARED = 0.6
+"""Of the smaller mask's pixels. On 64 pairs of synthetic plots, 16 of 22 finds of a stalk that a better find shows share more with
+that one's, and 2 of 144 pairs of touching finds of two stalks do."""
+
+Piece = tuple[np.ndarray, tuple[int, int]]
+"""A mask [h, w] in a part of the image, and line and column of its first pixel there."""
+
+
+def found_once(pieces: Sequence[Piece], scores: np.ndarray, most_shared: float = MOST_SHARED) -> np.ndarray:
+    """Which finds to keep: the best goes first, and takes away those whose masks it shares.
+
+    Args:
+        pieces: N masks, float32 from 0 to 1 or bool, and where they are.
+        scores: [N] of the finds; of equal ones, the first goes first.
+        most_shared: Share of the smaller of two masks above which they show the same stalk.
+
+    Returns:
+        [N] bool.
+    """
+    inside = [np.asarray(mask) >= 0.5 for mask, _ in pieces]
+    sizes = [int(np.count_nonzero(each)) for each in inside]
+    kept: list[int] = []
+    for place in np.argsort(-np.asarray(scores), kind="stable").tolist():
+        corner = pieces[place][1]
+        shared = (_shared(inside[place], corner, inside[other], pieces[other][1]) for other in kept)
+        least = (min(sizes[place], sizes[other]) for other in kept)
+        if not any(common > most_shared * size for common, size in zip(shared, least)):
+            kept.append(place)
+    return np.isin(np.arange(len(pieces)), kept)
+
+
+def _shared(first: np.ndarray, corner: tuple[int, int], second: np.ndarray, other: tuple[int, int]) -> int:
+    """Pixels that are in both of two masks."""
+    low = np.maximum(corner, other)
+    high = np.minimum(np.add(corner, first.shape), np.add(other, second.shape))
+    if (high <= low).any():
+        return 0
+    parts = [
+        mask[low[0] - top : high[0] - top, low[1] - left : high[1] - left]
+        for mask, (top, left) in ((first, corner), (second, other))
+    ]
+    return int(np.count_nonzero(parts[0] & parts[1]))
