@@ -319,6 +319,11 @@ def test_the_height_with_most_room_is_taken_and_what_is_blocked_is_refused():
     # A neighbour that leans over the target at its height, and away from it below.
     leaning, other = choose([line(0.0, 0.0), line(0.02, -0.03, -0.3)], stops)
     assert leaning.point[2] < HEIGHT and leaning.room > LEAST_ROOM
+    # Its neighbour is as thick as it is at the height of the grasp, and where it bends to.
+    bent = dataclasses.replace(line(0.1, 0.0), bend=(-0.5, 0.0), taper=-0.02)
+    rooms = [choose([line(0.0, 0.0), each], stops, (0.45, 0.45))[0].room for each in (line(0.1, 0.0), bent)]
+    up = 0.45 - HEIGHT
+    assert rooms[0] - rooms[1] == pytest.approx(0.5 * up**2 - 0.5 * 0.02 * up, abs=0.003)
     # Two that stand as near at every height.
     assert all(each.is_blocked for each in choose([line(0.0, 0.0), line(0.015, 0.0)], stops))
     # What is out of reach is not blocked.

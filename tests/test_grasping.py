@@ -175,22 +175,31 @@ def test_stitch_errors_are_those_of_the_row():
 # --- grasp points ---
 
 
-def seen(stalks: list[tuple[float, float, float]], driven: float, hidden: tuple[float, float] = (9.0, 9.0)) -> Cloud:
-    """What one pair sees of stalks: x and y of their feet, and lean along the row in m per m; 14 mm thick, m.
+def seen(
+    stalks: list[tuple[float, float, float]],
+    driven: float,
+    hidden: tuple[float, float] = (9.0, 9.0),
+    bend: float = 0.0,
+    taper: float = 0.0,
+) -> Cloud:
+    """What one pair sees of stalks: x and y of their feet, and lean along the row in m per m; 14 mm thick at 0.75 m, m.
 
     Args:
         stalks: In the robot frame of the last pair.
         driven: How far the robot still has to drive until then.
         hidden: Heights between which nothing is seen.
+        bend: Of all stalks, along the row, per m.
+        taper: By how much they are thicker for each m upwards, m.
     """
     pose = MOUNT.pose
     depth = np.full((320, 320), np.nan, np.float32)
     for x, y, lean in sorted(stalks, key=lambda stalk: -stalk[1]):
         heights = np.linspace(0.2, 1.3, 3000)
         heights = heights[(heights < hidden[0]) | (heights > hidden[1])]
-        middle = np.stack([x + lean * heights + driven, np.full_like(heights, y), heights], axis=1)
-        for across in np.linspace(-0.007, 0.007, 41):
-            front = middle + [across, -math.sqrt(0.007**2 - across**2), 0.0]
+        middle = np.stack([x + lean * heights + bend * heights**2 + driven, np.full_like(heights, y), heights], axis=1)
+        radius = 0.007 + 0.5 * taper * (heights - 0.75)
+        for angle in np.linspace(-0.5 * np.pi, 0.5 * np.pi, 61):
+            front = middle + radius[:, None] * [math.sin(angle), -math.cos(angle), 0.0]
             camera = pose.to_camera(front)
             column, line = np.round(camera[:, :2] / camera[:, 2:] * CAMERA.focal + CAMERA.centre).astype(int).T
             inside = (column >= 0) & (column < 320) & (line >= 0) & (line < 320)
@@ -219,6 +228,25 @@ def test_a_line_per_stalk_in_spite_of_what_hides_it():
         assert point.direction[0] / point.direction[2] == pytest.approx(lean, abs=0.02)
         assert point.thickness == pytest.approx(0.014, abs=0.004)
         assert point.at_height(0.5)[0] == pytest.approx(x + 0.5 * lean, abs=0.008)
+
+
+def test_lines_bend_and_taper_as_the_stalks_do():
+    """A straight line would be 19 mm beside them at 0.45 m, and 11 mm at 1.05 m."""
+    bend, taper = -0.12, -0.012
+    clouds = [
+        seen(STALKS, far, hidden=hidden, bend=bend, taper=taper) for far, hidden in ((0.1, (0.5, 0.7)), (0.05, (9.0, 9.0)))
+    ]
+    points = found_in(clouds, [Motion.along(-0.1), Motion.along(-0.05)])
+    assert len(points) == len(STALKS)
+    for point, (x, y, lean) in zip(points, STALKS):
+        for height in (0.35, 0.45, 0.75, 1.05):
+            there = point.at_height(height)
+            np.testing.assert_allclose(there, [x + lean * height + bend * height**2, y, height], atol=0.004)
+        assert point.direction[0] / point.direction[2] == pytest.approx(lean + 2 * bend * point.point[2], abs=0.02)
+        np.testing.assert_allclose(point.at_height(np.array([0.45, 1.05]))[1], point.at_height(1.05))
+        assert point.taper == pytest.approx(taper, abs=0.006)
+        assert point.thickness_at(0.45) - point.thickness_at(1.05) == pytest.approx(-0.6 * point.taper)
+        assert point.thickness_at(9.0) == 0.5 * point.thickness
 
 
 def test_what_other_pairs_see_through_is_no_stalk():

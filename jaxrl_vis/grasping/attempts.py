@@ -147,9 +147,7 @@ def _found_again(choice: Choice, point: GraspPoint, perception: Perception, chor
         return np.full(2, np.nan)
     motion: Motion = perception.to_last[choice.stop]
     seen = motion(chords[choice.stop].middle)
-    heights = seen[:, 2] - point.point[2]
-    line = point.point + heights[:, None] * (point.direction / point.direction[2])
-    beside = (seen - line)[:, :2]
+    beside = (seen - point.at_height(seen[:, 2]))[:, :2]
     near = (np.abs(seen[:, 2] - choice.point[2]) < _AROUND) & (np.linalg.norm(beside, axis=1) < _BESIDE)
     return np.median(beside[near], axis=0) if near.sum() >= _LEAST else np.full(2, np.nan)
 

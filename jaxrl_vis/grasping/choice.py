@@ -51,16 +51,15 @@ def choose(points: Sequence[GraspPoint], stops: np.ndarray, heights: tuple[float
         stops: [S, 3], `Stands.origin` of each place where the robot may stop, in the same frame, m.
         heights: Lowest and highest grasp, m above the ground.
     """
-    radii = radii_of(points)
     chosen = []
-    for place, each in enumerate(points):
-        others = [other for other in range(len(points)) if other != place]
+    for each in points:
+        others = [other for other in points if other is not each]
         best, worth = Choice(-1, 1, -np.inf, each.point), -np.inf
         for step in _STEPS:
             height = float(np.clip(each.point[2] + step, *heights))
             target = each.at_height(height)
-            beside = np.array([points[other].at_height(height) for other in others]).reshape(-1, 3)
-            way = arm.best_way(stops, target, beside[:, :2], radii[others], _ENOUGH)
+            beside = np.array([other.at_height(height) for other in others]).reshape(-1, 3)
+            way = arm.best_way(stops, target, beside[:, :2], radii_of(others, height), _ENOUGH)
             if way.stop < 0:
                 continue
             value = min(way.room, _ENOUGH) - _UNSURE * abs(height - each.point[2])
@@ -76,19 +75,20 @@ def choose_nearest(points: Sequence[GraspPoint], stops: np.ndarray, heights: tup
     Args:
         points, stops, heights: See `choose`.
     """
-    radii = radii_of(points)
     chosen = []
-    for place, each in enumerate(points):
-        target = each.at_height(float(np.clip(each.point[2], *heights)))
-        others = [other for other in range(len(points)) if other != place]
-        beside = np.array([points[other].at_height(float(target[2])) for other in others]).reshape(-1, 3)
+    for each in points:
+        height = float(np.clip(each.point[2], *heights))
+        target = each.at_height(height)
+        others = [other for other in points if other is not each]
+        beside = np.array([other.at_height(height) for other in others]).reshape(-1, 3)
         stop = int(np.argmin(np.abs(stops[:, 0] - target[0])))
-        way = arm.best_way(stops[stop : stop + 1], target, beside[:, :2], radii[others], _ENOUGH)
+        way = arm.best_way(stops[stop : stop + 1], target, beside[:, :2], radii_of(others, height), _ENOUGH)
         chosen.append(Choice(stop if way.stop >= 0 else -1, way.side, way.room, target))
     return chosen
 
 
-def radii_of(points: Sequence[GraspPoint]) -> np.ndarray:
-    """Radii [B] of stalks, m: a usual one where a thickness is not known."""
-    radii = np.array([0.5 * each.thickness for each in points])
+def radii_of(points: Sequence[GraspPoint], height: float | None = None) -> np.ndarray:
+    """Radii [B] of stalks at a height, or at their grasp points, m: a usual one where a thickness is not known."""
+    thickness = [each.thickness if height is None else each.thickness_at(height) for each in points]
+    radii = 0.5 * np.array(thickness, float)
     return np.where(np.isfinite(radii), radii, _USUAL)

@@ -2,7 +2,7 @@
 
 Pieces of stalks give lines; chords of all pairs that lie along a line belong to it, above and below what hides the rest; a
 stalk is a line that enough chords of enough pairs support. Its grasp point lies where most of it is seen, at a height at which
-the gripper works.
+the gripper works. Lines bend: half a metre below the grasp point a straight one is 12 mm beside the stalk, a bent one 2 mm.
 """
 
 import dataclasses
@@ -25,9 +25,11 @@ class GraspPoint:
     Attributes:
         point: [3] float64, middle of the stalk where it is to be grasped, in the robot frame of the last pair, m.
         direction: [3] float64, unit vector along the stalk there, upwards.
-        thickness: Diameter, m; not a number where it was not measured.
+        thickness: Diameter there, m; not a number where it was not measured.
         frames: How many pairs show it.
         spread: Standard deviation of what was seen around the line, horizontally, m; not a number where unknown.
+        bend: How much it turns, x and y, per m.
+        taper: By how much its diameter grows for each m upwards, m.
     """
 
     point: np.ndarray
@@ -35,13 +37,22 @@ class GraspPoint:
     thickness: float
     frames: int
     spread: float
+    bend: tuple[float, float] = (0.0, 0.0)
+    taper: float = 0.0
 
-    def at_height(self, height: float) -> np.ndarray:
-        """Where the stalk's line is at a height in m: [3], m."""
-        return self.point + self.direction * ((height - self.point[2]) / self.direction[2])
+    def at_height(self, height: float | np.ndarray) -> np.ndarray:
+        """Where the stalk's line is at heights [...] in m: [..., 3], m."""
+        up = np.asarray(height - self.point[2])[..., None]
+        return self.point + self.direction * (up / self.direction[2]) + np.array([*self.bend, 0.0]) * up**2
+
+    def thickness_at(self, height: float) -> float:
+        """Diameter at a height in m, m; no less than half of what it is at the grasp point."""
+        return max(self.thickness + self.taper * (height - self.point[2]), 0.5 * self.thickness)
 
 
 _NEAR = 0.009  # m: chords so near a line belong to it
+_LONG = 0.3  # m: of a stalk that shows how it bends
+_USUAL_TAPER = -0.01  # m per m
 _OPENING = 0.03  # by how much more for each m beyond what is known of the line
 _LEAST_PIECE = 0.03  # m
 _STEEPEST = 0.6  # m per m
@@ -129,7 +140,7 @@ def _grow(chords: Chords, members: np.ndarray, free: np.ndarray) -> np.ndarray:
     for _ in range(6):
         known = chords.middle[members]
         low, high = known[:, 2].min(), known[:, 2].max()
-        coefficients, middle = _robust(known, bent=high - low > 0.3)
+        coefficients, middle = _robust(known, bent=high - low > _LONG)
         if np.abs(coefficients[1]).max() > _STEEPEST:
             return members[:0]
         beyond = np.maximum(np.maximum(low - points[:, 2], points[:, 2] - high), 0.0)
@@ -165,18 +176,37 @@ def _grasp(chords: Chords, members: np.ndarray, least_frames: int, heights: tupl
         return None
     near = np.flatnonzero(within[best])
     local, middle = _robust(points[near], bent=False)
-    height = places[best] - middle
-    x, y = local[0] + local[1] * height
-    direction = np.array([*local[1], 1.0])
+    x, y = local[0] + local[1] * (places[best] - middle)
     spread = float(np.sqrt(np.mean(np.minimum(_offsets(points[near], local, middle), _NEAR) ** 2)))
     thickness = float(np.median(chords.thickness[members[near]]))
-    return GraspPoint(np.array([x, y, places[best]]), direction / np.linalg.norm(direction), thickness, frames, spread)
+    # Where it goes from there, all of it says.
+    whole, middle = _robust(points, bent=np.ptp(points[:, 2]) > _LONG)
+    bend = whole[2] if len(whole) > 2 else np.zeros(2)
+    direction = np.array([*(whole[1] + 2.0 * bend * (places[best] - middle)), 1.0])
+    return GraspPoint(
+        np.array([x, y, places[best]]),
+        direction / np.linalg.norm(direction),
+        thickness,
+        frames,
+        spread,
+        (float(bend[0]), float(bend[1])),
+        _taper(points[:, 2], chords.thickness[members]),
+    )
+
+
+def _taper(heights: np.ndarray, thickness: np.ndarray) -> float:
+    """By how much a diameter grows for each m upwards, m: from the lower half of what is seen to the upper one."""
+    if np.ptp(heights) < _LONG:
+        return _USUAL_TAPER
+    upper = heights > 0.5 * (heights.min() + heights.max())
+    parts = [(np.median(heights[half]), np.median(thickness[half])) for half in (upper, ~upper)]
+    return float((parts[0][1] - parts[1][1]) / (parts[0][0] - parts[1][0]))
 
 
 def _agreed(point: GraspPoint, sight: Sight) -> int:
     """How often pairs show the stalk along its line; 0 where fewer than two do, or too many see through it."""
     places = point.point[2] + np.arange(-_AROUND, _AROUND, 0.5 * _BIN)
-    shown, through = sight.look(np.array([point.at_height(height) for height in places]))
+    shown, through = sight.look(point.at_height(places))
     count = int(shown.sum())
     frames = int((shown.sum(axis=1) >= _LEAST_SHOWN).sum())
     agreed = frames >= min(2, len(sight.clouds)) and count >= _LEAST_SHARE * (count + through.sum())
