@@ -34,7 +34,7 @@ from jaxrl_vis_envs.plants.stand import MAST_DISTANCE, STALKS, Stands, concatena
 Loop = Literal["open", "again", "policy"]
 
 _MOST = 1024  # arms in a program
-_AROUND = 0.1  # m: above and below the grasp a pair is asked for the stalk again
+_AROUND = 0.1  # m: above and below the grasp a pair is asked for the stalk again; so far a line is as good as straight
 _BESIDE = 0.015  # m: what it shows further away from the line is another stalk
 _LEAST = 5  # chords
 _AHEAD = 1.5  # looks: a stalk is expected to go on as it did for so long after it was seen
@@ -128,9 +128,10 @@ def _from_stop(choice: Choice, scene: Scene, perception: Perception, points: np.
 
 def _seen(choice: Choice, x: float, target: np.ndarray, scene: Scene, perception: Perception) -> Stands:
     """The stalks that were found around an arm with its mast ``x`` m along the row, for a target [3] in the plot's frame."""
-    ends = np.array([[each.point, each.point + each.direction] for each in perception.points])
+    height = float(choice.point[2])
+    ends = np.array([each.at_height(np.array([height, height + _AROUND])) for each in perception.points])
     ends = _from_stop(choice, scene, perception, ends)
-    return stand_of_lines(ends[:, 0], ends[:, 1] - ends[:, 0], radii_of(perception.points), x, target, POLICY_STALKS)
+    return stand_of_lines(ends[:, 0], ends[:, 1] - ends[:, 0], radii_of(perception.points, height), x, target, POLICY_STALKS)
 
 
 def _off(target: np.ndarray, places: np.ndarray, stalk: int) -> np.ndarray:

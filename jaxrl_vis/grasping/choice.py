@@ -18,7 +18,7 @@ LEAST_ROOM = 0.0045
 _ENOUGH = 0.02  # m: more room is no better
 _STEPS = tuple(sign * step for step in np.arange(0.0, 0.31, 0.05) for sign in (-1.0, 1.0))
 # m, from the height of the grasp point: further away the line is not believed
-_UNSURE = 0.015  # m per m: how much less is known of a stalk away from the height of its grasp point
+_UNSURE = 0.005  # m per m: how much less is known of a stalk away from the height of its grasp point
 _USUAL = 0.007  # m: radius of a stalk whose thickness is not known
 
 
@@ -53,18 +53,15 @@ def choose(points: Sequence[GraspPoint], stops: np.ndarray, heights: tuple[float
     """
     chosen = []
     for each in points:
-        others = [other for other in points if other is not each]
         best, worth = Choice(-1, 1, -np.inf, each.point), -np.inf
         for step in _STEPS:
             height = float(np.clip(each.point[2] + step, *heights))
-            target = each.at_height(height)
-            beside = np.array([other.at_height(height) for other in others]).reshape(-1, 3)
-            way = arm.best_way(stops, target, beside[:, :2], radii_of(others, height), _ENOUGH)
+            way = _way(each, points, stops, height)
             if way.stop < 0:
                 continue
             value = min(way.room, _ENOUGH) - _UNSURE * abs(height - each.point[2])
             if value > worth:
-                best, worth = Choice(way.stop, way.side, way.room, target), value
+                best, worth = Choice(way.stop, way.side, way.room, each.at_height(height)), value
         chosen.append(best)
     return chosen
 
@@ -79,12 +76,17 @@ def choose_nearest(points: Sequence[GraspPoint], stops: np.ndarray, heights: tup
     for each in points:
         height = float(np.clip(each.point[2], *heights))
         target = each.at_height(height)
-        others = [other for other in points if other is not each]
-        beside = np.array([other.at_height(height) for other in others]).reshape(-1, 3)
         stop = int(np.argmin(np.abs(stops[:, 0] - target[0])))
-        way = arm.best_way(stops[stop : stop + 1], target, beside[:, :2], radii_of(others, height), _ENOUGH)
+        way = _way(each, points, stops[stop : stop + 1], height)
         chosen.append(Choice(stop if way.stop >= 0 else -1, way.side, way.room, target))
     return chosen
+
+
+def _way(point: GraspPoint, points: Sequence[GraspPoint], stops: np.ndarray, height: float) -> arm.Way:
+    """The best way to one of the points at a height, among all others as they are there."""
+    others = [other for other in points if other is not point]
+    beside = np.array([other.at_height(height) for other in others]).reshape(-1, 3)
+    return arm.best_way(stops, point.at_height(height), beside[:, :2], radii_of(others, height), _ENOUGH)
 
 
 def radii_of(points: Sequence[GraspPoint], height: float | None = None) -> np.ndarray:
