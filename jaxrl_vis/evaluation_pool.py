@@ -16,6 +16,7 @@ import math
 import multiprocessing
 import os
 import signal
+import threading
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -83,7 +84,7 @@ class Each(Protocol):
 
 @contextlib.contextmanager
 def processes(workers: int) -> Iterator[Each]:
-    """Processes that share the GPUs and cores; after an error they are ended at once.
+    """Processes that share the GPUs and cores; after an error they are ended at once, and with this process however it ends.
 
     Args:
         workers: How many; 1 or less for this one.
@@ -147,10 +148,19 @@ def _environments(workers: int) -> list[dict[str, str]]:
     return [{**threads, **share, **devices[index % len(devices)].environment} for index in range(workers)]
 
 
+def _end_with_parent() -> None:
+    """Waits until the process that started this one is gone, killed for instance: nobody wants what is computed here then."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
 def _prepare(counter: Any, environments: list[dict[str, str]]) -> None:
     """Makes a new process one of several."""
     # The one that started it ends it: both would otherwise be interrupted at once.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     with counter.get_lock():
         index = counter.value
         counter.value += 1

@@ -5,6 +5,10 @@ import itertools
 import json
 import multiprocessing
 import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
@@ -68,6 +72,46 @@ def test_what_goes_wrong_with_endless_numbers_is_told():
         list(results_of(broken, itertools.count(), 2))
     with pytest.raises(RequestError, match="was ended from outside"):
         list(results_of(killed, itertools.count(), 2))
+
+
+def test_processes_end_with_the_one_that_started_them_however_that_ends(tmp_path: Path, clean_environment: dict[str, str]):
+    script = tmp_path / "evaluation.py"
+    script.write_text(
+        "import os, time\n"
+        "from pathlib import Path\n"
+        "from jaxrl_vis.evaluation_pool import results_of\n"
+        "def work(number):\n"
+        "    Path(__file__).with_name(f'{number}.part').write_text(str(os.getpid()))\n"
+        "    Path(__file__).with_name(f'{number}.part').rename(Path(__file__).with_name(f'{number}.pid'))\n"
+        "    time.sleep(120)\n"
+        "if __name__ == '__main__':\n"
+        "    list(results_of(work, range(2), 2))\n"
+    )
+    started = subprocess.Popen([sys.executable, script], env=clean_environment)
+    try:
+        wait_until(lambda: len(list(tmp_path.glob("*.pid"))) == 2, 60.0)
+    finally:
+        started.kill()
+        started.wait()
+    workers = [int(path.read_text()) for path in tmp_path.glob("*.pid")]
+    wait_until(lambda: not any(runs(worker) for worker in workers), 10.0)
+
+
+def wait_until(holds: Callable[[], bool], seconds: float) -> None:
+    deadline = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < deadline, "it did not come to that in time"
+        time.sleep(0.05)
+
+
+def runs(process: int) -> bool:
+    """Whether a process does anything; one that has ended may still be listed."""
+    try:
+        os.kill(process, 0)
+        status = Path(f"/proc/{process}/stat")
+        return not (status.exists() and status.read_text().rpartition(")")[2].split()[0] == "Z")
+    except (ProcessLookupError, FileNotFoundError):
+        return False
 
 
 def test_a_file_goes_on_where_it_was_and_holds_one_evaluation(tmp_path: Path):
