@@ -1,5 +1,6 @@
 """Which implementation a program contains follows its platform and what people ask for; no GPU is needed."""
 
+import gc
 from types import SimpleNamespace
 
 import jax
@@ -9,6 +10,7 @@ import pytest
 from small_scene import small_scene
 
 from jaxrl_vis.learner import encoder_kernel
+from jaxrl_vis.run.programs import rarely_collecting_garbage
 from jaxrl_vis_envs import compilation
 from jaxrl_vis_envs.compilation import (
     by_platform,
@@ -203,3 +205,17 @@ def test_the_probe_of_the_kernel_is_an_instance_of_it(monkeypatch):
     from jaxrl_vis_envs.render.gpu import kernel
 
     assert KERNEL_CALL in kernel.probe_program().lower(lowering_platforms=("cuda",)).as_text()
+
+
+@pytest.mark.parametrize("chosen", [(700, 10, 10), (0, 10, 10), (500_000, 5, 5)])
+def test_garbage_is_looked_for_as_before_once_programs_are_traced(chosen):
+    """Whatever the process chose, also never; and never more often while they are."""
+    before = gc.get_threshold()
+    try:
+        gc.set_threshold(*chosen)
+        with pytest.raises(ZeroDivisionError), rarely_collecting_garbage():
+            assert gc.get_threshold()[0] == (max(chosen[0], 100_000) if chosen[0] else 0)
+            raise ZeroDivisionError
+        assert gc.get_threshold() == chosen
+    finally:
+        gc.set_threshold(*before)
