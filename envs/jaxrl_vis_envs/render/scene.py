@@ -13,7 +13,6 @@ import numbers
 from typing import Any, Self
 
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 
@@ -207,10 +206,11 @@ class Scene:
         seen_through = reading.planes_seen_through(mj_model, camera_id, camera, plane_backs)
         clear = np.where(seen_through[ids], reading.CLEAR_FROM_BEHIND, 0)
         clear = np.where(appearance["rgba"][ids, 3] < reading.OPAQUE, reading.CLEAR, clear)
+        arrays = {name: np.asarray(value, np.float32) for name, value in leaves.items()}
+        arrays |= {"texels": texels, **meshes.build_triangles(mj_model, ids)}
         return cls(
-            **{name: jnp.asarray(np.asarray(value, np.float32)) for name, value in leaves.items()},
-            texels=jnp.asarray(texels),
-            **{name: jnp.asarray(value) for name, value in meshes.build_triangles(mj_model, ids).items()},
+            # All at once: `jnp.asarray` compiles a program for each shape.
+            **jax.device_put(arrays),
             object_ids=tuple(ids.tolist()),
             object_types=tuple(types[ids].tolist()),
             transparent=tuple(clear.tolist()),

@@ -121,15 +121,19 @@ def _clustered(corners: np.ndarray, normals: np.ndarray, coordinates: np.ndarray
     table = np.concatenate(parts, axis=1)
     groups = _grouped(corners.mean(1), np.arange(count))
     # No ray meets a triangle whose height is 1 everywhere.
-    rows = np.zeros((len(groups) * CLUSTER, COLUMNS))
-    rows[:, 11] = 1.0
-    balls = np.zeros((len(groups), 4))
-    for number, group in enumerate(groups):
-        rows[number * CLUSTER : number * CLUSTER + len(group)] = table[group]
-        points = corners[group].reshape(-1, 3)
-        middle = 0.5 * (points.min(0) + points.max(0))
-        balls[number] = *middle, np.linalg.norm(points - middle, axis=1).max()
-    return rows, balls
+    rows = np.zeros((len(groups), CLUSTER, COLUMNS))
+    rows[:, :, 11] = 1.0
+    if not groups:
+        return rows.reshape(-1, COLUMNS), np.zeros((0, 4))
+    full = np.arange(CLUSTER) < np.array([len(group) for group in groups])[:, None]
+    # Groups that are not full have their first triangle again where others have further ones.
+    members = np.repeat(np.array([group[:1] for group in groups]), CLUSTER, axis=1)
+    members[full] = np.concatenate(groups)
+    rows[full] = table[members[full]]
+    points = corners[members].reshape(-1, CLUSTER * 3, 3)
+    middles = 0.5 * (points.min(1) + points.max(1))
+    radii = np.linalg.norm(points - middles[:, None], axis=2).max(1)
+    return rows.reshape(-1, COLUMNS), np.concatenate([middles, radii[:, None]], axis=1)
 
 
 def _grouped(middles: np.ndarray, members: np.ndarray) -> list[np.ndarray]:
