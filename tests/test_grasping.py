@@ -43,7 +43,7 @@ CAMERA = Calibration(320, 320, 190.0, (159.5, 159.5), 0.07)
 MOUNT = Mount()
 WIDTH = ["--width", "256", "--frames", "3"]
 FEW = {
-    "layout": {"rows_behind": 0, "stalks_mean": 9, "stalks_sd": 0, "tillers": 0, "spacing_minimum": 0.08, "plot_length": 1.0},
+    "layout": {"rows_behind": 0, "stalks_mean": 7, "stalks_sd": 0, "tillers": 0, "spacing_minimum": 0.08, "plot_length": 1.0},
     "leaves": {"density": 0.4, "litter": 10},
     "stalks": {"diameter_mean": 0.024, "diameter_sd": 0.002, "lean_sd": [1, 1]},
     "imaging": {"samples": 1},
@@ -419,7 +419,7 @@ def grasp(folder: Path, out: Path, *words: str) -> int:
 def test_synth_writes_exact_truth(runs):
     truth = json.loads((runs / "plot_0000" / "plot.json").read_text())
     plot = draw(read(runs.parent / "few.json", GRASPING_FAMILIES), 0)
-    assert truth["count"] == len(plot.measured) == 9
+    assert truth["count"] == len(plot.measured) == 7
     for stalk, told in zip(plot.measured, truth["stalks"]):
         x, y, z, diameter = np.array(told["middle_line_x_y_z_diameter_mm"]).T
         middle, _ = stalk.at_height(0.75)
