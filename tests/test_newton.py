@@ -28,6 +28,7 @@ def test_the_line_search_finds_the_least_cost():
     """Over parabolas of 1 to 12 constraints, some of them equalities, some that the line does not touch."""
     rng = np.random.default_rng(1)
     lengths = np.linspace(0, 40, 400_001)
+    search = jax.jit(newton._line_search)
     for rows in (1, 3, 12) * 8:
         residual, along = rng.normal(size=(2, rows))
         along[rng.random(rows) < 0.2] = 0.0
@@ -35,7 +36,7 @@ def test_the_line_search_finds_the_least_cost():
         second = rng.uniform(0.1, 1)
         slope = np.where(is_equality | (residual < 0), stiffness, 0) @ (residual * along)
         first = -abs(rng.normal()) - max(slope, 0.0)  # downhill at the start, as Newton's direction is
-        found = newton._line_search(*map(jnp.float32, (residual, along, stiffness)), is_equality, first, second)
+        found = search(*map(np.float32, (residual, along, stiffness)), is_equality, first, second)
         there = residual[:, None] + along[:, None] * lengths
         acting = np.where(is_equality[:, None] | (there < 0), stiffness[:, None], 0)
         costs = first * lengths + 0.5 * second * lengths**2 + 0.5 * (acting * there**2).sum(axis=0)

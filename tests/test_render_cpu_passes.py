@@ -110,10 +110,14 @@ def test_packed_normals_come_back():
     np.testing.assert_allclose(found, directions / jnp.linalg.norm(directions, axis=0), atol=1e-4)
 
 
+_powers = jax.jit(arithmetic.power)
+_slopes = jax.jit(jax.vmap(jax.grad(arithmetic.power), in_axes=(0, None)))
+
+
 @pytest.mark.parametrize("exponent", [0.0, 0.5, 1.0, 10.0, 64.0, 128.0])
 def test_powers_are_right_to_a_fifth_of_a_grey_level(exponent):
     base = np.concatenate([np.linspace(0.0, 1.0, 20_001), 1.0 - np.geomspace(1e-7, 1e-2, 1000)]).astype(np.float32)
-    found = jax.jit(arithmetic.power)(base, jnp.float32(exponent))
+    found = _powers(base, jnp.float32(exponent))
     np.testing.assert_allclose(found, np.maximum(base, np.float64(1e-6)) ** exponent, atol=1.0 / 5 / 255)
-    slope = jax.vmap(jax.grad(arithmetic.power), in_axes=(0, None))(base[1:], jnp.float32(exponent))
+    slope = _slopes(base[1:], jnp.float32(exponent))
     np.testing.assert_allclose(slope, exponent * np.float64(base[1:]) ** (exponent - 1.0), rtol=1e-3, atol=1e-6)

@@ -34,11 +34,16 @@ def drawn(body: str, camera: str = "above", size: int = 17, header: str = FLAT_L
     return shown(scene, mj_data)
 
 
+@env_jit
+def draw(scene: Scene, poses: dict):
+    """Compiled once for all scenes that are alike in all but numbers."""
+    return render(scene, SimpleNamespace(**poses), normals=True, distance=True)
+
+
 def shown(scene: Scene, mj_data):
-    """A frame of NumPy arrays, with normals and distance, compiled (what the cache of compiled programs keeps)."""
+    """A frame of NumPy arrays, with normals and distance."""
     poses = {name: np.array(getattr(mj_data, name), np.float32) for name in POSES}
-    drawing = env_jit(lambda scene, poses: render(scene, SimpleNamespace(**poses), normals=True, distance=True))
-    return jax.tree.map(np.asarray, drawing(scene, poses))
+    return jax.tree.map(np.asarray, draw(scene, poses))
 
 
 def test_normals_and_distance_of_a_ball():
@@ -60,7 +65,7 @@ def test_only_what_is_asked_for_comes_back():
     poses = {name: np.array(getattr(mj_data, name), np.float32) for name in POSES}
 
     def planes(**wanted):
-        return env_jit(lambda poses: render_planes(scene, SimpleNamespace(**poses), **wanted))(poses)
+        return env_jit(lambda scene, poses: render_planes(scene, SimpleNamespace(**poses), **wanted))(scene, poses)
 
     whole = planes(**everything)
     shapes = dict(rgb=(3, 8, 12), depth=(8, 12), segmentation=(8, 12), normals=(3, 8, 12), distance=(8, 12))
@@ -176,11 +181,12 @@ def test_what_has_no_thickness_is_a_sheet_and_what_has_no_area_is_not_there():
     scene = Scene.from_mjmodel(mj_model, "above", 41, 41)
     poses = {name: np.array(getattr(mj_data, name), np.float32) for name in POSES}
 
-    def depth_and_labels(**more):
+    def depth_and_labels(scene, poses, **more):
         planes = render_planes(scene, SimpleNamespace(**poses), rgb=False, segmentation=True, **more)
         return planes.depth, planes.segmentation
 
-    (depth, labels), (plain_depth, plain_labels) = env_jit(lambda: (depth_and_labels(), depth_and_labels(distance=True)))()
+    both = env_jit(lambda *given: (depth_and_labels(*given), depth_and_labels(*given, distance=True)))
+    (depth, labels), (plain_depth, plain_labels) = both(scene, poses)
     np.testing.assert_array_equal(labels, plain_labels)
     np.testing.assert_allclose(depth, plain_depth, rtol=1e-5)
     assert set(np.unique(labels)) == {-1, 0, 1}
