@@ -374,7 +374,7 @@ def test_env_jit_switches_off_fusion_emitters_on_a_cpu_where_jax_can(monkeypatch
     expected = {"xla_cpu_use_fusion_emitters": False} if takes_it else {}
     assert options["compiler_options"] == expected
     assert compilation.compiler_options("gpu") == compilation.compiler_options("gpu", runs_once=True) == {}
-    assert compilation.compiler_options("cpu", runs_once=True) == {**expected, "xla_backend_optimization_level": 1}
+    assert compilation.compiler_options("cpu", runs_once=True) == {**expected, "xla_backend_optimization_level": 0}
 
 
 def test_compiling_fetch_reach_after_jax_has_started():

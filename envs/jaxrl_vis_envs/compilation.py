@@ -36,12 +36,12 @@ _kernels = jax.make_user_context(default_value=None)
 def compiler_options(backend: str | None = None, *, runs_once: bool = False) -> dict[str, Any]:
     """Compiler options for programs that contain physics or rendering, for ``backend`` (default: the one JAX runs on).
 
-    ``runs_once`` is for a program that takes longer to compile than to run: a CPU's machine code is then hardly optimised
-    (drawing the first parameters of all networks: 2 s to compile in place of 19).
+    ``runs_once`` is for a program that takes longer to compile than to run: a CPU's machine code is then not optimised
+    (drawing the first parameters of all networks: 1.2 s to compile in place of 2.3, and the same bits).
     """
     if (backend or jax.default_backend()) != "cpu":
         return {}
-    options: dict[str, Any] = {"xla_backend_optimization_level": 1} if runs_once else {}
+    options: dict[str, Any] = {"xla_backend_optimization_level": 0} if runs_once else {}
     if jax.__version_info__ < (0, 11):
         options["xla_cpu_use_fusion_emitters"] = False
     return options
