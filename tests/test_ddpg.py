@@ -1,16 +1,22 @@
 """The learner in environments with known answers, and the mechanisms of the thesis on batches with known shares."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import probe_environments as probes
 import pytest
+from learners import begin, experienced, iteration_of_one
 
 from jaxrl_vis.config import preset
 from jaxrl_vis.learner import rollout
 from jaxrl_vis.learner.train_step import make_train_step
 
 DISCOUNT = 0.75  # 1 - 1/horizon of the probes
+# Probes that are learned with the same settings.
+ALIKE = (probes.ThreeStepsAway(), probes.TwoPlaces(), probes.TwoGoals())
+KEYS = jax.random.key(0)[None]
 
 
 def trained(env, iterations=12, **overrides):
@@ -27,19 +33,25 @@ def trained(env, iterations=12, **overrides):
         "relabel_probability": 0.0,
     }
     program = make_train_step(env, preset("debug", **{**settings, **overrides}))
-    loop = program.init(jax.random.key(7)[None])
+    iterate = program.train_iteration
+    if env in ALIKE and not overrides:
+        iterate = functools.partial(iteration_of_one(ALIKE, program.config), ALIKE.index(env))
+    loop = begin(program, jax.random.key(7)[None])
     for _ in range(iterations):
-        loop, metrics = program.train_iteration(loop)
+        loop, metrics = iterate(loop)
     return program, jax.tree.map(lambda leaf: leaf[0], loop.train), metrics
 
 
 def values(program, train, observations, goals, action=0.0):
     """The critic's values of [B] points and goals."""
     networks = program.networks
-    points = networks.prepare(train.normalizer, jnp.asarray(observations, jnp.float32)[:, None])
-    goals = networks.prepare(train.normalizer, jnp.asarray(goals, jnp.float32)[:, None])
-    actions = jnp.full((points.shape[0], 1), action)
-    return np.asarray(networks.value(train.critic, jnp.stack([points, goals]), actions))
+
+    @jax.jit
+    def value(train, points, goals):
+        latents = jnp.stack([networks.prepare(train.normalizer, each) for each in (points, goals)])
+        return networks.value(train.critic, latents, jnp.full((points.shape[0], 1), action))
+
+    return np.asarray(value(train, *(np.array(each, np.float32)[:, None] for each in (observations, goals))))
 
 
 def test_value_of_a_place_that_is_always_the_goal():
@@ -48,18 +60,18 @@ def test_value_of_a_place_that_is_always_the_goal():
 
 
 def test_values_are_discounted():
-    program, train, _ = trained(probes.ThreeStepsAway())
+    program, train, _ = trained(ALIKE[0])
     expected = [-1.0 - DISCOUNT, -1.0, 0.0]
     np.testing.assert_allclose(values(program, train, [-3.0, -2.0, -1.0], [0.0] * 3), expected, atol=0.15)
 
 
 def test_value_depends_on_the_observation():
-    program, train, _ = trained(probes.TwoPlaces(), iterations=25)
+    program, train, _ = trained(ALIKE[1], iterations=25)
     np.testing.assert_allclose(values(program, train, [0.0, 1.0], [0.0, 0.0]), [0.0, -1.0 / (1.0 - DISCOUNT)], atol=0.3)
 
 
 def test_value_depends_on_the_goal():
-    program, train, _ = trained(probes.TwoGoals(), iterations=25)
+    program, train, _ = trained(ALIKE[2], iterations=25)
     np.testing.assert_allclose(values(program, train, [0.0, 0.0], [0.0, 1.0]), [0.0, -1.0 / (1.0 - DISCOUNT)], atol=0.3)
 
 
@@ -101,7 +113,7 @@ def test_one_trace_and_a_new_episode_every_time():
             return super().advance(state, action)
 
     program = make_train_step(Counting(), preset("debug"))
-    loop = program.init(jax.random.key(0)[None])
+    loop = begin(program, KEYS)
     goals = []
     for _ in range(3):
         loop, _ = program.train_iteration(loop)
@@ -111,33 +123,26 @@ def test_one_trace_and_a_new_episode_every_time():
     assert len(set(goals)) == 3
 
 
-@pytest.mark.parametrize("rewards", [(None, None), (0.0, -1.0)])
+@functools.cache
+def filtering(positive=None, negative=None):
+    settings = {"num_envs": 32, "updates_per_iteration": 1, "batch_size": 256}
+    settings |= {"method": "indicator_balance_filter", "reward_positive": positive, "reward_negative": negative}
+    return make_train_step(probes.PointImage(), preset("debug", **settings))
+
+
+@pytest.mark.parametrize("rewards", [(), (0.0, -1.0)])
 def test_a_fresh_filter_drops_nothing(rewards):
     """At initialisation no negative is dropped, under +1/-1 and under 0/-1 (there the critic must start below the band)."""
-    program = make_train_step(
-        probes.PointImage(),
-        preset(
-            "debug",
-            method="indicator_balance_filter",
-            reward_positive=rewards[0],
-            reward_negative=rewards[1],
-            updates_per_iteration=1,
-            batch_size=256,
-            num_envs=32,
-        ),
-    )
-    _, metrics = program.train_iteration(program.init(jax.random.key(0)[None]))
+    program = filtering(*rewards)
+    _, metrics = program.train_iteration(begin(program, KEYS))
     assert metrics["train/filtered_share"][0] == 0.0
     assert metrics["train/positive_share"][0] > 0.3
 
 
 def test_the_filter_drops_negatives_that_the_critic_values_like_positives():
     """Place 0 is its own goal, seen with noise in one byte, so most of its indicator rewards are false negatives."""
-    program = make_train_step(
-        probes.PointImage(),
-        preset("debug", method="indicator_balance_filter", num_envs=32, updates_per_iteration=1, batch_size=256),
-    )
-    loop = program.init(jax.random.key(0)[None])
+    program = filtering()
+    loop = begin(program, KEYS)
     head = loop.train.critic["head"]
     last = sorted(head)[-1]
     confident = {**head, last: {**head[last], "bias": head[last]["bias"] + 1e3}}
@@ -155,7 +160,7 @@ def test_share_of_positives_is_the_one_derived(method, expected):
     program = make_train_step(
         probes.PointImage(), preset("debug", method=method, num_envs=256, updates_per_iteration=40, batch_size=512)
     )
-    _, metrics = program.train_iteration(program.init(jax.random.key(3)[None]))
+    _, metrics = program.train_iteration(begin(program, jax.random.key(3)[None]))
     assert abs(float(metrics["train/positive_share"][0]) - expected) < 0.012
 
 
@@ -175,27 +180,28 @@ def test_targets_follow_once_an_interval(interval, updates):
     """After U updates in one iteration, targets have moved floor(U / interval) times: by each step's own online networks."""
     config = preset("debug", num_envs=4, batch_size=8, target_update_interval=interval, target_decay=0.9)
     program = make_train_step(probes.GoWhereTold(), config.replace(updates_per_iteration=updates))
-    single = make_train_step(probes.GoWhereTold(), config.replace(updates_per_iteration=1))
-    first = program.init(jax.random.key(0)[None]).train
-    loop, _ = program.train_iteration(program.init(jax.random.key(0)[None]))
-    moved = jax.tree.map(lambda new, old: bool(jnp.any(new != old)), loop.train.target_critic, first.target_critic)
+    first = jax.device_get(begin(program, KEYS).train)
+    train = jax.device_get(program.update_many(*experienced(program, KEYS[0]))[0])
+    moved = jax.tree.map(lambda new, old: bool(np.any(new != old)), train.target_critic, first.target_critic)
     assert any(jax.tree.leaves(moved)) == (updates >= interval)
     if interval == 1:  # and by how much: a tenth of the way to where the online network is
-        loop, _ = single.train_iteration(single.init(jax.random.key(0)[None]))
-        for target, online, old in zip(*map(jax.tree.leaves, (loop.train.target_actor, loop.train.actor, first.actor))):
+        for target, online, old in zip(*map(jax.tree.leaves, (train.target_actor, train.actor, first.actor))):
             np.testing.assert_allclose(target, 0.9 * old + 0.1 * online, atol=1e-6)
 
 
 def test_exploration_has_its_shares_and_spread():
     """Whole vectors are uniform with the share asked for; the others stray from the policy with the deviation asked for."""
     program = make_train_step(probes.GoWhereTold(), preset("debug"))
-    train = jax.tree.map(lambda leaf: leaf[0], program.init(jax.random.key(0)[None]).train)
-    observations, count = jnp.zeros((20_000, 1)), 20_000
-    latents = rollout.encode(program.networks, train, train.normalizer, observations)
+    train = jax.tree.map(lambda leaf: np.asarray(leaf)[0], begin(program, KEYS).train)
+    observations, count = np.zeros((20_000, 1), np.float32), 20_000
 
     def actions(exploration):
-        act = jax.jit(lambda key: rollout.choose_actions(program.networks, train, latents, exploration, key, observations))
-        return np.asarray(act(jax.random.key(5)))[:, 0]
+        @jax.jit
+        def act(key, train):
+            latents = rollout.encode(program.networks, train, train.normalizer, observations)
+            return rollout.choose_actions(program.networks, train, latents, exploration, key, observations)
+
+        return np.asarray(act(jax.random.key(5), train))[:, 0]
 
     policy = actions(rollout.NO_EXPLORATION)
     assert np.ptp(policy) == 0.0 and abs(policy[0]) < 0.5
@@ -226,7 +232,7 @@ def test_success_counts_at_the_last_step():
 
     for reached, success in ((2, 0.0), (probes.Probe.horizon, 1.0)):
         program = make_train_step(Passing(reached), preset("debug", eval_episodes=4))
-        outcome, recording = program.evaluate(program.init(jax.random.key(0)[None]).train, jax.random.key(1))
+        outcome, recording = program.evaluate(begin(program, KEYS).train, jax.random.key(1))
         assert outcome["eval/success"][0] == success
         assert outcome["eval/goal_distance"][0] == probes.Probe.horizon - reached
         np.testing.assert_array_equal(recording["success"], success)
@@ -240,7 +246,7 @@ def test_goals_can_have_statistics_of_their_own(source):
 
     def statistics(normalizers):
         program = make_train_step(env, preset("debug", normalizers=normalizers, **settings))
-        loop, metrics = program.train_iteration(program.init(jax.random.key(0)[None]))
+        loop, metrics = program.train_iteration(begin(program, KEYS))
         assert metrics["guard/nonfinite"][0] == 0
         outcome, _ = program.evaluate(loop.train, jax.random.key(1))
         assert np.isfinite(outcome["eval/goal_distance"]).all()
@@ -279,12 +285,11 @@ def test_a_shared_encoder_learns_nothing_from_the_actor():
     def critic_after(learning_rate):
         config = preset("debug", encoders="shared", actor_learning_rate=learning_rate, batch_size=8, updates_per_iteration=1)
         program = make_train_step(probes.SeenGoWhereTold(), config)
-        loop, _ = program.train_iteration(program.init(jax.random.key(0)[None]))
-        return loop.train
+        return jax.device_get(program.update_many(*experienced(program, KEYS[0]))[0])
 
     slow, fast = critic_after(1e-5), critic_after(1e-1)
     jax.tree.map(np.testing.assert_array_equal, slow.critic, fast.critic)
-    assert any(jax.tree.leaves(jax.tree.map(lambda one, other: bool(jnp.any(one != other)), slow.actor, fast.actor)))
+    assert any(jax.tree.leaves(jax.tree.map(lambda one, other: bool(np.any(one != other)), slow.actor, fast.actor)))
 
 
 def test_the_actor_steps_once_an_interval():
@@ -292,10 +297,8 @@ def test_the_actor_steps_once_an_interval():
     counts = {}
     for interval in (1, 3):
         program = make_train_step(probes.GoWhereTold(), config.replace(actor_interval=interval))
-        loop, metrics = program.train_iteration(program.init(jax.random.key(0)[None]))
-        counts[interval] = tuple(
-            int(moments[0].count[0]) for moments in (loop.train.actor_optimizer, loop.train.critic_optimizer)
-        )
+        train, metrics = program.update_many(*experienced(program, KEYS[0]))
+        counts[interval] = tuple(int(moments[0].count[0]) for moments in (train.actor_optimizer, train.critic_optimizer))
         assert np.isfinite(metrics["train/actor_loss"]).all()
     assert counts == {1: (6, 6), 3: (2, 6)}
 
@@ -319,7 +322,7 @@ def test_goals_that_are_reached_already_give_way():
     for kept in (1.0, 0.25, 0.0):
         config = preset("debug", num_envs=16, batch_size=512, relabel_probability=1.0, trivial_goals=kept)
         program = make_train_step(Elsewhere(), config)
-        _, metrics = program.train_iteration(program.init(jax.random.key(0)[None]))
+        _, metrics = program.update_many(*experienced(program, KEYS[0]))
         shares[kept] = float(metrics["train/positive_share"][0])
     assert shares[1.0] == 1.0 and shares[0.0] == 0.0
     assert shares[0.25] == pytest.approx(0.25, abs=0.05)
