@@ -193,7 +193,7 @@ def test_exploration_has_its_shares_and_spread():
     """Whole vectors are uniform with the share asked for; the others stray from the policy with the deviation asked for."""
     program = make_train_step(probes.GoWhereTold(), preset("debug"))
     train = jax.tree.map(lambda leaf: np.asarray(leaf)[0], begin(program, KEYS).train)
-    observations, count = np.zeros((20_000, 1), np.float32), 20_000
+    observations, count = jnp.zeros((20_000, 1)), 20_000
 
     def actions(exploration):
         @jax.jit
