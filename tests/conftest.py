@@ -85,7 +85,8 @@ TASKS = ("hand", "sawyer", "fetch", "finger", "stalk", "reacher")
 # At the end of a run no worker should wait for the other, so what takes longest comes first.
 FIRST = (*TASKS, "test_trainer", "test_render_parity")
 # Files that share the programs of another one: notebooks and pages train with the smallest preset, as tests of the trainer do.
-SHARED = dict.fromkeys(("test_docs", "test_notebooks", "test_resume", "test_signals"), "test_trainer")
+# Not test_signals: it makes JAX forget what was traced.
+SHARED = dict.fromkeys(("test_docs", "test_notebooks", "test_resume"), "test_trainer")
 
 
 def group_of(nodeid: str) -> str:

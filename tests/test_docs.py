@@ -21,6 +21,7 @@ from typing import Any
 import doc_blocks
 import pytest
 import render_models
+import small_program
 from doc_blocks import ROOT, Block, blocks, pages_with
 from fake_program import make_fake_trainer, small_config
 
@@ -51,19 +52,15 @@ def name_of(page: Path) -> str:
 @contextlib.contextmanager
 def small_settings() -> Iterator[None]:
     """Everything that is trained is trained by the smallest preset, in one program that is traced once."""
-    full_preset, full_program = config.preset, trainer.make_train_step
+    full_preset = config.preset
 
     def small_preset(name: str, **overrides: Any) -> Config:
         make_env(validate(full_preset(name, **overrides)))  # what the page asks for must be right
         return full_preset("debug", env="VisualReacher")
 
-    @functools.cache
-    def program_of(asked: Config) -> Any:
-        return full_program(make_env(asked), asked)
-
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(config, "preset", small_preset)
-        patch.setattr(trainer, "make_train_step", lambda env, asked: program_of(asked))
+        patch.setattr(trainer, "make_train_step", small_program.make_train_step)
         yield
 
 

@@ -9,17 +9,16 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+import small_program
 from fake_program import FakeProgram, as_plain, final_state, make_fake_trainer, rows_without_time, small_config
 
 from jaxrl_vis.config import Config, preset
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner import train_step
 from jaxrl_vis.learner.environment import make_env
 from jaxrl_vis.run import loop as run_loop
 from jaxrl_vis.run import memory, metrics, trained, trainer
 from jaxrl_vis.run.checkpoint import Checkpoints
 from jaxrl_vis.run.folder import RunFolder, default_folder, read_config
-from jaxrl_vis_envs.compilation import env_jit
 
 
 def test_a_run_reports_logs_and_draws(straight, capsys):
@@ -159,34 +158,29 @@ def test_evaluate_and_play_a_run(straight, tmp_path, monkeypatch):
 def test_the_real_program_resumes_bit_for_bit(tmp_path, capsys):
     """The same as above with physics, cameras and networks. Traced once: the three runs share the program."""
     config = preset("debug", env="VisualReacher", full_checkpoint_interval=2)
-    program = train_step.make_train_step(make_env(config), config)
-    original, calls = program.train_iteration.__wrapped__, []
-
-    def train_iteration(loop):  # of the same name, so that the next test finds it compiled
-        calls.append(0)
-        return original(loop)
-
-    program = dataclasses.replace(program, train_iteration=env_jit(train_iteration, donate_argnums=0))
+    env = make_env(config)
 
     def run(path, resume=False, **changes):
         asked = config.replace(**changes)
-        mine = trainer.Trainer(asked, dataclasses.replace(program, config=asked), path, resume=resume)
+        mine = trainer.Trainer(asked, small_program.make_train_step(env, asked), path, resume=resume)
         return mine, list(mine.run())
 
     mine, reports = run(tmp_path / "straight")
-    assert [report.iteration for report in reports] == [1, 2, 3, 4] and len(calls) == 1
+    assert [report.iteration for report in reports] == [1, 2, 3, 4]
     run(tmp_path / "cut", env_steps=400)
     run(tmp_path / "cut", resume=True)
     assert rows_without_time(tmp_path / "cut") == rows_without_time(tmp_path / "straight")
     both = final_state(tmp_path / "cut", mine.shapes), final_state(tmp_path / "straight", mine.shapes)
     assert all(map(np.array_equal, *both)) and any(leaf.any() for leaf in both[0])
     assert (tmp_path / "cut" / "video.gif").stat().st_size > 10_000
-    line = memory.check_memory(config, mine.shapes, program.replay_bytes, program.steps_per_iteration)
+    assert small_program.traces(config) == 1  # in this process, whatever other tests have trained with it
+    line = memory.check_memory(config, mine.shapes, mine.program.replay_bytes, mine.program.steps_per_iteration)
     assert line.startswith("replay ")
 
 
 @pytest.mark.slow
-def test_the_script_runs(tmp_path, checkout, capsys):
+def test_the_script_runs(tmp_path, checkout, capsys, monkeypatch):
+    monkeypatch.setattr(trainer, "make_train_step", small_program.make_train_step)
     script = runpy.run_path(str(checkout / "notebooks" / "train.py"))
     assert len((checkout / "notebooks" / "train.py").read_text().splitlines()) < 40
     script["main"]("debug", "VisualReacher", str(tmp_path / "run"))
