@@ -6,7 +6,7 @@ import itertools
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from jaxrl_vis.cli.checks import check_counts, check_extra
 from jaxrl_vis.cli.parsing import ByPlaceToo
@@ -14,6 +14,9 @@ from jaxrl_vis.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.evaluation_pool import results_of, share_accelerator
 from jaxrl_vis.report.outputs import check_writable
+
+if TYPE_CHECKING:
+    from jaxrl_vis.phenotyping.detector.detect import Settings
 
 _FIRST_SEED = 100_000
 """Of the plots that networks learn from: evaluations use the seeds below."""
@@ -30,6 +33,10 @@ class Train:
     place of synthetic plots."""
     spec: Path | None = None
     """A JSON or TOML file with the values of a synthetic family of your own."""
+    start: str | None = None
+    """Weights to go on from: a file of an earlier training, `shipped` for those of the package, or `random`; if not given,
+    `shipped` where the boxes of --data are about as tall as those that these weights find, as a few images are too few to learn
+    everything from, and `random` otherwise."""
     minutes: float | None = None
     """Most minutes; the weights are written at the end, and every half minute before."""
     steps: int = 20000
@@ -40,8 +47,8 @@ class Train:
     """Images per update."""
     snips: int = 32
     """Strips at full resolution per update, for the masks."""
-    rate: float = 1e-3
-    """Highest learning rate."""
+    rate: float | None = None
+    """Highest learning rate; 0.001 if not given, and 0.0003 where --start names weights."""
     workers: int = 4
     """How many processes draw synthetic plots while the networks learn; 1: a thread of this one."""
     width: int | None = None
@@ -64,6 +71,8 @@ def train(options: Train) -> int:
         raise RequestError("--data takes images of your own: leave out --spec and --width, which describe synthetic ones")
     if options.minutes is not None and not options.minutes > 0:
         raise RequestError(f"--minutes must be more than 0, not {options.minutes:g}")
+    if options.rate is not None and not options.rate > 0:
+        raise RequestError(f"--rate must be more than 0, not {options.rate:g}")
     if options.out.suffix != ".npz":
         raise RequestError(f"the weights go into a file that ends in .npz, not {options.out}")
     check_extra("phenotype", "phenotyping")
@@ -77,16 +86,19 @@ def train(options: Train) -> int:
 
 def _train(options: Train) -> int:
     from jaxrl_vis import __version__
-    from jaxrl_vis.phenotyping.detector.detect import Settings
     from jaxrl_vis.phenotyping.detector.weights import write_weights
-    from jaxrl_vis.phenotyping.training.examples import Example, annotated_examples, settings_for, synthetic_examples
+    from jaxrl_vis.phenotyping.training.examples import Example, annotated_examples, any_outlined, synthetic_examples
     from jaxrl_vis.phenotyping.training.loop import Plan, train
     from jaxrl_vis_envs.plants import TRAINING, read
 
-    settings = Settings()
+    before, settings, origin_before = _start(options)
+    left_alone = {}
+    if options.data is not None and before is not None and not any_outlined(options.data):
+        # A box is no outline: what the weights know of masks is better.
+        left_alone = {"segmenter": before["segmenter"]}
+        print("masks stay as they are: no annotation has an outline, only boxes")
     sources: list[Iterator[Example]]
     if options.data is not None:
-        settings = settings_for(options.data, settings)
         sources = [annotated_examples(options.data, settings)]
         origin = "annotated images"
     else:
@@ -106,20 +118,44 @@ def _train(options: Train) -> int:
         first=min(24, options.images),
         batch=options.batch,
         snips=options.snips,
-        rate=options.rate,
+        rate=options.rate or (1e-3 if before is None else 3e-4),
         seed=options.seed,
     )
-    about = {"version": __version__, "origin": origin, "steps": 0, "seed": options.seed}
+    about = {"version": __version__, "origin": origin + origin_before, "steps": 0, "seed": options.seed}
     started = time.monotonic()
 
     def report(step, progress, images, losses, params) -> None:
-        write_weights(options.out, params, settings, {**about, "steps": step})
+        write_weights(options.out, {**params, **left_alone}, settings, {**about, "steps": step})
         parts = "  ".join(f"{name} {value:.3f}" for name, value in losses.items())
         print(
             f"{(time.monotonic() - started) / 60:5.1f} min  {progress:4.0%}  step {step}  {images} images  {parts}", flush=True
         )
 
-    params, steps = train(sources, settings, plan, report)
-    write_weights(options.out, params, settings, {**about, "steps": steps})
-    print(f"{options.out}: {steps} updates on {origin}, {options.out.stat().st_size / 1e6:.1f} MB")
+    params, steps = train(sources, settings, plan, report, start=before)
+    write_weights(options.out, {**params, **left_alone}, settings, {**about, "steps": steps})
+    print(f"{options.out}: {steps} updates on {origin}{origin_before}, {options.out.stat().st_size / 1e6:.1f} MB")
     return 0
+
+
+def _start(options: Train) -> tuple[Any, "Settings", str]:
+    """Parameters to go on from (None: random ones), settings of the networks, and what to say of it."""
+    from jaxrl_vis.phenotyping.detector.detect import Settings
+    from jaxrl_vis.phenotyping.detector.weights import SHIPPED, read_weights
+    from jaxrl_vis.phenotyping.training.examples import settings_for
+
+    fitting = None if options.data is None else settings_for(options.data, Settings())
+    start = options.start or ("random" if fitting is None else "shipped")
+    if start == "random":
+        return None, fitting or Settings(), ""
+    params, settings, _ = read_weights(SHIPPED if start == "shipped" else Path(start))
+    if fitting is not None and not 0.5 <= fitting.band_lines / settings.band_lines <= 2.0:
+        why = (
+            f"boxes of {options.data} are {fitting.band_lines:.0f} pixels tall in images of {settings.width}, and those that "
+            f"the weights `{start}` find {settings.band_lines:.0f}"
+        )
+        if options.start is not None:
+            raise RequestError(f"{why}: annotate stalks from 8 to 16 inches above the ground, or give --start random")
+        print(f"starting from random weights: {why}")
+        return None, fitting, ""
+    # What was learned goes with its anchors, so those of the annotations are not taken.
+    return params, settings, f", from {'the weights that ship' if start == 'shipped' else start}"

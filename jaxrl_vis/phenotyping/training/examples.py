@@ -196,6 +196,11 @@ def settings_for(folder: Path, settings: Settings) -> Settings:
     return dataclasses.replace(settings, band_lines=round(float(np.median(sizes[:, 1])), 1), anchor_widths=across)
 
 
+def any_outlined(folder: Path) -> bool:
+    """Whether any annotation of a folder has more than a box."""
+    return any(each.get("segmentation") for each in read_annotations(folder)["annotations"])
+
+
 def _of_annotation(annotation: dict[str, Any], size: tuple[int, int]) -> tuple[list[float], np.ndarray]:
     """Box and axis of one annotation, and its mask [H, W] bool; all of the box where there is no mask."""
     left, top, wide, tall = map(float, annotation["bbox"])

@@ -116,7 +116,7 @@ def _optimiser() -> optax.GradientTransformation:
 
 
 def train(
-    sources: list[Iterator[Example]], settings: Settings, plan: Plan, report: Report, every: float = 30.0
+    sources: list[Iterator[Example]], settings: Settings, plan: Plan, report: Report, every: float = 30.0, start: Any = None
 ) -> tuple[Any, int]:
     """Trains the networks.
 
@@ -126,6 +126,7 @@ def train(
         plan: How long and how fast.
         report: See `Report`.
         every: How often, s.
+        start: Parameters to go on from, as they are returned; None: random ones.
 
     Returns:
         Parameters with ``detector`` and ``segmenter``, and the number of updates.
@@ -140,11 +141,14 @@ def train(
     dtype = jnp.bfloat16 if jax.default_backend() in ("gpu", "tpu") else jnp.float32
     pool = _Pool(sources, plan)
     detector_key, segmenter_key, steps_key = jax.random.split(root, 3)
-    blank = jnp.zeros((1, 32, 32, 3))
-    params = {
-        "detector": initial(settings, detector_key),
-        "segmenter": Segmenter(settings.segmenter).init(segmenter_key, blank),
-    }
+    if start is None:
+        blank = jnp.zeros((1, 32, 32, 3))
+        params = {
+            "detector": initial(settings, detector_key),
+            "segmenter": Segmenter(settings.segmenter).init(segmenter_key, blank),
+        }
+    else:
+        params = jax.tree.map(lambda leaf: jnp.array(leaf, jnp.float32), start)
     state = params, jax.tree.map(jnp.array, params), _optimiser().init(params)
 
     def update(step: int, rates: tuple[jax.Array, jax.Array]) -> tuple[dict[str, jax.Array], Any] | None:
