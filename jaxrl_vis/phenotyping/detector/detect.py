@@ -165,9 +165,10 @@ def detect(params: Any, image: jax.Array, settings: Settings, dtype: Any = jnp.f
 
 def initial(settings: Settings, key: jax.Array) -> Any:
     """Parameters of a detector that has learned nothing."""
-    images = jnp.zeros((1, 2 * PADDING, 2 * PADDING, 3))
-    regions = jnp.zeros((1, *GRID, settings.channels[2]))
-    return settings.detector().init(key, images, regions)
+    images = jax.ShapeDtypeStruct((1, 2 * PADDING, 2 * PADDING, 3), jnp.float32)
+    regions = jax.ShapeDtypeStruct((1, *GRID, settings.channels[2]), jnp.float32)
+    # Lazily: parameters are drawn, and the network itself is not run, of which each operation would be compiled by itself.
+    return settings.detector().lazy_init(key, images, regions)
 
 
 def pad(image: np.ndarray) -> np.ndarray:

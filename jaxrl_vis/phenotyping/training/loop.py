@@ -110,6 +110,12 @@ def _update(
     return (params, average, moments), parts
 
 
+@jax.jit
+def _beginning(params: Any) -> tuple[Any, Any]:
+    """The average of parameters before the first update, and the optimiser's state."""
+    return jax.tree.map(jnp.copy, params), _optimiser().init(params)  # a donated buffer must not appear twice
+
+
 def _optimiser() -> optax.GradientTransformation:
     # The rate is applied outside, as it follows the clock.
     return optax.chain(optax.clip_by_global_norm(5.0), optax.adamw(1.0, weight_decay=1e-4))
@@ -142,14 +148,14 @@ def train(
     pool = _Pool(sources, plan)
     detector_key, segmenter_key, steps_key = jax.random.split(root, 3)
     if start is None:
-        blank = jnp.zeros((1, 32, 32, 3))
+        blank = jax.ShapeDtypeStruct((1, 32, 32, 3), jnp.float32)
         params = {
             "detector": initial(settings, detector_key),
-            "segmenter": Segmenter(settings.segmenter).init(segmenter_key, blank),
+            "segmenter": Segmenter(settings.segmenter).lazy_init(segmenter_key, blank),
         }
     else:
         params = jax.tree.map(lambda leaf: jnp.array(leaf, jnp.float32), start)
-    state = params, jax.tree.map(jnp.array, params), _optimiser().init(params)
+    state = params, *_beginning(params)
 
     def update(step: int, rates: tuple[jax.Array, jax.Array]) -> tuple[dict[str, jax.Array], Any] | None:
         nonlocal state
