@@ -19,14 +19,14 @@ from jaxrl_vis.config import Config, preset, resolve
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import normalizer, reward_errors
 from jaxrl_vis.learner.auxiliary import make_auxiliary
-from jaxrl_vis.learner.ddpg import make_ddpg
+from jaxrl_vis.learner.ddpg import Algorithm, make_ddpg
 from jaxrl_vis.learner.networks import Networks
 from jaxrl_vis.learner.replay import Replay
 from jaxrl_vis.learner.sampling import Sampler
 from jaxrl_vis.learner.sharding import make_layout
 from jaxrl_vis.learner.shards import DATA, Shards
 from jaxrl_vis.run import memory
-from jaxrl_vis.types import Batch, Episodes, ReplayState
+from jaxrl_vis.types import Batch, Episodes, ReplayState, TrainState
 from jaxrl_vis.validation import validate
 
 
@@ -131,13 +131,14 @@ class _Elsewhere:
 def in_parts(function, count: int, *arrays):
     """Calls a function with parts of arrays, side by side, as devices would; each part's result along a new first axis."""
     parts = [array.reshape(count, -1, *array.shape[1:]) for array in arrays]
-    return jax.vmap(lambda *part: function(Shards(count), *part), axis_name=DATA)(*parts)
+    return jax.jit(jax.vmap(lambda *part: function(Shards(count), *part), axis_name=DATA))(*parts)
 
 
 def test_statistics_of_parts_are_those_of_the_whole() -> None:
     seen = 100.0 + 20.0 * jax.random.normal(jax.random.key(0), (8, 3, 5))
-    before = normalizer.update(normalizer.init(jax.ShapeDtypeStruct((5,), jnp.float32)), seen[:4])
-    whole = normalizer.update(before, seen)
+    update = jax.jit(normalizer.update)
+    before = update(normalizer.init(jax.ShapeDtypeStruct((5,), jnp.float32)), seen[:4])
+    whole = update(before, seen)
     parts = in_parts(lambda shards, part: normalizer.update(before, part, shards=shards), 2, seen)
     for name in ("count", "mean", "sum_of_squares"):
         for part in getattr(parts, name):
@@ -150,7 +151,7 @@ def test_each_part_takes_its_own_transitions_of_a_batch() -> None:
     replay = Replay(num_rollouts=2, num_envs=3, horizon=5)
     state = ReplayState(Episodes(*(jnp.zeros((6, 7, 2)) for _ in range(3))), jnp.int32(6))
     resolved, key, iteration = resolve(config, 5), jax.random.key(3), jnp.int32(1)
-    whole = Sampler(config, resolved, replay, 0.1).choose(state, key, iteration)
+    whole = jax.jit(Sampler(config, resolved, replay, 0.1).choose)(state, key, iteration)
 
     def choose(shards, _):
         return Sampler(config, resolved, replay, 0.1, shards=shards).choose(state, key, iteration)
@@ -179,19 +180,27 @@ SPEC = jax.ShapeDtypeStruct((2, 16, 16), jnp.uint8)
 SIZE = 16
 
 
-def gradients(config: Config, shards: Shards, batch: Batch) -> Any:
-    """Gradients and metrics of a fresh learner."""
+def make_algorithm(config: Config, shards: Shards) -> Algorithm:
     networks = Networks(config, SPEC, 2, 0.0)
     auxiliary = make_auxiliary(config, SPEC, 2, 1, networks.dtype)
-    resolved = resolve(config, 6)
-    algorithm = make_ddpg(networks, config, resolved, auxiliary, shards)
-    train = algorithm.init(jax.random.key(1))
+    return make_ddpg(networks, config, resolve(config, 6), auxiliary, shards)
+
+
+def make_learner(config: Config) -> TrainState:
+    """A fresh one that has seen a few images."""
+    train = make_algorithm(config, Shards()).init(jax.random.key(1))
     train = train.replace(normalizer=normalizer.update(train.normalizer, jnp.arange(1024.0).reshape(2, 1, 2, 16, 16) % 200))
     # As high as the filter's threshold, so that it drops some transitions and keeps others.
-    high = 0.0 if math.isinf(resolved.filter_threshold) else resolved.filter_threshold
-    is_output = {True: high, False: 0.0}
+    threshold = resolve(config, 6).filter_threshold
+    is_output = {True: 0.0 if math.isinf(threshold) else threshold, False: 0.0}
     critic = jax.tree.map_with_path(lambda path, leaf: leaf + is_output["output" in str(path) and leaf.ndim == 1], train.critic)
-    return algorithm.gradients(algorithm.begin(train.replace(critic=critic)), batch, True)
+    return train.replace(critic=critic)
+
+
+def gradients(config: Config, shards: Shards, train: TrainState, batch: Batch) -> Any:
+    """Gradients and metrics."""
+    algorithm = make_algorithm(config, shards)
+    return algorithm.gradients(algorithm.begin(train), batch, True)
 
 
 def make_batch(config: Config) -> Batch:
@@ -200,7 +209,11 @@ def make_batch(config: Config) -> Batch:
     success = jax.random.bernoulli(next(keys), 0.3, (SIZE,)).astype(jnp.float32)
     reward = jnp.where(jax.random.bernoulli(next(keys), 0.4, (SIZE,)), 1.0, -1.0) if config.method != "autoencoder" else None
     actions, states = (jax.random.uniform(next(keys), (SIZE, 2), minval=-1.0) for _ in range(2))
-    return Batch(images, actions, states, states, reward=reward, success=success)
+    batch = Batch(images, actions, states, states, reward=reward, success=success)
+    if not config.aux_tasks:
+        return batch
+    auxiliary = make_auxiliary(config, SPEC, 2, 1, jnp.float32)
+    return batch.replace(targets=auxiliary.targets(jax.random.key(0), batch, None))
 
 
 @pytest.mark.parametrize(
@@ -216,13 +229,9 @@ def make_batch(config: Config) -> Batch:
 def test_gradients_and_metrics_of_parts_are_those_of_the_whole_batch(changes: dict[str, Any]) -> None:
     """Whatever a weighting or a filter makes of losses and gradients, it makes of those of the whole batch."""
     config = validate(preset("debug", batch_size=SIZE, updates_per_iteration=10, compute_dtype="float32", **changes))
-    batch = make_batch(config)
-    targets = None
-    if config.aux_tasks:
-        auxiliary = make_auxiliary(config, SPEC, 2, 1, jnp.float32)
-        targets = auxiliary.targets(jax.random.key(0), batch, None)
-    batch = batch.replace(targets=targets)
-    whole = jax.jit(functools.partial(gradients, config, Shards()))(batch)
+    batch = jax.jit(functools.partial(make_batch, config))()
+    train = jax.jit(functools.partial(make_learner, config))()
+    whole = jax.jit(functools.partial(gradients, config, Shards()))(train, batch)
     filters = config.method == "indicator_balance_filter"
     assert 0.0 < whole[1]["train/filtered_share"] < 1.0 if filters else whole[1]["train/filtered_share"] == 0.0
 
@@ -230,7 +239,8 @@ def test_gradients_and_metrics_of_parts_are_those_of_the_whole_batch(changes: di
         axis = 1 if leaf.ndim == 5 and leaf.shape[0] == 3 else 0
         return jnp.moveaxis(leaf.reshape(*leaf.shape[:axis], 2, -1, *leaf.shape[axis + 1 :]), axis, 0)
 
-    parts = jax.jit(jax.vmap(functools.partial(gradients, config, Shards(2)), axis_name=DATA))(jax.tree.map(part_of, batch))
+    of_part = jax.vmap(functools.partial(gradients, config, Shards(2)), in_axes=(None, 0), axis_name=DATA)
+    parts = jax.jit(lambda train, batch: of_part(train, jax.tree.map(part_of, batch)))(train, batch)
     for (path, expected), leaf in zip(jax.tree.leaves_with_path(whole), jax.tree.leaves(parts), strict=True):
         for part in leaf:
             np.testing.assert_allclose(part, expected, rtol=2e-4, atol=2e-6, err_msg=jax.tree_util.keystr(path))
