@@ -18,15 +18,22 @@ from jaxrl_vis.learner.replay import Indices, Replay
 from jaxrl_vis.learner.sampling import Choice, Sampler
 from jaxrl_vis.types import Episodes
 from jaxrl_vis.validation import validate
+from jaxrl_vis_envs.compilation import env_jit
 
 SPEC = jax.ShapeDtypeStruct((2, 16, 16), jnp.uint8)
 ACTIONS, HORIZON, EPISODES, BATCH = 2, 6, 4, 16
 ALL = auxtasks.NAMES
 
 
+@functools.cache
 def rollout() -> Episodes:
+    return _rollout(jax.random.key(0))
+
+
+@jax.jit
+def _rollout(key: jax.Array) -> Episodes:
     """Episodes of a bright spot that actions move over a fixed pattern."""
-    keys = jax.random.split(jax.random.key(0), 3)
+    keys = jax.random.split(key, 3)
     actions = jax.random.uniform(keys[0], (EPISODES, HORIZON, ACTIONS), minval=-1.0, maxval=1.0)
     places = jnp.cumsum(jnp.pad(2.0 * actions, ((0, 0), (1, 1), (0, 0))), axis=1) + 8.0
     grid = jnp.stack(jnp.meshgrid(jnp.arange(16.0), jnp.arange(16.0), indexing="ij"))
@@ -41,6 +48,30 @@ def config(**overrides):
 
 
 @functools.cache
+def drawn_places():
+    """Episodes and slots of a batch, [2, B]."""
+    return jax.device_get(jax.random.randint(jax.random.key(1), (2, BATCH), 0, EPISODES))
+
+
+@functools.cache
+def stored(keeps_flow):
+    """The rollout as a learner stores it that does or does not learn optical flow."""
+    if not keeps_flow:
+        return rollout()
+    auxiliary = make_auxiliary(config(aux_tasks=("optical_flow",), weighting="sum"), SPEC, ACTIONS, 1, jnp.float32)
+    return jax.jit(auxiliary.with_flow)(rollout())
+
+
+@functools.cache
+def fresh(tasks, encoders, target_encoder):
+    """A fresh learner but for the state of its weighting: how losses are weighted changes nothing else at the beginning."""
+    chosen = config(aux_tasks=tasks, weighting="sum" if tasks else "none", encoders=encoders, target_encoder=target_encoder)
+    algorithm = make_ddpg(Networks(chosen, SPEC, ACTIONS, 0.0), chosen, resolve(chosen, HORIZON))
+    # The key is an argument: of a constant, XLA would draw the numbers itself, and slowly.
+    return env_jit(algorithm.init, runs_once=True)(jax.random.key(3))
+
+
+@functools.cache
 def learner(**overrides):
     """The learner, one update as a compiled function, and its state and batch at the beginning."""
     chosen = config(**overrides)
@@ -50,19 +81,23 @@ def learner(**overrides):
     algorithm = make_ddpg(networks, chosen, resolved, auxiliary)
     replay = Replay(1, EPISODES, HORIZON)
     sampler = Sampler(chosen, resolved, replay, 0.5, auxiliary=auxiliary)
-    stored = replay.of_rollout(auxiliary.with_flow(rollout()))
-    places = jax.random.randint(jax.random.key(1), (2, BATCH), 0, EPISODES)
-    choice = Choice(Indices(places[0], places[1]), jnp.full(BATCH, HORIZON + 1), target_key=jax.random.key(2))
-    if not auxiliary.tasks:
-        choice = choice._replace(target_key=None)
-    batch = sampler.batch(stored, choice)
+
+    @jax.jit
+    def chosen_batch(episodes, places, key):
+        choice = Choice(Indices(places[0], places[1]), jnp.full(BATCH, HORIZON + 1), target_key=key)
+        if not auxiliary.tasks:
+            choice = choice._replace(target_key=None)
+        return sampler.batch(replay.of_rollout(episodes), choice)
 
     @functools.partial(jax.jit, static_argnums=2)
     def update(working, batch, with_actor=True):
         gradients, metrics = algorithm.gradients(working, batch, with_actor)
         return algorithm.apply(working, gradients), gradients, metrics
 
-    return algorithm, update, algorithm.begin(algorithm.init(jax.random.key(3))), batch
+    batch = chosen_batch(stored(auxiliary.keeps_flow), drawn_places(), jax.random.key(2))
+    start = fresh(chosen.aux_tasks, chosen.encoders, chosen.target_encoder)
+    start = start.replace(weighting=auxiliary.init_state(start.critic["encoder"]))
+    return algorithm, update, algorithm.begin(start), batch
 
 
 def sizes(tree):
@@ -142,16 +177,14 @@ def test_an_actor_that_shares_the_encoder_has_no_heads():
 
 
 def test_kept_flow_is_that_of_the_images():
-    episodes = make_auxiliary(config(aux_tasks=("optical_flow",), weighting="sum"), SPEC, ACTIONS, 1, jnp.float32).with_flow(
-        rollout()
-    )
+    episodes = jax.device_get(stored(True))
     assert episodes.flow is not None and episodes.flow.shape == (EPISODES, HORIZON, 16, 16) and episodes.flow.dtype == jnp.uint8
     images = episodes.observations
-    wanted = optical_flow.flow_strength(images[1, 2][None], images[1, 3][None])[0]
+    wanted = jax.jit(optical_flow.flow_strength)(images[1, 2][None], images[1, 3][None])[0]
     np.testing.assert_allclose(optical_flow.from_bytes(episodes.flow[1, 2]), np.clip(wanted, 0.0, 255 / 16), atol=1 / 32 + 1e-4)
     assert wanted.max() > 0.5
     _, _, _, batch = learner(aux_tasks=("optical_flow",), weighting="sum")
-    place = jax.random.randint(jax.random.key(1), (2, BATCH), 0, EPISODES)[:, 3]
+    place = drawn_places()[:, 3]
     np.testing.assert_array_equal(batch.targets.flow[3], optical_flow.from_bytes(episodes.flow[place[0], place[1]]))
 
 

@@ -30,6 +30,12 @@ from jaxrl_vis.phenotyping.training.examples import (
 from jaxrl_vis.phenotyping.training.loop import Plan, train
 from jaxrl_vis_envs.plants import family
 
+# One program each, in place of one for every operation in them.
+nms, band_overlap, overlap = jax.jit(nms), jax.jit(band_overlap), jax.jit(overlap)
+encode, decode, vary_snips = jax.jit(encode), jax.jit(decode), jax.jit(vary_snips)
+roi_align, best_proposals = jax.jit(roi_align, static_argnums=(2, 3, 4, 5)), jax.jit(best_proposals, static_argnums=(3, 4))
+assign, suppress, move = jax.jit(assign), jax.jit(suppress), jax.jit(move, static_argnums=3)
+
 RECORDED = np.load(Path(__file__).parent / "data" / "torchvision_boxes.npz")
 TINY = Settings(
     width=64,
@@ -197,7 +203,7 @@ def test_stalks_move_with_their_images():
     images = np.zeros((8, 64, 64, 3), np.uint8)
     images[:, :60] = [each.image for each in examples]
     stalks, kinds = (np.stack([getattr(each, name) for each in examples]) for name in ("stalks", "kinds"))
-    moved, places, kinds = move(*map(jnp.asarray, (images, stalks, kinds)), (60, 64), jax.random.key(0))
+    moved, places, kinds = move(jnp.asarray(images), jnp.asarray(stalks), jnp.asarray(kinds), (60, 64), jax.random.key(0))
     assert moved.dtype == jnp.uint8
     compared = 0
     for image, stalk, kind in zip(np.asarray(moved), np.asarray(places)[:, 0], np.asarray(kinds)[:, 0]):
