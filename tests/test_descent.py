@@ -1,6 +1,7 @@
 """The constraint solver that is written out number by number, and its GPU kernel, which Pallas's interpreter runs here."""
 
 import functools
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -133,6 +134,16 @@ def test_dry_friction_is_not_jumped_over():
     assert float(descent.lowest(slope_at, corners, jnp.float32(1.0))) == pytest.approx(0.3, abs=1e-5)
 
 
+@jax.jit
+def lowest_over_parabolas(residual, along, stiffness, first, second):
+    def slope_at(length):
+        there = residual + length * along
+        acting = jnp.where(there < 0, stiffness, 0.0) * along
+        return first + second * length + acting @ there, second + acting @ along
+
+    return descent.lowest(slope_at, list(-residual / along), jnp.float32(1.0))
+
+
 def test_the_line_search_finds_the_least_cost():
     """Over parabolas of 1 to 12 constraints that start or end along the line."""
     rng = np.random.default_rng(1)
@@ -142,12 +153,7 @@ def test_the_line_search_finds_the_least_cost():
         second = rng.uniform(0.1, 1)
         first = -abs(rng.normal()) - max(np.where(residual < 0, stiffness, 0) @ (residual * along), 0.0)  # downhill
 
-        def slope_at(length, residual=residual, along=along, stiffness=stiffness, first=first, second=second):
-            there = residual + length * along
-            acting = jnp.where(there < 0, stiffness, 0.0) * along
-            return first + second * length + acting @ there, second + acting @ along
-
-        found = descent.lowest(slope_at, [jnp.float32(corner) for corner in -residual / along], jnp.float32(1.0))
+        found = lowest_over_parabolas(*(np.float32(each) for each in (residual, along, stiffness, first, second)))
         there = residual[:, None] + along[:, None] * lengths
         costs = first * lengths + 0.5 * second * lengths**2
         costs += 0.5 * (np.where(there < 0, stiffness[:, None], 0) * there**2).sum(axis=0)
@@ -159,7 +165,7 @@ def test_the_kernel_has_the_same_motion(solved):
     first = jax.tree.map(lambda array: jnp.asarray(array[:4], jnp.float32).reshape(2, 2, *array.shape[1:]), given)
     # Two axes, as in training: seeds and environments.
     kernel = functools.partial(newton_kernel.solve, STRUCTURE, interpret=True)
-    for ours, theirs in zip(jax.vmap(jax.vmap(kernel))(first), motion, strict=True):
+    for ours, theirs in zip(jax.jit(jax.vmap(jax.vmap(kernel)))(first), motion, strict=True):
         np.testing.assert_allclose(ours.reshape(4, -1), theirs[:4], rtol=1e-4, atol=1e-4)
 
 
@@ -183,8 +189,20 @@ def test_the_hand_has_few_rows_that_tie_any_joint_to_any_other():
     assert {len(row) for row in structure.rows[:28]} == {1, 2}
 
 
-def test_a_problem_of_the_hand_is_solved():
-    """24 joints: a tree's factorization, and contacts added one by one. It is not compiled, which takes minutes."""
+def loop_of_numpy(first, last, body, state):
+    for number in range(first, last):
+        state = body(number, state)
+    return state
+
+
+def test_a_problem_of_the_hand_is_solved(monkeypatch):
+    """24 joints: a tree's factorization, and contacts added one by one.
+
+    NumPy does the arithmetic, in float32, too: to compile it takes minutes, and JAX takes ten seconds for it number by number.
+    """
+    monkeypatch.setattr(descent, "jnp", np)
+    monkeypatch.setattr(descent, "jax", SimpleNamespace(lax=SimpleNamespace(fori_loop=loop_of_numpy)))
+    monkeypatch.setattr(algebra, "jnp", np)
     env = environments.make("HandReach")
     structure = constraints.structure_of(mjx.put_model(env.mj_model), exact=True)._replace(iterations=10, warm=False)
     rng = np.random.default_rng(3)
@@ -205,11 +223,10 @@ def test_a_problem_of_the_hand_is_solved():
         most=np.zeros((count, rows)),
         cone=np.zeros((count, 0, 6)),
     )
-    numbers = descent.numbers_of(
-        structure, lambda name, *place: jnp.asarray(getattr(given, name)[(slice(None), *place)], jnp.float32)
-    )
-    with jax.disable_jit():
-        motion = Motion(*(np.stack(part, axis=1) for part in descent.solve(structure, numbers)))
+    given = Problem(*(array.astype(np.float32) for array in given))
+    numbers = descent.numbers_of(structure, lambda name, *place: getattr(given, name)[(slice(None), *place)])
+    motion = Motion(*(np.stack(part, axis=1) for part in descent.solve(structure, numbers)))
+    assert motion.acceleration.dtype == np.float32
     residual = np.einsum("brj,bj->br", given.jacobian, motion.acceleration) - given.target
     pull = np.where(residual < 0, -given.stiffness * residual, 0.0)
     assert (pull[:, 28:] > 0).any(axis=1).all() and (pull[:, 28:] == 0).any()
