@@ -493,7 +493,7 @@ def test_what_comes_beside_the_losses() -> None:
         (lambda: make_weighting("sum").init((MAIN, "near", "near")), ["two losses are called 'near'"]),
         (lambda: weighted_grad(losses_of, make_weighting("sum"), way="onehot"), ["'onehot'", "did you mean one_hot"]),
         (
-            lambda: weighted_grad(losses_of, make_weighting("sum"))(
+            lambda: jax.jit(weighted_grad(losses_of, make_weighting("sum")))(
                 *in_float32(problem(0))[:1], WRONG, in_float32(problem(0)[1])
             ),
             ["losses are far, main, near", "began with main, other"],
