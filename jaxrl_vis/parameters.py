@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxrl_vis.errors import RequestError
@@ -68,5 +67,5 @@ def read_parameters(path: Path, command: str) -> tuple[dict[str, Any], dict[str,
         *folders, last = name.split("/")
         for folder in folders:
             place = place.setdefault(folder, {})
-        place[last] = jnp.asarray(array, jnp.float32)
-    return params, about
+        place[last] = array.astype(np.float32)  # by NumPy: JAX would compile a program for each shape
+    return jax.device_put(params), about
