@@ -25,7 +25,7 @@ _IMAGES = (*_RENDERER, f"{_ENVS}/pixels.py")
 _TASK = (f"{_ENVS}/tasks/{{task}}.py", f"{_ENVS}/tasks/assets/{{task}}.xml")
 _LEARNER = ("jaxrl_vis/learner", "jaxrl_vis/config.py", "jaxrl_vis/methods.py")
 _TIMING = "jaxrl_vis/bench/timing.py"
-_TORCH = ("jaxrl_vis/bench/torch_learner.py", "jaxrl_vis/bench/torch_peer.py")
+_TORCH = tuple(f"jaxrl_vis/bench/torch_{part}.py" for part in ("layout", "learner", "peer"))
 _SCENES = ("jaxrl_vis/bench/scene_images.py", "jaxrl_vis/bench/render_scenes.py", _TIMING)
 
 MEASURED: dict[str, tuple[str, ...]] = {

@@ -6,23 +6,21 @@
 Parameters are float32 tensors by name ("encoder/kernel_0", "head/output/bias"); large kernels have a copy in the dtype that the
 networks compute in, which Adam writes with them. Everything is changed in place, so a graph finds it where it was.
 
-The replay holds images in the order that the encoder reads, which spares every step the rearrangement that ours makes:
-
-    blocks          nested 2x2 blocks, as `blocks.to_blocks`: each layer is a matrix product
-    convolutions    [H, W, C], PyTorch's channels_last: each layer is a convolution of 2x2 pixels with stride 2
+The replay holds images in the order that the encoder reads, see `torch_layout`, which spares every step the rearrangement that
+ours makes.
 """
 
 import dataclasses
 import functools
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, Literal
+from typing import Any
 
 import torch  # pyright: ignore[reportMissingImports]
 import torch.nn.functional as F  # noqa: N812 - its usual name  # pyright: ignore[reportMissingImports]
 
-Encoder = Literal["blocks", "convolutions"]
-ENCODERS: tuple[Encoder, ...] = ("blocks", "convolutions")
+from jaxrl_vis.bench import torch_layout
+
 NETWORKS = ("actor", "critic", "target_actor", "target_critic")
 
 _BETA_1, _BETA_2, _EPSILON = 0.9, 0.999, 1e-8  # Adam's, as in optax
@@ -36,7 +34,7 @@ class Rules:
     """What is learned and how; the numbers of a `Config` and its `Resolved`.
 
     Attributes:
-        encoder: How images are encoded, see above.
+        encoder: How images are encoded, see `torch_layout`.
         dtype: The dtype that the networks compute in.
         levels: Layers of the encoder.
         hidden: Hidden layers of a head.
@@ -49,7 +47,7 @@ class Rules:
             actor_learning_rate, critic_learning_rate, normalizer_clip: As in ours.
     """
 
-    encoder: Encoder
+    encoder: torch_layout.Encoder
     dtype: Any
     levels: int
     hidden: int
@@ -76,37 +74,6 @@ class Rules:
     normalizer_clip: float
 
 
-def to_layout(images: Any, encoder: Encoder, levels: int) -> Any:
-    """Planar images [..., C, H, W] in the order that an encoder reads: [..., blocks, 4^levels * C] or [..., H, W, C]."""
-    if encoder == "convolutions":
-        return images.movedim(-3, -1).contiguous()
-    *batch, channels, height, width = images.shape
-    rows, columns = height >> levels, width >> levels
-    images = images[..., : rows << levels, : columns << levels]
-    twos = (2,) * levels
-    first = len(batch)
-    row_axis, column_axis = first + 1, first + 2 + levels
-    pairs = [axis for level in range(1, levels + 1) for axis in (row_axis + level, column_axis + level)]
-    images = images.reshape(*batch, channels, rows, *twos, columns, *twos)
-    return images.permute(*range(first), row_axis, column_axis, *pairs, first).reshape(*batch, rows * columns, -1)
-
-
-def _from_ours(name: str, parameter: Any, encoder: Encoder) -> Any:
-    """A parameter of ours as this learner holds it: kernels of convolutions are [outputs, inputs, 2, 2] in channels_last."""
-    if encoder == "blocks" or not name.startswith("encoder/kernel_"):
-        return parameter.clone()
-    rows, outputs = parameter.shape
-    kernel = parameter.reshape(2, 2, rows // 4, outputs).permute(3, 2, 0, 1)
-    return kernel.contiguous(memory_format=torch.channels_last)
-
-
-def to_ours(name: str, parameter: Any, encoder: Encoder) -> Any:
-    """Undoes `_from_ours`, for a parameter or its gradient."""
-    if encoder == "blocks" or not name.startswith("encoder/kernel_"):
-        return parameter
-    return parameter.permute(2, 3, 1, 0).reshape(-1, parameter.shape[0])
-
-
 class Replay:
     """Episodes on the device, as `replay.ReplayState` holds them, every image in the order that the encoder reads.
 
@@ -123,7 +90,7 @@ class Replay:
         self.observations = torch.empty(0)
         for first in range(0, self.episodes, _REARRANGED):
             images = torch.tensor(observations[first : first + _REARRANGED], device=device)
-            images = to_layout(images, rules.encoder, rules.levels).flatten(0, 1)
+            images = torch_layout.to_layout(images, rules.encoder, rules.levels).flatten(0, 1)
             if first == 0:
                 rows = self.episodes * self.slots
                 self.observations = torch.empty((rows, *images.shape[1:]), dtype=torch.uint8, device=device)
@@ -154,7 +121,9 @@ class Learner:
     ):
         self.rules, self.replay, self.device = rules, replay, device
         self.networks: dict[str, Tensors] = {
-            network: {name: _from_ours(name, leaf.to(device), rules.encoder) for name, leaf in networks[network].items()}
+            network: {
+                name: torch_layout.from_ours(name, leaf.to(device), rules.encoder) for name, leaf in networks[network].items()
+            }
             for network in NETWORKS
         }
         self.copies: dict[str, Tensors] = {
@@ -168,7 +137,8 @@ class Learner:
         # [] float32 each: gradient steps of either network, on the device because Adam's corrections depend on them.
         self.counts = {network: torch.zeros((), device=device) for network in ("actor", "critic")}
         self.statistics = [
-            tuple(to_layout(plane.to(device), rules.encoder, rules.levels) for plane in pair) for pair in statistics
+            tuple(torch_layout.to_layout(plane.to(device), rules.encoder, rules.levels) for plane in pair)
+            for pair in statistics
         ]
         self.losses = torch.zeros(2, device=device)
         self.updates = 0  # on the host: which step comes next follows from it

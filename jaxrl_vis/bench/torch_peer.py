@@ -204,7 +204,7 @@ class _Peer:
     def __init__(self, program: TrainStep, train: TrainState, replay: ReplayState):
         self._module = load()
         self._torch = self._module.torch
-        self.version, self.encoders = str(self._torch.__version__), self._module.ENCODERS
+        self.version, self.encoders = str(self._torch.__version__), self._module.torch_layout.ENCODERS
         self.device = "cpu" if jax.default_backend() == "cpu" else "cuda"
         self._program, self._train = program, train
         self.reference = reference(program, train, replay)
@@ -243,7 +243,8 @@ class _Peer:
             losses.append([float(critic_error), float(policy_loss)])
             for network, gradients in (("critic", critic), ("actor", actor)):
                 name = COMPARED_LAYER[network]
-                slopes.setdefault(network, self._module.to_ours(name, gradients[name], encoder).cpu().numpy())
+                slope = self._module.torch_layout.to_ours(name, gradients[name], encoder)
+                slopes.setdefault(network, slope.cpu().numpy())
             learner.apply(critic, actor if turns[0] else {}, turns[1])
         torch.backends.cuda.matmul.allow_tf32, torch.backends.cudnn.allow_tf32 = precise
         return compare(self.reference, np.asarray(losses), slopes)
