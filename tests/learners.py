@@ -13,9 +13,10 @@ from jaxrl_vis_envs.compilation import env_jit
 # Fields that only gradient steps and evaluations read. (`normalizer_source` can make insertion relabel, too.)
 _LATER = ("updates_per_iteration", "batch_size", "n_step", "target_decay", "target_update_interval", "actor_interval") + (
     *("actor_learning_rate", "relabel_probability", "trivial_goals", "action_penalty", "random_shift", "eval_episodes"),
+    *("reward_noise", "reward_false_positives", "reward_false_negatives", "reward_clutter"),
 )
 # Those that a rollout reads, but not a fresh learner: what rewards mean for one, `critic_output_bias` says.
-_NOT_AT_FIRST = ("normalizer_source", "normalizer_floor", "reward_positive", "reward_negative")
+_NOT_AT_FIRST = ("normalizer_source", "normalizer_floor", "reward_positive", "reward_negative", "observation_noise")
 
 _compiled = {}
 

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import probe_environments as probes
 import pytest
+from learners import begin
 from test_ddpg import DISCOUNT, trained
 
 from jaxrl_vis.config import preset, resolve
@@ -46,19 +47,20 @@ def test_the_return_of_an_autoencoder_is_in_q(with_autoencoder):
     """Nothing moves, so Q is the likeness of point and goal, paid for ever: 1 for equal ones, less across the image."""
     program, train, metrics = with_autoencoder
     networks = program.networks
-    see = jax.vmap(probes.SeenGoWhereTold().see)
-    points = see(jnp.linspace(0.45, 0.85, 8)[:, None])
+    points = np.linspace(0.45, 0.85, 8, dtype=np.float32)[:, None]
 
-    def values_and_rewards(goal_images):
-        inputs = [networks.prepare(train.normalizer, each) for each in (points, goal_images)]
+    @jax.jit
+    def values_and_rewards(train, goals):
+        images = [jax.vmap(probes.SeenGoWhereTold().see)(each) for each in (points, goals)]
+        inputs = [networks.prepare(train.normalizer, each) for each in images]
         latents = jnp.stack([networks.encode(train.critic, each) for each in inputs])
         rewards = cosine_reward(*(networks.encode(train.autoencoder.params, each) for each in inputs))
-        return np.asarray(networks.value(train.critic, latents, jnp.zeros((8, 1)))), np.asarray(rewards)
+        return networks.value(train.critic, latents, jnp.zeros((8, 1))), rewards
 
-    values, rewards = values_and_rewards(points)
+    values, rewards = values_and_rewards(train, points)
     np.testing.assert_allclose(rewards, 1.0, atol=1e-5)
     np.testing.assert_allclose(values, BEST, atol=0.35)
-    values, rewards = values_and_rewards(see(jnp.linspace(-0.45, -0.85, 8)[:, None]))
+    values, rewards = values_and_rewards(train, -points)
     assert rewards.min() < 0.5  # there are unlike ones among them
     np.testing.assert_allclose(values, BEST * rewards, atol=0.5)
     assert abs(metrics["train/value_at_goals"][0] - BEST) < 0.35
@@ -67,7 +69,7 @@ def test_the_return_of_an_autoencoder_is_in_q(with_autoencoder):
 
 def test_an_autoencoder_learns_to_reconstruct(with_autoencoder):
     program, train, late = with_autoencoder
-    _, early = program.train_iteration(program.init(jax.random.key(7)[None]))
+    _, early = program.train_iteration(begin(program, jax.random.key(7)[None]))
     assert late["train/autoencoder_loss"][0] < 0.5 * early["train/autoencoder_loss"][0]
     assert set(train.autoencoder.params) == {"encoder", "decoder"}
 
@@ -95,7 +97,7 @@ def test_stacked_images_are_compared_as_goals():
     networks, resolved = program.networks, program.resolved
     latent_reward = make_latent_reward(networks, program.config, resolved, env.frame_stack)
     assert latent_reward is not None
-    train = jax.tree.map(lambda leaf: leaf[0], program.init(jax.random.key(0)[None]).train)
+    train = jax.tree.map(lambda leaf: leaf[0], begin(program, jax.random.key(0)[None]).train)
     moving = jax.random.bits(jax.random.key(1), (size, 2, 8, 8), jnp.uint8)
     reached = jax.vmap(env.as_goal)(moving)
     batch = Batch(jnp.stack([moving, reached, moving]), jnp.zeros((size, 1)), jnp.zeros((size, 1)), jnp.zeros((size, 1)))
@@ -233,7 +235,7 @@ def test_errors_of_the_estimator_show_in_the_diagnostics():
     options = {"reward_false_positives": 0.1, "reward_false_negatives": 0.2, "reward_clutter": 0.5, "relabel_probability": 0.9}
     config = preset("debug", num_envs=256, updates_per_iteration=20, batch_size=512, **options)
     program = make_train_step(probes.GoWhereTold(), config)
-    _, metrics = program.train_iteration(program.init(jax.random.key(3)[None]))
+    _, metrics = program.train_iteration(begin(program, jax.random.key(3)[None]))
     assert abs(metrics["train/false_positive_share"][0] - 0.1) < 0.03
     true_share = metrics["train/positive_share"][0]  # of what is there, about a fifth is not paid
     assert 0.0 < metrics["train/false_negative_share"][0] < 0.25 * true_share / (1.0 - true_share)
@@ -257,18 +259,22 @@ def test_noisy_frames_equal_themselves_and_no_others(noise):
     env = StillImage()
     config = preset("debug", method="indicator", num_envs=4, batch_size=4 * env.horizon, observation_noise=noise)
     program = make_train_step(env, config)
-    loop = program.init(jax.random.key(0)[None])
+    loop = begin(program, jax.random.key(0)[None])
     episodes, _ = program.rollout(loop.train, jax.random.key(1)[None])
     assert episodes.observations.dtype == jnp.uint8
     frames = np.asarray(episodes.observations[0]).reshape(-1, 64)
     assert len(np.unique(frames, axis=0)) == (1 if noise == 0.0 else len(frames))
     state = program.replay.of_rollout(jax.tree.map(lambda leaf: leaf[0], episodes))
     sampler = Sampler(config, resolve(config, env.horizon), program.replay, env.threshold)
-    choice = sampler.choose(state, jax.random.key(2), jnp.int32(0))
-    own = Choice(choice.indices, choice.indices.time + 1)
-    later = Choice(choice.indices, choice.indices.time + 2)
-    np.testing.assert_array_equal(sampler.batch(state, own).reward, 1.0)
-    np.testing.assert_array_equal(sampler.batch(state, later).reward, 1.0 if noise == 0.0 else -1.0)
+
+    @jax.jit
+    def rewards(state, key):
+        indices = sampler.choose(state, key, jnp.int32(0)).indices
+        return [sampler.batch(state, Choice(indices, indices.time + further)).reward for further in (1, 2)]
+
+    own, later = rewards(state, jax.random.key(2))
+    np.testing.assert_array_equal(own, 1.0)
+    np.testing.assert_array_equal(later, 1.0 if noise == 0.0 else -1.0)
 
 
 def test_noise_has_its_deviation_and_stays_in_range():
