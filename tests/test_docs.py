@@ -41,8 +41,10 @@ from jaxrl_vis_envs.names import TASKS
 DOCS = ROOT / "docs"
 # Commands that are executed; those that train, measure or draw for long are parsed and checked.
 EXECUTED = {"eval", "envs", "doctor", "--version", "--help"}
-# Python blocks are executed with the task that compiles fastest, and with small batches.
+# Python blocks are executed with the task that compiles fastest, with small batches, and an environment of Gymnasium's with the
+# images of the run that plays on the same page, so that its programs serve both.
 SMALLER = {"FetchReach": "Reacher", "4096": "4", "num_envs=64": "num_envs=4"}
+SMALLER |= {"image_size=64, render_mode": 'image_size=16, pixels="depth", render_mode'}
 
 
 def name_of(page: Path) -> str:
