@@ -40,7 +40,7 @@ class StaysPut(probes.SeenGoWhereTold):
 
 @pytest.fixture(scope="module")
 def with_autoencoder():
-    return trained(StaysPut(), method="autoencoder", iterations=25)
+    return trained(StaysPut(), method="autoencoder", iterations=14)
 
 
 def test_the_return_of_an_autoencoder_is_in_q(with_autoencoder):
