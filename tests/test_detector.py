@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tiny_detector import TINY
 
 from jaxrl_vis.errors import NonFiniteError, RequestError
 from jaxrl_vis.phenotyping.annotations import decode_counts, read_annotations
@@ -21,6 +22,7 @@ from jaxrl_vis.phenotyping.detector.weights import read_weights, write_weights
 from jaxrl_vis.phenotyping.images import rgb8
 from jaxrl_vis.phenotyping.training.augment import move, vary_snips
 from jaxrl_vis.phenotyping.training.examples import (
+    MOST,
     Example,
     _instance_masks,
     annotated_examples,
@@ -37,19 +39,6 @@ roi_align, best_proposals = jax.jit(roi_align, static_argnums=(2, 3, 4, 5)), jax
 assign, suppress, move = jax.jit(assign), jax.jit(suppress), jax.jit(move, static_argnums=3)
 
 RECORDED = np.load(Path(__file__).parent / "data" / "torchvision_boxes.npz")
-TINY = Settings(
-    width=64,
-    full_width=64,
-    snip_lines=32,
-    snip_columns=16,
-    band_lines=30.0,
-    anchor_widths=(6.0, 12.0),
-    channels=(8, 8, 8, 8),
-    hidden=8,
-    segmenter=(8, 8),
-    proposals=12,
-    most=8,
-)
 
 
 # --- operators ---
@@ -190,7 +179,7 @@ def drawing(seed: int) -> Example:
         image[line, begin:end] = 200
         mask[line, begin:end] = True
     stalk = np.array([min(top, bottom) - 3, 15, max(top, bottom) + 3, 45, top, bottom], np.float32)
-    stalks, kinds = np.zeros((4, 6), np.float32), np.zeros(4, np.int32)
+    stalks, kinds = np.zeros((MOST, 6), np.float32), np.zeros(MOST, np.int32)
     stalks[0], kinds[0] = stalk, STALK
     snips = np.asarray(cut(jnp.asarray(image), stalk[None], (32, 16)))
     masks = np.asarray(cut(jnp.asarray(mask), stalk[None], (32, 16)))

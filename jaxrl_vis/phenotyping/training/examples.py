@@ -28,8 +28,9 @@ LEAST_VISIBLE = 0.3
 """Share of a stalk in the band that must be seen for it to count."""
 _MasksOf = Callable[[np.ndarray, np.ndarray, tuple[int, int]], np.ndarray]
 """Masks [N, h, w] bool of the snips of stalks with indices [N], from their places [N or more, 6] and the snips' shape."""
+MOST = 56
+"""Stalks of an image that networks learn from."""
 _BARELY = 0.02  # what is seen less is not there
-_MOST = 56
 _THIN = 4
 _HIGHER = 0.3  # share of the stalks of which the networks also learn the piece around the upper height
 
@@ -147,8 +148,8 @@ def _example(
         snips = np.asarray(cut(on_device, places, shape))[: len(clear)]
         masks = masks_of(clear, places, shape)
     divisor = np.array([scale[1], scale[0], scale[1], scale[0], scale[1], scale[1]], np.float32)
-    count = min(len(stalks), _MOST)
-    padded, padded_kinds = np.zeros((_MOST, 6), np.float32), np.full(_MOST, NOTHING, np.int32)
+    count = min(len(stalks), MOST)
+    padded, padded_kinds = np.zeros((MOST, 6), np.float32), np.full(MOST, NOTHING, np.int32)
     padded[:count], padded_kinds[:count] = (stalks / divisor)[:count], kinds[:count]
     return Example(np.asarray(reduced), padded, padded_kinds, snips, masks)
 

@@ -1,0 +1,18 @@
+"""Settings of networks that compile quickly, and images as large as they are made for."""
+
+from jaxrl_vis.phenotyping.detector.detect import Settings
+
+IMAGE = (60, 64)
+TINY = Settings(
+    width=64,
+    full_width=64,
+    snip_lines=32,
+    snip_columns=16,
+    band_lines=30.0,
+    anchor_widths=(6.0, 12.0),
+    channels=(8, 8, 8, 8),
+    hidden=8,
+    segmenter=(8, 8),
+    proposals=12,
+    most=8,
+)
