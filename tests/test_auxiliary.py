@@ -18,7 +18,6 @@ from jaxrl_vis.learner.replay import Indices, Replay
 from jaxrl_vis.learner.sampling import Choice, Sampler
 from jaxrl_vis.types import Episodes
 from jaxrl_vis.validation import validate
-from jaxrl_vis_envs.compilation import env_jit
 
 SPEC = jax.ShapeDtypeStruct((2, 16, 16), jnp.uint8)
 ACTIONS, HORIZON, EPISODES, BATCH = 2, 6, 4, 16
@@ -67,8 +66,8 @@ def fresh(tasks, encoders, target_encoder):
     """A fresh learner but for the state of its weighting: how losses are weighted changes nothing else at the beginning."""
     chosen = config(aux_tasks=tasks, weighting="sum" if tasks else "none", encoders=encoders, target_encoder=target_encoder)
     algorithm = make_ddpg(Networks(chosen, SPEC, ACTIONS, 0.0), chosen, resolve(chosen, HORIZON))
-    # The key is an argument: of a constant, XLA would draw the numbers itself, and slowly.
-    return env_jit(algorithm.init, runs_once=True)(jax.random.key(3))
+    # Not as a program: operation by operation, what is drawn in one size is compiled once for all of these learners.
+    return algorithm.init(jax.random.key(3))
 
 
 @functools.cache
