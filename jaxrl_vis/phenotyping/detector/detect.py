@@ -51,6 +51,12 @@ class Settings:
     threshold: float = 0.4
     least_score: float = 0.05
 
+    def at_width(self, width: int) -> "Settings":
+        """These settings for images that are reduced to another width; what is looked for is as large in the world."""
+        scale = width / self.width
+        anchors = tuple(round(each * scale, 3) for each in self.anchor_widths)
+        return dataclasses.replace(self, width=width, band_lines=self.band_lines * scale, anchor_widths=anchors)
+
     def detector(self, dtype: Any = jnp.float32) -> Detector:
         """The network that these settings describe."""
         return Detector(self.channels, self.hidden, len(self.anchor_widths), dtype)
