@@ -10,15 +10,15 @@ import functools
 import resource
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from side_by_side import Once, print_rate, timed
 
-from jaxrl_vis.evaluation_pool import processes, share_accelerator
+from jaxrl_vis.evaluation_pool import share_accelerator
 from jaxrl_vis.phenotyping.detector.detect import detect, pad
 from jaxrl_vis.phenotyping.detector.finder import Finder, reduce
 from jaxrl_vis.phenotyping.detector.weights import SHIPPED, read_weights
@@ -30,52 +30,19 @@ from jaxrl_vis_envs.plants.pairs import Sequence
 from jaxrl_vis_envs.plants.truth import stalks_in_view
 
 
-def timed(run: Callable[[], Any], repeats: int) -> list[float]:
-    """Seconds of each repeat, after one that compiles."""
-    run()
-    times = []
-    for _ in range(repeats):
-        started = time.perf_counter()
-        run()
-        times.append(time.perf_counter() - started)
-    return times
-
-
-def pairs_a_second(workers: int, seconds: float, pairs: list[tuple[np.ndarray, np.ndarray]], stated: Calibration) -> None:
-    """Prints how long a pair takes where so many processes look at pairs side by side, each at one of its own."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder)
-        np.savez(path / "pairs.npz", *[image for pair in pairs for image in pair])
-        with processes(workers) as each:
-            work = functools.partial(_work, path, workers, seconds, stated)
-            counts = list(each(work, range(workers)))
-    total, finds = sum(count for count, _ in counts), [found for _, found in counts]
-    assert len({tuple(each) for each in finds}) > 1 or workers < 2, "all pairs gave the same"
-    print(f"{workers} processes: {seconds / total:.4f} s a pair ({total} pairs in {seconds:.0f} s)")
-
-
-def _work(folder: Path, workers: int, seconds: float, stated: Calibration, index: int) -> tuple[int, list[float]]:
-    """What one process does: pairs from arrays in memory, once all are ready; how many, and the widths of the last one."""
-    images = list(np.load(folder / "pairs.npz").values())
+def make(path: Path, stated: Calibration) -> tuple[Once, int]:
+    """What a process does with the pairs in a file."""
+    images = list(np.load(path).values())
     pairs = list(zip(images[::2], images[1::2]))
     params, settings, _ = read_weights(SHIPPED)
-    finder, widths = Finder(params, settings), []
+    finder = Finder(params, settings)
 
     def once(number: int) -> list[float]:
-        left, right = pairs[(index + number) % len(pairs)]
+        left, right = pairs[number]
         detections, ground = find_with_ground(finder, left, right, stated)
         return [each.diameter_mm or 0.0 for each in look(detections, left, right, stated, ground=ground)]
 
-    for number in range(len(pairs)):
-        once(number)
-    (folder / f"ready_{index}").touch()
-    while len(list(folder.glob("ready_*"))) < workers:
-        time.sleep(0.01)
-    count, started = 0, time.perf_counter()
-    while time.perf_counter() - started < seconds:
-        widths = once(count)
-        count += 1
-    return count, widths
+    return once, len(pairs)
 
 
 if __name__ == "__main__":
@@ -133,6 +100,8 @@ if __name__ == "__main__":
     print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6:.2f} GB, drawing the pair included")
     if options.workers:
         some = [sequence[frame] for frame in (5, 12, 19, 26)]
-        images = [(np.asarray(each.left), np.asarray(each.right)) for each in some]
-        for workers in options.workers:
-            pairs_a_second(workers, options.seconds, images, stated)
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "pairs.npz"
+            np.savez(path, *[np.asarray(image) for each in some for image in (each.left, each.right)])
+            for workers in options.workers:
+                print_rate(functools.partial(make, path, stated), workers, options.seconds)

@@ -124,6 +124,17 @@ def test_proposals_are_the_best_anchors_and_no_copies():
     assert between.max() <= TINY.proposal_threshold
 
 
+def test_copies_of_a_stalk_leave_room_for_another():
+    easy, hard = jnp.array([20.0, 10.0, 30.0, 40.0]), jnp.array([44.0, 10.0, 54.0, 40.0])
+    anchors = jnp.concatenate([jnp.tile(easy, (99, 1)), hard[None]])
+    logits = jnp.linspace(5.0, 1.0, len(anchors))
+    codes = jnp.zeros((len(anchors), 6))
+    for candidates, wanted in ((99, [easy]), (100, [easy, hard])):
+        settings = dataclasses.replace(TINY, candidates=candidates)
+        boxes, _, valid = best_proposals(logits, codes, anchors, settings, (60, 64))
+        np.testing.assert_allclose(boxes[valid], jnp.stack(wanted), atol=1e-5)
+
+
 def test_boxes_on_unclear_stalks_are_neither_right_nor_wrong():
     truth = jnp.array([[10.0, 0, 20, 60, 15, 15], [40, 0, 50, 60, 45, 45], [70, 0, 80, 60, 75, 75]])
     kinds = jnp.array([STALK, UNCLEAR, NOTHING])

@@ -1,0 +1,73 @@
+"""Time for one pair of 1,024 x 1,024 on the way to grasp points, from arrays in memory: `python benchmarks/grasp_pair.py`.
+
+Matching, masks, clouds, stitches and grasp points of runs of five pairs of the shifted family; drawing them is not in it.
+``--workers 1 8 15`` says how long a pair takes where so many processes look at runs, as with `grasp eval --workers`.
+"""
+
+import argparse
+import functools
+import pickle
+import resource
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from side_by_side import Once, print_rate
+
+from jaxrl_vis.evaluation_pool import share_accelerator
+from jaxrl_vis.grasping.evaluate import Scene, draw_scene
+from jaxrl_vis.grasping.masks.painter import SHIPPED, Painter, read_weights
+from jaxrl_vis.grasping.perceive import Perception, perceive
+from jaxrl_vis.provenance import device_name
+from jaxrl_vis_envs.plants.grasping import GRASPING_FAMILIES
+
+
+def look(scene: Scene, painter: Painter) -> Perception:
+    """All that a run's pairs say."""
+    return perceive(scene.views, lambda image, _: painter(image), scene.drive.stated, scene.mount)
+
+
+def make(path: Path) -> tuple[Once, int]:
+    """What a process does with the runs in a file."""
+    scenes = pickle.loads(path.read_bytes())
+    params, settings, _ = read_weights(SHIPPED["segmentation"])
+    painter = Painter(params, settings)
+
+    def once(number: int) -> list[float]:
+        return [float(each) for point in look(scenes[number], painter).points for each in point.point]
+
+    return once, len(scenes)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description="Time for one synthetic pair.")
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument(
+        "--workers", type=int, nargs="*", default=[], help="processes side by side; several numbers, one by one"
+    )
+    parser.add_argument("--seconds", type=float, default=10.0, help="how long each number of them is timed")
+    options = parser.parse_args()
+    if options.workers:
+        share_accelerator()
+    scenes = [draw_scene(GRASPING_FAMILIES["shifted"], seed) for seed in range(3)]
+    params, settings, _ = read_weights(SHIPPED["segmentation"])
+    painter = Painter(params, settings)
+    started = time.perf_counter()
+    look(scenes[0], painter)
+    first = time.perf_counter() - started
+    runs = [look(scenes[number % len(scenes)], painter) for number in range(options.repeats)]
+    assert len({str([point.point for point in run.points]) for run in runs}) > 1, "all runs gave the same"
+    count = len(scenes[0].views)
+    height, width = scenes[0].views[0].left.shape[:2]
+    whole = [sum(run.seconds.values()) / count for run in runs]
+    print(f"{width} x {height}, runs of {count} pairs, {len(runs[0].points)} grasp points in the first, on {device_name()}")
+    print(f"{np.median(whole):.3f} s a pair (least {min(whole):.3f}); the first run, which compiles, {first:.1f} s")
+    for name in runs[0].seconds:
+        print(f"  {np.median([run.seconds[name] / count for run in runs]):.4f} s  {name}")
+    print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6:.2f} GB, drawing the pairs included")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "scenes.pickle"
+        path.write_bytes(pickle.dumps(scenes))
+        for workers in options.workers:
+            print_rate(functools.partial(make, path), workers, options.seconds, count)

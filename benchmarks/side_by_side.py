@@ -1,0 +1,58 @@
+"""How often something is done in a second where several processes do it side by side; for the scripts beside this one."""
+
+import functools
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from jaxrl_vis.evaluation_pool import processes
+
+Once = Callable[[int], list[float]]
+"""Does it once, with the input of that number, and says something of what came out."""
+
+
+def timed(run: Callable[[], object], repeats: int) -> list[float]:
+    """Seconds of each repeat, after one that compiles."""
+    run()
+    times = []
+    for _ in range(repeats):
+        started = time.perf_counter()
+        run()
+        times.append(time.perf_counter() - started)
+    return times
+
+
+def print_rate(make: Callable[[], tuple[Once, int]], workers: int, seconds: float, each_is: float = 1.0) -> None:
+    """Prints how long a pair takes where so many processes look at pairs, each at one of its own.
+
+    Args:
+        make: Called in each process: what it does, and for how many inputs; these are done once before time is taken.
+        workers: How many processes.
+        seconds: How long they go on, once all are ready.
+        each_is: How many pairs are looked at each time.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        with processes(workers) as each:
+            done = list(each(functools.partial(_work, make, Path(folder), workers, seconds), range(workers)))
+    results = [results for _, results in done]
+    assert len({tuple(each) for each in results}) > 1 or workers < 2, "all pairs gave the same"
+    pairs = sum(count for count, _ in done) * each_is
+    print(f"{workers} processes: {seconds / pairs:.4f} s a pair ({pairs:.0f} pairs in {seconds:.0f} s)")
+
+
+def _work(
+    make: Callable[[], tuple[Once, int]], folder: Path, workers: int, seconds: float, index: int
+) -> tuple[int, list[float]]:
+    """What one process does: how often it came to an end, and what came out last."""
+    once, inputs = make()
+    for number in range(inputs):
+        once(number)
+    (folder / f"ready_{index}").touch()
+    while len(list(folder.glob("ready_*"))) < workers:
+        time.sleep(0.01)
+    count, result, started = 0, [], time.perf_counter()
+    while time.perf_counter() - started < seconds:
+        result = once((index + count) % inputs)
+        count += 1
+    return count, result
