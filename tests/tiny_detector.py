@@ -13,7 +13,6 @@ TINY = Settings(
     channels=(8, 8, 8, 8),
     hidden=8,
     segmenter=(8, 8),
-    candidates=36,
     proposals=12,
     most=8,
 )

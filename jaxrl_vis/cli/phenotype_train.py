@@ -164,5 +164,7 @@ def _start(options: Train) -> tuple[Any, "Settings", str]:
             raise RequestError(f"{why}: annotate stalks from 8 to 16 inches above the ground, or give --start random")
         print(f"starting from random weights: {why}")
         return None, fitting, ""
-    # What was learned goes with its anchors, so those of the annotations are not taken.
+    # What was learned goes with its anchors, so those of the annotations are not taken. How many candidates there are is no
+    # part of it: what the head has not seen yet it learns now.
+    settings = dataclasses.replace(settings, candidates=Settings().candidates)
     return params, settings, f", from {'the weights that ship' if start == 'shipped' else start}"
