@@ -186,9 +186,7 @@ class Scene:
                 would be seen cannot be drawn (skins, flexes, signed distance fields, lights that are images, shadows of
                 meshes).
         """
-        for name, pixels in (("height", height), ("width", width)):
-            if not isinstance(pixels, numbers.Integral) or pixels < 1:
-                raise ValueError(f"an image needs a whole number of pixels each way, at least one, not {name}={pixels!r}")
+        _check_size(height=height, width=width)
         reading.check_names(mj_model, leave_out)
         camera_id = reading.find_camera(mj_model, camera)
         appearance = reading.object_appearance(mj_model)
@@ -229,3 +227,10 @@ class Scene:
     def replace(self, **changes: Any) -> Self:
         """A copy with some fields changed."""
         return dataclasses.replace(self, **changes)
+
+
+def _check_size(**lengths: int) -> None:
+    """Raises a ValueError that names the first length that no image can have."""
+    for name, pixels in lengths.items():
+        if not isinstance(pixels, numbers.Integral) or pixels < 1:
+            raise ValueError(f"an image needs a whole number of pixels each way, at least one, not {name}={pixels!r}")
