@@ -53,9 +53,6 @@ class Train:
     """How many processes draw synthetic plots while the networks learn; 1: a thread of this one."""
     width: int | None = None
     """Width of a synthetic image in pixels, in place of the family's 3376; what is seen stays the same."""
-    detector_width: int | None = None
-    """Width in pixels to which images are reduced before stalks are looked for; 844 if not given, or that of the weights of
-    --start. More tells stalks that stand close together better apart, and takes longer."""
     seed: int = 0
     """Of everything random."""
 
@@ -69,7 +66,6 @@ def train(options: Train) -> int:
         snips=options.snips,
         workers=options.workers,
         width=options.width,
-        detector_width=options.detector_width,
     )
     if options.data is not None and (options.spec is not None or options.width is not None):
         raise RequestError("--data takes images of your own: leave out --spec and --width, which describe synthetic ones")
@@ -147,14 +143,11 @@ def _start(options: Train) -> tuple[Any, "Settings", str]:
     from jaxrl_vis.phenotyping.detector.weights import SHIPPED, read_weights
     from jaxrl_vis.phenotyping.training.examples import settings_for
 
-    width = options.detector_width
-    anew = Settings() if width is None else Settings().at_width(width)
-    fitting = None if options.data is None else settings_for(options.data, anew)
+    fitting = None if options.data is None else settings_for(options.data, Settings())
     start = options.start or ("random" if fitting is None else "shipped")
     if start == "random":
-        return None, fitting or anew, ""
+        return None, fitting or Settings(), ""
     params, settings, _ = read_weights(SHIPPED if start == "shipped" else Path(start))
-    settings = settings if width is None else settings.at_width(width)
     if fitting is not None and not 0.5 <= fitting.band_lines / settings.band_lines <= 2.0:
         why = (
             f"boxes of {options.data} are {fitting.band_lines:.0f} pixels tall in images of {settings.width}, and those that "
