@@ -4,7 +4,6 @@ Matching, masks, clouds, stitches and grasp points of runs of five pairs of the 
 ``--workers 1 8 15`` says how long a pair takes where so many processes look at runs, as with `grasp eval --workers`.
 """
 
-import argparse
 import functools
 import pickle
 import resource
@@ -13,9 +12,8 @@ import time
 from pathlib import Path
 
 import numpy as np
-from side_by_side import Once, print_rate
+from side_by_side import Once, options, print_rate
 
-from jaxrl_vis.evaluation_pool import share_accelerator
 from jaxrl_vis.grasping.evaluate import Scene, draw_scene
 from jaxrl_vis.grasping.masks.painter import SHIPPED, Painter, read_weights
 from jaxrl_vis.grasping.perceive import Perception, perceive
@@ -41,22 +39,16 @@ def make(path: Path) -> tuple[Once, int]:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description="Time for one synthetic pair.")
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument(
-        "--workers", type=int, nargs="*", default=[], help="processes side by side; several numbers, one by one"
-    )
-    parser.add_argument("--seconds", type=float, default=10.0, help="how long each number of them is timed")
-    options = parser.parse_args()
-    if options.workers:
-        share_accelerator()
-    scenes = [draw_scene(GRASPING_FAMILIES["shifted"], seed) for seed in range(3)]
+    asked = options()
+    family = GRASPING_FAMILIES["shifted"]
+    family = family if asked.width is None else family.at_width(asked.width)
+    scenes = [draw_scene(family, seed) for seed in range(3)]
     params, settings, _ = read_weights(SHIPPED["segmentation"])
     painter = Painter(params, settings)
     started = time.perf_counter()
     look(scenes[0], painter)
     first = time.perf_counter() - started
-    runs = [look(scenes[number % len(scenes)], painter) for number in range(options.repeats)]
+    runs = [look(scenes[number % len(scenes)], painter) for number in range(asked.repeats)]
     assert len({str([point.point for point in run.points]) for run in runs}) > 1, "all runs gave the same"
     count = len(scenes[0].views)
     height, width = scenes[0].views[0].left.shape[:2]
@@ -69,5 +61,5 @@ if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scenes.pickle"
         path.write_bytes(pickle.dumps(scenes))
-        for workers in options.workers:
-            print_rate(functools.partial(make, path), workers, options.seconds, count)
+        for workers in asked.workers:
+            print_rate(functools.partial(make, path), workers, asked.seconds, count)

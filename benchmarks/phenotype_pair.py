@@ -5,7 +5,6 @@ are timed one after the other in repeats of their own; in the whole, the ground 
 ``--workers 1 8 14`` says how long a pair takes where so many processes look at pairs, as with `phenotype run --workers`.
 """
 
-import argparse
 import functools
 import resource
 import tempfile
@@ -16,9 +15,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from side_by_side import Once, print_rate, timed
+from side_by_side import Once, options, print_rate, timed
 
-from jaxrl_vis.evaluation_pool import share_accelerator
 from jaxrl_vis.phenotyping.detector.detect import detect, pad
 from jaxrl_vis.phenotyping.detector.finder import Finder, reduce
 from jaxrl_vis.phenotyping.detector.weights import SHIPPED, read_weights
@@ -46,17 +44,8 @@ def make(path: Path, stated: Calibration) -> tuple[Once, int]:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description="Time and memory for one synthetic pair.")
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--width", type=int, default=3376, help="of an image, pixels")
-    parser.add_argument(
-        "--workers", type=int, nargs="*", default=[], help="processes side by side; several numbers, one by one"
-    )
-    parser.add_argument("--seconds", type=float, default=10.0, help="how long each number of them is timed")
-    options = parser.parse_args()
-    if options.workers:
-        share_accelerator()
-    family = SHIFTED.at_width(options.width)
+    asked = options()
+    family = SHIFTED if asked.width is None else SHIFTED.at_width(asked.width)
     sequence = Sequence.of(draw(family, 3))
     pair = sequence[15]
     left, right, stated = np.asarray(pair.left), np.asarray(pair.right), sequence.drive.stated
@@ -72,7 +61,7 @@ if __name__ == "__main__":
     detections, ground, sightings = once()
     first = time.perf_counter() - started
     measured = sum(each.diameter_mm is not None for each in sightings)
-    whole = timed(once, options.repeats)
+    whole = timed(once, asked.repeats)
     print(f"{left.shape[1]} x {left.shape[0]}, {len(detections)} finds, {measured} measured, on {device_name()}")
     print(f"{np.median(whole):.3f} s a pair (least {min(whole):.3f}); the first one, which compiles, {first:.1f} s")
     small = pad(reduce(left, settings.width)[0])
@@ -86,7 +75,7 @@ if __name__ == "__main__":
         "disparities and widths": lambda: look(detections, left, right, stated, ground=ground),
     }
     for name, part in parts.items():
-        print(f"  {np.median(timed(part, options.repeats)):.4f} s  {name}")
+        print(f"  {np.median(timed(part, asked.repeats)):.4f} s  {name}")
     print("what an evaluated pair costs besides:")
     on_device = (pair.left, pair.right, pair.instance, pair.depth)
     truth = np.asarray(pair.instance), np.asarray(pair.depth)
@@ -96,12 +85,12 @@ if __name__ == "__main__":
         "truth of the stalks": lambda: stalks_in_view(sequence.plot, pair.pose, sequence.drive.true, *truth),
     }
     for name, part in others.items():
-        print(f"  {np.median(timed(part, min(options.repeats, 3))):.4f} s  {name}")
+        print(f"  {np.median(timed(part, min(asked.repeats, 3))):.4f} s  {name}")
     print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6:.2f} GB, drawing the pair included")
-    if options.workers:
+    if asked.workers:
         some = [sequence[frame] for frame in (5, 12, 19, 26)]
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "pairs.npz"
             np.savez(path, *[np.asarray(image) for each in some for image in (each.left, each.right)])
-            for workers in options.workers:
-                print_rate(functools.partial(make, path, stated), workers, options.seconds)
+            for workers in asked.workers:
+                print_rate(functools.partial(make, path, stated), workers, asked.seconds)

@@ -1,12 +1,13 @@
 """How often something is done in a second where several processes do it side by side; for the scripts beside this one."""
 
+import argparse
 import functools
 import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
 
-from jaxrl_vis.evaluation_pool import processes
+from jaxrl_vis.evaluation_pool import processes, share_accelerator
 
 Once = Callable[[int], list[float]]
 """Does it once, with the input of that number, and says something of what came out."""
@@ -21,6 +22,21 @@ def timed(run: Callable[[], object], repeats: int) -> list[float]:
         run()
         times.append(time.perf_counter() - started)
     return times
+
+
+def options() -> argparse.Namespace:
+    """What the scripts are asked for; one that asks for several processes shares its GPU with them."""
+    parser = argparse.ArgumentParser(description="Time and memory for one synthetic pair.")
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument(
+        "--workers", type=int, nargs="*", default=[], help="processes side by side; several numbers, one by one"
+    )
+    parser.add_argument("--seconds", type=float, default=10.0, help="how long each number of them is timed")
+    parser.add_argument("--width", type=int, help="of an image, pixels, in place of the family's")
+    found = parser.parse_args()
+    if found.workers:
+        share_accelerator()
+    return found
 
 
 def print_rate(make: Callable[[], tuple[Once, int]], workers: int, seconds: float, each_is: float = 1.0) -> None:
