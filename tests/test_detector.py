@@ -12,7 +12,7 @@ from tiny_detector import TINY
 from jaxrl_vis.errors import NonFiniteError, RequestError
 from jaxrl_vis.phenotyping.annotations import decode_counts, read_annotations
 from jaxrl_vis.phenotyping.detector.anchors import anchors_of, decode, encode
-from jaxrl_vis.phenotyping.detector.boxes import band_overlap, nms, overlap, roi_align, suppress
+from jaxrl_vis.phenotyping.detector.boxes import band_overlap, overlap, roi_align, suppress
 from jaxrl_vis.phenotyping.detector.detect import Settings, best_proposals
 from jaxrl_vis.phenotyping.detector.doubles import found_once
 from jaxrl_vis.phenotyping.detector.finder import Finder
@@ -33,10 +33,17 @@ from jaxrl_vis.phenotyping.training.loop import Plan, train
 from jaxrl_vis_envs.plants import family
 
 # One program each, in place of one for every operation in them.
-nms, band_overlap, overlap = jax.jit(nms), jax.jit(band_overlap), jax.jit(overlap)
+band_overlap, overlap = jax.jit(band_overlap), jax.jit(overlap)
 encode, decode, vary_snips = jax.jit(encode), jax.jit(decode), jax.jit(vary_snips)
 roi_align, best_proposals = jax.jit(roi_align, static_argnums=(2, 3, 4, 5)), jax.jit(best_proposals, static_argnums=(3, 4))
 assign, suppress, move = jax.jit(assign), jax.jit(suppress), jax.jit(move, static_argnums=3)
+
+
+@jax.jit
+def nms(boxes, scores, threshold, valid=None):
+    """Non-maximum suppression of boxes [N, 4] by intersection over union, as torchvision's."""
+    return suppress(overlap(boxes, boxes), scores, threshold, valid)
+
 
 RECORDED = np.load(Path(__file__).parent / "data" / "torchvision_boxes.npz")
 
@@ -56,6 +63,18 @@ def test_roi_align_is_torchvisions(aligned):
     np.testing.assert_allclose(np.asarray(pooled), RECORDED[f"pooled_{int(aligned)}"], atol=2e-5)
 
 
+def test_a_region_leans_as_its_stalk():
+    """In features that say their column, each line of the grid is moved as the middle of a box is that leans."""
+    lines, columns = jnp.meshgrid(jnp.arange(40.0), jnp.arange(60.0), indexing="ij")
+    features = jnp.stack([lines, columns], axis=-1)
+    boxes, lean = jnp.array([[20.0, 10.0, 28.0, 30.0], [30.0, 4.0, 38.0, 24.0]]), jnp.array([10.0, -5.0])
+    upright = np.asarray(roi_align(features, boxes, (5, 4), 1.0, 2, True))
+    leaning = np.asarray(roi_align(features, boxes, (5, 4), 1.0, 2, True, lean))
+    moved = np.asarray(lean)[:, None] * np.array([-0.4, -0.2, 0.0, 0.2, 0.4])
+    np.testing.assert_allclose(leaning[..., 0], upright[..., 0], atol=1e-4)
+    np.testing.assert_allclose(leaning[..., 1], upright[..., 1] + moved[..., None], atol=1e-4)
+
+
 def test_what_is_not_there_suppresses_nothing():
     boxes = jnp.array([[0.0, 0, 10, 10], [1, 0, 11, 10], [40, 0, 50, 10]])
     scores = jnp.array([0.9, 0.8, 0.7])
@@ -69,7 +88,7 @@ def test_parallel_stalks_that_lean_are_two():
     beside = [12.0, 2.0, 52.0, 137.0, 47.0, 17.0]
     again = [1.0, 3.0, 41.0, 138.0, 36.0, 6.0]
     stalks = jnp.array([first, beside, again])
-    overlaps = np.asarray(band_overlap(stalks[:, :4], stalks[:, 4:]))
+    overlaps = np.asarray(band_overlap(stalks, stalks))
     assert np.asarray(overlap(stalks[:, :4], stalks[:, :4]))[0, 1] > 0.5
     assert overlaps[0, 1] < 0.01 and overlaps[0, 2] > 0.6
     assert suppress(jnp.asarray(overlaps), jnp.array([0.9, 0.8, 0.7]), 0.4).tolist() == [True, True, False]
@@ -104,9 +123,9 @@ def test_a_stalk_that_two_finds_outline_is_one():
 def test_codes_are_inverted():
     rng = np.random.default_rng(0)
     corner = rng.uniform(0, 100, (50, 2))
-    boxes = np.concatenate([corner, corner + rng.uniform(5, 50, (50, 2))], axis=1)
-    stalks = np.concatenate([boxes + rng.uniform(-2, 2, (50, 4)), rng.uniform(0, 100, (50, 2))], axis=1)
-    back = decode(encode(jnp.asarray(stalks), jnp.asarray(boxes)), jnp.asarray(boxes))
+    others = np.concatenate([corner, corner + rng.uniform(5, 50, (50, 2)), rng.uniform(0, 100, (50, 2))], axis=1)
+    stalks = others + np.concatenate([rng.uniform(-2, 2, (50, 4)), rng.uniform(-50, 50, (50, 2))], axis=1)
+    back = decode(encode(jnp.asarray(stalks), jnp.asarray(others)), jnp.asarray(others))
     np.testing.assert_allclose(np.asarray(back), stalks, atol=1e-3)
 
 
@@ -114,31 +133,32 @@ def test_proposals_are_the_best_anchors_and_no_copies():
     shape = (64, 64)
     anchors = jnp.asarray(anchors_of(shape, 30.0, (6.0, 12.0)))
     logits = jnp.full(len(anchors), -5.0).at[jnp.array([40, 42, 90])].set(jnp.array([3.0, 2.0, 4.0]))
-    boxes, scores, valid = best_proposals(logits, jnp.zeros((len(anchors), 6)), anchors, TINY, shape)
-    assert boxes.shape == (12, 4) and valid.shape == (12,)
+    stalks, scores, valid = best_proposals(logits, jnp.zeros((len(anchors), 6)), anchors, TINY, shape)
+    assert stalks.shape == (12, 6) and valid.shape == (12,)
     assert scores[0] == 4.0
-    kept = np.asarray(boxes)[np.asarray(valid)]
-    assert kept.min() >= 0 and kept.max() <= 64
-    between = np.array(overlap(jnp.asarray(kept), jnp.asarray(kept)))
+    kept = np.asarray(stalks)[np.asarray(valid)]
+    assert kept[:, :4].min() >= 0 and kept[:, :4].max() <= 64
+    between = np.array(band_overlap(jnp.asarray(kept), jnp.asarray(kept)))
     np.fill_diagonal(between, 0)
     assert between.max() <= TINY.proposal_threshold
 
 
 def test_copies_of_a_stalk_leave_room_for_another():
-    easy, hard = jnp.array([20.0, 10.0, 30.0, 40.0]), jnp.array([44.0, 10.0, 54.0, 40.0])
+    """Another may lean across it: their boxes overlap by most of them, their strips do not."""
+    easy, hard = jnp.array([20.0, 10.0, 40.0, 40.0, 22.0, 38.0]), jnp.array([20.0, 10.0, 40.0, 40.0, 38.0, 22.0])
     anchors = jnp.concatenate([jnp.tile(easy, (99, 1)), hard[None]])
     logits = jnp.linspace(5.0, 1.0, len(anchors))
     codes = jnp.zeros((len(anchors), 6))
     for candidates, wanted in ((99, [easy]), (100, [easy, hard])):
         settings = dataclasses.replace(TINY, candidates=candidates)
-        boxes, _, valid = best_proposals(logits, codes, anchors, settings, (60, 64))
-        np.testing.assert_allclose(boxes[valid], jnp.stack(wanted), atol=1e-5)
+        stalks, _, valid = best_proposals(logits, codes, anchors, settings, (60, 64))
+        np.testing.assert_allclose(stalks[valid], jnp.stack(wanted), atol=1e-5)
 
 
 def test_boxes_on_unclear_stalks_are_neither_right_nor_wrong():
-    truth = jnp.array([[10.0, 0, 20, 60, 15, 15], [40, 0, 50, 60, 45, 45], [70, 0, 80, 60, 75, 75]])
+    truth = jnp.array([[10.0, 0, 20, 60], [40, 0, 50, 60], [70, 0, 80, 60]])
     kinds = jnp.array([STALK, UNCLEAR, NOTHING])
-    which, shows, none = assign(truth[:, :4], truth, kinds, 0.5, 0.3)
+    which, shows, none = assign(overlap(truth, truth), kinds, 0.5, 0.3)
     assert which[0] == 0 and shows.tolist() == [True, False, False] and none.tolist() == [False, False, True]
 
 

@@ -16,7 +16,7 @@ _UNIT = np.array([0.2, 0.1, 0.3, 0.1, 0.3, 0.3], np.float32)  # about the spread
 
 
 def anchors_of(shape: tuple[int, int], heights: float, widths: tuple[float, ...]) -> np.ndarray:
-    """Anchors [K, 4] float32 of an image of ``shape`` (lines, columns), in the order of `Detector.propose`.
+    """Anchors [K, 6] float32 of an image of ``shape`` (lines, columns), in the order of `Detector.propose`.
 
     Args:
         shape: Multiples of the networks' padding.
@@ -28,25 +28,27 @@ def anchors_of(shape: tuple[int, int], heights: float, widths: tuple[float, ...]
     x = (np.arange(columns) + 0.5) * ANCHOR_STRIDE[1]
     y, x, wide = np.meshgrid(y, x, np.asarray(widths), indexing="ij")
     half = 0.5 * heights
-    return np.stack([x - wide / 2, y - half, x + wide / 2, y + half], axis=-1).reshape(-1, 4).astype(np.float32)
+    return np.stack([x - wide / 2, y - half, x + wide / 2, y + half, x, x], axis=-1).reshape(-1, 6).astype(np.float32)
 
 
-def encode(stalks: jax.Array, boxes: jax.Array) -> jax.Array:
-    """Codes [..., 6] of stalks [..., 6] relative to boxes [..., 4]."""
-    size = jnp.maximum(boxes[..., 2:] - boxes[..., :2], 1e-3)
-    middle = 0.5 * (boxes[..., :2] + boxes[..., 2:])
-    own = jnp.maximum(stalks[..., 2:4] - stalks[..., :2], 1e-3)
-    offset = (0.5 * (stalks[..., :2] + stalks[..., 2:4]) - middle) / size
-    axis = (stalks[..., 4:] - middle[..., :1]) / size[..., :1]
-    return jnp.concatenate([offset, jnp.log(own / size), axis], axis=-1) / _UNIT
+def encode(stalks: jax.Array, others: jax.Array) -> jax.Array:
+    """Codes [..., 6] of stalks [..., 6] relative to others [..., 6]."""
+    middle, size = _middle_and_size(others)
+    own_middle, own_size = _middle_and_size(stalks)
+    axis = (stalks[..., 4:] - others[..., 4:]) / size[..., :1]
+    return jnp.concatenate([(own_middle - middle) / size, jnp.log(own_size / size), axis], axis=-1) / _UNIT
 
 
-def decode(codes: jax.Array, boxes: jax.Array) -> jax.Array:
+def decode(codes: jax.Array, others: jax.Array) -> jax.Array:
     """The inverse of `encode`."""
     codes = codes * _UNIT
-    size = jnp.maximum(boxes[..., 2:] - boxes[..., :2], 1e-3)
-    middle = 0.5 * (boxes[..., :2] + boxes[..., 2:])
+    middle, size = _middle_and_size(others)
     half = 0.5 * size * jnp.exp(jnp.clip(codes[..., 2:4], -_MOST, _MOST))
     centre = middle + codes[..., :2] * size
-    axis = middle[..., :1] + codes[..., 4:] * size[..., :1]
+    axis = others[..., 4:] + codes[..., 4:] * size[..., :1]
     return jnp.concatenate([centre - half, centre + half, axis], axis=-1)
+
+
+def _middle_and_size(stalks: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Of the boxes of stalks [..., 6]: both [..., 2], across and down."""
+    return 0.5 * (stalks[..., :2] + stalks[..., 2:4]), jnp.maximum(stalks[..., 2:4] - stalks[..., :2], 1e-3)

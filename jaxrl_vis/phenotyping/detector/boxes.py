@@ -53,33 +53,37 @@ def suppress(overlaps: jax.Array, scores: jax.Array, threshold: float, valid: ja
     return jnp.zeros(scores.shape, bool).at[order].set(kept)
 
 
-def nms(boxes: jax.Array, scores: jax.Array, threshold: float, valid: jax.Array | None = None) -> jax.Array:
-    """Non-maximum suppression of boxes [N, 4] by intersection over union; see `suppress`."""
-    return suppress(overlap(boxes, boxes), scores, threshold, valid)
-
-
-def band_overlap(boxes: jax.Array, axes: jax.Array, lines: int = 8) -> jax.Array:
-    """How much of each other stalks cover, [N, N]: intersection over union of the strips that they are, not of their boxes.
+def band_overlap(first: jax.Array, second: jax.Array, lines: int = 8) -> jax.Array:
+    """How much of each other stalks cover, [N, M]: intersection over union of the strips that they are, not of their boxes.
 
     Boxes of two parallel stalks that lean overlap by half, though the stalks stand apart; strips do not. Both are compared at
     the same heights of the band.
 
     Args:
-        boxes: [N, 4].
-        axes: [N, 2], columns of a stalk's middle at the top and at the bottom of its box.
+        first, second: [N, 6] and [M, 6] stalks: boxes, and columns of a stalk's middle at the top and at the bottom of its box.
         lines: At how many heights.
     """
-    share = (jnp.arange(lines) + 0.5) / lines
-    middle = axes[:, :1] + (axes[:, 1:] - axes[:, :1]) * share  # [N, lines]
-    wide = boxes[:, 2] - boxes[:, 0]
-    half = 0.5 * jnp.maximum(wide - jnp.abs(axes[:, 1] - axes[:, 0]), 0.1 * wide)[:, None]
-    low, high = middle - half, middle + half
-    common = jnp.maximum(jnp.minimum(high[:, None], high[None]) - jnp.maximum(low[:, None], low[None]), 0.0).sum(-1)
-    union = (high - low).sum(-1)[:, None] + (high - low).sum(-1)[None] - common
+    (low, high), (other_low, other_high) = _edges(first, lines), _edges(second, lines)
+    common = jnp.minimum(high[:, None], other_high[None]) - jnp.maximum(low[:, None], other_low[None])
+    common = jnp.maximum(common, 0.0).sum(-1)
+    union = (high - low).sum(-1)[:, None] + (other_high - other_low).sum(-1)[None] - common
     across = common / jnp.maximum(union, 1e-6)
-    shared = jnp.minimum(boxes[:, None, 3], boxes[None, :, 3]) - jnp.maximum(boxes[:, None, 1], boxes[None, :, 1])
-    least = jnp.minimum(boxes[:, None, 3] - boxes[:, None, 1], boxes[None, :, 3] - boxes[None, :, 1])
+    shared = jnp.minimum(first[:, None, 3], second[None, :, 3]) - jnp.maximum(first[:, None, 1], second[None, :, 1])
+    least = jnp.minimum((first[:, 3] - first[:, 1])[:, None], (second[:, 3] - second[:, 1])[None])
     return across * jnp.clip(shared / jnp.maximum(least, 1e-6), 0.0, 1.0)
+
+
+def _edges(stalks: jax.Array, lines: int) -> tuple[jax.Array, jax.Array]:
+    """Columns of both edges of the strips of stalks [N, 6] at some heights, both [N, lines]."""
+    middle = stalks[:, 4:5] + (stalks[:, 5:] - stalks[:, 4:5]) * (jnp.arange(lines) + 0.5) / lines
+    half = strip_half_width(stalks)[:, None]
+    return middle - half, middle + half
+
+
+def strip_half_width(stalks: jax.Array) -> jax.Array:
+    """Half the width [N] of the strips of stalks [N, 6]: a box is wider by what its stalk leans."""
+    wide = stalks[:, 2] - stalks[:, 0]
+    return 0.5 * jnp.maximum(wide - jnp.abs(stalks[:, 5] - stalks[:, 4]), 0.1 * wide)
 
 
 def roi_align(
@@ -89,6 +93,7 @@ def roi_align(
     scale: float | tuple[float, float] = 1.0,
     samples: int = 2,
     aligned: bool = False,
+    lean: jax.Array | None = None,
 ) -> jax.Array:
     """Features of each box on a grid of its own, by bilinear interpolation.
 
@@ -100,6 +105,8 @@ def roi_align(
         samples: Points in each direction of a cell of the grid, of which the mean is taken.
         aligned: Whether the middle of the first feature lies at 0.5, as of the first pixel. If not, a box is at least one
             feature wide and tall.
+        lean: [N], by how much more a box's bottom is moved to the right than its top, about its middle: a box that leans, of
+            which each line of the grid stays level. None for upright boxes.
 
     Returns:
         [N, size[0], size[1], C].
@@ -110,17 +117,20 @@ def roi_align(
     scaled = boxes * jnp.array([horizontal, vertical, horizontal, vertical], boxes.dtype) - shift
 
     def weights(low: jax.Array, high: jax.Array, cells: int, length: int) -> jax.Array:
-        """How much each of ``length`` features counts in each cell: [N, cells, length]."""
+        """How much each of ``length`` features counts in each cell: [..., cells, length] for low and high [...]."""
         extent = high - low if aligned else jnp.maximum(high - low, 1.0)
         share = (jnp.arange(cells * samples) + 0.5) / (cells * samples)
-        place = low[:, None] + extent[:, None] * share
+        place = low[..., None] + extent[..., None] * share
         seen = (place >= -1.0) & (place <= length)
         place = jnp.clip(place, 0.0, length - 1.0)
         each = jnp.maximum(1.0 - jnp.abs(place[..., None] - jnp.arange(length)), 0.0) * seen[..., None]
-        return each.reshape(boxes.shape[0], cells, samples, length).mean(axis=2)
+        return each.reshape(*low.shape, cells, samples, length).mean(axis=-2)
 
     lines = weights(scaled[:, 1], scaled[:, 3], size[0], height)
-    columns = weights(scaled[:, 0], scaled[:, 2], size[1], width)
     # Interpolation is separable. The lines go first: a stalk is taller than it is wide, so that leaves less to do.
     tall = jnp.einsum("nih,hwc->niwc", lines, features)
-    return jnp.einsum("njw,niwc->nijc", columns, tall)
+    if lean is None:
+        return jnp.einsum("njw,niwc->nijc", weights(scaled[:, 0], scaled[:, 2], size[1], width), tall)
+    moved = (lean * horizontal)[:, None] * ((jnp.arange(size[0]) + 0.5) / size[0] - 0.5)
+    columns = weights(scaled[:, :1] + moved, scaled[:, 2:3] + moved, size[1], width)
+    return jnp.einsum("nijw,niwc->nijc", columns, tall)

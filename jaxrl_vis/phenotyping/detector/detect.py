@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxrl_vis.phenotyping.detector.anchors import anchors_of, decode
-from jaxrl_vis.phenotyping.detector.boxes import band_overlap, nms, roi_align, suppress
+from jaxrl_vis.phenotyping.detector.boxes import band_overlap, roi_align, strip_half_width, suppress
 from jaxrl_vis.phenotyping.detector.networks import PADDING, STRIDE, Detector
 
 GRID = (14, 7)
@@ -33,7 +33,7 @@ class Settings:
             easy: among 480, two thirds of the stalks that were missed on crowded images had none.
         proposals: How many proposals are judged.
         most: How many stalks an image may show.
-        proposal_threshold: Overlap of boxes above which only one is proposed.
+        proposal_threshold: Overlap of strips above which only one is proposed.
         threshold: Overlap of strips above which two finds are one stalk.
         least_score: What is no find.
     """
@@ -50,7 +50,7 @@ class Settings:
     candidates: int = 1920
     proposals: int = 160
     most: int = 64
-    proposal_threshold: float = 0.7
+    proposal_threshold: float = 0.6
     threshold: float = 0.4
     least_score: float = 0.05
 
@@ -88,17 +88,20 @@ def normalise(images: jax.Array) -> jax.Array:
     return 2.0 * jnp.sqrt(images.astype(jnp.float32) / 255.0) - 1.0
 
 
-def around(boxes: jax.Array) -> jax.Array:
-    """Boxes [..., 4] with some of what is beside them: a head judges a stalk by its surroundings, too."""
-    size = boxes[..., 2:] - boxes[..., :2]
-    more = jnp.concatenate([0.25 * size[..., :1] + 6.0, 0.08 * size[..., 1:]], axis=-1)
-    return jnp.concatenate([boxes[..., :2] - more, boxes[..., 2:] + more], axis=-1)
+def regions_of(features: jax.Array, stalks: jax.Array) -> jax.Array:
+    """Features [R, *GRID, C] along stalks [R, 6] of an image whose features are [H, W, C].
 
-
-def regions_of(features: jax.Array, boxes: jax.Array) -> jax.Array:
-    """Features [R, *GRID, C] of boxes [R, 4] of an image whose features are [H, W, C]."""
+    A region follows the axis, so that a stalk that leans stands upright in it: in a clump, two that lean differently have about
+    the same box. It holds some of what is beside the stalk, too, as a head judges by that.
+    """
+    tall = jnp.maximum(stalks[:, 3] - stalks[:, 1], 1e-3)
+    more = 0.08 * tall
+    slope = (stalks[:, 5] - stalks[:, 4]) / tall
+    half = 1.5 * strip_half_width(stalks) + 6.0
+    top, bottom = stalks[:, 4] - more * slope, stalks[:, 5] + more * slope
+    box = [0.5 * (top + bottom) - half, stalks[:, 1] - more, 0.5 * (top + bottom) + half, stalks[:, 3] + more]
     scale = (1.0 / STRIDE[0], 1.0 / STRIDE[1])
-    return roi_align(features, around(boxes), GRID, scale, samples=2, aligned=True)
+    return roi_align(features, jnp.stack(box, axis=-1), GRID, scale, samples=2, aligned=True, lean=bottom - top)
 
 
 def best_proposals(
@@ -109,22 +112,31 @@ def best_proposals(
     Args:
         logits: [K] of the anchors.
         codes: [K, 6].
-        anchors: [K, 4].
+        anchors: [K, 6].
         settings: How many, and what is a copy.
         shape: Lines and columns of the image; what reaches beyond it is cut off.
 
     Returns:
-        Boxes [P, 4], scores [P] float32 and which there are [P] bool, P = settings.proposals.
+        Stalks [P, 6], scores [P] float32 and which there are [P] bool, P = settings.proposals.
     """
     count = min(settings.candidates, logits.shape[0])
     scores, places = jax.lax.top_k(logits, count)
-    boxes = decode(codes[places], anchors[places])[:, :4]
-    boxes = jnp.clip(boxes, 0.0, jnp.array([shape[1], shape[0], shape[1], shape[0]], jnp.float32))
-    kept = nms(boxes, scores, settings.proposal_threshold)
-    kept &= (boxes[:, 2] - boxes[:, 0] > 2.0) & (boxes[:, 3] - boxes[:, 1] > 8.0)
+    stalks = within(decode(codes[places], anchors[places]), shape)
+    size = stalks[:, 2:4] - stalks[:, :2]
+    kept = suppress(band_overlap(stalks, stalks), scores, settings.proposal_threshold)
+    kept &= (size[:, 0] > 2.0) & (size[:, 1] > 8.0)
     scores = jnp.where(kept, scores, -jnp.inf)
     best, places = jax.lax.top_k(scores, min(settings.proposals, count))
-    return boxes[places], best, jnp.isfinite(best)
+    return stalks[places], best, jnp.isfinite(best)
+
+
+def within(stalks: jax.Array, shape: tuple[int, int]) -> jax.Array:
+    """Stalks [N, 6] with their boxes cut off where an image of ``shape`` ends, and the axis where the box does."""
+    left, top, right, bottom, above, below = jnp.moveaxis(stalks, -1, 0)
+    slope = (below - above) / jnp.maximum(bottom - top, 1e-3)
+    first, last = jnp.clip(top, 0.0, shape[0]), jnp.clip(bottom, 0.0, shape[0])
+    axis = above + slope * (first - top), below + slope * (last - bottom)
+    return jnp.stack([jnp.clip(left, 0.0, shape[1]), first, jnp.clip(right, 0.0, shape[1]), last, *axis], axis=-1)
 
 
 def heads(
@@ -136,12 +148,14 @@ def heads(
     return logits, codes
 
 
-def judge(network: Detector, params: Any, features: jax.Array, boxes: jax.Array, valid: jax.Array, settings: Settings) -> Found:
-    """What the head says of proposals [P, 4] of one image with features [H, W, C]: stalks, less what is found twice."""
-    logits, codes = heads(network, params, regions_of(features, boxes), "judge_all")
-    stalks, scores = decode(codes, boxes), jax.nn.sigmoid(logits)
+def judge(
+    network: Detector, params: Any, features: jax.Array, proposals: jax.Array, valid: jax.Array, settings: Settings
+) -> Found:
+    """What the head says of proposals [P, 6] of one image with features [H, W, C]: stalks, less what is found twice."""
+    logits, codes = heads(network, params, regions_of(features, proposals), "judge_all")
+    stalks, scores = decode(codes, proposals), jax.nn.sigmoid(logits)
     valid = valid & (scores >= settings.least_score)
-    kept = suppress(band_overlap(stalks[:, :4], stalks[:, 4:]), jnp.where(valid, scores, -1.0), settings.threshold, valid)
+    kept = suppress(band_overlap(stalks, stalks), jnp.where(valid, scores, -1.0), settings.threshold, valid)
     best, places = jax.lax.top_k(jnp.where(kept, scores, -1.0), min(settings.most, scores.shape[0]))
     return Found(stalks[places], jnp.maximum(best, 0.0), best > 0.0)
 
@@ -162,8 +176,8 @@ def detect(params: Any, image: jax.Array, settings: Settings, dtype: Any = jnp.f
     features = network.apply(params, normalise(image)[None], method="features")
     assert isinstance(features, jax.Array)
     logits, codes = heads(network, params, features, "propose")
-    boxes, _, valid = best_proposals(logits[0], codes[0], anchors, settings, shape)
-    return judge(network, params, features[0], boxes, valid, settings)
+    proposals, _, valid = best_proposals(logits[0], codes[0], anchors, settings, shape)
+    return judge(network, params, features[0], proposals, valid, settings)
 
 
 def initial(settings: Settings, key: jax.Array) -> Any:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import optax
 
 from jaxrl_vis.phenotyping.detector.anchors import anchors_of, encode
-from jaxrl_vis.phenotyping.detector.boxes import overlap
+from jaxrl_vis.phenotyping.detector.boxes import band_overlap, overlap
 from jaxrl_vis.phenotyping.detector.detect import Settings, best_proposals, heads, normalise, regions_of
 from jaxrl_vis.phenotyping.detector.networks import Segmenter
 from jaxrl_vis.phenotyping.detector.snips import smoothed
@@ -16,12 +16,11 @@ from jaxrl_vis.phenotyping.detector.snips import smoothed
 NOTHING, UNCLEAR, STALK = 0, 1, 2
 
 
-def assign(boxes: jax.Array, truth: jax.Array, kinds: jax.Array, positive: float, negative: float) -> tuple[jax.Array, ...]:
+def assign(overlaps: jax.Array, kinds: jax.Array, positive: float, negative: float) -> tuple[jax.Array, ...]:
     """Which stalk each box belongs to.
 
     Args:
-        boxes: [K, 4].
-        truth: [T, 6] stalks.
+        overlaps: [K, T] of boxes and true stalks.
         kinds: [T] int32: NOTHING, UNCLEAR or STALK.
         positive: Overlap from which on a box shows a stalk.
         negative: Overlap below which it shows none.
@@ -30,8 +29,8 @@ def assign(boxes: jax.Array, truth: jax.Array, kinds: jax.Array, positive: float
         Index of the stalk [K] int32; whether the box shows it [K] bool; whether it shows none [K] bool. Boxes between the two,
         and those on unclear stalks, are neither.
     """
-    overlaps = jnp.where((kinds == STALK)[None, :], overlap(boxes, truth[:, :4]), 0.0)
-    unclear = jnp.where((kinds == UNCLEAR)[None, :], overlap(boxes, truth[:, :4]), 0.0).max(axis=1) >= negative
+    unclear = jnp.where((kinds == UNCLEAR)[None, :], overlaps, 0.0).max(axis=1) >= negative
+    overlaps = jnp.where((kinds == STALK)[None, :], overlaps, 0.0)
     best = overlaps.max(axis=1)
     # The best box of each stalk shows it even where none overlaps it enough.
     best_of_stalk = overlaps.max(axis=0)
@@ -63,22 +62,24 @@ def detector_loss(
     logits, codes = heads(network, params, features, "propose")
 
     def of_image(features, logits, codes, truth, kinds, key):
-        which, shows, none = assign(anchors, truth, kinds, 0.5, 0.3)
+        which, shows, none = assign(overlap(anchors[:, :4], truth[:, :4]), kinds, 0.5, 0.3)
         found = _focal(logits, shows, none) / jnp.maximum(shows.sum(), 1)
         placed = _distance(codes, encode(truth[which], anchors), shows)
 
-        boxes, _, valid = best_proposals(*jax.lax.stop_gradient((logits, codes)), anchors, settings, shape)
-        size = jnp.concatenate([truth[:, 2:4] - truth[:, :2]] * 2, axis=-1)
-        near = truth[:, :4] + 0.15 * jax.random.normal(key, truth[:, :4].shape) * size
-        boxes = jnp.concatenate([boxes, near])
+        proposals, _, valid = best_proposals(*jax.lax.stop_gradient((logits, codes)), anchors, settings, shape)
+        size = jnp.concatenate([truth[:, 2:4] - truth[:, :2]] * 2 + [truth[:, 2:3] - truth[:, :1]] * 2, axis=-1)
+        near = truth + 0.15 * jax.random.normal(key, truth.shape) * size
+        proposals = jnp.concatenate([proposals, near])
         valid = jnp.concatenate([valid, kinds == STALK])
-        which, shows, none = assign(boxes, truth, kinds, 0.5, 0.45)
+        # In a clump, the box of what stands between two stalks overlaps both by half, and its strip neither.
+        alike = 0.5 * (overlap(proposals[:, :4], truth[:, :4]) + band_overlap(proposals, truth))
+        which, shows, none = assign(alike, kinds, 0.5, 0.45)
         shows, none = shows & valid, none & valid
-        judged, refined = heads(network, params, regions_of(features, boxes), "judge_all")
+        judged, refined = heads(network, params, regions_of(features, proposals), "judge_all")
         weight = (shows | none).astype(jnp.float32)
         right = optax.sigmoid_binary_cross_entropy(judged, shows.astype(jnp.float32))
         judgement = (right * weight).sum() / jnp.maximum(weight.sum(), 1.0)
-        refinement = _distance(refined, encode(truth[which], boxes), shows)
+        refinement = _distance(refined, encode(truth[which], proposals), shows)
         return found, placed, 2.0 * judgement, 2.0 * refinement
 
     keys = jax.random.split(key, images.shape[0])
