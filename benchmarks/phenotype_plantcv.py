@@ -10,7 +10,10 @@ compared is the width of a mask alone. PlantCV's way is that of its documentatio
 """
 
 import argparse
+import functools
+import multiprocessing
 import sys
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +23,12 @@ PRUNED = 50
 """Pixels: barbs of a skeleton that PlantCV cuts off, about as long as its examples say."""
 
 
-def keep_masks(options: argparse.Namespace) -> None:
-    """Draws plots, and writes the masks of what is measured at 12 inches with our width and the truth."""
+Masks = tuple[list[np.ndarray], list[tuple[float, ...]]]
+"""Masks, packed, and of each: seed, stalk, its shape, mm per pixel, our width and the true one in mm, lean in degrees."""
+
+
+def masks_of(options: argparse.Namespace, seed: int) -> Masks:
+    """Draws a plot: masks of what is measured at 12 inches with our width and the truth."""
     import dataclasses
 
     from jaxrl_vis.phenotyping.detector.finder import Finder
@@ -39,30 +46,39 @@ def keep_masks(options: argparse.Namespace) -> None:
     finder = Finder(params, settings)
     packed: list[np.ndarray] = []
     rows: list[tuple[float, ...]] = []
-    for seed in range(options.seed, options.seed + options.plots):
-        sequence = Sequence.of(draw(family, seed))
-        stated, true = sequence.drive.stated, sequence.drive.true
-        for pair in sequence:
-            left, right, instance = np.asarray(pair.left), np.asarray(pair.right), np.asarray(pair.instance)
-            seen = stalks_in_view(sequence.plot, pair.pose, true, instance, np.asarray(pair.depth))
-            ideal = perfect_detections(map(dataclasses.asdict, seen), instance)
-            finds, ground = find_with_ground(
-                (lambda image, ideal=ideal: ideal) if options.truth else finder, left, right, stated
-            )
-            sightings = look(finds, left, right, stated, ground=ground)
-            owners, _ = match(finds, seen)
-            for find, sighting, owner in zip(finds, sightings, owners):
-                at = sighting.height_m
-                if owner is None or sighting.diameter_mm is None or at is None or abs(at - HEIGHTS[0]) > 0.0127:
-                    continue
-                mask = np.asarray(find.mask, np.float32) >= 0.5
-                packed.append(np.packbits(mask))
-                scale = sighting.diameter_mm / (sighting.width_px or np.nan)
-                truth = true_diameter(sequence.plot.stalks[owner])
-                rows.append((seed, owner, *mask.shape, scale, sighting.diameter_mm, truth, sighting.lean_deg or 0.0))
-        print(f"plot {seed}: {len(rows)} masks so far", flush=True)
+    sequence = Sequence.of(draw(family, seed))
+    stated, true = sequence.drive.stated, sequence.drive.true
+    for pair in sequence:
+        left, right, instance = np.asarray(pair.left), np.asarray(pair.right), np.asarray(pair.instance)
+        seen = stalks_in_view(sequence.plot, pair.pose, true, instance, np.asarray(pair.depth))
+        ideal = perfect_detections(map(dataclasses.asdict, seen), instance)
+        finds, ground = find_with_ground((lambda image, ideal=ideal: ideal) if options.truth else finder, left, right, stated)
+        sightings = look(finds, left, right, stated, ground=ground)
+        owners, _ = match(finds, seen)
+        for find, sighting, owner in zip(finds, sightings, owners):
+            at = sighting.height_m
+            if owner is None or sighting.diameter_mm is None or at is None or abs(at - HEIGHTS[0]) > 0.0127:
+                continue
+            mask = np.asarray(find.mask, np.float32) >= 0.5
+            packed.append(np.packbits(mask))
+            scale = sighting.diameter_mm / (sighting.width_px or np.nan)
+            truth = true_diameter(sequence.plot.stalks[owner])
+            rows.append((seed, owner, *mask.shape, scale, sighting.diameter_mm, truth, sighting.lean_deg or 0.0))
+    return packed, rows
+
+
+def keep_masks(options: argparse.Namespace) -> None:
+    """Draws plots, and writes their masks."""
+    packed: list[np.ndarray] = []
+    rows: list[tuple[float, ...]] = []
+    seeds = range(options.seed, options.seed + options.plots)
+    # Even one worker is a process of its own: two that share a GPU must not begin with a copy of one that uses it.
+    with ProcessPoolExecutor(options.workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+        for seed, (masks, about) in zip(seeds, pool.map(functools.partial(masks_of, options), seeds)):
+            packed, rows = packed + masks, rows + about
+            print(f"plot {seed}: {len(rows)} masks so far", flush=True)
     ends = np.cumsum([len(each) for each in packed])
-    about = f"{options.plots} synthetic plots of family {family.name}, {options.frames} pairs each, {options.width} pixels wide"
+    about = f"{options.plots} synthetic plots of family {options.family}, {options.frames} pairs each, {options.width} pixels wide"
     masks = np.concatenate(packed) if packed else np.zeros(0, np.uint8)
     np.savez_compressed(options.file, masks=masks, ends=ends, rows=np.array(rows), about=f"{about}, {_masks_are(options)}")
     print(f"{options.file}: {len(rows)} masks, {options.file.stat().st_size / 1e6:.1f} MB")
@@ -129,6 +145,7 @@ if __name__ == "__main__":
     parser.add_argument("--plots", type=int, default=0, help="draw so many, and keep their masks")
     parser.add_argument("--seed", type=int, default=0, help="of the first plot")
     parser.add_argument("--family", default="shifted", choices=("training", "shifted"))
+    parser.add_argument("--workers", type=int, default=1, help="processes that draw plots side by side")
     parser.add_argument("--frames", type=int, default=34, help="pairs of a plot")
     parser.add_argument("--width", type=int, default=3376, help="of an image, pixels")
     parser.add_argument("--truth", action="store_true", help="true masks in place of the networks'")

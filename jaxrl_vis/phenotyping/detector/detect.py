@@ -50,7 +50,7 @@ class Settings:
     candidates: int = 1920
     proposals: int = 160
     most: int = 64
-    proposal_threshold: float = 0.6
+    proposal_threshold: float = 0.7
     threshold: float = 0.4
     least_score: float = 0.05
 
