@@ -78,7 +78,8 @@ def keep_masks(options: argparse.Namespace) -> None:
             packed, rows = packed + masks, rows + about
             print(f"plot {seed}: {len(rows)} masks so far", flush=True)
     ends = np.cumsum([len(each) for each in packed])
-    about = f"{options.plots} synthetic plots of family {options.family}, {options.frames} pairs each, {options.width} pixels wide"
+    drawn = f"{options.plots} synthetic plots of family {options.family}"
+    about = f"{drawn}, {options.frames} pairs each, {options.width} pixels wide"
     masks = np.concatenate(packed) if packed else np.zeros(0, np.uint8)
     np.savez_compressed(options.file, masks=masks, ends=ends, rows=np.array(rows), about=f"{about}, {_masks_are(options)}")
     print(f"{options.file}: {len(rows)} masks, {options.file.stat().st_size / 1e6:.1f} MB")
