@@ -79,7 +79,8 @@ class Config:
     filter_threshold: float | None = None
     """q0: negatives with Q above it are dropped as false. None: the middle of its band, for filtering methods."""
     trivial_goals: float = 1.0
-    """Share kept of relabelled goals that are reached already before the action; the others give way to the original goal."""
+    """Share kept of relabelled goals that are reached already before the action; the others give way to what another episode
+    observed."""
     reward_positive: float | None = None
     """R+. None: 0 for the oracle, 1 for other methods."""
     reward_negative: float | None = None

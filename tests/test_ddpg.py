@@ -312,11 +312,12 @@ def test_a_target_sums_the_rewards_of_several_steps():
 
 
 def test_goals_that_are_reached_already_give_way():
-    """A point that stays where it is has reached every relabelled goal; the original one is elsewhere."""
+    """To what other episodes observed: points that stay where they are, each elsewhere, have reached all their own goals."""
 
     class Elsewhere(probes.AlwaysThere):
         def start(self, key):
-            return jnp.zeros(1), jnp.ones(1)
+            place = 1000.0 * jax.random.uniform(key, (1,))
+            return place, -1.0 - place
 
     shares = {}
     for kept in (1.0, 0.25, 0.0):
@@ -324,5 +325,6 @@ def test_goals_that_are_reached_already_give_way():
         program = make_train_step(Elsewhere(), config)
         _, metrics = program.update_many(*experienced(program, KEYS[0]))
         shares[kept] = float(metrics["train/positive_share"][0])
-    assert shares[1.0] == 1.0 and shares[0.0] == 0.0
-    assert shares[0.25] == pytest.approx(0.25, abs=0.05)
+    same = 1 / 16  # the other episode may be the same one
+    assert shares[1.0] == 1.0 and shares[0.0] == pytest.approx(same, abs=0.05)
+    assert shares[0.25] == pytest.approx(0.25 + 0.75 * same, abs=0.06)

@@ -39,6 +39,17 @@ def filled(rollouts: int, capacity: int = 3):
     return replay, state
 
 
+def test_a_goal_may_be_another_episodes():
+    replay, state = filled(3)
+    indices = replay.sample_indices(state, jax.random.key(0), jnp.int32(2), 200)
+    other = jnp.roll(indices.episode, 1)
+    batch = replay.gather(state, indices, indices.time + 1, goal_episode=other)
+    np.testing.assert_array_equal(batch.goal[:, 0, 0, 0], other)
+    np.testing.assert_array_equal(batch.goal[:, 1, 3, 3], indices.time + 1)
+    np.testing.assert_array_equal(batch.goal_state, np.stack([other, indices.time + 1], axis=-1))
+    np.testing.assert_array_equal(batch.observation_t[:, 0, 0, 0], indices.episode)
+
+
 @pytest.mark.parametrize("rollouts", [1, 2, 3, 4, 8])
 def test_samples_are_whole_and_from_what_is_stored(rollouts):
     replay, state = filled(rollouts)

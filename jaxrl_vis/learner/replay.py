@@ -144,14 +144,22 @@ class Replay(NamedTuple):
             time=jax.random.randint(time_key, (batch_size,), 0, self.horizon),
         )
 
-    def gather(self, state: ReplayState, indices: Indices, goal_slot: jax.Array, steps: int = 1) -> Batch:
-        """Reads transitions, with what is in a slot of the same episode as their goal.
+    def gather(
+        self,
+        state: ReplayState,
+        indices: Indices,
+        goal_slot: jax.Array,
+        steps: int = 1,
+        goal_episode: jax.Array | None = None,
+    ) -> Batch:
+        """Reads transitions, with what is in a slot of the same episode, or of another one, as their goal.
 
         Args:
             state: The replay.
             indices: Where the transitions lie, [B] each.
             goal_slot: [B] int32 in [1, T+1].
             steps: Of a transition; it has fewer where the episode ends.
+            goal_episode: [B] int32, whose slots those are; None: of the transitions' own episodes.
 
         Returns:
             The transitions, without rewards.
@@ -160,11 +168,12 @@ class Replay(NamedTuple):
         episode, time = indices
         last = jnp.minimum(time + steps, self.horizon) if steps > 1 else time + 1
         slots = jnp.stack([time, goal_slot, last])
+        goal_episode = episode if goal_episode is None else goal_episode
         return Batch(
-            observations=unpack(observations[jnp.broadcast_to(episode, slots.shape), slots]),
+            observations=unpack(observations[jnp.stack([episode, goal_episode, episode]), slots]),
             action=actions[episode, time],
             state_tp1=states[episode, time + 1],
-            goal_state=states[episode, goal_slot],
+            goal_state=states[goal_episode, goal_slot],
         )
 
     def flow(self, state: ReplayState, indices: Indices) -> jax.Array:

@@ -32,7 +32,8 @@ class Choice(NamedTuple):
 
     Attributes:
         indices: Where the transitions lie, [B] each.
-        goal_slot: [B] int32 in [t + 1, T + 1].
+        goal_slot: [B] int32 in [t + 1, T + 1]; of another episode, in [1, T].
+        goal_episode: [B] int32, whose slots those are; None: of the transitions' own episodes.
         shift: [B, 2] int32, see `Batch`; or None.
         target_key: [] a typed key, for targets of auxiliary tasks; or None.
         clutter_end: [] float32, see `reward_errors`; or None.
@@ -40,6 +41,7 @@ class Choice(NamedTuple):
 
     indices: Indices
     goal_slot: jax.Array
+    goal_episode: jax.Array | None = None
     shift: jax.Array | None = None
     target_key: jax.Array | None = None
     clutter_end: jax.Array | None = None
@@ -78,16 +80,18 @@ class Sampler:
         sample_key, goal_key = jax.random.split(key)
         indices = self.replay.sample_indices(state, sample_key, iteration, self.config.batch_size)
         goal_slot = self.goal_slots(goal_key, indices.time)
-        if self.config.trivial_goals < 1.0:
-            goal_slot = self._without_trivial(state, jax.random.fold_in(key, _TRIVIAL), indices, goal_slot)
         choice = Choice(indices, goal_slot)
+        if self.config.trivial_goals < 1.0:
+            gives_way = self._gives_way(state, jax.random.fold_in(key, _TRIVIAL), indices, goal_slot)
+            # Transitions are drawn at random, so those of the next one's episode are, too.
+            choice = choice._replace(goal_episode=jnp.where(gives_way, jnp.roll(indices.episode, 1), indices.episode))
         if self.config.random_shift:
             most, shape = self.config.random_shift, (self.config.batch_size, 2)
             choice = choice._replace(shift=jax.random.randint(jax.random.fold_in(key, _SHIFT), shape, -most, most + 1))
         if self.config.reward_clutter < 1.0:
             choice = choice._replace(clutter_end=self._clutter_end(state))
-        indices, goal_slot, shift = jax.tree.map(self.shards.part, (choice.indices, choice.goal_slot, choice.shift))
-        choice = choice._replace(indices=indices, goal_slot=goal_slot, shift=shift)
+        parted = jax.tree.map(self.shards.part, choice._replace(clutter_end=None))
+        choice = parted._replace(clutter_end=choice.clutter_end)
         if not self._has_targets:
             return choice
         return choice._replace(target_key=self.shards.own_key(jax.random.fold_in(key, _TARGETS)))
@@ -108,13 +112,17 @@ class Sampler:
         shares = self.config.relabel_probability, self.resolved.balance_probability
         return choose_goal_slots(key, time, self.replay.horizon, *shares)
 
-    def _without_trivial(self, state: ReplayState, key: jax.Array, indices: Indices, goal_slot: jax.Array) -> jax.Array:
-        """``goal_slot``, or the original goal for most of the goals that are reached before the action already."""
+    def _gives_way(self, state: ReplayState, key: jax.Array, indices: Indices, goal_slot: jax.Array) -> jax.Array:
+        """Which relabelled goals [B] bool give way to one of another episode: most of those that are reached already.
+
+        Not to the original goals. Where these look different from what episodes show (VisualFingerTurn's finger always hangs
+        down in them), all that is seldom reached would look like that, and a critic would tell rewards by it.
+        """
         episode, time = indices
         states = state.episodes.states
         is_trivial = goals.success(states[episode, time], states[episode, goal_slot], self.threshold) > 0
-        gives_way = is_trivial & ~jax.random.bernoulli(key, self.config.trivial_goals, time.shape)
-        return jnp.where(gives_way, self.replay.horizon + 1, goal_slot)
+        is_trivial &= goal_slot <= self.replay.horizon
+        return is_trivial & ~jax.random.bernoulli(key, self.config.trivial_goals, time.shape)
 
     def batch(self, state: ReplayState, choice: Choice) -> Batch:
         """Reads what was chosen, with goals that stand still and rewards that belong to them.
@@ -126,7 +134,8 @@ class Sampler:
         Returns:
             B transitions with rewards.
         """
-        batch = self.replay.gather(state, choice.indices, choice.goal_slot, self.config.n_step).replace(shift=choice.shift)
+        batch = self.replay.gather(state, choice.indices, choice.goal_slot, self.config.n_step, choice.goal_episode)
+        batch = batch.replace(shift=choice.shift)
         if choice.target_key is not None:
             assert self.auxiliary is not None
             flow = self.replay.flow(state, choice.indices) if self.auxiliary.keeps_flow else None
