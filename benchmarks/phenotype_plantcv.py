@@ -11,9 +11,7 @@ compared is the width of a mask alone. PlantCV's way is that of its documentatio
 
 import argparse
 import functools
-import multiprocessing
 import sys
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -22,13 +20,12 @@ import numpy as np
 PRUNED = 50
 """Pixels: barbs of a skeleton that PlantCV cuts off, about as long as its examples say."""
 
-
 Masks = tuple[list[np.ndarray], list[tuple[float, ...]]]
 """Masks, packed, and of each: seed, stalk, its shape, mm per pixel, our width and the true one in mm, lean in degrees."""
 
 
-def masks_of(options: argparse.Namespace, seed: int) -> Masks:
-    """Draws a plot: masks of what is measured at 12 inches with our width and the truth."""
+def masks_of(options: argparse.Namespace, seed: int) -> tuple[int, Masks]:
+    """Draws a plot: its seed, and the masks of what is measured at 12 inches with our width and the truth."""
     import dataclasses
 
     from jaxrl_vis.phenotyping.detector.finder import Finder
@@ -64,19 +61,23 @@ def masks_of(options: argparse.Namespace, seed: int) -> Masks:
             scale = sighting.diameter_mm / (sighting.width_px or np.nan)
             truth = true_diameter(sequence.plot.stalks[owner])
             rows.append((seed, owner, *mask.shape, scale, sighting.diameter_mm, truth, sighting.lean_deg or 0.0))
-    return packed, rows
+    return seed, (packed, rows)
 
 
 def keep_masks(options: argparse.Namespace) -> None:
     """Draws plots, and writes their masks."""
-    packed: list[np.ndarray] = []
-    rows: list[tuple[float, ...]] = []
+    from jaxrl_vis.evaluation_pool import results_of, share_accelerator
+
+    if options.workers > 1:
+        share_accelerator()
+    plots: list[tuple[int, Masks]] = []
     seeds = range(options.seed, options.seed + options.plots)
-    # Even one worker is a process of its own: two that share a GPU must not begin with a copy of one that uses it.
-    with ProcessPoolExecutor(options.workers, mp_context=multiprocessing.get_context("spawn")) as pool:
-        for seed, (masks, about) in zip(seeds, pool.map(functools.partial(masks_of, options), seeds)):
-            packed, rows = packed + masks, rows + about
-            print(f"plot {seed}: {len(rows)} masks so far", flush=True)
+    for seed, masks in results_of(functools.partial(masks_of, options), seeds, options.workers):
+        plots.append((seed, masks))
+        print(f"plot {seed}: {len(masks[1])} masks", flush=True)
+    plots.sort(key=lambda plot: plot[0])
+    packed = [mask for _, (masks, _) in plots for mask in masks]
+    rows = [row for _, (_, about) in plots for row in about]
     ends = np.cumsum([len(each) for each in packed])
     drawn = f"{options.plots} synthetic plots of family {options.family}"
     about = f"{drawn}, {options.frames} pairs each, {options.width} pixels wide"

@@ -10,6 +10,7 @@ import pytest
 from tiny_detector import TINY
 
 from jaxrl_vis.errors import NonFiniteError, RequestError
+from jaxrl_vis.parameters import write_parameters
 from jaxrl_vis.phenotyping.annotations import decode_counts, read_annotations
 from jaxrl_vis.phenotyping.detector.anchors import anchors_of, decode, encode
 from jaxrl_vis.phenotyping.detector.boxes import band_overlap, overlap, roi_align, suppress
@@ -336,6 +337,13 @@ def test_files_that_hold_no_weights(tmp_path, text):
         read_weights(path)
     with pytest.raises(RequestError, match="cannot read the weights"):
         read_weights(tmp_path / "missing.npz")
+
+
+def test_weights_whose_numbers_meant_something_else(tmp_path):
+    path = tmp_path / "weights.npz"
+    write_parameters(path, {"detector": {"bias": np.zeros(3)}}, {"schema": 1, "settings": dataclasses.asdict(TINY)})
+    with pytest.raises(RequestError, match="of another version: train them again with `jaxrl-vis phenotype train`"):
+        read_weights(path)
 
 
 def test_annotations_of_ones_own(tmp_path):

@@ -11,7 +11,8 @@ from jaxrl_vis.phenotyping.detector.detect import Settings
 
 SHIPPED = Path(__file__).with_name("stalks.npz")
 """Weights that come with the package, trained on synthetic stalks."""
-SCHEMA = 1
+SCHEMA = 2
+"""Raised where the same numbers mean something else: since 2, boxes and axes are in codes relative to the proposal's axis."""
 _COMMAND = "jaxrl-vis phenotype train"
 
 
