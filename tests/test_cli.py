@@ -19,9 +19,11 @@ from jaxrl_vis.cli.eval import Eval
 from jaxrl_vis.cli.parsing import parse
 from jaxrl_vis.cli.play import Play
 from jaxrl_vis.cli.train import Train, training_config
-from jaxrl_vis.config import PRESETS, Config
+from jaxrl_vis.config import PRESETS, Config, preset
 from jaxrl_vis.errors import NonFiniteError, StorageError, Terminated
+from jaxrl_vis.methods import METHODS, MethodName
 from jaxrl_vis.report.outputs import check_writable
+from jaxrl_vis.run.command import options_of
 
 
 def one_line(capsys: pytest.CaptureFixture[str], status: int) -> str:
@@ -151,6 +153,14 @@ def test_every_preset_survives_the_command_line(name: str) -> None:
     assert training_config(parse(Train, tokens)) == PRESETS[name]
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_the_command_of_a_configuration_gives_that_configuration(method: MethodName) -> None:
+    choices: list[dict[str, Any]] = [{}, {"trivial_goals": 1.0}, {"hidden_sizes": (8, 8), "clip_targets_above": False}]
+    for changes in choices:
+        config = preset("fast", env="VisualFingerTurn", method=method, **changes)
+        assert training_config(parse(Train, options_of(config))) == config
+
+
 def test_a_task_is_named_by_its_place_or_by_its_name(capsys: pytest.CaptureFixture[str]) -> None:
     for command, before in ((Train, ["--preset", "debug"]), (Bench, ["env"])):
         for words in (["Reacher"], ["--env", "Reacher"], ["--env=Reacher"], ["Reacher", "--env", "Reacher"]):
@@ -208,9 +218,9 @@ def test_examples_of_the_readme_leave_nothing_untracked(checkout: Path) -> None:
 
 
 def test_flags_may_contradict_a_preset_both_ways() -> None:
-    for preset, word, expected in (("paper", "--clip-targets-above", True), ("cpu", "--no-clip-targets-above", False)):
-        assert training_config(parse(Train, ["--preset", preset, word])).clip_targets_above is expected
-        assert training_config(parse(Train, ["--preset", preset])).clip_targets_above is not expected
+    for name, word, expected in (("paper", "--clip-targets-above", True), ("cpu", "--no-clip-targets-above", False)):
+        assert training_config(parse(Train, ["--preset", name, word])).clip_targets_above is expected
+        assert training_config(parse(Train, ["--preset", name])).clip_targets_above is not expected
 
 
 def test_auto_follows_the_hardware() -> None:

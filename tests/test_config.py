@@ -72,6 +72,18 @@ def test_presets_make_sense_and_come_back_from_json(name: str) -> None:
     assert config_from_dict(json.loads(json.dumps(dataclasses.asdict(config)))) == config
 
 
+def test_a_preset_leaves_out_what_the_method_cannot_do() -> None:
+    """The finger's presets look at true states, which indicator methods do without."""
+    for name, env in (("fast", "VisualFingerTurn"), ("cpu", "FingerTurn")):
+        assert validate(preset(name, env=env)).trivial_goals < 1.0
+        assert validate(preset(name, env=env, trivial_goals=0.9)).trivial_goals == 0.9
+        for method in METHODS:
+            config = validate(preset(name, env=env, method=method))
+            assert config.trivial_goals == 1.0 or METHODS[method].reward == "oracle"
+    with pytest.raises(RequestError, match="indicatr"):
+        validate(preset("fast", env="VisualFingerTurn", method="indicatr"))
+
+
 def test_numbers_from_elsewhere_are_welcome() -> None:
     config = validate(preset("debug", seed=np.int64(3), action_noise=np.float32(0.5)))
     assert config_from_dict(dataclasses.asdict(config)) == config

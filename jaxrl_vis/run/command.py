@@ -9,7 +9,7 @@ from jaxrl_vis.config import Config, preset
 def options_of(config: Config) -> list[str]:
     """What follows ``jaxrl-vis train``: the task, the preset, and what differs from that."""
     words = [config.env, "--preset", config.preset]
-    base = preset(config.preset, env=config.env)
+    base = preset(config.preset, env=config.env, method=config.method).replace(method=preset(config.preset).method)
     for field in dataclasses.fields(Config):
         value = getattr(config, field.name)
         if field.name in ("env", "preset") or value == getattr(base, field.name):
