@@ -315,9 +315,8 @@ _DEBUG = _CPU.replace(
 PRESETS: dict[str, Config] = {config.preset: config for config in (_PAPER, _FAST, _CPU, _DEBUG)}
 """``paper``: the authors' release. ``fast``: ours. ``cpu``: what two cores do in minutes. ``debug``: seconds, no learning."""
 
-# What a task asks for beside that, by the ablations of docs/learner.md. A rollout of the hand waits for the GPU's latency:
-# with 500 environments it takes hardly longer than with 100.
-_OF_TASK: dict[tuple[str, str], dict[str, Any]] = {
+# A rollout of the hand waits for the GPU's latency: with 500 environments it takes hardly longer than with 100.
+OF_TASK: dict[tuple[str, str], dict[str, Any]] = {
     ("fast", "HandReach"): {
         "num_envs": 500,
         "updates_per_iteration": 1000,
@@ -330,6 +329,7 @@ _OF_TASK: dict[tuple[str, str], dict[str, Any]] = {
     ("fast", "FingerTurn"): {"trivial_goals": 0.2},
     ("cpu", "FingerTurn"): {"trivial_goals": 0.2},
 }
+"""(preset, task) -> fields that this preset has otherwise for this task, from images or states; see docs/learner.md."""
 _OF_STATES = ("trivial_goals",)  # of those, what reads true states: left out where the method has none
 
 
@@ -347,7 +347,7 @@ def preset(name: str, **overrides: Any) -> Config:
         raise RequestError(f"unknown preset {name!r}{nearest(name, list(PRESETS))}")
     config = PRESETS[name]
     task = str(overrides.get("env", config.env)).removeprefix("Visual")
-    of_task = _OF_TASK.get((name, task), {})
+    of_task = OF_TASK.get((name, task), {})
     method = METHODS.get(overrides.get("method", config.method))
     if method is not None and method.reward != "oracle":
         of_task = {field: value for field, value in of_task.items() if field not in _OF_STATES}

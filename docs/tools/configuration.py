@@ -1,4 +1,4 @@
-"""Writes the table of docs/configuration.md from `jaxrl_vis.config`; a test fails where the page is not what this writes.
+"""Writes the tables of docs/configuration.md from `jaxrl_vis.config`; a test fails where the page is not what this writes.
 
 python docs/tools/configuration.py
 """
@@ -10,11 +10,12 @@ from pathlib import Path
 
 from jaxrl_vis import fields
 from jaxrl_vis.cli.parsing import _described
-from jaxrl_vis.config import PRESETS, Config
+from jaxrl_vis.config import OF_TASK, PRESETS, Config
 from jaxrl_vis.run.folder import MAY_CHANGE
 
 PAGE = Path(__file__).resolve().parents[1] / "configuration.md"
-BEGIN, END = "<!-- fields: begin -->\n", "<!-- fields: end -->"
+BEGIN, END = "<!-- fields: begin -->\n", "<!-- fields: end -->\n"
+LAST = "<!-- tasks: end -->"
 
 
 def _shown(value: object) -> str:
@@ -56,11 +57,20 @@ def table() -> str:
     return "\n".join([*lines[1:], ""])
 
 
+def of_tasks() -> str:
+    """What presets have otherwise for some tasks."""
+    lines = ["## What presets have otherwise for some tasks", "", "| preset | task | fields |", "|---|---|---|"]
+    for (preset, task), values in OF_TASK.items():
+        fields_of_task = ", ".join(f"`{name}` **{_shown(value)}**" for name, value in values.items())
+        lines.append(f"| `{preset}` | {task}, Visual{task} | {fields_of_task} |")
+    return "\n".join([*lines, ""])
+
+
 def page(text: str) -> str:
-    """The page with its table as it is to be."""
+    """The page with its tables as they are to be."""
     before, _, rest = text.partition(BEGIN)
-    _, _, after = rest.partition(END)
-    return f"{before}{BEGIN}{table()}{END}{after}"
+    _, _, after = rest.partition(LAST)
+    return f"{before}{BEGIN}{table()}{END}\n{of_tasks()}{LAST}{after}"
 
 
 if __name__ == "__main__":
