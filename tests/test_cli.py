@@ -150,7 +150,7 @@ def test_only_given_options_override_the_preset() -> None:
 @pytest.mark.parametrize("name", sorted(PRESETS))
 def test_every_preset_survives_the_command_line(name: str) -> None:
     tokens = ["--preset", name]
-    assert training_config(parse(Train, tokens)) == PRESETS[name]
+    assert training_config(parse(Train, tokens)) == preset(name)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -403,3 +403,12 @@ def test_doctor_reports_what_fails(monkeypatch: pytest.MonkeyPatch, capsys: pyte
     output = capsys.readouterr().out
     assert "FAIL  devices        RuntimeError: no device at all" in output
     assert "ok    versions" in output
+
+
+def test_a_reader_that_has_seen_enough_is_no_error() -> None:
+    command = [sys.executable, "-m", "jaxrl_vis", "train", "--help"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as program:
+        assert program.stdout is not None and program.stderr is not None
+        program.stdout.close()
+        assert program.stderr.read() == ""
+        assert program.wait() == 141

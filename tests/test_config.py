@@ -90,6 +90,14 @@ def test_numbers_from_elsewhere_are_welcome() -> None:
     assert isinstance(config_from_dict({"discount": 0}).discount, float)
 
 
+def test_a_preset_shifts_images_where_there_are_some() -> None:
+    assert preset("fast", env="VisualFetchReach").random_shift > 0
+    assert preset("fast", env="VisualFetchReach", method="indicator").random_shift > 0
+    assert preset("fast", env="VisualFetchReach", random_shift=0).random_shift == 0
+    assert preset("fast", env="FetchReach").random_shift == 0
+    assert validate(preset("fast", env="VisualFetchReach", method="autoencoder")).random_shift == 0
+
+
 @pytest.mark.parametrize(
     ("values", "complaint"),
     [

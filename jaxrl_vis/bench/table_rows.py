@@ -140,13 +140,32 @@ LEARNING = (
     ),
     Learning(
         "VisualFetchReach, 64x64 RGB-D, oracle reward",
-        {"fetch_reach_oracle": preset("fast", seeds=5, env_steps=100_000)},
+        {"fetch_reach_oracle": preset("fast", seeds=5, env_steps=60_000, eval_interval=1)},
         targets=(0.9, 0.97),
     ),
     Learning(
         "VisualFetchReach, 64x64 RGB-D, indicator rewards with balancing and filtering (images only)",
-        {"fetch_reach_indicator": preset("fast", seeds=5, method="indicator_balance_filter", env_steps=100_000)},
+        {
+            "fetch_reach_indicator": preset(
+                "fast", seeds=5, method="indicator_balance_filter", env_steps=60_000, eval_interval=1
+            )
+        },
         targets=(0.9, 0.97),
+    ),
+    Learning(
+        "VisualFingerTurn, 64x64 RGB-D, three frames, oracle reward",
+        {"finger_turn_oracle": preset("fast", env="VisualFingerTurn", seeds=5, env_steps=500_000, eval_interval=5)},
+        targets=(0.9, 0.97),
+    ),
+    Learning(
+        "VisualHandReach, 64x64 RGB-D, oracle reward, seeds 0 to 2 and 3 to 4",
+        {
+            f"hand_reach_oracle_from_{seed}": preset(
+                "fast", env="VisualHandReach", seed=seed, seeds=seeds, env_steps=2_000_000, eval_interval=2
+            )
+            for seed, seeds in ((0, 3), (3, 2))
+        },
+        targets=(0.65, 0.8),
     ),
     Learning(
         "VisualFetchReach, 100x100 RGB-D, with the authors' hyper-parameters (`paper`: 1 update per 100 steps, no auxiliary "

@@ -28,7 +28,7 @@ def training_config(settings: Settings, **overrides: Any) -> Config:
     overrides |= {"seeds": settings.seeds, "weighting": settings.weighting, "aux_tasks": settings.aux_tasks}
     overrides["aux_gradients"] = settings.aux_gradients
     if settings.peer == "torch":
-        overrides["trivial_goals"] = 1.0  # the peer relabels without looking at states
+        overrides |= {"trivial_goals": 1.0, "random_shift": 0}  # the peer does neither
     return preset("fast" if settings.on_accelerator else "cpu", env=settings.env, **overrides)
 
 

@@ -111,8 +111,12 @@ def entry() -> None:
     After a signal the process ends at once: what was to be saved is saved, and threads that still write a checkpoint, which a
     second signal has given up, are not waited for.
     """
-    status = main()
-    sys.stdout.flush()
+    try:
+        status = main()
+        sys.stdout.flush()
+    except BrokenPipeError:  # whoever read what is printed has seen enough: `jaxrl-vis train --help | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what Python flushes at its end
+        status = 141
     sys.stderr.flush()
     if status in (130, 143) or (status and processes.are_several()):
         os._exit(status)  # of several processes that failed, none must wait for the others
