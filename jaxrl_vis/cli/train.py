@@ -46,8 +46,8 @@ class Train:
     env: Annotated[str | None, ByPlaceToo()] = None
     """The environment; `jaxrl-vis envs` lists them, and module:Name is one of your own. VisualFetchReach if not given."""
     preset: Annotated[str, SayDefault(default_preset)] = "auto"
-    """paper, fast, cpu or debug, some of which have settings of their own for some tasks (docs/configuration.md); auto is fast on
-    an accelerator, else cpu."""
+    """paper, fast, cpu or debug, which may have settings of their own for a task (docs/configuration.md); auto is fast on an
+    accelerator, else cpu."""
     changes: Annotated[Mapping[str, Any], ChangesOf(Config, default_of)] = dataclasses.field(default_factory=dict)
     devices: str | None = None
     """How many devices to use, or all (docs/scaling.md). Several seeds are divided among them; of one seed, each batch and the
