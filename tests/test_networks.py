@@ -53,7 +53,7 @@ class EncoderCase:
     """Latents of some images and gradients of a weighted sum of them, by each of the implementations."""
 
     def __init__(self, shape, batch, which, dtype):
-        config = preset("fast", latent_size=16, compute_dtype=dtype)
+        config = preset("fast", encoders="separate", latent_size=16, compute_dtype=dtype)
         self.networks = Networks(config, jax.ShapeDtypeStruct(shape, jnp.uint8), 2, 0.0)
         self.which, self._found = which, {}
         rng = np.random.default_rng(0)
