@@ -66,7 +66,7 @@ FAMILY = Family(
     preset="paper",
     of_task=_OF_TASK,
     # Presets that learn faster than the authors' release need no budget like its.
-    longest={"fast": {FETCH: 100_000, HAND: 2_000_000, FINGER: 1_000_000}},
+    longest={"fast": {FETCH: 100_000, HAND: 2_000_000, FINGER: 500_000}},
     quick=QUICK,
 )
 
