@@ -335,6 +335,14 @@ OF_TASK: dict[tuple[str, str], dict[str, Any]] = {
         "target_encoder": False,
         "random_shift": 2,
     },
+    ("cpu", "FetchReach"): {
+        "num_envs": 16,
+        "updates_per_iteration": 50,
+        "eval_interval": 8,
+        "encoders": "shared",
+        "target_encoder": False,
+        "random_shift": 1,
+    },
     ("fast", "FingerTurn"): {"trivial_goals": 0.2},
     ("cpu", "FingerTurn"): {"trivial_goals": 0.2},
 }

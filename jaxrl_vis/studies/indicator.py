@@ -46,10 +46,8 @@ VARIANTS: dict[str, Variant] = {
 REACHER, FETCH, SAWYER, FINGER = "VisualReacher", "VisualFetchReach", "VisualSawyerReach", "VisualFingerTurn"
 _OTHERS = {"Reacher": 100_000, "FetchReach": 100_000, "VisualHandReach": 700_000, FINGER: 500_000}
 # All methods see images as they are: the autoencoder compares them, and cannot do with shifted ones.
-_AS_ELSEWHERE = {
-    name: getattr(PRESETS["fast"], name)
-    for name in ("num_envs", "updates_per_iteration", "eval_interval", "encoders", "target_encoder", "random_shift")
-}
+_OWN = ("num_envs", "updates_per_iteration", "eval_interval", "encoders", "target_encoder", "random_shift")
+_AS_ELSEWHERE = {preset: {name: getattr(PRESETS[preset], name) for name in _OWN} for preset in ("fast", "cpu")}
 
 FAMILY = Family(
     name="indicator",
@@ -60,8 +58,7 @@ FAMILY = Family(
     # All methods relabel alike, and only the oracle knows what is trivial.
     of_task={
         ("fast", REACHER): {"image_size": 100},
-        ("fast", FETCH): _AS_ELSEWHERE,
-        ("fast", "FetchReach"): _AS_ELSEWHERE,
+        **{(preset, task): own for preset, own in _AS_ELSEWHERE.items() for task in (FETCH, "FetchReach")},
         ("fast", FINGER): {"trivial_goals": 1.0},
         ("cpu", FINGER): {"trivial_goals": 1.0},
     },
