@@ -137,7 +137,7 @@ class Config:
     """Whether weighting cosine learns logarithms of the losses."""
     aux_form: Literal["thesis", "release"] = "thesis"
     """Whose targets the auxiliary tasks have, where the thesis and the authors' release differ (`auxtasks.Options`)."""
-    aux_gradients: Literal["per_loss", "one_hot", "jvp"] = "per_loss"
+    aux_gradients: Literal["per_loss", "one_hot", "jvp", "latents"] = "per_loss"
     """How gradients of losses are found and compared, for weightings that compare them; all ways agree
     (`learner.weighting.gradients`)."""
 
@@ -348,7 +348,8 @@ OF_TASK: dict[tuple[str, str], dict[str, Any]] = {
 }
 """(preset, task) -> fields that this preset has otherwise for this task, from images or states; see docs/learner.md."""
 _OF_STATES = ("trivial_goals",)  # of those, what reads true states: left out where the method has none
-_OF_IMAGES = ("random_shift",)  # and what images alone can have: left out from states, and where images are rewards
+# And what images alone can have: left out from states, where images are rewards, and where auxiliary losses read them.
+_OF_IMAGES = ("random_shift",)
 
 
 def preset(name: str, **overrides: Any) -> Config:
@@ -370,7 +371,8 @@ def preset(name: str, **overrides: Any) -> Config:
     left_out: tuple[str, ...] = ()
     if method is not None and method.reward != "oracle":
         left_out += _OF_STATES
-    if not env.startswith("Visual") or (method is not None and method.reward == "autoencoder"):
+    reads_images = bool(overrides.get("aux_tasks")) or (method is not None and method.reward == "autoencoder")
+    if not env.startswith("Visual") or reads_images:
         left_out += _OF_IMAGES
     of_task = {field: value for field, value in of_task.items() if field not in left_out}
     return config.replace(**{**of_task, **overrides})

@@ -132,7 +132,7 @@ def test_a_weighted_gradient_is_the_sum_of_the_losses_own():
     assert np.abs(both - found[()]).max() > 0.1 * np.abs(both).max()
 
 
-@pytest.mark.parametrize("way", ["one_hot", "jvp"])
+@pytest.mark.parametrize("way", ["one_hot", "jvp", "latents"])
 def test_all_ways_to_gradients_agree(way):
     settings = {"aux_tasks": ("forward_dynamics", "egomotion"), "weighting": "ol_aux"}
     _, update, working, batch = learner(**settings)

@@ -9,9 +9,10 @@ import optax
 import pytest
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner import auxtasks
-from jaxrl_vis.learner.auxtasks import autoencoder, heads
+from jaxrl_vis.learner import auxtasks, decoder_kernel
+from jaxrl_vis.learner.auxtasks import autoencoder, heads, optical_flow
 from jaxrl_vis.learner.blocks import from_blocks
+from jaxrl_vis.learner.encoder_kernel_patches import to_patches
 
 LATENTS = ("latent_t", "latent_tp1", "latent_moved")
 # The latents that each loss has a gradient to.
@@ -186,3 +187,36 @@ def test_tasks_that_show_states_have_no_auxiliary_tasks():
     assert auxtasks.make([], spec) == {}
     with pytest.raises(RequestError, match=r"auxiliary tasks \(egomotion\) train an encoder of images.*states of 10 numbers"):
         auxtasks.make(["egomotion"], spec)
+
+
+@pytest.mark.parametrize(
+    ("channels", "dtype", "tolerance"), [(4, jnp.float32, 1e-4), (3, jnp.float32, 1e-4), (4, jnp.bfloat16, 0.03)]
+)
+@pytest.mark.parametrize("implementation", ["kernel", "plain"])
+def test_decoders_as_kernels_have_the_same_losses_and_gradients(channels, dtype, tolerance, implementation, monkeypatch):
+    """Beside an observation in the encoder's patches: by Pallas's interpreter, and what runs without a GPU."""
+    if implementation == "kernel":
+        monkeypatch.setattr(decoder_kernel, "squared_error", functools.partial(decoder_kernel.squared_error, interpret=True))
+    spec = make_spec(channels, 32, latent_size=16, dtype=dtype, levels=3)
+    tasks, view = auxtasks.make(("autoencoder", "optical_flow"), spec), make_view(spec, 4)
+    view = view.replace(image=view.image.astype(dtype), flow=optical_flow.from_bytes(optical_flow.to_bytes(view.flow)))
+    goals = jax.random.normal(jax.random.key(3), (5, channels, 32, 32)).astype(dtype)
+    patches = to_patches(jnp.concatenate([view.image, goals]), spec.levels)  # the encoder reads more than one observation
+
+    @jax.jit
+    def both():
+        params = init_all(tasks)
+        params = jax.tree.map(lambda leaf: leaf + 0.1 * jax.random.normal(jax.random.key(leaf.size), leaf.shape), params)
+
+        def losses(params, latents, view):
+            view = view.replace(latent_t=latents[0], latent_tp1=latents[1])
+            return sum((3.0 + len(name)) * task.loss(params[name], view) for name, task in tasks.items())
+
+        of_all = jax.value_and_grad(losses, argnums=(0, 1))
+        latents = view.latent_t, view.latent_tp1
+        return of_all(params, latents, view), of_all(params, latents, view.replace(patches=patches))
+
+    expected, found = both()
+    for ours, theirs in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        ours, theirs = (np.asarray(leaf, np.float32) for leaf in (ours, theirs))
+        assert np.linalg.norm(ours - theirs) <= tolerance * np.linalg.norm(theirs) and np.any(theirs != 0.0)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from small_scene import small_scene
 
-from jaxrl_vis.learner import encoder_kernel
+from jaxrl_vis.learner import encoder_kernel_passes
 from jaxrl_vis.run.programs import rarely_collecting_garbage
 from jaxrl_vis_envs import compilation
 from jaxrl_vis_envs.compilation import (
@@ -106,7 +106,7 @@ def test_a_kernel_that_does_not_compile_is_left_out_and_named_once(gpu, monkeypa
         assert runs_gpu_kernels(breaks)
 
 
-@pytest.mark.parametrize("module", [kernel, encoder_kernel, newton_kernel])
+@pytest.mark.parametrize("module", [kernel, encoder_kernel_passes, newton_kernel])
 def test_the_kernels_themselves_are_probed_in_the_midst_of_a_trace(module, gpu):
     """As far as they can be compiled without a GPU: down to Triton's code."""
     gpu()

@@ -119,6 +119,8 @@ def test_encoders_are_differentiated_forwards_where_tangents_are_wanted(implemen
     _, gradient = case.latents_and_gradient(implementation)
     if implementation != "products":
         monkeypatch.setattr(Networks, "uses_kernel", True)
+    if implementation == "kernel":
+        monkeypatch.setattr(encoder_kernel, "encode", functools.partial(encoder_kernel.encode, interpret=True))
     inputs = jax.jit(case.networks.prepare)(case.statistics, case.images)
     rng = np.random.default_rng(1)
     along = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape), jnp.float32), case.params)
@@ -136,6 +138,27 @@ def test_encoders_are_differentiated_forwards_where_tangents_are_wanted(implemen
     np.testing.assert_allclose(tangent, expected, rtol=1e-3)
     with pytest.raises(TypeError, match="custom_vjp"):
         jax.jvp(loss, (case.params,), (along,))
+
+
+@pytest.mark.parametrize("implementation", ["kernel", "plain"])
+def test_images_move_alike_whoever_prepares_them(implementation, monkeypatch):
+    case = encoder_case(*SHAPES[2], "float32")
+    shift = jnp.array([[0, 0], [2, -3], [-1, 4], [5, 5], [-40, 0], [1, 0]], jnp.int32)
+
+    @jax.jit
+    def latents():
+        inputs = case.networks.prepare(case.statistics, case.images, shift)
+        return case.networks.encode({"encoder": case.params}, inputs)
+
+    expected = latents()
+    monkeypatch.setattr(Networks, "uses_kernel", True)
+    for name in ("prepare", "encode") if implementation == "kernel" else ():
+        monkeypatch.setattr(encoder_kernel, name, functools.partial(getattr(encoder_kernel, name), interpret=True))
+    jax.clear_caches()
+    np.testing.assert_allclose(latents(), expected, rtol=1e-4, atol=1e-4)
+    still = case.networks.encode({"encoder": case.params}, case.networks.prepare(case.statistics, case.images))
+    assert not np.allclose(still[1:], expected[1:], atol=0.1)
+    np.testing.assert_allclose(still[0], expected[0], rtol=1e-4, atol=1e-4)
 
 
 def test_in_bfloat16_the_gpu_kernel_is_as_near_to_float32_as_plain_products_are():

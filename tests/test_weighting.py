@@ -47,10 +47,17 @@ def problem(seed: int = 0, size: int = 12) -> tuple[dict[str, Any], dict[str, np
     return {"encoder": encoder, "heads": heads}, {"x": random.normal(size=(size, 5)), **targets}
 
 
+def encode(encoder: Any, batch: Any, module: Any = jnp) -> Any:
+    return module.tanh(batch["x"] @ encoder["kernel"] + encoder["bias"])
+
+
+def losses_of_latents(params: Any, latent: Any, batch: Any, module: Any = jnp) -> dict[str, Any]:
+    return {name: module.mean((latent @ head - batch[name]) ** 2) for name, head in params["heads"].items()}
+
+
 def losses_of(params: Any, batch: Any, module: Any = jnp) -> dict[str, Any]:
     """Mean squared errors of three linear heads on one encoder, in JAX or in NumPy."""
-    latent = module.tanh(batch["x"] @ params["encoder"]["kernel"] + params["encoder"]["bias"])
-    return {name: module.mean((latent @ head - batch[name]) ** 2) for name, head in params["heads"].items()}
+    return losses_of_latents(params, encode(params["encoder"], batch, module), batch, module)
 
 
 def encoder_of(params: Any) -> Any:
@@ -83,11 +90,18 @@ def assert_close(one: Any, other: Any, tolerance: float = 2e-5) -> None:
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance), one, other)
 
 
-WAYS: tuple[Any, ...] = ("per_loss", "one_hot", "jvp")
+WAYS: tuple[Any, ...] = ("per_loss", "one_hot", "jvp", "latents")
 
 
 def ways_of(weighting: Weighting) -> tuple[Any, ...]:
     return WAYS[:2] if weighting.needs == "gradients" else WAYS
+
+
+def gradient_by(way: Any, weighting: Weighting, **options: Any) -> Any:
+    """`weighted_grad` of the problem, its latents told where they are needed."""
+    if way != "latents":
+        return weighted_grad(losses_of, weighting, encoder_of, way, **options)
+    return weighted_grad(losses_of_latents, weighting, encoder_of, way, encode=encode, **options)
 
 
 @pytest.mark.parametrize("case", ["sum", "fixed", "cosine of logarithms", "ol_aux", "ol_aux total", "ol_aux as released"])
@@ -97,7 +111,7 @@ def test_ways_agree_and_find_the_gradient_of_the_weighted_objective(case: str) -
 
     @jax.jit
     def all_ways(params: Any, state: Any) -> Any:
-        found = [weighted_grad(losses_of, weighting, encoder_of, way)(params, state, batch) for way in ways_of(weighting)]
+        found = [gradient_by(way, weighting)(params, state, batch) for way in ways_of(weighting)]
         weights = found[0].weights
         return found, jax.grad(lambda params: weighting.objective(weights, losses_of(params, batch)))(params)
 
@@ -125,14 +139,15 @@ def passes_through_the_encoder(way: Any, losses: int) -> int:
     params["heads"] = {name: params["heads"][MAIN] for name in names}
     batch = {"x": batch["x"], **{name: batch[MAIN] for name in names}}
     weighting = make_weighting("ol_aux")
-    gradient = weighted_grad(losses_of, weighting, encoder_of, way)
+    gradient = gradient_by(way, weighting)
     equations = jax.make_jaxpr(gradient)(params, weighting.init(names), batch).eqns
     products = [each for each in equations if each.primitive.name == "dot_general"]
     return sum(batch["x"].shape in [operand.aval.shape for operand in each.invars] for each in products)
 
 
-def test_jvp_passes_do_not_grow_with_the_number_of_losses() -> None:
+def test_forward_ways_pass_the_encoder_as_often_for_many_losses() -> None:
     assert passes_through_the_encoder("jvp", 3) == passes_through_the_encoder("jvp", 10) <= 5
+    assert passes_through_the_encoder("latents", 3) == passes_through_the_encoder("latents", 10) <= 5
     assert passes_through_the_encoder("per_loss", 10) >= 20
 
 
@@ -172,7 +187,7 @@ def test_bfloat16() -> None:
 
     @jax.jit
     def all_ways(params: Any) -> Any:
-        return [weighted_grad(losses_of, weighting, encoder_of, way)(params, weighting.init(NAMES), batch) for way in WAYS]
+        return [gradient_by(way, weighting)(params, weighting.init(NAMES), batch) for way in WAYS]
 
     exact = all_ways(params)[0]
     for coarse in all_ways(jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16), params)):
@@ -423,7 +438,7 @@ def test_parts_of_a_batch_on_several_devices_are_one_batch() -> None:
     def on_both() -> Any:
         found = []
         for way in WAYS:
-            gradient = weighted_grad(losses_of, weighting, encoder_of, way, reduce=lambda tree: jax.lax.pmean(tree, "devices"))
+            gradient = gradient_by(way, weighting, reduce=lambda tree: jax.lax.pmean(tree, "devices"))
             found.append(jax.vmap(gradient, in_axes=(None, None, 0), axis_name="devices")(params, state, parts))
         return weighted_grad(losses_of, weighting, encoder_of)(params, state, batch), found
 
@@ -460,11 +475,12 @@ def test_what_comes_beside_the_losses() -> None:
     weighting = make_weighting("ol_aux")
     state = weighting.init(NAMES)
 
-    def with_more(params: Any, batch: Any) -> Any:
-        return losses_of(params, batch), {"size": jnp.sum(batch["x"])}
+    def with_more(params: Any, latent: Any, batch: Any) -> Any:
+        return losses_of_latents(params, latent, batch), {"size": jnp.sum(batch["x"])}
 
     for way in WAYS:
-        found = jax.eval_shape(weighted_grad(with_more, weighting, encoder_of, way, has_aux=True), params, state, batch)
+        gradient = weighted_grad(with_more, weighting, encoder_of, way, has_aux=True, encode=encode)
+        found = jax.eval_shape(gradient, params, state, batch)
         assert jax.tree.map(lambda leaf: leaf.shape, found.extra) == {"size": ()}
 
 
@@ -492,6 +508,7 @@ def test_what_comes_beside_the_losses() -> None:
         (lambda: make_weighting("sum").init(("near", "far")), ["no loss is called 'main'"]),
         (lambda: make_weighting("sum").init((MAIN, "near", "near")), ["two losses are called 'near'"]),
         (lambda: weighted_grad(losses_of, make_weighting("sum"), way="onehot"), ["'onehot'", "did you mean one_hot"]),
+        (lambda: weighted_grad(losses_of, make_weighting("sum"), way="latents"), ["give encode"]),
         (
             lambda: jax.jit(weighted_grad(losses_of, make_weighting("sum")))(
                 *in_float32(problem(0))[:1], WRONG, in_float32(problem(0)[1])

@@ -52,7 +52,7 @@ class Bench:
     """Auxiliary tasks in the gradient steps (update, train)."""
     weighting: WeightingName = "none"
     """How their losses are weighted (update, train)."""
-    aux_gradients: Literal["per_loss", "one_hot", "jvp"] = "per_loss"
+    aux_gradients: Literal["per_loss", "one_hot", "jvp", "latents"] = "per_loss"
     """How gradients of losses are found and compared (update, train)."""
     peer: Peer | None = None
     """Measure another side by side: a renderer on the same poses (render: mujoco, warp), MuJoCo Playground's FingerTurn

@@ -144,10 +144,10 @@ def make_auxiliary(
             f"weighting {config.weighting} has no auxiliary tasks to weight: add --aux-tasks with some of "
             f"{' '.join(auxtasks.NAMES)}, or use --weighting none"
         )
-    if config.aux_gradients == "jvp" and weighting.needs == "gradients":
+    if config.aux_gradients in ("jvp", "latents") and weighting.needs == "gradients":
         raise RequestError(
-            f"weighting {config.weighting} keeps whole gradients here, which --aux-gradients jvp does not find: "
-            "use per_loss or one_hot"
+            f"weighting {config.weighting} keeps whole gradients here, which --aux-gradients {config.aux_gradients} does not "
+            "find: use per_loss or one_hot"
         )
     if config.updates_per_iteration % weighting.interval:
         raise RequestError(

@@ -1,6 +1,7 @@
 """Images in nested 2x2 blocks: the order in which strided 2x2 convolutions, and transposed ones, are plain matrix products."""
 
 import jax
+import jax.numpy as jnp
 
 
 def to_blocks(frames: jax.Array, levels: int) -> jax.Array:
@@ -35,3 +36,16 @@ def from_blocks(blocks: jax.Array, height: int, width: int) -> jax.Array:
     inside = range(first + 2, first + 2 + 2 * levels)
     blocks = blocks.transpose(*range(first), blocks.ndim - 1, first, *inside[::2], first + 1, *inside[1::2])
     return blocks.reshape(*batch, channels, height, width)
+
+
+def shifted(images: jax.Array, shift: jax.Array) -> jax.Array:
+    """Planar images [B, C, H, W] moved by [B, 2] int32 pixels, down and to the right; what moves in is 0."""
+    height, width = images.shape[-2:]
+
+    def moved(image: jax.Array, shift: jax.Array) -> jax.Array:
+        rows, columns = jnp.arange(height) - shift[0], jnp.arange(width) - shift[1]
+        inside = ((rows >= 0) & (rows < height))[:, None] & ((columns >= 0) & (columns < width))
+        rows, columns = jnp.clip(rows, 0, height - 1), jnp.clip(columns, 0, width - 1)
+        return jnp.where(inside, image[..., rows, :][..., columns], 0)
+
+    return jax.vmap(moved)(images, shift)

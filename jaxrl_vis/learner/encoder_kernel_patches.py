@@ -12,6 +12,8 @@ import jax.numpy as jnp
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
 
+from jaxrl_vis.learner.blocks import shifted
+
 LEVELS = 3
 """Layers in the kernel."""
 WORD = 4
@@ -30,14 +32,14 @@ def divisor(number: int, limit: int) -> int:
     return math.gcd(number, limit)
 
 
-def _word_offsets(first_patch: Any, patches: int, shape: tuple[int, int, int], levels: int) -> tuple[jax.Array, jax.Array]:
-    """Where the words of some patches lie in a planar image, and whether they are there: [patches, 16 C'] int32 and bool.
+def _word_places(first_patch: Any, patches: int, shape: tuple[int, int, int], levels: int) -> tuple[jax.Array, ...]:
+    """Channel, row and column, in words, of the words of some patches in a planar image: [patches, 16 C'] int32 each.
 
     Patches run over the 2^levels blocks of the image, row by row, and within a block over its halves of halves (as
     `blocks.to_blocks`), so that the next layers find their windows side by side. Words of a patch run over (quarter's row,
     quarter's column, channel, row).
     """
-    channels, height, width = shape
+    channels, _, width = shape
     columns, padded = width >> levels, padded_channels(channels)
     size = (patches, 16 * padded)
     # Non-negative throughout: lax.div and lax.rem, unlike // and %, then compile to shifts and masks.
@@ -54,13 +56,14 @@ def _word_offsets(first_patch: Any, patches: int, shape: tuple[int, int, int], l
 
     row = 8 * row + 4 * div(word, 8 * padded) + rem(word, 4)
     column = 2 * column + rem(div(word, 4 * padded), 2)
-    channel = rem(div(word, 4), padded)
-    return channel * (height * width // WORD) + row * (width // WORD) + column, channel < channels
+    return rem(div(word, 4), padded), row, column
 
 
 def _prepare_kernel(words_ref, mean_ref, scale_ref, out_ref, *, shape, levels, limit):
     images, patches, size = out_ref.shape
-    offsets, there = _word_offsets(pl.program_id(0) * patches, patches, shape, levels)
+    channels, height, width = shape
+    channel, row, column = _word_places(pl.program_id(0) * patches, patches, shape, levels)
+    offsets, there = channel * (height * width // WORD) + row * (width // WORD) + column, channel < channels
     pixels = (patches, size // WORD, WORD)
     byte = jax.lax.broadcasted_iota(jnp.int32, pixels, 2)
     inside = jnp.broadcast_to(there[:, :, None], pixels)
@@ -79,8 +82,37 @@ def _prepare_kernel(words_ref, mean_ref, scale_ref, out_ref, *, shape, levels, l
     jax.lax.fori_loop(0, images, one_image, None)
 
 
+def _prepare_shifted_kernel(bytes_ref, mean_ref, scale_ref, shift_ref, out_ref, *, shape, levels, limit):
+    """As `_prepare_kernel`, of images that move: no pixel keeps its place in a word, nor its statistics."""
+    images, patches, size = out_ref.shape
+    channels, height, width = shape
+    pixels = (patches, size // WORD, WORD)
+    places = _word_places(pl.program_id(0) * patches, patches, shape, levels)
+    channel, row, column = (jnp.broadcast_to(place[:, :, None], pixels) for place in places)
+    column = column * WORD + jax.lax.broadcasted_iota(jnp.int32, pixels, 2)
+
+    def one_image(image, _):
+        from_row, from_column = row - shift_ref[image, 0], column - shift_ref[image, 1]
+        there = (from_row >= 0) & (from_row < height) & (from_column >= 0) & (from_column < width) & (channel < channels)
+        pixel = (channel * height + from_row) * width + from_column
+        values = plgpu.load(bytes_ref.at[image, pixel], mask=there, other=0).astype(jnp.float32)
+        mean = plgpu.load(mean_ref.at[pixel], mask=there, other=0.0)
+        scale = plgpu.load(scale_ref.at[pixel], mask=there, other=0.0)
+        values = jnp.clip((values - mean) * scale, -limit, limit)
+        out_ref[image] = values.astype(out_ref.dtype).reshape(patches, size)
+
+    jax.lax.fori_loop(0, images, one_image, None)
+
+
 def prepare_on_gpu(
-    images: jax.Array, mean: jax.Array, scale: jax.Array, levels: int, limit: float, dtype: Any, interpret: bool = False
+    images: jax.Array,
+    mean: jax.Array,
+    scale: jax.Array,
+    shift: jax.Array | None,
+    levels: int,
+    limit: float,
+    dtype: Any,
+    interpret: bool = False,
 ) -> jax.Array:
     """`encoder_kernel.prepare` as a kernel; ``interpret`` runs it without a GPU."""
     batch, *shape = images.shape
@@ -89,28 +121,41 @@ def prepare_on_gpu(
     size = 64 * padded_channels(channels)
     tile, together = divisor(patches, _PREPARE_PATCHES), divisor(batch, _PREPARE_IMAGES)
     pixels = math.prod(shape)
-    words = jax.lax.bitcast_convert_type(images.reshape(batch, pixels // WORD, WORD), jnp.uint32)
+    data, of_images = (
+        images.reshape(batch, pixels),
+        lambda columns: pl.BlockSpec((together, columns), lambda _, image: (image, 0)),
+    )
     whole = pl.BlockSpec((pixels,), lambda patch, image: (0,))
+    if shift is None:
+        kernel, data = _prepare_kernel, jax.lax.bitcast_convert_type(data.reshape(batch, -1, WORD), jnp.uint32)
+        more, more_specs = (), []
+    else:
+        kernel, more, more_specs = _prepare_shifted_kernel, (shift,), [of_images(2)]
     return pl.pallas_call(
-        functools.partial(_prepare_kernel, shape=tuple(shape), levels=levels, limit=limit),
+        functools.partial(kernel, shape=tuple(shape), levels=levels, limit=limit),
         out_shape=jax.ShapeDtypeStruct((batch, patches, size), dtype),
         grid=(patches // tile, batch // together),
-        in_specs=[pl.BlockSpec((together, pixels // WORD), lambda patch, image: (image, 0)), whole, whole],
+        in_specs=[of_images(data.shape[1]), whole, whole, *more_specs],
         out_specs=pl.BlockSpec((together, tile, size), lambda patch, image: (image, patch, 0)),
         compiler_params=_PREPARE,
         interpret=interpret,
-        name="prepare_patches",
-    )(words, mean.reshape(pixels), scale.reshape(pixels))
+        name="prepare_patches" if shift is None else "prepare_shifted_patches",
+    )(data, mean.reshape(pixels), scale.reshape(pixels), *more)
 
 
-def prepare_plainly(images: jax.Array, mean: jax.Array, scale: jax.Array, levels: int, limit: float, dtype: Any) -> jax.Array:
+def prepare_plainly(
+    images: jax.Array, mean: jax.Array, scale: jax.Array, shift: jax.Array | None, levels: int, limit: float, dtype: Any
+) -> jax.Array:
     """`encoder_kernel.prepare` in plain JAX."""
-    patches, mean, scale = (_to_patches(array, levels) for array in (images, mean, scale))
+    if shift is not None:
+        values = jnp.clip((images.astype(jnp.float32) - mean) * scale, -limit, limit).astype(dtype)
+        return to_patches(shifted(values, shift), levels)
+    patches, mean, scale = (to_patches(array, levels) for array in (images, mean, scale))
     return jnp.clip((patches.astype(jnp.float32) - mean) * scale, -limit, limit).astype(dtype)
 
 
-def _to_patches(images: jax.Array, levels: int) -> jax.Array:
-    """[..., C, H, W] -> [..., patches, 64 C'], in the order of `_word_offsets`; channels that are padding hold zeros."""
+def to_patches(images: jax.Array, levels: int) -> jax.Array:
+    """[..., C, H, W] -> [..., patches, 64 C'], in the order of `_word_places`; channels that are padding hold zeros."""
     *batch, channels, height, width = images.shape
     rows, columns, finer = height >> levels, width >> levels, (2,) * (levels - LEVELS)
     images = images[..., : rows << levels, : columns << levels]

@@ -22,36 +22,15 @@ import jax.numpy as jnp
 
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner import encoder_kernel, normalizer, tangents
-from jaxrl_vis.learner.blocks import to_blocks
+from jaxrl_vis.learner import encoder_kernel, normalizer
+from jaxrl_vis.learner.blocks import shifted, to_blocks
+from jaxrl_vis.learner.products import product
 from jaxrl_vis.types import Batch, NormalizerState, Params, TrainState
 
 _glorot = nn.initializers.glorot_uniform()
 
 # Inputs at most this wide are multiplied element by element: a GPU's matrix units would pad them.
 _NARROW = 16
-
-
-def _product(values: jax.Array, kernel: jax.Array) -> jax.Array:
-    """``values @ kernel``, [..., M, K] and [..., K, N]."""
-    return values @ kernel if tangents.are_wanted() else _product_with_rule(values, kernel)
-
-
-@jax.custom_vjp
-def _product_with_rule(values: jax.Array, kernel: jax.Array) -> jax.Array:
-    return values @ kernel
-
-
-def _product_backward(residuals: tuple[jax.Array, jax.Array], gradient: jax.Array) -> tuple[jax.Array, jax.Array]:
-    values, kernel = residuals
-    # JAX's own rule makes the kernel's gradient transposed, and the optimiser then reads it against the grain.
-    batch = tuple(range(values.ndim - 2))
-    rows, columns = len(batch), len(batch) + 1
-    kernel_gradient = jax.lax.dot_general(values, gradient, (((rows,), (rows,)), (batch, batch)))
-    return jax.lax.dot_general(gradient, kernel, (((columns,), (columns,)), (batch, batch))), kernel_gradient
-
-
-_product_with_rule.defvjp(lambda values, kernel: (values @ kernel, (values, kernel)), _product_backward)
 
 
 class _Encoder(nn.Module):
@@ -74,7 +53,7 @@ class _Encoder(nn.Module):
                 (4 * channels, filters),
             )
             bias = self.param(f"bias_{level}", nn.initializers.zeros, (filters,))
-            values = _product(values.reshape(-1, 4 * channels), kernel.astype(self.dtype))
+            values = product(values.reshape(-1, 4 * channels), kernel.astype(self.dtype))
             values = nn.relu(values + bias.astype(self.dtype))
             channels = filters
         return _Dense(self.latent_size, self.dtype, name="latent")(values.reshape(batch, count * channels))
@@ -103,7 +82,7 @@ class _Dense(nn.Module):
             if part <= _NARROW:
                 total = total + jnp.sum(values[..., None] * rows[:, None], axis=(0, 2))
             else:
-                total = total + jnp.sum(_product(values, rows), axis=0)
+                total = total + jnp.sum(product(values, rows), axis=0)
             first += parts * part
         return total
 
@@ -131,7 +110,8 @@ class Networks:
 
     Attributes:
         init_actor, init_critic: key -> {"encoder": ..., "head": ...}.
-        prepare: (normalizer, observations [B, ...]) -> inputs: what encoders read; made once for all four networks.
+        prepare: (normalizer, observations [B, ...], possibly how to shift them) -> inputs: what encoders read; made once for
+            all four networks.
         encode: (actor or critic parameters, inputs [B, ...]) -> latent [B, latent].
         act: (actor, latents [2, B, latent] of observations and goals) -> [B, A] float32 in (-1, 1).
         value: (critic, latents [2, B, latent], action [B, A]) -> [B] float32.
@@ -168,7 +148,6 @@ class Networks:
         return (
             self.sees_images
             and self.dtype == jnp.bfloat16
-            and not self.config.random_shift
             and encoder_kernel.supports(self.config.encoder_filters, self.observation_spec.shape)
             and encoder_kernel.is_available()
         )
@@ -249,26 +228,32 @@ class Networks:
 
     def prepare_batch(self, train: TrainState, batch: Batch) -> jax.Array:
         """`prepare` of the three observations of B transitions, side by side: [3 B, ...]; of moved images, [4 B, ...]."""
-        if batch.shift is not None and self.sees_images:
-            return self._prepare_shifted(train, batch)
         if train.goal_normalizer is None:
-            inputs = self.prepare(train.normalizer, batch.observations.reshape(-1, *batch.observations.shape[2:]))
+            count, size, *shape = batch.observations.shape
+            shift = None if batch.shift is None else jnp.tile(batch.shift, (count, 1))
+            inputs = self.prepare(train.normalizer, batch.observations.reshape(count * size, *shape), shift)
         else:
             statistics = (train.normalizer, train.goal_normalizer, train.normalizer)
-            parts = [self.prepare(each, rows) for each, rows in zip(statistics, batch.observations, strict=True)]
-            inputs = jnp.concatenate(parts)
+            parts = zip(statistics, batch.observations, strict=True)
+            inputs = jnp.concatenate([self.prepare(each, rows, batch.shift) for each, rows in parts])
         if batch.targets is None or batch.targets.images_moved is None:
             return inputs
         return jnp.concatenate([inputs, self.prepare(train.normalizer, batch.targets.images_moved)])
 
-    def prepare(self, statistics: NormalizerState, observations: jax.Array) -> jax.Array:
-        """Normalises and orders [B, ...] observations for the encoders: [B, blocks, block size], or [B, S] for states."""
+    def prepare(self, statistics: NormalizerState, observations: jax.Array, shift: jax.Array | None = None) -> jax.Array:
+        """Normalises and orders [B, ...] observations for the encoders: [B, blocks, block size], or [B, S] for states.
+
+        Images may be moved by ``shift`` [B, 2] int32, as of `Batch`. They are normalised first: what moves in is the mean.
+        """
         mean, scale = statistics.mean, normalizer.scale(statistics, self.config.normalizer_floor)
+        if not self.sees_images:
+            return self._normalized(observations, mean, scale)
         if self.uses_kernel:
-            return encoder_kernel.prepare(observations, mean, scale, self._levels, self.config.normalizer_clip, self.dtype)
-        if self.sees_images:
-            observations, mean, scale = (to_blocks(array, self._levels) for array in (observations, mean, scale))
-        return self._normalized(observations, mean, scale)
+            limit = self.config.normalizer_clip
+            return encoder_kernel.prepare(observations, mean, scale, self._levels, limit, self.dtype, shift)
+        if shift is not None:
+            return to_blocks(shifted(self._normalized(observations, mean, scale), shift), self._levels)
+        return self._normalized(*(to_blocks(array, self._levels) for array in (observations, mean, scale)))
 
     def normalize(self, statistics: NormalizerState, observations: jax.Array) -> jax.Array:
         """Normalised [B, ...] observations in their own order, in the dtype that the networks compute in."""
@@ -277,26 +262,6 @@ class Networks:
     def _normalized(self, observations: jax.Array, mean: jax.Array, scale: jax.Array) -> jax.Array:
         limit = self.config.normalizer_clip
         return jnp.clip((observations.astype(jnp.float32) - mean) * scale, -limit, limit).astype(self.dtype)
-
-    def _prepare_shifted(self, train: TrainState, batch: Batch) -> jax.Array:
-        """As `prepare_batch`, of images that are moved after they were normalised: what moves in is the mean image."""
-        statistics = (train.normalizer, train.goal_statistics, train.normalizer)
-        floor = self.config.normalizer_floor
-        parts = [
-            self._normalized(rows, each.mean, normalizer.scale(each, floor))
-            for each, rows in zip(statistics, batch.observations, strict=True)
-        ]
-        height, width = self.observation_spec.shape[-2:]
-        assert batch.shift is not None
-
-        def moved(image: jax.Array, shift: jax.Array) -> jax.Array:
-            rows, columns = jnp.arange(height) - shift[0], jnp.arange(width) - shift[1]
-            inside = ((rows >= 0) & (rows < height))[:, None] & ((columns >= 0) & (columns < width))
-            rows, columns = jnp.clip(rows, 0, height - 1), jnp.clip(columns, 0, width - 1)
-            return jnp.where(inside, image[..., rows, :][..., columns], 0)
-
-        images = jax.vmap(jax.vmap(moved), in_axes=(0, None))(jnp.stack(parts), batch.shift)
-        return to_blocks(images.reshape(-1, *self.observation_spec.shape), self._levels)
 
     def encode(self, params: Params, inputs: jax.Array, which: slice = slice(None)) -> jax.Array:
         """Latents of ``which`` of the prepared observations, [B, latent]; a state vector is its own latent."""

@@ -11,7 +11,7 @@ The actor's loss values its actions with the critic's latents from the critic's 
 
 import dataclasses
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +24,9 @@ from jaxrl_vis.learner.networks import Networks
 from jaxrl_vis.learner.shards import Shards
 from jaxrl_vis.learner.weighting import MAIN, Weighted, WeightingState, weighted_grad
 from jaxrl_vis.types import Batch, Params
+
+# Ways in which each loss has a pass through the encoder of its own.
+_APART = ("per_loss", "one_hot")
 
 
 class ComputeCopies(NamedTuple):
@@ -55,15 +58,18 @@ class Latents(NamedTuple):
     moved: jax.Array | None = None
 
 
-def _encode_online(networks: Networks, auxiliary: Auxiliary, params: Params, inputs: jax.Array, size: int) -> Latents:
+def _encode_online(
+    networks: Networks, auxiliary: Auxiliary, params: Params, inputs: jax.Array, size: int, apart: bool
+) -> Latents:
     """Latents of all observations that losses read, with gradient.
 
-    Most auxiliary losses read two of them or one. Encoded one by one, the gradient of each loss passes through these alone.
+    Most auxiliary losses read two of them or one. Encoded ``apart``, the gradient of each loss passes through these alone.
     """
-    if not auxiliary.tasks:
-        pair = _encode(networks, params, inputs, size, 0)
-        return Latents(pair, pair[0])
-    before, goal, *others = (_encode(networks, params, inputs, size, n, count=1)[0] for n in range(auxiliary.observations))
+    count = auxiliary.observations
+    if not apart:
+        together = _encode(networks, params, inputs, size, 0, count)
+        return Latents(together[:2], together[0], *together[2:])
+    before, goal, *others = (_encode(networks, params, inputs, size, n, count=1)[0] for n in range(count))
     return Latents(jnp.stack([before, goal]), before, *others)
 
 
@@ -117,24 +123,24 @@ class Objectives:
         """The critic's losses and their gradient; ``extra`` is (latents, values [B], keep [B])."""
         networks, weighting = self.networks, self.auxiliary.weighting
         size = batch.action.shape[0]
+        # Weightings that compare no gradients need one backward pass only, which the last way of finding them takes.
+        way = "latents" if weighting.needs == "losses" else self.config.aux_gradients
 
-        def critic_losses(critic: Params):
+        def encode(encoder: Params) -> Latents:
+            return _encode_online(networks, self.auxiliary, {"encoder": encoder}, inputs, size, apart=way in _APART)
+
+        def critic_losses(critic: Params, latents: Latents):
             assert batch.reward is not None
-            latents = _encode_online(networks, self.auxiliary, critic, inputs, size)
             target = self._target(now, inputs, latents, batch)
             value = networks.value(critic, latents.pair, batch.action)
             keep = losses.keep_mask(batch.reward, value, self.resolved.reward_negative, self.resolved.filter_threshold)
-            others = self._auxiliary(critic, latents, image, batch)
+            others = self._auxiliary(critic, latents, inputs, image, batch)
             return {MAIN: losses.critic_loss(value, target, keep, self._kept(keep)), **others}, (latents, value, keep)
 
-        def with_tangent_rules(critic: Params):
-            with tangents.with_tangents():
-                return critic_losses(critic)
-
-        # Weightings that compare no gradients need one backward pass only, which the last way of finding them takes.
-        way = "jvp" if weighting.needs == "losses" else self.config.aux_gradients
-        options = {"forwards": with_tangent_rules, **({"reduce": self.shards.mean} if self.reduces_early else {})}
-        find = weighted_grad(critic_losses, weighting, lambda critic: critic["encoder"], way, has_aux=True, **options)
+        options: dict[str, Any] = {"forwards": tangents.with_tangents, "encode": encode, "has_aux": True}
+        if self.reduces_early:
+            options["reduce"] = self.shards.mean
+        find = weighted_grad(critic_losses, weighting, lambda critic: critic.get("encoder"), way, **options)
         state = self.auxiliary.start(now.critic.get("encoder")) if state is None else state
         return find(now.critic, state, held=held) if weighting.held else find(now.critic, state)
 
@@ -166,8 +172,8 @@ class Objectives:
         has_encoder = self.config.encoders == "separate"
         latents, others = critic_latents, {}
         if has_encoder:
-            latents = _encode_online(self.networks, self.auxiliary, actor, inputs, batch.action.shape[0])
-            others = self._auxiliary(actor, latents, image, batch)
+            latents = _encode_online(self.networks, self.auxiliary, actor, inputs, batch.action.shape[0], apart=False)
+            others = self._auxiliary(actor, latents, inputs, image, batch)
         if self.auxiliary.weighting.log:
             others = {name: self.shards.whole(loss) for name, loss in others.items()}
         action = self.networks.act(actor, latents.pair)
@@ -176,7 +182,11 @@ class Objectives:
         loss = losses.actor_loss(value, action, self.config.action_penalty, best, self.shards.whole)
         return loss + self.auxiliary.weighting.objective(weights, others), action
 
-    def _auxiliary(self, params: Params, latents: Latents, image: jax.Array | None, batch: Batch) -> dict[str, jax.Array]:
+    def _auxiliary(
+        self, params: Params, latents: Latents, inputs: jax.Array, image: jax.Array | None, batch: Batch
+    ) -> dict[str, jax.Array]:
         """Losses of the auxiliary tasks on a network's latents, by name."""
         seen = {"latent_t": latents.before, "latent_tp1": latents.after, "latent_moved": latents.moved}
-        return self.auxiliary.losses(params.get("heads", {}), View(**seen, image=image, action=batch.action), batch)
+        patches = inputs if self.networks.uses_kernel else None
+        view = View(**seen, image=image, patches=patches, action=batch.action)
+        return self.auxiliary.losses(params.get("heads", {}), view, batch)

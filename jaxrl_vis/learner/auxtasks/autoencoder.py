@@ -28,10 +28,15 @@ def make(spec: Spec, in_grey: bool = False) -> AuxTask:
     def decode(params: Params, view: View) -> jax.Array:
         return heads.decode(params, view.latent_t, spec.dtype)
 
+    def loss(params: Params, view: View) -> jax.Array:
+        if view.patches is not None and not in_grey and heads.has_kernel(view.latent_t.shape[0], shape, spec.levels):
+            return heads.decoding_error(params, view.latent_t, view.patches, spec.dtype)
+        return mean_squared_error(decode(params, view), to_blocks(target(view), spec.levels))
+
     return AuxTask(
         name="autoencoder",
         needs=frozenset({"image"}),
         init=lambda key: heads.init_decoder(key, spec.latent_size, shape, spec.levels),
         predict=lambda params, view: from_blocks(decode(params, view), *whole),
-        loss=lambda params, view: mean_squared_error(decode(params, view), to_blocks(target(view), spec.levels)),
+        loss=loss,
     )

@@ -10,6 +10,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxrl_vis.learner import decoder_kernel, encoder_kernel_patches
+from jaxrl_vis.learner.encoder_kernel_passes import LEAST_ROWS
+from jaxrl_vis.learner.products import product
 from jaxrl_vis.types import Params
 
 _glorot = jax.nn.initializers.glorot_uniform()
@@ -58,13 +61,46 @@ def decode(params: Params, values: jax.Array, dtype: Any) -> jax.Array:
         values: [B, inputs].
         dtype: What is computed in.
     """
-    batch, levels = values.shape[0], len(params) - 1
-    layers = [params["dense"], *(params[f"up_{level}"] for level in range(levels))]
-    for level, layer in enumerate(layers):
-        values = values if level == 0 else jax.nn.relu(values)
-        product = values.astype(dtype) @ layer["kernel"].astype(dtype)
-        values = product.reshape(-1, layer["bias"].shape[0]) + layer["bias"].astype(dtype)
-        if level == 0:
-            values = values.reshape(-1, layers[1]["kernel"].shape[0])
-    size = 4**levels * values.shape[-1]
-    return values.reshape(batch, -1, size).astype(jnp.float32)
+    layers = _layers(params)
+    pixels = _through(layers, values, dtype) + layers[-1]["bias"].astype(dtype)
+    size = 4 ** (len(layers) - 1) * pixels.shape[-1]
+    return pixels.reshape(values.shape[0], -1, size).astype(jnp.float32)
+
+
+def decoding_error(params: Params, values: jax.Array, patches: jax.Array, dtype: Any) -> jax.Array:
+    """The mean squared error of what `decode` makes, [] float32, by one kernel for the finest two layers.
+
+    Args:
+        params: From `init_decoder`; see `has_kernel`.
+        values: [B, inputs].
+        patches: [at least B, patches, 64 C'], what is to be decoded, as `encoder_kernel_patches.to_patches` orders it.
+        dtype: What is computed in.
+    """
+    *coarser, before, finer, finest = _layers(params)
+    cells = _through([*coarser, before], values, dtype)
+    weights = decoder_kernel.make_weights(before["bias"], finer, finest)
+    total = decoder_kernel.squared_error(cells, patches.reshape(-1, patches.shape[-1] // 4), weights)
+    return total / (cells.shape[0] * 16 * finest["bias"].shape[0])
+
+
+def has_kernel(batch: int, shape: tuple[int, int, int], levels: int) -> bool:
+    """Whether `decoding_error` can decode ``batch`` images of shape C, H, W by a decoder of so many levels."""
+    channels, height, width = shape
+    cells = batch * (height >> levels) * (width >> levels) * 4 ** (levels - 2)
+    is_whole = levels >= encoder_kernel_patches.LEVELS and cells % LEAST_ROWS == 0
+    return is_whole and decoder_kernel.supports(channels, _CHANNELS, _FINEST_CHANNELS)
+
+
+def _layers(params: Params) -> list[Params]:
+    """From the coarsest to the finest."""
+    return [params["dense"], *(params[f"up_{level}"] for level in range(len(params) - 1))]
+
+
+def _through(layers: list[Params], values: jax.Array, dtype: Any) -> jax.Array:
+    """What the last layer makes before its bias is added: [.., outputs of a pixel], in ``dtype``."""
+    for number, layer in enumerate(layers):
+        if number > 0:
+            biased = values + layers[number - 1]["bias"].astype(dtype)
+            values = jax.nn.relu(biased).reshape(-1, layer["kernel"].shape[0])
+        values = product(values.astype(dtype), layer["kernel"].astype(dtype)).reshape(-1, layer["bias"].shape[0])
+    return values

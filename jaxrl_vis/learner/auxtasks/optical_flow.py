@@ -7,6 +7,7 @@ from jaxrl_vis.learner.auxtasks import farneback, heads
 from jaxrl_vis.learner.auxtasks.images import grey
 from jaxrl_vis.learner.auxtasks.task import AuxTask, Spec, View, mean_squared_error, read
 from jaxrl_vis.learner.blocks import from_blocks, to_blocks
+from jaxrl_vis.learner.encoder_kernel_patches import to_patches
 from jaxrl_vis.types import Params
 
 
@@ -19,11 +20,16 @@ def make(spec: Spec) -> AuxTask:
     _, height, width = spec.observation.shape
     whole = (height >> spec.levels << spec.levels, width >> spec.levels << spec.levels)
 
+    def both(view: View) -> jax.Array:
+        return jnp.concatenate([view.latent_t, read(view, "latent_tp1")], axis=-1)
+
     def decode(params: Params, view: View) -> jax.Array:
-        latents = jnp.concatenate([view.latent_t, read(view, "latent_tp1")], axis=-1)
-        return heads.decode(params, latents, spec.dtype)
+        return heads.decode(params, both(view), spec.dtype)
 
     def loss(params: Params, view: View) -> jax.Array:
+        if view.patches is not None and heads.has_kernel(view.latent_t.shape[0], (1, height, width), spec.levels):
+            patches = to_patches(read(view, "flow")[:, None].astype(spec.dtype), spec.levels)
+            return heads.decoding_error(params, both(view), patches, spec.dtype)
         return mean_squared_error(decode(params, view), to_blocks(read(view, "flow")[:, None], spec.levels))
 
     return AuxTask(

@@ -1,6 +1,6 @@
 """Gradients of several losses, what weightings need to know about them, and their weighted sum.
 
-`weighted_grad` is to a dictionary of losses what `jax.grad` is to a single one. It finds gradients in one of three ways, which
+`weighted_grad` is to a dictionary of losses what `jax.grad` is to a single one. It finds gradients in one of four ways, which
 agree up to rounding:
 
     per_loss   one `jax.grad` for each loss: the reference, and the default                    losses, dots, gradients
@@ -8,12 +8,18 @@ agree up to rounding:
     jvp        one backward pass for the direction d that losses are compared with, one
                `jax.jvp` of all losses along d (its tangents are all dots), and one backward
                pass for the weighted sum; with weightings that need losses, the last alone     losses, dots
+    latents    likewise, where losses read the shared parameters through latents z alone:
+               each loss is differentiated down to z, g_i, and only d and the weighted sum
+               farther; <d, grad L_i> = <J d, g_i>, where J d is the tangent of z              losses, dots
 
-On the right are the `Weighting.needs` that each can serve. The third makes as many passes for ten losses as for two, but every
-operation must have a tangent rule, which those of `jax.custom_vjp` lack: ``forwards`` may be the same losses without them.
+On the right are the `Weighting.needs` that each can serve. The last two pass through the shared parameters as often for ten
+losses as for two; latents, which differentiates no head forwards, is the faster one. What is differentiated forwards must have
+tangent rules, which operations of `jax.custom_vjp` lack: ``forwards`` may be a context in which it is traced without those.
 """
 
-from collections.abc import Callable, Mapping
+import contextlib
+import functools
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Literal, NamedTuple, get_args
 
 import jax
@@ -23,9 +29,10 @@ from jaxrl_vis.errors import RequestError, nearest
 from jaxrl_vis.learner.weighting.base import MAIN, Losses, Weighting, WeightingState, Weights, dot, weighted_sum
 from jaxrl_vis.types import Metrics, Params
 
-Way = Literal["per_loss", "one_hot", "jvp"]
+Way = Literal["per_loss", "one_hot", "jvp", "latents"]
 LossesFunction = Callable[..., Any]
 Selector = Callable[[Params], Params]
+_FORWARD_WAYS = ("jvp", "latents")
 
 
 class Weighted(NamedTuple):
@@ -106,13 +113,15 @@ def weighted_grad(
     way: Way = "per_loss",
     has_aux: bool = False,
     reduce: Selector = everything,
-    forwards: LossesFunction | None = None,
+    forwards: Callable[[], contextlib.AbstractContextManager] = contextlib.nullcontext,
+    encode: Callable[..., Any] | None = None,
 ) -> Callable[..., Weighted]:
     """The gradient of a dictionary of losses, weighted.
 
     Args:
         losses_fn: (params, *args) -> [] floats by name, of which one is called `MAIN`; with ``has_aux``, and anything else
-            beside these. A gradient is taken for each loss as a whole, heads and shared parameters alike.
+            beside these. A gradient is taken for each loss as a whole, heads and shared parameters alike. With ``encode``:
+            (params, latents, *args).
         weighting: From `make_weighting`.
         shared: Selects the parameters in which gradients are compared, for instance ``lambda params: params["encoder"]``. It
             may only pick: what it returns must be parts of its argument.
@@ -120,8 +129,9 @@ def weighted_grad(
         has_aux: See ``losses_fn``.
         reduce: Applied to losses, gradients and dots before the weighting sees them, where each device has its own part of the
             data and the losses are means: ``lambda tree: jax.lax.pmean(tree, axis)``.
-        forwards: For ``way`` jvp: what computes the same as ``losses_fn`` by operations that have tangent rules; that itself if
-            not given.
+        forwards: Makes the context in which what is differentiated forwards is traced.
+        encode: (what ``shared`` selects, *args) -> latents, any tree of arrays. ``losses_fn`` must read the shared parameters
+            through these alone. Way latents needs it; the others take it, too.
 
     Returns:
         (params, state, *args) -> `Weighted`, with state from ``weighting.init(names, shared(params))``. A weighting with
@@ -132,7 +142,12 @@ def weighted_grad(
         RequestError: There is no such way, or it does not find what the weighting needs; from the function returned: the losses
             are not those that the state began with, ``held`` is missing, or given without need.
     """
-    _check_way(way, weighting)
+    _check_way(way, weighting, encode is not None)
+    of_latents = losses_fn
+    if encode is not None:
+
+        def losses_fn(params: Params, *args: Any) -> Any:
+            return of_latents(params, encode(shared(params), *args), *args)
 
     def by_gradients(params: Params, state: WeightingState, *args: Any, held: Params = None) -> Weighted:
         losses, gradients, extra = loss_gradients(losses_fn, params, *args, way=way, has_aux=has_aux)
@@ -147,7 +162,7 @@ def weighted_grad(
         return Weighted(combined, state, losses, metrics, weights, extra)
 
     def by_jvp(params: Params, state: WeightingState, *args: Any) -> Weighted:
-        whole, forward = (_in_float32(each, has_aux) for each in (losses_fn, forwards or losses_fn))
+        whole = _in_float32(losses_fn, has_aux)
         local, pullback, extra = jax.vjp(lambda params: whole(params, *args), params, has_aux=True)
         _check_names(local, state)
         losses = reduce(local)
@@ -162,37 +177,93 @@ def weighted_grad(
                 direction = combined = backward(weighting.coefficients(state.weights, losses))
             else:
                 direction = backward({name: jnp.full_like(loss, name == MAIN) for name, loss in losses.items()})
-            along = _embed(shared, params, direction)
-            _, tangents = jax.jvp(lambda params: forward(params, *args)[0], (params,), (along,))
+            along = _embed(shared, params, shared(direction))
+            with forwards():
+                _, tangents = jax.jvp(lambda params: whole(params, *args)[0], (params,), (along,))
             statistics = reduce({name: tangent for name, tangent in tangents.items() if name != MAIN})
         weights, state, metrics = weighting.update(losses, statistics, state)
         if combined is None:
             combined = backward(weighting.coefficients(weights, losses))
         return Weighted(combined, state, losses, metrics, weights, extra)
 
+    def by_latents(params: Params, state: WeightingState, *args: Any) -> Weighted:
+        assert encode is not None
+        picked = shared(params)
+        latents, to_shared = jax.vjp(lambda picked: encode(picked, *args), picked)
+        found = _gradients_at(_in_float32(of_latents, has_aux), tuple(state.weights), params, latents, *args)
+        losses, of_params, at_latents, extra = found
+        losses = reduce(losses)
+
+        def backward(coefficients: Mapping[str, jax.Array]) -> Params:
+            """The gradient in the shared parameters of a sum of losses."""
+            return to_shared(_like(weighted_sum(at_latents, coefficients), latents))[0]
+
+        statistics = None
+        if weighting.needs == "dots":
+            direction = {name: jnp.float32(name == MAIN) for name in losses}
+            if weighting.main_grad == "total":
+                direction = weighting.coefficients(state.weights, losses)
+            along = _like(reduce(jax.tree.map(_to_float32, backward(direction))), picked)
+            with forwards():
+                _, tangent = jax.jvp(lambda picked: encode(picked, *args), (picked,), (along,))
+            statistics = reduce({name: dot(tangent, at_latents[name]) for name in losses if name != MAIN})
+        weights, state, metrics = weighting.update(losses, statistics, state)
+        coefficients = weighting.coefficients(weights, losses)
+        of_shared = _embed(shared, params, backward(coefficients))
+        combined = jax.tree.map(jnp.add, weighted_sum(of_params, coefficients), jax.tree.map(_to_float32, of_shared))
+        return Weighted(reduce(combined), state, losses, metrics, weights, extra)
+
     def gradient(params: Params, state: WeightingState, *args: Any, held: Params = None) -> Weighted:
         if weighting.held and held is None:
             raise RequestError(f"weighting {weighting.name} needs held=, the parameters that its interval began with")
         if not weighting.held and held is not None:
             raise RequestError(f"weighting {weighting.name} holds no parameters; leave out held")
-        return by_jvp(params, state, *args) if way == "jvp" else by_gradients(params, state, *args, held=held)
+        if way in _FORWARD_WAYS:
+            return {"jvp": by_jvp, "latents": by_latents}[way](params, state, *args)
+        return by_gradients(params, state, *args, held=held)
 
     return gradient
 
 
-def _check_way(way: str, weighting: Weighting) -> None:
+def _gradients_at(
+    whole: LossesFunction, names: tuple[str, ...], params: Params, latents: Any, *args: Any
+) -> tuple[dict[str, jax.Array], dict[str, Params], dict[str, Any], Any]:
+    """Each loss, its gradients with respect to the parameters and to the latents, by name; and what else there was."""
+    losses, of_params, at_latents, extra = {}, {}, {}, None
+
+    def one(name: str, params: Params, latents: Any) -> tuple[jax.Array, Any]:
+        found, extra = whole(params, latents, *args)
+        if set(found) != set(names):
+            _raise_names(found, names)
+        return found[name], extra
+
+    for name in names:
+        # Each by itself, so that a compiler finds what the others compute in it to be of no use.
+        losses[name], pullback, beside = jax.vjp(functools.partial(one, name), params, latents, has_aux=True)
+        of_params[name], at_latents[name] = pullback(jnp.ones_like(losses[name]))
+        extra = beside if name == MAIN else extra
+    return losses, of_params, at_latents, extra
+
+
+def _check_way(way: str, weighting: Weighting, has_latents: bool) -> None:
     if way not in get_args(Way):
         raise RequestError(f"unknown way to find gradients {way!r}{nearest(way, get_args(Way))}")
-    if way == "jvp" and weighting.needs == "gradients":
+    if way in _FORWARD_WAYS and weighting.needs == "gradients":
         raise RequestError(
-            f"weighting {weighting.name} needs whole gradients, which jvp does not find; use one_hot or per_loss"
+            f"weighting {weighting.name} needs whole gradients, which {way} does not find; use one_hot or per_loss"
         )
+    if way == "latents" and not has_latents:
+        raise RequestError("way latents needs to know what the latents are: give encode, or use jvp")
 
 
 def _check_names(losses: Losses, state: WeightingState) -> None:
     if set(losses) != set(state.weights):
-        there, known = (", ".join(sorted(names)) for names in (losses, state.weights))
-        raise RequestError(f"losses are {there}, but the weighting began with {known}; give init the names of all losses")
+        _raise_names(losses, state.weights)
+
+
+def _raise_names(there: Iterable[str], known: Iterable[str]) -> None:
+    there, known = (", ".join(sorted(names)) for names in (there, known))
+    raise RequestError(f"losses are {there}, but the weighting began with {known}; give init the names of all losses")
 
 
 def _to_float32(leaf: jax.Array) -> jax.Array:
@@ -209,9 +280,13 @@ def _in_float32(losses_fn: LossesFunction, has_aux: bool) -> Callable[..., tuple
     return whole
 
 
-def _embed(shared: Selector, params: Params, direction: Params) -> Params:
-    """``direction`` in the shared parameters and zero in all others, in the parameters' dtypes."""
-    direction = jax.tree.map(lambda leaf, like: leaf.astype(like.dtype), direction, params)
-    _, back = jax.vjp(shared, params)  # of a function that only picks, the transpose puts back
-    (placed,) = back(shared(direction))
+def _like(tree: Params, like: Params) -> Params:
+    """A tree in the dtypes of another."""
+    return jax.tree.map(lambda leaf, other: leaf.astype(other.dtype), tree, like)
+
+
+def _embed(shared: Selector, params: Params, part: Params) -> Params:
+    """``part`` in the shared parameters and zero in all others, in the parameters' dtypes."""
+    picked, back = jax.vjp(shared, params)  # of a function that only picks, the transpose puts back
+    (placed,) = back(_like(part, picked))
     return placed
