@@ -137,9 +137,9 @@ class Config:
     """Whether weighting cosine learns logarithms of the losses."""
     aux_form: Literal["thesis", "release"] = "thesis"
     """Whose targets the auxiliary tasks have, where the thesis and the authors' release differ (`auxtasks.Options`)."""
-    aux_gradients: Literal["per_loss", "one_hot", "jvp", "latents"] = "per_loss"
+    aux_gradients: Literal["auto", "per_loss", "one_hot", "jvp", "latents"] = "auto"
     """How gradients of losses are found and compared, for weightings that compare them; all ways agree
-    (`learner.weighting.gradients`)."""
+    (`learner.weighting.gradients`). auto: latents, the fastest, or one_hot for weightings that keep whole gradients."""
 
     # -- Networks
     encoder_filters: tuple[int, ...] = (16, 32, 64, 64)
@@ -348,8 +348,7 @@ OF_TASK: dict[tuple[str, str], dict[str, Any]] = {
 }
 """(preset, task) -> fields that this preset has otherwise for this task, from images or states; see docs/learner.md."""
 _OF_STATES = ("trivial_goals",)  # of those, what reads true states: left out where the method has none
-# And what images alone can have: left out from states, where images are rewards, and where auxiliary losses read them.
-_OF_IMAGES = ("random_shift",)
+_OF_IMAGES = ("random_shift",)  # and what images alone can have: left out from states, and where images are rewards
 
 
 def preset(name: str, **overrides: Any) -> Config:
@@ -371,8 +370,7 @@ def preset(name: str, **overrides: Any) -> Config:
     left_out: tuple[str, ...] = ()
     if method is not None and method.reward != "oracle":
         left_out += _OF_STATES
-    reads_images = bool(overrides.get("aux_tasks")) or (method is not None and method.reward == "autoencoder")
-    if not env.startswith("Visual") or reads_images:
+    if not env.startswith("Visual") or (method is not None and method.reward == "autoencoder"):
         left_out += _OF_IMAGES
     of_task = {field: value for field, value in of_task.items() if field not in left_out}
     return config.replace(**{**of_task, **overrides})

@@ -41,7 +41,7 @@ class Settings:
     peer: str | None = None
     aux_tasks: tuple[str, ...] = ()
     weighting: str = "none"
-    aux_gradients: str = "per_loss"
+    aux_gradients: str = "auto"
     scene: str | None = None
     on_accelerator: bool = False
 
@@ -97,4 +97,4 @@ class Settings:
         if self.weighting == "none":
             return {}
         about = {"weighting": self.weighting, "aux_tasks": " ".join(self.aux_tasks)}
-        return about if self.aux_gradients == "per_loss" else {**about, "aux_gradients": self.aux_gradients}
+        return about if self.aux_gradients == "auto" else {**about, "aux_gradients": self.aux_gradients}

@@ -52,7 +52,7 @@ class Bench:
     """Auxiliary tasks in the gradient steps (update, train)."""
     weighting: WeightingName = "none"
     """How their losses are weighted (update, train)."""
-    aux_gradients: Literal["per_loss", "one_hot", "jvp", "latents"] = "per_loss"
+    aux_gradients: Literal["auto", "per_loss", "one_hot", "jvp", "latents"] = "auto"
     """How gradients of losses are found and compared (update, train)."""
     peer: Peer | None = None
     """Measure another side by side: a renderer on the same poses (render: mujoco, warp), MuJoCo Playground's FingerTurn
@@ -83,7 +83,7 @@ def run(options: Bench) -> int:
         raise RequestError("--peer torch learns with one seed: leave out --seeds")
     if (options.weighting != "none" or options.aux_tasks) and (options.benchmark not in ("update", "train") or options.peer):
         raise RequestError("--weighting and --aux-tasks go with `bench update` and `bench train` only, without a peer")
-    if options.aux_gradients != "per_loss" and options.weighting == "none":
+    if options.aux_gradients != "auto" and options.weighting == "none":
         raise RequestError("--aux-gradients goes with --weighting and --aux-tasks, whose gradients it compares")
     if (options.devices is not None or options.data_devices is not None) and options.benchmark != "train":
         raise RequestError("--devices and --data-devices go with `bench train` only")

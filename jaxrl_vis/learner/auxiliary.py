@@ -6,7 +6,7 @@ ddpg         latents of all observations that some task reads, losses, and a wei
 """
 
 import dataclasses
-from typing import Any
+from typing import Any, Literal
 
 import jax
 
@@ -14,7 +14,8 @@ from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import auxtasks
 from jaxrl_vis.learner.auxtasks import AuxTask, Spec, Targets, View, optical_flow
-from jaxrl_vis.learner.weighting import MAIN, Weighting, WeightingState, make_weighting
+from jaxrl_vis.learner.blocks import shifted
+from jaxrl_vis.learner.weighting import MAIN, Way, Weighting, WeightingState, make_weighting
 from jaxrl_vis.types import Batch, Episodes, Params
 
 _EPISODES_AT_ONCE = 10  # of which optical flow is computed: some 500 images fill a GPU, and more would fill its memory
@@ -29,12 +30,23 @@ class Auxiliary:
         weighting: Of their losses and the main one.
         options: How the tasks were made.
         frame_stack: Images that an observation stacks.
+        gradients: ``Config.aux_gradients``.
     """
 
     tasks: dict[str, AuxTask]
     weighting: Weighting
     options: auxtasks.Options = auxtasks.Options()
     frame_stack: int = 1
+    gradients: Literal["auto", "per_loss", "one_hot", "jvp", "latents"] = "auto"
+
+    @property
+    def way(self) -> Way:
+        """How gradients of losses are found: by default as fast as the weighting allows."""
+        if self.weighting.needs == "losses":
+            return "latents"  # one backward pass is all
+        if self.gradients == "auto":
+            return "one_hot" if self.weighting.needs == "gradients" else "latents"
+        return self.gradients
 
     @property
     def needs(self) -> frozenset[str]:
@@ -116,7 +128,11 @@ class Auxiliary:
 
 
 def _with_targets(view: View, batch: Batch) -> View:
-    return view.replace(motion=batch.targets.motion, flow=batch.targets.flow)
+    """The view with the targets of the batch, moved as its images are."""
+    flow = batch.targets.flow
+    if flow is not None and batch.shift is not None:
+        flow = shifted(flow[:, None], batch.shift)[:, 0]
+    return view.replace(motion=batch.targets.motion, flow=flow)
 
 
 def make_auxiliary(
@@ -153,12 +169,11 @@ def make_auxiliary(
         raise RequestError(
             f"weighting_interval ({weighting.interval}) must divide updates_per_iteration ({config.updates_per_iteration})"
         )
-    for name, is_set in (("random_shift", config.random_shift > 0), ("n_step", config.n_step > 1)):
-        if config.aux_tasks and is_set:
-            raise RequestError(f"{name} and aux_tasks exclude each other: targets are of single steps, as the camera saw them")
+    if config.aux_tasks and config.n_step > 1:
+        raise RequestError("n_step and aux_tasks exclude each other: targets are of single steps")
     spec = Spec(observation, action_size, config.latent_size, frame_stack, len(config.encoder_filters), dtype)
     options = auxtasks.RELEASE if config.aux_form == "release" else auxtasks.Options()
-    return Auxiliary(auxtasks.make(config.aux_tasks, spec, options), weighting, options, frame_stack)
+    return Auxiliary(auxtasks.make(config.aux_tasks, spec, options), weighting, options, frame_stack, config.aux_gradients)
 
 
 def _options(config: Config) -> dict[str, Any]:

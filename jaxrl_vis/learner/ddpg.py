@@ -204,7 +204,7 @@ def make_ddpg(
         if rewarded is not None:
             batch = batch.replace(reward=rewarded.reward)
         assert batch.reward is not None
-        image = networks.normalize(train.normalizer, batch.observation_t) if "image" in auxiliary.needs else None
+        image = networks.normalize(train.normalizer, batch.observation_t, batch.shift) if "image" in auxiliary.needs else None
         found = learning.of_critic(now, train.weighting, inputs, image, batch, working.held)
         latents, value, keep = found.extra
         counts = diagnostics.count_rewards(

@@ -13,12 +13,11 @@ Pixels have the order of the encoder's patches (`encoder_kernel_patches`): chann
 nested blocks. So what an autoencoder is to reconstruct is what the encoder read, byte for byte.
 
 The gradient of the cells is written in the networks' dtype, those of the weights are added up in float32 as in
-`encoder_kernel_passes`; both belong to the sum of squares and are multiplied by the gradient that comes in.
+`encoder_kernel_passes`; both are multiplied by the gradient that comes in.
 """
 
 import functools
 import itertools
-import math
 from typing import Any, NamedTuple
 
 import jax
@@ -71,8 +70,8 @@ def make_weights(bias_in: jax.Array, finer: dict[str, jax.Array], finest: dict[s
     missing = padded_channels(channels) - channels
     window = finest["kernel"].reshape(features, 2, 2, channels)  # feature, row and column in a quarter, channel
     window = jnp.pad(window, [(0, 0), (0, 0), (0, 0), (0, missing)]).transpose(0, 3, 1, 2)
-    # To (quarter's row and column, feature) and (channel, quarter's row, row, quarter's column, column): a quarter makes its own
-    # pixels only.
+    # To (quarter's row and column, feature) and (channel, quarter's row, row, quarter's column, column), where a quarter makes
+    # its own pixels only.
     same = jnp.eye(2, dtype=window.dtype)
     of_rows, of_columns = same[:, None, None, None, :, None, None, None], same[None, :, None, None, None, None, :, None]
     cell = window[None, None, :, :, None, :, None, :] * of_rows * of_columns
@@ -98,7 +97,7 @@ def _forward(cells: jax.Array, weights: Weights) -> tuple[jax.Array, jax.Array, 
     return hidden, finer, dot(finer, weights.kernel_2) + weights.bias_2[None, :]
 
 
-def _kernel(cells_ref, target_ref, *refs, tile):
+def _kernel(cells_ref, target_ref, *refs, tile, scale):
     weights, (gradient_ref, sums_ref) = Weights(*(ref[...] for ref in refs[:-2])), refs[-2:]
 
     def add_rows(values):
@@ -111,7 +110,7 @@ def _kernel(cells_ref, target_ref, *refs, tile):
         hidden, finer, pixels = _forward(cells_ref[here, :], weights)
         error = pixels - target_ref[here, :].astype(jnp.float32)
         squares += jnp.sum(error * error, axis=0)
-        before_2 = (2.0 * error).astype(hidden.dtype)
+        before_2 = (2.0 * scale * error).astype(hidden.dtype)
         before_1 = before(finer, dot(before_2, weights.kernel_2, (1, 1)))
         before_in = before(hidden, dot(before_1, weights.kernel_1, (1, 1)))
         gradient_ref[here, :] = before_in
@@ -136,16 +135,16 @@ def _kernel(cells_ref, target_ref, *refs, tile):
 
 
 def _on_gpu(
-    cells: jax.Array, target: jax.Array, weights: Weights, interpret: bool = False
+    cells: jax.Array, target: jax.Array, weights: Weights, scale: float, interpret: bool = False
 ) -> tuple[jax.Array, jax.Array, Weights]:
-    """The sum of squared errors, and its gradients with respect to the cells and the weights."""
+    """The scaled sum of squared errors, and its gradients with respect to the cells and the weights."""
     count, features = cells.shape
     tile = divisor(count, _CELLS)
     block = tile * divisor(count // tile, _TILES)
     programs, cast = count // block, _cast(weights, cells.dtype)
     total = sum(array.size for array in weights) + weights.bias_2.size
     gradient, partial_sums = pl.pallas_call(
-        functools.partial(_kernel, tile=tile),
+        functools.partial(_kernel, tile=tile, scale=scale),
         out_shape=(
             jax.ShapeDtypeStruct((count, features), cells.dtype),
             # All sums in one row, so that one reduction adds up the programs.
@@ -161,31 +160,34 @@ def _on_gpu(
     ends = list(itertools.accumulate(array.size for array in weights))
     *sums, squares = jnp.split(jnp.sum(partial_sums, axis=0), ends)
     found = Weights(*(part.reshape(like.shape).astype(like.dtype) for part, like in zip(sums, weights, strict=True)))
-    return jnp.sum(squares), gradient, found
+    return scale * jnp.sum(squares), gradient, found
 
 
-def _plainly(cells: jax.Array, target: jax.Array, weights: Weights) -> jax.Array:
+def _plainly(cells: jax.Array, target: jax.Array, weights: Weights, scale: float) -> jax.Array:
     pixels = _forward(cells, _cast(weights, cells.dtype))[2]
-    return jnp.sum(jnp.square(pixels - target[: cells.shape[0]].astype(jnp.float32)))
+    return scale * jnp.sum(jnp.square(pixels - target[: cells.shape[0]].astype(jnp.float32)))
 
 
-def _plainly_with_gradients(cells: jax.Array, target: jax.Array, weights: Weights) -> tuple[jax.Array, jax.Array, Weights]:
-    error, gradients = jax.value_and_grad(lambda cells, weights: _plainly(cells, target, weights), (0, 1))(cells, weights)
+def _plainly_with_gradients(
+    cells: jax.Array, target: jax.Array, weights: Weights, scale: float
+) -> tuple[jax.Array, jax.Array, Weights]:
+    error, gradients = jax.value_and_grad(_plainly, (0, 2))(cells, target, weights, scale)
     return error, *gradients
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(3,))
-def _squared_error(cells: jax.Array, target: jax.Array, weights: Weights, interpret: bool) -> jax.Array:
-    return _plainly(cells, target, weights)
+@functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4))
+def _squared_error(cells: jax.Array, target: jax.Array, weights: Weights, scale: float, interpret: bool) -> jax.Array:
+    return _plainly(cells, target, weights, scale)
 
 
-def _squared_error_forward(cells: jax.Array, target: jax.Array, weights: Weights, interpret: bool):
-    on_gpu = functools.partial(_on_gpu, interpret=interpret)
-    error, *gradients = dispatch(on_gpu, _plainly_with_gradients, cells, target, weights, interpret=interpret)
+def _squared_error_forward(cells: jax.Array, target: jax.Array, weights: Weights, scale: float, interpret: bool):
+    on_gpu = functools.partial(_on_gpu, scale=scale, interpret=interpret)
+    plainly = functools.partial(_plainly_with_gradients, scale=scale)
+    error, *gradients = dispatch(on_gpu, plainly, cells, target, weights, interpret=interpret)
     return error, (gradients, target)
 
 
-def _squared_error_backward(interpret: bool, residuals: Any, factor: jax.Array):
+def _squared_error_backward(scale: float, interpret: bool, residuals: Any, factor: jax.Array):
     (of_cells, of_weights), target = residuals
     of_cells, of_weights = jax.tree.map(lambda leaf: (factor * leaf).astype(leaf.dtype), (of_cells, of_weights))
     return of_cells, jnp.zeros_like(target), of_weights
@@ -194,17 +196,21 @@ def _squared_error_backward(interpret: bool, residuals: Any, factor: jax.Array):
 _squared_error.defvjp(_squared_error_forward, _squared_error_backward)
 
 
-def squared_error(cells: jax.Array, target: jax.Array, weights: Weights, interpret: bool = False) -> jax.Array:
-    """The sum over pixels of squared errors, [] float32; differentiable with respect to cells and weights.
+def squared_error(cells: jax.Array, target: jax.Array, weights: Weights, scale: float, interpret: bool = False) -> jax.Array:
+    """The sum over pixels of squared errors, times ``scale``: [] float32; differentiable with respect to cells and weights.
 
     Args:
         cells: [M, F], M a multiple of 16: what the layer before makes, without its bias.
         target: [at least M, 16 C'], of which the first M rows count; what is padding must be 0.
         weights: From `make_weights`.
+        scale: A number, so that where nothing else is multiplied, the gradient is written as it is wanted.
         interpret: Run the kernel without a GPU, slowly.
+
+    Raises:
+        ValueError: M is something else.
     """
-    if math.gcd(cells.shape[0], LEAST_ROWS) < LEAST_ROWS:
+    if cells.shape[0] % LEAST_ROWS:
         raise ValueError(f"{cells.shape[0]} cells are not a multiple of {LEAST_ROWS}")
     if tangents.are_wanted():
-        return _plainly(cells, target, weights)
-    return _squared_error(cells, target, weights, interpret)
+        return _plainly(cells, target, weights, scale)
+    return _squared_error(cells, target, weights, scale, interpret)

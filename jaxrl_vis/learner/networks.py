@@ -228,17 +228,13 @@ class Networks:
 
     def prepare_batch(self, train: TrainState, batch: Batch) -> jax.Array:
         """`prepare` of the three observations of B transitions, side by side: [3 B, ...]; of moved images, [4 B, ...]."""
-        if train.goal_normalizer is None:
-            count, size, *shape = batch.observations.shape
-            shift = None if batch.shift is None else jnp.tile(batch.shift, (count, 1))
-            inputs = self.prepare(train.normalizer, batch.observations.reshape(count * size, *shape), shift)
-        else:
-            statistics = (train.normalizer, train.goal_normalizer, train.normalizer)
-            parts = zip(statistics, batch.observations, strict=True)
-            inputs = jnp.concatenate([self.prepare(each, rows, batch.shift) for each, rows in parts])
-        if batch.targets is None or batch.targets.images_moved is None:
-            return inputs
-        return jnp.concatenate([inputs, self.prepare(train.normalizer, batch.targets.images_moved)])
+        moved = None if batch.targets is None else batch.targets.images_moved
+        images = [*batch.observations] if moved is None else [*batch.observations, moved]
+        if train.goal_normalizer is None:  # together, and while they are bytes
+            shift = None if batch.shift is None else jnp.tile(batch.shift, (len(images), 1))
+            return self.prepare(train.normalizer, jnp.concatenate(images), shift)
+        statistics = (train.normalizer, train.goal_normalizer, train.normalizer, train.normalizer)
+        return jnp.concatenate([self.prepare(each, rows, batch.shift) for each, rows in zip(statistics, images, strict=False)])
 
     def prepare(self, statistics: NormalizerState, observations: jax.Array, shift: jax.Array | None = None) -> jax.Array:
         """Normalises and orders [B, ...] observations for the encoders: [B, blocks, block size], or [B, S] for states.
@@ -255,9 +251,11 @@ class Networks:
             return to_blocks(shifted(self._normalized(observations, mean, scale), shift), self._levels)
         return self._normalized(*(to_blocks(array, self._levels) for array in (observations, mean, scale)))
 
-    def normalize(self, statistics: NormalizerState, observations: jax.Array) -> jax.Array:
-        """Normalised [B, ...] observations in their own order, in the dtype that the networks compute in."""
-        return self._normalized(observations, statistics.mean, normalizer.scale(statistics, self.config.normalizer_floor))
+    def normalize(self, statistics: NormalizerState, observations: jax.Array, shift: jax.Array | None = None) -> jax.Array:
+        """As `prepare`, with the observations in their own order: [B, ...] in the dtype that the networks compute in."""
+        scale = normalizer.scale(statistics, self.config.normalizer_floor)
+        normalized = self._normalized(observations, statistics.mean, scale)
+        return normalized if shift is None else shifted(normalized, shift)
 
     def _normalized(self, observations: jax.Array, mean: jax.Array, scale: jax.Array) -> jax.Array:
         limit = self.config.normalizer_clip

@@ -121,10 +121,8 @@ class Objectives:
         held: Params,
     ) -> Weighted:
         """The critic's losses and their gradient; ``extra`` is (latents, values [B], keep [B])."""
-        networks, weighting = self.networks, self.auxiliary.weighting
+        networks, weighting, way = self.networks, self.auxiliary.weighting, self.auxiliary.way
         size = batch.action.shape[0]
-        # Weightings that compare no gradients need one backward pass only, which the last way of finding them takes.
-        way = "latents" if weighting.needs == "losses" else self.config.aux_gradients
 
         def encode(encoder: Params) -> Latents:
             return _encode_online(networks, self.auxiliary, {"encoder": encoder}, inputs, size, apart=way in _APART)

@@ -79,8 +79,8 @@ def decoding_error(params: Params, values: jax.Array, patches: jax.Array, dtype:
     *coarser, before, finer, finest = _layers(params)
     cells = _through([*coarser, before], values, dtype)
     weights = decoder_kernel.make_weights(before["bias"], finer, finest)
-    total = decoder_kernel.squared_error(cells, patches.reshape(-1, patches.shape[-1] // 4), weights)
-    return total / (cells.shape[0] * 16 * finest["bias"].shape[0])
+    pixels = cells.shape[0] * 16 * finest["bias"].shape[0]
+    return decoder_kernel.squared_error(cells, patches.reshape(-1, patches.shape[-1] // 4), weights, 1.0 / pixels)
 
 
 def has_kernel(batch: int, shape: tuple[int, int, int], levels: int) -> bool:

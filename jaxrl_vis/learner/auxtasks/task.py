@@ -44,8 +44,8 @@ class View(Replaceable):
         motion: [B, 1 or 3] float32 in [-1, 1], how they were rotated (and shifted).
         image: [B, C, H, W] any float dtype, the observations before, normalised as for the encoder.
         flow: [B, H, W] float32, strength of the optical flow (`optical_flow.flow_strength`).
-        patches: [at least B, patches, 64 C'], ``image`` and more as `encoder_kernel.prepare` orders them, where the encoder reads
-            them so: decoders, too, are kernels then (`decoder_kernel`).
+        patches: [at least B, patches, 64 C'], ``image`` and others as `encoder_kernel.prepare` orders them, where the encoder
+            reads them so: decoders, too, are kernels then (`decoder_kernel`).
     """
 
     latent_t: jax.Array
