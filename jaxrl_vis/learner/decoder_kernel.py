@@ -26,7 +26,7 @@ from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
 
 from jaxrl_vis.learner import tangents
-from jaxrl_vis.learner.encoder_kernel_passes import LEAST_ROWS, before, dispatch, dot, rows, whole
+from jaxrl_vis.learner.encoder_kernel_passes import LEAST_ROWS, before, dispatch, dot, layer, rectified, rows, whole
 from jaxrl_vis.learner.encoder_kernel_patches import divisor, padded_channels
 
 _MOST_CHANNELS = 4  # beyond, the weights' gradients no longer fit into registers
@@ -92,8 +92,8 @@ def _cast(weights: Weights, dtype: Any) -> Weights:
 def _forward(cells: jax.Array, weights: Weights) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Rectified cells, the layer above them, both in the dtype of ``cells``, and pixels in float32."""
     dtype = cells.dtype
-    hidden = jnp.maximum(cells.astype(jnp.float32) + weights.bias_in[None, :], 0.0).astype(dtype)
-    finer = jnp.maximum(dot(hidden, weights.kernel_1) + weights.bias_1[None, :], 0.0).astype(dtype)
+    hidden = rectified(cells.astype(jnp.float32) + weights.bias_in[None, :]).astype(dtype)
+    finer = layer(hidden, weights.kernel_1, weights.bias_1)
     return hidden, finer, dot(finer, weights.kernel_2) + weights.bias_2[None, :]
 
 

@@ -91,7 +91,12 @@ def dot(left: jax.Array, right: jax.Array, contract: tuple[int, int] = (1, 0)) -
 
 def layer(values: jax.Array, kernel: jax.Array, bias: jax.Array) -> jax.Array:
     """A product with bias and rectifier, in the dtype of ``values``."""
-    return jnp.maximum(dot(values, kernel) + bias[None, :], 0.0).astype(values.dtype)
+    return rectified(dot(values, kernel) + bias[None, :]).astype(values.dtype)
+
+
+def rectified(values: jax.Array) -> jax.Array:
+    """A rectifier with gradient 0 at 0, as `jax.nn.relu` has and `jnp.maximum` has not: blank parts of images lie there."""
+    return jnp.where(values > 0.0, values, 0.0)
 
 
 def before(after: jax.Array, gradient: jax.Array) -> jax.Array:
