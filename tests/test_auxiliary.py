@@ -163,7 +163,7 @@ def test_targets_move_with_the_images_whoever_makes_them(monkeypatch):
         ours, theirs = (jax.tree.leaves(found[random_shift, uses_kernel]) for uses_kernel in (True, False))
         for left, right in zip(ours, theirs, strict=True):
             np.testing.assert_allclose(left, right, rtol=5e-3, atol=2e-5)
-    for name in tasks[:2]:
+    for name in ("autoencoder", "optical_flow"):
         assert found[0, False][1][f"train/loss/{name}"] != found[3, False][1][f"train/loss/{name}"]
 
 

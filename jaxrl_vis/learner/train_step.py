@@ -232,26 +232,25 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None) 
     algorithm = make_ddpg(networks, config, resolved, auxiliary, shards)
     replay = make_replay(config.replay_transitions, config.num_envs, env.horizon)
     replay = replay._replace(num_envs=config.num_envs // shards.count)
+    replay_spec = replay.spec(env.observation_spec, env.goal_state_size, env.action_size, auxiliary.keeps_flow)
     sampler = Sampler(config, resolved, replay, env.threshold, env.as_goal if env.frame_stack > 1 else None, auxiliary, shards)
     insert = _make_insert(config, sampler, auxiliary)
     update_many = _make_update_many(config, sampler, algorithm)
     learn = _make_learn(insert, update_many, algorithm, shards)
     exploration = Exploration(config.random_action_probability, config.action_noise)
 
-    def init(key: jax.Array) -> LoopState:
-        return LoopState(
-            train=algorithm.init(key),
-            replay=replay.init(env.observation_spec, env.goal_state_size, env.action_size, auxiliary.keeps_flow),
-            key=key,
-            iteration=jnp.zeros((), jnp.int32),
-        )
-
-    def init_seeds(keys: jax.Array) -> LoopState:
-        loop = per_seed(init, out_axes=_SEED_AXES)(keys)
-        return loop.replace(replay=layout.folded(loop.replay, replay.num_envs))
-
     def per_seed(function, in_axes: Any = 0, out_axes: Any = 0):
         return jax.vmap(function, in_axes=in_axes, out_axes=out_axes)
+
+    def init_seeds(keys: jax.Array) -> LoopState:
+        # Of all seeds at once. Those of one seed, repeated under `vmap`, would lie in memory beside them.
+        empty = jax.tree.map(lambda leaf: jnp.zeros((len(keys), *leaf.shape), leaf.dtype), replay_spec)
+        return LoopState(
+            train=per_seed(algorithm.init)(keys),
+            replay=layout.folded(empty, replay.num_envs),
+            key=keys,
+            iteration=jnp.zeros((), jnp.int32),
+        )
 
     def rollout(train: TrainState, keys: jax.Array) -> tuple[Episodes, Metrics]:
         episodes, outcome, _ = play(env, networks, train, keys, config.num_envs, exploration, shards=shards)
