@@ -143,26 +143,24 @@ def weighted_grad(
             are not those that the state began with, ``held`` is missing, or given without need.
     """
     _check_way(way, weighting, encode is not None)
-    of_latents = losses_fn
-    if encode is not None:
 
-        def losses_fn(params: Params, *args: Any) -> Any:
-            return of_latents(params, encode(shared(params), *args), *args)
+    def losses_of(params: Params, *args: Any) -> Any:
+        return losses_fn(params, *args) if encode is None else losses_fn(params, encode(shared(params), *args), *args)
 
     def by_gradients(params: Params, state: WeightingState, *args: Any, held: Params = None) -> Weighted:
-        losses, gradients, extra = loss_gradients(losses_fn, params, *args, way=way, has_aux=has_aux)
+        losses, gradients, extra = loss_gradients(losses_of, params, *args, way=way, has_aux=has_aux)
         _check_names(losses, state)
         losses, gradients = reduce((losses, gradients))
         seen, compared = losses, gradients
         if weighting.held:
-            seen, compared = reduce(loss_gradients(losses_fn, held, *args, way=way, has_aux=has_aux)[:2])
+            seen, compared = reduce(loss_gradients(losses_of, held, *args, way=way, has_aux=has_aux)[:2])
         statistics = measure(weighting, seen, {name: shared(tree) for name, tree in compared.items()}, state)
         weights, state, metrics = weighting.update(seen, statistics, state)
         combined = weighted_sum(gradients, weighting.coefficients(weights, losses))
         return Weighted(combined, state, losses, metrics, weights, extra)
 
     def by_jvp(params: Params, state: WeightingState, *args: Any) -> Weighted:
-        whole = _in_float32(losses_fn, has_aux)
+        whole = _in_float32(losses_of, has_aux)
         local, pullback, extra = jax.vjp(lambda params: whole(params, *args), params, has_aux=True)
         _check_names(local, state)
         losses = reduce(local)
@@ -187,10 +185,10 @@ def weighted_grad(
         return Weighted(combined, state, losses, metrics, weights, extra)
 
     def by_latents(params: Params, state: WeightingState, *args: Any) -> Weighted:
-        assert encode is not None
-        picked = shared(params)
-        latents, to_shared = jax.vjp(lambda picked: encode(picked, *args), picked)
-        found = _gradients_at(_in_float32(of_latents, has_aux), tuple(state.weights), params, latents, *args)
+        picked, to_latents = shared(params), encode
+        assert to_latents is not None
+        latents, to_shared = jax.vjp(lambda picked: to_latents(picked, *args), picked)
+        found = _gradients_at(_in_float32(losses_fn, has_aux), tuple(state.weights), params, latents, *args)
         losses, of_params, at_latents, extra = found
         losses = reduce(losses)
 
@@ -205,7 +203,7 @@ def weighted_grad(
                 direction = weighting.coefficients(state.weights, losses)
             along = _like(reduce(jax.tree.map(_to_float32, backward(direction))), picked)
             with forwards():
-                _, tangent = jax.jvp(lambda picked: encode(picked, *args), (picked,), (along,))
+                _, tangent = jax.jvp(lambda picked: to_latents(picked, *args), (picked,), (along,))
             statistics = reduce({name: dot(tangent, at_latents[name]) for name in losses if name != MAIN})
         weights, state, metrics = weighting.update(losses, statistics, state)
         coefficients = weighting.coefficients(weights, losses)
