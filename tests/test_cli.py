@@ -142,7 +142,7 @@ def test_bad_input_gets_one_line_and_exit_2(tokens: list[str], parts: list[str],
 def test_only_given_options_override_the_preset() -> None:
     tokens = ["--preset", "cpu", "--image-size", "24", "--no-clip-targets-above", "--hidden-sizes", "8", "8"]
     config = training_config(parse(Train, tokens))
-    assert config == PRESETS["cpu"].replace(image_size=24, clip_targets_above=False, hidden_sizes=(8, 8))
+    assert config == preset("cpu", image_size=24, clip_targets_above=False, hidden_sizes=(8, 8))
     tokens = ["VisualReacher", "--preset", "paper", "--batch_size=64"]
     assert training_config(parse(Train, tokens)) == PRESETS["paper"].replace(env="VisualReacher", batch_size=64)
 
@@ -225,7 +225,7 @@ def test_flags_may_contradict_a_preset_both_ways() -> None:
 
 def test_auto_follows_the_hardware() -> None:
     tokens = ["--seeds", "2"]
-    assert training_config(parse(Train, tokens)) == PRESETS["cpu"].replace(seeds=2)
+    assert training_config(parse(Train, tokens)) == preset("cpu", seeds=2)
 
 
 def test_resume_starts_from_the_saved_configuration(tmp_path: Path) -> None:

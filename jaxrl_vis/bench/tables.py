@@ -4,6 +4,7 @@
 `jaxrl-vis bench --check` lists it.
 """
 
+import dataclasses
 import re
 import statistics
 from collections.abc import Callable, Iterator
@@ -78,7 +79,8 @@ def speed_table(results: Path) -> str:
     return "\n".join(lines)
 
 
-_OF_THE_FOLDER = ("checkpoint_interval", "full_checkpoint_interval")  # what a run leaves on the disk, not what it learns
+# What a run leaves on the disk, and by which way it finds the same gradients: not what it learns.
+_NO_MATTER = ("checkpoint_interval", "full_checkpoint_interval", "aux_gradients")
 
 
 def evidence_of(row: Learning, results: Path) -> list[learning.Evidence]:
@@ -93,9 +95,14 @@ def evidence_of(row: Learning, results: Path) -> list[learning.Evidence]:
         if evidence is None:
             return []
         made_with = config_from_dict(evidence.record["config"])
-        if made_with.replace(**{field: getattr(config, field) for field in _OF_THE_FOLDER}) != config:
-            asked = command_of(config)
-            raise RequestError(f"evidence {name} was made by `{evidence.record['command']}`, and the README says `{asked}`")
+        made_with = made_with.replace(**{field: getattr(config, field) for field in _NO_MATTER})
+        if made_with != config:
+            names = [field.name for field in dataclasses.fields(config)]
+            differ = [each for each in names if getattr(made_with, each) != getattr(config, each)]
+            raise RequestError(
+                f"evidence {name} was made by `{evidence.record['command']}`, and the README says `{command_of(config)}`, "
+                f"which has other {', '.join(differ)}: train it anew, then benchmarks/keep_learning.py"
+            )
         found.append(evidence)
     return found
 
