@@ -18,6 +18,7 @@ tangent rules, which operations of `jax.custom_vjp` lack: ``forwards`` may be a 
 """
 
 import contextlib
+import dataclasses
 import functools
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Literal, NamedTuple, get_args
@@ -143,84 +144,99 @@ def weighted_grad(
             are not those that the state began with, ``held`` is missing, or given without need.
     """
     _check_way(way, weighting, encode is not None)
+    return _Finder(losses_fn, weighting, shared, way, has_aux, reduce, forwards, encode).find
 
-    def losses_of(params: Params, *args: Any) -> Any:
-        return losses_fn(params, *args) if encode is None else losses_fn(params, encode(shared(params), *args), *args)
 
-    def by_gradients(params: Params, state: WeightingState, *args: Any, held: Params = None) -> Weighted:
-        losses, gradients, extra = loss_gradients(losses_of, params, *args, way=way, has_aux=has_aux)
+@dataclasses.dataclass(frozen=True)
+class _Finder:
+    """What `weighted_grad` was given, and each way as a method."""
+
+    losses_fn: LossesFunction
+    weighting: Weighting
+    shared: Selector
+    way: Way
+    has_aux: bool
+    reduce: Selector
+    forwards: Callable[[], contextlib.AbstractContextManager]
+    encode: Callable[..., Any] | None
+
+    def find(self, params: Params, state: WeightingState, *args: Any, held: Params = None) -> Weighted:
+        if self.weighting.held and held is None:
+            raise RequestError(f"weighting {self.weighting.name} needs held=, the parameters that its interval began with")
+        if not self.weighting.held and held is not None:
+            raise RequestError(f"weighting {self.weighting.name} holds no parameters; leave out held")
+        if self.way in _FORWARD_WAYS:
+            return (self._by_jvp if self.way == "jvp" else self._by_latents)(params, state, *args)
+        return self._by_gradients(params, state, *args, held=held)
+
+    def _losses_of(self, params: Params, *args: Any) -> Any:
+        if self.encode is None:
+            return self.losses_fn(params, *args)
+        return self.losses_fn(params, self.encode(self.shared(params), *args), *args)
+
+    def _by_gradients(self, params: Params, state: WeightingState, *args: Any, held: Params = None) -> Weighted:
+        losses, gradients, extra = loss_gradients(self._losses_of, params, *args, way=self.way, has_aux=self.has_aux)
         _check_names(losses, state)
-        losses, gradients = reduce((losses, gradients))
+        losses, gradients = self.reduce((losses, gradients))
         seen, compared = losses, gradients
-        if weighting.held:
-            seen, compared = reduce(loss_gradients(losses_of, held, *args, way=way, has_aux=has_aux)[:2])
-        statistics = measure(weighting, seen, {name: shared(tree) for name, tree in compared.items()}, state)
-        weights, state, metrics = weighting.update(seen, statistics, state)
-        combined = weighted_sum(gradients, weighting.coefficients(weights, losses))
+        if self.weighting.held:
+            seen, compared = self.reduce(loss_gradients(self._losses_of, held, *args, way=self.way, has_aux=self.has_aux)[:2])
+        statistics = measure(self.weighting, seen, {name: self.shared(tree) for name, tree in compared.items()}, state)
+        weights, state, metrics = self.weighting.update(seen, statistics, state)
+        combined = weighted_sum(gradients, self.weighting.coefficients(weights, losses))
         return Weighted(combined, state, losses, metrics, weights, extra)
 
-    def by_jvp(params: Params, state: WeightingState, *args: Any) -> Weighted:
-        whole = _in_float32(losses_of, has_aux)
+    def _by_jvp(self, params: Params, state: WeightingState, *args: Any) -> Weighted:
+        whole = _in_float32(self._losses_of, self.has_aux)
         local, pullback, extra = jax.vjp(lambda params: whole(params, *args), params, has_aux=True)
         _check_names(local, state)
-        losses = reduce(local)
+        losses = self.reduce(local)
 
         def backward(coefficients: Mapping[str, jax.Array]) -> Params:
             (gradient,) = pullback({name: coefficients[name].astype(loss.dtype) for name, loss in local.items()})
-            return reduce(jax.tree.map(_to_float32, gradient))
+            return self.reduce(jax.tree.map(_to_float32, gradient))
 
         combined = statistics = None
-        if weighting.needs == "dots":
-            if weighting.main_grad == "total":
-                direction = combined = backward(weighting.coefficients(state.weights, losses))
+        if self.weighting.needs == "dots":
+            if self.weighting.main_grad == "total":
+                direction = combined = backward(self.weighting.coefficients(state.weights, losses))
             else:
                 direction = backward({name: jnp.full_like(loss, name == MAIN) for name, loss in losses.items()})
-            along = _embed(shared, params, shared(direction))
-            with forwards():
+            along = _embed(self.shared, params, self.shared(direction))
+            with self.forwards():
                 _, tangents = jax.jvp(lambda params: whole(params, *args)[0], (params,), (along,))
-            statistics = reduce({name: tangent for name, tangent in tangents.items() if name != MAIN})
-        weights, state, metrics = weighting.update(losses, statistics, state)
+            statistics = self.reduce({name: tangent for name, tangent in tangents.items() if name != MAIN})
+        weights, state, metrics = self.weighting.update(losses, statistics, state)
         if combined is None:
-            combined = backward(weighting.coefficients(weights, losses))
+            combined = backward(self.weighting.coefficients(weights, losses))
         return Weighted(combined, state, losses, metrics, weights, extra)
 
-    def by_latents(params: Params, state: WeightingState, *args: Any) -> Weighted:
-        picked, to_latents = shared(params), encode
+    def _by_latents(self, params: Params, state: WeightingState, *args: Any) -> Weighted:
+        picked, to_latents = self.shared(params), self.encode
         assert to_latents is not None
         latents, to_shared = jax.vjp(lambda picked: to_latents(picked, *args), picked)
-        found = _gradients_at(_in_float32(losses_fn, has_aux), tuple(state.weights), params, latents, *args)
+        found = _gradients_at(_in_float32(self.losses_fn, self.has_aux), tuple(state.weights), params, latents, *args)
         losses, of_params, at_latents, extra = found
-        losses = reduce(losses)
+        losses = self.reduce(losses)
 
         def backward(coefficients: Mapping[str, jax.Array]) -> Params:
             """The gradient in the shared parameters of a sum of losses."""
             return to_shared(_like(weighted_sum(at_latents, coefficients), latents))[0]
 
         statistics = None
-        if weighting.needs == "dots":
+        if self.weighting.needs == "dots":
             direction = {name: jnp.float32(name == MAIN) for name in losses}
-            if weighting.main_grad == "total":
-                direction = weighting.coefficients(state.weights, losses)
-            along = _like(reduce(jax.tree.map(_to_float32, backward(direction))), picked)
-            with forwards():
+            if self.weighting.main_grad == "total":
+                direction = self.weighting.coefficients(state.weights, losses)
+            along = _like(self.reduce(jax.tree.map(_to_float32, backward(direction))), picked)
+            with self.forwards():
                 _, tangent = jax.jvp(lambda picked: to_latents(picked, *args), (picked,), (along,))
-            statistics = reduce({name: dot(tangent, at_latents[name]) for name in losses if name != MAIN})
-        weights, state, metrics = weighting.update(losses, statistics, state)
-        coefficients = weighting.coefficients(weights, losses)
-        of_shared = _embed(shared, params, backward(coefficients))
+            statistics = self.reduce({name: dot(tangent, at_latents[name]) for name in losses if name != MAIN})
+        weights, state, metrics = self.weighting.update(losses, statistics, state)
+        coefficients = self.weighting.coefficients(weights, losses)
+        of_shared = _embed(self.shared, params, backward(coefficients))
         combined = jax.tree.map(jnp.add, weighted_sum(of_params, coefficients), jax.tree.map(_to_float32, of_shared))
-        return Weighted(reduce(combined), state, losses, metrics, weights, extra)
-
-    def gradient(params: Params, state: WeightingState, *args: Any, held: Params = None) -> Weighted:
-        if weighting.held and held is None:
-            raise RequestError(f"weighting {weighting.name} needs held=, the parameters that its interval began with")
-        if not weighting.held and held is not None:
-            raise RequestError(f"weighting {weighting.name} holds no parameters; leave out held")
-        if way in _FORWARD_WAYS:
-            return {"jvp": by_jvp, "latents": by_latents}[way](params, state, *args)
-        return by_gradients(params, state, *args, held=held)
-
-    return gradient
+        return Weighted(self.reduce(combined), state, losses, metrics, weights, extra)
 
 
 def _gradients_at(
