@@ -15,6 +15,7 @@ class Settings:
 
     Attributes:
         env: The environment.
+        preset: Whose networks and gradient steps are measured.
         envs: Environments (or images) side by side; one measurement each.
         image_size: Height and width of images.
         pixels: Channels: rgbd, rgb or depth.
@@ -30,6 +31,7 @@ class Settings:
     """
 
     env: str = "VisualFetchReach"
+    preset: str | None = None
     envs: tuple[int, ...] = ()
     image_size: int | None = None
     pixels: str | None = None
@@ -81,6 +83,10 @@ class Settings:
         if not self.has_images:
             return {"env": self.env}
         return {"env": self.env, "image_size": self.image_size, "pixels": self.pixels}
+
+    def preset_config(self) -> dict[str, str]:
+        """What a record says about the preset; nothing of the device's own, as records from before another could be asked for."""
+        return {} if self.preset is None else {"preset": self.preset}
 
     def seeds_config(self) -> dict[str, int]:
         """What a record says about the number of learners; nothing of one, as records from before there could be several."""

@@ -19,7 +19,7 @@ from jaxrl_vis.types import LoopState, ReplayState
 
 
 def training_config(settings: Settings, **overrides: Any) -> Config:
-    """The preset of this device, with the benchmark's environment, images and sizes."""
+    """The preset that was asked for, or that of this device, with the benchmark's environment, images and sizes."""
     if settings.has_images:
         overrides |= {"image_size": settings.image_size, "pixels": settings.pixels}
     if settings.batch_size is not None:
@@ -29,7 +29,8 @@ def training_config(settings: Settings, **overrides: Any) -> Config:
     overrides["aux_gradients"] = settings.aux_gradients
     if settings.peer == "torch":
         overrides |= {"trivial_goals": 1.0, "random_shift": 0}  # the peer does neither
-    return preset("fast" if settings.on_accelerator else "cpu", env=settings.env, **overrides)
+    own = "fast" if settings.on_accelerator else "cpu"
+    return preset(settings.preset or own, env=settings.env, **overrides)
 
 
 def fill_replay(replay: ReplayState, key: jax.Array) -> ReplayState:
@@ -122,6 +123,7 @@ def measure(settings: Settings) -> Iterator[Measurement]:
         unit="updates/s",
         config={
             **settings.image_config(),
+            **settings.preset_config(),
             "method": config.method,
             "batch_size": config.batch_size,
             "dtype": dtype,

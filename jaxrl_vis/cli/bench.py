@@ -32,6 +32,8 @@ class Bench:
     """Measure nothing: write the tables of the README from the records."""
     env: Annotated[str, ByPlaceToo()] = "VisualFetchReach"
     """The environment; module:Name is one of your own."""
+    preset: Literal["paper", "fast", "cpu", "debug"] | None = None
+    """Whose networks and gradient steps (update, train); fast on accelerators and cpu on a CPU if not given."""
     envs: tuple[int, ...] = ()
     """Environments (or images) side by side, one measurement each; sizes that suit the device if not given."""
     image_size: int | None = None
@@ -85,6 +87,8 @@ def run(options: Bench) -> int:
         raise RequestError("--weighting and --aux-tasks go with `bench update` and `bench train` only, without a peer")
     if options.aux_gradients != "auto" and options.weighting == "none":
         raise RequestError("--aux-gradients goes with --weighting and --aux-tasks, whose gradients it compares")
+    if options.preset is not None and options.benchmark not in ("update", "train"):
+        raise RequestError("--preset goes with `bench update` and `bench train` only")
     if (options.devices is not None or options.data_devices is not None) and options.benchmark != "train":
         raise RequestError("--devices and --data-devices go with `bench train` only")
     check_counts(
