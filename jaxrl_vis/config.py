@@ -326,6 +326,7 @@ OF_TASK: dict[tuple[str, str], dict[str, Any]] = {
         "encoders": "shared",
         "target_encoder": False,
         "actor_interval": 2,
+        "random_shift": 2,
     },
     ("fast", "FetchReach"): {
         "num_envs": 25,

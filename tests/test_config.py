@@ -94,7 +94,8 @@ def test_a_preset_shifts_images_where_there_are_some() -> None:
     assert preset("fast", env="VisualFetchReach").random_shift > 0
     assert preset("fast", env="VisualFetchReach", method="indicator").random_shift > 0
     assert preset("fast", env="VisualFetchReach", random_shift=0).random_shift == 0
-    assert preset("fast", env="FetchReach").random_shift == 0
+    assert preset("fast", env="VisualHandReach").random_shift > 0
+    assert preset("fast", env="FetchReach").random_shift == preset("fast", env="HandReach").random_shift == 0
     assert validate(preset("fast", env="VisualFetchReach", method="autoencoder")).random_shift == 0
 
 

@@ -85,7 +85,7 @@ class Settings:
         return {"env": self.env, "image_size": self.image_size, "pixels": self.pixels}
 
     def preset_config(self) -> dict[str, str]:
-        """What a record says about the preset; nothing of the device's own, as records from before another could be asked for."""
+        """What a record says about the preset; nothing of the device's own, as in records from before that."""
         return {} if self.preset is None else {"preset": self.preset}
 
     def seeds_config(self) -> dict[str, int]:
