@@ -82,6 +82,25 @@ def test_a_change_is_told_with_the_spread_of_the_repeats() -> None:
     assert record.describe(new, old).endswith("the same speed, no more than the spread of the repeats, 4.0 %)")
 
 
+def test_a_calibration_keeps_no_more_than_two_results_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hundreds of results of half a gigabyte would fill a device."""
+    alive, most = 0, 0
+
+    class Result:
+        def __init__(self) -> None:
+            nonlocal alive, most
+            alive += 1
+            most = max(most, alive)
+
+        def __del__(self) -> None:
+            nonlocal alive
+            alive -= 1
+
+    monkeypatch.setattr(conditions, "calibrations", lambda: {"results": conditions.Work(Result, (), 1.0)})
+    assert conditions.calibrate()["results"] > 0.0
+    assert alive == 0 and most <= 2
+
+
 def test_what_a_machine_is_calibrated_with_is_computed_when_it_is_measured() -> None:
     """Constants would be computed by the compiler: for minutes on a GPU, and then never again."""
     for work in conditions.calibrations().values():
