@@ -111,6 +111,10 @@ class Config:
     """Rewards that a target sums before it trusts the critic. More than 1 needs true states, and a method without a filter."""
     action_penalty: float = 1.0
     """Weight of the mean squared action in the actor's loss."""
+    actor_log: Literal["value", "loss"] = "value"
+    """Of what an actor learns the logarithm, with weightings that take logarithms. value: of its value's distance from the best
+    there can be, as in the authors' release, with the action penalty added afterwards, which weighs as many times more as that
+    distance is large. loss: of the distance and the penalty together, which keeps their proportion."""
     clip_targets_above: bool = True
     """Clip critic targets at R+/(1-gamma) too (they are always clipped at R-/(1-gamma) below)."""
     random_action_probability: float = 0.3
@@ -344,8 +348,8 @@ OF_TASK: dict[tuple[str, str], dict[str, Any]] = {
         "target_encoder": False,
         "random_shift": 1,
     },
-    ("fast", "FingerTurn"): {"trivial_goals": 0.2},
-    ("cpu", "FingerTurn"): {"trivial_goals": 0.2},
+    ("fast", "FingerTurn"): {"trivial_goals": 0.2, "actor_log": "loss"},
+    ("cpu", "FingerTurn"): {"trivial_goals": 0.2, "actor_log": "loss"},
 }
 """(preset, task) -> fields that this preset has otherwise for this task, from images or states; see docs/learner.md."""
 _OF_STATES = ("trivial_goals",)  # of those, what reads true states: left out where the method has none

@@ -249,3 +249,12 @@ def test_an_actor_learns_the_logarithm_of_its_distance_from_the_best_value():
     penalty = float(metrics["train/action_size"]) ** 2
     # The critic is fresh: all values are near 0.
     np.testing.assert_allclose(metrics["train/actor_loss"] - penalty, np.log(best), atol=0.2)
+
+
+def test_an_actor_learns_the_logarithm_of_value_and_penalty_together_where_asked():
+    weight = 1e6
+    _, update, working, batch = learner(weighting="none_log", actor_log="loss", action_penalty=weight)
+    _, _, metrics = update(working, batch)
+    penalty = weight * float(metrics["train/action_size"]) ** 2
+    assert penalty > 1000.0  # else the value, which is near 0 here, would matter
+    np.testing.assert_allclose(metrics["train/actor_loss"], np.log(penalty), atol=0.2)

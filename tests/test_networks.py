@@ -229,3 +229,23 @@ def test_losses_by_hand():
     np.testing.assert_allclose(losses.critic_loss(jnp.array([1.0, 5.0, 3.0]), jnp.array([0.0, 0.0, 0.0]), keep), 5.0)
     assert losses.critic_loss(jnp.ones(3), jnp.zeros(3), jnp.zeros(3)) == 0.0
     np.testing.assert_allclose(losses.actor_loss(jnp.array([2.0, 4.0]), jnp.array([[1.0], [0.0]]), 0.5), -3.0 + 0.25)
+
+
+@pytest.mark.parametrize(("log_of", "expected"), [("value", np.log(7.0) + 0.25), ("loss", np.log(7.25))])
+def test_the_logarithm_of_an_actors_loss_by_hand(log_of, expected):
+    """Of a value whose distance from the best is 7, and a mean squared action of 0.5 that weighs 0.5."""
+    value, action = jnp.array([2.0, 4.0]), jnp.array([[1.0], [0.0]])
+    np.testing.assert_allclose(losses.actor_loss(value, action, 0.5, 10.0, log_of=log_of), expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("log_of", ["value", "loss"])
+def test_which_logarithm_keeps_the_proportion_of_value_and_action_penalty(log_of):
+    def proportion(**options):
+        def loss(value, action):
+            return losses.actor_loss(value, action, 0.5, **options)
+
+        of_value, of_action = jax.grad(loss, argnums=(0, 1))(jnp.array([-20.0, -30.0]), jnp.array([[0.6], [0.2]]))
+        return float(of_action[0, 0] / of_value[0])
+
+    kept = np.isclose(proportion(log_below=0.0, log_of=log_of), proportion(), rtol=1e-4)
+    assert kept == (log_of == "loss")

@@ -81,6 +81,7 @@ def speed_table(results: Path) -> str:
 
 # What a run leaves on the disk, and by which way it finds the same gradients: not what it learns.
 _NO_MATTER = ("checkpoint_interval", "full_checkpoint_interval", "aux_gradients")
+_OF_LOGARITHMS = ("actor_log",)
 
 
 def evidence_of(row: Learning, results: Path) -> list[learning.Evidence]:
@@ -95,7 +96,8 @@ def evidence_of(row: Learning, results: Path) -> list[learning.Evidence]:
         if evidence is None:
             return []
         made_with = config_from_dict(evidence.record["config"])
-        made_with = made_with.replace(**{field: getattr(config, field) for field in _NO_MATTER})
+        no_matter = (*_NO_MATTER, *_OF_LOGARITHMS) if config.weighting in ("none", "sum") else _NO_MATTER
+        made_with = made_with.replace(**{field: getattr(config, field) for field in no_matter})
         if made_with != config:
             names = [field.name for field in dataclasses.fields(config)]
             differ = [each for each in names if getattr(made_with, each) != getattr(config, each)]

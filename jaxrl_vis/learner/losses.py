@@ -4,6 +4,7 @@ Subscripts are time: ``value_t`` belongs to the state before the action, ``value
 """
 
 from collections.abc import Callable
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -65,6 +66,7 @@ def actor_loss(
     action_penalty: float,
     log_below: float | None = None,
     whole: Callable[[jax.Array], jax.Array] = lambda mean: mean,
+    log_of: Literal["value", "loss"] = "value",
 ) -> jax.Array:
     """Minus the mean value of the policy's own actions, plus their weighted mean square: [] float32.
 
@@ -75,8 +77,14 @@ def actor_loss(
         log_below: The greatest value that there can be, R+/(1-gamma): the logarithm of the distance to it takes the place of
             minus the value, as auxiliary losses that are learned as logarithms ask for. With the rewards 0/-1 of the OL-AUX
             release, it is 0, and this is the release's log(-Q). None: no logarithm.
-        whole: Makes the mean value of the whole batch of that of these transitions, before a logarithm is taken.
+        whole: Makes the mean of the whole batch of that of these transitions, before a logarithm is taken.
+        log_of: value, the distance alone, with the mean square added to its logarithm (the release); or loss, both together.
+            The slope of a logarithm is the inverse of its argument: with ``value`` it divides the value's gradient, but not
+            that of the mean square.
     """
-    value = jnp.mean(value_t)
-    loss = -value if log_below is None else jnp.log(jnp.maximum(log_below - whole(value), LOG_FLOOR))
-    return loss + action_penalty * jnp.mean(jnp.square(action))
+    value, penalty = jnp.mean(value_t), action_penalty * jnp.mean(jnp.square(action))
+    if log_below is None:
+        return penalty - value
+    if log_of == "loss":
+        return jnp.log(jnp.maximum(whole(log_below - value + penalty), LOG_FLOOR))
+    return jnp.log(jnp.maximum(log_below - whole(value), LOG_FLOOR)) + penalty

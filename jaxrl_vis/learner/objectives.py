@@ -177,7 +177,7 @@ class Objectives:
         action = self.networks.act(actor, latents.pair)
         value = self.networks.value(critic, critic_latents.pair, action)
         best = self.resolved.reward_positive / (1.0 - self.resolved.discount) if self.auxiliary.weighting.log else None
-        loss = losses.actor_loss(value, action, self.config.action_penalty, best, self.shards.whole)
+        loss = losses.actor_loss(value, action, self.config.action_penalty, best, self.shards.whole, self.config.actor_log)
         return loss + self.auxiliary.weighting.objective(weights, others), action
 
     def _auxiliary(
