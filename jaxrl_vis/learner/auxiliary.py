@@ -54,11 +54,10 @@ class Auxiliary:
         return auxtasks.needs_of(self.tasks)
 
     @property
-    def observations(self) -> int:
-        """How many observations of a transition are encoded with gradient: before, goal, after, moved, in this order."""
-        if "latent_moved" in self.needs:
-            return 4
-        return 3 if "latent_tp1" in self.needs else 2
+    def others(self) -> tuple[str, ...]:
+        """What else than an observation and a goal is encoded with gradient: ``after`` and ``moved`` (`networks.Inputs`)."""
+        read = {"after": "latent_tp1", "moved": "latent_moved"}
+        return tuple(name for name, latent in read.items() if latent in self.needs)
 
     def init_heads(self, key: jax.Array) -> dict[str, Params]:
         """Fresh parameters of all heads, by task."""

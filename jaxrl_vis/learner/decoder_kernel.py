@@ -26,12 +26,22 @@ from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
 
 from jaxrl_vis.learner import tangents
-from jaxrl_vis.learner.encoder_kernel_passes import LEAST_ROWS, before, dispatch, dot, layer, rectified, rows, whole
+from jaxrl_vis.learner.encoder_kernel_passes import (
+    LEAST_ROWS,
+    before,
+    dispatch,
+    dot,
+    layer,
+    rectified,
+    rows,
+    tiles_of_program,
+    whole,
+)
 from jaxrl_vis.learner.encoder_kernel_patches import divisor, padded_channels
 
 _MOST_CHANNELS = 4  # beyond, the weights' gradients no longer fit into registers
 # Cells in a tile, tiles that one program works through, and how they are run.
-_CELLS, _TILES, _PARAMS = 64, 8, plgpu.CompilerParams(num_warps=4, num_stages=1)
+_CELLS, _TILES, _PARAMS = 64, 32, plgpu.CompilerParams(num_warps=4, num_stages=1)
 
 
 class Weights(NamedTuple):
@@ -140,7 +150,7 @@ def _on_gpu(
     """The scaled sum of squared errors, and its gradients with respect to the cells and the weights."""
     count, features = cells.shape
     tile = divisor(count, _CELLS)
-    block = tile * divisor(count // tile, _TILES)
+    block = tile * tiles_of_program(count // tile, count // tile, _TILES)
     programs, cast = count // block, _cast(weights, cells.dtype)
     total = sum(array.size for array in weights) + weights.bias_2.size
     gradient, partial_sums = pl.pallas_call(

@@ -20,7 +20,8 @@ LEAST_ROWS = 16
 """Of a product in a kernel."""
 # Measured on an H200: patches in a tile, tiles that one program works through, and how they are run.
 _FORWARD_PATCHES, _FORWARD_TILES, _FORWARD = 16, 8, plgpu.CompilerParams(num_warps=4, num_stages=3)
-_BACKWARD_PATCHES, _BACKWARD_TILES, _BACKWARD = 16, 16, plgpu.CompilerParams(num_warps=4, num_stages=1)
+_BACKWARD_PATCHES, _BACKWARD_TILES, _BACKWARD = 16, 64, plgpu.CompilerParams(num_warps=4, num_stages=1)
+_LEAST_PROGRAMS = 256  # about two for each of a large GPU's processors
 
 
 class Weights(NamedTuple):
@@ -161,6 +162,20 @@ def rows(count: int, columns: int, skipped: int = 0) -> pl.BlockSpec:
     return pl.BlockSpec((count, columns), lambda program: (program + skipped, 0))
 
 
+def tiles_of_program(tiles: int, total: int, limit: int) -> int:
+    """How many tiles one program works through where it leaves a sum: many, for few sums, as long as all processors are busy.
+
+    Args:
+        tiles: What the number must divide.
+        total: Tiles of all programs.
+        limit: At most so many.
+    """
+    most = divisor(tiles, limit)
+    while most > 1 and total < most * _LEAST_PROGRAMS:
+        most //= 2
+    return most
+
+
 def cast_kernels(weights: Weights, dtype: Any) -> Weights:
     """Kernels in the dtype of the products; biases are added in float32."""
     return weights._replace(**{name: getattr(weights, name).astype(dtype) for name in ("kernel_1", "kernel_2", "kernel_3")})
@@ -226,7 +241,8 @@ def _backward_on_gpu(
     """Gradients of the weights, float32."""
     size, outputs = patches.shape[1], out.shape[1]
     tile = divisor(math.gcd(first, count), _BACKWARD_PATCHES)
-    block = tile * divisor(math.gcd(first, count) // tile, _BACKWARD_TILES)
+    tiles = math.gcd(first, count) // tile
+    block = tile * tiles_of_program(tiles, count // tile, _BACKWARD_TILES)
     programs = count // block
     cast = cast_kernels(weights, patches.dtype)
     total = sum(array.size for array in weights)

@@ -16,7 +16,7 @@ import optax
 from jaxrl_vis.config import Config, Resolved
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import auxtasks
-from jaxrl_vis.learner.networks import Networks
+from jaxrl_vis.learner.networks import Inputs, Networks
 from jaxrl_vis.methods import METHODS
 from jaxrl_vis.types import Batch, Params, Replaceable, TrainState
 
@@ -81,30 +81,30 @@ class LatentReward:
         params = {"encoder": self.networks.init_encoder(encoder_key), "decoder": self.task.init(decoder_key)}
         return AutoencoderState(params=params, optimizer=self.optimizer.init(params))
 
-    def of_batch(self, train: TrainState, inputs: jax.Array, batch: Batch) -> Rewarded:
+    def of_batch(self, train: TrainState, inputs: Inputs, batch: Batch) -> Rewarded:
         """Rewards of a batch, and the gradient for the autoencoder.
 
         Args:
             train: The learner, with the autoencoder and the statistics that observations are normalised with.
-            inputs: [3 B, ...] from `Networks.prepare_batch`.
+            inputs: From `Networks.prepare_batch`.
             batch: The transitions.
         """
-        networks, size = self.networks, batch.action.shape[0]
+        networks = self.networks
         if batch.reached is None:
-            reached, reached_inputs, which = batch.observation_tp1, inputs, slice(2 * size, 3 * size)
+            reached, pieces = batch.observation_tp1, inputs.pieces("after")
         else:
-            reached, which = batch.reached, slice(None)
-            reached_inputs = networks.prepare(train.normalizer, reached)
+            reached = batch.reached
+            pieces = [(networks.prepare(train.normalizer, reached), slice(None))]
         image = networks.normalize(train.normalizer, reached)
 
         def reconstruction(params: Params) -> tuple[jax.Array, jax.Array]:
-            latent = networks.encode(params, reached_inputs, which)
+            latent = networks.encode_pieces(params, pieces)
             view = auxtasks.View(latent_t=latent, action=batch.action, image=image)
             return self.task.loss(params["decoder"], view), latent
 
         params = train.autoencoder.params
         (loss, latent), gradient = jax.value_and_grad(reconstruction, has_aux=True)(params)
-        goal_latent = networks.encode(params, inputs, slice(size, 2 * size))
+        goal_latent = networks.encode_pieces(params, inputs.pieces("goal"))
         reward = cosine_reward(latent, goal_latent, self.resolved.reward_positive, self.resolved.reward_negative)
         return Rewarded(reward, loss, gradient)
 

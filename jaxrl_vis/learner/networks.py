@@ -14,7 +14,7 @@ Observation and goal go through the same encoder; actor and critic have one each
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -34,16 +34,16 @@ _NARROW = 16
 
 
 class _Encoder(nn.Module):
-    """[B, blocks, 4^levels * C] -> [B, latent]."""
+    """[B, blocks, 4^levels * C] -> [B, latent]; of several such arrays, one after the other."""
 
     filters: Sequence[int]
     latent_size: int
     dtype: Any
 
     @nn.compact
-    def __call__(self, blocks: jax.Array, first_layer: int = 0) -> jax.Array:
-        values = blocks.astype(self.dtype)
-        batch, count, size = values.shape
+    def __call__(self, *pieces: jax.Array, first_layer: int = 0) -> jax.Array:
+        pieces = tuple(blocks.astype(self.dtype) for blocks in pieces)
+        count, size = pieces[0].shape[1:]
         channels = size // 4 ** (len(self.filters) - first_layer)
         for level, filters in list(enumerate(self.filters))[first_layer:]:
             # Initialised as the convolution that it is: fan-out counts the window too.
@@ -52,11 +52,14 @@ class _Encoder(nn.Module):
                 lambda key, shape: _glorot(key, (2, 2, shape[0] // 4, shape[1])).reshape(shape),
                 (4 * channels, filters),
             )
-            bias = self.param(f"bias_{level}", nn.initializers.zeros, (filters,))
-            values = product(values.reshape(-1, 4 * channels), kernel.astype(self.dtype))
-            values = nn.relu(values + bias.astype(self.dtype))
+            bias = self.param(f"bias_{level}", nn.initializers.zeros, (filters,)).astype(self.dtype)
+            kernel = kernel.astype(self.dtype)
+            pieces = tuple(nn.relu(product(values.reshape(-1, 4 * channels), kernel) + bias) for values in pieces)
             channels = filters
-        return _Dense(self.latent_size, self.dtype, name="latent")(values.reshape(batch, count * channels))
+        # Only here, where they are smallest, are the pieces put together.
+        features = [values.reshape(-1, count * channels) for values in pieces]
+        features = jnp.concatenate(features) if len(features) > 1 else features[0]
+        return _Dense(self.latent_size, self.dtype, name="latent")(features)
 
 
 class _Dense(nn.Module):
@@ -85,6 +88,40 @@ class _Dense(nn.Module):
                 total = total + jnp.sum(product(values, rows), axis=0)
             first += parts * part
         return total
+
+
+_OBSERVED = ("before", "goal", "after")
+ORDER = (*_OBSERVED, "moved")
+"""Names of observations as `Inputs` has them."""
+
+Piece = tuple[jax.Array, slice]
+"""Some of an array of prepared observations: the array [B, ...], and which."""
+
+
+class Inputs(NamedTuple):
+    """The observations of B transitions as encoders read them (`Networks.prepare_batch`).
+
+    Attributes:
+        observed: [3 B, ...], those before, the goals, those after.
+        moved: [B, ...], rotated ones; None where no auxiliary task asks for them.
+    """
+
+    observed: jax.Array
+    moved: jax.Array | None = None
+
+    def pieces(self, *names: str) -> list[Piece]:
+        """Where those observations lie that are called ``before``, ``goal``, ``after`` and ``moved``, in this order."""
+        size, found = self.observed.shape[0] // len(_OBSERVED), []
+        for name in names:
+            if name == "moved":
+                assert self.moved is not None
+                found.append((self.moved, slice(0, size)))
+                continue
+            start = _OBSERVED.index(name) * size
+            if found and found[-1][0] is self.observed and found[-1][1].stop == start:  # neighbours are one piece
+                start = found.pop()[1].start
+            found.append((self.observed, slice(start, (_OBSERVED.index(name) + 1) * size)))
+        return found
 
 
 class _Head(nn.Module):
@@ -226,15 +263,19 @@ class Networks:
             lambda converted, leaf: leaf if converted is None else converted, copy, params, is_leaf=lambda leaf: leaf is None
         )
 
-    def prepare_batch(self, train: TrainState, batch: Batch) -> jax.Array:
-        """`prepare` of the three observations of B transitions, side by side: [3 B, ...]; of moved images, [4 B, ...]."""
+    def prepare_batch(self, train: TrainState, batch: Batch) -> Inputs:
+        """`prepare` of all observations of B transitions."""
         moved = None if batch.targets is None else batch.targets.images_moved
-        images = [*batch.observations] if moved is None else [*batch.observations, moved]
+        if moved is not None:
+            moved = self.prepare(train.normalizer, moved, batch.shift)
         if train.goal_normalizer is None:  # together, and while they are bytes
-            shift = None if batch.shift is None else jnp.tile(batch.shift, (len(images), 1))
-            return self.prepare(train.normalizer, jnp.concatenate(images), shift)
-        statistics = (train.normalizer, train.goal_normalizer, train.normalizer, train.normalizer)
-        return jnp.concatenate([self.prepare(each, rows, batch.shift) for each, rows in zip(statistics, images, strict=False)])
+            count, size, *shape = batch.observations.shape
+            shift = None if batch.shift is None else jnp.tile(batch.shift, (count, 1))
+            together = self.prepare(train.normalizer, batch.observations.reshape(count * size, *shape), shift)
+            return Inputs(together, moved)
+        statistics = (train.normalizer, train.goal_normalizer, train.normalizer)
+        pieces = [self.prepare(each, rows, batch.shift) for each, rows in zip(statistics, batch.observations, strict=True)]
+        return Inputs(jnp.concatenate(pieces), moved)
 
     def prepare(self, statistics: NormalizerState, observations: jax.Array, shift: jax.Array | None = None) -> jax.Array:
         """Normalises and orders [B, ...] observations for the encoders: [B, blocks, block size], or [B, S] for states.
@@ -263,19 +304,19 @@ class Networks:
 
     def encode(self, params: Params, inputs: jax.Array, which: slice = slice(None)) -> jax.Array:
         """Latents of ``which`` of the prepared observations, [B, latent]; a state vector is its own latent."""
+        return self.encode_pieces(params, [(inputs, which)])
+
+    def encode_pieces(self, params: Params, pieces: Sequence[Piece]) -> jax.Array:
+        """Latents of some of several arrays of prepared observations, one after the other: [B, latent]."""
         if not self.sees_images:
-            return inputs[which]
-        first_layer = 0
-        if self.uses_kernel:
-            weights = encoder_kernel.make_weights(params["encoder"], self.observation_spec.shape[0])
-            first_layer = encoder_kernel.LEVELS
-            inputs = encoder_kernel.encode(inputs, weights, which)
-            batch, patches, size = inputs.shape
-            finer = 4 ** (self._levels - first_layer)
-            inputs = inputs.reshape(batch, patches // finer, finer * size)
-        else:
-            inputs = inputs[which]
-        return self._encoder.apply({"params": params["encoder"]}, inputs, first_layer)
+            return jnp.concatenate([inputs[which] for inputs, which in pieces])
+        if not self.uses_kernel:
+            return self._encoder.apply({"params": params["encoder"]}, *(inputs[which] for inputs, which in pieces))
+        weights = encoder_kernel.make_weights(params["encoder"], self.observation_spec.shape[0])
+        found = [encoder_kernel.encode(inputs, weights, which) for inputs, which in pieces]
+        finer = 4 ** (self._levels - encoder_kernel.LEVELS)
+        blocks = [part.reshape(part.shape[0], part.shape[1] // finer, finer * part.shape[2]) for part in found]
+        return self._encoder.apply({"params": params["encoder"]}, *blocks, first_layer=encoder_kernel.LEVELS)
 
     def act(self, actor: Params, latents: jax.Array) -> jax.Array:
         """Actions [B, A] float32 in (-1, 1) for latents [2, B, latent] of observations and goals."""

@@ -11,6 +11,7 @@ The actor's loss values its actions with the critic's latents from the critic's 
 
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -20,7 +21,7 @@ from jaxrl_vis.config import Config, Resolved
 from jaxrl_vis.learner import losses, tangents
 from jaxrl_vis.learner.auxiliary import Auxiliary
 from jaxrl_vis.learner.auxtasks import View
-from jaxrl_vis.learner.networks import Networks
+from jaxrl_vis.learner.networks import ORDER, Inputs, Networks
 from jaxrl_vis.learner.shards import Shards
 from jaxrl_vis.learner.weighting import MAIN, Weighted, WeightingState, weighted_grad
 from jaxrl_vis.types import Batch, Params
@@ -38,9 +39,9 @@ class ComputeCopies(NamedTuple):
     target_critic: Params
 
 
-def _encode(networks: Networks, params: Params, inputs: jax.Array, size: int, first: int, count: int = 2) -> jax.Array:
-    """Latents [count, B, latent] of observations ``first``, ``first`` + 1, ... of those of a batch of ``size`` transitions."""
-    return networks.encode(params, inputs, slice(first * size, (first + count) * size)).reshape(count, size, -1)
+def _encode(networks: Networks, params: Params, inputs: Inputs, *names: str) -> jax.Array:
+    """Latents [names, B, latent] of the observations of these names."""
+    return networks.encode_pieces(params, inputs.pieces(*names)).reshape(len(names), inputs.observed.shape[0] // 3, -1)
 
 
 class Latents(NamedTuple):
@@ -58,36 +59,58 @@ class Latents(NamedTuple):
     moved: jax.Array | None = None
 
 
-def _encode_online(
-    networks: Networks, auxiliary: Auxiliary, params: Params, inputs: jax.Array, size: int, apart: bool
-) -> Latents:
+def _encode_online(networks: Networks, auxiliary: Auxiliary, params: Params, inputs: Inputs, apart: bool) -> Latents:
     """Latents of all observations that losses read, with gradient.
 
     Most auxiliary losses read two of them or one. Encoded ``apart``, the gradient of each loss passes through these alone.
     """
-    count = auxiliary.observations
-    if not apart:
-        together = _encode(networks, params, inputs, size, 0, count)
-        return Latents(together[:2], together[0], *together[2:])
-    before, goal, *others = (_encode(networks, params, inputs, size, n, count=1)[0] for n in range(count))
-    return Latents(jnp.stack([before, goal]), before, *others)
+    names = ("before", "goal", *auxiliary.others)
+    if apart:
+        found = {name: _encode(networks, params, inputs, name)[0] for name in names}
+        pair = jnp.stack([found["before"], found["goal"]])
+    else:
+        together = _encode(networks, params, inputs, *sorted(names, key=ORDER.index))
+        found, pair = dict(zip(sorted(names, key=ORDER.index), together)), together[:2]
+    return Latents(pair, found["before"], found.get("after"), found.get("moved"))
 
 
-def _next_latents(networks: Networks, now: ComputeCopies, inputs: jax.Array, latents: Latents) -> tuple[jax.Array, jax.Array]:
+def _encoders(networks: Networks, auxiliary: Auxiliary, inputs: Inputs) -> dict[str, Callable[[Params], jax.Array]]:
+    """What the critic's main loss reads of the observations, and what auxiliary losses read, as functions of the encoder.
+
+    The main loss looks at goals and auxiliary losses never do, so gradients have less to pass through.
+    """
+
+    def of(*names: str) -> Callable[[Params], jax.Array]:
+        return lambda encoder: _encode(networks, {"encoder": encoder}, inputs, *names)
+
+    return {_MAIN_READS: of("before", "goal"), _OTHERS_READ: of("before", *auxiliary.others)}
+
+
+_MAIN_READS, _OTHERS_READ = "main", "others"
+
+
+def _together(auxiliary: Auxiliary, found: Latents | dict[str, jax.Array]) -> Latents:
+    """Latents as losses take them, from what was encoded at once or by `_encoders`."""
+    if isinstance(found, Latents):
+        return found
+    before, *others = found[_OTHERS_READ]
+    return Latents(found[_MAIN_READS], before, **dict(zip(auxiliary.others, others, strict=True)))
+
+
+def _next_latents(networks: Networks, now: ComputeCopies, inputs: Inputs, latents: Latents) -> tuple[jax.Array, jax.Array]:
     """Latents [2, B, latent] of the observation after and the goal, for the target actor and for the target critic.
 
     Heads take them in this order; observations come as (goal, after). ``latents`` are the online critic's.
     """
-    size = latents.before.shape[0]
     if networks.config.target_encoder:
-        of_critic = _encode(networks, now.target_critic, inputs, size, 1)[::-1]
+        of_critic = _encode(networks, now.target_critic, inputs, "goal", "after")[::-1]
     else:
         after = latents.after
-        after = _encode(networks, now.critic, inputs, size, 2, count=1) if after is None else after[None]
+        after = _encode(networks, now.critic, inputs, "after") if after is None else after[None]
         of_critic = jnp.concatenate([after, latents.pair[1:]])
     if networks.config.encoders == "shared":
         return of_critic, of_critic
-    of_actor = _encode(networks, networks.with_encoder(now.target_actor, now.actor), inputs, size, 1)[::-1]
+    of_actor = _encode(networks, networks.with_encoder(now.target_actor, now.actor), inputs, "goal", "after")[::-1]
     return of_actor, of_critic
 
 
@@ -115,27 +138,30 @@ class Objectives:
         self,
         now: ComputeCopies,
         state: WeightingState | None,
-        inputs: jax.Array,
+        inputs: Inputs,
         image: jax.Array | None,
         batch: Batch,
         held: Params,
     ) -> Weighted:
         """The critic's losses and their gradient; ``extra`` is (latents, values [B], keep [B])."""
         networks, weighting, way = self.networks, self.auxiliary.weighting, self.auxiliary.way
-        size = batch.action.shape[0]
 
         def encode(encoder: Params) -> Latents:
-            return _encode_online(networks, self.auxiliary, {"encoder": encoder}, inputs, size, apart=way in _APART)
+            return _encode_online(networks, self.auxiliary, {"encoder": encoder}, inputs, apart=way in _APART)
 
-        def critic_losses(critic: Params, latents: Latents):
+        def critic_losses(critic: Params, found: Latents | dict[str, jax.Array]):
             assert batch.reward is not None
+            latents = _together(self.auxiliary, found)
             target = self._target(now, inputs, latents, batch)
             value = networks.value(critic, latents.pair, batch.action)
             keep = losses.keep_mask(batch.reward, value, self.resolved.reward_negative, self.resolved.filter_threshold)
             others = self._auxiliary(critic, latents, inputs, image, batch)
             return {MAIN: losses.critic_loss(value, target, keep, self._kept(keep)), **others}, (latents, value, keep)
 
-        options: dict[str, Any] = {"forwards": tangents.with_tangents, "encode": encode, "has_aux": True}
+        # Where the main gradient is passed on by itself, the others' need not pass through all that it does.
+        passes_apart = way == "latents" and weighting.needs == "dots"
+        encoders = _encoders(networks, self.auxiliary, inputs) if passes_apart else encode
+        options: dict[str, Any] = {"forwards": tangents.with_tangents, "encode": encoders, "has_aux": True}
         if self.reduces_early:
             options["reduce"] = self.shards.mean
         find = weighted_grad(critic_losses, weighting, lambda critic: critic.get("encoder"), way, **options)
@@ -148,7 +174,7 @@ class Objectives:
             return None
         return jnp.maximum(self.shards.mean(jnp.sum(keep)), 1.0 / self.shards.count)
 
-    def _target(self, now: ComputeCopies, inputs: jax.Array, latents: Latents, batch: Batch) -> jax.Array:
+    def _target(self, now: ComputeCopies, inputs: Inputs, latents: Latents, batch: Batch) -> jax.Array:
         assert batch.reward is not None
         networks, resolved = self.networks, self.resolved
         of_actor, of_critic = _next_latents(networks, now, inputs, jax.lax.stop_gradient(latents))
@@ -160,7 +186,7 @@ class Objectives:
         self,
         actor: Params,
         critic: Params,
-        inputs: jax.Array,
+        inputs: Inputs,
         critic_latents: Latents,
         image: jax.Array | None,
         batch: Batch,
@@ -170,7 +196,7 @@ class Objectives:
         has_encoder = self.config.encoders == "separate"
         latents, others = critic_latents, {}
         if has_encoder:
-            latents = _encode_online(self.networks, self.auxiliary, actor, inputs, batch.action.shape[0], apart=False)
+            latents = _encode_online(self.networks, self.auxiliary, actor, inputs, apart=False)
             others = self._auxiliary(actor, latents, inputs, image, batch)
         if self.auxiliary.weighting.log:
             others = {name: self.shards.whole(loss) for name, loss in others.items()}
@@ -181,10 +207,10 @@ class Objectives:
         return loss + self.auxiliary.weighting.objective(weights, others), action
 
     def _auxiliary(
-        self, params: Params, latents: Latents, inputs: jax.Array, image: jax.Array | None, batch: Batch
+        self, params: Params, latents: Latents, inputs: Inputs, image: jax.Array | None, batch: Batch
     ) -> dict[str, jax.Array]:
         """Losses of the auxiliary tasks on a network's latents, by name."""
         seen = {"latent_t": latents.before, "latent_tp1": latents.after, "latent_moved": latents.moved}
-        patches = inputs if self.networks.uses_kernel else None
+        patches = inputs.observed if self.networks.uses_kernel else None
         view = View(**seen, image=image, patches=patches, action=batch.action)
         return self.auxiliary.losses(params.get("heads", {}), view, batch)

@@ -95,8 +95,9 @@ def _predict(networks: Networks, auxiliary: Auxiliary, train: TrainState, episod
     nothing = jnp.zeros((count, 0))  # nobody asks for true states here
     batch = Batch(jnp.stack([before, goals, after]), actions, nothing, nothing)
     batch = batch.replace(targets=auxiliary.targets(key, batch, episode.flow))
-    latents = networks.encode(train.critic, networks.prepare_batch(train, batch))
-    latent_t, _, latent_tp1, *moved = latents.reshape(-1, count, networks.config.latent_size)
+    names = ("before", "after", *(name for name in auxiliary.others if name != "after"))
+    latents = networks.encode_pieces(train.critic, networks.prepare_batch(train, batch).pieces(*names))
+    latent_t, latent_tp1, *moved = latents.reshape(len(names), count, networks.config.latent_size)
     image = networks.normalize(train.normalizer, before) if "image" in auxiliary.needs else None
     view = View(latent_t, actions, latent_tp1, *moved, image=image)
     predicted = auxiliary.predictions(train.critic["heads"], view, batch)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxrl_vis.learner.auxtasks import heads
-from jaxrl_vis.learner.auxtasks.images import read_between
+from jaxrl_vis.learner.auxtasks.images import from_words, read_words_between, to_words
 from jaxrl_vis.learner.auxtasks.task import AuxTask, Spec, View, mean_squared_error, read
 from jaxrl_vis.types import Params
 
@@ -72,7 +72,7 @@ def rotate(images: jax.Array, angle: jax.Array, shift: jax.Array, border: Border
     height, width = images.shape[-2:]
     last_x, last_y = width - 1.0, height - 1.0
 
-    def one(image: jax.Array, angle: jax.Array, shift: jax.Array) -> jax.Array:
+    def one(words: jax.Array, angle: jax.Array, shift: jax.Array) -> jax.Array:
         cos, sin = jnp.cos(angle), jnp.sin(angle)
         zoom = jnp.float32(1.0)
         if border == "clip":
@@ -84,7 +84,8 @@ def rotate(images: jax.Array, angle: jax.Array, shift: jax.Array, border: Border
         x, y = cos * right - sin * down + last_x / 2, sin * right + cos * down + last_y / 2
         # A pixel reaches half a pixel beyond its centre.
         is_inside = (jnp.abs(x - last_x / 2) <= width / 2) & (jnp.abs(y - last_y / 2) <= height / 2)
-        values = read_between(image.transpose(1, 2, 0), x, y)
-        return jnp.where(is_inside[..., None], jnp.round(values), 0.0).astype(image.dtype).transpose(2, 0, 1)
+        return jnp.where(is_inside, read_words_between(words, x, y), jnp.uint32(0))
 
-    return jax.vmap(one)(images, angle, shift)
+    # A barrier, lest a compiler puts a word together for each of its bytes anew.
+    words = jax.lax.optimization_barrier(jax.vmap(one)(to_words(images), angle, shift))
+    return from_words(words, images.shape[1])

@@ -151,11 +151,15 @@ def _expand(images: jax.Array, scale: float, rows: int, columns: int, settings: 
     (height, width), shape = images.shape[1:], (settings.radius, settings.sigma)
     value_y, slope_y, curvature_y = _fits(rows, height, scale, *shape)
     value_x, slope_x, curvature_x = _fits(columns, width, scale, *shape)
-    planes = _product(
-        np.concatenate([value_y, slope_y, curvature_y]), images, np.concatenate([value_x, slope_x, curvature_x]).T
-    ).reshape(2, 3, rows, 3, columns)
-    chosen = [planes[:, 0, :, 1], planes[:, 1, :, 0], planes[:, 0, :, 2], planes[:, 2, :, 0], 0.5 * planes[:, 1, :, 1]]
-    return jnp.stack(chosen, axis=-1)
+
+    def fitted(of_rows: list[np.ndarray], of_columns: np.ndarray) -> list[jax.Array]:
+        planes = _product(np.concatenate(of_rows), images, of_columns.T)
+        return [planes[:, part * rows : (part + 1) * rows] for part in range(len(of_rows))]
+
+    down, yy = fitted([slope_y, curvature_y], value_x)
+    right, xy = fitted([value_y, slope_y], slope_x)
+    (xx,) = fitted([value_y], curvature_x)
+    return jnp.stack([right, down, xx, yy, 0.5 * xy], axis=-1)
 
 
 def _equations(expansion_t: jax.Array, expansion_tp1: jax.Array, found: jax.Array) -> jax.Array:

@@ -1,5 +1,7 @@
 """Grey levels of observations, and images read between their pixels."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 
@@ -29,15 +31,70 @@ def read_between(values: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
             of the nearest border.
     """
     height, width, size = values.shape
-    x, y = jnp.clip(x, 0.0, width - 1.0), jnp.clip(y, 0.0, height - 1.0)
-    left, top = jnp.clip(jnp.floor(x), 0, width - 2), jnp.clip(jnp.floor(y), 0, height - 2)
-    right, down = (x - left)[..., None], (y - top)[..., None]
-    first = (top * width + left).astype(jnp.int32)
+    first, right, down = _neighbours(height, width, x, y)
     flat = values.reshape(height * width, size)
 
     def pixel(offset: int) -> jax.Array:
         return flat.at[first + offset].get(mode="clip").astype(jnp.float32)
 
+    return _between(pixel, width, right[..., None], down[..., None])
+
+
+def _neighbours(height: int, width: int, x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Which pixel is the upper left one of the four around each place, and how far right and down of it the place is."""
+    x, y = jnp.clip(x, 0.0, width - 1.0), jnp.clip(y, 0.0, height - 1.0)
+    left, top = jnp.clip(jnp.floor(x), 0, width - 2), jnp.clip(jnp.floor(y), 0, height - 2)
+    return (top * width + left).astype(jnp.int32), x - left, y - top
+
+
+def _between(pixel: Callable[[int], jax.Array], width: int, right: jax.Array, down: jax.Array) -> jax.Array:
+    """Linear interpolation between four pixels, given by their distance from the upper left one."""
     upper = (1.0 - right) * pixel(0) + right * pixel(1)
     lower = (1.0 - right) * pixel(width) + right * pixel(width + 1)
     return (1.0 - down) * upper + down * lower
+
+
+_BYTES = 4  # in a word
+
+
+def to_words(images: jax.Array) -> jax.Array:
+    """Four channels side by side in a word: [B, C, H, W] uint8 -> [B, ceil(C / 4), H, W] uint32, padded with zeros.
+
+    What is read at a pixel is then read once for four channels.
+    """
+    batch, channels, *size = images.shape
+    padded = jnp.pad(images, [(0, 0), (0, -channels % _BYTES), (0, 0), (0, 0)]).astype(jnp.uint32)
+    padded = padded.reshape(batch, -1, _BYTES, *size)
+    first, second, third, fourth = (padded[:, :, byte] << (8 * byte) for byte in range(_BYTES))
+    return first | second | third | fourth
+
+
+def from_words(words: jax.Array, channels: int) -> jax.Array:
+    """Undoes `to_words`: [B, words, H, W] uint32 -> [B, channels, H, W] uint8."""
+    batch, _, *size = words.shape
+    apart = jnp.stack([_byte(words, byte) for byte in range(_BYTES)], axis=2)
+    return apart.reshape(batch, -1, *size)[:, :channels].astype(jnp.uint8)
+
+
+def _byte(words: jax.Array, byte: int) -> jax.Array:
+    return (words >> (8 * byte)) & 255
+
+
+def read_words_between(words: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
+    """`read_between` of bytes in words, rounded: [words, ...] uint32.
+
+    Args:
+        words: [words, H, W] uint32 from `to_words`.
+        x, y: As of `read_between`.
+    """
+    count, height, width = words.shape
+    first, right, down = _neighbours(height, width, x, y)
+    flat = words.reshape(count, height * width)
+    read = {offset: flat.at[:, first + offset].get(mode="clip") for offset in (0, 1, width, width + 1)}
+
+    def value(byte: int) -> jax.Array:
+        values = _between(lambda offset: _byte(read[offset], byte).astype(jnp.float32), width, right, down)
+        return jnp.round(values).astype(jnp.uint32) << (8 * byte)
+
+    first_byte, second, third, fourth = (value(byte) for byte in range(_BYTES))
+    return first_byte | second | third | fourth

@@ -10,7 +10,7 @@ agree up to rounding:
                pass for the weighted sum; with weightings that need losses, the last alone     losses, dots
     latents    likewise, where losses read the shared parameters through latents z alone:
                each loss is differentiated down to z, g_i, and only d and the weighted sum
-               farther; <d, grad L_i> = <J d, g_i>, where J d is the tangent of z              losses, dots
+               farther; <d, grad L_i> = <J d, g_i>, where J d is the tangent of z (`latents`)  losses, dots
 
 On the right are the `Weighting.needs` that each can serve. The last two pass through the shared parameters as often for ten
 losses as for two; latents, which differentiates no head forwards, is the faster one. What is differentiated forwards must have
@@ -19,7 +19,6 @@ tangent rules, which operations of `jax.custom_vjp` lack: ``forwards`` may be a 
 
 import contextlib
 import dataclasses
-import functools
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -27,11 +26,13 @@ import jax
 import jax.numpy as jnp
 
 from jaxrl_vis.errors import RequestError, nearest
+from jaxrl_vis.learner.weighting import latents
 from jaxrl_vis.learner.weighting.base import MAIN, Losses, Weighting, WeightingState, Weights, dot, weighted_sum
 from jaxrl_vis.types import Metrics, Params
 
 Way = Literal["per_loss", "one_hot", "jvp", "latents"]
 LossesFunction = Callable[..., Any]
+Encode = Callable[..., Any] | Mapping[str, Callable[..., Any]]
 Selector = Callable[[Params], Params]
 _FORWARD_WAYS = ("jvp", "latents")
 
@@ -115,7 +116,7 @@ def weighted_grad(
     has_aux: bool = False,
     reduce: Selector = everything,
     forwards: Callable[[], contextlib.AbstractContextManager] = contextlib.nullcontext,
-    encode: Callable[..., Any] | None = None,
+    encode: Encode | None = None,
 ) -> Callable[..., Weighted]:
     """The gradient of a dictionary of losses, weighted.
 
@@ -132,7 +133,8 @@ def weighted_grad(
             data and the losses are means: ``lambda tree: jax.lax.pmean(tree, axis)``.
         forwards: Makes the context in which what is differentiated forwards is traced.
         encode: (what ``shared`` selects, *args) -> latents, any tree of arrays. ``losses_fn`` must read the shared parameters
-            through these alone. Way latents needs it; the others take it, too.
+            through these alone. Way latents needs it; the others take it, too. Or a dictionary of such functions, where latents
+            are a dictionary of the same names: gradients then pass only through those that a loss reads.
 
     Returns:
         (params, state, *args) -> `Weighted`, with state from ``weighting.init(names, shared(params))``. A weighting with
@@ -158,7 +160,7 @@ class _Finder:
     has_aux: bool
     reduce: Selector
     forwards: Callable[[], contextlib.AbstractContextManager]
-    encode: Callable[..., Any] | None
+    encode: Encode | None
 
     def find(self, params: Params, state: WeightingState, *args: Any, held: Params = None) -> Weighted:
         if self.weighting.held and held is None:
@@ -172,7 +174,10 @@ class _Finder:
     def _losses_of(self, params: Params, *args: Any) -> Any:
         if self.encode is None:
             return self.losses_fn(params, *args)
-        return self.losses_fn(params, self.encode(self.shared(params), *args), *args)
+        picked = self.shared(params)
+        if isinstance(self.encode, Mapping):
+            return self.losses_fn(params, {name: encode(picked, *args) for name, encode in self.encode.items()}, *args)
+        return self.losses_fn(params, self.encode(picked, *args), *args)
 
     def _by_gradients(self, params: Params, state: WeightingState, *args: Any, held: Params = None) -> Weighted:
         losses, gradients, extra = loss_gradients(self._losses_of, params, *args, way=self.way, has_aux=self.has_aux)
@@ -202,7 +207,7 @@ class _Finder:
                 direction = combined = backward(self.weighting.coefficients(state.weights, losses))
             else:
                 direction = backward({name: jnp.full_like(loss, name == MAIN) for name, loss in losses.items()})
-            along = _embed(self.shared, params, self.shared(direction))
+            along = latents.like(_embed(self.shared, params, self.shared(direction)), params)
             with self.forwards():
                 _, tangents = jax.jvp(lambda params: whole(params, *args)[0], (params,), (along,))
             statistics = self.reduce({name: tangent for name, tangent in tangents.items() if name != MAIN})
@@ -212,51 +217,29 @@ class _Finder:
         return Weighted(combined, state, losses, metrics, weights, extra)
 
     def _by_latents(self, params: Params, state: WeightingState, *args: Any) -> Weighted:
-        picked, to_latents = self.shared(params), self.encode
-        assert to_latents is not None
-        latents, to_shared = jax.vjp(lambda picked: to_latents(picked, *args), picked)
-        found = _gradients_at(_in_float32(self.losses_fn, self.has_aux), tuple(state.weights), params, latents, *args)
-        losses, of_params, at_latents, extra = found
-        losses = self.reduce(losses)
-
-        def backward(coefficients: Mapping[str, jax.Array]) -> Params:
-            """The gradient in the shared parameters of a sum of losses."""
-            return to_shared(_like(weighted_sum(at_latents, coefficients), latents))[0]
-
-        statistics = None
+        assert self.encode is not None
+        whole = _in_float32(self.losses_fn, self.has_aux)
+        through = latents.encode(self.encode, self.shared(params), *args)
+        found = latents.differentiate(whole, through, params, *args)
+        _check_names(found.losses, state)
+        losses = self.reduce(found.losses)
+        statistics = of_shared = None
         if self.weighting.needs == "dots":
-            direction = {name: jnp.float32(name == MAIN) for name in losses}
-            if self.weighting.main_grad == "total":
-                direction = self.weighting.coefficients(state.weights, losses)
-            along = _like(self.reduce(jax.tree.map(_to_float32, backward(direction))), picked)
+            is_total = self.weighting.main_grad == "total"
+            first = self.weighting.coefficients(state.weights, losses) if is_total else {MAIN: jnp.ones(())}
+            of_first = through.backward(found.at_latents, first)
             with self.forwards():
-                _, tangent = jax.jvp(lambda picked: to_latents(picked, *args), (picked,), (along,))
-            statistics = self.reduce({name: dot(tangent, at_latents[name]) for name in losses if name != MAIN})
+                dots = through.dots(self.reduce(of_first), found.at_latents)
+            statistics = self.reduce(dots)
+            of_shared = None if is_total else of_first
         weights, state, metrics = self.weighting.update(losses, statistics, state)
         coefficients = self.weighting.coefficients(weights, losses)
-        of_shared = _embed(self.shared, params, backward(coefficients))
-        combined = jax.tree.map(jnp.add, weighted_sum(of_params, coefficients), jax.tree.map(_to_float32, of_shared))
-        return Weighted(self.reduce(combined), state, losses, metrics, weights, extra)
-
-
-def _gradients_at(
-    whole: LossesFunction, names: tuple[str, ...], params: Params, latents: Any, *args: Any
-) -> tuple[dict[str, jax.Array], dict[str, Params], dict[str, Any], Any]:
-    """Each loss, its gradients with respect to the parameters and to the latents, by name; and what else there was."""
-    losses, of_params, at_latents, extra = {}, {}, {}, None
-
-    def one(name: str, params: Params, latents: Any) -> tuple[jax.Array, Any]:
-        found, extra = whole(params, latents, *args)
-        if set(found) != set(names):
-            _raise_names(found, names)
-        return found[name], extra
-
-    for name in names:
-        # Each by itself, so that a compiler finds what the others compute in it to be of no use.
-        losses[name], pullback, beside = jax.vjp(functools.partial(one, name), params, latents, has_aux=True)
-        of_params[name], at_latents[name] = pullback(jnp.ones_like(losses[name]))
-        extra = beside if name == MAIN else extra
-    return losses, of_params, at_latents, extra
+        rest = coefficients if of_shared is None else {name: each for name, each in coefficients.items() if name != MAIN}
+        added = through.backward(found.at_latents, rest)
+        if of_shared is not None:  # the main loss's own has been found already, and gradients add up
+            added = jax.tree.map(lambda main, other: coefficients[MAIN] * main + other, of_shared, added)
+        combined = jax.tree.map(jnp.add, found.combined(params, coefficients), _embed(self.shared, params, added))
+        return Weighted(self.reduce(combined), state, losses, metrics, weights, found.extra)
 
 
 def _check_way(way: str, weighting: Weighting, has_latents: bool) -> None:
@@ -294,13 +277,10 @@ def _in_float32(losses_fn: LossesFunction, has_aux: bool) -> Callable[..., tuple
     return whole
 
 
-def _like(tree: Params, like: Params) -> Params:
-    """A tree in the dtypes of another."""
-    return jax.tree.map(lambda leaf, other: leaf.astype(other.dtype), tree, like)
-
-
 def _embed(shared: Selector, params: Params, part: Params) -> Params:
-    """``part`` in the shared parameters and zero in all others, in the parameters' dtypes."""
-    picked, back = jax.vjp(shared, params)  # of a function that only picks, the transpose puts back
-    (placed,) = back(_like(part, picked))
+    """``part`` in the shared parameters and zero in all others, in the dtypes of ``part`` or float32."""
+    dtype = jnp.result_type(jnp.float32, *jax.tree.leaves(part))
+    shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, dtype), params)
+    part = jax.tree.map(lambda leaf: leaf.astype(dtype), part)
+    (placed,) = jax.linear_transpose(shared, shapes)(part)  # of a function that only picks, the transpose puts back
     return placed

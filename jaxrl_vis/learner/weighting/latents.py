@@ -1,0 +1,160 @@
+"""Gradients of losses that read the shared parameters through latents alone (`gradients`, way latents).
+
+    encode          latents of every group, and the way back through each
+    differentiate   each loss down to what it reads of the parameters and of the latents
+
+What a loss reads is found by tracing it, so that nothing is computed for what it does not: a gradient passes only through those
+groups of latents that it is not zero in, and a head's gradient is not added to the zeros of all other losses.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.extend.core import Literal
+
+from jaxrl_vis.learner.weighting.base import MAIN, dot, weighted_sum
+from jaxrl_vis.types import Params
+
+_ALL = "all"  # the group of latents that were not given names
+
+AtLatents = Mapping[str, Mapping[str, Any]]
+"""Loss -> group of latents that it reads -> its gradient there."""
+
+
+def like(tree: Params, other: Params) -> Params:
+    """A tree in the dtypes of another."""
+    return jax.tree.map(lambda leaf, model: leaf.astype(model.dtype), tree, other)
+
+
+@dataclasses.dataclass(frozen=True)
+class Through:
+    """Latents, and the ways from and to the shared parameters.
+
+    Attributes:
+        latents: By group.
+        pullbacks: By group: of a gradient there, the gradient in the shared parameters.
+        functions: By group: the shared parameters -> its latents.
+        picked: The shared parameters.
+        has_names: Whether losses take a dictionary of groups rather than the one that there is.
+    """
+
+    latents: dict[str, Any]
+    pullbacks: dict[str, Callable[[Any], tuple[Params]]]
+    functions: Mapping[str, Callable[[Params], Any]]
+    picked: Params
+    has_names: bool
+
+    def backward(self, at_latents: AtLatents, coefficients: Mapping[str, jax.Array]) -> Params:
+        """The gradient in the shared parameters of a sum of some losses, float32."""
+        total = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, jnp.promote_types(leaf.dtype, jnp.float32)), self.picked)
+        for group, pullback in self.pullbacks.items():
+            readers = {name: at[group] for name, at in at_latents.items() if name in coefficients and group in at}
+            if readers:
+                (part,) = pullback(like(weighted_sum(readers, coefficients), self.latents[group]))
+                total = jax.tree.map(lambda before, more: before + more.astype(before.dtype), total, part)
+        return total
+
+    def dots(self, direction: Params, at_latents: AtLatents) -> dict[str, jax.Array]:
+        """The inner products of each auxiliary loss's gradient and a direction in the shared parameters, [] float32 by name."""
+        along, others = like(direction, self.picked), {name: at for name, at in at_latents.items() if name != MAIN}
+        read = {group for at in others.values() for group in at}
+        tangents = {
+            group: jax.jvp(encode, (self.picked,), (along,))[1] for group, encode in self.functions.items() if group in read
+        }
+        return {
+            name: sum((dot(tangents[group], gradient) for group, gradient in at.items()), jnp.zeros(()))
+            for name, at in others.items()
+        }
+
+
+def encode(functions: Callable[..., Any] | Mapping[str, Callable[..., Any]], picked: Params, *args: Any) -> Through:
+    """Latents of the shared parameters ``picked``; ``functions`` as of `gradients.weighted_grad`."""
+    has_names = isinstance(functions, Mapping)
+    named = functions if isinstance(functions, Mapping) else {_ALL: functions}
+    of_picked = {group: (lambda picked, encode=encode: encode(picked, *args)) for group, encode in named.items()}
+    passes = {group: jax.vjp(function, picked) for group, function in of_picked.items()}
+    latents = {group: found for group, (found, _) in passes.items()}
+    return Through(latents, {group: back for group, (_, back) in passes.items()}, of_picked, picked, has_names)
+
+
+@dataclasses.dataclass(frozen=True)
+class Differentiated:
+    """Losses and their gradients, each with respect to what it reads.
+
+    Attributes:
+        losses: [] float32 by name.
+        of_params: Loss -> place among the parameters' leaves -> gradient.
+        at_latents: See `AtLatents`.
+        extra: What the main loss's function returned beside the losses.
+    """
+
+    losses: dict[str, jax.Array]
+    of_params: dict[str, dict[int, jax.Array]]
+    at_latents: AtLatents
+    extra: Any
+
+    def combined(self, params: Params, coefficients: Mapping[str, jax.Array]) -> Params:
+        """The weighted sum of all gradients with respect to the parameters, but for what passes through latents: float32."""
+        leaves, structure = jax.tree.flatten(params)
+
+        def total(place: int, leaf: jax.Array) -> jax.Array:
+            zeros = jnp.zeros(leaf.shape, jnp.promote_types(leaf.dtype, jnp.float32))
+            found = {name: of[place] for name, of in self.of_params.items() if place in of}
+            return sum((coefficients[name] * gradient.astype(zeros.dtype) for name, gradient in found.items()), zeros)
+
+        return jax.tree.unflatten(structure, [total(place, leaf) for place, leaf in enumerate(leaves)])
+
+
+def differentiate(whole: Callable[..., Any], through: Through, params: Params, *args: Any) -> Differentiated:
+    """Each loss, and its gradients with respect to the parameters and the latents that it reads.
+
+    Args:
+        whole: (params, latents, *args) -> (losses, [] floats by name; anything else).
+        through: From `encode`.
+        params: The parameters.
+        args: More arguments.
+    """
+    leaves, structure = jax.tree.flatten(params)
+
+    def of_leaves(leaves: Sequence[Any], latents: Mapping[str, Any]) -> Any:
+        read = latents if through.has_names else latents[_ALL]
+        return whole(jax.tree.unflatten(structure, leaves), read, *args)
+
+    losses, of_params, at_latents, extra = {}, {}, {}, None
+    for name, (places, groups) in _find_reads(of_leaves, leaves, through.latents).items():
+
+        def one(chosen: dict[int, jax.Array], latents: dict[str, Any], name: str = name) -> tuple[jax.Array, Any]:
+            now = [chosen.get(place, leaf) for place, leaf in enumerate(leaves)]
+            found, extra = of_leaves(now, through.latents | latents)
+            return found[name], extra
+
+        # Each by itself, so that a compiler finds what the others compute in it to be of no use.
+        chosen, read = {place: leaves[place] for place in places}, {group: through.latents[group] for group in groups}
+        losses[name], pullback, beside = jax.vjp(one, chosen, read, has_aux=True)
+        of_params[name], at_latents[name] = pullback(jnp.ones_like(losses[name]))
+        extra = beside if name == MAIN else extra
+    return Differentiated(losses, of_params, at_latents, extra)
+
+
+def _find_reads(of_leaves: Callable[..., Any], leaves: list[jax.Array], latents: dict[str, Any]) -> dict[str, Any]:
+    """Loss -> (places of leaves, groups of latents) that its gradient can be other than zero in.
+
+    Within a nested program every result counts as reading every argument: so rather too much is found than too little.
+    """
+    program, shapes = jax.make_jaxpr(lambda *given: of_leaves(*given)[0], return_shape=True)(leaves, latents)
+    variables = program.jaxpr.invars
+    of_leaf, rest = variables[: len(leaves)], iter(variables[len(leaves) :])
+    # Leaves of a dictionary come in the order of its sorted keys.
+    of_group = {group: [next(rest) for _ in jax.tree.leaves(latents[group])] for group in sorted(latents)}
+    found = {}
+    for name, result in zip(sorted(shapes), program.jaxpr.outvars, strict=True):
+        needed = set() if isinstance(result, Literal) else {result}
+        for equation in reversed(program.jaxpr.eqns):
+            if equation.primitive.name != "stop_gradient" and needed.intersection(equation.outvars):
+                needed.update(variable for variable in equation.invars if not isinstance(variable, Literal))
+        places = [place for place, variable in enumerate(of_leaf) if variable in needed]
+        found[name] = places, [group for group, members in of_group.items() if needed.intersection(members)]
+    return found
