@@ -90,7 +90,7 @@ class Auxiliary:
             return episodes
 
         def of_episode(images: jax.Array) -> jax.Array:
-            strength = optical_flow.flow_strength(images[:-1], images[1:], self.frame_stack, self.options.stretch)
+            strength = optical_flow.flow_strength_along(images, self.frame_stack, self.options.stretch)
             return optical_flow.to_bytes(strength, self.options.stretch)
 
         return episodes.replace(flow=jax.lax.map(of_episode, episodes.observations[:, :-1], batch_size=_EPISODES_AT_ONCE))

@@ -8,9 +8,9 @@ same surface displaced by d, its coefficients are A and b - 2Ad, so that
 which is solved in the least-squares sense over a window around the pixel, with the coefficients of the next image read at the
 displacement that was found before; from coarse images to fine ones, several times at each.
 
-Every linear step (smoothing, resizing, the fit, the window's mean, borders) is the same for all rows and for all columns. It is
-therefore two products with small constant matrices, L @ image @ R, into which successive steps are multiplied beforehand: an
-image is smoothed, resized and expanded at once. Images are small, so the zeros of these matrices cost less than kernels would.
+Smoothing, resizing and the fit, borders included, are the same for all rows and for all columns. They are therefore two
+products with small constant matrices, L @ image @ R, into which successive steps are multiplied beforehand: an image is
+smoothed, resized and expanded at once. Images are small, so the zeros of these matrices cost less than kernels would.
 
 Where the paper leaves a choice, it is that of OpenCV's ``calcOpticalFlowFarneback``, whose flow this agrees with: an image is
 reflected at its borders when it is smoothed and repeated when it is fitted, pixels near a border count less, no level of the
@@ -20,12 +20,13 @@ unit of the grey levels: with 0 to 255 next to nothing; with 0 to 1 it leaves le
 
 import dataclasses
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis.learner.auxtasks.images import read_between
+from jaxrl_vis.learner.auxtasks.images import read_planes_between
 
 _SMALLEST_LEVEL = 32  # pixels
 _REGULARIZATION = 1e-3  # of a determinant, in grey levels to the fourth power
@@ -53,6 +54,10 @@ class Settings:
     sigma: float = 1.2
 
 
+Planes = tuple[Any, ...]
+"""Numbers of each pixel, as images [rows, columns] of their own: as one array, they would be copied on the way into it."""
+
+
 def flow(images_t: jax.Array, images_tp1: jax.Array, settings: Settings = Settings()) -> jax.Array:
     """Displacements [B, H, W, 2] float32, (right, down) in pixels, of what is seen at each pixel of the first images.
 
@@ -61,40 +66,62 @@ def flow(images_t: jax.Array, images_tp1: jax.Array, settings: Settings = Settin
         images_tp1: The same, one step later.
         settings: Window, pyramid, iterations.
     """
-    pair_flow = functools.partial(_pair_flow, settings=settings)
-    return jax.vmap(pair_flow)(images_t.astype(jnp.float32), images_tp1.astype(jnp.float32))
+    expand = jax.vmap(functools.partial(_expansions, settings=settings))
+    return _between(expand(images_t), expand(images_tp1), settings)
 
 
-def _pair_flow(image_t: jax.Array, image_tp1: jax.Array, settings: Settings) -> jax.Array:
-    height, width = image_t.shape
-    images, found = jnp.stack([image_t, image_tp1]), None
-    for scale in reversed(_scales(height, width, settings)):
-        rows, columns = round(height * scale), round(width * scale)
-        if found is None:
-            found = jnp.zeros((2, rows, columns))
+def flow_along(images: jax.Array, settings: Settings = Settings()) -> jax.Array:
+    """`flow` from each image of a sequence to the next one: [T + 1, H, W] -> [T, H, W, 2]; each is expanded once."""
+    expansions = jax.vmap(functools.partial(_expansions, settings=settings))(images)
+    before, after = (jax.tree.map(lambda plane, part=part: plane[part], expansions) for part in (slice(-1), slice(1, None)))
+    return _between(before, after, settings)
+
+
+def _between(before: list[Planes], after: list[Planes], settings: Settings) -> jax.Array:
+    displace = functools.partial(_displacements, settings=settings)
+    return jnp.stack(jax.vmap(displace)(before, after), axis=-1)
+
+
+def _displacements(before: list[Planes], after: list[Planes], settings: Settings) -> Planes:
+    """Displacements to the right and down, from the expansions of two images, the coarsest level first."""
+    found: Planes = ()
+    for expansion_t, expansion_tp1 in zip(before, after, strict=True):
+        rows, columns = expansion_t[0].shape
+        if not found:
+            found = (jnp.zeros((rows, columns)),) * 2
         else:
-            resize_rows, resize_columns = (_resizing(new, old) for new, old in zip((rows, columns), found.shape[1:]))
-            found = _product(resize_rows, found, resize_columns.T) / settings.scale
-        expansion_t, expansion_tp1 = _expand(images, scale, rows, columns, settings)
-        averages = [_filter(size, np.full(settings.window, 1.0 / settings.window), "edge") for size in (rows, columns)]
+            resize_rows, resize_columns = (_resizing(new, old) for new, old in zip((rows, columns), found[0].shape))
+            found = tuple(_product(resize_rows, plane, resize_columns.T) / settings.scale for plane in found)
         for _ in range(settings.iterations):
-            equations = _equations(expansion_t, expansion_tp1, found)
-            found = _solve(_product(averages[0], equations, averages[1].T))
-    assert found is not None
-    return jnp.moveaxis(found, 0, -1)
+            equations = _equations(expansion_t, expansion_tp1, *found)
+            found = _solve(tuple(_mean_in_window(plane, settings.window) for plane in equations))
+    return found
 
 
-def _product(left: np.ndarray, planes: jax.Array, right: np.ndarray) -> jax.Array:
-    """``left @ plane @ right`` of each plane [..., H, W], in full float32: determinants are differences of large numbers."""
-    left, right = left.astype(np.float32), right.astype(np.float32)
-    planes = jnp.matmul(planes, right, precision=jax.lax.Precision.HIGHEST)
-    return jnp.matmul(left, planes, precision=jax.lax.Precision.HIGHEST)
+def _mean_in_window(plane: jax.Array, window: int) -> jax.Array:
+    """The mean of a square window around each pixel of a plane [H, W] that is repeated at its borders."""
+    rows, columns = (_filter(size, np.full(window, 1.0 / window), "edge") for size in plane.shape)
+    return _product(rows, plane, columns.T)
+
+
+def _product(left: np.ndarray, plane: jax.Array, right: np.ndarray) -> jax.Array:
+    """``left @ plane @ right`` for a plane [H, W]."""
+    return _by_rows(left, _by_columns(plane, right))
+
+
+# In full float32: determinants are differences of large numbers.
+def _by_columns(plane: jax.Array, right: np.ndarray) -> jax.Array:
+    return jnp.matmul(plane, right.astype(np.float32), precision=jax.lax.Precision.HIGHEST)
+
+
+def _by_rows(left: np.ndarray, plane: jax.Array) -> jax.Array:
+    return jnp.matmul(left.astype(np.float32), plane, precision=jax.lax.Precision.HIGHEST)
 
 
 def _scales(height: int, width: int, settings: Settings) -> list[float]:
-    """Sizes of the pyramid's levels over that of the image, the finest first."""
-    scales = [settings.scale**level for level in range(settings.levels + 1)]
-    return [1.0, *(scale for scale in scales[1:] if min(height, width) * scale >= _SMALLEST_LEVEL)]
+    """Sizes of the pyramid's levels over that of the image, the coarsest first."""
+    scales = [settings.scale**level for level in range(settings.levels, 0, -1)]
+    return [*(scale for scale in scales if min(height, width) * scale >= _SMALLEST_LEVEL), 1.0]
 
 
 def _filter(size: int, taps: np.ndarray, border: str) -> np.ndarray:
@@ -146,43 +173,38 @@ def _fits(new: int, old: int, scale: float, radius: int, sigma: float) -> tuple[
     return value_fit, slope_fit, curvature_fit
 
 
-def _expand(images: jax.Array, scale: float, rows: int, columns: int, settings: Settings) -> jax.Array:
-    """Coefficients [2, rows, columns, 5] of images [2, H, W] at one level: b (right, down), then A's (xx, yy, xy)."""
-    (height, width), shape = images.shape[1:], (settings.radius, settings.sigma)
-    value_y, slope_y, curvature_y = _fits(rows, height, scale, *shape)
-    value_x, slope_x, curvature_x = _fits(columns, width, scale, *shape)
-
-    def fitted(of_rows: list[np.ndarray], of_columns: np.ndarray) -> list[jax.Array]:
-        planes = _product(np.concatenate(of_rows), images, of_columns.T)
-        return [planes[:, part * rows : (part + 1) * rows] for part in range(len(of_rows))]
-
-    down, yy = fitted([slope_y, curvature_y], value_x)
-    right, xy = fitted([value_y, slope_y], slope_x)
-    (xx,) = fitted([value_y], curvature_x)
-    return jnp.stack([right, down, xx, yy, 0.5 * xy], axis=-1)
+def _expansions(image: jax.Array, settings: Settings) -> list[Planes]:
+    """Coefficients of an image [H, W] at each level, the coarsest first: b (right, down), then A's (xx, yy, xy)."""
+    (height, width), shape = image.shape, (settings.radius, settings.sigma)
+    image, found = image.astype(jnp.float32), []
+    for scale in _scales(height, width, settings):
+        value_y, slope_y, curvature_y = _fits(round(height * scale), height, scale, *shape)
+        value_x, slope_x, curvature_x = _fits(round(width * scale), width, scale, *shape)
+        value, slope, curvature = (_by_columns(image, fit.T) for fit in (value_x, slope_x, curvature_x))
+        pairs = (value_y, slope), (slope_y, value), (value_y, curvature), (curvature_y, value), (0.5 * slope_y, slope)
+        found.append(tuple(_by_rows(of_rows, planes) for of_rows, planes in pairs))
+    return found
 
 
-def _equations(expansion_t: jax.Array, expansion_tp1: jax.Array, found: jax.Array) -> jax.Array:
-    """A'A (xx, xy, yy) and A'(b_t - b_t+1)/2 (x, y) at each pixel: [5, rows, columns].
+def _equations(expansion_t: Planes, expansion_tp1: Planes, found_right: jax.Array, found_down: jax.Array) -> Planes:
+    """A'A (xx, xy, yy) and A'(b_t - b_t+1)/2 (x, y) at each pixel, [rows, columns] each.
 
     Args:
-        expansion_t, expansion_tp1: [rows, columns, 5] from `_expand`.
-        found: [2, rows, columns], the displacements so far.
+        expansion_t, expansion_tp1: From `_expansions`.
+        found_right, found_down: [rows, columns], the displacements so far.
     """
-    rows, columns, _ = expansion_t.shape
-    x, y = jnp.arange(columns) + found[0], jnp.arange(rows)[:, None] + found[1]
+    rows, columns = found_right.shape
+    x, y = jnp.arange(columns) + found_right, jnp.arange(rows)[:, None] + found_down
     is_inside = (x >= 0) & (x < columns - 1) & (y >= 0) & (y < rows - 1)
-    warped = read_between(expansion_tp1, x, y)
-    # What has left the image says nothing about curvature, and its slope counts as 0.
-    warped = jnp.where(is_inside[..., None], warped, expansion_t * np.array([0, 0, 1, 1, 1], np.float32))
-    mean = jnp.moveaxis(0.5 * (expansion_t + warped), -1, 0)
-    change = jnp.moveaxis(0.5 * (expansion_t - warped), -1, 0)
     weight = np.outer(_border_weights(rows), _border_weights(columns)).astype(np.float32)
-    xx, yy, xy = weight * mean[2:]
+    # What has left the image says nothing about curvature, and its slope counts as 0.
+    outside = (0.0, 0.0, *expansion_t[2:])
+    warped = [jnp.where(is_inside, there, other) for there, other in zip(read_planes_between(expansion_tp1, x, y), outside)]
+    right, down = (0.5 * weight * (here - there) for here, there in zip(expansion_t[:2], warped[:2]))
+    xx, yy, xy = (0.5 * weight * (here + there) for here, there in zip(expansion_t[2:], warped[2:]))
     # The coefficients were read at the displacement so far, so what is missing is measured from there.
-    right = weight * change[0] + xx * found[0] + xy * found[1]
-    down = weight * change[1] + xy * found[0] + yy * found[1]
-    return jnp.stack([xx * xx + xy * xy, (xx + yy) * xy, yy * yy + xy * xy, xx * right + xy * down, xy * right + yy * down])
+    right, down = right + xx * found_right + xy * found_down, down + xy * found_right + yy * found_down
+    return xx * xx + xy * xy, (xx + yy) * xy, yy * yy + xy * xy, xx * right + xy * down, xy * right + yy * down
 
 
 def _border_weights(size: int) -> np.ndarray:
@@ -193,10 +215,11 @@ def _border_weights(size: int) -> np.ndarray:
     return weights
 
 
-def _solve(equations: jax.Array) -> jax.Array:
-    """Displacements [2, rows, columns] that solve the equations of each pixel, [5, rows, columns] from `_equations`."""
+def _solve(equations: Planes) -> Planes:
+    """Displacements to the right and down that solve the equations of each pixel, from `_equations`."""
     xx, xy, yy, right, down = equations
     # Nothing moves farther than the image is wide. Along a straight edge, the determinant is rounding and nothing else.
-    limit = max(equations.shape[1:])
+    limit = max(xx.shape)
     determinant = jnp.maximum(xx * yy - xy * xy, 0.0) + _REGULARIZATION
-    return jnp.clip(jnp.stack([yy * right - xy * down, xx * down - xy * right]) / determinant, -limit, limit)
+    numerators = yy * right - xy * down, xx * down - xy * right
+    return tuple(jnp.clip(numerator / determinant, -limit, limit) for numerator in numerators)

@@ -1,6 +1,6 @@
 """Grey levels of observations, and images read between their pixels."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -22,22 +22,22 @@ def grey(images: jax.Array, frame_stack: int = 1) -> jax.Array:
     return red + green + blue
 
 
-def read_between(values: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
-    """Values at any place, by linear interpolation between the centres of pixels: [..., K] float32.
+def read_planes_between(planes: Sequence[jax.Array], x: jax.Array, y: jax.Array) -> list[jax.Array]:
+    """Planes at any place, by linear interpolation between the centres of pixels: [...] float32 each.
 
     Args:
-        values: [H, W, K] of any dtype.
+        planes: [H, W] each, of any dtype.
         x, y: [...] float32, columns and rows, counted from the centre of the first; outside of the image, what is read is that
             of the nearest border.
     """
-    height, width, size = values.shape
+    height, width = planes[0].shape
     first, right, down = _neighbours(height, width, x, y)
-    flat = values.reshape(height * width, size)
 
-    def pixel(offset: int) -> jax.Array:
-        return flat.at[first + offset].get(mode="clip").astype(jnp.float32)
+    def read(plane: jax.Array) -> jax.Array:
+        flat = plane.reshape(height * width).astype(jnp.float32)
+        return _between(lambda offset: flat.at[first + offset].get(mode="promise_in_bounds"), width, right, down)
 
-    return _between(pixel, width, right[..., None], down[..., None])
+    return [read(plane) for plane in planes]
 
 
 def _neighbours(height: int, width: int, x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -81,16 +81,17 @@ def _byte(words: jax.Array, byte: int) -> jax.Array:
 
 
 def read_words_between(words: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
-    """`read_between` of bytes in words, rounded: [words, ...] uint32.
+    """`read_planes_between` of bytes in words, rounded: [words, ...] uint32.
 
     Args:
         words: [words, H, W] uint32 from `to_words`.
-        x, y: As of `read_between`.
+        x, y: As of `read_planes_between`.
     """
     count, height, width = words.shape
     first, right, down = _neighbours(height, width, x, y)
     flat = words.reshape(count, height * width)
-    read = {offset: flat.at[:, first + offset].get(mode="clip") for offset in (0, 1, width, width + 1)}
+    places = (0, 1, width, width + 1)
+    read = {offset: flat.at[:, first + offset].get(mode="promise_in_bounds") for offset in places}
 
     def value(byte: int) -> jax.Array:
         values = _between(lambda offset: _byte(read[offset], byte).astype(jnp.float32), width, right, down)

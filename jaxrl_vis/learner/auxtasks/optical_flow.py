@@ -69,8 +69,20 @@ def flow_strength(images_t: jax.Array, images_tp1: jax.Array, frame_stack: int =
             fast things move is lost, and where nothing moves, traces of rounding are stretched. With such grey levels
             Farneback's regularisation outweighs the images (`farneback`), so that sharp edges count more than their speed.
     """
-    unit = 255.0 if stretch else 1.0
-    flow = farneback.flow(grey(images_t, frame_stack) / unit, grey(images_tp1, frame_stack) / unit)
+    unit = _unit(stretch)
+    return _strength(farneback.flow(grey(images_t, frame_stack) / unit, grey(images_tp1, frame_stack) / unit), stretch)
+
+
+def flow_strength_along(images: jax.Array, frame_stack: int = 1, stretch: bool = False) -> jax.Array:
+    """`flow_strength` from each image of a sequence [T + 1, C, H, W] to the next one: [T, H, W] float32."""
+    return _strength(farneback.flow_along(grey(images, frame_stack) / _unit(stretch)), stretch)
+
+
+def _unit(stretch: bool) -> float:
+    return 255.0 if stretch else 1.0
+
+
+def _strength(flow: jax.Array, stretch: bool) -> jax.Array:
     strength = jnp.sqrt(jnp.sum(jnp.square(flow), axis=-1))
     if not stretch:
         return strength
