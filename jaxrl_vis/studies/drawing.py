@@ -12,6 +12,7 @@ from matplotlib.ticker import MaxNLocator, PercentFormatter
 from jaxrl_vis.report.plots import FAINT, INK, draw_median, style_curves
 
 _WIDTH, _HEIGHT, _HEADER, _FOOTER = 4.9, 3.5, 0.85, 0.85  # inches, of a panel and of what is above and below all of them
+_LINE, _LETTERS = 0.17, 14  # inches from a line of the subtitle to the next, and letters of it in an inch
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,30 +73,49 @@ def draw_panels(path: Path, rows: Sequence[Sequence[Panel]], title: str, subtitl
         title: The first line, bold.
         subtitle: The second line.
     """
-    width, height = max(7.5, _WIDTH * len(rows[0])), _HEIGHT * len(rows) + _HEADER + _FOOTER
+    width = max(7.5, _WIDTH * len(rows[0]))
+    lines = _broken(subtitle, int((width - 0.7) * _LETTERS))
+    labels = {curve.label for row in rows for panel in row for curve in panel.curves}
+    longest = max(map(len, labels), default=0)
+    columns = max(1, min(len(labels), int(width / max(2.1, 0.55 + 0.068 * longest))))
+    header = _HEADER + _LINE * (len(lines) - 1)
+    footer = _FOOTER + _LINE * max(0, -(-len(labels) // columns) - 2)
+    height = _HEIGHT * len(rows) + header + footer
     figure = Figure(figsize=(width, height), dpi=150, facecolor="white")
     grid = figure.subplots(len(rows), len(rows[0]), squeeze=False)
     entries = {}
     for axes, panel in zip(grid.flat, (panel for row in rows for panel in row), strict=True):
         _draw(axes, panel)
-        handles, labels = axes.get_legend_handles_labels()
-        entries |= {label: handle for label, handle in zip(labels, handles, strict=True) if label not in entries}
+        handles, names = axes.get_legend_handles_labels()
+        entries |= {name: handle for name, handle in zip(names, handles, strict=True) if name not in entries}
     for axes in grid[-1]:
         axes.set_xlabel("environment steps per seed", fontsize=9.5, color=INK)
     figure.text(0.35 / width, 1 - 0.22 / height, title, fontsize=14, weight="bold", color=INK, va="center")
-    figure.text(0.35 / width, 1 - 0.48 / height, subtitle, fontsize=9, color=FAINT, va="center")
-    longest = max((len(label) for label in entries), default=0)
-    columns = max(1, min(len(entries), int(width / max(2.1, 0.55 + 0.068 * longest))))
+    for number, line in enumerate(lines):
+        figure.text(0.35 / width, 1 - (0.48 + _LINE * number) / height, line, fontsize=9, color=FAINT, va="center")
     figure.legend(
         list(entries.values()), list(entries), loc="lower center", ncols=columns, frameon=False, fontsize=9, labelcolor=INK
     )
     left, right = 0.6 / width, 1 - 0.2 / width
     figure.subplots_adjust(
-        **{"left": left, "right": right, "bottom": (_FOOTER + 0.15) / height, "top": 1 - (_HEADER + 0.2) / height},
+        **{"left": left, "right": right, "bottom": (footer + 0.15) / height, "top": 1 - (header + 0.2) / height},
         **{"wspace": 0.2, "hspace": 0.3},
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
+
+
+def _broken(text: str, letters: int) -> list[str]:
+    """A text in lines of at most so many letters, if its clauses allow: it is broken after semicolons."""
+    lines = [""]
+    for clause in text.split("; "):
+        longer = f"{lines[-1]}; {clause}" if lines[-1] else clause
+        if len(longer) <= letters or not lines[-1]:
+            lines[-1] = longer
+        else:
+            lines[-1] += ";"
+            lines.append(clause)
+    return lines
 
 
 def _draw(axes: Axes, panel: Panel) -> None:
