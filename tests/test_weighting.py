@@ -151,6 +151,72 @@ def test_forward_ways_pass_the_encoder_as_often_for_many_losses() -> None:
     assert passes_through_the_encoder("per_loss", 10) >= 20
 
 
+def halves(names: tuple[str, ...] = ("first", "second")) -> dict[str, Any]:
+    """Latents of the first and the second half of a minibatch, as two groups."""
+    parts = dict(zip(("first", "second"), (slice(0, 6), slice(6, 12)), strict=True))
+    return {name: functools.partial(encode_part, part=parts[name]) for name in names}
+
+
+def encode_part(encoder: Any, batch: Any, part: slice) -> Any:
+    return jnp.tanh(batch["x"][part] @ encoder["kernel"] + encoder["bias"])
+
+
+def losses_of_halves(params: Any, latents: Any, batch: Any) -> dict[str, Any]:
+    """main reads the first half, near the second one, far both; of the first, main also reads what has no gradient."""
+    heads, first, second = params["heads"], latents["first"], latents["second"]
+    still = jax.lax.stop_gradient(jnp.mean(second))
+    return {
+        MAIN: jnp.mean((first @ heads[MAIN] - batch[MAIN][:6] - 0.1 * still) ** 2),
+        "near": jnp.mean((second @ heads["near"] - batch["near"][6:]) ** 2),
+        "far": jnp.mean((jnp.concatenate([first, second]) @ heads["far"] - batch["far"]) ** 2),
+    }
+
+
+@pytest.mark.parametrize("case", ["none", "balance", "cosine", "ol_aux", "ol_aux total"])
+def test_latents_in_groups(case: str) -> None:
+    weighting = weighting_of(case)
+    params, batch = in_float32(problem(0))
+    ways = ("per_loss", "jvp", "latents")
+
+    @jax.jit
+    def all_ways(params: Any, state: Any) -> Any:
+        gradients = [weighted_grad(losses_of_halves, weighting, encoder_of, way, encode=halves()) for way in ways]
+        return [gradient(params, state, batch) for gradient in gradients]
+
+    state = weighting.init(NAMES)
+    for _ in range(3):
+        reference, *others = all_ways(params, state)
+        for other in others:
+            assert_close(other, reference)
+        params = jax.tree.map(lambda leaf, change: leaf - np.float32(0.02) * change, params, reference.gradient)
+        state = reference.state
+
+
+@pytest.mark.parametrize(("others", "passes"), [(("near",), (2, 4)), (("near", "far"), (5, 4))])
+def test_gradients_pass_only_through_latents_that_losses_read(others: tuple[str, ...], passes: tuple[int, int]) -> None:
+    params, batch = in_float32(problem(0))
+    names = (MAIN, *others)
+    weighting = make_weighting("ol_aux")
+
+    def chosen(params: Any, latents: Any, batch: Any) -> dict[str, Any]:
+        found = losses_of_halves({"heads": {**problem(0)[0]["heads"], **params["heads"]}}, latents, batch)
+        return {name: found[name] for name in names}
+
+    params["heads"] = {name: params["heads"][name] for name in names}
+    gradient = weighted_grad(chosen, weighting, encoder_of, "latents", encode=halves())
+    found = jax.make_jaxpr(gradient)(params, weighting.init(names), batch)
+    slices = {}  # variable -> the half of the inputs that it is
+    counted = {0: 0, 6: 0}
+    for equation in found.jaxpr.eqns:
+        if equation.primitive.name == "slice" and equation.invars[0].aval.shape == batch["x"].shape:
+            slices[equation.outvars[0]] = equation.params["start_indices"][0]
+        if equation.primitive.name == "dot_general":
+            for operand in equation.invars:
+                counted[slices.get(operand, 0)] += operand in slices
+    # Forward; backward for the main loss; forward with a tangent, and backward for the others: of those that are needed.
+    assert (counted[0], counted[6]) == passes
+
+
 def test_dots_are_those_of_finite_differences() -> None:
     weighting = make_weighting("ol_aux", log=False)
 
