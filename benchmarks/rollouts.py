@@ -7,15 +7,13 @@ the GPU and on the CPU backend of the same process: of ``qpos``, and of ``qvel``
 """
 
 import argparse
-import collections
 import sys
-import tempfile
 import time
-from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
+from kernels import kernels
 
 import jaxrl_vis_envs
 from jaxrl_vis_envs.compilation import compiler_options, env_jit
@@ -39,20 +37,6 @@ def rollout(env: Any, count: int, steps: int) -> Any:
 def reset(env: Any, count: int) -> Any:
     """Start states of so many environments."""
     return env_jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), count))
-
-
-def kernels(call: Any) -> tuple[collections.Counter, collections.Counter]:
-    """Nanoseconds and launches of each kernel of a call, by name."""
-    with tempfile.TemporaryDirectory() as folder:
-        with jax.profiler.trace(folder):
-            call()
-        data = jax.profiler.ProfileData.from_file(str(next(Path(folder).rglob("*.xplane.pb"))))
-    spent, launches = collections.Counter(), collections.Counter()
-    streams = (line for plane in data.planes if "GPU" in plane.name for line in plane.lines if line.name.startswith("Stream"))
-    for event in (event for line in streams for event in line.events):
-        spent[event.name] += event.duration_ns
-        launches[event.name] += 1
-    return spent, launches
 
 
 def report_speed(name: str, env: Any, count: int) -> None:
