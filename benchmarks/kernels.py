@@ -3,8 +3,8 @@
     python benchmarks/kernels.py [TASK] [--preset P] [--parts update rollout insert] [--set FIELD VALUE ...] [--rows 20]
 
 Every part is a program of its own, with a replay full of noise, as `jaxrl-vis bench update` has it. Printed are its time, that
-of its kernels together, and those that take most of it; what the names stand for is in the compiled program, which ``--hlo FOLDER``
-writes.
+of its kernels together, and those that take most of it. What the names stand for is in the compiled program, which
+``--hlo FOLDER`` writes.
 """
 
 import argparse
