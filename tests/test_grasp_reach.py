@@ -139,6 +139,17 @@ def test_room_is_the_least_distance_of_the_open_gripper_from_others():
     assert beside(0.0, -0.08) > 0.005 > 0 > beside(0.0, -0.08, whole_way=True)
 
 
+def test_the_folded_arm_needs_room_as_it_turns():
+    target = np.array([[-0.42, -0.1, HEIGHT]])
+
+    def beside(x: float, y: float, whole_way: bool = True) -> float:
+        return float(arm.room(target, np.array([[[x, y]]]), np.array([[0.006]]), whole_way).max())
+
+    assert beside(-0.12, -0.22) < 0 < beside(0.12, -0.22)  # it turns to the left
+    assert beside(-0.12, -0.1) > 0.005  # behind where it turns
+    assert beside(-0.12, -0.22, whole_way=False) > 0.1
+
+
 def test_the_way_with_most_room_is_taken():
     origins = np.array([origin_of(x) for x in (-0.35, 0.0, 0.35)])
     target = np.array([0.0, 0.0, HEIGHT])

@@ -103,10 +103,11 @@ def test_red_is_red():
     np.testing.assert_allclose(redness(pixels), [1.0, 0.0, 30 / 255, -1.0], atol=1e-6)
 
 
-def test_a_plane_is_matched_and_put_where_it_is():
+@pytest.mark.parametrize("depth", [0.56, 0.24])
+def test_a_plane_is_matched_and_put_where_it_is(depth):
     rng = np.random.default_rng(0)
-    disparity = 24
-    texture = rng.integers(0, 255, (320, 344)).astype(np.uint8)
+    disparity = round(CAMERA.focal * CAMERA.baseline / depth)
+    texture = rng.integers(0, 255, (320, 320 + disparity)).astype(np.uint8)
     left, right = texture[:, :320], texture[:, disparity : disparity + 320]
     found = match(left, right, CAMERA, MOUNT)
     assert np.isfinite(found[:, disparity + 8 :]).mean() > 0.98
@@ -247,6 +248,30 @@ def test_lines_bend_and_taper_as_the_stalks_do():
         assert point.taper == pytest.approx(taper, abs=0.006)
         assert point.thickness_at(0.45) - point.thickness_at(1.05) == pytest.approx(-0.6 * point.taper)
         assert point.thickness_at(9.0) == 0.5 * point.thickness
+
+
+def both(one: Cloud, other: Cloud) -> Cloud:
+    """What a pair sees of what is in two clouds."""
+    depth = np.fmin(*(np.where(cloud.red, cloud.depth, np.float32(np.nan)) for cloud in (one, other)))
+    red = np.isfinite(depth)
+    return organised(CAMERA.disparity(np.where(red, depth, np.float32(0.9))).astype(np.float32), red, CAMERA, MOUNT)
+
+
+def test_stalks_beside_each_other_in_one_pair_are_two():
+    """Their grasp points are so far apart in height that the lines alone could be of one stalk."""
+    left, right = (0.0, 0.55, 0.0), (0.021, 0.55, 0.0)
+    drives = (0.1, 0.05, 0.0)
+    clouds = [both(seen([left], far, hidden=(0.6, 9.0)), seen([right], far, hidden=(0.0, 0.48))) for far in drives]
+    points = found_in(clouds, [Motion.along(-far) for far in drives])
+    assert [round(point.point[0], 3) for point in points] == pytest.approx([0.0, 0.021], abs=0.003)
+    assert abs(points[0].point[2] - points[1].point[2]) > 0.25
+
+
+def test_a_stalk_that_pairs_show_beside_itself_is_one():
+    drives = (0.1, 0.05, 0.0)
+    clouds = [seen([(0.0, 0.55, 0.0)], far, hidden=(0.5, 0.9) if far else (9.0, 9.0)) for far in drives]
+    points = found_in(clouds, [Motion.along(-far + (0.0 if far else 0.014)) for far in drives])
+    assert len(points) == 1
 
 
 def test_what_other_pairs_see_through_is_no_stalk():

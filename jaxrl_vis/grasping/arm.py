@@ -20,7 +20,7 @@ RATE = 250.0
 """Frequency of the controllers, Hz."""
 FOLDED = 0.34
 """Distance of the grip from the first joint before it moves outwards, m."""
-_ROOM_POINTS = 40
+_ROOM_POINTS, _TURN_POINTS = 40, 16
 _FOLDED_ROOM = 0.02  # m, of the tips of the folded jaws from the middle of the nearest stalk that they reach for
 HOME = (0.0, stalk_arm.SHOULDER[1] + FOLDED, 0.85)
 """Where the grip waits, m in the frame of a stand."""
@@ -165,7 +165,8 @@ def room(target: np.ndarray, others: np.ndarray, radii: np.ndarray, whole_way: b
         target: [B, 3], m in the frame of the stand.
         others: [B, M, 2], where the middles of other stalks are at the target's height, m; nan for none.
         radii: [B, M], of these, m.
-        whole_way: From where the grip starts outwards, forearm included; if not, beside the open jaws at the target alone.
+        whole_way: As the folded arm turns, and from there outwards, forearm included; if not, beside the open jaws at the
+            target alone. While it turns, the arm comes from another height: stalks are taken to stand upright.
 
     Returns:
         [B, 2] float64, for the elbow at 1 and -1: the least distance between a stalk and the gripper, m. Negative where they
@@ -174,9 +175,14 @@ def room(target: np.ndarray, others: np.ndarray, radii: np.ndarray, whole_way: b
     target, others = np.asarray(target, float), np.asarray(others, float)
     from_shoulder = target[:, :2] - np.array(stalk_arm.SHOULDER)
     distance = np.linalg.norm(from_shoulder, axis=-1)
-    shares = np.linspace(0.0, 1.0, _ROOM_POINTS) if whole_way else np.ones(1)
-    radius = np.minimum(FOLDED, distance)[:, None] * (1 - shares) + distance[:, None] * shares
-    place = from_shoulder[:, None] / distance[:, None, None] * radius[..., None]
+    bearing = np.arctan2(-from_shoulder[:, 0], from_shoulder[:, 1])[:, None]
+    outwards = np.linspace(0.0, 1.0, _ROOM_POINTS) if whole_way else np.ones(1)
+    radius = np.minimum(FOLDED, distance)[:, None] * (1 - outwards) + distance[:, None] * outwards
+    if whole_way:
+        turned = np.linspace(0.0, 1.0, _TURN_POINTS, endpoint=False)
+        radius = np.concatenate([np.full((len(target), _TURN_POINTS), FOLDED), radius], axis=1)
+        bearing = bearing * np.concatenate([turned, np.ones(_ROOM_POINTS)])
+    place = np.stack([-np.sin(bearing), np.cos(bearing)], axis=-1) * radius[..., None]
     found = []
     for side in (1.0, -1.0):
         angles = stalk_arm.angles_at(place, np.full(radius.shape, side), np)

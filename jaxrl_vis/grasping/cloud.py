@@ -30,13 +30,13 @@ class Mount:
 
     height: float = 1.0
     pitch: float = 15.0
-    nearest: float = 0.33
+    nearest: float = 0.22
     farthest: float = 0.95
 
     @classmethod
     def of(cls, rig: Rig) -> "Mount":
         """As the cameras of a family are mounted, but for what varies."""
-        return cls(rig.camera_height, rig.pitch, max(rig.distance - 0.22, 0.15), rig.distance + 0.4)
+        return cls(rig.camera_height, rig.pitch, max(rig.distance - 0.33, 0.15), rig.distance + 0.4)
 
     @property
     def pose(self) -> Pose:

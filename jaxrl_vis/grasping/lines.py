@@ -6,6 +6,7 @@ the gripper works. Lines bend: half a metre below the grasp point a straight one
 """
 
 import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 
@@ -65,6 +66,17 @@ _LEAST_SHARE = 0.4  # of the pairs and places that show it or see through it
 _APART = 0.012  # m: lines that come nearer are one stalk
 _BEND = 0.04  # by how much more for each m between the heights at which they were seen
 _REST_WITHIN, _REST_SPREAD = 0.025, 0.003  # m
+_LEVEL = 0.002  # m: chords of one pair that differ less in height are of one line of its image
+_LEAST_BESIDE, _SHARE_BESIDE = 20, 0.2  # chords that lie beside each other, of two stalks that do
+_APART_BESIDE = 0.008  # m
+
+
+class _Found(NamedTuple):
+    """A line, the chords that it is made of, and how often pairs show it."""
+
+    point: GraspPoint
+    members: np.ndarray
+    shown: int
 
 
 def grasp_points(chords: Chords, sight: Sight, heights: tuple[float, float] = HEIGHTS) -> list[GraspPoint]:
@@ -76,8 +88,7 @@ def grasp_points(chords: Chords, sight: Sight, heights: tuple[float, float] = HE
         heights: Lowest and highest grasp, m above the ground.
     """
     free = np.ones(len(chords), bool)
-    found: list[GraspPoint] = []
-    shown: list[int] = []
+    found: list[_Found] = []
     for seed in _seeds(chords):
         members = seed[free[seed]]
         if np.ptp(chords.middle[members, 2]) < _LEAST_PIECE if len(members) else True:
@@ -91,10 +102,9 @@ def grasp_points(chords: Chords, sight: Sight, heights: tuple[float, float] = HE
             continue
         count = _agreed(point, sight)
         if count:
-            found.append(point)
-            shown.append(count)
-    order = np.argsort(-np.array(shown), kind="stable")
-    return sorted(_distinct([found[place] for place in order]), key=lambda each: float(each.point[0]))
+            found.append(_Found(point, members, count))
+    found.sort(key=lambda each: -each.shown)
+    return sorted((each.point for each in _distinct(found, chords)), key=lambda point: float(point.point[0]))
 
 
 def _seeds(chords: Chords) -> list[np.ndarray]:
@@ -213,18 +223,32 @@ def _agreed(point: GraspPoint, sight: Sight) -> int:
     return count if agreed else 0
 
 
-def _distinct(found: list[GraspPoint]) -> list[GraspPoint]:
+def _distinct(found: list[_Found], chords: Chords) -> list[_Found]:
     """Without lines that are the same stalk as one before them."""
-    kept: list[GraspPoint] = []
+    kept: list[_Found] = []
     for each in found:
-        if not any(_same(each, other) for other in kept):
+        if not any(_same(each.point, other.point) and not _beside(chords, each, other) for other in kept):
             kept.append(each)
     return kept
 
 
 def _same(point: GraspPoint, other: GraspPoint) -> bool:
-    """Whether a line is the same stalk as another one that is seen better."""
+    """Whether a line is likely the same stalk as another one that is seen better."""
     up = point.point[2] - other.point[2]
     distance = float(np.linalg.norm((point.point - other.at_height(point.point[2]))[:2]))
     # What is left of a stalk beside its line is near it, and scatters.
     return distance < _APART + _BEND * abs(up) or (distance < _REST_WITHIN and point.spread > _REST_SPREAD)
+
+
+def _beside(chords: Chords, one: _Found, other: _Found) -> bool:
+    """Whether pairs show two lines beside each other at the same heights: then they are two stalks, however near."""
+    apart = [np.zeros(0)]
+    for frame in np.intersect1d(chords.frame[one.members], chords.frame[other.members]):
+        mine, theirs = (chords.middle[each.members[chords.frame[each.members] == frame]] for each in (one, other))
+        theirs = theirs[np.argsort(theirs[:, 2])]
+        place = np.searchsorted(0.5 * (theirs[1:, 2] + theirs[:-1, 2]), mine[:, 2])
+        level = np.abs(theirs[place, 2] - mine[:, 2]) < _LEVEL
+        apart.append(np.linalg.norm((theirs[place] - mine)[level, :2], axis=1))
+    found = np.concatenate(apart)
+    enough = max(_LEAST_BESIDE, _SHARE_BESIDE * min(len(one.members), len(other.members)))
+    return len(found) >= enough and float(np.median(found)) > _APART_BESIDE
