@@ -104,6 +104,14 @@ def test_a_cell_that_fails_is_told_in_one_line_and_the_others_go_on(tmp_path: Pa
     assert is_finished(cells[1], tmp_path) and said[-1].startswith("b-300: done in") and "success 0.30" in said[-1]
 
 
+def test_the_longest_begin_first(tmp_path: Path) -> None:
+    with_losses = {"aux_tasks": ("egomotion",), "weighting": "sum"}
+    cells = [make_cell("short"), make_cell("like it"), make_cell("weighted", **with_losses), make_cell("long", env_steps=600)]
+    script = Script()
+    assert run(cells, tmp_path, script)[0] == []
+    assert [family for family, _ in script.calls] == ["weighted", "long", "short", "like it"]
+
+
 def test_every_device_has_one_process_at_a_time(tmp_path: Path) -> None:
     cells = [make_cell(name) for name in "abcde"]
     devices = [Device(f"GPU {number}", {"CUDA_VISIBLE_DEVICES": str(number)}) for number in (3, 5)]
