@@ -1,10 +1,9 @@
-"""The configuration of a training run: one frozen dataclass, four presets, and what follows from them for an environment.
+"""The configuration of a training run: one frozen dataclass and four presets. What follows for an environment: `resolved`.
 
 Imports no JAX, so that the command line can print its help at once.
 """
 
 import dataclasses
-import math
 from collections.abc import Mapping
 from typing import Any, Literal, Self
 
@@ -190,73 +189,6 @@ class Config:
             if name not in names:
                 raise RequestError(f"unknown option {name!r}{nearest(name, names)}")
         return dataclasses.replace(self, **changes)
-
-
-@dataclasses.dataclass(frozen=True)
-class Resolved:
-    """What follows from a `Config` and the environment's horizon: no None left.
-
-    Attributes:
-        horizon: T, control steps in an episode.
-        discount: gamma.
-        reward_positive, reward_negative: R+ and R-.
-        balance_probability: p2.
-        filter_threshold: q0; infinity where the method does not filter.
-        critic_output_bias: What the critic predicts before it has learned anything.
-        target_minimum, target_maximum: Bounds of the critic's targets.
-    """
-
-    horizon: int
-    discount: float
-    reward_positive: float
-    reward_negative: float
-    balance_probability: float
-    filter_threshold: float
-    critic_output_bias: float
-    target_minimum: float
-    target_maximum: float
-
-
-def resolve(config: Config, horizon: int) -> Resolved:
-    """Fills in the defaults that depend on the method and the horizon.
-
-    The filter's band is R- + gamma R+/(1-gamma) < q0 < R+/(1-gamma) (thesis, section 5.1.4); its middle is the default. A
-    critic that starts at or above q0 would drop every negative before it has learned from one, and so never come down. With
-    rewards 0/-1 a fresh critic (Q near 0) does: there it starts at R-/(1-gamma), the least value any state can have.
-
-    Raises:
-        RequestError: The discount or the filter threshold lies outside its range.
-    """
-    method = METHODS[config.method]
-    discount = 1.0 - 1.0 / horizon if config.discount is None else config.discount
-    if not 0.0 <= discount < 1.0:
-        raise RequestError(f"discount must lie in [0, 1), not {discount}; leave it out for 1 - 1/horizon")
-    positive = method.reward_positive if config.reward_positive is None else config.reward_positive
-    negative = method.reward_negative if config.reward_negative is None else config.reward_negative
-    if positive <= negative:
-        raise RequestError(f"reward_positive ({positive}) must be larger than reward_negative ({negative})")
-    best, worst = positive / (1.0 - discount), negative / (1.0 - discount)
-    low = negative + discount * best
-    threshold = math.inf
-    if method.filter:
-        threshold = (low + best) / 2 if config.filter_threshold is None else config.filter_threshold
-    if config.filter_threshold is not None:
-        if not method.filter:
-            filtering = " or ".join(name for name, other in METHODS.items() if other.filter)
-            raise RequestError(f"filter_threshold needs --method {filtering}")
-        if not low < threshold < best:
-            raise RequestError(f"filter_threshold {threshold} lies outside its band ({low:g}, {best:g})")
-    return Resolved(
-        horizon=horizon,
-        discount=discount,
-        reward_positive=positive,
-        reward_negative=negative,
-        balance_probability=method.balance_probability if config.balance_probability is None else config.balance_probability,
-        filter_threshold=threshold,
-        critic_output_bias=worst if threshold <= 0.0 else 0.0,
-        target_minimum=worst,
-        target_maximum=best if config.clip_targets_above else math.inf,
-    )
 
 
 _PAPER = Config(

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxrl_vis.config import preset, resolve
+from jaxrl_vis.config import preset
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import auxtasks
 from jaxrl_vis.learner.auxiliary import make_auxiliary
@@ -16,6 +16,7 @@ from jaxrl_vis.learner.ddpg import make_ddpg
 from jaxrl_vis.learner.networks import Networks
 from jaxrl_vis.learner.replay import Indices, Replay
 from jaxrl_vis.learner.sampling import Choice, Sampler
+from jaxrl_vis.resolved import resolve
 from jaxrl_vis.types import Episodes
 from jaxrl_vis.validation import validate
 

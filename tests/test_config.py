@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 from jaxrl_vis import fields
-from jaxrl_vis.config import PRESETS, Config, Pixels, config_from_dict, preset, resolve
+from jaxrl_vis.config import PRESETS, Config, Pixels, config_from_dict, preset
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.methods import METHODS, MethodName
+from jaxrl_vis.resolved import resolve
 from jaxrl_vis.validation import validate
 from jaxrl_vis_envs.pixels import CHANNELS
 

@@ -199,7 +199,8 @@ import jax, jax.numpy as jnp
 from jaxrl_vis import cli
 from jaxrl_vis.cli.parsing import parse
 from jaxrl_vis.cli.train import Train, training_config
-from jaxrl_vis.config import preset, resolve
+from jaxrl_vis.config import preset
+from jaxrl_vis.resolved import resolve
 from jaxrl_vis.learner import ddpg
 from jaxrl_vis.learner.auxtasks import Targets
 from jaxrl_vis.learner.networks import Networks

@@ -17,7 +17,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("errors", "methods"),
     ("fields",),
     ("config", "types", "provenance", "files", "parameters"),
-    ("devices", "processes", "validation"),
+    ("devices", "processes", "resolved", "validation"),
     ("evaluation_pool", "learner"),
     ("report",),
     ("run",),

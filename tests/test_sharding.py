@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from jaxrl_vis import cli
-from jaxrl_vis.config import Config, preset, resolve
+from jaxrl_vis.config import Config, preset
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import normalizer, reward_errors
 from jaxrl_vis.learner.auxiliary import make_auxiliary
@@ -25,6 +25,7 @@ from jaxrl_vis.learner.replay import Replay
 from jaxrl_vis.learner.sampling import Sampler
 from jaxrl_vis.learner.sharding import make_layout
 from jaxrl_vis.learner.shards import DATA, Shards
+from jaxrl_vis.resolved import resolve
 from jaxrl_vis.run import memory
 from jaxrl_vis.types import Batch, Episodes, ReplayState, TrainState
 from jaxrl_vis.validation import validate

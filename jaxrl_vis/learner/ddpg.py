@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from jaxrl_vis.config import Config, Resolved
+from jaxrl_vis.config import Config
 from jaxrl_vis.learner import diagnostics, normalizer
 from jaxrl_vis.learner.auxiliary import Auxiliary, make_auxiliary
 from jaxrl_vis.learner.latent_reward import LatentReward, make_latent_reward
@@ -25,6 +25,7 @@ from jaxrl_vis.learner.networks import Networks
 from jaxrl_vis.learner.objectives import ComputeCopies, Objectives
 from jaxrl_vis.learner.shards import ONE, Shards
 from jaxrl_vis.learner.weighting import MAIN, Weighted, WeightingState
+from jaxrl_vis.resolved import Resolved
 from jaxrl_vis.types import Batch, Metrics, Params, TrainState
 
 # Folded into the networks' keys for the heads of auxiliary tasks, so that these change nothing else.

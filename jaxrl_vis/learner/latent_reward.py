@@ -13,11 +13,12 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from jaxrl_vis.config import Config, Resolved
+from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import auxtasks
 from jaxrl_vis.learner.networks import Inputs, Networks
 from jaxrl_vis.methods import METHODS
+from jaxrl_vis.resolved import Resolved
 from jaxrl_vis.types import Batch, Params, Replaceable, TrainState
 
 _SMALL = 1e-6  # of a latent's length: the direction of a shorter one means nothing

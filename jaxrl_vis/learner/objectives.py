@@ -17,13 +17,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxrl_vis.config import Config, Resolved
+from jaxrl_vis.config import Config
 from jaxrl_vis.learner import losses, tangents
 from jaxrl_vis.learner.auxiliary import Auxiliary
 from jaxrl_vis.learner.auxtasks import View
 from jaxrl_vis.learner.networks import ORDER, Inputs, Networks
 from jaxrl_vis.learner.shards import Shards
 from jaxrl_vis.learner.weighting import MAIN, Weighted, WeightingState, weighted_grad
+from jaxrl_vis.resolved import Resolved
 from jaxrl_vis.types import Batch, Params
 
 # Ways in which each loss has a pass through the encoder of its own.

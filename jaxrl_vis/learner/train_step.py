@@ -19,7 +19,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxrl_vis.config import Config, Resolved, resolve
+from jaxrl_vis.config import Config
 from jaxrl_vis.learner import normalizer
 from jaxrl_vis.learner.auxiliary import Auxiliary, make_auxiliary
 from jaxrl_vis.learner.ddpg import Algorithm, Working, make_ddpg
@@ -30,6 +30,7 @@ from jaxrl_vis.learner.rollout import Exploration, play
 from jaxrl_vis.learner.sampling import Choice, Sampler
 from jaxrl_vis.learner.sharding import Layout, make_layout
 from jaxrl_vis.learner.shards import Shards
+from jaxrl_vis.resolved import Resolved, resolve
 from jaxrl_vis.types import Episodes, LoopState, Metrics, ReplayState, TrainState
 from jaxrl_vis.validation import validate
 from jaxrl_vis_envs.base import GoalEnv
