@@ -40,7 +40,7 @@ from jaxrl_vis.learner.encoder_kernel_passes import (
 from jaxrl_vis.learner.encoder_kernel_patches import divisor, padded_channels
 
 _MOST_CHANNELS = 4  # beyond, the weights' gradients no longer fit into registers
-# Cells in a tile, tiles that one program works through, and how they are run.
+# Cells in a tile, tiles that one program works through at most, and how they are run.
 _CELLS, _TILES, _PARAMS = 64, 32, plgpu.CompilerParams(num_warps=4, num_stages=1)
 
 

@@ -18,7 +18,7 @@ from jaxrl_vis_envs.compilation import accelerator, by_platform, runs_gpu_kernel
 
 LEAST_ROWS = 16
 """Of a product in a kernel."""
-# Measured on an H200: patches in a tile, tiles that one program works through, and how they are run.
+# Measured on an H200: patches in a tile, tiles that one program works through (at most, on the way back), and how they are run.
 _FORWARD_PATCHES, _FORWARD_TILES, _FORWARD = 16, 8, plgpu.CompilerParams(num_warps=4, num_stages=3)
 _BACKWARD_PATCHES, _BACKWARD_TILES, _BACKWARD = 16, 64, plgpu.CompilerParams(num_warps=4, num_stages=1)
 _LEAST_PROGRAMS = 256  # about two for each of a large GPU's processors

@@ -90,9 +90,7 @@ class _Dense(nn.Module):
         return total
 
 
-_OBSERVED = ("before", "goal", "after")
-ORDER = (*_OBSERVED, "moved")
-"""Names of observations as `Inputs` has them."""
+_OBSERVED = ("before", "goal", "after")  # as `Inputs` has them
 
 Piece = tuple[jax.Array, slice]
 """Some of an array of prepared observations: the array [B, ...], and which."""
@@ -109,9 +107,14 @@ class Inputs(NamedTuple):
     observed: jax.Array
     moved: jax.Array | None = None
 
+    @property
+    def size(self) -> int:
+        """B."""
+        return self.observed.shape[0] // len(_OBSERVED)
+
     def pieces(self, *names: str) -> list[Piece]:
-        """Where those observations lie that are called ``before``, ``goal``, ``after`` and ``moved``, in this order."""
-        size, found = self.observed.shape[0] // len(_OBSERVED), []
+        """Where observations lie, called ``before``, ``goal``, ``after`` or ``moved``, in the order of ``names``."""
+        size, found = self.size, []
         for name in names:
             if name == "moved":
                 assert self.moved is not None

@@ -21,7 +21,7 @@ from jaxrl_vis.config import Config
 from jaxrl_vis.learner import losses, tangents
 from jaxrl_vis.learner.auxiliary import Auxiliary
 from jaxrl_vis.learner.auxtasks import View
-from jaxrl_vis.learner.networks import ORDER, Inputs, Networks
+from jaxrl_vis.learner.networks import Inputs, Networks
 from jaxrl_vis.learner.shards import Shards
 from jaxrl_vis.learner.weighting import MAIN, Weighted, WeightingState, weighted_grad
 from jaxrl_vis.resolved import Resolved
@@ -42,7 +42,7 @@ class ComputeCopies(NamedTuple):
 
 def _encode(networks: Networks, params: Params, inputs: Inputs, *names: str) -> jax.Array:
     """Latents [names, B, latent] of the observations of these names."""
-    return networks.encode_pieces(params, inputs.pieces(*names)).reshape(len(names), inputs.observed.shape[0] // 3, -1)
+    return networks.encode_pieces(params, inputs.pieces(*names)).reshape(len(names), inputs.size, -1)
 
 
 class Latents(NamedTuple):
@@ -67,12 +67,15 @@ def _encode_online(networks: Networks, auxiliary: Auxiliary, params: Params, inp
     """
     names = ("before", "goal", *auxiliary.others)
     if apart:
-        found = {name: _encode(networks, params, inputs, name)[0] for name in names}
-        pair = jnp.stack([found["before"], found["goal"]])
+        found = [_encode(networks, params, inputs, name)[0] for name in names]
+        pair = jnp.stack(found[:2])
     else:
-        together = _encode(networks, params, inputs, *sorted(names, key=ORDER.index))
-        found, pair = dict(zip(sorted(names, key=ORDER.index), together)), together[:2]
-    return Latents(pair, found["before"], found.get("after"), found.get("moved"))
+        found = _encode(networks, params, inputs, *names)
+        pair = found[:2]
+    return Latents(pair, found[0], **dict(zip(auxiliary.others, found[2:], strict=True)))
+
+
+_MAIN_READS, _OTHERS_READ = "main", "others"
 
 
 def _encoders(networks: Networks, auxiliary: Auxiliary, inputs: Inputs) -> dict[str, Callable[[Params], jax.Array]]:
@@ -85,9 +88,6 @@ def _encoders(networks: Networks, auxiliary: Auxiliary, inputs: Inputs) -> dict[
         return lambda encoder: _encode(networks, {"encoder": encoder}, inputs, *names)
 
     return {_MAIN_READS: of("before", "goal"), _OTHERS_READ: of("before", *auxiliary.others)}
-
-
-_MAIN_READS, _OTHERS_READ = "main", "others"
 
 
 def _together(auxiliary: Auxiliary, found: Latents | dict[str, jax.Array]) -> Latents:
