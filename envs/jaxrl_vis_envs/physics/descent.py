@@ -119,9 +119,16 @@ def numbers_of(structure: Structure, read: Callable[..., Any]) -> Problem:
     )
 
 
-def solve(structure: Structure, problem: Problem) -> Motion:
-    """The motion under a problem's constraints, all in numbers."""
-    descent = _Descent(structure, problem)
+def solve(structure: Structure, problem: Problem, in_kernel: bool = False) -> Motion:
+    """The motion under a problem's constraints, all in numbers.
+
+    Args:
+        structure: Of the problem.
+        problem: Its numbers.
+        in_kernel: Whether loops may end early where that needs a program whose loops have no fixed length: a line is then not
+            searched for the step that is taken whole.
+    """
+    descent = _Descent(structure, problem, in_kernel)
     free = solve_positive(problem.mass, problem.force)
     damped_mass = dict(problem.mass)
     for joint, damping in enumerate(problem.damping):
@@ -129,31 +136,30 @@ def solve(structure: Structure, problem: Problem) -> Motion:
     if not structure.rows:
         nothing = [0.0 * number for number in free]
         return Motion(free, free, nothing, solve_positive(damped_mass, problem.force))
-    acceleration = free
+    acceleration, residual = free, descent.residual(free)
     if structure.warm:
-        is_better = descent.cost(problem.warm, free) < descent.cost(free, free)
+        warm_residual = descent.residual(problem.warm)
+        is_better = descent.cost(problem.warm, warm_residual, free) < descent.cost(free, residual, free)
         acceleration = [jnp.where(is_better, *pair) for pair in zip(problem.warm, free, strict=True)]
-    steps = structure.iterations + structure.exact
-    acceleration = list(jax.lax.fori_loop(0, steps, descent.improve, tuple(acceleration)))
-    force = descent.at(acceleration).force
-    forces = [one + other for one, other in zip(problem.force, force, strict=True)]
-    return Motion(free, acceleration, force, solve_positive(damped_mass, forces))
+        residual = [jnp.where(is_better, *pair) for pair in zip(warm_residual, residual, strict=True)]
+    start = descent.at(acceleration, residual)
+    place = jax.lax.fori_loop(0, structure.iterations + structure.exact, descent.improve, start)
+    forces = [one + other for one, other in zip(problem.force, place.force, strict=True)]
+    return Motion(free, place.acceleration, place.force, solve_positive(damped_mass, forces))
 
 
 class _Place(NamedTuple):
-    """The cost's derivatives at some accelerations.
+    """Some accelerations, and what comes of them.
 
     Attributes:
+        acceleration: Of the joints.
         residual: By how much each row differs from its target.
-        stiffness: Of each row that acts by itself, 0 of others.
-        cones: For each cone, the places of its second derivatives by the residuals of its rows, below the diagonal too.
         force: Of the constraints on the joints.
         gradient: Of the cost.
     """
 
+    acceleration: Numbers
     residual: Numbers
-    stiffness: Numbers
-    cones: list[Matrix]
     force: Numbers
     gradient: Numbers
 
@@ -161,18 +167,24 @@ class _Place(NamedTuple):
 class _Descent:
     """The cost of a problem, and steps down from it."""
 
-    def __init__(self, structure: Structure, problem: Problem) -> None:
-        self._structure, self._problem = structure, problem
+    def __init__(self, structure: Structure, problem: Problem, in_kernel: bool) -> None:
+        self._structure, self._problem, self._in_kernel = structure, problem, in_kernel
         in_cones = {row for first, size in structure.cones for row in range(first, first + size)}
         self._alone = [row for row in range(len(structure.rows)) if row not in in_cones]
 
-    def cost(self, acceleration: Numbers, free: Numbers) -> Any:
+    def residual(self, acceleration: Numbers) -> Numbers:
+        """By how much each row differs from its target."""
+        rows = zip(self._problem.jacobian, self._problem.target, strict=True)
+        return [dot(entries, acceleration) - target for entries, target in rows]
+
+    def cost(self, acceleration: Numbers, residual: Numbers, free: Numbers) -> Any:
         """The cost, up to a constant."""
         problem = self._problem
-        inertial = product(problem.mass, acceleration)
-        pairs = zip(inertial, problem.force, acceleration, free, strict=True)
-        cost = 0.5 * total((inertia - force) * (there - start) for inertia, force, there, start in pairs)
-        residual = self._residual(acceleration)
+        cost: Any = 0.0
+        if acceleration is not free:
+            inertial = product(problem.mass, acceleration)
+            pairs = zip(inertial, problem.force, acceleration, free, strict=True)
+            cost = 0.5 * total((inertia - force) * (there - start) for inertia, force, there, start in pairs)
         for row in self._alone:
             x, most, stiffness = residual[row], self._most(row), problem.stiffness[row]
             if most is None:
@@ -187,63 +199,49 @@ class _Descent:
             cost = cost + 0.5 * jnp.where(cone.is_stuck, stuck, cone.stiffness * gap * gap)
         return cost
 
-    def improve(self, step: Any, acceleration: tuple[Any, ...]) -> tuple[Any, ...]:
+    def improve(self, step: Any, here: _Place) -> _Place:
         """One Newton step: as long as the cost is least along it, and the last one, if exact, whole or not at all."""
-        here = self.at(list(acceleration))
         direction = self._direction(here)
         # A line tells nothing where what there is to gain is less than rounding errors: then no further than Newton's own step.
         gain = -inner(here.gradient, direction)
-        forces = zip(self._problem.force, here.force, acceleration, strict=True)
+        forces = zip(self._problem.force, here.force, here.acceleration, strict=True)
         work = total((jnp.abs(free) + jnp.abs(pull)) * jnp.abs(there) for free, pull, there in forces)
-        length = self._line_search(here, direction)
+        is_last = step == self._structure.iterations if self._structure.exact else False
+        searches = jnp.where(is_last, 0, LINE_SEARCH_STEPS) if self._structure.exact and self._in_kernel else LINE_SEARCH_STEPS
+        length = self._line_search(here, direction, searches)
         length = jnp.where(gain > _ROUNDING * work, length, jnp.minimum(length, 1.0))
         if self._structure.exact:
-            is_last = step == self._structure.iterations
             length = jnp.where(is_last, 1.0, length)
-        moved = [start + length * part for start, part in zip(acceleration, direction, strict=True)]
+        moved = [start + length * part for start, part in zip(here.acceleration, direction, strict=True)]
+        there = self.at(moved, self.residual(moved))
         if self._structure.exact:
-            there = self.at(moved)
             is_better = total(part * part for part in there.gradient) < total(part * part for part in here.gradient)
             is_better = is_better | jnp.logical_not(is_last)
-            moved = [jnp.where(is_better, *pair) for pair in zip(moved, acceleration, strict=True)]
-        return tuple(moved)
+            pairs = zip(there, here, strict=True)
+            there = _Place(*([jnp.where(is_better, *pair) for pair in zip(*numbers, strict=True)] for numbers in pairs))
+        return there
 
-    def at(self, acceleration: Numbers) -> _Place:
-        """Forces and derivatives at some accelerations."""
+    def at(self, acceleration: Numbers, residual: Numbers) -> _Place:
+        """Forces and gradient at some accelerations."""
         problem = self._problem
-        residual = self._residual(acceleration)
-        stiffness: Numbers = [0.0] * len(residual)
         pull: Numbers = [0.0] * len(residual)
-        cones: list[Matrix] = []
         for row in self._alone:
-            x, most = residual[row], self._most(row)
+            x, most, stiffness = residual[row], self._most(row), problem.stiffness[row]
             if most is None:
-                stiffness[row] = self._acting(row, x)
-                pull[row] = -stiffness[row] * x
+                pull[row] = -self._acting(row, x) * x
             else:
-                slides = self._slides(row, x)
-                stiffness[row] = jnp.where(slides, 0.0, problem.stiffness[row])
-                pull[row] = jnp.where(slides, jnp.where(x < 0, most, -most), -problem.stiffness[row] * x)
-        for index, (first, _) in enumerate(self._structure.cones):
+                pull[row] = jnp.where(self._slides(row, x), jnp.where(x < 0, most, -most), -stiffness * x)
+        for index in range(len(self._structure.cones)):
             cone = self._cone(index, residual)
-            for row in self._cone_rows(index):
-                stiffness[row] = jnp.where(cone.is_stuck, problem.stiffness[row], 0.0)
-                pull[row] = -stiffness[row] * residual[row]
-            matrix, forces = cone.derivatives()
-            cones.append(matrix)
-            for part, force in enumerate(forces):
-                pull[first + part] = pull[first + part] + force
+            for row, force in zip(self._cone_rows(index), cone.forces(), strict=True):
+                pull[row] = force - jnp.where(cone.is_stuck, problem.stiffness[row], 0.0) * residual[row]
         force: Numbers = [0.0] * self._structure.joints
         for row, entries in enumerate(problem.jacobian):
             for joint, entry in entries.items():
                 force[joint] = force[joint] + entry * pull[row]
         inertial = product(problem.mass, acceleration)
         gradient = [left - right - pulled for left, right, pulled in zip(inertial, problem.force, force, strict=True)]
-        return _Place(residual, stiffness, cones, force, gradient)
-
-    def _residual(self, acceleration: Numbers) -> Numbers:
-        rows = zip(self._problem.jacobian, self._problem.target, strict=True)
-        return [dot(entries, acceleration) - target for entries, target in rows]
+        return _Place(acceleration, residual, force, gradient)
 
     def _most(self, row: int) -> Any:
         """The greatest force of a row of dry friction; None for other rows."""
@@ -253,6 +251,12 @@ class _Descent:
         """A row's stiffness where it acts, 0 elsewhere."""
         stiffness = self._problem.stiffness[row]
         return stiffness if row < self._structure.equalities else jnp.where(residual < 0, stiffness, 0.0)
+
+    def _curvature(self, row: int, residual: Any) -> Any:
+        """The cost's second derivative by the residual of a row that acts by itself."""
+        if self._most(row) is None:
+            return self._acting(row, residual)
+        return jnp.where(self._slides(row, residual), 0.0, self._problem.stiffness[row])
 
     def _slides(self, row: int, residual: Any) -> Any:
         """Whether dry friction is at its greatest; as in MJX, a greatest friction of 0 holds for ever."""
@@ -271,22 +275,23 @@ class _Descent:
         """Newton's direction: downhill, as far as the cost's lowest point if nothing started or ended on the way."""
         problem, apart = self._problem, self._structure.apart
         matrix: Matrix = dict(problem.mass)
+        stiffness = {row: self._curvature(row, place.residual[row]) for row in self._alone}
         for row in self._alone:
             if row not in apart:
-                add_square(matrix, problem.jacobian[row], place.stiffness[row])
-        for index, second in enumerate(place.cones):
-            rows = self._cone_rows(index)
-            for (left, right), value in second.items():
-                stuck = place.stiffness[rows[left]] if left == right else 0.0
+                add_square(matrix, problem.jacobian[row], stiffness[row])
+        for index in range(len(self._structure.cones)):
+            cone, rows = self._cone(index, place.residual), self._cone_rows(index)
+            for (left, right), value in cone.curvature().items():
+                stuck = jnp.where(cone.is_stuck, problem.stiffness[rows[left]], 0.0) if left == right else 0.0
                 add_product(matrix, problem.jacobian[rows[left]], problem.jacobian[rows[right]], value + stuck)
-        roots = [jnp.sqrt(place.stiffness[row]) for row in apart]
+        roots = [jnp.sqrt(stiffness[row]) for row in apart]
         added = [
             {j: entry * root for j, entry in problem.jacobian[row].items()} for row, root in zip(apart, roots, strict=True)
         ]
         return [-part for part in solve_positive(matrix, place.gradient, added)]
 
-    def _line_search(self, place: _Place, direction: Numbers) -> Any:
-        """The length of the step along ``direction`` for which the cost is least."""
+    def _line_search(self, place: _Place, direction: Numbers, searches: Any) -> Any:
+        """The length of the step along ``direction`` for which the cost is least, after so many ``searches``."""
         problem = self._problem
         along = [dot(entries, direction) for entries in problem.jacobian]
         # The inertial part of the slope at the start is the gradient's less the constraints'.
@@ -321,10 +326,10 @@ class _Descent:
             corners += [ratio(end - x, v) for end in ends]
         for index in range(len(self._structure.cones)):
             corners += self._cone(index, place.residual).corners([along[row] for row in self._cone_rows(index)])
-        return lowest(slope_at, corners, first)
+        return lowest(slope_at, corners, first, searches)
 
 
-def lowest(slope_at: Callable[[Any], tuple[Any, Any]], corners: Numbers, like: Any) -> Any:
+def lowest(slope_at: Callable[[Any], tuple[Any, Any]], corners: Numbers, like: Any, searches: Any = LINE_SEARCH_STEPS) -> Any:
     """Where a convex cost along a line is least, after a few steps that narrow the range where that can be.
 
     A step goes to where Newton's method leads; where that is out of the range, or no less far than half of the step before, to
@@ -335,6 +340,7 @@ def lowest(slope_at: Callable[[Any], tuple[Any, Any]], corners: Numbers, like: A
         slope_at: The cost's slope, not positive at 0, and its curvature, at a length.
         corners: Lengths at which the curvature jumps.
         like: A number of the batch.
+        searches: How many steps.
     """
 
     def narrow(_: Any, state: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -348,13 +354,14 @@ def lowest(slope_at: Callable[[Any], tuple[Any, Any]], corners: Numbers, like: A
         converges = (onward > low) & (onward < high) & (jnp.abs(step) < 0.5 * before) | (high == _ENDLESS) | (step == 0)
         nearest, distance = middle, 0.499 * (high - low)  # not the corner that is an end of the range, but for rounding
         for corner in corners:
-            is_nearer = jnp.abs(corner - middle) < distance
-            nearest, distance = jnp.where(is_nearer, corner, nearest), jnp.where(is_nearer, jnp.abs(corner - middle), distance)
+            away = jnp.abs(corner - middle)
+            is_nearer = away < distance
+            nearest, distance = jnp.where(is_nearer, corner, nearest), jnp.where(is_nearer, away, distance)
         there = jnp.where(converges, onward, nearest)
         return there, jnp.abs(there - length), low, low_slope, high, high_slope
 
     start = 0.0 * like
     endless = start + _ENDLESS
     state = (start, endless, start, -endless, endless, endless)
-    _, _, low, low_slope, high, high_slope = jax.lax.fori_loop(0, LINE_SEARCH_STEPS, narrow, state)
+    _, _, low, low_slope, high, high_slope = jax.lax.fori_loop(0, searches, narrow, state)
     return jnp.where(high_slope < -low_slope, high, low)

@@ -41,7 +41,15 @@ class _Row(NamedTuple):
     most: Any = None
 
 
-def take(constants: Mechanism, state: State, control: Numbers, applied: Numbers, count: int, exact: bool) -> State:
+def take(
+    constants: Mechanism,
+    state: State,
+    control: Numbers,
+    applied: Numbers,
+    count: int,
+    exact: bool,
+    in_kernel: bool = False,
+) -> State:
     """``count`` physics steps, with the same controls.
 
     Args:
@@ -51,6 +59,7 @@ def take(constants: Mechanism, state: State, control: Numbers, applied: Numbers,
         applied: Further forces on the joints, N m or N.
         count: How many.
         exact: Whether forces are as exact as float32 allows (see `mjx_model.step`); contacts always are.
+        in_kernel: See `descent.solve`.
 
     Returns:
         The state after them.
@@ -59,14 +68,16 @@ def take(constants: Mechanism, state: State, control: Numbers, applied: Numbers,
     control = [_clipped(number, pair) for number, pair in zip(control, ends, strict=True)]
 
     def advance(_: Any, state: State) -> State:
-        return _step(constants, state, control, applied, exact)
+        return _step(constants, state, control, applied, exact, in_kernel)
 
     return jax.lax.fori_loop(0, count, advance, state)
 
 
-def _step(constants: Mechanism, state: State, control: Numbers, applied: Numbers, exact: bool) -> State:
+def _step(
+    constants: Mechanism, state: State, control: Numbers, applied: Numbers, exact: bool, in_kernel: bool = False
+) -> State:
     structure, problem, order = problem_of(constants, state, control, applied, exact)
-    motion = descent.solve(structure, problem)
+    motion = descent.solve(structure, problem, in_kernel)
     place = {joint: index for index, joint in enumerate(order)}
     damped, acceleration, force = (
         [part[place[joint]] for joint in range(len(order))] for part in (motion.damped, motion.acceleration, motion.force)

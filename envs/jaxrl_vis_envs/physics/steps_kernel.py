@@ -74,7 +74,7 @@ def _simulate(constants: Mechanism, count: int, exact: bool, rows: list[jax.Arra
     joints = len(constants.links)
     position, velocity, acceleration, applied = (rows[first * joints :][:joints] for first in range(4))
     start = State(position, velocity, acceleration, [0.0 * number for number in position])
-    end = steps.take(constants, start, rows[4 * joints :], applied, count, exact)
+    end = steps.take(constants, start, rows[4 * joints :], applied, count, exact, in_kernel=True)
     return [number for part in end for number in part]
 
 
