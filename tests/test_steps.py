@@ -106,7 +106,11 @@ def columns(array) -> list[np.ndarray]:
     return list(np.asarray(array, np.float32).T)
 
 
-def taken(model: mjx.Model, data: mjx.Data, count: int, exact: bool = True) -> steps.State:
+def branch_of_numpy(condition, one, other):
+    return one() if condition else other()
+
+
+def taken(model: mjx.Model, data: mjx.Data, count: int, in_kernel: bool) -> steps.State:
     """`steps.take` of a batch, [B, N] each."""
     state = steps.State(*map(columns, (data.qpos, data.qvel, data.qacc_warmstart, data.qvel)))
     constants, control, applied = mechanism.mechanism_of(model), columns(data.ctrl), columns(data.qfrc_applied)
@@ -114,8 +118,8 @@ def taken(model: mjx.Model, data: mjx.Data, count: int, exact: bool = True) -> s
         for module in (algebra, capsules, cones, descent, folding, reference, steps):
             patch.setattr(module, "jnp", Float32Numpy())
         for module in (descent, steps):
-            patch.setattr(module, "jax", SimpleNamespace(lax=SimpleNamespace(fori_loop=loop_of_numpy)))
-        state = steps.take(constants, state, control, applied, count, exact)
+            patch.setattr(module, "jax", SimpleNamespace(lax=SimpleNamespace(fori_loop=loop_of_numpy, cond=branch_of_numpy)))
+        state = steps.take(constants, state, control, applied, count, True, in_kernel)
     return steps.State(*(np.stack(part, axis=1) for part in state))
 
 
@@ -153,7 +157,7 @@ def test_a_step_of_each_task_is_that_of_matrices(name):
     after = one_step(data)
     touching = (np.asarray(after._impl.contact.dist) < 0).sum(axis=1)
     assert (touching == 0).sum() > 5 and (touching > 0).sum() > 2
-    state = taken(env._model, data, 1)
+    state = taken(env._model, data, 1, in_kernel=True)
     assert state.acceleration.dtype == np.float32
     # Rounding errors of float32, 1e-7 of what cancels, times the condition of the mass matrix and of stiff contacts.
     scale = np.abs(np.asarray(after.qacc)).max(axis=1)
@@ -168,7 +172,7 @@ def test_a_control_step_of_each_task_is_that_of_matrices(name):
     data = states(name)
     env, _ = by_matrices(name, 1)
     _, control_step = by_matrices(name, env.config.substeps)
-    after, state = control_step(data), taken(env._model, data, env.config.substeps)
+    after, state = control_step(data), taken(env._model, data, env.config.substeps, in_kernel=False)
     error = np.abs(state.position - np.asarray(after.qpos)).max(axis=1)
     # A contact that begins one step later changes more than rounding errors do.
     assert np.median(error) < 2e-6 and error.max() < 1e-3, np.sort(error)[-5:]
@@ -192,7 +196,7 @@ def test_a_step_of_a_model_with_everything(warmstart):
     after = env_jit(jax.vmap(lambda data: mjx_model.step(model, data, True)))(data)
     contact = np.asarray(after._impl.contact.dist) - np.asarray(after._impl.contact.includemargin)
     assert ((contact < 0).sum(axis=0) > 10).all() and ((contact < 0).sum(axis=1) > 1).sum() > 10
-    state = taken(model, data, 1)
+    state = taken(model, data, 1, in_kernel=warmstart == "disable")
     scale = np.abs(np.asarray(after.qacc)).max(axis=1)
     error = np.abs(state.acceleration - np.asarray(after.qacc)).max(axis=1) / scale
     assert np.median(error) < 2e-6 and error.max() < 1e-3, np.sort(error)[-10:]

@@ -135,9 +135,10 @@ def touch(pair: Pair, places: Places) -> Touch:
     at_1 = _within(minus(times(cosine, at_2), along_1), half_1)
     point = add(middle_1, scale(axis_1, at_1))
     gap = subtract(add(middle_2, scale(axis_2, at_2)), point)
-    inverse = 1.0 / jnp.sqrt(jnp.maximum(dot(gap, gap), _TINY))
+    square = dot(gap, gap)
+    inverse = 1.0 / jnp.sqrt(jnp.maximum(square, _TINY))
     normal = scale(gap, inverse)
-    distance = dot(gap, normal) - (radius_1 + radius_2)
+    distance = square * inverse - (radius_1 + radius_2)
     return Touch(distance, add(point, scale(normal, radius_1 + 0.5 * distance)), normal)
 
 

@@ -28,6 +28,8 @@ from jaxrl_vis_envs.physics.cones import Cone, cone_at
 
 LINE_SEARCH_STEPS = 10
 """Points of the line at which a slope is computed."""
+_FEW_LINE_SEARCH_STEPS = 7
+"""The same where no corners are looked at: after these, steps of the hand are at the lowest point but for rounding errors."""
 _ROUNDING = 1.2e-7  # of float32
 _ENDLESS = 1e30
 
@@ -46,6 +48,7 @@ class Structure(NamedTuple):
         iterations: Newton steps.
         warm: Whether the last accelerations may be the first guess.
         exact: Whether one more Newton step is taken whole where it makes the gradient smaller.
+        corners: Whether line searches that do not converge go on from the places where the slope bends, as dry friction needs.
     """
 
     joints: int
@@ -58,6 +61,7 @@ class Structure(NamedTuple):
     iterations: int
     warm: bool
     exact: bool
+    corners: bool = True
 
 
 class Problem(NamedTuple):
@@ -125,8 +129,7 @@ def solve(structure: Structure, problem: Problem, in_kernel: bool = False) -> Mo
     Args:
         structure: Of the problem.
         problem: Its numbers.
-        in_kernel: Whether loops may end early where that needs a program whose loops have no fixed length: a line is then not
-            searched for the step that is taken whole.
+        in_kernel: Whether a branch costs less than what is in it: then no line is searched for the step that is taken whole.
     """
     descent = _Descent(structure, problem, in_kernel)
     free = solve_positive(problem.mass, problem.force)
@@ -207,11 +210,17 @@ class _Descent:
         forces = zip(self._problem.force, here.force, here.acceleration, strict=True)
         work = total((jnp.abs(free) + jnp.abs(pull)) * jnp.abs(there) for free, pull, there in forces)
         is_last = step == self._structure.iterations if self._structure.exact else False
-        searches = jnp.where(is_last, 0, LINE_SEARCH_STEPS) if self._structure.exact and self._in_kernel else LINE_SEARCH_STEPS
-        length = self._line_search(here, direction, searches)
-        length = jnp.where(gain > _ROUNDING * work, length, jnp.minimum(length, 1.0))
-        if self._structure.exact:
-            length = jnp.where(is_last, 1.0, length)
+
+        def search() -> Any:
+            length = self._line_search(here, direction)
+            return jnp.where(gain > _ROUNDING * work, length, jnp.minimum(length, 1.0))
+
+        if not self._structure.exact:
+            length = search()
+        elif self._in_kernel:
+            length = jax.lax.cond(is_last, lambda: 0.0 * gain + 1.0, search)
+        else:
+            length = jnp.where(is_last, 1.0, search())
         moved = [start + length * part for start, part in zip(here.acceleration, direction, strict=True)]
         there = self.at(moved, self.residual(moved))
         if self._structure.exact:
@@ -290,10 +299,11 @@ class _Descent:
         ]
         return [-part for part in solve_positive(matrix, place.gradient, added)]
 
-    def _line_search(self, place: _Place, direction: Numbers, searches: Any) -> Any:
-        """The length of the step along ``direction`` for which the cost is least, after so many ``searches``."""
+    def _line_search(self, place: _Place, direction: Numbers) -> Any:
+        """The length of the step along ``direction`` for which the cost is least."""
         problem = self._problem
         along = [dot(entries, direction) for entries in problem.jacobian]
+        pulling = {row: problem.stiffness[row] * along[row] for row in self._alone if self._most(row) is None}
         # The inertial part of the slope at the start is the gradient's less the constraints'.
         first = total((g + f) * d for g, f, d in zip(place.gradient, place.force, direction, strict=True))
         second = total(m * d for m, d in zip(product(problem.mass, direction), direction, strict=True))
@@ -304,7 +314,7 @@ class _Descent:
             for row in self._alone:
                 x, v, most, stiffness = there[row], along[row], self._most(row), problem.stiffness[row]
                 if most is None:
-                    acting = self._acting(row, x) * v
+                    acting = pulling[row] if row < self._structure.equalities else jnp.where(x < 0, pulling[row], 0.0)
                     slope, curvature = slope + acting * x, curvature + acting * v
                 else:
                     slides = self._slides(row, x)
@@ -319,6 +329,8 @@ class _Descent:
                 curvature = curvature + jnp.where(cone.is_stuck, stuck_curvature, cone_curvature)
             return slope, curvature
 
+        if not self._structure.corners:
+            return lowest(slope_at, [], first, _FEW_LINE_SEARCH_STEPS)
         corners: Numbers = []
         for row in self._alone[self._structure.equalities :]:
             x, v, most = place.residual[row], along[row], self._most(row)
@@ -326,21 +338,21 @@ class _Descent:
             corners += [ratio(end - x, v) for end in ends]
         for index in range(len(self._structure.cones)):
             corners += self._cone(index, place.residual).corners([along[row] for row in self._cone_rows(index)])
-        return lowest(slope_at, corners, first, searches)
+        return lowest(slope_at, corners, first)
 
 
-def lowest(slope_at: Callable[[Any], tuple[Any, Any]], corners: Numbers, like: Any, searches: Any = LINE_SEARCH_STEPS) -> Any:
+def lowest(slope_at: Callable[[Any], tuple[Any, Any]], corners: Numbers, like: Any, steps: int = LINE_SEARCH_STEPS) -> Any:
     """Where a convex cost along a line is least, after a few steps that narrow the range where that can be.
 
     A step goes to where Newton's method leads; where that is out of the range, or no less far than half of the step before, to
-    the corner next to the middle of the range. Without these, a slope that turns within a short stretch between two flat ones,
-    as that of dry friction does, is jumped over for ever.
+    the corner next to the middle of the range, or to the middle if there are no corners. Without these, a slope that turns
+    within a short stretch between two flat ones, as that of dry friction does, is jumped over for ever.
 
     Args:
         slope_at: The cost's slope, not positive at 0, and its curvature, at a length.
         corners: Lengths at which the curvature jumps.
         like: A number of the batch.
-        searches: How many steps.
+        steps: How many.
     """
 
     def narrow(_: Any, state: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -363,5 +375,5 @@ def lowest(slope_at: Callable[[Any], tuple[Any, Any]], corners: Numbers, like: A
     start = 0.0 * like
     endless = start + _ENDLESS
     state = (start, endless, start, -endless, endless, endless)
-    _, _, low, low_slope, high, high_slope = jax.lax.fori_loop(0, searches, narrow, state)
+    _, _, low, low_slope, high, high_slope = jax.lax.fori_loop(0, steps, narrow, state)
     return jnp.where(high_slope < -low_slope, high, low)

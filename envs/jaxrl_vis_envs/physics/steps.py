@@ -137,6 +137,7 @@ def problem_of(
         iterations=constants.iterations,
         warm=constants.warm,
         exact=exact,
+        corners=bool(constants.frictions or cones),
     )
     return structure, problem, order
 
