@@ -6,7 +6,7 @@ matrices takes a library hundreds. Zeros that the structure of the model brings 
 Source: the primal problem of MuJoCo's documentation, "Computation", constraint model; Newton's method as there.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -129,7 +129,8 @@ def solve(structure: Structure, problem: Problem, in_kernel: bool = False) -> Mo
     Args:
         structure: Of the problem.
         problem: Its numbers.
-        in_kernel: Whether a branch costs less than what is in it: then no line is searched for the step that is taken whole.
+        in_kernel: Whether a loop carries numbers for nothing, so that none is computed twice, and whether a branch costs less
+            than what is in it, so that no line is searched for the step that is taken whole. On a CPU neither is so.
     """
     descent = _Descent(structure, problem, in_kernel)
     free = solve_positive(problem.mass, problem.force)
@@ -145,8 +146,17 @@ def solve(structure: Structure, problem: Problem, in_kernel: bool = False) -> Mo
         is_better = descent.cost(problem.warm, warm_residual, free) < descent.cost(free, residual, free)
         acceleration = [jnp.where(is_better, *pair) for pair in zip(problem.warm, free, strict=True)]
         residual = [jnp.where(is_better, *pair) for pair in zip(warm_residual, residual, strict=True)]
-    start = descent.at(acceleration, residual)
-    place = jax.lax.fori_loop(0, structure.iterations + structure.exact, descent.improve, start)
+    steps = structure.iterations + structure.exact
+    if in_kernel:
+        place = jax.lax.fori_loop(0, steps, descent.improve, descent.at(acceleration, residual))
+    else:
+
+        def improve(step: Any, acceleration: tuple[Any, ...]) -> tuple[Any, ...]:
+            here = descent.at(list(acceleration), descent.residual(acceleration))
+            return tuple(descent.improve(step, here).acceleration)
+
+        acceleration = list(jax.lax.fori_loop(0, steps, improve, tuple(acceleration)))
+        place = descent.at(acceleration, descent.residual(acceleration))
     forces = [one + other for one, other in zip(problem.force, place.force, strict=True)]
     return Motion(free, place.acceleration, place.force, solve_positive(damped_mass, forces))
 
@@ -175,7 +185,7 @@ class _Descent:
         in_cones = {row for first, size in structure.cones for row in range(first, first + size)}
         self._alone = [row for row in range(len(structure.rows)) if row not in in_cones]
 
-    def residual(self, acceleration: Numbers) -> Numbers:
+    def residual(self, acceleration: Sequence[Any]) -> Numbers:
         """By how much each row differs from its target."""
         rows = zip(self._problem.jacobian, self._problem.target, strict=True)
         return [dot(entries, acceleration) - target for entries, target in rows]
