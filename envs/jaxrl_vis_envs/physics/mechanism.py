@@ -140,7 +140,7 @@ def _has_simple_contacts(model: mjx.Model) -> bool:
         return False
     for one, other, index in pairs:
         is_capsules = model.geom_type[one] == model.geom_type[other] == mujoco.mjtGeom.mjGEOM_CAPSULE
-        moves = any(model.body_weldid[model.geom_bodyid[geom]] != 0 for geom in (one, other))
+        moves = model.body_weldid[model.geom_bodyid[one]] != model.body_weldid[model.geom_bodyid[other]]
         if (
             index < 0
             or not is_capsules
