@@ -106,6 +106,12 @@ def columns(array) -> list[np.ndarray]:
     return list(np.asarray(array, np.float32).T)
 
 
+def open_loop_of_numpy(condition, body, state):
+    while condition(state):
+        state = body(state)
+    return state
+
+
 def branch_of_numpy(condition, one, other):
     return one() if condition else other()
 
@@ -117,8 +123,9 @@ def taken(model: mjx.Model, data: mjx.Data, count: int, in_kernel: bool) -> step
     with pytest.MonkeyPatch.context() as patch, np.errstate(over="ignore"):
         for module in (algebra, capsules, cones, descent, folding, reference, steps):
             patch.setattr(module, "jnp", Float32Numpy())
+        lax = SimpleNamespace(fori_loop=loop_of_numpy, while_loop=open_loop_of_numpy, cond=branch_of_numpy)
         for module in (descent, steps):
-            patch.setattr(module, "jax", SimpleNamespace(lax=SimpleNamespace(fori_loop=loop_of_numpy, cond=branch_of_numpy)))
+            patch.setattr(module, "jax", SimpleNamespace(lax=lax))
         state = steps.take(constants, state, control, applied, count, True, in_kernel)
     return steps.State(*(np.stack(part, axis=1) for part in state))
 

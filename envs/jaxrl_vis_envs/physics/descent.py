@@ -340,7 +340,7 @@ class _Descent:
             return slope, curvature
 
         if not self._structure.corners:
-            return lowest(slope_at, [], first, _FEW_LINE_SEARCH_STEPS)
+            return lowest(slope_at, [], first, _FEW_LINE_SEARCH_STEPS, self._in_kernel)
         corners: Numbers = []
         for row in self._alone[self._structure.equalities :]:
             x, v, most = place.residual[row], along[row], self._most(row)
@@ -348,10 +348,16 @@ class _Descent:
             corners += [ratio(end - x, v) for end in ends]
         for index in range(len(self._structure.cones)):
             corners += self._cone(index, place.residual).corners([along[row] for row in self._cone_rows(index)])
-        return lowest(slope_at, corners, first)
+        return lowest(slope_at, corners, first, in_kernel=self._in_kernel)
 
 
-def lowest(slope_at: Callable[[Any], tuple[Any, Any]], corners: Numbers, like: Any, steps: int = LINE_SEARCH_STEPS) -> Any:
+def lowest(
+    slope_at: Callable[[Any], tuple[Any, Any]],
+    corners: Numbers,
+    like: Any,
+    steps: int = LINE_SEARCH_STEPS,
+    in_kernel: bool = False,
+) -> Any:
     """Where a convex cost along a line is least, after a few steps that narrow the range where that can be.
 
     A step goes to where Newton's method leads; where that is out of the range, or no less far than half of the step before, to
@@ -362,7 +368,8 @@ def lowest(slope_at: Callable[[Any], tuple[Any, Any]], corners: Numbers, like: A
         slope_at: The cost's slope, not positive at 0, and its curvature, at a length.
         corners: Lengths at which the curvature jumps.
         like: A number of the batch.
-        steps: How many.
+        steps: How many at most.
+        in_kernel: Whether steps end where they move nothing, which in a program for many episodes is a loop of unknown length.
     """
 
     def narrow(_: Any, state: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -385,5 +392,15 @@ def lowest(slope_at: Callable[[Any], tuple[Any, Any]], corners: Numbers, like: A
     start = 0.0 * like
     endless = start + _ENDLESS
     state = (start, endless, start, -endless, endless, endless)
-    _, _, low, low_slope, high, high_slope = jax.lax.fori_loop(0, steps, narrow, state)
+    if in_kernel:
+        # No further than until all episodes of the warp are there.
+        def goes_on(counted: tuple[Any, ...]) -> Any:
+            step, length, change, *_ = counted
+            return (step < steps) & (jnp.max(jnp.where(change > _ROUNDING * jnp.abs(length), 1, 0)) > 0)
+
+        counted = jax.lax.while_loop(goes_on, lambda counted: (counted[0] + 1, *narrow(0, counted[1:])), (0, *state))
+        state = counted[1:]
+    else:
+        state = jax.lax.fori_loop(0, steps, narrow, state)
+    _, _, low, low_slope, high, high_slope = state
     return jnp.where(high_slope < -low_slope, high, low)
