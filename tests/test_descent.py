@@ -141,7 +141,7 @@ def lowest_over_parabolas(residual, along, stiffness, first, second, in_kernel):
         acting = jnp.where(there < 0, stiffness, 0.0) * along
         return first + second * length + acting @ there, second + acting @ along
 
-    return descent.lowest(slope_at, list(-residual / along), jnp.float32(1.0), in_kernel=in_kernel)
+    return descent.lowest(slope_at, list(-residual / along), jnp.float32(1.0), matters=jnp.bool_(True) if in_kernel else None)
 
 
 @pytest.mark.parametrize("in_kernel", [False, True])

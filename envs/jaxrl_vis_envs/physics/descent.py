@@ -31,6 +31,7 @@ LINE_SEARCH_STEPS = 10
 _FEW_LINE_SEARCH_STEPS = 7
 """The same where no corners are looked at: after these, steps of the hand are at the lowest point but for rounding errors."""
 _ROUNDING = 1.2e-7  # of float32
+_STILL = 1e-5  # a change of a step's length, relative to it, that changes nothing
 _ENDLESS = 1e30
 
 
@@ -222,8 +223,9 @@ class _Descent:
         is_last = step == self._structure.iterations if self._structure.exact else False
 
         def search() -> Any:
-            length = self._line_search(here, direction)
-            return jnp.where(gain > _ROUNDING * work, length, jnp.minimum(length, 1.0))
+            tells = gain > _ROUNDING * work
+            length = self._line_search(here, direction, tells)
+            return jnp.where(tells, length, jnp.minimum(length, 1.0))
 
         if not self._structure.exact:
             length = search()
@@ -309,8 +311,9 @@ class _Descent:
         ]
         return [-part for part in solve_positive(matrix, place.gradient, added)]
 
-    def _line_search(self, place: _Place, direction: Numbers) -> Any:
-        """The length of the step along ``direction`` for which the cost is least."""
+    def _line_search(self, place: _Place, direction: Numbers, tells: Any) -> Any:
+        """The length of the step along ``direction`` for which the cost is least, where the line ``tells`` it."""
+        matters = tells if self._in_kernel else None
         problem = self._problem
         along = [dot(entries, direction) for entries in problem.jacobian]
         pulling = {row: problem.stiffness[row] * along[row] for row in self._alone if self._most(row) is None}
@@ -340,7 +343,7 @@ class _Descent:
             return slope, curvature
 
         if not self._structure.corners:
-            return lowest(slope_at, [], first, _FEW_LINE_SEARCH_STEPS, self._in_kernel)
+            return lowest(slope_at, [], first, _FEW_LINE_SEARCH_STEPS, matters)
         corners: Numbers = []
         for row in self._alone[self._structure.equalities :]:
             x, v, most = place.residual[row], along[row], self._most(row)
@@ -348,7 +351,7 @@ class _Descent:
             corners += [ratio(end - x, v) for end in ends]
         for index in range(len(self._structure.cones)):
             corners += self._cone(index, place.residual).corners([along[row] for row in self._cone_rows(index)])
-        return lowest(slope_at, corners, first, in_kernel=self._in_kernel)
+        return lowest(slope_at, corners, first, matters=matters)
 
 
 def lowest(
@@ -356,7 +359,7 @@ def lowest(
     corners: Numbers,
     like: Any,
     steps: int = LINE_SEARCH_STEPS,
-    in_kernel: bool = False,
+    matters: Any = None,
 ) -> Any:
     """Where a convex cost along a line is least, after a few steps that narrow the range where that can be.
 
@@ -369,7 +372,7 @@ def lowest(
         corners: Lengths at which the curvature jumps.
         like: A number of the batch.
         steps: How many at most.
-        in_kernel: Whether steps end where they move nothing, which in a program for many episodes is a loop of unknown length.
+        matters: In a kernel, for which episodes: steps end, after two of them, where they move none of these any more.
     """
 
     def narrow(_: Any, state: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -392,11 +395,12 @@ def lowest(
     start = 0.0 * like
     endless = start + _ENDLESS
     state = (start, endless, start, -endless, endless, endless)
-    if in_kernel:
+    if matters is not None:
         # No further than until all episodes of the warp are there.
         def goes_on(counted: tuple[Any, ...]) -> Any:
             step, length, change, *_ = counted
-            return (step < steps) & (jnp.max(jnp.where(change > _ROUNDING * jnp.abs(length), 1, 0)) > 0)
+            moves = matters & (change > _STILL * jnp.abs(length))
+            return (step < steps) & ((step < 2) | (jnp.max(jnp.where(moves, 1, 0)) > 0))
 
         counted = jax.lax.while_loop(goes_on, lambda counted: (counted[0] + 1, *narrow(0, counted[1:])), (0, *state))
         state = counted[1:]
