@@ -134,17 +134,18 @@ def test_dry_friction_is_not_jumped_over():
     assert float(descent.lowest(slope_at, corners, jnp.float32(1.0))) == pytest.approx(0.3, abs=1e-5)
 
 
-@jax.jit
-def lowest_over_parabolas(residual, along, stiffness, first, second):
+@functools.partial(jax.jit, static_argnums=5)
+def lowest_over_parabolas(residual, along, stiffness, first, second, in_kernel):
     def slope_at(length):
         there = residual + length * along
         acting = jnp.where(there < 0, stiffness, 0.0) * along
         return first + second * length + acting @ there, second + acting @ along
 
-    return descent.lowest(slope_at, list(-residual / along), jnp.float32(1.0))
+    return descent.lowest(slope_at, list(-residual / along), jnp.float32(1.0), matters=jnp.bool_(True) if in_kernel else None)
 
 
-def test_the_line_search_finds_the_least_cost():
+@pytest.mark.parametrize("in_kernel", [False, True])
+def test_the_line_search_finds_the_least_cost(in_kernel):
     """Over parabolas of 1 to 12 constraints that start or end along the line."""
     rng = np.random.default_rng(1)
     lengths = np.linspace(0, 40, 400_001)
@@ -153,7 +154,7 @@ def test_the_line_search_finds_the_least_cost():
         second = rng.uniform(0.1, 1)
         first = -abs(rng.normal()) - max(np.where(residual < 0, stiffness, 0) @ (residual * along), 0.0)  # downhill
 
-        found = lowest_over_parabolas(*(np.float32(each) for each in (residual, along, stiffness, first, second)))
+        found = lowest_over_parabolas(*(np.float32(each) for each in (residual, along, stiffness, first, second)), in_kernel)
         there = residual[:, None] + along[:, None] * lengths
         costs = first * lengths + 0.5 * second * lengths**2
         costs += 0.5 * (np.where(there < 0, stiffness[:, None], 0) * there**2).sum(axis=0)

@@ -5,7 +5,7 @@ Positive definite matrices are factorized from the last row on, which keeps the 
 identity).
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -98,7 +98,7 @@ def ratio(above: Any, below: Any) -> Any:
     return above / jnp.where(below == 0, TINY, below)
 
 
-def dot(row: dict[int, Any], column: Numbers) -> Any:
+def dot(row: dict[int, Any], column: Sequence[Any]) -> Any:
     """A row (joint -> number) times a column."""
     return total(entry * column[joint] for joint, entry in row.items())
 

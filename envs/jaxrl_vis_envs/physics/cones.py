@@ -31,8 +31,8 @@ class Cone(NamedTuple):
     stiffness: Any
     is_stuck: Any
 
-    def derivatives(self) -> tuple[Matrix, Numbers]:
-        """The cost's second derivatives by the rows' residuals, and the forces; both 0 where all rows are stuck or free."""
+    def curvature(self) -> Matrix:
+        """The cost's second derivatives by the rows' residuals; 0 where all rows are stuck or free."""
         friction, safe = self.friction, jnp.maximum(self.tangent, TINY)
         gap = self.normal - friction * self.tangent
         units = [part / safe for part in self.scaled[1:]]
@@ -49,10 +49,14 @@ class Cone(NamedTuple):
                 turn = (1.0 if row == column else 0.0) - units[row - 1] * units[column - 1]
                 value = friction * friction * units[row - 1] * units[column - 1] - bend * turn
                 matrix[row, column] = outer * self.scales[column] * value
-        pull = self.stiffness * gap
-        forces = [-pull * self.scales[0]]
-        forces += [pull * friction * unit * scale for unit, scale in zip(units, self.scales[1:], strict=True)]
-        return matrix, forces
+        return matrix
+
+    def forces(self) -> Numbers:
+        """Of the rows; 0 where all are stuck or free."""
+        pull = self.stiffness * (self.normal - self.friction * self.tangent)
+        safe = jnp.maximum(self.tangent, TINY)
+        across = zip(self.scaled[1:], self.scales[1:], strict=True)
+        return [-pull * self.scales[0], *(pull * self.friction * (part / safe) * scale for part, scale in across)]
 
     def along(self, direction: Numbers) -> tuple[Any, Any]:
         """The cost's slope and curvature along a direction of the rows' residuals, where they are not stuck."""

@@ -6,7 +6,7 @@ matrices takes a library hundreds. Zeros that the structure of the model brings 
 Source: the primal problem of MuJoCo's documentation, "Computation", constraint model; Newton's method as there.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -28,7 +28,10 @@ from jaxrl_vis_envs.physics.cones import Cone, cone_at
 
 LINE_SEARCH_STEPS = 10
 """Points of the line at which a slope is computed."""
+_FEW_LINE_SEARCH_STEPS = 7
+"""The same where no corners are looked at: after these, steps of the hand are at the lowest point but for rounding errors."""
 _ROUNDING = 1.2e-7  # of float32
+_STILL = 1e-5  # a change of a step's length, relative to it, that changes nothing
 _ENDLESS = 1e30
 
 
@@ -46,6 +49,7 @@ class Structure(NamedTuple):
         iterations: Newton steps.
         warm: Whether the last accelerations may be the first guess.
         exact: Whether one more Newton step is taken whole where it makes the gradient smaller.
+        corners: Whether line searches that do not converge go on from the places where the slope bends, as dry friction needs.
     """
 
     joints: int
@@ -58,6 +62,7 @@ class Structure(NamedTuple):
     iterations: int
     warm: bool
     exact: bool
+    corners: bool = True
 
 
 class Problem(NamedTuple):
@@ -119,9 +124,16 @@ def numbers_of(structure: Structure, read: Callable[..., Any]) -> Problem:
     )
 
 
-def solve(structure: Structure, problem: Problem) -> Motion:
-    """The motion under a problem's constraints, all in numbers."""
-    descent = _Descent(structure, problem)
+def solve(structure: Structure, problem: Problem, in_kernel: bool = False) -> Motion:
+    """The motion under a problem's constraints, all in numbers.
+
+    Args:
+        structure: Of the problem.
+        problem: Its numbers.
+        in_kernel: Whether a loop carries numbers for nothing, so that none is computed twice, and whether a branch costs less
+            than what is in it, so that no line is searched for the step that is taken whole. On a CPU neither is so.
+    """
+    descent = _Descent(structure, problem, in_kernel)
     free = solve_positive(problem.mass, problem.force)
     damped_mass = dict(problem.mass)
     for joint, damping in enumerate(problem.damping):
@@ -129,31 +141,39 @@ def solve(structure: Structure, problem: Problem) -> Motion:
     if not structure.rows:
         nothing = [0.0 * number for number in free]
         return Motion(free, free, nothing, solve_positive(damped_mass, problem.force))
-    acceleration = free
+    acceleration, residual = free, descent.residual(free)
     if structure.warm:
-        is_better = descent.cost(problem.warm, free) < descent.cost(free, free)
+        warm_residual = descent.residual(problem.warm)
+        is_better = descent.cost(problem.warm, warm_residual, free) < descent.cost(free, residual, free)
         acceleration = [jnp.where(is_better, *pair) for pair in zip(problem.warm, free, strict=True)]
+        residual = [jnp.where(is_better, *pair) for pair in zip(warm_residual, residual, strict=True)]
     steps = structure.iterations + structure.exact
-    acceleration = list(jax.lax.fori_loop(0, steps, descent.improve, tuple(acceleration)))
-    force = descent.at(acceleration).force
-    forces = [one + other for one, other in zip(problem.force, force, strict=True)]
-    return Motion(free, acceleration, force, solve_positive(damped_mass, forces))
+    if in_kernel:
+        place = jax.lax.fori_loop(0, steps, descent.improve, descent.at(acceleration, residual))
+    else:
+
+        def improve(step: Any, acceleration: tuple[Any, ...]) -> tuple[Any, ...]:
+            here = descent.at(list(acceleration), descent.residual(acceleration))
+            return tuple(descent.improve(step, here).acceleration)
+
+        acceleration = list(jax.lax.fori_loop(0, steps, improve, tuple(acceleration)))
+        place = descent.at(acceleration, descent.residual(acceleration))
+    forces = [one + other for one, other in zip(problem.force, place.force, strict=True)]
+    return Motion(free, place.acceleration, place.force, solve_positive(damped_mass, forces))
 
 
 class _Place(NamedTuple):
-    """The cost's derivatives at some accelerations.
+    """Some accelerations, and what comes of them.
 
     Attributes:
+        acceleration: Of the joints.
         residual: By how much each row differs from its target.
-        stiffness: Of each row that acts by itself, 0 of others.
-        cones: For each cone, the places of its second derivatives by the residuals of its rows, below the diagonal too.
         force: Of the constraints on the joints.
         gradient: Of the cost.
     """
 
+    acceleration: Numbers
     residual: Numbers
-    stiffness: Numbers
-    cones: list[Matrix]
     force: Numbers
     gradient: Numbers
 
@@ -161,18 +181,24 @@ class _Place(NamedTuple):
 class _Descent:
     """The cost of a problem, and steps down from it."""
 
-    def __init__(self, structure: Structure, problem: Problem) -> None:
-        self._structure, self._problem = structure, problem
+    def __init__(self, structure: Structure, problem: Problem, in_kernel: bool) -> None:
+        self._structure, self._problem, self._in_kernel = structure, problem, in_kernel
         in_cones = {row for first, size in structure.cones for row in range(first, first + size)}
         self._alone = [row for row in range(len(structure.rows)) if row not in in_cones]
 
-    def cost(self, acceleration: Numbers, free: Numbers) -> Any:
+    def residual(self, acceleration: Sequence[Any]) -> Numbers:
+        """By how much each row differs from its target."""
+        rows = zip(self._problem.jacobian, self._problem.target, strict=True)
+        return [dot(entries, acceleration) - target for entries, target in rows]
+
+    def cost(self, acceleration: Numbers, residual: Numbers, free: Numbers) -> Any:
         """The cost, up to a constant."""
         problem = self._problem
-        inertial = product(problem.mass, acceleration)
-        pairs = zip(inertial, problem.force, acceleration, free, strict=True)
-        cost = 0.5 * total((inertia - force) * (there - start) for inertia, force, there, start in pairs)
-        residual = self._residual(acceleration)
+        cost: Any = 0.0
+        if acceleration is not free:
+            inertial = product(problem.mass, acceleration)
+            pairs = zip(inertial, problem.force, acceleration, free, strict=True)
+            cost = 0.5 * total((inertia - force) * (there - start) for inertia, force, there, start in pairs)
         for row in self._alone:
             x, most, stiffness = residual[row], self._most(row), problem.stiffness[row]
             if most is None:
@@ -187,63 +213,56 @@ class _Descent:
             cost = cost + 0.5 * jnp.where(cone.is_stuck, stuck, cone.stiffness * gap * gap)
         return cost
 
-    def improve(self, step: Any, acceleration: tuple[Any, ...]) -> tuple[Any, ...]:
+    def improve(self, step: Any, here: _Place) -> _Place:
         """One Newton step: as long as the cost is least along it, and the last one, if exact, whole or not at all."""
-        here = self.at(list(acceleration))
         direction = self._direction(here)
         # A line tells nothing where what there is to gain is less than rounding errors: then no further than Newton's own step.
         gain = -inner(here.gradient, direction)
-        forces = zip(self._problem.force, here.force, acceleration, strict=True)
+        forces = zip(self._problem.force, here.force, here.acceleration, strict=True)
         work = total((jnp.abs(free) + jnp.abs(pull)) * jnp.abs(there) for free, pull, there in forces)
-        length = self._line_search(here, direction)
-        length = jnp.where(gain > _ROUNDING * work, length, jnp.minimum(length, 1.0))
+        is_last = step == self._structure.iterations if self._structure.exact else False
+
+        def search() -> Any:
+            tells = gain > _ROUNDING * work
+            length = self._line_search(here, direction, tells)
+            return jnp.where(tells, length, jnp.minimum(length, 1.0))
+
+        if not self._structure.exact:
+            length = search()
+        elif self._in_kernel:
+            length = jax.lax.cond(is_last, lambda: 0.0 * gain + 1.0, search)
+        else:
+            length = jnp.where(is_last, 1.0, search())
+        moved = [start + length * part for start, part in zip(here.acceleration, direction, strict=True)]
+        there = self.at(moved, self.residual(moved))
         if self._structure.exact:
-            is_last = step == self._structure.iterations
-            length = jnp.where(is_last, 1.0, length)
-        moved = [start + length * part for start, part in zip(acceleration, direction, strict=True)]
-        if self._structure.exact:
-            there = self.at(moved)
             is_better = total(part * part for part in there.gradient) < total(part * part for part in here.gradient)
             is_better = is_better | jnp.logical_not(is_last)
-            moved = [jnp.where(is_better, *pair) for pair in zip(moved, acceleration, strict=True)]
-        return tuple(moved)
+            pairs = zip(there, here, strict=True)
+            there = _Place(*([jnp.where(is_better, *pair) for pair in zip(*numbers, strict=True)] for numbers in pairs))
+        return there
 
-    def at(self, acceleration: Numbers) -> _Place:
-        """Forces and derivatives at some accelerations."""
+    def at(self, acceleration: Numbers, residual: Numbers) -> _Place:
+        """Forces and gradient at some accelerations."""
         problem = self._problem
-        residual = self._residual(acceleration)
-        stiffness: Numbers = [0.0] * len(residual)
         pull: Numbers = [0.0] * len(residual)
-        cones: list[Matrix] = []
         for row in self._alone:
-            x, most = residual[row], self._most(row)
+            x, most, stiffness = residual[row], self._most(row), problem.stiffness[row]
             if most is None:
-                stiffness[row] = self._acting(row, x)
-                pull[row] = -stiffness[row] * x
+                pull[row] = -self._acting(row, x) * x
             else:
-                slides = self._slides(row, x)
-                stiffness[row] = jnp.where(slides, 0.0, problem.stiffness[row])
-                pull[row] = jnp.where(slides, jnp.where(x < 0, most, -most), -problem.stiffness[row] * x)
-        for index, (first, _) in enumerate(self._structure.cones):
+                pull[row] = jnp.where(self._slides(row, x), jnp.where(x < 0, most, -most), -stiffness * x)
+        for index in range(len(self._structure.cones)):
             cone = self._cone(index, residual)
-            for row in self._cone_rows(index):
-                stiffness[row] = jnp.where(cone.is_stuck, problem.stiffness[row], 0.0)
-                pull[row] = -stiffness[row] * residual[row]
-            matrix, forces = cone.derivatives()
-            cones.append(matrix)
-            for part, force in enumerate(forces):
-                pull[first + part] = pull[first + part] + force
+            for row, force in zip(self._cone_rows(index), cone.forces(), strict=True):
+                pull[row] = force - jnp.where(cone.is_stuck, problem.stiffness[row], 0.0) * residual[row]
         force: Numbers = [0.0] * self._structure.joints
         for row, entries in enumerate(problem.jacobian):
             for joint, entry in entries.items():
                 force[joint] = force[joint] + entry * pull[row]
         inertial = product(problem.mass, acceleration)
         gradient = [left - right - pulled for left, right, pulled in zip(inertial, problem.force, force, strict=True)]
-        return _Place(residual, stiffness, cones, force, gradient)
-
-    def _residual(self, acceleration: Numbers) -> Numbers:
-        rows = zip(self._problem.jacobian, self._problem.target, strict=True)
-        return [dot(entries, acceleration) - target for entries, target in rows]
+        return _Place(acceleration, residual, force, gradient)
 
     def _most(self, row: int) -> Any:
         """The greatest force of a row of dry friction; None for other rows."""
@@ -253,6 +272,12 @@ class _Descent:
         """A row's stiffness where it acts, 0 elsewhere."""
         stiffness = self._problem.stiffness[row]
         return stiffness if row < self._structure.equalities else jnp.where(residual < 0, stiffness, 0.0)
+
+    def _curvature(self, row: int, residual: Any) -> Any:
+        """The cost's second derivative by the residual of a row that acts by itself."""
+        if self._most(row) is None:
+            return self._acting(row, residual)
+        return jnp.where(self._slides(row, residual), 0.0, self._problem.stiffness[row])
 
     def _slides(self, row: int, residual: Any) -> Any:
         """Whether dry friction is at its greatest; as in MJX, a greatest friction of 0 holds for ever."""
@@ -271,24 +296,27 @@ class _Descent:
         """Newton's direction: downhill, as far as the cost's lowest point if nothing started or ended on the way."""
         problem, apart = self._problem, self._structure.apart
         matrix: Matrix = dict(problem.mass)
+        stiffness = {row: self._curvature(row, place.residual[row]) for row in self._alone}
         for row in self._alone:
             if row not in apart:
-                add_square(matrix, problem.jacobian[row], place.stiffness[row])
-        for index, second in enumerate(place.cones):
-            rows = self._cone_rows(index)
-            for (left, right), value in second.items():
-                stuck = place.stiffness[rows[left]] if left == right else 0.0
+                add_square(matrix, problem.jacobian[row], stiffness[row])
+        for index in range(len(self._structure.cones)):
+            cone, rows = self._cone(index, place.residual), self._cone_rows(index)
+            for (left, right), value in cone.curvature().items():
+                stuck = jnp.where(cone.is_stuck, problem.stiffness[rows[left]], 0.0) if left == right else 0.0
                 add_product(matrix, problem.jacobian[rows[left]], problem.jacobian[rows[right]], value + stuck)
-        roots = [jnp.sqrt(place.stiffness[row]) for row in apart]
+        roots = [jnp.sqrt(stiffness[row]) for row in apart]
         added = [
             {j: entry * root for j, entry in problem.jacobian[row].items()} for row, root in zip(apart, roots, strict=True)
         ]
         return [-part for part in solve_positive(matrix, place.gradient, added)]
 
-    def _line_search(self, place: _Place, direction: Numbers) -> Any:
-        """The length of the step along ``direction`` for which the cost is least."""
+    def _line_search(self, place: _Place, direction: Numbers, tells: Any) -> Any:
+        """The length of the step along ``direction`` for which the cost is least, where the line ``tells`` it."""
+        matters = tells if self._in_kernel else None
         problem = self._problem
         along = [dot(entries, direction) for entries in problem.jacobian]
+        pulling = {row: problem.stiffness[row] * along[row] for row in self._alone if self._most(row) is None}
         # The inertial part of the slope at the start is the gradient's less the constraints'.
         first = total((g + f) * d for g, f, d in zip(place.gradient, place.force, direction, strict=True))
         second = total(m * d for m, d in zip(product(problem.mass, direction), direction, strict=True))
@@ -299,7 +327,7 @@ class _Descent:
             for row in self._alone:
                 x, v, most, stiffness = there[row], along[row], self._most(row), problem.stiffness[row]
                 if most is None:
-                    acting = self._acting(row, x) * v
+                    acting = pulling[row] if row < self._structure.equalities else jnp.where(x < 0, pulling[row], 0.0)
                     slope, curvature = slope + acting * x, curvature + acting * v
                 else:
                     slides = self._slides(row, x)
@@ -314,6 +342,8 @@ class _Descent:
                 curvature = curvature + jnp.where(cone.is_stuck, stuck_curvature, cone_curvature)
             return slope, curvature
 
+        if not self._structure.corners:
+            return lowest(slope_at, [], first, _FEW_LINE_SEARCH_STEPS, matters)
         corners: Numbers = []
         for row in self._alone[self._structure.equalities :]:
             x, v, most = place.residual[row], along[row], self._most(row)
@@ -321,20 +351,28 @@ class _Descent:
             corners += [ratio(end - x, v) for end in ends]
         for index in range(len(self._structure.cones)):
             corners += self._cone(index, place.residual).corners([along[row] for row in self._cone_rows(index)])
-        return lowest(slope_at, corners, first)
+        return lowest(slope_at, corners, first, matters=matters)
 
 
-def lowest(slope_at: Callable[[Any], tuple[Any, Any]], corners: Numbers, like: Any) -> Any:
+def lowest(
+    slope_at: Callable[[Any], tuple[Any, Any]],
+    corners: Numbers,
+    like: Any,
+    steps: int = LINE_SEARCH_STEPS,
+    matters: Any = None,
+) -> Any:
     """Where a convex cost along a line is least, after a few steps that narrow the range where that can be.
 
     A step goes to where Newton's method leads; where that is out of the range, or no less far than half of the step before, to
-    the corner next to the middle of the range. Without these, a slope that turns within a short stretch between two flat ones,
-    as that of dry friction does, is jumped over for ever.
+    the corner next to the middle of the range, or to the middle if there are no corners. Without these, a slope that turns
+    within a short stretch between two flat ones, as that of dry friction does, is jumped over for ever.
 
     Args:
         slope_at: The cost's slope, not positive at 0, and its curvature, at a length.
         corners: Lengths at which the curvature jumps.
         like: A number of the batch.
+        steps: How many at most.
+        matters: In a kernel, for which episodes: steps end, after two of them, where they move none of these any more.
     """
 
     def narrow(_: Any, state: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -348,13 +386,25 @@ def lowest(slope_at: Callable[[Any], tuple[Any, Any]], corners: Numbers, like: A
         converges = (onward > low) & (onward < high) & (jnp.abs(step) < 0.5 * before) | (high == _ENDLESS) | (step == 0)
         nearest, distance = middle, 0.499 * (high - low)  # not the corner that is an end of the range, but for rounding
         for corner in corners:
-            is_nearer = jnp.abs(corner - middle) < distance
-            nearest, distance = jnp.where(is_nearer, corner, nearest), jnp.where(is_nearer, jnp.abs(corner - middle), distance)
+            away = jnp.abs(corner - middle)
+            is_nearer = away < distance
+            nearest, distance = jnp.where(is_nearer, corner, nearest), jnp.where(is_nearer, away, distance)
         there = jnp.where(converges, onward, nearest)
         return there, jnp.abs(there - length), low, low_slope, high, high_slope
 
     start = 0.0 * like
     endless = start + _ENDLESS
     state = (start, endless, start, -endless, endless, endless)
-    _, _, low, low_slope, high, high_slope = jax.lax.fori_loop(0, LINE_SEARCH_STEPS, narrow, state)
+    if matters is not None:
+        # No further than until all episodes of the warp are there.
+        def goes_on(counted: tuple[Any, ...]) -> Any:
+            step, length, change, *_ = counted
+            moves = matters & (change > _STILL * jnp.abs(length))
+            return (step < steps) & ((step < 2) | (jnp.max(jnp.where(moves, 1, 0)) > 0))
+
+        counted = jax.lax.while_loop(goes_on, lambda counted: (counted[0] + 1, *narrow(0, counted[1:])), (0, *state))
+        state = counted[1:]
+    else:
+        state = jax.lax.fori_loop(0, steps, narrow, state)
+    _, _, low, low_slope, high, high_slope = state
     return jnp.where(high_slope < -low_slope, high, low)

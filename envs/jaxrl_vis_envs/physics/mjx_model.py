@@ -12,8 +12,10 @@ import numpy as np
 from mujoco import mjx
 from mujoco.mjx._src import math, sensor, smooth
 
-from jaxrl_vis_envs.physics import constraints
+from jaxrl_vis_envs.compilation import by_platform, runs_gpu_kernels
+from jaxrl_vis_envs.physics import constraints, mechanism, steps_kernel
 from jaxrl_vis_envs.physics.kinematics import kinematics
+from jaxrl_vis_envs.physics.steps import State
 
 __all__ = [
     "kinematics",
@@ -67,13 +69,45 @@ def simulate(model: mjx.Model, data: mjx.Data, substeps: int, exact: bool = Fals
 
 
 def take_steps(model: mjx.Model, data: mjx.Data, count: int, exact: bool = False) -> mjx.Data:
-    """``count`` physics steps (`step`); poses and true states are then one step old."""
+    """``count`` physics steps (`step`); poses and true states are then older than ``qpos``.
 
+    On a GPU that runs kernels, models that `mechanism` takes have them all in one (`steps_kernel`). Contacts between capsules
+    are then exact in any case, and if more pairs touch than ``max_contact_points``, all of them count. Nothing but positions,
+    velocities, accelerations, time and the constraints' forces is new afterwards. Forces on bodies (``xfrc_applied``) are not
+    heeded: with any, positions are not a number.
+    """
+    if not mechanism.takes(model):
+        return _one_by_one(model, data, count, exact)
+
+    def by_kernel_or_not(data: mjx.Data) -> mjx.Data:
+        if runs_gpu_kernels(steps_kernel.probe):
+            return _in_one_kernel(model, data, count, exact)
+        return _one_by_one(model, data, count, exact)
+
+    return by_platform(by_kernel_or_not, data)
+
+
+def _one_by_one(model: mjx.Model, data: mjx.Data, count: int, exact: bool) -> mjx.Data:
     def substep(data: mjx.Data, _: Any) -> tuple[mjx.Data, None]:
         return step(model, data, exact), None
 
     with _full_precision():
         return jax.lax.scan(substep, data, length=count)[0]
+
+
+def _in_one_kernel(model: mjx.Model, data: mjx.Data, count: int, exact: bool, interpret: bool = False) -> mjx.Data:
+    constants = mechanism.mechanism_of(model)
+    state = State(data.qpos, data.qvel, data.qacc_warmstart, data.qfrc_constraint)
+    state = steps_kernel.take(constants, state, data.ctrl, data.qfrc_applied, count, exact, interpret)
+    is_pushed = jnp.any(data.xfrc_applied != 0)
+    return data.replace(
+        qpos=jnp.where(is_pushed, jnp.nan, state.position),
+        qvel=state.velocity,
+        qacc=state.acceleration,
+        qacc_warmstart=state.acceleration,
+        qfrc_constraint=state.force,
+        time=data.time + count * model.opt.timestep,
+    )
 
 
 def _full_precision() -> Any:

@@ -88,7 +88,8 @@ def _kernel(problems: Any, motions: Any, done: Any, *, structure: Structure, int
     rows = [problems[row, own] for row in range(problems.shape[0])] if interpret else lanes.read_rows(problems)
     every_place = [(name, place) for name, places in _places(structure).items() for place in places]
     numbers = dict(zip(every_place, rows, strict=True))
-    motion = descent.solve(structure, descent.numbers_of(structure, lambda name, *place: numbers[name, place]))
+    problem = descent.numbers_of(structure, lambda name, *place: numbers[name, place])
+    motion = descent.solve(structure, problem, in_kernel=True)
     results = [jnp.broadcast_to(jnp.asarray(number, jnp.float32), (lanes.LANES,)) for part in motion for number in part]
     if interpret:
         for row, result in enumerate(results):

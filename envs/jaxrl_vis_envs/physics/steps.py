@@ -1,0 +1,253 @@
+"""Physics steps number by number: from positions, velocities and controls to those after a step, all in one program.
+
+As matrices, a step is a hundred operations of which each takes a GPU longer to start than to run; as numbers, all of them fit
+into one kernel (`steps_kernel`). Of the model everything is a constant (`mechanism`).
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxrl_vis_envs.physics import capsules, descent, dynamics, mechanism
+from jaxrl_vis_envs.physics.algebra import Matrix, Numbers
+from jaxrl_vis_envs.physics.descent import Problem, Structure
+from jaxrl_vis_envs.physics.folding import minus, plus, times
+from jaxrl_vis_envs.physics.mechanism import Contact, Limit, Mechanism
+
+
+class State(NamedTuple):
+    """What a step begins and ends with: numbers for each joint, or arrays of them.
+
+    Attributes:
+        position: rad or m.
+        velocity: rad/s or m/s.
+        acceleration: Of the last step, where the constraint solver may start from, rad/s^2 or m/s^2.
+        force: Of the constraints on the joints in the last step, N m or N.
+    """
+
+    position: Any
+    velocity: Any
+    acceleration: Any
+    force: Any
+
+
+class _Row(NamedTuple):
+    """One constraint: see `descent.Problem`. ``most`` is that of dry friction."""
+
+    entries: dict[int, Any]
+    stiffness: Any
+    target: Any
+    most: Any = None
+
+
+def take(
+    constants: Mechanism,
+    state: State,
+    control: Numbers,
+    applied: Numbers,
+    count: int,
+    exact: bool,
+    in_kernel: bool = False,
+) -> State:
+    """``count`` physics steps, with the same controls.
+
+    Args:
+        constants: Of the model.
+        state: Before them.
+        control: One number for each actuator.
+        applied: Further forces on the joints, N m or N.
+        count: How many.
+        exact: Whether forces are as exact as float32 allows (see `mjx_model.step`); contacts always are.
+        in_kernel: See `descent.solve`.
+
+    Returns:
+        The state after them.
+    """
+    ends = [actuator.control_ends for actuator in constants.actuators]
+    control = [_clipped(number, pair) for number, pair in zip(control, ends, strict=True)]
+
+    def advance(_: Any, state: State) -> State:
+        return _step(constants, state, control, applied, exact, in_kernel)
+
+    return jax.lax.fori_loop(0, count, advance, state)
+
+
+def _step(
+    constants: Mechanism, state: State, control: Numbers, applied: Numbers, exact: bool, in_kernel: bool = False
+) -> State:
+    structure, problem, order = problem_of(constants, state, control, applied, exact)
+    motion = descent.solve(structure, problem, in_kernel)
+    place = {joint: index for index, joint in enumerate(order)}
+    damped, acceleration, force = (
+        [part[place[joint]] for joint in range(len(order))] for part in (motion.damped, motion.acceleration, motion.force)
+    )
+    timestep = constants.timestep
+    velocity = [rate + timestep * change for rate, change in zip(state.velocity, damped, strict=True)]
+    position = [there + timestep * rate for there, rate in zip(state.position, velocity, strict=True)]
+    return State(position, velocity, acceleration, force)
+
+
+def problem_of(
+    constants: Mechanism, state: State, control: Numbers, applied: Numbers, exact: bool
+) -> tuple[Structure, Problem, list[int]]:
+    """The constraint problem of one step.
+
+    Its joints come in an order of their own, so that its matrices fill in little as they are factorized from the last row on:
+    of each place in this order, the joint that stands there comes with it.
+    """
+    displacement = [minus(there, rest) for there, rest in zip(state.position, constants.rest, strict=True)]
+    joints = dynamics.joints_at(constants.links, displacement)
+    mass = dynamics.mass_matrix(constants.links, joints)
+    for joint, armature in enumerate(constants.armature):
+        mass[joint, joint] = plus(mass[joint, joint], armature)
+    for shares, armature in constants.tendon_masses:
+        _add_tendon(mass, shares, armature)
+    rows = [_friction_row(friction, state) for friction in constants.frictions]
+    rows += [_limit_row(limit, state) for limit in constants.limits]
+    places = capsules.Places(constants.links, joints, mechanism.common_link(constants))
+    cones = []
+    for contact in constants.contacts:
+        if contact.cone:
+            cones.append((len(rows), len(contact.references)))
+        rows += _contact_rows(contact, places, state)
+    force = _forces(constants, state, joints, control, applied)
+    order = elimination_order(len(joints), list(mass), [tuple(row.entries) for row in rows])
+    place = {joint: index for index, joint in enumerate(order)}
+    ordered = {_below_diagonal(place[one], place[other]): number for (one, other), number in mass.items()}
+    problem = Problem(
+        mass=ordered,
+        force=[force[joint] for joint in order],
+        warm=[state.acceleration[joint] for joint in order],
+        damping=[constants.timestep * constants.damping[joint] for joint in order],
+        jacobian=[{place[joint]: entry for joint, entry in row.entries.items()} for row in rows],
+        stiffness=[row.stiffness for row in rows],
+        target=[row.target for row in rows],
+        most={index: row.most for index, row in enumerate(rows) if row.most is not None},
+        cone=[contact.cone for contact in constants.contacts if contact.cone],
+    )
+    structure = Structure(
+        joints=len(joints),
+        mass=tuple(sorted(ordered)),
+        rows=tuple(tuple(sorted(entries)) for entries in problem.jacobian),
+        equalities=0,
+        frictions=len(constants.frictions),
+        cones=tuple(cones),
+        apart=(),
+        iterations=constants.iterations,
+        warm=constants.warm,
+        exact=exact,
+        corners=bool(constants.frictions or cones),
+    )
+    return structure, problem, order
+
+
+def elimination_order(size: int, mass: list[tuple[int, int]], rows: list[tuple[int, ...]]) -> list[int]:
+    """An order of joints in which a matrix fills in little if it is factorized from the last row on: greedily.
+
+    Args:
+        size: How many joints there are.
+        mass: Places of the mass matrix, (joint, ancestor) and others. A joint comes after those that it hangs on, in which
+            order this matrix itself does not fill in at all.
+        rows: The joints that each constraint ties to each other.
+    """
+    neighbours: list[set[int]] = [set() for _ in range(size)]
+    for joints in [*mass, *rows]:
+        for joint in joints:
+            neighbours[joint] |= set(joints) - {joint}
+    below: list[set[int]] = [set() for _ in range(size)]
+    for joint, ancestor in mass:
+        if ancestor < joint:
+            below[ancestor].add(joint)
+    left, backwards = set(range(size)), []
+    while left:
+        joint = min((j for j in left if not below[j] & left), key=lambda j: (len(neighbours[j] & left), -j))
+        left.remove(joint)
+        backwards.append(joint)
+        tied = neighbours[joint] & left
+        for other in tied:
+            neighbours[other] |= tied - {other}
+    return backwards[::-1]
+
+
+def _below_diagonal(one: int, other: int) -> tuple[int, int]:
+    return (one, other) if one > other else (other, one)
+
+
+def _add_tendon(mass: Matrix, shares: dict[int, float], armature: float) -> None:
+    """Adds the armature of a tendon; its places are there without any, too, as in `constraints.structure_of`."""
+    if armature == 0.0:
+        return
+    for one, share in shares.items():
+        for other, factor in shares.items():
+            if other <= one:
+                mass[one, other] = plus(mass.get((one, other), 0.0), armature * share * factor)
+
+
+def _forces(constants: Mechanism, state: State, joints: list[dynamics.Joint], control: Numbers, applied: Numbers) -> Numbers:
+    """On the joints, without constraints."""
+    bias = dynamics.bias(constants.links, joints, state.velocity, constants.gravity)
+    forces = []
+    for joint, (there, rate) in enumerate(zip(state.position, state.velocity, strict=True)):
+        stiffness, rest = constants.springs[joint]
+        spring = times(stiffness, minus(there, rest)) if stiffness else 0.0
+        passive = plus(spring, times(constants.damping[joint], rate))
+        forces.append(minus(minus(applied[joint], bias[joint]), passive))
+    for actuator, signal in zip(constants.actuators, control, strict=True):
+        length = times(actuator.gear, state.position[actuator.joint])
+        speed = times(actuator.gear, state.velocity[actuator.joint])
+        gain, bias_force = (
+            plus(level, times(slope, length), times(drag, speed)) for level, slope, drag in (actuator.gain, actuator.bias)
+        )
+        force = _clipped(plus(times(gain, signal), bias_force), actuator.force_ends)
+        forces[actuator.joint] = plus(forces[actuator.joint], times(actuator.gear, force))
+    return forces
+
+
+def _friction_row(friction: mechanism.Friction, state: State) -> _Row:
+    reference = friction.reference
+    stiffness = reference.softness(friction.inverse_weight, reference.impedance(0.0))
+    target = times(-reference.damping, state.velocity[friction.joint])
+    return _Row({friction.joint: 1.0}, stiffness, target, friction.most)
+
+
+def _limit_row(limit: Limit, state: State) -> _Row:
+    """Pushes back from the nearer end."""
+    low, high = limit.ends
+    length = plus(*(times(share, state.position[joint]) for joint, share in limit.joints.items()))
+    speed = plus(*(times(share, state.velocity[joint]) for joint, share in limit.joints.items()))
+    above, below = minus(length, low), minus(high, length)
+    is_low = above < below
+    distance = minus(jnp.minimum(above, below), limit.margin)
+    entries = {joint: jnp.where(is_low, share, -share) for joint, share in limit.joints.items()}
+    reference, speed = limit.reference, jnp.where(is_low, speed, -speed)
+    impedance = reference.impedance(distance)
+    stiffness = jnp.where(distance < 0, reference.softness(limit.inverse_weight, impedance), 0.0)
+    pull = plus(times(reference.damping, speed), times(reference.stiffness, impedance, distance))
+    return _Row(entries, stiffness, minus(0.0, pull))
+
+
+def _contact_rows(contact: Contact, places: capsules.Places, state: State) -> list[_Row]:
+    """One row along the normal, and those of friction across it."""
+    touch = capsules.touch(contact.pair, places)
+    distance = minus(touch.distance, contact.margin)
+    directions = capsules.frame_about(touch.normal) if contact.cone else (touch.normal,)
+    rows = []
+    for direction, weight, reference in zip(directions, contact.inverse_weights, contact.references, strict=True):
+        entries = capsules.levers(contact.pair, places, direction, touch.position)
+        impedance = reference.impedance(distance)
+        stiffness = jnp.where(distance < 0, reference.softness(weight, impedance), 0.0)
+        speed = plus(*(times(entry, state.velocity[joint]) for joint, entry in entries.items()))
+        pull = times(reference.damping, speed)
+        if not rows:
+            pull = plus(pull, times(reference.stiffness, impedance, distance))
+        rows.append(_Row(entries, stiffness, minus(0.0, pull)))
+    return rows
+
+
+def _clipped(number: Any, ends: tuple[float, float]) -> Any:
+    """``number`` between two ends, either of which may be infinite."""
+    low, high = ends
+    if low > -jnp.inf:
+        number = jnp.maximum(number, low)
+    return jnp.minimum(number, high) if high < jnp.inf else number

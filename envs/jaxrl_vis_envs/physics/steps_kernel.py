@@ -1,0 +1,136 @@
+"""`steps.take` as one GPU kernel (Pallas, by Triton): a thread simulates one episode through all steps of a control step.
+
+Positions and velocities stay on the chip from the first step to the last. In place of some 150 kernels a physics step there is
+one for all of them.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+from jax.custom_batching import custom_vmap
+from jax.experimental import pallas as pl
+from jax.experimental.pallas import triton as plgpu
+from mujoco import mjx
+
+from jaxrl_vis_envs.physics import lanes, steps
+from jaxrl_vis_envs.physics.mechanism import Mechanism, mechanism_of
+from jaxrl_vis_envs.physics.steps import State
+
+_COMPILER = plgpu.CompilerParams(num_warps=1, num_stages=1)
+
+
+def take(
+    constants: Mechanism,
+    state: State,
+    control: jax.Array,
+    applied: jax.Array,
+    count: int,
+    exact: bool,
+    interpret: bool = False,
+) -> State:
+    """`steps.take` for arrays, float32; over all axes of `jax.vmap` in one kernel.
+
+    Args:
+        constants: Of the model, of N joints.
+        state: [N] each; its ``force`` is not used.
+        control: [nu].
+        applied: [N].
+        count: Physics steps.
+        exact: See `steps.take`.
+        interpret: Run the kernel without a GPU, slowly.
+
+    Returns:
+        The state after them, [N] each.
+    """
+    inputs = jnp.concatenate([state.position, state.velocity, state.acceleration, applied, control])
+    result = _batched(constants, count, exact, interpret)(inputs[None])[0]
+    return State(*result.reshape(len(State._fields), len(constants.links)))
+
+
+def _batched(constants: Mechanism, count: int, exact: bool, interpret: bool) -> Callable[[jax.Array], jax.Array]:
+    """Final states [B, 4 N] of inputs [B, 4 N + nu]. Another axis of `jax.vmap` makes B larger."""
+    # Traced once for all launches.
+    simulate = jax.jit(functools.partial(_simulate, constants, count, exact))
+
+    @custom_vmap
+    def final(inputs: jax.Array) -> jax.Array:
+        return _launch(len(constants.links), simulate, inputs, interpret)
+
+    @final.def_vmap
+    def _(size: int, in_batched: list[bool], inputs: jax.Array) -> tuple[jax.Array, bool]:
+        del in_batched  # there is one input, so it is batched
+        flat = final(inputs.reshape(-1, inputs.shape[-1]))
+        return flat.reshape(size, -1, flat.shape[-1]), True
+
+    return final
+
+
+def _simulate(constants: Mechanism, count: int, exact: bool, rows: list[jax.Array]) -> list[jax.Array]:
+    """Final numbers of an episode's numbers, in the order of `_batched`; arrays [32] each."""
+    joints = len(constants.links)
+    position, velocity, acceleration, applied = (rows[first * joints :][:joints] for first in range(4))
+    start = State(position, velocity, acceleration, [0.0 * number for number in position])
+    end = steps.take(constants, start, rows[4 * joints :], applied, count, exact, in_kernel=True)
+    return [number for part in end for number in part]
+
+
+def _launch(joints: int, simulate: Callable[..., list[jax.Array]], inputs: jax.Array, interpret: bool) -> jax.Array:
+    batch = inputs.shape[0]
+    programs = pl.cdiv(batch, lanes.LANES)
+    # Threads beyond the last episode simulate that again.
+    inputs = jnp.pad(inputs, ((0, programs * lanes.LANES - batch), (0, 0)), mode="edge")
+    final, _ = pl.pallas_call(
+        functools.partial(_kernel, simulate=simulate, interpret=interpret),
+        grid=(programs,),
+        out_shape=[
+            jax.ShapeDtypeStruct((len(State._fields) * joints, programs * lanes.LANES), jnp.float32),
+            jax.ShapeDtypeStruct((programs,), jnp.int32),
+        ],
+        compiler_params=_COMPILER,
+        interpret=interpret,
+        name="take_physics_steps",
+    )(inputs.T)
+    return final.T[:batch]
+
+
+def _kernel(inputs: Any, final: Any, done: Any, *, simulate: Callable[..., list[jax.Array]], interpret: bool) -> None:
+    program = pl.program_id(0)
+    own = pl.ds(program * lanes.LANES, lanes.LANES)
+    rows = [inputs[row, own] for row in range(inputs.shape[0])] if interpret else lanes.read_rows(inputs)
+    results = simulate(rows)
+    if interpret:
+        for row, result in enumerate(results):
+            final[row, own] = result
+    else:
+        done[program] = lanes.write_rows(final, results)
+
+
+_PROBE = """
+<mujoco>
+  <option solver="Newton" cone="elliptic" iterations="1"/>
+  <default><geom type="capsule" fromto="0 0 0 0 0 .2" size=".02"/><pair condim="3"/></default>
+  <worldbody>
+    <body><joint axis="0 1 0" frictionloss=".1"/><geom name="one"/></body>
+    <body pos=".1 0 0"><joint type="slide" axis="1 0 0" limited="true" range="-.1 .1"/><geom name="other"/></body>
+  </worldbody>
+  <contact><pair geom1="one" geom2="other"/></contact>
+</mujoco>
+"""
+
+
+def probe() -> None:
+    """Compiles a small instance of the kernel for the device that is the default; raises what that raises."""
+    probe_program().lower().compile()
+
+
+def probe_program() -> Any:
+    """A small instance of the kernel, traced (`jax.stages.Traced`): hinge and slide, dry friction, a limit, a contact."""
+    constants = mechanism_of(mjx.put_model(mujoco.MjModel.from_xml_string(_PROBE)))
+    joints = jnp.zeros((2, 2), jnp.float32)
+    state = State(joints, joints, joints, joints)
+    take_steps = functools.partial(take, constants, count=2, exact=True)
+    return jax.jit(jax.vmap(lambda state, applied: take_steps(state, joints[0, :0], applied))).trace(state, joints)
