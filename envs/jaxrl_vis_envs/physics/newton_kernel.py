@@ -89,7 +89,7 @@ def _kernel(problems: Any, motions: Any, done: Any, *, structure: Structure, int
     every_place = [(name, place) for name, places in _places(structure).items() for place in places]
     numbers = dict(zip(every_place, rows, strict=True))
     problem = descent.numbers_of(structure, lambda name, *place: numbers[name, place])
-    motion = descent.solve(structure, problem, in_kernel=True)
+    motion = descent.solve(structure, problem)
     results = [jnp.broadcast_to(jnp.asarray(number, jnp.float32), (lanes.LANES,)) for part in motion for number in part]
     if interpret:
         for row, result in enumerate(results):

@@ -5,6 +5,7 @@ one for all of them.
 """
 
 import functools
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -20,7 +21,14 @@ from jaxrl_vis_envs.physics import lanes, steps
 from jaxrl_vis_envs.physics.mechanism import Mechanism, mechanism_of
 from jaxrl_vis_envs.physics.steps import State
 
+VARIABLE = "JAXRL_VIS_STEPS_KERNEL"
+"""Environment variable that asks for the kernel: 1 does, anything else does not."""
 _COMPILER = plgpu.CompilerParams(num_warps=1, num_stages=1)
+
+
+def is_wanted() -> bool:
+    """Whether the kernel is used where it can be: not unless it is asked for, until it was measured on a GPU."""
+    return os.environ.get(VARIABLE, "").strip() == "1"
 
 
 def take(
