@@ -29,6 +29,7 @@ from jaxrl_vis_envs.physics import (
     welds,
 )
 from jaxrl_vis_envs.physics.mjx_model import mjx
+from jaxrl_vis_envs.tasks.fetch_reach import FetchReach, VisualFetchReachConfig
 from tests.test_steps import Float32Numpy, branch_of_numpy, columns, loop_of_numpy, lowered_for_cuda, open_loop_of_numpy
 
 # Welds of two bodies that hang on one joint, on a mocap body and on the world; joints and geoms that mocap bodies carry; planes
@@ -225,6 +226,14 @@ def test_all_steps_of_a_task_are_one_kernel_for_nvidia(name, monkeypatch):
     program = lowered_for_cuda(env._model, data)
     assert program.count("take_physics_steps") >= 1 and "solve_constraints" not in program
     assert program.count("stablehlo.") < 150
+
+
+def test_what_is_drawn_at_a_mocap_body_changes_nothing():
+    env = FetchReach(VisualFetchReachConfig(cross_hair=True))
+    assert mechanism.takes(env._model)
+    plain, drawn = (mechanism.mechanism_of(model) for model in (environments.make("FetchReach")._model, env._model))
+    assert len(drawn.holds) == len(plain.holds) == 1 and len(drawn.contacts) == len(plain.contacts) == 2
+    assert drawn.mocaps == plain.mocaps == (0,)
 
 
 REFUSED = {

@@ -63,10 +63,10 @@ class Places:
         """The quaternion of a link's frame, which goes on from one sign to the other as its joints turn."""
         if link not in self._turns:
             own, joint = self._tree[link], self._joints[link]
-            start = quaternions.multiply(self.turn(own.parent), quaternions.of_matrix(own.turn))
-            self._turns[link] = (
-                start if own.slides else quaternions.multiply(start, quaternions.about(own.axis, joint.half_turn))
-            )
+            turn = quaternions.multiply(self.turn(own.parent), quaternions.of_matrix(own.turn))
+            if not own.slides:
+                turn = quaternions.multiply(turn, quaternions.about(own.axis, joint.half_turn))
+            self._turns[link] = turn
         return self._turns[link]
 
     def axis(self, joint: int) -> Vector:
