@@ -60,7 +60,7 @@ class Places:
         return combine(self._poses[link].axes, floats(direction))
 
     def turn(self, link: int) -> Quaternion:
-        """The quaternion of a link's frame, which goes on from one sign to the other as its joints turn."""
+        """The quaternion of a link's frame."""
         if link not in self._turns:
             own, joint = self._tree[link], self._joints[link]
             turn = quaternions.multiply(self.turn(own.parent), quaternions.of_matrix(own.turn))

@@ -1,8 +1,4 @@
-"""Unit quaternions number by number (`folding`): four numbers, the real part first, as in MuJoCo.
-
-Their sign matters here, although either turns alike: MuJoCo's welds pull a body back the way that the quaternions say, not the
-shorter one.
-"""
+"""Unit quaternions number by number (`folding`): four numbers, the real part first. Either sign is the same turn."""
 
 from typing import Any
 
@@ -62,7 +58,7 @@ def about(axis: int, half: tuple[Any, Any]) -> Quaternion:
 
 
 def of_matrix(matrix: np.ndarray) -> Quaternion:
-    """A known rotation matrix [3, 3] as a quaternion, of either sign, with zeros where rounding errors left something."""
+    """A known rotation matrix [3, 3] as a quaternion, with zeros where rounding errors left something."""
     quaternion = np.empty(4)
     mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(matrix, np.float64).ravel())
     return floats(np.where(np.abs(quaternion) < 1e-9, 0.0, quaternion))  # type: ignore[return-value] - of four

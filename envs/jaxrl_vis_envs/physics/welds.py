@@ -56,7 +56,7 @@ def weld_of(model: mjx.Model, tree: list[Link], frames: list[Frame], index: int)
     numbers = np.asarray(model.eq_data, np.float64)[index]
     own = frames[bodies[0]], frames[bodies[1]]
     anchors = numbers[3:6], numbers[0:3]
-    turns = [_turn_of(model, tree, frames, body) for body in bodies]
+    turns = [quaternions.of_matrix(frame.turn) for frame in own]
     chains = [links.carriers(tree, frame.link) for frame in own]
     alone = [tuple(joint for joint in these if joint not in others) for these, others in (chains, chains[::-1])]
     return Weld(
@@ -66,22 +66,6 @@ def weld_of(model: mjx.Model, tree: list[Link], frames: list[Frame], index: int)
         torque_scale=float(numbers[10]),
         carriers=(alone[0], alone[1], tuple(joint for joint in chains[0] if joint in chains[1])),
     )
-
-
-def _turn_of(model: mjx.Model, tree: list[Link], frames: list[Frame], body: int) -> Quaternion:
-    """The quaternion of a body relative to its link, of the sign with which the body's own has that of MuJoCo."""
-    theirs, above = np.array([1.0, 0.0, 0.0, 0.0]), body
-    while above and model.body_mocapid[above] < 0:
-        own = np.asarray(model.body_quat, np.float64)[above]
-        theirs = np.array(quaternions.multiply(floats(own / np.linalg.norm(own)), floats(theirs)))  # type: ignore[arg-type]
-        above = int(model.body_parentid[above])
-    frame = frames[body]
-    turn = quaternions.of_matrix(frame.turn)
-    ours, link = turn, frame.link
-    while link >= 0:
-        ours, link = quaternions.multiply(quaternions.of_matrix(tree[link].turn), ours), tree[link].parent
-    sign = 1.0 if float(theirs @ np.array(ours)) > 0 else -1.0
-    return floats(sign * np.array(turn))  # type: ignore[return-value] - of four
 
 
 def apartness(weld: Weld, places: Places) -> Apartness:
@@ -96,7 +80,8 @@ def apartness(weld: Weld, places: Places) -> Apartness:
     turned: Vector = scale((x, y, z), weld.torque_scale)
     errors = [*gap, *turned]
 
-    # The turn's error is a product of quaternions; it changes by half of the product with the velocity of turning between.
+    # The turn's error is a product of quaternions; it changes by half of the product with the velocity of turning between. With
+    # the other sign of a quaternion error and change are the opposite, which is the same constraint.
     body = weld.frames[1]
     axes = [places.direction(body.link, axis) for axis in body.turn.T]
     rates = []
