@@ -299,7 +299,7 @@ def test_which_models_have_steps_by_numbers():
     takes = {
         name: mechanism.takes(environments.make(name)._model) for name in ("FingerTurn", "HandReach", "Reacher", "FetchReach")
     }
-    assert takes == {"FingerTurn": True, "HandReach": True, "Reacher": False, "FetchReach": False}
+    assert takes == {"FingerTurn": True, "HandReach": True, "Reacher": False, "FetchReach": True}
     hand = environments.make("HandReach")
     assert mechanism.takes(hand._goal_model)
     without_contacts = HandReach(HandReachConfig(contacts=False))._model

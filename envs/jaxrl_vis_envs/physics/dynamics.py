@@ -6,6 +6,8 @@ little is left to compute. It is also where float32 loses least: nothing is a sm
 Source: Featherstone, "Rigid Body Dynamics Algorithms": recursive Newton-Euler, 5.3, and composite rigid bodies, 6.2.
 """
 
+from collections.abc import Collection, Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,11 +39,13 @@ class Joint(NamedTuple):
         sine: Of the angle it has turned by; a known 0 where it slides.
         cosine: A known 1 where it slides.
         slide: The way it has slid, m; a known 0 where it turns.
+        half_turn: Sine and cosine of half the angle, for joints of which quaternions are asked for.
     """
 
     sine: Any
     cosine: Any
     slide: Any
+    half_turn: tuple[Any, Any] = (0.0, 1.0)
 
 
 class Pose(NamedTuple):
@@ -64,12 +68,19 @@ class _Body(NamedTuple):
     inertia: Symmetric
 
 
-def joints_at(links: list[Link], displacement: list[Any]) -> list[Joint]:
-    """The joints, moved by ``displacement`` (rad or m) from where they are at rest."""
-    return [
-        Joint(0.0, 1.0, moved) if link.slides else Joint(*sine_and_cosine(moved), 0.0)
-        for link, moved in zip(links, displacement, strict=True)
-    ]
+def joints_at(links: list[Link], displacement: list[Any], with_half_turns: Collection[int] = ()) -> list[Joint]:
+    """The joints, moved by ``displacement`` (rad or m) from where they are at rest, some of them with `Joint.half_turn`."""
+    joints = []
+    for index, (link, moved) in enumerate(zip(links, displacement, strict=True)):
+        if link.slides:
+            joints.append(Joint(0.0, 1.0, moved))
+        elif index in with_half_turns:
+            sine, cosine = sine_and_cosine(0.5 * moved)
+            twice = 2.0 * sine
+            joints.append(Joint(twice * cosine, 1.0 - twice * sine, 0.0, (sine, cosine)))
+        else:
+            joints.append(Joint(*sine_and_cosine(moved), 0.0))
+    return joints
 
 
 def pose_after(link: Link, joint: Joint, before: Pose) -> Pose:
@@ -96,16 +107,22 @@ def mass_matrix(links: list[Link], joints: list[Joint]) -> dict[tuple[int, int],
         else:
             impulse, spin = cross(axis, whole[index].moment), symmetric_times(whole[index].inertia, axis)
         here = index
-        while here != WORLD:
+        while here >= 0:
             matrix[index, here] = (impulse if links[here].slides else spin)[links[here].axis]
             impulse, spin = _wrench_to_parent(links[here], joints[here], impulse, spin)
             here = links[here].parent
-        if link.parent != WORLD:
+        if link.parent >= 0:
             whole[link.parent] = _together(whole[link.parent], _to_parent(link, joints[index], whole[index]))
     return matrix
 
 
-def bias(links: list[Link], joints: list[Joint], velocity: list[Any], gravity: np.ndarray) -> list[Any]:
+def bias(
+    links: list[Link],
+    joints: list[Joint],
+    velocity: list[Any],
+    gravity: np.ndarray,
+    roots: Mapping[int, Pose] = MappingProxyType({}),
+) -> list[Any]:
     """The forces on the joints (N m or N) that their ``velocity`` (rad/s or m/s) takes if nothing accelerates, under gravity.
 
     Args:
@@ -113,17 +130,21 @@ def bias(links: list[Link], joints: list[Joint], velocity: list[Any], gravity: n
         joints: Where they are.
         velocity: Of the joints.
         gravity: [3], m/s^2, in the world.
+        roots: Where the mocap bodies are in the world that links hang on.
     """
+    starts = {WORLD: _Motion(NOTHING, NOTHING, _vector(-gravity))}
+    for root, pose in roots.items():
+        x, y, z = (dot(axis, _vector(-gravity)) for axis in pose.axes)
+        starts[root] = _Motion(NOTHING, NOTHING, (x, y, z))
     motions: list[_Motion] = []
     for link, joint, rate in zip(links, joints, velocity, strict=True):
-        start = _Motion(NOTHING, NOTHING, _vector(-gravity))
-        motions.append((start if link.parent == WORLD else motions[link.parent]).carried(link, joint, rate))
+        motions.append((motions[link.parent] if link.parent >= 0 else starts[link.parent]).carried(link, joint, rate))
     wrenches = [motion.wrench(link) for motion, link in zip(motions, links, strict=True)]
     forces: list[Any] = [0.0] * len(links)
     for index in reversed(range(len(links))):
         link, (force, torque) = links[index], wrenches[index]
         forces[index] = (force if link.slides else torque)[link.axis]
-        if link.parent != WORLD:
+        if link.parent >= 0:
             force, torque = _wrench_to_parent(link, joints[index], force, torque)
             own_force, own_torque = wrenches[link.parent]
             wrenches[link.parent] = add(own_force, force), add(own_torque, torque)

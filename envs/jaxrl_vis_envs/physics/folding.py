@@ -62,6 +62,11 @@ def choose(condition: Any, one: Any, other: Any) -> Any:
     return jnp.where(condition, one, other)
 
 
+def inverse_root(number: Any, least: float) -> Any:
+    """One over the square root of a number, or of ``least`` where that is more."""
+    return 1.0 / math.sqrt(max(number, least)) if isinstance(number, float) else 1.0 / jnp.sqrt(jnp.maximum(number, least))
+
+
 def add(*vectors: Vector) -> Vector:
     """The sum of vectors."""
     x, y, z = zip(*vectors, strict=True)

@@ -14,6 +14,7 @@ import numpy as np
 from mujoco import mjx
 
 WORLD = -1
+"""The link that stands still. Mocap bodies, which stand still during a step, are links below it (`link_of_mocap`)."""
 _ROUNDING = 1e-9  # what is smaller, relative to the largest number of its kind, is a zero that was computed
 
 
@@ -21,7 +22,7 @@ class Link(NamedTuple):
     """What a joint carries, in a frame of its own. Arrays are float64.
 
     Attributes:
-        parent: The joint before it, or `WORLD`.
+        parent: The joint before it, or `WORLD`, or that of a mocap body.
         turn: [3, 3], its axes in the parent's frame where the joint is at rest (at ``qpos0``).
         shift: [3], its origin in the parent's frame, m; at rest where the joint slides.
         axis: Which of its axes the joint turns about or slides along.
@@ -45,7 +46,7 @@ class Frame(NamedTuple):
     """A pose relative to a link.
 
     Attributes:
-        link: Its joint, or `WORLD`.
+        link: Its joint, or `WORLD`, or that of a mocap body.
         turn: [3, 3] float64, the axes.
         shift: [3] float64, the origin, m.
     """
@@ -62,7 +63,9 @@ def links_of(model: mjx.Model) -> tuple[list[Link], list[Frame]]:
     position, rotation = _array(model.body_pos), _rotations(model.body_quat)
     anchor, axes = _array(model.jnt_pos), _array(model.jnt_axis)
     for body in range(1, model.nbody):
+        mocap = int(model.body_mocapid[body])
         frame = _within(frames[model.body_parentid[body]], rotation[body], position[body])
+        frame = Frame(link_of_mocap(mocap), np.eye(3), np.zeros(3)) if mocap >= 0 else frame
         first, count = model.body_jntadr[body], model.body_jntnum[body]
         for joint in range(first, first + count):
             axis, towards = _frame_along(axes[joint])
@@ -81,7 +84,7 @@ def _add_masses(model: mjx.Model, links: list[Link], frames: list[Frame]) -> Non
     centre, rotation = _array(model.body_ipos), _rotations(model.body_iquat)
     for body in range(1, model.nbody):
         at = _within(frames[body], rotation[body], centre[body])
-        if at.link != WORLD:
+        if at.link >= 0:
             link = links[at.link]
             own = at.turn @ np.diag(principal[body]) @ at.turn.T
             away = mass[body] * (at.shift @ at.shift * np.eye(3) - np.outer(at.shift, at.shift))
@@ -98,10 +101,15 @@ def geom_frame(model: mjx.Model, frames: list[Frame], geom: int) -> Frame:
     return _within(frames[model.geom_bodyid[geom]], turn, _array(model.geom_pos)[geom])
 
 
+def link_of_mocap(mocap: int) -> int:
+    """The link that a mocap body is, and the other way round."""
+    return WORLD - 1 - mocap
+
+
 def carriers(links: list[Link], link: int) -> list[int]:
-    """The joints that move a link, from the world on; none for the world."""
+    """The joints that move a link, from the world on; none for the world and mocap bodies."""
     found = []
-    while link != WORLD:
+    while link >= 0:
         found.append(link)
         link = links[link].parent
     return found[::-1]

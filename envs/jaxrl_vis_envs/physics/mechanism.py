@@ -8,11 +8,12 @@ import numpy as np
 from mujoco import mjx
 from mujoco.mjx._src import collision_driver
 
-from jaxrl_vis_envs.physics import capsules, links, reference
+from jaxrl_vis_envs.physics import capsules, links, reference, welds
 from jaxrl_vis_envs.physics.capsules import Pair
 from jaxrl_vis_envs.physics.folding import floats
 from jaxrl_vis_envs.physics.links import WORLD, Link
 from jaxrl_vis_envs.physics.reference import Reference
+from jaxrl_vis_envs.physics.welds import Weld
 
 # What is written out for each joint and for each pair of capsules has to fit into one kernel.
 _MOST_JOINTS, _MOST_PAIRS = 32, 32
@@ -24,6 +25,10 @@ _HEEDED = (
     | _FLAG.mjDSBL_GRAVITY | _FLAG.mjDSBL_WARMSTART | _FLAG.mjDSBL_REFSAFE | _FLAG.mjDSBL_CLAMPCTRL
     | _FLAG.mjDSBL_EQUALITY | _FLAG.mjDSBL_SENSOR | _FLAG.mjDSBL_MIDPHASE | _FLAG.mjDSBL_FILTERPARENT
 )  # fmt: skip
+_SHAPES = (
+    (mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CAPSULE),
+    (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_SPHERE),
+)
 _BY_CENTRE_OF_MASS = (mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM, mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODYCOM)
 
 
@@ -47,13 +52,22 @@ class Limit(NamedTuple):
 
 
 class Contact(NamedTuple):
-    """What two capsules do where they touch."""
+    """What two geoms do where they touch."""
 
     pair: Pair
     margin: float
-    inverse_weights: tuple[float, ...]  # for each row: along the normal, and across it where there is friction
+    inverse_weights: tuple[float, ...]  # for each row: along the normal, and across it where there is an elliptic cone
     references: tuple[Reference, ...]
-    cone: tuple[float, ...]  # see `descent.Problem`; empty without friction
+    cone: tuple[float, ...]  # see `descent.Problem`; empty if the cone is not elliptic
+    pyramid: tuple[float, ...]  # friction along two directions and about the normal, which all edges of a pyramid share
+
+
+class Hold(NamedTuple):
+    """A weld, and how hard it is: for what is apart, and for what is turned."""
+
+    weld: Weld
+    inverse_weights: tuple[float, float]
+    reference: Reference
 
 
 class Actuator(NamedTuple):
@@ -82,6 +96,8 @@ class Mechanism(NamedTuple):
     frictions: tuple[Friction, ...]
     limits: tuple[Limit, ...]
     contacts: tuple[Contact, ...]
+    holds: tuple[Hold, ...]
+    mocaps: tuple[int, ...]  # those that something hangs on
     iterations: int
     warm: bool
 
@@ -89,14 +105,16 @@ class Mechanism(NamedTuple):
 def takes(model: mjx.Model) -> bool:
     """Whether a model has steps number by number.
 
-    It has if its numbers are known, if its joints have one degree of freedom, if all contacts are between capsules of explicit
-    pairs, without friction or with elliptic cones, and if it has limits, dry friction of joints, tendons that are sums of
-    joints, and actuators of joints without activation, but no equalities, mocap bodies, sensors, fluid or gravity
+    It has if its numbers are known, if its joints have one degree of freedom, if all contacts are of explicit pairs of two
+    capsules, or of a plane and a sphere, without friction or with elliptic or pyramidal cones, the latter also with friction
+    about the normal; and if it has limits, dry friction of joints, tendons that are sums of joints, actuators of joints without
+    activation, mocap bodies, and welds of bodies that act from the start, but no other equalities, sensors, fluid or gravity
     compensation; with MuJoCo's Newton solver and Euler's method, implicit in the damping.
     """
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(model)):
         return False
-    return _is_simple(model) and _has_simple_tendons(model) and _has_simple_actuators(model) and _has_simple_contacts(model)
+    parts = (_is_simple, _has_simple_tendons, _has_simple_actuators, _has_simple_equalities, _has_simple_contacts)
+    return all(is_so(model) for is_so in parts)
 
 
 def _is_simple(model: mjx.Model) -> bool:
@@ -106,9 +124,9 @@ def _is_simple(model: mjx.Model) -> bool:
     option = model.opt
     is_newton = option.solver == mujoco.mjtSolver.mjSOL_NEWTON and option.integrator == mujoco.mjtIntegrator.mjINT_EULER
     is_plain = not (int(option.disableflags) & ~int(_HEEDED)) and option.enableflags == 0
-    has_more = model.na or model.neq or model.nmocap or model.nsensor or option._impl.has_fluid_params or model.flg_gravcomp
+    has_more = model.na or model.nsensor or option._impl.has_fluid_params or model.flg_gravcomp
     follows = np.isin(np.concatenate([model.cam_mode, model.light_mode]), [int(mode) for mode in _BY_CENTRE_OF_MASS]).any()
-    powers = [model.jnt_solimp, model.tendon_solimp_lim, model.pair_solimp, model.dof_solimp]
+    powers = [model.jnt_solimp, model.tendon_solimp_lim, model.pair_solimp, model.dof_solimp, model.eq_solimp]
     curves = np.concatenate([np.asarray(rows, np.float64).reshape(-1, 5) for rows in powers])
     is_whole = np.all((curves[:, 4] == np.round(curves[:, 4])) & (curves[:, 4] <= 6) & (curves[:, 0] <= curves[:, 1]))
     return bool(is_newton and is_plain and not has_more and not follows and is_whole) and not np.any(model.jnt_actfrclimited)
@@ -135,20 +153,35 @@ def _has_simple_contacts(model: mjx.Model) -> bool:
     if flags & int(_FLAG.mjDSBL_CONTACT | _FLAG.mjDSBL_CONSTRAINT):
         return True
     is_elliptic = model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+    dims = (1, 3) if is_elliptic else (1, 3, 4)
     pairs = list(collision_driver.geom_pairs(model))
     if len(pairs) > _MOST_PAIRS:
         return False
     for one, other, index in pairs:
-        is_capsules = model.geom_type[one] == model.geom_type[other] == mujoco.mjtGeom.mjGEOM_CAPSULE
-        moves = model.body_weldid[model.geom_bodyid[one]] != model.body_weldid[model.geom_bodyid[other]]
-        if (
-            index < 0
-            or not is_capsules
-            or not moves
-            or not (model.pair_dim[index] == 1 or (model.pair_dim[index] == 3 and is_elliptic))
-        ):
+        bodies = int(model.geom_bodyid[one]), int(model.geom_bodyid[other])
+        moves = model.body_weldid[bodies[0]] != model.body_weldid[bodies[1]] and _is_any_carried(model, bodies)
+        shapes = int(model.geom_type[one]), int(model.geom_type[other])
+        if index < 0 or shapes not in _SHAPES or not moves or model.pair_dim[index] not in dims:
             return False
     return True
+
+
+def _has_simple_equalities(model: mjx.Model) -> bool:
+    if not model.neq or int(model.opt.disableflags) & _without(_FLAG.mjDSBL_EQUALITY):
+        return True
+    is_weld = (model.eq_type == mujoco.mjtEq.mjEQ_WELD) & (model.eq_objtype == mujoco.mjtObj.mjOBJ_BODY)
+    bodies = zip(model.eq_obj1id, model.eq_obj2id, strict=True)
+    return bool(np.all(is_weld & model.eq_active0)) and all(_is_any_carried(model, pair) for pair in bodies)
+
+
+def _is_any_carried(model: mjx.Model, bodies: tuple[int, int]) -> bool:
+    """Whether joints move one of two bodies."""
+    for body in map(int, bodies):
+        while body:
+            if model.body_jntnum[body]:
+                return True
+            body = int(model.body_parentid[body])
+    return False
 
 
 def mechanism_of(model: mjx.Model) -> Mechanism:
@@ -158,6 +191,11 @@ def mechanism_of(model: mjx.Model) -> Mechanism:
     tendons = [_joints_of_tendon(model, tendon) for tendon in range(model.ntendon)]
     armature = np.asarray(model.tendon_armature)
     has_gravity = not flags & _FLAG.mjDSBL_GRAVITY
+    contacts = _contacts(model, tree, frames) if not flags & _without(_FLAG.mjDSBL_CONTACT) else []
+    holds = _holds(model, tree, frames) if not flags & _without(_FLAG.mjDSBL_EQUALITY) else []
+    placed = [frame for contact in contacts for frame in contact.pair.frames]
+    placed += [frame for hold in holds for frame in hold.weld.frames]
+    used = {link.parent for link in tree} | {frame.link for frame in placed}
     return Mechanism(
         links=tree,
         rest=floats(np.asarray(model.qpos0)),
@@ -170,7 +208,9 @@ def mechanism_of(model: mjx.Model) -> Mechanism:
         actuators=tuple(_actuator(model, index) for index in range(model.nu)),
         frictions=tuple(_frictions(model)) if not flags & _without(_FLAG.mjDSBL_FRICTIONLOSS) else (),
         limits=tuple(_limits(model, tendons)) if not flags & _without(_FLAG.mjDSBL_LIMIT) else (),
-        contacts=tuple(_contacts(model, tree, frames)) if not flags & _without(_FLAG.mjDSBL_CONTACT) else (),
+        contacts=tuple(contacts),
+        holds=tuple(holds),
+        mocaps=tuple(sorted(links.link_of_mocap(link) for link in used if link < WORLD)),
         iterations=int(model.opt.iterations),
         warm=not flags & _FLAG.mjDSBL_WARMSTART,
     )
@@ -231,10 +271,11 @@ def _limits(model: mjx.Model, tendons: list[dict[int, float]]) -> list[Limit]:
 
 
 def _contacts(model: mjx.Model, tree: list[Link], frames: list[links.Frame]) -> list[Contact]:
-    """The contacts of all pairs, those without friction first."""
+    """The contacts of all pairs, those with the fewest rows first."""
     weight, impratio = np.asarray(model.body_invweight0, np.float64)[:, 0], float(model.opt.impratio)
     frictions = np.maximum(np.asarray(model.pair_friction, np.float64), mujoco.mjMINVAL)
-    found = []
+    is_elliptic = model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+    found: list[tuple[int, Contact]] = []
     for one, other, index in collision_driver.geom_pairs(model):
         pair = capsules.pair_of(model, tree, frames, (int(one), int(other)))
         dim, friction = int(model.pair_dim[index]), frictions[index]
@@ -242,21 +283,39 @@ def _contacts(model: mjx.Model, tree: list[Link], frames: list[links.Frame]) -> 
         solref, across = np.asarray(model.pair_solref)[index], np.asarray(model.pair_solreffriction)[index]
         across = across if across.any() else solref
         solimp = np.asarray(model.pair_solimp)[index]
-        ratios = [friction[0] ** 2 / friction[row - 1] ** 2 / impratio for row in range(1, dim)]
-        found.append(
-            Contact(
-                pair=pair,
-                margin=float(np.asarray(model.pair_margin)[index]),
+        reference = _reference(model, solref, solimp)
+        contact = Contact(pair, float(np.asarray(model.pair_margin)[index]), (inverse,), (reference,), (), ())
+        if dim > 1 and is_elliptic:
+            ratios = [friction[0] ** 2 / friction[row - 1] ** 2 / impratio for row in range(1, dim)]
+            contact = contact._replace(
                 inverse_weights=(inverse, *(float(inverse * ratio) for ratio in ratios)),
-                references=tuple(_reference(model, solref if row == 0 else across, solimp) for row in range(dim)),
-                cone=(float(friction[0] / np.sqrt(impratio)), *floats(friction[: dim - 1])) if dim > 1 else (),
+                references=(reference, *[_reference(model, across, solimp)] * (dim - 1)),
+                cone=(float(friction[0] / np.sqrt(impratio)), *floats(friction[: dim - 1])),
             )
-        )
-    return sorted(found, key=lambda contact: len(contact.cone))
+        elif dim > 1:
+            square = float(friction[0] ** 2)
+            inverse = inverse * (1.0 + square) * 2.0 * square / impratio
+            contact = contact._replace(inverse_weights=(inverse,), pyramid=floats(friction[: dim - 1]))
+        found.append((dim, contact))
+    return [contact for _, contact in sorted(found, key=lambda each: each[0])]
+
+
+def _holds(model: mjx.Model, tree: list[Link], frames: list[links.Frame]) -> list[Hold]:
+    weights = np.asarray(model.body_invweight0, np.float64)
+    found = []
+    for index in range(model.neq):
+        weight = weights[model.eq_obj1id[index]] + weights[model.eq_obj2id[index]]
+        constants = _reference(model, np.asarray(model.eq_solref)[index], np.asarray(model.eq_solimp)[index])
+        weld = welds.weld_of(model, tree, frames, index)
+        found.append(Hold(weld, (float(weight[0]), float(weight[1])), constants))
+    return found
 
 
 def common_link(mechanism: Mechanism) -> int:
-    """The link in whose frame contacts are found: the last that all hang on, or the world, by which friction has its axes."""
-    if any(contact.cone for contact in mechanism.contacts):
+    """The link in whose frame contacts are found: the last that all hang on, or the world, by which friction has its axes.
+
+    Welds, too, are in the world, where mocap bodies are.
+    """
+    if mechanism.holds or mechanism.mocaps or any(contact.cone or contact.pyramid for contact in mechanism.contacts):
         return WORLD
     return capsules.common_link(mechanism.links, [contact.pair for contact in mechanism.contacts])

@@ -73,9 +73,9 @@ def take_steps(model: mjx.Model, data: mjx.Data, count: int, exact: bool = False
 
     On a GPU that runs kernels, models that `mechanism` takes have them all in one if the environment variable
     ``JAXRL_VIS_STEPS_KERNEL`` is 1 (`steps_kernel`). Contacts between capsules are then exact in any case, and if more pairs
-    touch than ``max_contact_points``, all of them count. Nothing but positions, velocities, accelerations, time and the
-    constraints' forces is new afterwards. Forces on bodies (``xfrc_applied``) are not heeded: with any, positions are not a
-    number.
+    touch than ``max_contact_points`` or ``max_geom_pairs``, all of them count. Nothing but positions, velocities,
+    accelerations, time and the constraints' forces is new afterwards. Forces on bodies (``xfrc_applied``) and welds that are
+    turned off (``eq_active``) are not heeded: with any, positions are not a number.
     """
     if not steps_kernel.is_wanted() or not mechanism.takes(model):
         return _one_by_one(model, data, count, exact)
@@ -99,10 +99,14 @@ def _one_by_one(model: mjx.Model, data: mjx.Data, count: int, exact: bool) -> mj
 def _in_one_kernel(model: mjx.Model, data: mjx.Data, count: int, exact: bool, interpret: bool = False) -> mjx.Data:
     constants = mechanism.mechanism_of(model)
     state = State(data.qpos, data.qvel, data.qacc_warmstart, data.qfrc_constraint)
-    state = steps_kernel.take(constants, state, data.ctrl, data.qfrc_applied, count, exact, interpret)
-    is_pushed = jnp.any(data.xfrc_applied != 0)
+    used = np.array(constants.mocaps, int)
+    mocap = jnp.concatenate([data.mocap_pos[used], data.mocap_quat[used]], axis=1) if len(used) else None
+    state = steps_kernel.take(constants, state, data.ctrl, data.qfrc_applied, count, exact, interpret, mocap)
+    is_unlike = jnp.any(data.xfrc_applied != 0)
+    if constants.holds:
+        is_unlike = is_unlike | ~jnp.all(data.eq_active)
     return data.replace(
-        qpos=jnp.where(is_pushed, jnp.nan, state.position),
+        qpos=jnp.where(is_unlike, jnp.nan, state.position),
         qvel=state.velocity,
         qacc=state.acceleration,
         qacc_warmstart=state.acceleration,

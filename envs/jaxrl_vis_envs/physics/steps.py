@@ -4,16 +4,18 @@ As matrices, a step is a hundred operations of which each takes a GPU longer to 
 into one kernel (`steps_kernel`). Of the model everything is a constant (`mechanism`).
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from jaxrl_vis_envs.physics import capsules, descent, dynamics, mechanism
+from jaxrl_vis_envs.physics import capsules, descent, dynamics, links, mechanism, places, welds
 from jaxrl_vis_envs.physics.algebra import Matrix, Numbers
 from jaxrl_vis_envs.physics.descent import Problem, Structure
 from jaxrl_vis_envs.physics.folding import minus, plus, times
-from jaxrl_vis_envs.physics.mechanism import Contact, Limit, Mechanism
+from jaxrl_vis_envs.physics.mechanism import Contact, Hold, Limit, Mechanism
+from jaxrl_vis_envs.physics.places import Places, Root
 
 
 class State(NamedTuple):
@@ -30,6 +32,14 @@ class State(NamedTuple):
     velocity: Any
     acceleration: Any
     force: Any
+
+
+class Surroundings(NamedTuple):
+    """What stays the same from step to step: controls, within their ends; further forces on the joints; mocap bodies."""
+
+    control: Numbers
+    applied: Numbers
+    roots: dict[int, Root]
 
 
 class _Row(NamedTuple):
@@ -49,6 +59,7 @@ def take(
     count: int,
     exact: bool,
     in_kernel: bool = False,
+    mocap: Sequence[Any] = (),
 ) -> State:
     """``count`` physics steps, with the same controls.
 
@@ -60,23 +71,23 @@ def take(
         count: How many.
         exact: Whether forces are as exact as float32 allows (see `mjx_model.step`); contacts always are.
         in_kernel: See `descent.solve`.
+        mocap: Seven numbers for each of ``constants.mocaps``: position, m, and quaternion, of any length.
 
     Returns:
         The state after them.
     """
     ends = [actuator.control_ends for actuator in constants.actuators]
     control = [_clipped(number, pair) for number, pair in zip(control, ends, strict=True)]
+    roots = places.roots_of(tuple(links.link_of_mocap(index) for index in constants.mocaps), list(mocap))
 
     def advance(_: Any, state: State) -> State:
-        return _step(constants, state, control, applied, exact, in_kernel)
+        return _step(constants, state, Surroundings(control, applied, roots), exact, in_kernel)
 
     return jax.lax.fori_loop(0, count, advance, state)
 
 
-def _step(
-    constants: Mechanism, state: State, control: Numbers, applied: Numbers, exact: bool, in_kernel: bool = False
-) -> State:
-    structure, problem, order = problem_of(constants, state, control, applied, exact)
+def _step(constants: Mechanism, state: State, around: Surroundings, exact: bool, in_kernel: bool = False) -> State:
+    structure, problem, order = problem_of(constants, state, around, exact)
     motion = descent.solve(structure, problem, in_kernel)
     place = {joint: index for index, joint in enumerate(order)}
     damped, acceleration, force = (
@@ -88,30 +99,31 @@ def _step(
     return State(position, velocity, acceleration, force)
 
 
-def problem_of(
-    constants: Mechanism, state: State, control: Numbers, applied: Numbers, exact: bool
-) -> tuple[Structure, Problem, list[int]]:
+def problem_of(constants: Mechanism, state: State, around: Surroundings, exact: bool) -> tuple[Structure, Problem, list[int]]:
     """The constraint problem of one step.
 
     Its joints come in an order of their own, so that its matrices fill in little as they are factorized from the last row on:
     of each place in this order, the joint that stands there comes with it.
     """
     displacement = [minus(there, rest) for there, rest in zip(state.position, constants.rest, strict=True)]
-    joints = dynamics.joints_at(constants.links, displacement)
+    turned = {joint for hold in constants.holds for frame in hold.weld.frames for joint in _chain(constants, frame.link)}
+    joints = dynamics.joints_at(constants.links, displacement, turned)
     mass = dynamics.mass_matrix(constants.links, joints)
     for joint, armature in enumerate(constants.armature):
         mass[joint, joint] = plus(mass[joint, joint], armature)
     for shares, armature in constants.tendon_masses:
         _add_tendon(mass, shares, armature)
-    rows = [_friction_row(friction, state) for friction in constants.frictions]
+    where = Places(constants.links, joints, mechanism.common_link(constants), around.roots)
+    rows = [row for hold in constants.holds for row in _hold_rows(hold, where, state)]
+    equalities = len(rows)
+    rows += [_friction_row(friction, state) for friction in constants.frictions]
     rows += [_limit_row(limit, state) for limit in constants.limits]
-    places = capsules.Places(constants.links, joints, mechanism.common_link(constants))
     cones = []
     for contact in constants.contacts:
         if contact.cone:
             cones.append((len(rows), len(contact.references)))
-        rows += _contact_rows(contact, places, state)
-    force = _forces(constants, state, joints, control, applied)
+        rows += _contact_rows(contact, where, state)
+    force = _forces(constants, state, joints, around)
     order = elimination_order(len(joints), list(mass), [tuple(row.entries) for row in rows])
     place = {joint: index for index, joint in enumerate(order)}
     ordered = {_below_diagonal(place[one], place[other]): number for (one, other), number in mass.items()}
@@ -130,7 +142,7 @@ def problem_of(
         joints=len(joints),
         mass=tuple(sorted(ordered)),
         rows=tuple(tuple(sorted(entries)) for entries in problem.jacobian),
-        equalities=0,
+        equalities=equalities,
         frictions=len(constants.frictions),
         cones=tuple(cones),
         apart=(),
@@ -184,16 +196,21 @@ def _add_tendon(mass: Matrix, shares: dict[int, float], armature: float) -> None
                 mass[one, other] = plus(mass.get((one, other), 0.0), armature * share * factor)
 
 
-def _forces(constants: Mechanism, state: State, joints: list[dynamics.Joint], control: Numbers, applied: Numbers) -> Numbers:
+def _chain(constants: Mechanism, link: int) -> list[int]:
+    return links.carriers(constants.links, link)
+
+
+def _forces(constants: Mechanism, state: State, joints: list[dynamics.Joint], around: Surroundings) -> Numbers:
     """On the joints, without constraints."""
-    bias = dynamics.bias(constants.links, joints, state.velocity, constants.gravity)
+    poses = {link: root.pose for link, root in around.roots.items()}
+    bias = dynamics.bias(constants.links, joints, state.velocity, constants.gravity, poses)
     forces = []
     for joint, (there, rate) in enumerate(zip(state.position, state.velocity, strict=True)):
         stiffness, rest = constants.springs[joint]
         spring = times(stiffness, minus(there, rest)) if stiffness else 0.0
         passive = plus(spring, times(constants.damping[joint], rate))
-        forces.append(minus(minus(applied[joint], bias[joint]), passive))
-    for actuator, signal in zip(constants.actuators, control, strict=True):
+        forces.append(minus(minus(around.applied[joint], bias[joint]), passive))
+    for actuator, signal in zip(constants.actuators, around.control, strict=True):
         length = times(actuator.gear, state.position[actuator.joint])
         speed = times(actuator.gear, state.velocity[actuator.joint])
         gain, bias_force = (
@@ -227,21 +244,58 @@ def _limit_row(limit: Limit, state: State) -> _Row:
     return _Row(entries, stiffness, minus(0.0, pull))
 
 
-def _contact_rows(contact: Contact, places: capsules.Places, state: State) -> list[_Row]:
-    """One row along the normal, and those of friction across it."""
-    touch = capsules.touch(contact.pair, places)
+def _hold_rows(hold: Hold, where: Places, state: State) -> list[_Row]:
+    """Three rows for the position and three for the turn, all as hard as their common length says."""
+    apart, reference = welds.apartness(hold.weld, where), hold.reference
+    impedance = reference.impedance(apart.length)
+    softness = [reference.softness(weight, impedance) for weight in hold.inverse_weights]
+    rows = []
+    for index, (error, entries) in enumerate(zip(apart.errors, apart.entries, strict=True)):
+        pull = plus(times(reference.damping, _speed(entries, state)), times(reference.stiffness, impedance, error))
+        rows.append(_Row(entries, softness[index // 3], minus(0.0, pull)))
+    return rows
+
+
+def _speed(entries: dict[int, Any], state: State) -> Any:
+    return plus(*(times(entry, state.velocity[joint]) for joint, entry in entries.items()))
+
+
+def _contact_rows(contact: Contact, where: Places, state: State) -> list[_Row]:
+    """One row along the normal, and those of friction across it; with a pyramid, one for each edge."""
+    touch = capsules.touch(contact.pair, where)
     distance = minus(touch.distance, contact.margin)
+    if contact.pyramid:
+        return _edge_rows(contact, touch, distance, where, state)
     directions = capsules.frame_about(touch.normal) if contact.cone else (touch.normal,)
     rows = []
     for direction, weight, reference in zip(directions, contact.inverse_weights, contact.references, strict=True):
-        entries = capsules.levers(contact.pair, places, direction, touch.position)
+        entries = capsules.levers(contact.pair, where, direction, touch.position)
         impedance = reference.impedance(distance)
         stiffness = jnp.where(distance < 0, reference.softness(weight, impedance), 0.0)
-        speed = plus(*(times(entry, state.velocity[joint]) for joint, entry in entries.items()))
-        pull = times(reference.damping, speed)
+        pull = times(reference.damping, _speed(entries, state))
         if not rows:
             pull = plus(pull, times(reference.stiffness, impedance, distance))
         rows.append(_Row(entries, stiffness, minus(0.0, pull)))
+    return rows
+
+
+def _edge_rows(contact: Contact, touch: capsules.Touch, distance: Any, where: Places, state: State) -> list[_Row]:
+    """Two rows for each direction of friction: along the normal and, to either side, as far across as friction goes."""
+    reference = contact.references[0]
+    impedance = reference.impedance(distance)
+    stiffness = jnp.where(distance < 0, reference.softness(contact.inverse_weights[0], impedance), 0.0)
+    normal, *across = capsules.frame_about(touch.normal)
+    ahead = capsules.levers(contact.pair, where, normal, touch.position)
+    aside = [capsules.levers(contact.pair, where, direction, touch.position) for direction in across]
+    aside = [*aside, capsules.spins(contact.pair, where, normal)][: len(contact.pyramid)]
+    pull = plus(times(reference.damping, _speed(ahead, state)), times(reference.stiffness, impedance, distance))
+    rows = []
+    for friction, entries in zip(contact.pyramid, aside, strict=True):
+        slid = {joint: times(friction, entry) for joint, entry in entries.items()}
+        drag = times(reference.damping, _speed(slid, state))
+        for combine in (plus, minus):
+            edge = {joint: combine(entry, slid[joint]) for joint, entry in ahead.items()}
+            rows.append(_Row(edge, stiffness, minus(0.0, combine(pull, drag))))
     return rows
 
 

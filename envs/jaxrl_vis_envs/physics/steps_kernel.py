@@ -39,6 +39,7 @@ def take(
     count: int,
     exact: bool,
     interpret: bool = False,
+    mocap: jax.Array | None = None,
 ) -> State:
     """`steps.take` for arrays, float32; over all axes of `jax.vmap` in one kernel.
 
@@ -50,17 +51,19 @@ def take(
         count: Physics steps.
         exact: See `steps.take`.
         interpret: Run the kernel without a GPU, slowly.
+        mocap: [M, 7], for each of ``constants.mocaps``.
 
     Returns:
         The state after them, [N] each.
     """
-    inputs = jnp.concatenate([state.position, state.velocity, state.acceleration, applied, control])
+    around = [applied, control] if mocap is None else [applied, control, mocap.reshape(-1)]
+    inputs = jnp.concatenate([state.position, state.velocity, state.acceleration, *around])
     result = _batched(constants, count, exact, interpret)(inputs[None])[0]
     return State(*result.reshape(len(State._fields), len(constants.links)))
 
 
 def _batched(constants: Mechanism, count: int, exact: bool, interpret: bool) -> Callable[[jax.Array], jax.Array]:
-    """Final states [B, 4 N] of inputs [B, 4 N + nu]. Another axis of `jax.vmap` makes B larger."""
+    """Final states [B, 4 N] of inputs [B, 4 N + nu + 7 M]. Another axis of `jax.vmap` makes B larger."""
     # Traced once for all launches.
     simulate = jax.jit(functools.partial(_simulate, constants, count, exact))
 
@@ -82,7 +85,9 @@ def _simulate(constants: Mechanism, count: int, exact: bool, rows: list[jax.Arra
     joints = len(constants.links)
     position, velocity, acceleration, applied = (rows[first * joints :][:joints] for first in range(4))
     start = State(position, velocity, acceleration, [0.0 * number for number in position])
-    end = steps.take(constants, start, rows[4 * joints :], applied, count, exact, in_kernel=True)
+    controls = len(constants.actuators)
+    control, mocap = rows[4 * joints :][:controls], rows[4 * joints + controls :]
+    end = steps.take(constants, start, control, applied, count, exact, in_kernel=True, mocap=mocap)
     return [number for part in end for number in part]
 
 
