@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks import environments
 from jaxrl_vis_envs.compilation import KERNELS_VARIABLE, env_jit
-from jaxrl_vis_envs.physics import algebra, constraints, descent, newton_kernel
+from jaxrl_vis_envs.physics import algebra, constraints, descent, line_search, newton_kernel
 from jaxrl_vis_envs.physics.descent import Motion, Problem, Structure
 from jaxrl_vis_envs.physics.mjx_model import mjx
 
@@ -131,7 +131,7 @@ def test_dry_friction_is_not_jumped_over():
         return knee + 0.1 * (length - 0.3), jnp.where(jnp.abs(length - 0.3) < 1e-3, 1000.1, 0.1)
 
     corners = [jnp.float32(0.299), jnp.float32(0.301), jnp.float32(-4.0)]
-    assert float(descent.lowest(slope_at, corners, jnp.float32(1.0))) == pytest.approx(0.3, abs=1e-5)
+    assert float(line_search.lowest(slope_at, corners, jnp.float32(1.0))) == pytest.approx(0.3, abs=1e-5)
 
 
 @functools.partial(jax.jit, static_argnums=5)
@@ -141,7 +141,9 @@ def lowest_over_parabolas(residual, along, stiffness, first, second, in_kernel):
         acting = jnp.where(there < 0, stiffness, 0.0) * along
         return first + second * length + acting @ there, second + acting @ along
 
-    return descent.lowest(slope_at, list(-residual / along), jnp.float32(1.0), matters=jnp.bool_(True) if in_kernel else None)
+    return line_search.lowest(
+        slope_at, list(-residual / along), jnp.float32(1.0), matters=jnp.bool_(True) if in_kernel else None
+    )
 
 
 @pytest.mark.parametrize("in_kernel", [False, True])
@@ -201,9 +203,10 @@ def test_a_problem_of_the_hand_is_solved(monkeypatch):
 
     NumPy does the arithmetic, in float32, too: to compile it takes minutes, and JAX takes ten seconds for it number by number.
     """
-    monkeypatch.setattr(descent, "jnp", np)
-    monkeypatch.setattr(descent, "jax", SimpleNamespace(lax=SimpleNamespace(fori_loop=loop_of_numpy)))
-    monkeypatch.setattr(algebra, "jnp", np)
+    for module in (algebra, descent, line_search):
+        monkeypatch.setattr(module, "jnp", np)
+    for module in (descent, line_search):
+        monkeypatch.setattr(module, "jax", SimpleNamespace(lax=SimpleNamespace(fori_loop=loop_of_numpy)))
     env = environments.make("HandReach")
     structure = constraints.structure_of(mjx.put_model(env.mj_model), exact=True)._replace(iterations=10, warm=False)
     rng = np.random.default_rng(3)

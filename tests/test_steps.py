@@ -22,6 +22,7 @@ from jaxrl_vis_envs.physics import (
     descent,
     dynamics,
     folding,
+    line_search,
     links,
     mechanism,
     mjx_model,
@@ -121,10 +122,10 @@ def taken(model: mjx.Model, data: mjx.Data, count: int, in_kernel: bool) -> step
     state = steps.State(*map(columns, (data.qpos, data.qvel, data.qacc_warmstart, data.qvel)))
     constants, control, applied = mechanism.mechanism_of(model), columns(data.ctrl), columns(data.qfrc_applied)
     with pytest.MonkeyPatch.context() as patch, np.errstate(over="ignore"):
-        for module in (algebra, capsules, cones, descent, folding, reference, steps):
+        for module in (algebra, capsules, cones, descent, folding, line_search, reference, steps):
             patch.setattr(module, "jnp", Float32Numpy())
         lax = SimpleNamespace(fori_loop=loop_of_numpy, while_loop=open_loop_of_numpy, cond=branch_of_numpy)
-        for module in (descent, steps):
+        for module in (descent, line_search, steps):
             patch.setattr(module, "jax", SimpleNamespace(lax=lax))
         state = steps.take(constants, state, control, applied, count, True, in_kernel)
     return steps.State(*(np.stack(part, axis=1) for part in state))

@@ -18,6 +18,7 @@ from jaxrl_vis_envs.physics import (
     descent,
     dynamics,
     folding,
+    line_search,
     links,
     mechanism,
     mjx_model,
@@ -113,10 +114,10 @@ def taken(model: mjx.Model, data: mjx.Data, count: int, in_kernel: bool, exact: 
     mocap = np.concatenate([data.mocap_pos[:, used], data.mocap_quat[:, used]], axis=2).reshape(data.qpos.shape[0], -1)
     state = steps.State(*map(columns, (data.qpos, data.qvel, data.qacc_warmstart, data.qvel)))
     with pytest.MonkeyPatch.context() as patch, np.errstate(over="ignore"):
-        for module in (algebra, capsules, cones, descent, folding, quaternions, reference, steps, welds):
+        for module in (algebra, capsules, cones, descent, folding, line_search, quaternions, reference, steps, welds):
             patch.setattr(module, "jnp", Float32Numpy())
         lax = SimpleNamespace(fori_loop=loop_of_numpy, while_loop=open_loop_of_numpy, cond=branch_of_numpy)
-        for module in (descent, steps):
+        for module in (descent, line_search, steps):
             patch.setattr(module, "jax", SimpleNamespace(lax=lax))
         control, applied = columns(data.ctrl), columns(data.qfrc_applied)
         state = steps.take(constants, state, control, applied, count, exact, in_kernel, columns(mocap))

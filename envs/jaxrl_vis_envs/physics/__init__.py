@@ -2,7 +2,8 @@
 
 mjx_model           loading a model, and stepping it: `step`, `take_steps`, `simulate`
 constraints         motion under constraints; `solver_of` names the solver of a model
-descent             the same for small models, number by number (`algebra`, `cones`); newton_kernel makes it a GPU kernel
+descent             the same for small models, number by number (`algebra`, `cones`, `line_search`); newton_kernel makes it a
+                    GPU kernel
 newton              the same for models of few joints in matrices, for CPUs; what neither takes is left to MJX
 steps               physics steps number by number, by folding, quaternions, links, dynamics, places, capsules, welds, reference
                     and mechanism; steps_kernel makes all steps of a control step one GPU kernel
