@@ -26,9 +26,11 @@ from jaxrl_vis_envs.physics import (
     links,
     mechanism,
     mjx_model,
+    quaternions,
     reference,
     steps,
     steps_kernel,
+    welds,
 )
 from jaxrl_vis_envs.physics.mjx_model import mjx
 from jaxrl_vis_envs.tasks.hand_reach import HandReach, HandReachConfig
@@ -117,17 +119,20 @@ def branch_of_numpy(condition, one, other):
     return one() if condition else other()
 
 
-def taken(model: mjx.Model, data: mjx.Data, count: int, in_kernel: bool) -> steps.State:
-    """`steps.take` of a batch, [B, N] each."""
+def taken(model: mjx.Model, data: mjx.Data, count: int, in_kernel: bool, exact: bool = True) -> steps.State:
+    """`steps.take` of a batch, [B, N] each, in NumPy."""
+    constants = mechanism.mechanism_of(model)
+    used = list(constants.mocaps)
+    mocap = np.concatenate([data.mocap_pos[:, used], data.mocap_quat[:, used]], axis=2).reshape(data.qpos.shape[0], -1)
     state = steps.State(*map(columns, (data.qpos, data.qvel, data.qacc_warmstart, data.qvel)))
-    constants, control, applied = mechanism.mechanism_of(model), columns(data.ctrl), columns(data.qfrc_applied)
     with pytest.MonkeyPatch.context() as patch, np.errstate(over="ignore"):
-        for module in (algebra, capsules, cones, descent, folding, line_search, reference, steps):
+        for module in (algebra, capsules, cones, descent, folding, line_search, quaternions, reference, steps, welds):
             patch.setattr(module, "jnp", Float32Numpy())
         lax = SimpleNamespace(fori_loop=loop_of_numpy, while_loop=open_loop_of_numpy, cond=branch_of_numpy)
         for module in (descent, line_search, steps):
             patch.setattr(module, "jax", SimpleNamespace(lax=lax))
-        state = steps.take(constants, state, control, applied, count, True, in_kernel)
+        control, applied = columns(data.ctrl), columns(data.qfrc_applied)
+        state = steps.take(constants, state, control, applied, count, exact, in_kernel, columns(mocap))
     return steps.State(*(np.stack(part, axis=1) for part in state))
 
 

@@ -1,7 +1,6 @@
 """Physics steps number by number (`test_steps`) of models with welds, mocap bodies, spheres on planes and pyramidal cones."""
 
 import functools
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -12,26 +11,17 @@ import pytest
 from benchmarks import environments
 from jaxrl_vis_envs.compilation import KERNELS_VARIABLE, env_jit
 from jaxrl_vis_envs.physics import (
-    algebra,
-    capsules,
-    cones,
-    descent,
     dynamics,
-    folding,
-    line_search,
     links,
     mechanism,
     mjx_model,
     places,
     quaternions,
-    reference,
-    steps,
     steps_kernel,
-    welds,
 )
 from jaxrl_vis_envs.physics.mjx_model import mjx
 from jaxrl_vis_envs.tasks.fetch_reach import FetchReach, VisualFetchReachConfig
-from tests.test_steps import Float32Numpy, branch_of_numpy, columns, loop_of_numpy, lowered_for_cuda, open_loop_of_numpy
+from tests.test_steps import columns, lowered_for_cuda, taken
 
 # Welds of two bodies that hang on one joint, on a mocap body and on the world; joints and geoms that mocap bodies carry; planes
 # that lean and that mocap bodies carry; at places and along axes that nothing folds away.
@@ -105,23 +95,6 @@ def odd_states(mj_model: mujoco.MjModel, count: int) -> mjx.Data:
     drawn = {name: rng.normal(0, draw[name], getattr(data, name).shape) for name in draw}
     drawn["mocap_pos"] += np.asarray(data.mocap_pos)
     return data.replace(**{name: jnp.asarray(values, jnp.float32) for name, values in drawn.items()})
-
-
-def taken(model: mjx.Model, data: mjx.Data, count: int, in_kernel: bool, exact: bool) -> steps.State:
-    """`steps.take` of a batch, [B, N] each, in NumPy."""
-    constants = mechanism.mechanism_of(model)
-    used = list(constants.mocaps)
-    mocap = np.concatenate([data.mocap_pos[:, used], data.mocap_quat[:, used]], axis=2).reshape(data.qpos.shape[0], -1)
-    state = steps.State(*map(columns, (data.qpos, data.qvel, data.qacc_warmstart, data.qvel)))
-    with pytest.MonkeyPatch.context() as patch, np.errstate(over="ignore"):
-        for module in (algebra, capsules, cones, descent, folding, line_search, quaternions, reference, steps, welds):
-            patch.setattr(module, "jnp", Float32Numpy())
-        lax = SimpleNamespace(fori_loop=loop_of_numpy, while_loop=open_loop_of_numpy, cond=branch_of_numpy)
-        for module in (descent, line_search, steps):
-            patch.setattr(module, "jax", SimpleNamespace(lax=lax))
-        control, applied = columns(data.ctrl), columns(data.qfrc_applied)
-        state = steps.take(constants, state, control, applied, count, exact, in_kernel, columns(mocap))
-    return steps.State(*(np.stack(part, axis=1) for part in state))
 
 
 @functools.cache

@@ -7,16 +7,74 @@ an array, and is added here.
 """
 
 import functools
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
+from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
 from jax.interpreters import mlir
 
 LANES = 32
 """Threads of a program: those of a warp."""
+_COMPILER = plgpu.CompilerParams(num_warps=1, num_stages=1)
+
+Compute = Callable[[list[jax.Array]], Iterable[Any]]
+
+
+def as_kernel(name: str, compute: Compute, outputs: int, interpret: bool) -> Callable[[jax.Array], jax.Array]:
+    """A function of episodes as one GPU kernel, in which a thread has an episode and a program 32 of them.
+
+    Args:
+        name: Of the kernel.
+        compute: Makes an episode's outputs of its inputs; numbers are [32] float32, one for each thread.
+        outputs: How many it makes.
+        interpret: Run the kernel without a GPU, slowly.
+
+    Returns:
+        Inputs [B, I] float32 -> outputs [B, ``outputs``]. Another axis of `jax.vmap` makes B larger.
+    """
+
+    @custom_vmap
+    def run(inputs: jax.Array) -> jax.Array:
+        batch = inputs.shape[0]
+        programs = pl.cdiv(batch, LANES)
+        # Threads beyond the last episode compute that again: zeros might be nothing to compute with.
+        inputs = jnp.pad(inputs, ((0, programs * LANES - batch), (0, 0)), mode="edge")
+        results, _ = pl.pallas_call(
+            functools.partial(_kernel, compute=compute, interpret=interpret),
+            grid=(programs,),
+            out_shape=[
+                jax.ShapeDtypeStruct((outputs, programs * LANES), jnp.float32),
+                jax.ShapeDtypeStruct((programs,), jnp.int32),
+            ],
+            compiler_params=_COMPILER,
+            interpret=interpret,
+            name=name,
+        )(inputs.T)
+        return results.T[:batch]
+
+    @run.def_vmap
+    def _(size: int, in_batched: list[bool], inputs: jax.Array) -> tuple[jax.Array, bool]:
+        del in_batched  # there is one input, so it is batched
+        flat = run(inputs.reshape(-1, inputs.shape[-1]))
+        return flat.reshape(size, -1, flat.shape[-1]), True
+
+    return run
+
+
+def _kernel(inputs: Any, results: Any, done: Any, *, compute: Compute, interpret: bool) -> None:
+    program = pl.program_id(0)
+    own = pl.ds(program * LANES, LANES)
+    rows = [inputs[row, own] for row in range(inputs.shape[0])] if interpret else read_rows(inputs)
+    numbers = [jnp.broadcast_to(jnp.asarray(number, jnp.float32), (LANES,)) for number in compute(rows)]
+    if interpret:
+        for row, number in enumerate(numbers):
+            results[row, own] = number
+    else:
+        done[program] = write_rows(results, numbers)
 
 
 @functools.cache

@@ -7,20 +7,14 @@ Numbers are read and written in a way of their own (`lanes`): Pallas's own takes
 """
 
 import functools
-from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_batching import custom_vmap
-from jax.experimental import pallas as pl
-from jax.experimental.pallas import triton as plgpu
 
 from jaxrl_vis_envs.physics import descent, lanes
 from jaxrl_vis_envs.physics.descent import Motion, Problem, Structure
-
-_COMPILER = plgpu.CompilerParams(num_warps=1, num_stages=1)
 
 
 def solve(structure: Structure, problem: Problem, interpret: bool = False) -> Motion:
@@ -33,8 +27,9 @@ def solve(structure: Structure, problem: Problem, interpret: bool = False) -> Mo
     """
     places = _places(structure)
     parts = [array[tuple(np.array(places[name]).T)] for name, array in problem._asdict().items() if places[name]]
-    motion = _batched(structure, interpret)(jnp.concatenate(parts)[None])[0]
-    return Motion(*motion.reshape(len(Motion._fields), structure.joints))
+    outputs = len(Motion._fields) * structure.joints
+    kernel = lanes.as_kernel("solve_constraints", functools.partial(_solved, structure), outputs, interpret)
+    return Motion(*kernel(jnp.concatenate(parts)[None])[0].reshape(len(Motion._fields), structure.joints))
 
 
 def _places(structure: Structure) -> dict[str, list[tuple[int, ...]]]:
@@ -44,58 +39,12 @@ def _places(structure: Structure) -> dict[str, list[tuple[int, ...]]]:
     return places
 
 
-def _batched(structure: Structure, interpret: bool) -> Callable[[jax.Array], jax.Array]:
-    """Motions [B, outputs] of problems [B, inputs], in numbers whose order is that of `_places` and of `Motion`.
-
-    Another axis of `jax.vmap` makes B larger.
-    """
-
-    @custom_vmap
-    def motions(problems: jax.Array) -> jax.Array:
-        return _launch(structure, problems, interpret)
-
-    @motions.def_vmap
-    def _(size: int, in_batched: list[bool], problems: jax.Array) -> tuple[jax.Array, bool]:
-        del in_batched  # there is one input, so it is batched
-        flat = motions(problems.reshape(-1, problems.shape[-1]))
-        return flat.reshape(size, -1, flat.shape[-1]), True
-
-    return motions
-
-
-def _launch(structure: Structure, problems: jax.Array, interpret: bool) -> jax.Array:
-    batch = problems.shape[0]
-    programs = pl.cdiv(batch, lanes.LANES)
-    # Threads beyond the last episode solve that again: zeros would be no problem to solve.
-    problems = jnp.pad(problems, ((0, programs * lanes.LANES - batch), (0, 0)), mode="edge")
-    motions, _ = pl.pallas_call(
-        functools.partial(_kernel, structure=structure, interpret=interpret),
-        grid=(programs,),
-        out_shape=[
-            jax.ShapeDtypeStruct((len(Motion._fields) * structure.joints, programs * lanes.LANES), jnp.float32),
-            jax.ShapeDtypeStruct((programs,), jnp.int32),
-        ],
-        compiler_params=_COMPILER,
-        interpret=interpret,
-        name="solve_constraints",
-    )(problems.T)
-    return motions.T[:batch]
-
-
-def _kernel(problems: Any, motions: Any, done: Any, *, structure: Structure, interpret: bool) -> None:
-    program = pl.program_id(0)
-    own = pl.ds(program * lanes.LANES, lanes.LANES)
-    rows = [problems[row, own] for row in range(problems.shape[0])] if interpret else lanes.read_rows(problems)
+def _solved(structure: Structure, rows: list[jax.Array]) -> list[Any]:
+    """The numbers of a motion, of those of a problem in the order of `_places`."""
     every_place = [(name, place) for name, places in _places(structure).items() for place in places]
     numbers = dict(zip(every_place, rows, strict=True))
-    problem = descent.numbers_of(structure, lambda name, *place: numbers[name, place])
-    motion = descent.solve(structure, problem)
-    results = [jnp.broadcast_to(jnp.asarray(number, jnp.float32), (lanes.LANES,)) for part in motion for number in part]
-    if interpret:
-        for row, result in enumerate(results):
-            motions[row, own] = result
-    else:
-        done[program] = lanes.write_rows(motions, results)
+    motion = descent.solve(structure, descent.numbers_of(structure, lambda name, *place: numbers[name, place]))
+    return [number for part in motion for number in part]
 
 
 def probe() -> None:

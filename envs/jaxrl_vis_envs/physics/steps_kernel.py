@@ -6,15 +6,11 @@ one for all of them.
 
 import functools
 import os
-from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
-from jax.custom_batching import custom_vmap
-from jax.experimental import pallas as pl
-from jax.experimental.pallas import triton as plgpu
 from mujoco import mjx
 
 from jaxrl_vis_envs.physics import lanes, steps
@@ -23,7 +19,6 @@ from jaxrl_vis_envs.physics.steps import State
 
 VARIABLE = "JAXRL_VIS_STEPS_KERNEL"
 """Environment variable that asks for the kernel: 1 does, anything else does not."""
-_COMPILER = plgpu.CompilerParams(num_warps=1, num_stages=1)
 
 
 def is_wanted() -> bool:
@@ -58,30 +53,15 @@ def take(
     """
     around = [applied, control] if mocap is None else [applied, control, mocap.reshape(-1)]
     inputs = jnp.concatenate([state.position, state.velocity, state.acceleration, *around])
-    result = _batched(constants, count, exact, interpret)(inputs[None])[0]
-    return State(*result.reshape(len(State._fields), len(constants.links)))
-
-
-def _batched(constants: Mechanism, count: int, exact: bool, interpret: bool) -> Callable[[jax.Array], jax.Array]:
-    """Final states [B, 4 N] of inputs [B, 4 N + nu + 7 M]. Another axis of `jax.vmap` makes B larger."""
     # Traced once for all launches.
     simulate = jax.jit(functools.partial(_simulate, constants, count, exact))
-
-    @custom_vmap
-    def final(inputs: jax.Array) -> jax.Array:
-        return _launch(len(constants.links), simulate, inputs, interpret)
-
-    @final.def_vmap
-    def _(size: int, in_batched: list[bool], inputs: jax.Array) -> tuple[jax.Array, bool]:
-        del in_batched  # there is one input, so it is batched
-        flat = final(inputs.reshape(-1, inputs.shape[-1]))
-        return flat.reshape(size, -1, flat.shape[-1]), True
-
-    return final
+    joints = len(constants.links)
+    kernel = lanes.as_kernel("take_physics_steps", simulate, len(State._fields) * joints, interpret)
+    return State(*kernel(inputs[None])[0].reshape(len(State._fields), joints))
 
 
 def _simulate(constants: Mechanism, count: int, exact: bool, rows: list[jax.Array]) -> list[jax.Array]:
-    """Final numbers of an episode's numbers, in the order of `_batched`; arrays [32] each."""
+    """Final numbers of an episode's numbers, in the order of `take`."""
     joints = len(constants.links)
     position, velocity, acceleration, applied = (rows[first * joints :][:joints] for first in range(4))
     start = State(position, velocity, acceleration, [0.0 * number for number in position])
@@ -89,37 +69,6 @@ def _simulate(constants: Mechanism, count: int, exact: bool, rows: list[jax.Arra
     control, mocap = rows[4 * joints :][:controls], rows[4 * joints + controls :]
     end = steps.take(constants, start, control, applied, count, exact, in_kernel=True, mocap=mocap)
     return [number for part in end for number in part]
-
-
-def _launch(joints: int, simulate: Callable[..., list[jax.Array]], inputs: jax.Array, interpret: bool) -> jax.Array:
-    batch = inputs.shape[0]
-    programs = pl.cdiv(batch, lanes.LANES)
-    # Threads beyond the last episode simulate that again.
-    inputs = jnp.pad(inputs, ((0, programs * lanes.LANES - batch), (0, 0)), mode="edge")
-    final, _ = pl.pallas_call(
-        functools.partial(_kernel, simulate=simulate, interpret=interpret),
-        grid=(programs,),
-        out_shape=[
-            jax.ShapeDtypeStruct((len(State._fields) * joints, programs * lanes.LANES), jnp.float32),
-            jax.ShapeDtypeStruct((programs,), jnp.int32),
-        ],
-        compiler_params=_COMPILER,
-        interpret=interpret,
-        name="take_physics_steps",
-    )(inputs.T)
-    return final.T[:batch]
-
-
-def _kernel(inputs: Any, final: Any, done: Any, *, simulate: Callable[..., list[jax.Array]], interpret: bool) -> None:
-    program = pl.program_id(0)
-    own = pl.ds(program * lanes.LANES, lanes.LANES)
-    rows = [inputs[row, own] for row in range(inputs.shape[0])] if interpret else lanes.read_rows(inputs)
-    results = simulate(rows)
-    if interpret:
-        for row, result in enumerate(results):
-            final[row, own] = result
-    else:
-        done[program] = lanes.write_rows(final, results)
 
 
 _PROBE = """
