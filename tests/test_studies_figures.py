@@ -211,6 +211,9 @@ def test_a_figure_shows_what_is_finished_and_lists_the_rest(tmp_path: Path, caps
     assert make_figure(Request("5.6", STUDIES["5.6"], tmp_path / "w.pdf", runs, tasks=(FETCH,), draw_only=True))
     assert (tmp_path / "w.pdf").read_bytes().startswith(b"%PDF")
     assert "not defined" in (tmp_path / "w.md").read_text()  # all weights were alike
+    shorter = Request("5.6", STUDIES["5.6"], tmp_path / "w.pdf", runs, (FETCH,), scope=Scope(env_steps=120_000), draw_only=True)
+    assert make_figure(shorter)
+    assert "not there yet" not in (tmp_path / "w.md").read_text()  # gains are those of figure 5.5, at its own budget
     assert make_figure(Request("5.5", STUDIES["5.5"], tmp_path / "alone.png", runs, tasks=(FETCH,), draw_only=True))
     assert all(has_colour(tmp_path / "alone.png", VARIANTS[name].colour) for name in AUX_TASKS)
 

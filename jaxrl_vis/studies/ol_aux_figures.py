@@ -1,5 +1,6 @@
 """What figures 5.4 to 5.7 show: curves of success with the authors' behind, curves of weights, and their tables."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -68,8 +69,10 @@ def _steps_table(lines: Lines, tasks: Sequence[str]):
 
 
 def _weights_table(request: Request, lines: Lines, tasks: Sequence[str]):
-    cells = cells_of(STUDIES[_ALONE], tasks, (BASELINE, *AUX_TASKS), request.scope)
-    others, _ = read_lines(cells, request.runs)
+    # Weights may be drawn over other budgets than single tasks have: then the runs of figure 5.5 itself say what each gains.
+    scopes = (dataclasses.replace(request.scope, env_steps=None), request.scope)
+    cells = [cells_of(STUDIES[_ALONE], tasks, (BASELINE, *AUX_TASKS), scope) for scope in scopes]
+    others = {key: line for each in cells for key, line in read_lines(each, request.runs)[0].items()}
     weighted = {task: next(line for (of_task, _), line in lines.items() if of_task == task) for task in tasks}
     bases = {task: line for (task, variant), line in others.items() if variant == BASELINE}
     names = {name: name.replace("_", " ") for name in AUX_TASKS}
