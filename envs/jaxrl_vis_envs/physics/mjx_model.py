@@ -71,13 +71,12 @@ def simulate(model: mjx.Model, data: mjx.Data, substeps: int, exact: bool = Fals
 def take_steps(model: mjx.Model, data: mjx.Data, count: int, exact: bool = False) -> mjx.Data:
     """``count`` physics steps (`step`); poses and true states are then older than ``qpos``.
 
-    On a GPU that runs kernels, models that `mechanism` takes have them all in one if the environment variable
-    ``JAXRL_VIS_STEPS_KERNEL`` is 1 (`steps_kernel`). Contacts between capsules are then exact in any case, and if more pairs
-    touch than ``max_contact_points`` or ``max_geom_pairs``, all of them count. Nothing but positions, velocities,
-    accelerations, time and the constraints' forces is new afterwards. Forces on bodies (``xfrc_applied``) and welds that are
-    turned off (``eq_active``) are not heeded: with any, positions are not a number.
+    On a GPU that runs kernels, models that `mechanism` takes have them all in one (`steps_kernel`). Contacts between capsules
+    are then exact in any case, and if more pairs touch than ``max_contact_points`` or ``max_geom_pairs``, all of them count.
+    Nothing but positions, velocities, accelerations, time and the constraints' forces is new afterwards. Forces on bodies
+    (``xfrc_applied``) and welds that are turned off (``eq_active``) are not heeded: with any, positions are not a number.
     """
-    if not steps_kernel.is_wanted() or not mechanism.takes(model):
+    if not mechanism.takes(model):
         return _one_by_one(model, data, count, exact)
 
     def by_kernel_or_not(data: mjx.Data) -> mjx.Data:

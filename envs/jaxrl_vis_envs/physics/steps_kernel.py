@@ -5,7 +5,6 @@ one for all of them.
 """
 
 import functools
-import os
 from typing import Any
 
 import jax
@@ -16,14 +15,6 @@ from mujoco import mjx
 from jaxrl_vis_envs.physics import lanes, steps
 from jaxrl_vis_envs.physics.mechanism import Mechanism, mechanism_of
 from jaxrl_vis_envs.physics.steps import State
-
-VARIABLE = "JAXRL_VIS_STEPS_KERNEL"
-"""Environment variable that asks for the kernel: 1 does, anything else does not."""
-
-
-def is_wanted() -> bool:
-    """Whether the kernel is used where it can be: not unless it is asked for, until it was measured on a GPU."""
-    return os.environ.get(VARIABLE, "").strip() == "1"
 
 
 def take(
