@@ -20,7 +20,7 @@ from jaxrl_vis_envs.compilation import (
     tracing_for,
     tracing_for_default_device,
 )
-from jaxrl_vis_envs.physics import newton_kernel
+from jaxrl_vis_envs.physics import newton_kernel, steps_kernel
 from jaxrl_vis_envs.render import render_planes
 from jaxrl_vis_envs.render.gpu import kernel
 
@@ -106,7 +106,7 @@ def test_a_kernel_that_does_not_compile_is_left_out_and_named_once(gpu, monkeypa
         assert runs_gpu_kernels(breaks)
 
 
-@pytest.mark.parametrize("module", [kernel, encoder_kernel_passes, newton_kernel])
+@pytest.mark.parametrize("module", [kernel, encoder_kernel_passes, newton_kernel, steps_kernel])
 def test_the_kernels_themselves_are_probed_in_the_midst_of_a_trace(module, gpu):
     """As far as they can be compiled without a GPU: down to Triton's code."""
     gpu()

@@ -5,7 +5,9 @@ For a whole step of the hand NumPy does the arithmetic, in float32, too: to comp
 
 import copy
 import functools
+import re
 from types import SimpleNamespace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -119,7 +121,7 @@ def branch_of_numpy(condition, one, other):
     return one() if condition else other()
 
 
-def taken(model: mjx.Model, data: mjx.Data, count: int, in_kernel: bool, exact: bool = True) -> steps.State:
+def taken(model: mjx.Model, data: mjx.Data, count: int, in_kernel: bool, exact: Any = True) -> steps.State:
     """`steps.take` of a batch, [B, N] each, in NumPy."""
     constants = mechanism.mechanism_of(model)
     used = list(constants.mocaps)
@@ -132,7 +134,8 @@ def taken(model: mjx.Model, data: mjx.Data, count: int, in_kernel: bool, exact: 
         for module in (descent, line_search, steps):
             patch.setattr(module, "jax", SimpleNamespace(lax=lax))
         control, applied = columns(data.ctrl), columns(data.qfrc_applied)
-        state = steps.take(constants, state, control, applied, count, exact, in_kernel, columns(mocap))
+        timestep = float(model.opt.timestep)
+        state = steps.take(constants, state, control, applied, timestep, count, exact, in_kernel, columns(mocap))
     return steps.State(*(np.stack(part, axis=1) for part in state))
 
 
@@ -215,6 +218,27 @@ def test_a_step_of_a_model_with_everything(warmstart):
     assert np.median(error) < 2e-6 and error.max() < 1e-3, np.sort(error)[-10:]
 
 
+@pytest.mark.parametrize("is_exact", [False, True])
+def test_whether_steps_are_exact_may_be_a_number(is_exact):
+    mj_model = odd_model()
+    model, data = mjx.put_model(mj_model), odd_states(mj_model, 50)
+    known, read = (taken(model, data, 2, in_kernel=True, exact=exact) for exact in (is_exact, np.int32(is_exact)))
+    for one, other in zip(known, read, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_mechanisms_are_the_same_where_their_content_is():
+    def content(**changes):
+        mj_model = odd_model()
+        for name, value in changes.items():
+            getattr(mj_model, name)[:] = value
+        return mechanism.content(mechanism.mechanism_of(mjx.put_model(mj_model)))
+
+    assert hash(content()) == hash(content()) and content() == content()
+    for name in ("dof_damping", "body_mass", "jnt_range", "pair_margin", "geom_pos", "tendon_armature"):
+        assert content(**{name: 0.123}) != content(), name
+
+
 @pytest.mark.parametrize("name", ["HandReach", "FingerTurn", "Reacher", "odd"])
 def test_masses_and_bias_forces_are_those_of_mujoco(name, monkeypatch):
     """In double precision, but for what MJX has rounded of the model."""
@@ -285,15 +309,33 @@ def lowered_for_cuda(model: mjx.Model, data: mjx.Data) -> str:
 @pytest.mark.parametrize("name", ["FingerTurn", "HandReach"])
 def test_all_steps_of_a_task_are_one_kernel_for_nvidia(name, monkeypatch):
     monkeypatch.delenv(KERNELS_VARIABLE, raising=False)
-    monkeypatch.setenv(steps_kernel.VARIABLE, "1")
     env = environments.make(name)
     data = jax.eval_shape(lambda: jax.vmap(lambda _: mjx.make_data(env.mj_model))(jnp.zeros(8)))
     program = lowered_for_cuda(env._model, data)
     assert program.count("take_physics_steps") >= 1 and "solve_constraints" not in program
     assert program.count("stablehlo.") < 100
 
-    monkeypatch.delenv(steps_kernel.VARIABLE)
-    assert "take_physics_steps" not in lowered_for_cuda(env._model, data)
+
+def test_goals_and_steps_of_the_hand_are_one_kernel(monkeypatch):
+    """Which XLA compiles once, as the code is the same to the last letter: number, length and exactness of steps are inputs."""
+    monkeypatch.delenv(KERNELS_VARIABLE, raising=False)
+    env = environments.make("HandReach")
+
+    def from_goal(key, action):
+        with tracing_for("cuda"), kernels(True):
+            return env.act(env.sample_goal(key), action)
+
+    keys, actions = jax.eval_shape(lambda: (jax.random.split(jax.random.key(0), 8), jnp.zeros((8, env.action_size))))
+    program = jax.jit(jax.vmap(from_goal)).trace(keys, actions).lower(lowering_platforms=("cuda",)).as_text()
+    assert program.count("take_physics_steps") >= 1 and len(set(re.findall('ir = "[^"]*"', program))) == 1
+
+
+def test_steps_are_taken_one_by_one_where_their_kernel_does_not_compile(monkeypatch):
+    monkeypatch.setattr(mjx_model, "runs_gpu_kernels", lambda probe: probe is not steps_kernel.probe)
+    env = environments.make("FingerTurn")
+    data = jax.eval_shape(lambda: jax.vmap(lambda _: mjx.make_data(env.mj_model))(jnp.zeros(8)))
+    program = lowered_for_cuda(env._model, data)
+    assert "take_physics_steps" not in program and "solve_constraints" in program
 
 
 def test_the_probe_is_a_kernel_for_nvidia():

@@ -17,7 +17,6 @@ from jaxrl_vis_envs.physics import (
     mjx_model,
     places,
     quaternions,
-    steps_kernel,
 )
 from jaxrl_vis_envs.physics.mjx_model import mjx
 from jaxrl_vis_envs.tasks.fetch_reach import FetchReach, VisualFetchReachConfig
@@ -194,7 +193,6 @@ def test_the_kernel_takes_the_same_steps():
 @pytest.mark.parametrize("name", ["FetchReach", "SawyerReach", "StalkReach"])
 def test_all_steps_of_a_task_are_one_kernel_for_nvidia(name, monkeypatch):
     monkeypatch.delenv(KERNELS_VARIABLE, raising=False)
-    monkeypatch.setenv(steps_kernel.VARIABLE, "1")
     env = environments.make(name)
     data = jax.eval_shape(lambda: jax.vmap(lambda _: mjx.make_data(env.mj_model))(jnp.zeros(8)))
     program = lowered_for_cuda(env._model, data)

@@ -121,7 +121,7 @@ def numbers_of(structure: Structure, read: Callable[..., Any]) -> Problem:
     )
 
 
-def solve(structure: Structure, problem: Problem, in_kernel: bool = False) -> Motion:
+def solve(structure: Structure, problem: Problem, in_kernel: bool = False, exact: Any = True) -> Motion:
     """The motion under a problem's constraints, all in numbers.
 
     Args:
@@ -129,6 +129,7 @@ def solve(structure: Structure, problem: Problem, in_kernel: bool = False) -> Mo
         problem: Its numbers.
         in_kernel: Whether a loop carries numbers for nothing, so that none is computed twice, and whether a branch costs less
             than what is in it, so that no line is searched for the step that is taken whole. On a CPU neither is so.
+        exact: If the structure is exact, whether the problem is solved so this time; True or an int32, 1 or 0.
     """
     descent = _Descent(structure, problem, in_kernel)
     free = solve_positive(problem.mass, problem.force)
@@ -144,7 +145,7 @@ def solve(structure: Structure, problem: Problem, in_kernel: bool = False) -> Mo
         is_better = descent.cost(problem.warm, warm_residual, free) < descent.cost(free, residual, free)
         acceleration = [jnp.where(is_better, *pair) for pair in zip(problem.warm, free, strict=True)]
         residual = [jnp.where(is_better, *pair) for pair in zip(warm_residual, residual, strict=True)]
-    steps = structure.iterations + structure.exact
+    steps = structure.iterations + exact if structure.exact else structure.iterations
     if in_kernel:
         place = jax.lax.fori_loop(0, steps, descent.improve, descent.at(acceleration, residual))
     else:

@@ -107,8 +107,10 @@ def mass_matrix(links: list[Link], joints: list[Joint]) -> dict[tuple[int, int],
         else:
             impulse, spin = cross(axis, whole[index].moment), symmetric_times(whole[index].inertia, axis)
         here = index
-        while here >= 0:
+        while True:
             matrix[index, here] = (impulse if links[here].slides else spin)[links[here].axis]
+            if links[here].parent < 0:
+                break
             impulse, spin = _wrench_to_parent(links[here], joints[here], impulse, spin)
             here = links[here].parent
         if link.parent >= 0:

@@ -7,7 +7,7 @@ an array, and is added here.
 """
 
 import functools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Hashable, Iterable
 from typing import Any
 
 import jax
@@ -15,21 +15,26 @@ import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
+from jax.extend.core import jaxpr_as_fun
 from jax.interpreters import mlir
 
 LANES = 32
 """Threads of a program: those of a warp."""
 _COMPILER = plgpu.CompilerParams(num_warps=1, num_stages=1)
 
-Compute = Callable[[list[jax.Array]], Iterable[Any]]
+Compute = Callable[[Any, list[jax.Array]], Iterable[Any]]
 
 
-def as_kernel(name: str, compute: Compute, outputs: int, interpret: bool) -> Callable[[jax.Array], jax.Array]:
+def as_kernel(name: str, compute: Compute, known: Hashable, outputs: int, interpret: bool) -> Callable[[jax.Array], jax.Array]:
     """A function of episodes as one GPU kernel, in which a thread has an episode and a program 32 of them.
+
+    Calls in one program of one function, with the same ``known`` and for as many episodes, are one kernel: it is compiled once.
 
     Args:
         name: Of the kernel.
-        compute: Makes an episode's outputs of its inputs; numbers are [32] float32, one for each thread.
+        compute: Makes an episode's outputs of what is known and of the episode's inputs; numbers are [32] float32, one for each
+            thread. It is traced once for all numbers of episodes.
+        known: What is known before the program runs.
         outputs: How many it makes.
         interpret: Run the kernel without a GPU, slowly.
 
@@ -43,17 +48,8 @@ def as_kernel(name: str, compute: Compute, outputs: int, interpret: bool) -> Cal
         programs = pl.cdiv(batch, LANES)
         # Threads beyond the last episode compute that again: zeros might be nothing to compute with.
         inputs = jnp.pad(inputs, ((0, programs * LANES - batch), (0, 0)), mode="edge")
-        results, _ = pl.pallas_call(
-            functools.partial(_kernel, compute=compute, interpret=interpret),
-            grid=(programs,),
-            out_shape=[
-                jax.ShapeDtypeStruct((outputs, programs * LANES), jnp.float32),
-                jax.ShapeDtypeStruct((programs,), jnp.int32),
-            ],
-            compiler_params=_COMPILER,
-            interpret=interpret,
-            name=name,
-        )(inputs.T)
+        launch = _traced(name, compute, known, outputs, interpret, inputs.T.shape, jax.sharding.get_abstract_mesh())
+        results, _ = launch(inputs.T)
         return results.T[:batch]
 
     @run.def_vmap
@@ -65,11 +61,37 @@ def as_kernel(name: str, compute: Compute, outputs: int, interpret: bool) -> Cal
     return run
 
 
-def _kernel(inputs: Any, results: Any, done: Any, *, compute: Compute, interpret: bool) -> None:
+@functools.lru_cache(maxsize=16)
+def _traced(
+    name: str, compute: Compute, known: Hashable, outputs: int, interpret: bool, shape: tuple[int, int], mesh: Any
+) -> Callable[[jax.Array], list[jax.Array]]:
+    """The kernel for inputs of a ``shape`` [I, 32 * programs], traced; one that was traced within a ``mesh`` stays there.
+
+    XLA takes two kernels for one if they are equal to the last letter. Of one that was traced in another place, the debug
+    information is not.
+    """
+    del mesh
+    programs = shape[1] // LANES
+    launch = pl.pallas_call(
+        functools.partial(_kernel, compute=compute, known=known, interpret=interpret),
+        grid=(programs,),
+        out_shape=[
+            jax.ShapeDtypeStruct((outputs, programs * LANES), jnp.float32),
+            jax.ShapeDtypeStruct((programs,), jnp.int32),
+        ],
+        compiler_params=_COMPILER,
+        interpret=interpret,
+        name=name,
+    )
+    return jaxpr_as_fun(jax.make_jaxpr(launch)(jax.ShapeDtypeStruct(shape, jnp.float32)))
+
+
+def _kernel(inputs: Any, results: Any, done: Any, *, compute: Compute, known: Hashable, interpret: bool) -> None:
     program = pl.program_id(0)
     own = pl.ds(program * LANES, LANES)
     rows = [inputs[row, own] for row in range(inputs.shape[0])] if interpret else read_rows(inputs)
-    numbers = [jnp.broadcast_to(jnp.asarray(number, jnp.float32), (LANES,)) for number in compute(rows)]
+    computed = jax.jit(compute, static_argnums=0)(known, rows)
+    numbers = [jnp.broadcast_to(jnp.asarray(number, jnp.float32), (LANES,)) for number in computed]
     if interpret:
         for row, number in enumerate(numbers):
             results[row, own] = number

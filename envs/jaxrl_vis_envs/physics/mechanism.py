@@ -1,6 +1,7 @@
 """What is known of a model before it runs, for physics steps number by number (`steps`); and which models have such steps."""
 
-from typing import NamedTuple
+from collections.abc import Hashable
+from typing import Any, NamedTuple
 
 import jax
 import mujoco
@@ -91,7 +92,6 @@ class Mechanism(NamedTuple):
     springs: tuple[tuple[float, float], ...]  # stiffness and the position without force
     tendon_masses: tuple[tuple[dict[int, float], float], ...]  # of each tendon: shares of joints, and armature
     gravity: np.ndarray
-    timestep: float
     actuators: tuple[Actuator, ...]
     frictions: tuple[Friction, ...]
     limits: tuple[Limit, ...]
@@ -204,7 +204,6 @@ def mechanism_of(model: mjx.Model) -> Mechanism:
         springs=tuple(zip(floats(np.asarray(model.jnt_stiffness)), floats(np.asarray(model.qpos_spring)), strict=True)),
         tendon_masses=tuple((joints, float(mass)) for joints, mass in zip(tendons, armature, strict=True)),
         gravity=np.asarray(model.opt.gravity, np.float64) * has_gravity,
-        timestep=float(model.opt.timestep),
         actuators=tuple(_actuator(model, index) for index in range(model.nu)),
         frictions=tuple(_frictions(model)) if not flags & _without(_FLAG.mjDSBL_FRICTIONLOSS) else (),
         limits=tuple(_limits(model, tendons)) if not flags & _without(_FLAG.mjDSBL_LIMIT) else (),
@@ -309,6 +308,15 @@ def _holds(model: mjx.Model, tree: list[Link], frames: list[links.Frame]) -> lis
         weld = welds.weld_of(model, tree, frames, index)
         found.append(Hold(weld, (float(weight[0]), float(weight[1])), constants))
     return found
+
+
+def content(part: Any) -> Hashable:
+    """The numbers of a mechanism or of a part of it: mechanisms are the same where these are equal."""
+    if isinstance(part, np.ndarray):
+        return part.shape, part.tobytes()
+    if isinstance(part, dict):
+        return tuple((key, content(value)) for key, value in part.items())
+    return tuple(map(content, part)) if isinstance(part, list | tuple) else part
 
 
 def common_link(mechanism: Mechanism) -> int:

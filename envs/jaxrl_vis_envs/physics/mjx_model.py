@@ -68,21 +68,23 @@ def simulate(model: mjx.Model, data: mjx.Data, substeps: int, exact: bool = Fals
     return kinematics(model, take_steps(model, data, substeps, exact))
 
 
-def take_steps(model: mjx.Model, data: mjx.Data, count: int, exact: bool = False) -> mjx.Data:
+def take_steps(model: mjx.Model, data: mjx.Data, count: int, exact: bool = False, beside_exact: bool = False) -> mjx.Data:
     """``count`` physics steps (`step`); poses and true states are then older than ``qpos``.
 
-    On a GPU that runs kernels, models that `mechanism` takes have them all in one if the environment variable
-    ``JAXRL_VIS_STEPS_KERNEL`` is 1 (`steps_kernel`). Contacts between capsules are then exact in any case, and if more pairs
-    touch than ``max_contact_points`` or ``max_geom_pairs``, all of them count. Nothing but positions, velocities,
-    accelerations, time and the constraints' forces is new afterwards. Forces on bodies (``xfrc_applied``) and welds that are
-    turned off (``eq_active``) are not heeded: with any, positions are not a number.
+    On a GPU that runs kernels, models that `mechanism` takes have them all in one (`steps_kernel`). Contacts between capsules
+    are then exact in any case, and if more pairs touch than ``max_contact_points`` or ``max_geom_pairs``, all of them count.
+    Nothing but positions, velocities, accelerations, time and the constraints' forces is new afterwards. Forces on bodies
+    (``xfrc_applied``) and welds that are turned off (``eq_active``) are not heeded: with any, positions are not a number.
+
+    ``beside_exact`` is for steps that are not exact in a program that also has exact ones, of a model that is the same but for
+    its time step: they share a kernel then, which is compiled once.
     """
-    if not steps_kernel.is_wanted() or not mechanism.takes(model):
+    if not mechanism.takes(model):
         return _one_by_one(model, data, count, exact)
 
     def by_kernel_or_not(data: mjx.Data) -> mjx.Data:
         if runs_gpu_kernels(steps_kernel.probe):
-            return _in_one_kernel(model, data, count, exact)
+            return _in_one_kernel(model, data, count, exact, beside_exact)
         return _one_by_one(model, data, count, exact)
 
     return by_platform(by_kernel_or_not, data)
@@ -96,12 +98,16 @@ def _one_by_one(model: mjx.Model, data: mjx.Data, count: int, exact: bool) -> mj
         return jax.lax.scan(substep, data, length=count)[0]
 
 
-def _in_one_kernel(model: mjx.Model, data: mjx.Data, count: int, exact: bool, interpret: bool = False) -> mjx.Data:
-    constants = mechanism.mechanism_of(model)
+def _in_one_kernel(
+    model: mjx.Model, data: mjx.Data, count: int, exact: bool, beside_exact: bool = False, interpret: bool = False
+) -> mjx.Data:
+    constants, timestep = mechanism.mechanism_of(model), float(model.opt.timestep)
     state = State(data.qpos, data.qvel, data.qacc_warmstart, data.qfrc_constraint)
     used = np.array(constants.mocaps, int)
     mocap = jnp.concatenate([data.mocap_pos[used], data.mocap_quat[used]], axis=1) if len(used) else None
-    state = steps_kernel.take(constants, state, data.ctrl, data.qfrc_applied, count, exact, interpret, mocap)
+    state = steps_kernel.take(
+        constants, state, data.ctrl, data.qfrc_applied, timestep, count, exact, beside_exact, interpret, mocap
+    )
     is_unlike = jnp.any(data.xfrc_applied != 0)
     if constants.holds:
         is_unlike = is_unlike | ~jnp.all(data.eq_active)

@@ -28,7 +28,7 @@ def solve(structure: Structure, problem: Problem, interpret: bool = False) -> Mo
     places = _places(structure)
     parts = [array[tuple(np.array(places[name]).T)] for name, array in problem._asdict().items() if places[name]]
     outputs = len(Motion._fields) * structure.joints
-    kernel = lanes.as_kernel("solve_constraints", functools.partial(_solved, structure), outputs, interpret)
+    kernel = lanes.as_kernel("solve_constraints", _solved, structure, outputs, interpret)
     return Motion(*kernel(jnp.concatenate(parts)[None])[0].reshape(len(Motion._fields), structure.joints))
 
 

@@ -35,8 +35,16 @@ class State(NamedTuple):
 
 
 class Surroundings(NamedTuple):
-    """What stays the same from step to step: controls, within their ends; further forces on the joints; mocap bodies."""
+    """What stays the same from step to step.
 
+    Attributes:
+        timestep: s.
+        control: Of the actuators, within their ends.
+        applied: Further forces on the joints, N m or N.
+        roots: The mocap bodies.
+    """
+
+    timestep: Any
     control: Numbers
     applied: Numbers
     roots: dict[int, Root]
@@ -56,20 +64,25 @@ def take(
     state: State,
     control: Numbers,
     applied: Numbers,
-    count: int,
-    exact: bool,
+    timestep: Any,
+    count: Any,
+    exact: Any,
     in_kernel: bool = False,
     mocap: Sequence[Any] = (),
 ) -> State:
     """``count`` physics steps, with the same controls.
+
+    How long and how many steps are, and how exact, may be known or not: one program then serves all of it.
 
     Args:
         constants: Of the model.
         state: Before them.
         control: One number for each actuator.
         applied: Further forces on the joints, N m or N.
-        count: How many.
-        exact: Whether forces are as exact as float32 allows (see `mjx_model.step`); contacts always are.
+        timestep: s.
+        count: How many; a whole number or an int32.
+        exact: Whether forces are as exact as float32 allows (see `mjx_model.step`); contacts always are. A bool, or an int32,
+            1 or 0.
         in_kernel: See `descent.solve`.
         mocap: Seven numbers for each of ``constants.mocaps``: position, m, and quaternion, of any length.
 
@@ -81,19 +94,19 @@ def take(
     roots = places.roots_of(tuple(links.link_of_mocap(index) for index in constants.mocaps), list(mocap))
 
     def advance(_: Any, state: State) -> State:
-        return _step(constants, state, Surroundings(control, applied, roots), exact, in_kernel)
+        return _step(constants, state, Surroundings(timestep, control, applied, roots), exact, in_kernel)
 
     return jax.lax.fori_loop(0, count, advance, state)
 
 
-def _step(constants: Mechanism, state: State, around: Surroundings, exact: bool, in_kernel: bool = False) -> State:
-    structure, problem, order = problem_of(constants, state, around, exact)
-    motion = descent.solve(structure, problem, in_kernel)
+def _step(constants: Mechanism, state: State, around: Surroundings, exact: Any, in_kernel: bool = False) -> State:
+    structure, problem, order = problem_of(constants, state, around, exact is not False)
+    motion = descent.solve(structure, problem, in_kernel, exact)
     place = {joint: index for index, joint in enumerate(order)}
     damped, acceleration, force = (
         [part[place[joint]] for joint in range(len(order))] for part in (motion.damped, motion.acceleration, motion.force)
     )
-    timestep = constants.timestep
+    timestep = around.timestep
     velocity = [rate + timestep * change for rate, change in zip(state.velocity, damped, strict=True)]
     position = [there + timestep * rate for there, rate in zip(state.position, velocity, strict=True)]
     return State(position, velocity, acceleration, force)
@@ -131,7 +144,7 @@ def problem_of(constants: Mechanism, state: State, around: Surroundings, exact: 
         mass=ordered,
         force=[force[joint] for joint in order],
         warm=[state.acceleration[joint] for joint in order],
-        damping=[constants.timestep * constants.damping[joint] for joint in order],
+        damping=[times(around.timestep, constants.damping[joint]) for joint in order],
         jacobian=[{place[joint]: entry for joint, entry in row.entries.items()} for row in rows],
         stiffness=[row.stiffness for row in rows],
         target=[row.target for row in rows],

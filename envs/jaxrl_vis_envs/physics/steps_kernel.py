@@ -4,8 +4,9 @@ Positions and velocities stay on the chip from the first step to the last. In pl
 one for all of them.
 """
 
+import dataclasses
 import functools
-import os
+from collections.abc import Hashable
 from typing import Any
 
 import jax
@@ -13,17 +14,9 @@ import jax.numpy as jnp
 import mujoco
 from mujoco import mjx
 
-from jaxrl_vis_envs.physics import lanes, steps
+from jaxrl_vis_envs.physics import lanes, mechanism, steps
 from jaxrl_vis_envs.physics.mechanism import Mechanism, mechanism_of
 from jaxrl_vis_envs.physics.steps import State
-
-VARIABLE = "JAXRL_VIS_STEPS_KERNEL"
-"""Environment variable that asks for the kernel: 1 does, anything else does not."""
-
-
-def is_wanted() -> bool:
-    """Whether the kernel is used where it can be: not unless it is asked for, until it was measured on a GPU."""
-    return os.environ.get(VARIABLE, "").strip() == "1"
 
 
 def take(
@@ -31,43 +24,64 @@ def take(
     state: State,
     control: jax.Array,
     applied: jax.Array,
+    timestep: float,
     count: int,
     exact: bool,
+    beside_exact: bool = False,
     interpret: bool = False,
     mocap: jax.Array | None = None,
 ) -> State:
     """`steps.take` for arrays, float32; over all axes of `jax.vmap` in one kernel.
+
+    How long and how many steps are, and whether they are exact, the kernel reads: calls in one program with the same constants
+    for as many episodes are one kernel, which is compiled once.
 
     Args:
         constants: Of the model, of N joints.
         state: [N] each; its ``force`` is not used.
         control: [nu].
         applied: [N].
+        timestep: s.
         count: Physics steps.
         exact: See `steps.take`.
+        beside_exact: Whether steps that are not exact share the kernel of those that are, which is a little larger.
         interpret: Run the kernel without a GPU, slowly.
         mocap: [M, 7], for each of ``constants.mocaps``.
 
     Returns:
         The state after them, [N] each.
     """
+    pace = jnp.array([timestep, count, exact], jnp.float32)
     around = [applied, control] if mocap is None else [applied, control, mocap.reshape(-1)]
-    inputs = jnp.concatenate([state.position, state.velocity, state.acceleration, *around])
-    # Traced once for all launches.
-    simulate = jax.jit(functools.partial(_simulate, constants, count, exact))
+    inputs = jnp.concatenate([pace, state.position, state.velocity, state.acceleration, *around])
+    known = _Known(mechanism.content(constants), constants, exact or beside_exact)
     joints = len(constants.links)
-    kernel = lanes.as_kernel("take_physics_steps", simulate, len(State._fields) * joints, interpret)
+    kernel = lanes.as_kernel("take_physics_steps", _simulate, known, len(State._fields) * joints, interpret)
     return State(*kernel(inputs[None])[0].reshape(len(State._fields), joints))
 
 
-def _simulate(constants: Mechanism, count: int, exact: bool, rows: list[jax.Array]) -> list[jax.Array]:
+@dataclasses.dataclass(frozen=True)
+class _Known:
+    """Constants, which are equal to others where their content is, and whether steps may be exact."""
+
+    content: Hashable
+    constants: Mechanism = dataclasses.field(compare=False)
+    may_be_exact: bool
+
+
+def _simulate(known: _Known, rows: list[jax.Array]) -> list[jax.Array]:
     """Final numbers of an episode's numbers, in the order of `take`."""
+    constants = known.constants
     joints = len(constants.links)
+    (timestep, *pace), rows = rows[:3], rows[3:]
+    # The same for all threads of a warp, which go through the same loops.
+    count, is_exact = (jnp.max(number).astype(jnp.int32) for number in pace)
+    exact = is_exact if known.may_be_exact else False
     position, velocity, acceleration, applied = (rows[first * joints :][:joints] for first in range(4))
     start = State(position, velocity, acceleration, [0.0 * number for number in position])
     controls = len(constants.actuators)
     control, mocap = rows[4 * joints :][:controls], rows[4 * joints + controls :]
-    end = steps.take(constants, start, control, applied, count, exact, in_kernel=True, mocap=mocap)
+    end = steps.take(constants, start, control, applied, timestep, count, exact, in_kernel=True, mocap=mocap)
     return [number for part in end for number in part]
 
 
@@ -94,5 +108,5 @@ def probe_program() -> Any:
     constants = mechanism_of(mjx.put_model(mujoco.MjModel.from_xml_string(_PROBE)))
     joints = jnp.zeros((2, 2), jnp.float32)
     state = State(joints, joints, joints, joints)
-    take_steps = functools.partial(take, constants, count=2, exact=True)
+    take_steps = functools.partial(take, constants, timestep=0.01, count=2, exact=True)
     return jax.jit(jax.vmap(lambda state, applied: take_steps(state, joints[0, :0], applied))).trace(state, joints)

@@ -167,7 +167,8 @@ class HandReach(MjxGoalEnv):
 
         def act(data: mjx.Data, action: jax.Array) -> tuple[mjx.Data, None]:
             data = data.replace(ctrl=self._targets(action))
-            return mjx_model.take_steps(self._goal_model, data, self.config.goal_substeps), None
+            steps = self.config.goal_substeps
+            return mjx_model.take_steps(self._goal_model, data, steps, beside_exact=self.exact_contacts), None
 
         return self.configuration(jax.lax.scan(act, self._start, actions)[0].qpos)
 
