@@ -17,6 +17,7 @@ the kernels and the same functions in plain JAX: ``0`` never uses a kernel, ``1`
 import concurrent.futures
 import contextlib
 import functools
+import importlib
 import os
 import sys
 from collections.abc import Callable, Iterator
@@ -157,6 +158,7 @@ def runs_gpu_kernels(probe: Callable[[], object] | None = None) -> bool:
         chosen = _chosen_by_environment()
     if target_platform() not in ("cuda", "gpu") or chosen is False:
         return False
+    _name_triton_dialect()
     return chosen is True or (_has_tensor_cores() and (probe is None or _compiles(probe)))
 
 
@@ -165,6 +167,17 @@ def _chosen_by_environment() -> bool | None:
     if value not in _CHOICES:
         raise ValueError(f"{KERNELS_VARIABLE} is {value!r}: set it to 0 (plain JAX), 1 (kernels) or auto")
     return _CHOICES[value]
+
+
+@functools.cache
+def _name_triton_dialect() -> None:
+    """Lets MLIR find the Python module of Triton's dialect, which jaxlib keeps elsewhere than MLIR expects it.
+
+    It looks for one, by an import, for nearly every value of a kernel, and Python does not remember that an import has failed:
+    a third of the time that it takes to lower a program with kernels.
+    """
+    with contextlib.suppress(ImportError):
+        sys.modules.setdefault("jaxlib.mlir.dialects.tt", importlib.import_module("jaxlib.triton.dialect"))
 
 
 def _has_tensor_cores() -> bool:

@@ -6,6 +6,7 @@ one for all of them.
 
 import functools
 import os
+import pickle
 from typing import Any
 
 import jax
@@ -53,15 +54,20 @@ def take(
     """
     around = [applied, control] if mocap is None else [applied, control, mocap.reshape(-1)]
     inputs = jnp.concatenate([state.position, state.velocity, state.acceleration, *around])
-    # Traced once for all launches.
-    simulate = jax.jit(functools.partial(_simulate, constants, count, exact))
+    simulate = functools.partial(_simulate, pickle.dumps(constants), count, exact)
     joints = len(constants.links)
     kernel = lanes.as_kernel("take_physics_steps", simulate, len(State._fields) * joints, interpret)
     return State(*kernel(inputs[None])[0].reshape(len(State._fields), joints))
 
 
-def _simulate(constants: Mechanism, count: int, exact: bool, rows: list[jax.Array]) -> list[jax.Array]:
-    """Final numbers of an episode's numbers, in the order of `take`."""
+@functools.partial(jax.jit, static_argnums=(0, 1, 2))
+def _simulate(pickled: bytes, count: int, exact: bool, rows: list[jax.Array]) -> list[jax.Array]:
+    """Final numbers of an episode's numbers, in the order of `take`.
+
+    Jitted so that it is traced once for all launches, in however many programs they are. The constants come as bytes, by which
+    they are known again: they are made anew for every program.
+    """
+    constants: Mechanism = pickle.loads(pickled)
     joints = len(constants.links)
     position, velocity, acceleration, applied = (rows[first * joints :][:joints] for first in range(4))
     start = State(position, velocity, acceleration, [0.0 * number for number in position])
