@@ -76,7 +76,9 @@ class Programs:
     @functools.cached_property
     def shapes(self) -> LoopState:
         """Shapes and types of the loop state, and where it lies; traced, not allocated."""
-        return self.layout.with_shardings(jax.eval_shape(self.program.init, self.run_keys), self.layout.loop)
+        with tracing_for_default_device(), trusting_kernels():  # as it will be compiled, so that it is traced once
+            shapes = jax.eval_shape(self.program.init, self.run_keys)
+        return self.layout.with_shardings(shapes, self.layout.loop)
 
     @functools.cached_property
     def shows_images(self) -> bool:
