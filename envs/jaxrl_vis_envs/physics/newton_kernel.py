@@ -39,8 +39,12 @@ def _places(structure: Structure) -> dict[str, list[tuple[int, ...]]]:
     return places
 
 
+@functools.partial(jax.jit, static_argnums=0)
 def _solved(structure: Structure, rows: list[jax.Array]) -> list[Any]:
-    """The numbers of a motion, of those of a problem in the order of `_places`."""
+    """The numbers of a motion, of those of a problem in the order of `_places`.
+
+    Jitted so that it is traced once for all launches, in however many programs they are.
+    """
     every_place = [(name, place) for name, places in _places(structure).items() for place in places]
     numbers = dict(zip(every_place, rows, strict=True))
     motion = descent.solve(structure, descent.numbers_of(structure, lambda name, *place: numbers[name, place]))
