@@ -1,11 +1,13 @@
 """What there is to compute on: asked of JAX, or, where an answer must not wait for JAX, guessed."""
 
+import contextlib
 import dataclasses
 import importlib.util
 import json
 import os
 import subprocess
 import sys
+import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -17,6 +19,20 @@ from jaxrl_vis.provenance import child_environment
 # The packages by which JAX reaches an accelerator, and files that show that the machine has one.
 _NVIDIA = (("jax_cuda12_plugin", "jax_cuda13_plugin"), ("/dev/nvidiactl", "/dev/nvidia0", "/dev/dxg"))
 _TPU = (("libtpu",), ("/dev/accel0", "/dev/vfio/0"))
+
+
+def start_devices() -> None:
+    """Lets JAX start its devices in a thread of its own, which for a GPU takes a second or two: time to import the rest.
+
+    Whoever uses devices, or calls `check_devices`, waits for it. If it fails, they fail, too, and say why.
+    """
+    import jax
+
+    def start() -> None:
+        with contextlib.suppress(Exception):
+            jax.devices()
+
+    threading.Thread(target=start, name="start devices").start()
 
 
 def check_devices() -> None:

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from small_scene import small_scene
 
+from jaxrl_vis.config import preset
 from jaxrl_vis.learner import encoder_kernel_passes
-from jaxrl_vis.run.programs import rarely_collecting_garbage
+from jaxrl_vis.learner.sharding import ONE_DEVICE
+from jaxrl_vis.run.programs import Programs, rarely_collecting_garbage
 from jaxrl_vis_envs import compilation
 from jaxrl_vis_envs.compilation import (
     by_platform,
@@ -104,6 +106,64 @@ def test_a_kernel_that_does_not_compile_is_left_out_and_named_once(gpu, monkeypa
     monkeypatch.setenv("JAXRL_VIS_KERNELS", "1")  # asks for the error itself
     with tracing_for("cuda"):
         assert runs_gpu_kernels(breaks)
+
+
+def run_of(function) -> Programs:
+    """A run of which ``init`` is a function of keys, and nothing else is there."""
+    programs = Programs(preset("debug"), SimpleNamespace(env=None, layout=ONE_DEVICE, init=jax.jit(function)))
+    programs.shapes = SimpleNamespace(train=None)  # type: ignore[assignment]
+    return programs
+
+
+def test_a_run_trusts_kernels_and_asks_where_its_programs_do_not_compile(gpu, monkeypatch, capsys):
+    gpu()
+    monkeypatch.setattr(compilation, "_trusted", set())
+    probed = []
+
+    def breaks() -> None:
+        probed.append("breaks")
+        raise RuntimeError("ptxas: no")
+
+    def works() -> None:
+        probed.append("works")
+
+    def function(keys):
+        with tracing_for("cuda"):
+            assert runs_gpu_kernels(works)
+            if runs_gpu_kernels(breaks):
+                raise RuntimeError("as compilers fail")
+            return jnp.ones(3)
+
+    programs = run_of(function)
+    assert programs.compiled("init")(programs.run_keys).sum() == 3
+    assert sorted(probed) == ["breaks", "works"]
+    assert "ptxas: no" in capsys.readouterr().err
+
+    def mistaken(keys):
+        with tracing_for("cuda"):
+            assert runs_gpu_kernels(works)
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(compilation, "_trusted", set())
+    with pytest.raises(ZeroDivisionError):
+        run_of(mistaken).compiled("init")
+    assert not capsys.readouterr().err
+
+
+def test_a_run_whose_programs_compile_asks_nothing(gpu):
+    gpu()
+    probed = []
+
+    def probe() -> None:
+        probed.append(True)
+
+    def function(keys):
+        with tracing_for("cuda"):
+            return jnp.ones(3) * runs_gpu_kernels(probe)
+
+    programs = run_of(function)
+    assert programs.compiled("init")(programs.run_keys).sum() == 3
+    assert not probed
 
 
 @pytest.mark.parametrize("module", [kernel, encoder_kernel_passes, newton_kernel, steps_kernel])

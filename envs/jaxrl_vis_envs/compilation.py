@@ -11,12 +11,13 @@ What is fast on a CPU is slow on a GPU and vice versa, and some functions have a
 (Pallas, by Triton). Which of these is used follows the platform that a program is compiled for, which is not always that of the
 default backend: `by_platform`. The environment variable ``JAXRL_VIS_KERNELS`` and the context manager `kernels` choose between
 the kernels and the same functions in plain JAX: ``0`` never uses a kernel, ``1`` uses them on every NVIDIA GPU, and ``auto``
-(the default) uses each where a small instance of it compiles.
+(the default) uses each where a small instance of it compiles. A run does not wait for those: `trusting_kernels`.
 """
 
 import concurrent.futures
 import contextlib
 import functools
+import importlib
 import os
 import sys
 from collections.abc import Callable, Iterator
@@ -27,10 +28,14 @@ import jax
 KERNELS_VARIABLE = "JAXRL_VIS_KERNELS"
 _CHOICES = {"auto": None, "": None, "0": False, "1": True}
 
-# The platform of the branch of `by_platform` that is being traced, and the choice of `kernels`; None outside of them. They are
-# part of what JAX knows a traced function by, so that one which was traced for a platform is traced again for another.
+# The platform of the branch of `by_platform` that is being traced, the choice of `kernels`, and whether this is within
+# `trusting_kernels`; None outside of them. They are part of what JAX knows a traced function by, so that one which was traced
+# for a platform is traced again for another.
 _platform = jax.make_user_context(default_value=None)
 _kernels = jax.make_user_context(default_value=None)
+_trust = jax.make_user_context(default_value=None)
+# Of the kernels that were used without asking.
+_trusted: set[Callable[[], object]] = set()
 
 
 def compiler_options(backend: str | None = None, *, runs_once: bool = False) -> dict[str, Any]:
@@ -139,6 +144,24 @@ def kernels(enabled: bool | None) -> Iterator[None]:
         yield
 
 
+@contextlib.contextmanager
+def trusting_kernels() -> Iterator[None]:
+    """What is traced inside uses kernels without asking first whether they compile: asking takes seconds, and nearly all do.
+
+    Whoever compiles the program asks afterwards if it does not compile: `distrusted_kernels`.
+    """
+    with _trust(True):
+        yield
+
+
+def distrusted_kernels() -> bool:
+    """Whether any kernel that `trusting_kernels` has let into a program does not compile; one line on stderr names each.
+
+    If so, what was traced there is worth another try, outside of it.
+    """
+    return not all([_compiles(probe) for probe in sorted(_trusted, key=lambda probe: probe.__module__)])
+
+
 def runs_gpu_kernels(probe: Callable[[], object] | None = None) -> bool:
     """Whether hand-written kernels are used in what is being traced.
 
@@ -147,7 +170,8 @@ def runs_gpu_kernels(probe: Callable[[], object] | None = None) -> bool:
 
     Args:
         probe: Compiles a small instance of the kernel, and raises whatever that raises. It is called once in a process; if it
-            raises, one line on stderr says so. None for a kernel that is known to compile.
+            raises, one line on stderr says so. Within `trusting_kernels` it is not called. None for a kernel that is known to
+            compile.
 
     Raises:
         ValueError: The environment variable holds something else than 0, 1 or auto.
@@ -157,7 +181,13 @@ def runs_gpu_kernels(probe: Callable[[], object] | None = None) -> bool:
         chosen = _chosen_by_environment()
     if target_platform() not in ("cuda", "gpu") or chosen is False:
         return False
-    return chosen is True or (_has_tensor_cores() and (probe is None or _compiles(probe)))
+    _name_triton_dialect()
+    if chosen is True or not _has_tensor_cores() or probe is None:
+        return chosen is True or _has_tensor_cores()
+    if _trust.value:
+        _trusted.add(probe)
+        return True
+    return _compiles(probe)
 
 
 def _chosen_by_environment() -> bool | None:
@@ -165,6 +195,17 @@ def _chosen_by_environment() -> bool | None:
     if value not in _CHOICES:
         raise ValueError(f"{KERNELS_VARIABLE} is {value!r}: set it to 0 (plain JAX), 1 (kernels) or auto")
     return _CHOICES[value]
+
+
+@functools.cache
+def _name_triton_dialect() -> None:
+    """Lets MLIR find the Python module of Triton's dialect, which jaxlib keeps elsewhere than MLIR expects it.
+
+    It looks for one, by an import, for nearly every value of a kernel, and Python does not remember that an import has failed:
+    a third of the time that it takes to lower a program with kernels.
+    """
+    with contextlib.suppress(ImportError):
+        sys.modules.setdefault("jaxlib.mlir.dialects.tt", importlib.import_module("jaxlib.triton.dialect"))
 
 
 def _has_tensor_cores() -> bool:

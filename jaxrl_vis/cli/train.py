@@ -1,6 +1,7 @@
 """``jaxrl-vis train``."""
 
 import dataclasses
+import importlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -9,7 +10,7 @@ from jaxrl_vis import processes
 from jaxrl_vis.cli.checks import check_counts, check_env
 from jaxrl_vis.cli.parsing import ByPlaceToo, ChangesOf, SayDefault
 from jaxrl_vis.config import PRESETS, Config, preset
-from jaxrl_vis.devices import check_devices, count_devices, guess_accelerator
+from jaxrl_vis.devices import check_devices, count_devices, guess_accelerator, start_devices
 from jaxrl_vis.errors import RequestError, nearest
 from jaxrl_vis.report.outputs import check_writable
 from jaxrl_vis.run import loggers
@@ -95,6 +96,8 @@ def training_config(options: Train) -> Config:
         from jaxrl_vis.run.signals import shielded_children
 
         with shielded_children():  # threads that JAX starts with its first use of a device never see signals
+            start_devices()
+            importlib.import_module("jaxrl_vis.run.trainer")  # will be needed, and takes as long
             check_devices()
             name = _auto(jax.default_backend() != "cpu")
     return preset(name, **changes)

@@ -1,7 +1,8 @@
-"""Colours for what has none: depth and geom ids, in the video and in the gallery."""
+"""Colours for what has none: depth and geom ids, in the video and in the gallery.
 
-import matplotlib
-import matplotlib.colors
+Matplotlib is imported where it is used: a run imports this module before it knows that it will draw.
+"""
+
 import numpy as np
 
 
@@ -15,6 +16,8 @@ def depth_colours(depth: np.ndarray, near: float, far: float) -> np.ndarray:
     Returns:
         [H, W, 3] uint8.
     """
+    import matplotlib
+
     share = np.clip((depth.astype(np.float32) - near) / (far - near), 0.0, 1.0)
     return (matplotlib.colormaps["magma"](0.97 - 0.92 * share)[..., :3] * 255).round().astype(np.uint8)
 
@@ -30,6 +33,8 @@ def label_colours(labels: np.ndarray, geoms: int, sky: tuple[int, int, int]) -> 
     Returns:
         [H, W, 3] uint8.
     """
+    import matplotlib.colors
+
     hues = (np.arange(geoms) * 0.61803399) % 1.0
     values = np.where(np.arange(geoms) % 2 == 0, 0.95, 0.65)
     palette = matplotlib.colors.hsv_to_rgb(np.stack([hues, np.full(geoms, 0.65), values], axis=-1))

@@ -20,15 +20,15 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
-
-import orbax.checkpoint as ocp
-from orbax.checkpoint.checkpoint_managers import LatestN
+from typing import TYPE_CHECKING, Any
 
 from jaxrl_vis import processes
 from jaxrl_vis.errors import RequestError, StorageError
 from jaxrl_vis.run.arrays import as_saved, check_structure, describe, host_specs, is_intact, rebuild, to_host, to_save
 from jaxrl_vis.types import LoopState, TrainState
+
+if TYPE_CHECKING:  # orbax takes a fifth of the time that this package does to import: whatever uses it imports it
+    import orbax.checkpoint as ocp
 
 LIGHT, FULL = "light", "full"
 SCHEMA = 2
@@ -120,7 +120,10 @@ class Checkpoints:
         self._reported: set[tuple[str, int]] = set()  # damaged ones
         self._unsilence: Callable[[], None] | None = None
 
-    def _manager(self, tier: str) -> ocp.CheckpointManager:
+    def _manager(self, tier: str) -> "ocp.CheckpointManager":
+        import orbax.checkpoint as ocp
+        from orbax.checkpoint.checkpoint_managers import LatestN
+
         if tier not in self._managers:
             if self._unsilence is None:
                 self._unsilence = _silence_orbax()
@@ -161,6 +164,8 @@ class Checkpoints:
         self.wait()
 
     def _save(self, tier: str, iteration: int, items: dict[str, Any], progress: dict[str, Any]) -> None:
+        import orbax.checkpoint as ocp
+
         described = {name: describe(arrays) for name, arrays in items.items()}
         manifest = {"schema": SCHEMA, "iteration": iteration, "items": described, "progress": progress}
         arguments: dict[str, Any] = {name: ocp.args.StandardSave(arrays) for name, arrays in items.items()}
@@ -273,6 +278,8 @@ class Checkpoints:
         return None
 
     def _restore(self, tier: str, iteration: int, template: LoopState, with_rest: bool) -> Restored:
+        import orbax.checkpoint as ocp
+
         manifest = self._read(tier, iteration, {"manifest": ocp.args.JsonRestore()})["manifest"]
         if not isinstance(manifest, dict) or not {"schema", "items"} <= set(manifest):
             raise _Damaged("its manifest is incomplete")
@@ -295,6 +302,8 @@ class Checkpoints:
         return Restored(tier, iteration, trees["train"], loop, manifest.get("progress", manifest.get("memo", {})))
 
     def _read(self, tier: str, iteration: int, arguments: dict[str, Any]) -> Any:
+        import orbax.checkpoint as ocp
+
         try:
             manager = self._manager(tier)  # first, for `_hushed` puts back the hooks that it finds
             with _hushed():

@@ -237,8 +237,9 @@ class RunLoop:
         while self._done < self._total:
             assert self._loop is not None
             self._loop, values = self._programs.train_iteration(self._loop)
-            # Matplotlib takes half a second to import: now the device is busy. Once is enough; asking again costs nothing.
-            importlib.import_module("jaxrl_vis.report.plots")
+            # Matplotlib and orbax take half a second to import: now the device is busy. Asking again costs nothing.
+            for name in ("jaxrl_vis.report.plots", "orbax.checkpoint"):
+                importlib.import_module(name)
             self._done += 1
             before, waiting = waiting, (self._done, values)
             if before is not None:

@@ -7,7 +7,7 @@ import concurrent.futures
 import contextlib
 import functools
 import gc
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
@@ -21,7 +21,7 @@ from jaxrl_vis.run.arrays import to_host
 from jaxrl_vis.run.nonfinite import broken_leaves
 from jaxrl_vis.run.signals import shield_this_thread
 from jaxrl_vis.types import LoopState, Metrics, TrainState
-from jaxrl_vis_envs.compilation import tracing_for_default_device
+from jaxrl_vis_envs.compilation import distrusted_kernels, tracing_for_default_device, trusting_kernels
 
 # Evaluation draws from a key of its own, the same at every evaluation and for every seed.
 _EVALUATION_SEED = 2**31 - 1
@@ -76,7 +76,9 @@ class Programs:
     @functools.cached_property
     def shapes(self) -> LoopState:
         """Shapes and types of the loop state, and where it lies; traced, not allocated."""
-        return self.layout.with_shardings(jax.eval_shape(self.program.init, self.run_keys), self.layout.loop)
+        with tracing_for_default_device(), trusting_kernels():  # as it will be compiled, so that it is traced once
+            shapes = jax.eval_shape(self.program.init, self.run_keys)
+        return self.layout.with_shardings(shapes, self.layout.loop)
 
     @functools.cached_property
     def shows_images(self) -> bool:
@@ -99,16 +101,28 @@ class Programs:
         Returns:
             The compiled programs by name.
         """
+        self._make([name for name in _NAMES if name not in self._compiled])
+        return dict(self._compiled)
+
+    def _make(self, names: Sequence[str]) -> None:
+        """Compiles programs, which then are `_compiled`."""
         enable_compilation_cache()
+        try:
+            with trusting_kernels():
+                self._compiled |= self._side_by_side(names)
+        except Exception:
+            if not distrusted_kernels():
+                raise
+            self._compiled |= self._side_by_side(names)
+
+    def _side_by_side(self, names: Sequence[str]) -> dict[str, Any]:
         # Tracing is Python and goes one by one; XLA compiles without the interpreter's lock, meanwhile.
         with concurrent.futures.ThreadPoolExecutor(len(_NAMES), initializer=shield_this_thread) as pool:
-            missing = [name for name in _NAMES if name not in self._compiled]
-            futures = {name: pool.submit(self._lower(name).compile) for name in missing}
-            if not processes.are_several():
-                # Taking keys apart is a program, too.
+            futures = {name: pool.submit(self._lower(name).compile) for name in names}
+            if "init" in names and not processes.are_several():
+                # Taking keys apart, as saving does, is a program, too.
                 to_host({"keys": self.run_keys, "evaluation": self.evaluation_key}, copy=True)
-            self._compiled |= {name: future.result() for name, future in futures.items()}
-        return dict(self._compiled)
+            return {name: future.result() for name, future in futures.items()}
 
     def _lower(self, name: str) -> Any:
         if name == "broken_leaves":
@@ -124,8 +138,7 @@ class Programs:
     def compiled(self, name: str) -> Any:
         """One compiled program: ``init``, ``train_iteration``, ``evaluate`` or ``broken_leaves``."""
         if name not in self._compiled:
-            enable_compilation_cache()
-            self._compiled[name] = self._lower(name).compile()
+            self._make([name])
         return self._compiled[name]
 
     def init(self, keys: jax.Array) -> LoopState:
