@@ -1,4 +1,4 @@
-"""The kernels of the encoder's first three layers: forward, backward, and forward with tangents (`encoder_kernel`).
+"""The kernels of the encoder's first layers: forward and backward (`encoder_kernel`; `encoder_kernel_tangents` has a third).
 
 Each with the same in plain JAX, for processes without such a GPU and as the kernels' reference.
 """
@@ -18,30 +18,28 @@ from jaxrl_vis_envs.compilation import accelerator, by_platform, runs_gpu_kernel
 
 LEAST_ROWS = 16
 """Of a product in a kernel."""
-# Measured on an H200: patches in a tile, tiles that one program works through (at most, on the way back), and how they are run.
-_FORWARD_PATCHES, _FORWARD_TILES, _FORWARD = 16, 8, plgpu.CompilerParams(num_warps=4, num_stages=3)
-_BACKWARD_PATCHES, _BACKWARD_TILES, _BACKWARD = 16, 64, plgpu.CompilerParams(num_warps=4, num_stages=1)
+TILE = 16
+"""Patches in a tile."""
+# Measured on an H200: tiles that one program works through (at most, on the way back), and how they are run.
+FORWARD_TILES, FORWARD = 8, plgpu.CompilerParams(num_warps=4, num_stages=3)
+_BACKWARD_TILES, _BACKWARD = 64, plgpu.CompilerParams(num_warps=4, num_stages=1)
+# As many sums as these fit into the registers of four warps; more need eight.
+_MOST_SUMS, _BACKWARD_WITH_MORE = 16_384, plgpu.CompilerParams(num_warps=8, num_stages=1)
 _LEAST_PROGRAMS = 256  # about two for each of a large GPU's processors
+_JOINING = 2
+"""From this layer on, counted from 0, a row is made of four rows of the layer before."""
 
 
 class Weights(NamedTuple):
-    """Three layers as the kernel multiplies them, float32.
+    """Layers as the kernels multiply them, float32.
 
     Attributes:
-        kernel_1: [16 C', 4 F1] for a quarter; C' is C padded to a power of two.
-        bias_1: [4 F1].
-        kernel_2: [4 F1, F2].
-        bias_2: [F2].
-        kernel_3: [4 F2, F3].
-        bias_3: [F3].
+        kernels: [16 C', 4 F1] for a quarter, where C' is C padded to a power of two; [4 F1, F2]; [4 F2, F3]; [4 F3, F4].
+        biases: [4 F1]; [F2]; [F3]; [F4].
     """
 
-    kernel_1: jax.Array
-    bias_1: jax.Array
-    kernel_2: jax.Array
-    bias_2: jax.Array
-    kernel_3: jax.Array
-    bias_3: jax.Array
+    kernels: tuple[jax.Array, ...]
+    biases: tuple[jax.Array, ...]
 
 
 # -- Where they run
@@ -62,12 +60,14 @@ def probe() -> None:
 
 def probe_program() -> Any:
     """Small instances of all three kernels in one program, traced (`jax.stages.Traced`)."""
-    shape = (4, 8, 8)
+    shape, levels = (4, 16, 16), LEVELS + 1
     images, of_pixels = jnp.zeros((LEAST_ROWS, *shape), jnp.uint8), jnp.zeros(shape)
-    weights = Weights(*(jnp.zeros(size) for size in ((64, 64), (64,), (64, 16), (16,), (64, 16), (16,))))
+    sizes = (64, 64), (64, 16), (64, 16), (64, 16)
+    weights = Weights(tuple(map(jnp.zeros, sizes)), tuple(jnp.zeros(columns) for _, columns in sizes))
 
     def all_three(images: jax.Array, mean: jax.Array, scale: jax.Array, weights: Weights) -> Weights:
-        patches = prepare_on_gpu(images, mean, scale, None, LEVELS, 5.0, jnp.bfloat16)[:, 0]
+        patches = prepare_on_gpu(images, mean, scale, None, levels, 5.0, jnp.bfloat16)
+        patches = patches.reshape(-1, patches.shape[-1])
         out = _apply_on_gpu(patches, weights, 0, patches.shape[0])
         return _backward_on_gpu(patches, weights, out, out, 0, patches.shape[0])
 
@@ -105,51 +105,98 @@ def before(after: jax.Array, gradient: jax.Array) -> jax.Array:
     return jnp.where(after > 0.0, gradient, 0.0).astype(after.dtype)
 
 
-def _forward_kernel(x_ref, *refs, patches):
-    weights, out_ref = Weights(*(ref[...] for ref in refs[:-1])), refs[-1]
+def _layers(quarters: jax.Array, weights: Weights) -> list[jax.Array]:
+    """What each layer makes of [4 R, 16 C'] quarters of patches; `joined` says in which rows."""
+    found, values = [], quarters
+    for level, (kernel, bias) in enumerate(zip(*weights, strict=True)):
+        values = layer(joined(values, level), kernel, bias)
+        found.append(values)
+    return found
+
+
+def joined(values: jax.Array, level: int) -> jax.Array:
+    """What a layer multiplies: rows of the layer before, four side by side where it has a quarter of them."""
+    return _repeated(values.reshape(values.shape[0] // 4, -1)) if level >= _JOINING else values
+
+
+def _repeated(values: jax.Array) -> jax.Array:
+    """Each row several times over where there are fewer than a product must have: of a tile, the fourth layer has four."""
+    rows, columns = values.shape
+    times = max(1, LEAST_ROWS // rows)
+    if times == 1:
+        return values
+    return jnp.broadcast_to(values[:, None, :], (rows, times, columns)).reshape(rows * times, columns)
+
+
+def once(values: jax.Array, rows: int) -> jax.Array:
+    """Undoes `_repeated`, for results of ``rows`` rows: the mean of rows that are equal, and exactly they."""
+    times = values.shape[0] // rows
+    if times == 1:
+        return values
+    total = jnp.sum(values.astype(jnp.float32).reshape(rows, times, -1), axis=1)
+    return (total * (1.0 / times)).astype(values.dtype)
+
+
+def read(refs: Any) -> Weights:
+    """What a kernel is given for weights: kernels, then biases."""
+    values = tuple(ref[...] for ref in refs)
+    return Weights(values[: len(values) // 2], values[len(values) // 2 :])
+
+
+def _forward_kernel(x_ref, *refs):
+    weights, out_ref = read(refs[:-1]), refs[-1]
+    rows, quarters = rows_of_tile(x_ref, out_ref)
 
     def one_tile(tile, _):
-        x = x_ref[pl.ds(tile * 4 * patches, 4 * patches), :]
-        hidden = layer(x, weights.kernel_1, weights.bias_1)
-        hidden = layer(hidden, weights.kernel_2, weights.bias_2).reshape(patches, -1)
-        out_ref[pl.ds(tile * patches, patches), :] = layer(hidden, weights.kernel_3, weights.bias_3)
+        *_, out = _layers(x_ref[pl.ds(tile * quarters, quarters), :], weights)
+        out_ref[pl.ds(tile * rows, rows), :] = once(out, rows)
 
-    jax.lax.fori_loop(0, out_ref.shape[0] // patches, one_tile, None)
+    jax.lax.fori_loop(0, out_ref.shape[0] // rows, one_tile, None)
 
 
-def _backward_kernel(x_ref, out_ref, gradient_ref, *refs, patches):
-    weights, sums_ref = Weights(*(ref[...] for ref in refs[:-1])), refs[-1]
+def rows_of_tile(x_ref: Any, out_ref: Any) -> tuple[int, int]:
+    """How many rows of the result a tile has, and how many quarters of patches."""
+    quarters = 4 * TILE
+    return quarters * out_ref.shape[0] // x_ref.shape[0], quarters
+
+
+def _backward_kernel(x_ref, out_ref, gradient_ref, *refs):
+    weights, sums_ref = read(refs[:-1]), refs[-1]
+    rows, quarters = rows_of_tile(x_ref, out_ref)
+    hidden_layers = Weights(weights.kernels[:-1], weights.biases[:-1])
 
     def add_rows(values):
         """The sum over rows, in each of the result's rows: as a product, it costs half of what a reduction does."""
         return dot(jnp.ones((LEAST_ROWS, values.shape[0]), values.dtype), values)
 
     def one_tile(tile, sums):
-        x = x_ref[pl.ds(tile * 4 * patches, 4 * patches), :]
-        here = pl.ds(tile * patches, patches)
-        hidden_1 = layer(x, weights.kernel_1, weights.bias_1)
-        hidden_2 = layer(hidden_1, weights.kernel_2, weights.bias_2)
-        before_3 = before(out_ref[here, :], gradient_ref[here, :])
-        gradient_2 = dot(before_3, weights.kernel_3, (1, 1)).reshape(hidden_2.shape)
-        before_2 = before(hidden_2, gradient_2)
-        before_1 = before(hidden_1, dot(before_2, weights.kernel_2, (1, 1)))
-        return Weights(
-            sums.kernel_1 + dot(x, before_1, (0, 0)),
-            sums.bias_1 + add_rows(before_1),
-            sums.kernel_2 + dot(hidden_1, before_2, (0, 0)),
-            sums.bias_2 + add_rows(before_2),
-            sums.kernel_3 + dot(hidden_2.reshape(patches, -1), before_3, (0, 0)),
-            sums.bias_3 + add_rows(before_3),
-        )
+        here = pl.ds(tile * rows, rows)
+        values = [x_ref[pl.ds(tile * quarters, quarters), :]]
+        values += [*_layers(values[0], hidden_layers), _repeated(out_ref[here, :])]
+        gradient = _repeated(gradient_ref[here, :])
+        of_kernels, of_biases = list(sums.kernels), list(sums.biases)
+        for level in reversed(range(len(of_kernels))):
+            inputs = joined(values[level], level)
+            gradient = before(values[level + 1], gradient)
+            of_kernels[level] += dot(inputs, gradient, (0, 0))
+            of_biases[level] += add_rows(gradient)
+            if level:
+                gradient = dot(gradient, weights.kernels[level], (1, 1))
+                gradient = once(gradient, values[level].size // inputs.shape[1]).reshape(values[level].shape)
+        return Weights(tuple(of_kernels), tuple(of_biases))
 
-    zeros = [jnp.zeros(value.shape if value.ndim > 1 else (LEAST_ROWS, value.shape[0]), jnp.float32) for value in weights]
-    sums = jax.lax.fori_loop(0, out_ref.shape[0] // patches, one_tile, Weights(*zeros))
-    first = 0
-    for like, value in zip(weights, sums, strict=True):
-        if like.ndim == 1:  # sixteen times the same sum
-            value = jnp.sum(value, axis=0) * (1.0 / LEAST_ROWS)
-        sums_ref[pl.ds(first, like.size)] = value.reshape(-1)
-        first += like.size
+    start = Weights(
+        tuple(jnp.zeros(kernel.shape, jnp.float32) for kernel in weights.kernels),
+        tuple(jnp.zeros((LEAST_ROWS, bias.shape[0]), jnp.float32) for bias in weights.biases),
+    )
+    sums = jax.lax.fori_loop(0, out_ref.shape[0] // rows, one_tile, start)
+    # A bias's are sixteen times the same sum, and the last layer's are sums of rows that are repeated.
+    of_biases = [jnp.sum(value, axis=0) * (1.0 / LEAST_ROWS) for value in sums.biases]
+    share, first = min(1.0, rows / LEAST_ROWS), 0
+    for values in (sums.kernels, of_biases):
+        for value in (*values[:-1], values[-1] * share):
+            sums_ref[pl.ds(first, value.size)] = value.reshape(-1)
+            first += value.size
 
 
 def whole(array: jax.Array) -> pl.BlockSpec:
@@ -178,48 +225,66 @@ def tiles_of_program(tiles: int, total: int, limit: int) -> int:
 
 def cast_kernels(weights: Weights, dtype: Any) -> Weights:
     """Kernels in the dtype of the products; biases are added in float32."""
-    return weights._replace(**{name: getattr(weights, name).astype(dtype) for name in ("kernel_1", "kernel_2", "kernel_3")})
+    return weights._replace(kernels=tuple(kernel.astype(dtype) for kernel in weights.kernels))
+
+
+def patches_of_row(weights: Weights) -> int:
+    """How many patches a row of the result is made of."""
+    return 4 ** (len(weights.kernels) - LEVELS)
+
+
+def tiles_between(weights: Weights, first: int, count: int) -> tuple[int, int]:
+    """Rows of the result in a tile, and how many tiles divide both numbers of rows."""
+    rows = TILE // patches_of_row(weights)
+    return rows, math.gcd(first, count) // rows
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2, 3, 4))
 def apply(patches: jax.Array, weights: Weights, first: int, count: int, interpret: bool = False) -> jax.Array:
-    """Three layers of 2x2 stride-2 convolutions with rectifiers, for some patches: [M, 64 C'] -> [count, F3], same dtype.
+    """Layers of 2x2 stride-2 convolutions with rectifiers, for some patches: [M, 64 C'] -> [count, F], same dtype.
 
     Differentiable with respect to the weights only: patches are data.
 
     Args:
         patches: [M, 64 C'] from `prepare`.
         weights: From `make_weights`.
-        first, count: Which rows; both multiples of 16.
+        first, count: Which rows of the result for all patches; both multiples of those of a tile, `TILE` patches.
         interpret: Run the kernel without a GPU, slowly.
     """
     place = {"first": first, "count": count}
     on_gpu = functools.partial(_apply_on_gpu, **place, interpret=interpret)
-    return dispatch(on_gpu, functools.partial(_apply_plainly, **place), patches, weights, interpret=interpret)
+    return dispatch(on_gpu, functools.partial(apply_plainly, **place), patches, weights, interpret=interpret)
+
+
+def quarters_of(patches: jax.Array, weights: Weights, first: int, block: int) -> tuple[jax.Array, pl.BlockSpec]:
+    """Patches as the kernels read them, and those of a program's ``block`` of rows."""
+    size, of_row = patches.shape[1] // 4, 4 * patches_of_row(weights)
+    return patches.reshape(-1, size), rows(of_row * block, size, first // block)
 
 
 def _apply_on_gpu(patches: jax.Array, weights: Weights, first: int, count: int, interpret: bool = False) -> jax.Array:
-    size, outputs = patches.shape[1], weights.bias_3.shape[0]
-    tile = divisor(math.gcd(first, count), _FORWARD_PATCHES)
-    block = tile * divisor(math.gcd(first, count) // tile, _FORWARD_TILES)
-    cast = cast_kernels(weights, patches.dtype)
+    outputs = weights.biases[-1].shape[0]
+    tile, tiles = tiles_between(weights, first, count)
+    block = tile * divisor(tiles, FORWARD_TILES)
+    data, data_spec = quarters_of(patches, weights, first, block)
+    cast = jax.tree.leaves(cast_kernels(weights, patches.dtype))
     return pl.pallas_call(
-        functools.partial(_forward_kernel, patches=tile),
+        _forward_kernel,
         out_shape=jax.ShapeDtypeStruct((count, outputs), patches.dtype),
         grid=(count // block,),
-        in_specs=[rows(4 * block, size // 4, first // block), *map(whole, cast)],
+        in_specs=[data_spec, *map(whole, cast)],
         out_specs=rows(block, outputs),
-        compiler_params=_FORWARD,
+        compiler_params=FORWARD,
         interpret=interpret,
         name="encode_patches",
-    )(patches.reshape(-1, size // 4), *cast)
+    )(data, *cast)
 
 
-def _apply_plainly(patches: jax.Array, weights: Weights, first: int, count: int) -> jax.Array:
-    cast = cast_kernels(weights, patches.dtype)
-    quarters = patches[first : first + count].reshape(-1, patches.shape[1] // 4)
-    hidden = layer(layer(quarters, cast.kernel_1, cast.bias_1), cast.kernel_2, cast.bias_2)
-    return layer(hidden.reshape(count, -1), cast.kernel_3, cast.bias_3)
+def apply_plainly(patches: jax.Array, weights: Weights, first: int, count: int) -> jax.Array:
+    """`apply` in plain JAX."""
+    of_row = patches_of_row(weights)
+    chosen = patches[first * of_row : (first + count) * of_row].reshape(-1, patches.shape[1] // 4)
+    return once(_layers(chosen, cast_kernels(weights, patches.dtype))[-1], count)
 
 
 def _apply_forward(patches: jax.Array, weights: Weights, first: int, count: int, interpret: bool):
@@ -239,112 +304,33 @@ def _backward_on_gpu(
     patches: jax.Array, weights: Weights, out: jax.Array, gradient: jax.Array, first: int, count: int, interpret: bool = False
 ) -> Weights:
     """Gradients of the weights, float32."""
-    size, outputs = patches.shape[1], out.shape[1]
-    tile = divisor(math.gcd(first, count), _BACKWARD_PATCHES)
-    tiles = math.gcd(first, count) // tile
+    outputs = out.shape[1]
+    tile, tiles = tiles_between(weights, first, count)
     block = tile * tiles_of_program(tiles, count // tile, _BACKWARD_TILES)
     programs = count // block
-    cast = cast_kernels(weights, patches.dtype)
-    total = sum(array.size for array in weights)
+    data, data_spec = quarters_of(patches, weights, first, block)
+    cast, like = jax.tree.leaves(cast_kernels(weights, patches.dtype)), jax.tree.leaves(weights)
+    total = sum(array.size for array in like)
     partial_sums = pl.pallas_call(
-        functools.partial(_backward_kernel, patches=tile),
+        _backward_kernel,
         # All weights in one row, so that one reduction adds up the programs.
         out_shape=jax.ShapeDtypeStruct((programs, total), jnp.float32),
         grid=(programs,),
-        in_specs=[
-            rows(4 * block, size // 4, first // block),
-            rows(block, outputs),
-            rows(block, outputs),
-            *map(whole, cast),
-        ],
+        in_specs=[data_spec, rows(block, outputs), rows(block, outputs), *map(whole, cast)],
         out_specs=pl.BlockSpec((None, total), lambda program: (program, 0)),
-        compiler_params=_BACKWARD,
+        compiler_params=_BACKWARD if total <= _MOST_SUMS else _BACKWARD_WITH_MORE,
         interpret=interpret,
         name="encode_patches_backward",
-    )(patches.reshape(-1, size // 4), out, gradient, *cast)
-    sums = jnp.split(jnp.sum(partial_sums, axis=0), list(itertools.accumulate(array.size for array in weights))[:-1])
-    return Weights(*(part.reshape(like.shape).astype(like.dtype) for part, like in zip(sums, weights, strict=True)))
+    )(data, out, gradient, *cast)
+    sums = jnp.split(jnp.sum(partial_sums, axis=0), list(itertools.accumulate(array.size for array in like))[:-1])
+    sums = [part.reshape(array.shape).astype(array.dtype) for part, array in zip(sums, like, strict=True)]
+    return jax.tree.unflatten(jax.tree.structure(weights), sums)
 
 
 def _backward_plainly(
     patches: jax.Array, weights: Weights, out: jax.Array, gradient: jax.Array, first: int, count: int
 ) -> Weights:
-    return jax.vjp(lambda weights: _apply_plainly(patches, weights, first, count), weights)[1](gradient)[0]
+    return jax.vjp(lambda weights: apply_plainly(patches, weights, first, count), weights)[1](gradient)[0]
 
 
 apply.defvjp(_apply_forward, _apply_backward)
-
-
-# -- Tangents
-
-
-def _tangent_kernel(x_ref, *refs, patches):
-    inputs, (out_ref, tangent_ref) = [ref[...] for ref in refs[:-2]], refs[-2:]
-    weights, along = Weights(*inputs[: len(inputs) // 2]), Weights(*inputs[len(inputs) // 2 :])
-
-    def one_tile(tile, _):
-        x = x_ref[pl.ds(tile * 4 * patches, 4 * patches), :]
-        values, tangents = _layer_along(x, None, weights.kernel_1, weights.bias_1, along.kernel_1, along.bias_1)
-        values, tangents = _layer_along(values, tangents, weights.kernel_2, weights.bias_2, along.kernel_2, along.bias_2)
-        values, tangents = values.reshape(patches, -1), tangents.reshape(patches, -1)
-        here = pl.ds(tile * patches, patches)
-        out_ref[here, :], tangent_ref[here, :] = _layer_along(
-            values, tangents, weights.kernel_3, weights.bias_3, along.kernel_3, along.bias_3
-        )
-
-    jax.lax.fori_loop(0, out_ref.shape[0] // patches, one_tile, None)
-
-
-def _layer_along(
-    values: jax.Array,
-    tangents: jax.Array | None,
-    kernel: jax.Array,
-    bias: jax.Array,
-    kernel_along: jax.Array,
-    bias_along: jax.Array,
-) -> tuple[jax.Array, jax.Array]:
-    """`layer` and its tangent, for tangents of the values (None: they have none), of the kernel and of the bias."""
-    out, change = layer(values, kernel, bias), dot(values, kernel_along) + bias_along[None, :]
-    if tangents is not None:
-        change += dot(tangents, kernel)
-    return out, before(out, change)
-
-
-@functools.partial(jax.custom_jvp, nondiff_argnums=(2, 3, 4))
-def apply_forwards(patches: jax.Array, weights: Weights, first: int, count: int, interpret: bool = False) -> jax.Array:
-    """`apply`, differentiable forwards instead, with respect to the weights."""
-    return apply(patches, weights, first, count, interpret)
-
-
-@apply_forwards.defjvp
-def _apply_along(first: int, count: int, interpret: bool, primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
-    patches, weights = primals
-    place = {"first": first, "count": count}
-    on_gpu = functools.partial(_along_on_gpu, **place, interpret=interpret)
-    plainly = functools.partial(_along_plainly, **place)
-    return dispatch(on_gpu, plainly, patches, weights, tangents[1], interpret=interpret)
-
-
-def _along_on_gpu(
-    patches: jax.Array, weights: Weights, along: Weights, first: int, count: int, interpret: bool = False
-) -> tuple[jax.Array, jax.Array]:
-    """What `apply` makes of patches, and its tangent along a direction of the weights, [count, F3] each."""
-    size, outputs = patches.shape[1], weights.bias_3.shape[0]
-    tile = divisor(math.gcd(first, count), _FORWARD_PATCHES)
-    block = tile * divisor(math.gcd(first, count) // tile, _FORWARD_TILES)
-    cast, along = cast_kernels(weights, patches.dtype), cast_kernels(along, patches.dtype)
-    out = jax.ShapeDtypeStruct((count, outputs), patches.dtype)
-    return pl.pallas_call(
-        functools.partial(_tangent_kernel, patches=tile),
-        out_shape=(out, out),
-        grid=(count // block,),
-        in_specs=[rows(4 * block, size // 4, first // block), *map(whole, (*cast, *along))],
-        out_specs=(rows(block, outputs), rows(block, outputs)),
-        compiler_params=_FORWARD,
-        interpret=interpret,
-        name="encode_patches_along",
-    )(patches.reshape(-1, size // 4), *cast, *along)
-
-
-def _along_plainly(patches: jax.Array, weights: Weights, along: Weights, first: int, count: int) -> tuple[jax.Array, jax.Array]:
-    return jax.jvp(lambda weights: _apply_plainly(patches, weights, first, count), (weights,), (along,))

@@ -315,11 +315,13 @@ class Networks:
             return jnp.concatenate([inputs[which] for inputs, which in pieces])
         if not self.uses_kernel:
             return self._encoder.apply({"params": params["encoder"]}, *(inputs[which] for inputs, which in pieces))
-        weights = encoder_kernel.make_weights(params["encoder"], self.observation_spec.shape[0])
+        channels = self.observation_spec.shape[0]
+        weights = encoder_kernel.make_weights(params["encoder"], channels)
         found = [encoder_kernel.encode(inputs, weights, which) for inputs, which in pieces]
-        finer = 4 ** (self._levels - encoder_kernel.LEVELS)
+        done = encoder_kernel.layers(self.config.encoder_filters, channels)
+        finer = 4 ** (self._levels - done)
         blocks = [part.reshape(part.shape[0], part.shape[1] // finer, finer * part.shape[2]) for part in found]
-        return self._encoder.apply({"params": params["encoder"]}, *blocks, first_layer=encoder_kernel.LEVELS)
+        return self._encoder.apply({"params": params["encoder"]}, *blocks, first_layer=done)
 
     def act(self, actor: Params, latents: jax.Array) -> jax.Array:
         """Actions [B, A] float32 in (-1, 1) for latents [2, B, latent] of observations and goals."""
