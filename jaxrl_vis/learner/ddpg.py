@@ -11,14 +11,14 @@ latents, too, ``target_encoder=False`` computes targets with the online encoders
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 
 from jaxrl_vis.config import Config
-from jaxrl_vis.learner import diagnostics, normalizer
+from jaxrl_vis.learner import adam, diagnostics, normalizer
 from jaxrl_vis.learner.auxiliary import Auxiliary, make_auxiliary
 from jaxrl_vis.learner.latent_reward import LatentReward, make_latent_reward
 from jaxrl_vis.learner.networks import Networks
@@ -38,13 +38,15 @@ class Working(NamedTuple):
     """A learner between two gradient steps of one iteration. Its insides are this module's own.
 
     Attributes:
-        train: The learner.
+        train: The learner; its counters are those of the beginning.
         copies: Its parameters as the networks compute with them.
+        counts: [3] int32, gradient steps: those of the critic, of the actor, and `TrainState.updates`.
         held: The critic's parameters that the weighting's interval began with, for a weighting that asks for them; else None.
     """
 
     train: TrainState
     copies: ComputeCopies
+    counts: jax.Array
     held: Params = None
 
 
@@ -89,9 +91,7 @@ def _networks_of(state: TrainState) -> tuple[Params, ...]:
     return state.actor, state.critic, state.target_actor, state.target_critic
 
 
-def _start(
-    networks: Networks, auxiliary: Auxiliary, latent_reward: LatentReward | None, optimizers: "_Optimizers", key: jax.Array
-) -> TrainState:
+def _start(networks: Networks, auxiliary: Auxiliary, latent_reward: LatentReward | None, key: jax.Array) -> TrainState:
     """A learner that has learned nothing: targets equal the online networks."""
     actor_key, critic_key = jax.random.split(key)
     actor, critic = networks.init_actor(actor_key), networks.init_critic(critic_key)
@@ -107,8 +107,8 @@ def _start(
         critic=critic,
         target_actor=target_actor,
         target_critic=target_critic,
-        actor_optimizer=optimizers.actor.init(actor),
-        critic_optimizer=optimizers.critic.init(critic),
+        actor_optimizer=adam.init(actor),
+        critic_optimizer=adam.init(critic),
         normalizer=normalizer.init(networks.observation_spec),
         goal_normalizer=normalizer.init(networks.observation_spec) if separate else None,
         updates=jnp.zeros((), jnp.int32),
@@ -117,19 +117,30 @@ def _start(
     )
 
 
-class _Optimizers(NamedTuple):
-    actor: optax.GradientTransformation
-    critic: optax.GradientTransformation
+def _counts_of(train: TrainState) -> jax.Array:
+    """`Working.counts`: one array, because XLA has a kernel for each counter that is one number."""
+    return jnp.stack([adam.count(train.critic_optimizer), adam.count(train.actor_optimizer), train.updates])
 
 
-def _apply(state: TrainState, gradients: Gradients, optimizers: _Optimizers, config: Config) -> TrainState:
-    """One step of both optimisers, and the targets a little after the online networks."""
-    critic, critic_moments = _step(optimizers.critic, state.critic, gradients.critic, state.critic_optimizer)
+def _with_counts(train: TrainState, counts: jax.Array) -> TrainState:
+    """The learner with its own counters again."""
+    return train.replace(
+        critic_optimizer=adam.with_count(train.critic_optimizer, counts[0]),
+        actor_optimizer=adam.with_count(train.actor_optimizer, counts[1]),
+        updates=counts[2],
+    )
+
+
+def _apply(state: TrainState, counts: jax.Array, gradients: Gradients, config: Config) -> TrainState:
+    """One step of both optimisers, and the targets a little after the online networks; ``counts`` include this step."""
+    corrections = adam.corrections(counts[:2])
+    critic, critic_moments = adam.step(
+        state.critic, gradients.critic, state.critic_optimizer, config.critic_learning_rate, corrections[0]
+    )
     actor, actor_moments = state.actor, state.actor_optimizer
     if gradients.actor is not None:
-        actor, actor_moments = _step(optimizers.actor, actor, gradients.actor, actor_moments)
-    updates = state.updates + 1
-    follow = jnp.where(updates % config.target_update_interval == 0, 1.0 - config.target_decay, 0.0)
+        actor, actor_moments = adam.step(actor, gradients.actor, actor_moments, config.actor_learning_rate, corrections[1])
+    follow = jnp.where(counts[2] % config.target_update_interval == 0, 1.0 - config.target_decay, 0.0)
 
     def followed(online: Params, target: Params) -> Params:
         return optax.incremental_update({part: online[part] for part in target}, target, follow)
@@ -141,14 +152,8 @@ def _apply(state: TrainState, gradients: Gradients, optimizers: _Optimizers, con
         target_critic=followed(critic, state.target_critic),
         actor_optimizer=actor_moments,
         critic_optimizer=critic_moments,
-        updates=updates,
         weighting=gradients.weighting,
     )
-
-
-def _step(optimizer: optax.GradientTransformation, params: Params, gradient: Params, moments: Any) -> tuple[Params, Any]:
-    change, moments = optimizer.update(gradient, moments)
-    return optax.apply_updates(params, change), moments
 
 
 def _value_at_goals(networks: Networks, train: TrainState, goals: jax.Array) -> jax.Array:
@@ -188,13 +193,12 @@ def make_ddpg(
     """
     if auxiliary is None:
         auxiliary = make_auxiliary(config, networks.observation_spec, networks.action_size, 1, networks.dtype)
-    optimizers = _Optimizers(optax.adam(config.actor_learning_rate), optax.adam(config.critic_learning_rate))
     latent_reward = make_latent_reward(networks, config, resolved, auxiliary.frame_stack)
     learning = Objectives(networks, config, resolved, auxiliary, shards)
     keeps_state, held = auxiliary.weighting.name != "none", auxiliary.weighting.held
 
-    def begin(train: TrainState, held: Params = None) -> Working:
-        return Working(train, ComputeCopies(*map(networks.compute_copy, _networks_of(train))), held)
+    def working_of(train: TrainState, counts: jax.Array, held: Params = None) -> Working:
+        return Working(train, ComputeCopies(*map(networks.compute_copy, _networks_of(train))), counts, held)
 
     def gradients(working: Working, batch: Batch, with_actor: bool = True) -> tuple[Gradients, Metrics]:
         train = working.train
@@ -234,19 +238,21 @@ def make_ddpg(
         return Gradients(critic_gradient, actor_gradient, found.state if keeps_state else None, of_autoencoder), metrics
 
     def apply(working: Working, chosen: Gradients) -> Working:
-        train = _apply(working.train, chosen, optimizers, config)
+        counts = working.counts + jnp.array([1, int(chosen.actor is not None), 1])
+        train = _apply(working.train, counts, chosen, config)
         if latent_reward is not None:
             train = train.replace(autoencoder=latent_reward.apply(train.autoencoder, chosen.autoencoder))
         if not held:
-            return begin(train)
+            return working_of(train, counts)
         is_new = train.weighting.updates % auxiliary.weighting.interval == 0
-        return begin(train, jax.tree.map(lambda now, before: jnp.where(is_new, now, before), train.critic, working.held))
+        kept = jax.tree.map(lambda now, before: jnp.where(is_new, now, before), train.critic, working.held)
+        return working_of(train, counts, kept)
 
     return Algorithm(
-        init=lambda key: _start(networks, auxiliary, latent_reward, optimizers, key),
-        begin=lambda train: begin(train, train.critic if held else None),
+        init=lambda key: _start(networks, auxiliary, latent_reward, key),
+        begin=lambda train: working_of(train, _counts_of(train), train.critic if held else None),
         gradients=gradients,
         apply=apply,
-        end=lambda working: working.train,
+        end=lambda working: _with_counts(working.train, working.counts),
         value_at_goals=functools.partial(_value_at_goals, networks),
     )

@@ -115,21 +115,25 @@ def _make_update_many(config: Config, sampler: Sampler, algorithm: Algorithm):
             gradients, metrics = algorithm.gradients(working, batch, with_actor)
             return algorithm.apply(working, gradients), metrics
 
-        def updates(working: Working, choices: Choice) -> tuple[Working, Metrics]:
+        names: list[str] = []
+
+        def updates(working: Working, choices: Choice) -> tuple[Working, jax.Array]:
             """Updates of which the last one is the actor's, too; unrolled, so that the loop's body has no conditional."""
             found: list[Metrics] = []
             for number in range(interval):
                 choice = jax.tree.map(lambda leaf, number=number: leaf[number], choices)
                 working, metrics = one_update(working, choice, with_actor=number == interval - 1)
                 found.append(metrics)
-            return working, {name: _mean([each[name] for each in found if name in each]) for name in found[-1]}
+            names[:] = found[-1]
+            # As one vector, because writing each number by itself would be a kernel each.
+            return working, jnp.stack([_mean([each[name] for each in found if name in each]) for name in names])
 
         # What all updates learn from is chosen at once: in the loop, drawing numbers would be a dozen tiny kernels an update.
         keys = jax.random.split(key, config.updates_per_iteration)
         choices = jax.vmap(lambda update_key: sampler.choose(replay, update_key, iteration))(keys)
         choices = jax.tree.map(lambda leaf: leaf.reshape(-1, interval, *leaf.shape[1:]), choices)
         working, metrics = jax.lax.scan(updates, algorithm.begin(train), choices)
-        return algorithm.end(working), jax.tree.map(jnp.mean, metrics)
+        return algorithm.end(working), dict(zip(names, jnp.mean(metrics, axis=0), strict=True))
 
     return update_many
 
