@@ -142,7 +142,7 @@ def taken(model: mjx.Model, data: mjx.Data, count: int, in_kernel: bool, exact: 
 @functools.cache
 def by_matrices(name: str, count: int):
     env = environments.make(name)
-    return env, env_jit(jax.vmap(lambda data: mjx_model.take_steps(env._model, data, count, True)))
+    return env, env_jit(jax.vmap(lambda data: mjx_model._one_by_one(env._model, data, count, True)))
 
 
 @functools.cache
@@ -192,6 +192,22 @@ def test_a_control_step_of_each_task_is_that_of_matrices(name):
     error = np.abs(state.position - np.asarray(after.qpos)).max(axis=1)
     # A contact that begins one step later changes more than rounding errors do.
     assert np.median(error) < 2e-6 and error.max() < 1e-3, np.sort(error)[-5:]
+
+
+def test_on_a_cpu_the_finger_goes_number_by_number():
+    data = states("FingerTurn")
+    env, _ = by_matrices("FingerTurn", 1)
+    _, control_step = by_matrices("FingerTurn", env.config.substeps)
+    after = control_step(data)
+    found = env_jit(jax.vmap(lambda data: mjx_model.take_steps(env._model, data, env.config.substeps, True)))(data)
+    assert not np.array_equal(found.qpos, after.qpos)  # or they would be matrices, too
+    for name in ("qpos", "time"):
+        np.testing.assert_allclose(getattr(found, name), getattr(after, name), atol=1e-3)
+    assert np.median(np.abs(found.qpos - after.qpos).max(axis=1)) < 2e-6
+    np.testing.assert_allclose(found.qacc_warmstart, found.qacc)
+    pushed = data.replace(xfrc_applied=data.xfrc_applied.at[0, 1, 0].set(1.0))
+    found = env_jit(jax.vmap(lambda data: mjx_model.take_steps(env._model, data, 1)))(pushed)
+    assert np.isnan(found.qpos[0]).all() and np.isfinite(found.qpos[1:]).all()
 
 
 def odd_states(mj_model: mujoco.MjModel, count: int) -> mjx.Data:

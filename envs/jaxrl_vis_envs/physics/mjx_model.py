@@ -12,8 +12,8 @@ import numpy as np
 from mujoco import mjx
 from mujoco.mjx._src import math, sensor, smooth
 
-from jaxrl_vis_envs.compilation import by_platform, runs_gpu_kernels
-from jaxrl_vis_envs.physics import constraints, mechanism, steps_kernel
+from jaxrl_vis_envs.compilation import by_platform, runs_gpu_kernels, targets_cpu
+from jaxrl_vis_envs.physics import constraints, mechanism, steps, steps_kernel
 from jaxrl_vis_envs.physics.kinematics import kinematics
 from jaxrl_vis_envs.physics.steps import State
 
@@ -29,6 +29,8 @@ __all__ = [
     "tip_jacobian",
 ]
 
+# With more joints, steps number by number take longer on a CPU than as matrices, and several times as long to compile.
+_FEW_JOINTS = 3
 _ASSETS = pathlib.Path(__file__).resolve().parents[1] / "tasks" / "assets"
 
 
@@ -71,10 +73,11 @@ def simulate(model: mjx.Model, data: mjx.Data, substeps: int, exact: bool = Fals
 def take_steps(model: mjx.Model, data: mjx.Data, count: int, exact: bool = False, beside_exact: bool = False) -> mjx.Data:
     """``count`` physics steps (`step`); poses and true states are then older than ``qpos``.
 
-    On a GPU that runs kernels, models that `mechanism` takes have them all in one (`steps_kernel`). Contacts between capsules
-    are then exact in any case, and if more pairs touch than ``max_contact_points`` or ``max_geom_pairs``, all of them count.
-    Nothing but positions, velocities, accelerations, time and the constraints' forces is new afterwards. Forces on bodies
-    (``xfrc_applied``) and welds that are turned off (``eq_active``) are not heeded: with any, positions are not a number.
+    On a GPU that runs kernels, models that `mechanism` takes have them all in one (`steps_kernel`), and on a CPU those of them
+    that have few joints are simulated number by number, too (`steps`). Contacts between capsules are then exact in any case,
+    and if more pairs touch than ``max_contact_points`` or ``max_geom_pairs``, all of them count. Nothing but positions,
+    velocities, accelerations, time and the constraints' forces is new afterwards. Forces on bodies (``xfrc_applied``) and welds
+    that are turned off (``eq_active``) are not heeded: with any, positions are not a number.
 
     ``beside_exact`` is for steps that are not exact in a program that also has exact ones, of a model that is the same but for
     its time step: they share a kernel then, which is compiled once.
@@ -85,6 +88,8 @@ def take_steps(model: mjx.Model, data: mjx.Data, count: int, exact: bool = False
     def by_kernel_or_not(data: mjx.Data) -> mjx.Data:
         if runs_gpu_kernels(steps_kernel.probe):
             return _in_one_kernel(model, data, count, exact, beside_exact)
+        if targets_cpu() and model.nv <= _FEW_JOINTS:
+            return _by_numbers(model, data, count, exact)
         return _one_by_one(model, data, count, exact)
 
     return by_platform(by_kernel_or_not, data)
@@ -101,13 +106,29 @@ def _one_by_one(model: mjx.Model, data: mjx.Data, count: int, exact: bool) -> mj
 def _in_one_kernel(
     model: mjx.Model, data: mjx.Data, count: int, exact: bool, beside_exact: bool = False, interpret: bool = False
 ) -> mjx.Data:
+    return _with_steps(
+        model, data, count, functools.partial(steps_kernel.take, exact=exact, beside_exact=beside_exact, interpret=interpret)
+    )
+
+
+def _by_numbers(model: mjx.Model, data: mjx.Data, count: int, exact: bool) -> mjx.Data:
+    def take(constants: Any, state: State, control: Any, applied: Any, timestep: float, count: int, mocap: Any = None) -> State:
+        start = State(*map(list, state))
+        around = list(control), list(applied)
+        poses = [] if mocap is None else list(mocap.reshape(-1))
+        end = steps.take(constants, start, *around, timestep, count, exact, mocap=poses)
+        return State(*map(jnp.stack, end))
+
+    return _with_steps(model, data, count, take)
+
+
+def _with_steps(model: mjx.Model, data: mjx.Data, count: int, take: Callable[..., State]) -> mjx.Data:
+    """The data after steps by a function of constants, state, controls, forces, time step, count and poses of mocap bodies."""
     constants, timestep = mechanism.mechanism_of(model), float(model.opt.timestep)
     state = State(data.qpos, data.qvel, data.qacc_warmstart, data.qfrc_constraint)
     used = np.array(constants.mocaps, int)
     mocap = jnp.concatenate([data.mocap_pos[used], data.mocap_quat[used]], axis=1) if len(used) else None
-    state = steps_kernel.take(
-        constants, state, data.ctrl, data.qfrc_applied, timestep, count, exact, beside_exact, interpret, mocap
-    )
+    state = take(constants, state, data.ctrl, data.qfrc_applied, timestep, count, mocap=mocap)
     is_unlike = jnp.any(data.xfrc_applied != 0)
     if constants.holds:
         is_unlike = is_unlike | ~jnp.all(data.eq_active)
