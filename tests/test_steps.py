@@ -199,15 +199,20 @@ def test_on_a_cpu_the_finger_goes_number_by_number():
     env, _ = by_matrices("FingerTurn", 1)
     _, control_step = by_matrices("FingerTurn", env.config.substeps)
     after = control_step(data)
-    found = env_jit(jax.vmap(lambda data: mjx_model.take_steps(env._model, data, env.config.substeps, True)))(data)
+    found = env_jit(jax.vmap(lambda data: mjx_model.take_steps(env._model, data, env.config.substeps, True, True)))(data)
     assert not np.array_equal(found.qpos, after.qpos)  # or they would be matrices, too
     for name in ("qpos", "time"):
         np.testing.assert_allclose(getattr(found, name), getattr(after, name), atol=1e-3)
     assert np.median(np.abs(found.qpos - after.qpos).max(axis=1)) < 2e-6
     np.testing.assert_allclose(found.qacc_warmstart, found.qacc)
     pushed = data.replace(xfrc_applied=data.xfrc_applied.at[0, 1, 0].set(1.0))
-    found = env_jit(jax.vmap(lambda data: mjx_model.take_steps(env._model, data, 1)))(pushed)
+    found = env_jit(jax.vmap(lambda data: mjx_model.take_steps(env._model, data, 1, True, True)))(pushed)
     assert np.isnan(found.qpos[0]).all() and np.isfinite(found.qpos[1:]).all()
+    # Whoever does not say that nothing is pushed gets what MJX does.
+    found = env_jit(jax.vmap(lambda data: mjx_model.take_steps(env._model, data, 1, True)))(pushed)
+    _, one_step = by_matrices("FingerTurn", 1)
+    np.testing.assert_array_equal(found.qpos, one_step(pushed).qpos)
+    assert not np.array_equal(found.qvel[0], one_step(data).qvel[0])
 
 
 def odd_states(mj_model: mujoco.MjModel, count: int) -> mjx.Data:
@@ -317,7 +322,7 @@ def lowered_for_cuda(model: mjx.Model, data: mjx.Data) -> str:
 
     def control_step(data):
         with tracing_for("cuda"), kernels(True):
-            return mjx_model.take_steps(model, data, 5, True)
+            return mjx_model.take_steps(model, data, 5, True, True)
 
     return jax.jit(jax.vmap(control_step)).trace(data).lower(lowering_platforms=("cuda",)).as_text()
 

@@ -117,8 +117,8 @@ def states(name: str) -> mjx.Data:
         actions[:, ::2, axis] = sign
     with pytest.MonkeyPatch.context() as patch:
         # What `act` does before its steps.
-        patch.setattr(mjx_model, "take_steps", lambda model, data, count: data)
-        patch.setattr(mjx_model, "simulate", lambda model, data, count: data)
+        patch.setattr(mjx_model, "take_steps", lambda model, data, count, **rest: data)
+        patch.setattr(mjx_model, "simulate", lambda model, data, count, **rest: data)
         begin = jax.jit(jax.vmap(lambda data, action: env.act(mjx_model.kinematics(env._model, data), action)))
         data = jax.jit(jax.vmap(env.sample_start))(jax.random.split(jax.random.key(3), 48))
         for action in jnp.asarray(actions, jnp.float32):

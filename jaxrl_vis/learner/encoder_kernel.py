@@ -41,14 +41,14 @@ from jaxrl_vis.learner.encoder_kernel_tangents import apply_forwards
 
 __all__ = ["encode", "is_available", "layers", "make_weights", "prepare", "supports"]
 
-# More of either (four layers, or three of 16 channels) agree with plain products and compile, but no GPU has run them yet.
+# Four layers, and three of 16 channels, agree with plain products and compile, but no GPU has run them yet.
 _MOST_CHANNELS, _MOST_LAYERS = 4, 3
-_MOST_LAYERS_OF_MANY, _MANY_CHANNELS = 3, 5  # beyond, the weights' gradients no longer fit into registers
+_FEW_CHANNELS = 4  # with more, the gradients of a fourth layer would not fit into registers
 
 
 def layers(filters: Sequence[Any], channels: int) -> int:
     """How many layers of an encoder with these output channels, of images with ``channels``, are in the kernel."""
-    return min(len(filters), _MOST_LAYERS_OF_MANY if channels >= _MANY_CHANNELS else _MOST_LAYERS)
+    return min(len(filters), _MOST_LAYERS if channels <= _FEW_CHANNELS else LEVELS)
 
 
 def supports(filters: tuple[int, ...], shape: tuple[int, ...]) -> bool:

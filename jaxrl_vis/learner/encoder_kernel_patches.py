@@ -15,11 +15,11 @@ from jax.experimental.pallas import triton as plgpu
 from jaxrl_vis.learner.blocks import shifted
 
 LEVELS = 3
-"""Layers in the kernel."""
+"""Layers of which a patch is one row of the result."""
 WORD = 4
 """Pixels that are read at a time: four neighbours in a row, one byte each."""
-# Measured on an H200: pixels and images of one program, and how it is run.
-_PREPARE_PIXELS, _PREPARE_IMAGES, _PREPARE = 4096, 16, plgpu.CompilerParams(num_warps=8, num_stages=2)
+# Measured on an H200: patches, or numbers where those are large, and images of one program, and how it is run.
+_PREPARE_PATCHES, _PREPARE_NUMBERS, _PREPARE_IMAGES, _PREPARE = 16, 4096, 16, plgpu.CompilerParams(num_warps=8, num_stages=2)
 
 
 def padded_channels(channels: int) -> int:
@@ -119,7 +119,7 @@ def prepare_on_gpu(
     channels, height, width = shape
     patches = (height >> levels) * (width >> levels) * 4 ** (levels - LEVELS)
     size = 64 * padded_channels(channels)
-    tile, together = divisor(patches, _PREPARE_PIXELS // size), divisor(batch, _PREPARE_IMAGES)
+    tile, together = divisor(patches, min(_PREPARE_PATCHES, _PREPARE_NUMBERS // size)), divisor(batch, _PREPARE_IMAGES)
     pixels = math.prod(shape)
     data, of_images = (
         images.reshape(batch, pixels),

@@ -61,38 +61,53 @@ def still_data(mj_model: mujoco.MjModel, keyframe: str | None = None) -> mjx.Dat
     return start_data(mj_model, mj_data)
 
 
-def simulate(model: mjx.Model, data: mjx.Data, substeps: int, exact: bool = False) -> mjx.Data:
-    """``substeps`` physics steps (`step`), after which every pose belongs to the final ``qpos``.
+def simulate(model: mjx.Model, data: mjx.Data, substeps: int, exact: bool = False, undisturbed: bool = False) -> mjx.Data:
+    """``substeps`` physics steps (`take_steps`), after which every pose belongs to the final ``qpos``.
 
     `mjx.step` leaves the poses of the state *before* its last integration, so `kinematics` is needed once more for the
     image, the true state and ``qpos`` to agree.
     """
-    return kinematics(model, take_steps(model, data, substeps, exact))
+    return kinematics(model, take_steps(model, data, substeps, exact, undisturbed))
 
 
-def take_steps(model: mjx.Model, data: mjx.Data, count: int, exact: bool = False, beside_exact: bool = False) -> mjx.Data:
-    """``count`` physics steps (`step`); poses and true states are then older than ``qpos``.
+def take_steps(
+    model: mjx.Model,
+    data: mjx.Data,
+    count: int,
+    exact: bool = False,
+    undisturbed: bool = False,
+    beside_exact: bool = False,
+) -> mjx.Data:
+    """``count`` physics steps; poses and true states are then older than ``qpos``.
 
-    On a GPU that runs kernels, models that `mechanism` takes have them all in one (`steps_kernel`), and on a CPU those of them
-    that have few joints are simulated number by number, too (`steps`). Contacts between capsules are then exact in any case,
-    and if more pairs touch than ``max_contact_points`` or ``max_geom_pairs``, all of them count. Nothing but positions,
-    velocities, accelerations, time and the constraints' forces is new afterwards. Forces on bodies (``xfrc_applied``) and welds
-    that are turned off (``eq_active``) are not heeded: with any, positions are not a number.
+    Args:
+        model: What is simulated.
+        data: Its state.
+        count: How many steps.
+        exact: See `step`.
+        undisturbed: Nothing pushes bodies (``xfrc_applied`` is 0), and no weld is turned off (``eq_active``). Models that
+            `mechanism` takes are then simulated number by number where that is faster: on a GPU that runs kernels, in one
+            kernel (`steps_kernel`), and on a CPU those of few joints (`steps`). Contacts between capsules are then exact in any
+            case, and if more pairs touch than ``max_contact_points`` or ``max_geom_pairs``, all of them count. If something
+            does disturb them, positions are not a number.
+        beside_exact: For steps that are not exact in a program that also has exact ones, of a model that is the same but for
+            its time step: they share a kernel then, which is compiled once.
 
-    ``beside_exact`` is for steps that are not exact in a program that also has exact ones, of a model that is the same but for
-    its time step: they share a kernel then, which is compiled once.
+    Returns:
+        The state after them. Number by number, nothing but positions, velocities, accelerations, time and the constraints'
+        forces is new.
     """
-    if not mechanism.takes(model):
+    if not (undisturbed and mechanism.takes(model)):
         return _one_by_one(model, data, count, exact)
 
-    def by_kernel_or_not(data: mjx.Data) -> mjx.Data:
+    def by_numbers_or_not(data: mjx.Data) -> mjx.Data:
         if runs_gpu_kernels(steps_kernel.probe):
             return _in_one_kernel(model, data, count, exact, beside_exact)
         if targets_cpu() and model.nv <= _FEW_JOINTS:
             return _by_numbers(model, data, count, exact)
         return _one_by_one(model, data, count, exact)
 
-    return by_platform(by_kernel_or_not, data)
+    return by_platform(by_numbers_or_not, data)
 
 
 def _one_by_one(model: mjx.Model, data: mjx.Data, count: int, exact: bool) -> mjx.Data:
@@ -112,18 +127,11 @@ def _in_one_kernel(
 
 
 def _by_numbers(model: mjx.Model, data: mjx.Data, count: int, exact: bool) -> mjx.Data:
-    def take(constants: Any, state: State, control: Any, applied: Any, timestep: float, count: int, mocap: Any = None) -> State:
-        start = State(*map(list, state))
-        around = list(control), list(applied)
-        poses = [] if mocap is None else list(mocap.reshape(-1))
-        end = steps.take(constants, start, *around, timestep, count, exact, mocap=poses)
-        return State(*map(jnp.stack, end))
-
-    return _with_steps(model, data, count, take)
+    return _with_steps(model, data, count, functools.partial(steps.take_arrays, exact=exact))
 
 
 def _with_steps(model: mjx.Model, data: mjx.Data, count: int, take: Callable[..., State]) -> mjx.Data:
-    """The data after steps by a function of constants, state, controls, forces, time step, count and poses of mocap bodies."""
+    """The data after steps by ``take``, which has the arguments of `steps.take_arrays`."""
     constants, timestep = mechanism.mechanism_of(model), float(model.opt.timestep)
     state = State(data.qpos, data.qvel, data.qacc_warmstart, data.qfrc_constraint)
     used = np.array(constants.mocaps, int)

@@ -99,6 +99,23 @@ def take(
     return jax.lax.fori_loop(0, count, advance, state)
 
 
+def take_arrays(
+    constants: Mechanism,
+    state: State,
+    control: jax.Array,
+    applied: jax.Array,
+    timestep: float,
+    count: int,
+    exact: bool,
+    mocap: jax.Array | None = None,
+) -> State:
+    """`take` for arrays: of N joints, [N] each; controls [nu]; mocap bodies [M, 7] or None."""
+    start = State(*map(list, state))
+    poses = [] if mocap is None else list(mocap.reshape(-1))
+    end = take(constants, start, list(control), list(applied), timestep, count, exact, mocap=poses)
+    return State(*map(jnp.stack, end))
+
+
 def _step(constants: Mechanism, state: State, around: Surroundings, exact: Any, in_kernel: bool = False) -> State:
     structure, problem, order = problem_of(constants, state, around, exact is not False)
     motion = descent.solve(structure, problem, in_kernel, exact)

@@ -100,7 +100,8 @@ class FingerTurn(MjxGoalEnv):
         return self.configuration(self._still.qpos.at[2].set(angle))
 
     def act(self, data: mjx.Data, action: jax.Array) -> mjx.Data:
-        return mjx_model.simulate(self._model, data.replace(ctrl=action), self.config.substeps, self.exact_contacts)
+        data = data.replace(ctrl=action)
+        return mjx_model.simulate(self._model, data, self.config.substeps, self.exact_contacts, undisturbed=True)
 
     def achieved(self, data: mjx.Data) -> jax.Array:
         return (data.site_xpos[self._tip] - data.xpos[self._hinge])[jnp.array([0, 2])]

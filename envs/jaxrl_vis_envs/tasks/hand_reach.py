@@ -123,9 +123,8 @@ class HandReach(MjxGoalEnv):
         return self._after_random_actions(key)
 
     def act(self, data: mjx.Data, action: jax.Array) -> mjx.Data:
-        return mjx_model.simulate(
-            self._model, data.replace(ctrl=self._targets(action)), self.config.substeps, self.exact_contacts
-        )
+        data = data.replace(ctrl=self._targets(action))
+        return mjx_model.simulate(self._model, data, self.config.substeps, self.exact_contacts, undisturbed=True)
 
     def achieved(self, data: mjx.Data) -> jax.Array:
         return data.site_xpos[self._tips].reshape(-1)
@@ -167,8 +166,8 @@ class HandReach(MjxGoalEnv):
 
         def act(data: mjx.Data, action: jax.Array) -> tuple[mjx.Data, None]:
             data = data.replace(ctrl=self._targets(action))
-            steps = self.config.goal_substeps
-            return mjx_model.take_steps(self._goal_model, data, steps, beside_exact=self.exact_contacts), None
+            substeps, is_beside = self.config.goal_substeps, self.exact_contacts
+            return mjx_model.take_steps(self._goal_model, data, substeps, undisturbed=True, beside_exact=is_beside), None
 
         return self.configuration(jax.lax.scan(act, self._start, actions)[0].qpos)
 

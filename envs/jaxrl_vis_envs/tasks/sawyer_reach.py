@@ -99,7 +99,8 @@ class SawyerReach(PulledArm):
         centre = jnp.asarray(self.config.goal_centre, jnp.float32)
         reach = 0.5 * jnp.asarray(self.config.goal_size, jnp.float32) + self.config.workspace_margin
         target = jnp.clip(data.mocap_pos[0] + self.config.action_scale * action, centre - reach, centre + reach)
-        return mjx_model.simulate(self._model, data.replace(mocap_pos=target[None]), self.config.substeps)
+        data = data.replace(mocap_pos=target[None])
+        return mjx_model.simulate(self._model, data, self.config.substeps, undisturbed=True)
 
     def goal_configuration(self, goal: jax.Array) -> mjx.Data:
         """The arm at rest with its grip at or near ``goal`` [3] (m, world), the hand down."""

@@ -144,7 +144,7 @@ class StalkReach(MjxGoalEnv):
         foot = data.mocap_pos[self._layout.mocap]
         wind = bending.wind_torque(self._model, self._layout, gusts, foot, data.time)
         data = data.replace(ctrl=stalk_arm.joints_at(place, 1.0), qfrc_applied=wind)
-        return mjx_model.simulate(self._model, data, self.config.substeps)
+        return mjx_model.simulate(self._model, data, self.config.substeps, undisturbed=True)
 
     def achieved(self, data: mjx.Data) -> jax.Array:
         return stalk_arm.grip_at(data.qpos[:3]) - self._moved(data)
