@@ -17,9 +17,11 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+import time
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Protocol, TypeVar
@@ -122,10 +124,20 @@ def processes(workers: int) -> Iterator[Each]:
         children = set(multiprocessing.active_children()) - others
         for child in children:
             child.terminate()
-        for child in children:
-            child.join(5.0)
+        _wait_for(children, 5.0)
         raise
     pool.shutdown()
+
+
+def _wait_for(children: Collection[BaseProcess], seconds: float) -> None:
+    """Waits until children have ended, but no longer than so many seconds.
+
+    `BaseProcess.join` would return too soon at times: the pool's own thread waits for its processes, too, and of two threads
+    only one is told by the system how a process ended; the other takes it for one that runs until the first has noted it.
+    """
+    deadline = time.monotonic() + seconds
+    while any(child.is_alive() for child in children) and time.monotonic() < deadline:
+        time.sleep(0.01)
 
 
 def share_accelerator() -> None:
