@@ -365,13 +365,13 @@ def test_goals_need_no_mujoco():
     assert subprocess.run([sys.executable, "-c", code], check=False, env=SUBPROCESS_ENVIRONMENT).returncode == 0
 
 
-def test_env_jit_switches_off_fusion_emitters_on_a_cpu_where_jax_can(monkeypatch):
+def test_env_jit_switches_off_what_slows_physics_on_a_cpu_where_jax_can(monkeypatch):
     options = {}
     monkeypatch.setattr(jax, "jit", lambda function, **given: options.update(given))
     compilation.env_jit(lambda: None, donate_argnums=0)
     assert options["donate_argnums"] == 0
     takes_it = jax.default_backend() == "cpu" and jax.__version_info__ < (0, 11)
-    expected = {"xla_cpu_use_fusion_emitters": False} if takes_it else {}
+    expected = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_experimental_ynn_fusion_type": ""} if takes_it else {}
     assert options["compiler_options"] == expected
     assert compilation.compiler_options("gpu") == compilation.compiler_options("gpu", runs_once=True) == {}
     assert compilation.compiler_options("cpu", runs_once=True) == {**expected, "xla_backend_optimization_level": 0}

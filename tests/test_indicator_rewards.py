@@ -25,12 +25,13 @@ BEST = 1.0 / (1.0 - DISCOUNT)
 
 
 class StaysPut(probes.SeenGoWhereTold):
-    """The point stays where it starts; the goal is there, or on the other side."""
+    """The point stays where it starts, on either side; the goal is there, or on the other side."""
 
     def start(self, key):
-        place_key, side_key = jax.random.split(key)
-        position = jax.random.uniform(place_key, (1,), minval=0.4, maxval=0.9)
-        return position, jnp.where(jax.random.bernoulli(side_key), position, -position)
+        place_key, side_key, goal_key = jax.random.split(key, 3)
+        place = jax.random.uniform(place_key, (1,), minval=0.4, maxval=0.9)
+        position = jnp.where(jax.random.bernoulli(side_key), place, -place)
+        return position, jnp.where(jax.random.bernoulli(goal_key), position, -position)
 
     def move(self, position, action):
         return position
@@ -60,11 +61,11 @@ def test_the_return_of_an_autoencoder_is_in_q(with_autoencoder):
 
     values, rewards = values_and_rewards(train, points)
     np.testing.assert_allclose(rewards, 1.0, atol=1e-5)
-    np.testing.assert_allclose(values, BEST, atol=0.35)
+    np.testing.assert_allclose(values, BEST, atol=0.15)
     values, rewards = values_and_rewards(train, -points)
     assert rewards.min() < 0.5  # there are unlike ones among them
     np.testing.assert_allclose(values, BEST * rewards, atol=0.5)
-    assert abs(metrics["train/value_at_goals"][0] - BEST) < 0.35
+    assert abs(metrics["train/value_at_goals"][0] - BEST) < 0.1
     assert (program.resolved.target_minimum, program.resolved.target_maximum) == (0.0, BEST)
 
 

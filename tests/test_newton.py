@@ -40,7 +40,7 @@ def test_the_line_search_finds_the_least_cost():
         there = residual[:, None] + along[:, None] * lengths
         acting = np.where(is_equality[:, None] | (there < 0), stiffness[:, None], 0)
         costs = first * lengths + 0.5 * second * lengths**2 + 0.5 * (acting * there**2).sum(axis=0)
-        assert float(found) == pytest.approx(lengths[costs.argmin()], abs=1e-3)
+        assert float(found) == pytest.approx(min(lengths[costs.argmin()], newton._LONGEST), abs=1e-3)
 
 
 def test_nothing_moves_where_nothing_pulls():
@@ -80,7 +80,7 @@ def test_a_step_is_that_of_mjx():
     assert forces[:, 12:18].any() and forces[:, 18:].any()  # contacts of both fingers
     scale = np.abs(theirs.qvel).max(axis=1, keepdims=True)
     assert (np.abs(theirs.qvel - data.qvel) / scale).max() > 0.1
-    np.testing.assert_allclose(ours.qvel / scale, theirs.qvel / scale, atol=2e-4)
+    np.testing.assert_allclose(ours.qvel / scale, theirs.qvel / scale, atol=5e-5)
     np.testing.assert_allclose(ours.qpos, theirs.qpos, atol=1e-5)
     np.testing.assert_allclose(ours.time, theirs.time)
 

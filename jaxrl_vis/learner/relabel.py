@@ -13,6 +13,8 @@ What is observed in that slot becomes the goal in `sampling`.
 import jax
 import jax.numpy as jnp
 
+from jaxrl_vis.learner.draws import scaled
+
 
 def choose_goal_slots(
     key: jax.Array, time: jax.Array, horizon: int, relabel_probability: float, balance_probability: float
@@ -26,10 +28,7 @@ def choose_goal_slots(
         relabel_probability: p1.
         balance_probability: p2.
     """
-    strategy_key, future_key = jax.random.split(key)
-    strategy = jax.random.uniform(strategy_key, time.shape)
-    future = time + 1 + jnp.floor(jax.random.uniform(future_key, time.shape) * (horizon - time)).astype(jnp.int32)
-    # A uniform number just below 1 may round up to one slot too many when it is scaled.
-    future = jnp.minimum(future, horizon)
+    strategy, fraction = jax.random.uniform(key, (2, *time.shape))
+    future = time + 1 + scaled(fraction, horizon - time)
     slots = jnp.where(strategy < relabel_probability, future, horizon + 1)
     return jnp.where(strategy < relabel_probability * balance_probability, time + 1, slots).astype(jnp.int32)

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxrl_vis.learner.draws import scaled
 from jaxrl_vis.types import Batch, Episodes, ReplayState
 
 _WORD = 4  # bytes
@@ -136,13 +137,10 @@ class Replay(NamedTuple):
             iteration: [] int32.
             batch_size: B.
         """
-        episode_key, time_key = jax.random.split(key)
-        end = (iteration % self.num_rollouts + 1) * self.num_envs
-        age = jax.random.randint(episode_key, (batch_size,), 1, jnp.maximum(state.size, 1) + 1)
-        return Indices(
-            episode=(end - age) % self.num_episodes,
-            time=jax.random.randint(time_key, (batch_size,), 0, self.horizon),
-        )
+        of_episode, of_time = jax.random.uniform(key, (2, batch_size))
+        latest = (iteration % self.num_rollouts + 1) * self.num_envs - 1
+        age = scaled(of_episode, jnp.maximum(state.size, 1))
+        return Indices(episode=(latest - age) % self.num_episodes, time=scaled(of_time, self.horizon))
 
     def gather(
         self,

@@ -65,13 +65,13 @@ def choose_actions(
     action = networks.act(train.actor, jnp.stack([encode(networks, train, train.normalizer, observations), goal_latents]))
     if exploration == NO_EXPLORATION:
         return action
-    noise_key, choice_key, random_key = jax.random.split(key, 3)
+    noise_key, random_key = jax.random.split(key)
     noise = shards.draw(lambda shape: jax.random.normal(noise_key, shape), action.shape)
     action = jnp.clip(action + exploration.action_noise * noise, -1.0, 1.0)
-    uniform = shards.draw(lambda shape: jax.random.uniform(random_key, shape, minval=-1.0, maxval=1.0), action.shape)
-    share = exploration.random_action_probability
-    choose = shards.draw(lambda shape: jax.random.bernoulli(choice_key, share, shape), (*action.shape[:-1], 1))
-    return jnp.where(choose, uniform, action)
+    # One draw says whether an action is random, and which.
+    drawn = shards.draw(lambda shape: jax.random.uniform(random_key, shape), (*action.shape[:-1], 1 + action.shape[-1]))
+    is_random = drawn[..., :1] < exploration.random_action_probability
+    return jnp.where(is_random, 2.0 * drawn[..., 1:] - 1.0, action)
 
 
 def split_keys(keys: jax.Array, num_envs: int, shards: Shards = ONE) -> tuple[jax.Array, jax.Array]:

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jaxrl_vis.config import Config
 from jaxrl_vis.learner import reward_errors
 from jaxrl_vis.learner.auxiliary import Auxiliary
+from jaxrl_vis.learner.draws import scaled
 from jaxrl_vis.learner.relabel import choose_goal_slots
 from jaxrl_vis.learner.replay import Indices, Replay
 from jaxrl_vis.learner.shards import ONE, Shards
@@ -88,7 +89,8 @@ class Sampler:
             choice = choice._replace(goal_episode=jnp.where(gives_way, jnp.roll(indices.episode, 1), indices.episode))
         if self.config.random_shift:
             most, shape = self.config.random_shift, (self.config.batch_size, 2)
-            choice = choice._replace(shift=jax.random.randint(jax.random.fold_in(key, _SHIFT), shape, -most, most + 1))
+            fraction = jax.random.uniform(jax.random.fold_in(key, _SHIFT), shape)
+            choice = choice._replace(shift=scaled(fraction, 2 * most + 1) - most)
         if self.config.reward_clutter < 1.0:
             choice = choice._replace(clutter_end=self._clutter_end(state))
         parted = jax.tree.map(self.shards.part, choice._replace(clutter_end=None))
