@@ -5,7 +5,7 @@ from typing import Any
 
 from jaxrl_vis.config import Config, preset
 
-DEVICES = {"H200": "NVIDIA H200 x1", "2 CPU cores": "Intel(R) Xeon(R) Processor, 2 cores"}
+DEVICES = {"H200": "NVIDIA H200 x1", "2 CPU cores": "AMD EPYC, 2 cores"}
 """Columns of the speed table, and the devices that their records name."""
 
 
