@@ -1,10 +1,12 @@
 """Which kernels a training iteration spends its time in, on a GPU: of a gradient step, a control step and an insertion.
 
     python benchmarks/kernels.py [TASK] [--preset P] [--parts update rollout insert] [--set FIELD VALUE ...] [--rows 20]
+        [--options xla_gpu_command_buffer_scheduling_mode=CONCURRENT ...]
 
 Every part is a program of its own, with a replay full of noise, as `jaxrl-vis bench update` has it. Printed are its time, that
 of its kernels together, and those that take most of it. What the names stand for is in the compiled program, which
-``--hlo FOLDER`` writes.
+``--hlo FOLDER`` writes. With ``--options``, of which there may be several sets, the same is measured with these compiler
+options, too.
 """
 
 import argparse
@@ -63,8 +65,8 @@ def report(name: str, call: Callable[[], Any], turns: int, rows: int) -> None:
     sys.stdout.flush()
 
 
-def measure(program: TrainStep, parts: list[str], rows: int, hlo: Path | None) -> None:
-    """Compiles the parts and reports each."""
+def measure(program: TrainStep, parts: list[str], rows: int, hlo: Path | None, options: dict[str, Any]) -> None:
+    """Compiles the parts with compiler options and reports each."""
     loop, keys = start(program), seed_keys(program, 2)
     train, replay, iteration = loop.train, loop.replay, jnp.zeros((), jnp.int32)
     rolled = jax.eval_shape(program.rollout, train, keys)[0]
@@ -78,7 +80,7 @@ def measure(program: TrainStep, parts: list[str], rows: int, hlo: Path | None) -
     for part in dict.fromkeys([*(["rollout"] if "insert" in parts else []), *parts]):
         function, given, _, _ = arguments[part]
         with rarely_collecting_garbage():
-            compiled[part] = function.lower(*given).compile()
+            compiled[part] = function.lower(*given).compile(options)
         if hlo is not None:
             hlo.mkdir(parents=True, exist_ok=True)
             (hlo / f"{part}.txt").write_text(compiled[part].as_text(), encoding="utf-8")
@@ -98,6 +100,18 @@ def measure(program: TrainStep, parts: list[str], rows: int, hlo: Path | None) -
     for part in parts:
         _, _, turns, what = arguments[part]
         report(f"{what} of {program.config.seeds} learners", lambda part=part: call(part), turns, rows)
+
+
+def options_of(words: list[str]) -> dict[str, Any]:
+    """Compiler options, NAME=VALUE each.
+
+    Raises:
+        RequestError: A word is none.
+    """
+    pairs = [word.partition("=") for word in words]
+    if wrong := [name for name, equals, _ in pairs if not equals]:
+        raise RequestError(f"--options takes NAME=VALUE, not {wrong[0]!r}")
+    return {name: {"true": True, "false": False}.get(value.lower(), value) for name, _, value in pairs}
 
 
 def config_of(options: argparse.Namespace) -> Config:
@@ -127,6 +141,9 @@ def main() -> int:
     )
     parser.add_argument("--rows", type=int, default=20, help="kernels to list of each part")
     parser.add_argument("--hlo", type=Path, help="a folder for the compiled programs")
+    parser.add_argument(
+        "--options", nargs="+", action="append", default=[], metavar="NAME=VALUE", help="compiler options to try"
+    )
     options = parser.parse_args()
     try:
         check_devices()
@@ -134,7 +151,10 @@ def main() -> int:
             raise RequestError("kernels are seen on an NVIDIA GPU only, and JAX computes on something else here")
         config = config_of(options)
         enable_compilation_cache()
-        measure(make_train_step(make_env(config), config), options.parts, options.rows, options.hlo)
+        program = make_train_step(make_env(config), config)
+        for words in ([], *options.options):
+            print(f"-- {' '.join(words) or 'as it is'}")
+            measure(program, options.parts, options.rows, options.hlo, options_of(words))
     except RequestError as error:
         print(error, file=sys.stderr)
         return 2
