@@ -151,10 +151,11 @@ def main() -> int:
             raise RequestError("kernels are seen on an NVIDIA GPU only, and JAX computes on something else here")
         config = config_of(options)
         enable_compilation_cache()
+        sets = {" ".join(words) or "as it is": options_of(words) for words in ([], *options.options)}
         program = make_train_step(make_env(config), config)
-        for words in ([], *options.options):
-            print(f"-- {' '.join(words) or 'as it is'}")
-            measure(program, options.parts, options.rows, options.hlo, options_of(words))
+        for name, compiler_options in sets.items():
+            print(f"-- {name}")
+            measure(program, options.parts, options.rows, options.hlo, compiler_options)
     except RequestError as error:
         print(error, file=sys.stderr)
         return 2
