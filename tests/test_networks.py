@@ -45,17 +45,17 @@ def test_the_encoder_is_a_stack_of_strided_convolutions(size):
 
 
 @functools.cache
-def encoder_case(shape, batch: int, first: int, layers: int, dtype):
-    return EncoderCase(shape, batch, slice(first, batch), layers, dtype)
+def encoder_case(shape, batch: int, first: int, dtype):
+    return EncoderCase(shape, batch, slice(first, batch), dtype)
 
 
 class EncoderCase:
     """Latents of some images and gradients of a weighted sum of them, by each of the implementations."""
 
-    def __init__(self, shape, batch, which, layers, dtype):
+    def __init__(self, shape, batch, which, dtype):
         config = preset("fast", encoders="separate", latent_size=16, compute_dtype=dtype)
         self.networks = Networks(config, jax.ShapeDtypeStruct(shape, jnp.uint8), 2, 0.0)
-        self.which, self.layers, self._found = which, layers, {}
+        self.which, self._found = which, {}
         rng = np.random.default_rng(0)
 
         def drawn(path, leaf):
@@ -81,7 +81,6 @@ class EncoderCase:
         with pytest.MonkeyPatch.context() as patch:
             if implementation != "products":
                 patch.setattr(Networks, "uses_kernel", True)
-                patch.setattr(encoder_kernel, "layers", lambda filters, channels: self.layers)
             for name in ("prepare", "encode") if implementation == "kernel" else ():
                 patch.setattr(encoder_kernel, name, functools.partial(getattr(encoder_kernel, name), interpret=True))
 
@@ -95,16 +94,16 @@ class EncoderCase:
 
 
 SHAPES = [
-    ((4, 64, 64), 3, 1, 3),
-    ((1, 16, 16), 3, 1, 4),  # too few patches for a tile
-    ((3, 40, 36), 6, 2, 4),  # borders to crop, a channel to pad
-    ((12, 32, 32), 2, 0, 3),  # three images
+    ((4, 64, 64), 3, 1),
+    ((1, 16, 16), 3, 1),  # too few patches for a tile
+    ((3, 40, 35), 6, 2),  # borders to crop, a channel to pad
+    ((12, 32, 32), 2, 0),  # three images
 ]
 
 
-@pytest.mark.parametrize(("shape", "batch", "first", "layers"), SHAPES)
-def test_the_gpu_kernel_computes_and_differentiates_the_same_function(shape, batch, first, layers):
-    case = encoder_case(shape, batch, first, layers, "float32")
+@pytest.mark.parametrize(("shape", "batch", "first"), SHAPES)
+def test_the_gpu_kernel_computes_and_differentiates_the_same_function(shape, batch, first):
+    case = encoder_case(shape, batch, first, "float32")
     assert not case.networks.uses_kernel
     expected, expected_gradient = case.latents_and_gradient("products")
     for implementation in ("kernel", "plain"):
@@ -121,7 +120,6 @@ def test_encoders_are_differentiated_forwards_where_tangents_are_wanted(implemen
     _, gradient = case.latents_and_gradient(implementation)
     if implementation != "products":
         monkeypatch.setattr(Networks, "uses_kernel", True)
-        monkeypatch.setattr(encoder_kernel, "layers", lambda filters, channels: case.layers)
     if implementation == "kernel":
         monkeypatch.setattr(encoder_kernel, "encode", functools.partial(encoder_kernel.encode, interpret=True))
     inputs = jax.jit(case.networks.prepare)(case.statistics, case.images)
@@ -146,7 +144,7 @@ def test_encoders_are_differentiated_forwards_where_tangents_are_wanted(implemen
 @pytest.mark.parametrize("implementation", ["kernel", "plain"])
 def test_images_move_alike_whoever_prepares_them(implementation, monkeypatch):
     case = encoder_case(*SHAPES[2], "float32")
-    shift = jnp.array([[0, 0], [2, -3], [-1, 4], [5, 5], [-40, 0], [1, 0]], jnp.int32)
+    shift = jnp.array([[0, 0], [2, -3], [-1, 4], [5, 5], [-40, 0], [1, -40]], jnp.int32)
 
     @jax.jit
     def latents():
@@ -167,8 +165,8 @@ def test_images_move_alike_whoever_prepares_them(implementation, monkeypatch):
 def test_in_bfloat16_the_gpu_kernel_is_as_near_to_float32_as_plain_products_are():
     """Both round; neither is the truth. Errors are those of the whole leaf, relative to its float32 value."""
     shape, batch, first = (4, 32, 32), 16, 0
-    truth = encoder_case(shape, batch, first, 4, "float32").latents_and_gradient("products")
-    case = encoder_case(shape, batch, first, 4, "bfloat16")
+    truth = encoder_case(shape, batch, first, "float32").latents_and_gradient("products")
+    case = encoder_case(shape, batch, first, "bfloat16")
 
     def errors(implementation):
         found = case.latents_and_gradient(implementation)
@@ -183,7 +181,7 @@ def test_in_bfloat16_the_gpu_kernel_is_as_near_to_float32_as_plain_products_are(
 
 @pytest.mark.parametrize(
     ("filters", "shape"),
-    [((16, 32), (4, 64, 64)), ((16, 24, 64, 64), (4, 64, 64)), ((16, 32, 64), (4, 64, 66)), ((16, 32, 64, 64), (12, 64, 64))],
+    [((16, 32), (4, 64, 64)), ((16, 24, 64, 64), (4, 64, 64)), ((16, 32, 64, 64), (20, 64, 64))],
 )
 def test_what_the_gpu_kernel_cannot_take_goes_the_other_way(filters, shape):
     assert not encoder_kernel.supports(filters, shape)

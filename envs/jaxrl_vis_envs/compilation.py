@@ -9,6 +9,10 @@ cores, and gradient steps take up to a seventh less.
 JAX 0.11 has no such option per function any more (it refuses the name). Its emitters do not explode, but leave physics on a CPU
 about half as fast (FetchReach, 64 environments, two cores: 1,100 environment steps a second against 2,350).
 
+On a GPU the many small kernels of a gradient step are launched together, as a CUDA graph. XLA makes a chain of them, unless
+it is told that those which do not wait for each other may run side by side: a gradient step of VisualFetchReach (64x64, H100)
+then took 548 us in place of 689 with the preset paper, and 438 in place of 489 with fast.
+
 What is fast on a CPU is slow on a GPU and vice versa, and some functions have a hand-written kernel for NVIDIA GPUs
 (Pallas, by Triton). Which of these is used follows the platform that a program is compiled for, which is not always that of the
 default backend: `by_platform`. The environment variable ``JAXRL_VIS_KERNELS`` and the context manager `kernels` choose between
@@ -46,7 +50,10 @@ def compiler_options(backend: str | None = None, *, runs_once: bool = False) -> 
     ``runs_once`` is for a program that takes longer to compile than to run: a CPU's machine code is then not optimised
     (drawing the first parameters of all networks: 1.2 s to compile in place of 2.3, and the same bits).
     """
-    if (backend or jax.default_backend()) != "cpu":
+    backend = backend or jax.default_backend()
+    if backend == "gpu":
+        return {"xla_gpu_command_buffer_scheduling_mode": "CONCURRENT"}
+    if backend != "cpu":
         return {}
     options: dict[str, Any] = {"xla_backend_optimization_level": 0} if runs_once else {}
     if jax.__version_info__ < (0, 11):

@@ -1,18 +1,19 @@
-"""The encoder's first layers, four at most, as one GPU kernel each way (Pallas, by Triton).
+"""The encoder's first three layers as one GPU kernel each way (Pallas, by Triton).
 
-Windows of 2x2 pixels with stride 2 never overlap, so three layers see a *patch* of 8x8 pixels at a time and nothing else, and
-the fourth sees four patches. A tile of R patches (`encoder_kernel_patches` makes them, in an order that has windows side by
-side) passes through all layers without leaving the chip:
+Windows of 2x2 pixels with stride 2 never overlap, so three layers see a *patch* of 8x8 pixels at a time and nothing else. A
+tile of R patches (`encoder_kernel_patches` makes them, in an order that has windows side by side) passes through all three
+without leaving the chip:
 
     4 R quarters of 4x4 pixels     [4 R, 16 C']  @ [16 C', 4 F1]   layer 1, its four windows at once: block-diagonal
                                    [4 R, 4 F1]   @ [4 F1, F2]      layer 2
     R patches                      [R, 4 F2]     @ [4 F2, F3]      layer 3
-    R / 4 blocks of 16x16 pixels   [R / 4, 4 F3] @ [4 F3, F4]      layer 4
 
 Layer 1 multiplies three zeros for every number, because products 16 wide leave a GPU's matrix units idle anyway. As separate
-products, the layers would spend nine tenths of their time on writing and reading each other's activations. The backward kernel
-computes all layers but the last again, keeps the gradients of the weights in registers over several tiles, and writes a partial
-sum for each program; those are added up in a fixed order, so a resumed run repeats itself exactly.
+products, the layers would spend nine tenths of their time on writing and reading each other's activations. A fourth layer would
+see four patches at a time, so that a tile has too few rows of it: in here, it made gradient steps a third slower.
+
+The backward kernel computes all layers but the last again, keeps the gradients of the weights in registers over several tiles,
+and writes a partial sum for each program; those are added up in a fixed order, so a resumed run repeats itself exactly.
 
 `networks` has the same function as plain matrix products: that is the reference, and what a process without such a GPU runs.
 Where there is one, images are put into patches whatever a program is compiled for, and a program for another platform computes
@@ -21,41 +22,25 @@ the layers here, from the same patches, in plain JAX.
 
 import functools
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from jaxrl_vis.learner import tangents
-from jaxrl_vis.learner.encoder_kernel_passes import (
-    TILE,
-    Weights,
-    apply,
-    dispatch,
-    is_available,
-    patches_of_row,
-)
-from jaxrl_vis.learner.encoder_kernel_patches import LEVELS, WORD, padded_channels, prepare_on_gpu, prepare_plainly
+from jaxrl_vis.learner.encoder_kernel_passes import TILE, Weights, apply, dispatch, is_available
+from jaxrl_vis.learner.encoder_kernel_patches import LEVELS, padded_channels, prepare_on_gpu, prepare_plainly
 from jaxrl_vis.learner.encoder_kernel_tangents import apply_forwards
 
-__all__ = ["encode", "is_available", "layers", "make_weights", "prepare", "supports"]
+__all__ = ["LEVELS", "encode", "is_available", "make_weights", "prepare", "supports"]
 
-# Four layers, and three of 16 channels, agree with plain products and compile, but no GPU has run them yet.
-_MOST_CHANNELS, _MOST_LAYERS = 4, 3
-_FEW_CHANNELS = 4  # with more, the gradients of a fourth layer would not fit into registers
-
-
-def layers(filters: Sequence[Any], channels: int) -> int:
-    """How many layers of an encoder with these output channels, of images with ``channels``, are in the kernel."""
-    return min(len(filters), _MOST_LAYERS if channels <= _FEW_CHANNELS else LEVELS)
+_MOST_CHANNELS = 16
 
 
 def supports(filters: tuple[int, ...], shape: tuple[int, ...]) -> bool:
     """Whether the kernel can take encoders with these output channels, and images [C, H, W] of this shape."""
-    channels, _, width = shape
-    powers = all(16 <= size <= 64 and size & (size - 1) == 0 for size in filters[: layers(filters, channels)])
-    return len(filters) >= LEVELS and powers and channels <= _MOST_CHANNELS and width % WORD == 0
+    powers = all(16 <= size <= 64 and size & (size - 1) == 0 for size in filters[:LEVELS])
+    return len(filters) >= LEVELS and powers and shape[0] <= _MOST_CHANNELS
 
 
 def make_weights(params: dict[str, Any], channels: int) -> Weights:
@@ -67,13 +52,10 @@ def make_weights(params: dict[str, Any], channels: int) -> Weights:
     same = jnp.eye(2, dtype=window.dtype)
     same = same[:, None, None, None, :, None, None] * same[:, None, None, :, None]
     quarter = window.transpose(2, 0, 1, 3)[:, None, :, None, :, None, None, :] * same
-    count = layers([name for name in params if name.startswith("kernel_")], channels)
+    finer = range(1, LEVELS)
     return Weights(
-        kernels=(
-            quarter.reshape(16 * padded_channels(channels), -1),
-            *(params[f"kernel_{level}"] for level in range(1, count)),
-        ),
-        biases=(jnp.tile(params["bias_0"], 4), *(params[f"bias_{level}"] for level in range(1, count))),
+        kernels=(quarter.reshape(16 * padded_channels(channels), -1), *(params[f"kernel_{level}"] for level in finer)),
+        biases=(jnp.tile(params["bias_0"], 4), *(params[f"bias_{level}"] for level in finer)),
     )
 
 
@@ -93,7 +75,7 @@ def prepare(
     """Normalises images and puts them into patches: [B, C, H, W] uint8 -> [B, patches, 64 C'] of ``dtype``.
 
     Args:
-        images: Planar images, their width a multiple of `WORD`.
+        images: Planar images.
         mean, scale: [C, H, W] float32.
         levels: All the encoder's layers; borders that do not fill a block of 2^levels pixels are cropped.
         limit: Normalised values are clipped to plus and minus this.
@@ -110,17 +92,17 @@ def prepare(
 
 
 def encode(patches: jax.Array, weights: Weights, which: slice = slice(None), interpret: bool = False) -> jax.Array:
-    """`apply` to ``which`` of the images: [B, patches, 64 C'] -> [images, rows, F], same dtype.
+    """`apply` to ``which`` of the images: [B, patches, 64 C'] -> [images, patches, F], same dtype.
 
     Images are chosen here rather than by slicing before, because a slice that a kernel reads is a copy.
     """
     batch, of_image, size = patches.shape
-    images, per_image = range(batch)[which], of_image // patches_of_row(weights)
-    first, count = images.start * per_image, len(images) * per_image
+    images = range(batch)[which]
+    first, count = images.start * of_image, len(images) * of_image
     rows = count
-    if math.gcd(images.start * of_image, len(images) * of_image) % TILE:  # a few small images
+    if math.gcd(first, count) % TILE:  # a few small images
         patches = jnp.pad(patches[which], ((0, -len(images) % TILE), (0, 0), (0, 0)))
-        first, rows = 0, patches.shape[0] * per_image
+        first, rows = 0, patches.shape[0] * of_image
     chosen = apply_forwards if tangents.are_wanted() else apply
     out: jax.Array = chosen(patches.reshape(-1, size), weights, first, rows, interpret)  # type: ignore[assignment]
-    return out[:count].reshape(-1, per_image, out.shape[-1])
+    return out[:count].reshape(-1, of_image, out.shape[-1])

@@ -6,6 +6,7 @@ Each with the same in plain JAX, for processes without such a GPU and as the ker
 import functools
 import itertools
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -26,16 +27,14 @@ _BACKWARD_TILES, _BACKWARD = 64, plgpu.CompilerParams(num_warps=4, num_stages=1)
 # As many sums as these fit into the registers of four warps; more need eight.
 _MOST_SUMS, _BACKWARD_WITH_MORE = 16_384, plgpu.CompilerParams(num_warps=8, num_stages=1)
 _LEAST_PROGRAMS = 256  # about two for each of a large GPU's processors
-_JOINING = 2
-"""From this layer on, counted from 0, a row is made of four rows of the layer before."""
 
 
 class Weights(NamedTuple):
     """Layers as the kernels multiply them, float32.
 
     Attributes:
-        kernels: [16 C', 4 F1] for a quarter, where C' is C padded to a power of two; [4 F1, F2]; [4 F2, F3]; [4 F3, F4].
-        biases: [4 F1]; [F2]; [F3]; [F4].
+        kernels: [16 C', 4 F1] for a quarter, where C' is C padded to a power of two; [4 F1, F2]; [4 F2, F3].
+        biases: [4 F1]; [F2]; [F3].
     """
 
     kernels: tuple[jax.Array, ...]
@@ -62,7 +61,7 @@ def probe_program() -> Any:
     """Small instances of all three kernels in one program, traced (`jax.stages.Traced`)."""
     shape, levels = (4, 16, 16), LEVELS + 1
     images, of_pixels = jnp.zeros((LEAST_ROWS, *shape), jnp.uint8), jnp.zeros(shape)
-    sizes = (64, 64), (64, 16), (64, 16), (64, 16)
+    sizes = (64, 64), (64, 16), (64, 16)
     weights = Weights(tuple(map(jnp.zeros, sizes)), tuple(jnp.zeros(columns) for _, columns in sizes))
 
     def all_three(images: jax.Array, mean: jax.Array, scale: jax.Array, weights: Weights) -> Weights:
@@ -74,7 +73,7 @@ def probe_program() -> Any:
     return jax.jit(all_three).trace(images, of_pixels, of_pixels, weights)
 
 
-def dispatch(on_gpu: Any, plain: Any, *arguments: Any, interpret: bool) -> Any:
+def dispatch(on_gpu: Any, plain: Any, *arguments: Any, interpret: bool, probe: Callable[[], None] = probe) -> Any:
     """The kernel where a program is compiled for a GPU that runs it, and the same in plain JAX for every other platform."""
     if interpret:
         return on_gpu(*arguments)
@@ -115,26 +114,8 @@ def _layers(quarters: jax.Array, weights: Weights) -> list[jax.Array]:
 
 
 def joined(values: jax.Array, level: int) -> jax.Array:
-    """What a layer multiplies: rows of the layer before, four side by side where it has a quarter of them."""
-    return _repeated(values.reshape(values.shape[0] // 4, -1)) if level >= _JOINING else values
-
-
-def _repeated(values: jax.Array) -> jax.Array:
-    """Each row several times over where there are fewer than a product must have: of a tile, the fourth layer has four."""
-    rows, columns = values.shape
-    times = max(1, LEAST_ROWS // rows)
-    if times == 1:
-        return values
-    return jnp.broadcast_to(values[:, None, :], (rows, times, columns)).reshape(rows * times, columns)
-
-
-def once(values: jax.Array, rows: int) -> jax.Array:
-    """Undoes `_repeated`, for results of ``rows`` rows: the mean of rows that are equal, and exactly they."""
-    times = values.shape[0] // rows
-    if times == 1:
-        return values
-    total = jnp.sum(values.astype(jnp.float32).reshape(rows, times, -1), axis=1)
-    return (total * (1.0 / times)).astype(values.dtype)
+    """What a layer multiplies: the third one four quarters side by side, the others rows of the layer before."""
+    return values.reshape(values.shape[0] // 4, -1) if level == LEVELS - 1 else values
 
 
 def read(refs: Any) -> Weights:
@@ -145,24 +126,25 @@ def read(refs: Any) -> Weights:
 
 def _forward_kernel(x_ref, *refs):
     weights, out_ref = read(refs[:-1]), refs[-1]
-    rows, quarters = rows_of_tile(x_ref, out_ref)
 
     def one_tile(tile, _):
-        *_, out = _layers(x_ref[pl.ds(tile * quarters, quarters), :], weights)
-        out_ref[pl.ds(tile * rows, rows), :] = once(out, rows)
+        *_, out_ref[rows_of(tile), :] = _layers(x_ref[quarters_of(tile), :], weights)
 
-    jax.lax.fori_loop(0, out_ref.shape[0] // rows, one_tile, None)
+    jax.lax.fori_loop(0, out_ref.shape[0] // TILE, one_tile, None)
 
 
-def rows_of_tile(x_ref: Any, out_ref: Any) -> tuple[int, int]:
-    """How many rows of the result a tile has, and how many quarters of patches."""
-    quarters = 4 * TILE
-    return quarters * out_ref.shape[0] // x_ref.shape[0], quarters
+def rows_of(tile: Any) -> pl.Slice:
+    """Rows of a tile in the result."""
+    return pl.ds(tile * TILE, TILE)
+
+
+def quarters_of(tile: Any) -> pl.Slice:
+    """Quarters of patches of a tile."""
+    return pl.ds(4 * tile * TILE, 4 * TILE)
 
 
 def _backward_kernel(x_ref, out_ref, gradient_ref, *refs):
     weights, sums_ref = read(refs[:-1]), refs[-1]
-    rows, quarters = rows_of_tile(x_ref, out_ref)
     hidden_layers = Weights(weights.kernels[:-1], weights.biases[:-1])
 
     def add_rows(values):
@@ -170,33 +152,26 @@ def _backward_kernel(x_ref, out_ref, gradient_ref, *refs):
         return dot(jnp.ones((LEAST_ROWS, values.shape[0]), values.dtype), values)
 
     def one_tile(tile, sums):
-        here = pl.ds(tile * rows, rows)
-        values = [x_ref[pl.ds(tile * quarters, quarters), :]]
-        values += [*_layers(values[0], hidden_layers), _repeated(out_ref[here, :])]
-        gradient = _repeated(gradient_ref[here, :])
-        of_kernels, of_biases = list(sums.kernels), list(sums.biases)
-        for level in reversed(range(len(of_kernels))):
-            inputs = joined(values[level], level)
+        values = [x_ref[quarters_of(tile), :]]
+        values += [*_layers(values[0], hidden_layers), out_ref[rows_of(tile), :]]
+        gradient, of_kernels, of_biases = gradient_ref[rows_of(tile), :], list(sums.kernels), list(sums.biases)
+        for level in reversed(range(LEVELS)):
             gradient = before(values[level + 1], gradient)
-            of_kernels[level] += dot(inputs, gradient, (0, 0))
+            of_kernels[level] += dot(joined(values[level], level), gradient, (0, 0))
             of_biases[level] += add_rows(gradient)
             if level:
-                gradient = dot(gradient, weights.kernels[level], (1, 1))
-                gradient = once(gradient, values[level].size // inputs.shape[1]).reshape(values[level].shape)
+                gradient = dot(gradient, weights.kernels[level], (1, 1)).reshape(values[level].shape)
         return Weights(tuple(of_kernels), tuple(of_biases))
 
     start = Weights(
         tuple(jnp.zeros(kernel.shape, jnp.float32) for kernel in weights.kernels),
         tuple(jnp.zeros((LEAST_ROWS, bias.shape[0]), jnp.float32) for bias in weights.biases),
     )
-    sums = jax.lax.fori_loop(0, out_ref.shape[0] // rows, one_tile, start)
-    # A bias's are sixteen times the same sum, and the last layer's are sums of rows that are repeated.
-    of_biases = [jnp.sum(value, axis=0) * (1.0 / LEAST_ROWS) for value in sums.biases]
-    share, first = min(1.0, rows / LEAST_ROWS), 0
-    for values in (sums.kernels, of_biases):
-        for value in (*values[:-1], values[-1] * share):
-            sums_ref[pl.ds(first, value.size)] = value.reshape(-1)
-            first += value.size
+    sums, first = jax.lax.fori_loop(0, out_ref.shape[0] // TILE, one_tile, start), 0
+    # A bias's are sixteen times the same sum.
+    for value in (*sums.kernels, *(jnp.sum(value, axis=0) * (1.0 / LEAST_ROWS) for value in sums.biases)):
+        sums_ref[pl.ds(first, value.size)] = value.reshape(-1)
+        first += value.size
 
 
 def whole(array: jax.Array) -> pl.BlockSpec:
@@ -228,17 +203,6 @@ def cast_kernels(weights: Weights, dtype: Any) -> Weights:
     return weights._replace(kernels=tuple(kernel.astype(dtype) for kernel in weights.kernels))
 
 
-def patches_of_row(weights: Weights) -> int:
-    """How many patches a row of the result is made of."""
-    return 4 ** (len(weights.kernels) - LEVELS)
-
-
-def tiles_between(weights: Weights, first: int, count: int) -> tuple[int, int]:
-    """Rows of the result in a tile, and how many tiles divide both numbers of rows."""
-    rows = TILE // patches_of_row(weights)
-    return rows, math.gcd(first, count) // rows
-
-
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2, 3, 4))
 def apply(patches: jax.Array, weights: Weights, first: int, count: int, interpret: bool = False) -> jax.Array:
     """Layers of 2x2 stride-2 convolutions with rectifiers, for some patches: [M, 64 C'] -> [count, F], same dtype.
@@ -248,7 +212,7 @@ def apply(patches: jax.Array, weights: Weights, first: int, count: int, interpre
     Args:
         patches: [M, 64 C'] from `prepare`.
         weights: From `make_weights`.
-        first, count: Which rows of the result for all patches; both multiples of those of a tile, `TILE` patches.
+        first, count: Which patches; both multiples of `TILE`.
         interpret: Run the kernel without a GPU, slowly.
     """
     place = {"first": first, "count": count}
@@ -256,17 +220,16 @@ def apply(patches: jax.Array, weights: Weights, first: int, count: int, interpre
     return dispatch(on_gpu, functools.partial(apply_plainly, **place), patches, weights, interpret=interpret)
 
 
-def quarters_of(patches: jax.Array, weights: Weights, first: int, block: int) -> tuple[jax.Array, pl.BlockSpec]:
-    """Patches as the kernels read them, and those of a program's ``block`` of rows."""
-    size, of_row = patches.shape[1] // 4, 4 * patches_of_row(weights)
-    return patches.reshape(-1, size), rows(of_row * block, size, first // block)
+def as_quarters(patches: jax.Array, first: int, block: int) -> tuple[jax.Array, pl.BlockSpec]:
+    """Patches as the kernels read them, and a program's ``block`` of them."""
+    size = patches.shape[1] // 4
+    return patches.reshape(-1, size), rows(4 * block, size, first // block)
 
 
 def _apply_on_gpu(patches: jax.Array, weights: Weights, first: int, count: int, interpret: bool = False) -> jax.Array:
     outputs = weights.biases[-1].shape[0]
-    tile, tiles = tiles_between(weights, first, count)
-    block = tile * divisor(tiles, FORWARD_TILES)
-    data, data_spec = quarters_of(patches, weights, first, block)
+    block = TILE * divisor(math.gcd(first, count) // TILE, FORWARD_TILES)
+    data, data_spec = as_quarters(patches, first, block)
     cast = jax.tree.leaves(cast_kernels(weights, patches.dtype))
     return pl.pallas_call(
         _forward_kernel,
@@ -282,9 +245,8 @@ def _apply_on_gpu(patches: jax.Array, weights: Weights, first: int, count: int, 
 
 def apply_plainly(patches: jax.Array, weights: Weights, first: int, count: int) -> jax.Array:
     """`apply` in plain JAX."""
-    of_row = patches_of_row(weights)
-    chosen = patches[first * of_row : (first + count) * of_row].reshape(-1, patches.shape[1] // 4)
-    return once(_layers(chosen, cast_kernels(weights, patches.dtype))[-1], count)
+    chosen = patches[first : first + count].reshape(-1, patches.shape[1] // 4)
+    return _layers(chosen, cast_kernels(weights, patches.dtype))[-1]
 
 
 def _apply_forward(patches: jax.Array, weights: Weights, first: int, count: int, interpret: bool):
@@ -305,10 +267,9 @@ def _backward_on_gpu(
 ) -> Weights:
     """Gradients of the weights, float32."""
     outputs = out.shape[1]
-    tile, tiles = tiles_between(weights, first, count)
-    block = tile * tiles_of_program(tiles, count // tile, _BACKWARD_TILES)
+    block = TILE * tiles_of_program(math.gcd(first, count) // TILE, count // TILE, _BACKWARD_TILES)
     programs = count // block
-    data, data_spec = quarters_of(patches, weights, first, block)
+    data, data_spec = as_quarters(patches, first, block)
     cast, like = jax.tree.leaves(cast_kernels(weights, patches.dtype)), jax.tree.leaves(weights)
     total = sum(array.size for array in like)
     partial_sums = pl.pallas_call(

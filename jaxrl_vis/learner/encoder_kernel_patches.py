@@ -16,10 +16,10 @@ from jaxrl_vis.learner.blocks import shifted
 
 LEVELS = 3
 """Layers of which a patch is one row of the result."""
-WORD = 4
-"""Pixels that are read at a time: four neighbours in a row, one byte each."""
-# Measured on an H200: patches, or numbers where those are large, and images of one program, and how it is run.
-_PREPARE_PATCHES, _PREPARE_NUMBERS, _PREPARE_IMAGES, _PREPARE = 16, 4096, 16, plgpu.CompilerParams(num_warps=8, num_stages=2)
+_SIDE = 4
+"""Of a quarter of a patch, in pixels."""
+# Measured on an H100: numbers, of one image, and images of one program, and how it is run.
+_PREPARE_NUMBERS, _PREPARE_IMAGES, _PREPARE = 4096, 16, plgpu.CompilerParams(num_warps=8, num_stages=2)
 
 
 def padded_channels(channels: int) -> int:
@@ -32,74 +32,44 @@ def divisor(number: int, limit: int) -> int:
     return math.gcd(number, limit)
 
 
-def _word_places(first_patch: Any, patches: int, shape: tuple[int, int, int], levels: int) -> tuple[jax.Array, ...]:
-    """Channel, row and column, in words, of the words of some patches in a planar image: [patches, 16 C'] int32 each.
+def _prepare_kernel(images_ref, mean_ref, scale_ref, *refs, shape, levels, limit):
+    """Some blocks, side by side, of several images; read as they lie in the image, and put into patches on the chip.
 
-    Patches run over the 2^levels blocks of the image, row by row, and within a block over its halves of halves (as
-    `blocks.to_blocks`), so that the next layers find their windows side by side. Words of a patch run over (quarter's row,
-    quarter's column, channel, row).
+    The last of ``refs`` is the result; before it is how far each image moves, if they do.
     """
-    channels, _, width = shape
-    columns, padded = width >> levels, padded_channels(channels)
-    size = (patches, 16 * padded)
-    # Non-negative throughout: lax.div and lax.rem, unlike // and %, then compile to shifts and masks.
-    div, rem = lambda a, b: jax.lax.div(a, jnp.int32(b)), lambda a, b: jax.lax.rem(a, jnp.int32(b))
-    patch = first_patch + jax.lax.broadcasted_iota(jnp.int32, size, 0)
-    word = jax.lax.broadcasted_iota(jnp.int32, size, 1)
-
-    finer = levels - LEVELS
-    block = div(patch, 4**finer)
-    row, column = div(block, columns), rem(block, columns)
-    for level in reversed(range(finer)):
-        quarter = rem(div(patch, 4**level), 4)
-        row, column = 2 * row + div(quarter, 2), 2 * column + rem(quarter, 2)
-
-    row = 8 * row + 4 * div(word, 8 * padded) + rem(word, 4)
-    column = 2 * column + rem(div(word, 4 * padded), 2)
-    return rem(div(word, 4), padded), row, column
-
-
-def _prepare_kernel(words_ref, mean_ref, scale_ref, out_ref, *, shape, levels, limit):
+    *moves, out_ref = refs
     images, patches, size = out_ref.shape
     channels, height, width = shape
-    channel, row, column = _word_places(pl.program_id(0) * patches, patches, shape, levels)
-    offsets, there = channel * (height * width // WORD) + row * (width // WORD) + column, channel < channels
-    pixels = (patches, size // WORD, WORD)
-    byte = jax.lax.broadcasted_iota(jnp.int32, pixels, 2)
-    inside = jnp.broadcast_to(there[:, :, None], pixels)
-    places = offsets[:, :, None] * WORD + byte
-    # The same pixels of every image: their statistics stay in registers.
-    mean = plgpu.load(mean_ref.at[places], mask=inside, other=0.0)
-    scale = plgpu.load(scale_ref.at[places], mask=inside, other=0.0)
-    shift = (8 * byte).astype(jnp.uint32)
+    block, columns, finer = 1 << levels, width >> levels, levels - LEVELS
+    across = patches // 4**finer
+    tile = (size // (16 * _SIDE), block, across * block)
+    # Non-negative: lax.div and lax.rem, unlike // and %, then compile to shifts and masks.
+    first, columns = pl.program_id(0) * across, jnp.int32(columns)
+    channel, row, column = (jax.lax.broadcasted_iota(jnp.int32, tile, axis) for axis in range(3))
+    row += jax.lax.div(first, columns) * block
+    column += jax.lax.rem(first, columns) * block
+    # Coarse to fine: block, halves of halves, quarter of a patch; then channel, row, column.
+    parts = (tile[0], *[2] * finer, 2, _SIDE, across, *[2] * finer, 2, _SIDE)
+    halves = [axis for level in range(finer + 1) for axis in (1 + level, finer + 4 + level)]
+    order = (finer + 3, *halves, 0, finer + 2, 2 * finer + 5)
+
+    def statistics(pixel: jax.Array, there: jax.Array) -> list[jax.Array]:
+        return [plgpu.load(ref.at[pixel], mask=there, other=0.0) for ref in (mean_ref, scale_ref)]
+
+    pixel, there = (channel * height + row) * width + column, channel < channels
+    still = [pixel, there, *statistics(pixel, there)]
 
     def one_image(image, _):
-        words = plgpu.load(words_ref.at[image, offsets], mask=there, other=0)
-        values = (jax.lax.shift_right_logical(jnp.broadcast_to(words[:, :, None], pixels), shift) & 255).astype(jnp.float32)
-        values = jnp.clip((values - mean) * scale, -limit, limit)
-        out_ref[image] = values.astype(out_ref.dtype).reshape(patches, size)
-
-    jax.lax.fori_loop(0, images, one_image, None)
-
-
-def _prepare_shifted_kernel(bytes_ref, mean_ref, scale_ref, shift_ref, out_ref, *, shape, levels, limit):
-    """As `_prepare_kernel`, of images that move: no pixel keeps its place in a word, nor its statistics."""
-    images, patches, size = out_ref.shape
-    channels, height, width = shape
-    pixels = (patches, size // WORD, WORD)
-    places = _word_places(pl.program_id(0) * patches, patches, shape, levels)
-    channel, row, column = (jnp.broadcast_to(place[:, :, None], pixels) for place in places)
-    column = column * WORD + jax.lax.broadcasted_iota(jnp.int32, pixels, 2)
-
-    def one_image(image, _):
-        from_row, from_column = row - shift_ref[image, 0], column - shift_ref[image, 1]
-        there = (from_row >= 0) & (from_row < height) & (from_column >= 0) & (from_column < width) & (channel < channels)
-        pixel = (channel * height + from_row) * width + from_column
-        values = plgpu.load(bytes_ref.at[image, pixel], mask=there, other=0).astype(jnp.float32)
-        mean = plgpu.load(mean_ref.at[pixel], mask=there, other=0.0)
-        scale = plgpu.load(scale_ref.at[pixel], mask=there, other=0.0)
-        values = jnp.clip((values - mean) * scale, -limit, limit)
-        out_ref[image] = values.astype(out_ref.dtype).reshape(patches, size)
+        places = still
+        if moves:
+            from_row, from_column = row - moves[0][image, 0], column - moves[0][image, 1]
+            inside = (from_row >= 0) & (from_row < height) & (from_column >= 0) & (from_column < width) & there
+            pixel = (channel * height + from_row) * width + from_column
+            places = [pixel, inside, *statistics(pixel, inside)]
+        pixel, inside, mean, scale = places
+        values = plgpu.load(images_ref.at[image, pixel], mask=inside, other=0).astype(jnp.float32)
+        values = jnp.clip((values - mean) * scale, -limit, limit).astype(out_ref.dtype)
+        out_ref[image] = values.reshape(parts).transpose(order).reshape(patches, size)
 
     jax.lax.fori_loop(0, images, one_image, None)
 
@@ -117,30 +87,26 @@ def prepare_on_gpu(
     """`encoder_kernel.prepare` as a kernel; ``interpret`` runs it without a GPU."""
     batch, *shape = images.shape
     channels, height, width = shape
-    patches = (height >> levels) * (width >> levels) * 4 ** (levels - LEVELS)
-    size = 64 * padded_channels(channels)
-    tile, together = divisor(patches, min(_PREPARE_PATCHES, _PREPARE_NUMBERS // size)), divisor(batch, _PREPARE_IMAGES)
-    pixels = math.prod(shape)
-    data, of_images = (
-        images.reshape(batch, pixels),
-        lambda columns: pl.BlockSpec((together, columns), lambda _, image: (image, 0)),
-    )
+    rows, columns, of_block = height >> levels, width >> levels, 4 ** (levels - LEVELS)
+    size, together = 16 * _SIDE * padded_channels(channels), divisor(batch, _PREPARE_IMAGES)
+    tile = of_block * divisor(columns, max(1, _PREPARE_NUMBERS // (of_block * size)))
+    patches, pixels = rows * columns * of_block, math.prod(shape)
+    moves = () if shift is None else (shift,)
+
+    def of_images(numbers: int) -> pl.BlockSpec:
+        return pl.BlockSpec((together, numbers), lambda _, image: (image, 0))
+
     whole = pl.BlockSpec((pixels,), lambda patch, image: (0,))
-    if shift is None:
-        kernel, data = _prepare_kernel, jax.lax.bitcast_convert_type(data.reshape(batch, -1, WORD), jnp.uint32)
-        more, more_specs = (), []
-    else:
-        kernel, more, more_specs = _prepare_shifted_kernel, (shift,), [of_images(2)]
     return pl.pallas_call(
-        functools.partial(kernel, shape=tuple(shape), levels=levels, limit=limit),
+        functools.partial(_prepare_kernel, shape=tuple(shape), levels=levels, limit=limit),
         out_shape=jax.ShapeDtypeStruct((batch, patches, size), dtype),
         grid=(patches // tile, batch // together),
-        in_specs=[of_images(data.shape[1]), whole, whole, *more_specs],
+        in_specs=[of_images(pixels), whole, whole, *(of_images(2) for _ in moves)],
         out_specs=pl.BlockSpec((together, tile, size), lambda patch, image: (image, patch, 0)),
         compiler_params=_PREPARE,
         interpret=interpret,
-        name="prepare_patches" if shift is None else "prepare_shifted_patches",
-    )(data, mean.reshape(pixels), scale.reshape(pixels), *more)
+        name="prepare_shifted_patches" if moves else "prepare_patches",
+    )(images.reshape(batch, pixels), mean.reshape(pixels), scale.reshape(pixels), *moves)
 
 
 def prepare_plainly(
@@ -155,16 +121,21 @@ def prepare_plainly(
 
 
 def to_patches(images: jax.Array, levels: int) -> jax.Array:
-    """[..., C, H, W] -> [..., patches, 64 C'], in the order of `_word_places`; channels that are padding hold zeros."""
+    """[..., C, H, W] -> [..., patches, 64 C']; channels that are padding hold zeros.
+
+    Patches run over the 2^levels blocks of the image, row by row, and within a block over its halves of halves (as
+    `blocks.to_blocks`), so that the next layers find their windows side by side. Pixels of a patch run over (quarter's row,
+    quarter's column, channel, row, column).
+    """
     *batch, channels, height, width = images.shape
     rows, columns, finer = height >> levels, width >> levels, (2,) * (levels - LEVELS)
     images = images[..., : rows << levels, : columns << levels]
-    images = images.reshape(*batch, channels, rows, *finer, 2, WORD, columns, *finer, 2, WORD)
+    images = images.reshape(*batch, channels, rows, *finer, 2, _SIDE, columns, *finer, 2, _SIDE)
     first, along = len(batch), levels - LEVELS + 3  # axes before the channels', and those of a side
     row_axis, column_axis = first + 1, first + 1 + along
     # Coarse to fine; within a quarter of a patch: channel, row, column.
     pairs = [axis for level in range(along - 1) for axis in (row_axis + level, column_axis + level)]
     images = images.transpose(*range(first), *pairs, first, row_axis + along - 1, column_axis + along - 1)
-    images = images.reshape(*batch, -1, 4, channels, WORD * WORD)
+    images = images.reshape(*batch, -1, 4, channels, _SIDE * _SIDE)
     images = jnp.pad(images, [(0, 0)] * (first + 2) + [(0, padded_channels(channels) - channels), (0, 0)])
     return images.reshape(*batch, -1, 64 * padded_channels(channels))

@@ -5,6 +5,7 @@ And the same in plain JAX, as in `encoder_kernel_passes`. Weightings that need d
 """
 
 import functools
+import math
 from typing import Any
 
 import jax
@@ -13,21 +14,21 @@ from jax.experimental import pallas as pl
 from jaxrl_vis.learner.encoder_kernel_passes import (
     FORWARD,
     FORWARD_TILES,
+    TILE,
     Weights,
     apply,
     apply_plainly,
+    as_quarters,
     before,
     cast_kernels,
     dispatch,
     dot,
     joined,
     layer,
-    once,
     quarters_of,
     read,
     rows,
-    rows_of_tile,
-    tiles_between,
+    rows_of,
     whole,
 )
 from jaxrl_vis.learner.encoder_kernel_patches import divisor
@@ -36,18 +37,16 @@ from jaxrl_vis.learner.encoder_kernel_patches import divisor
 def _tangent_kernel(x_ref, *refs):
     inputs, (out_ref, tangent_ref) = refs[:-2], refs[-2:]
     weights, along = read(inputs[: len(inputs) // 2]), read(inputs[len(inputs) // 2 :])
-    rows, quarters = rows_of_tile(x_ref, out_ref)
 
     def one_tile(tile, _):
-        values, tangents = x_ref[pl.ds(tile * quarters, quarters), :], None
+        values, tangents = x_ref[quarters_of(tile), :], None
         for level, parameters in enumerate(zip(*weights, *along, strict=True)):
             tangents = None if tangents is None else joined(tangents, level)
             values, tangents = _layer_along(joined(values, level), tangents, *parameters)
         assert tangents is not None  # there is a layer
-        here = pl.ds(tile * rows, rows)
-        out_ref[here, :], tangent_ref[here, :] = once(values, rows), once(tangents, rows)
+        out_ref[rows_of(tile), :], tangent_ref[rows_of(tile), :] = values, tangents
 
-    jax.lax.fori_loop(0, out_ref.shape[0] // rows, one_tile, None)
+    jax.lax.fori_loop(0, out_ref.shape[0] // TILE, one_tile, None)
 
 
 def _layer_along(
@@ -85,9 +84,8 @@ def _along_on_gpu(
 ) -> tuple[jax.Array, jax.Array]:
     """What `apply` makes of patches, and its tangent along a direction of the weights, [count, F] each."""
     outputs = weights.biases[-1].shape[0]
-    tile, tiles = tiles_between(weights, first, count)
-    block = tile * divisor(tiles, FORWARD_TILES)
-    data, data_spec = quarters_of(patches, weights, first, block)
+    block = TILE * divisor(math.gcd(first, count) // TILE, FORWARD_TILES)
+    data, data_spec = as_quarters(patches, first, block)
     cast = jax.tree.leaves([cast_kernels(each, patches.dtype) for each in (weights, along)])
     out = jax.ShapeDtypeStruct((count, outputs), patches.dtype)
     return pl.pallas_call(

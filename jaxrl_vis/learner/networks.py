@@ -22,7 +22,7 @@ import jax.numpy as jnp
 
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner import encoder_kernel, normalizer
+from jaxrl_vis.learner import encoder_kernel, head_kernel, normalizer
 from jaxrl_vis.learner.blocks import shifted, to_blocks
 from jaxrl_vis.learner.products import product
 from jaxrl_vis.types import Batch, NormalizerState, Params, TrainState
@@ -318,15 +318,22 @@ class Networks:
         channels = self.observation_spec.shape[0]
         weights = encoder_kernel.make_weights(params["encoder"], channels)
         found = [encoder_kernel.encode(inputs, weights, which) for inputs, which in pieces]
-        done = encoder_kernel.layers(self.config.encoder_filters, channels)
-        finer = 4 ** (self._levels - done)
+        finer = 4 ** (self._levels - encoder_kernel.LEVELS)
         blocks = [part.reshape(part.shape[0], part.shape[1] // finer, finer * part.shape[2]) for part in found]
-        return self._encoder.apply({"params": params["encoder"]}, *blocks, first_layer=done)
+        return self._encoder.apply({"params": params["encoder"]}, *blocks, first_layer=encoder_kernel.LEVELS)
 
     def act(self, actor: Params, latents: jax.Array) -> jax.Array:
         """Actions [B, A] float32 in (-1, 1) for latents [2, B, latent] of observations and goals."""
-        return jnp.tanh(self._head(self.action_size, 0.0).apply({"params": actor["head"]}, latents))
+        return jnp.tanh(self._apply_head(self._head(self.action_size, 0.0), actor["head"], latents))
 
     def value(self, critic: Params, latents: jax.Array, action: jax.Array) -> jax.Array:
         """Values [B] float32 of actions [B, A] for latents [2, B, latent] of observations and goals."""
-        return self._head(1, self.critic_output_bias).apply({"params": critic["head"]}, latents, action)[..., 0]
+        return self._apply_head(self._head(1, self.critic_output_bias), critic["head"], latents, action)[..., 0]
+
+    def _apply_head(self, head: _Head, params: Params, *inputs: jax.Array) -> jax.Array:
+        *_, batch, _ = inputs[0].shape
+        supported = self.dtype == jnp.bfloat16 and head_kernel.supports(head.hidden_sizes, batch)
+        if not (supported and head_kernel.is_available()):
+            return head.apply({"params": params}, *inputs)
+        first = _Dense(head.hidden_sizes[0], self.dtype).apply({"params": params["hidden_0"]}, *inputs)
+        return head_kernel.apply(nn.relu(first), head_kernel.make_weights(params))
