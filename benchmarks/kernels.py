@@ -1,12 +1,12 @@
 """Which kernels a training iteration spends its time in, on a GPU: of a gradient step, a control step and an insertion.
 
     python benchmarks/kernels.py [TASK] [--preset P] [--parts update rollout insert] [--set FIELD VALUE ...] [--rows 20]
-        [--options xla_gpu_command_buffer_scheduling_mode=CONCURRENT ...]
+        [--in-order] [--options xla_gpu_autotune_level=0 ...]
 
 Every part is a program of its own, with a replay full of noise, as `jaxrl-vis bench update` has it. Printed are its time, that
-of its kernels together, and those that take most of it. What the names stand for is in the compiled program, which
-``--hlo FOLDER`` writes. With ``--options``, of which there may be several sets, the same is measured with these compiler
-options, too.
+of its kernels together, which is more where they run side by side, and those that take most of it. What the names stand for is
+in the compiled program, which ``--hlo FOLDER`` writes. With ``--options``, of which there may be several sets, the same is
+measured with these compiler options, too.
 """
 
 import argparse
@@ -33,40 +33,57 @@ from jaxrl_vis.run.programs import rarely_collecting_garbage
 PARTS = ("update", "rollout", "insert")
 
 
-def kernels(call: Callable[[], Any]) -> tuple[collections.Counter, collections.Counter]:
-    """Nanoseconds and launches of each kernel of a call, which must wait for its results, by name."""
+def traced(call: Callable[[], Any]) -> list[tuple[float, float, str]]:
+    """Start and duration in nanoseconds and name of each kernel of a call, which must wait for its results, in order."""
     with tempfile.TemporaryDirectory() as folder:
         with jax.profiler.trace(folder):
             call()
         data = jax.profiler.ProfileData.from_file(str(next(Path(folder).rglob("*.xplane.pb"))))
-    spent, launches = collections.Counter(), collections.Counter()
     streams = (line for plane in data.planes if "GPU" in plane.name for line in plane.lines if line.name.startswith("Stream"))
-    for event in (event for line in streams for event in line.events):
-        spent[event.name] += event.duration_ns
-        launches[event.name] += 1
+    return sorted((event.start_ns, event.duration_ns, event.name) for line in streams for event in line.events)
+
+
+def kernels(call: Callable[[], Any]) -> tuple[collections.Counter, collections.Counter]:
+    """Nanoseconds and launches of each kernel of a call, by name; `traced`."""
+    return counted(traced(call))
+
+
+def counted(events: list[tuple[float, float, str]]) -> tuple[collections.Counter, collections.Counter]:
+    """Nanoseconds and launches of each kernel, by name."""
+    spent, launches = collections.Counter(), collections.Counter()
+    for _, duration, name in events:
+        spent[name] += duration
+        launches[name] += 1
     return spent, launches
 
 
-def report(name: str, call: Callable[[], Any], turns: int, rows: int) -> None:
-    """Prints where a call spends its time, per one of its ``turns``."""
+def report(name: str, call: Callable[[], Any], turns: int, rows: int, in_order: bool) -> None:
+    """Prints where a call spends its time, per one of its ``turns``, and the kernels of one of them ``in_order``."""
     call()
     seconds = []
     for _ in range(3):
         begun = time.perf_counter()
         call()
         seconds.append(time.perf_counter() - begun)
-    spent, launches = kernels(call)
+    events = traced(call)
+    spent, launches = counted(events)
     print(
         f"{name}: {1e6 * min(seconds) / turns:.0f} us, of which {sum(spent.values()) / turns / 1e3:.0f} us in "
         f"{sum(launches.values()) / turns:.0f} kernels"
     )
     for kernel, nanoseconds in spent.most_common(rows):
         print(f"  {nanoseconds / turns / 1e3:10.1f} us  {launches[kernel] / turns:7.1f} x  {kernel[:90]}")
+    of_turn = len(events) // turns
+    of_one = events[turns // 2 * of_turn :][:of_turn]
+    for begun, duration, kernel in of_one if in_order else ():
+        print(f"  at {(begun - of_one[0][0]) / 1e3:8.1f} us for {duration / 1e3:7.1f} us  {kernel[:90]}")
     sys.stdout.flush()
 
 
-def measure(program: TrainStep, parts: list[str], rows: int, hlo: Path | None, options: dict[str, Any]) -> None:
+def measure(program: TrainStep, asked: argparse.Namespace, options: dict[str, Any]) -> None:
     """Compiles the parts with compiler options and reports each."""
+    parts: list[str] = asked.parts
+    hlo: Path | None = asked.hlo
     loop, keys = start(program), seed_keys(program, 2)
     train, replay, iteration = loop.train, loop.replay, jnp.zeros((), jnp.int32)
     rolled = jax.eval_shape(program.rollout, train, keys)[0]
@@ -99,7 +116,7 @@ def measure(program: TrainStep, parts: list[str], rows: int, hlo: Path | None, o
     episodes = compiled["rollout"](train, keys)[0] if "insert" in parts else None
     for part in parts:
         _, _, turns, what = arguments[part]
-        report(f"{what} of {program.config.seeds} learners", lambda part=part: call(part), turns, rows)
+        report(f"{what} of {program.config.seeds} learners", lambda part=part: call(part), turns, asked.rows, asked.in_order)
 
 
 def options_of(words: list[str]) -> dict[str, Any]:
@@ -140,6 +157,7 @@ def main() -> int:
         "--set", nargs="+", action="append", default=[], metavar=("FIELD", "VALUE"), help="a field of the configuration"
     )
     parser.add_argument("--rows", type=int, default=20, help="kernels to list of each part")
+    parser.add_argument("--in-order", action="store_true", help="list the kernels of one turn, too, in their order")
     parser.add_argument("--hlo", type=Path, help="a folder for the compiled programs")
     parser.add_argument(
         "--options", nargs="+", action="append", default=[], metavar="NAME=VALUE", help="compiler options to try"
@@ -155,7 +173,7 @@ def main() -> int:
         program = make_train_step(make_env(config), config)
         for name, compiler_options in sets.items():
             print(f"-- {name}")
-            measure(program, options.parts, options.rows, options.hlo, compiler_options)
+            measure(program, options, compiler_options)
     except RequestError as error:
         print(error, file=sys.stderr)
         return 2

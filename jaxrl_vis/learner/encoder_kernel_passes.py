@@ -133,12 +133,12 @@ def _forward_kernel(x_ref, *refs):
     jax.lax.fori_loop(0, out_ref.shape[0] // TILE, one_tile, None)
 
 
-def rows_of(tile: Any) -> pl.Slice:
+def rows_of(tile: Any) -> Any:
     """Rows of a tile in the result."""
     return pl.ds(tile * TILE, TILE)
 
 
-def quarters_of(tile: Any) -> pl.Slice:
+def quarters_of(tile: Any) -> Any:
     """Quarters of patches of a tile."""
     return pl.ds(4 * tile * TILE, 4 * TILE)
 

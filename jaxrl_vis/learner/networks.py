@@ -330,10 +330,11 @@ class Networks:
         """Values [B] float32 of actions [B, A] for latents [2, B, latent] of observations and goals."""
         return self._apply_head(self._head(1, self.critic_output_bias), critic["head"], latents, action)[..., 0]
 
-    def _apply_head(self, head: _Head, params: Params, *inputs: jax.Array) -> jax.Array:
+    def _apply_head(self, head: Any, params: Params, *inputs: jax.Array) -> jax.Array:
         *_, batch, _ = inputs[0].shape
         supported = self.dtype == jnp.bfloat16 and head_kernel.supports(head.hidden_sizes, batch)
         if not (supported and head_kernel.is_available()):
             return head.apply({"params": params}, *inputs)
-        first = _Dense(head.hidden_sizes[0], self.dtype).apply({"params": params["hidden_0"]}, *inputs)
-        return head_kernel.apply(nn.relu(first), head_kernel.make_weights(params))
+        first: Any = _Dense(head.hidden_sizes[0], self.dtype)
+        values = nn.relu(first.apply({"params": params["hidden_0"]}, *inputs))
+        return head_kernel.apply(values, head_kernel.make_weights(params))
