@@ -6,7 +6,6 @@ Each with the same in plain JAX, for processes without such a GPU and as the ker
 import functools
 import itertools
 import math
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -73,7 +72,7 @@ def probe_program() -> Any:
     return jax.jit(all_three).trace(images, of_pixels, of_pixels, weights)
 
 
-def dispatch(on_gpu: Any, plain: Any, *arguments: Any, interpret: bool, probe: Callable[[], None] = probe) -> Any:
+def dispatch(on_gpu: Any, plain: Any, *arguments: Any, interpret: bool) -> Any:
     """The kernel where a program is compiled for a GPU that runs it, and the same in plain JAX for every other platform."""
     if interpret:
         return on_gpu(*arguments)

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner import encoder_kernel, head_kernel, normalizer
+from jaxrl_vis.learner import encoder_kernel, normalizer
 from jaxrl_vis.learner.blocks import shifted, to_blocks
 from jaxrl_vis.learner.products import product
 from jaxrl_vis.types import Batch, NormalizerState, Params, TrainState
@@ -324,17 +324,8 @@ class Networks:
 
     def act(self, actor: Params, latents: jax.Array) -> jax.Array:
         """Actions [B, A] float32 in (-1, 1) for latents [2, B, latent] of observations and goals."""
-        return jnp.tanh(self._apply_head(self._head(self.action_size, 0.0), actor["head"], latents))
+        return jnp.tanh(self._head(self.action_size, 0.0).apply({"params": actor["head"]}, latents))
 
     def value(self, critic: Params, latents: jax.Array, action: jax.Array) -> jax.Array:
         """Values [B] float32 of actions [B, A] for latents [2, B, latent] of observations and goals."""
-        return self._apply_head(self._head(1, self.critic_output_bias), critic["head"], latents, action)[..., 0]
-
-    def _apply_head(self, head: Any, params: Params, *inputs: jax.Array) -> jax.Array:
-        *_, batch, _ = inputs[0].shape
-        supported = self.dtype == jnp.bfloat16 and head_kernel.supports(head.hidden_sizes, batch)
-        if not (supported and head_kernel.is_available()):
-            return head.apply({"params": params}, *inputs)
-        first: Any = _Dense(head.hidden_sizes[0], self.dtype)
-        values = nn.relu(first.apply({"params": params["hidden_0"]}, *inputs))
-        return head_kernel.apply(values, head_kernel.make_weights(params))
+        return self._head(1, self.critic_output_bias).apply({"params": critic["head"]}, latents, action)[..., 0]
