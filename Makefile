@@ -54,10 +54,10 @@ bench-cpu: $(STAMPS)/base ## Run the five benchmarks at CPU sizes; records land 
 		JAX_PLATFORMS=cpu $(BIN)/jaxrl-vis bench $$benchmark $(if $(RESULTS),--results "$(RESULTS)") $(ARGS); done
 
 pins: .venv/bin/python ## Write requirements/*.txt anew
-	@$(PINS) $(PINS_ARGS) pyproject.toml -o requirements/base.txt
+	@$(PINS) $(PINS_ARGS) pyproject.toml -c requirements/cpu.in -o requirements/base.txt
 	@$(PINS) $(PINS_ARGS) pyproject.toml --group dev -c requirements/base.txt -o requirements/dev.txt
 	@$(PINS) $(PINS_ARGS) --group docs -c requirements/dev.txt -o requirements/docs.txt
-	@$(PINS) $(PINS_ARGS) pyproject.toml --extra cuda12 -c requirements/base.txt -o requirements/gpu.txt
+	@$(PINS) $(PINS_ARGS) pyproject.toml --extra cuda12 -o requirements/gpu.txt
 	@if grep -E -n '://|--(extra-)?(index-url|find-links)' requirements/*.txt; then echo "pins must carry no address" >&2; exit 1; fi
 
 clean: ## Remove what make built (not runs/)

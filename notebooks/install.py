@@ -84,13 +84,16 @@ def install(source: Path) -> str | None:
     extra = cuda_extra(
         driver_version, versions(("jax", *(f"jax-{name}-plugin" for name in _OLDEST_DRIVER))), required_jax(source)
     )
-    if driver_version is not None and driver_version < min(_OLDEST_DRIVER.values()):
+    usable = driver_version is not None and driver_version >= min(_OLDEST_DRIVER.values())
+    if driver_version is not None and not usable:
         print(f"the GPU's driver, {driver_version}, is older than {min(_OLDEST_DRIVER.values())}: JAX will use the CPU")
+    # Some versions of JAX are slow there.
+    limits = [] if usable else ["--constraint", str(source.resolve() / "requirements" / "cpu.in")]
     target = f"{source.resolve()}[{extra}]" if extra else str(source.resolve())
     print(f"installing {target}; this takes a minute or more", flush=True)
     before = loaded()
     pip = subprocess.run(
-        [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", target],
+        [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *limits, target],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,

@@ -186,3 +186,21 @@ def test_a_replaced_package_that_was_in_use_asks_for_a_restart(fake_pip, checkou
 def test_an_installation_that_went_well_says_nothing_more(fake_pip, checkout):
     assert INSTALL["install"](checkout) is None
     assert {"numpy", "pytest"} <= set(INSTALL["loaded"]())
+
+
+@pytest.mark.parametrize(("driver", "is_limited"), [(None, True), (470, True), (580, False)])
+def test_without_a_usable_gpu_versions_that_are_slow_on_a_cpu_are_left_out(driver, is_limited, monkeypatch):
+    calls = []
+
+    def run(words, **_):
+        calls.append(words)
+        return subprocess.CompletedProcess(words, 0, stdout="")
+
+    monkeypatch.setitem(INSTALL["install"].__globals__, "driver", lambda: driver)
+    monkeypatch.setattr(subprocess, "run", run)
+    assert INSTALL["install"](FOLDER.parent) is None
+    (words,) = calls
+    limits = [Path(word) for word in words if word.endswith(".in")]
+    assert bool(limits) == is_limited
+    for path in limits:
+        assert "jax<0.11" in path.read_text().splitlines()

@@ -7,7 +7,8 @@ to call it takes longer than to add a few numbers: without, FetchReach in 16 env
 cores, and gradient steps take up to a seventh less.
 
 JAX 0.11 has no such option per function any more (it refuses the name). Its emitters do not explode, but leave physics on a CPU
-about half as fast (FetchReach, 64 environments, two cores: 1,100 environment steps a second against 2,350).
+about half as fast (FetchReach, 64 environments, two cores: 1,100 environment steps a second against 2,350). So `make` and the
+notebooks install 0.10 where there is no GPU (requirements/cpu.in).
 
 On a GPU the many small kernels of a gradient step are launched together, as a CUDA graph. XLA makes a chain of them, unless
 it is told that those which do not wait for each other may run side by side: a gradient step of VisualFetchReach (64x64, H100)
