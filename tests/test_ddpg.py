@@ -48,7 +48,7 @@ def values(program, train, observations, goals, action=0.0):
 
     @jax.jit
     def value(train, points, goals):
-        latents = jnp.stack([networks.prepare(train.normalizer, each) for each in (points, goals)])
+        latents = jnp.stack([networks.prepare(networks.scaling(train.normalizer), each) for each in (points, goals)])
         return networks.value(train.critic, latents, jnp.full((points.shape[0], 1), action))
 
     return np.asarray(value(train, *(np.array(each, np.float32)[:, None] for each in (observations, goals))))

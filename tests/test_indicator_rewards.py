@@ -54,7 +54,7 @@ def test_the_return_of_an_autoencoder_is_in_q(with_autoencoder):
     @jax.jit
     def values_and_rewards(train, goals):
         images = [jax.vmap(probes.SeenGoWhereTold().see)(each) for each in (points, goals)]
-        inputs = [networks.prepare(train.normalizer, each) for each in images]
+        inputs = [networks.prepare(networks.scaling(train.normalizer), each) for each in images]
         latents = jnp.stack([networks.encode(train.critic, each) for each in inputs])
         rewards = cosine_reward(*(networks.encode(train.autoencoder.params, each) for each in inputs))
         return networks.value(train.critic, latents, jnp.zeros((8, 1))), rewards
@@ -107,7 +107,7 @@ def test_stacked_images_are_compared_as_goals():
     @jax.jit
     def rewards(train, batch):
         train = train.replace(normalizer=normalizer.update(train.normalizer, batch.observations))
-        inputs = networks.prepare_batch(train, batch)
+        inputs = networks.prepare_batch(networks.batch_scaling(train), batch)
         return [latent_reward.of_batch(train, inputs, each).reward for each in (batch.replace(reached=reached), batch)]
 
     of_reached, of_moving = rewards(train, batch)

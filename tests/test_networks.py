@@ -37,7 +37,7 @@ def test_the_encoder_is_a_stack_of_strided_convolutions(size):
             values = nn.relu(values + params["encoder"][f"bias_{level}"])
         dense = params["encoder"]["latent"]
         expected = values.reshape(2, -1) @ dense["kernel"] + dense["bias"]
-        return networks.encode(params, networks.prepare(statistics, frames)), expected
+        return networks.encode(params, networks.prepare(networks.scaling(statistics), frames)), expected
 
     latent, expected = latents_in_both_ways()
     assert np.abs(expected).max() > 0.1
@@ -85,7 +85,7 @@ class EncoderCase:
                 patch.setattr(encoder_kernel, name, functools.partial(getattr(encoder_kernel, name), interpret=True))
 
             def loss(params, probe):
-                inputs = self.networks.prepare(self.statistics, self.images)
+                inputs = self.networks.prepare(self.networks.scaling(self.statistics), self.images)
                 latent = self.networks.encode({"encoder": params}, inputs, self.which)
                 return jnp.sum(latent.astype(jnp.float32) * probe), latent.astype(jnp.float32)
 
@@ -122,7 +122,7 @@ def test_encoders_are_differentiated_forwards_where_tangents_are_wanted(implemen
         monkeypatch.setattr(Networks, "uses_kernel", True)
     if implementation == "kernel":
         monkeypatch.setattr(encoder_kernel, "encode", functools.partial(encoder_kernel.encode, interpret=True))
-    inputs = jax.jit(case.networks.prepare)(case.statistics, case.images)
+    inputs = jax.jit(case.networks.prepare)(case.networks.scaling(case.statistics), case.images)
     rng = np.random.default_rng(1)
     along = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape), jnp.float32), case.params)
 
@@ -148,7 +148,7 @@ def test_images_move_alike_whoever_prepares_them(implementation, monkeypatch):
 
     @jax.jit
     def latents():
-        inputs = case.networks.prepare(case.statistics, case.images, shift)
+        inputs = case.networks.prepare(case.networks.scaling(case.statistics), case.images, shift)
         return case.networks.encode({"encoder": case.params}, inputs)
 
     expected = latents()
@@ -157,7 +157,9 @@ def test_images_move_alike_whoever_prepares_them(implementation, monkeypatch):
         monkeypatch.setattr(encoder_kernel, name, functools.partial(getattr(encoder_kernel, name), interpret=True))
     jax.clear_caches()
     np.testing.assert_allclose(latents(), expected, rtol=1e-4, atol=1e-4)
-    still = case.networks.encode({"encoder": case.params}, case.networks.prepare(case.statistics, case.images))
+    still = case.networks.encode(
+        {"encoder": case.params}, case.networks.prepare(case.networks.scaling(case.statistics), case.images)
+    )
     assert not np.allclose(still[1:], expected[1:], atol=0.1)
     np.testing.assert_allclose(still[0], expected[0], rtol=1e-4, atol=1e-4)
 

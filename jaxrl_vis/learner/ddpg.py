@@ -21,7 +21,7 @@ from jaxrl_vis.config import Config
 from jaxrl_vis.learner import adam, diagnostics, normalizer
 from jaxrl_vis.learner.auxiliary import Auxiliary, make_auxiliary
 from jaxrl_vis.learner.latent_reward import LatentReward, make_latent_reward
-from jaxrl_vis.learner.networks import Networks
+from jaxrl_vis.learner.networks import BatchScaling, Networks
 from jaxrl_vis.learner.objectives import ComputeCopies, Objectives
 from jaxrl_vis.learner.shards import ONE, Shards
 from jaxrl_vis.learner.weighting import MAIN, Weighted, WeightingState
@@ -40,12 +40,15 @@ class Working(NamedTuple):
     Attributes:
         train: The learner; its counters are those of the beginning.
         copies: Its parameters as the networks compute with them.
+        scaling: What observations are normalised with. It stays the same, and is here because it would otherwise be worked out
+            in every step, before all else.
         counts: [3] int32, gradient steps: those of the critic, of the actor, and `TrainState.updates`.
         held: The critic's parameters that the weighting's interval began with, for a weighting that asks for them; else None.
     """
 
     train: TrainState
     copies: ComputeCopies
+    scaling: BatchScaling
     counts: jax.Array
     held: Params = None
 
@@ -159,7 +162,7 @@ def _apply(state: TrainState, counts: jax.Array, gradients: Gradients, config: C
 def _value_at_goals(networks: Networks, train: TrainState, goals: jax.Array) -> jax.Array:
     """`Algorithm.value_at_goals`."""
     statistics = (train.normalizer,) if train.goal_normalizer is None else (train.normalizer, train.goal_normalizer)
-    inputs = [networks.prepare(each, goals) for each in statistics]
+    inputs = [networks.prepare(networks.scaling(each), goals) for each in statistics]
 
     def latents(params: Params) -> jax.Array:
         encoded = [networks.encode(params, each) for each in inputs]
@@ -197,19 +200,21 @@ def make_ddpg(
     learning = Objectives(networks, config, resolved, auxiliary, shards)
     keeps_state, held = auxiliary.weighting.name != "none", auxiliary.weighting.held
 
-    def working_of(train: TrainState, counts: jax.Array, held: Params = None) -> Working:
-        return Working(train, ComputeCopies(*map(networks.compute_copy, _networks_of(train))), counts, held)
+    def copies_of(train: TrainState) -> ComputeCopies:
+        return ComputeCopies(*map(networks.compute_copy, _networks_of(train)))
 
     def gradients(working: Working, batch: Batch, with_actor: bool = True) -> tuple[Gradients, Metrics]:
         train = working.train
         now = ComputeCopies(*map(networks.with_compute_copy, _networks_of(train), working.copies))
         # Before, goal, after, moved: the online networks read the first two, their targets the second and third.
-        inputs = networks.prepare_batch(train, batch)
+        inputs = networks.prepare_batch(working.scaling, batch)
         rewarded = None if latent_reward is None else latent_reward.of_batch(train, inputs, batch)
         if rewarded is not None:
             batch = batch.replace(reward=rewarded.reward)
         assert batch.reward is not None
-        image = networks.normalize(train.normalizer, batch.observation_t, batch.shift) if "image" in auxiliary.needs else None
+        image = None
+        if "image" in auxiliary.needs:
+            image = networks.normalize(working.scaling.observations, batch.observation_t, batch.shift)
         found = learning.of_critic(now, train.weighting, inputs, image, batch, working.held)
         latents, value, keep = found.extra
         counts = diagnostics.count_rewards(
@@ -242,15 +247,25 @@ def make_ddpg(
         train = _apply(working.train, counts, chosen, config)
         if latent_reward is not None:
             train = train.replace(autoencoder=latent_reward.apply(train.autoencoder, chosen.autoencoder))
+        working = working._replace(train=train, copies=copies_of(train), counts=counts)
         if not held:
-            return working_of(train, counts)
+            return working
         is_new = train.weighting.updates % auxiliary.weighting.interval == 0
         kept = jax.tree.map(lambda now, before: jnp.where(is_new, now, before), train.critic, working.held)
-        return working_of(train, counts, kept)
+        return working._replace(held=kept)
+
+    def begin(train: TrainState) -> Working:
+        return Working(
+            train=train,
+            copies=copies_of(train),
+            scaling=networks.batch_scaling(train),
+            counts=_counts_of(train),
+            held=train.critic if held else None,
+        )
 
     return Algorithm(
         init=lambda key: _start(networks, auxiliary, latent_reward, key),
-        begin=lambda train: working_of(train, _counts_of(train), train.critic if held else None),
+        begin=begin,
         gradients=gradients,
         apply=apply,
         end=lambda working: _with_counts(working.train, working.counts),

@@ -90,13 +90,13 @@ class LatentReward:
             inputs: From `Networks.prepare_batch`.
             batch: The transitions.
         """
-        networks = self.networks
+        networks, scaling = self.networks, self.networks.scaling(train.normalizer)
         if batch.reached is None:
             reached, pieces = batch.observation_tp1, inputs.pieces("after")
         else:
             reached = batch.reached
-            pieces = [(networks.prepare(train.normalizer, reached), slice(None))]
-        image = networks.normalize(train.normalizer, reached)
+            pieces = [(networks.prepare(scaling, reached), slice(None))]
+        image = networks.normalize(scaling, reached)
 
         def reconstruction(params: Params) -> tuple[jax.Array, jax.Array]:
             latent = networks.encode_pieces(params, pieces)

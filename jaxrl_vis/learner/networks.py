@@ -24,6 +24,7 @@ from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import encoder_kernel, normalizer
 from jaxrl_vis.learner.blocks import shifted, to_blocks
+from jaxrl_vis.learner.normalizer import Scaling
 from jaxrl_vis.learner.products import product
 from jaxrl_vis.types import Batch, NormalizerState, Params, TrainState
 
@@ -90,6 +91,18 @@ class _Dense(nn.Module):
         return total
 
 
+class BatchScaling(NamedTuple):
+    """What the observations of transitions are normalised with.
+
+    Attributes:
+        observations: Before and after the action; goals, too, unless they have their own.
+        goals: None where they have not.
+    """
+
+    observations: Scaling
+    goals: Scaling | None
+
+
 _OBSERVED = ("before", "goal", "after")  # as `Inputs` has them
 
 Piece = tuple[jax.Array, slice]
@@ -150,8 +163,8 @@ class Networks:
 
     Attributes:
         init_actor, init_critic: key -> {"encoder": ..., "head": ...}.
-        prepare: (normalizer, observations [B, ...], possibly how to shift them) -> inputs: what encoders read; made once for
-            all four networks.
+        prepare: (scaling, observations [B, ...], possibly how to shift them) -> inputs: what encoders read; made once for all
+            four networks.
         encode: (actor or critic parameters, inputs [B, ...]) -> latent [B, latent].
         act: (actor, latents [2, B, latent] of observations and goals) -> [B, A] float32 in (-1, 1).
         value: (critic, latents [2, B, latent], action [B, A]) -> [B] float32.
@@ -266,26 +279,36 @@ class Networks:
             lambda converted, leaf: leaf if converted is None else converted, copy, params, is_leaf=lambda leaf: leaf is None
         )
 
-    def prepare_batch(self, train: TrainState, batch: Batch) -> Inputs:
+    def scaling(self, statistics: NormalizerState) -> Scaling:
+        """What `prepare` and `normalize` take."""
+        return Scaling(statistics.mean, normalizer.scale(statistics, self.config.normalizer_floor))
+
+    def batch_scaling(self, train: TrainState) -> BatchScaling:
+        """What `prepare_batch` takes. It stays the same for all gradient steps of an iteration."""
+        of_goals = None if train.goal_normalizer is None else self.scaling(train.goal_normalizer)
+        return BatchScaling(self.scaling(train.normalizer), of_goals)
+
+    def prepare_batch(self, scaling: BatchScaling, batch: Batch) -> Inputs:
         """`prepare` of all observations of B transitions."""
+        of_observations, of_goals = scaling
         moved = None if batch.targets is None else batch.targets.images_moved
         if moved is not None:
-            moved = self.prepare(train.normalizer, moved, batch.shift)
-        if train.goal_normalizer is None:  # together, and while they are bytes
+            moved = self.prepare(of_observations, moved, batch.shift)
+        if of_goals is None:  # together, and while they are bytes
             count, size, *shape = batch.observations.shape
             shift = None if batch.shift is None else jnp.tile(batch.shift, (count, 1))
-            together = self.prepare(train.normalizer, batch.observations.reshape(count * size, *shape), shift)
+            together = self.prepare(of_observations, batch.observations.reshape(count * size, *shape), shift)
             return Inputs(together, moved)
-        statistics = (train.normalizer, train.goal_normalizer, train.normalizer)
-        pieces = [self.prepare(each, rows, batch.shift) for each, rows in zip(statistics, batch.observations, strict=True)]
+        each_scaling = (of_observations, of_goals, of_observations)
+        pieces = [self.prepare(each, rows, batch.shift) for each, rows in zip(each_scaling, batch.observations, strict=True)]
         return Inputs(jnp.concatenate(pieces), moved)
 
-    def prepare(self, statistics: NormalizerState, observations: jax.Array, shift: jax.Array | None = None) -> jax.Array:
+    def prepare(self, scaling: Scaling, observations: jax.Array, shift: jax.Array | None = None) -> jax.Array:
         """Normalises and orders [B, ...] observations for the encoders: [B, blocks, block size], or [B, S] for states.
 
         Images may be moved by ``shift`` [B, 2] int32, as of `Batch`. They are normalised first: what moves in is the mean.
         """
-        mean, scale = statistics.mean, normalizer.scale(statistics, self.config.normalizer_floor)
+        mean, scale = scaling
         if not self.sees_images:
             return self._normalized(observations, mean, scale)
         if self.uses_kernel:
@@ -295,10 +318,9 @@ class Networks:
             return to_blocks(shifted(self._normalized(observations, mean, scale), shift), self._levels)
         return self._normalized(*(to_blocks(array, self._levels) for array in (observations, mean, scale)))
 
-    def normalize(self, statistics: NormalizerState, observations: jax.Array, shift: jax.Array | None = None) -> jax.Array:
+    def normalize(self, scaling: Scaling, observations: jax.Array, shift: jax.Array | None = None) -> jax.Array:
         """As `prepare`, with the observations in their own order: [B, ...] in the dtype that the networks compute in."""
-        scale = normalizer.scale(statistics, self.config.normalizer_floor)
-        normalized = self._normalized(observations, statistics.mean, scale)
+        normalized = self._normalized(observations, *scaling)
         return normalized if shift is None else shifted(normalized, shift)
 
     def _normalized(self, observations: jax.Array, mean: jax.Array, scale: jax.Array) -> jax.Array:

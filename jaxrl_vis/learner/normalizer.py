@@ -3,11 +3,25 @@
 A camera that stands still sees mostly things that never change: subtracting the mean image leaves what moves.
 """
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 
 from jaxrl_vis.learner.shards import ONE, Shards
 from jaxrl_vis.types import NormalizerState
+
+
+class Scaling(NamedTuple):
+    """What observations are normalised with, as statistics say it.
+
+    Attributes:
+        mean: [...] float32, in the observation's unit.
+        scale: [...] float32, 1 / standard deviation.
+    """
+
+    mean: jax.Array
+    scale: jax.Array
 
 
 def init(observation_spec: jax.ShapeDtypeStruct) -> NormalizerState:

@@ -36,7 +36,9 @@ NO_EXPLORATION = Exploration()
 
 def encode(networks: Networks, train: TrainState, statistics: NormalizerState, observations: jax.Array) -> jax.Array:
     """What the online actor makes of images (or states) [E, ...] with these ``statistics``: [E, Z]."""
-    return networks.encode(networks.with_encoder(train.actor, train.critic), networks.prepare(statistics, observations))
+    return networks.encode(
+        networks.with_encoder(train.actor, train.critic), networks.prepare(networks.scaling(statistics), observations)
+    )
 
 
 def choose_actions(

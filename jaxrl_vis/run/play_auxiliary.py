@@ -9,7 +9,6 @@ import numpy as np
 
 from jaxrl_vis.devices import enable_compilation_cache
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner import normalizer
 from jaxrl_vis.learner.auxiliary import Auxiliary
 from jaxrl_vis.learner.auxtasks import View
 from jaxrl_vis.learner.auxtasks.egomotion import MAX_ANGLE
@@ -96,9 +95,10 @@ def _predict(networks: Networks, auxiliary: Auxiliary, train: TrainState, episod
     batch = Batch(jnp.stack([before, goals, after]), actions, nothing, nothing)
     batch = batch.replace(targets=auxiliary.targets(key, batch, episode.flow))
     names = ("before", "after", *(name for name in auxiliary.others if name != "after"))
-    latents = networks.encode_pieces(train.critic, networks.prepare_batch(train, batch).pieces(*names))
+    inputs = networks.prepare_batch(networks.batch_scaling(train), batch)
+    latents = networks.encode_pieces(train.critic, inputs.pieces(*names))
     latent_t, latent_tp1, *moved = latents.reshape(len(names), count, networks.config.latent_size)
-    image = networks.normalize(train.normalizer, before) if "image" in auxiliary.needs else None
+    image = networks.normalize(networks.scaling(train.normalizer), before) if "image" in auxiliary.needs else None
     view = View(latent_t, actions, latent_tp1, *moved, image=image)
     predicted = auxiliary.predictions(train.critic["heads"], view, batch)
     found: dict[str, Any] = {}
@@ -115,7 +115,7 @@ def _predict(networks: Networks, auxiliary: Auxiliary, train: TrainState, episod
 
 def _as_image(networks: Networks, train: TrainState, values: jax.Array) -> jax.Array:
     """Normalised images [T, C or 1, H, W] as grey levels, uint8."""
-    mean, scale = train.normalizer.mean, normalizer.scale(train.normalizer, networks.config.normalizer_floor)
+    mean, scale = networks.scaling(train.normalizer)
     height, width = values.shape[-2:]
     if values.shape[1] == mean.shape[0]:
         levels = values / scale[:, :height, :width] + mean[:, :height, :width]

@@ -84,7 +84,7 @@ class Policy:
             actor, *statistics = parameters
             dtype = self.observation_spec.dtype
             latents = [
-                networks.encode(actor, networks.prepare(each, jnp.asarray(seen, dtype)[None]))
+                networks.encode(actor, networks.prepare(networks.scaling(each), jnp.asarray(seen, dtype)[None]))
                 for each, seen in zip(statistics, (observation, goal), strict=True)
             ]
             return networks.act(actor, jnp.stack(latents))[0]
