@@ -31,7 +31,7 @@ from jaxrl_vis.learner.sampling import Choice, Sampler
 from jaxrl_vis.learner.sharding import Layout, make_layout
 from jaxrl_vis.learner.shards import Shards
 from jaxrl_vis.resolved import Resolved, resolve
-from jaxrl_vis.types import Episodes, LoopState, Metrics, ReplayState, TrainState
+from jaxrl_vis.types import Batch, Episodes, LoopState, Metrics, ReplayState, TrainState
 from jaxrl_vis.validation import validate
 from jaxrl_vis_envs.base import GoalEnv
 from jaxrl_vis_envs.compilation import env_jit
@@ -110,29 +110,32 @@ def _make_update_many(config: Config, sampler: Sampler, algorithm: Algorithm):
     interval = config.actor_interval
 
     def update_many(train: TrainState, replay: ReplayState, key: jax.Array, iteration: jax.Array) -> tuple[TrainState, Metrics]:
-        def one_update(working: Working, choice: Choice, with_actor: bool) -> tuple[Working, Metrics]:
-            batch = sampler.batch(replay, choice)
-            gradients, metrics = algorithm.gradients(working, batch, with_actor)
-            return algorithm.apply(working, gradients), metrics
-
         names: list[str] = []
 
-        def updates(working: Working, choices: Choice) -> tuple[Working, jax.Array]:
-            """Updates of which the last one is the actor's, too; unrolled, so that the loop's body has no conditional."""
-            found: list[Metrics] = []
+        def updates(state: tuple[Working, Batch], following: Choice) -> tuple[tuple[Working, Batch], jax.Array]:
+            """Updates of which the last one is the actor's, too; unrolled, so that the loop's body has no conditional.
+
+            Each has its batch already, and reads the next one's. A GPU does that while it computes; with its own batch it would
+            have to begin with it.
+            """
+            (working, batch), found = state, []
             for number in range(interval):
-                choice = jax.tree.map(lambda leaf, number=number: leaf[number], choices)
-                working, metrics = one_update(working, choice, with_actor=number == interval - 1)
+                gradients, metrics = algorithm.gradients(working, batch, number == interval - 1)
+                working = algorithm.apply(working, gradients)
+                batch = sampler.batch(replay, jax.tree.map(lambda leaf, number=number: leaf[number], following))
                 found.append(metrics)
             names[:] = found[-1]
             # As one vector, because writing each number by itself would be a kernel each.
-            return working, jnp.stack([_mean([each[name] for each in found if name in each]) for name in names])
+            metrics = jnp.stack([_mean([each[name] for each in found if name in each]) for name in names])
+            return (working, batch), metrics
 
         # What all updates learn from is chosen at once: in the loop, drawing numbers would be a dozen tiny kernels an update.
         keys = jax.random.split(key, config.updates_per_iteration)
         choices = jax.vmap(lambda update_key: sampler.choose(replay, update_key, iteration))(keys)
-        choices = jax.tree.map(lambda leaf: leaf.reshape(-1, interval, *leaf.shape[1:]), choices)
-        working, metrics = jax.lax.scan(updates, algorithm.begin(train), choices)
+        batch = sampler.batch(replay, jax.tree.map(lambda leaf: leaf[0], choices))
+        # After the last one comes the first one again, for nobody.
+        following = jax.tree.map(lambda leaf: jnp.roll(leaf, -1, axis=0).reshape(-1, interval, *leaf.shape[1:]), choices)
+        (working, _), metrics = jax.lax.scan(updates, (algorithm.begin(train), batch), following)
         return algorithm.end(working), dict(zip(names, jnp.mean(metrics, axis=0), strict=True))
 
     return update_many
