@@ -55,9 +55,9 @@ bench-cpu: $(STAMPS)/base ## Run the five benchmarks at CPU sizes; records land 
 
 pins: .venv/bin/python ## Write requirements/*.txt anew
 	@$(PINS) $(PINS_ARGS) pyproject.toml -c requirements/cpu.in -o requirements/base.txt
-	@$(PINS) $(PINS_ARGS) pyproject.toml --group dev -c requirements/base.txt -o requirements/dev.txt
+	@$(PINS) $(PINS_ARGS) pyproject.toml --group dev -o requirements/dev.txt
 	@$(PINS) $(PINS_ARGS) --group docs -c requirements/dev.txt -o requirements/docs.txt
-	@$(PINS) $(PINS_ARGS) pyproject.toml --extra cuda12 -o requirements/gpu.txt
+	@$(PINS) $(PINS_ARGS) pyproject.toml --extra cuda12 -c requirements/dev.txt -o requirements/gpu.txt
 	@if grep -E -n '://|--(extra-)?(index-url|find-links)' requirements/*.txt; then echo "pins must carry no address" >&2; exit 1; fi
 
 clean: ## Remove what make built (not runs/)
@@ -74,9 +74,13 @@ clean: ## Remove what make built (not runs/)
 	@uv --version >/dev/null 2>&1 || $(MAKE) --no-print-directory .uv/bin/uv
 	@$(UV) venv --quiet --python "$(PYTHON)" .venv
 
-# dev holds all of base, at the same versions.
+# dev holds all of gpu but CUDA, at the same versions, so that either may follow the other. base has an older JAX
+# (requirements/cpu.in), which dev gives way to where there is no GPU.
+INSTALL = $(UV) pip install --quiet --compile-bytecode --python .venv --require-hashes
+$(STAMPS)/dev: requirements/base.txt
 $(STAMPS)/%: requirements/%.txt pyproject.toml | .venv/bin/python
 	@echo "installing requirements/$*.txt into .venv/"
-	@$(UV) pip install --quiet --compile-bytecode --python .venv --require-hashes -r requirements/$*.txt
+	@$(INSTALL) -r requirements/$*.txt
+	@$(if $(filter dev-base,$*-$(ACCELERATOR)),$(INSTALL) -r requirements/base.txt)
 	@$(UV) pip install --quiet --python .venv --no-deps -e .
 	@mkdir -p $(STAMPS) && touch $@

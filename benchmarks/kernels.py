@@ -75,8 +75,8 @@ def report(name: str, call: Callable[[], Any], turns: int, rows: int, in_order: 
         print(f"  {nanoseconds / turns / 1e3:10.1f} us  {launches[kernel] / turns:7.1f} x  {kernel[:90]}")
     of_turn = len(events) // turns
     of_one = events[turns // 2 * of_turn :][:of_turn]
-    for begun, duration, kernel in of_one if in_order else ():
-        print(f"  at {(begun - of_one[0][0]) / 1e3:8.1f} us for {duration / 1e3:7.1f} us  {kernel[:90]}")
+    for at, duration, kernel in of_one if in_order else ():
+        print(f"  at {(at - of_one[0][0]) / 1e3:8.1f} us for {duration / 1e3:7.1f} us  {kernel[:90]}")
     sys.stdout.flush()
 
 

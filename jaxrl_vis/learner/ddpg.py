@@ -134,6 +134,22 @@ def _with_counts(train: TrainState, counts: jax.Array) -> TrainState:
     )
 
 
+def _copies_of(networks: Networks, train: TrainState) -> ComputeCopies:
+    """All four networks as they are computed with."""
+    return ComputeCopies(*map(networks.compute_copy, _networks_of(train)))
+
+
+def _begin(networks: Networks, train: TrainState, held: bool) -> Working:
+    """`Algorithm.begin`."""
+    return Working(
+        train=train,
+        copies=_copies_of(networks, train),
+        scaling=networks.batch_scaling(train),
+        counts=_counts_of(train),
+        held=train.critic if held else None,
+    )
+
+
 def _apply(state: TrainState, counts: jax.Array, gradients: Gradients, config: Config) -> TrainState:
     """One step of both optimisers, and the targets a little after the online networks; ``counts`` include this step."""
     corrections = adam.corrections(counts[:2])
@@ -200,9 +216,6 @@ def make_ddpg(
     learning = Objectives(networks, config, resolved, auxiliary, shards)
     keeps_state, held = auxiliary.weighting.name != "none", auxiliary.weighting.held
 
-    def copies_of(train: TrainState) -> ComputeCopies:
-        return ComputeCopies(*map(networks.compute_copy, _networks_of(train)))
-
     def gradients(working: Working, batch: Batch, with_actor: bool = True) -> tuple[Gradients, Metrics]:
         train = working.train
         now = ComputeCopies(*map(networks.with_compute_copy, _networks_of(train), working.copies))
@@ -247,25 +260,16 @@ def make_ddpg(
         train = _apply(working.train, counts, chosen, config)
         if latent_reward is not None:
             train = train.replace(autoencoder=latent_reward.apply(train.autoencoder, chosen.autoencoder))
-        working = working._replace(train=train, copies=copies_of(train), counts=counts)
+        working = working._replace(train=train, copies=_copies_of(networks, train), counts=counts)
         if not held:
             return working
         is_new = train.weighting.updates % auxiliary.weighting.interval == 0
         kept = jax.tree.map(lambda now, before: jnp.where(is_new, now, before), train.critic, working.held)
         return working._replace(held=kept)
 
-    def begin(train: TrainState) -> Working:
-        return Working(
-            train=train,
-            copies=copies_of(train),
-            scaling=networks.batch_scaling(train),
-            counts=_counts_of(train),
-            held=train.critic if held else None,
-        )
-
     return Algorithm(
         init=lambda key: _start(networks, auxiliary, latent_reward, key),
-        begin=begin,
+        begin=lambda train: _begin(networks, train, held),
         gradients=gradients,
         apply=apply,
         end=lambda working: _with_counts(working.train, working.counts),
