@@ -49,7 +49,7 @@ class Episodes(Replaceable):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class ReplayState(Replaceable):
-    """A ring of N episodes. Same arrays as `Episodes` with E = N, but for the packing of images (`replay`).
+    """A ring of N episodes. Same arrays as `Episodes` with E = N, but for images: packed, and one for each instant (`replay`).
 
     Attributes:
         episodes: [N, ...] storage; the part that was never written is zero.

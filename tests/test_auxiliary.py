@@ -92,7 +92,7 @@ def learner(**overrides):
 
     @functools.partial(jax.jit, static_argnums=2)
     def update(working, batch, with_actor=True):
-        gradients, metrics = algorithm.gradients(working, batch, with_actor)
+        gradients, metrics = algorithm.gradients(working, algorithm.prepare(working, batch), with_actor)
         return algorithm.apply(working, gradients), gradients, metrics
 
     batch = chosen_batch(stored(auxiliary.keeps_flow), drawn_places(), jax.random.key(2))

@@ -225,7 +225,8 @@ algorithm = ddpg.make_ddpg(networks, config, resolved)
 def one_step(key):
     images = jnp.zeros((3, 2, 1, 16, 16), jnp.uint8)
     batch = Batch(images, jnp.zeros((2, 2)), jnp.zeros((2, 2)), jnp.zeros((2, 2)), jnp.zeros(2), targets=Targets())
-    gradients, metrics = algorithm.gradients(algorithm.begin(algorithm.init(key)), batch)
+    working = algorithm.begin(algorithm.init(key))
+    gradients, metrics = algorithm.gradients(working, algorithm.prepare(working, batch), True)
     assert metrics["train/loss/latent_size"].shape == ()
     return gradients
 

@@ -201,7 +201,8 @@ def make_learner(config: Config) -> TrainState:
 def gradients(config: Config, shards: Shards, train: TrainState, batch: Batch) -> Any:
     """Gradients and metrics."""
     algorithm = make_algorithm(config, shards)
-    return algorithm.gradients(algorithm.begin(train), batch, True)
+    working = algorithm.begin(train)
+    return algorithm.gradients(working, algorithm.prepare(working, batch), True)
 
 
 def make_batch(config: Config) -> Batch:

@@ -31,7 +31,7 @@ def test_relabelled_goals_are_what_was_reached_standing_still():
     before = 10 * np.arange(ENVS)[:, None] + np.maximum(slots - 1, 0)
     before[:, -1] = newest[:, -1]  # the goal that was given stands still
     frames = np.broadcast_to(np.stack([newest, before], axis=2)[..., None, None], (ENVS, horizon + 2, 2, 4, 4))
-    replay = make_replay(ENVS * horizon, ENVS, horizon)
+    replay = make_replay(ENVS * horizon, ENVS, horizon, frame_stack=2)
     rollout = Episodes(
         jnp.asarray(frames, jnp.uint8), jnp.zeros((ENVS, horizon + 2, 2)), jnp.zeros((ENVS, horizon, env.action_size))
     )
@@ -40,9 +40,11 @@ def test_relabelled_goals_are_what_was_reached_standing_still():
     config = preset("debug", method="indicator")
     sampler = Sampler(config, resolve(config, horizon), replay, env.threshold, env.as_goal)
     choice = Choice(Indices(episode, time), goal_slot)
-    batch, still = replay.gather(state, choice.indices, choice.goal_slot), sampler.batch(state, choice)
-    np.testing.assert_array_equal(still.observation_t, batch.observation_t)
-    np.testing.assert_array_equal(still.observation_tp1, batch.observation_tp1)
+    still = sampler.batch(state, choice)
+    np.testing.assert_array_equal(still.observation_t, frames[episode, time])
+    np.testing.assert_array_equal(still.observation_tp1, frames[episode, time + 1])
+    np.testing.assert_array_equal(replay.stacked(state), frames)
+    assert state.episodes.observations.nbytes == frames.size // 2  # each image once, a byte a pixel
     for row in range(len(time)):
         e, t, g = int(episode[row]), int(time[row]), int(goal_slot[row])
         np.testing.assert_array_equal(still.goal[row], env.as_goal(frames[e, g].astype(np.uint8)))
@@ -82,10 +84,11 @@ def program(frame_stack: int = 2):
     config = preset("debug", method="indicator_balance_filter", relabel_probability=1.0, **SETTINGS)
     env = Walker(frame_stack)
 
-    def look(gradients, working, batch, with_actor):
+    def look(gradients, working, prepared, with_actor):
+        batch = prepared.batch
         goal, after = (images.reshape(len(batch.reward), frame_stack, -1) for images in (batch.goal, batch.observation_tp1))
         arrived = jnp.all(goal[:, 0] == after[:, 0], axis=-1)
-        return gradients(working, batch, with_actor)[0], {
+        return gradients(working, prepared, with_actor)[0], {
             "goals_that_stand_still": jnp.mean(jnp.all(goal == goal[:, :1], axis=(1, 2))),
             "observations_that_move": jnp.mean(jnp.any(after != after[:, :1], axis=(1, 2))),
             "arrived": jnp.mean(arrived),

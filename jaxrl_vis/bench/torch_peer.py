@@ -25,7 +25,6 @@ from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import normalizer
 from jaxrl_vis.learner.ddpg import make_ddpg
-from jaxrl_vis.learner.replay import unpack
 from jaxrl_vis.learner.sampling import Choice, Sampler
 from jaxrl_vis.learner.train_step import TrainStep
 from jaxrl_vis.types import ReplayState, TrainState
@@ -88,7 +87,7 @@ def unalike(train: TrainState, program: TrainStep, replay: ReplayState) -> Train
     """
     networks, target_key = program.networks, jax.random.key(7)
     fresh = {"actor": networks.init_actor(target_key), "critic": networks.init_critic(target_key)}
-    images = unpack(replay.episodes.observations[:4])
+    images = program.replay.stacked(jax.tree.map(lambda leaf: leaf[:4] if leaf.ndim else leaf, replay))
     changes: dict[str, Any] = {
         f"target_{name}": {part: tree[part] for part in getattr(train, f"target_{name}")} for name, tree in fresh.items()
     }
@@ -125,7 +124,7 @@ def reference(program: TrainStep, train: TrainState, replay: ReplayState) -> Ref
     def step(with_actor: bool, train: TrainState, replay: ReplayState, choice: Choice) -> tuple[TrainState, jax.Array, Any]:
         working = algorithm.begin(train)
         # The actor's gradient is compared in every step, and taken where it is its turn.
-        gradients, metrics = algorithm.gradients(working, sampler.batch(replay, choice), True)
+        gradients, metrics = algorithm.gradients(working, algorithm.prepare(working, sampler.batch(replay, choice)), True)
         losses = jnp.stack([metrics["train/critic_loss"], metrics["train/actor_loss"]])
         taken = gradients if with_actor else gradients._replace(actor=None)
         return algorithm.end(algorithm.apply(working, taken)), losses, gradients
@@ -209,13 +208,12 @@ class _Peer:
         self._program, self._train = program, train
         self.reference = reference(program, train, replay)
         episodes = replay.episodes
-        self._episodes = [np.asarray(leaf) for leaf in (episodes.observations, episodes.states, episodes.actions)]
+        leaves = program.replay.stacked(replay), episodes.states, episodes.actions
+        self._episodes = [np.asarray(leaf) for leaf in leaves]
 
     def replay(self, encoder: str) -> Any:
         """Our replay as a `torch_learner.Replay`."""
-        words, *rest = self._episodes
-        images = words.view(np.uint8)  # four pixels a word, in order, where they are packed
-        return self._module.Replay(images, *rest, self._rules(encoder, "float32"), self.device)
+        return self._module.Replay(*self._episodes, self._rules(encoder, "float32"), self.device)
 
     def _rules(self, encoder: str, dtype: str) -> Any:
         return _rules(self._module, self._program, self._train, encoder, getattr(self._torch, dtype))

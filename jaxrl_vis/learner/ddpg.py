@@ -1,5 +1,6 @@
 """Deep deterministic policy gradient with goals (Lillicrap et al., 2016), one gradient step as pure functions.
 
+    prepare      what the networks read of a batch, which nothing that is learned changes
     gradients    losses of a batch, main and auxiliary, and one weighted gradient for each network
     apply        optimisers, then target networks
 
@@ -21,7 +22,7 @@ from jaxrl_vis.config import Config
 from jaxrl_vis.learner import adam, diagnostics, normalizer
 from jaxrl_vis.learner.auxiliary import Auxiliary, make_auxiliary
 from jaxrl_vis.learner.latent_reward import LatentReward, make_latent_reward
-from jaxrl_vis.learner.networks import BatchScaling, Networks
+from jaxrl_vis.learner.networks import BatchScaling, Inputs, Networks
 from jaxrl_vis.learner.objectives import ComputeCopies, Objectives
 from jaxrl_vis.learner.shards import ONE, Shards
 from jaxrl_vis.learner.weighting import MAIN, Weighted, WeightingState
@@ -53,6 +54,20 @@ class Working(NamedTuple):
     held: Params = None
 
 
+class Prepared(NamedTuple):
+    """A batch as `Algorithm.gradients` takes it.
+
+    Attributes:
+        batch: With rewards.
+        inputs: Its observations as the encoders read them.
+        image: [B, C, H, W] its observations before the action, normalised, where an auxiliary task asks for them; else None.
+    """
+
+    batch: Batch
+    inputs: Inputs
+    image: jax.Array | None = None
+
+
 class Gradients(NamedTuple):
     """What a batch changes.
 
@@ -74,7 +89,8 @@ class Algorithm(NamedTuple):
     Attributes:
         init: key -> TrainState.
         begin: TrainState -> Working, before the first of several gradient steps.
-        gradients: (Working, Batch with rewards, whether for the actor, too) -> (Gradients, metrics of [] float32).
+        prepare: (Working, Batch with rewards) -> Prepared, the same for every gradient step after one `begin`.
+        gradients: (Working, Prepared, whether for the actor, too) -> (Gradients, metrics of [] float32).
         apply: (Working, Gradients) -> Working, after one gradient step.
         end: Working -> TrainState.
         value_at_goals: (TrainState, goals [E, ...]) -> [] float32, the mean value of the policy's actions where the goal itself
@@ -83,7 +99,8 @@ class Algorithm(NamedTuple):
 
     init: Callable[[jax.Array], TrainState]
     begin: Callable[[TrainState], Working]
-    gradients: Callable[[Working, Batch, bool], tuple[Gradients, Metrics]]
+    prepare: Callable[[Working, Batch], Prepared]
+    gradients: Callable[[Working, Prepared, bool], tuple[Gradients, Metrics]]
     apply: Callable[[Working, Gradients], Working]
     end: Callable[[Working], TrainState]
     value_at_goals: Callable[[TrainState, jax.Array], jax.Array]
@@ -216,18 +233,20 @@ def make_ddpg(
     learning = Objectives(networks, config, resolved, auxiliary, shards)
     keeps_state, held = auxiliary.weighting.name != "none", auxiliary.weighting.held
 
-    def gradients(working: Working, batch: Batch, with_actor: bool = True) -> tuple[Gradients, Metrics]:
-        train = working.train
-        now = ComputeCopies(*map(networks.with_compute_copy, _networks_of(train), working.copies))
+    def prepare(working: Working, batch: Batch) -> Prepared:
+        image = None
+        if "image" in auxiliary.needs:
+            image = networks.normalize(working.scaling.observations, batch.observation_t, batch.shift)
         # Before, goal, after, moved: the online networks read the first two, their targets the second and third.
-        inputs = networks.prepare_batch(working.scaling, batch)
+        return Prepared(batch, networks.prepare_batch(working.scaling, batch), image)
+
+    def gradients(working: Working, prepared: Prepared, with_actor: bool = True) -> tuple[Gradients, Metrics]:
+        train, (batch, inputs, image) = working.train, prepared
+        now = ComputeCopies(*map(networks.with_compute_copy, _networks_of(train), working.copies))
         rewarded = None if latent_reward is None else latent_reward.of_batch(train, inputs, batch)
         if rewarded is not None:
             batch = batch.replace(reward=rewarded.reward)
         assert batch.reward is not None
-        image = None
-        if "image" in auxiliary.needs:
-            image = networks.normalize(working.scaling.observations, batch.observation_t, batch.shift)
         found = learning.of_critic(now, train.weighting, inputs, image, batch, working.held)
         latents, value, keep = found.extra
         counts = diagnostics.count_rewards(
@@ -270,6 +289,7 @@ def make_ddpg(
     return Algorithm(
         init=lambda key: _start(networks, auxiliary, latent_reward, key),
         begin=lambda train: _begin(networks, train, held),
+        prepare=prepare,
         gradients=gradients,
         apply=apply,
         end=lambda working: _with_counts(working.train, working.counts),

@@ -5,7 +5,9 @@
                    |                +-- four pixels (uint8) a word: XLA copies element by element, whatever their size
                    +-- rollouts of E episodes, one after the other; N is a multiple of E
 
-Images whose width four does not divide, and state vectors, are kept as they are.
+Images whose width four does not divide, and state vectors, are kept as they are. Where observations stack the images of the
+latest control steps, the newest one of each is kept: the others are in the slots before it, or in slot 0 where the episode
+began. A goal stands still, so that all its images are one.
 
 A rollout is written as one contiguous slice. The place follows from the iteration, which all seeds share, so that under `vmap`
 over seeds it stays a slice and does not become a scatter. Samples are drawn from the newest ``size`` episodes.
@@ -43,12 +45,6 @@ def unpack(observations: jax.Array) -> jax.Array:
     return jax.lax.bitcast_convert_type(observations, jnp.uint8).reshape(*shape, words * _WORD)
 
 
-def _packed(episodes: Episodes) -> Episodes:
-    """Episodes as they are stored."""
-    flow = None if episodes.flow is None else pack(episodes.flow)
-    return episodes.replace(observations=pack(episodes.observations), flow=flow)
-
-
 class Indices(NamedTuple):
     """Where B transitions lie: [B] int32 each.
 
@@ -68,11 +64,13 @@ class Replay(NamedTuple):
         num_rollouts: Rollouts that the ring holds.
         num_envs: E, episodes in a rollout.
         horizon: T.
+        frame_stack: F, images that an observation stacks along C, the newest first; 1 for state vectors.
     """
 
     num_rollouts: int
     num_envs: int
     horizon: int
+    frame_stack: int = 1
 
     @property
     def num_episodes(self) -> int:
@@ -92,9 +90,11 @@ class Replay(NamedTuple):
         """
         episodes, horizon = self.num_episodes, self.horizon
         flow = pack(jnp.zeros((episodes, horizon, *observation.shape[-2:]), jnp.uint8)) if with_flow else None
+        first, *others = observation.shape
+        kept = (episodes, horizon + 2, first // self.frame_stack, *others)
         return ReplayState(
             episodes=Episodes(
-                observations=pack(jnp.zeros((episodes, horizon + 2, *observation.shape), observation.dtype)),
+                observations=pack(jnp.zeros(kept, observation.dtype)),
                 states=jnp.zeros((episodes, horizon + 2, goal_state_size), jnp.float32),
                 actions=jnp.zeros((episodes, horizon, action_size), jnp.float32),
                 flow=flow,
@@ -108,9 +108,14 @@ class Replay(NamedTuple):
         """Shapes and dtypes of the storage, without allocating it; arguments as of `init`."""
         return jax.eval_shape(lambda: self.init(observation, goal_state_size, action_size, with_flow))
 
+    def _stored(self, rollout: Episodes) -> Episodes:
+        """Episodes as they are stored."""
+        newest = rollout.observations[:, :, : rollout.observations.shape[2] // self.frame_stack]
+        return rollout.replace(observations=pack(newest), flow=None if rollout.flow is None else pack(rollout.flow))
+
     def of_rollout(self, rollout: Episodes) -> ReplayState:
         """A replay of one rollout that holds just these E episodes."""
-        return ReplayState(episodes=_packed(rollout), size=jnp.full((), self.num_envs, jnp.int32))
+        return ReplayState(episodes=self._stored(rollout), size=jnp.full((), self.num_envs, jnp.int32))
 
     def insert(self, state: ReplayState, rollout: Episodes, iteration: jax.Array) -> ReplayState:
         """Writes the E episodes of a rollout, over the oldest ones once the ring is full.
@@ -124,7 +129,7 @@ class Replay(NamedTuple):
         episodes = jax.tree.map(
             lambda storage, new: jax.lax.dynamic_update_slice_in_dim(storage, new, start, axis=0),
             state.episodes,
-            _packed(rollout),
+            self._stored(rollout),
         )
         return ReplayState(episodes=episodes, size=jnp.minimum(state.size + self.num_envs, self.num_episodes))
 
@@ -160,7 +165,7 @@ class Replay(NamedTuple):
             goal_episode: [B] int32, whose slots those are; None: of the transitions' own episodes.
 
         Returns:
-            The transitions, without rewards.
+            The transitions, without rewards; of stacked images the goal's stand still.
         """
         observations, states, actions = state.episodes.observations, state.episodes.states, state.episodes.actions
         episode, time = indices
@@ -168,11 +173,29 @@ class Replay(NamedTuple):
         slots = jnp.stack([time, goal_slot, last])
         goal_episode = episode if goal_episode is None else goal_episode
         return Batch(
-            observations=unpack(observations[jnp.stack([episode, goal_episode, episode]), slots]),
+            observations=self._observed(observations, jnp.stack([episode, goal_episode, episode]), slots),
             action=actions[episode, time],
             state_tp1=states[episode, time + 1],
             goal_state=states[goal_episode, goal_slot],
         )
+
+    def _observed(self, stored: jax.Array, episodes: jax.Array, slots: jax.Array) -> jax.Array:
+        """Observations [3, B, ...] before, of the goal and after, of these slots [3, B]."""
+        if self.frame_stack == 1:
+            return unpack(stored[episodes, slots])
+        ago = jnp.arange(self.frame_stack) * jnp.array([[[1]], [[0]], [[1]]])
+        images = unpack(stored[episodes[..., None], jnp.maximum(slots[..., None] - ago, 0)])
+        return images.reshape(*slots.shape, -1, *images.shape[-2:])
+
+    def stacked(self, state: ReplayState) -> jax.Array:
+        """All observations of the episodes as they were collected, [N, T+2, ...]."""
+        images = unpack(state.episodes.observations)
+        if self.frame_stack == 1:
+            return images
+        slots = jnp.arange(self.horizon + 2)
+        ago = jnp.arange(self.frame_stack) * (slots[:, None] <= self.horizon)
+        images = images[:, jnp.maximum(slots[:, None] - ago, 0)]
+        return images.reshape(*images.shape[:2], -1, *images.shape[-2:])
 
     def flow(self, state: ReplayState, indices: Indices) -> jax.Array:
         """The optical flow of transitions, as episodes have it: [B, H, W] uint8."""
@@ -180,15 +203,16 @@ class Replay(NamedTuple):
         return unpack(state.episodes.flow[indices.episode, indices.time])
 
 
-def make_replay(transitions: int, num_envs: int, horizon: int) -> Replay:
+def make_replay(transitions: int, num_envs: int, horizon: int, frame_stack: int = 1) -> Replay:
     """A replay of at least ``transitions`` transitions, rounded up to whole rollouts; nothing is allocated yet.
 
     Args:
         transitions: Least number of transitions to hold.
         num_envs: E, episodes in a rollout.
         horizon: T, control steps in an episode.
+        frame_stack: F, images that an observation stacks.
     """
-    return Replay(num_rollouts=max(1, math.ceil(transitions / (num_envs * horizon))), num_envs=num_envs, horizon=horizon)
+    return Replay(max(1, math.ceil(transitions / (num_envs * horizon))), num_envs, horizon, frame_stack)
 
 
 def num_bytes(spec: ReplayState) -> int:

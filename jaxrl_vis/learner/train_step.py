@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from jaxrl_vis.config import Config
 from jaxrl_vis.learner import normalizer
 from jaxrl_vis.learner.auxiliary import Auxiliary, make_auxiliary
-from jaxrl_vis.learner.ddpg import Algorithm, Working, make_ddpg
+from jaxrl_vis.learner.ddpg import Algorithm, Prepared, Working, make_ddpg
 from jaxrl_vis.learner.evaluate import make_evaluate
 from jaxrl_vis.learner.networks import Networks
 from jaxrl_vis.learner.replay import Replay, make_replay, num_bytes
@@ -31,7 +31,7 @@ from jaxrl_vis.learner.sampling import Choice, Sampler
 from jaxrl_vis.learner.sharding import Layout, make_layout
 from jaxrl_vis.learner.shards import Shards
 from jaxrl_vis.resolved import Resolved, resolve
-from jaxrl_vis.types import Batch, Episodes, LoopState, Metrics, ReplayState, TrainState
+from jaxrl_vis.types import Episodes, LoopState, Metrics, ReplayState, TrainState
 from jaxrl_vis.validation import validate
 from jaxrl_vis_envs.base import GoalEnv
 from jaxrl_vis_envs.compilation import env_jit
@@ -112,30 +112,36 @@ def _make_update_many(config: Config, sampler: Sampler, algorithm: Algorithm):
     def update_many(train: TrainState, replay: ReplayState, key: jax.Array, iteration: jax.Array) -> tuple[TrainState, Metrics]:
         names: list[str] = []
 
-        def updates(state: tuple[Working, Batch], following: Choice) -> tuple[tuple[Working, Batch], jax.Array]:
+        def updates(state: tuple[Working, Prepared], following: Choice) -> tuple[tuple[Working, Prepared], jax.Array]:
             """Updates of which the last one is the actor's, too; unrolled, so that the loop's body has no conditional.
 
-            Each has its batch already, and reads the next one's. A GPU does that while it computes; with its own batch it would
-            have to begin with it.
+            Each has its batch already, and reads and prepares the next one. A GPU does that while it computes; with its own
+            batch it would have to begin with it.
             """
-            (working, batch), found = state, []
+            (working, prepared), found = state, []
             for number in range(interval):
-                gradients, metrics = algorithm.gradients(working, batch, number == interval - 1)
-                working = algorithm.apply(working, gradients)
-                batch = sampler.batch(replay, jax.tree.map(lambda leaf, number=number: leaf[number], following))
+                coming = read(working, jax.tree.map(lambda leaf, number=number: leaf[number], following))
+                # Before all else: where XLA puts it last, it writes over the batch before, which is in use until then.
+                working, coming = jax.lax.optimization_barrier((working, coming))
+                gradients, metrics = algorithm.gradients(working, prepared, number == interval - 1)
+                working, prepared = algorithm.apply(working, gradients), coming
                 found.append(metrics)
             names[:] = found[-1]
             # As one vector, because writing each number by itself would be a kernel each.
             metrics = jnp.stack([_mean([each[name] for each in found if name in each]) for name in names])
-            return (working, batch), metrics
+            return (working, prepared), metrics
+
+        def read(working: Working, choice: Choice) -> Prepared:
+            return algorithm.prepare(working, sampler.batch(replay, choice))
 
         # What all updates learn from is chosen at once: in the loop, drawing numbers would be a dozen tiny kernels an update.
         keys = jax.random.split(key, config.updates_per_iteration)
         choices = jax.vmap(lambda update_key: sampler.choose(replay, update_key, iteration))(keys)
-        batch = sampler.batch(replay, jax.tree.map(lambda leaf: leaf[0], choices))
+        working = algorithm.begin(train)
+        prepared = read(working, jax.tree.map(lambda leaf: leaf[0], choices))
         # After the last one comes the first one again, for nobody.
         following = jax.tree.map(lambda leaf: jnp.roll(leaf, -1, axis=0).reshape(-1, interval, *leaf.shape[1:]), choices)
-        (working, _), metrics = jax.lax.scan(updates, (algorithm.begin(train), batch), following)
+        (working, _), metrics = jax.lax.scan(updates, (working, prepared), following)
         return algorithm.end(working), dict(zip(names, jnp.mean(metrics, axis=0), strict=True))
 
     return update_many
@@ -238,10 +244,11 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None) 
     networks = Networks(config, env.observation_spec, env.action_size, resolved.critic_output_bias)
     auxiliary = make_auxiliary(config, env.observation_spec, env.action_size, env.frame_stack, networks.dtype)
     algorithm = make_ddpg(networks, config, resolved, auxiliary, shards)
-    replay = make_replay(config.replay_transitions, config.num_envs, env.horizon)
+    stacked = env.frame_stack if networks.sees_images else 1
+    replay = make_replay(config.replay_transitions, config.num_envs, env.horizon, stacked)
     replay = replay._replace(num_envs=config.num_envs // shards.count)
     replay_spec = replay.spec(env.observation_spec, env.goal_state_size, env.action_size, auxiliary.keeps_flow)
-    sampler = Sampler(config, resolved, replay, env.threshold, env.as_goal if env.frame_stack > 1 else None, auxiliary, shards)
+    sampler = Sampler(config, resolved, replay, env.threshold, env.as_goal if stacked > 1 else None, auxiliary, shards)
     insert = _make_insert(config, sampler, auxiliary)
     update_many = _make_update_many(config, sampler, algorithm)
     learn = _make_learn(insert, update_many, algorithm, shards)

@@ -84,8 +84,6 @@ class Programs:
     def shows_images(self) -> bool:
         """Whether what the robot sees can be shown in a video."""
         _, episodes, slots, *image = jax.eval_shape(self.layout.unfolded, self.shapes.replay).episodes.observations.shape
-        if len(image) == 3:  # of stacked images the newest is shown
-            image[0] //= self.env.frame_stack
         return videos.shows_images((episodes, slots, *image))
 
     @property
