@@ -56,10 +56,10 @@ def compiler_options(backend: str | None = None, *, runs_once: bool = False) -> 
         return {"xla_gpu_command_buffer_scheduling_mode": "CONCURRENT"}
     if backend != "cpu":
         return {}
-    options: dict[str, Any] = {"xla_backend_optimization_level": 0} if runs_once else {}
+    options: dict[str, Any] = {"xla_cpu_experimental_ynn_fusion_type": ""}
     if jax.__version_info__ < (0, 11):
-        options |= {"xla_cpu_use_fusion_emitters": False, "xla_cpu_experimental_ynn_fusion_type": ""}
-    return options
+        options["xla_cpu_use_fusion_emitters"] = False
+    return options | ({"xla_backend_optimization_level": 0} if runs_once else {})
 
 
 def env_jit(function: Callable, *, runs_once: bool = False, **jit_options: Any) -> Any:

@@ -121,8 +121,6 @@ def _make_update_many(config: Config, sampler: Sampler, algorithm: Algorithm):
             (working, prepared), found = state, []
             for number in range(interval):
                 coming = read(working, jax.tree.map(lambda leaf, number=number: leaf[number], following))
-                # Before all else: where XLA puts it last, it writes over the batch before, which is in use until then.
-                working, coming = jax.lax.optimization_barrier((working, coming))
                 gradients, metrics = algorithm.gradients(working, prepared, number == interval - 1)
                 working, prepared = algorithm.apply(working, gradients), coming
                 found.append(metrics)
