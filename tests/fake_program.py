@@ -16,6 +16,7 @@ import numpy as np
 
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import Terminated
+from jaxrl_vis.learner.replay import make_replay
 from jaxrl_vis.learner.sharding import ONE_DEVICE
 from jaxrl_vis.run import metrics
 from jaxrl_vis.run.checkpoint import Checkpoints
@@ -43,6 +44,7 @@ class FakeProgram:
         self.num_iterations = math.ceil(config.env_steps / self.steps_per_iteration)
         episodes = math.ceil(config.replay_transitions / self.steps_per_iteration) * config.num_envs
         size = config.image_size
+        self.replay = make_replay(config.replay_transitions, config.num_envs, HORIZON)
         self.replay_bytes = episodes * ((HORIZON + 2) * (size * size + 3 * 4) + HORIZON * 4 * 4) + 4
 
         def init_one(key):

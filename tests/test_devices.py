@@ -1,6 +1,7 @@
 """What JAX computes on: told in one line where it is not there, and guessed where help must not wait for JAX."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -97,3 +98,16 @@ def test_a_gpu_without_its_packages_is_mended_by_the_extra(monkeypatch: pytest.M
 def test_sizes_are_all_in_one_unit() -> None:
     sizes = [show_bytes(count) for count in (0, 1000, 5 * 2**20, 2**27, 3 * 2**30, 2**45)]
     assert sizes == ["under 0.001 GiB", "under 0.001 GiB", "0.005 GiB", "0.1 GiB", "3.0 GiB", "32768.0 GiB"]
+
+
+@pytest.mark.parametrize("given", [{}, {"XLA_CLIENT_MEM_FRACTION": "0.5"}, {"XLA_PYTHON_CLIENT_MEM_FRACTION": "0.4"}])
+def test_training_claims_most_of_a_gpu_unless_told_how_much(given: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    names = ("XLA_CLIENT_MEM_FRACTION", "XLA_PYTHON_CLIENT_MEM_FRACTION")
+    for name in names:
+        monkeypatch.setenv(name, "")  # so that what is set here ends with the test
+        monkeypatch.delenv(name)
+    for name, value in given.items():
+        monkeypatch.setenv(name, value)
+    devices.claim_memory()
+    # JAX refuses to start with both.
+    assert {name: os.environ[name] for name in names if name in os.environ} == (given or {names[1]: "0.9"})

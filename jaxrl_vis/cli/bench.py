@@ -9,7 +9,7 @@ import tyro
 from jaxrl_vis.cli.checks import check_counts, check_env
 from jaxrl_vis.cli.parsing import ByPlaceToo
 from jaxrl_vis.config import Pixels
-from jaxrl_vis.devices import check_devices, count_devices
+from jaxrl_vis.devices import check_devices, claim_memory, count_devices
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.methods import AuxTaskName, WeightingName
 from jaxrl_vis.report.outputs import check_writable
@@ -103,6 +103,8 @@ def run(options: Bench) -> int:
     check_env(options.env)
     if options.json is not None:
         check_writable(options.json, "--json")
+    if options.benchmark == "train":
+        claim_memory()
     from jaxrl_vis import bench
     from jaxrl_vis.bench.record import user_folder
 

@@ -10,7 +10,7 @@ from jaxrl_vis import processes
 from jaxrl_vis.cli.checks import check_counts, check_env
 from jaxrl_vis.cli.parsing import ByPlaceToo, ChangesOf, SayDefault
 from jaxrl_vis.config import PRESETS, Config, preset
-from jaxrl_vis.devices import check_devices, count_devices, guess_accelerator, start_devices
+from jaxrl_vis.devices import check_devices, claim_memory, count_devices, guess_accelerator, start_devices
 from jaxrl_vis.errors import RequestError, nearest
 from jaxrl_vis.report.outputs import check_writable
 from jaxrl_vis.run import loggers
@@ -106,6 +106,7 @@ def training_config(options: Train) -> Config:
 def run(options: Train) -> int:
     """Trains; every report has already been shown and saved by the trainer."""
     check_counts(start_timeout=options.start_timeout)
+    claim_memory()
     place = processes.find_place(options.coordinator, options.num_processes, options.process_id)
     if place is not None:
         processes.start(place, options.start_timeout)

@@ -98,7 +98,8 @@ class RunLoop:
             self._say(f"nothing to resume in {self._folder.path}: starting at the beginning")
         steps = self._program.steps_per_iteration
         shapes, layout = self._programs.shapes, self._programs.layout
-        memory = check_memory(self._config, shapes, self._program.replay_bytes, steps, layout)
+        stacked = self._program.replay.frame_stack
+        memory = check_memory(self._config, shapes, self._program.replay_bytes, steps, layout, stacked)
         processes.meet("checked")  # before the first of them writes anything that the others would find
         with self._folder.lock() if self._writes else contextlib.nullcontext(), self._console:
             if goes_on and self._is_finished():

@@ -88,7 +88,12 @@ def _least_available(layout: Layout) -> int | None:
 
 
 def check_memory(
-    config: Config, loop_shapes: Any, replay_bytes: int, steps_per_iteration: int, layout: Layout = ONE_DEVICE
+    config: Config,
+    loop_shapes: Any,
+    replay_bytes: int,
+    steps_per_iteration: int,
+    layout: Layout = ONE_DEVICE,
+    frame_stack: int = 1,
 ) -> str:
     """Compares what a run needs on a device with what there is.
 
@@ -98,6 +103,7 @@ def check_memory(
         replay_bytes: Of one seed's replay.
         steps_per_iteration: Environment steps of one seed in an iteration; the replay's capacity is a multiple of it.
         layout: Where it runs.
+        frame_stack: Images that an observation stacks, of which the replay keeps one; rollouts and batches have all.
 
     Returns:
         A line for the reader, such as ``replay 0.3 GiB of 22.0 GiB``.
@@ -111,8 +117,9 @@ def check_memory(
     train = max(0, tree_bytes(loop_shapes) - replay_bytes * config.seeds) * share
     replay = replay_bytes * config.seeds * share / parts
     bytes_per_rollout = replay * steps_per_iteration / capacity
-    batch = bytes_per_rollout / steps_per_iteration * config.batch_size * 4
-    beside = train * (1 + _TRAIN_COPIES) + bytes_per_rollout * _ROLLOUT_COPIES + batch * _BATCH_COPIES + _SLACK_BYTES
+    collected = bytes_per_rollout * frame_stack
+    batch = collected / steps_per_iteration * config.batch_size * 4
+    beside = train * (1 + _TRAIN_COPIES) + collected * _ROLLOUT_COPIES + batch * _BATCH_COPIES + _SLACK_BYTES
     there, each = _least_available(layout), "" if layout.num_devices == 1 else " a device"
     if there is None:
         return f"replay {show_bytes(replay)}{each}"
