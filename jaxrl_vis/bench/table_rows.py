@@ -5,7 +5,7 @@ from typing import Any
 
 from jaxrl_vis.config import Config, preset
 
-DEVICES = {"H200": "NVIDIA H200 x1", "2 CPU cores": "AMD EPYC, 2 cores"}
+DEVICES = {"H100": "NVIDIA H100 80GB HBM3 x1", "H200": "NVIDIA H200 x1", "2 CPU cores": "AMD EPYC, 2 cores"}
 """Columns of the speed table, and the devices that their records name."""
 
 
@@ -69,10 +69,10 @@ class Learning:
 _IMAGES = "{image_size}x{image_size} {pixels}"
 
 
-def _environment(env: str, more: str = "") -> Speed:
+def _environment(env: str, more: str = "", gpu: str = "H100") -> Speed:
     text = f"{{value}} env-steps/s ({{envs:,}} environments, {_IMAGES})"
     figures = (Figure("env/steps", {"env": env}, text),)
-    return Speed(f"`bench env --env {env}`{more}", {"H200": figures, "2 CPU cores": figures})
+    return Speed(f"`bench env --env {env}`{more}", {gpu: figures, "2 CPU cores": figures})
 
 
 def _scene(size: int, pixels: str) -> Figure:
@@ -85,14 +85,19 @@ def _peer(name: str, peer: str, size: int) -> Figure:
     return Figure(name, config, f"{peer}: {{value}} images/s {_IMAGES} (batch {{images:,}})")
 
 
+def _update(text: str, config: dict[str, object]) -> Figure:
+    return Figure("update/gradient_steps", {"env": "VisualFetchReach", **config}, text)
+
+
+_NO_SHIFT: dict[str, object] = {"preset": "fast", "without": "random_shift"}
 _UPDATE = f"{{value}} updates/s (batch {{batch_size}}, {_IMAGES}, {{dtype}})"
 
 SPEED = (
     _environment("VisualFetchReach"),
-    _environment("VisualReacher"),
+    _environment("VisualReacher", gpu="H200"),
     _environment("VisualHandReach", ", 20 physics steps each"),
     _environment("VisualFingerTurn", ", 21 physics steps of 10 ms each, 3 stacked images"),
-    _environment("VisualSawyerReach"),
+    _environment("VisualSawyerReach", gpu="H200"),
     Speed(
         "`bench render --scene fetch_reach`: images of new poses ([more](docs/renderer.md))",
         {
@@ -116,13 +121,15 @@ SPEED = (
     Speed(
         "`bench update`: DDPG, replay included",
         {
-            "H200": (
-                Figure("update/gradient_steps", {"env": "VisualFetchReach"}, _UPDATE),
-                Figure(
-                    "update/gradient_steps",
-                    {"env": "VisualFetchReach"},
-                    "{roofline[gflop]:.1f} GFLOP and {moved_gib:.2f} GiB an update at the least, so "
-                    "{roofline[tflop_per_s]:.0f} TFLOP/s",
+            "H100": (
+                _update(
+                    "{value} updates/s (`fast` without shifted images; batch {batch_size}, 64x64 RGB-D, {dtype})", _NO_SHIFT
+                ),
+                _update("{value} of five learners together (`fast`)", {"preset": "fast", "seeds": 5}),
+                _update("{value} (`paper`'s networks)", {"preset": "paper", "image_size": 64}),
+                _update("{value} (`paper`, 100x100)", {"preset": "paper", "image_size": 100}),
+                _update(
+                    "at least {roofline[gflop]:.1f} GFLOP an update, so {roofline[tflop_per_s]:.0f} TFLOP/s (`fast`)", _NO_SHIFT
                 ),
             ),
             "2 CPU cores": (Figure("update/gradient_steps", {"env": "VisualFetchReach"}, _UPDATE),),

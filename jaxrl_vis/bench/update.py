@@ -1,5 +1,6 @@
 """Gradient steps alone, including sampling from the replay and relabelling; on request, PyTorch beside ours."""
 
+import dataclasses
 import math
 from collections.abc import Iterator
 from typing import Any
@@ -31,6 +32,13 @@ def training_config(settings: Settings, **overrides: Any) -> Config:
         overrides |= {"trivial_goals": 1.0, "random_shift": 0}  # the peer does neither
     own = "fast" if settings.on_accelerator else "cpu"
     return preset(settings.preset or own, env=settings.env, **overrides)
+
+
+def _left_out(settings: Settings, config: Config) -> dict[str, str]:
+    """For a record's configuration: what the preset does, and its gradient steps beside a peer do not."""
+    whole = training_config(dataclasses.replace(settings, peer=None))
+    names = [name for name in ("random_shift", "trivial_goals") if getattr(config, name) != getattr(whole, name)]
+    return {"without": " ".join(names)} if names else {}
 
 
 def fill_replay(replay: ReplayState, key: jax.Array) -> ReplayState:
@@ -127,6 +135,7 @@ def measure(settings: Settings) -> Iterator[Measurement]:
             "method": config.method,
             "batch_size": config.batch_size,
             "dtype": dtype,
+            **_left_out(settings, config),
             **settings.seeds_config(),
             **settings.auxiliary_config(),
         },
