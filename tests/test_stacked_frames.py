@@ -12,6 +12,7 @@ import jaxrl_vis_envs
 from jaxrl_vis.config import preset
 from jaxrl_vis.learner import train_step
 from jaxrl_vis.learner.ddpg import make_ddpg
+from jaxrl_vis.learner.environment import make_env
 from jaxrl_vis.learner.replay import Indices, make_replay
 from jaxrl_vis.learner.sampling import Choice, Sampler
 from jaxrl_vis.resolved import resolve
@@ -52,6 +53,18 @@ def test_relabelled_goals_are_what_was_reached_standing_still():
         # Reached where the goal is the very next image, though what was observed there shows that it moved.
         assert (still.reward[row] > 0) == (g == t + 1)
         assert not np.array_equal(still.goal[row], still.observation_tp1[row])
+
+
+def test_what_the_replay_puts_together_is_what_the_camera_saw():
+    """Episodes draw the images before anew, from joint positions; the replay takes those that it has. They are the same."""
+    config = preset("debug", env="VisualReacher", frame_stack=3, pixels="rgbd", **SETTINGS | {"image_size": 16})
+    made = train_step.make_train_step(make_env(config), config)
+    episodes, _ = made.rollout(made.init(jax.random.key(0)[None]).train, jax.random.key(1)[None])
+    episodes = jax.tree.map(lambda leaf: leaf[0], episodes)
+    seen = np.asarray(episodes.observations)
+    assert seen.shape == (ENVS, made.env.horizon + 2, 12, 16, 16)
+    assert np.any(seen[:, 1:-1, :4] != seen[:, 1:-1, 4:8], axis=(2, 3, 4)).mean() > 0.5  # the arm moves
+    np.testing.assert_array_equal(made.replay.stacked(made.replay.of_rollout(episodes)), seen)
 
 
 class Walker(Probe):

@@ -112,7 +112,8 @@ class GoalEnv(abc.ABC):
     def observe(self, state: State) -> jax.Array:
         """What the agent sees of ``state``: planar [C, H, W] uint8, or [S] float32 for the state variants.
 
-        Where images are stacked, C is F times the channels of one, and the newest comes first.
+        Where images are stacked, C is F times the channels of one, and the newest comes first. The others are the newest ones
+        of the observations before, or of the first one where the episode began: a replay keeps the newest alone.
         """
 
     def as_goal(self, frame: jax.Array) -> jax.Array:

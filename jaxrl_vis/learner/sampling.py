@@ -58,7 +58,7 @@ class Sampler:
         resolved: p2, R+ and R-.
         replay: What to read from.
         threshold: Of the oracle's reward, in the unit of the true states.
-        as_goal: [...] -> [...], makes a goal of an observation (`GoalEnv.as_goal`); None where an observation is one already.
+        as_goal: [...] -> [...], makes a goal of what was reached (`GoalEnv.as_goal`); None where an observation is one already.
         auxiliary: Whose targets batches carry.
         shards: Of the learner. ``replay`` is one part, and so are batches; the configuration's batch size is that of all.
     """
