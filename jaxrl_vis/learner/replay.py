@@ -170,32 +170,28 @@ class Replay(NamedTuple):
         observations, states, actions = state.episodes.observations, state.episodes.states, state.episodes.actions
         episode, time = indices
         last = jnp.minimum(time + steps, self.horizon) if steps > 1 else time + 1
-        slots = jnp.stack([time, goal_slot, last])
         goal_episode = episode if goal_episode is None else goal_episode
+        episodes, slots = jnp.stack([episode, goal_episode, episode]), jnp.stack([time, goal_slot, last])
         return Batch(
-            observations=self._observed(observations, jnp.stack([episode, goal_episode, episode]), slots),
+            observations=self._read(observations, episodes, slots, jnp.array([[False], [True], [False]])),
             action=actions[episode, time],
             state_tp1=states[episode, time + 1],
             goal_state=states[goal_episode, goal_slot],
         )
 
-    def _observed(self, stored: jax.Array, episodes: jax.Array, slots: jax.Array) -> jax.Array:
-        """Observations [3, B, ...] before, of the goal and after, of these slots [3, B]."""
+    def _read(self, stored: jax.Array, episodes: jax.Array, slots: jax.Array, stands_still: jax.Array) -> jax.Array:
+        """Observations [..., C, H, W] in slots [...] of episodes [...]; of what stands still, all images are the newest."""
         if self.frame_stack == 1:
             return unpack(stored[episodes, slots])
-        ago = jnp.arange(self.frame_stack) * jnp.array([[[1]], [[0]], [[1]]])
+        ago = jnp.where(stands_still[..., None], 0, jnp.arange(self.frame_stack))
         images = unpack(stored[episodes[..., None], jnp.maximum(slots[..., None] - ago, 0)])
         return images.reshape(*slots.shape, -1, *images.shape[-2:])
 
     def stacked(self, state: ReplayState) -> jax.Array:
         """All observations of the episodes as they were collected, [N, T+2, ...]."""
-        images = unpack(state.episodes.observations)
-        if self.frame_stack == 1:
-            return images
-        slots = jnp.arange(self.horizon + 2)
-        ago = jnp.arange(self.frame_stack) * (slots[:, None] <= self.horizon)
-        images = images[:, jnp.maximum(slots[:, None] - ago, 0)]
-        return images.reshape(*images.shape[:2], -1, *images.shape[-2:])
+        stored = state.episodes.observations
+        episodes, slots = jnp.indices(stored.shape[:2])
+        return self._read(stored, episodes, slots, slots > self.horizon)
 
     def flow(self, state: ReplayState, indices: Indices) -> jax.Array:
         """The optical flow of transitions, as episodes have it: [B, H, W] uint8."""
