@@ -66,7 +66,7 @@ def imported(clock: Clock, options: argparse.Namespace) -> Any:
     env = make_env(config)
     clock.lap("environment")
     enable_compilation_cache()
-    return Programs(config, make_train_step(env, config))
+    return Programs(config, make_train_step(env, config), keep=True)
 
 
 def parts(clock: Clock, options: argparse.Namespace) -> None:

@@ -15,6 +15,8 @@ os.environ["JAX_PLATFORMS"] = "cpu"
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(tempfile.gettempdir()) / f"jaxrl-vis-tests-{getpass.getuser()}"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.05")
 os.environ.setdefault("MPLBACKEND", "Agg")
+# Tests replace parts of the package, which programs that an earlier test has kept would not show.
+os.environ["JAXRL_VIS_KEEP_PROGRAMS"] = "0"
 # Where each operation was called from, all the way up, is a twentieth of what there is to compile.
 os.environ.setdefault("JAX_INCLUDE_FULL_TRACEBACKS_IN_LOCATIONS", "0")
 # Programs of tests run for a moment: optimising their machine code takes longer. What XLA makes of them before is the same.

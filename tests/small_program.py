@@ -7,17 +7,16 @@ import functools
 from jaxrl_vis.config import Config
 from jaxrl_vis.learner import train_step
 from jaxrl_vis.learner.environment import make_env
+from jaxrl_vis.run.kept_programs import HOST_FIELDS
 from jaxrl_vis_envs.base import GoalEnv
 from jaxrl_vis_envs.compilation import env_jit
 
 _TRACES: collections.Counter[Config] = collections.Counter()
-# What the host does with a run: nothing that is compiled knows of it.
-_OF_THE_HOST = ("env_steps", "eval_interval", "checkpoint_interval", "full_checkpoint_interval")
 
 
 def _trained_alike(config: Config) -> Config:
     defaults = Config()
-    return config.replace(**{name: getattr(defaults, name) for name in _OF_THE_HOST})
+    return config.replace(**{name: getattr(defaults, name) for name in HOST_FIELDS})
 
 
 @functools.cache

@@ -125,8 +125,14 @@ def run(options: Train) -> int:
     run_dir = options.run_dir or default_folder(config)
     check_there(run_dir, options.resume)
     check_writable(run_dir, "--run-dir", folder=True)
-    log = options.log or None
-    made = trainer.make_trainer(config, options.run_dir, resume=options.resume, overwrite=options.overwrite, log=log)
+    made = trainer.make_trainer(
+        config,
+        options.run_dir,
+        resume=options.resume,
+        overwrite=options.overwrite,
+        log=options.log or None,
+        keep_programs=True,
+    )
     for _ in made.run():
         pass
     return 0

@@ -8,6 +8,7 @@ import contextlib
 import functools
 import gc
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -18,6 +19,7 @@ from jaxrl_vis.config import Config
 from jaxrl_vis.devices import enable_compilation_cache
 from jaxrl_vis.report import videos
 from jaxrl_vis.run.arrays import to_host
+from jaxrl_vis.run.kept_programs import CompiledOfLeaves, KeptPrograms, fingerprint
 from jaxrl_vis.run.nonfinite import broken_leaves
 from jaxrl_vis.run.signals import shield_this_thread
 from jaxrl_vis.types import LoopState, Metrics, TrainState
@@ -27,6 +29,8 @@ from jaxrl_vis_envs.compilation import distrusted_kernels, tracing_for_default_d
 _EVALUATION_SEED = 2**31 - 1
 # What takes longest to compile comes first: it compiles while the others are traced.
 _NAMES = ("train_iteration", "evaluate", "init", "broken_leaves")
+# Those that take long to trace, and their options.
+_KEPT: dict[str, dict[str, Any]] = {"init": {"runs_once": True}, "train_iteration": {"donate_argnums": 0}, "evaluate": {}}
 # Of objects made since the last collection of garbage; Python's own default is 700.
 _OBJECTS_WHILE_TRACING = 100_000
 
@@ -42,12 +46,23 @@ def rarely_collecting_garbage() -> Iterator[None]:
         gc.set_threshold(*before)
 
 
+def _without_loop_states(results: Any) -> Any:
+    """Results of a program, with the leaves of each loop state, a list, in its place."""
+
+    def leaves(part: Any) -> Any:
+        return jax.tree.leaves(part) if isinstance(part, LoopState) else part
+
+    return jax.tree.map(leaves, results, is_leaf=lambda part: isinstance(part, LoopState))
+
+
 class Programs:
     """What a configuration executes. Nothing is compiled or allocated until it is called or `compile` is.
 
     Args:
         config: The run.
         program: What `jaxrl_vis.learner.train_step.make_train_step` returns, or anything with the same attributes.
+        keep: Keep on disk what was traced, and trace nothing that is kept there: `kept_programs` says when that is right. Only
+            where one device computes.
 
     Attributes:
         config: The run.
@@ -57,11 +72,13 @@ class Programs:
         seeds: The seeds, in the order of the seed axis.
     """
 
-    def __init__(self, config: Config, program: Any):
+    def __init__(self, config: Config, program: Any, keep: bool = False):
         self.config, self.program, self.env = config, program, program.env
         self.layout = program.layout
         self.seeds = range(config.seed, config.seed + config.seeds)
         self._compiled: dict[str, Any] = {}
+        self._kept: KeptPrograms | None = None
+        self._may_keep = keep and self.layout.mesh is None
 
     @functools.cached_property
     def run_keys(self) -> jax.Array:
@@ -104,14 +121,22 @@ class Programs:
 
     def _make(self, names: Sequence[str]) -> None:
         """Compiles programs, which then are `_compiled`."""
-        enable_compilation_cache()
+        cache = Path(enable_compilation_cache())
+        if self._may_keep and (found := fingerprint(self.config, self.env)):
+            self._kept = KeptPrograms(cache / "programs", found)
         try:
             with trusting_kernels():
                 self._compiled |= self._side_by_side(names)
         except Exception:
-            if not distrusted_kernels():
+            is_kept = self._kept is not None
+            if self._kept is not None:
+                self._kept.forget()
+            self._kept, self._may_keep = None, False
+            if not distrusted_kernels() and not is_kept:
                 raise
             self._compiled |= self._side_by_side(names)
+        if self._kept is not None:
+            self._kept.write()
 
     def _side_by_side(self, names: Sequence[str]) -> dict[str, Any]:
         # Tracing is Python and goes one by one; XLA compiles without the interpreter's lock, meanwhile.
@@ -120,7 +145,10 @@ class Programs:
             if "init" in names and not processes.are_several():
                 # Taking keys apart, as saving does, is a program, too.
                 to_host({"keys": self.run_keys, "evaluation": self.evaluation_key}, copy=True)
-            return {name: future.result() for name, future in futures.items()}
+            compiled = {name: future.result() for name, future in futures.items()}
+        if self._kept is None:
+            return compiled
+        return {name: self._of_trees(name, each) if name in _KEPT else each for name, each in compiled.items()}
 
     def _lower(self, name: str) -> Any:
         if name == "broken_leaves":
@@ -131,7 +159,22 @@ class Programs:
             "evaluate": (self.shapes.train, self.evaluation_key),
         }
         with tracing_for_default_device(), rarely_collecting_garbage():
-            return getattr(self.program, name).lower(*arguments[name])
+            function = getattr(self.program, name)
+            if self._kept is None:
+                return function.lower(*arguments[name])
+            return self._kept.lower(name, function, arguments[name], _without_loop_states, **_KEPT[name])
+
+    def _of_trees(self, name: str, compiled: Any) -> CompiledOfLeaves:
+        """A kept program as the program that it was traced from: its loop states are trees again, not lists."""
+        tree = jax.tree.structure(self.shapes)
+
+        def restored(part: Any) -> Any:
+            return jax.tree.unflatten(tree, part) if isinstance(part, list) else part
+
+        def restore(results: Any) -> Any:
+            return tuple(map(restored, results)) if isinstance(results, tuple) else restored(results)
+
+        return CompiledOfLeaves(compiled, restore)
 
     def compiled(self, name: str) -> Any:
         """One compiled program: ``init``, ``train_iteration``, ``evaluate`` or ``broken_leaves``."""

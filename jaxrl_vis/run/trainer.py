@@ -41,6 +41,7 @@ class Trainer:
         resume: Go on with the run in ``run_dir``.
         overwrite: Delete the run in ``run_dir`` and start again.
         log: Loggers that are told beside metrics.jsonl: ``tensorboard``, ``wandb``. None: those of the run that goes on.
+        keep_programs: Trace nothing that an earlier process has traced (`jaxrl_vis.run.kept_programs`).
 
     Attributes:
         config: The run.
@@ -58,8 +59,9 @@ class Trainer:
         resume: bool = False,
         overwrite: bool = False,
         log: Sequence[str] | None = None,
+        keep_programs: bool = False,
     ):
-        self.config, self.programs = config, Programs(config, program)
+        self.config, self.programs = config, Programs(config, program, keep_programs)
         self.env, self.seeds = self.programs.env, self.programs.seeds
         self.folder = RunFolder(default_folder(config) if run_dir is None else Path(run_dir))
         self._resume, self._overwrite = resume, overwrite
@@ -148,6 +150,7 @@ def make_trainer(
     resume: bool = False,
     overwrite: bool = False,
     log: Sequence[str] | None = None,
+    keep_programs: bool = False,
 ) -> Trainer:
     """Builds the environment and the programs of a configuration. Compiles, allocates and writes nothing.
 
@@ -157,6 +160,8 @@ def make_trainer(
         resume: Go on with the run in that folder; in an empty one it starts at the beginning, and says so.
         overwrite: Delete the run in that folder and start again.
         log: Loggers that are told beside metrics.jsonl: ``tensorboard``, ``wandb``. None: those of the run that goes on.
+        keep_programs: Trace nothing that an earlier process has traced. For processes that have replaced nothing in this
+            package's modules, which would not be seen (`jaxrl_vis.run.kept_programs`).
 
     Raises:
         RequestError: The configuration asks for something that cannot be, or contradicts the saved run.
@@ -172,4 +177,4 @@ def make_trainer(
             locate_env(config)  # imports MuJoCo, meanwhile
         check_devices()
     config = locate_env(config)
-    return Trainer(config, make_train_step(make_env(config), config), run_dir, resume, overwrite, log)
+    return Trainer(config, make_train_step(make_env(config), config), run_dir, resume, overwrite, log, keep_programs)

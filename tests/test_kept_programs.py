@@ -1,0 +1,182 @@
+"""Programs that an earlier process has traced: found again, equal, and only where nothing has changed."""
+
+import dataclasses
+import os
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+import small_program
+
+from jaxrl_vis import cli
+from jaxrl_vis.config import preset
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.learner.environment import make_env
+from jaxrl_vis.run import kept_programs, programs, trainer
+from jaxrl_vis.run.kept_programs import VARIABLE, fingerprint
+from jaxrl_vis.run.programs import Programs
+from jaxrl_vis_envs.compilation import env_jit, kernels
+
+CONFIG = preset("debug")
+NAMES = ("evaluate", "init", "train_iteration")
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch) -> Path:
+    """Where programs are kept, which nothing turns off."""
+    monkeypatch.setenv(VARIABLE, "1")
+    monkeypatch.setattr(programs, "enable_compilation_cache", lambda: str(tmp_path))
+    return tmp_path / "programs"
+
+
+@pytest.fixture(scope="module")
+def program():
+    return small_program.make_train_step(make_env(CONFIG), CONFIG)
+
+
+def untraceable(program, *names: str):
+    """The same program, except that functions cannot be traced."""
+
+    def refuse(*arguments):
+        raise AssertionError("traced")
+
+    return dataclasses.replace(program, **{name: env_jit(refuse) for name in names})
+
+
+def results(made: Programs) -> list[np.ndarray]:
+    """All that two iterations and an evaluation return."""
+    loop, first = made.train_iteration(made.init(made.run_keys))
+    loop, second = made.train_iteration(loop)
+    leaves = jax.tree.leaves((loop.replace(key=jax.random.key_data(loop.key)), first, second, made.evaluate(loop.train)))
+    return [np.asarray(leaf) for leaf in leaves]
+
+
+def assert_equal(found: list[np.ndarray], expected: list[np.ndarray]) -> None:
+    assert len(found) == len(expected)
+    assert all(np.array_equal(*pair, equal_nan=pair[0].dtype.kind == "f") for pair in zip(found, expected, strict=True))
+
+
+def names_in(folder: Path) -> list[str]:
+    return sorted(path.name.partition("-")[0] for path in folder.iterdir())
+
+
+def test_what_was_traced_once_is_not_traced_again_and_computes_the_same(folder, program):
+    straight = results(Programs(CONFIG, program))
+    assert not folder.exists()
+    first = Programs(CONFIG, program, keep=True)
+    first.compile()
+    assert names_in(folder) == list(NAMES)
+    assert_equal(results(first), straight)
+    again = Programs(CONFIG, untraceable(program, "train_iteration", "evaluate"), keep=True)
+    again.compile()
+    assert_equal(results(again), straight)
+    assert again.compile()["train_iteration"].memory_analysis().argument_size_in_bytes > 0
+    with pytest.raises(AssertionError, match="traced"):
+        Programs(CONFIG.replace(batch_size=8), untraceable(program, "train_iteration"), keep=True).compile()
+
+
+def test_damaged_and_unsuitable_programs_are_traced_anew(folder, program):
+    Programs(CONFIG, program, keep=True).compile()
+    files = {path.name.partition("-")[0]: path for path in folder.iterdir()}
+    good = {name: path.read_bytes() for name, path in files.items()}
+    files["train_iteration"].write_bytes(good["train_iteration"][:-100])
+    files["init"].write_bytes(b"")
+    Programs(CONFIG, program, keep=True).compile()
+    assert {path.name.partition("-")[0]: path.read_bytes() for path in folder.iterdir()} == good
+    files["train_iteration"].write_bytes(good["evaluate"])  # whole, but of something else
+    unsuitable = Programs(CONFIG, program, keep=True)
+    unsuitable.compile()
+    assert_equal(results(unsuitable), results(Programs(CONFIG, program)))
+    assert names_in(folder) == []
+    Programs(CONFIG, program, keep=True).compile()
+    assert names_in(folder) == list(NAMES)
+
+
+def test_a_folder_that_cannot_be_written_to_keeps_nothing_and_hinders_nothing(folder, program):
+    folder.write_text("a file")
+    Programs(CONFIG, program, keep=True).compile()
+    assert folder.read_text() == "a file"
+
+
+def test_the_oldest_programs_make_room(folder, program, monkeypatch):
+    folder.mkdir()
+    for age in range(5):
+        path = folder / f"init-{age}.stablehlo"
+        path.write_bytes(b"old")
+        os.utime(path, (1000 - age, 1000 - age))
+    monkeypatch.setattr(kept_programs, "MOST_FILES", 5)
+    Programs(CONFIG, program, keep=True).compile()
+    assert names_in(folder) == ["evaluate", "init", "init", "init", "train_iteration"]
+    assert {"init-0.stablehlo", "init-1.stablehlo"} <= {path.name for path in folder.iterdir()}
+
+
+def test_a_fingerprint_is_of_all_that_is_compiled_in(folder, monkeypatch):
+    env = make_env(CONFIG)
+    own = fingerprint(CONFIG, env)
+    assert own is not None
+    assert own == fingerprint(CONFIG.replace(seed=7, env_steps=12_345, eval_interval=3), env)
+    others = [fingerprint(CONFIG.replace(**{name: value}), env) for name, value in (("seeds", 2), ("discount", 0.5))]
+    before = jax.config.jax_default_matmul_precision
+    try:
+        jax.config.update("jax_default_matmul_precision", "highest")
+        others.append(fingerprint(CONFIG, env))
+    finally:
+        jax.config.update("jax_default_matmul_precision", before)
+    monkeypatch.setattr(kept_programs, "versions", lambda: {"jax": "0"})
+    others.append(fingerprint(CONFIG, env))
+    monkeypatch.setattr(kept_programs, "_code", lambda: "other")
+    others.append(fingerprint(CONFIG, env))
+    assert len({own, *others}) == 1 + len(others)
+
+
+def test_a_fingerprint_sees_whether_kernels_are_used(folder, monkeypatch):
+    env = make_env(CONFIG)
+    monkeypatch.setattr(kept_programs, "runs_gpu_kernels", lambda: True)
+    with_kernels = fingerprint(CONFIG, env)
+    monkeypatch.setattr(kept_programs, "runs_gpu_kernels", lambda: False)
+    assert with_kernels != fingerprint(CONFIG, env)
+    with kernels(False):
+        assert fingerprint(CONFIG, env) is not None
+
+
+def test_a_change_of_any_file_of_a_package_is_another_program(tmp_path, monkeypatch):
+    package = tmp_path / "some_package"
+    (package / "assets").mkdir(parents=True)
+    (package / "__init__.py").write_text("")
+    (package / "assets" / "model.xml").write_text("<mujoco/>")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(kept_programs, "_PACKAGES", ("some_package",))
+    digest = kept_programs._code.__wrapped__
+    before = digest()
+    (package / "__pycache__").mkdir()
+    (package / "__pycache__" / "x.pyc").write_bytes(b"1")
+    assert digest() == before
+    (package / "assets" / "model.xml").write_text("<mujoco />")
+    assert digest() != before
+
+
+def test_environments_from_elsewhere_are_not_kept(folder, monkeypatch):
+    env = make_env(CONFIG)
+
+    class Own(type(env)):
+        pass
+
+    assert fingerprint(CONFIG, object.__new__(Own)) is None
+    monkeypatch.setenv(VARIABLE, "0")
+    assert fingerprint(CONFIG, env) is None
+
+
+def test_commands_keep_programs_and_scripts_do_not(tmp_path, monkeypatch, capsys):
+    asked = []
+
+    def remember(config, program, keep=False):
+        asked.append(keep)
+        raise RequestError("enough")
+
+    monkeypatch.setattr(trainer, "Programs", remember)
+    assert cli.main(["train", "VisualFetchReach", "--preset", "debug", "--run-dir", str(tmp_path / "run")]) == 2
+    with pytest.raises(RequestError, match="enough"):
+        trainer.make_trainer(CONFIG)
+    assert asked == [True, False]
+    assert "enough" in capsys.readouterr().err
