@@ -53,14 +53,18 @@ def imported(clock: Clock, options: argparse.Namespace) -> Any:
     import jaxrl_vis.run.trainer  # noqa: F401
 
     clock.lap("import jaxrl_vis")
-    jax.devices()
-    clock.lap("device")
     from jaxrl_vis import preset
-    from jaxrl_vis.devices import enable_compilation_cache
-    from jaxrl_vis.learner.environment import make_env
+    from jaxrl_vis.devices import check_devices, enable_compilation_cache, start_devices
+    from jaxrl_vis.learner.environment import locate_env, make_env
     from jaxrl_vis.learner.train_step import make_train_step
     from jaxrl_vis.run.programs import Programs
 
+    # As `make_trainer` does it: devices start while MuJoCo is imported.
+    start_devices()
+    locate_env(preset("fast", env=options.env))
+    clock.lap("import the environment")
+    check_devices()
+    clock.lap("device")
     name = options.preset or ("cpu" if jax.default_backend() == "cpu" else "fast")
     config = preset(name, env=options.env, seeds=options.seeds)
     env = make_env(config)

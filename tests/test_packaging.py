@@ -29,7 +29,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
 )
 # The same for the environments.
 ENVIRONMENT_LAYERS: tuple[tuple[str, ...], ...] = (
-    ("checks", "compilation", "goals", "names", "quiet_warp"),
+    ("checks", "compilation", "goals", "names", "mjx_imports"),
     ("physics", "plants", "render", "task_modules"),
     ("randomization",),
     ("base",),
@@ -137,6 +137,27 @@ def test_mjx_does_not_print_that_warp_is_missing(clean_environment: dict[str, st
     for code in ("import jaxrl_vis_envs; from mujoco import mjx", "import jaxrl_vis_envs.adapters.brax_viewer"):
         done = subprocess.run([sys.executable, "-c", code], env=clean_environment, capture_output=True, text=True)
         assert (done.returncode, done.stdout) == (0, ""), done.stdout + done.stderr
+
+
+# A box of eight corners above a plane, as a mesh.
+_MESH = """
+import sys, jaxrl_vis_envs, mujoco
+from mujoco import mjx
+assert not {"trimesh", "scipy.spatial"} & set(sys.modules)
+box = "0 0 1  1 0 1  0 1 1  0 0 2  1 1 1  1 0 2  0 1 2  1 1 2"
+model = mujoco.MjModel.from_xml_string(
+    f"<mujoco><asset><mesh name='box' vertex='{box}'/></asset><worldbody><geom type='plane' size='1 1 1'/>"
+    "<body><freejoint/><geom type='mesh' mesh='box'/></body></worldbody></mujoco>"
+)
+convex = mjx.put_model(model)._impl.mesh_convex
+assert convex[0].face.shape == (6, 4, 3), convex[0].face.shape
+import trimesh, scipy.spatial
+assert trimesh.Trimesh.__module__ == "trimesh.base" and scipy.spatial.ConvexHull
+"""
+
+
+def test_mjx_loads_libraries_for_meshes_only_where_there_are_meshes(clean_environment: dict[str, str]) -> None:
+    subprocess.run([sys.executable, "-c", _MESH], env=clean_environment, check=True)
 
 
 def test_names_load_no_jax(clean_environment: dict[str, str]) -> None:

@@ -4,13 +4,13 @@
     state = env.reset(jax.random.key(0))
 
 Importing this package loads neither MuJoCo nor JAX: the learner's leaves import `jaxrl_vis_envs.goals` alone. The names below
-are looked up when they are first used. Once it is imported, MJX does not print that Warp is missing.
+are looked up when they are first used. Once it is imported, MJX does not print that Warp is missing, and is imported faster.
 """
 
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from jaxrl_vis_envs import quiet_warp
+from jaxrl_vis_envs import mjx_imports
 
 if TYPE_CHECKING:
     from jaxrl_vis_envs.base import GoalEnv, State
@@ -40,7 +40,7 @@ __all__ = [
 ]
 
 
-quiet_warp.install()
+mjx_imports.install()
 
 
 def __getattr__(name: str) -> Any:

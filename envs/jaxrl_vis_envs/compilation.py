@@ -48,7 +48,7 @@ _kernels = jax.make_user_context(default_value=None)
 _trust = jax.make_user_context(default_value=None)
 # Of a product [M, K] x [K, N] in Triton: rows, columns and depth of a block, then how it is computed. Layers here are 50 to 256
 # wide. Blocks half as high or as wide took 2 to 8 % longer a gradient step.
-_TILE = "block_m: 64 block_n: 64 block_k: 64 split_k: 1 num_stages: 3 num_warps: 4 num_ctas: 1"
+_TILE = "block_m: 64 block_n: 64 block_k: 64 num_stages: 3 num_warps: 4 num_ctas: 1"
 # Of the kernels that were used without asking.
 _trusted: set[Callable[[], object]] = set()
 
