@@ -1,10 +1,10 @@
 """Spares the import of MJX what nothing here needs: two lines on stdout, and libraries for meshes.
 
-MJX prints that Warp is missing, which is an option of MJX that nothing here uses, when its module `mujoco.mjx.warp` is imported.
-And its module of meshes imports trimesh and `scipy.spatial`, which takes three quarters of the time of the whole import, for
-models in which meshes collide. The package `jaxrl_vis_envs` installs the hook below when it is imported itself, which loads
-neither MuJoCo nor JAX: it takes those two lines away, and nothing else that is printed, and lets those libraries wait until they
-are used. Where MJX was imported before, nothing is left to do.
+MJX prints that Warp is missing, which is an option of MJX that nothing here uses, when its module `mujoco.mjx.warp` is
+imported. And its module of meshes imports trimesh and `scipy.spatial`, which takes three quarters of the time of the whole
+import, for models in which meshes collide. The package `jaxrl_vis_envs` installs the hook below when it is imported itself,
+which loads neither MuJoCo nor JAX: it takes those two lines away, and nothing else that is printed, and lets those libraries
+wait until they are used. Where MJX was imported before, nothing is left to do.
 """
 
 import contextlib
