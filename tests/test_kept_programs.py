@@ -14,6 +14,7 @@ from jaxrl_vis.config import preset
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.environment import make_env
 from jaxrl_vis.run import kept_programs, programs, trainer
+from jaxrl_vis.run.folder import RunFolder
 from jaxrl_vis.run.kept_programs import VARIABLE, fingerprint
 from jaxrl_vis.run.programs import Programs
 from jaxrl_vis_envs.compilation import env_jit, kernels
@@ -165,6 +166,23 @@ def test_environments_from_elsewhere_are_not_kept(folder, monkeypatch):
     assert fingerprint(CONFIG, object.__new__(Own)) is None
     monkeypatch.setenv(VARIABLE, "0")
     assert fingerprint(CONFIG, env) is None
+
+
+@pytest.mark.parametrize("command", ["eval", "play"])
+def test_commands_find_what_training_has_traced(command, tmp_path, monkeypatch, capsys):
+    run_dir = tmp_path / "run"
+    run_dir.mkdir()
+    RunFolder(run_dir).open(CONFIG, False, False, ())
+    (run_dir / "checkpoints" / "light" / "2").mkdir(parents=True)
+    asked = []
+
+    def remember(config, program, keep=False):
+        asked.append(keep)
+        raise RequestError("enough")
+
+    monkeypatch.setattr(trainer, "Programs", remember)
+    assert cli.main([command, str(run_dir)]) == 2
+    assert asked == [True] and "enough" in capsys.readouterr().err
 
 
 def test_commands_keep_programs_and_scripts_do_not(tmp_path, monkeypatch, capsys):

@@ -37,6 +37,6 @@ def run(options: Play) -> int:
     if options.aux:
         play_auxiliary.play_auxiliary(options.run_dir, out, episodes=options.episodes)
     else:
-        trained.play_run(options.run_dir, out, episodes=options.episodes, three_dimensional=options.html)
+        trained.play_run(options.run_dir, out, episodes=options.episodes, three_dimensional=options.html, keep_programs=True)
     print(out)
     return 0

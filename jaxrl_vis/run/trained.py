@@ -13,13 +13,19 @@ from jaxrl_vis.run.memory import check_compiled
 from jaxrl_vis.run.trainer import Trainer, make_trainer
 
 
-def open_run(run_dir: Path | str, **changes: object) -> Trainer:
+def open_run(run_dir: Path | str, keep_programs: bool = False, **changes: object) -> Trainer:
     """The trainer of a run, on one device, with fields of its configuration changed; nothing in its folder is touched.
+
+    Args:
+        run_dir: The run folder.
+        keep_programs: As of `make_trainer`; what training has traced is found then.
+        **changes: Fields of `Config`.
 
     Raises:
         RequestError: There is no run, or it cannot be made any more.
     """
-    return make_trainer(read_config(Path(run_dir)).replace(devices=1, data_devices=None, **changes))
+    config = read_config(Path(run_dir)).replace(devices=1, data_devices=None, **changes)
+    return make_trainer(config, keep_programs=keep_programs)
 
 
 def load(trainer: Trainer, run_dir: Path | str, checkpoint: int | None = None) -> Restored:
@@ -49,12 +55,13 @@ def load(trainer: Trainer, run_dir: Path | str, checkpoint: int | None = None) -
     return restored
 
 
-def evaluate_run(run_dir: Path | str, episodes: int | None = None) -> dict[str, list[float]]:
+def evaluate_run(run_dir: Path | str, episodes: int | None = None, keep_programs: bool = False) -> dict[str, list[float]]:
     """Evaluates the newest good checkpoint of a run.
 
     Args:
         run_dir: The run folder.
         episodes: How many; None: as many as during training.
+        keep_programs: As of `open_run`.
 
     Returns:
         ``eval/success``, ``eval/goal_distance`` and the like: one number per seed.
@@ -62,14 +69,16 @@ def evaluate_run(run_dir: Path | str, episodes: int | None = None) -> dict[str, 
     Raises:
         RequestError: There is no run, nothing usable in it, or too little memory for so many episodes.
     """
-    trainer = open_run(run_dir, **({} if episodes is None else {"eval_episodes": episodes}))
+    trainer = open_run(run_dir, keep_programs, **({} if episodes is None else {"eval_episodes": episodes}))
     restored = load(trainer, run_dir)
     check_compiled({"evaluate": trainer.programs.compiled("evaluate")}, already_there=True)
     values = jax.device_get(trainer.evaluate(restored.train))
     return {name: [float(number) for number in value] for name, value in values.items()}
 
 
-def play_run(run_dir: Path | str, out: Path | str, episodes: int = 6, three_dimensional: bool = False) -> None:
+def play_run(
+    run_dir: Path | str, out: Path | str, episodes: int = 6, three_dimensional: bool = False, keep_programs: bool = False
+) -> None:
     """Plays episodes with the first seed of the newest good checkpoint of a run, and writes them as a video.
 
     Args:
@@ -78,13 +87,14 @@ def play_run(run_dir: Path | str, out: Path | str, episodes: int = 6, three_dime
         episodes: How many to show.
         three_dimensional: Write an .html page for brax's viewer (needs brax) instead of the robot's images; for state
             variants, too.
+        keep_programs: As of `open_run`.
 
     Raises:
         RequestError: There is no run, nothing usable in it, no image to show, or no way to write ``out``.
     """
     out = Path(out)
     (viewer.check_page if three_dimensional else videos.check_output)(out)
-    trainer = open_run(run_dir, eval_episodes=max(1, episodes))
+    trainer = open_run(run_dir, keep_programs, eval_episodes=max(1, episodes))
     programs = trainer.programs
     if not (programs.shows_images or three_dimensional):
         raise RequestError(f"{trainer.config.env} shows the robot no images: play a run on a Visual task, or with --html")
