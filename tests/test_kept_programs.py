@@ -17,6 +17,7 @@ from jaxrl_vis.run import kept_programs, programs, trainer
 from jaxrl_vis.run.folder import RunFolder
 from jaxrl_vis.run.kept_programs import VARIABLE, fingerprint
 from jaxrl_vis.run.programs import Programs
+from jaxrl_vis_envs import compilation
 from jaxrl_vis_envs.compilation import env_jit, kernels
 
 CONFIG = preset("debug")
@@ -28,6 +29,7 @@ def folder(tmp_path, monkeypatch) -> Path:
     """Where programs are kept, which nothing turns off."""
     monkeypatch.setenv(VARIABLE, "1")
     monkeypatch.setattr(programs, "enable_compilation_cache", lambda: str(tmp_path))
+    monkeypatch.setattr(compilation, "_trusted", set())  # of kernels that other tests have let in
     return tmp_path / "programs"
 
 

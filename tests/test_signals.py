@@ -92,8 +92,8 @@ def compilations():
     def watch(trainer):
         compile_all = trainer.programs.compile
 
-        def compile_and_watch():
-            compiled = compile_all()
+        def compile_and_watch(**options):
+            compiled = compile_all(**options)
             watching.append(True)
             return compiled
 

@@ -71,7 +71,7 @@ def test_the_compilers_own_figures_count_on_a_cpu_too(straight, tmp_path, monkey
     with pytest.raises(RequestError, match="(evaluate|train_iteration|broken_leaves) needs .* --eval-episodes") as refused:
         memory.check_compiled(compiled, already_there=False)
     assert "\n" not in str(refused.value)
-    monkeypatch.setattr(trained, "make_trainer", lambda config: trainer.Trainer(config, FakeProgram(config)))
+    monkeypatch.setattr(trained, "make_trainer", lambda config, **_: trainer.Trainer(config, FakeProgram(config)))
     monkeypatch.setattr(memory, "available_bytes", lambda: 100)
     with pytest.raises(RequestError, match="evaluate needs"):
         trained.evaluate_run(straight[0])

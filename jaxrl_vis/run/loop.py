@@ -45,6 +45,12 @@ GUARD = "guard/"
 """Metrics whose names begin like this stop a run where they are not 0; all others reach metrics.jsonl."""
 
 
+def _import_what_saves() -> None:
+    """Matplotlib and orbax, which take a second or two to import: while XLA compiles, that costs nothing."""
+    for name in ("jaxrl_vis.report.plots", "orbax.checkpoint"):
+        importlib.import_module(name)
+
+
 @dataclasses.dataclass(frozen=True)
 class Report:
     """What the host knows about one iteration.
@@ -172,7 +178,7 @@ class RunLoop:
 
         started = time.monotonic()
         self._say("compiling (once; the next start finds it in the cache) ...")
-        compiled = programs.compile()
+        compiled = programs.compile(meanwhile=_import_what_saves)
         self._compile_s = time.monotonic() - started
         self._progress.compile_s += self._compile_s
         return compiled
@@ -238,9 +244,6 @@ class RunLoop:
         while self._done < self._total:
             assert self._loop is not None
             self._loop, values = self._programs.train_iteration(self._loop)
-            # Matplotlib and orbax take half a second to import: now the device is busy. Asking again costs nothing.
-            for name in ("jaxrl_vis.report.plots", "orbax.checkpoint"):
-                importlib.import_module(name)
             self._done += 1
             before, waiting = waiting, (self._done, values)
             if before is not None:

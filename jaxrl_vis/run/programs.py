@@ -7,7 +7,7 @@ import concurrent.futures
 import contextlib
 import functools
 import gc
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -108,43 +108,49 @@ class Programs:
         """How long an image of the video is shown, s: as long as it lasted, but not too fast to follow."""
         return max(0.04, float(self.env.control_period))
 
-    def compile(self) -> dict[str, Any]:
+    def compile(self, meanwhile: Callable[[], None] = lambda: None) -> dict[str, Any]:
         """Compiles everything that a run needs, side by side, the small operations of saving and evaluating included.
 
         Each function is traced once, here, and what was compiled here is what runs later.
 
+        Args:
+            meanwhile: Called when all is traced, and XLA has the processor to itself.
+
         Returns:
             The compiled programs by name.
         """
-        self._make([name for name in _NAMES if name not in self._compiled])
+        self._make([name for name in _NAMES if name not in self._compiled], meanwhile)
         return dict(self._compiled)
 
-    def _make(self, names: Sequence[str]) -> None:
+    def _make(self, names: Sequence[str], meanwhile: Callable[[], None] = lambda: None) -> None:
         """Compiles programs, which then are `_compiled`."""
         cache = Path(enable_compilation_cache())
         if self._may_keep and (found := fingerprint(self.config, self.env)):
             self._kept = KeptPrograms(cache / "programs", found)
+            try:
+                with trusting_kernels():
+                    self._compiled |= self._side_by_side(names, meanwhile)
+                self._kept.write()
+                return
+            except Exception:  # whatever is wrong with them, or with a kernel in them, is found below, without
+                self._kept.forget()
+                self._kept, self._may_keep = None, False
         try:
             with trusting_kernels():
-                self._compiled |= self._side_by_side(names)
+                self._compiled |= self._side_by_side(names, meanwhile)
         except Exception:
-            is_kept = self._kept is not None
-            if self._kept is not None:
-                self._kept.forget()
-            self._kept, self._may_keep = None, False
-            if not distrusted_kernels() and not is_kept:
+            if not distrusted_kernels():
                 raise
-            self._compiled |= self._side_by_side(names)
-        if self._kept is not None:
-            self._kept.write()
+            self._compiled |= self._side_by_side(names, meanwhile)
 
-    def _side_by_side(self, names: Sequence[str]) -> dict[str, Any]:
+    def _side_by_side(self, names: Sequence[str], meanwhile: Callable[[], None]) -> dict[str, Any]:
         # Tracing is Python and goes one by one; XLA compiles without the interpreter's lock, meanwhile.
         with concurrent.futures.ThreadPoolExecutor(len(_NAMES), initializer=shield_this_thread) as pool:
             futures = {name: pool.submit(self._lower(name).compile) for name in names}
             if "init" in names and not processes.are_several():
                 # Taking keys apart, as saving does, is a program, too.
                 to_host({"keys": self.run_keys, "evaluation": self.evaluation_key}, copy=True)
+            meanwhile()
             compiled = {name: future.result() for name, future in futures.items()}
         if self._kept is None:
             return compiled
