@@ -71,7 +71,7 @@ def test_off_adds_nothing() -> None:
             data, goal = self.sample_start(key), self.sample_goal(key)
             state = self.state_at(data, self.achieved(goal))
             both = jax.tree.map(lambda *leaves: jnp.stack(leaves), data, goal)
-            frame, goal_frame = jax.vmap(lambda data: self._draw(data, None))(both)
+            frame, goal_frame = jax.lax.map(lambda data: self._draw(data, None), both)
             return state.replace(obs={"observation": frame, "achieved_goal": frame, "desired_goal": goal_frame})
 
     plain = Plain(env.config)

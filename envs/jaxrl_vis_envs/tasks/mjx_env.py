@@ -94,9 +94,9 @@ class MjxGoalEnv(GoalEnv):
         data, goal_data = self.sample_start(key), self.sample_goal(key)
         domain = randomization.sample(key, self._randomization, self._model, self.action_size, self._scene)
         state = self.state_at(data, self.goal_state_of(key, goal_data), domain)
-        # One program draws both: that halves what there is to compile.
+        # One after the other in a loop: one copy to compile, which is traced as that of `observe` is.
         both = jax.tree.map(lambda *leaves: jnp.stack(leaves), data, goal_data)
-        frame, goal = jax.vmap(lambda data: self._observe(data, None, domain))(both)
+        frame, goal = jax.lax.map(lambda data: self._observe(data, None, domain), both)
         return state.replace(obs={"observation": frame, "achieved_goal": frame, "desired_goal": goal})
 
     def advance(self, state: State, action: jax.Array) -> State:
