@@ -4,7 +4,8 @@ MJX prints that Warp is missing, which is an option of MJX that nothing here use
 imported. And its module of meshes imports trimesh and `scipy.spatial`, which takes three quarters of the time of the whole
 import, for models in which meshes collide. The package `jaxrl_vis_envs` installs the hook below when it is imported itself,
 which loads neither MuJoCo nor JAX: it takes those two lines away, and nothing else that is printed, and lets those libraries
-wait until they are used. Where MJX was imported before, nothing is left to do.
+wait until they are used. Where MJX was imported before, nothing is left to do. What is printed while Warp is looked for comes
+out afterwards.
 """
 
 import contextlib
@@ -47,6 +48,7 @@ def _without_mesh_libraries() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _without_remark() -> Iterator[None]:
+    """What is printed inside, less MJX's remark."""
     printed = io.StringIO()
     try:
         with contextlib.redirect_stdout(printed):

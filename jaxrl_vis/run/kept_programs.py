@@ -54,14 +54,8 @@ def fingerprint(config: Config, env: GoalEnv) -> str | None:
         target = [target_platform(), runs_gpu_kernels()]
     # The seed is an argument, in the form of keys.
     compiled_in = {name: value for name, value in dataclasses.asdict(config).items() if name not in (*HOST_FIELDS, "seed")}
-    depends_on = [
-        compiled_in,
-        versions(),
-        device_record(),
-        target,
-        settings,
-    ]
-    return hashlib.sha256(json.dumps([depends_on, _code()], sort_keys=True, default=repr).encode()).hexdigest()
+    depends_on = [compiled_in, versions(), device_record(), target, settings, _code()]
+    return hashlib.sha256(json.dumps(depends_on, sort_keys=True, default=repr).encode()).hexdigest()
 
 
 @functools.cache
@@ -127,7 +121,7 @@ class KeptPrograms:
             of_leaves = jax.jit(lambda leaves: simplify(jax.tree.unflatten(tree, call(*leaves))))
             exported = export.export(of_leaves, platforms=(target_platform(),), disabled_checks=_CHECKS)(leaves)
             self._fresh[name] = data = bytes(exported.serialize())
-        # Also what has just been traced: what was read compiles to other machine code than what was not, for XLA's cache.
+        # Also what has just been traced: XLA's cache takes a program that was read for another one than that which was traced.
         program = export.deserialize(bytearray(data))
         return env_jit(program.call, **jit_options).lower(leaves)
 
