@@ -24,6 +24,16 @@ def test_the_solution_of_small_systems():
     np.testing.assert_allclose(solved, truth, atol=2e-3)
 
 
+def test_one_matrix_for_many_right_sides():
+    """Over axes that only one of the two has."""
+    rng = np.random.default_rng(0)
+    roots, right = rng.normal(size=(3, 4, 4)), rng.normal(size=(3, 5, 4))
+    matrices = roots @ roots.transpose(0, 2, 1) + np.eye(4)
+    solve = jax.vmap(jax.vmap(newton.solve_positive, (None, 0)))
+    solved = solve(jnp.asarray(matrices, jnp.float32), jnp.asarray(right, jnp.float32))
+    np.testing.assert_allclose(solved, np.linalg.solve(matrices[:, None], right[..., None])[..., 0], atol=1e-4)
+
+
 def test_the_line_search_finds_the_least_cost():
     """Over parabolas of 1 to 12 constraints, some of them equalities, some that the line does not touch."""
     rng = np.random.default_rng(1)
