@@ -280,11 +280,15 @@ class Learner:
         if actor:
             self._adam("actor", actor, self.rules.actor_learning_rate)
         if with_targets:
-            for network in ("critic", "actor"):
-                target = self.networks[f"target_{network}"]
-                online = [self.networks[network][name] for name in target]
-                torch._foreach_lerp_(list(target.values()), online, 1.0 - self.rules.target_decay)
-                self._copy(f"target_{network}")
+            self.follow()
+
+    def follow(self) -> None:
+        """Target networks, a little after the others."""
+        for network in ("critic", "actor"):
+            target = self.networks[f"target_{network}"]
+            online = [self.networks[network][name] for name in target]
+            torch._foreach_lerp_(list(target.values()), online, 1.0 - self.rules.target_decay)
+            self._copy(f"target_{network}")
 
     def _adam(self, network: str, gradients: Tensors, learning_rate: float) -> None:
         parameters = list(self.networks[network].values())
@@ -341,16 +345,21 @@ class Compiled:
         on_gpu = learner.device != "cpu"
         # The graphs are captured here and not by PyTorch, which leaves out steps that change their inputs.
         mode = "max-autotune-no-cudagraphs" if on_gpu else None
-        compiled = torch.compile(learner.step, fullgraph=True, dynamic=False, mode=mode)
+        compile_ = functools.partial(torch.compile, fullgraph=True, dynamic=False, mode=mode)
+        step, follow = compile_(learner.step), compile_(learner.follow)
+        # Where target networks follow now and then, they do so after the step: as part of it, it would be compiled twice.
+        at_every_step = learner.rules.target_update_interval == 1
         interval = math.lcm(learner.rules.actor_interval, learner.rules.target_update_interval)
-        needed = {learner.turns() for _ in range(interval)}
-        self._calls: dict[tuple[bool, bool], Callable[[], None]] = {
-            turns: functools.partial(compiled, self._choices, self._cursor, turns) for turns in needed
-        }
-        for turns, call in list(self._calls.items()):
+        self._calls: dict[tuple[bool, bool], Callable[[], None]] = {}
+        for with_actor, with_targets in {learner.turns() for _ in range(interval)}:
+
+            def call(with_actor: bool = with_actor, with_targets: bool = with_targets) -> None:
+                step(self._choices, self._cursor, (with_actor, at_every_step))
+                if with_targets and not at_every_step:
+                    follow()
+
             call()
-            if on_gpu:
-                self._calls[turns] = self._captured(call)
+            self._calls[with_actor, with_targets] = self._captured(call) if on_gpu else call
 
     def _captured(self, call: Callable[[], None]) -> Callable[[], None]:
         stream = torch.cuda.Stream()
