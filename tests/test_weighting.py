@@ -1,4 +1,4 @@
-"""Weightings of auxiliary losses, on a network that is small enough to differentiate by finite differences."""
+"""Weightings of auxiliary losses: their rules, and what states of theirs go through."""
 
 import functools
 import os
@@ -12,257 +12,24 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 import pytest
+from weighting_problem import (
+    NAMES,
+    OPTIONS,
+    WAYS,
+    assert_close,
+    encode,
+    encoder_of,
+    gradient_by,
+    in_float32,
+    losses_of,
+    losses_of_latents,
+    problem,
+    weighting_of,
+)
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.weighting import MAIN, WEIGHTINGS, Weighting, loss_gradients, make_weighting, measure, weighted_grad
-from jaxrl_vis.learner.weighting.base import dot, log_loss, log_slope
-
-NAMES = (MAIN, "near", "far")
-OPTIONS: dict[str, dict[str, Any]] = {
-    "none": {},
-    "none_log": {},
-    "sum": {},
-    "fixed": {"weights": {"near": 0.1, "far": 10.0}},
-    "balance": {},
-    "cosine": {},
-    "cosine of logarithms": {"log": True},
-    "ol_aux": {"interval": 2, "learning_rate": 0.01},
-    "ol_aux total": {"interval": 2, "learning_rate": 0.01, "main_grad": "total"},
-    "ol_aux window": {"interval": 2, "learning_rate": 0.01, "window": 3},
-    "ol_aux as released": {"learning_rate": 0.01, "main_grad": "total", "window": 4},
-    "ol_aux_ablation": {"interval": 2, "learning_rate": 0.01},
-}
-
-
-def weighting_of(case: str) -> Weighting:
-    return make_weighting(case.split()[0], **OPTIONS[case])
-
-
-def problem(seed: int = 0, size: int = 12) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Parameters of an encoder and three heads, and a minibatch, as float64."""
-    random = np.random.default_rng(seed)
-    encoder = {"kernel": random.normal(size=(5, 4)), "bias": random.normal(size=4)}
-    heads = {"main": random.normal(size=4), "near": random.normal(size=(4, 2)), "far": random.normal(size=(4, 3))}
-    targets = {"main": random.normal(size=size), "near": random.normal(size=(size, 2)), "far": random.normal(size=(size, 3))}
-    return {"encoder": encoder, "heads": heads}, {"x": random.normal(size=(size, 5)), **targets}
-
-
-def encode(encoder: Any, batch: Any, module: Any = jnp) -> Any:
-    return module.tanh(batch["x"] @ encoder["kernel"] + encoder["bias"])
-
-
-def losses_of_latents(params: Any, latent: Any, batch: Any, module: Any = jnp) -> dict[str, Any]:
-    return {name: module.mean((latent @ head - batch[name]) ** 2) for name, head in params["heads"].items()}
-
-
-def losses_of(params: Any, batch: Any, module: Any = jnp) -> dict[str, Any]:
-    """Mean squared errors of three linear heads on one encoder, in JAX or in NumPy."""
-    return losses_of_latents(params, encode(params["encoder"], batch, module), batch, module)
-
-
-def encoder_of(params: Any) -> Any:
-    return params["encoder"]
-
-
-def in_float32(tree: Any) -> Any:
-    return jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), tree)
-
-
-def encoder_gradients(params: Any, batch: Any) -> dict[str, np.ndarray]:
-    """The oracle: gradients of each loss with respect to the encoder, flat, by central differences in float64."""
-    leaves, structure = jax.tree.flatten(params["encoder"])
-    found: dict[str, list[float]] = {name: [] for name in NAMES}
-    for leaf in leaves:
-        for place in np.ndindex(leaf.shape):
-            sides = []
-            for step in (1e-5, -1e-5):
-                old = leaf[place]
-                leaf[place] = old + step
-                sides.append(losses_of({**params, "encoder": jax.tree.unflatten(structure, leaves)}, batch, np))
-                leaf[place] = old
-            for name, values in found.items():
-                values.append((sides[0][name] - sides[1][name]) / 2e-5)
-    return {name: np.array(values) for name, values in found.items()}
-
-
-def assert_close(one: Any, other: Any, tolerance: float = 2e-5) -> None:
-    assert jax.tree.structure(one) == jax.tree.structure(other)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance), one, other)
-
-
-WAYS: tuple[Any, ...] = ("per_loss", "one_hot", "jvp", "latents")
-
-
-def ways_of(weighting: Weighting) -> tuple[Any, ...]:
-    return WAYS[:2] if weighting.needs == "gradients" else WAYS
-
-
-def gradient_by(way: Any, weighting: Weighting, **options: Any) -> Any:
-    """`weighted_grad` of the problem, its latents told where they are needed."""
-    if way != "latents":
-        return weighted_grad(losses_of, weighting, encoder_of, way, **options)
-    return weighted_grad(losses_of_latents, weighting, encoder_of, way, encode=encode, **options)
-
-
-@pytest.mark.parametrize("case", ["sum", "fixed", "cosine of logarithms", "ol_aux", "ol_aux total", "ol_aux as released"])
-def test_ways_agree_and_find_the_gradient_of_the_weighted_objective(case: str) -> None:
-    weighting = weighting_of(case)
-    params, batch = in_float32(problem(0))
-
-    @jax.jit
-    def all_ways(params: Any, state: Any) -> Any:
-        found = [gradient_by(way, weighting)(params, state, batch) for way in ways_of(weighting)]
-        weights = found[0].weights
-        return found, jax.grad(lambda params: weighting.objective(weights, losses_of(params, batch)))(params)
-
-    state = weighting.init(NAMES, encoder_of(params))
-    for _ in range(6):
-        (reference, *others), expected = all_ways(params, state)
-        for other in others:
-            assert_close(other, reference)
-        assert_close(reference.gradient, expected)
-        assert reference.weights[MAIN] == 1 and set(reference.weights) == set(NAMES)
-        params = jax.tree.map(lambda leaf, change: leaf - np.float32(0.02) * change, params, reference.gradient)
-        state = reference.state
-    if weighting.needs == "gradients":
-        with pytest.raises(RequestError, match="use one_hot or per_loss"):
-            weighted_grad(losses_of, weighting, encoder_of, "jvp")
-    if "ol_aux" in case:  # weights have moved, and differently
-        moved = np.array([reference.weights[name] for name in NAMES[1:]])
-        assert (moved >= 0).all() and (np.abs(moved - 1) > 0.001).all() and moved[0] != moved[1]
-
-
-def passes_through_the_encoder(way: Any, losses: int) -> int:
-    """How often a step multiplies by the encoder's inputs: once a forward pass, a backward pass or a tangent."""
-    params, batch = in_float32(problem(0))
-    names = [MAIN, *(f"other{number}" for number in range(losses - 1))]
-    params["heads"] = {name: params["heads"][MAIN] for name in names}
-    batch = {"x": batch["x"], **{name: batch[MAIN] for name in names}}
-    weighting = make_weighting("ol_aux")
-    gradient = gradient_by(way, weighting)
-    equations = jax.make_jaxpr(gradient)(params, weighting.init(names), batch).eqns
-    products = [each for each in equations if each.primitive.name == "dot_general"]
-    return sum(batch["x"].shape in [operand.aval.shape for operand in each.invars] for each in products)
-
-
-def test_forward_ways_pass_the_encoder_as_often_for_many_losses() -> None:
-    assert passes_through_the_encoder("jvp", 3) == passes_through_the_encoder("jvp", 10) <= 5
-    assert passes_through_the_encoder("latents", 3) == passes_through_the_encoder("latents", 10) <= 5
-    assert passes_through_the_encoder("per_loss", 10) >= 20
-
-
-def halves(names: tuple[str, ...] = ("first", "second")) -> dict[str, Any]:
-    """Latents of the first and the second half of a minibatch, as two groups."""
-    parts = dict(zip(("first", "second"), (slice(0, 6), slice(6, 12)), strict=True))
-    return {name: functools.partial(encode_part, part=parts[name]) for name in names}
-
-
-def encode_part(encoder: Any, batch: Any, part: slice) -> Any:
-    return jnp.tanh(batch["x"][part] @ encoder["kernel"] + encoder["bias"])
-
-
-def losses_of_halves(params: Any, latents: Any, batch: Any) -> dict[str, Any]:
-    """main reads the first half, near the second one, far both; of the first, main also reads what has no gradient."""
-    heads, first, second = params["heads"], latents["first"], latents["second"]
-    still = jax.lax.stop_gradient(jnp.mean(second))
-    return {
-        MAIN: jnp.mean((first @ heads[MAIN] - batch[MAIN][:6] - 0.1 * still) ** 2),
-        "near": jnp.mean((second @ heads["near"] - batch["near"][6:]) ** 2),
-        "far": jnp.mean((jnp.concatenate([first, second]) @ heads["far"] - batch["far"]) ** 2),
-    }
-
-
-@pytest.mark.parametrize("case", ["none", "balance", "cosine", "ol_aux", "ol_aux total"])
-def test_latents_in_groups(case: str) -> None:
-    weighting = weighting_of(case)
-    params, batch = in_float32(problem(0))
-    ways = ("per_loss", "jvp", "latents")
-
-    @jax.jit
-    def all_ways(params: Any, state: Any) -> Any:
-        gradients = [weighted_grad(losses_of_halves, weighting, encoder_of, way, encode=halves()) for way in ways]
-        return [gradient(params, state, batch) for gradient in gradients]
-
-    state = weighting.init(NAMES)
-    for _ in range(3):
-        reference, *others = all_ways(params, state)
-        for other in others:
-            assert_close(other, reference)
-        params = jax.tree.map(lambda leaf, change: leaf - np.float32(0.02) * change, params, reference.gradient)
-        state = reference.state
-
-
-@pytest.mark.parametrize(("others", "passes"), [(("near",), (2, 4)), (("near", "far"), (5, 4))])
-def test_gradients_pass_only_through_latents_that_losses_read(others: tuple[str, ...], passes: tuple[int, int]) -> None:
-    params, batch = in_float32(problem(0))
-    names = (MAIN, *others)
-    weighting = make_weighting("ol_aux")
-
-    def chosen(params: Any, latents: Any, batch: Any) -> dict[str, Any]:
-        found = losses_of_halves({"heads": {**problem(0)[0]["heads"], **params["heads"]}}, latents, batch)
-        return {name: found[name] for name in names}
-
-    params["heads"] = {name: params["heads"][name] for name in names}
-    gradient = weighted_grad(chosen, weighting, encoder_of, "latents", encode=halves())
-    found = jax.make_jaxpr(gradient)(params, weighting.init(names), batch)
-    slices = {}  # variable -> the half of the inputs that it is
-    counted = {0: 0, 6: 0}
-    for equation in found.jaxpr.eqns:
-        if equation.primitive.name == "slice" and equation.invars[0].aval.shape == batch["x"].shape:
-            slices[equation.outvars[0]] = equation.params["start_indices"][0]
-        if equation.primitive.name == "dot_general":
-            for operand in equation.invars:
-                counted[slices.get(operand, 0)] += operand in slices
-    # Forward; backward for the main loss; forward with a tangent, and backward for the others: of those that are needed.
-    assert (counted[0], counted[6]) == passes
-
-
-def test_dots_are_those_of_finite_differences() -> None:
-    weighting = make_weighting("ol_aux", log=False)
-
-    @jax.jit
-    def both_ways(params: Any, batch: Any) -> list[dict[str, jax.Array]]:
-        found = [weighted_grad(losses_of, weighting, encoder_of, way) for way in ("per_loss", "jvp")]
-        return [gradient(params, weighting.init(NAMES), batch).metrics for gradient in found]
-
-    for seed in range(3):
-        params, batch = problem(seed)
-        oracle = encoder_gradients(params, batch)
-        for metrics in both_ways(*in_float32((params, batch))):
-            for name in NAMES[1:]:
-                value = metrics[f"dot/{name}"]
-                assert value.dtype == jnp.float32
-                sizes = np.linalg.norm(oracle[name]) * np.linalg.norm(oracle[MAIN])
-                assert abs(float(value) - oracle[name] @ oracle[MAIN]) <= 1e-5 * sizes
-
-
-def test_dots_of_large_trees_are_exact_enough() -> None:
-    random = np.random.default_rng(0)
-    one = {"a": random.normal(size=(700, 512)).astype(np.float32), "b": random.normal(size=3).astype(np.float32)}
-    for other in (one, jax.tree.map(lambda leaf: np.roll(leaf, 1), one)):
-        expected = sum(np.vdot(one[name].astype(np.float64), other[name].astype(np.float64)) for name in one)
-        sizes = sum(np.sum(leaf.astype(np.float64) ** 2) for leaf in one.values())
-        assert abs(float(jax.jit(dot)(one, other)) - expected) <= 1e-5 * sizes
-        assert jax.jit(dot)(*jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.bfloat16), (one, other))).dtype == jnp.float32
-
-
-def test_bfloat16() -> None:
-    """Of parameters in bfloat16: weights and gradients are float32, and point where those of float32 parameters do."""
-    params, batch = in_float32(problem(1, size=64))
-    weighting = make_weighting("ol_aux", interval=1, learning_rate=0.01)
-
-    @jax.jit
-    def all_ways(params: Any) -> Any:
-        return [gradient_by(way, weighting)(params, weighting.init(NAMES), batch) for way in WAYS]
-
-    exact = all_ways(params)[0]
-    for coarse in all_ways(jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16), params)):
-        assert all(leaf.dtype in (jnp.float32, jnp.int32) for leaf in jax.tree.leaves(coarse))
-        one, other = (np.concatenate([leaf.ravel() for leaf in jax.tree.leaves(each.gradient)]) for each in (exact, coarse))
-        assert one @ other >= 0.99 * np.linalg.norm(one) * np.linalg.norm(other)
-        for name in NAMES[1:]:
-            assert np.sign(coarse.metrics[f"dot/{name}"]) == np.sign(exact.metrics[f"dot/{name}"])
-
+from jaxrl_vis.learner.weighting.base import log_loss, log_slope
 
 # -- OL-AUX
 
@@ -518,7 +285,7 @@ def test_a_batch_spread_over_devices_by_the_compiler(clean_environment: dict[str
     code = """
 import jax, numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from test_weighting import *
+from weighting_problem import *
 
 params, batch = in_float32(problem(5, size=24))
 mesh = Mesh(np.array(jax.devices()), ("data",))

@@ -1,0 +1,186 @@
+"""Gradients of weighted losses, and their dot products: all ways to find them against each other and finite differences."""
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from weighting_problem import (
+    NAMES,
+    WAYS,
+    assert_close,
+    encoder_gradients,
+    encoder_of,
+    gradient_by,
+    in_float32,
+    losses_of,
+    problem,
+    ways_of,
+    weighting_of,
+)
+
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.learner.weighting import MAIN, make_weighting, weighted_grad
+from jaxrl_vis.learner.weighting.base import dot
+
+
+@pytest.mark.parametrize("case", ["sum", "fixed", "cosine of logarithms", "ol_aux", "ol_aux total", "ol_aux as released"])
+def test_ways_agree_and_find_the_gradient_of_the_weighted_objective(case: str) -> None:
+    weighting = weighting_of(case)
+    params, batch = in_float32(problem(0))
+
+    @jax.jit
+    def all_ways(params: Any, state: Any) -> Any:
+        found = [gradient_by(way, weighting)(params, state, batch) for way in ways_of(weighting)]
+        weights = found[0].weights
+        return found, jax.grad(lambda params: weighting.objective(weights, losses_of(params, batch)))(params)
+
+    state = weighting.init(NAMES, encoder_of(params))
+    for _ in range(6):
+        (reference, *others), expected = all_ways(params, state)
+        for other in others:
+            assert_close(other, reference)
+        assert_close(reference.gradient, expected)
+        assert reference.weights[MAIN] == 1 and set(reference.weights) == set(NAMES)
+        params = jax.tree.map(lambda leaf, change: leaf - np.float32(0.02) * change, params, reference.gradient)
+        state = reference.state
+    if weighting.needs == "gradients":
+        with pytest.raises(RequestError, match="use one_hot or per_loss"):
+            weighted_grad(losses_of, weighting, encoder_of, "jvp")
+    if "ol_aux" in case:  # weights have moved, and differently
+        moved = np.array([reference.weights[name] for name in NAMES[1:]])
+        assert (moved >= 0).all() and (np.abs(moved - 1) > 0.001).all() and moved[0] != moved[1]
+
+
+def passes_through_the_encoder(way: Any, losses: int) -> int:
+    """How often a step multiplies by the encoder's inputs: once a forward pass, a backward pass or a tangent."""
+    params, batch = in_float32(problem(0))
+    names = [MAIN, *(f"other{number}" for number in range(losses - 1))]
+    params["heads"] = {name: params["heads"][MAIN] for name in names}
+    batch = {"x": batch["x"], **{name: batch[MAIN] for name in names}}
+    weighting = make_weighting("ol_aux")
+    gradient = gradient_by(way, weighting)
+    equations = jax.make_jaxpr(gradient)(params, weighting.init(names), batch).eqns
+    products = [each for each in equations if each.primitive.name == "dot_general"]
+    return sum(batch["x"].shape in [operand.aval.shape for operand in each.invars] for each in products)
+
+
+def test_forward_ways_pass_the_encoder_as_often_for_many_losses() -> None:
+    assert passes_through_the_encoder("jvp", 3) == passes_through_the_encoder("jvp", 10) <= 5
+    assert passes_through_the_encoder("latents", 3) == passes_through_the_encoder("latents", 10) <= 5
+    assert passes_through_the_encoder("per_loss", 10) >= 20
+
+
+def halves(names: tuple[str, ...] = ("first", "second")) -> dict[str, Any]:
+    """Latents of the first and the second half of a minibatch, as two groups."""
+    parts = dict(zip(("first", "second"), (slice(0, 6), slice(6, 12)), strict=True))
+    return {name: functools.partial(encode_part, part=parts[name]) for name in names}
+
+
+def encode_part(encoder: Any, batch: Any, part: slice) -> Any:
+    return jnp.tanh(batch["x"][part] @ encoder["kernel"] + encoder["bias"])
+
+
+def losses_of_halves(params: Any, latents: Any, batch: Any) -> dict[str, Any]:
+    """main reads the first half, near the second one, far both; of the first, main also reads what has no gradient."""
+    heads, first, second = params["heads"], latents["first"], latents["second"]
+    still = jax.lax.stop_gradient(jnp.mean(second))
+    return {
+        MAIN: jnp.mean((first @ heads[MAIN] - batch[MAIN][:6] - 0.1 * still) ** 2),
+        "near": jnp.mean((second @ heads["near"] - batch["near"][6:]) ** 2),
+        "far": jnp.mean((jnp.concatenate([first, second]) @ heads["far"] - batch["far"]) ** 2),
+    }
+
+
+@pytest.mark.parametrize("case", ["none", "balance", "cosine", "ol_aux", "ol_aux total"])
+def test_latents_in_groups(case: str) -> None:
+    weighting = weighting_of(case)
+    params, batch = in_float32(problem(0))
+    ways = ("per_loss", "jvp", "latents")
+
+    @jax.jit
+    def all_ways(params: Any, state: Any) -> Any:
+        gradients = [weighted_grad(losses_of_halves, weighting, encoder_of, way, encode=halves()) for way in ways]
+        return [gradient(params, state, batch) for gradient in gradients]
+
+    state = weighting.init(NAMES)
+    for _ in range(3):
+        reference, *others = all_ways(params, state)
+        for other in others:
+            assert_close(other, reference)
+        params = jax.tree.map(lambda leaf, change: leaf - np.float32(0.02) * change, params, reference.gradient)
+        state = reference.state
+
+
+@pytest.mark.parametrize(("others", "passes"), [(("near",), (2, 4)), (("near", "far"), (5, 4))])
+def test_gradients_pass_only_through_latents_that_losses_read(others: tuple[str, ...], passes: tuple[int, int]) -> None:
+    params, batch = in_float32(problem(0))
+    names = (MAIN, *others)
+    weighting = make_weighting("ol_aux")
+
+    def chosen(params: Any, latents: Any, batch: Any) -> dict[str, Any]:
+        found = losses_of_halves({"heads": {**problem(0)[0]["heads"], **params["heads"]}}, latents, batch)
+        return {name: found[name] for name in names}
+
+    params["heads"] = {name: params["heads"][name] for name in names}
+    gradient = weighted_grad(chosen, weighting, encoder_of, "latents", encode=halves())
+    found = jax.make_jaxpr(gradient)(params, weighting.init(names), batch)
+    slices = {}  # variable -> the half of the inputs that it is
+    counted = {0: 0, 6: 0}
+    for equation in found.jaxpr.eqns:
+        if equation.primitive.name == "slice" and equation.invars[0].aval.shape == batch["x"].shape:
+            slices[equation.outvars[0]] = equation.params["start_indices"][0]
+        if equation.primitive.name == "dot_general":
+            for operand in equation.invars:
+                counted[slices.get(operand, 0)] += operand in slices
+    # Forward; backward for the main loss; forward with a tangent, and backward for the others: of those that are needed.
+    assert (counted[0], counted[6]) == passes
+
+
+def test_dots_are_those_of_finite_differences() -> None:
+    weighting = make_weighting("ol_aux", log=False)
+
+    @jax.jit
+    def both_ways(params: Any, batch: Any) -> list[dict[str, jax.Array]]:
+        found = [weighted_grad(losses_of, weighting, encoder_of, way) for way in ("per_loss", "jvp")]
+        return [gradient(params, weighting.init(NAMES), batch).metrics for gradient in found]
+
+    for seed in range(3):
+        params, batch = problem(seed)
+        oracle = encoder_gradients(params, batch)
+        for metrics in both_ways(*in_float32((params, batch))):
+            for name in NAMES[1:]:
+                value = metrics[f"dot/{name}"]
+                assert value.dtype == jnp.float32
+                sizes = np.linalg.norm(oracle[name]) * np.linalg.norm(oracle[MAIN])
+                assert abs(float(value) - oracle[name] @ oracle[MAIN]) <= 1e-5 * sizes
+
+
+def test_dots_of_large_trees_are_exact_enough() -> None:
+    random = np.random.default_rng(0)
+    one = {"a": random.normal(size=(700, 512)).astype(np.float32), "b": random.normal(size=3).astype(np.float32)}
+    for other in (one, jax.tree.map(lambda leaf: np.roll(leaf, 1), one)):
+        expected = sum(np.vdot(one[name].astype(np.float64), other[name].astype(np.float64)) for name in one)
+        sizes = sum(np.sum(leaf.astype(np.float64) ** 2) for leaf in one.values())
+        assert abs(float(jax.jit(dot)(one, other)) - expected) <= 1e-5 * sizes
+        assert jax.jit(dot)(*jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.bfloat16), (one, other))).dtype == jnp.float32
+
+
+def test_bfloat16() -> None:
+    """Of parameters in bfloat16: weights and gradients are float32, and point where those of float32 parameters do."""
+    params, batch = in_float32(problem(1, size=64))
+    weighting = make_weighting("ol_aux", interval=1, learning_rate=0.01)
+
+    @jax.jit
+    def all_ways(params: Any) -> Any:
+        return [gradient_by(way, weighting)(params, weighting.init(NAMES), batch) for way in WAYS]
+
+    exact = all_ways(params)[0]
+    for coarse in all_ways(jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16), params)):
+        assert all(leaf.dtype in (jnp.float32, jnp.int32) for leaf in jax.tree.leaves(coarse))
+        one, other = (np.concatenate([leaf.ravel() for leaf in jax.tree.leaves(each.gradient)]) for each in (exact, coarse))
+        assert one @ other >= 0.99 * np.linalg.norm(one) * np.linalg.norm(other)
+        for name in NAMES[1:]:
+            assert np.sign(coarse.metrics[f"dot/{name}"]) == np.sign(exact.metrics[f"dot/{name}"])
