@@ -297,6 +297,8 @@ def test_names_that_do_not_exist():
         ("VisualFetchReach", {"depth_encoding": "log"}),
         ("VisualFetchReach", {"cross_hair": "yes"}),
         ("VisualFetchReach", {"finger_colour": "pink"}),
+        ("VisualHandReach", {"view": "side"}),
+        ("VisualHandReach", {"tip_marks": "blinking"}),
         ("FetchReach", {"goal_at": "nose"}),
         ("FetchReach", {"substeps": 1}),
         ("FetchReach", {"goal_range": -0.1}),

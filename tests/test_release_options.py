@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from point_mass import PointMass, PointMassConfig
@@ -127,6 +128,44 @@ def test_grey_fingers():
     assert np.isin(labels, fingers).sum() > 5
     np.testing.assert_array_equal((grey != orange)[:3].any(axis=0), np.isin(labels, fingers))
     np.testing.assert_array_equal(grey[3], orange[3])
+
+
+def test_the_hand_from_before_its_fingertips():
+    env = make("VisualHandReach", image_size=SIZE, view="fingertips")
+    data = mujoco.MjData(env.mj_model)
+    mujoco.mj_forward(env.mj_model, data)
+    camera = data.camera(env.camera)
+    right, up, back = camera.xmat.reshape(3, 3).T
+    np.testing.assert_allclose(camera.xpos, (1.0, 0.05, 0.15))
+    np.testing.assert_allclose((right, up, back), ((1, 0, 0), (0, 0, 1), (0, -1, 0)), atol=1e-9)
+    assert env.mj_model.camera(env.camera).fovy == 12 and env.observation_spec.shape == (4, SIZE, SIZE)
+    assert make("VisualHandReach", image_size=SIZE).camera == make("HandReach").camera == "front"
+    # What is drawn is what that camera sees: fingertips in a row, from the thumb's to the little finger's.
+    scene = Scene.from_mjmodel(env.mj_model, camera=env.camera, height=SIZE, width=SIZE)
+    labels = np.asarray(env_jit(lambda data: render(scene, data).segmentation)(env._start))
+    columns = [np.nonzero(labels == env.mj_model.geom(f"{name}tip").id)[1].mean() for name in ("th", "ff", "mf", "rf", "lf")]
+    assert columns == sorted(columns)
+
+
+def test_faint_marks_of_fingertips():
+    """Other colours where tips and their links are seen, and nowhere else; nothing else of the model is different."""
+    faint, bright = (make("VisualHandReach", image_size=SIZE, tip_marks=marks).mj_model for marks in ("faint", "bright"))
+    marks = [faint.geom(f"{finger}tip").id for finger in ("ff", "mf", "rf", "lf", "th")]
+    links = [faint.geom(f"{finger}distal").id for finger in ("ff", "mf", "rf", "lf", "th")]
+    np.testing.assert_allclose(faint.geom_rgba[marks, 3], 0.2)
+    assert (np.ptp(faint.geom_rgba[links], axis=0) == 0).all() and (np.ptp(bright.geom_rgba[links], axis=0) > 0)[:3].all()
+    others = np.setdiff1d(np.arange(faint.ngeom), marks + links)
+    for name in ("geom_rgba", "geom_size"):
+        np.testing.assert_array_equal(getattr(faint, name)[others], getattr(bright, name)[others])
+    for name in ("body_mass", "body_inertia", "pair_geom1", "jnt_range", "qpos0"):
+        np.testing.assert_array_equal(getattr(faint, name), getattr(bright, name))
+    env = make("VisualHandReach", image_size=SIZE)
+    scene = Scene.from_mjmodel(env.mj_model, camera="front", height=SIZE, width=SIZE)
+    labels = np.asarray(env_jit(lambda data: render(scene, data).segmentation)(env._start))
+    of = {name: make("VisualHandReach", image_size=SIZE, tip_marks=name) for name in ("faint", "bright")}
+    one, other = (np.asarray(env_jit(env.observe)(env.state_at(env._start, jnp.zeros(15)))).astype(int) for env in of.values())
+    changed = (np.abs(one - other)[:3] > 1).any(axis=0)  # two programs round differently
+    assert changed.sum() > 20 and np.isin(labels[changed], marks + links).all()
 
 
 def test_depth_as_opengl_holds_it():

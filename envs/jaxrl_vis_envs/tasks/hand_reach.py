@@ -14,7 +14,7 @@ joints of the four fingers have no actuator; a tendon ties them to the joint bef
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -28,9 +28,13 @@ from jaxrl_vis_envs.pixels import Observer, PixelsConfig
 from jaxrl_vis_envs.tasks.config import TaskConfig
 from jaxrl_vis_envs.tasks.mjx_env import MjxGoalEnv, register_task
 
+View = Literal["palm", "fingertips"]
+TipMarks = Literal["bright", "faint"]
 _CONTROL_PERIOD = 0.04  # s
 _FINGERTIPS = ("fftip", "mftip", "rftip", "lftip", "thtip")
 _THUMB = 4
+_FAINT_RADIUS, _FAINT_ALPHA = 0.01, 0.2  # m; of the release's marks
+_PLAIN = (0.88, 0.88, 0.9, 1.0)  # colour of a finger's last link, where it has none of its own
 # Gym's rule, m in the world: where thumb and finger meet, from the palm's origin; its scatter; how far from it each tip stays.
 _MEETING_OFFSET = (0.0, -0.09, 0.05)
 _MEETING_SCATTER = 0.005
@@ -81,6 +85,15 @@ class VisualHandReachConfig(PixelsConfig, HandReachConfig):
     """Depths that bytes 0 and 255 stand for, m: 1 mm a step, from above fingers that point up to below the lowest knuckle."""
     clip_range: tuple[float, float] = (0.0124, 62.0)
     """The clipping planes of the release, m."""
+    view: View = "palm"
+    """Where the camera is: above the palm, or before the fingertips, as in the release."""
+    tip_marks: TipMarks = "bright"
+    """What marks fingertips: opaque spheres and links in their colour, or hardly visible smaller spheres, as in the release."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.one_of(self, "view", get_args(View))
+        checks.one_of(self, "tip_marks", get_args(TipMarks))
 
 
 class HandReach(MjxGoalEnv):
@@ -106,6 +119,12 @@ class HandReach(MjxGoalEnv):
         if not config.contacts:
             mj_model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
         self.control_period = _CONTROL_PERIOD
+        if isinstance(config, VisualHandReachConfig) and config.tip_marks == "faint":
+            for name in _FINGERTIPS:
+                mj_model.geom(name).rgba[3] = _FAINT_ALPHA
+                mj_model.geom(name).size[0] = _FAINT_RADIUS
+                mj_model.geom(name.replace("tip", "distal")).rgba = _PLAIN
+        self.camera = self.camera_of(config)
         self._tips = np.array([mj_model.site(name).id for name in _FINGERTIPS])
         self._start = mjx_model.still_data(mj_model, "start")
         super().__init__(config, mj_model, observer)
@@ -113,6 +132,11 @@ class HandReach(MjxGoalEnv):
         goal_model.opt = mj_model.opt
         goal_model.opt.timestep = _CONTROL_PERIOD / config.goal_substeps
         self._goal_model = mjx.put_model(goal_model)
+
+    @classmethod
+    def camera_of(cls, config: HandReachConfig) -> str:
+        is_before = isinstance(config, VisualHandReachConfig) and config.view == "fingertips"
+        return "fingertips" if is_before else cls.camera
 
     def sample_start(self, key: jax.Array) -> mjx.Data:
         return self._start

@@ -57,6 +57,12 @@ class MjxGoalEnv(GoalEnv):
         if self._randomization.varies_appearance and self._scene is None:
             raise ValueError("camera, lights and colours can only be randomized in a task that draws images")
 
+    @classmethod
+    def camera_of(cls, config: Any) -> str:
+        """The camera of the model that the visual task sees through with these settings."""
+        del config
+        return cls.camera
+
     @abc.abstractmethod
     def sample_start(self, key: jax.Array) -> mjx.Data:
         """The start of the episode ``reset(key)``, with poses that belong to its ``qpos``; ``key`` is [], typed."""
@@ -157,7 +163,7 @@ def register_task(task: type[MjxGoalEnv], config_class: type, visual_config_clas
     build: Any = task  # subclasses build the model themselves, and take no `mj_model`
 
     def build_visual(config: Any) -> MjxGoalEnv:
-        return build(config, lambda mj_model: image_observer(mj_model, task.camera, config))
+        return build(config, lambda mj_model: image_observer(mj_model, task.camera_of(config), config))
 
     name = task.__name__
     register(name, lambda config: build(config, None), config_class)
