@@ -33,6 +33,7 @@ TipMarks = Literal["bright", "faint"]
 _CONTROL_PERIOD = 0.04  # s
 _FINGERTIPS = ("fftip", "mftip", "rftip", "lftip", "thtip")
 _THUMB = 4
+_RELEASE_CAMERA = "fingertips"
 _FAINT_RADIUS, _FAINT_ALPHA = 0.01, 0.2  # m; of the release's marks
 _PLAIN = (0.88, 0.88, 0.9, 1.0)  # colour of a finger's last link, where it has none of its own
 # Gym's rule, m in the world: where thumb and finger meet, from the palm's origin; its scatter; how far from it each tip stays.
@@ -112,7 +113,8 @@ class HandReach(MjxGoalEnv):
             config: The settings.
             observer: Given the model, returns the function from poses to images. Default: `observe_state`.
         """
-        mj_model = mjx_model.load_model("hand_reach.xml")
+        self.camera = self.camera_of(config)
+        mj_model = mjx_model.load_model("hand_reach.xml", None if self.camera == type(self).camera else _add_release_camera)
         mj_model.opt.iterations = config.solver_iterations
         mj_model.opt.ls_iterations = config.line_search_iterations
         mj_model.opt.timestep = _CONTROL_PERIOD / config.substeps
@@ -124,7 +126,6 @@ class HandReach(MjxGoalEnv):
                 mj_model.geom(name).rgba[3] = _FAINT_ALPHA
                 mj_model.geom(name).size[0] = _FAINT_RADIUS
                 mj_model.geom(name.replace("tip", "distal")).rgba = _PLAIN
-        self.camera = self.camera_of(config)
         self._tips = np.array([mj_model.site(name).id for name in _FINGERTIPS])
         self._start = mjx_model.still_data(mj_model, "start")
         super().__init__(config, mj_model, observer)
@@ -136,7 +137,7 @@ class HandReach(MjxGoalEnv):
     @classmethod
     def camera_of(cls, config: HandReachConfig) -> str:
         is_before = isinstance(config, VisualHandReachConfig) and config.view == "fingertips"
-        return "fingertips" if is_before else cls.camera
+        return _RELEASE_CAMERA if is_before else cls.camera
 
     def sample_start(self, key: jax.Array) -> mjx.Data:
         return self._start
@@ -207,6 +208,11 @@ class HandReach(MjxGoalEnv):
         meets = (jnp.arange(len(_FINGERTIPS)) == finger) | (jnp.arange(len(_FINGERTIPS)) == _THUMB)
         meets &= jax.random.uniform(return_key) >= _RETURN_SHARE
         return jnp.where(meets[:, None], near_meeting, start)
+
+
+def _add_release_camera(spec: mujoco.MjSpec) -> None:
+    """The camera of the authors' release: before the fingertips, it looks along world y, and up is up."""
+    spec.worldbody.add_camera(name=_RELEASE_CAMERA, pos=[1.0, 0.05, 0.15], quat=[1.0, 1.0, 0.0, 0.0], fovy=12.0)
 
 
 def _joints_by_actuator(mj_model: mujoco.MjModel) -> np.ndarray:
