@@ -69,6 +69,8 @@ class Config:
     """Transitions in a gradient step."""
     replay_transitions: int = 200_000
     """Replay capacity; rounded up to whole rollouts."""
+    replay_mean_age: int | None = None
+    """Mean age of samples, in transitions: the older, the rarer, as if new episodes replaced random ones. None: all alike."""
 
     # -- Goal relabelling and reward (thesis, section 5.1.4)
     relabel_probability: float = 0.9

@@ -82,6 +82,22 @@ def test_transitions_are_sampled_evenly():
     assert np.all(np.abs(counts - 2000) < 5 * np.sqrt(2000))
 
 
+@pytest.mark.parametrize("rollouts", [2, 8])
+def test_older_transitions_are_sampled_as_seldom_as_asked_for(rollouts):
+    """Ages fall exponentially, over what is stored: as where each new episode takes the place of a random one."""
+    capacity, mean_age = 6, 2
+    replay = make_replay(capacity * ENVS * HORIZON, ENVS, HORIZON, mean_age=mean_age * ENVS * HORIZON)
+    state = replay.init(jax.ShapeDtypeStruct((2, 4, 4), jnp.uint8), goal_state_size=2, action_size=2)
+    for iteration in range(rollouts):
+        state = replay.insert(state, encoded_rollout(iteration * ENVS), jnp.int32(iteration))
+    indices = replay.sample_indices(state, jax.random.key(0), jnp.int32(rollouts - 1), 50_000)
+    batch = replay.gather(state, indices, indices.time + 1)
+    age = rollouts - 1 - np.asarray(batch.action)[:, 0] // ENVS
+    shares = np.exp(-np.arange(min(rollouts, capacity)) / mean_age)
+    found = np.bincount(age.astype(int), minlength=len(shares)) / len(age)
+    np.testing.assert_allclose(found, shares / shares.sum(), atol=0.01)
+
+
 def test_after_an_emptied_ring_only_new_episodes_are_sampled():
     """Resuming without the replay restores the iteration but starts with an empty ring."""
     replay, state = filled(0)

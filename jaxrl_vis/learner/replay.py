@@ -65,12 +65,14 @@ class Replay(NamedTuple):
         num_envs: E, episodes in a rollout.
         horizon: T.
         frame_stack: F, images that an observation stacks along C, the newest first; 1 for state vectors.
+        mean_age: Of what is sampled, in rollouts, if probabilities are to fall exponentially with age; None: they are even.
     """
 
     num_rollouts: int
     num_envs: int
     horizon: int
     frame_stack: int = 1
+    mean_age: float | None = None
 
     @property
     def num_episodes(self) -> int:
@@ -134,7 +136,7 @@ class Replay(NamedTuple):
         return ReplayState(episodes=episodes, size=jnp.minimum(state.size + self.num_envs, self.num_episodes))
 
     def sample_indices(self, state: ReplayState, key: jax.Array, iteration: jax.Array, batch_size: int) -> Indices:
-        """B transitions, evenly over the stored ones.
+        """B transitions of the stored ones: evenly, or newer ones more often than older ones (``mean_age``).
 
         Args:
             state: The replay, with the rollout of ``iteration`` inserted.
@@ -144,7 +146,11 @@ class Replay(NamedTuple):
         """
         of_episode, of_time = jax.random.uniform(key, (2, batch_size))
         latest = (iteration % self.num_rollouts + 1) * self.num_envs - 1
-        age = scaled(of_episode, jnp.maximum(state.size, 1))
+        size = jnp.maximum(state.size, 1)
+        if self.mean_age is not None:  # an exponential distribution that ends with the oldest episode
+            mean = self.mean_age * self.num_envs
+            of_episode = -mean * jnp.log1p(of_episode * jnp.expm1(-size / mean)) / size
+        age = scaled(of_episode, size)
         return Indices(episode=(latest - age) % self.num_episodes, time=scaled(of_time, self.horizon))
 
     def gather(
@@ -199,7 +205,7 @@ class Replay(NamedTuple):
         return unpack(state.episodes.flow[indices.episode, indices.time])
 
 
-def make_replay(transitions: int, num_envs: int, horizon: int, frame_stack: int = 1) -> Replay:
+def make_replay(transitions: int, num_envs: int, horizon: int, frame_stack: int = 1, mean_age: int | None = None) -> Replay:
     """A replay of at least ``transitions`` transitions, rounded up to whole rollouts; nothing is allocated yet.
 
     Args:
@@ -207,8 +213,11 @@ def make_replay(transitions: int, num_envs: int, horizon: int, frame_stack: int 
         num_envs: E, episodes in a rollout.
         horizon: T, control steps in an episode.
         frame_stack: F, images that an observation stacks.
+        mean_age: Of what is sampled, transitions; None: samples are even.
     """
-    return Replay(max(1, math.ceil(transitions / (num_envs * horizon))), num_envs, horizon, frame_stack)
+    of_rollout = num_envs * horizon
+    in_rollouts = None if mean_age is None else mean_age / of_rollout
+    return Replay(max(1, math.ceil(transitions / of_rollout)), num_envs, horizon, frame_stack, in_rollouts)
 
 
 def num_bytes(spec: ReplayState) -> int:

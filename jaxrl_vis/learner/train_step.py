@@ -243,7 +243,7 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None) 
     auxiliary = make_auxiliary(config, env.observation_spec, env.action_size, env.frame_stack, networks.dtype)
     algorithm = make_ddpg(networks, config, resolved, auxiliary, shards)
     stacked = env.frame_stack if networks.sees_images else 1
-    replay = make_replay(config.replay_transitions, config.num_envs, env.horizon, stacked)
+    replay = make_replay(config.replay_transitions, config.num_envs, env.horizon, stacked, config.replay_mean_age)
     replay = replay._replace(num_envs=config.num_envs // shards.count)
     replay_spec = replay.spec(env.observation_spec, env.goal_state_size, env.action_size, auxiliary.keeps_flow)
     sampler = Sampler(config, resolved, replay, env.threshold, env.as_goal if stacked > 1 else None, auxiliary, shards)
