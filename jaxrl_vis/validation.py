@@ -37,8 +37,8 @@ def validate(config: Config) -> Config:
             raise RequestError(f"{field.name} must be at most {_LARGEST_COUNT}, not {value}")
     if config.frame_stack is not None and config.frame_stack < 1:
         raise RequestError(f"frame_stack must be at least 1, not {config.frame_stack}")
-    if config.replay_mean_age is not None and config.replay_mean_age < 1:
-        raise RequestError(f"replay_mean_age must be at least 1, or none, not {config.replay_mean_age}")
+    if config.replay_mean_age is not None and not 1 <= config.replay_mean_age <= _LARGEST_COUNT:
+        raise RequestError(f"replay_mean_age must be from 1 to {_LARGEST_COUNT}, or none, not {config.replay_mean_age}")
     for name in ("encoder_filters", "hidden_sizes"):
         if any(size < 1 for size in getattr(config, name)):
             raise RequestError(f"{name} must all be at least 1, not {' '.join(map(str, getattr(config, name)))}")

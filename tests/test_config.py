@@ -29,6 +29,7 @@ BAD_VALUES: tuple[tuple[str, Any, str], ...] = (
     ("actor_interval", 3, "actor_interval (3) must divide updates_per_iteration"),
     ("actor_interval", 0, "actor_interval must be at least 1"),
     ("random_shift", -1, "random_shift must be at least 0"),
+    ("replay_mean_age", 0, "replay_mean_age must be from 1 to"),
     ("trivial_goals", 1.5, "trivial_goals is a share and must lie in [0, 1]"),
     ("encoders", "joint", "encoders cannot be 'joint'"),
     ("num_envs", 10**20, "num_envs must be at most"),

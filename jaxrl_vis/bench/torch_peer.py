@@ -281,7 +281,7 @@ def check_config(program: TrainStep) -> None:
         RequestError: Rewards are not the oracle's, observations are not images, or the peer lacks an option that is set.
     """
     config: Config = program.config
-    for name in ("random_shift", "n_step", "trivial_goals"):
+    for name in ("random_shift", "n_step", "trivial_goals", "replay_mean_age"):
         if getattr(config, name) != getattr(Config, name):
             raise RequestError(f"--peer torch does not know {name}: leave it at {getattr(Config, name)}")
     if config.method != "oracle" or not program.networks.sees_images:

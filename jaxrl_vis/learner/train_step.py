@@ -154,7 +154,7 @@ def _see(train: TrainState, episodes: Episodes, key: jax.Array, config: Config, 
         axes = (0, 1)
     else:  # as the authors' release: as many transitions as the rollout has, relabelled
         count = config.num_envs * sampler.replay.horizon
-        latest = sampler.replay._replace(num_rollouts=1)
+        latest = sampler.replay._replace(num_rollouts=1, mean_age=None)
         sampler = dataclasses.replace(sampler, config=config.replace(batch_size=count), replay=latest)
         rollout = latest.of_rollout(episodes)
         batch = sampler.batch(rollout, sampler.choose(rollout, key, jnp.zeros((), jnp.int32)))

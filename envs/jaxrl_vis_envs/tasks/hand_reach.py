@@ -2,7 +2,8 @@
 
 HandReach of Gym's robotics environments with the goals of the OL-AUX release: where the fingertips are after 20 random actions
 from the start, most of which fully open or close each joint. ``goal_rule="meet"`` is Gym's own: the thumb meets a finger over
-the palm, or, one time in ten, everything returns to the start; its threshold in Gym is .01 m.
+the palm, or, one time in ten, everything returns to the start; its threshold in Gym is .01 m. The release's images differ from
+ours in where the camera is (``view``) and in what marks the fingertips (``tip_marks``).
 
     VisualHandReach   sees RGB-D from above the palm; each fingertip has its own colour
     HandReach         sees joint angles and velocities, and the fingertips
@@ -113,8 +114,8 @@ class HandReach(MjxGoalEnv):
             config: The settings.
             observer: Given the model, returns the function from poses to images. Default: `observe_state`.
         """
-        self.camera = self.camera_of(config)
-        mj_model = mjx_model.load_model("hand_reach.xml", None if self.camera == type(self).camera else _add_release_camera)
+        is_before = self.camera_of(config) == _RELEASE_CAMERA
+        mj_model = mjx_model.load_model("hand_reach.xml", _add_release_camera if is_before else None)
         mj_model.opt.iterations = config.solver_iterations
         mj_model.opt.ls_iterations = config.line_search_iterations
         mj_model.opt.timestep = _CONTROL_PERIOD / config.substeps

@@ -25,7 +25,7 @@ from jaxrl_vis_envs.registry import register
 class MjxGoalEnv(GoalEnv):
     """A `GoalEnv` whose `State.data` is an `mjx.Data` with poses that belong to its ``qpos``."""
 
-    camera: str  # the camera of the model that the visual task sees through
+    camera: str  # the camera of the model that the visual task sees through, unless `camera_of` says otherwise
     exact_contacts: bool = False  # whether its physics steps are those of `mjx_model.step` with ``exact``
 
     def __init__(self, config: Any, mj_model: mujoco.MjModel, observer: Callable[[mujoco.MjModel], Observer] | None) -> None:
@@ -46,6 +46,7 @@ class MjxGoalEnv(GoalEnv):
                 " jax.config.update('jax_enable_x64', False) first"
             )
         self.config = config
+        self.camera = self.camera_of(config)
         self.horizon = config.horizon
         self.threshold = config.threshold
         self.frame_stack = getattr(config, "frame_stack", 1)
