@@ -92,9 +92,24 @@ def test_families_keep_configurations_apart() -> None:
     """Two cells of one name are one cell."""
     seen: dict[str, Cell] = {}
     for preset in ("paper", "fast"):
-        for figure in STUDIES:
-            for parts in all_cells(figure, variants=tuple(VARIANTS), preset=preset).values():
-                assert seen.setdefault(parts[0].name, parts[0]) == parts[0]
+        for options in ((), ("view=fingertips",), ("view=fingertips", "tip_marks=faint")):
+            for figure in STUDIES:
+                changes = {"env_options": options}
+                for parts in all_cells(figure, variants=tuple(VARIANTS), preset=preset, changes=changes).values():
+                    assert parts[0].config.env_options == options
+                    assert seen.setdefault(parts[0].name, parts[0]) == parts[0]
+
+
+def test_settings_of_an_environment_are_shown_and_name_one_folder(tmp_path: Path) -> None:
+    scope = Scope(seeds=2, env_steps=100_000, changes={"env_options": ("depth_encoding=zbuffer", "clip_range=0.1/9")})
+    ((cell,),) = cells_of(STUDIES["5.4"], (FETCH,), ("none",), scope).values()
+    made_up(cell, tmp_path, slope(1.0))
+    assert [folder.name for folder in tmp_path.iterdir()] == [cell.name]
+    request = Request("5.4", STUDIES["5.4"], tmp_path / "f.png", tmp_path, (FETCH,), ("none",), scope, draw_only=True)
+    assert make_figure(request, lambda line: None)
+    assert "preset paper, depth_encoding=zbuffer, clip_range=0.1/9," in request.out.with_suffix(".md").read_text()
+    plain = dataclasses.replace(request, scope=dataclasses.replace(scope, changes={}))
+    assert not make_figure(plain, lambda line: None)  # these would be other runs
 
 
 def test_what_the_authors_released_is_shipped() -> None:

@@ -79,6 +79,8 @@ class Figure:
     """At most so many seeds in one program, where memory is short; all of them if not given."""
     env_steps: int | None = None
     """Environment steps of every run; the figure's own budgets if not given."""
+    env_options: tuple[str, ...] = ()
+    """Settings of the environment in every run, as of `train`: view=fingertips tip_marks=faint."""
     runs: Path | None = None
     """Folder of all run folders and logs, shared by figures of one subject; runs/ol_aux or runs/indicator if not given."""
     minutes: float | None = None
@@ -187,7 +189,7 @@ def _request(options: Figure, out: Path) -> "Request":
         seeds=options.seeds or (1 if options.quick else 5),
         seeds_per_run=options.seeds_per_run,
         env_steps=options.env_steps,
-        changes=quick,
+        changes=quick | ({"env_options": options.env_options} if options.env_options else {}),
     )
     return Request(
         figure=options.figure,

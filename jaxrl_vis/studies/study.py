@@ -1,6 +1,7 @@
 """What every study is made of: variants of a configuration, on tasks, over seeds. The studies: `indicator`, `ol_aux`."""
 
 import dataclasses
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -120,7 +121,8 @@ def _cells(study: Study, task: str, variant: str, scope: Scope) -> list[Cell]:
     config = config.replace(**_OF_PRESET.get(scope.preset, {}), **study.family.of_task.get((scope.preset, task), {}))
     config = config.replace(env_steps=_budget(study, task, variant, scope, config))
     changed = config.replace(**study.family.variants[variant].changes).replace(**scope.changes)
-    family = f"{task}-{variant}-{scope.preset}"
+    options = (re.sub(r"[^\w=.-]", "_", option) for option in changed.env_options)  # it names a folder
+    family = "-".join((task, variant, scope.preset, *options))
     return split_seeds(Cell(family, validate(changed)), scope.seeds_per_run or scope.seeds)
 
 
