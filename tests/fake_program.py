@@ -37,7 +37,7 @@ class FakeProgram:
     """See the module."""
 
     def __init__(self, config: Config, nan_at: int | None = None, break_state: bool = False, filtered_share: float = 0.1):
-        self.config, self.traces, self.layout = config, 0, ONE_DEVICE
+        self.config, self.traces, self.layout, self.parts = config, 0, ONE_DEVICE, None
         self.env = types.SimpleNamespace(distance_unit="m", threshold=0.05, control_period=0.04, horizon=HORIZON, frame_stack=1)
         self.steps_per_iteration = config.num_envs * HORIZON
         self.updates_per_iteration = 3

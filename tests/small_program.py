@@ -22,13 +22,14 @@ def _trained_alike(config: Config) -> Config:
 @functools.cache
 def _program_of(config: Config) -> train_step.TrainStep:
     program = train_step.make_train_step(make_env(config), config)
-    original = program.train_iteration.__wrapped__
+    original = program.parts.learn.__wrapped__
 
-    def train_iteration(loop):  # of the same name, so that what another process has compiled is found
+    def learn_parts(loop, parts):  # of the same name, so that what another process has compiled is found
         _TRACES[config] += 1
-        return original(loop)
+        return original(loop, parts)
 
-    return dataclasses.replace(program, train_iteration=env_jit(train_iteration, donate_argnums=0))
+    learn = env_jit(learn_parts, donate_argnums=0)
+    return dataclasses.replace(program, parts=dataclasses.replace(program.parts, learn=learn))
 
 
 def make_train_step(env: GoalEnv, config: Config) -> train_step.TrainStep:
@@ -37,5 +38,5 @@ def make_train_step(env: GoalEnv, config: Config) -> train_step.TrainStep:
 
 
 def traces(config: Config) -> int:
-    """How often this process has traced the training iteration of a configuration."""
+    """How often this process has traced what follows the rollouts of a configuration."""
     return _TRACES[_trained_alike(config)]

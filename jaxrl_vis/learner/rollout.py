@@ -31,6 +31,12 @@ class Exploration(NamedTuple):
     action_noise: float = 0.0
 
 
+    @property
+    def is_none(self) -> bool:
+        """Whether actions are known to be the policy's own; not so of numbers that a compiled program is given."""
+        return all(isinstance(value, float | int) and value == 0 for value in self)
+
+
 NO_EXPLORATION = Exploration()
 
 
@@ -65,7 +71,7 @@ def choose_actions(
         [E, A] float32 in [-1, 1].
     """
     action = networks.act(train.actor, jnp.stack([encode(networks, train, train.normalizer, observations), goal_latents]))
-    if exploration == NO_EXPLORATION:
+    if exploration.is_none:
         return action
     noise_key, random_key = jax.random.split(key)
     noise = shards.draw(lambda shape: jax.random.normal(noise_key, shape), action.shape)
@@ -83,6 +89,15 @@ def split_keys(keys: jax.Array, num_envs: int, shards: Shards = ONE) -> tuple[ja
     """
     reset_keys, policy_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
     return jax.vmap(lambda key: shards.part(jax.random.split(key, num_envs)))(reset_keys).reshape(-1), policy_keys
+
+
+def split_keys_of_part(keys: jax.Array, num_envs: int, first: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """`split_keys` for ``num_envs`` environments from number ``first`` on: the same resets, and noise of their own."""
+    reset_keys, policy_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
+    numbers = first + jnp.arange(num_envs)
+    # JAX makes the same key number i in either way, however many there are.
+    each = jax.vmap(jax.vmap(jax.random.fold_in, (None, 0)), (0, None))(reset_keys, numbers)
+    return each.reshape(-1), jax.vmap(jax.random.fold_in, (0, None))(policy_keys, first)
 
 
 def add_noise(key: jax.Array, observations: jax.Array, deviation: float, shards: Shards = ONE) -> jax.Array:
@@ -129,6 +144,7 @@ def play(
     num_kept: int | None = None,
     record: Callable[[State], Any] | None = None,
     shards: Shards = ONE,
+    first: jax.Array | None = None,
 ) -> Rollout:
     """Plays one episode in each of E environments, for each of S learners side by side.
 
@@ -144,6 +160,8 @@ def play(
         num_kept: K, how many of the episodes to keep (the first ones); None: all.
         record: What else to keep, a pytree made of the state of one environment after reset and after each step.
         shards: Of each learner. In one part, E / ``shards.count`` of its environments are played.
+        first: [] int32, the number of the first environment, where a rollout is played E environments at a time; None: all at
+            once.
     """
     num_seeds = keys.shape[0]
     num_envs, num_drawn = num_envs // shards.count, num_envs
@@ -166,7 +184,10 @@ def play(
     def recorded(state: State) -> Any:
         return None if record is None else jax.tree.map(kept, jax.vmap(record)(state))
 
-    reset_keys, policy_keys = split_keys(keys, num_drawn, shards)
+    if first is None:
+        reset_keys, policy_keys = split_keys(keys, num_drawn, shards)
+    else:
+        reset_keys, policy_keys = split_keys_of_part(keys, num_drawn, first)
     state = jax.vmap(env.reset)(reset_keys)
     assert state.obs is not None
     first_observation = seen(state.obs["observation"], policy_keys, _FIRST_NOISE)

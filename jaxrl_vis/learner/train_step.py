@@ -25,6 +25,7 @@ from jaxrl_vis.learner.auxiliary import Auxiliary, make_auxiliary
 from jaxrl_vis.learner.ddpg import Algorithm, Prepared, Working, make_ddpg
 from jaxrl_vis.learner.evaluate import make_evaluate
 from jaxrl_vis.learner.networks import Networks
+from jaxrl_vis.learner.parts import Parts, make_parts
 from jaxrl_vis.learner.replay import Replay, make_replay, num_bytes
 from jaxrl_vis.learner.rollout import Exploration, play
 from jaxrl_vis.learner.sampling import Choice, Sampler
@@ -59,6 +60,7 @@ class TrainStep:
             (TrainState, ReplayState, Episodes, keys [S], iteration) -> (TrainState, ReplayState), the first two donated;
             (TrainState, ReplayState, keys [S], iteration) -> (TrainState, metrics) after ``updates_per_iteration`` steps, the
             first donated.
+        parts: The same run in parts, as a CPU computes it (`jaxrl_vis.learner.parts`); None on several devices.
     """
 
     env: GoalEnv
@@ -74,6 +76,7 @@ class TrainStep:
     rollout: Any
     insert: Any
     update_many: Any
+    parts: Parts | None
 
     @property
     def steps_per_iteration(self) -> int:
@@ -281,11 +284,16 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None) 
     ) -> tuple[TrainState, Metrics]:
         return per_seed(update_many, (0, 0, 0, None))(train, layout.unfolded(replay_state), keys, iteration)
 
+    def keys_of(keys: jax.Array, iteration: jax.Array) -> jax.Array:
+        return per_seed(lambda key: jax.random.split(jax.random.fold_in(key, iteration)), out_axes=1)(keys)
+
+    learn_each = per_seed(learn, (_SEED_AXES, 0, 0, 0), (_SEED_AXES, 0))
+
     def train_iteration(loop: LoopState) -> tuple[LoopState, Metrics]:
         loop = loop.replace(replay=layout.unfolded(loop.replay))
-        keys = per_seed(lambda key: jax.random.split(jax.random.fold_in(key, loop.iteration)), out_axes=1)(loop.key)
+        keys = keys_of(loop.key, loop.iteration)
         episodes, outcome = rollout(loop.train, keys[0])
-        loop, metrics = per_seed(learn, (_SEED_AXES, 0, 0, 0), (_SEED_AXES, 0))(loop, episodes, outcome, keys[1])
+        loop, metrics = learn_each(loop, episodes, outcome, keys[1])
         return loop.replace(replay=layout.folded(loop.replay, replay.num_envs)), metrics
 
     return TrainStep(
@@ -298,4 +306,5 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None) 
         layout=layout,
         **_jitted(layout, init_seeds, train_iteration, rollout, insert_seeds, update_seeds),
         evaluate=_jitted_evaluate(layout, make_evaluate(env, networks, config, shards)),
+        parts=make_parts(env, networks, config, keys_of, learn_each) if layout.mesh is None else None,
     )

@@ -14,6 +14,7 @@ import dataclasses
 import functools
 import hashlib
 import importlib.util
+import itertools
 import json
 import os
 from collections.abc import Callable
@@ -76,7 +77,7 @@ class CompiledOfLeaves:
     """A compiled program that takes and returns leaves, called with trees.
 
     Args:
-        compiled: From ``jax.jit(...).lower(...).compile()``; takes a list of leaves. Asked for anything else, this is it.
+        compiled: From ``jax.jit(...).lower(...).compile()``; takes a list of leaves for each argument. Asked for anything else, this is it.
         restore: What its results are, given what it returns.
     """
 
@@ -85,7 +86,7 @@ class CompiledOfLeaves:
 
     def __call__(self, *arguments: Any) -> Any:
         """What the program returns for these trees."""
-        return self._restore(self._compiled(jax.tree.leaves(arguments)))
+        return self._restore(self._compiled(*map(jax.tree.leaves, arguments)))
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._compiled, name)
@@ -111,19 +112,19 @@ class KeptPrograms:
             function: Jitted.
             arguments: Shapes of what it takes.
             simplify: Makes arrays, lists, tuples and dictionaries of what it returns.
-            **jit_options: As of `env_jit`; ``donate_argnums=0`` stands for all arguments.
+            **jit_options: As of `env_jit`.
         """
-        leaves = jax.tree.leaves(arguments)
+        leaves = tuple(map(jax.tree.leaves, arguments))
         data = self._read(name)
         if data is None:
             traced = function.trace(*arguments)
             call, tree = jaxpr_as_fun(traced.jaxpr), jax.tree.structure(traced.out_info)
-            of_leaves = jax.jit(lambda leaves: simplify(jax.tree.unflatten(tree, call(*leaves))))
-            exported = export.export(of_leaves, platforms=(target_platform(),), disabled_checks=_CHECKS)(leaves)
+            of_leaves = jax.jit(lambda *leaves: simplify(jax.tree.unflatten(tree, call(*itertools.chain(*leaves)))))
+            exported = export.export(of_leaves, platforms=(target_platform(),), disabled_checks=_CHECKS)(*leaves)
             self._fresh[name] = data = bytes(exported.serialize())
         # Also what has just been traced: XLA's cache takes a program that was read for another one than that which was traced.
         program = export.deserialize(bytearray(data))
-        return env_jit(program.call, **jit_options).lower(leaves)
+        return env_jit(program.call, **jit_options).lower(*leaves)
 
     def write(self) -> None:
         """Keeps what was traced; call it when it has been compiled. Where that cannot be written, nothing is kept."""

@@ -142,7 +142,7 @@ def check_compiled(programs: dict[str, Any], already_there: bool, layout: Layout
     """The same question with the compiler's own figures. Still nothing is allocated.
 
     Args:
-        programs: Compiled programs by name; ``train_iteration`` among them, where a state is to be made.
+        programs: Compiled programs by name; ``train_iteration`` or ``learn`` among them, where a state is to be made.
         already_there: The loop state is on the device already.
         layout: Where they run; the compiler's figures are those of one device.
 
@@ -153,7 +153,8 @@ def check_compiled(programs: dict[str, Any], already_there: bool, layout: Layout
     if there is None:
         return
     analyses = {name: program.memory_analysis() for name, program in programs.items()}
-    state = analyses["train_iteration"].argument_size_in_bytes if analyses.get("train_iteration") else 0
+    training = analyses.get("train_iteration") or analyses.get("learn")
+    state = training.argument_size_in_bytes if training else 0
     for name, analysis in analyses.items():
         if analysis is None or name == "init":
             continue

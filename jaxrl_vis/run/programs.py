@@ -1,6 +1,9 @@
 """A configuration and its compiled programs: everything that a run, an evaluation or a notebook executes on the device.
 
 All of it is compiled before training starts, so that the end of a run, where signals and full disks come, compiles nothing.
+
+On a CPU a training iteration and an evaluation are made of the same smaller programs (`jaxrl_vis.learner.parts`), which compile
+in little more than half the time and run on all cores; elsewhere each is a program of its own.
 """
 
 import concurrent.futures
@@ -17,20 +20,33 @@ import jax.numpy as jnp
 from jaxrl_vis import processes
 from jaxrl_vis.config import Config
 from jaxrl_vis.devices import enable_compilation_cache
+from jaxrl_vis.learner.parts import played_spec
+from jaxrl_vis.learner.rollout import Exploration
 from jaxrl_vis.report import videos
 from jaxrl_vis.run.arrays import to_host
 from jaxrl_vis.run.kept_programs import CompiledOfLeaves, KeptPrograms, fingerprint
 from jaxrl_vis.run.nonfinite import broken_leaves
+from jaxrl_vis.run.side_by_side import SideBySide
 from jaxrl_vis.run.signals import shield_this_thread
-from jaxrl_vis.types import LoopState, Metrics, TrainState
-from jaxrl_vis_envs.compilation import distrusted_kernels, tracing_for_default_device, trusting_kernels
+from jaxrl_vis.types import Episodes, LoopState, Metrics, TrainState
+from jaxrl_vis_envs.compilation import distrusted_kernels, targets_cpu, tracing_for_default_device, trusting_kernels
 
 # Evaluation draws from a key of its own, the same at every evaluation and for every seed.
 _EVALUATION_SEED = 2**31 - 1
 # What takes longest to compile comes first: it compiles while the others are traced.
-_NAMES = ("train_iteration", "evaluate", "init", "broken_leaves")
+_WHOLE = ("train_iteration", "evaluate", "init", "broken_leaves")
+_PARTS = ("play", "learn", "keys")
+_IN_PARTS = ("play", "learn", "init", "broken_leaves", "keys")
 # Those that take long to trace, and their options.
-_KEPT: dict[str, dict[str, Any]] = {"init": {"runs_once": True}, "train_iteration": {"donate_argnums": 0}, "evaluate": {}}
+_KEPT: dict[str, dict[str, Any]] = {
+    "init": {"runs_once": True},
+    "train_iteration": {"donate_argnums": 0},
+    "evaluate": {},
+    "play": {},
+    "learn": {"donate_argnums": 0},
+}
+# Trees that programs return, which are lists of their leaves in what is kept.
+_TREES = (LoopState, Episodes)
 # Of objects made since the last collection of garbage; Python's own default is 700.
 _OBJECTS_WHILE_TRACING = 100_000
 
@@ -46,13 +62,13 @@ def rarely_collecting_garbage() -> Iterator[None]:
         gc.set_threshold(*before)
 
 
-def _without_loop_states(results: Any) -> Any:
-    """Results of a program, with the leaves of each loop state, a list, in its place."""
+def _without_trees(results: Any) -> Any:
+    """Results of a program, with the leaves of each of `_TREES`, a list, in its place."""
 
     def leaves(part: Any) -> Any:
-        return jax.tree.leaves(part) if isinstance(part, LoopState) else part
+        return jax.tree.leaves(part) if isinstance(part, _TREES) else part
 
-    return jax.tree.map(leaves, results, is_leaf=lambda part: isinstance(part, LoopState))
+    return jax.tree.map(leaves, results, is_leaf=lambda part: isinstance(part, _TREES))
 
 
 class Programs:
@@ -79,6 +95,9 @@ class Programs:
         self._compiled: dict[str, Any] = {}
         self._kept: KeptPrograms | None = None
         self._may_keep = keep and self.layout.mesh is None
+        with tracing_for_default_device():
+            in_parts = program.parts is not None and targets_cpu()
+        self._side_by_side = SideBySide(self.env, program.parts, self.compiled) if in_parts else None
 
     @functools.cached_property
     def run_keys(self) -> jax.Array:
@@ -119,7 +138,9 @@ class Programs:
         Returns:
             The compiled programs by name.
         """
-        self._make([name for name in _NAMES if name not in self._compiled], meanwhile)
+        names = _WHOLE if self._side_by_side is None else _IN_PARTS
+        if missing := [name for name in names if name not in self._compiled]:
+            self._make(missing, meanwhile)
         return dict(self._compiled)
 
     def _make(self, names: Sequence[str], meanwhile: Callable[[], None] = lambda: None) -> None:
@@ -129,7 +150,7 @@ class Programs:
             self._kept = KeptPrograms(cache / "programs", found)
             try:
                 with trusting_kernels():
-                    self._compiled |= self._side_by_side(names, meanwhile)
+                    self._compiled |= self._all(names, meanwhile)
                 self._kept.write()
                 return
             except Exception:  # whatever is wrong with them, or with a kernel in them, is found below, without
@@ -137,15 +158,15 @@ class Programs:
                 self._kept, self._may_keep = None, False
         try:
             with trusting_kernels():
-                self._compiled |= self._side_by_side(names, meanwhile)
+                self._compiled |= self._all(names, meanwhile)
         except Exception:
             if not distrusted_kernels():
                 raise
-            self._compiled |= self._side_by_side(names, meanwhile)
+            self._compiled |= self._all(names, meanwhile)
 
-    def _side_by_side(self, names: Sequence[str], meanwhile: Callable[[], None]) -> dict[str, Any]:
+    def _all(self, names: Sequence[str], meanwhile: Callable[[], None]) -> dict[str, Any]:
         # Tracing is Python and goes one by one; XLA compiles without the interpreter's lock, meanwhile.
-        with concurrent.futures.ThreadPoolExecutor(len(_NAMES), initializer=shield_this_thread) as pool:
+        with concurrent.futures.ThreadPoolExecutor(len(names), initializer=shield_this_thread) as pool:
             futures = {name: pool.submit(self._lower(name).compile) for name in names}
             if "init" in names and not processes.are_several():
                 # Taking keys apart, as saving does, is a program, too.
@@ -159,20 +180,33 @@ class Programs:
     def _lower(self, name: str) -> Any:
         if name == "broken_leaves":
             return jax.jit(broken_leaves).lower(self.shapes)
-        arguments: dict[str, tuple] = {
-            "init": (self.run_keys,),
-            "train_iteration": (self.shapes,),
-            "evaluate": (self.shapes.train, self.evaluation_key),
-        }
+        arguments = self._arguments(name)
+        function = getattr(self.program.parts if name in _PARTS else self.program, name)
         with tracing_for_default_device(), rarely_collecting_garbage():
-            function = getattr(self.program, name)
-            if self._kept is None:
-                return function.lower(*arguments[name])
-            return self._kept.lower(name, function, arguments[name], _without_loop_states, **_KEPT[name])
+            if self._kept is None or name not in _KEPT:
+                return function.lower(*arguments)
+            return self._kept.lower(name, function, arguments, _without_trees, **_KEPT[name])
+
+    def _arguments(self, name: str) -> tuple:
+        """Shapes of what a program is called with."""
+        if name == "init":
+            return (self.run_keys,)
+        shapes = self.shapes
+        if name == "train_iteration":
+            return (shapes,)
+        if name == "evaluate":
+            return shapes.train, self.evaluation_key
+        if name == "keys":
+            return shapes.key, shapes.iteration
+        number = jax.ShapeDtypeStruct((), jnp.float32)
+        if name == "play":
+            return shapes.train, shapes.key, jax.ShapeDtypeStruct((), jnp.int32), Exploration(number, number)
+        size, num_envs = self.program.parts.size, self.config.num_envs
+        return shapes, [played_spec(self.env, size, len(self.seeds))] * len(range(0, num_envs, size))
 
     def _of_trees(self, name: str, compiled: Any) -> CompiledOfLeaves:
         """A kept program as the program that it was traced from: its loop states are trees again, not lists."""
-        tree = jax.tree.structure(self.shapes)
+        tree = jax.tree.structure(Episodes(0, 0, 0) if name == "play" else self.shapes)  # type: ignore[arg-type]
 
         def restored(part: Any) -> Any:
             return jax.tree.unflatten(tree, part) if isinstance(part, list) else part
@@ -183,7 +217,7 @@ class Programs:
         return CompiledOfLeaves(compiled, restore)
 
     def compiled(self, name: str) -> Any:
-        """One compiled program: ``init``, ``train_iteration``, ``evaluate`` or ``broken_leaves``."""
+        """One compiled program, by its name in `compile`."""
         if name not in self._compiled:
             self._make([name])
         return self._compiled[name]
@@ -192,8 +226,15 @@ class Programs:
         """A fresh learner with an empty replay, for each of the typed keys [S]."""
         return self.compiled("init")(self.layout.put(keys, self.layout.by_seed))
 
+    def of_evaluation(self) -> dict[str, Any]:
+        """The compiled programs that an evaluation needs, by name."""
+        name = "evaluate" if self._side_by_side is None else "play"
+        return {name: self.compiled(name)}
+
     def train_iteration(self, loop: LoopState) -> tuple[LoopState, Metrics]:
         """One iteration; ``loop`` is donated. See `Trainer.train_iteration`."""
+        if self._side_by_side is not None:
+            return self._side_by_side.train_iteration(loop, self.config.num_envs)
         return self.compiled("train_iteration")(loop)
 
     def evaluate(self, train: TrainState, key: jax.Array | None = None) -> tuple[Metrics, dict[str, jax.Array]]:
@@ -204,6 +245,8 @@ class Programs:
             key: Draws the episodes; None: always the same ones.
         """
         key = self.evaluation_key if key is None else self.layout.put(key, self.layout.everywhere)
+        if self._side_by_side is not None:
+            return self._side_by_side.evaluate(train, jnp.stack([key for _ in self.seeds]), self.config.eval_episodes)
         return self.compiled("evaluate")(train, key)
 
     def broken_leaves(self, loop: LoopState) -> list[str]:

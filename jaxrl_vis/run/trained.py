@@ -71,7 +71,7 @@ def evaluate_run(run_dir: Path | str, episodes: int | None = None, keep_programs
     """
     trainer = open_run(run_dir, keep_programs, **({} if episodes is None else {"eval_episodes": episodes}))
     restored = load(trainer, run_dir)
-    check_compiled({"evaluate": trainer.programs.compiled("evaluate")}, already_there=True)
+    check_compiled(trainer.programs.of_evaluation(), already_there=True)
     values = jax.device_get(trainer.evaluate(restored.train))
     return {name: [float(number) for number in value] for name, value in values.items()}
 

@@ -1,0 +1,95 @@
+"""Training and evaluation in parts, as on a CPU: the same as all at once, but for the noise that each part draws."""
+
+import functools
+import math
+
+import jax
+import numpy as np
+import pytest
+
+from jaxrl_vis.config import preset
+from jaxrl_vis.learner.environment import make_env
+from jaxrl_vis.learner.parts import PART_SIZE, part_size, played_spec
+from jaxrl_vis.learner.rollout import Exploration
+from jaxrl_vis.learner.train_step import TrainStep, make_train_step
+from jaxrl_vis.run.programs import Programs
+from jaxrl_vis.run.side_by_side import SideBySide
+
+SIZES = {"num_envs": 10, "seeds": 2, "eval_episodes": 13, "image_size": 16}
+CONFIG = preset("debug", env="VisualReacher", random_action_probability=0.0, action_noise=0.0, **SIZES)
+
+
+@pytest.fixture(scope="module")
+def program() -> TrainStep:
+    return make_train_step(make_env(CONFIG), CONFIG)
+
+
+@pytest.fixture(scope="module")
+def programs(program: TrainStep) -> Programs:
+    made = Programs(CONFIG, program)
+    made.compile()
+    return made
+
+
+def assert_near(found, expected) -> None:
+    assert jax.tree.structure(found) == jax.tree.structure(expected)
+    for ours, theirs in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        if jax.dtypes.issubdtype(ours.dtype, jax.dtypes.prng_key):
+            ours, theirs = jax.random.key_data(ours), jax.random.key_data(theirs)
+        assert ours.shape == theirs.shape and ours.dtype == theirs.dtype
+        # A pixel at an edge may round to the next of 256 values.
+        ours, theirs = np.asarray(ours, np.float64), np.asarray(theirs, np.float64)
+        np.testing.assert_allclose(ours, theirs, rtol=2e-3, atol=1.0 if theirs.max(initial=0) > 100 else 1e-4)
+
+
+@pytest.mark.parametrize("num_envs", [1, 3, 7, 8, 9, 13, 16, 25, 80, 1000])
+def test_parts_are_few_small_and_nearly_full(num_envs: int) -> None:
+    size = part_size(num_envs)
+    count = math.ceil(num_envs / size)
+    assert size <= PART_SIZE and count == math.ceil(num_envs / PART_SIZE)
+    assert count * size - num_envs < count
+
+
+def test_an_evaluation_is_of_the_same_episodes(program: TrainStep, programs: Programs) -> None:
+    train = programs.init(programs.run_keys).train
+    assert set(programs.of_evaluation()) == {"play"}
+    assert_near(programs.evaluate(train), program.evaluate(train, programs.evaluation_key))
+    other, _ = programs.evaluate(train, jax.random.key(5))
+    assert not np.array_equal(other["eval/goal_distance"], programs.evaluate(train)[0]["eval/goal_distance"])
+
+
+def test_an_iteration_without_noise_is_the_same(program: TrainStep, programs: Programs) -> None:
+    expected, found = programs.init(programs.run_keys), programs.init(programs.run_keys)
+    for _ in range(2):
+        expected, expected_metrics = program.train_iteration(expected)
+        found, metrics = programs.train_iteration(found)
+        assert_near(metrics, expected_metrics)
+    assert_near(found.replay, expected.replay)
+    assert_near((found.key, found.iteration), (expected.key, expected.iteration))
+
+
+def test_each_part_draws_its_own_noise_and_the_same_one_again(program: TrainStep, programs: Programs) -> None:
+    train = programs.init(programs.run_keys).train
+    side_by_side = SideBySide(program.env, program.parts, programs.compiled)
+    play = functools.partial(side_by_side.play, train, programs.run_keys, 10)
+    policy, random, noisy, again = (
+        np.concatenate([episodes.actions for episodes, _ in play(Exploration(*exploration))], axis=1)
+        for exploration in ((0.0, 0.0), (1.0, 0.0), (0.0, 0.2), (0.0, 0.2))
+    )
+    assert policy.shape == (2, 10, program.env.horizon, 2)
+    assert abs(random.mean()) < 0.05 and abs(random.std() - 3**-0.5) < 0.05
+    assert np.array_equal(noisy, again)
+    noise = (noisy - policy)[:, :, 0]  # of the first step, which both took in the same state
+    assert 0.1 < noise.std() < 0.3
+    assert len(np.unique(np.round(random, 6))) > 0.99 * random.size  # no part repeats another one
+
+
+def test_what_is_played_has_the_shapes_that_are_compiled_for(program: TrainStep, programs: Programs) -> None:
+    played = program.parts.play(
+        programs.init(programs.run_keys).train, programs.run_keys, np.int32(0), Exploration(np.float32(0), np.float32(0))
+    )
+    spec = played_spec(program.env, program.parts.size, 2)
+    assert jax.tree.structure(spec) == jax.tree.structure(played)
+    assert [(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(spec)] == [
+        (leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(played)
+    ]
