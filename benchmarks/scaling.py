@@ -71,7 +71,6 @@ class Timed:
     def __init__(self, config: Config, env: Any, evaluates: bool):
         self.config, self.evaluates = config, evaluates
         self.programs = Programs(config, make_train_step(env, config))
-        self.names = ("init", "train_iteration", *(("evaluate",) if evaluates else ()))
         self.loop: Any = None
         self.compile_s = 0.0
 
@@ -104,8 +103,10 @@ class Timed:
 
     def compile(self) -> None:
         """Compiles its programs, or finds them in the compile cache."""
-        for name in self.names:
-            self.programs.compiled(name)
+        self.programs.compiled("init")
+        self.programs.of_training()
+        if self.evaluates:
+            self.programs.of_evaluation()
 
 
 def compile_all(everything: list[Timed]) -> float:

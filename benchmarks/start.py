@@ -80,14 +80,14 @@ def parts(clock: Clock, options: argparse.Namespace) -> None:
     programs = imported(clock, options)
     program, shapes, keys = programs.program, programs.shapes, programs.run_keys
     clock.lap("shapes")
+    for name in programs.names:
+        lowered = programs.lower(name)
+        clock.lap(f"{name}: trace and lower")
+        lowered.compile()
+        clock.lap(f"{name}: compile")
     episodes, _ = jax.eval_shape(program.rollout, shapes.train, keys)
-    clock.lap(
-        "rollout: trace"
-    )  # JAX keeps what it traced, so train_iteration, which contains it, takes less than it would alone
+    clock.lap("rollout: trace")  # JAX keeps what it traced, so what is part of something above takes less than it would alone
     arguments = {
-        "init": (keys,),
-        "train_iteration": (shapes,),
-        "evaluate": (shapes.train, programs.evaluation_key),
         "rollout": (shapes.train, keys),
         "insert": (shapes.train, shapes.replay, episodes, keys, shapes.iteration),
         "update_many": (shapes.train, shapes.replay, keys, shapes.iteration),

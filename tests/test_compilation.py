@@ -110,7 +110,7 @@ def test_a_kernel_that_does_not_compile_is_left_out_and_named_once(gpu, monkeypa
 
 def run_of(function) -> Programs:
     """A run of which ``init`` is a function of keys, and nothing else is there."""
-    programs = Programs(preset("debug"), SimpleNamespace(env=None, layout=ONE_DEVICE, init=jax.jit(function)))
+    programs = Programs(preset("debug"), SimpleNamespace(env=None, layout=ONE_DEVICE, parts=None, init=jax.jit(function)))
     programs.shapes = SimpleNamespace(train=None)  # type: ignore[assignment]
     return programs
 

@@ -12,6 +12,7 @@ from learners import begin, experienced, iteration_of_one
 from jaxrl_vis.config import preset
 from jaxrl_vis.learner import rollout
 from jaxrl_vis.learner.train_step import make_train_step
+from jaxrl_vis.run.programs import Programs
 
 DISCOUNT = 0.75  # 1 - 1/horizon of the probes
 # Probes that are learned with the same settings.
@@ -164,12 +165,13 @@ def test_share_of_positives_is_the_one_derived(method, expected):
     assert abs(float(metrics["train/positive_share"][0]) - expected) < 0.012
 
 
-def test_replay_is_written_in_place():
+@pytest.mark.parametrize("name", ["train_iteration", "learn"])
+def test_replay_is_written_in_place(name):
     """The compiled iteration holds no second copy of the replay: it is aliased, and temporaries stay far below it."""
-    program = make_train_step(probes.PointImage(), preset("debug", replay_transitions=200_000))
-    loop = jax.eval_shape(program.init, jax.random.split(jax.random.key(0), 2))
-    memory = program.train_iteration.lower(loop).compile().memory_analysis()
-    replay = 2 * program.replay_bytes
+    config = preset("debug", replay_transitions=200_000, seeds=2)
+    programs = Programs(config, make_train_step(probes.PointImage(), config))
+    memory = programs.lower(name).compile().memory_analysis()
+    replay = 2 * programs.program.replay_bytes
     assert replay > 10e6
     assert memory.alias_size_in_bytes >= replay
     assert memory.temp_size_in_bytes < 0.2 * replay

@@ -1,22 +1,25 @@
-"""Training and evaluation in parts, as on a CPU: the same as all at once, but for the noise that each part draws."""
+"""Training and evaluation in parts, as runs on one device have them: the same as all at once."""
 
 import functools
 import math
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxrl_vis.config import preset
+from jaxrl_vis.learner import parts
 from jaxrl_vis.learner.environment import make_env
 from jaxrl_vis.learner.parts import PART_SIZE, part_size, played_spec
 from jaxrl_vis.learner.rollout import Exploration
+from jaxrl_vis.learner.shards import ONE, Slice
 from jaxrl_vis.learner.train_step import TrainStep, make_train_step
 from jaxrl_vis.run.programs import Programs
 from jaxrl_vis.run.side_by_side import SideBySide
 
 SIZES = {"num_envs": 10, "seeds": 2, "eval_episodes": 13, "image_size": 16}
-CONFIG = preset("debug", env="VisualReacher", random_action_probability=0.0, action_noise=0.0, **SIZES)
+CONFIG = preset("debug", env="VisualReacher", **SIZES)
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +61,7 @@ def test_an_evaluation_is_of_the_same_episodes(program: TrainStep, programs: Pro
     assert not np.array_equal(other["eval/goal_distance"], programs.evaluate(train)[0]["eval/goal_distance"])
 
 
-def test_an_iteration_without_noise_is_the_same(program: TrainStep, programs: Programs) -> None:
+def test_iterations_are_the_same(program: TrainStep, programs: Programs) -> None:
     expected, found = programs.init(programs.run_keys), programs.init(programs.run_keys)
     for _ in range(2):
         expected, expected_metrics = program.train_iteration(expected)
@@ -68,20 +71,46 @@ def test_an_iteration_without_noise_is_the_same(program: TrainStep, programs: Pr
     assert_near((found.key, found.iteration), (expected.key, expected.iteration))
 
 
-def test_each_part_draws_its_own_noise_and_the_same_one_again(program: TrainStep, programs: Programs) -> None:
+def test_rollouts_are_the_same_and_explore(program: TrainStep, programs: Programs) -> None:
     train = programs.init(programs.run_keys).train
     side_by_side = SideBySide(program.env, program.parts, programs.compiled)
+    assert_near(side_by_side.rollout(train, programs.run_keys, 10), program.rollout(train, programs.run_keys))
     play = functools.partial(side_by_side.play, train, programs.run_keys, 10)
-    policy, random, noisy, again = (
-        np.concatenate([episodes.actions for episodes, _ in play(Exploration(*exploration))], axis=1)
-        for exploration in ((0.0, 0.0), (1.0, 0.0), (0.0, 0.2), (0.0, 0.2))
+    policy, random, noisy = (
+        np.concatenate([episodes.actions for episodes, _ in play(Exploration(*exploration))], axis=1)[:, :, 0]
+        for exploration in ((0.0, 0.0), (1.0, 0.0), (0.0, 0.2))  # first actions, which all three take in the same state
     )
-    assert policy.shape == (2, 10, program.env.horizon, 2)
-    assert abs(random.mean()) < 0.05 and abs(random.std() - 3**-0.5) < 0.05
-    assert np.array_equal(noisy, again)
-    noise = (noisy - policy)[:, :, 0]  # of the first step, which both took in the same state
-    assert 0.1 < noise.std() < 0.3
-    assert len(np.unique(np.round(random, 6))) > 0.99 * random.size  # no part repeats another one
+    assert policy.shape == (2, 10, 2)
+    assert abs(random.std() - 3**-0.5) < 0.15 and 0.1 < (noisy - policy).std() < 0.3
+
+
+def test_a_gpu_plays_all_at_once(monkeypatch: pytest.MonkeyPatch, program: TrainStep, programs: Programs) -> None:
+    """And evaluates with a program of its own."""
+    monkeypatch.setattr(parts, "targets_cpu", lambda: False)
+    made = make_train_step(program.env, CONFIG)
+    assert (made.parts.size, made.parts.plays_any) == (CONFIG.num_envs, False)
+    whole = Programs(CONFIG, made)
+    assert set(whole.names) == {"play", "learn", "evaluate", "init", "broken_leaves", "keys"}
+    assert set(whole.of_training()) == {"play", "learn", "keys"} and set(whole.of_evaluation()) == {"evaluate"}
+    found, metrics = whole.train_iteration(whole.init(whole.run_keys))
+    expected, expected_metrics = program.train_iteration(programs.init(programs.run_keys))
+    assert_near(metrics, expected_metrics)
+    assert_near(found.replay, expected.replay)
+    assert_near(whole.evaluate(found.train), program.evaluate(expected.train, programs.evaluation_key))
+
+
+def test_slices_are_of_what_all_draw_but_for_the_noise_of_images() -> None:
+    key = jax.random.key(3)
+    whole = jax.random.normal(key, (10, 3))
+    slices = [Slice(first=jnp.int32(first), total=10) for first in (0, 4, 8, 12)]
+    drawn = jnp.concatenate([each.draw(lambda shape: jax.random.normal(key, shape), (4, 3)) for each in slices])
+    np.testing.assert_array_equal(drawn[:10], whole)
+    assert not drawn[10:].any()
+    keys = jax.random.key_data(jnp.concatenate([each.split(key, 4) for each in slices]))
+    np.testing.assert_array_equal(keys, jax.random.key_data(jax.random.split(key, 16)))
+    noise = np.asarray(jnp.concatenate([each.noise(key, (4, 3)) for each in slices]))
+    assert len(np.unique(noise)) == noise.size
+    np.testing.assert_array_equal(ONE.noise(key, (10, 3)), whole)
 
 
 def test_what_is_played_has_the_shapes_that_are_compiled_for(program: TrainStep, programs: Programs) -> None:

@@ -89,6 +89,10 @@ def _update(text: str, config: dict[str, object]) -> Figure:
     return Figure("update/gradient_steps", {"env": "VisualFetchReach", **config}, text)
 
 
+def _peer_update(preset: str, text: str) -> Figure:
+    return Figure("update/peer_torch", {"preset": preset, "image_size": 64}, text)
+
+
 _FAST: dict[str, object] = {"preset": "fast", "seeds": None, "without": None}
 _UPDATE = f"{{value}} updates/s (batch {{batch_size}}, {_IMAGES}, {{dtype}})"
 
@@ -131,6 +135,15 @@ SPEED = (
                 ),
             ),
             "2 CPU cores": (Figure("update/gradient_steps", {"env": "VisualFetchReach"}, _UPDATE),),
+        },
+    ),
+    Speed(
+        "`bench update --peer torch`: the same gradient steps in PyTorch, compiled with max-autotune ([more](docs/learner.md))",
+        {
+            "H100": (
+                _peer_update("paper", "{ours_over_peer} times PyTorch's {value} updates/s (`paper`)"),
+                _peer_update("fast", "{ours_over_peer} times its {value} (`fast`, no shifted images)"),
+            )
         },
     ),
 )

@@ -1,7 +1,7 @@
 """Whole training iterations, as `jaxrl-vis train` runs them, and where their time goes.
 
-    iteration    rollout, insert and updates as one program, the host reading the metrics of one iteration during the next
-    parts        each of the three as a program of its own, and what an iteration pays for evaluations and for the host
+    iteration    rollout, insert and updates, the host reading the metrics of one iteration during the next
+    parts        each of the three by itself, and what an iteration pays for evaluations and for the host
     promise      the time that `bench env` and `bench update` give for the same environments and the same gradient steps
 
     efficiency   on several devices: the time of one device with its share of the seeds, or of the batch and the environments,
@@ -10,6 +10,7 @@
 An iteration that takes longer than the promise loses time between its parts, to the policy in the rollout, or to the replay.
 """
 
+import functools
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -25,14 +26,19 @@ from jaxrl_vis.bench.timing import measure as measure_time
 from jaxrl_vis.bench.update import seed_keys, time_updates, training_config
 from jaxrl_vis.config import Config, data_devices_of
 from jaxrl_vis.learner.train_step import TrainStep, make_train_step
+from jaxrl_vis.run.programs import Programs
 from jaxrl_vis.types import LoopState
 from jaxrl_vis_envs.base import GoalEnv
 
 _BUDGET_S = 40.0
 
 
-def time_iterations(program: TrainStep, repeats: int) -> tuple[LoopState, Timing, dict[str, float]]:
+def time_iterations(programs: Programs, repeats: int) -> tuple[LoopState, Timing, dict[str, float]]:
     """Trains for a while.
+
+    Args:
+        programs: What trains; without a cache, or the time of compilation means nothing.
+        repeats: Timed repeats at most.
 
     Returns:
         What was trained, the time of an iteration whose metrics the host reads during the next, and in seconds: ``compile``,
@@ -41,13 +47,15 @@ def time_iterations(program: TrainStep, repeats: int) -> tuple[LoopState, Timing
     Raises:
         FloatingPointError: A metric is not finite.
     """
-    loop = program.init(seed_keys(program, 0))
-    compiled, compile_s = compile_timed(program.train_iteration, loop)
-    loop, waiting = compiled(loop)
+    loop = programs.program.init(seed_keys(programs.program, 0))
+    start = time.perf_counter()
+    programs.of_training()
+    compile_s = time.perf_counter() - start
+    loop, waiting = programs.train_iteration(loop)
 
     def dispatch() -> Any:
         nonlocal loop, waiting
-        loop, waiting = compiled(loop)
+        loop, waiting = programs.train_iteration(loop)
         return waiting
 
     def train() -> Any:
@@ -70,24 +78,27 @@ def _settled(program: TrainStep, call: Callable[[], Any]) -> Callable[[], Any]:
     return lambda: jax.block_until_ready(call())
 
 
-def time_parts(program: TrainStep, loop: LoopState, repeats: int) -> dict[str, float]:
-    """Seconds of what an iteration consists of, each as a program of its own at the iteration's own sizes.
+def time_parts(programs: Programs, loop: LoopState, repeats: int) -> dict[str, float]:
+    """Seconds of what an iteration consists of, each by itself at the iteration's own sizes.
 
     Args:
-        program: What the iteration is made of.
+        programs: What the iteration is made of.
         loop: Donated.
         repeats: Timed repeats at most.
 
     Returns:
         ``rollout``, ``insert``, ``updates``, and ``evaluation``, an iteration's part of it.
     """
-    keys, iteration = seed_keys(program, 3), loop.iteration
-    key = program.layout.put(jax.random.key(4), program.layout.everywhere)
-    evaluate, _ = compile_timed(program.evaluate, loop.train, key)
-    evaluation = measure_time(_settled(program, lambda: evaluate(loop.train, key)), repeats)
-    play, _ = compile_timed(program.rollout, loop.train, keys)
-    rollout = measure_time(_settled(program, lambda: play(loop.train, keys)), repeats)
-    episodes, _ = play(loop.train, keys)
+    program, iteration = programs.program, loop.iteration
+    keys, key = seed_keys(program, 3), jax.random.key(4)
+    evaluation = measure_time(_settled(program, lambda: programs.evaluate(loop.train, key)), repeats)
+    if programs.side_by_side is None:
+        together, _ = compile_timed(program.rollout, loop.train, keys)
+        play = functools.partial(together, loop.train, keys)
+    else:
+        play = functools.partial(programs.side_by_side.rollout, loop.train, keys, program.config.num_envs)
+    rollout = measure_time(_settled(program, play), repeats)
+    episodes, _ = play()
     insert, _ = compile_timed(program.insert, loop.train, loop.replay, episodes, keys, iteration)
     train, replay = loop.train, loop.replay
 
@@ -129,7 +140,8 @@ def share_of_one(config: Config) -> Config:
 
 def _time_share(env: GoalEnv, config: Config, settings: Settings) -> float:
     """Seconds of an iteration of `share_of_one`."""
-    return time_iterations(make_train_step(env, share_of_one(config)), settings.repeats)[1].median_s
+    share = share_of_one(config)
+    return time_iterations(Programs(share, make_train_step(env, share), cache=False), settings.repeats)[1].median_s
 
 
 def measure(settings: Settings) -> Iterator[Measurement]:
@@ -138,8 +150,9 @@ def measure(settings: Settings) -> Iterator[Measurement]:
     for count in settings.counts((0,), (0,)):  # 0: the preset's own number of environments
         config = training_config(settings, **({"num_envs": count} if count else {}))
         program, started = make_train_step(env, config), time.perf_counter()
-        loop, timing, seconds = time_iterations(program, settings.repeats)
-        parts = {**time_parts(program, loop, settings.repeats), "host": seconds["host"]}
+        programs = Programs(config, program, cache=False)
+        loop, timing, seconds = time_iterations(programs, settings.repeats)
+        parts = {**time_parts(programs, loop, settings.repeats), "host": seconds["host"]}
         del loop
         efficiency = (
             {} if config.devices == 1 else {"efficiency": round(_time_share(env, config, settings) / timing.median_s, 3)}

@@ -1,6 +1,6 @@
 """How good a learner is, and what its first few episodes look like, in one program."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from types import ModuleType
 from typing import Any
 
@@ -23,7 +23,7 @@ def num_recorded(num_episodes: int, shards: Shards = ONE) -> int:
     return min(max(1, _NUM_RECORDED // shards.count), num_episodes // shards.count)
 
 
-def metrics_of(outcome: Metrics, xp: ModuleType = jnp) -> Metrics:
+def metrics_of(outcome: Mapping[str, Any], xp: ModuleType = jnp) -> Metrics:
     """What an evaluation says of episodes that ended so: [S] float32, of ``success`` and ``goal_distance`` [S, N].
 
     Args:

@@ -1,19 +1,19 @@
-"""Training iterations and evaluations made of one program that plays a few environments: how a CPU runs them.
+"""A training iteration in two programs, which a run on one device calls one after the other.
 
     keys     which random numbers this iteration's rollout draws
-    play     `PART_SIZE` environments, from number ``first`` on     training calls it E / 8 times, an evaluation N / 8 times
-    learn    what they have played -> replay, statistics, gradient steps
+    play     environments, from number ``first`` on         -> their episodes
+    learn    replay, statistics, gradient steps, metrics
 
-Most of what takes long to compile is physics and images, and here both purposes share it. And calls that do not wait for each
-other keep all cores busy (`jaxrl_vis.run.side_by_side`), which XLA does not: it shares out single operations, and those of a
-physics step are too small. On two cores an iteration's 16 environments of VisualFetchReach are played in 0.13 s in place of
-0.25, and its evaluation of 256 episodes takes 2.0 s in place of 2.7.
+They are what `train_step` has in one program. XLA compiles the two side by side, and nothing is lost: what is played lies in
+the device's memory in either case, and neither waits for the host.
 
-A GPU plays all environments at once: there an iteration is one program, and an evaluation another (`train_step`, `evaluate`).
+A GPU plays all environments at once. A CPU plays `PART_SIZE` at a time, by as many threads as it has cores
+(`jaxrl_vis.run.side_by_side`): XLA would share out single operations, and those of a physics step are too small for that. On
+two cores 16 environments of VisualFetchReach are played in 0.13 s in place of 0.25. An evaluation of 256 episodes calls the
+same program, and takes 2.0 s in place of 2.7; so most of what takes long to compile, physics and images, is compiled once.
 """
 
 import dataclasses
-import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -24,15 +24,13 @@ import jax.numpy as jnp
 from jaxrl_vis.config import Config
 from jaxrl_vis.learner.networks import Networks
 from jaxrl_vis.learner.rollout import Exploration, play
+from jaxrl_vis.learner.shards import ONE, Slice
 from jaxrl_vis.types import Episodes, LoopState, Metrics, TrainState
 from jaxrl_vis_envs.base import GoalEnv
-from jaxrl_vis_envs.compilation import env_jit
+from jaxrl_vis_envs.compilation import env_jit, targets_cpu, tracing_for_default_device
 
 PART_SIZE = 8
-"""Environments of a part at most: as many float32 numbers as the vector registers of most CPUs hold.
-
-It does not depend on the number of cores, for a part draws its own noise: a run is to be the same on a larger machine.
-"""
+"""Environments of a part at most, on a CPU: as many float32 numbers as the vector registers of most of them hold."""
 
 Played = tuple[Episodes, Metrics]
 """Episodes [S, P, ...], and ``success`` and ``goal_distance`` at their last steps, [S, P] float32."""
@@ -44,15 +42,16 @@ class Parts:
 
     Attributes:
         size: P, environments of a part.
+        plays_any: Whether ``play`` can begin with any environment, and so evaluate, too; else it plays all of a rollout.
         exploration: The noise of training; an evaluation has none.
         keys: (keys [S], iteration []) -> keys [S] of this iteration's rollout.
-        play: (TrainState, keys [S], first [] int32, `Exploration`) -> `Played`. Environment ``first + i`` starts as it does where
-            all are played at once; the noise of a part is its own.
+        play: (TrainState, keys [S], first [] int32, `Exploration`) -> `Played`, see `shards.Slice`.
         learn: (LoopState, parts) -> (LoopState, metrics of [S] float32), the first donated. The parts are those of all E
-            environments, in their order; what they have beyond that is left out.
+            environments in their order; what they have beyond that is left out.
     """
 
     size: int
+    plays_any: bool
     exploration: Exploration
     keys: Any
     play: Any
@@ -85,21 +84,26 @@ def make_parts(
         keys_of: (keys [S], iteration) -> keys [2, S]: of an iteration's rollout, and of what comes after it.
         learn: (LoopState, Episodes, outcome, keys [S]) -> (LoopState, metrics): what comes after a rollout, for all seeds.
     """
-    size = part_size(config.num_envs)
+    with tracing_for_default_device():
+        plays_any = targets_cpu()
+    total = config.num_envs
+    size = part_size(total) if plays_any else total
 
     def keys(seed_keys: jax.Array, iteration: jax.Array) -> jax.Array:
         return keys_of(seed_keys, iteration)[0]
 
     def play_part(train: TrainState, rollout_keys: jax.Array, first: jax.Array, exploration: Exploration) -> Played:
-        episodes, outcome, _ = play(env, networks, train, rollout_keys, size, exploration, first=first)
+        shards = Slice(first=first, total=total) if plays_any else ONE
+        episodes, outcome, _ = play(env, networks, train, rollout_keys, size, exploration, shards=shards)
         return episodes, outcome
 
     def learn_parts(loop: LoopState, parts: Sequence[Played]) -> tuple[LoopState, Metrics]:
-        episodes, outcome = jax.tree.map(lambda *leaves: joined(leaves, config.num_envs), *parts)
+        episodes, outcome = jax.tree.map(lambda *leaves: joined(leaves, total), *parts)
         return learn(loop, episodes, outcome, keys_of(loop.key, loop.iteration)[1])
 
     return Parts(
         size=size,
+        plays_any=plays_any,
         exploration=Exploration(config.random_action_probability, config.action_noise),
         keys=env_jit(keys),
         play=env_jit(play_part),
@@ -107,12 +111,15 @@ def make_parts(
     )
 
 
-def played_spec(env: GoalEnv, size: int, seeds: int) -> Played:
+def played_spec(env: GoalEnv, size: int, seeds: int) -> tuple[Episodes, dict[str, Any]]:
     """Shapes and types of what `Parts.play` returns, without tracing it."""
-    spec = functools.partial(jax.ShapeDtypeStruct, dtype=jnp.float32)
+
+    def spec(shape: tuple[int, ...], dtype: Any = jnp.float32) -> Any:
+        return jax.ShapeDtypeStruct(shape, dtype)
+
     slots = (seeds, size, env.horizon + 2)
     episodes = Episodes(
-        observations=jax.ShapeDtypeStruct((*slots, *env.observation_spec.shape), env.observation_spec.dtype),
+        observations=spec((*slots, *env.observation_spec.shape), env.observation_spec.dtype),
         states=spec((*slots, env.goal_state_size)),
         actions=spec((seeds, size, env.horizon, env.action_size)),
     )

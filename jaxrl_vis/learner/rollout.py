@@ -27,9 +27,8 @@ class Exploration(NamedTuple):
         action_noise: Standard deviation of the Gaussian noise on the others.
     """
 
-    random_action_probability: float = 0.0
-    action_noise: float = 0.0
-
+    random_action_probability: float | jax.Array = 0.0
+    action_noise: float | jax.Array = 0.0
 
     @property
     def is_none(self) -> bool:
@@ -88,16 +87,7 @@ def split_keys(keys: jax.Array, num_envs: int, shards: Shards = ONE) -> tuple[ja
     Of a learner in several parts, only the resets of this part.
     """
     reset_keys, policy_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
-    return jax.vmap(lambda key: shards.part(jax.random.split(key, num_envs)))(reset_keys).reshape(-1), policy_keys
-
-
-def split_keys_of_part(keys: jax.Array, num_envs: int, first: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """`split_keys` for ``num_envs`` environments from number ``first`` on: the same resets, and noise of their own."""
-    reset_keys, policy_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
-    numbers = first + jnp.arange(num_envs)
-    # JAX makes the same key number i in either way, however many there are.
-    each = jax.vmap(jax.vmap(jax.random.fold_in, (None, 0)), (0, None))(reset_keys, numbers)
-    return each.reshape(-1), jax.vmap(jax.random.fold_in, (0, None))(policy_keys, first)
+    return jax.vmap(lambda key: shards.split(key, num_envs))(reset_keys).reshape(-1), policy_keys
 
 
 def add_noise(key: jax.Array, observations: jax.Array, deviation: float, shards: Shards = ONE) -> jax.Array:
@@ -109,7 +99,7 @@ def add_noise(key: jax.Array, observations: jax.Array, deviation: float, shards:
         deviation: Standard deviation of the noise, in the observation's unit.
         shards: Of the learner; observations are those of one part.
     """
-    noisy = observations + deviation * shards.draw(lambda shape: jax.random.normal(key, shape), observations.shape)
+    noisy = observations + deviation * shards.noise(key, observations.shape)
     if observations.dtype == jnp.uint8:
         noisy = jnp.clip(jnp.round(noisy), 0.0, 255.0)
     return noisy.astype(observations.dtype)
@@ -144,7 +134,6 @@ def play(
     num_kept: int | None = None,
     record: Callable[[State], Any] | None = None,
     shards: Shards = ONE,
-    first: jax.Array | None = None,
 ) -> Rollout:
     """Plays one episode in each of E environments, for each of S learners side by side.
 
@@ -160,8 +149,6 @@ def play(
         num_kept: K, how many of the episodes to keep (the first ones); None: all.
         record: What else to keep, a pytree made of the state of one environment after reset and after each step.
         shards: Of each learner. In one part, E / ``shards.count`` of its environments are played.
-        first: [] int32, the number of the first environment, where a rollout is played E environments at a time; None: all at
-            once.
     """
     num_seeds = keys.shape[0]
     num_envs, num_drawn = num_envs // shards.count, num_envs
@@ -184,10 +171,7 @@ def play(
     def recorded(state: State) -> Any:
         return None if record is None else jax.tree.map(kept, jax.vmap(record)(state))
 
-    if first is None:
-        reset_keys, policy_keys = split_keys(keys, num_drawn, shards)
-    else:
-        reset_keys, policy_keys = split_keys_of_part(keys, num_drawn, first)
+    reset_keys, policy_keys = split_keys(keys, num_drawn, shards)
     state = jax.vmap(env.reset)(reset_keys)
     assert state.obs is not None
     first_observation = seen(state.obs["observation"], policy_keys, _FIRST_NOISE)

@@ -77,7 +77,8 @@ class CompiledOfLeaves:
     """A compiled program that takes and returns leaves, called with trees.
 
     Args:
-        compiled: From ``jax.jit(...).lower(...).compile()``; takes a list of leaves for each argument. Asked for anything else, this is it.
+        compiled: From ``jax.jit(...).lower(...).compile()``; takes a list of leaves for each argument. Asked for anything else,
+            this is it.
         restore: What its results are, given what it returns.
     """
 

@@ -2,8 +2,8 @@
 
 All of it is compiled before training starts, so that the end of a run, where signals and full disks come, compiles nothing.
 
-On a CPU a training iteration and an evaluation are made of the same smaller programs (`jaxrl_vis.learner.parts`), which compile
-in little more than half the time and run on all cores; elsewhere each is a program of its own.
+On one device a training iteration is two programs, which XLA compiles side by side (`jaxrl_vis.learner.parts`), and a CPU
+evaluates with one of these, too. On several devices an iteration is one program.
 """
 
 import concurrent.futures
@@ -29,14 +29,14 @@ from jaxrl_vis.run.nonfinite import broken_leaves
 from jaxrl_vis.run.side_by_side import SideBySide
 from jaxrl_vis.run.signals import shield_this_thread
 from jaxrl_vis.types import Episodes, LoopState, Metrics, TrainState
-from jaxrl_vis_envs.compilation import distrusted_kernels, targets_cpu, tracing_for_default_device, trusting_kernels
+from jaxrl_vis_envs.compilation import distrusted_kernels, tracing_for_default_device, trusting_kernels
 
 # Evaluation draws from a key of its own, the same at every evaluation and for every seed.
 _EVALUATION_SEED = 2**31 - 1
 # What takes longest to compile comes first: it compiles while the others are traced.
 _WHOLE = ("train_iteration", "evaluate", "init", "broken_leaves")
 _PARTS = ("play", "learn", "keys")
-_IN_PARTS = ("play", "learn", "init", "broken_leaves", "keys")
+_IN_PARTS = ("play", "learn", "evaluate", "init", "broken_leaves", "keys")
 # Those that take long to trace, and their options.
 _KEPT: dict[str, dict[str, Any]] = {
     "init": {"runs_once": True},
@@ -79,6 +79,7 @@ class Programs:
         program: What `jaxrl_vis.learner.train_step.make_train_step` returns, or anything with the same attributes.
         keep: Keep on disk what was traced, and trace nothing that is kept there: `kept_programs` says when that is right. Only
             where one device computes.
+        cache: Keep on disk what was compiled, too.
 
     Attributes:
         config: The run.
@@ -86,18 +87,19 @@ class Programs:
         env: The environment.
         layout: Where seeds, and the parts of learners, lie.
         seeds: The seeds, in the order of the seed axis.
+        side_by_side: What trains in parts; None where an iteration is one program.
     """
 
-    def __init__(self, config: Config, program: Any, keep: bool = False):
+    def __init__(self, config: Config, program: Any, keep: bool = False, cache: bool = True):
         self.config, self.program, self.env = config, program, program.env
         self.layout = program.layout
         self.seeds = range(config.seed, config.seed + config.seeds)
         self._compiled: dict[str, Any] = {}
         self._kept: KeptPrograms | None = None
-        self._may_keep = keep and self.layout.mesh is None
-        with tracing_for_default_device():
-            in_parts = program.parts is not None and targets_cpu()
-        self._side_by_side = SideBySide(self.env, program.parts, self.compiled) if in_parts else None
+        self._may_keep, self._caches = keep and cache and self.layout.mesh is None, cache
+        parts = program.parts
+        self.side_by_side = None if parts is None else SideBySide(self.env, parts, self.compiled)
+        self._evaluates_in_parts = parts is not None and parts.plays_any
 
     @functools.cached_property
     def run_keys(self) -> jax.Array:
@@ -127,6 +129,12 @@ class Programs:
         """How long an image of the video is shown, s: as long as it lasted, but not too fast to follow."""
         return max(0.04, float(self.env.control_period))
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The programs that a run needs."""
+        names = _WHOLE if self.side_by_side is None else _IN_PARTS
+        return tuple(name for name in names if name != "evaluate" or not self._evaluates_in_parts)
+
     def compile(self, meanwhile: Callable[[], None] = lambda: None) -> dict[str, Any]:
         """Compiles everything that a run needs, side by side, the small operations of saving and evaluating included.
 
@@ -138,16 +146,20 @@ class Programs:
         Returns:
             The compiled programs by name.
         """
-        names = _WHOLE if self._side_by_side is None else _IN_PARTS
+        self._those(self.names, meanwhile)
+        return dict(self._compiled)
+
+    def _those(self, names: Sequence[str], meanwhile: Callable[[], None] = lambda: None) -> dict[str, Any]:
+        """Programs by name; those that are not compiled yet are now."""
         if missing := [name for name in names if name not in self._compiled]:
             self._make(missing, meanwhile)
-        return dict(self._compiled)
+        return {name: self._compiled[name] for name in names}
 
     def _make(self, names: Sequence[str], meanwhile: Callable[[], None] = lambda: None) -> None:
         """Compiles programs, which then are `_compiled`."""
-        cache = Path(enable_compilation_cache())
+        cache = enable_compilation_cache() if self._caches else ""
         if self._may_keep and (found := fingerprint(self.config, self.env)):
-            self._kept = KeptPrograms(cache / "programs", found)
+            self._kept = KeptPrograms(Path(cache) / "programs", found)
             try:
                 with trusting_kernels():
                     self._compiled |= self._all(names, meanwhile)
@@ -167,7 +179,7 @@ class Programs:
     def _all(self, names: Sequence[str], meanwhile: Callable[[], None]) -> dict[str, Any]:
         # Tracing is Python and goes one by one; XLA compiles without the interpreter's lock, meanwhile.
         with concurrent.futures.ThreadPoolExecutor(len(names), initializer=shield_this_thread) as pool:
-            futures = {name: pool.submit(self._lower(name).compile) for name in names}
+            futures = {name: pool.submit(self.lower(name).compile) for name in names}
             if "init" in names and not processes.are_several():
                 # Taking keys apart, as saving does, is a program, too.
                 to_host({"keys": self.run_keys, "evaluation": self.evaluation_key}, copy=True)
@@ -177,7 +189,8 @@ class Programs:
             return compiled
         return {name: self._of_trees(name, each) if name in _KEPT else each for name, each in compiled.items()}
 
-    def _lower(self, name: str) -> Any:
+    def lower(self, name: str) -> Any:
+        """A program as JAX has lowered it, to be compiled."""
         if name == "broken_leaves":
             return jax.jit(broken_leaves).lower(self.shapes)
         arguments = self._arguments(name)
@@ -198,7 +211,7 @@ class Programs:
             return shapes.train, self.evaluation_key
         if name == "keys":
             return shapes.key, shapes.iteration
-        number = jax.ShapeDtypeStruct((), jnp.float32)
+        number: Any = jax.ShapeDtypeStruct((), jnp.float32)
         if name == "play":
             return shapes.train, shapes.key, jax.ShapeDtypeStruct((), jnp.int32), Exploration(number, number)
         size, num_envs = self.program.parts.size, self.config.num_envs
@@ -218,9 +231,7 @@ class Programs:
 
     def compiled(self, name: str) -> Any:
         """One compiled program, by its name in `compile`."""
-        if name not in self._compiled:
-            self._make([name])
-        return self._compiled[name]
+        return self._those([name])[name]
 
     def init(self, keys: jax.Array) -> LoopState:
         """A fresh learner with an empty replay, for each of the typed keys [S]."""
@@ -228,13 +239,16 @@ class Programs:
 
     def of_evaluation(self) -> dict[str, Any]:
         """The compiled programs that an evaluation needs, by name."""
-        name = "evaluate" if self._side_by_side is None else "play"
-        return {name: self.compiled(name)}
+        return self._those(["play"] if self._evaluates_in_parts else ["evaluate"])
+
+    def of_training(self) -> dict[str, Any]:
+        """The compiled programs that an iteration needs, by name."""
+        return self._those(["train_iteration"] if self.side_by_side is None else _PARTS)
 
     def train_iteration(self, loop: LoopState) -> tuple[LoopState, Metrics]:
         """One iteration; ``loop`` is donated. See `Trainer.train_iteration`."""
-        if self._side_by_side is not None:
-            return self._side_by_side.train_iteration(loop, self.config.num_envs)
+        if self.side_by_side is not None:
+            return self.side_by_side.train_iteration(loop, self.config.num_envs)
         return self.compiled("train_iteration")(loop)
 
     def evaluate(self, train: TrainState, key: jax.Array | None = None) -> tuple[Metrics, dict[str, jax.Array]]:
@@ -244,10 +258,11 @@ class Programs:
             train: The learner, [S, ...].
             key: Draws the episodes; None: always the same ones.
         """
-        key = self.evaluation_key if key is None else self.layout.put(key, self.layout.everywhere)
-        if self._side_by_side is not None:
-            return self._side_by_side.evaluate(train, jnp.stack([key for _ in self.seeds]), self.config.eval_episodes)
-        return self.compiled("evaluate")(train, key)
+        chosen: Any = self.evaluation_key if key is None else self.layout.put(key, self.layout.everywhere)
+        if self.side_by_side is not None and self._evaluates_in_parts:
+            keys = jnp.stack([chosen] * len(self.seeds))
+            return self.side_by_side.evaluate(train, keys, self.config.eval_episodes)
+        return self.compiled("evaluate")(train, chosen)
 
     def broken_leaves(self, loop: LoopState) -> list[str]:
         """Names of the floating-point leaves of the loop state that hold a NaN or an infinity."""

@@ -1,6 +1,7 @@
-"""Parts of rollouts, played side by side by threads: what a run on a CPU does in place of one large program.
+"""Rollouts in parts, which threads play side by side, and what is learned from them: how a run on one device trains.
 
-Each thread waits for the end of what it calls. Without, XLA would take one call after the other.
+Each thread waits for the end of what it calls. Without, XLA would take one call after the other. A rollout that is one part is
+called and not waited for, so that a GPU's host is ahead of it.
 """
 
 import concurrent.futures
@@ -12,7 +13,7 @@ import jax
 import numpy as np
 
 from jaxrl_vis.learner.evaluate import metrics_of, num_recorded, recording_of
-from jaxrl_vis.learner.parts import Parts
+from jaxrl_vis.learner.parts import Parts, Played, joined
 from jaxrl_vis.learner.rollout import NO_EXPLORATION, Exploration
 from jaxrl_vis.run.signals import shield_this_thread
 from jaxrl_vis.types import Episodes, LoopState, Metrics, TrainState
@@ -25,7 +26,7 @@ def num_threads() -> int:
 
 
 class SideBySide:
-    """Training and evaluation by the programs of `Parts`.
+    """Training and evaluation by the programs of `Parts`, the latter where they play any environments.
 
     Args:
         env: The environment.
@@ -53,13 +54,21 @@ class SideBySide:
             Each part's episodes (None where they are not kept) and outcome.
         """
         program, size = self._compiled("play"), self._parts.size
-        noise = Exploration(*map(np.float32, exploration))
+        noise: Any = Exploration(*map(np.float32, exploration))  # type: ignore[arg-type]
+        if size == count:
+            return [program(train, keys, np.int32(0), noise)]
 
         def play(first: int) -> tuple[Episodes | None, Metrics]:
             episodes, outcome = jax.block_until_ready(program(train, keys, np.int32(first), noise))
             return episodes if num_kept is None or first < num_kept else None, outcome
 
         return list(self._pool.map(play, range(0, count, size)))
+
+    def rollout(self, train: TrainState, keys: jax.Array, num_envs: int) -> Played:
+        """As `TrainStep.rollout`: all parts of one rollout of training, put together."""
+        played = self.play(train, keys, num_envs, self._parts.exploration)
+        episodes, outcome = jax.tree.map(lambda *leaves: joined(leaves, num_envs), *played)
+        return episodes, outcome
 
     def train_iteration(self, loop: LoopState, num_envs: int) -> tuple[LoopState, Metrics]:
         """As `TrainStep.train_iteration`."""
@@ -71,9 +80,9 @@ class SideBySide:
         kept = num_recorded(count)
         played = jax.device_get(self.play(train, keys, count, NO_EXPLORATION, num_kept=kept))
 
-        def joined(parts: list[np.ndarray], count: int) -> np.ndarray:
+        def first(parts: list[np.ndarray], count: int) -> np.ndarray:
             return np.concatenate(parts, axis=1)[:, :count]
 
-        outcome = {name: joined([part[name] for _, part in played], count) for name in ("success", "goal_distance")}
-        observations = joined([episodes.observations for episodes, _ in played if episodes is not None], kept)
+        outcome = {name: first([part[name] for _, part in played], count) for name in ("success", "goal_distance")}
+        observations = first([episodes.observations for episodes, _ in played if episodes is not None], kept)
         return metrics_of(outcome, np), recording_of(observations, outcome["success"], self._env.frame_stack)
