@@ -3,7 +3,7 @@
     python benchmarks/weighting_cost.py [--losses 5 10] [--ways jvp latents] [--image-size 64] [--batch-size 512] [--json FILE]
 
 An encoder of the preset `paper` reads RGB-D images before and after an action. The main loss is a value of three hidden layers;
-each auxiliary loss is a linear head on both latents with targets of its own. For each number of auxiliary losses and each way to
+each auxiliary loss is a linear head on both latents with its own targets. For each number of auxiliary losses and each way to
 their gradients, gradient steps are timed with fixed weights and with OL-AUX-5. What is in the second and not in the first is
 what the weighting itself takes. By one `jax.jvp` along the main gradient that hardly grows with the number of losses.
 """
