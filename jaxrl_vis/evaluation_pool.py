@@ -28,6 +28,7 @@ from typing import Any, Protocol, TypeVar
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.files import write_atomically
+from jaxrl_vis_envs.cores import num_cores
 
 Record = dict[str, Any]
 """What is kept of one number."""
@@ -152,8 +153,7 @@ def _environments(workers: int) -> list[dict[str, str]]:
     from jaxrl_vis.devices import list_devices
 
     devices = list_devices()
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    threads = dict.fromkeys(_THREADS, str(max(cores // workers, 1)))
+    threads = dict.fromkeys(_THREADS, str(max(num_cores() // workers, 1)))
     share = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
     if cache := jax.config.jax_compilation_cache_dir:  # one compiles for all
         share["JAX_COMPILATION_CACHE_DIR"] = cache

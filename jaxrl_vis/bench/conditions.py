@@ -19,6 +19,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxrl_vis_envs.cores import num_cores
+
 SAME_SPEED = 0.1
 """Calibrations that differ by at most this share are of the same speed."""
 BUSY_CORES = 0.3
@@ -123,7 +125,7 @@ class Watch:
 
     def __init__(self) -> None:
         self._busy, self._before = busy_cores(), calibrate()
-        self._cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        self._cores = num_cores()
 
     def conditions(self) -> dict[str, Any]:
         """What a record keeps: machine, cores, cores busy with other programs before the benchmark, and two calibrations."""

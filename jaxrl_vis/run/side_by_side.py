@@ -5,7 +5,6 @@ called and not waited for, so that a GPU's host is ahead of it.
 """
 
 import concurrent.futures
-import os
 from collections.abc import Callable
 from typing import Any
 
@@ -18,11 +17,7 @@ from jaxrl_vis.learner.rollout import NO_EXPLORATION, Exploration
 from jaxrl_vis.run.signals import shield_this_thread
 from jaxrl_vis.types import Episodes, LoopState, Metrics, TrainState
 from jaxrl_vis_envs.base import GoalEnv
-
-
-def num_threads() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+from jaxrl_vis_envs.cores import num_cores
 
 
 class SideBySide:
@@ -36,7 +31,7 @@ class SideBySide:
 
     def __init__(self, env: GoalEnv, parts: Parts, compiled: Callable[[str], Any]):
         self._env, self._parts, self._compiled = env, parts, compiled
-        self._pool = concurrent.futures.ThreadPoolExecutor(num_threads(), initializer=shield_this_thread)
+        self._pool = concurrent.futures.ThreadPoolExecutor(num_cores(), initializer=shield_this_thread)
 
     def play(
         self, train: TrainState, keys: jax.Array, count: int, exploration: Exploration, num_kept: int | None = None

@@ -11,7 +11,6 @@ cores; on an accelerator many at a time, those with equally much in them togethe
 
 import concurrent.futures
 import functools
-import os
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -20,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxrl_vis_envs.compilation import compiler_options
+from jaxrl_vis_envs.cores import num_cores
 from jaxrl_vis_envs.plants.surfaces import GROUND, NOTHING
 from jaxrl_vis_envs.plants.tables import CONE_HIT, FAR, NEAR, TRIANGLE_HIT, View, tile_of
 from jaxrl_vis_envs.plants.texture import noise, ramp
@@ -97,7 +97,7 @@ def draw(
     order = np.argsort(-work, kind="stable")
     on_cpu = jax.default_backend() == "cpu"
     at_once = min(at_once or (1 if on_cpu else _TILES_AT_ONCE), len(order))
-    workers = _cores() if on_cpu else 1
+    workers = num_cores() if on_cpu else 1
     parts = [order[start::workers] for start in range(workers)]
     share = max(map(len, parts))  # all parts have one size, so one program: a missing tile is another one again
     parts = [np.concatenate([part, np.repeat(order[:1], share - len(part))]) for part in parts]
@@ -110,11 +110,6 @@ def draw(
     place[np.concatenate(parts)[::-1]] = np.arange(share * workers)[::-1]
     join = _joiner(tile, width, height)
     return tuple(join(jnp.asarray(place), *(result[part] for result in results)) for part in range(3))  # pyright: ignore
-
-
-def _cores() -> int:
-    """How many cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @functools.cache
