@@ -29,7 +29,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
 )
 # The same for the environments.
 ENVIRONMENT_LAYERS: tuple[tuple[str, ...], ...] = (
-    ("checks", "compilation", "goals", "names", "mjx_imports"),
+    ("checks", "compilation", "cores", "goals", "names", "mjx_imports"),
     ("physics", "plants", "render", "task_modules"),
     ("randomization",),
     ("base",),
