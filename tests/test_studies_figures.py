@@ -107,7 +107,7 @@ def test_settings_of_an_environment_are_shown_and_name_one_folder(tmp_path: Path
     assert [folder.name for folder in tmp_path.iterdir()] == [cell.name]
     request = Request("5.4", STUDIES["5.4"], tmp_path / "f.png", tmp_path, (FETCH,), ("none",), scope, draw_only=True)
     assert make_figure(request, lambda line: None)
-    assert "preset paper, depth_encoding=zbuffer, clip_range=0.1/9," in request.out.with_suffix(".md").read_text()
+    assert "depth_encoding=zbuffer, clip_range=0.1/9; preset paper, one" in request.out.with_suffix(".md").read_text()
     plain = dataclasses.replace(request, scope=dataclasses.replace(scope, changes={}))
     assert not make_figure(plain, lambda line: None)  # these would be other runs
 

@@ -91,8 +91,9 @@ def _about(request: Request, lines: Sequence[Line]) -> str:
     seeds = sorted({seed for line in lines for seed in line.seeds})
     which = f"seed {seeds[0]}" if len(seeds) == 1 else f"seeds {seeds[0]} to {seeds[-1]}; line: median, band: 25 to 75 %"
     often = sorted({f"{line.steps_per_update:.3g}" for line in lines}, key=float)
-    preset = ", ".join((f"preset {request.scope.preset}", *request.scope.changes.get("env_options", ())))
-    return f"{preset}, one gradient step per {' or '.join(often)} environment steps; {which}"
+    options = ", ".join(request.scope.changes.get("env_options", ()))
+    learning = f"preset {request.scope.preset}, one gradient step per {' or '.join(often)} environment steps"
+    return "; ".join(part for part in (options, learning, which) if part)
 
 
 def _common_notes(study: Study, lines: dict[tuple[str, str], Line], unfinished: Sequence[str]) -> list[str]:
