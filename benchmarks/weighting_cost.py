@@ -14,7 +14,7 @@ import functools
 import json
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +27,7 @@ from jaxrl_vis.learner import tangents
 from jaxrl_vis.learner.networks import Networks
 from jaxrl_vis.learner.normalizer import Scaling
 from jaxrl_vis.learner.weighting import MAIN, Weighting, make_weighting, weighted_grad
+from jaxrl_vis.learner.weighting.gradients import Way
 from jaxrl_vis_envs.compilation import env_jit
 
 STEPS = 40
@@ -132,7 +133,9 @@ def main() -> int:
     """Reads the command line and prints a table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--losses", type=int, nargs="+", default=[5, 10], help="numbers of auxiliary losses")
-    parser.add_argument("--ways", nargs="+", default=["jvp", "latents"], help="ways to gradients, of weighted_grad")
+    parser.add_argument(
+        "--ways", nargs="+", choices=get_args(Way), default=["jvp", "latents"], help="ways to gradients, of weighted_grad"
+    )
     parser.add_argument("--image-size", type=int, default=64)
     parser.add_argument("--batch-size", type=int, default=512)
     parser.add_argument("--json", type=Path, help="a file for the figures")
@@ -146,9 +149,11 @@ def main() -> int:
         for count in options.losses:
             problem = Problem(networks, options.batch_size, tuple(f"loss_{number}" for number in range(count)))
             weightings = {"fixed": make_weighting("balance"), "learned": make_weighting("ol_aux", interval=5)}
-            seconds = {name: time_step(problem, weighting, way)[0] for name, weighting in weightings.items()}
+            found = {name: time_step(problem, weighting, way) for name, weighting in weightings.items()}
+            seconds = {name: step for name, (step, _) in found.items()}
             added = seconds["learned"] - seconds["fixed"]
-            rows.append({"way": way, "losses": count, **seconds, "added": added})
+            compiling = {f"compile_{name}": round(compile_s, 1) for name, (_, compile_s) in found.items()}
+            rows.append({"way": way, "losses": count, **seconds, "added": added, **compiling})
             print(
                 f"{way:12}{count:8}{1e6 * seconds['fixed']:12.0f}{1e6 * seconds['learned']:14.0f}{1e6 * added:12.0f}",
                 flush=True,

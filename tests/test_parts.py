@@ -74,7 +74,7 @@ def test_iterations_are_the_same(program: TrainStep, programs: Programs) -> None
 def test_rollouts_are_the_same_and_explore(program: TrainStep, programs: Programs) -> None:
     train = programs.init(programs.run_keys).train
     side_by_side = SideBySide(program.env, program.parts, programs.compiled)
-    assert_near(side_by_side.rollout(train, programs.run_keys, 10), program.rollout(train, programs.run_keys))
+    assert_near(side_by_side.rollout(train, programs.run_keys), program.rollout(train, programs.run_keys))
     play = functools.partial(side_by_side.play, train, programs.run_keys, 10)
     policy, random, noisy = (
         np.concatenate([episodes.actions for episodes, _ in play(Exploration(*exploration))], axis=1)[:, :, 0]

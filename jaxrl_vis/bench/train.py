@@ -96,7 +96,7 @@ def time_parts(programs: Programs, loop: LoopState, repeats: int) -> dict[str, f
         together, _ = compile_timed(program.rollout, loop.train, keys)
         play = functools.partial(together, loop.train, keys)
     else:
-        play = functools.partial(programs.side_by_side.rollout, loop.train, keys, program.config.num_envs)
+        play = functools.partial(programs.side_by_side.rollout, loop.train, keys)
     rollout = measure_time(_settled(program, play), repeats)
     episodes, _ = play()
     insert, _ = compile_timed(program.insert, loop.train, loop.replay, episodes, keys, iteration)

@@ -16,6 +16,7 @@ same program, and takes 2.0 s in place of 2.7; so most of what takes long to com
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
+from types import ModuleType
 from typing import Any
 
 import jax
@@ -42,6 +43,7 @@ class Parts:
 
     Attributes:
         size: P, environments of a part.
+        total: E, environments of a rollout of training.
         plays_any: Whether ``play`` can begin with any environment, and so evaluate, too; else it plays all of a rollout.
         exploration: The noise of training; an evaluation has none.
         keys: (keys [S], iteration []) -> keys [S] of this iteration's rollout.
@@ -51,11 +53,17 @@ class Parts:
     """
 
     size: int
+    total: int
     plays_any: bool
     exploration: Exploration
     keys: Any
     play: Any
     learn: Any
+
+    @property
+    def count(self) -> int:
+        """Parts of a rollout of training."""
+        return math.ceil(self.total / self.size)
 
 
 def part_size(num_envs: int) -> int:
@@ -63,9 +71,9 @@ def part_size(num_envs: int) -> int:
     return math.ceil(num_envs / math.ceil(num_envs / PART_SIZE))
 
 
-def joined(parts: Sequence[jax.Array], count: int) -> jax.Array:
-    """Arrays [S, P, ...] of parts as one [S, ``count``, ...]."""
-    return jnp.concatenate(parts, axis=1)[:, :count]
+def joined(parts: Sequence[Any], count: int, xp: ModuleType = jnp) -> Any:
+    """Arrays [S, P, ...] of parts, of ``jax.numpy`` or ``numpy``, as one [S, ``count``, ...]."""
+    return xp.concatenate(parts, axis=1)[:, :count]
 
 
 def make_parts(
@@ -103,6 +111,7 @@ def make_parts(
 
     return Parts(
         size=size,
+        total=total,
         plays_any=plays_any,
         exploration=Exploration(config.random_action_probability, config.action_noise),
         keys=env_jit(keys),

@@ -99,7 +99,7 @@ class Programs:
         self._may_keep, self._caches = keep and cache and self.layout.mesh is None, cache
         parts = program.parts
         self.side_by_side = None if parts is None else SideBySide(self.env, parts, self.compiled)
-        self._evaluates_in_parts = parts is not None and parts.plays_any
+        self._evaluator = self.side_by_side if parts is not None and parts.plays_any else None
 
     @functools.cached_property
     def run_keys(self) -> jax.Array:
@@ -133,7 +133,7 @@ class Programs:
     def names(self) -> tuple[str, ...]:
         """The programs that a run needs."""
         names = _WHOLE if self.side_by_side is None else _IN_PARTS
-        return tuple(name for name in names if name != "evaluate" or not self._evaluates_in_parts)
+        return tuple(name for name in names if name != "evaluate" or self._evaluator is None)
 
     def compile(self, meanwhile: Callable[[], None] = lambda: None) -> dict[str, Any]:
         """Compiles everything that a run needs, side by side, the small operations of saving and evaluating included.
@@ -214,8 +214,8 @@ class Programs:
         number: Any = jax.ShapeDtypeStruct((), jnp.float32)
         if name == "play":
             return shapes.train, shapes.key, jax.ShapeDtypeStruct((), jnp.int32), Exploration(number, number)
-        size, num_envs = self.program.parts.size, self.config.num_envs
-        return shapes, [played_spec(self.env, size, len(self.seeds))] * len(range(0, num_envs, size))
+        parts = self.program.parts
+        return shapes, [played_spec(self.env, parts.size, len(self.seeds))] * parts.count
 
     def _of_trees(self, name: str, compiled: Any) -> CompiledOfLeaves:
         """A kept program as the program that it was traced from: its loop states are trees again, not lists."""
@@ -239,7 +239,7 @@ class Programs:
 
     def of_evaluation(self) -> dict[str, Any]:
         """The compiled programs that an evaluation needs, by name."""
-        return self._those(["play"] if self._evaluates_in_parts else ["evaluate"])
+        return self._those(["evaluate"] if self._evaluator is None else ["play"])
 
     def of_training(self) -> dict[str, Any]:
         """The compiled programs that an iteration needs, by name."""
@@ -248,7 +248,7 @@ class Programs:
     def train_iteration(self, loop: LoopState) -> tuple[LoopState, Metrics]:
         """One iteration; ``loop`` is donated. See `Trainer.train_iteration`."""
         if self.side_by_side is not None:
-            return self.side_by_side.train_iteration(loop, self.config.num_envs)
+            return self.side_by_side.train_iteration(loop)
         return self.compiled("train_iteration")(loop)
 
     def evaluate(self, train: TrainState, key: jax.Array | None = None) -> tuple[Metrics, dict[str, jax.Array]]:
@@ -259,9 +259,9 @@ class Programs:
             key: Draws the episodes; None: always the same ones.
         """
         chosen: Any = self.evaluation_key if key is None else self.layout.put(key, self.layout.everywhere)
-        if self.side_by_side is not None and self._evaluates_in_parts:
+        if self._evaluator is not None:
             keys = jnp.stack([chosen] * len(self.seeds))
-            return self.side_by_side.evaluate(train, keys, self.config.eval_episodes)
+            return self._evaluator.evaluate(train, keys, self.config.eval_episodes)
         return self.compiled("evaluate")(train, chosen)
 
     def broken_leaves(self, loop: LoopState) -> list[str]:

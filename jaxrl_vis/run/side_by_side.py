@@ -50,7 +50,7 @@ class SideBySide:
         """
         program, size = self._compiled("play"), self._parts.size
         noise: Any = Exploration(*map(np.float32, exploration))  # type: ignore[arg-type]
-        if size == count:
+        if count <= size:
             return [program(train, keys, np.int32(0), noise)]
 
         def play(first: int) -> tuple[Episodes | None, Metrics]:
@@ -59,25 +59,22 @@ class SideBySide:
 
         return list(self._pool.map(play, range(0, count, size)))
 
-    def rollout(self, train: TrainState, keys: jax.Array, num_envs: int) -> Played:
+    def rollout(self, train: TrainState, keys: jax.Array) -> Played:
         """As `TrainStep.rollout`: all parts of one rollout of training, put together."""
-        played = self.play(train, keys, num_envs, self._parts.exploration)
-        episodes, outcome = jax.tree.map(lambda *leaves: joined(leaves, num_envs), *played)
+        total = self._parts.total
+        played = self.play(train, keys, total, self._parts.exploration)
+        episodes, outcome = jax.tree.map(lambda *leaves: joined(leaves, total), *played)
         return episodes, outcome
 
-    def train_iteration(self, loop: LoopState, num_envs: int) -> tuple[LoopState, Metrics]:
+    def train_iteration(self, loop: LoopState) -> tuple[LoopState, Metrics]:
         """As `TrainStep.train_iteration`."""
         keys = self._compiled("keys")(loop.key, loop.iteration)
-        return self._compiled("learn")(loop, self.play(loop.train, keys, num_envs, self._parts.exploration))
+        return self._compiled("learn")(loop, self.play(loop.train, keys, self._parts.total, self._parts.exploration))
 
     def evaluate(self, train: TrainState, keys: jax.Array, count: int) -> tuple[Metrics, dict[str, Any]]:
         """As `TrainStep.evaluate`, with the key of each seed, [S]; what is returned are NumPy's arrays."""
         kept = num_recorded(count)
         played = jax.device_get(self.play(train, keys, count, NO_EXPLORATION, num_kept=kept))
-
-        def first(parts: list[np.ndarray], count: int) -> np.ndarray:
-            return np.concatenate(parts, axis=1)[:, :count]
-
-        outcome = {name: first([part[name] for _, part in played], count) for name in ("success", "goal_distance")}
-        observations = first([episodes.observations for episodes, _ in played if episodes is not None], kept)
+        outcome = {name: joined([part[name] for _, part in played], count, np) for name in ("success", "goal_distance")}
+        observations = joined([episodes.observations for episodes, _ in played if episodes is not None], kept, np)
         return metrics_of(outcome, np), recording_of(observations, outcome["success"], self._env.frame_stack)
