@@ -272,7 +272,7 @@ OF_TASK: dict[tuple[str, str], dict[str, Any]] = {
         "eval_interval": 4,
         "encoders": "shared",
         "target_encoder": False,
-        "random_shift": 2,
+        "random_shift": 6,
     },
     ("cpu", "FetchReach"): {
         "num_envs": 16,
