@@ -14,10 +14,20 @@ from jaxrl_vis.methods import METHODS
 _LARGEST_SEED = 2**32 - 1  # a random key is made of 32 bits of it: larger seeds would repeat smaller ones
 _LARGEST_COUNT = 2**31 - 1  # arrays are indexed by int32; environment steps are counted on the host, without a bound
 
+_OL_AUX = ("ol_aux", "ol_aux_ablation")
+_OF_WEIGHTINGS = {
+    **dict.fromkeys(("weighting_interval", "weighting_beta", "weighting_main_grad", "weighting_window"), _OL_AUX),
+    "weighting_fixed": ("fixed",),
+    "weighting_log": ("cosine",),
+}
 _FALSE_REWARDS = ("reward_false_positives", "reward_false_negatives")
 _SHARES = (
     *("relabel_probability", "balance_probability", "trivial_goals", "random_action_probability", "target_decay"),
     *(*_FALSE_REWARDS, "reward_clutter"),
+)
+_AT_LEAST_0 = (
+    *("seed", "full_checkpoint_interval", "random_shift", "action_penalty", "weighting_beta"),
+    *("action_noise", "observation_noise", "reward_noise"),
 )
 
 
@@ -49,9 +59,10 @@ def validate(config: Config) -> Config:
     for name in ("actor_learning_rate", "critic_learning_rate", "normalizer_floor", "normalizer_clip", "randomize_strength"):
         if not getattr(config, name) > 0.0:
             raise RequestError(f"{name} must be positive, not {getattr(config, name)}")
-    for name in ("seed", "full_checkpoint_interval", "action_noise", "observation_noise", "reward_noise", "random_shift"):
-        if getattr(config, name) < 0:
-            raise RequestError(f"{name} must be at least 0, not {getattr(config, name)}")
+    for name in _AT_LEAST_0:
+        value = getattr(config, name)
+        if value is not None and value < 0:
+            raise RequestError(f"{name} must be at least 0, not {value}")
     if config.updates_per_iteration % config.actor_interval:
         raise RequestError(
             f"actor_interval ({config.actor_interval}) must divide updates_per_iteration ({config.updates_per_iteration})"
@@ -60,10 +71,30 @@ def validate(config: Config) -> Config:
     if config.n_step > 1 and method.filter:
         raise RequestError(f"n_step {config.n_step} with method {config.method}: the filter's band is that of one step")
     _validate_reward(config)
+    _validate_auxiliary(config)
+    if not config.randomize and _is_set(config, "randomize_strength"):
+        raise RequestError(f"randomize_strength {config.randomize_strength} varies nothing: say what, with --randomize")
     _validate_devices(config)
     if config.seed + config.seeds - 1 > _LARGEST_SEED:
         raise RequestError(f"seed {config.seed} is too large: the last of {config.seeds} must be at most {_LARGEST_SEED}")
     return config
+
+
+def _is_set(config: Config, name: str) -> bool:
+    """Whether a field is not as it is where nobody asks for anything."""
+    return getattr(config, name) != next(field.default for field in dataclasses.fields(Config) if field.name == name)
+
+
+def _validate_auxiliary(config: Config) -> None:
+    """Raises a RequestError where an option is another weighting's, or there are no tasks that it could be one of."""
+    for name, weightings in _OF_WEIGHTINGS.items():
+        if _is_set(config, name) and config.weighting not in weightings:
+            raise RequestError(
+                f"{name} is an option of weighting {' and '.join(weightings)}, which {config.weighting} does not read: "
+                f"leave it out, or choose --weighting {weightings[0]}"
+            )
+    if _is_set(config, "aux_form") and not config.aux_tasks:
+        raise RequestError(f"aux_form {config.aux_form} is a form of auxiliary tasks, and there are none: add --aux-tasks")
 
 
 def _validate_devices(config: Config) -> None:

@@ -12,12 +12,13 @@ from jaxrl_vis.config import preset
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import diagnostics, normalizer, reward_errors
 from jaxrl_vis.learner.latent_reward import cosine_reward, make_latent_reward
+from jaxrl_vis.learner.replay import Replay
 from jaxrl_vis.learner.rollout import add_noise
 from jaxrl_vis.learner.sampling import Choice, Sampler
 from jaxrl_vis.learner.train_step import make_train_step
 from jaxrl_vis.resolved import resolve
 from jaxrl_vis.run.metrics import with_precision
-from jaxrl_vis.types import Batch
+from jaxrl_vis.types import Batch, Episodes
 from jaxrl_vis.validation import validate
 from jaxrl_vis_envs import goals
 
@@ -218,7 +219,7 @@ def test_noise_on_the_estimate_has_its_deviation_and_is_the_same_every_time():
 @pytest.mark.parametrize("clutter", [1.0, 0.25])
 def test_false_rewards_have_their_shares_where_they_belong(clutter):
     states, goal_states = spread()
-    end = None if clutter == 1.0 else reward_errors.find_clutter_end(goal_states, jnp.int32(20_000), clutter)
+    end = None if clutter == 1.0 else reward_errors.find_clutter_end(goal_states, jnp.ones(20_000, bool), clutter)
     for is_positive, share in ((jnp.zeros(20_000, bool), 0.1), (jnp.ones(20_000, bool), 0.2)):
         flipped = reward_errors.flip(is_positive, states, goal_states, 0.1, 0.2, clutter, end)
         is_false = np.asarray(flipped != is_positive)
@@ -228,9 +229,19 @@ def test_false_rewards_have_their_shares_where_they_belong(clutter):
         np.testing.assert_array_equal(flipped, reward_errors.flip(is_positive, states, goal_states, 0.1, 0.2, clutter, end))
 
 
-def test_the_clutter_ends_where_the_share_of_stored_goals_does():
-    stored = jnp.array([[3.0], [1.0], [2.0], [4.0], [-9.0], [-9.0]])  # two were never written
-    assert reward_errors.find_clutter_end(stored, jnp.int32(4), 0.5) == 3.0
+@pytest.mark.parametrize("first", [0, 1, 2])
+def test_the_clutter_ends_where_the_share_of_stored_goals_does(first):
+    """Also where the ring was not written from its beginning on, as after a resumption without the replay."""
+    config = validate(preset("debug", reward_clutter=0.5, reward_false_positives=0.1))
+    replay = Replay(num_rollouts=3, num_envs=2, horizon=5)
+    state = replay.init(jax.ShapeDtypeStruct((2,), jnp.float32), goal_state_size=1, action_size=1)
+    sampler = Sampler(config, resolve(config, 5), replay, 0.1)
+    for iteration, reached in ((first, (3.0, 1.0)), (first + 1, (2.0, 4.0))):
+        goal_states = jnp.broadcast_to(jnp.array(reached)[:, None, None], (2, 7, 1))
+        rollout = Episodes(observations=jnp.zeros((2, 7, 2)), states=goal_states, actions=jnp.zeros((2, 5, 1)))
+        state = replay.insert(state, rollout, jnp.int32(iteration))
+        end = sampler.choose(state, jax.random.key(0), jnp.int32(iteration)).clutter_end
+        assert end == 3.0
 
 
 def test_errors_of_the_estimator_show_in_the_diagnostics():

@@ -12,7 +12,9 @@ from jaxrl_vis.config import preset
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import encoder_kernel, losses, normalizer, tangents
 from jaxrl_vis.learner.blocks import from_blocks, to_blocks
+from jaxrl_vis.learner.environment import make_env
 from jaxrl_vis.learner.networks import Networks
+from jaxrl_vis.learner.train_step import make_train_step
 
 
 def make_networks(size, filters=(4, 8, 16), **overrides):
@@ -207,6 +209,14 @@ def test_blocks_become_images_again(height, width, levels):
 def test_an_image_smaller_than_a_block_is_refused():
     with pytest.raises(RequestError, match="image_size 7 is too small for 3 encoder layers, which need at least 8"):
         make_networks(7)
+
+
+def test_shifts_move_images_and_not_out_of_sight():
+    with pytest.raises(RequestError, match="random_shift 16 could move images of 16 pixels out of sight"):
+        make_train_step(make_env(preset("debug", random_shift=16)), preset("debug", random_shift=16))
+    states = preset("debug", env="FetchReach", random_shift=1)
+    with pytest.raises(RequestError, match="random_shift 1 moves images, and FetchReach observes states: leave it out"):
+        make_train_step(make_env(states), states)
 
 
 def test_statistics_are_those_of_all_frames():

@@ -171,6 +171,43 @@ def test_a_stale_full_checkpoint_destroys_nothing(tmp_path, capsys):
     assert not any("resume/replay_lost_at" in row for row in rows)
 
 
+@pytest.mark.parametrize("full", [0, 2])
+def test_a_run_that_was_interrupted_before_its_last_evaluation_is_finished_once(straight, tmp_path, capsys, full):
+    path, config = tmp_path / "run", small_config(full_checkpoint_interval=full)
+    interrupted(config, path, 7)
+    assert metrics.read_rows(path / "metrics.jsonl")[-1]["iteration"] == 6
+    list(make_fake_trainer(config, path, resume=True).run())
+    assert rows_without_time(path) == rows_without_time(straight[0])
+    assert Checkpoints(path / "checkpoints").iterations(FULL) == ([6, 8] if full else [])
+    capsys.readouterr()
+    assert list(make_fake_trainer(config, path, resume=True).run()) == []
+    assert "is finished already" in capsys.readouterr().out
+
+
+def test_a_run_that_is_asked_for_fewer_steps_than_it_has_is_evaluated(tmp_path, capsys):
+    path, config = tmp_path / "run", small_config(eval_interval=4, full_checkpoint_interval=0)
+    interrupted(config, path, 5)
+    done = Checkpoints(path / "checkpoints").newest()
+    assert done in (6, 7) and metrics.read_rows(path / "metrics.jsonl")[-1]["iteration"] == 4
+    shorter = config.replace(env_steps=50)
+    list(make_fake_trainer(shorter, path, resume=True).run())
+    assert metrics.read_rows(path / "metrics.jsonl")[-1]["iteration"] == done
+    assert "success at the end: seed 0: " in capsys.readouterr().out
+    list(make_fake_trainer(shorter, path, resume=True).run())
+    assert "is finished already" in capsys.readouterr().out
+
+
+def test_a_loop_that_is_left_can_be_entered_again(straight, tmp_path):
+    path = tmp_path / "run"
+    trainer = make_fake_trainer(small_config(), path)
+    for report in trainer.run():
+        if report.iteration == 5:
+            break
+    assert next(trainer.run()).iteration == 5  # saved after 4
+    assert [report.iteration for report in trainer.run()][-1] == 8
+    assert rows_without_time(path) == rows_without_time(straight[0])
+
+
 def test_a_damaged_final_checkpoint_is_not_a_finished_run(straight, tmp_path, capsys):
     path = tmp_path / "run"
     list(make_fake_trainer(small_config(), path).run())

@@ -168,11 +168,11 @@ def test_the_cluttered_part_of_the_workspace_is_that_of_all_parts() -> None:
     replay = Replay(num_rollouts=2, num_envs=4, horizon=5)
     states = jax.random.uniform(jax.random.key(5), (2, 8, 7, 2))
     sizes = jnp.int32(4)  # the first rollout of each part
-    expected = reward_errors.find_clutter_end(states[:, :4, -1].reshape(8, 2), jnp.int32(8), 0.5)
+    expected = reward_errors.find_clutter_end(states[:, :4, -1].reshape(8, 2), jnp.ones(8, bool), 0.5)
 
     def end(shards, part):
         sampler = Sampler(config, resolve(config, 5), replay, 0.1, shards=shards)
-        return sampler._clutter_end(ReplayState(Episodes(part[0], part[0], part[0]), sizes))
+        return sampler._clutter_end(ReplayState(Episodes(part[0], part[0], part[0]), sizes), jnp.int32(0))
 
     np.testing.assert_allclose(in_parts(end, 2, states), [expected, expected])
 

@@ -14,13 +14,14 @@ from jaxrl_vis import cli
 from jaxrl_vis.run.folder import SCHEMA
 from jaxrl_vis.studies import indicator
 from jaxrl_vis.studies.authors import mean_difference, released_curves
-from jaxrl_vis.studies.cells import Cell
+from jaxrl_vis.studies.cells import Cell, contradiction, is_finished
 from jaxrl_vis.studies.figures import make_figure
 from jaxrl_vis.studies.ol_aux import AUX_TASKS, FETCH, FINGER, HAND, LEVELS, STUDIES, VARIANTS
 from jaxrl_vis.studies.results import Line, Reached, mean_weight, reached
 from jaxrl_vis.studies.show import Request
 from jaxrl_vis.studies.study import Scope, cells_of
 from jaxrl_vis.studies.tables import Named, steps_table, to_csv, weights_table
+from jaxrl_vis.validation import validate
 
 EVERY = 20_000
 
@@ -281,6 +282,27 @@ def test_a_comparison_with_an_oracle_that_fails_does_not_count(tmp_path: Path) -
         "VisualSawyerReach: the oracle itself ends at a success of 0.640, where at least 0.9 is"
         in (tmp_path / "f.md").read_text()
     )
+
+
+def test_runs_of_other_settings_are_drawn_only_where_nothing_is_trained_and_named(tmp_path: Path) -> None:
+    (cell,) = all_cells("5.4")[FETCH, "none"]
+    # Which logarithm the actor learns makes no difference where nothing is weighted.
+    older = dataclasses.replace(cell, config=cell.config.replace(random_shift=3, actor_log="loss"))
+    made_up(older, tmp_path, slope(1.0))
+    assert contradiction(cell, tmp_path) and not is_finished(cell, tmp_path)
+    request = Request("5.4", STUDIES["5.4"], tmp_path / "f.png", tmp_path, (FETCH,), ("none",), draw_only=True)
+    assert make_figure(request)
+    text = request.out.with_suffix(".md").read_text()
+    assert "no auxiliary losses: not as it would be trained now, with random_shift (saved 3, asked 0)." in text
+
+
+@pytest.mark.parametrize("preset", ["paper", "fast", "cpu", "debug"])
+def test_every_figure_of_rewards_can_be_made_with_every_preset(preset: str) -> None:
+    family = indicator.FAMILY
+    for study in indicator.STUDIES.values():
+        for parts in cells_of(study, family.tasks, study.variants, Scope(preset)).values():
+            for cell in parts:
+                validate(cell.config)
 
 
 def test_a_run_that_lost_its_replay_is_owned_up_to(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from jaxrl_vis.run import loop as run_loop
 from jaxrl_vis.run import memory, metrics, trained, trainer
 from jaxrl_vis.run.checkpoint import Checkpoints
 from jaxrl_vis.run.folder import RunFolder, default_folder, read_config
+from jaxrl_vis.run.nonfinite import dump
 
 
 def test_a_run_reports_logs_and_draws(straight, capsys):
@@ -93,6 +94,29 @@ def test_a_non_finite_number_stops_the_run(tmp_path, break_state, capsys):
     shapes = make_fake_trainer(small_config(), None).shapes
     restored = Checkpoints(path / "checkpoints", read_only=True).restore_for_resume(shapes)
     assert restored.iteration == 4 and all(np.isfinite(leaf).all() for leaf in as_plain(restored.train))
+
+
+def test_bad_episodes_of_a_replay_that_devices_share_are_dumped(tmp_path):
+    """Its episodes are numbered by rollout and environment."""
+    made = make_fake_trainer(small_config(), None)
+    loop = made.init(made.run_keys)
+    states, actions = loop.replay.episodes.states, loop.replay.episodes.actions
+    folded = [array.reshape(2, -1, 2, *array.shape[2:]) for array in (states.at[1, 3].set(np.nan), actions)]
+    episodes = loop.replay.episodes.replace(states=folded[0], actions=folded[1])
+    dump(tmp_path / "dump.npz", loop.replace(replay=loop.replay.replace(episodes=episodes)), {}, [])
+    dumped = np.load(tmp_path / "dump.npz")
+    assert dumped["episodes.seed_index"].tolist() == [1] and dumped["episodes.slot"].tolist() == [3]
+    assert np.isnan(dumped["episodes.states"]).all()
+
+
+def test_keys_of_the_wrong_kind_or_number_are_refused():
+    two = make_fake_trainer(small_config(), None)
+    with pytest.raises(RequestError, match=r"init takes one key, or one for each of 2 seeds, not \(3,\) of them"):
+        two.init(jax.random.split(jax.random.key(0), 3))
+    with pytest.raises(RequestError, match=r"evaluate takes a typed JAX key, such as jax.random.key\(0\), not 0"):
+        two.evaluate(two.shapes, 0)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(RequestError, match="evaluate takes one key for all seeds"):
+        two.evaluate(two.shapes, two.run_keys)
 
 
 def test_a_filter_that_takes_everything_is_reported(tmp_path, capsys):

@@ -88,7 +88,7 @@ class Figure:
     per_device: int = 1
     """Runs side by side on each device: while one is compiled, another one computes."""
     draw_only: bool = False
-    """Train nothing: draw what is there."""
+    """Train nothing: draw what is there, also runs of other settings, such as an earlier version's; the table says which."""
 
 
 def run(options: Figure) -> int:

@@ -176,11 +176,15 @@ class Networks:
     critic_output_bias: float
 
     def __post_init__(self) -> None:
-        """Checks the image's size.
+        """Checks the image's size, and whether it can be moved as far as it is to be.
 
         Raises:
-            RequestError: The image is smaller than one block of the encoder.
+            RequestError: The image is smaller than one block of the encoder, or could be moved out of sight; or there is no
+                image to be moved.
         """
+        shift = self.config.random_shift
+        if shift and not self.sees_images:
+            raise RequestError(f"random_shift {shift} moves images, and {self.config.env} observes states: leave it out")
         if self.sees_images:
             *_, height, width = self.observation_spec.shape
             least = 2**self._levels
@@ -188,6 +192,11 @@ class Networks:
                 raise RequestError(
                     f"image_size {min(height, width)} is too small for {self._levels} encoder layers, which need at least "
                     f"{least}: raise --image-size or shorten --encoder-filters"
+                )
+            if shift >= min(height, width):
+                raise RequestError(
+                    f"random_shift {shift} could move images of {min(height, width)} pixels out of sight: take a few pixels, "
+                    "such as --random-shift 2"
                 )
 
     @property

@@ -135,6 +135,20 @@ class Replay(NamedTuple):
         )
         return ReplayState(episodes=episodes, size=jnp.minimum(state.size + self.num_envs, self.num_episodes))
 
+    def _latest(self, iteration: jax.Array) -> jax.Array:
+        """Where the last episode of the rollout of ``iteration`` lies."""
+        return (iteration % self.num_rollouts + 1) * self.num_envs - 1
+
+    def is_stored(self, state: ReplayState, iteration: jax.Array) -> jax.Array:
+        """Which places hold an episode: [N] bool. Not always the first ones: a resumed run may begin anywhere in the ring.
+
+        Args:
+            state: The replay, with the rollout of ``iteration`` inserted.
+            iteration: [] int32.
+        """
+        age = (self._latest(iteration) - jnp.arange(self.num_episodes)) % self.num_episodes
+        return age < state.size
+
     def sample_indices(self, state: ReplayState, key: jax.Array, iteration: jax.Array, batch_size: int) -> Indices:
         """B transitions of the stored ones: evenly, or newer ones more often than older ones (``mean_age``).
 
@@ -145,7 +159,7 @@ class Replay(NamedTuple):
             batch_size: B.
         """
         of_episode, of_time = jax.random.uniform(key, (2, batch_size))
-        latest = (iteration % self.num_rollouts + 1) * self.num_envs - 1
+        latest = self._latest(iteration)
         size = jnp.maximum(state.size, 1)
         if self.mean_age is not None:  # an exponential distribution that ends with the oldest episode
             mean = self.mean_age * self.num_envs

@@ -61,14 +61,13 @@ def flip(
     return is_positive ^ is_false
 
 
-def find_clutter_end(goal_states: jax.Array, size: jax.Array, clutter: float) -> jax.Array:
+def find_clutter_end(goal_states: jax.Array, is_stored: jax.Array, clutter: float) -> jax.Array:
     """The first coordinate below which the share ``clutter`` of all goals lies: [] float32.
 
     Args:
         goal_states: [N, G] float32, true states of goals: they are spread over the workspace whatever the policy does.
-        size: [] int32, how many of the N there are; they come first.
+        is_stored: [N] bool, which of the N there are.
         clutter: The share, in (0, 1).
     """
-    count = goal_states.shape[0]
-    ordered = jnp.sort(jnp.where(jnp.arange(count) < size, goal_states[:, 0], jnp.inf))
-    return ordered[jnp.clip((clutter * size).astype(jnp.int32), 0, count - 1)]
+    ordered = jnp.sort(jnp.where(is_stored, goal_states[:, 0], jnp.inf))
+    return ordered[jnp.clip((clutter * jnp.sum(is_stored)).astype(jnp.int32), 0, len(ordered) - 1)]

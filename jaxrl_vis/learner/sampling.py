@@ -92,19 +92,17 @@ class Sampler:
             fraction = jax.random.uniform(jax.random.fold_in(key, _SHIFT), shape)
             choice = choice._replace(shift=scaled(fraction, 2 * most + 1) - most)
         if self.config.reward_clutter < 1.0:
-            choice = choice._replace(clutter_end=self._clutter_end(state))
+            choice = choice._replace(clutter_end=self._clutter_end(state, iteration))
         parted = jax.tree.map(self.shards.part, choice._replace(clutter_end=None))
         choice = parted._replace(clutter_end=choice.clutter_end)
         if not self._has_targets:
             return choice
         return choice._replace(target_key=self.shards.own_key(jax.random.fold_in(key, _TARGETS)))
 
-    def _clutter_end(self, state: ReplayState) -> jax.Array:
-        goal_states = state.episodes.states[:, -1]
-        if self.shards.count > 1:
-            # Those that are there come first in each part; in the order of the slots they do so in all parts together.
-            goal_states = jnp.moveaxis(self.shards.gather(goal_states[None]), 0, 1).reshape(-1, goal_states.shape[-1])
-        return reward_errors.find_clutter_end(goal_states, state.size * self.shards.count, self.config.reward_clutter)
+    def _clutter_end(self, state: ReplayState, iteration: jax.Array) -> jax.Array:
+        goal_states = self.shards.gather(state.episodes.states[:, -1])
+        is_stored = self.shards.gather(self.replay.is_stored(state, iteration))
+        return reward_errors.find_clutter_end(goal_states, is_stored, self.config.reward_clutter)
 
     @property
     def _has_targets(self) -> bool:

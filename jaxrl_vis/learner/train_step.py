@@ -1,4 +1,4 @@
-"""One training iteration, for one or several seeds, as one compiled program.
+"""One training iteration, for one or several seeds, as one compiled program (`parts`: as two, for one device).
 
     key = fold_in(seed's key, iteration)
     rollout     reset, then scan over T: act, advance, observe            -> E episodes
@@ -60,7 +60,7 @@ class TrainStep:
             (TrainState, ReplayState, Episodes, keys [S], iteration) -> (TrainState, ReplayState), the first two donated;
             (TrainState, ReplayState, keys [S], iteration) -> (TrainState, metrics) after ``updates_per_iteration`` steps, the
             first donated.
-        parts: The same run in parts, as a CPU computes it (`jaxrl_vis.learner.parts`); None on several devices.
+        parts: The same run in two programs, as one device computes it (`jaxrl_vis.learner.parts`); None on several devices.
     """
 
     env: GoalEnv

@@ -214,11 +214,15 @@ class Checkpoints:
             self._unsilence()
             self._unsilence = None
 
-    def retire_full(self) -> None:
-        """Deletes full checkpoints that are older than a light one which is safely on the disk: nothing goes on from them."""
+    def retire_full(self, has_ended: bool = False) -> None:
+        """Deletes full checkpoints that are older than a light one which is safely on the disk: nothing goes on from them.
+
+        Args:
+            has_ended: Delete those that are as new, too: the run has come to its end.
+        """
         newest = max(self.iterations(LIGHT), default=-1)
         for iteration in self.iterations(FULL):
-            if iteration < newest:
+            if iteration < newest + has_ended:
                 self._forget(FULL)
                 if processes.is_first():
                     shutil.rmtree(self._folder / FULL / str(iteration), ignore_errors=True)

@@ -35,6 +35,12 @@ MAY_CHANGE = (
 """Fields that a resumed run may set anew: where its task lies now, how long to train, on how many devices, how often to look
 and save. All others shape what is learned."""
 
+_OF_WEIGHTINGS = (
+    *(field.name for field in dataclasses.fields(Config) if field.name.startswith("weighting_")),
+    *("aux_gradients", "aux_form", "actor_log"),
+)
+"""But for these, where losses are neither weighted nor logarithms: nothing reads them."""
+
 
 def default_folder(config: Config) -> Path:
     """``runs/<env>-<method>-<preset>-seed<first>`` or ``...-seeds<first>to<last>``, below the working directory.
@@ -202,10 +208,11 @@ def contradictions(saved: Config, config: Config, but_for: Collection[str] = MAY
         but_for: Fields that do not count.
     """
     before, asked = dataclasses.asdict(saved), dataclasses.asdict(config)
+    unread = _OF_WEIGHTINGS if saved.weighting == config.weighting == "none" else ()
     return [
         f"{name} (saved {before[name]}, asked {asked[name]})"
         for name in sorted(before)
-        if name not in but_for and before[name] != asked[name]
+        if name not in but_for and name not in unread and before[name] != asked[name]
     ]
 
 

@@ -96,6 +96,8 @@ class RunLoop:
         self._begun, self._begun_at = 0, self._mark
         self._marked_iteration, self._compile_s = 0, 0.0
         self._is_left_alone = False
+        self._owed_evaluation = False  # what was restored owes an evaluation, and would whenever it is restored
+        self.has_begun = False  # the folder is this run's
 
     def reports(self, resume: bool, overwrite: bool) -> Iterator[Report]:
         """The whole run; see `Trainer.run`."""
@@ -163,7 +165,13 @@ class RunLoop:
             self._say("the last checkpoint is not usable, so the run is not finished: going on from the last good one")
             return False
         files = [self._folder.curve, self._folder.video] if self._programs.shows_images else [self._folder.curve]
-        return not Progress.from_dict(restored.progress).evaluation_due and all(file.exists() for file in files)
+        return self._is_evaluated(restored) and all(file.exists() for file in files)
+
+    def _is_evaluated(self, restored: Restored) -> bool:
+        """Whether the evaluation that a run ends with is there, if what was restored is its end."""
+        rows = metrics.read_rows(self._folder.metrics)
+        is_due = Progress.from_dict(restored.progress).evaluation_due
+        return not is_due and any(row["iteration"] == restored.iteration and "eval/success" in row for row in rows)
 
     def _prepare(self, goes_on: bool, memory: str) -> dict[str, Any]:
         """Restores and compiles; the compiled programs by name. Nothing is written."""
@@ -190,6 +198,7 @@ class RunLoop:
         processes.meet("compiled")
         if self._writes:
             self._folder.open(self._config, goes_on, overwrite, self._log)
+        self.has_begun = True
         damaged = self._checkpoints.set_aside_after(self._done) if goes_on else []
         if self._writes:
             self._begin_log(goes_on, damaged)
@@ -217,6 +226,9 @@ class RunLoop:
     def _take_over(self, restored: Restored) -> None:
         self._progress = Progress.from_dict(restored.progress)
         self._done = restored.iteration
+        # A run that has come far enough before it was evaluated, or that is asked for fewer steps than it has, ends with that.
+        self._progress.evaluation_due |= self._done >= self._total and not self._is_evaluated(restored)
+        self._owed_evaluation = self._progress.evaluation_due
         if restored.loop is not None:
             self._loop = restored.loop
             self._say(f"resumed at iteration {self._done} of {self._total}, exactly")
@@ -379,9 +391,9 @@ class RunLoop:
 
     def _finish(self, interruption: Interruption) -> None:
         assert self._loop is not None
-        if not self._saver.has(LIGHT, self._done):
+        if self._owed_evaluation or not self._saver.has(LIGHT, self._done):
             self._saver.light(self._loop, self._done, self._progress_now())
-        if self._config.full_checkpoint_interval and not self._saver.has(FULL, self._done):
+        if self._config.full_checkpoint_interval and (self._owed_evaluation or not self._saver.has(FULL, self._done)):
             self._saver.full(self._loop, self._done, self._progress_now())
         self._saver.finish()
         self._console.stop()

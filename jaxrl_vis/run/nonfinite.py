@@ -38,6 +38,8 @@ def dump(file: Path, loop: LoopState, values: PerSeed, leaves: list[str]) -> Non
     """
     found = {f"train.{name}": array for name, array in to_host(loop.train, copy=True).items()}
     episodes = {name: np.asarray(getattr(loop.replay.episodes, name)) for name in ("states", "actions")}
+    # Where devices share a learner, episodes are numbered by rollout and environment (`sharding.Layout`).
+    episodes = {name: array.reshape(len(array), -1, *array.shape[-2:]) for name, array in episodes.items()}
     bad = ~(np.isfinite(episodes["states"]).all((-2, -1)) & np.isfinite(episodes["actions"]).all((-2, -1)))
     seeds, slots = (index[:_MAX_EPISODES] for index in np.nonzero(bad))
     found |= {"episodes.seed_index": seeds, "episodes.slot": slots}

@@ -247,9 +247,10 @@ class Programs:
 
     def train_iteration(self, loop: LoopState) -> tuple[LoopState, Metrics]:
         """One iteration; ``loop`` is donated. See `Trainer.train_iteration`."""
+        compiled = self.of_training()  # all of them before the first is called, so that they are compiled side by side
         if self.side_by_side is not None:
             return self.side_by_side.train_iteration(loop)
-        return self.compiled("train_iteration")(loop)
+        return compiled["train_iteration"](loop)
 
     def evaluate(self, train: TrainState, key: jax.Array | None = None) -> tuple[Metrics, dict[str, jax.Array]]:
         """Metrics of the policy without noise, [S] float32, and images of the first few episodes of every seed.

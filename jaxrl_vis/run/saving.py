@@ -59,14 +59,14 @@ class Saver:
         self._checkpoints.save_full(iteration, loop, dataclasses.asdict(progress))
 
     def finish(self) -> None:
-        """Returns when everything is on the disk, and deletes a full checkpoint that a newer light one has replaced.
+        """Returns when everything is on the disk, and deletes full checkpoints of a run that keeps none: it has ended.
 
         Raises:
             StorageError: Something could not be written.
         """
         self._checkpoints.wait()
         if not self._keeps_full:
-            self._checkpoints.retire_full()
+            self._checkpoints.retire_full(has_ended=True)
 
     def on_signal(self, loop: LoopState, iteration: int, progress: Progress, signal_name: str) -> None:
         """Saves the learner, then everything. A full disk in between leaves the light checkpoint, and says so.

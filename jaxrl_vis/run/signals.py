@@ -69,7 +69,7 @@ class Interruption:
     @property
     def name(self) -> str:
         """What to call it in a message."""
-        return "SIGTERM" if self.signal == signal.SIGTERM else "Ctrl-C"
+        return "Ctrl-C" if self.signal == signal.SIGINT else "SIGTERM"  # as `end` has it: another process may have been told
 
     def _note(self, number: int, _: FrameType | None) -> None:
         if self.signal is not None:

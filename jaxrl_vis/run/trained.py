@@ -6,6 +6,7 @@ import jax
 import numpy as np
 
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.learner.evaluate import num_recorded
 from jaxrl_vis.report import videos, viewer
 from jaxrl_vis.run.checkpoint import FULL, LIGHT, Checkpoints, Restored
 from jaxrl_vis.run.folder import read_config
@@ -94,7 +95,7 @@ def play_run(
     """
     out = Path(out)
     (viewer.check_page if three_dimensional else videos.check_output)(out)
-    trainer = open_run(run_dir, keep_programs, eval_episodes=max(1, episodes))
+    trainer = open_run(run_dir, keep_programs, eval_episodes=num_recorded(max(1, episodes)))
     programs = trainer.programs
     if not (programs.shows_images or three_dimensional):
         raise RequestError(f"{trainer.config.env} shows the robot no images: play a run on a Visual task, or with --html")

@@ -2,7 +2,7 @@
 
     trainer = make_trainer(config)
     loop = trainer.init(jax.random.key(0))
-    loop, metrics = trainer.train_iteration(loop)       # one compiled step; what you do between two of them is up to you
+    loop, metrics = trainer.train_iteration(loop)       # a rollout and gradient steps; what you do between two is up to you
     for report in trainer.run(): ...                    # or the whole thing: logs, evaluates, saves, draws
 
 What was trained is used by `jaxrl_vis.run.trained`.
@@ -99,12 +99,13 @@ class Trainer:
                 ``seed=0``; with several it is split into one each. Or [S] keys, taken as they are.
 
         Raises:
-            RequestError: ``key`` is a seed, or a key of the old kind.
+            RequestError: ``key`` is a seed, a key of the old kind, or of another number of seeds.
         """
-        if not (hasattr(key, "dtype") and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)):
-            raise RequestError(f"init takes a typed JAX key, such as jax.random.key(0), not {key!r}")
+        _check_key("init", key)
         if key.ndim == 0:
             key = key[None] if self.config.seeds == 1 else jax.random.split(key, self.config.seeds)
+        if key.shape != (self.config.seeds,):
+            raise RequestError(f"init takes one key, or one for each of {self.config.seeds} seeds, not {key.shape} of them")
         return self.programs.init(key)
 
     def train_iteration(self, loop: LoopState) -> tuple[LoopState, Metrics]:
@@ -120,8 +121,15 @@ class Trainer:
 
         Args:
             loop: What was trained.
-            key: Draws the episodes; None: always the same ones.
+            key: A typed key that draws the episodes; None: always the same ones.
+
+        Raises:
+            RequestError: ``key`` is a seed, a key of the old kind, or several keys.
         """
+        if key is not None:
+            _check_key("evaluate", key)
+            if key.ndim:
+                raise RequestError(f"evaluate takes one key for all seeds, not {key.shape} of them")
         return self.programs.evaluate(loop.train if isinstance(loop, LoopState) else loop, key)[0]
 
     def run(self) -> Iterator[Report]:
@@ -129,7 +137,7 @@ class Trainer:
 
         Compiles; evaluates every ``eval_interval`` iterations and at the end; writes metrics, checkpoints, the curve and the
         video into the run folder; and says on stdout what it does. SIGTERM and Ctrl-C (in the main thread) are acted upon
-        between two iterations.
+        between two iterations. Whoever leaves the loop early keeps what was saved until then; the next call goes on from there.
 
         Raises:
             RequestError: The folder, the saved run or the memory does not suit the configuration, or another process writes
@@ -139,9 +147,17 @@ class Trainer:
             Terminated: SIGTERM, after saving.
             KeyboardInterrupt: Ctrl-C, after saving.
         """
-        yield from RunLoop(self.programs, self.folder, self._log).reports(self._resume, self._overwrite)
-        # Asked again, a finished run is resumed, and says that there is nothing left to do.
-        self._resume, self._overwrite = True, False
+        loop = RunLoop(self.programs, self.folder, self._log)
+        try:
+            yield from loop.reports(self._resume, self._overwrite)
+        finally:
+            if loop.has_begun:  # asked again, it goes on; a finished run says that there is nothing left to do
+                self._resume, self._overwrite = True, False
+
+
+def _check_key(function: str, key: Any) -> None:
+    if not (hasattr(key, "dtype") and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)):
+        raise RequestError(f"{function} takes a typed JAX key, such as jax.random.key(0), not {key!r}")
 
 
 def make_trainer(

@@ -97,15 +97,23 @@ def _reached(folder: Path, cell: Cell) -> int | None:
     return min((each for each, seeds in steps.items() if seeds >= set(cell.seeds)), default=None)
 
 
+def differences(cell: Cell, runs: Path) -> list[str]:
+    """In which settings the cell's run is another one, in words; none where it is not, or where there is none yet.
+
+    Raises:
+        RequestError: Its config.json cannot be read.
+    """
+    folder = folder_of(cell, runs)
+    return contradictions(read_config(folder), cell.config) if RunFolder(folder).config.exists() else []
+
+
 def contradiction(cell: Cell, runs: Path) -> str | None:
     """Why the cell's folder cannot be used for it, in one line; None where it can, or where there is none yet."""
-    folder = folder_of(cell, runs)
-    if not RunFolder(folder).config.exists():
-        return None
     try:
-        found = contradictions(read_config(folder), cell.config)
+        found = differences(cell, runs)
     except RequestError as error:
         return str(error)
+    folder = folder_of(cell, runs)
     return f"{folder} holds another run, with {'; '.join(found)}: move it away, or take another --runs" if found else None
 
 
@@ -115,13 +123,10 @@ def is_finished(cell: Cell, runs: Path) -> bool:
 
 
 def rows_of(cell: Cell, runs: Path) -> list[dict[str, Any]]:
-    """The evaluations of a finished cell, up to its end, from metrics.jsonl; none where it is not finished."""
-    if not is_finished(cell, runs):
-        return []
+    """The evaluations of the cell's run up to its end, from metrics.jsonl, whatever its settings; none before it has ended."""
     folder = folder_of(cell, runs)
     end = _reached(folder, cell)
-    assert end is not None
-    return [row for row in read_rows(RunFolder(folder).metrics) if row["env_steps"] <= end]
+    return [] if end is None else [row for row in read_rows(RunFolder(folder).metrics) if row["env_steps"] <= end]
 
 
 def standing(cell: Cell, runs: Path) -> str:

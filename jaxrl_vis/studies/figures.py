@@ -50,7 +50,7 @@ def make_figure(request: Request, say: Callable[[str], None] = print) -> bool:
         run_cells(
             list(wanted.values()), request.runs, lambda: shared(list_devices(), request.per_device), request.seconds, say=say
         )
-    lines, unfinished = read_lines(cells, request.runs)
+    lines, unfinished = read_lines(cells, request.runs, as_they_are=request.draw_only)
     for text in unfinished:
         say(f"not drawn: {text}")
     if not any(variant in variants for _, variant in lines):
@@ -101,6 +101,11 @@ def _common_notes(study: Study, lines: dict[tuple[str, str], Line], unfinished: 
         f"{task}, {study.family.variants[variant].label}: a run went on without its replay, and is not exact."
         for (task, variant), line in lines.items()
         if line.has_lost_replay()
+    ]
+    notes += [
+        f"{task}, {study.family.variants[variant].label}: not as it would be trained now, with {'; '.join(line.unlike)}."
+        for (task, variant), line in lines.items()
+        if line.unlike
     ]
     records = [record for line in lines.values() for record in line.records]
     for name, found in (

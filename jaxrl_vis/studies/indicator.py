@@ -43,8 +43,9 @@ VARIANTS: dict[str, Variant] = {
 }
 """Everything that a figure can show, by name."""
 
-REACHER, FETCH, SAWYER, FINGER = "VisualReacher", "VisualFetchReach", "VisualSawyerReach", "VisualFingerTurn"
-_OTHERS = {"Reacher": 100_000, "FetchReach": 100_000, "VisualHandReach": 700_000, FINGER: 500_000}
+REACHER, FETCH, SAWYER = "VisualReacher", "VisualFetchReach", "VisualSawyerReach"
+HAND, FINGER = "VisualHandReach", "VisualFingerTurn"
+_OTHERS = {"Reacher": 100_000, "FetchReach": 100_000, HAND: 700_000, FINGER: 500_000}
 # All methods see images as they are: the autoencoder compares them, and cannot do with shifted ones.
 _OWN = ("num_envs", "updates_per_iteration", "eval_interval", "encoders", "target_encoder", "random_shift")
 _AS_ELSEWHERE = {preset: {name: getattr(PRESETS[preset], name) for name in _OWN} for preset in ("fast", "cpu")}
@@ -59,6 +60,7 @@ FAMILY = Family(
     of_task={
         ("fast", REACHER): {"image_size": 100},
         **{(preset, task): own for preset, own in _AS_ELSEWHERE.items() for task in (FETCH, "FetchReach")},
+        ("fast", HAND): {"random_shift": 0},
         ("fast", FINGER): {"trivial_goals": 1.0},
         ("cpu", FINGER): {"trivial_goals": 1.0},
     },

@@ -11,7 +11,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.report.learning import curve, steps_to
 from jaxrl_vis.report.plots import gather, show_steps
 from jaxrl_vis.run.folder import read_record
-from jaxrl_vis.studies.cells import Cell, folder_of, rows_of, standing
+from jaxrl_vis.studies.cells import Cell, contradiction, differences, folder_of, rows_of, standing
 
 SUCCESS = "eval/success"
 DISTANCE = "eval/goal_distance"
@@ -25,12 +25,14 @@ class Line:
         task, variant: Their names.
         rows: Evaluations of all seeds, from metrics.jsonl.
         records: config.json of each run that it was read from.
+        unlike: In which settings these runs are not what would be trained now.
     """
 
     task: str
     variant: str
     rows: Sequence[Mapping[str, Any]]
     records: Sequence[Mapping[str, Any]] = ()
+    unlike: Sequence[str] = ()
 
     @property
     def points(self) -> list[tuple[int, float]]:
@@ -61,20 +63,35 @@ class Line:
         return any("resume/replay_lost_at" in row for row in self.rows)
 
 
-def read_lines(cells: Mapping[tuple[str, str], Sequence[Cell]], runs: Path) -> tuple[dict[tuple[str, str], Line], list[str]]:
+def read_lines(
+    cells: Mapping[tuple[str, str], Sequence[Cell]], runs: Path, as_they_are: bool = False
+) -> tuple[dict[tuple[str, str], Line], list[str]]:
     """The lines of finished cells, and what is missing.
+
+    Args:
+        cells: (task, variant) -> the runs of a line.
+        runs: The folder of run folders.
+        as_they_are: Also read runs of other settings, such as those that a preset had in an earlier version.
 
     Returns:
         (task, variant) -> line, without those of which a cell is not finished; and a text for each cell that is not.
     """
     lines, unfinished = {}, []
     for (task, variant), parts in cells.items():
-        found = [rows_of(cell, runs) for cell in parts]
+        found = [rows_of(cell, runs) if as_they_are or contradiction(cell, runs) is None else [] for cell in parts]
         unfinished += [f"{cell.name}: {standing(cell, runs)}" for cell, rows in zip(parts, found, strict=True) if not rows]
         if all(found):
             records = [_record(folder_of(cell, runs)) for cell in parts]
-            lines[task, variant] = Line(task, variant, [row for rows in found for row in rows], records)
+            unlike = sorted({each for cell in parts for each in _differences(cell, runs)})
+            lines[task, variant] = Line(task, variant, [row for rows in found for row in rows], records, unlike)
     return lines, unfinished
+
+
+def _differences(cell: Cell, runs: Path) -> list[str]:
+    try:
+        return differences(cell, runs)
+    except RequestError as error:
+        return [str(error)]
 
 
 def _record(folder: Path) -> dict[str, Any]:

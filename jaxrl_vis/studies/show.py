@@ -21,7 +21,7 @@ class Request:
         tasks: Environments; none: those of the study.
         variants: Names of its family's variants; none: those of the study.
         scope: How it is run.
-        draw_only: Train nothing.
+        draw_only: Train nothing: draw what is there, also runs of other settings, and say which those are.
         seconds: Stop training after so long.
         per_device: Runs side by side on each device.
     """
