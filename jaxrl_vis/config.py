@@ -19,7 +19,10 @@ ComputeDtype = Literal["auto", "float32", "bfloat16"]
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """One training run. Counts are per seed; lengths of time are in control steps unless a unit is given."""
+    """One training run. Counts are per seed; lengths of time are in control steps unless a unit is given.
+
+    The defaults are the preset ``fast``'s; `preset` also has what that has otherwise for some tasks.
+    """
 
     env: str = "VisualFetchReach"
     """The environment; `jaxrl-vis envs` lists them, and module:Name is one of your own."""
@@ -57,13 +60,13 @@ class Config:
     """How far it varies, in multiples of the typical ranges (`jaxrl_vis_envs.randomization.KINDS`)."""
     observation_noise: float = 0.0
     """Standard deviation of the camera's noise, in the observation's unit (grey levels for images); new in every frame."""
-    num_envs: int = 80
+    num_envs: int = 100
     """Environments in a rollout; each plays one episode per iteration."""
 
     # -- How long, and how often to learn
     env_steps: int = 200_000
     """Environment steps to train for; rounded up to whole iterations of num_envs * horizon."""
-    updates_per_iteration: int = 40
+    updates_per_iteration: int = 200
     """Gradient steps after each rollout."""
     batch_size: int = 512
     """Transitions in a gradient step."""
@@ -102,9 +105,9 @@ class Config:
     """Adam step size of the actor."""
     critic_learning_rate: float = 1e-3
     """Adam step size of the critic."""
-    target_decay: float = 0.98
+    target_decay: float = 0.99
     """Share of a target network that stays at each update of it."""
-    target_update_interval: int = 40
+    target_update_interval: int = 1
     """Gradient steps between target updates."""
     actor_interval: int = 1
     """Gradient steps of the critic for each one of the actor; divides updates_per_iteration."""
@@ -171,7 +174,7 @@ class Config:
     """Normalised observations are clipped to plus and minus this."""
 
     # -- Evaluating and saving
-    eval_interval: int = 5
+    eval_interval: int = 2
     """Iterations between evaluations; one more comes at the end."""
     eval_episodes: int = 1000
     """Episodes of an evaluation, always the same ones."""
@@ -207,17 +210,7 @@ _PAPER = Config(
     eval_interval=5,
 )
 
-_FAST = Config(
-    preset="fast",
-    num_envs=100,
-    env_steps=200_000,
-    updates_per_iteration=200,
-    batch_size=512,
-    replay_transitions=200_000,
-    target_decay=0.99,
-    target_update_interval=1,
-    eval_interval=2,
-)
+_FAST = Config()
 
 _CPU = _FAST.replace(
     preset="cpu",

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from nvidia import lowered_for_nvidia
 from small_scene import small_scene
 
 from jaxrl_vis.config import preset
@@ -44,6 +45,8 @@ def gpu(monkeypatch):
 
 
 def lowered(function, platform: str, *arguments) -> str:
+    if platform == "cuda":
+        return lowered_for_nvidia(lambda: jax.jit(function).trace(*arguments))
     return jax.jit(function).trace(*arguments).lower(lowering_platforms=(platform,)).as_text()
 
 
@@ -172,7 +175,7 @@ def test_the_kernels_themselves_are_probed_in_the_midst_of_a_trace(module, gpu):
     gpu()
 
     def probe() -> None:
-        module.probe_program().lower(lowering_platforms=("cuda",))
+        lowered_for_nvidia(module.probe_program)
 
     @jax.jit
     def traced(x):
@@ -264,7 +267,7 @@ def test_the_probe_of_the_kernel_is_an_instance_of_it(monkeypatch):
     """That it compiles needs a GPU; that it can be lowered does not."""
     from jaxrl_vis_envs.render.gpu import kernel
 
-    assert KERNEL_CALL in kernel.probe_program().lower(lowering_platforms=("cuda",)).as_text()
+    assert KERNEL_CALL in lowered_for_nvidia(kernel.probe_program)
 
 
 @pytest.mark.parametrize("chosen", [(700, 10, 10), (0, 10, 10), (500_000, 5, 5)])

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from nvidia import lowered_for_nvidia
 
 from benchmarks import environments
 from jaxrl_vis_envs.compilation import KERNELS_VARIABLE, env_jit, kernels, tracing_for
@@ -324,7 +325,7 @@ def lowered_for_cuda(model: mjx.Model, data: mjx.Data) -> str:
         with tracing_for("cuda"), kernels(True):
             return mjx_model.take_steps(model, data, 5, True, True)
 
-    return jax.jit(jax.vmap(control_step)).trace(data).lower(lowering_platforms=("cuda",)).as_text()
+    return lowered_for_nvidia(lambda: jax.jit(jax.vmap(control_step)).trace(data))
 
 
 @pytest.mark.parametrize("name", ["FingerTurn", "HandReach"])
@@ -347,7 +348,7 @@ def test_goals_and_steps_of_the_hand_are_one_kernel(monkeypatch):
             return env.act(env.sample_goal(key), action)
 
     keys, actions = jax.eval_shape(lambda: (jax.random.split(jax.random.key(0), 8), jnp.zeros((8, env.action_size))))
-    program = jax.jit(jax.vmap(from_goal)).trace(keys, actions).lower(lowering_platforms=("cuda",)).as_text()
+    program = lowered_for_nvidia(lambda: jax.jit(jax.vmap(from_goal)).trace(keys, actions))
     assert program.count("take_physics_steps") >= 1 and len(set(re.findall('ir = "[^"]*"', program))) == 1
 
 
@@ -360,7 +361,7 @@ def test_steps_are_taken_one_by_one_where_their_kernel_does_not_compile(monkeypa
 
 
 def test_the_probe_is_a_kernel_for_nvidia():
-    program = steps_kernel.probe_program().lower(lowering_platforms=("cuda",)).as_text()
+    program = lowered_for_nvidia(steps_kernel.probe_program)
     assert "take_physics_steps" in program
 
 
