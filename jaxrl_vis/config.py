@@ -159,7 +159,8 @@ class Config:
     encoders: Literal["separate", "shared"] = "separate"
     """Whether the actor has an encoder of its own, or acts on the latents of the critic's, which it cannot change."""
     target_encoder: bool = True
-    """Whether targets have slowly following encoders, or, like their heads' online counterparts, read the online ones."""
+    """Whether target networks have encoders of their own, which follow slowly; if not, the targets' heads read the online
+    encoders' latents."""
     random_shift: int = 0
     """Images of a batch move by up to so many pixels each way, the three of a transition alike (Kostrikov et al., 2020)."""
     compute_dtype: ComputeDtype = "auto"
