@@ -3,7 +3,7 @@
     python benchmarks/adapters.py sb3 [--env FetchReach] [--steps 20000]      Stable-Baselines3: DDPG with HER, sparse reward
     python benchmarks/adapters.py brax [--env FetchReach] [--steps 180000]    brax: PPO, dense reward
 
-Needs ``pip install 'jaxrl-vis[gymnasium]' stable-baselines3``, or ``pip install 'jaxrl-vis[brax]'``. Success is the share of
+The first needs ``pip install '.[gymnasium]' stable-baselines3``; brax is there. Success is the share of
 256 episodes that lie within the threshold at their last step, without exploration. Exit status: 0 it learned; 1 it did not.
 """
 

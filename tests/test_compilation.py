@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.experimental.pallas import triton as plgpu
 from nvidia import lowered_for_nvidia
 from small_scene import small_scene
 
@@ -14,7 +15,7 @@ from jaxrl_vis.config import preset
 from jaxrl_vis.learner import encoder_kernel_passes
 from jaxrl_vis.learner.sharding import ONE_DEVICE
 from jaxrl_vis.run.programs import Programs, rarely_collecting_garbage
-from jaxrl_vis_envs import compilation
+from jaxrl_vis_envs import compilation, gpu_kernels
 from jaxrl_vis_envs.compilation import (
     by_platform,
     kernels,
@@ -183,6 +184,26 @@ def test_the_kernels_themselves_are_probed_in_the_midst_of_a_trace(module, gpu):
             return x + runs_gpu_kernels(probe)
 
     assert traced(jnp.float32(0)) == 1
+
+
+@pytest.mark.skipif(jax.__version_info__ < (0, 11), reason="JAX 0.10 does not ask what a GPU is called")
+@pytest.mark.parametrize(("capability", "name"), [("8.6", "NVIDIA A10"), ("8.7", "NVIDIA A10"), ("7.5", None)])
+def test_a_card_that_jax_does_not_know_is_called_by_the_name_of_one_like_it(gpu, monkeypatch, capability, name):
+    monkeypatch.setattr(gpu_kernels, "_called", {})
+    gpu(capability)
+    assert gpu_kernels._stand_in() == name
+
+    def double(source, target):
+        target[...] = 2.0 * source[...]
+
+    row = jax.ShapeDtypeStruct((32,), jnp.float32)
+    call = gpu_kernels.kernel_call(double, out_shape=row, compiler_params=plgpu.CompilerParams(num_warps=1), name="double")
+    program = jax.jit(call).trace(row)
+    if name is None:
+        with pytest.raises(RuntimeError, match="AbstractDevice"):
+            program.lower(lowering_platforms=("cuda",))
+    else:
+        assert KERNEL_CALL in program.lower(lowering_platforms=("cuda",)).as_text()
 
 
 def test_a_program_holds_the_branch_of_its_own_platform(gpu):

@@ -38,6 +38,7 @@ from jaxrl_vis.learner.encoder_kernel_passes import (
     whole,
 )
 from jaxrl_vis.learner.encoder_kernel_patches import divisor, padded_channels
+from jaxrl_vis_envs.gpu_kernels import kernel_call
 
 _MOST_CHANNELS = 4  # beyond, the weights' gradients no longer fit into registers
 # Cells in a tile, tiles that one program works through at most, and how they are run.
@@ -153,7 +154,7 @@ def _on_gpu(
     block = tile * tiles_of_program(count // tile, count // tile, _TILES)
     programs, cast = count // block, _cast(weights, cells.dtype)
     total = sum(array.size for array in weights) + weights.bias_2.size
-    gradient, partial_sums = pl.pallas_call(
+    gradient, partial_sums = kernel_call(
         functools.partial(_kernel, tile=tile, scale=scale),
         out_shape=(
             jax.ShapeDtypeStruct((count, features), cells.dtype),

@@ -15,6 +15,7 @@ from jax.experimental.pallas import triton as plgpu
 
 from jaxrl_vis.learner.encoder_kernel_patches import LEVELS, divisor, prepare_on_gpu
 from jaxrl_vis_envs.compilation import accelerator, by_platform, runs_gpu_kernels, tracing_for
+from jaxrl_vis_envs.gpu_kernels import kernel_call
 
 LEAST_ROWS = 16
 """Of a product in a kernel."""
@@ -230,7 +231,7 @@ def _apply_on_gpu(patches: jax.Array, weights: Weights, first: int, count: int, 
     block = TILE * divisor(math.gcd(first, count) // TILE, FORWARD_TILES)
     data, data_spec = as_quarters(patches, first, block)
     cast = jax.tree.leaves(cast_kernels(weights, patches.dtype))
-    return pl.pallas_call(
+    return kernel_call(
         _forward_kernel,
         out_shape=jax.ShapeDtypeStruct((count, outputs), patches.dtype),
         grid=(count // block,),
@@ -271,7 +272,7 @@ def _backward_on_gpu(
     data, data_spec = as_quarters(patches, first, block)
     cast, like = jax.tree.leaves(cast_kernels(weights, patches.dtype)), jax.tree.leaves(weights)
     total = sum(array.size for array in like)
-    partial_sums = pl.pallas_call(
+    partial_sums = kernel_call(
         _backward_kernel,
         # All weights in one row, so that one reduction adds up the programs.
         out_shape=jax.ShapeDtypeStruct((programs, total), jnp.float32),

@@ -13,6 +13,7 @@ from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
 
 from jaxrl_vis.learner.blocks import shifted
+from jaxrl_vis_envs.gpu_kernels import kernel_call
 
 LEVELS = 3
 """Layers of which a patch is one row of the result."""
@@ -97,7 +98,7 @@ def prepare_on_gpu(
         return pl.BlockSpec((together, numbers), lambda _, image: (image, 0))
 
     whole = pl.BlockSpec((pixels,), lambda patch, image: (0,))
-    return pl.pallas_call(
+    return kernel_call(
         functools.partial(_prepare_kernel, shape=tuple(shape), levels=levels, limit=limit),
         out_shape=jax.ShapeDtypeStruct((batch, patches, size), dtype),
         grid=(patches // tile, batch // together),

@@ -9,7 +9,6 @@ import math
 from typing import Any
 
 import jax
-from jax.experimental import pallas as pl
 
 from jaxrl_vis.learner.encoder_kernel_passes import (
     FORWARD,
@@ -32,6 +31,7 @@ from jaxrl_vis.learner.encoder_kernel_passes import (
     whole,
 )
 from jaxrl_vis.learner.encoder_kernel_patches import divisor
+from jaxrl_vis_envs.gpu_kernels import kernel_call
 
 
 def _tangent_kernel(x_ref, *refs):
@@ -88,7 +88,7 @@ def _along_on_gpu(
     data, data_spec = as_quarters(patches, first, block)
     cast = jax.tree.leaves([cast_kernels(each, patches.dtype) for each in (weights, along)])
     out = jax.ShapeDtypeStruct((count, outputs), patches.dtype)
-    return pl.pallas_call(
+    return kernel_call(
         _tangent_kernel,
         out_shape=(out, out),
         grid=(count // block,),

@@ -18,6 +18,8 @@ from jax.experimental.pallas import triton as plgpu
 from jax.extend.core import jaxpr_as_fun
 from jax.interpreters import mlir
 
+from jaxrl_vis_envs.gpu_kernels import kernel_call
+
 LANES = 32
 """Threads of a program: those of a warp."""
 _COMPILER = plgpu.CompilerParams(num_warps=1, num_stages=1)
@@ -72,7 +74,7 @@ def _traced(
     """
     del mesh
     programs = shape[1] // LANES
-    launch = pl.pallas_call(
+    launch = kernel_call(
         functools.partial(_kernel, compute=compute, known=known, interpret=interpret),
         grid=(programs,),
         out_shape=[

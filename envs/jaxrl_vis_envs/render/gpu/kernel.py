@@ -17,6 +17,7 @@ from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
 
 from jaxrl_vis_envs.compilation import runs_gpu_kernels
+from jaxrl_vis_envs.gpu_kernels import kernel_call
 from jaxrl_vis_envs.render import camera
 from jaxrl_vis_envs.render.camera import Rays
 from jaxrl_vis_envs.render.outputs import Outputs, Planes
@@ -344,7 +345,7 @@ def draw(
         "segmentation": ((pixels,), jnp.int32),
     }
     drawn = {name: jax.ShapeDtypeStruct(*kind) for name, kind in kinds.items() if getattr(outputs, name)}
-    planes = pl.pallas_call(
+    planes = kernel_call(
         functools.partial(_kernel, scene=_without_arrays(scene), outputs=outputs, tile=tile),
         out_shape=list(drawn.values()),
         grid=(words.shape[0],),
