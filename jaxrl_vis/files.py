@@ -13,12 +13,13 @@ def write_atomically(path: Path, text: str) -> None:
     """Replaces a file's contents in one step: a reader, or a power cut, sees the old contents or the new ones.
 
     Args:
-        path: The file; its folder exists.
+        path: The file; folders that are missing on the way are made.
         text: The new contents, written as UTF-8.
 
     Raises:
-        OSError: The folder is missing or cannot be written to.
+        OSError: A folder cannot be made, or the file cannot be written.
     """
+    path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(path.name + ".tmp")
     with temporary.open("w", encoding="utf-8") as file:
         file.write(text)

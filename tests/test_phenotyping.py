@@ -301,6 +301,7 @@ def test_calibrations_of_opencv_and_ros_are_read(tmp_path):
         assert dataclasses.astuple(found)[:2] == (640, 480)
         assert found.focal == each.focal and found.baseline == pytest.approx(0.1) and found.offset == pytest.approx(each.offset)
         assert found.depth(found.disparity(np.array([0.8]))) == pytest.approx(0.8)
+    assert read_calibration(matrices(tmp_path / "rig.xml", 0.1)).baseline == pytest.approx(0.1)
     (tmp_path / "left.yaml").write_text(ros(CAMERAS, 0.0))
     (tmp_path / "right.yaml").write_text(ros(CAMERAS, 0.1))
     assert read_calibration(tmp_path) == read_calibration(tmp_path / "right.yaml") == CAMERAS
@@ -308,6 +309,15 @@ def test_calibrations_of_opencv_and_ros_are_read(tmp_path):
     (tmp_path / "left.yaml").write_text(info.format(0))
     (tmp_path / "right.yaml").write_text(info.format(-50))
     assert read_calibration(tmp_path) == CAMERAS
+
+
+def test_a_calibration_that_begins_with_a_mark_of_byte_order(tmp_path):
+    write_calibration(tmp_path / "rig.yaml", CAMERAS)
+    (tmp_path / "rig.yaml").write_text((tmp_path / "rig.yaml").read_text(), encoding="utf-8-sig")
+    assert read_calibration(tmp_path / "rig.yaml").focal == CAMERAS.focal
+
+
+LEFT = "[500, 0, 319.5, 0, 0, 500, 239.5, 0, 0, 0, 1, 0]"
 
 
 def matrices(
@@ -362,6 +372,19 @@ def test_bad_calibrations_are_told_in_one_line(tmp_path, arguments, part):
         ("a: [1, 2", "not a calibration"),
         ("\x00\x01\x02", "neither P1 and P2"),
         ("K: [1, 2, 3]", "neither P1 and P2"),
+        ("- 1\n- 2", "it holds a list"),
+        ("[1, 2]", "it holds a list"),
+        ("hello", "neither YAML nor XML"),
+        ("P1: hello\nP2: hello", "P1 of the left camera must be 3 x 4 numbers"),
+        ("P1: {rows: 3, cols: 4, data: 7}\nP2: 1", "P1 of the left camera must be 3 x 4 numbers"),
+        ("P1: [a, b, c, d, e, f, g, h, i, j, k, l]\nP2: 1", "P1 of the left camera must be 3 x 4 numbers"),
+        ("P1: !!opencv-matrix\n  rows: 3\n  cols: 4\n  dt: d\n  data: [1, 2]\nP2: 1", "P1 of the left camera must be 3 x 4"),
+        ("P1: !!opencv-matrix\n  dt: d\n  data: [1, 2]\nP2: 1", "P1 of the left camera must be 3 x 4"),
+        ("P1: !!opencv-matrix\n  rows: 3\n  cols: 4\n  dt: d\n  data: hello\nP2: 1", "P1 of the left camera must be 3 x 4"),
+        (f'P1: {LEFT}\nP2: {LEFT}\nimage_width: "640"\nimage_height: 480', "image_width and image_height must be numbers"),
+        (f"P1: {LEFT}\nP2: {LEFT}\nimage_width: 640\nimage_height: .Inf", "image_width and image_height must be numbers"),
+        (f"P1: {LEFT}\nP2: {LEFT}\nimage_size: [640, x]", "image_size must be numbers"),
+        (f"P1: {LEFT}\nP2: {LEFT}\nimage_size: [640, 480]\nunit: 5", "unit must be m or mm"),
     ],
 )
 def test_files_that_are_no_calibration(tmp_path, text, part):
@@ -408,6 +431,30 @@ def test_images_survive_files(tmp_path, suffix):
     (tmp_path / f"b{suffix}").write_bytes(b"no image")
     with pytest.raises(OSError, match=f"b{suffix} is not an image"):
         read_image(tmp_path / f"b{suffix}")
+
+
+@pytest.mark.parametrize("kind", ["int8", "int16", "int32", "float32", "float64"])
+@pytest.mark.parametrize("shape", [(4, 5), (4, 5, 3)])
+def test_images_of_other_numbers_are_told(tmp_path, kind, shape):
+    """One line that pairs are skipped with, both as text and as ``strerror``, which stands beside the name elsewhere."""
+    path = tmp_path / "a.tiff"
+    assert cv2.imwrite(str(path), np.ones(shape, kind))
+    with pytest.raises(OSError, match=f"a.tiff holds {kind} pixels: save it with 8 or 16 bits") as error:
+        read_image(path)
+    assert error.value.strerror == f"it holds {kind} pixels: save it with 8 or 16 bits"
+
+
+def test_what_opencv_stumbles_over_is_no_image(tmp_path, monkeypatch):
+    write_image(tmp_path / "a.png", np.zeros((2, 3), np.uint8))
+
+    def fail(*_):
+        raise cv2.error("of its own")
+
+    monkeypatch.setattr(cv2, "imdecode", fail)
+    with pytest.raises(OSError, match="a.png is not an image"):
+        read_image(tmp_path / "a.png")
+    with pytest.raises(OSError, match="a.png holds no disparities"):
+        read_disparity(tmp_path / "a.png")
 
 
 def test_disparities_are_read_in_every_convention(tmp_path):

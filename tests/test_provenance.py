@@ -81,5 +81,10 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path) -> None:
     assert path.read_text() == "old"
     write_atomically(path, "new")
     assert path.read_text() == "new"
-    with pytest.raises(FileNotFoundError):
-        write_atomically(tmp_path / "missing" / "file", "x")
+
+
+def test_a_write_makes_the_folders_that_are_missing(tmp_path: Path) -> None:
+    write_atomically(tmp_path / "new" / "sub" / "file.json", "x")
+    assert (tmp_path / "new" / "sub" / "file.json").read_text() == "x"
+    with pytest.raises(OSError, match="exists|directory"):
+        write_atomically(tmp_path / "new" / "sub" / "file.json" / "file", "x")

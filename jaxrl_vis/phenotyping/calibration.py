@@ -51,9 +51,10 @@ def read_calibration(path: Path, unit: Unit | None = None) -> Calibration:
         sizes.append(_size(store, files[min(place, len(files) - 1)]))
     if sizes[0] != sizes[1]:
         raise RequestError(f"{path}: the left image has {_times(sizes[0])} pixels and the right one {_times(sizes[1])}")
-    said = stores[0].getNode("unit").string()
-    if said and said not in _METRES:
-        raise RequestError(f"{path}: unit must be m or mm, not {said!r}")
+    node = stores[0].getNode("unit")
+    said = node.string()
+    if (said or not node.empty()) and said not in _METRES:
+        raise RequestError(f"{path}: unit must be m or mm, not {said or 'something that is no text'}")
     return _checked(path, matrices[0], matrices[1], sizes[0], unit or said or "m")
 
 
@@ -107,7 +108,7 @@ def _beside(path: Path, side: str) -> Path:
 def _storage(path: Path) -> cv2.FileStorage:
     """The file, opened. ROS writes YAML without the line by which OpenCV knows its own."""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")  # editors of Windows begin a file with a mark that OpenCV does not know
     except OSError as error:
         raise RequestError(f"there is no calibration {path}: {error.strerror}") from error
     except UnicodeDecodeError as error:
@@ -115,9 +116,13 @@ def _storage(path: Path) -> cv2.FileStorage:
     if not text.lstrip().startswith(("%YAML", "<?xml", "{")):
         text = "%YAML:1.0\n---\n" + text
     try:
-        return cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        store = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        root = store.root()
     except (SystemError, cv2.error) as error:
         raise RequestError(f"{path} is not a calibration: it is neither YAML nor XML that OpenCV reads") from error
+    if not root.empty() and not root.isMap():
+        raise RequestError(f"{path} is not a calibration: it holds a list, not names with values such as P1 and P2")
+    return store
 
 
 def _matrix(store: cv2.FileStorage, names: tuple[str, ...], path: Path, side: str) -> np.ndarray:
@@ -127,24 +132,41 @@ def _matrix(store: cv2.FileStorage, names: tuple[str, ...], path: Path, side: st
         raise RequestError(
             f"{path} has no projection matrix of the {side} camera ({' or '.join(names)}): rectify the pair first"
         )
-    values = node.mat() if node.isMap() and not node.getNode("dt").empty() else None
-    if values is None:
-        data = node.getNode("data") if node.isMap() else node
-        values = np.array([data.at(place).real() for place in range(int(data.size()))])
-    if values.size != 12 or not np.isfinite(values).all():
+    values = _numbers(node)
+    if values is None or values.size != 12 or not np.isfinite(values).all():
         raise RequestError(f"{path}: {names[0]} of the {side} camera must be 3 x 4 numbers")
     return values.reshape(3, 4)
 
 
+def _numbers(node: cv2.FileNode) -> np.ndarray | None:
+    """The numbers [N] float64 of a list, or of a matrix of ROS or OpenCV; None where it is none of these.
+
+    Not by ``node.mat()``: of a matrix without rows, or with text in its data, OpenCV writes where it must not, and the program
+    ends.
+    """
+    data = node.getNode("data") if node.isMap() else node
+    each = [data.at(place) for place in range(int(data.size()))] if data.isSeq() else []
+    # Of a text, OpenCV gives the greatest number that there is.
+    return np.array([one.real() for one in each], float) if all(one.isReal() or one.isInt() for one in each) else None
+
+
 def _size(store: cv2.FileStorage, path: Path) -> tuple[int, int]:
+    """Width and height of the images that were calibrated, pixels."""
     for names in (("image_width", "image_height"), ("width", "height")):
         nodes = [store.getNode(name) for name in names]
         if not any(node.empty() for node in nodes):
-            return int(nodes[0].real()), int(nodes[1].real())
+            return _whole(nodes, path, " and ".join(names))
     node = store.getNode("image_size")
     if not node.empty() and node.isSeq() and node.size() == 2:
-        return int(node.at(0).real()), int(node.at(1).real())
+        return _whole([node.at(0), node.at(1)], path, "image_size")
     raise RequestError(f"{path} does not say for which images it is: add image_width and image_height")
+
+
+def _whole(nodes: list[cv2.FileNode], path: Path, names: str) -> tuple[int, int]:
+    values = [node.real() if node.isReal() or node.isInt() else math.nan for node in nodes]
+    if not all(math.isfinite(value) and value >= 1 for value in values):
+        raise RequestError(f"{path}: {names} must be numbers of pixels, without quotation marks")
+    return int(values[0]), int(values[1])
 
 
 def _checked(path: Path, left: np.ndarray, right: np.ndarray, size: tuple[int, int], unit: str) -> Calibration:

@@ -37,11 +37,17 @@ def read_image(path: Path) -> np.ndarray:
     Raises:
         OSError: It cannot be read, or is no whole image. One line that names it.
     """
-    data = np.fromfile(path, np.uint8)
-    image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+    image = _decoded(path)
     if image is None:
-        raise OSError(f"{path} is not an image, or only a part of one")
-    return image if image.ndim == 2 else cv2.cvtColor(image[..., :3], cv2.COLOR_BGR2RGB)
+        raise _unreadable(path, "is not an image, or only a part of one")
+    if image.dtype not in (np.uint8, np.uint16):
+        # Which of such numbers is black and which is white, nobody has said.
+        raise _unreadable(path, f"holds {image.dtype} pixels: save it with 8 or 16 bits")
+    if image.ndim == 2:
+        return image
+    if image.shape[2] < 3:
+        raise _unreadable(path, f"has {image.shape[2]} channels: save it with 1 or 3")
+    return cv2.cvtColor(image[..., :3], cv2.COLOR_BGR2RGB)
 
 
 def rgb8(image: np.ndarray) -> np.ndarray:
@@ -69,9 +75,28 @@ def read_disparity(path: Path, scale: float = 256.0) -> np.ndarray:
     Raises:
         OSError: It cannot be read, or holds no disparities. One line that names it.
     """
-    data = np.fromfile(path, np.uint8)
-    image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
-    if image is None or image.ndim != 2 or image.dtype == np.uint8:
+    image = _decoded(path)
+    if image is None or image.ndim != 2 or image.dtype.itemsize == 1:
         raise OSError(f"{path} holds no disparities: name a PFM, or a TIFF or PNG of 16 bits or more and one channel")
     values = image.astype(np.float32) / (1.0 if image.dtype.kind == "f" else scale)
     return np.where(np.isfinite(values) & (values > 0), values, np.nan)
+
+
+def _decoded(path: Path) -> np.ndarray | None:
+    """What a file holds, [H, W] or [H, W, channels] of any type, blue first; None where OpenCV cannot tell.
+
+    Raises:
+        OSError: The file cannot be read.
+    """
+    data = np.fromfile(path, np.uint8)
+    try:
+        return cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+    except cv2.error:
+        return None
+
+
+def _unreadable(path: Path, why: str) -> OSError:
+    """An error whose text names the file, and whose ``strerror`` does not, as those of the operating system."""
+    error = OSError(f"{path} {why}")
+    error.strerror = f"it {why}"
+    return error

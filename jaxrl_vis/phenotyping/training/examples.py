@@ -6,13 +6,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.phenotyping.annotations import decode_mask, read_annotations
+from jaxrl_vis.phenotyping.annotations import decode_mask, outlined_mask, read_annotations
 from jaxrl_vis.phenotyping.detector.detect import Settings
 from jaxrl_vis.phenotyping.detector.finder import higher_up, reduce
 from jaxrl_vis.phenotyping.detector.losses import NOTHING, STALK, UNCLEAR
@@ -158,7 +157,7 @@ def annotated_examples(folder: Path, settings: Settings) -> Iterator[Example]:
     """Examples of a folder of annotated images; see `read_annotations`.
 
     Raises:
-        RequestError: There are no annotations, or an image is missing.
+        RequestError: There are no annotations, or one is wrong; or an image is missing, or of another size than they say.
     """
     data = read_annotations(folder)
     of_image: dict[int, list[dict[str, Any]]] = {}
@@ -169,7 +168,14 @@ def annotated_examples(folder: Path, settings: Settings) -> Iterator[Example]:
             image = rgb8(read_image(folder / about["file_name"]))
         except OSError as error:
             raise RequestError(f"the annotations in {folder} name an image that cannot be read: {error}") from error
-        found = [_of_annotation(each, image.shape[:2]) for each in of_image.get(about["id"], [])]
+        size = about["height"], about["width"]
+        if image.shape[:2] != size:
+            # Where it is larger or smaller than what was annotated, boxes lie where no stalk is.
+            raise RequestError(
+                f"{folder / about['file_name']} has {image.shape[1]} x {image.shape[0]} pixels, but {about['source']} is for "
+                f"{size[1]} x {size[0]}: save the image at the size at which it was annotated"
+            )
+        found = [_of_annotation(each, size) for each in of_image.get(about["id"], [])]
         stalks = np.array([stalk for stalk, _ in found], np.float32).reshape(-1, 6)
         masks = [mask for _, mask in found]
         kinds = np.full(len(found), STALK, np.int32)
@@ -199,23 +205,21 @@ def settings_for(folder: Path, settings: Settings) -> Settings:
 
 def any_outlined(folder: Path) -> bool:
     """Whether any annotation of a folder has more than a box."""
-    return any(each.get("segmentation") for each in read_annotations(folder)["annotations"])
+    return any(each["segmentation"] for each in read_annotations(folder)["annotations"])
 
 
 def _of_annotation(annotation: dict[str, Any], size: tuple[int, int]) -> tuple[list[float], np.ndarray]:
     """Box and axis of one annotation, and its mask [H, W] bool; all of the box where there is no mask."""
-    left, top, wide, tall = map(float, annotation["bbox"])
-    segmentation = annotation.get("segmentation")
-    mask = np.zeros(size, np.uint8)
-    if isinstance(segmentation, dict) and isinstance(segmentation.get("counts"), list):
-        mask = decode_mask(segmentation).astype(np.uint8)
-    elif isinstance(segmentation, list) and segmentation:
-        cv2.fillPoly(mask, [np.round(np.reshape(each, (-1, 2)) - 0.5).astype(np.int32) for each in segmentation], (1,))
+    left, top, wide, tall = annotation["bbox"]
+    segmentation = annotation["segmentation"]
+    right, bottom = left + wide, top + tall
+    if isinstance(segmentation, dict):
+        mask = decode_mask(segmentation)
     else:
-        mask[round(top) : round(top + tall), round(left) : round(left + wide)] = 1
+        mask = outlined_mask(segmentation or [[left, top, right, top, right, bottom, left, bottom]], size)
     line, column = np.nonzero(mask)
     axis = [left + wide / 2] * 2
     if line.size > 50 and np.ptp(line) > 8:
         slope, offset = np.polyfit(line + 0.5, column + 0.5, 1)
-        axis = [float(np.clip(offset + slope * each, left, left + wide)) for each in (top, top + tall)]
-    return [left, top, left + wide, top + tall, *axis], mask.astype(bool)
+        axis = [float(np.clip(offset + slope * each, left, right)) for each in (top, bottom)]
+    return [left, top, right, bottom, *axis], mask
