@@ -104,6 +104,13 @@ def test_missing_pairs_and_missing_odometry_are_told_and_the_run_goes_on(runs, t
     assert first["pairs_skipped"] == "1" and "pairs skipped: 1" in first["flag"] and int(first["grasp_points"]) > 2
     assert second["flag"] == "no odometry: only the last pair was used" and int(second["grasp_points"]) > 2
     assert "skipped plot_0000/001: there is no right image" in capsys.readouterr().err
+    # Once they are back, the same command uses them.
+    shutil.copy(runs / "plot_0000" / "right_001.png", folder / "plot_0000")
+    shutil.copy(runs / "plot_0001" / "odometry.csv", folder / "plot_0001")
+    assert grasp(folder, tmp_path / "out") == 0
+    assert [(row["flag"], row["pairs"], row["stitches"]) for row in table(tmp_path / "out" / "runs.csv")] == [
+        ("ok", "3", "2")
+    ] * 2
     for number in range(3):
         (folder / "plot_0000" / f"left_00{number}.png").write_bytes(b"")
     assert grasp(folder / "plot_0000", tmp_path / "none") == 3
@@ -198,7 +205,7 @@ def test_masks_are_compared_with_the_truth_and_the_figure_is_drawn(spec, tmp_pat
         "stitches of the thesis",
         "grasp points of the thesis",
     ]
-    out = tmp_path / "figure.png"
+    out = tmp_path / "new" / "figure.png"
     draw_figure(out, family, 0, None, "truth")
     assert out.stat().st_size > 50_000
     draw_reach(tmp_path / "reach.png", family, 0, None, 5.0, tmp_path / "arm.gif", size=48)
@@ -220,6 +227,8 @@ def test_masks_are_compared_with_the_truth_and_the_figure_is_drawn(spec, tmp_pat
         (["eval", "--weights", "missing.npz"], "cannot read the weights"),
         (["eval", "--masks", "truth", "--weights", "w.npz"], "leave out --weights"),
         (["eval", "--wind", "5"], "--wind goes with --reach"),
+        (["eval", "--loops", "open"], "--loops goes with --reach"),
+        (["eval", "--thesis", "--points", "default"], "leave out --thesis or --points default"),
         (["eval", "--reach", "--wind", "0", "-5"], "--wind must be from 0 to 100 mm, not -5"),
         (["eval", "--workers", "0"], "--workers must be at least 1"),
         (["run", "missing"], "there is no folder"),

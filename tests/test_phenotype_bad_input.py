@@ -1,5 +1,6 @@
 """What becomes of bad files and of commands that were stopped: one line each, and nothing is lost."""
 
+import json
 import os
 import shutil
 import signal
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 from phenotype_plots import run, table
 
+from jaxrl_vis import cli
 from jaxrl_vis.phenotyping.detector.finder import Detection
 from jaxrl_vis.phenotyping.images import read_image, write_image
 from jaxrl_vis.phenotyping.pairing import wrong_with
@@ -118,6 +120,94 @@ def test_a_run_that_was_stopped_gives_the_same_tables(plots, results, tmp_path, 
     assert "holds the results of another request" in capsys.readouterr().err
 
 
+def test_what_is_put_back_is_counted_and_drawn(plots, results, tmp_path, capsys):
+    """The same command, once a missing image and the odometry are there: tables and overlays as if they had always been."""
+    plot, out = tmp_path / "plot_0000", tmp_path / "out"
+    shutil.copytree(plots / "plot_0000", plot)
+    (plot / "right_001.png").unlink()
+    (plot / "odometry.csv").unlink()
+    assert run(plot, out) == 3
+    assert "plot_0000: no odometry (there is no" in capsys.readouterr().err
+    kept = (out / "pairs" / "plot_0000" / "000.json").read_bytes()
+    for name in ("right_001.png", "odometry.csv"):
+        shutil.copy(plots / "plot_0000" / name, plot)
+    assert run(plot, out) == 0
+    (row,), (own, _) = table(out / "plots.csv"), table(results / "plots.csv")
+    assert row == own and (out / "pairs" / "plot_0000" / "000.json").read_bytes() == kept
+    for number in range(4):
+        name = f"overlays/plot_0000/{number:03d}.png"
+        assert (out / name).read_bytes() == (results / name).read_bytes()
+    # What changes is computed again, and an overlay of what cannot be used goes.
+    shutil.copy(plots / "plot_0001" / "left_002.png", plot)
+    (plot / "right_003.png").write_bytes(b"")
+    before = (out / "pairs" / "plot_0000" / "002.json").read_bytes()
+    assert run(plot, out) == 3
+    assert (out / "pairs" / "plot_0000" / "002.json").read_bytes() != before
+    assert not (out / "overlays" / "plot_0000" / "003.png").exists()
+
+
+def test_what_messages_advise_may_follow_in_the_same_folder(plots, tmp_path, capsys):
+    """A calibration after a run without; and another finder after one that found nothing."""
+    plot, out = tmp_path / "plot_0000", tmp_path / "out"
+    shutil.copytree(plots / "plot_0000", plot)
+    shutil.move(plot / "calibration.yaml", tmp_path)
+    assert run(plot, out) == 0
+    assert table(out / "plots.csv")[0]["flag"] == "no calibration"
+    assert run(plot, out, "--calibration", str(tmp_path / "calibration.yaml")) == 0
+    (row,) = table(out / "plots.csv")
+    assert row["flag"] == "ok" and float(row["width_mean_mm"]) > 10
+    assert run(plot, out, "--calibration", str(tmp_path / "calibration.yaml"), "--method", "ellipse") == 2
+    assert 'another request (method: "strip", not "ellipse")' in capsys.readouterr().err
+    (plot / "truth").rename(tmp_path / "truth")
+    other = tmp_path / "other"
+    assert run(plot, other) == 2 and (other / "run.json").exists()
+    (tmp_path / "truth").rename(plot / "truth")
+    assert run(plot, other, "--calibration", str(tmp_path / "calibration.yaml"), "--method", "ellipse") == 0
+
+
+def test_synth_adds_the_truth_that_is_missing(tmp_path, capsys):
+    words = ["phenotype", "synth", str(tmp_path), "--width", "211", "--frames", "1", "--truth"]
+    assert cli.main([*words, "boxes", "--format", "jpeg"]) == 0
+    assert cli.main([*words, "all"]) == 0
+    assert "there already" not in capsys.readouterr().out
+    assert (tmp_path / "plot_0000" / "truth" / "instance_000.png").exists()
+    assert [path.name for path in sorted((tmp_path / "plot_0000").glob("left_*"))] == ["left_000.png"]
+    annotations = json.loads((tmp_path / "plot_0000" / "annotations.json").read_text())["annotations"]
+    assert annotations and all("segmentation" in each for each in annotations)
+    # What holds more than is asked for stays.
+    assert cli.main([*words, "boxes"]) == 0
+    assert "1 there already" in capsys.readouterr().out
+
+
+def test_odometry_that_contradicts_the_images_gives_no_count(plots, results, tmp_path, capsys):
+    (own, _) = table(results / "plots.csv")
+    for factor, flag in ((100.0, "odometry does not fit the images"), (-1.0, "ok")):
+        plot = tmp_path / str(factor) / "plot_0000"
+        shutil.copytree(plots / "plot_0000", plot)
+        rows = table(plot / "odometry.csv")
+        lines = [f"{row['left']},{factor * float(row['distance_m'])}" for row in rows]
+        (plot / "odometry.csv").write_text("\n".join(["left,distance_m", *lines]) + "\n")
+        assert run(plot, tmp_path / str(factor) / "out") == 0
+        (row,) = table(tmp_path / str(factor) / "out" / "plots.csv")
+        assert row["flag"] == flag and row["stalks"] == (own["stalks"] if factor < 0 else "")
+    assert "plot_0000: odometry does not fit the images, so no count" in capsys.readouterr().err
+
+
+def test_stalks_without_a_single_width_are_told(plots, results, tmp_path, capsys):
+    """Their records say that none could be measured; the plot is not ok."""
+    out = tmp_path / "out"
+    shutil.copytree(results, out)
+    for path in (out / "pairs" / "plot_0000").glob("*.json"):
+        record = json.loads(path.read_text())
+        for each in record["sightings"]:
+            each.update(diameter_mm=None, upper_mm=None, reason="unclear")
+        path.write_text(json.dumps(record))
+    assert run(plots, out) == 0
+    row = table(out / "plots.csv")[0]
+    assert row["flag"] == "no widths" and int(row["stalks"]) > 0 and row["width_mean_mm"] == ""
+    assert "plot_0000: no width" in capsys.readouterr().err
+
+
 def test_a_run_that_was_killed_gives_the_same_tables(plots, results, tmp_path, clean_environment):
     """SIGKILL after the first pairs, and the command again."""
     out = tmp_path / "out"
@@ -151,6 +241,8 @@ def test_widths_without_ground_say_so(plots, tmp_path, capsys):
     assert {each["height_in"] for each in stalks} == {""} and {each["width_24in_mm"] for each in stalks} == {""}
     assert float(row["width_mean_mm"]) > 10
     assert "plot_0000: the ground is not seen, so nobody knows at what height" in capsys.readouterr().err
+    page = (tmp_path / "out" / "qc.html").read_text()
+    assert "mm thick, no visible ground" in page and "thick at 12 inches" not in page
 
 
 def test_empty_fields_have_no_stalks(plots, tmp_path):

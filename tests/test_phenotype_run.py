@@ -51,6 +51,8 @@ def test_several_processes_write_the_same(plots, results, tmp_path):
         (["--speed", "0"], "--speed must be more than 0"),
         (["--calibration", "missing.yaml"], "there is no calibration"),
         (["--masks", "network", "--weights", "missing.npz"], "cannot read the weights"),
+        (["--weights", "missing.npz"], "--masks truth uses no weights: leave out --weights"),
+        (["--speed", "0.05"], "--speed goes with an odometry.csv that holds times"),
     ],
 )
 def test_wrong_requests_of_run(plots, tmp_path, capsys, words, part):
@@ -114,6 +116,7 @@ def test_eval_in_two_processes_and_after_a_stop_is_the_same(plots, tmp_path, cap
         (["eval", "--workers", "0"], "--workers"),
         (["eval", "--least-score", "2"], "--least-score must be from 0 to 1"),
         (["eval", "--weights", "missing.npz"], "cannot read the weights"),
+        (["eval", "--masks", "truth", "--weights", "w.npz"], "leave out --weights"),
         (["eval", "--spec", "missing.toml"], "missing.toml"),
     ],
 )
@@ -147,7 +150,7 @@ def evaluation(tmp_path_factory) -> Path:
 
 @pytest.mark.parametrize("figure", ["3.4", "3.5", "table3.1"])
 def test_figures_of_chapter_3(evaluation, tmp_path, figure):
-    out = tmp_path / ("table.md" if figure == "table3.1" else "figure.png")
+    out = tmp_path / "new" / ("table.md" if figure == "table3.1" else "figure.png")
     assert cli.main(["figure", figure, "--out", str(out), "--evaluation", str(evaluation)]) == 0
     text, rows = out.with_suffix(".md").read_text(), table(out.with_suffix(".csv"))
     assert "ynthetic" in text and len(rows) == 3

@@ -8,8 +8,9 @@ import pytest
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.phenotyping.detector.finder import Detection
+from jaxrl_vis.phenotyping.direction import follow_either_way
 from jaxrl_vis.phenotyping.evaluate import PlotScore, average_precision, match, summary
-from jaxrl_vis.phenotyping.folders import find_plots, read_odometry
+from jaxrl_vis.phenotyping.folders import find_plots, read_odometries, read_odometry, why_no_odometry
 from jaxrl_vis.phenotyping.heights import USUAL_TAPER, robust_width, widths_of
 from jaxrl_vis.phenotyping.measure import Measurement
 from jaxrl_vis.phenotyping.sightings import Sighting, _hidden_edges
@@ -31,6 +32,11 @@ CAMERAS = Calibration(1500, 1200, 1000.0, (0.0, 600.0), 0.1)
         ("left_2.png", "right_2.png", "left_10.png", "right_10.png"),
         ("row-2-L.JPG", "row-2-R.JPG", "row-10-L.JPG", "row-10-R.JPG"),
         ("left/2.tif", "right/2.tif", "left/10.tif", "right/10.tif"),
+        ("Left/2.tif", "Right/2.tif", "Left/10.tif", "Right/10.tif"),
+        ("L/2.tif", "R/2.tif", "L/10.tif", "R/10.tif"),
+        ("R2_left_2.png", "R2_right_2.png", "R2_left_10.png", "R2_right_10.png"),
+        ("plot_R1_L_2.png", "plot_R1_R_2.png", "plot_R1_L_10.png", "plot_R1_R_10.png"),
+        ("L_r3_2.png", "R_r3_2.png", "L_r3_10.png", "R_r3_10.png"),
     ],
 )
 def test_pairs_are_found_by_their_names(tmp_path, names):
@@ -38,6 +44,7 @@ def test_pairs_are_found_by_their_names(tmp_path, names):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
     (tmp_path / "left_notes.txt").touch()
+    (tmp_path / "disparity_left_2.png").touch()
     (plot,) = find_plots(tmp_path)
     assert [pair.name[-2:].strip("-_") for pair in plot.pairs] == ["2", "10"]
     assert [(pair.left.name, pair.right.name) for pair in plot.pairs] == [  # pyright: ignore[reportOptionalMemberAccess]
@@ -68,13 +75,26 @@ def test_odometry_by_distance_time_and_name(tmp_path):
     table = tmp_path / "odometry.csv"
     table.write_text("left,distance_m\nleft_1.png,0.5\nleft_0.png,0.25\n")
     assert read_odometry(plot) == {"0": 0.25, "1": 0.5}
+    table.write_bytes("\ufeffleft, distance_m\r\nraw/left_1.png,0.5\r\nleft_0.png,0.25\r\n".encode())
+    assert read_odometry(plot) == {"0": 0.25, "1": 0.5}
+    table.write_text("left,distance_m\nleft_9.png,0.5\nleft_0.png,0.25\n")
+    driven = read_odometry(plot)
+    assert driven == {"0": 0.25}
+    assert "has no row for left_1.png:" in str(why_no_odometry(plot, driven, plot.pairs))
+    assert why_no_odometry(plot, driven, plot.pairs[:1]) is None
+    with pytest.raises(RequestError, match="leave it out"):
+        read_odometries([plot], speed=0.05)
     table.write_text("time_s\n1\n3\n")
+    assert "--speed" in str(why_no_odometry(plot, None, plot.pairs))
+    assert read_odometries([plot], speed=0.05)[plot.name] is not None
     assert read_odometry(plot) is None
     assert read_odometry(plot, speed=0.05) == {"0": 0.05, "1": pytest.approx(0.15)}
     for text, part in (
         ("distance_m\n1\nnan\n", "no number"),
         ("distance_m\nx\n", "no number"),
         ("metres\n1\n", "needs a column"),
+        ("distance_m\n1\n", "1 rows for 2 pairs"),
+        ("distance_m\n" + "9" * 200_000 + "\n", "is no table"),
     ):
         table.write_text(text)
         with pytest.raises(RequestError, match=part):
@@ -121,6 +141,34 @@ def test_a_robot_that_drives_backwards_sees_the_same():
     counted = [track for track in tracks if track.counted]
     assert len(counted) == len(STALKS) and path.length == pytest.approx(2.0, rel=0.02)
     assert counted[0].position_m > counted[-1].position_m
+
+
+def test_cameras_may_move_to_their_left_while_distances_grow():
+    frames, distances = drive(STALKS)
+    found = follow_either_way(frames[::-1], distances, CAMERAS)
+    counted = [track for track in found.tracks if track.counted]
+    assert found.fits and len(counted) == len(STALKS) and found.path.length == pytest.approx(2.0, rel=0.02)
+    places = [track.position_m for track in counted]
+    assert places == sorted(places)
+    np.testing.assert_allclose(places, [1.95 - x for x, _ in STALKS[::-1]], atol=0.03)
+    # What fits as it is given stays as it is.
+    plain = follow(frames, distances, CAMERAS)
+    same = follow_either_way(frames, distances, CAMERAS)
+    assert same.fits and same.tracks == plain[0] and np.array_equal(same.path.places, plain[1].places)
+
+
+@pytest.mark.parametrize("scale", [0.0, 0.5, 2.0, 100.0, -100.0])
+def test_odometry_in_another_unit_does_not_fit(scale):
+    frames, distances = drive(STALKS)
+    assert not follow_either_way(frames, scale * distances, CAMERAS).fits
+
+
+def test_images_that_share_nothing_contradict_nothing():
+    """A pair every 1.3 m, of 1.2 m each."""
+    rng = np.random.default_rng(0)
+    frames = [[sighting(x) for x in rng.uniform(-0.6, 0.6, 16)] for _ in range(6)]
+    assert follow_either_way(frames, 1.3 * np.arange(6), CAMERAS).fits
+    assert follow_either_way([], np.zeros(0), CAMERAS).fits
 
 
 def test_stalks_that_are_missed_in_some_pairs_stay_one():

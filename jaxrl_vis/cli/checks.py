@@ -6,6 +6,7 @@ from pathlib import Path
 from jaxrl_vis.cli.parsing import PROGRAM
 from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.provenance import install_command
 from jaxrl_vis.run.signals import shielded_children
 
 # What an extra brings: module -> package.
@@ -27,7 +28,7 @@ def check_extra(command: str, extra: str) -> None:
     """
     missing = [package for module, package in _EXTRAS[extra].items() if importlib.util.find_spec(module) is None]
     if missing:
-        raise RequestError(f"{command} needs {', '.join(missing)}: pip install 'jaxrl-vis[{extra}]'")
+        raise RequestError(f"{command} needs {', '.join(missing)}: {install_command(extra)}")
 
 
 def check_env(name: str, folder: str | None = None) -> None:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from jaxrl_vis.run.policy import Policy
 
 _MOST_WIND = 100.0  # mm
+_LOOPS: tuple[Literal["open", "again", "policy"], ...] = ("again",)
 
 
 # What trains networks and draws figures and videos.
@@ -35,10 +36,10 @@ class Eval:
     """What finds the pixels of stalks: one of the networks that are shipped, or the truth, to see what the rest makes of it."""
     thesis: bool = False
     """Stitch and find grasp points as the thesis describes it: --stitch thesis --points thesis."""
-    stitch: Literal["default", "thesis"] = "default"
-    """How clouds are stitched."""
-    points: Literal["default", "thesis"] = "default"
-    """How grasp points are found."""
+    stitch: Literal["default", "thesis"] | None = None
+    """How clouds are stitched; default if not given."""
+    points: Literal["default", "thesis"] | None = None
+    """How grasp points are found; default if not given."""
     family: Literal["training", "shifted"] | None = None
     """What rows are drawn from; training, if no --spec says otherwise."""
     shift: tuple[str, ...] = ()
@@ -57,7 +58,7 @@ class Eval:
     """Send the simulated arm to every grasp point, too, and say what its jaws hold."""
     wind: tuple[float, ...] = ()
     """With --reach: how far stalks sway in the wind, mm; 0 if not given. Several, such as 0 10 20, share what was seen."""
-    loops: tuple[Literal["open", "again", "policy"], ...] = ("again",)
+    loops: tuple[Literal["open", "again", "policy"], ...] = _LOOPS
     """With --reach: whether the arm goes to where a stalk was seen (open), finds it again on the way (again), or is brought
     there by a policy of VisualStalkReach (policy). With policy, all loops are compared on scenes like those of its task."""
     policy: Path | None = None
@@ -83,6 +84,11 @@ def evaluate(options: Eval) -> int:
             raise RequestError(f"--wind must be from 0 to {_MOST_WIND:g} mm, not {wind:g}")
     if not options.reach and (options.wind or options.policy is not None):
         raise RequestError(f"--{'wind' if options.wind else 'policy'} goes with --reach")
+    if not options.reach and options.policy is None and options.loops != _LOOPS:
+        raise RequestError("--loops goes with --reach")
+    for name, way in (("stitch", options.stitch), ("points", options.points)):
+        if options.thesis and way == "default":
+            raise RequestError(f"--thesis is --stitch thesis --points thesis: leave out --thesis or --{name} default")
     if not options.loops or len(set(options.loops)) < len(options.loops):
         raise RequestError("--loops must name each of some of open, again and policy once")
     if ("policy" in options.loops) != (options.policy is not None):

@@ -65,6 +65,8 @@ def evaluate(options: Eval) -> int:
         raise RequestError(f"--seed must be at least 0, not {options.seed}")
     if not 0.0 <= options.least_score <= 1.0:
         raise RequestError(f"--least-score must be from 0 to 1, not {options.least_score:g}")
+    if options.masks == "truth" and options.weights is not None:
+        raise RequestError("--masks truth uses no weights: leave out --weights")
     check_extra("phenotype", "phenotyping")
     if options.json is not None:
         check_writable(options.json, "--json")

@@ -58,6 +58,8 @@ def run(options: Run) -> int:
         raise RequestError(f"--speed must be more than 0, not {options.speed:g}")
     if not options.disparity_scale > 0:
         raise RequestError(f"--disparity-scale must be more than 0, not {options.disparity_scale:g}")
+    if options.masks == "truth" and options.weights is not None:
+        raise RequestError("--masks truth uses no weights: leave out --weights")
     check_counts(workers=options.workers)
     check_extra("phenotype", "phenotyping")
     check_writable(options.out, "--out", folder=True)
@@ -72,7 +74,7 @@ def run(options: Run) -> int:
     check_devices()
     enable_compilation_cache()
     from jaxrl_vis.phenotyping.pipeline import Request, run
-    from jaxrl_vis.phenotyping.results import NO_GROUND
+    from jaxrl_vis.phenotyping.results import NO_GROUND, NO_WIDTHS
 
     if options.masks == "truth":
         from jaxrl_vis.phenotyping.truth_on_disk import find_truth
@@ -87,14 +89,22 @@ def run(options: Run) -> int:
         if calibrations[plot.name] is None:
             print(f"{plot.name}: no calibration, so no millimetres and no count: name one with --calibration", file=sys.stderr)
 
+    uncounted: dict[str, str] = {}
     try:
         with progress("pairs") as done:
-            rows, skipped = run(plots, find, request, done, options.workers)
+            rows, skipped = run(plots, find, request, done, options.workers, uncounted.__setitem__)
     except OSError as error:
         raise StorageError(
             f"cannot write to {options.out}: {error.strerror or error}; run the command again to go on"
         ) from error
+    for name, why in uncounted.items():
+        if calibrations[name] is not None:
+            print(f"{name}: {why}, so no count", file=sys.stderr)
     for row in rows:
+        if row["flag"] == NO_WIDTHS:
+            print(
+                f"{row['plot']}: no width: none of its {row['stalks']} stalks could be measured, see qc.html", file=sys.stderr
+            )
         if row["flag"] == NO_GROUND:
             print(
                 f"{row['plot']}: the ground is not seen, so nobody knows at what height the widths were taken", file=sys.stderr

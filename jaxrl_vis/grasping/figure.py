@@ -44,6 +44,7 @@ def draw_figure(out: Path, family: Family, seed: int, mask: Mask | None, name: s
     _cloud(figure.add_subplot(grid[1, 0], projection="3d"), None, red, "(b) after the threshold")
     _slice(figure.add_subplot(grid[0, 2]), figure.add_subplot(grid[1, 2]), red, scene, perception)
     _cloud(figure.add_subplot(grid[1, 1], projection="3d"), None, red, "(d) grasp points", perception)
+    out.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(out, dpi=130)
     return perception
 

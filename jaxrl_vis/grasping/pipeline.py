@@ -1,7 +1,8 @@
 """Folders of pairs to grasp points: `run` reads, perceives and writes, and goes on where it was stopped.
 
     OUT/run.json                 what was asked for: a folder holds the results of one request
-        runs/RUN.json            what came of one run; what is there is not computed again
+        runs/RUN.json            what came of one run, and of which files; not computed again while these are the same, unless
+                                 pairs were skipped
         overlays/RUN.png         the last left image, its stalks in red, and the grasp points in it
         points.csv  runs.csv  skipped.csv
 
@@ -22,7 +23,7 @@ import jaxrl_vis
 from jaxrl_vis.files import write_atomically
 from jaxrl_vis.grasping.cloud import Mount
 from jaxrl_vis.grasping.perceive import Perception, View, Ways, perceive
-from jaxrl_vis.phenotyping.folders import PairFiles, PlotFolder, claim, read_odometry
+from jaxrl_vis.phenotyping.folders import PairFiles, PlotFolder, claim, read_odometries, stamp, stamps
 from jaxrl_vis.phenotyping.images import write_image
 from jaxrl_vis.phenotyping.reading import Unusable, read_pair
 from jaxrl_vis.phenotyping.results import Row, write_rows
@@ -109,7 +110,7 @@ def run(runs: list[PlotFolder], find: Find, request: Request, done: Callable[[Ro
         RequestError: The folder holds other results, or a run's odometry cannot be read.
         OSError: A file cannot be written.
     """
-    driven = {each.name: read_odometry(each, request.speed) for each in runs}
+    driven = read_odometries(runs, request.speed)
     _claim(runs, request)
     rows: list[Row] = []
     points: list[Row] = []
@@ -117,8 +118,10 @@ def run(runs: list[PlotFolder], find: Find, request: Request, done: Callable[[Ro
     (request.out / "runs").mkdir(exist_ok=True)
     for each in runs:
         path = request.out / "runs" / f"{each.name}.json"
-        if not path.exists():
-            write_atomically(path, json.dumps(_record(each, driven[each.name], find, request)) + "\n")
+        made_of = _made_of(each)  # before the files are read: they may be replaced meanwhile
+        if not _is_done(path, made_of):
+            record = {**_record(each, driven[each.name], find, request), "of": made_of}
+            write_atomically(path, json.dumps(record) + "\n")
         record = json.loads(path.read_text(encoding="utf-8"))
         rows, points, skipped = [*rows, record["row"]], points + record["points"], skipped + record["skipped"]
         write_rows(request.out / "runs.csv", RUN_COLUMNS, rows)
@@ -140,7 +143,24 @@ def _claim(runs: list[PlotFolder], request: Request) -> None:
         "calibrations": {name: dataclasses.asdict(each) for name, each in request.calibrations.items()},
         "runs": {each.name: str(each.folder.resolve()) for each in runs},
     }
-    claim(request.out, about)
+    claim(request.out, about, any(request.out.glob("runs/*.json")))
+
+
+def _made_of(folder: PlotFolder) -> dict[str, Any]:
+    """What a record depends on, beside what the whole folder of results does."""
+    return {
+        "odometry": stamp(folder.folder / "odometry.csv"),
+        "pairs": {pair.name: stamps(pair) for pair in folder.pairs},
+    }
+
+
+def _is_done(path: Path, made_of: dict[str, Any]) -> bool:
+    """Whether a record is of the files as they are now. One with skipped pairs, or without a word of its files, is not."""
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except (FileNotFoundError, ValueError):
+        return False
+    return not record["skipped"] and record.get("of") == made_of
 
 
 def _record(folder: PlotFolder, driven: dict[str, float] | None, find: Find, request: Request) -> dict[str, Any]:

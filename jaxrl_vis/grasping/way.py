@@ -17,17 +17,6 @@ _HALF_WIDTH = 0.45  # m, of what is shown of the row
 _PLANNED, _TAKEN, _HELD, _STALK = "#2b6cb0", "#dd6b20", "#2f855a", "#a0aec0"
 
 
-def path_table(result: ReachResult, index: int) -> list[dict[str, float]]:
-    """The two ways of reach ``index``, a row for each point: time in s, places in m in the plot's frame, distance in mm."""
-    rows = []
-    for place, (planned, taken) in enumerate(zip(result.path[index], result.taken[index])):
-        row = {"time_s": (place + 1) * result.interval}
-        row |= {f"planned_{axis}_m": float(value) for axis, value in zip("xyz", planned)}
-        row |= {f"taken_{axis}_m": float(value) for axis, value in zip("xyz", taken)}
-        rows.append({**row, "distance_mm": 1000 * float(np.linalg.norm(planned - taken))})
-    return rows
-
-
 def draw_path(path: Path, stands: Stands, targets: np.ndarray, result: ReachResult, index: int = 0) -> None:
     """Writes the figure of one reach.
 

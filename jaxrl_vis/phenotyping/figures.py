@@ -65,6 +65,7 @@ def draw_counts(data: dict[str, Any], out: Path) -> None:
     axis.set(xlim=(low, high), ylim=(low, high), xlabel="stalks of the plot", ylabel="stalks counted", aspect="equal")
     axis.set_title(f"Synthetic plots, family {data['family']}\n{text}", fontsize=10)
     axis.legend(frameon=False)
+    out.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(out, dpi=150)
     plt.close(figure)
     rows = [{"seed": each["seed"], "true": each["true"], "counted": each["counted"]} for each in data["each"]]
@@ -100,6 +101,7 @@ def draw_widths(data: dict[str, Any], out: Path) -> None:
         f"Synthetic plots, family {data['family']}, {len(true)} stalks, {len(shown)} of them shown\n{text}", fontsize=10
     )
     axis.legend(frameon=False, ncols=4, fontsize=9, loc="lower right")
+    out.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(out, dpi=150)
     plt.close(figure)
     rows = [

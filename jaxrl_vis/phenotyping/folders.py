@@ -1,7 +1,7 @@
 """Folders of stereo pairs: which images belong together, and how far the robot had driven.
 
 left_000.png  right_000.png          or  anything with left and right, or L and R, as a word of its name
-left/000.png  right/000.png          or  the same in two folders
+left/000.png  right/000.png          or  the same in two folders, which may also be called L and R
 disparity_000.pfm, disparity/000.png optional: disparities of the left images, in place of our own
 odometry.csv                         distance_m, or time_s, with the name of the left image (left) or in order
 """
@@ -10,7 +10,7 @@ import csv
 import dataclasses
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,9 @@ _IMAGES = {".png", ".jpg", ".jpeg", ".tif", ".tiff"}
 SAMPLE = Path(__file__).with_name("sample_row")
 """A short synthetic row that comes with the package."""
 _DISPARITIES = {".pfm", ".png", ".tif", ".tiff"}
-_SIDE = re.compile(r"(?<![a-z])(left|right|l|r)(?![a-z])", re.IGNORECASE)
+_WORD = re.compile(r"(?<![a-z])(left|right)(?![a-z])", re.IGNORECASE)
+_LETTER = re.compile(r"(?<![a-z])[lr](?![a-z])", re.IGNORECASE)
+_OTHER = {"left": "right", "right": "left", "l": "r", "r": "l"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,24 +82,71 @@ def find_plots(folder: Path) -> list[PlotFolder]:
 
 
 def _pairs(folder: Path) -> tuple[PairFiles, ...]:
-    sides: dict[str, dict[str, Path]] = {}
-    nested = [folder / side for side in ("left", "right")]
-    if all(path.is_dir() for path in nested):
-        for path in nested:
-            for image in _images(path):
-                sides.setdefault(image.stem, {})[path.name] = image
-    for image in _images(folder):
-        words = _SIDE.findall(image.stem)
-        if words:
-            name = _SIDE.sub("", image.stem, count=1).strip("_-. ") or "pair"
-            sides.setdefault(name, {})["left" if words[0].lower().startswith("l") else "right"] = image
-    for path in [*_images(folder / "disparity", _DISPARITIES), *_images(folder, _DISPARITIES)]:
+    sides = _by_folder(folder) or {}
+    for name, each in _by_name(folder).items():
+        sides.setdefault(name, {}).update(each)
+    stored = _folder_of(folder, ("disparity",))
+    inside = [] if stored is None else _images(stored, _DISPARITIES)
+    for path in [*inside, *_images(folder, _DISPARITIES)]:
         beside = path.parent == folder
         name = re.sub("disparity", "", path.stem, flags=re.IGNORECASE).strip("_-. ") if beside else path.stem
         if name in sides and (not beside or "disparity" in path.stem.lower()):
             sides[name]["disparity"] = path
     found = [PairFiles(name, each.get("left"), each.get("right"), each.get("disparity")) for name, each in sides.items()]
     return tuple(sorted(found, key=lambda pair: _natural(pair.name)))
+
+
+def _by_folder(folder: Path) -> dict[str, dict[str, Path]]:
+    """Images in two folders, one for each side, by the name of their pair and their side."""
+    nested = {side: _folder_of(folder, (side, side[0])) for side in ("left", "right")}
+    sides: dict[str, dict[str, Path]] = {}
+    if all(nested.values()):
+        for side, path in nested.items():
+            assert path is not None
+            # A folder L that holds whole pairs is a plot of that name, and no side.
+            if any(len(each) == 2 for each in _by_name(path).values()):
+                return {}
+            for image in _images(path):
+                sides.setdefault(image.stem, {})[side] = image
+    return sides
+
+
+def _by_name(folder: Path) -> dict[str, dict[str, Path]]:
+    """Images that say in their names which side they show, by the name of their pair and their side."""
+    images = [path for path in _images(folder) if "disparity" not in path.stem.lower()]
+    stems = {path.stem.lower() for path in images}
+    sides: dict[str, dict[str, Path]] = {}
+    for image in images:
+        word = _side_in(image.stem, stems)
+        if word is not None:
+            name = (image.stem[: word.start()] + image.stem[word.end() :]).strip("_-. ") or "pair"
+            sides.setdefault(name, {})["left" if word.group().lower().startswith("l") else "right"] = image
+    return sides
+
+
+def _side_in(stem: str, stems: set[str]) -> re.Match[str] | None:
+    """The word of an image's name that says which side it shows; None if there is none.
+
+    Names of rows and repetitions hold such letters, too, as in R2_left_000 or plot_R1_L_000. So words go before letters, and
+    what makes another image's name, if exchanged, before what does not; of several the last, as plots are mostly named first.
+
+    Args:
+        stem: Of its name.
+        stems: Those of all images of its folder, in small letters.
+    """
+    words = list(_WORD.finditer(stem)) or list(_LETTER.finditer(stem))
+    paired = [
+        each for each in words if (stem[: each.start()] + _OTHER[each.group().lower()] + stem[each.end() :]).lower() in stems
+    ]
+    return (paired or words or [None])[-1]
+
+
+def _folder_of(folder: Path, names: tuple[str, ...]) -> Path | None:
+    """The folder in a folder that has one of some names, whatever their case; the first name goes before the others."""
+    found = (
+        [path for path in sorted(folder.iterdir()) if path.name.lower() in names and path.is_dir()] if folder.is_dir() else []
+    )
+    return min(found, key=lambda path: names.index(path.name.lower()), default=None)
 
 
 def _images(folder: Path, suffixes: set[str] = _IMAGES) -> list[Path]:
@@ -111,54 +160,156 @@ def _natural(name: str) -> list[tuple[int, int, str]]:
     return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", name) if part]
 
 
+def read_odometries(plots: Sequence[PlotFolder], speed: float | None) -> dict[str, dict[str, float] | None]:
+    """What `read_odometry` says of each plot, by the plot's name.
+
+    Raises:
+        RequestError: A file cannot be used, or none of them needs the speed.
+    """
+    driven = {plot.name: read_odometry(plot, speed) for plot in plots}
+    if speed is not None and not any(_holds_times_only(plot) for plot in plots):
+        raise RequestError("--speed goes with an odometry.csv that holds times (time_s) and no distance_m: leave it out")
+    return driven
+
+
 def read_odometry(plot: PlotFolder, speed: float | None = None) -> dict[str, float] | None:
-    """How far the robot had driven for each pair, by the pair's name, m; None if nothing says so.
+    """How far the robot had driven for each pair, by the pair's name, m; None if nothing says so, see `why_no_odometry`.
 
     Args:
         plot: With ``odometry.csv``.
         speed: Of the robot, m/s: for files that hold times only.
 
     Raises:
-        RequestError: The file cannot be read, or does not say how far or when.
+        RequestError: The file cannot be read, does not say how far or when, or nobody can tell which of its rows is which pair.
     """
     path = plot.folder / "odometry.csv"
     if not path.exists():
         return None
+    columns, rows = _read_table(path)
+    if "distance_m" not in columns and "time_s" not in columns:
+        raise RequestError(f"{path} needs a column distance_m, or time_s and --speed")
+    if "distance_m" not in columns and speed is None:
+        return None
     try:
-        with path.open(encoding="utf-8", newline="") as file:
-            rows = list(csv.DictReader(file))
-        columns = set(rows[0]) if rows else set()
         if "distance_m" in columns:
             values = [float(row["distance_m"]) for row in rows]
-        elif "time_s" in columns and speed is not None:
-            values = [speed * float(row["time_s"]) for row in rows]
-        elif "time_s" in columns:
-            return None
         else:
-            raise RequestError(f"{path} needs a column distance_m, or time_s and --speed")
+            values = [(speed or 0.0) * float(row["time_s"]) for row in rows]
         if not np.isfinite(values).all():
             raise ValueError
-    except RequestError:
-        raise
-    except OSError as error:
-        raise RequestError(f"cannot read {path}: {error.strerror or error}") from error
     except (ValueError, TypeError) as error:
         raise RequestError(f"{path} holds something that is no number: distances and times must be finite numbers") from error
     if "left" in columns:
-        of_file = {row["left"]: value for row, value in zip(rows, values)}
+        of_file = {Path((row["left"] or "").strip()).name: value for row, value in zip(rows, values)}
         return {pair.name: of_file[pair.left.name] for pair in plot.pairs if pair.left and pair.left.name in of_file}
+    if len(values) != len(plot.pairs):
+        raise RequestError(
+            f"{path} has {len(values)} rows for {len(plot.pairs)} pairs, so nobody can tell which is which: "
+            "add a column left with the names of the left images"
+        )
     return {pair.name: value for pair, value in zip(plot.pairs, values)}
 
 
-def claim(out: Path, about: Mapping[str, Any]) -> None:
+def why_no_odometry(plot: PlotFolder, driven: Mapping[str, float] | None, pairs: Sequence[PairFiles]) -> str | None:
+    """What is missing to know how far the robot had driven, in words; None if nothing is.
+
+    Args:
+        plot: The plot.
+        driven: What `read_odometry` says of it.
+        pairs: Those of its pairs for which it must be known.
+    """
+    path = plot.folder / "odometry.csv"
+    if driven is None:
+        return f"{path} holds times only: give the robot's speed with --speed" if path.exists() else f"there is no {path}"
+    unknown = [pair.name if pair.left is None else pair.left.name for pair in pairs if pair.name not in driven]
+    if not unknown:
+        return None
+    others = f" and {len(unknown) - 3} others" if len(unknown) > 3 else ""
+    return f"{path} has no row for {', '.join(unknown[:3])}{others}: its column left must name them"
+
+
+def _holds_times_only(plot: PlotFolder) -> bool:
+    path = plot.folder / "odometry.csv"
+    columns = _read_table(path)[0] if path.exists() else []
+    return "time_s" in columns and "distance_m" not in columns
+
+
+def _read_table(path: Path) -> tuple[list[str], list[dict[str, str]]]:
+    """The columns and the rows of a CSV file.
+
+    Raises:
+        RequestError: It cannot be read.
+    """
+    try:
+        # Spreadsheets write a mark of the byte order before the first column's name.
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            reader = csv.DictReader(file, skipinitialspace=True)
+            reader.fieldnames = [name.strip() for name in reader.fieldnames or []]
+            return list(reader.fieldnames), list(reader)
+    except OSError as error:
+        raise RequestError(f"cannot read {path}: {error.strerror or error}") from error
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise RequestError(f"{path} is no table: save it as CSV in UTF-8 ({error})") from error
+
+
+def stamp(path: Path | None) -> list[int] | None:
+    """What changes with a file's contents: its size in bytes and when it was changed, ns; None where there is no file."""
+    try:
+        about = None if path is None else path.stat()
+    except OSError:
+        return None
+    return None if about is None else [about.st_size, about.st_mtime_ns]
+
+
+def stamps(pair: PairFiles) -> dict[str, list[int] | None]:
+    """The `stamp` of each file of a pair; what was computed of a pair holds as long as they are the same."""
+    return {"left": stamp(pair.left), "right": stamp(pair.right), "disparity": stamp(pair.disparity)}
+
+
+def claim(out: Path, about: Mapping[str, Any], begun: bool) -> None:
     """Writes down in a folder of results what they are results of, or checks that it is the same as before.
+
+    A folder that holds no results yet may be claimed for something else, and a plot that had no calibration may get one:
+    that is what messages advise.
+
+    Args:
+        out: The folder; made if it is missing.
+        about: What is asked for.
+        begun: Whether it holds results.
 
     Raises:
         RequestError: The folder holds the results of another request.
     """
-    text = json.dumps(about, indent=2) + "\n"
+    about = json.loads(json.dumps(about))
     path = out / "run.json"
-    if path.exists() and path.read_text(encoding="utf-8") != text:
-        raise RequestError(f"{out} holds the results of another request: choose another folder, or remove it")
+    if begun and path.exists():
+        try:
+            before = json.loads(path.read_text(encoding="utf-8"))
+            differing = _differences(before, about)
+        except (ValueError, AttributeError):
+            differing = "run.json cannot be read"
+        if differing:
+            raise RequestError(
+                f"{out} holds the results of another request ({differing}): choose another folder with --out, or remove it"
+            )
     out.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, text)
+    write_atomically(path, json.dumps(about, indent=2) + "\n")
+
+
+def _differences(before: Mapping[str, Any], about: Mapping[str, Any]) -> str:
+    """In what two requests differ, in words; empty if in nothing that matters."""
+    told = []
+    for name in dict.fromkeys([*about, *before]):
+        old, new = before.get(name), about.get(name)
+        if name == "calibrations" and isinstance(old, dict) and isinstance(new, dict):
+            # Records of plots say which calibration they are of, so one that comes later makes them again.
+            old = {plot: new.get(plot) if each is None else each for plot, each in old.items()}
+        if old == new:
+            continue
+        if isinstance(old, dict) or isinstance(new, dict):
+            old, new = old or {}, new or {}
+            parts = [part for part in dict.fromkeys([*old, *new]) if old.get(part) != new.get(part)]
+            told.append(f"{name}: other values of {', '.join(parts[:3])}{' and others' if len(parts) > 3 else ''}")
+        else:
+            told.append(f"{name}: {json.dumps(old)}, not {json.dumps(new)}")
+    return "; ".join(told)

@@ -1,8 +1,9 @@
 """Folders of pairs to tables: `run` reads, finds, measures, follows and writes, and goes on where it was stopped.
 
     OUT/run.json                 what was asked for: a folder holds the results of one request
-        pairs/PLOT/PAIR.json     sightings, or why the pair was skipped; what is there is not computed again
-        overlays/PLOT/PAIR.png
+        pairs/PLOT/PAIR.json     sightings, or why the pair was skipped, and of which files; not computed again while these are
+                                 the same, unless the pair was skipped
+        overlays/PLOT/PAIR.png   drawn again where they show something else; drawn.json says what they show
         stalks.csv  plots.csv  skipped.csv
         qc.html                  the same with pictures, and what was rejected
 
@@ -10,9 +11,9 @@ Tables are always made from the files under pairs/, so they do not depend on whe
 processes look at pairs. Each of them has one pair in memory at a time.
 """
 
-import csv
 import dataclasses
 import functools
+import hashlib
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -24,7 +25,8 @@ import jaxrl_vis
 from jaxrl_vis.evaluation_pool import Each, processes
 from jaxrl_vis.files import write_atomically
 from jaxrl_vis.phenotyping.detector.finder import Detection
-from jaxrl_vis.phenotyping.folders import PairFiles, PlotFolder, claim, read_odometry
+from jaxrl_vis.phenotyping.direction import follow_either_way
+from jaxrl_vis.phenotyping.folders import PairFiles, PlotFolder, claim, read_odometries, stamps, why_no_odometry
 from jaxrl_vis.phenotyping.images import write_image
 from jaxrl_vis.phenotyping.measure import Method
 from jaxrl_vis.phenotyping.overlay import draw_overlay
@@ -41,12 +43,13 @@ from jaxrl_vis.phenotyping.results import (
     write_rows,
 )
 from jaxrl_vis.phenotyping.sightings import NO_CALIBRATION, Sighting, find_with_ground, look
-from jaxrl_vis.phenotyping.track import Track, follow
+from jaxrl_vis.phenotyping.track import Track
 from jaxrl_vis_envs.plants import Calibration
 
 Find = Callable[[np.ndarray, PlotFolder, PairFiles], list[Detection]]
 """Finds the stalks of a left image [H, W, 3] uint8."""
 NO_ODOMETRY = "no odometry"
+NO_FIT = "odometry does not fit the images"
 SKIPPED_COLUMNS = ("plot", "pair", "why")
 
 
@@ -77,6 +80,7 @@ def run(
     request: Request,
     done: Callable[[str, int, int], None] = lambda plot, pair, of: None,
     workers: int = 1,
+    say: Callable[[str, str], None] = lambda plot, why: None,
 ) -> tuple[list[Row], list[Row]]:
     """Writes the results of plots.
 
@@ -86,6 +90,7 @@ def run(
         request: What is asked for.
         done: Called after each pair with the plot's name, how many of its pairs are done, and how many it has.
         workers: How many processes look at pairs and draw overlays; 1 for this one.
+        say: Called for each plot without a count with its name and why it has none.
 
     Returns:
         The rows of plots.csv and of skipped.csv.
@@ -94,14 +99,14 @@ def run(
         RequestError: The folder holds other results, or a plot's odometry cannot be read.
         OSError: A file cannot be written.
     """
-    driven = {plot.name: read_odometry(plot, request.speed) for plot in plots}
+    driven = read_odometries(plots, request.speed)
     _claim(plots, request)
     about = [
         f"jaxrl-vis {jaxrl_vis.__version__}; finds by {request.finder}; widths by the method {request.method}.",
         "Tables: stalks.csv, plots.csv and skipped.csv; all pairs: overlays/.",
     ]
     with processes(workers) as each, Page(about, request.out / "overlays", len(plots)) as page:
-        return _run(plots, find, request, driven, page, done, each)
+        return _run(plots, find, request, driven, page, done, say, each)
 
 
 def _run(
@@ -111,6 +116,7 @@ def _run(
     driven: dict[str, dict[str, float] | None],
     page: Page,
     done: Callable[[str, int, int], None],
+    say: Callable[[str, str], None],
     each: Each,
 ) -> tuple[list[Row], list[Row]]:
     """Plot by plot; see `run`."""
@@ -121,7 +127,7 @@ def _run(
         folder = request.out / "pairs" / plot.name
         folder.mkdir(parents=True, exist_ok=True)
         paths = {pair.name: folder / f"{pair.name}.json" for pair in plot.pairs}
-        missing = [pair for pair in plot.pairs if not paths[pair.name].exists()]
+        missing = [pair for pair in plot.pairs if not _is_done(paths[pair.name], pair, request.calibrations[plot.name])]
         for number in range(1, len(plot.pairs) - len(missing) + 1):
             done(plot.name, number, len(plot.pairs))
         for number, (name, record) in enumerate(each(functools.partial(_record, plot, find, request), missing), start=1):
@@ -134,6 +140,9 @@ def _run(
             if "skipped" in record
         ]
         result = _finish(plot, records, driven[plot.name], request, each)
+        if result.row["stalks"] == "":
+            why = why_no_odometry(plot, driven[plot.name], plot.pairs) if result.row["flag"] == NO_ODOMETRY else None
+            say(plot.name, result.row["flag"] + ("" if why is None else f" ({why})"))
         page.add(result)
         stalks, rows, skipped = stalks + result.stalks, [*rows, result.row], skipped + bad
         write_rows(request.out / "stalks.csv", STALK_COLUMNS, stalks)
@@ -156,12 +165,31 @@ def _claim(plots: list[PlotFolder], request: Request) -> None:
         },
         "plots": {plot.name: str(plot.folder.resolve()) for plot in plots},
     }
-    claim(request.out, about)
+    claim(request.out, about, any(request.out.glob("pairs/*/*.json")))
+
+
+def _is_done(path: Path, pair: PairFiles, calibration: Calibration | None) -> bool:
+    """Whether a record is of the files as they are now. One that was skipped, or does not say of which it is, is not."""
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except (FileNotFoundError, ValueError):
+        return False
+    return "sightings" in record and record.get("of") == _made_of(pair, calibration)
+
+
+def _made_of(pair: PairFiles, calibration: Calibration | None) -> dict[str, Any]:
+    """What a record depends on, beside what the whole folder of results does."""
+    return {**stamps(pair), "calibration": None if calibration is None else _digest(dataclasses.asdict(calibration))}
+
+
+def _digest(value: Any) -> str:
+    return hashlib.sha256(json.dumps(value).encode()).hexdigest()[:16]
 
 
 def _record(plot: PlotFolder, find: Find, request: Request, pair: PairFiles) -> tuple[str, dict[str, Any]]:
     """The name of a pair, and what is kept of it."""
     calibration = request.calibrations[plot.name]
+    made_of = _made_of(pair, calibration)  # before the files are read: they may be replaced meanwhile
     try:
         left, right = read_pair(pair, calibration, pair.disparity is None)
         disparity = known_disparity(pair, left, request.disparity_scale)
@@ -178,6 +206,7 @@ def _record(plot: PlotFolder, find: Find, request: Request, pair: PairFiles) -> 
         "size": list(left.shape[:2]),
         "camera_height_m": None if ground is None else round(ground.camera_height, 4),
         "sightings": [dataclasses.asdict(each) for each in sightings],
+        "of": made_of,
     }
 
 
@@ -191,29 +220,50 @@ def _finish(
     origin = Origin(plot.name, request.method, jaxrl_vis.__version__)
     calibration = request.calibrations[plot.name]
     known = driven is not None and all(pair.name in driven for pair, _ in usable)
-    if calibration is None or driven is None or not known or len(usable) < 2:
-        why = _what_is_missing(len(usable), calibration)
-        labels: list[list[str | None]] = [[None] * len(frame) for frame in frames]
-        tracks, start = [], 0.0
+    why, tracks, start = _what_is_missing(len(usable), calibration), [], 0.0
+    labels: list[list[str | None]] = [[None] * len(frame) for frame in frames]
+    found = None
+    if calibration is not None and driven is not None and known and len(usable) >= 2:
+        found = follow_either_way(frames, np.array([driven[pair.name] for pair, _ in usable]), calibration)
+        why = NO_FIT
+    if found is None or not found.fits:
         stalks, row = rows_without_path(frames, skipped, origin, why)
     else:
-        distances = np.array([driven[pair.name] for pair, _ in usable])
-        tracks, path = follow(frames, distances, calibration)
+        tracks, path = found.tracks, found.path
         labels = labels_of(frames, tracks)
         start = float(path.places[0])
         stalks, row = rows_of(frames, tracks, path, skipped, origin)
-    folder = request.out / "overlays" / plot.name
-    folder.mkdir(parents=True, exist_ok=True)
-    targets = [folder / f"{pair.name}.png" for pair, _ in usable]
-    missing = [
-        (target, pair, frame, names)
-        for target, (pair, _), frame, names in zip(targets, usable, frames, labels)
-        if not target.exists()
-    ]
-    for _ in each(functools.partial(_draw_overlay, plot.name), missing):
-        pass
+    _draw_overlays(plot.name, request.out / "overlays" / plot.name, usable, labels, each)
     width = usable[0][1]["size"][1] if usable else 0
     return PlotResult(row, stalks, [pair.name for pair, _ in usable], frames, tracks, start, width)
+
+
+def _draw_overlays(
+    plot: str, folder: Path, usable: list[tuple[PairFiles, dict[str, Any]]], labels: list[list[str | None]], each: Each
+) -> None:
+    """Writes the overlays of a plot that are missing or show something else."""
+    folder.mkdir(parents=True, exist_ok=True)
+    index = folder / "drawn.json"
+    shown = {pair.name: _digest([record, names]) for (pair, record), names in zip(usable, labels)}
+    try:
+        drawn = dict(json.loads(index.read_text(encoding="utf-8")))
+    except (FileNotFoundError, ValueError, TypeError):
+        drawn = {}
+    for name in drawn.keys() - shown.keys():
+        (folder / f"{name}.png").unlink(missing_ok=True)  # of a pair that cannot be used any more
+    missing = [
+        (folder / f"{pair.name}.png", pair, [Sighting.read(values) for values in record["sightings"]], names)
+        for (pair, record), names in zip(usable, labels)
+        if drawn.get(pair.name) != shown[pair.name] or not (folder / f"{pair.name}.png").exists()
+    ]
+    if drawn != shown:
+        # Before anything is drawn: what is drawn anew must not be taken for the old one, if this is stopped.
+        current = {name: digest for name, digest in drawn.items() if digest == shown.get(name)}
+        write_atomically(index, json.dumps(current) + "\n")
+    for _ in each(functools.partial(_draw_overlay, plot), missing):
+        pass
+    if drawn != shown:
+        write_atomically(index, json.dumps(shown) + "\n")
 
 
 def _draw_overlay(plot: str, asked: tuple[Path, PairFiles, list[Sighting], list[str | None]]) -> None:
@@ -238,9 +288,3 @@ def labels_of(frames: list[list[Sighting]], tracks: list[Track]) -> list[list[st
         for frame, place in track.sightings:
             labels[frame][place] = str(number)
     return labels
-
-
-def read_rows(path: Path) -> list[dict[str, str]]:
-    """A table that `run` wrote."""
-    with path.open(encoding="utf-8", newline="") as file:
-        return list(csv.DictReader(file))

@@ -21,6 +21,7 @@ import numpy as np
 from jaxrl_vis.phenotyping.images import read_image
 from jaxrl_vis.phenotyping.overlay import scale_of
 from jaxrl_vis.phenotyping.qc_style import SCRIPT, STYLE
+from jaxrl_vis.phenotyping.results import NO_GROUND
 from jaxrl_vis.phenotyping.sightings import Sighting
 from jaxrl_vis.phenotyping.track import Track
 
@@ -193,7 +194,8 @@ def _safe(value: Any) -> str:
 
 def _headline(row: dict[str, Any]) -> str:
     parts = [f"{row['stalks']} stalks"] if row["stalks"] != "" else []
-    parts += [f"{float(row['width_mean_mm']):.1f} mm thick at 12 inches"] if row["width_mean_mm"] != "" else []
+    where = "" if row["flag"] == NO_GROUND else " at 12 inches"
+    parts += [f"{float(row['width_mean_mm']):.1f} mm thick{where}"] if row["width_mean_mm"] != "" else []
     return ", ".join([*parts, *([] if row["flag"] == "ok" else [str(row["flag"])])])
 
 

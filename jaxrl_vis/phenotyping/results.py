@@ -55,6 +55,8 @@ Row = dict[str, Any]
 _MOST_ERROR = 0.08  # of a width: what its pairs disagree about by more is no measurement
 NO_GROUND = "no visible ground"
 """Flag of widths at a height that is not known."""
+NO_WIDTHS = "no widths"
+"""Flag of a plot whose stalks were counted, but none of them measured."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,7 +119,14 @@ def _flag(widths: StalkWidths, confidence: float) -> str:
 def _plot_row(stalks: list[Row], pairs: int, length: float, skipped: int, origin: Origin) -> Row:
     widths = np.array([float(row["width_mm"]) for row in stalks if row["width_mm"] != ""])
     unknown = [row for row in stalks if row["flag"] == NO_GROUND]
-    flag = "no stalks" if not stalks else "pairs skipped" if skipped else NO_GROUND if len(unknown) > len(stalks) / 2 else "ok"
+    if not stalks:
+        flag = "no stalks"
+    elif not widths.size:
+        flag = NO_WIDTHS
+    elif skipped:
+        flag = "pairs skipped"
+    else:
+        flag = NO_GROUND if len(unknown) > len(stalks) / 2 else "ok"
     return {
         "plot": origin.plot,
         "pairs": pairs,

@@ -10,7 +10,8 @@
         plot.json            count, each stalk's diameters, the cameras as they are; written last, so it says that the plot is
         whole
 
-A plot that is whole is not drawn again, so a command that was stopped goes on where it was.
+A plot that is whole is not drawn again, so a command that was stopped goes on where it was; one that holds less of the truth
+than is asked for is.
 """
 
 import csv
@@ -73,12 +74,24 @@ def write_plots(
     write_atomically(index, text)
     present = 0
     for seed in seeds:
-        if (folder / name_of(seed) / "plot.json").exists():
-            present += 1
-            done(seed, family.rig.frames)
-            continue
+        whole = folder / name_of(seed) / "plot.json"
+        if whole.exists():
+            if _holds(whole.parent, truth, family.rig.frames):
+                present += 1
+                done(seed, family.rig.frames)
+                continue
+            whole.unlink()  # until all is there again
+            for image in [*whole.parent.glob("left_*.*"), *whole.parent.glob("right_*.*")]:
+                image.unlink()  # they may be of another format
         write_plot(folder / name_of(seed), draw(family, seed), image_format, truth, done)
     return present
+
+
+def _holds(folder: Path, truth: Truth, frames: int) -> bool:
+    """Whether a plot that is whole holds as much of the truth as is asked for, or more."""
+    maps = [folder / "truth" / f"{kind}_{frame:03d}.png" for kind in ("instance", "disparity") for frame in range(frames)]
+    wanted = {"none": [], "boxes": [folder / "annotations.json"], "all": [folder / "annotations.json", *maps]}[truth]
+    return all(path.exists() for path in wanted)
 
 
 def name_of(seed: int) -> str:

@@ -122,11 +122,19 @@ def is_finished(cell: Cell, runs: Path) -> bool:
     return _reached(folder_of(cell, runs), cell) is not None and contradiction(cell, runs) is None
 
 
-def rows_of(cell: Cell, runs: Path) -> list[dict[str, Any]]:
-    """The evaluations of the cell's run up to its end, from metrics.jsonl, whatever its settings; none before it has ended."""
+def rows_of(cell: Cell, runs: Path, as_it_is: bool = False) -> list[dict[str, Any]]:
+    """The evaluations of a finished cell, up to its end, from metrics.jsonl; none where it is not finished.
+
+    Args:
+        cell: The cell.
+        runs: The folder of run folders.
+        as_it_is: A run of other settings will do, such as those that a preset had in an earlier version.
+    """
     folder = folder_of(cell, runs)
     end = _reached(folder, cell)
-    return [] if end is None else [row for row in read_rows(RunFolder(folder).metrics) if row["env_steps"] <= end]
+    if end is None or not (as_it_is or contradiction(cell, runs) is None):
+        return []
+    return [row for row in read_rows(RunFolder(folder).metrics) if row["env_steps"] <= end]
 
 
 def standing(cell: Cell, runs: Path) -> str:

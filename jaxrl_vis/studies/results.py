@@ -11,7 +11,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.report.learning import curve, steps_to
 from jaxrl_vis.report.plots import gather, show_steps
 from jaxrl_vis.run.folder import read_record
-from jaxrl_vis.studies.cells import Cell, contradiction, differences, folder_of, rows_of, standing
+from jaxrl_vis.studies.cells import Cell, differences, folder_of, rows_of, standing
 
 SUCCESS = "eval/success"
 DISTANCE = "eval/goal_distance"
@@ -78,7 +78,7 @@ def read_lines(
     """
     lines, unfinished = {}, []
     for (task, variant), parts in cells.items():
-        found = [rows_of(cell, runs) if as_they_are or contradiction(cell, runs) is None else [] for cell in parts]
+        found = [rows_of(cell, runs, as_they_are) for cell in parts]
         unfinished += [f"{cell.name}: {standing(cell, runs)}" for cell, rows in zip(parts, found, strict=True) if not rows]
         if all(found):
             records = [_record(folder_of(cell, runs)) for cell in parts]
