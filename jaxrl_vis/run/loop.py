@@ -126,7 +126,7 @@ class RunLoop:
                 self._checkpoints.close()
             except (OSError, StorageError) as error:
                 self._rescue()
-                raise self._storage_error(error) from error
+                raise self._saver.storage_error(error) from error
             except NonFiniteError:
                 raise
             except Exception:
@@ -138,14 +138,6 @@ class RunLoop:
                     with contextlib.suppress(StorageError):
                         self._checkpoints.close()
                     self._loggers.close(in_a_hurry=bool(interruption))
-
-    def _storage_error(self, error: OSError | StorageError) -> StorageError:
-        what = str(error)
-        if isinstance(error, OSError):
-            what = f"cannot write to {self._folder.path} ({error.strerror or type(error).__name__})"
-        kept = self._checkpoints.newest()
-        good = "there is no checkpoint yet" if kept is None else f"the last checkpoint is of iteration {kept}"
-        return StorageError(f"{what}; {good}: make room, then go on with --run-dir {self._folder.path} --resume")
 
     def _rescue(self) -> None:
         self._console.stop()

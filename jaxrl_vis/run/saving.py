@@ -98,6 +98,15 @@ class Saver:
                 self.light(loop, iteration, progress)
                 self._checkpoints.wait()
 
+    def storage_error(self, error: OSError | StorageError) -> StorageError:
+        """What a run that could not write ends with: what failed, what there is, and how to go on."""
+        what = str(error)
+        if isinstance(error, OSError):
+            what = f"cannot write to {self._folder.path} ({error.strerror or type(error).__name__})"
+        kept = self._checkpoints.newest()
+        good = "there is no checkpoint yet" if kept is None else f"the last checkpoint is of iteration {kept}"
+        return StorageError(f"{what}; {good}: make room, then go on with --run-dir {self._folder.path} --resume")
+
     def _refuse_nonfinite(self, loop: LoopState, iteration: int) -> None:
         # The guard looks at losses and states; a parameter that broke in the very last update shows in the next iteration's.
         if broken := self._programs.broken_leaves(loop):
