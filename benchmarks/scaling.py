@@ -10,6 +10,7 @@ For each number of devices N, beside one device of the same machine:
     all-reduce     the mean of as many numbers as an update averages, alone
     resume         what N devices saved, restored on one device and on others: parameters, optimisers and replay bit-equal, and
                    trained further on one
+    processes      seeds and weak 2048 of the most devices once more, by two processes with half of the devices each
 
 All programs are compiled before, by processes of their own side by side, which leave them in the compile cache: tracing is
 Python, and goes one by one in a process. ``--quick`` takes small images and few updates, to see that it works: on a CPU with
@@ -18,8 +19,12 @@ XLA_FLAGS=--xla_force_host_platform_device_count=2.
 
 import argparse
 import dataclasses
+import functools
+import json
 import math
 import os
+import re
+import socket
 import statistics
 import subprocess
 import sys
@@ -33,7 +38,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import PartitionSpec
 
-from jaxrl_vis import preset
+from jaxrl_vis import preset, processes
 from jaxrl_vis.bench.conditions import Watch
 from jaxrl_vis.bench.record import Measurement, to_record, write_json
 from jaxrl_vis.config import Config
@@ -69,10 +74,13 @@ class Timed:
     """
 
     def __init__(self, config: Config, env: Any, evaluates: bool):
-        self.config, self.evaluates = config, evaluates
-        self.programs = Programs(config, make_train_step(env, config))
+        self.config, self.env, self.evaluates = config, env, evaluates
         self.loop: Any = None
-        self.compile_s = 0.0
+
+    @functools.cached_property
+    def programs(self) -> Programs:
+        """Made when they are needed: one of two processes has none for one device."""
+        return Programs(self.config, make_train_step(self.env, self.config))
 
     def run(self, cycles: int) -> list[float]:
         """Seconds of an iteration in each of several cycles; one cycle goes before.
@@ -209,21 +217,29 @@ def figures_of(base: Config, env: Any, numbers: list[int], batches: tuple[int, .
     return found
 
 
-def measure(figure: Figure, one: list[float], cycles: int) -> tuple[str, Measurement]:
-    """A line of the table, and the record."""
-    config, seconds = figure.timed.config, figure.timed.run(cycles)
-    before, after, count = statistics.median(one), statistics.median(seconds), config.devices
-    speedup = before / after * (1 if figure.kind == "strong" else count)
+def compare(kind: str, config: Config, one: list[float], seconds: list[float], ideal: int) -> tuple[str, Measurement]:
+    """A line of the table, and the record.
+
+    Args:
+        kind: seeds, weak, strong or processes.
+        config: What was trained.
+        one: Seconds of an iteration of what it is compared with.
+        seconds: Its own.
+        ideal: The speed-up at an efficiency of one.
+    """
+    before, after = statistics.median(one), statistics.median(seconds)
+    speedup = before / after * (1 if kind == "strong" else ideal)
     spread = max((max(each) - min(each)) / statistics.median(each) for each in (one, seconds))
     line = (
-        f"{figure.kind:8}{count:8}{config.seeds:7}{config.batch_size:8}{config.num_envs:6}{1e3 * before:11,.1f} ms"
-        f"{1e3 * after:11,.1f} ms{speedup:10.3f}{speedup / count:12.1%}{spread:9.1%}"
+        f"{kind:10}{config.devices:8}{config.seeds:7}{config.batch_size:8}{config.num_envs:6}{1e3 * before:11,.1f} ms"
+        f"{1e3 * after:11,.1f} ms{speedup:10.3f}{speedup / ideal:12.1%}{spread:9.1%}"
     )
     names = ("env", "preset", "image_size", "pixels", "num_envs", "batch_size", "seeds", "devices", "updates_per_iteration")
-    details = {"one_device_ms": 1e3 * before, "ms": 1e3 * after, "efficiency": speedup / count, "spread": spread}
+    compared = "one_process_ms" if kind == "processes" else "one_device_ms"
+    details = {compared: 1e3 * before, "ms": 1e3 * after, "efficiency": speedup / ideal, "spread": spread}
     details = {name: round(value, 4) for name, value in details.items()} | {"repeats": len(seconds)}
     described = {name: getattr(config, name) for name in names}
-    return line, Measurement(f"scaling/{figure.kind}", round(speedup, 4), "x one device", described, details)
+    return line, Measurement(f"scaling/{kind}", round(speedup, 4), "x one device", described, details)
 
 
 def measure_all_reduce(figure: Figure) -> tuple[str, Measurement]:
@@ -240,8 +256,58 @@ def measure_all_reduce(figure: Figure) -> tuple[str, Measurement]:
     return line, Measurement("scaling/all_reduce", round(1 / seconds, 1), "all-reduces/s", described)
 
 
+def in_processes(figures: list[Figure], positions: list[int], times: list[list[float]]) -> list[tuple[str, Measurement]]:
+    """What two processes with half of the devices each take for the same: lines of the table, and the records.
+
+    Args:
+        figures: To be trained once more, all on equally many devices.
+        positions: Of each among all configurations.
+        times: Seconds of an iteration of each, by one process.
+    """
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        place = ["--coordinator", f"localhost:{free.getsockname()[1]}", "--positions", *map(str, positions)]
+    half = figures[0].timed.config.devices // 2
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES", ",".join(map(str, range(2 * half)))).split(",")
+    children = []
+    for index in range(2):
+        variables = dict(os.environ, CUDA_VISIBLE_DEVICES=",".join(visible[index * half : (index + 1) * half]))
+        if "XLA_FLAGS" in variables:  # a CPU's devices
+            variables["XLA_FLAGS"] = re.sub(r"(device_count=)\d+", rf"\g<1>{half}", variables["XLA_FLAGS"])
+        command = [sys.executable, *sys.argv, *place, "--process-id", str(index)]
+        children.append(subprocess.Popen(command, env=variables, stdout=subprocess.PIPE, text=True))
+    printed = [child.communicate()[0] for child in children]
+    if any(child.returncode for child in children):
+        raise SystemExit(f"two processes ended with {', '.join(str(child.returncode) for child in children)}")
+    found = []
+    for figure, one, two in zip(figures, times, json.loads(printed[0].splitlines()[-1]), strict=True):
+        line, measurement = compare("processes", figure.timed.config, one, two, 1)
+        kind = f"scaling/processes_{figure.kind}"
+        found.append((line, dataclasses.replace(measurement, name=kind, unit="x one process")))
+    return found
+
+
+def measure_as_process(timed: list[Timed], cycles: int) -> None:
+    """One of two processes: compiles and trains each configuration, and prints a list of the seconds of an iteration."""
+    seconds = []
+    for each in timed:
+        each.compile()
+        processes.meet("compiled")
+        seconds.append(each.run(cycles))
+        each.loop = None
+    print(json.dumps(seconds), flush=True)
+
+
+def write_records(file: Path | None, watch: Watch, measurements: list[Measurement]) -> None:
+    """Writes what has been measured so far, if there is a file for it."""
+    if file is not None:
+        conditions = watch.conditions()
+        write_json(file, [to_record(each, conditions) for each in measurements])
+        print(f"records: {file}", flush=True)
+
+
 HEAD = (
-    f"{'what':8}{'devices':>8}{'seeds':>7}{'batch':>8}{'envs':>6}{'one device':>14}{'all':>14}"
+    f"{'what':10}{'devices':>8}{'seeds':>7}{'batch':>8}{'envs':>6}{'compared to':>14}{'itself':>14}"
     f"{'speed-up':>10}{'efficiency':>12}{'spread':>9}"
 )
 
@@ -255,11 +321,16 @@ def main() -> None:
     parser.add_argument("--seeds-per-device", type=int, default=1)
     parser.add_argument("--json", type=Path, help="also write the records here")
     parser.add_argument("--quick", action="store_true", help="small, to see that it works")
+    parser.add_argument("--positions", type=int, nargs="+", help=argparse.SUPPRESS)  # of one of two processes
+    parser.add_argument("--coordinator", help=argparse.SUPPRESS)
+    parser.add_argument("--process-id", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--compile-only", type=int, metavar="N", help="fill the compile cache for the N-th configuration")
     options = parser.parse_args()
     # Processes that compile share the devices' memory with this one.
     os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
     enable_compilation_cache()
+    if options.coordinator:
+        processes.start(processes.Place(options.coordinator, 2, options.process_id))
     began, there = time.perf_counter(), len(jax.devices())
     numbers = [count for count in options.devices or (2, 4, 8) if 1 < count <= there]
     if not numbers:
@@ -273,6 +344,9 @@ def main() -> None:
     everything = [*alone, *(figure.timed for figure in figures)]
     if options.compile_only is not None:
         everything[options.compile_only].compile()
+        return
+    if options.positions is not None:
+        measure_as_process([everything[position] for position in options.positions], options.cycles)
         return
     watch = Watch()
     lines, measurements, times = [], [], {}
@@ -288,7 +362,9 @@ def main() -> None:
         one.loop = None  # makes room
     keep(HEAD)
     for figure in figures:
-        keep(*measure(figure, times[id(figure.one)], options.cycles))
+        times[id(figure)] = figure.timed.run(options.cycles)
+        ideal = figure.timed.config.devices
+        keep(*compare(figure.kind, figure.timed.config, times[id(figure.one)], times[id(figure)], ideal))
         is_last = figure is [each for each in figures if each.timed.config.devices == figure.timed.config.devices][-1]
         if is_last:  # one learner, of the smallest batch
             keep(*measure_all_reduce(figure))
@@ -299,16 +375,19 @@ def main() -> None:
                 keep(line)
             figure.one.loop = None
         figure.timed.loop = None
+    write_records(options.json, watch, measurements)
+    if numbers[-1] % 2 == 0:
+        again = [each for each in figures if each.timed.config.devices == numbers[-1] and each.kind in ("seeds", "weak")][:2]
+        positions = [len(alone) + figures.index(each) for each in again]
+        for line, measurement in in_processes(again, positions, [times[id(each)] for each in again]):
+            keep(line, measurement)
     took = time.perf_counter() - began
     print(
         f"\n{options.env}, preset fast, {base.image_size}x{base.image_size} {base.pixels}, on {there} x "
         f"{jax.devices()[0].device_kind}, JAX {jax.__version__}, {took:.0f} s\n"
     )
     print("\n".join(lines))
-    if options.json is not None:
-        conditions = watch.conditions()
-        write_json(options.json, [to_record(each, conditions) for each in measurements])
-        print(f"records: {options.json}")
+    write_records(options.json, watch, measurements)
 
 
 if __name__ == "__main__":

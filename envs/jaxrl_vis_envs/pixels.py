@@ -74,7 +74,7 @@ class ImageObserver:
         self.scene = Scene.from_mjmodel(mj_model, camera=camera, height=size, width=size)
         self.spec = jax.ShapeDtypeStruct((config.frame_stack * CHANNELS[config.pixels], size, size), jnp.uint8)
         self._config = config
-        self._model = mjx.put_model(mj_model)
+        self._model = mjx_model.put_model(mj_model)
 
     def __call__(self, data: mjx.Data, history: jax.Array | None = None, domain: Domain | None = None) -> jax.Array:
         """Draws.

@@ -120,7 +120,7 @@ def arms_among(stalks: int) -> Arms:
     mj_model = stalk_arm.build(stalks)
     layout = bending.layout_of(mj_model)
     rest = mjx_model.still_data(mj_model)
-    model = mjx.put_model(mj_model)
+    model = mjx_model.put_model(mj_model)
     geoms = np.asarray(jax.jit(mjx.collision)(model, rest)._impl.contact.geom)
     places = {}
     for name in stalk_arm.JAWS + stalk_arm.LINKS:

@@ -44,12 +44,18 @@ def load_model(file_name: str, edit: Callable[[mujoco.MjSpec], None] | None = No
     return spec.compile()
 
 
+def put_model(mj_model: mujoco.MjModel) -> mjx.Model:
+    """`mjx.put_model`, on a device of this process: by itself, MJX takes the first device of all processes."""
+    return mjx.put_model(mj_model, device=jax.local_devices()[0])
+
+
 def start_data(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> mjx.Data:
-    """`mjx.put_data`, with a strong type on every array.
+    """`mjx.put_data`, on a device of this process, with a strong type on every array.
 
     A weakly typed ``time`` changes its type in the first step, so that everything compiles twice (mujoco issue 2306).
     """
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), mjx.put_data(mj_model, mj_data))
+    data = mjx.put_data(mj_model, mj_data, device=jax.local_devices()[0])
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), data)
 
 
 def still_data(mj_model: mujoco.MjModel, keyframe: str | None = None) -> mjx.Data:

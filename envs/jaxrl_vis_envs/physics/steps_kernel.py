@@ -105,7 +105,8 @@ def probe() -> None:
 
 def probe_program() -> Any:
     """A small instance of the kernel, traced (`jax.stages.Traced`): hinge and slide, dry friction, a limit, a contact."""
-    constants = mechanism_of(mjx.put_model(mujoco.MjModel.from_xml_string(_PROBE)))
+    model = mujoco.MjModel.from_xml_string(_PROBE)
+    constants = mechanism_of(mjx.put_model(model, device=jax.local_devices()[0]))
     joints = jnp.zeros((2, 2), jnp.float32)
     state = State(joints, joints, joints, joints)
     take_steps = functools.partial(take, constants, timestep=0.01, count=2, exact=True)

@@ -133,7 +133,7 @@ class HandReach(MjxGoalEnv):
         goal_model = mjx_model.load_model("hand_reach.xml")
         goal_model.opt = mj_model.opt
         goal_model.opt.timestep = _CONTROL_PERIOD / config.goal_substeps
-        self._goal_model = mjx.put_model(goal_model)
+        self._goal_model = mjx_model.put_model(goal_model)
 
     @classmethod
     def camera_of(cls, config: HandReachConfig) -> str:

@@ -17,6 +17,7 @@ import mujoco
 from jaxrl_vis_envs import randomization
 from jaxrl_vis_envs.base import GoalEnv, State, push_history, sanitize_action, start_history
 from jaxrl_vis_envs.names import visual_name
+from jaxrl_vis_envs.physics import mjx_model
 from jaxrl_vis_envs.physics.mjx_model import mjx
 from jaxrl_vis_envs.pixels import ImageObserver, Observer, image_observer
 from jaxrl_vis_envs.registry import register
@@ -51,7 +52,7 @@ class MjxGoalEnv(GoalEnv):
         self.threshold = config.threshold
         self.frame_stack = getattr(config, "frame_stack", 1)
         self.mj_model = mj_model
-        self._model = mjx.put_model(mj_model)
+        self._model = mjx_model.put_model(mj_model)
         self._draw = observer(mj_model) if observer is not None else None
         self._randomization: randomization.Randomization = getattr(config, "randomization", randomization.OFF)
         self._scene = getattr(self._draw, "scene", None)
@@ -137,7 +138,7 @@ class MjxGoalEnv(GoalEnv):
 
     @functools.cached_property
     def _data_shape(self) -> mjx.Data:
-        return jax.eval_shape(lambda: mjx.make_data(self.mj_model))
+        return jax.eval_shape(lambda: mjx.make_data(self.mj_model, device=jax.local_devices()[0]))
 
     def _under(self, domain: randomization.Domain | None) -> Self:
         """This task with the dynamics of an episode: a copy, so that what `act` does stays a function of its arguments."""
