@@ -90,6 +90,16 @@ def trained(config, layout=None, iterations=3):
     return program, loop, [*found, jax.device_get(program.evaluate(loop.train, key)[0])]
 
 
+def trained_in_parts(config, iterations=3):
+    """The last loop state and the metrics of all iterations, as a run computes them."""
+    programs = Programs(config, make_train_step(ENV, config))
+    loop, found = programs.init(programs.run_keys), []
+    for _ in range(iterations):
+        loop, metrics = programs.train_iteration(loop)
+        found.append(jax.device_get(metrics))
+    return loop, found
+
+
 def plain(tree):
     leaves = named_leaves(tree).items()
     keys = {name for name, leaf in leaves if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)}
@@ -143,6 +153,8 @@ def main() -> None:
     program, loop, of_four = trained(wide)
     _, emulated, of_parts = trained(wide, Emulated(shards=Shards(2)))
     found["data: metrics"], found["data: state"] = difference(of_parts, of_four), difference(emulated, loop)
+    loop_of_parts, of_run = trained_in_parts(wide)
+    found["parts: metrics"], found["parts: state"] = difference(of_four[:-1], of_run), difference(loop, loop_of_parts)
     rollouts = [
         {name: metrics[name] for name in ("train/success", "train/goal_distance")} for metrics in (of_one[0], of_four[0])
     ]

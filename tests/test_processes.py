@@ -132,6 +132,22 @@ def test_two_processes_learn_and_save_what_one_does(pair: tuple[Path, list, list
         np.testing.assert_allclose(ours, theirs, atol=1e-4)
 
 
+def test_processes_train_a_task_of_ours(tmp_path: Path) -> None:
+    """Its physics model must lie on devices of each process itself."""
+    words = ["--preset", "debug", "--seeds", "2", "--env-steps", "800", "--run-dir", str(tmp_path / "run")]
+    place = ["--coordinator", f"127.0.0.1:{free_port()}", "--num-processes", "2"]
+    train = [sys.executable, "-m", "jaxrl_vis", "train", "Reacher", *words, *place]
+    ends = ended(
+        [
+            subprocess.Popen([*train, "--process-id", index], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+            for index in ("0", "1")
+        ],
+        200,
+    )
+    assert [status for status, _, _ in ends] == [0, 0], ends
+    assert {row["seed"] for row in rows_without_time(tmp_path / "run")} == {0, 1}
+
+
 def test_only_the_first_process_writes_and_speaks(pair: tuple[Path, list, list, float]) -> None:
     run_dir, _, ((_, first, _), (_, second, _)), _ = pair
     assert "success at the end" in first and "success" not in second

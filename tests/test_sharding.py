@@ -57,6 +57,11 @@ def test_a_learner_in_two_parts_learns_on_two_devices_what_it_learns_on_one(foun
     assert found["data: state"] < 1e-4  # sums of squares of many grey levels
 
 
+def test_a_run_learns_in_parts_what_one_program_does(found: dict[str, Any]) -> None:
+    assert found["parts: metrics"] < 1e-5
+    assert found["parts: state"] < 1e-4
+
+
 def test_environments_start_and_explore_alike_on_however_many_devices(found: dict[str, Any]) -> None:
     assert found["data: first rollout"] < 1e-6
 

@@ -1,4 +1,4 @@
-"""A training iteration in two programs, which a run on one device calls one after the other.
+"""A training iteration in two programs, which a run calls one after the other.
 
     keys     which random numbers this iteration's rollout draws
     play     environments, from number ``first`` on         -> their episodes
@@ -7,13 +7,15 @@
 They are what `train_step` has in one program. XLA compiles the two side by side, and nothing is lost: what is played lies in
 the device's memory in either case, and neither waits for the host.
 
-A GPU plays all environments at once. A CPU plays `PART_SIZE` at a time, by as many threads as it has cores
-(`jaxrl_vis.run.side_by_side`): XLA would share out single operations, and those of a physics step are too small for that. On
-two cores 16 environments of VisualFetchReach are played in 0.13 s in place of 0.25. An evaluation of 256 episodes calls the
-same program, and takes 2.0 s in place of 2.7; so most of what takes long to compile, physics and images, is compiled once.
+A GPU plays all environments at once, and so do several devices. One CPU plays `PART_SIZE` at a time, by as many threads as it
+has cores (`jaxrl_vis.run.side_by_side`): XLA would share out single operations, and those of a physics step are too small for
+that. On two cores 16 environments of VisualFetchReach are played in 0.13 s in place of 0.25. An evaluation of 256 episodes
+calls the same program, and takes 2.0 s in place of 2.7; so most of what takes long to compile, physics and images, is compiled
+once.
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Sequence
 from types import ModuleType
@@ -25,7 +27,8 @@ import jax.numpy as jnp
 from jaxrl_vis.config import Config
 from jaxrl_vis.learner.networks import Networks
 from jaxrl_vis.learner.rollout import Exploration, play
-from jaxrl_vis.learner.shards import ONE, Slice
+from jaxrl_vis.learner.sharding import Layout
+from jaxrl_vis.learner.shards import Slice
 from jaxrl_vis.types import Episodes, LoopState, Metrics, TrainState
 from jaxrl_vis_envs.base import GoalEnv
 from jaxrl_vis_envs.compilation import env_jit, targets_cpu, tracing_for_default_device
@@ -42,7 +45,7 @@ class Parts:
     """The programs of a run in parts; make it with `make_parts`.
 
     Attributes:
-        size: P, environments of a part.
+        size: P, environments of a part, on all devices together.
         total: E, environments of a rollout of training.
         plays_any: Whether ``play`` can begin with any environment, and so evaluate, too; else it plays all of a rollout.
         exploration: The noise of training; an evaluation has none.
@@ -80,43 +83,54 @@ def make_parts(
     env: GoalEnv,
     networks: Networks,
     config: Config,
+    layout: Layout,
     keys_of: Callable[[jax.Array, jax.Array], jax.Array],
     learn: Callable[[LoopState, Episodes, Metrics, jax.Array], tuple[LoopState, Metrics]],
 ) -> Parts:
-    """Builds the programs of a run on one device. Nothing is compiled yet.
+    """Builds the programs of a run. Nothing is compiled yet.
 
     Args:
         env: The environment.
         networks: What the parameters mean.
         config: The run.
+        layout: Where it runs.
         keys_of: (keys [S], iteration) -> keys [2, S]: of an iteration's rollout, and of what comes after it.
-        learn: (LoopState, Episodes, outcome, keys [S]) -> (LoopState, metrics): what comes after a rollout, for all seeds.
+        learn: (LoopState, Episodes, outcome, keys [S]) -> (LoopState, metrics): what comes after a rollout, for all seeds of
+            one device.
     """
     with tracing_for_default_device():
-        plays_any = targets_cpu()
-    total = config.num_envs
+        plays_any = targets_cpu() and layout.mesh is None
+    total, shards = config.num_envs, layout.shards
     size = part_size(total) if plays_any else total
 
     def keys(seed_keys: jax.Array, iteration: jax.Array) -> jax.Array:
         return keys_of(seed_keys, iteration)[0]
 
     def play_part(train: TrainState, rollout_keys: jax.Array, first: jax.Array, exploration: Exploration) -> Played:
-        shards = Slice(first=first, total=total) if plays_any else ONE
-        episodes, outcome, _ = play(env, networks, train, rollout_keys, size, exploration, shards=shards)
+        played = Slice(first=first, total=total) if plays_any else shards
+        episodes, outcome, _ = play(env, networks, train, rollout_keys, size, exploration, shards=played)
         return episodes, outcome
 
     def learn_parts(loop: LoopState, parts: Sequence[Played]) -> tuple[LoopState, Metrics]:
         episodes, outcome = jax.tree.map(lambda *leaves: joined(leaves, total), *parts)
         return learn(loop, episodes, outcome, keys_of(loop.key, loop.iteration)[1])
 
+    seeds, environments, whole = layout.by_seed, layout.by_environment, layout.everywhere
+    spread = functools.partial(layout.spread, jit=env_jit)
     return Parts(
         size=size,
         total=total,
         plays_any=plays_any,
         exploration=Exploration(config.random_action_probability, config.action_noise),
-        keys=env_jit(keys),
-        play=env_jit(play_part),
-        learn=env_jit(learn_parts, donate_argnums=0),
+        keys=spread(keys, (seeds, whole), seeds),
+        play=spread(play_part, (seeds, seeds, whole, whole), (environments, environments)),
+        learn=spread(
+            learn_parts,
+            (layout.loop, environments),
+            (layout.loop, seeds),
+            kept_as=(layout.loop, layout.read_by_host),
+            donate_argnums=0,
+        ),
     )
 
 

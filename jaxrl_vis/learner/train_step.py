@@ -1,4 +1,4 @@
-"""One training iteration, for one or several seeds, as one compiled program (`parts`: as two, for one device).
+"""One training iteration, for one or several seeds, as one compiled program (`parts`: as two).
 
     key = fold_in(seed's key, iteration)
     rollout     reset, then scan over T: act, advance, observe            -> E episodes
@@ -60,7 +60,7 @@ class TrainStep:
             (TrainState, ReplayState, Episodes, keys [S], iteration) -> (TrainState, ReplayState), the first two donated;
             (TrainState, ReplayState, keys [S], iteration) -> (TrainState, metrics) after ``updates_per_iteration`` steps, the
             first donated.
-        parts: The same run in two programs, as one device computes it (`jaxrl_vis.learner.parts`); None on several devices.
+        parts: The same iteration in two programs, as runs compute it (`jaxrl_vis.learner.parts`).
     """
 
     env: GoalEnv
@@ -289,12 +289,14 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None) 
 
     learn_each = per_seed(learn, (_SEED_AXES, 0, 0, 0), (_SEED_AXES, 0))
 
+    def learn_seeds(loop: LoopState, episodes: Episodes, outcome: Metrics, keys: jax.Array) -> tuple[LoopState, Metrics]:
+        loop, metrics = learn_each(loop.replace(replay=layout.unfolded(loop.replay)), episodes, outcome, keys)
+        return loop.replace(replay=layout.folded(loop.replay, replay.num_envs)), metrics
+
     def train_iteration(loop: LoopState) -> tuple[LoopState, Metrics]:
-        loop = loop.replace(replay=layout.unfolded(loop.replay))
         keys = keys_of(loop.key, loop.iteration)
         episodes, outcome = rollout(loop.train, keys[0])
-        loop, metrics = learn_each(loop, episodes, outcome, keys[1])
-        return loop.replace(replay=layout.folded(loop.replay, replay.num_envs)), metrics
+        return learn_seeds(loop, episodes, outcome, keys[1])
 
     return TrainStep(
         env=env,
@@ -306,5 +308,5 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None) 
         layout=layout,
         **_jitted(layout, init_seeds, train_iteration, rollout, insert_seeds, update_seeds),
         evaluate=_jitted_evaluate(layout, make_evaluate(env, networks, config, shards)),
-        parts=make_parts(env, networks, config, keys_of, learn_each) if layout.mesh is None else None,
+        parts=make_parts(env, networks, config, layout, keys_of, learn_seeds),
     )

@@ -2,8 +2,8 @@
 
 All of it is compiled before training starts, so that the end of a run, where signals and full disks come, compiles nothing.
 
-On one device a training iteration is two programs, which XLA compiles side by side (`jaxrl_vis.learner.parts`), and a CPU
-evaluates with one of these, too. On several devices an iteration is one program.
+A training iteration is two programs, which XLA compiles side by side (`jaxrl_vis.learner.parts`), and a CPU evaluates with one
+of these, too.
 """
 
 import concurrent.futures
@@ -215,7 +215,8 @@ class Programs:
         if name == "play":
             return shapes.train, shapes.key, jax.ShapeDtypeStruct((), jnp.int32), Exploration(number, number)
         parts = self.program.parts
-        return shapes, [played_spec(self.env, parts.size, len(self.seeds))] * parts.count
+        played = played_spec(self.env, parts.size, len(self.seeds))
+        return shapes, [self.layout.with_shardings(played, self.layout.by_environment)] * parts.count
 
     def _of_trees(self, name: str, compiled: Any) -> CompiledOfLeaves:
         """A kept program as the program that it was traced from: its loop states are trees again, not lists."""
