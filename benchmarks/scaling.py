@@ -49,6 +49,7 @@ from jaxrl_vis.learner.shards import DATA
 from jaxrl_vis.learner.train_step import make_train_step
 from jaxrl_vis.run.arrays import named_leaves
 from jaxrl_vis.run.checkpoint import FULL, Checkpoints
+from jaxrl_vis.run.pending import Pending
 from jaxrl_vis.run.programs import Programs
 
 QUICK = {
@@ -85,24 +86,24 @@ class Timed:
     def run(self, cycles: int) -> list[float]:
         """Seconds of an iteration in each of several cycles; one cycle goes before.
 
-        A cycle is what lies between two evaluations. The host reads the metrics of each iteration during the next one, and at
-        the end of a cycle those of the last one, as in a run.
+        A cycle is what lies between two evaluations. As in a run, the host reads the metrics of each iteration during the
+        next one, and those of a cycle's last one during the evaluation, which it then waits for.
         """
         programs, count = self.programs, self.config.eval_interval
         loop = programs.init(programs.run_keys) if self.loop is None else self.loop
         seconds = []
         for cycle in range(cycles + 1):
-            start, before = time.perf_counter(), None
+            start, waiting = time.perf_counter(), []
             for _ in range(count):
                 loop, metrics = programs.train_iteration(loop)
-                if before is not None:
-                    jax.device_get(before)
-                before = metrics
-            found = jax.device_get(before)
-            if not all(np.isfinite(values).all() for values in found.values()):
-                raise FloatingPointError("training gave numbers that are not finite")
+                waiting.append(Pending(metrics))
+                if len(waiting) > 1:
+                    waiting.pop(0).read()
             if self.evaluates:
-                jax.device_get(programs.evaluate(loop.train)[0])
+                waiting.append(Pending(programs.evaluate(loop.train)[0]))
+            for pending in waiting:
+                if not all(np.isfinite(values).all() for values in pending.read().values()):
+                    raise FloatingPointError("training gave numbers that are not finite")
             jax.block_until_ready(loop.train)
             if cycle:
                 seconds.append((time.perf_counter() - start) / count)

@@ -26,6 +26,7 @@ from jaxrl_vis.bench.timing import measure as measure_time
 from jaxrl_vis.bench.update import seed_keys, time_updates, training_config
 from jaxrl_vis.config import Config, data_devices_of
 from jaxrl_vis.learner.train_step import TrainStep, make_train_step
+from jaxrl_vis.run.pending import Pending
 from jaxrl_vis.run.programs import Programs
 from jaxrl_vis.types import LoopState
 from jaxrl_vis_envs.base import GoalEnv
@@ -52,6 +53,7 @@ def time_iterations(programs: Programs, repeats: int) -> tuple[LoopState, Timing
     programs.of_training()
     compile_s = time.perf_counter() - start
     loop, waiting = programs.train_iteration(loop)
+    pending = Pending(waiting)
 
     def dispatch() -> Any:
         nonlocal loop, waiting
@@ -59,12 +61,12 @@ def time_iterations(programs: Programs, repeats: int) -> tuple[LoopState, Timing
         return waiting
 
     def train() -> Any:
-        before = waiting
-        after = dispatch()
-        metrics = {name: np.asarray(values) for name, values in before.items()}
-        if any(not np.isfinite(values).all() for values in metrics.values()):
+        nonlocal pending
+        before = pending
+        pending = Pending(dispatch())
+        if any(not np.isfinite(values).all() for values in before.read().values()):
             raise FloatingPointError("training gave numbers that are not finite")
-        return after
+        return waiting
 
     alone = measure_time(dispatch, repeats, _BUDGET_S)
     timing = measure_time(train, repeats, _BUDGET_S)

@@ -33,6 +33,7 @@ from jaxrl_vis.run.folder import RunFolder, read_record
 from jaxrl_vis.run.loggers import Loggers
 from jaxrl_vis.run.memory import check_compiled, check_memory
 from jaxrl_vis.run.metrics import PerSeed
+from jaxrl_vis.run.pending import Pending
 from jaxrl_vis.run.programs import Programs
 from jaxrl_vis.run.progress import Progress
 from jaxrl_vis.run.results import Results, describe
@@ -243,24 +244,26 @@ class RunLoop:
     def _train(self, interruption: Interruption) -> Iterator[Report]:
         config = self._config
         if self._progress.evaluation_due:
-            yield self._evaluate(self._report(self._done, {}))
-        waiting: tuple[int, dict[str, jax.Array]] | None = None  # an iteration that the device may still be working on
+            yield self._evaluate(self._report(self._done, {}), self._begin_evaluation())
+        waiting: tuple[int, Pending] | None = None  # an iteration that the device may still be working on
         while self._done < self._total:
             assert self._loop is not None
             self._loop, values = self._programs.train_iteration(self._loop)
             self._done += 1
-            before, waiting = waiting, (self._done, values)
+            before, waiting = waiting, (self._done, Pending(values))
             if before is not None:
                 yield self._read(*before)
             evaluation = self._is_due(config.eval_interval) or self._done == self._total
             light, full = self._is_due(config.checkpoint_interval), self._is_due(config.full_checkpoint_interval)
             if not (evaluation or light or full or (interruption and not processes.are_several())):
                 continue
+            # Before the metrics are read, so that the device does not wait for the host meanwhile.
+            outcome = self._begin_evaluation() if evaluation and self._programs.evaluates_ahead else None
             report, waiting = self._read(*waiting), None
             if processes.any_of(bool(interruption)):
                 self._save_and_end(evaluation, interruption)
             if evaluation:
-                report = self._evaluate(report)
+                report = self._evaluate(report, self._begin_evaluation() if outcome is None else outcome)
             if light:
                 self._saver.light(self._loop, self._done, self._progress_now())
             if full:
@@ -277,13 +280,13 @@ class RunLoop:
         env_steps, updates = self._program.steps_per_iteration, self._program.updates_per_iteration
         return Report(iteration, iteration * env_steps, iteration * updates, values)
 
-    def _read(self, iteration: int, on_device: dict[str, jax.Array]) -> Report:
+    def _read(self, iteration: int, pending: Pending) -> Report:
         """Waits for an iteration's metrics and takes them in.
 
         Raises:
             NonFiniteError: A guard has counted something.
         """
-        values = {name: self._per_seed(value) for name, value in jax.device_get(on_device).items()}
+        values = {name: self._per_seed(value) for name, value in pending.read().items()}
         guards = [values.pop(name) for name in list(values) if name.startswith(GUARD)]
         bad = sorted({self._config.seed + seed for counts in guards for seed, count in enumerate(counts) if count != 0})
         if bad:
@@ -296,13 +299,17 @@ class RunLoop:
         array = np.broadcast_to(np.asarray(value, np.float32), (self._config.seeds,))
         return [float(str(number)) for number in array]  # the shortest decimal that reads back as the same float32
 
-    def _evaluate(self, report: Report) -> Report:
-        """Evaluates the learner, writes a line per seed, and adds the figures to the report."""
+    def _begin_evaluation(self) -> Pending:
+        """Evaluates the learner; `_evaluate` waits for the outcome."""
         assert self._loop is not None
-        progress, speed = self._progress, self._speed(self._done)
-        progress.evaluation_due = True  # until its rows are on the disk, whatever happens in between
+        self._progress.evaluation_due = True  # until its rows are on the disk, whatever happens in between
         outcome, self._recorded = self._programs.evaluate(self._loop.train)
-        values = {name: self._per_seed(value) for name, value in jax.device_get(outcome).items()}
+        return Pending(outcome)
+
+    def _evaluate(self, report: Report, outcome: Pending) -> Report:
+        """Reads what an evaluation has found, writes a line per seed, and adds the figures to the report."""
+        progress, speed = self._progress, self._speed(self._done)
+        values = {name: self._per_seed(value) for name, value in outcome.read().items()}
         if not all(np.isfinite(row).all() for row in values.values()):
             self._stop_nonfinite(f"the evaluation after iteration {self._done}", values)
         means = metrics.with_precision(metrics.mean_of(progress.since_evaluation))

@@ -130,6 +130,11 @@ class Programs:
         return max(0.04, float(self.env.control_period))
 
     @property
+    def evaluates_ahead(self) -> bool:
+        """Whether `evaluate` returns before the device has done its work."""
+        return self._evaluator is None
+
+    @property
     def names(self) -> tuple[str, ...]:
         """The programs that a run needs."""
         names = _WHOLE if self.side_by_side is None else _IN_PARTS
