@@ -268,6 +268,8 @@ OF_TASK: dict[tuple[str, str], dict[str, Any]] = {
         "encoders": "shared",
         "target_encoder": False,
         "random_shift": 6,
+        "relabel_probability": 0.8,
+        "balance_probability": 0.3,
     },
     ("cpu", "FetchReach"): {
         "num_envs": 16,
@@ -281,8 +283,10 @@ OF_TASK: dict[tuple[str, str], dict[str, Any]] = {
     ("cpu", "FingerTurn"): {"trivial_goals": 0.2, "actor_log": "loss"},
 }
 """(preset, task) -> fields that this preset has otherwise for this task, from images or states; see docs/learner.md."""
-_OF_STATES = ("trivial_goals",)  # of those, what reads true states: left out where the method has none
-_OF_IMAGES = ("random_shift",)  # and what images alone can have: left out from states, and where images are rewards
+# Of those, what goes with the oracle's rewards: other methods read no true states, and have a balance of their own.
+_OF_ORACLE = ("trivial_goals", "balance_probability")
+# And what goes with images: left out from states, and where images are compared to give rewards.
+_OF_IMAGES = ("random_shift", "relabel_probability", "balance_probability")
 
 
 def preset(name: str, **overrides: Any) -> Config:
@@ -303,7 +307,7 @@ def preset(name: str, **overrides: Any) -> Config:
     method = METHODS.get(overrides.get("method", config.method))
     left_out: tuple[str, ...] = ()
     if method is not None and method.reward != "oracle":
-        left_out += _OF_STATES
+        left_out += _OF_ORACLE
     if not env.startswith("Visual") or (method is not None and method.reward == "autoencoder"):
         left_out += _OF_IMAGES
     of_task = {field: value for field, value in of_task.items() if field not in left_out}

@@ -42,7 +42,7 @@ MEASURED: dict[str, tuple[str, ...]] = {
     "train/updates": (*_PHYSICS, *_IMAGES, *_TASK, *_LEARNER, "jaxrl_vis/bench/train.py", _TIMING),
     **{
         f"scaling/{kind}": (*_PHYSICS, *_IMAGES, *_TASK, *_LEARNER, "benchmarks/scaling.py")
-        for kind in ("seeds", "weak", "strong")
+        for kind in ("seeds", "weak", "strong", "processes_seeds", "processes_weak")
     },
     "scaling/all_reduce": ("jaxrl_vis/learner/shards.py", "benchmarks/scaling.py"),
     "adapters/success": (*_PHYSICS, *_TASK, f"{_ENVS}/adapters", "benchmarks/adapters.py"),

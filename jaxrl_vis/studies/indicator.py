@@ -46,8 +46,9 @@ VARIANTS: dict[str, Variant] = {
 REACHER, FETCH, SAWYER = "VisualReacher", "VisualFetchReach", "VisualSawyerReach"
 HAND, FINGER = "VisualHandReach", "VisualFingerTurn"
 _OTHERS = {"Reacher": 100_000, "FetchReach": 100_000, HAND: 700_000, FINGER: 500_000}
-# All methods see images as they are: the autoencoder compares them, and cannot do with shifted ones.
-_OWN = ("num_envs", "updates_per_iteration", "eval_interval", "encoders", "target_encoder", "random_shift")
+# All methods see images as they are (the autoencoder compares them, and cannot do with shifted ones), and relabel alike.
+_LEARNER = ("num_envs", "updates_per_iteration", "eval_interval", "encoders", "target_encoder")
+_OWN = (*_LEARNER, "random_shift", "relabel_probability", "balance_probability")
 _AS_ELSEWHERE = {preset: {name: getattr(PRESETS[preset], name) for name in _OWN} for preset in ("fast", "cpu")}
 
 FAMILY = Family(
