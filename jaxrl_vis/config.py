@@ -284,9 +284,9 @@ OF_TASK: dict[tuple[str, str], dict[str, Any]] = {
 }
 """(preset, task) -> fields that this preset has otherwise for this task, from images or states; see docs/learner.md."""
 # Of those, what goes with the oracle's rewards: other methods read no true states, and have a balance of their own.
-_OF_ORACLE = ("trivial_goals", "balance_probability")
+OF_ORACLE = ("trivial_goals", "balance_probability")
 # And what goes with images: left out from states, and where images are compared to give rewards.
-_OF_IMAGES = ("random_shift", "relabel_probability", "balance_probability")
+OF_IMAGES = ("random_shift", "relabel_probability", "balance_probability")
 
 
 def preset(name: str, **overrides: Any) -> Config:
@@ -307,9 +307,9 @@ def preset(name: str, **overrides: Any) -> Config:
     method = METHODS.get(overrides.get("method", config.method))
     left_out: tuple[str, ...] = ()
     if method is not None and method.reward != "oracle":
-        left_out += _OF_ORACLE
+        left_out += OF_ORACLE
     if not env.startswith("Visual") or (method is not None and method.reward == "autoencoder"):
-        left_out += _OF_IMAGES
+        left_out += OF_IMAGES
     of_task = {field: value for field, value in of_task.items() if field not in left_out}
     return config.replace(**{**of_task, **overrides})
 

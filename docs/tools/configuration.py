@@ -10,7 +10,7 @@ from pathlib import Path
 
 from jaxrl_vis import fields
 from jaxrl_vis.cli.parsing import _described
-from jaxrl_vis.config import OF_TASK, PRESETS, Config
+from jaxrl_vis.config import OF_IMAGES, OF_ORACLE, OF_TASK, PRESETS, Config
 from jaxrl_vis.run.folder import MAY_CHANGE
 
 PAGE = Path(__file__).resolve().parents[1] / "configuration.md"
@@ -59,7 +59,16 @@ def table() -> str:
 
 def of_tasks() -> str:
     """What presets have otherwise for some tasks."""
-    lines = ["## What presets have otherwise for some tasks", "", "| preset | task | fields |", "|---|---|---|"]
+    of_images, of_oracle = (", ".join(f"`{name}`" for name in names) for names in (OF_IMAGES, OF_ORACLE))
+    lines = [
+        "## What presets have otherwise for some tasks",
+        "",
+        f"Where a task shows images, and they are not compared to give rewards (`--method autoencoder`): {of_images}.",
+        f"With the oracle's rewards: {of_oracle}. Elsewhere these are what the preset has for other tasks.",
+        "",
+        "| preset | task | fields |",
+        "|---|---|---|",
+    ]
     for (preset, task), values in OF_TASK.items():
         fields_of_task = ", ".join(f"`{name}` **{_shown(value)}**" for name, value in values.items())
         lines.append(f"| `{preset}` | {task}, Visual{task} | {fields_of_task} |")
