@@ -278,6 +278,8 @@ OF_TASK: dict[tuple[str, str], dict[str, Any]] = {
         "encoders": "shared",
         "target_encoder": False,
         "random_shift": 1,
+        "relabel_probability": 0.8,
+        "balance_probability": 0.3,
     },
     ("fast", "FingerTurn"): {"trivial_goals": 0.2, "actor_log": "loss"},
     ("cpu", "FingerTurn"): {"trivial_goals": 0.2, "actor_log": "loss"},

@@ -8,6 +8,7 @@ import dataclasses
 import os
 import socket
 import sys
+import threading
 import time
 from collections.abc import Mapping
 
@@ -17,6 +18,7 @@ START_S = 120
 """How long a process waits for the others at its start, s."""
 _HEARTBEAT_S = 20  # without a sign of life for so long, a process counts as dead, and ends the others
 _SHUTDOWN_S = 30
+_LEAVE_S = 10
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,6 +161,21 @@ def meet(name: str) -> None:
         from jax.experimental import multihost_utils
 
         multihost_utils.sync_global_devices(name)
+
+
+def leave_together() -> None:
+    """Waits a while for the others to end, too, so that each has said why; else JAX would end them in the middle of it.
+
+    To be called where what was asked for is refused, as all processes will find.
+    """
+    if not are_several():
+        return
+    import jax
+
+    # In a thread, because JAX ends a process whose wait has failed.
+    leaving = threading.Thread(target=jax.distributed.shutdown, daemon=True)
+    leaving.start()
+    leaving.join(_LEAVE_S)
 
 
 def any_of(answer: bool) -> bool:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxrl_vis.bench.conditions import Watch
-from jaxrl_vis.bench.record import Measurement, compare_and_keep, results_path, write_json
+from jaxrl_vis.bench.record import Measurement, compare_and_keep, load, results_path, write_json
 from jaxrl_vis.bench.settings import Settings
 
 BENCHMARKS = ("render", "physics", "env", "update", "train")
@@ -29,8 +29,9 @@ def run(benchmark: str, results: Path | None = None, json: Path | None = None, *
         **settings: Fields of `Settings`.
 
     Raises:
-        RequestError: A setting cannot be met.
+        RequestError: A setting cannot be met, or the file of kept records holds something else.
     """
+    load(results_path(benchmark, results))  # first: a figure that cannot be kept is lost
     measure = importlib.import_module(f"jaxrl_vis.bench.{benchmark}").measure
     measurements, records = [], []
     chosen, watch = Settings(**settings).for_this_device(), Watch()

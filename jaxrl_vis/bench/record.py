@@ -14,6 +14,7 @@ from typing import Any
 
 from jaxrl_vis import provenance
 from jaxrl_vis.bench.conditions import why_not_comparable
+from jaxrl_vis.errors import RequestError
 from jaxrl_vis.files import user_cache, write_atomically
 
 SCHEMA = 1
@@ -73,20 +74,38 @@ def load(path: Path) -> list[dict[str, Any]]:
     """The records in a file; none where it is missing.
 
     Raises:
-        ValueError: The file holds something else.
+        RequestError: The file holds something else.
     """
     if not path.exists():
         return []
-    records = json.loads(path.read_text())
-    if not isinstance(records, list) or any(record.get("schema") != SCHEMA for record in records):
-        raise ValueError(f"{path} holds no records of schema {SCHEMA}; move it away to start a new one")
+    records = _read(path)
+    if not isinstance(records, list) or not all(isinstance(each, dict) and each.get("schema") == SCHEMA for each in records):
+        raise RequestError(f"{path} holds no records of schema {SCHEMA}; move it away to start a new one")
     return records
 
 
+def _read(path: Path) -> Any:
+    """What a JSON file holds.
+
+    Raises:
+        RequestError: It holds something else, or cannot be read.
+    """
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise RequestError(f"cannot read {path}: {error.strerror or error}") from error
+    except ValueError as error:
+        raise RequestError(f"{path} is not JSON ({error}): move it away, or put back what it held") from error
+
+
 def read_all(folder: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """Every record in ``folder`` and below with its file, sorted by file. Files that hold something else are passed over."""
+    """Every record in ``folder`` and below with its file, sorted by file. JSON files of something else are passed over.
+
+    Raises:
+        RequestError: A file is not JSON, or cannot be read.
+    """
     for path in sorted(folder.rglob("*.json")):
-        contents = json.loads(path.read_text(encoding="utf-8"))
+        contents = _read(path)
         for record in contents if isinstance(contents, list) else [contents]:
             # The configuration of a run has a schema, too, but neither name nor value.
             if isinstance(record, dict) and record.get("schema") == SCHEMA and "name" in record:

@@ -118,6 +118,8 @@ def entry() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what Python flushes at its end
         status = 141
     sys.stderr.flush()
+    if status == _STATUS[RequestError]:
+        processes.leave_together()
     if status in (130, 143) or (status and processes.are_several()):
         os._exit(status)  # of several processes that failed, none must wait for the others
     sys.exit(status)
