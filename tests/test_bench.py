@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxrl_vis import bench, provenance
-from jaxrl_vis.bench import conditions, peaks, record, roofline, timing, train, update, variation
+from jaxrl_vis import bench, cli, provenance
+from jaxrl_vis.bench import conditions, peaks, physics, record, roofline, timing, train, update, variation
 from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.settings import Settings
 from jaxrl_vis.config import preset
@@ -141,6 +141,20 @@ def test_a_file_of_something_else_is_not_overwritten(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="schema"):
         record.keep(path, record.to_record(measurement(1.0)))
     assert path.read_text() == '[{"schema": 99}]'
+
+
+@pytest.mark.parametrize("contents", ["[{", '["a record"]', '{"schema": 1}'])
+def test_a_damaged_file_is_told_before_anything_is_measured(
+    contents: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The figure would be lost: it could not be kept."""
+    path = record.results_path("physics", tmp_path)
+    path.write_text(contents)
+    monkeypatch.setattr(physics, "measure", lambda _: pytest.fail("measured"))
+    assert cli.main(["bench", "physics", "--results", str(tmp_path)]) == 2
+    line = capsys.readouterr().err
+    assert str(path) in line and line.count("\n") == 1
+    assert path.read_text() == contents
 
 
 def test_json_holds_this_run_s_records(tmp_path: Path) -> None:

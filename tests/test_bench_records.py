@@ -299,3 +299,29 @@ def test_the_command_line_checks(tmp_path: Path, capsys: pytest.CaptureFixture[s
     for tokens, words in ((["bench"], "no benchmark given"), (["bench", "env", "--check"], "leave out env")):
         assert cli.main(tokens) == 2
         assert words in capsys.readouterr().err
+
+
+def test_tables_are_not_written_from_a_folder_that_is_not_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A name that was misspelt once replaced every figure of the README by `MISSING`."""
+    readme = tmp_path / "README.md"
+    before = check.README.read_text()
+    readme.write_text(before)
+    monkeypatch.setattr(check, "README", readme)
+    for option in ("--tables", "--check"):
+        assert cli.main(["bench", option, "--results", str(tmp_path / "nowhere")]) == 2
+        assert "there is no folder of records" in capsys.readouterr().err
+    assert readme.read_text() == before
+
+
+def test_a_damaged_file_of_records_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "env.json").write_text('[{"schema": 1,')
+    assert cli.main(["bench", "--check", "--results", str(tmp_path)]) == 2
+    line = capsys.readouterr().err
+    assert "env.json is not JSON" in line and line.count("\n") == 1
+    learning.keep(make_run(tmp_path / "run", rows_of([0.5])), "discs", tmp_path)
+    with (tmp_path / "learning" / "discs.metrics.jsonl").open("a") as file:
+        file.write('{"seed": 0, "env_')
+    with pytest.raises(RequestError, match="discs.metrics.jsonl has a line that is not JSON"):
+        learning.load("discs", tmp_path)

@@ -16,6 +16,9 @@ def check(results: Path | None = None, readme: Path = README, checkout: Path = p
         results: The folder of records; None for the checkout's own.
         readme: The file with the tables.
         checkout: The git checkout that the records' revisions belong to.
+
+    Raises:
+        RequestError: The folder of records is missing, or a file in it cannot be read.
     """
     results = results or record.results_folder()
     complaints = []

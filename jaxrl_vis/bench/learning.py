@@ -12,7 +12,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from jaxrl_vis.bench.record import SCHEMA
+from jaxrl_vis.bench.record import SCHEMA, read_json
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.files import write_atomically
 from jaxrl_vis.run.command import command_of
@@ -82,13 +82,20 @@ def keep(run: Path, name: str, results: Path) -> tuple[Path, Path]:
 
 
 def load(name: str, results: Path) -> Evidence | None:
-    """The evidence of that name; None where none was kept."""
+    """The evidence of that name; None where none was kept.
+
+    Raises:
+        RequestError: A file of it is damaged.
+    """
     folder = results / FOLDER
     record_file, metrics_file = folder / f"{name}.json", folder / f"{name}.metrics.jsonl"
     if not (record_file.exists() and metrics_file.exists()):
         return None
-    rows = [json.loads(line) for line in metrics_file.read_text(encoding="utf-8").splitlines()]
-    return Evidence(json.loads(record_file.read_text(encoding="utf-8")), rows)
+    try:
+        rows = [json.loads(line) for line in metrics_file.read_text(encoding="utf-8").splitlines()]
+    except ValueError as error:
+        raise RequestError(f"{metrics_file} has a line that is not JSON ({error}): put back what it held") from error
+    return Evidence(read_json(record_file), rows)
 
 
 def seconds(rows: list[dict[str, Any]]) -> tuple[float, float]:

@@ -78,13 +78,13 @@ def load(path: Path) -> list[dict[str, Any]]:
     """
     if not path.exists():
         return []
-    records = _read(path)
+    records = read_json(path)
     if not isinstance(records, list) or not all(isinstance(each, dict) and each.get("schema") == SCHEMA for each in records):
         raise RequestError(f"{path} holds no records of schema {SCHEMA}; move it away to start a new one")
     return records
 
 
-def _read(path: Path) -> Any:
+def read_json(path: Path) -> Any:
     """What a JSON file holds.
 
     Raises:
@@ -102,10 +102,12 @@ def read_all(folder: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
     """Every record in ``folder`` and below with its file, sorted by file. JSON files of something else are passed over.
 
     Raises:
-        RequestError: A file is not JSON, or cannot be read.
+        RequestError: There is no such folder, or a file is not JSON, or cannot be read.
     """
+    if not folder.is_dir():
+        raise RequestError(f"there is no folder of records {folder}: name one with --results")
     for path in sorted(folder.rglob("*.json")):
-        contents = _read(path)
+        contents = read_json(path)
         for record in contents if isinstance(contents, list) else [contents]:
             # The configuration of a run has a schema, too, but neither name nor value.
             if isinstance(record, dict) and record.get("schema") == SCHEMA and "name" in record:

@@ -163,7 +163,7 @@ def filled(text: str, results: Path) -> str:
     """``text`` with every table between its markers written anew.
 
     Raises:
-        RequestError: A marker is missing, or evidence contradicts its row.
+        RequestError: A marker is missing, evidence contradicts its row, or records cannot be read.
     """
     for name, write in TABLES.items():
         pattern = re.compile(rf"(<!-- {name}: begin[^>]*-->\n).*?(<!-- {name}: end -->)", re.DOTALL)
