@@ -135,6 +135,15 @@ def test_without_git_it_says_so_in_one_line(tmp_path: Path, capsys: pytest.Captu
     assert "not a git checkout" in line
 
 
+def test_what_was_not_looked_at_is_not_called_good(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(check, "README", tmp_path / "no.md")
+    monkeypatch.setattr(staleness, "stale_records", lambda *_: [])
+    assert cli.main(["bench", "--check", "--results", str(tmp_path)]) == 0
+    assert "every row has one" not in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("name", staleness.MEASURED)
 def test_measured_files_are_there(name: str, checkout: Path) -> None:
     for of_cpu in (True, False):

@@ -35,13 +35,14 @@ class Bench:
     preset: Literal["paper", "fast", "cpu", "debug"] | None = None
     """Whose networks and gradient steps (update, train); fast on accelerators and cpu on a CPU if not given."""
     envs: tuple[int, ...] = ()
-    """Environments (or images) side by side, one measurement each; sizes that suit the device if not given."""
+    """Environments (or images) side by side, one measurement each (all but update, which has none); sizes that suit the device
+    if not given."""
     image_size: int | None = None
     """Height and width of images; 64 on accelerators and 32 on a CPU if not given."""
     pixels: Pixels | None = None
     """Channels; rgbd on accelerators and depth on a CPU if not given."""
     batch_size: int | None = None
-    """Transitions in a gradient step (update)."""
+    """Transitions in a gradient step (update, train); the preset's if not given."""
     seeds: int = 1
     """Learners side by side in one program (update, train)."""
     devices: str | None = None
@@ -87,8 +88,9 @@ def run(options: Bench) -> int:
         raise RequestError("--weighting and --aux-tasks go with `bench update` and `bench train` only, without a peer")
     if options.aux_gradients != "auto" and options.weighting == "none":
         raise RequestError("--aux-gradients goes with --weighting and --aux-tasks, whose gradients it compares")
-    if options.preset is not None and options.benchmark not in ("update", "train"):
-        raise RequestError("--preset goes with `bench update` and `bench train` only")
+    for option in ("preset", "batch_size"):
+        if getattr(options, option) is not None and options.benchmark not in ("update", "train"):
+            raise RequestError(f"--{option.replace('_', '-')} goes with `bench update` and `bench train` only")
     if (options.devices is not None or options.data_devices is not None) and options.benchmark != "train":
         raise RequestError("--devices and --data-devices go with `bench train` only")
     check_counts(
@@ -118,15 +120,21 @@ def run(options: Bench) -> int:
 
 
 def _look_after_records(options: Bench) -> int:
-    if options.benchmark is not None:
-        raise RequestError(f"--check and --tables measure nothing: leave out {options.benchmark}")
+    for field in dataclasses.fields(options):
+        if field.name not in ("check", "tables", "results") and getattr(options, field.name) != field.default:
+            given = options.benchmark or f"--{field.name.replace('_', '-')}"
+            raise RequestError(f"--check and --tables measure nothing: leave out {given}")
+    from jaxrl_vis import provenance
     from jaxrl_vis.bench import check, record, tables
 
     if options.tables:
         check_writable(check.README)
         changed = tables.write_tables(check.README, options.results or record.results_folder())
         print(f"{check.README}: {'written' if changed else 'unchanged'}")
-    complaints = check.check(options.results) if options.check else []
+    complaints = check.check(options.results, check.README) if options.check else []
     if options.check:
-        print("\n".join(complaints) or "every record is of today's code, and every row has one")
+        good = "nothing that could be looked at is wrong"
+        if provenance.is_checkout() and check.README.exists():
+            good = "every record is of today's code, and every row has one"
+        print("\n".join(complaints) or good)
     return 1 if complaints else 0
