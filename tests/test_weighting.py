@@ -330,6 +330,7 @@ def test_what_comes_beside_the_losses() -> None:
         (lambda: make_weighting("sum", log=True), ["no option 'log'", "it has none"]),
         (lambda: make_weighting("ol_aux", interval=0), ["interval", "at least 1, not 0"]),
         (lambda: make_weighting("ol_aux", window=0), ["window", "at least 1, not 0"]),
+        (lambda: make_weighting("ol_aux", interval=2.5), ["interval", "a whole number, not 2.5"]),
         (lambda: make_weighting("ol_aux", beta=float("nan")), ["finite"]),
         (lambda: make_weighting("ol_aux", main_grad="totl"), ["main_grad", "did you mean total"]),
         (lambda: make_weighting("ol_aux_ablation", window=4), ["leave window at 1"]),
@@ -359,6 +360,20 @@ def test_bad_requests_get_one_line(make: Any, parts: list[str]) -> None:
 
 
 WRONG = make_weighting("sum").init((MAIN, "other"))
+
+
+@pytest.mark.parametrize("way", [way for way in WAYS if way != "latents"])
+def test_losses_of_another_form_get_one_line(way: Any) -> None:
+    weighting = make_weighting("sum")
+    for losses_fn, has_aux, wrong in (
+        (lambda point: {MAIN: point**2, "near": jnp.sum(point)}, False, "loss 'main' has shape (2,) and must be one number"),
+        (lambda point: jnp.sum(point), False, "losses_fn must return a dictionary of losses by name, not a "),
+        (lambda point: ({MAIN: jnp.sum(point), "near": jnp.sum(point)}, 1), False, "has_aux=True"),
+        (lambda point: {MAIN: jnp.sum(point), "near": jnp.sum(point)}, True, "losses by name, and what is beside them"),
+    ):
+        with pytest.raises(RequestError) as caught:
+            weighted_grad(losses_fn, weighting, way=way, has_aux=has_aux)(jnp.ones(2), weighting.init((MAIN, "near")))
+        assert wrong in str(caught.value)
 
 
 def test_every_weighting_is_tried_here() -> None:

@@ -76,6 +76,9 @@ def loss_gradients(
 
     Returns:
         Losses, [] float32 by name; gradients by name, each shaped like the parameters, float32; what else there was.
+
+    Raises:
+        RequestError: What ``losses_fn`` returns is no dictionary of numbers.
     """
     whole = _in_float32(losses_fn, has_aux)
     if way == "one_hot":
@@ -142,8 +145,9 @@ def weighted_grad(
         compared.
 
     Raises:
-        RequestError: There is no such way, or it does not find what the weighting needs; from the function returned: the losses
-            are not those that the state began with, ``held`` is missing, or given without need.
+        RequestError: There is no such way, or it does not find what the weighting needs; from the function returned: what
+            ``losses_fn`` returns is no dictionary of numbers, the losses are not those that the state began with, ``held`` is
+            missing, or given without need.
     """
     _check_way(way, weighting, encode is not None)
     return _Finder(losses_fn, weighting, shared, way, has_aux, reduce, forwards, encode).find
@@ -271,10 +275,28 @@ def _in_float32(losses_fn: LossesFunction, has_aux: bool) -> Callable[..., tuple
     """The same losses, at least float32, and what comes beside them, or None."""
 
     def whole(params: Params, *args: Any) -> tuple[dict[str, jax.Array], Any]:
-        losses, extra = losses_fn(params, *args) if has_aux else (losses_fn(params, *args), None)
+        losses, extra = _parts(losses_fn(params, *args), has_aux)
         return {name: _to_float32(jnp.asarray(loss)) for name, loss in losses.items()}, extra
 
     return whole
+
+
+def _parts(returned: Any, has_aux: bool) -> tuple[Losses, Any]:
+    """What a function of losses returned: the losses, and what is beside them, or None.
+
+    Raises:
+        RequestError: It is not that, or a loss is not a single number.
+    """
+    is_pair = isinstance(returned, tuple) and len(returned) == 2
+    losses, extra = returned if has_aux and is_pair else (returned, None)
+    if not isinstance(losses, Mapping) or (has_aux and not is_pair):
+        wanted = "losses by name, and what is beside them" if has_aux else "a dictionary of losses by name"
+        mend = "" if has_aux or not is_pair else "; has_aux=True takes what is beside them"
+        raise RequestError(f"losses_fn must return {wanted}, not a {type(returned).__name__}{mend}")
+    for name, loss in losses.items():
+        if jnp.shape(loss):
+            raise RequestError(f"loss {name!r} has shape {jnp.shape(loss)} and must be one number, such as its mean")
+    return losses, extra
 
 
 def _embed(shared: Selector, params: Params, part: Params) -> Params:

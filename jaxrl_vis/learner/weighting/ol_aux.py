@@ -184,6 +184,8 @@ def _zeros(names: Iterable[str], shared: Params, *leading: int) -> dict[str, Par
 
 def _check(label: str, interval: int, window: int, held: bool, main_grad: str) -> None:
     for name, count in (("interval", interval), ("window", window)):
+        if count % 1 != 0:
+            raise RequestError(f"{name} of weighting {label} must be a whole number, not {count}")
         if count < 1:
             raise RequestError(f"{name} of weighting {label} must be at least 1, not {count}")
     if held and window > 1:
