@@ -256,3 +256,59 @@ def test_what_is_left_out_must_be_there(ball):
         Scene.from_mjmodel(ball[0], "front", leave_out=("ball", "nosuch"))
     assert "\n" not in str(refusal.value) and "'ball'" not in str(refusal.value).partition(":")[0]
     assert len(Scene.from_mjmodel(ball[0], "front", leave_out=("ball", "skin", "flex")).object_ids) == 1
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (lambda _: ("model.xml",), "not from a str; mujoco.MjModel.from_xml_path"),
+        (lambda _: (mujoco.MjSpec(),), "not from a MjSpec; its compile"),
+        (lambda model: (mjx.put_model(model),), "not from a Model; mjx.put_model was given one"),
+        (lambda model: (model, ("front", "side")), "a scene has one camera: .* got a tuple"),
+        (lambda model: (model, 0.5), "a scene has one camera: .* got a float"),
+        (lambda model: (model, None, 4, 4, "all"), "groups must be numbers of groups.*'all'"),
+        (lambda model: (model, None, 4, 4, (0,), None), "site_groups must be numbers of groups.*None"),
+        (lambda model: (model, None, 4, 4, (0,), (), True, False, False, None, "ball"), "leave_out must be .*'ball'"),
+    ],
+)
+def test_what_no_scene_can_be_read_from_is_refused_in_one_line(ball, given, said):
+    with pytest.raises(ValueError, match=said) as refusal:
+        Scene.from_mjmodel(*given(ball[0]))
+    assert "\n" not in str(refusal.value)
+
+
+def test_groups_come_in_any_collection(ball):
+    for groups in ({4}, [4], np.array([4]), range(4, 5), 4):
+        assert Scene.from_mjmodel(ball[0], "front", groups=groups).object_ids == (1,)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (lambda scene, data: (data, scene), "a scene comes first, .* got MjData"),
+        (lambda scene, _: (scene, None), "mjx.Data or mujoco.MjData; NoneType has no geom_xpos"),
+        (lambda scene, data: (scene, SimpleNamespace(data=data)), "such as state.data; SimpleNamespace has no geom_xpos"),
+        (lambda scene, data: (scene, SimpleNamespace(**poses_of(data, 2))), r"\(3, 3\), got \(2, 3, 3\); jax.vmap"),
+        (lambda scene, data: (scene, SimpleNamespace(**poses_of(data) | {"geom_xpos": np.zeros((2, 3))})), "models differ"),
+        (
+            lambda scene, data: (scene, SimpleNamespace(**poses_of(data) | {"cam_xpos": np.zeros((0, 3))})),
+            "at least 1: the mod",
+        ),
+    ],
+)
+def test_poses_that_are_not_of_the_scene_are_refused_in_one_line(ball, given, said):
+    with pytest.raises(ValueError, match=said) as refusal:
+        render_planes(*given(ball[2], ball[1]))
+    assert "\n" not in str(refusal.value)
+
+
+def test_leaves_may_be_plain_numbers(ball):
+    _, mj_data, scene = ball
+    given = render_planes(scene.replace(fovy=30, zfar=8, rgba=np.array(scene.rgba, np.float64)), mj_data, rgb=False)
+    stated = render_planes(scene.replace(fovy=jnp.float32(30.0), zfar=jnp.float32(8.0)), mj_data, rgb=False)
+    assert given.depth.dtype == jnp.float32
+    np.testing.assert_array_equal(given.depth, stated.depth)
+
+
+def test_nothing_that_is_not_asked_for_is_returned(ball):
+    assert render_planes(ball[2], ball[1], rgb=False, depth=False) == (None, None, None, None, None)

@@ -6,6 +6,7 @@ colour of that object from the row of a table (`pixel.surface`, `pixel.shade`). 
 GPU (`gpu.kernel`), and passes that compute nothing twice on a CPU (`cpu.passes`).
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -21,8 +22,11 @@ from jaxrl_vis_envs.render.cpu import passes
 from jaxrl_vis_envs.render.gpu import kernel
 from jaxrl_vis_envs.render.outputs import Frame, Outputs, Planes
 from jaxrl_vis_envs.render.pixel import blocks, lights, lookup, raycast, shade, shapes, surface, transparent
-from jaxrl_vis_envs.render.pixel.prepare import prepare
+from jaxrl_vis_envs.render.pixel.prepare import check_poses, prepare
 from jaxrl_vis_envs.render.scene import Scene
+
+# Leaves of a scene that are not float32.
+_INTEGERS = {"texels": jnp.uint32, "cluster_places": jnp.int32}
 
 
 class _View(NamedTuple):
@@ -67,8 +71,14 @@ def render_planes(
 
     Returns:
         The planes that were asked for.
+
+    Raises:
+        ValueError: ``scene`` is no scene, or ``data`` has no poses, those of several environments, or those of another model.
     """
     outputs = Outputs(rgb, depth, segmentation, normals, distance, quantized)
+    check_poses(scene, data, rgb)
+    if not any(outputs[:-1]):  # the fast ways draw something in any case
+        return Planes(None, None, None)
     scene = _in_32_bits(scene)
     if not scene.object_ids:
         return _quantized(outputs, _draw_nothing(scene, data, outputs))
@@ -80,9 +90,10 @@ def render_planes(
 
 
 def _in_32_bits(scene: Scene) -> Scene:
-    """The scene with leaves of 32 bits, which keys of pixels need, whatever it was given where JAX computes in 64."""
-    narrow = {jnp.dtype("float64"): jnp.float32, jnp.dtype("int64"): jnp.int32}
-    return jax.tree.map(lambda leaf: leaf.astype(narrow.get(leaf.dtype, leaf.dtype)), scene)
+    """The scene with leaves as `Scene` states them, whatever it was given: numbers, or the 64 bits that JAX may compute in."""
+    leaves = [field.name for field in dataclasses.fields(scene) if not field.metadata.get("static")]
+    dtypes = {name: _INTEGERS.get(name, jnp.float32) for name in leaves}
+    return scene.replace(**{name: jnp.asarray(getattr(scene, name), dtype) for name, dtype in dtypes.items()})
 
 
 def _fast(scene: Scene, outputs: Outputs) -> Callable[..., Planes] | None:
@@ -229,6 +240,9 @@ def render(scene: Scene, data: Any, normals: bool = False, distance: bool = Fals
 
     Returns:
         The frame.
+
+    Raises:
+        ValueError: As `render_planes`.
     """
     planes = render_planes(scene, data, rgb=True, depth=True, segmentation=True, normals=normals, distance=distance)
     assert planes.rgb is not None and planes.depth is not None and planes.segmentation is not None

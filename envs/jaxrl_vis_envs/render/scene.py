@@ -182,11 +182,14 @@ class Scene:
             The scene. Objects with alpha 0 and objects of other groups are left out; tendons are not drawn.
 
         Raises:
-            ValueError: The camera or a geom to be left out does not exist, a size is no positive integer, or something that
-                would be seen cannot be drawn (skins, flexes, signed distance fields, lights that are images, shadows of
-                meshes).
+            ValueError: ``mj_model`` is no `mujoco.MjModel`, the camera or a geom to be left out does not exist, a size is no
+                positive integer, groups are no numbers, or something that would be seen cannot be drawn (skins, flexes,
+                signed distance fields, lights that are images, shadows of meshes).
         """
+        reading.check_model(mj_model)
         _check_size(height=height, width=width)
+        groups = reading.group_numbers("groups", groups)
+        site_groups = reading.group_numbers("site_groups", site_groups)
         reading.check_names(mj_model, leave_out)
         camera_id = reading.find_camera(mj_model, camera)
         appearance = reading.object_appearance(mj_model)

@@ -1,5 +1,7 @@
 """What MuJoCo's visualiser makes of a model: colours, lights, the camera's lens, and what cannot be drawn. NumPy only."""
 
+import numbers
+from collections.abc import Iterable
 from typing import Any
 
 import mujoco
@@ -42,12 +44,17 @@ def find_camera(mj_model: mujoco.MjModel, camera: Camera) -> int:
         if view.type != mujoco.mjtCamera.mjCAMERA_FREE:
             raise ValueError("an MjvCamera must be free or fixed: one that tracks a body belongs into the model")
         return FREE_CAMERA
-    if camera is None or camera == FREE_CAMERA:
+    if camera is None:
         return FREE_CAMERA
     if isinstance(camera, str):
         camera_id = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
-    else:
+    elif isinstance(camera, numbers.Integral) and not isinstance(camera, bool):
         camera_id = int(camera)
+        if camera_id == FREE_CAMERA:
+            return FREE_CAMERA
+    else:
+        kind = type(camera).__name__
+        raise ValueError(f"a scene has one camera: a name, an index, an MjvCamera, or None for a free one; got a {kind}")
     if not 0 <= camera_id < mj_model.ncam:
         names = ", ".join(repr(mj_model.camera(index).name) for index in range(mj_model.ncam)) or "none"
         raise ValueError(f"there is no camera {camera!r} in the model; its cameras are: {names}; or None for a free one")
@@ -130,8 +137,31 @@ def _clamped(group: np.ndarray) -> np.ndarray:
     return np.clip(group, 0, mujoco.mjNGROUP - 1)
 
 
+def check_model(mj_model: Any) -> None:
+    """Raises a ValueError where ``mj_model`` is something else that a model comes in."""
+    if isinstance(mj_model, mujoco.MjModel):
+        return
+    mends = {
+        "str": "; mujoco.MjModel.from_xml_path and from_xml_string read one",
+        "MjSpec": "; its compile() makes one",
+        "Model": "; mjx.put_model was given one",
+    }
+    kind = type(mj_model).__name__
+    raise ValueError(f"a scene is read from a mujoco.MjModel, not from a {kind}{mends.get(kind, '')}")
+
+
+def group_numbers(name: str, groups: Any) -> tuple[int, ...]:
+    """The numbers of groups, or a ValueError where they are none: that would hide everything without a word."""
+    listed = list(groups) if isinstance(groups, Iterable) else [groups]
+    if not all(isinstance(group, numbers.Integral) and not isinstance(group, bool) for group in listed):
+        raise ValueError(f"{name} must be numbers of groups, such as (0, 1, 2), got {groups!r}")
+    return tuple(map(int, listed))
+
+
 def check_names(mj_model: mujoco.MjModel, leave_out: tuple[str, ...]) -> None:
     """Raises a ValueError that names whatever is to be left out and is neither a geom's name nor "skin" nor "flex"."""
+    if isinstance(leave_out, str) or not isinstance(leave_out, Iterable):
+        raise ValueError(f"leave_out must be a tuple of names, such as ('skin',), got {leave_out!r}")
     geoms = [mj_model.geom(index).name for index in range(mj_model.ngeom)]
     unknown = [name for name in leave_out if name not in geoms and name not in ("skin", "flex")]
     if unknown:

@@ -5,8 +5,10 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 
 from jaxrl_vis_envs.render import camera
+from jaxrl_vis_envs.render.model.reading import FREE_CAMERA
 from jaxrl_vis_envs.render.pixel import lights, shapes
 from jaxrl_vis_envs.render.scene import Scene
 
@@ -36,6 +38,46 @@ def prepare(scene: Scene, data: Any, rgb: bool = True) -> Prepared:
         rgb: Whether anything is shaded.
     """
     return _prepared(rgb, scene, {name: getattr(data, name) for name in _POSES if hasattr(data, name)})
+
+
+def check_poses(scene: Any, data: Any, rgb: bool) -> None:
+    """Refuses what cannot be drawn from: JAX would take the last geom's pose for every one that is missing.
+
+    Args:
+        scene: What is drawn.
+        data: What is to hold the poses, see `render_planes`.
+        rgb: Whether anything is shaded.
+
+    Raises:
+        ValueError: ``scene`` is no scene, or ``data`` has no poses, those of several environments, or those of another model.
+    """
+    if not isinstance(scene, Scene):
+        raise ValueError(
+            f"a scene comes first, from Scene.from_mjmodel(mj_model), and then the data; got {type(scene).__name__}"
+        )
+    if scene.object_ids:
+        _check_kind(data, "geom_", scene.geom_count, is_exact=True)
+    if any(index >= scene.geom_count for index in scene.object_ids):
+        _check_kind(data, "site_", len(scene.size) - scene.geom_count, is_exact=True)
+    if scene.camera_id != FREE_CAMERA:
+        _check_kind(data, "cam_", scene.camera_id + 1)
+    if rgb and scene.light_types:
+        _check_kind(data, "", max(*scene.light_bodies, *scene.light_targets) + 1)
+
+
+def _check_kind(data: Any, kind: str, count: int, is_exact: bool = False) -> None:
+    """Refuses ``data`` unless it holds poses of ``count`` objects of a kind, or of more where that is not exact."""
+    for name, shapes_of_one in ((f"{kind}xpos", ((3,),)), (f"{kind}xmat", ((3, 3), (9,)))):
+        if not hasattr(data, name):
+            mend = ", such as state.data" if hasattr(getattr(data, "data", None), name) else ""
+            raise ValueError(f"poses are read from mjx.Data or mujoco.MjData{mend}; {type(data).__name__} has no {name}")
+        shape = np.shape(getattr(data, name))
+        if shape[1:] not in shapes_of_one:
+            expected = (count if is_exact else "...", *shapes_of_one[0])
+            raise ValueError(f"{name} of one environment has the shape {expected}, got {shape}; jax.vmap over a batch")
+        if shape[0] < count or (is_exact and shape[0] != count):
+            least = "" if is_exact else "at least "
+            raise ValueError(f"{name} holds {shape[0]} poses and the scene's model has {least}{count}: the models differ")
 
 
 @functools.partial(jax.jit, static_argnums=0)
