@@ -243,6 +243,14 @@ def test_typical_ranges_and_bad_ones() -> None:
             bad()
     with pytest.raises(ValueError, match="camera, lights"):
         typical("weather")
+    for value in ("wide", None, (0.1, 0.2), True):
+        with pytest.raises(ValueError, match="colour of the randomization must be .* got"):
+            Randomization(colour=value)
+    with pytest.raises(ValueError, match="no randomization of .*camera, lights"):
+        typical(["camera"])  # type: ignore[arg-type]
+    for strength in ("half", None, -1.0, float("nan")):
+        with pytest.raises(ValueError, match="the strength of a randomization must be"):
+            typical("camera", strength=strength)
     with pytest.raises(ValueError, match="draws images"):
         jaxrl_vis_envs.make("Reacher", randomization=LOOKS)
 

@@ -31,7 +31,7 @@ def positive(config: Any, *fields: str) -> None:
     """Refuses anything but finite numbers above 0."""
     for field in fields:
         value = getattr(config, field)
-        if not _is_finite(value) or value <= 0:
+        if not is_finite(value) or value <= 0:
             raise ValueError(f"{field} must be a finite number above 0, got {value!r}")
 
 
@@ -39,7 +39,7 @@ def not_negative(config: Any, *fields: str) -> None:
     """Refuses anything but finite numbers of at least 0."""
     for field in fields:
         value = getattr(config, field)
-        if not _is_finite(value) or value < 0:
+        if not is_finite(value) or value < 0:
             raise ValueError(f"{field} must be a finite number of at least 0, got {value!r}")
 
 
@@ -61,10 +61,11 @@ def one_of(config: Any, field: str, choices: Iterable[str]) -> None:
 def vector(config: Any, field: str, size: int) -> Sequence[float]:
     """Refuses anything but ``size`` finite numbers, which it returns."""
     value = getattr(config, field)
-    if not isinstance(value, Sequence) or len(value) != size or not all(map(_is_finite, value)):
+    if not isinstance(value, Sequence) or len(value) != size or not all(map(is_finite, value)):
         raise ValueError(f"{field} must be {size} finite numbers, got {value!r}")
     return value
 
 
-def _is_finite(value: Any) -> bool:
+def is_finite(value: Any) -> bool:
+    """Whether it is a real number, neither infinite nor NaN; True and False are none."""
     return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)

@@ -13,12 +13,12 @@ key, not stored and not computed: the program is the one without randomisation.
 """
 
 import dataclasses
-import math
 from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
 
+from jaxrl_vis_envs import checks
 from jaxrl_vis_envs.render import Scene
 
 Domain = dict[str, jax.Array]
@@ -38,7 +38,7 @@ class Randomization:
     Ranges that are shares multiply by 1 plus the deviation, and must be less than 1.
 
     Raises:
-        ValueError: A range is negative or not finite, or a share is 1 or more.
+        ValueError: A range is no number, negative or not finite, or a share is 1 or more.
     """
 
     camera_position: float = 0.0
@@ -70,8 +70,8 @@ class Randomization:
 
     def __post_init__(self) -> None:
         for name, value in dataclasses.asdict(self).items():
-            if not (math.isfinite(value) and value >= 0.0):
-                raise ValueError(f"{name} of the randomization must be a finite range of at least 0, got {value}")
+            if not (checks.is_finite(value) and value >= 0.0):
+                raise ValueError(f"{name} of the randomization must be a finite range of at least 0, got {value!r}")
             if name not in _ABSOLUTE and value >= 1.0:
                 raise ValueError(f"{name} of the randomization is a share and must be less than 1, got {value}")
 
@@ -91,7 +91,13 @@ class Randomization:
         return any(name in _MODEL_LEAVES for name in self.active)
 
     def scaled(self, strength: float) -> Self:
-        """The same with every range ``strength`` times as wide."""
+        """The same with every range ``strength`` times as wide.
+
+        Raises:
+            ValueError: ``strength`` is no finite number of at least 0, or a range leaves its bounds.
+        """
+        if not checks.is_finite(strength) or strength < 0.0:
+            raise ValueError(f"the strength of a randomization must be a finite number of at least 0, got {strength!r}")
         return type(self)(**{name: strength * value for name, value in dataclasses.asdict(self).items()})
 
 
@@ -110,10 +116,10 @@ def typical(*kinds: str, strength: float = 1.0) -> Randomization:
     """The typical ranges of these `KINDS`, ``strength`` times as wide.
 
     Raises:
-        ValueError: There is no such kind, or a range leaves its bounds.
+        ValueError: There is no such kind, ``strength`` is no finite number of at least 0, or a range leaves its bounds.
     """
     for kind in kinds:
-        if kind not in KINDS:
+        if not isinstance(kind, str) or kind not in KINDS:
             raise ValueError(f"there is no randomization of {kind!r}; choose among {', '.join(KINDS)}")
     ranges: dict[str, float] = {}
     for kind in kinds:
