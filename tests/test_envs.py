@@ -19,6 +19,7 @@ from benchmarks import environments
 from jaxrl_vis_envs import compilation, goals, names, pixels, registry
 from jaxrl_vis_envs.base import GoalEnv, State, sanitize_action
 from jaxrl_vis_envs.compilation import env_jit
+from jaxrl_vis_envs.tasks.config import TaskConfig
 
 BATCH, STEPS = 32, 8
 SOURCES = pathlib.Path(__file__).resolve().parents[1] / "envs"
@@ -197,6 +198,15 @@ def test_tasks_refuse_64_bits(name: str) -> None:
         jaxrl_vis_envs.make(name)
 
 
+@pytest.mark.parametrize("shape", [(), (3,), (5, 2)])
+def test_what_is_not_one_untyped_key_is_refused(shape: tuple[int, ...]) -> None:
+    env = jaxrl_vis_envs.make("Reacher")
+    with pytest.raises(ValueError, match="reset takes one JAX key, not an array of shape") as refused:
+        env.reset(np.zeros(shape, np.uint32))
+    assert "\n" not in str(refused.value)
+    env.check_key(np.zeros(2, np.uint32))
+
+
 def test_an_environment_without_a_registered_name_refuses_such_actions_too():
     env = PointMass(PointMassConfig())
     with pytest.raises(ValueError, match=r"PointMass takes an action of shape \(2,\), got \(1,\)"):
@@ -331,6 +341,18 @@ def test_register(monkeypatch):
         registry.register("Mine", lambda config: environments.make("FetchReach"), config_class)
     with pytest.raises(ValueError, match="dataclass"):
         registry.register("Other", lambda config: environments.make("Reacher"), dict)
+    with pytest.raises(ValueError, match="dataclass"):
+        registry.register("Other", lambda config: environments.make("Reacher"), config_class())
+    for word in (3, "", "my_task:Other"):
+        with pytest.raises(ValueError, match="a word without a colon"):
+            registry.register(word, lambda config: environments.make("Reacher"), config_class)
+    with pytest.raises(ValueError, match="factory of 'Other'"):
+        registry.register("Other", None, config_class)
+    with pytest.raises(ValueError, match="TaskConfig.horizon of 'Other' needs a default"):
+        registry.register("Other", lambda config: environments.make("Reacher"), TaskConfig)
+    registry.register("Nothing", lambda config: None, config_class)
+    with pytest.raises(ValueError, match="Nothing is no environment but None: its factory"):
+        jaxrl_vis_envs.make("Nothing")
 
 
 def test_what_an_environment_sees_is_known_before_it_is_built(monkeypatch):

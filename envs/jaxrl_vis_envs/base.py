@@ -147,7 +147,9 @@ class GoalEnv(abc.ABC):
         is_typed = hasattr(key, "dtype") and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
         if not is_typed and getattr(key, "dtype", None) != np.uint32:
             raise ValueError(f"reset takes a JAX key, such as jax.random.key(0), not {key!r}")
-        if len(key.shape) != (0 if is_typed else 1):
+        # An untyped one is [2], or [4] where JAX is set to another generator.
+        one = jax.eval_shape(lambda: jax.random.key(0) if is_typed else jax.random.PRNGKey(0))
+        if key.shape != one.shape:
             raise ValueError(f"reset takes one JAX key, not an array of shape {key.shape}; vmap over a batch")
 
     def check_action(self, action: jax.Array) -> None:

@@ -55,10 +55,18 @@ def register(name: str, factory: Callable[[Any], GoalEnv], config_class: type, s
         state_variant: The environment with the same physics that observes the state, where there is one.
 
     Raises:
-        ValueError: The name is taken by another factory, or ``config_class`` is not a dataclass.
+        ValueError: The name is taken by another factory or is no word, ``factory`` cannot be called, or ``config_class`` is not
+            such a dataclass.
     """
-    if not dataclasses.is_dataclass(config_class):
+    if not isinstance(name, str) or not name or task_modules.is_own(name):
+        raise ValueError(f"an environment is registered by a word without a colon, such as 'MyReach', got {name!r}")
+    if not callable(factory):
+        raise ValueError(f"factory of {name!r} must be a function from its configuration, got {factory!r}")
+    if not (isinstance(config_class, type) and dataclasses.is_dataclass(config_class)):
         raise ValueError(f"config_class of {name!r} must be a dataclass, got {config_class!r}")
+    missing = _without_default(config_class)
+    if missing is not None:
+        raise ValueError(f"{config_class.__name__}.{missing} of {name!r} needs a default")
     entry = _Entry(factory, config_class, state_variant)
     if _ENTRIES.get(name, entry) != entry or _BUILT_IN.get(name, config_class.__module__) != config_class.__module__:
         raise ValueError(f"an environment called {name!r} exists already; choose another name")
@@ -164,6 +172,8 @@ def make(name: str, **overrides: Any) -> GoalEnv:
         if override not in fields:
             raise UnknownOverrideError(f"{name} has no option {override!r}{nearest(override, fields)}")
     env = _build(name, entry, entry.config_class(**overrides))
+    if not isinstance(env, GoalEnv):
+        raise ValueError(f"{name} is no environment but {env!r}: its factory must return a jaxrl_vis_envs.GoalEnv")
     for constant in _CONSTANTS:
         if not hasattr(env, constant):
             raise ValueError(f"{name} has no {constant}: every environment says what its {', '.join(_CONSTANTS)} are")
@@ -257,10 +267,18 @@ def _entry_of_class(name: str, task: type[GoalEnv]) -> _Entry:
         raise UnknownEnvironmentError(
             f"the settings of {name} are unknown: annotate {first!r} of its __init__ with a dataclass of them"
         )
+    missing = _without_default(settings)
+    if missing is not None:
+        raise UnknownEnvironmentError(f"{settings.__name__}.{missing} of {name} needs a default")
+    return _Entry(build, settings)
+
+
+def _without_default(settings: Any) -> str | None:
+    """The first field of a dataclass that has to be given a value; None for none."""
     for field in dataclasses.fields(settings):
         if field.init and field.default is field.default_factory is dataclasses.MISSING:
-            raise UnknownEnvironmentError(f"{settings.__name__}.{field.name} of {name} needs a default")
-    return _Entry(build, settings)
+            return field.name
+    return None
 
 
 @dataclasses.dataclass(frozen=True)
