@@ -2,19 +2,22 @@
 
 import csv
 import dataclasses
+import itertools
 import json
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
 from jaxrl_vis import cli
 from jaxrl_vis.run.folder import SCHEMA
-from jaxrl_vis.studies import indicator
+from jaxrl_vis.studies import figures, indicator, indicator_figures
 from jaxrl_vis.studies.authors import mean_difference, released_curves
 from jaxrl_vis.studies.cells import Cell, contradiction, is_finished
+from jaxrl_vis.studies.drawing import Curve, Panel, compose
 from jaxrl_vis.studies.figures import make_figure
 from jaxrl_vis.studies.ol_aux import AUX_TASKS, FETCH, FINGER, HAND, LEVELS, STUDIES, VARIANTS
 from jaxrl_vis.studies.results import Line, Reached, mean_weight, reached
@@ -22,6 +25,7 @@ from jaxrl_vis.studies.show import Request
 from jaxrl_vis.studies.study import Scope, cells_of
 from jaxrl_vis.studies.tables import Named, steps_table, to_csv, weights_table
 from jaxrl_vis.validation import validate
+from jaxrl_vis_envs import registry
 
 EVERY = 20_000
 
@@ -269,6 +273,45 @@ def test_rewards_with_and_without_ground_truth_are_compared(tmp_path: Path, caps
     assert len(read) == 7 and float(read[0]["final_distance"]) < 0.001 and read[1]["filter_precision"] == ""
 
 
+def test_panels_say_no_more_about_an_inactive_filter_than_tables(tmp_path: Path) -> None:
+    """A single negative that was dropped and false once was a dot at 100 %, beside a table that gave no precision."""
+    study = indicator.STUDIES["5.2"]
+    variant = "indicator_balance_filter"
+    ((cell,),) = cells_of(study, ("VisualSawyerReach",), (variant,), Scope("fast")).values()
+    made_up(cell, tmp_path, slope(1.0))
+    for share, titles in ((0.009, 3), (0.011, 4)):
+        file = tmp_path / cell.name / "metrics.jsonl"
+        rewards = {"train/positive_share": 0.5, "train/false_negative_share": 0.1, "eval/goal_distance": 0.2}
+        rewards |= {"train/filtered_share": share, "train/filtered_false_share": share, "train/filter_precision": 1.0}
+        file.write_text("".join(json.dumps(json.loads(row) | rewards) + "\n" for row in file.read_text().splitlines()))
+        line = Line("VisualSawyerReach", variant, [json.loads(row) for row in file.read_text().splitlines()])
+        request = Request("5.2", study, tmp_path / "f.png", tmp_path)
+        shown = indicator_figures.show(request, {(line.task, variant): line}, [line.task], [variant])
+        curves, panels = shown.pictures[0].rows, [panel for row in shown.pictures[1].rows for panel in row]
+        assert len(panels) == titles and all(panel.has_values for panel in panels)
+        assert curves[1][0].title == "VisualSawyerReach: final distance to the goal (m)"
+
+
+@pytest.mark.parametrize("figure", [*indicator.STUDIES, *STUDIES])
+def test_no_text_of_a_figure_is_cut(figure: str) -> None:
+    """The title of `cameras` once ran out of a figure of one column."""
+    study = figures.STUDIES[figure]
+    steps, values = np.array([10_000, 100_000]), np.ones((1, 2))
+    curves = [Curve(study.family.variants[name].label, "#000000", steps, values) for name in study.variants]
+    panel = Panel("VisualFetchReach: dropped negatives that were false", curves)
+    subtitle = "preset fast, one gradient step per 25 environment steps; seeds 0 to 4; line: median, band: 25 to 75 %"
+    composed = compose([[panel]], f"{study.title} (figure {figure})", subtitle)
+    FigureCanvasAgg(composed).draw()
+    lines = [text.get_window_extent() for text in composed.texts]
+    boxes = [*lines, composed.legends[0].get_window_extent(), composed.axes[0].get_tightbbox()]
+    assert all(box.x0 >= 0.0 and box.x1 <= composed.bbox.x1 for box in boxes)
+    assert all(above.y0 >= below.y1 for above, below in itertools.pairwise(lines))  # and no line lies on the next
+
+
+def test_distances_of_figures_are_in_metres() -> None:
+    assert {registry.make(task).distance_unit for task in indicator.FAMILY.tasks} == {"m"}
+
+
 def test_a_comparison_with_an_oracle_that_fails_does_not_count(tmp_path: Path) -> None:
     study = indicator.STUDIES["5.2"]
     ((cell,),) = cells_of(study, ("VisualSawyerReach",), ("oracle",), Scope("fast")).values()
@@ -337,6 +380,7 @@ def test_seeds_of_several_runs_are_one_line(tmp_path: Path) -> None:
         (["5.4", "--seeds", "0"], ["--seeds must be at least 1"]),
         (["5.4", "--minutes", "0"], ["--minutes must be positive"]),
         (["5.4", "--minutes", "3", "--draw-only"], ["leave out --minutes"]),
+        (["5.4", "--runs", "nowhere", "--draw-only"], ["--runs nowhere is no folder", "--draw-only draws what was trained"]),
         (["5.4", "--runs", "/proc/x"], ["cannot write --runs /proc/x"]),
         (["5.4", "--out", "x.gif"], ["--out x.gif", ".png"]),
         (["quadratic", "--tasks", FETCH], ["--tasks", "not with quadratic"]),

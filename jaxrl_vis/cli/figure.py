@@ -180,6 +180,8 @@ def _request(options: Figure, out: Path) -> "Request":
     runs = options.runs or Path("runs") / study.family.name
     if not options.draw_only:
         check_writable(runs, "--runs", folder=True)
+    elif not runs.is_dir():
+        raise RequestError(f"--runs {runs} is no folder, and --draw-only draws what was trained: name where that is")
     quick = dict(study.family.quick) if options.quick else {}
     if options.env_steps is not None:
         quick.pop("env_steps", None)

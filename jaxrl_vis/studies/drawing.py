@@ -1,6 +1,7 @@
 """Figures of several runs: one column a task, one line a variant."""
 
 import dataclasses
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from jaxrl_vis.report.plots import FAINT, INK, draw_median, style_curves
 
 _WIDTH, _HEIGHT, _HEADER, _FOOTER = 4.9, 3.5, 0.85, 0.85  # inches, of a panel and of what is above and below all of them
 _LINE, _LETTERS = 0.17, 14  # inches from a line of the subtitle to the next, and letters of it in an inch
+_TITLE_LINE, _TITLE_LETTERS = 0.26, 8.3  # the same of the title
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,6 +50,11 @@ class Panel:
     curves: Sequence[Curve]
     is_share: bool = True
 
+    @property
+    def has_values(self) -> bool:
+        """Whether there is anything to see."""
+        return any(np.isfinite(curve.values).any() for curve in self.curves)
+
 
 @dataclasses.dataclass(frozen=True)
 class Picture:
@@ -69,16 +76,28 @@ def draw_panels(path: Path, rows: Sequence[Sequence[Panel]], title: str, subtitl
 
     Args:
         path: A .png, or any other format that matplotlib can write.
+        rows, title, subtitle: See `compose`.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    compose(rows, title, subtitle).savefig(path)
+
+
+def compose(rows: Sequence[Sequence[Panel]], title: str, subtitle: str) -> Figure:
+    """A figure of panels, with one legend for all of them.
+
+    Args:
         rows: Panels, row by row; all rows are of one length.
-        title: The first line, bold.
-        subtitle: The second line.
+        title: Above them, bold; broken where it is longer than the figure is wide, as the subtitle is.
+        subtitle: Below the title.
     """
     width = max(7.5, _WIDTH * len(rows[0]))
+    titles = textwrap.wrap(title, int((width - 0.7) * _TITLE_LETTERS))
     lines = _broken(subtitle, int((width - 0.7) * _LETTERS))
+    below = _TITLE_LINE * (len(titles) - 1)  # how far the subtitle moves down
     labels = {curve.label for row in rows for panel in row for curve in panel.curves}
     longest = max(map(len, labels), default=0)
     columns = max(1, min(len(labels), int(width / max(2.1, 0.55 + 0.068 * longest))))
-    header = _HEADER + _LINE * (len(lines) - 1)
+    header = _HEADER + below + _LINE * (len(lines) - 1)
     footer = _FOOTER + _LINE * max(0, -(-len(labels) // columns) - 2)
     height = _HEIGHT * len(rows) + header + footer
     figure = Figure(figsize=(width, height), dpi=150, facecolor="white")
@@ -90,9 +109,12 @@ def draw_panels(path: Path, rows: Sequence[Sequence[Panel]], title: str, subtitl
         entries |= {name: handle for name, handle in zip(names, handles, strict=True) if name not in entries}
     for axes in grid[-1]:
         axes.set_xlabel("environment steps per seed", fontsize=9.5, color=INK)
-    figure.text(0.35 / width, 1 - 0.22 / height, title, fontsize=14, weight="bold", color=INK, va="center")
+    for number, line in enumerate(titles):
+        at = 1 - (0.22 + _TITLE_LINE * number) / height
+        figure.text(0.35 / width, at, line, fontsize=14, weight="bold", color=INK, va="center")
     for number, line in enumerate(lines):
-        figure.text(0.35 / width, 1 - (0.48 + _LINE * number) / height, line, fontsize=9, color=FAINT, va="center")
+        at = 1 - (0.48 + below + _LINE * number) / height
+        figure.text(0.35 / width, at, line, fontsize=9, color=FAINT, va="center")
     figure.legend(
         list(entries.values()), list(entries), loc="lower center", ncols=columns, frameon=False, fontsize=9, labelcolor=INK
     )
@@ -101,8 +123,7 @@ def draw_panels(path: Path, rows: Sequence[Sequence[Panel]], title: str, subtitl
         **{"left": left, "right": right, "bottom": (footer + 0.15) / height, "top": 1 - (header + 0.2) / height},
         **{"wspace": 0.2, "hspace": 0.3},
     )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
+    return figure
 
 
 def _broken(text: str, letters: int) -> list[str]:
@@ -127,6 +148,8 @@ def _draw(axes: Axes, panel: Panel) -> None:
             axes.plot(curve.steps, np.median(curve.values, axis=0), color=curve.colour, label=curve.label, **style)
         else:
             draw_median(axes, curve.steps, curve.values, curve.colour, curve.label)
+    if not panel.has_values:
+        axes.text(0.5, 0.5, "no values", transform=axes.transAxes, ha="center", fontsize=9.5, color=FAINT)
     style_curves(axes, panel.title)
     axes.xaxis.set_major_locator(MaxNLocator(5))
     axes.set_xlim(0, 1.01 * end)

@@ -11,10 +11,11 @@ from jaxrl_vis.studies.results import DISTANCE, SUCCESS, Line, area, final
 from jaxrl_vis.studies.show import Request, Shown
 from jaxrl_vis.studies.tables import table_row
 
+_PRECISION, _FILTERED = "train/filter_precision", "train/filtered_share"
 _REWARDS = {
     "train/positive_share": "positive rewards",
-    "train/filtered_share": "negatives that the filter drops",
-    "train/filter_precision": "dropped negatives that were false",
+    _FILTERED: "negatives that the filter drops",
+    _PRECISION: "dropped negatives that were false",
     "train/false_negative_share": "negatives that are false",
 }
 """Shares that are logged about rewards, and what panels call them."""
@@ -34,24 +35,34 @@ def show(_: Request, lines: Mapping[tuple[str, str], Line], tasks: Sequence[str]
     def row(metric: str, title: str, is_share: bool = True) -> list[Panel]:
         return [Panel(f"{task}: {title}", _curves(lines, task, variants, metric), is_share) for task in tasks]
 
-    curves = Picture("", [row(SUCCESS, "success"), row(DISTANCE, "final distance to the goal", is_share=False)])
-    rewards = Picture("_rewards", [row(metric, title) for metric, title in _REWARDS.items()])
+    pictures = [Picture("", [row(SUCCESS, "success"), row(DISTANCE, "final distance to the goal (m)", is_share=False)])]
+    rewards = [row(metric, title) for metric, title in _REWARDS.items()]
+    rewards = [panels for panels in rewards if any(panel.has_values for panel in panels)]
+    if rewards:
+        pictures.append(Picture("_rewards", rewards))
     text, table = _tables(lines, tasks)
     notes = [
         "At the end: the last evaluation, in the median over seeds; in brackets the middle half of the seeds. Area: mean "
         "success over all evaluations. Rewards: means over training, in the median over seeds. The precision of a filter that "
-        f"drops less than {_ACTIVE:.0%} of the negatives is not given: it is inactive. Distances are in the unit of the task, "
-        "see docs/tasks.md."
+        f"drops less than {_ACTIVE:.0%} of the negatives is not given: it is inactive. Distances are in metres."
     ]
-    return Shown([curves, rewards], text, table, [*notes, *_oracle_notes(lines)])
+    return Shown(pictures, text, table, [*notes, *_oracle_notes(lines)])
 
 
 def _curves(lines: Mapping[tuple[str, str], Line], task: str, variants: Sequence[str], metric: str) -> list[Curve]:
     return [
-        Curve(VARIANTS[variant].label, VARIANTS[variant].colour, *lines[task, variant].values(metric))
+        Curve(VARIANTS[variant].label, VARIANTS[variant].colour, *_values(lines[task, variant], metric))
         for variant in variants
         if (task, variant) in lines
     ]
+
+
+def _values(line: Line, metric: str) -> tuple[np.ndarray, np.ndarray]:
+    """env_steps [P] and the metric [S, P]; no precision, NaN, where the filter is inactive, as in the tables."""
+    steps, values = line.values(metric)
+    if metric == _PRECISION:
+        values = np.where(line.values(_FILTERED)[1] >= _ACTIVE, values, np.nan)
+    return steps, values
 
 
 def _tables(lines: Mapping[tuple[str, str], Line], tasks: Sequence[str]) -> tuple[list[str], list[dict[str, Any]]]:
@@ -75,7 +86,7 @@ Quartiles = tuple[float, float, float]
 
 def _figures(line: Line) -> dict[str, Quartiles | float]:
     """Quartiles over seeds of what evaluations say, and medians of what rewards say."""
-    filtered = _mean(line, "train/filtered_share")
+    filtered = _mean(line, _FILTERED)
     return {
         "final_success": final(line, SUCCESS),
         "area": area(line),
