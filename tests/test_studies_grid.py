@@ -104,6 +104,18 @@ def test_a_cell_that_fails_is_told_in_one_line_and_the_others_go_on(tmp_path: Pa
     assert is_finished(cells[1], tmp_path) and said[-1].startswith("b-300: done in") and "success 0.30" in said[-1]
 
 
+def test_a_cell_that_trained_with_other_settings_says_which(tmp_path: Path) -> None:
+    """As where another version is installed while a figure is trained: its log ends as that of any good run."""
+    cell = make_cell("a")
+    script = Script()
+
+    def trains_another(_: Cell, folder: Path, goes_on: bool) -> Sequence[str]:
+        return script(dataclasses.replace(cell, config=cell.config.replace(discount=0.5)), folder, goes_on)
+
+    (failure,) = run_cells([cell], tmp_path, lambda: CPU, command=trains_another, say=lambda _: None)
+    assert "ended before it was finished" in failure and "discount (saved 0.5, asked" in failure
+
+
 def test_the_longest_begin_first(tmp_path: Path) -> None:
     with_losses = {"aux_tasks": ("egomotion",), "weighting": "sum"}
     cells = [make_cell("short"), make_cell("like it"), make_cell("weighted", **with_losses), make_cell("long", env_steps=600)]

@@ -202,7 +202,9 @@ class _Grid:
             self._say(f"{done.cell.name}: stopped after {took}; starting again goes on")
         else:
             why = "ended before it was finished" if status == 0 else f"failed with exit status {status}"
-            line = f"{done.cell.name}: {why} after {took}: {_last_line(done.log)} (log: {done.log})"
+            # A run of other settings, such as those of a version that was installed meanwhile, has nothing wrong in its log.
+            what = (contradiction(done.cell, self._runs) if status == 0 else None) or _last_line(done.log)
+            line = f"{done.cell.name}: {why} after {took}: {what} (log: {done.log})"
             self._failures.append(line)
             self._say(line)
 
