@@ -12,6 +12,7 @@ import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
+import point_mass
 import probe_environments as probes
 import pytest
 from brax.envs.wrappers import training
@@ -25,6 +26,7 @@ from jaxrl_vis_envs import goals, registry
 from jaxrl_vis_envs.adapters.brax import BraxEnv, lend_jax
 from jaxrl_vis_envs.adapters.gymnasium import GymnasiumEnv, GymnasiumVectorEnv, register_all
 from jaxrl_vis_envs.pixels import image_observer
+from jaxrl_vis_envs.randomization import Randomization
 from jaxrl_vis_envs.tasks import reacher
 
 HORIZON = probes.Probe.horizon
@@ -221,6 +223,14 @@ def test_environments_with_the_same_settings_are_compiled_once(registered):
         (lambda: GymnasiumEnv(told(), render_mode="human"), "rgb_array"),
         (lambda: GymnasiumEnv(told(), render_mode="rgb_array"), "no MuJoCo model"),
         (lambda: GymnasiumVectorEnv(told(), 0), "num_envs"),
+        (lambda: GymnasiumVectorEnv(told(), "3"), "num_envs must be a whole number of at least 1, got '3'"),
+        (lambda: GymnasiumVectorEnv(told(), 2.0), "num_envs must be a whole number of at least 1, got 2.0"),
+        (lambda: GymnasiumVectorEnv(told(), 2).reset(seed=1.5), "one for each of 2 environments, got 1.5"),
+        (lambda: GymnasiumEnv(None), "the name of an environment, or a GoalEnv that is made already, got a NoneType"),
+        (lambda: GymnasiumEnv(probes.GoWhereTold), "got the class GoWhereTold"),
+        (lambda: GymnasiumEnv("Reacher", horizon={}), "horizon must be a whole number of at least 1, got {}"),
+        (lambda: GymnasiumEnv("VisualReacher", depth_range=np.ones(2)), "depth_range must be 2 finite numbers, got array"),
+        (lambda: BraxEnv(None), "the name of an environment, or a GoalEnv that is made already, got a NoneType"),
         (lambda: GymnasiumVectorEnv(told(), 2, autoreset_mode="Disabled"), "NextStep or SameStep"),
         (lambda: GymnasiumVectorEnv(told(), 2).reset(seed=[1]), "each of 2"),
         (lambda: BraxEnv(told(), reward="sparse"), "oracle, dense"),
@@ -231,6 +241,26 @@ def test_bad_settings_are_refused_in_one_line(make, message):
     with pytest.raises(ValueError, match=re.escape(message)) as caught:
         make()
     assert "\n" not in str(caught.value)
+
+
+def test_rewards_are_of_states_of_the_right_size_and_in_32_bits():
+    env = GymnasiumEnv(told(), reward="dense")
+    rewards = env.compute_reward(np.zeros((3, 1)), np.array([[0], [1], [2]], np.uint8))
+    assert rewards.dtype == np.float32
+    np.testing.assert_array_equal(rewards, [0.0, -1.0, -2.0])
+    assert env.compute_reward([0.0], [1]) == -1.0
+    for states, desired in ((np.zeros((3, 2)), np.zeros((3, 1))), (np.zeros(1), 0.0)):
+        with pytest.raises(ValueError, match="states and goals end in an axis of 1, got") as refused:
+            env.compute_reward(states, desired)
+        assert "\n" not in str(refused.value)
+
+
+def test_a_rendered_image_has_the_looks_of_its_episode():
+    varied = point_mass.PointMass(point_mass.PointMassConfig(randomization=Randomization(colour=0.5)))
+    env = GymnasiumVectorEnv(varied, 2, render_mode="rgb_array", render_size=8)
+    observations, _ = env.reset(seed=0)
+    np.testing.assert_allclose(np.stack(env.render()), observations["pixels"][..., :3], atol=1)
+    assert np.abs(np.subtract(*env.render(), dtype=int)).mean() > 10
 
 
 def test_misuse_is_refused_in_one_line():

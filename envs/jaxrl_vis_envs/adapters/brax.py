@@ -23,9 +23,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxrl_vis_envs.adapters.environments import goal_env
 from jaxrl_vis_envs.adapters.rewards import Reward, reward_function
 from jaxrl_vis_envs.base import GoalEnv, State
-from jaxrl_vis_envs.registry import make
 
 try:
     from brax.envs.base import Env
@@ -52,11 +52,7 @@ class BraxEnv(Env):
     """
 
     def __init__(self, env: str | GoalEnv, reward: Reward = "oracle", **overrides: Any) -> None:
-        if overrides and not isinstance(env, str):
-            raise ValueError(
-                f"{', '.join(overrides)}: options go with the name of an environment, not with one that is made already"
-            )
-        self.goal_env = make(env, **overrides) if isinstance(env, str) else env
+        self.goal_env = goal_env(env, overrides)
         self._score = reward_function(reward, self.goal_env.threshold)
         self._sees_images = len(self.goal_env.observation_spec.shape) == 3
 

@@ -21,6 +21,8 @@ Goals are states, not images, so that ``compute_reward`` is vectorised and right
 Episodes have one length and end in truncation, never in termination.
 """
 
+import numbers
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -49,7 +51,8 @@ class GymnasiumEnv(gymnasium.Env):
     Args:
         env: The name of an environment, or a `GoalEnv`.
         reward: ``oracle`` (0 at the goal, -1 elsewhere) or ``dense`` (minus the distance to the goal).
-        render_mode: None, or ``rgb_array`` for images from the camera of the task, which state tasks have as well.
+        render_mode: None, or ``rgb_array`` for images from the camera of the task, which state tasks have as well; with the
+            looks of the episode where they are randomized.
         render_size: Height and width of what `render` returns, px; it has nothing to do with ``pixels``.
         **overrides: Fields of the environment's configuration to change, as in `jaxrl_vis_envs.make`.
 
@@ -79,7 +82,11 @@ class GymnasiumEnv(gymnasium.Env):
         return self._environments.env
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observations, dict[str, Any]]:
-        """Starts an episode; a ``seed`` settles it and all that follow. ``options`` has no meaning here."""
+        """Starts an episode; a ``seed`` settles it and all that follow. ``options`` has no meaning here.
+
+        Raises:
+            gymnasium.error.Error: ``seed`` is negative, or no whole number of Python's.
+        """
         super().reset(seed=seed)
         observations = self._environments.reset(np.array([_draw_seed(self.np_random)]))
         return _first(observations), self._info(observations)
@@ -98,8 +105,16 @@ class GymnasiumEnv(gymnasium.Env):
         return _first(observations), float(reward[0]), False, self._environments.is_over, self._info(observations)
 
     def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any = None) -> np.ndarray:
-        """Rewards of states [..., G] for goals [..., G]: [...] float32. ``info`` is not read."""
-        return self._environments.score(np.asarray(achieved_goal), np.asarray(desired_goal))
+        """Rewards of states [..., G] for goals [..., G]: [...] float32. ``info`` is not read.
+
+        Raises:
+            ValueError: States or goals are not of G numbers, or their leading axes do not go together.
+        """
+        states = [np.asarray(given, np.float32) for given in (achieved_goal, desired_goal)]
+        (size,) = self.observation_space["desired_goal"].shape
+        if any(state.shape[-1:] != (size,) for state in states):
+            raise ValueError(f"states and goals end in an axis of {size}, got {' and '.join(str(s.shape) for s in states)}")
+        return self._environments.score(*states)
 
     def compute_terminated(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any = None) -> np.ndarray:
         """Whether states [..., G] end an episode with goals [..., G]: never, [...] bool."""
@@ -119,7 +134,11 @@ class GymnasiumEnv(gymnasium.Env):
         return observation[0], goal[0]
 
     def render(self) -> Any:
-        """An image [size, size, 3] uint8, or None where no render mode was asked for."""
+        """An image [size, size, 3] uint8, or None where no render mode was asked for.
+
+        Raises:
+            gymnasium.error.ResetNeeded: There was no `reset`.
+        """
         images = self._environments.render()
         return None if images is None else images[0]
 
@@ -160,19 +179,19 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         render_size: int = 256,
         **overrides: Any,
     ) -> None:
-        if num_envs < 1:
-            raise ValueError(f"num_envs must be at least 1, got {num_envs}")
+        if isinstance(num_envs, bool) or not isinstance(num_envs, numbers.Integral) or num_envs < 1:
+            raise ValueError(f"num_envs must be a whole number of at least 1, got {num_envs!r}")
         mode = AutoresetMode(autoreset_mode)
         if mode == AutoresetMode.DISABLED:
             raise ValueError("autoreset_mode must be NextStep or SameStep")
         self._environments = Environments(env, reward, render_mode, render_size, overrides)
-        self.num_envs = num_envs
+        self.num_envs = int(num_envs)
         self.metadata = {**self._environments.metadata, "autoreset_mode": mode}
         self.render_mode = render_mode
         self.single_observation_space = self._environments.programs.space
         self.single_action_space = self._environments.action_space
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._resets_in_step = mode == AutoresetMode.SAME_STEP
         self._generators: list[np.random.Generator] = []
 
@@ -184,12 +203,19 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Starts all episodes. Environment i is seeded with ``seed + i`` or ``seed[i]``; ``options`` has no meaning here."""
+        """Starts all episodes. Environment i is seeded with ``seed + i`` or ``seed[i]``; ``options`` has no meaning here.
+
+        Raises:
+            ValueError: ``seed`` is neither a whole number nor one for each environment.
+            gymnasium.error.Error: A seed is negative, or no whole number of Python's.
+        """
         if seed is None or isinstance(seed, int | np.integer):
             seed = None if seed is None else int(seed)
             super().reset(seed=seed)
             seeds = [None if seed is None else seed + i for i in range(self.num_envs)]
         else:
+            if not isinstance(seed, Iterable):
+                raise ValueError(f"seed must be a whole number, or one for each of {self.num_envs} environments, got {seed!r}")
             seeds = list(seed)
         if len(seeds) != self.num_envs:
             raise ValueError(f"seed must hold one number for each of {self.num_envs} environments, got {len(seeds)}")
@@ -227,11 +253,19 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         return observations, reward, never, all_over.copy(), infos
 
     def learner_view(self) -> tuple[np.ndarray, np.ndarray]:
-        """Those of all environments, [N, ...]; see `GymnasiumEnv.learner_view`."""
+        """Those of all environments, [N, ...]; see `GymnasiumEnv.learner_view`.
+
+        Raises:
+            gymnasium.error.ResetNeeded: There was no `reset`.
+        """
         return self._environments.learner_view()
 
     def render(self) -> tuple[Any, ...] | None:
-        """Images [size, size, 3] uint8, one for each environment, or None where no render mode was asked for."""
+        """Images [size, size, 3] uint8, one for each environment, or None where no render mode was asked for.
+
+        Raises:
+            gymnasium.error.ResetNeeded: There was no `reset`.
+        """
         images = self._environments.render()
         return None if images is None else tuple(images)
 

@@ -10,9 +10,11 @@ import numpy as np
 from gymnasium import spaces
 
 from jaxrl_vis_envs import render
+from jaxrl_vis_envs.adapters.environments import goal_env
 from jaxrl_vis_envs.adapters.rewards import Reward, reward_function
 from jaxrl_vis_envs.base import GoalEnv, State
 from jaxrl_vis_envs.compilation import env_jit
+from jaxrl_vis_envs.randomization import varied_scene
 from jaxrl_vis_envs.registry import make
 
 Observations = dict[str, np.ndarray]
@@ -40,19 +42,20 @@ def _make_cached(name: str, overrides: tuple[tuple[str, Any], ...]) -> GoalEnv:
 
 
 def _made(env: str | GoalEnv, overrides: dict[str, Any]) -> GoalEnv:
-    """The environment of that name and those settings, made once.
+    """The environment of that name and those settings, made once where settings can be told apart: all are hashable.
 
     Raises:
-        ValueError: As `jaxrl_vis_envs.make`; or there are overrides for an environment that exists already.
+        ValueError: As `jaxrl_vis_envs.make` and `goal_env`.
     """
-    if isinstance(env, str):
-        settings = ((key, tuple(value) if isinstance(value, list) else value) for key, value in sorted(overrides.items()))
-        return _make_cached(env, tuple(settings))
-    if overrides:
-        raise ValueError(
-            f"{', '.join(overrides)}: options go with the name of an environment, not with one that is made already"
-        )
-    return env
+    if not isinstance(env, str):
+        return goal_env(env, overrides)
+    pairs = ((key, tuple(value) if isinstance(value, list) else value) for key, value in sorted(overrides.items()))
+    settings = tuple(pairs)
+    try:
+        hash(settings)
+    except TypeError:  # the environment refuses them with a line of its own, or takes them
+        return goal_env(env, overrides)
+    return _make_cached(env, settings)
 
 
 @functools.cache
@@ -103,12 +106,12 @@ def _space(shapes: dict[str, jax.ShapeDtypeStruct]) -> spaces.Dict:
 
 @functools.cache
 def _camera(env: GoalEnv, size: int) -> Any:
-    """A compiled function from the physics of N environments to their images [N, size, size, 3] uint8."""
+    """A compiled function from the physics of N environments, and what varies in each, to images [N, size, size, 3] uint8."""
     mj_model, camera = getattr(env, "mj_model", None), getattr(env, "camera", None)
     if mj_model is None or camera is None:
-        raise ValueError(f"{env.name} has no MuJoCo model with a camera to render through")
+        raise ValueError(f"{type(env).__name__} has no MuJoCo model with a camera to render through")
     scene = render.Scene.from_mjmodel(mj_model, camera=camera, height=size, width=size)
-    return env_jit(jax.vmap(lambda data: render.render(scene, data).rgb))
+    return env_jit(jax.vmap(lambda data, domain: render.render(varied_scene(scene, domain), data).rgb))
 
 
 class Environments:
@@ -199,7 +202,7 @@ class Environments:
             return None
         if self._state is None:
             raise gymnasium.error.ResetNeeded("call reset() before render()")
-        return np.array(self._camera(self._state.data))
+        return np.array(self._camera(self._state.data, self._state.domain))
 
 
 def _planar(observations: Observations) -> np.ndarray:
