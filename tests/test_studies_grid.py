@@ -220,6 +220,16 @@ def test_a_folder_with_another_run_is_refused_before_anything_starts(tmp_path: P
     assert command.calls == [("b", False)] and rows_of(cell, tmp_path) == []
 
 
+@pytest.mark.parametrize("contents", ['{"schema": ', '{"schema": 99}'])
+def test_a_damaged_run_is_told_with_a_mend_that_there_is(contents: str, tmp_path: Path) -> None:
+    """`train --overwrite` would mend it; a sweep and a figure have no such option."""
+    cell = make_cell("a")
+    (tmp_path / cell.name).mkdir()
+    (tmp_path / cell.name / "config.json").write_text(contents)
+    (failure,), said = run([cell], tmp_path, Script())
+    assert "move it away" in failure and "--overwrite" not in failure and said == [failure]
+
+
 def test_a_longer_run_serves_a_shorter_cell_and_never_the_other_way_round(tmp_path: Path) -> None:
     long, short = make_cell("a", env_steps=1000), make_cell("a", env_steps=250)
     run([short], tmp_path, Script())

@@ -109,12 +109,12 @@ def differences(cell: Cell, runs: Path) -> list[str]:
 
 def contradiction(cell: Cell, runs: Path) -> str | None:
     """Why the cell's folder cannot be used for it, in one line; None where it can, or where there is none yet."""
+    folder, mend = folder_of(cell, runs), "move it away, or take another --runs"
     try:
         found = differences(cell, runs)
-    except RequestError as error:
-        return str(error)
-    folder = folder_of(cell, runs)
-    return f"{folder} holds another run, with {'; '.join(found)}: move it away, or take another --runs" if found else None
+    except RequestError:  # which tells how `train` would mend it, with options that studies and sweeps do not have
+        return f"{folder} holds a config.json that is damaged, or of another version: {mend}"
+    return f"{folder} holds another run, with {'; '.join(found)}: {mend}" if found else None
 
 
 def is_finished(cell: Cell, runs: Path) -> bool:
