@@ -75,3 +75,12 @@ def test_what_the_gallery_cannot_draw_is_told(tmp_path: Path, capsys: pytest.Cap
         assert cli.main(["envs", *tokens]) == 2
         assert word in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["sheet.psd", "sheet.fits", "sheet.xbm", "sheet.zzz", "sheet"])
+def test_a_format_that_cannot_be_written_is_refused_before_the_work(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Pillow knows the first three, and only reads them, or writes no colours: it said so after the drawing."""
+    assert cli.main(["envs", "VisualReacher", "--gallery", str(tmp_path / name)]) == 2
+    assert "end its name in .png or .jpg" in capsys.readouterr().err and not list(tmp_path.iterdir())

@@ -5,6 +5,7 @@
 The table compiles nothing. A row of the sheet compiles two programs: one samples poses, one renders them all.
 """
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -145,8 +146,10 @@ def check_gallery(path: Path, names: Sequence[str] | None = None) -> Sequence[st
     Raises:
         RequestError: The file cannot be written, its ending names no format, or an environment shows no images.
     """
-    if path.suffix.lower() not in Image.registered_extensions():
-        raise RequestError(f"cannot write {path}: end its name in .png or .jpg")
+    try:  # Pillow knows endings of formats that it only reads, or that have no colours
+        Image.new("RGB", (1, 1)).save(io.BytesIO(), Image.registered_extensions()[path.suffix.lower()])
+    except (KeyError, OSError, ValueError) as error:
+        raise RequestError(f"cannot write {path}: end its name in .png or .jpg") from error
     check_writable(path)
     if names is None:
         return image_environments()
