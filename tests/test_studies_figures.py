@@ -238,6 +238,15 @@ def test_a_figure_shows_what_is_finished_and_lists_the_rest(tmp_path: Path, caps
     assert all(has_colour(tmp_path / "alone.png", VARIANTS[name].colour) for name in AUX_TASKS)
 
 
+def test_the_title_of_weights_names_their_method(tmp_path: Path) -> None:
+    (cell,) = all_cells("5.6", (FETCH,), ("ol_aux_1",))[FETCH, "ol_aux_1"]
+    made_up(cell, tmp_path, slope(1.0))
+    request = Request("5.6", STUDIES["5.6"], tmp_path / "w.png", tmp_path, (FETCH,), ("ol_aux_1",), draw_only=True)
+    assert make_figure(request)
+    title = request.out.with_suffix(".md").read_text().splitlines()[0]
+    assert title == "# Figure 5.6: Weights of the auxiliary losses in OL-AUX-1"
+
+
 def test_rewards_with_and_without_ground_truth_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     runs, out = tmp_path / "runs", tmp_path / "f.png"
     study = indicator.STUDIES["5.1"]
@@ -380,6 +389,8 @@ def test_seeds_of_several_runs_are_one_line(tmp_path: Path) -> None:
         (["5.4", "--seeds", "0"], ["--seeds must be at least 1"]),
         (["5.4", "--minutes", "0"], ["--minutes must be positive"]),
         (["5.4", "--minutes", "3", "--draw-only"], ["leave out --minutes"]),
+        (["5.6", "--methods", "ol_aux_5", "ol_aux_1"], ["weights of one method", "ol_aux_1"]),
+        (["5.6", "--methods", "sum"], ["weights of one method that learns them", "ol_aux_5"]),
         (["5.4", "--runs", "nowhere", "--draw-only"], ["--runs nowhere is no folder", "--draw-only draws what was trained"]),
         (["5.4", "--runs", "/proc/x"], ["cannot write --runs /proc/x"]),
         (["5.4", "--out", "x.gif"], ["--out x.gif", ".png"]),

@@ -160,7 +160,7 @@ def _request(options: Figure, out: Path) -> "Request":
         RequestError: An option makes no sense.
     """
     from jaxrl_vis.studies.figures import STUDIES
-    from jaxrl_vis.studies.ol_aux import FETCH
+    from jaxrl_vis.studies.ol_aux import FETCH, WEIGHTS, check_weights
     from jaxrl_vis.studies.show import Request
     from jaxrl_vis.studies.study import Scope
 
@@ -177,6 +177,8 @@ def _request(options: Figure, out: Path) -> "Request":
         raise RequestError(f"--minutes must be positive, not {options.minutes:g}")
     if options.draw_only and options.minutes is not None:
         raise RequestError("--draw-only trains nothing: leave out --minutes")
+    if options.figure == WEIGHTS:
+        check_weights(options.methods)
     runs = options.runs or Path("runs") / study.family.name
     if not options.draw_only:
         check_writable(runs, "--runs", folder=True)

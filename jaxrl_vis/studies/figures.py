@@ -68,12 +68,12 @@ def _write(
     study = request.study
     tasks = [task for task in request.tasks or study.steps if any((task, variant) in lines for variant in variants)]
     shown = _SHOW[study.family.name](request, lines, tasks, variants)
-    about, pictures = _about(request, list(lines.values())), []
+    about, title, pictures = _about(request, list(lines.values())), shown.title or study.title, []
     for picture in shown.pictures:
         pictures.append(request.out.with_stem(request.out.stem + picture.suffix))
         subtitle = "; ".join(part for part in (about, picture.subtitle) if part)
-        draw_panels(pictures[-1], picture.rows, f"{study.title} ({_name(request.figure)})", subtitle)
-    head = [f"# {_name(request.figure).capitalize()}: {study.title}", "", f"{about}.", ""]
+        draw_panels(pictures[-1], picture.rows, f"{title} ({_name(request.figure)})", subtitle)
+    head = [f"# {_name(request.figure).capitalize()}: {title}", "", f"{about}.", ""]
     markdown, table = (request.out.with_suffix(suffix) for suffix in (".md", ".csv"))
     notes = [*shown.notes, *_common_notes(study, lines, unfinished)]
     spaced = [line for note in notes for line in ((note,) if note.startswith("- ") else (note, ""))]

@@ -8,9 +8,11 @@
 Every figure also has a run without auxiliary losses, which speed-ups refer to. Runs are shared between figures.
 """
 
+from collections.abc import Sequence
 from typing import Any, get_args
 
 from jaxrl_vis.config import PRESETS
+from jaxrl_vis.errors import RequestError
 from jaxrl_vis.methods import AuxTaskName
 from jaxrl_vis.studies.study import Family, Study, Variant
 
@@ -102,3 +104,19 @@ STUDIES: dict[str, Study] = {
         extra=("none",),
     ),
 }
+
+WEIGHTS = "5.6"
+"""The figure of weights, which shows those of one method."""
+
+
+def check_weights(variants: Sequence[str]) -> None:
+    """Checks that `WEIGHTS` can be drawn of these variants; none stands for its own.
+
+    Raises:
+        RequestError: These are several, or weights of it do not learn.
+    """
+    learning = [name for name, variant in VARIANTS.items() if str(variant.changes.get("weighting")).startswith("ol_aux")]
+    if len(variants) > 1 or not set(variants) <= set(learning):
+        raise RequestError(
+            f"figure {WEIGHTS} shows weights of one method that learns them; choose one of {', '.join(learning)}"
+        )

@@ -8,7 +8,7 @@ import numpy as np
 from jaxrl_vis.report.plots import show_steps
 from jaxrl_vis.studies.authors import mean_difference, released_curves
 from jaxrl_vis.studies.drawing import Curve, Panel, Picture
-from jaxrl_vis.studies.ol_aux import AUX_TASKS, LEVELS, STUDIES, VARIANTS
+from jaxrl_vis.studies.ol_aux import AUX_TASKS, LEVELS, STUDIES, VARIANTS, WEIGHTS
 from jaxrl_vis.studies.results import SUCCESS, Line, read_lines
 from jaxrl_vis.studies.show import Request, Shown
 from jaxrl_vis.studies.study import cells_of
@@ -16,18 +16,18 @@ from jaxrl_vis.studies.tables import BASELINE, Named, steps_table, weights_table
 
 _AUTHORS = "authors' release"
 _ALONE = "5.5"  # the figure whose runs have single tasks
-_WEIGHTS = "5.6"
 
 Lines = Mapping[tuple[str, str], Line]
 
 
 def show(request: Request, lines: Lines, tasks: Sequence[str], variants: Sequence[str]) -> Shown:
     """What the figure shows of its lines."""
-    is_weights = request.figure == _WEIGHTS
+    is_weights = request.figure == WEIGHTS
     panels = [Panel(task, (_weights if is_weights else _success)(lines, task, variants), not is_weights) for task in tasks]
     text, rows = _weights_table(request, lines, tasks) if is_weights else _steps_table(lines, tasks)
     subtitle = "dashed: authors' release" if any(c.behind for panel in panels for c in panel.curves) else ""
-    return Shown([Picture("", [panels], subtitle)], text, rows, _notes(request, lines))
+    title = f"Weights of the auxiliary losses in {VARIANTS[variants[0]].label}" if is_weights else ""
+    return Shown([Picture("", [panels], subtitle)], text, rows, _notes(request, lines), title)
 
 
 def _success(lines: Lines, task: str, shown: Sequence[str]) -> list[Curve]:
@@ -80,7 +80,7 @@ def _weights_table(request: Request, lines: Lines, tasks: Sequence[str]):
 
 
 def _notes(request: Request, lines: Lines) -> list[str]:
-    if request.figure == _WEIGHTS:
+    if request.figure == WEIGHTS:
         return ["Weights are means over training, in the median over seeds; gains are differences of mean success."]
     notes = [
         "Steps to a level: the evaluation there and the next two reach it, in the median over seeds; in brackets the middle "

@@ -47,9 +47,11 @@ class Shown:
         text: Lines of Markdown: its tables.
         rows: The same to compute with.
         notes: Sentences below the tables.
+        title: In the place of the study's, where the lines that were asked for need another one.
     """
 
     pictures: Sequence[Picture]
     text: Sequence[str]
     rows: Sequence[Mapping[str, Any]]
     notes: Sequence[str]
+    title: str = ""
