@@ -38,9 +38,10 @@ class Bench:
     """Environments (or images) side by side, one measurement each (all but update, which has none); sizes that suit the device
     if not given."""
     image_size: int | None = None
-    """Height and width of images; 64 on accelerators and 32 on a CPU if not given."""
+    """Height and width of images; 64 on accelerators and 32 on a CPU if not given. render measures 64 and 100, or 32 and 64,
+    unless this is another one."""
     pixels: Pixels | None = None
-    """Channels; rgbd on accelerators and depth on a CPU if not given."""
+    """Channels; rgbd on accelerators and depth on a CPU if not given. render measures several."""
     batch_size: int | None = None
     """Transitions in a gradient step (update, train); the preset's if not given."""
     seeds: int = 1
@@ -62,7 +63,7 @@ class Bench:
     (physics: playground), or the same gradient steps in PyTorch (update: torch)."""
     scene: str | None = None
     """finger, fetch_reach, primitives or the path of an MJCF file: draw this in the place of an environment; all three for a
-    peer if not given (render)."""
+    peer if not given, but for primitives on a CPU (render)."""
     json: Path | None = None
     """Also write this run's records here."""
     results: Path | None = None

@@ -16,7 +16,8 @@ class Play:
     run_dir: Annotated[Path, ByPlaceToo()]
     """The run folder."""
     out: Path | None = None
-    """A .gif, .mp4 or .html file; play.gif (play.html with --html, play_aux.gif with --aux) in the run folder if not given."""
+    """A .gif, .mp4 or .html file, or a .png of some steps; play.gif (play.html with --html, play_aux.gif with --aux) in the run
+    folder if not given."""
     html: bool = False
     """Show the robot and its goal in three dimensions, on a page with brax's viewer (needs brax, and the page a network)."""
     aux: bool = False
