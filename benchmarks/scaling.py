@@ -49,7 +49,6 @@ from jaxrl_vis.learner.shards import DATA
 from jaxrl_vis.learner.train_step import make_train_step
 from jaxrl_vis.run.arrays import named_leaves
 from jaxrl_vis.run.checkpoint import FULL, Checkpoints
-from jaxrl_vis.run.pending import Pending
 from jaxrl_vis.run.programs import Programs
 
 QUICK = {
@@ -96,11 +95,11 @@ class Timed:
             start, waiting = time.perf_counter(), []
             for _ in range(count):
                 loop, metrics = programs.train_iteration(loop)
-                waiting.append(Pending(metrics))
+                waiting.append(programs.pending(metrics))
                 if len(waiting) > 1:
                     waiting.pop(0).read()
             if self.evaluates:
-                waiting.append(Pending(programs.evaluate(loop.train)[0]))
+                waiting.append(programs.pending(programs.evaluate(loop.train)[0]))
             for pending in waiting:
                 if not all(np.isfinite(values).all() for values in pending.read().values()):
                     raise FloatingPointError("training gave numbers that are not finite")

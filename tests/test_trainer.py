@@ -63,6 +63,23 @@ def test_a_replay_that_cannot_fit_is_refused_before_allocation(tmp_path, monkeyp
         memory.check_memory(fits.config, fits.shapes, fits.program.replay_bytes, 10)
 
 
+def test_an_evaluation_begins_early_only_where_there_is_room(straight, tmp_path, monkeypatch):
+    """Before the host has read what the iteration before found; it finds the same as one that begins later."""
+    run_dir, made, _ = straight
+    compiled = made.programs.compile()
+    state, scratch = memory._sizes(compiled)
+    largest, all_of_them = state + max(scratch.values()), state + sum(scratch.values())
+    assert largest < all_of_them
+    for there, fits in ((largest, False), (all_of_them - 1, False), (all_of_them, True)):
+        monkeypatch.setattr(memory, "available_bytes", lambda there=there: there)
+        memory.check_compiled(compiled, already_there=False)
+        assert memory.fit_together(compiled, already_there=False) is fits
+    monkeypatch.undo()
+    monkeypatch.setattr(run_loop, "fit_together", lambda *_: False)
+    list(make_fake_trainer(read_config(run_dir), tmp_path / "later").run())
+    assert rows_without_time(tmp_path / "later") == rows_without_time(run_dir)
+
+
 def test_the_compilers_own_figures_count_on_a_cpu_too(straight, tmp_path, monkeypatch):
     """Scratch memory of the evaluation, which depends on --eval-episodes, is asked for before anything is allocated."""
     compiled = straight[1].programs.compile()

@@ -26,7 +26,6 @@ from jaxrl_vis.bench.timing import measure as measure_time
 from jaxrl_vis.bench.update import seed_keys, time_updates, training_config
 from jaxrl_vis.config import Config, data_devices_of
 from jaxrl_vis.learner.train_step import TrainStep, make_train_step
-from jaxrl_vis.run.pending import Pending
 from jaxrl_vis.run.programs import Programs
 from jaxrl_vis.types import LoopState
 from jaxrl_vis_envs.base import GoalEnv
@@ -53,7 +52,7 @@ def time_iterations(programs: Programs, repeats: int) -> tuple[LoopState, Timing
     programs.of_training()
     compile_s = time.perf_counter() - start
     loop, waiting = programs.train_iteration(loop)
-    pending = Pending(waiting)
+    pending = programs.pending(waiting)
 
     def dispatch() -> Any:
         nonlocal loop, waiting
@@ -63,7 +62,7 @@ def time_iterations(programs: Programs, repeats: int) -> tuple[LoopState, Timing
     def train() -> Any:
         nonlocal pending
         before = pending
-        pending = Pending(dispatch())
+        pending = programs.pending(dispatch())
         if any(not np.isfinite(values).all() for values in before.read().values()):
             raise FloatingPointError("training gave numbers that are not finite")
         return waiting

@@ -31,7 +31,7 @@ from jaxrl_vis.run.checkpoint import FULL, LIGHT, Checkpoints, Restored
 from jaxrl_vis.run.console import RunConsole, show_seconds, show_shares
 from jaxrl_vis.run.folder import RunFolder, read_record
 from jaxrl_vis.run.loggers import Loggers
-from jaxrl_vis.run.memory import check_compiled, check_memory
+from jaxrl_vis.run.memory import check_compiled, check_memory, fit_together
 from jaxrl_vis.run.metrics import PerSeed
 from jaxrl_vis.run.pending import Pending
 from jaxrl_vis.run.programs import Programs
@@ -97,6 +97,7 @@ class RunLoop:
         self._begun, self._begun_at = 0, self._mark
         self._marked_iteration, self._compile_s = 0, 0.0
         self._is_left_alone = False
+        self._evaluates_ahead = False  # while the iteration before is still learned from
         self._owed_evaluation = False  # what was restored owes an evaluation, and would whenever it is restored
         self.has_begun = False  # the folder is this run's
 
@@ -187,8 +188,11 @@ class RunLoop:
     def _begin(self, compiled: dict[str, Any], goes_on: bool, overwrite: bool) -> None:
         """Asks for memory once more, the last thing that can refuse the run; then makes the folder and the state ready."""
         self._say(f"compiled in {show_seconds(self._compile_s)}")
-        check_compiled(compiled, already_there=self._loop is not None, layout=self._programs.layout)
+        is_there, layout = self._loop is not None, self._programs.layout
+        check_compiled(compiled, is_there, layout)
         processes.meet("compiled")
+        self._evaluates_ahead = not processes.any_of(not fit_together(compiled, is_there, layout))
+        self._evaluates_ahead &= self._programs.evaluates_ahead
         if self._writes:
             self._folder.open(self._config, goes_on, overwrite, self._log)
         self.has_begun = True
@@ -250,7 +254,7 @@ class RunLoop:
             assert self._loop is not None
             self._loop, values = self._programs.train_iteration(self._loop)
             self._done += 1
-            before, waiting = waiting, (self._done, Pending(values))
+            before, waiting = waiting, (self._done, self._programs.pending(values))
             if before is not None:
                 yield self._read(*before)
             evaluation = self._is_due(config.eval_interval) or self._done == self._total
@@ -258,7 +262,7 @@ class RunLoop:
             if not (evaluation or light or full or (interruption and not processes.are_several())):
                 continue
             # Before the metrics are read, so that the device does not wait for the host meanwhile.
-            outcome = self._begin_evaluation() if evaluation and self._programs.evaluates_ahead else None
+            outcome = self._begin_evaluation() if evaluation and self._evaluates_ahead else None
             report, waiting = self._read(*waiting), None
             if processes.any_of(bool(interruption)):
                 self._save_and_end(evaluation, interruption)
@@ -304,7 +308,7 @@ class RunLoop:
         assert self._loop is not None
         self._progress.evaluation_due = True  # until its rows are on the disk, whatever happens in between
         outcome, self._recorded = self._programs.evaluate(self._loop.train)
-        return Pending(outcome)
+        return self._programs.pending(outcome)
 
     def _evaluate(self, report: Report, outcome: Pending) -> Report:
         """Reads what an evaluation has found, writes a line per seed, and adds the figures to the report."""

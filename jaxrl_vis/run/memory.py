@@ -152,16 +152,33 @@ def check_compiled(programs: dict[str, Any], already_there: bool, layout: Layout
     there = _least_available(layout)
     if there is None:
         return
-    analyses = {name: program.memory_analysis() for name, program in programs.items()}
-    training = analyses.get("train_iteration") or analyses.get("learn")
-    state = training.argument_size_in_bytes if training else 0
-    for name, analysis in analyses.items():
-        if analysis is None or name == "init":
-            continue
-        scratch = analysis.temp_size_in_bytes + analysis.output_size_in_bytes - analysis.alias_size_in_bytes
-        needed = scratch + (0 if already_there else state)
-        if needed > there:
+    state, scratch = _sizes(programs)
+    for name, size in scratch.items():
+        if size + (0 if already_there else state) > there:
             raise RequestError(
-                f"{name} needs {show_bytes(scratch)} of scratch memory beside a state of {show_bytes(state)}; there are "
+                f"{name} needs {show_bytes(size)} of scratch memory beside a state of {show_bytes(state)}; there are "
                 f"{show_bytes(there)}: lower --num-envs, --eval-episodes, --batch-size or --replay-transitions"
             )
+
+
+def fit_together(programs: dict[str, Any], already_there: bool, layout: Layout = ONE_DEVICE) -> bool:
+    """Whether all programs have room at once, so that one may be called while another still runs.
+
+    Args:
+        programs, already_there, layout: As of `check_compiled`.
+    """
+    there = _least_available(layout)
+    state, scratch = _sizes(programs)
+    return there is None or sum(scratch.values()) + (0 if already_there else state) <= there
+
+
+def _sizes(programs: dict[str, Any]) -> tuple[int, dict[str, int]]:
+    """Bytes of the state that is trained, and of each program's scratch memory, on one device, as the compiler says."""
+    analyses = {name: program.memory_analysis() for name, program in programs.items()}
+    training = analyses.get("train_iteration") or analyses.get("learn")
+    scratch = {
+        name: analysis.temp_size_in_bytes + analysis.output_size_in_bytes - analysis.alias_size_in_bytes
+        for name, analysis in analyses.items()
+        if analysis is not None and name != "init"
+    }
+    return training.argument_size_in_bytes if training else 0, scratch

@@ -3,6 +3,9 @@
 Reading an array from a GPU takes some 0.1 ms, and one that lies on several GPUs as many times that. So they all travel as one.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,8 +14,8 @@ from jaxrl_vis.types import Metrics
 
 
 @jax.jit
-def _stacked(metrics: Metrics) -> jax.Array:
-    """Metrics of [S], in the order of their names, as [K, S]."""
+def stacked(metrics: Metrics) -> jax.Array:
+    """Metrics of [S] or [], in the order of their names, as [K, S]."""
     return jnp.stack(jnp.broadcast_arrays(*(metrics[name] for name in sorted(metrics))))
 
 
@@ -20,13 +23,16 @@ class Pending:
     """Metrics that a device may still be working on.
 
     Args:
-        metrics: [S] or [] float32 each, by name.
+        metrics: [S] or [] float32 each, by name. Those that the host has already are left alone.
+        stack: `stacked`, or what it was compiled to.
     """
 
-    def __init__(self, metrics: Metrics):
+    def __init__(self, metrics: Metrics, stack: Callable[[Metrics], jax.Array] = stacked):
         self._names = sorted(metrics)
-        self._rows = _stacked(dict(metrics))
-        self._rows.copy_to_host_async()
+        self._rows: Any = [metrics[name] for name in self._names]
+        if any(isinstance(value, jax.Array) for value in self._rows):
+            self._rows = stack(dict(metrics))
+            self._rows.copy_to_host_async()
 
     def read(self) -> dict[str, np.ndarray]:
         """Waits for them; [S] float32 each, by name."""

@@ -26,6 +26,7 @@ from jaxrl_vis.report import videos
 from jaxrl_vis.run.arrays import to_host
 from jaxrl_vis.run.kept_programs import CompiledOfLeaves, KeptPrograms, fingerprint
 from jaxrl_vis.run.nonfinite import broken_leaves
+from jaxrl_vis.run.pending import Pending, stacked
 from jaxrl_vis.run.side_by_side import SideBySide
 from jaxrl_vis.run.signals import shield_this_thread
 from jaxrl_vis.types import Episodes, LoopState, Metrics, TrainState
@@ -45,6 +46,8 @@ _KEPT: dict[str, dict[str, Any]] = {
     "play": {},
     "learn": {"donate_argnums": 0},
 }
+# Those that return metrics, and at which place.
+_METRICS = {"train_iteration": 1, "learn": 1, "evaluate": 0}
 # Trees that programs return, which are lists of their leaves in what is kept.
 _TREES = (LoopState, Episodes)
 # Of objects made since the last collection of garbage; Python's own default is 700.
@@ -95,6 +98,7 @@ class Programs:
         self.layout = program.layout
         self.seeds = range(config.seed, config.seed + config.seeds)
         self._compiled: dict[str, Any] = {}
+        self._stacks: dict[frozenset[str], Any] = {}
         self._kept: KeptPrograms | None = None
         self._may_keep, self._caches = keep and cache and self.layout.mesh is None, cache
         parts = program.parts
@@ -190,6 +194,10 @@ class Programs:
                 to_host({"keys": self.run_keys, "evaluation": self.evaluation_key}, copy=True)
             meanwhile()
             compiled = {name: future.result() for name, future in futures.items()}
+        for name, place in _METRICS.items():
+            if name in compiled:
+                metrics = compiled[name].out_info[place]
+                self._stacks[frozenset(metrics)] = stacked.lower(metrics).compile()
         if self._kept is None:
             return compiled
         return {name: self._of_trees(name, each) if name in _KEPT else each for name, each in compiled.items()}
@@ -270,6 +278,10 @@ class Programs:
             keys = jnp.stack([chosen] * len(self.seeds))
             return self._evaluator.evaluate(train, keys, self.config.eval_episodes)
         return self.compiled("evaluate")(train, chosen)
+
+    def pending(self, metrics: Metrics) -> Pending:
+        """What `train_iteration` or `evaluate` returned, to be read by the host; nothing is compiled for it."""
+        return Pending(metrics, self._stacks.get(frozenset(metrics), stacked))
 
     def broken_leaves(self, loop: LoopState) -> list[str]:
         """Names of the floating-point leaves of the loop state that hold a NaN or an infinity."""
