@@ -34,6 +34,29 @@ def test_one_matrix_for_many_right_sides():
     np.testing.assert_allclose(solved, np.linalg.solve(matrices[:, None], right[..., None])[..., 0], atol=1e-4)
 
 
+def test_derivatives_of_the_solution_of_small_systems():
+    """In both directions, of batches, and where only the tangents are a batch, as in `jax.jacfwd`."""
+    rng = np.random.default_rng(0)
+    roots, right = rng.normal(size=(3, 4, 4)), rng.normal(size=(3, 4))
+    matrices = roots @ roots.transpose(0, 2, 1) + np.eye(4)
+    inverses = np.linalg.inv(matrices)
+    solutions = np.einsum("bij,bj->bi", inverses, right)
+    by_matrix = -np.einsum("bij,bk->bijk", inverses, solutions)  # of entry [j, k]
+    for differentiate in (jax.jacfwd, jax.jacrev):
+        both = jax.jit(jax.vmap(differentiate(newton.solve_positive, argnums=(0, 1))))
+        of_matrix, of_right = both(jnp.asarray(matrices, jnp.float32), jnp.asarray(right, jnp.float32))
+        np.testing.assert_allclose(of_matrix, by_matrix, atol=1e-4)
+        np.testing.assert_allclose(of_right, inverses, atol=1e-4)
+
+
+def test_a_control_step_can_be_differentiated_in_both_directions():
+    env = environments.make("Reacher")
+    start = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(env.reset, jax.random.key(0)))
+    for differentiate in (jax.jacfwd, jax.grad):
+        slope = differentiate(lambda action: env.advance(start, action).metrics["goal_distance"])
+        assert jax.eval_shape(slope, jnp.zeros(env.action_size)).shape == (env.action_size,)
+
+
 def test_the_line_search_finds_the_least_cost():
     """Over parabolas of 1 to 12 constraints, some of them equalities, some that the line does not touch."""
     rng = np.random.default_rng(1)

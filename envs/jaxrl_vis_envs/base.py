@@ -6,7 +6,8 @@
     state = env.step(state, action)     advance, then observe, with ``state.obs`` filled in
 
 An environment object holds only constants (model, camera, configuration); a `State` holds everything that changes, so every
-method is a pure function that can be jitted, vmapped, scanned and differentiated through. Episodes have a fixed length
+method is a pure function that can be jitted, vmapped, scanned and differentiated through: forwards and in reverse, on a GPU
+within ``compilation.kernels(False)``, for physics has no derivatives in its kernels. Episodes have a fixed length
 (`GoalEnv.horizon`), ``done`` is always 0, and nothing resets by itself: no final observation is ever lost.
 """
 

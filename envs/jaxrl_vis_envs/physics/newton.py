@@ -128,9 +128,28 @@ def _line_search(
     return jnp.clip(length, 0.0, _LONGEST)
 
 
+@jax.custom_jvp
 def solve_positive(matrix: jax.Array, right: jax.Array) -> jax.Array:
-    """``matrix`` [N, N], small and positive definite, divides ``right`` [N]: [N]."""
+    """``matrix`` [N, N], small and positive definite, divides ``right`` [N]: [N].
+
+    Has derivatives of both kinds, forward and reverse, which JAX cannot find through a rule for batches.
+    """
     return _eliminate(matrix[None], right[None])[0]
+
+
+@solve_positive.defjvp
+def _differentiate(primals: tuple, tangents: tuple) -> tuple[jax.Array, jax.Array]:
+    """Of A x = b: A dx = db - dA x, and A, which is symmetric, divides what comes back in reverse, too."""
+    matrix, right = primals
+    matrix_change, right_change = tangents
+    solution = solve_positive(matrix, right)
+    change = jax.lax.custom_linear_solve(
+        lambda vector: _product(matrix, vector),
+        right_change - _product(matrix_change, solution),
+        lambda _, vector: solve_positive(matrix, vector),
+        symmetric=True,
+    )
+    return solution, change
 
 
 @custom_vmap
