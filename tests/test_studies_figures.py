@@ -321,6 +321,14 @@ def test_distances_of_figures_are_in_metres() -> None:
     assert {registry.make(task).distance_unit for task in indicator.FAMILY.tasks} == {"m"}
 
 
+def test_what_is_asked_for_twice_is_shown_once(tmp_path: Path) -> None:
+    (cell,) = all_cells("5.4", (FETCH,), ("none",))[FETCH, "none"]
+    made_up(cell, tmp_path, slope(1.0))
+    words = ["figure", "5.4", "--draw-only", "--runs", str(tmp_path), "--out", str(tmp_path / "f.png")]
+    assert cli.main([*words, "--tasks", FETCH, FETCH, "--methods", "none", "none"]) == 0
+    assert (tmp_path / "f.md").read_text().count(f"### {FETCH}") == 1
+
+
 def test_a_comparison_with_an_oracle_that_fails_does_not_count(tmp_path: Path) -> None:
     study = indicator.STUDIES["5.2"]
     ((cell,),) = cells_of(study, ("VisualSawyerReach",), ("oracle",), Scope("fast")).values()

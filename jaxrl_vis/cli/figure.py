@@ -178,7 +178,7 @@ def _request(options: Figure, out: Path) -> "Request":
     if options.draw_only and options.minutes is not None:
         raise RequestError("--draw-only trains nothing: leave out --minutes")
     if options.figure == WEIGHTS:
-        check_weights(options.methods)
+        check_weights(tuple(dict.fromkeys(options.methods)))
     runs = options.runs or Path("runs") / study.family.name
     if not options.draw_only:
         check_writable(runs, "--runs", folder=True)
@@ -200,8 +200,8 @@ def _request(options: Figure, out: Path) -> "Request":
         study=study,
         out=out,
         runs=runs,
-        tasks=options.tasks or ((FETCH,) if options.quick else ()),
-        variants=options.methods,
+        tasks=tuple(dict.fromkeys(options.tasks)) or ((FETCH,) if options.quick else ()),
+        variants=tuple(dict.fromkeys(options.methods)),
         scope=scope,
         draw_only=options.draw_only,
         seconds=None if options.minutes is None else 60.0 * options.minutes,
