@@ -2,22 +2,19 @@
 
 import csv
 import dataclasses
-import itertools
 import json
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
 from jaxrl_vis import cli
 from jaxrl_vis.run.folder import SCHEMA
-from jaxrl_vis.studies import figures, indicator, indicator_figures
+from jaxrl_vis.studies import indicator, indicator_figures
 from jaxrl_vis.studies.authors import mean_difference, released_curves
 from jaxrl_vis.studies.cells import Cell, contradiction, is_finished
-from jaxrl_vis.studies.drawing import Curve, Panel, compose
 from jaxrl_vis.studies.figures import make_figure
 from jaxrl_vis.studies.ol_aux import AUX_TASKS, FETCH, FINGER, HAND, LEVELS, STUDIES, VARIANTS
 from jaxrl_vis.studies.results import Line, Reached, mean_weight, reached
@@ -299,22 +296,6 @@ def test_panels_say_no_more_about_an_inactive_filter_than_tables(tmp_path: Path)
         curves, panels = shown.pictures[0].rows, [panel for row in shown.pictures[1].rows for panel in row]
         assert len(panels) == titles and all(panel.has_values for panel in panels)
         assert curves[1][0].title == "VisualSawyerReach: final distance to the goal (m)"
-
-
-@pytest.mark.parametrize("figure", [*indicator.STUDIES, *STUDIES])
-def test_no_text_of_a_figure_is_cut(figure: str) -> None:
-    """The title of `cameras` once ran out of a figure of one column."""
-    study = figures.STUDIES[figure]
-    steps, values = np.array([10_000, 100_000]), np.ones((1, 2))
-    curves = [Curve(study.family.variants[name].label, "#000000", steps, values) for name in study.variants]
-    panel = Panel("VisualFetchReach: dropped negatives that were false", curves)
-    subtitle = "preset fast, one gradient step per 25 environment steps; seeds 0 to 4; line: median, band: 25 to 75 %"
-    composed = compose([[panel]], f"{study.title} (figure {figure})", subtitle)
-    FigureCanvasAgg(composed).draw()
-    lines = [text.get_window_extent() for text in composed.texts]
-    boxes = [*lines, composed.legends[0].get_window_extent(), composed.axes[0].get_tightbbox()]
-    assert all(box.x0 >= 0.0 and box.x1 <= composed.bbox.x1 for box in boxes)
-    assert all(above.y0 >= below.y1 for above, below in itertools.pairwise(lines))  # and no line lies on the next
 
 
 def test_distances_of_figures_are_in_metres() -> None:
