@@ -12,7 +12,7 @@ from jaxrl_vis.phenotyping.measure import measure
 from jaxrl_vis.phenotyping.stereo import grey
 from jaxrl_vis_envs import plants
 from jaxrl_vis_envs.plants import SHIFTED, SHIFTS, TRAINING, drawing, tables
-from jaxrl_vis_envs.plants.family import INCH
+from jaxrl_vis_envs.plants.family import INCH, Family, Layout, Rig, Stalks
 from jaxrl_vis_envs.plants.pairs import Pair, Sequence
 from jaxrl_vis_envs.plants.truth import HEIGHTS, outline, stalks_in_view
 
@@ -138,6 +138,30 @@ def test_bad_specs_are_told_in_one_line(tmp_path, capsys, name, text, parts):
     assert len(lines) == 1
     assert all(part in lines[0] for part in parts), lines[0]
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: Family(stalks=Stalks(lean_sd=2.0)), r"stalks.lean_sd must be a range, \(low, high\), got 2.0"),
+        (lambda: Family(stalks=Stalks(lean_sd=(1.0, 2.0, 3.0))), "stalks.lean_sd must be a range"),
+        (lambda: Family(layout=Layout(stalks_mean=(1.0, 2.0))), "layout.stalks_mean must be finite and at least 0"),
+        (lambda: Family(rig=Rig(frames=2.5)), "rig.frames must be a whole number, got 2.5"),
+        (lambda: Family(stalks=None), "stalks must be a Stalks, got None"),
+        (lambda: Family(layout=Stalks()), "layout must be a Layout, got Stalks"),
+        (lambda: Family(stream=-1), "stream must be finite and at least 0, got -1"),
+        (lambda: TRAINING.at_width(100.5), "rig.width must be a whole number, got 100.5"),
+        (lambda: plants.draw(TRAINING, 1.5), "seed of a plot must be a whole number of at least 0, got 1.5"),
+        (lambda: plants.draw(TRAINING, -1), "seed of a plot must be a whole number of at least 0, got -1"),
+        (lambda: plants.drive(TRAINING, -1), "seed of a plot must be a whole number of at least 0, got -1"),
+        (lambda: plants.shift(TRAINING, ["flash"]), "there is no shift of .*did you mean flash"),
+        (lambda: plants.read("missing.json"), "missing.json cannot be read"),
+    ],
+)
+def test_bad_families_and_seeds_are_told_in_one_line(make, said):
+    with pytest.raises(ValueError, match=said) as told:
+        make()
+    assert "\n" not in str(told.value)
 
 
 def test_specs_change_what_they_name(tmp_path):

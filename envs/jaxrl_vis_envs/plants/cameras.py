@@ -90,7 +90,11 @@ class Drive:
 
 
 def drive(family: Family, seed: int) -> Drive:
-    """How the cameras of a family pass its plot of this seed; they see the ends of the drive from half a step inside."""
+    """How the cameras of a family pass its plot of this seed; they see the ends of the drive from half a step inside.
+
+    Raises:
+        ValueError: The seed is no whole number of at least 0.
+    """
     rig = family.rig
     rng = generator(family, seed, "drive")
     focal, baseline = (

@@ -221,10 +221,16 @@ def is_number(value: Any) -> bool:
     return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _check_range(label: str, value: Any) -> None:
-    low, high = value if isinstance(value, tuple) else (value, value)
+def _check_value(label: str, example: Any, value: Any) -> None:
+    """Refuses a value that is not of the kind of the example: a range, a whole number or a number."""
+    if isinstance(example, tuple) and not (isinstance(value, tuple) and len(value) == 2):
+        raise ValueError(f"{label} must be a range, (low, high), got {value!r}")
+    ends: tuple[Any, Any] = value if isinstance(example, tuple) else (value, value)
+    low, high = ends
     if not (is_number(low) and is_number(high)) or low < 0:
         raise ValueError(f"{label} must be finite and at least 0, got {value}")
+    if isinstance(example, int) and not isinstance(value, numbers.Integral):
+        raise ValueError(f"{label} must be a whole number, got {value}")
     if low > high:
         raise ValueError(f"{label} must run from low to high, got {value}")
 
@@ -290,7 +296,7 @@ class Family:
     """A distribution of plots. Equal families with equal seeds give equal plots.
 
     Raises:
-        ValueError: A value is out of range; the message names the field.
+        ValueError: A value is of another kind or out of range; the message names the field.
     """
 
     name: str = "training"
@@ -311,11 +317,14 @@ class Family:
     """Light and sensor."""
 
     def __post_init__(self) -> None:
+        _check_value("stream", 1, self.stream)
         for field in dataclasses.fields(self):
-            part = getattr(self, field.name)
+            part, example = getattr(self, field.name), field.default
+            if type(part) is not type(example) and dataclasses.is_dataclass(example):
+                raise ValueError(f"{field.name} must be a {type(example).__name__}, got {part!r}")
             if dataclasses.is_dataclass(part):
                 for each in dataclasses.fields(part):
-                    _check_range(f"{field.name}.{each.name}", getattr(part, each.name))
+                    _check_value(f"{field.name}.{each.name}", each.default, getattr(part, each.name))
         for label, (low, high) in _BOUNDS.items():
             part, name = label.split(".")
             value = getattr(getattr(self, part), name)

@@ -6,6 +6,7 @@ ground. A field at rest; whoever bends its stalks (wind, an arm) replaces their 
 
 import dataclasses
 import math
+import numbers
 
 import numpy as np
 
@@ -113,7 +114,13 @@ class Plot:
 
 
 def generator(family: Family, seed: int, purpose: str) -> np.random.Generator:
-    """Random numbers for one purpose in one plot; those of different families, seeds and purposes are independent."""
+    """Random numbers for one purpose in one plot; those of different families, seeds and purposes are independent.
+
+    Raises:
+        ValueError: The seed is no whole number of at least 0.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, numbers.Integral) or seed < 0:
+        raise ValueError(f"the seed of a plot must be a whole number of at least 0, got {seed!r}")
     return np.random.default_rng(np.random.SeedSequence([family.stream, seed, *purpose.encode()]))
 
 
@@ -125,10 +132,8 @@ def draw(family: Family, seed: int) -> Plot:
         seed: At least 0; equal families and seeds give equal plots.
 
     Raises:
-        ValueError: The seed is negative.
+        ValueError: The seed is no whole number of at least 0.
     """
-    if seed < 0:
-        raise ValueError(f"the seed of a plot must be at least 0, got {seed}")
     stalks: list[Stalk] = []
     layout = family.layout
     for row in range(1 + layout.rows_behind):

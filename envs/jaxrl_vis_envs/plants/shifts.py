@@ -47,8 +47,8 @@ def shift(family: Family, *factors: str, name: str = "", stream: int = 0) -> Fam
         ValueError: There is no such factor.
     """
     for factor in factors:
-        if factor not in SHIFTS:
-            raise ValueError(f"there is no shift of {factor!r}{nearest(factor, SHIFTS)}")
+        if not isinstance(factor, str) or factor not in SHIFTS:
+            raise ValueError(f"there is no shift of {factor!r}{nearest(str(factor), SHIFTS)}")
         for part, changes in SHIFTS[factor].items():
             family = dataclasses.replace(family, **{part: dataclasses.replace(getattr(family, part), **changes)})
     places = sum(1 << list(SHIFTS).index(factor) for factor in set(factors))

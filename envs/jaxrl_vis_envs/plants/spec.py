@@ -13,7 +13,7 @@ from jaxrl_vis_envs.plants.family import TRAINING, Family, is_number
 from jaxrl_vis_envs.plants.shifts import FAMILIES
 
 
-def read(path: Path, families: Mapping[str, Family] = FAMILIES) -> Family:
+def read(path: Path | str, families: Mapping[str, Family] = FAMILIES) -> Family:
     """A family from a file: the fields of `Family`, parts as tables; what is missing is as in the family called ``base``.
 
     Args:
@@ -23,6 +23,7 @@ def read(path: Path, families: Mapping[str, Family] = FAMILIES) -> Family:
     Raises:
         ValueError: The file cannot be read, or holds an unknown key or a bad value. One line that says which.
     """
+    path = Path(path)
     try:
         text = path.read_text(encoding="utf-8")
         values = tomllib.loads(text) if path.suffix.lower() == ".toml" else json.loads(text)
