@@ -111,7 +111,7 @@ class GymnasiumEnv(gymnasium.Env):
             ValueError: States or goals are not of G numbers, or their leading axes do not go together.
         """
         states = [np.asarray(given, np.float32) for given in (achieved_goal, desired_goal)]
-        (size,) = self.observation_space["desired_goal"].shape
+        (size,) = self._environments.programs.space["desired_goal"].shape or ()
         if any(state.shape[-1:] != (size,) for state in states):
             raise ValueError(f"states and goals end in an axis of {size}, got {' and '.join(str(s.shape) for s in states)}")
         return self._environments.score(*states)
