@@ -330,6 +330,7 @@ def test_what_comes_beside_the_losses() -> None:
         (lambda: make_weighting("sum", log=True), ["no option 'log'", "it has none"]),
         (lambda: make_weighting("ol_aux", interval=0), ["interval", "at least 1, not 0"]),
         (lambda: make_weighting("ol_aux", window=0), ["window", "at least 1, not 0"]),
+        (lambda: make_weighting("ol_aux").update({}, {}, make_weighting("sum").init(NAMES)), ["not one of weighting ol_aux"]),
         (lambda: make_weighting("ol_aux", interval=2.5), ["interval", "a whole number, not 2.5"]),
         (lambda: make_weighting("ol_aux", beta=float("nan")), ["finite"]),
         (lambda: make_weighting("ol_aux", main_grad="totl"), ["main_grad", "did you mean total"]),

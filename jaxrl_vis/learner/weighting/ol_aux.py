@@ -64,7 +64,8 @@ def ol_aux(
         held: The ablation of figure 5.7, see `ol_aux_ablation`.
 
     Raises:
-        RequestError: An argument makes no sense; from ``init``: gradients are needed, and ``shared`` is not given.
+        RequestError: An argument makes no sense; from ``init``: gradients are needed, and ``shared`` is not given; from
+            ``update``: the state is another weighting's.
     """
     label = "ol_aux_ablation" if held else "ol_aux"
     _check(label, interval, window, held, main_grad)
@@ -80,6 +81,8 @@ def ol_aux(
         return _begin(others, shared, window, held)
 
     def update(losses: Losses, statistics: Any, state: WeightingState) -> tuple[Weights, WeightingState, Metrics]:
+        if state.sums is None:
+            raise RequestError(f"the state is not one of weighting {label}: begin with its own init")
         if held:
             kept, sums = None, jax.tree.map(jnp.add, state.sums, {"losses": dict(losses), "gradients": dict(statistics)})
             mean = dots = _dots_of_held(weighting, sums, state)
