@@ -84,3 +84,11 @@ def test_a_format_that_cannot_be_written_is_refused_before_the_work(
     """Pillow knows the first three, and only reads them, or writes no colours: it said so after the drawing."""
     assert cli.main(["envs", "VisualReacher", "--gallery", str(tmp_path / name)]) == 2
     assert "end its name in .png or .jpg" in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
+def test_an_environment_that_is_named_twice_has_one_row(tmp_path: Path) -> None:
+    sheet = tmp_path / "sheet.png"
+    assert (
+        cli.main(["envs", "VisualReacher", "VisualReacher", "--gallery", str(sheet), "--goals", "1", "--image-size", "16"]) == 0
+    )
+    assert Image.open(sheet).height < 2 * 16 + 40

@@ -35,7 +35,7 @@ def run(options: Envs) -> int:
     from jaxrl_vis.report import gallery
 
     check_devices()
-    names = options.env or None
+    names = tuple(dict.fromkeys(options.env)) or None
     if options.gallery is not None:
         gallery.check_gallery(options.gallery, names)
     gallery.print_table(names)

@@ -25,7 +25,7 @@ class Predictions:
 
     Attributes:
         reconstruction: [K, T, C or 1, H, W] uint8, of the observation before the action.
-        flow: [K, T, H, W] float32, strength of the optical flow.
+        flow: [K, T, H, W] float32, strength of the optical flow, in pixels a step; in [0, 1] where each mask is stretched.
         flow_predicted: The same as predicted; borders that do not fill a block of the encoder may be missing.
         rotated: [K, T, C, H, W] uint8, the observation rotated.
         angle: [K, T] float32, by how many degrees, counter-clockwise.
