@@ -111,9 +111,10 @@ class GymnasiumEnv(gymnasium.Env):
             ValueError: States or goals are not of G numbers, or their leading axes do not go together.
         """
         states = [np.asarray(given, np.float32) for given in (achieved_goal, desired_goal)]
-        (size,) = self._environments.programs.space["desired_goal"].shape or ()
-        if any(state.shape[-1:] != (size,) for state in states):
-            raise ValueError(f"states and goals end in an axis of {size}, got {' and '.join(str(s.shape) for s in states)}")
+        one = self._environments.programs.space["desired_goal"].shape
+        if any(state.shape[-1:] != one for state in states):
+            given = " and ".join(str(state.shape) for state in states)
+            raise ValueError(f"one state and one goal have the shape {one}, got arrays of the shapes {given}")
         return self._environments.score(*states)
 
     def compute_terminated(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any = None) -> np.ndarray:
