@@ -384,6 +384,15 @@ def test_numpy_is_rewarded_by_numpy():
     np.testing.assert_array_equal(on_device, [1.0, -1.0])
 
 
+def test_the_distance_to_the_goal_has_a_gradient_everywhere():
+    slope = jax.vmap(jax.grad(goals.goal_distance), (0, None))
+    places = jnp.array([[0.0, 0.0], [3.0, 4.0], [jnp.nan, 0.0]])
+    np.testing.assert_allclose(slope(places, jnp.zeros(2))[:2], [[0.0, 0.0], [0.6, 0.8]], rtol=1e-6)
+    distances = goals.goal_distance(places, jnp.zeros(2))
+    assert distances.dtype == jnp.float32
+    np.testing.assert_array_equal(distances, [0.0, 5.0, np.nan])
+
+
 def test_goals_need_no_mujoco():
     code = "import sys, jaxrl_vis_envs, jaxrl_vis_envs.goals; sys.exit('mujoco' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False, env=SUBPROCESS_ENVIRONMENT).returncode == 0

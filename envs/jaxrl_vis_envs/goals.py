@@ -19,9 +19,13 @@ def _namespace(*arrays: Any) -> Any:
 
 
 def goal_distance(achieved_state: jax.Array, goal_state: jax.Array) -> jax.Array:
-    """Euclidean distance of [..., G] float32 states, in their unit: [...] float32."""
+    """Euclidean distance of [..., G] float32 states, in their unit: [...] float32. Its gradient is 0 where they are equal."""
     numpy = _namespace(achieved_state, goal_state)
-    return numpy.sqrt(numpy.sum(numpy.square(achieved_state - goal_state), axis=-1))
+    square = numpy.sum(numpy.square(achieved_state - goal_state), axis=-1)
+    if numpy is np:
+        return np.sqrt(square)
+    # A root has an endless slope at 0, which would make the gradient of a batch NaN.
+    return jnp.where(square == 0, 0.0, jnp.sqrt(jnp.where(square == 0, 1.0, square)))
 
 
 def success(achieved_state: jax.Array, goal_state: jax.Array, threshold: float) -> jax.Array:
