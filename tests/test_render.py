@@ -12,6 +12,7 @@ from mujoco import mjx
 
 from jaxrl_vis_envs.compilation import env_jit
 from jaxrl_vis_envs.render import Scene, render, render_planes
+from jaxrl_vis_envs.render.reference import ReferenceRenderer
 
 REFERENCES = pathlib.Path(__file__).parent / "data" / "render_references.npz"
 POSES = ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat", "xpos", "xmat", "site_xpos", "site_xmat")
@@ -312,3 +313,13 @@ def test_leaves_may_be_plain_numbers(ball):
 
 def test_nothing_that_is_not_asked_for_is_returned(ball):
     assert render_planes(ball[2], ball[1], rgb=False, depth=False) == (None, None, None, None, None)
+
+
+@pytest.mark.parametrize(
+    ("height", "width", "said"), [(-1, 4, "height=-1"), (4, 5.5, "width=5.5"), (4, 9999, "offwidth of the")]
+)
+def test_sizes_that_mujoco_cannot_draw_are_refused_in_one_line(ball, height, width, said):
+    """Before GL is looked for."""
+    with pytest.raises(ValueError, match=said) as refusal:
+        ReferenceRenderer(ball[0], height, width)
+    assert "\n" not in str(refusal.value)

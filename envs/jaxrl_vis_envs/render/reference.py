@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxrl_vis_envs.render.model.reading import FREE_CAMERA, Camera
 from jaxrl_vis_envs.render.outputs import Frame
+from jaxrl_vis_envs.render.scene import check_size
 
 
 class ReferenceRenderer:
@@ -24,13 +25,20 @@ class ReferenceRenderer:
         site_groups: Site groups that are drawn.
 
     Raises:
-        ValueError: The image is larger than the model's offscreen buffer.
+        ValueError: The image is larger than the model's offscreen buffer, or a size is no positive integer.
         RuntimeError: There is no usable GL library.
     """
 
     def __init__(
         self, mj_model: mujoco.MjModel, height: int, width: int, effects: bool = False, site_groups: tuple[int, ...] = ()
     ):
+        check_size(height=height, width=width)
+        buffer = mj_model.vis.global_
+        if height > buffer.offheight or width > buffer.offwidth:
+            raise ValueError(
+                f"the model's buffer has {buffer.offheight} x {buffer.offwidth} pixels, fewer than {height} x {width}: set"
+                " vis.global_.offheight and offwidth of the model first"
+            )
         self._model = mj_model
         try:
             self._renderer = mujoco.Renderer(mj_model, height, width)
@@ -53,6 +61,9 @@ class ReferenceRenderer:
         Args:
             mj_data: The poses.
             camera: As `Scene.from_mjmodel` takes it.
+
+        Raises:
+            ValueError: There is no such camera.
         """
         self._renderer.update_scene(mj_data, FREE_CAMERA if camera is None else camera, self._options)
         colour = self._renderer.render().copy()

@@ -187,7 +187,7 @@ class Scene:
                 signed distance fields, lights that are images, shadows of meshes).
         """
         reading.check_model(mj_model)
-        _check_size(height=height, width=width)
+        check_size(height=height, width=width)
         groups = reading.group_numbers("groups", groups)
         site_groups = reading.group_numbers("site_groups", site_groups)
         reading.check_names(mj_model, leave_out)
@@ -232,7 +232,7 @@ class Scene:
         return dataclasses.replace(self, **changes)
 
 
-def _check_size(**lengths: int) -> None:
+def check_size(**lengths: int) -> None:
     """Raises a ValueError that names the first length that no image can have."""
     for name, pixels in lengths.items():
         if not isinstance(pixels, numbers.Integral) or pixels < 1:
