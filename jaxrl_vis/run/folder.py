@@ -176,9 +176,9 @@ def read_record(path: Path) -> dict[str, Any]:
     except FileNotFoundError as error:
         raise RequestError(f"no run in {path}: there is no config.json") from error
     except (OSError, ValueError) as error:
-        raise RequestError(f"{file} cannot be read ({type(error).__name__}): --overwrite starts again") from error
+        raise RequestError(f"{file} cannot be read ({type(error).__name__}): train --overwrite starts again") from error
     if not isinstance(record, dict) or record.get("schema") != SCHEMA:
-        raise RequestError(f"{file} is not of schema {SCHEMA}: it was written by another version; use that, or --overwrite")
+        raise RequestError(f"{file} is not of schema {SCHEMA}: it was written by another version; use that, or start again with train --overwrite")
     return record
 
 
