@@ -9,7 +9,6 @@ site ``i``. Objects that are never seen keep their row, so that a row can be fou
 """
 
 import dataclasses
-import numbers
 from typing import Any, Self
 
 import jax
@@ -187,7 +186,7 @@ class Scene:
                 signed distance fields, lights that are images, shadows of meshes).
         """
         reading.check_model(mj_model)
-        check_size(height=height, width=width)
+        reading.check_size(height=height, width=width)
         groups = reading.group_numbers("groups", groups)
         site_groups = reading.group_numbers("site_groups", site_groups)
         reading.check_names(mj_model, leave_out)
@@ -230,10 +229,3 @@ class Scene:
     def replace(self, **changes: Any) -> Self:
         """A copy with some fields changed."""
         return dataclasses.replace(self, **changes)
-
-
-def check_size(**lengths: int) -> None:
-    """Raises a ValueError that names the first length that no image can have."""
-    for name, pixels in lengths.items():
-        if not isinstance(pixels, numbers.Integral) or pixels < 1:
-            raise ValueError(f"an image needs a whole number of pixels each way, at least one, not {name}={pixels!r}")

@@ -150,6 +150,13 @@ def check_model(mj_model: Any) -> None:
     raise ValueError(f"a scene is read from a mujoco.MjModel, not from a {kind}{mends.get(kind, '')}")
 
 
+def check_size(**lengths: int) -> None:
+    """Raises a ValueError that names the first length that no image can have."""
+    for name, pixels in lengths.items():
+        if not isinstance(pixels, numbers.Integral) or pixels < 1:
+            raise ValueError(f"an image needs a whole number of pixels each way, at least one, not {name}={pixels!r}")
+
+
 def group_numbers(name: str, groups: Any) -> tuple[int, ...]:
     """The numbers of groups, or a ValueError where they are none: that would hide everything without a word."""
     listed = list(groups) if isinstance(groups, Iterable) else [groups]
