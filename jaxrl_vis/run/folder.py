@@ -178,7 +178,9 @@ def read_record(path: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise RequestError(f"{file} cannot be read ({type(error).__name__}): train --overwrite starts again") from error
     if not isinstance(record, dict) or record.get("schema") != SCHEMA:
-        raise RequestError(f"{file} is not of schema {SCHEMA}: it was written by another version; use that, or start again with train --overwrite")
+        raise RequestError(
+            f"{file} is not of schema {SCHEMA}: it was written by another version; use that, or train --overwrite to start again"
+        )
     return record
 
 
