@@ -179,7 +179,7 @@ def read_record(path: Path) -> dict[str, Any]:
         raise RequestError(f"{file} cannot be read ({type(error).__name__}): train --overwrite starts again") from error
     if not isinstance(record, dict) or record.get("schema") != SCHEMA:
         raise RequestError(
-            f"{file} is not of schema {SCHEMA}: it was written by another version; use that, or train --overwrite to start again"
+            f"{file} is not of schema {SCHEMA}: it was written by another version; use that, or train --overwrite"
         )
     return record
 
