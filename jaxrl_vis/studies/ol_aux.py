@@ -11,7 +11,7 @@ Every figure also has a run without auxiliary losses, which speed-ups refer to. 
 from collections.abc import Sequence
 from typing import Any, get_args
 
-from jaxrl_vis.config import PRESETS
+from jaxrl_vis.config import OF_TASK, PRESETS
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.methods import AuxTaskName
 from jaxrl_vis.studies.study import Family, Study, Variant
@@ -57,7 +57,7 @@ _OF_TASK: dict[tuple[str, str], dict[str, Any]] = {
 }
 QUICK: dict[str, Any] = {
     # For all tasks alike: what FetchReach has otherwise with this preset takes more iterations.
-    **{name: getattr(PRESETS["cpu"], name) for name in ("num_envs", "encoders", "target_encoder", "random_shift")},
+    **{name: getattr(PRESETS["cpu"], name) for name in OF_TASK["cpu", "FetchReach"]},
     **{"env_steps": 19_200, "updates_per_iteration": 100, "batch_size": 64},
     **{"eval_interval": 1, "eval_episodes": 64},
 }
