@@ -281,6 +281,7 @@ OF_TASK: dict[tuple[str, str], dict[str, Any]] = {
         "relabel_probability": 0.8,
         "balance_probability": 0.3,
     },
+    ("cpu", "Reacher"): {"relabel_probability": 0.8, "balance_probability": 0.3},
     ("fast", "FingerTurn"): {"trivial_goals": 0.2, "actor_log": "loss"},
     ("cpu", "FingerTurn"): {"trivial_goals": 0.2, "actor_log": "loss"},
 }

@@ -113,8 +113,9 @@ def test_a_preset_relabels_as_the_method_and_the_observations_ask_for() -> None:
     assert preset("fast", env="VisualFetchReach").balance_probability == 0.3
     indicator = preset("fast", env="VisualFetchReach", method="indicator_balance_filter")  # with a balance of its own
     assert (indicator.relabel_probability, indicator.balance_probability) == (0.8, None)
-    for other in ({"env": "FetchReach"}, {"env": "VisualFetchReach", "method": "autoencoder"}):
-        config = preset("fast", **other)
+    assert preset("cpu", env="VisualReacher").balance_probability == 0.3
+    for other in ({"env": "FetchReach"}, {"env": "Reacher"}, {"env": "VisualFetchReach", "method": "autoencoder"}):
+        config = preset("cpu", **other)
         assert (config.relabel_probability, config.balance_probability) == (0.9, None)
 
 

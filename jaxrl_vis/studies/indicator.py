@@ -60,6 +60,7 @@ FAMILY = Family(
     # All methods relabel alike, and only the oracle knows what is trivial.
     of_task={
         ("fast", REACHER): {"image_size": 100},
+        ("cpu", REACHER): _AS_ELSEWHERE["cpu"],
         **{(preset, task): own for preset, own in _AS_ELSEWHERE.items() for task in (FETCH, "FetchReach")},
         ("fast", HAND): {"random_shift": 0},
         ("fast", FINGER): {"trivial_goals": 1.0},
