@@ -191,8 +191,8 @@ class RunLoop:
         is_there, layout = self._loop is not None, self._programs.layout
         check_compiled(compiled, is_there, layout)
         processes.meet("compiled")
-        self._evaluates_ahead = not processes.any_of(not fit_together(compiled, is_there, layout))
-        self._evaluates_ahead &= self._programs.evaluates_ahead
+        has_room = not processes.any_of(not fit_together(compiled, is_there, layout))
+        self._evaluates_ahead = self._programs.evaluates_ahead and has_room
         if self._writes:
             self._folder.open(self._config, goes_on, overwrite, self._log)
         self.has_begun = True
