@@ -74,6 +74,11 @@ def _without_trees(results: Any) -> Any:
     return jax.tree.map(leaves, results, is_leaf=lambda part: isinstance(part, _TREES))
 
 
+def _without_layout(shape: jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
+    """What a compiled program says of an array that it returns, less how it lies in the device's memory."""
+    return jax.ShapeDtypeStruct(shape.shape, shape.dtype, sharding=shape.sharding)
+
+
 class Programs:
     """What a configuration executes. Nothing is compiled or allocated until it is called or `compile` is.
 
@@ -196,7 +201,7 @@ class Programs:
             compiled = {name: future.result() for name, future in futures.items()}
         for name, place in _METRICS.items():
             if name in compiled:
-                metrics = compiled[name].out_info[place]
+                metrics = {key: _without_layout(each) for key, each in compiled[name].out_info[place].items()}
                 self._stacks[frozenset(metrics)] = stacked.lower(metrics).compile()
         if self._kept is None:
             return compiled
