@@ -93,11 +93,8 @@ def time_parts(programs: Programs, loop: LoopState, repeats: int) -> dict[str, f
     program, iteration = programs.program, loop.iteration
     keys, key = seed_keys(program, 3), jax.random.key(4)
     evaluation = measure_time(_settled(program, lambda: programs.evaluate(loop.train, key)), repeats)
-    if programs.side_by_side is None:
-        together, _ = compile_timed(program.rollout, loop.train, keys)
-        play = functools.partial(together, loop.train, keys)
-    else:
-        play = functools.partial(programs.side_by_side.rollout, loop.train, keys)
+    assert programs.side_by_side is not None
+    play = functools.partial(programs.side_by_side.rollout, loop.train, keys)
     rollout = measure_time(_settled(program, play), repeats)
     episodes, _ = play()
     insert, _ = compile_timed(program.insert, loop.train, loop.replay, episodes, keys, iteration)

@@ -199,6 +199,11 @@ def _make_learn(insert: Callable, update_many: Callable, algorithm: Algorithm, s
     return learn
 
 
+def _keys_of(keys: jax.Array, iteration: jax.Array) -> jax.Array:
+    """Keys [S] of the seeds -> [2, S]: of an iteration's rollout, and of what comes after it."""
+    return jax.vmap(lambda key: jax.random.split(jax.random.fold_in(key, iteration)), out_axes=1)(keys)
+
+
 def _count_nonfinite(tree: Any) -> jax.Array:
     floats = [leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating)]
     return sum((jnp.sum(~jnp.isfinite(leaf)) for leaf in floats), jnp.zeros((), jnp.int32)).astype(jnp.float32)
@@ -255,14 +260,11 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None) 
     learn = _make_learn(insert, update_many, algorithm, shards)
     exploration = Exploration(config.random_action_probability, config.action_noise)
 
-    def per_seed(function, in_axes: Any = 0, out_axes: Any = 0):
-        return jax.vmap(function, in_axes=in_axes, out_axes=out_axes)
-
     def init_seeds(keys: jax.Array) -> LoopState:
         # Of all seeds at once. Those of one seed, repeated under `vmap`, would lie in memory beside them.
         empty = jax.tree.map(lambda leaf: jnp.zeros((len(keys), *leaf.shape), leaf.dtype), replay_spec)
         return LoopState(
-            train=per_seed(algorithm.init)(keys),
+            train=jax.vmap(algorithm.init)(keys),
             replay=layout.folded(empty, replay.num_envs),
             key=keys,
             iteration=jnp.zeros((), jnp.int32),
@@ -275,26 +277,23 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None) 
     def insert_seeds(
         train: TrainState, replay_state: ReplayState, episodes: Episodes, keys: jax.Array, iteration: jax.Array
     ) -> tuple[TrainState, ReplayState]:
-        insert_each = per_seed(insert, (0, 0, 0, 0, None))
+        insert_each = jax.vmap(insert, (0, 0, 0, 0, None))
         train, replay_state = insert_each(train, layout.unfolded(replay_state), episodes, keys, iteration)
         return train, layout.folded(replay_state, replay.num_envs)
 
     def update_seeds(
         train: TrainState, replay_state: ReplayState, keys: jax.Array, iteration: jax.Array
     ) -> tuple[TrainState, Metrics]:
-        return per_seed(update_many, (0, 0, 0, None))(train, layout.unfolded(replay_state), keys, iteration)
+        return jax.vmap(update_many, (0, 0, 0, None))(train, layout.unfolded(replay_state), keys, iteration)
 
-    def keys_of(keys: jax.Array, iteration: jax.Array) -> jax.Array:
-        return per_seed(lambda key: jax.random.split(jax.random.fold_in(key, iteration)), out_axes=1)(keys)
-
-    learn_each = per_seed(learn, (_SEED_AXES, 0, 0, 0), (_SEED_AXES, 0))
+    learn_each = jax.vmap(learn, (_SEED_AXES, 0, 0, 0), (_SEED_AXES, 0))
 
     def learn_seeds(loop: LoopState, episodes: Episodes, outcome: Metrics, keys: jax.Array) -> tuple[LoopState, Metrics]:
         loop, metrics = learn_each(loop.replace(replay=layout.unfolded(loop.replay)), episodes, outcome, keys)
         return loop.replace(replay=layout.folded(loop.replay, replay.num_envs)), metrics
 
     def train_iteration(loop: LoopState) -> tuple[LoopState, Metrics]:
-        keys = keys_of(loop.key, loop.iteration)
+        keys = _keys_of(loop.key, loop.iteration)
         episodes, outcome = rollout(loop.train, keys[0])
         return learn_seeds(loop, episodes, outcome, keys[1])
 
@@ -308,5 +307,5 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None) 
         layout=layout,
         **_jitted(layout, init_seeds, train_iteration, rollout, insert_seeds, update_seeds),
         evaluate=_jitted_evaluate(layout, make_evaluate(env, networks, config, shards)),
-        parts=make_parts(env, networks, config, layout, keys_of, learn_seeds),
+        parts=make_parts(env, networks, config, layout, _keys_of, learn_seeds),
     )

@@ -14,7 +14,6 @@ signals at boundaries only, where they wait for each other anyway.
 
 import contextlib
 import dataclasses
-import importlib
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -37,19 +36,13 @@ from jaxrl_vis.run.pending import Pending
 from jaxrl_vis.run.programs import Programs
 from jaxrl_vis.run.progress import Progress
 from jaxrl_vis.run.results import Results, describe
-from jaxrl_vis.run.saving import Saver
+from jaxrl_vis.run.saving import Saver, import_what_saves
 from jaxrl_vis.run.signals import Interruption
 from jaxrl_vis.types import LoopState
 
 _FILTERED_TOO_MUCH, _FILTERED_EVALUATIONS = 0.9, 3
 GUARD = "guard/"
 """Metrics whose names begin like this stop a run where they are not 0; all others reach metrics.jsonl."""
-
-
-def _import_what_saves() -> None:
-    """Matplotlib and orbax, which take a second or two to import: while XLA compiles, that costs nothing."""
-    for name in ("jaxrl_vis.report.plots", "orbax.checkpoint"):
-        importlib.import_module(name)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -180,7 +173,7 @@ class RunLoop:
 
         started = time.monotonic()
         self._say("compiling (once; the next start finds it in the cache) ...")
-        compiled = programs.compile(meanwhile=_import_what_saves)
+        compiled = programs.compile(meanwhile=import_what_saves)
         self._compile_s = time.monotonic() - started
         self._progress.compile_s += self._compile_s
         return compiled
@@ -190,8 +183,7 @@ class RunLoop:
         self._say(f"compiled in {show_seconds(self._compile_s)}")
         is_there, layout = self._loop is not None, self._programs.layout
         check_compiled(compiled, is_there, layout)
-        processes.meet("compiled")
-        has_room = not processes.any_of(not fit_together(compiled, is_there, layout))
+        has_room = not processes.any_of(not fit_together(compiled, is_there, layout))  # and all have come here
         self._evaluates_ahead = self._programs.evaluates_ahead and has_room
         if self._writes:
             self._folder.open(self._config, goes_on, overwrite, self._log)

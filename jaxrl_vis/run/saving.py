@@ -7,6 +7,7 @@ of patience, or of disk, in between keeps the networks.
 
 import contextlib
 import dataclasses
+import importlib
 from collections.abc import Callable
 
 import jax
@@ -21,6 +22,12 @@ from jaxrl_vis.run.nonfinite import dump
 from jaxrl_vis.run.programs import Programs
 from jaxrl_vis.run.progress import Progress
 from jaxrl_vis.types import LoopState
+
+
+def import_what_saves() -> None:
+    """Matplotlib and orbax, which take a second or two to import: while XLA compiles, that costs nothing."""
+    for name in ("jaxrl_vis.report.plots", "orbax.checkpoint"):
+        importlib.import_module(name)
 
 
 class Saver:

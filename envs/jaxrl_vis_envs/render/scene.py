@@ -203,9 +203,7 @@ class Scene:
         leaves = {**appearance, **lights, **reading.camera_parameters(mj_model, camera_id, camera)}
         leaves["sky_top"], leaves["sky_bottom"] = reading.sky_colours(mj_model)
         leaves["haze_colour"] = mj_model.vis.rgba.haze[:3]
-        seen_through = reading.planes_seen_through(mj_model, camera_id, camera, plane_backs)
-        clear = np.where(seen_through[ids], reading.CLEAR_FROM_BEHIND, 0)
-        clear = np.where(appearance["rgba"][ids, 3] < reading.OPAQUE, reading.CLEAR, clear)
+        seen_through = reading.planes_seen_through(mj_model, camera_id, camera, plane_backs)[ids]
         arrays = {name: np.asarray(value, np.float32) for name, value in leaves.items()}
         arrays |= {"texels": texels, **meshes.build_triangles(mj_model, ids)}
         return cls(
@@ -213,7 +211,7 @@ class Scene:
             **jax.device_put(arrays),
             object_ids=tuple(ids.tolist()),
             object_types=tuple(types[ids].tolist()),
-            transparent=tuple(clear.tolist()),
+            transparent=reading.transparency(appearance["rgba"][ids, 3], seen_through),
             geom_count=mj_model.ngeom,
             camera_id=camera_id,
             projection=reading.projection(mj_model, camera_id, camera),

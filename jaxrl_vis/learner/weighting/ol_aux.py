@@ -69,9 +69,7 @@ def ol_aux(
     """
     label = "ol_aux_ablation" if held else "ol_aux"
     _check(label, interval, window, held, main_grad)
-    step_size = (5.0 * interval if beta is None else beta) * learning_rate
-    if not math.isfinite(step_size):
-        raise RequestError(f"beta and learning_rate of weighting {label} must be finite, not {beta} and {learning_rate}")
+    step_size = _step_size(label, interval, beta, learning_rate)
     keeps_gradients = held or window > 1
 
     def init(names: Iterable[str], shared: Params = None) -> WeightingState:
@@ -183,6 +181,13 @@ def _zeros(names: Iterable[str], shared: Params, *leading: int) -> dict[str, Par
         return jnp.zeros((*leading, *leaf.shape), jnp.promote_types(leaf.dtype, jnp.float32))
 
     return {name: jax.tree.map(zeros, shared) for name in names}
+
+
+def _step_size(label: str, interval: int, beta: float | None, learning_rate: float) -> float:
+    step_size = (5.0 * interval if beta is None else beta) * learning_rate
+    if not math.isfinite(step_size):
+        raise RequestError(f"beta and learning_rate of weighting {label} must be finite, not {beta} and {learning_rate}")
+    return step_size
 
 
 def _check(label: str, interval: int, window: int, held: bool, main_grad: str) -> None:

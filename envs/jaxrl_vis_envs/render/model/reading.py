@@ -323,6 +323,11 @@ def planes_seen_through(mj_model: mujoco.MjModel, camera_id: int, camera: Camera
     return np.concatenate([planes, np.zeros(mj_model.nsite, bool)])
 
 
+def transparency(alpha: np.ndarray, seen_through: np.ndarray) -> tuple[int, ...]:
+    """Of objects [N]: CLEAR by their alpha, CLEAR_FROM_BEHIND where they are planes that are ``seen_through``, else SOLID."""
+    return tuple(np.where(alpha < OPAQUE, CLEAR, np.where(seen_through, CLEAR_FROM_BEHIND, SOLID)).tolist())
+
+
 def haze_plane(mj_model: mujoco.MjModel, drawn: np.ndarray) -> tuple[int, float]:
     """The first endless plane that is drawn (-1 for none, or where there is no sky), and the width of the haze."""
     endless = (mj_model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) & np.all(mj_model.geom_size[:, :2] == 0, axis=1)
