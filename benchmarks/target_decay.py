@@ -1,0 +1,162 @@
+"""Writes docs/lab/target_decay.md's tables from the kept runs, and draws its figure.
+
+python benchmarks/target_decay.py            # write both
+python benchmarks/target_decay.py --check    # exit 1 if the page differs from the records
+"""
+
+import argparse
+import collections
+import dataclasses
+import itertools
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxrl_vis.report.learning import curve, steps_to
+from jaxrl_vis.report.plots import show_steps
+from jaxrl_vis.run.folder import read_record
+from jaxrl_vis.run.metrics import read_rows
+from jaxrl_vis.studies.authors import mean_difference, released_curves
+from jaxrl_vis.studies.seed_statistics import bootstrap_interval, interquartile_mean, permutation_p_value
+
+STUDIES = Path(__file__).parent / "results/studies"
+RUNS = STUDIES / "target_decay"
+PAGE = Path(__file__).parent.parent / "docs/lab/target_decay.md"
+BEGIN, END = "<!-- tables: begin -->", "<!-- tables: end -->"
+SUCCESS = "eval/success"
+RELEASED_DECAY = 0.98
+VARIANTS = {"none": "without", "ol_aux_5": "OL-AUX-5"}
+TASKS = {
+    "VisualFetchReach": ("VisualFetchReach", (0.5, 0.9), 240_000),
+    "VisualFingerTurn": ("VisualFingerTurn", (0.3, 0.5, 0.9), 1_000_000),
+    "VisualHandReach-view=fingertips": ("VisualHandReach as the authors saw it", (0.1, 0.2, 0.3), 1_000_000),
+}
+"""Task as in a record's name -> heading, levels of success, and the budget over which success is averaged."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Group:
+    """All seeds of one task, variant and decay.
+
+    Attributes:
+        rows: Evaluations of all seeds.
+        revisions: Revisions and devices of the runs.
+    """
+
+    rows: list[dict[str, Any]]
+    revisions: frozenset[str]
+
+    @property
+    def seeds(self) -> list[int]:
+        """The seeds, ascending."""
+        return sorted({row["seed"] for row in self.rows})
+
+    @property
+    def points(self) -> list[tuple[int, float]]:
+        """(environment steps, median success) where every seed was evaluated."""
+        return curve(self.rows, SUCCESS)
+
+    def means(self, budget: int) -> np.ndarray:
+        """Mean success of the evaluations up to ``budget``, [S]."""
+        return np.array(
+            [
+                np.mean([row[SUCCESS] for row in self.rows if row["seed"] == seed and row["env_steps"] <= budget])
+                for seed in self.seeds
+            ]
+        )
+
+
+def read_groups() -> dict[tuple[str, str, float], Group]:
+    """Kept runs by task, variant and decay; those of figure 5.4, seeds 0 to 4, where a decay was not run with fresh seeds."""
+    folders = collections.defaultdict(list)
+    for folder in sorted(RUNS.iterdir()):
+        task, variant, decay = re.fullmatch(r"(.+)-(\w+)-paper-decay([\d.]+)-seeds\d+to\d+", folder.name).groups()
+        folders[task, variant, float(decay)].append(folder)
+    for task, variant in itertools.product(TASKS, VARIANTS):
+        env, _, view = task.partition("-")
+        name = f"{env}-{variant}-paper-{view and view + '-*-'}seeds*"
+        folders.setdefault((task, variant, RELEASED_DECAY), sorted((STUDIES / "ol_aux").glob(name)))
+    return {key: _read_group(key[2], parts) for key, parts in folders.items()}
+
+
+def _read_group(decay: float, folders: list[Path]) -> Group:
+    records = [read_record(folder) for folder in folders]
+    assert all(record["config"]["target_decay"] == decay for record in records), folders
+    rows = [row for folder in folders for row in read_rows(folder / "metrics.jsonl") if SUCCESS in row]
+    revisions = {f"{record['git_revision'][:7]} on {record['device']['kind']}" for record in records}
+    return Group(rows, frozenset(revisions))
+
+
+def steps_cell(group: Group, level: float) -> str:
+    """Environment steps to a level, or the budget within which it was not reached."""
+    steps = steps_to(group.points, level)
+    return f"> {show_steps(group.points[-1][0])}" if steps is None else show_steps(steps)
+
+
+def task_table(task: str, groups: dict[tuple[str, str, float], Group]) -> list[str]:
+    """One row for each variant and decay."""
+    title, levels, budget = TASKS[task]
+    theirs = released_curves()
+    lines = [
+        f"| {title} | decay | seeds | {' | '.join(f'to {level:g}' for level in levels)} | mean success to "
+        f"{show_steps(budget)}, IQM (95 %) | from the authors' curve |",
+        "|---|---|---|" + "---|" * len(levels) + "---|---|",
+    ]
+    for variant, label in VARIANTS.items():
+        for (_, _, decay), group in sorted(groups.items(), key=lambda item: -item[0][2]):
+            if (task, variant, decay) not in groups or groups[task, variant, decay] is not group:
+                continue
+            means = group.means(budget)
+            low, high = bootstrap_interval([means])
+            distance = mean_difference(group.points, theirs[task.partition("-")[0], variant])
+            lines.append(
+                f"| {label} | {decay:g} | {group.seeds[0]} to {group.seeds[-1]} | "
+                + " | ".join(steps_cell(group, level) for level in levels)
+                + f" | {interquartile_mean([means]):.3f} ({low:.3f} to {high:.3f}) | {distance:.3f} |"
+            )
+    return lines
+
+
+def comparison_table(groups: dict[tuple[str, str, float], Group]) -> list[str]:
+    """What OL-AUX-5 adds at each decay: difference of means with an exact permutation test."""
+    lines = ["| task | decay | without | OL-AUX-5 | seeds | p |", "|---|---|---|---|---|---|"]
+    for task, (title, _, budget) in TASKS.items():
+        for decay in sorted({key[2] for key in groups if key[0] == task}, reverse=True):
+            pair = [groups.get((task, variant, decay)) for variant in VARIANTS]
+            if None in pair:
+                continue
+            means = [group.means(budget) for group in pair]
+            p = permutation_p_value(*means)
+            lines.append(
+                f"| {title} | {decay:g} | {means[0].mean():.3f} | {means[1].mean():.3f} | "
+                f"{len(means[0])} and {len(means[1])} | {p:.3f} |"
+            )
+    return lines
+
+
+def tables() -> str:
+    """Everything between the markers."""
+    groups = read_groups()
+    parts = [line for task in TASKS for line in [*task_table(task, groups), ""]]
+    made = sorted({text for group in groups.values() for text in group.revisions})
+    return "\n".join([*parts, *comparison_table(groups), "", f"Runs: {', '.join(made)}."]) + "\n"
+
+
+def main() -> int:
+    """Reads the command line and does what it asks for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true", help="compare, and write nothing")
+    options = parser.parse_args()
+    head, _, rest = PAGE.read_text(encoding="utf-8").partition(BEGIN)
+    page = f"{head}{BEGIN}\n{tables()}{END}{rest.partition(END)[2]}"
+    if options.check:
+        return int(page != PAGE.read_text(encoding="utf-8"))
+    PAGE.write_text(page, encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

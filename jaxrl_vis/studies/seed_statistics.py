@@ -1,0 +1,55 @@
+"""Statistics over seeds: interquartile means with bootstrap intervals, and exact permutation tests.
+
+The definitions are those of Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice" (2021,
+section 4): the interquartile mean is taken over all scores of all tasks, and seeds are resampled within their task.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import scipy.stats
+
+RESAMPLES = 20_000
+
+
+def interquartile_mean(scores: Sequence[np.ndarray]) -> float:
+    """Mean of the middle half of all scores.
+
+    Args:
+        scores: One array of scores a task, [S] each.
+    """
+    return float(scipy.stats.trim_mean(np.concatenate(scores), 0.25))
+
+
+def bootstrap_interval(scores: Sequence[np.ndarray], level: float = 0.95, seed: int = 0) -> tuple[float, float]:
+    """Percentile interval of the interquartile mean; seeds are resampled within their task.
+
+    Args:
+        scores: One array of scores a task, [S] each.
+        level: Coverage of the interval.
+        seed: Seed of the resampling.
+    """
+    random = np.random.default_rng(seed)
+    samples = [values[random.integers(len(values), size=(RESAMPLES, len(values)))] for values in map(np.asarray, scores)]
+    means = scipy.stats.trim_mean(np.concatenate(samples, axis=1), 0.25, axis=1)
+    low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
+    return float(low), float(high)
+
+
+def permutation_p_value(first: np.ndarray, second: np.ndarray) -> float:
+    """Two-sided p-value of the difference of two means, by all permutations of seeds between the two groups.
+
+    Args:
+        first, second: Scores of either group, [S] and [T]; at most ten seeds each, of which there are 184,756 permutations.
+
+    Raises:
+        ValueError: There are more permutations than can be listed, so that the test would not be exact.
+    """
+    first, second = np.asarray(first, float), np.asarray(second, float)
+    if min(len(first), len(second)) > 10 or len(first) + len(second) > 20:
+        raise ValueError(f"an exact test takes at most ten seeds in each group, not {len(first)} and {len(second)}")
+
+    def difference(a: np.ndarray, b: np.ndarray, axis: int) -> np.ndarray:
+        return np.mean(a, axis=axis) - np.mean(b, axis=axis)
+
+    return float(scipy.stats.permutation_test((first, second), difference, n_resamples=np.inf, vectorized=True).pvalue)
