@@ -14,7 +14,7 @@ from types import ModuleType
 
 import pytest
 
-from jaxrl_vis.errors import RequestError
+from jaxrl_vis.errors import RequestError, WorkerError
 from jaxrl_vis.evaluation_pool import Kept, Record, code_of, evaluate_each, results_of
 
 
@@ -52,7 +52,7 @@ def test_what_goes_wrong_in_a_process_is_told():
     found: dict[int, Record] = {}
     with pytest.raises(ValueError, match="number 2 is broken"):
         evaluate_each(broken, range(3), 2, found.__setitem__)
-    with pytest.raises(RequestError, match="was ended from outside"):
+    with pytest.raises(WorkerError, match="was ended from outside"):
         evaluate_each(killed, range(3), 2, found.__setitem__)
 
 
@@ -70,7 +70,7 @@ def test_endless_numbers_are_taken_as_they_are_needed(workers: int):
 def test_what_goes_wrong_with_endless_numbers_is_told():
     with pytest.raises(ValueError, match="number 2 is broken"):
         list(results_of(broken, itertools.count(), 2))
-    with pytest.raises(RequestError, match="was ended from outside"):
+    with pytest.raises(WorkerError, match="was ended from outside"):
         list(results_of(killed, itertools.count(), 2))
 
 

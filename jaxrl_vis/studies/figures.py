@@ -38,7 +38,7 @@ def make_figure(request: Request, say: Callable[[str], None] = print) -> bool:
     Raises:
         RequestError: Something that was asked for cannot be, see `cells_of` and `run_cells`.
         KeyboardInterrupt: Ctrl-C; nothing was drawn.
-        Terminated: SIGTERM; nothing was drawn.
+        Terminated: Another signal; nothing was drawn.
     """
     study = request.study
     tasks, variants = request.tasks or tuple(study.steps), request.variants or study.variants

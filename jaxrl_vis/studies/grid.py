@@ -26,7 +26,7 @@ from jaxrl_vis.provenance import child_environment
 from jaxrl_vis.run.command import options_of
 from jaxrl_vis.run.console import show_seconds
 from jaxrl_vis.run.folder import RunFolder
-from jaxrl_vis.run.signals import Interruption
+from jaxrl_vis.run.signals import SIGNALS, Interruption
 from jaxrl_vis.studies.cells import Cell, contradiction, is_finished, latest_rows, show_budget
 
 _POLL_S = 0.2
@@ -114,7 +114,7 @@ def run_cells(
     Raises:
         RequestError: No device was found, or the folder cannot be written to.
         KeyboardInterrupt: Ctrl-C, after all processes have saved and ended.
-        Terminated: SIGTERM, likewise.
+        Terminated: Another signal, likewise.
     """
     missing = [cell for cell in cells if not is_finished(cell, runs)]
     if not missing:
@@ -198,7 +198,7 @@ class _Grid:
         status, took = done.process.returncode, show_seconds(time.monotonic() - done.started)
         if status == 0 and is_finished(done.cell, self._runs):
             self._say(f"{done.cell.name}: done in {took}{_success(self._runs / done.cell.name)}")
-        elif self._is_stopping and status in (130, 143, -signal.SIGTERM, -signal.SIGINT):
+        elif self._is_stopping and (-status in SIGNALS or status - 128 in SIGNALS):
             self._say(f"{done.cell.name}: stopped after {took}; starting again goes on")
         else:
             why = "ended before it was finished" if status == 0 else f"failed with exit status {status}"
