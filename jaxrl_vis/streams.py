@@ -119,9 +119,10 @@ def reserve_standard_files() -> None:
 def let_go_of_broken_streams() -> None:
     """Flushes standard streams, for the last time, and leaves nothing in them that Python would complain about at its end."""
     for stream in (sys.stdout, sys.stderr):
+        if stream is None:
+            continue
         try:
-            if stream is not None:
-                stream.flush()
+            stream.flush()
         except Exception:  # noqa: BLE001 - as of `SafeStream`
             with contextlib.suppress(Exception):
                 nothing = os.open(os.devnull, os.O_WRONLY)

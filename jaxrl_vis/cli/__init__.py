@@ -3,8 +3,8 @@
 Nothing here imports JAX until a command runs, so that help and mistakes are answered at once.
 
 Exit status: 0 done; 1 unexpected, or files could not be written; 2 the request was wrong (one line on stderr); 3 finished, with
-files skipped; 4 stopped on a number that is not finite; 128 + its number after a signal (130 Ctrl-C, 143 SIGTERM), and 141 where
-the reader of what a command prints has left.
+files skipped; 4 stopped on a number that is not finite; 128 + its number after a signal (130 Ctrl-C, 143 SIGTERM), and 141
+where the reader of what a command prints has left.
 """
 
 import inspect

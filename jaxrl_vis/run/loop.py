@@ -178,7 +178,7 @@ class RunLoop:
             self._say("no usable checkpoint: starting at the beginning")
 
         started = time.monotonic()
-        self._say("compiling (once; the next start finds it in the cache) ...")
+        self._say(f"compiling ({programs.says_of_cache()}) ...")
         compiled = programs.compile(meanwhile=import_what_saves)
         self._compile_s = time.monotonic() - started
         self._progress.compile_s += self._compile_s

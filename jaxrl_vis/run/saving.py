@@ -20,7 +20,7 @@ from jaxrl_vis.errors import NonFiniteError, StorageError
 from jaxrl_vis.run.checkpoint import FULL, LIGHT, Checkpoints
 from jaxrl_vis.run.folder import RunFolder
 from jaxrl_vis.run.metrics import PerSeed
-from jaxrl_vis.run.nonfinite import dump
+from jaxrl_vis.run.nonfinite import dump, made_by_simulation
 from jaxrl_vis.run.programs import Programs
 from jaxrl_vis.run.progress import Progress
 from jaxrl_vis.run.signals import Interruption
@@ -148,10 +148,15 @@ class Saver:
         leaves = self._programs.broken_leaves(loop) if broken is None else broken
         leaves = [name.removeprefix("train.") for name in leaves if name.startswith("train.")]
         file = self._folder.nonfinite / f"iteration_{iteration}.npz"
+        simulated = None
         if not processes.are_several():
             dump(file, loop, values, leaves)
+            simulated = made_by_simulation(loop, self._programs.config.num_envs)
+            if simulated is None and not leaves and values and all(name.startswith("eval/") for name in values):
+                simulated = "the networks are finite"
         names = [name for name, row in values.items() if not np.isfinite(row).all()] + leaves
         shown = f" ({', '.join(names[:3])}{f' and {len(names) - 3} more' if len(names) > 3 else ''})" if names else ""
         good = "there is no checkpoint yet" if kept is None else f"the last good checkpoint is of iteration {kept}"
         dumped = "the state lies in several processes and is not kept" if processes.are_several() else f"state dumped to {file}"
-        raise NonFiniteError(f"non-finite numbers in {where}{shown}: {dumped}; {good}")
+        origin = f"they come from the simulation, not from the learner ({simulated}); " if simulated else ""
+        raise NonFiniteError(f"non-finite numbers in {where}{shown}: {origin}{dumped}; {good}")

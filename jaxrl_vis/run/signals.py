@@ -30,9 +30,7 @@ SIGNALS: tuple[int, ...] = tuple(int(getattr(signal, name)) for name in _NAMES i
 
 # These are sent by somebody who wants an end, and a second time by somebody who does not want to wait. Of all others a second
 # one says nothing new: SIGXCPU comes every second, and a closed terminal sends SIGHUP by the kernel and by the shell.
-_DELIBERATE = tuple(
-    int(getattr(signal, name)) for name in ("SIGINT", "SIGTERM", "SIGQUIT", "SIGBREAK") if hasattr(signal, name)
-)
+_DELIBERATE = tuple(number for number in SIGNALS if signal.Signals(number).name in ("SIGINT", "SIGTERM", "SIGQUIT", "SIGBREAK"))
 # Libraries install handlers in C for these two (JAX's notice of preemption, for one), which may be replaced.
 _TAKEN_FROM_LIBRARIES = (signal.SIGINT, signal.SIGTERM)
 _PATIENCE_S = 10.0  # after a signal a command has so long to end by itself: XLA, which compiles, may not look up for minutes
