@@ -130,7 +130,7 @@ def _status_of(words: Sequence[str], ending: Ending) -> int:
 
 
 def _ended_by(number: int) -> int:
-    print(f"{PROGRAM}: {name_of(number)}: ended before it was done; files that are written are whole", file=sys.stderr)
+    print(f"{PROGRAM}: {name_of(number)}: ended before it was done", file=sys.stderr)
     return 128 + number
 
 
