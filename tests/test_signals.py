@@ -215,8 +215,6 @@ def not_ignored():
 def test_every_signal_that_ends_a_process_saves_and_is_named(tmp_path, capsys, not_ignored):
     path = tmp_path / "my run"
     config = small_config(env_steps=180, eval_interval=50, checkpoint_interval=50, full_checkpoint_interval=0)
-        env_steps=10 * (2 * len(ENDS) + 2), eval_interval=50, checkpoint_interval=50, full_checkpoint_interval=0
-    )
     for count, number in enumerate(ENDS):
         trainer = make_fake_trainer(config, path, resume=count > 0)
         with pytest.raises(KeyboardInterrupt if number == signal.SIGINT else Terminated) as stopped:
