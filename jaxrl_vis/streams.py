@@ -83,6 +83,11 @@ def safe(stream: Any) -> SafeStream:
     return stream if isinstance(stream, SafeStream) else SafeStream(stream)
 
 
+def say(line: str) -> None:
+    """Prints a line to stdout, for whoever can see it."""
+    print(line, flush=True, file=safe(sys.stdout))
+
+
 @contextlib.contextmanager
 def safe_streams() -> Iterator[SafeStream]:
     """Lets everything in this process print to safe streams, third-party libraries included; gives stdout."""

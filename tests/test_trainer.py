@@ -114,9 +114,7 @@ def test_a_non_finite_number_stops_the_run(tmp_path, break_state, capsys):
 
 
 def test_numbers_that_the_simulation_made_are_told_from_those_of_the_learner(tmp_path):
-    with pytest.raises(
-        trainer.NonFiniteError, match="not from the learner .achieved_state of environment 0"
-    ):
+    with pytest.raises(trainer.NonFiniteError, match="not from the learner .achieved_state of environment 0"):
         list(make_fake_trainer(small_config(), tmp_path / "simulated", nan_at=4, break_state=True).run())
     with pytest.raises(trainer.NonFiniteError) as stopped:
         list(make_fake_trainer(small_config(), tmp_path / "learned", nan_at=4).run())

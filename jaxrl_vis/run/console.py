@@ -8,8 +8,8 @@ from typing import Self
 
 from rich.progress import Task
 
+from jaxrl_vis import streams
 from jaxrl_vis.run.bar import FittingProgress
-from jaxrl_vis.streams import safe
 
 
 def show_shares(values: Sequence[float]) -> str:
@@ -65,7 +65,7 @@ class RunConsole:
         if self._bar is not None:
             self._bar.console.print(line, markup=False, highlight=False, soft_wrap=True)
         else:
-            print(line, flush=True, file=safe(sys.stdout))
+            streams.say(line)
 
     def start(self, total: int, done: int) -> None:
         """Shows the bar, on a terminal.
@@ -74,7 +74,7 @@ class RunConsole:
             total: Iterations of the whole run.
             done: Iterations that an earlier part of the run has done.
         """
-        stream = safe(sys.stdout)
+        stream = streams.safe(sys.stdout)
         if self._quiet or not stream.isatty():
             return
         self._bar = FittingProgress(stream, _wordings, refresh_per_second=4)

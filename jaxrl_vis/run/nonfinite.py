@@ -43,7 +43,7 @@ def made_by_simulation(loop: LoopState, num_envs: int) -> str | None:
     if jnp.issubdtype(loop.replay.episodes.observations.dtype, jnp.floating):
         names.append("observations")
     episodes = _episodes(loop, "actions", *names)
-    is_bad = {name: ~np.isfinite(array).all(-1) for name, array in episodes.items()}
+    is_bad = {name: np.asarray(~np.isfinite(array).all(-1)) for name, array in episodes.items()}
     horizon = is_bad["actions"].shape[-1]
     first_action = _first(is_bad["actions"])
     for name, quantity in (("states", "achieved_state"), ("observations", "observation")):

@@ -10,6 +10,7 @@ FIGURE.csv   the same figures, to compute with
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from jaxrl_vis import streams
 from jaxrl_vis.devices import list_devices, shared
 from jaxrl_vis.files import write_atomically
 from jaxrl_vis.studies import indicator, indicator_figures, ol_aux, ol_aux_figures
@@ -29,7 +30,7 @@ _SHOW: dict[str, Callable[..., Shown]] = {
 }
 
 
-def make_figure(request: Request, say: Callable[[str], None] = print) -> bool:
+def make_figure(request: Request, say: Callable[[str], None] = streams.say) -> bool:
     """Trains what is missing and draws what is finished.
 
     Returns:

@@ -20,6 +20,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
+from jaxrl_vis import streams
 from jaxrl_vis.devices import Device
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.provenance import child_environment
@@ -94,7 +95,7 @@ def run_cells(
     find_devices: Callable[[], Sequence[Device]],
     seconds: float | None = None,
     command: Command = train_command,
-    say: Callable[[str], None] = print,
+    say: Callable[[str], None] = streams.say,
     start: Start = start_process,
 ) -> list[str]:
     """Trains the cells that are not finished; resumes those that were begun.
