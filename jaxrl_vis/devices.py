@@ -7,7 +7,9 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 import threading
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -18,6 +20,8 @@ from jaxrl_vis.provenance import child_environment
 
 _MOST_MEMORY = 0.9
 """Share of a GPU's memory; what drivers, CUDA graphs and libraries take comes on top."""
+_LEAST_KEPT_S = 1.0  # JAX's own: what takes longer to compile should be kept
+_BLOCK = 4096  # bytes; a full disk still makes files, but empty ones
 
 # The packages by which JAX reaches an accelerator, and files that show that the machine has one.
 _NVIDIA = (("jax_cuda12_plugin", "jax_cuda13_plugin"), ("/dev/nvidiactl", "/dev/nvidia0", "/dev/dxg"))
@@ -52,10 +56,15 @@ def check_devices() -> None:
     """Starts JAX, which fails where it is told to use what is not there.
 
     Raises:
-        RequestError: JAX_PLATFORMS asks for a platform that JAX cannot use here.
+        RequestError: JAX_PLATFORMS asks for a platform that JAX cannot use here, or JAX is told not to compile.
     """
     import jax
 
+    if jax.config.jax_disable_jit:
+        raise RequestError(
+            "JAX is told not to compile, and without that nothing here would end: unset JAX_DISABLE_JIT, or call"
+            " jax.config.update('jax_disable_jit', False) first"
+        )
     asked = jax.config.jax_platforms
     try:
         jax.default_backend()
@@ -71,21 +80,59 @@ def enable_compilation_cache() -> str:
     """Keeps compiled programs in a folder, so that the second start takes seconds.
 
     A folder that was chosen already (JAX_COMPILATION_CACHE_DIR, or jax.config) is left as it is; otherwise it is
-    ``jaxrl-vis/xla`` in the user's cache folder.
+    ``jaxrl-vis/xla`` in the user's cache folder, if that can be made. `cache_fault` says what is wrong with it, and JAX, which
+    would say so of each program, does not.
 
     Returns:
-        The folder.
+        The folder; empty where there is none.
     """
     import jax
     from jax.experimental.compilation_cache import compilation_cache
 
-    if not jax.config.jax_compilation_cache_dir:
-        jax.config.update("jax_compilation_cache_dir", str(user_cache() / "xla"))
+    default = default_cache()
+    if not jax.config.jax_compilation_cache_dir and _why_not_writable(default) is None:
+        jax.config.update("jax_compilation_cache_dir", str(default))
         # JAX decides at its first compilation whether it has a cache, and a notebook has compiled something by now.
         compilation_cache.reset_cache()
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
-    return str(jax.config.jax_compilation_cache_dir)
+    folder = jax.config.jax_compilation_cache_dir
+    if folder and cache_fault() is not None:
+        warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache entry", UserWarning)
+    return str(folder or "")
+
+
+def default_cache() -> Path:
+    """The folder of compiled programs where nobody has chosen another."""
+    return user_cache() / "xla"
+
+
+def cache_fault() -> str | None:
+    """Why the next start will not find what is compiled now, after `enable_compilation_cache`; None where it will."""
+    import jax
+
+    if not jax.config.jax_enable_compilation_cache or jax.config.jax_compilation_cache_max_size == 0:
+        return "JAX is told to keep no compiled programs"
+    folder = jax.config.jax_compilation_cache_dir
+    if not folder:
+        why = _why_not_writable(default_cache())
+        return f"{why}; set JAX_COMPILATION_CACHE_DIR to a folder that can" if why else "no cache is set up"
+    if jax.config.jax_persistent_cache_min_compile_time_secs > _LEAST_KEPT_S:
+        return f"only what takes {jax.config.jax_persistent_cache_min_compile_time_secs:g} s to compile is kept"
+    if "://" in folder:  # of a cloud, which JAX looks at
+        return None
+    return _why_not_writable(Path(folder))
+
+
+def _why_not_writable(folder: Path) -> str | None:
+    """Why a folder, which is made if need be, takes no file; None where it does."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(bytes(_BLOCK))
+    except OSError as error:
+        return f"{folder} cannot be written ({error.strerror or type(error).__name__})"
+    return None
 
 
 def count_devices(asked: str) -> int:

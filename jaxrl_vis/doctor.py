@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from jaxrl_vis import provenance
-from jaxrl_vis.devices import check_devices
+from jaxrl_vis.devices import cache_fault, check_devices, enable_compilation_cache
 from jaxrl_vis.errors import RequestError
 
 
@@ -40,16 +40,13 @@ def compilation_cache() -> str:
     """The folder where compiled programs are kept, and whether it can be written."""
     import jax
 
-    from jaxrl_vis.run import trainer
-
-    trainer.enable_compilation_cache()
-    folder = jax.config.jax_compilation_cache_dir
-    if not folder:
-        return "off: every run compiles again"
-    os.makedirs(folder, exist_ok=True)
-    if not os.access(folder, os.W_OK):
-        raise PermissionError(f"{folder} cannot be written; set JAX_COMPILATION_CACHE_DIR to a folder that can")
-    return folder
+    folder = enable_compilation_cache()
+    fault = cache_fault()
+    if fault is None:
+        return folder
+    if not jax.config.jax_enable_compilation_cache:
+        return f"off, every run compiles again: {fault}"
+    raise PermissionError(fault)
 
 
 def physics_and_camera() -> str:

@@ -4,7 +4,7 @@ import signal
 
 from jaxrl_vis_envs.names import nearest
 
-__all__ = ["NonFiniteError", "RequestError", "StorageError", "Terminated", "nearest"]
+__all__ = ["NonFiniteError", "RequestError", "StorageError", "Terminated", "WorkerError", "nearest"]
 
 
 class RequestError(ValueError):
@@ -20,7 +20,16 @@ class StorageError(RuntimeError):
 
 
 class Terminated(SystemExit):
-    """The run was stopped by SIGTERM, after saving. Left alone, it ends the program with status 143."""
+    """A signal other than Ctrl-C stopped the work, after saving. Left alone, it ends the program with 128 + its number.
 
-    def __init__(self) -> None:
-        super().__init__(128 + signal.SIGTERM)
+    Attributes:
+        signal: Its number.
+    """
+
+    def __init__(self, number: int = signal.SIGTERM) -> None:
+        super().__init__(128 + number)
+        self.signal = int(number)
+
+
+class WorkerError(RuntimeError):
+    """A process that works for this one was ended from outside. One line: what, and the mend. The command line exits with 1."""

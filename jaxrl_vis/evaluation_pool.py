@@ -15,19 +15,19 @@ import json
 import math
 import multiprocessing
 import os
-import signal
 import threading
 import time
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Protocol, TypeVar
 
-from jaxrl_vis.errors import RequestError
+from jaxrl_vis.errors import RequestError, WorkerError
 from jaxrl_vis.files import write_atomically
+from jaxrl_vis.run.signals import heed_parent_only, shielded_children
 from jaxrl_vis_envs.cores import num_cores
 
 Record = dict[str, Any]
@@ -52,7 +52,7 @@ def evaluate_each(
         done: Called in this process with each number and its record, in the order in which they are finished.
 
     Raises:
-        RequestError: A process was ended from outside, most likely as the memory was used up.
+        WorkerError: A process was ended from outside, most likely as the memory was used up.
     """
     numbers = list(numbers)
     with processes(min(workers, len(numbers))) as each:
@@ -73,7 +73,7 @@ def results_of(function: Callable[[A], T], arguments: Iterable[A], workers: int)
         workers: How many processes; 1 for this one. They are ended with the iterator.
 
     Raises:
-        RequestError: A process was ended from outside, most likely as the memory was used up.
+        WorkerError: A process was ended from outside, most likely as the memory was used up.
     """
     with processes(workers) as each:
         yield from each(function, arguments)
@@ -93,38 +93,42 @@ def processes(workers: int) -> Iterator[Each]:
         workers: How many; 1 or less for this one.
 
     Raises:
-        RequestError: One was ended from outside, most likely as the memory was used up.
+        WorkerError: One was ended from outside, most likely as the memory was used up.
     """
     if workers < 2:
         yield lambda function, arguments: map(function, arguments)
         return
     spawning = multiprocessing.get_context("spawn")
     others = set(multiprocessing.active_children())
-    pool = ProcessPoolExecutor(
-        workers, mp_context=spawning, initializer=_prepare, initargs=(spawning.Value("i", 0), _environments(workers))
-    )
+    with shielded_children():  # starts multiprocessing's own helper
+        counter = spawning.Value("i", 0)
+    pool = ProcessPoolExecutor(workers, mp_context=spawning, initializer=_prepare, initargs=(counter, _environments(workers)))
+
+    def submit(function: Callable[[A], T], argument: A) -> Future[T]:
+        with shielded_children():  # a process may be started, and this one alone ends it: see `_prepare`
+            return pool.submit(function, argument)
 
     def each(function: Callable[[A], T], arguments: Iterable[A]) -> Iterator[T]:
         arguments = iter(arguments)
         # Two each, so that none waits for this process.
-        waiting = {pool.submit(function, argument) for argument in itertools.islice(arguments, 2 * workers)}
+        waiting = {submit(function, argument) for argument in itertools.islice(arguments, 2 * workers)}
         while waiting:
             ready, waiting = wait(waiting, return_when=FIRST_COMPLETED)
-            waiting |= {pool.submit(function, argument) for argument in itertools.islice(arguments, len(ready))}
+            waiting |= {submit(function, argument) for argument in itertools.islice(arguments, len(ready))}
             for result in ready:
                 yield result.result()
 
     try:
         yield each
     except BrokenProcessPool as error:
-        raise RequestError(
+        raise WorkerError(
             f"one of {workers} processes was ended from outside, most likely for want of memory: use fewer --workers"
         ) from error
     except BaseException:
         pool.shutdown(wait=False, cancel_futures=True)
         children = set(multiprocessing.active_children()) - others
         for child in children:
-            child.terminate()
+            child.kill()
         _wait_for(children, 5.0)
         raise
     pool.shutdown()
@@ -170,8 +174,7 @@ def _end_with_parent() -> None:
 
 def _prepare(counter: Any, environments: list[dict[str, str]]) -> None:
     """Makes a new process one of several."""
-    # The one that started it ends it: both would otherwise be interrupted at once.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    heed_parent_only()  # both would otherwise be interrupted at once, by a signal to all of them
     threading.Thread(target=_end_with_parent, daemon=True).start()
     with counter.get_lock():
         index = counter.value

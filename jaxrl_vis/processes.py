@@ -180,9 +180,14 @@ def leave_together() -> None:
 
 def any_of(answer: bool) -> bool:
     """Whether any process says yes: all ask at the same point of the program, and get the same answer."""
+    return bool(greatest(int(answer)))
+
+
+def greatest(number: int) -> int:
+    """The greatest number that any process gives: all ask at the same point of the program, and get the same answer."""
     if not are_several():
-        return answer
+        return number
     import numpy as np
     from jax.experimental import multihost_utils
 
-    return bool(np.any(multihost_utils.process_allgather(np.asarray(answer))))
+    return int(np.max(multihost_utils.process_allgather(np.asarray(number))))

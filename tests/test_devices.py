@@ -1,14 +1,17 @@
 """What JAX computes on: told in one line where it is not there, and guessed where help must not wait for JAX."""
 
 import json
+import logging
 import os
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import pytest
+from fake_program import make_fake_trainer, small_config
 
-from jaxrl_vis import devices
+from jaxrl_vis import cli, devices
 from jaxrl_vis.run.memory import show_bytes
 
 _PROGRAM = """
@@ -111,3 +114,70 @@ def test_training_claims_most_of_a_gpu_unless_told_how_much(given: dict[str, str
     devices.claim_memory()
     # JAX refuses to start with both.
     assert {name: os.environ[name] for name in names if name in os.environ} == (given or {names[1]: "0.9"})
+
+
+@pytest.fixture
+def jax_config():
+    """JAX's settings, which are put back after the test, and its cache is started anew."""
+    import jax
+    from jax.experimental.compilation_cache import compilation_cache
+
+    names = ("compilation_cache_dir", "enable_compilation_cache", "compilation_cache_max_size", "disable_jit")
+    names = tuple(f"jax_{name}" for name in (*names, "persistent_cache_min_compile_time_secs"))
+    before = {name: getattr(jax.config, name) for name in names}
+    with warnings.catch_warnings():
+        yield lambda name, value: jax.config.update(f"jax_{name}", value)
+    for name, value in before.items():
+        jax.config.update(name, value)
+    compilation_cache.reset_cache()
+
+
+def test_what_a_run_says_of_the_cache_is_true(
+    tmp_path: Path, jax_config, monkeypatch: pytest.MonkeyPatch, capsys, recwarn
+) -> None:
+    from jax.experimental.compilation_cache import compilation_cache
+
+    said = make_fake_trainer(small_config(), None).programs.says_of_cache
+    home, elsewhere, file = tmp_path / "home", tmp_path / "elsewhere", tmp_path / "a file"
+    file.touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(home))
+    jax_config("compilation_cache_dir", None)
+    assert said() == "once; the next start finds it in the cache" and (home / "jaxrl-vis" / "xla").is_dir()
+    jax_config("compilation_cache_dir", str(elsewhere))
+    assert said() == f"once; the next start finds it in {elsewhere}" and elsewhere.is_dir()
+    jax_config("persistent_cache_min_compile_time_secs", 30.0)
+    monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "30")
+    assert said() == "as will every start: only what takes 30 s to compile is kept"
+    jax_config("enable_compilation_cache", False)
+    assert said() == "as will every start: JAX is told to keep no compiled programs"
+    jax_config("enable_compilation_cache", True)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(file))
+    jax_config("compilation_cache_dir", None)
+    assert said().endswith("cannot be written (Not a directory); set JAX_COMPILATION_CACHE_DIR to a folder that can")
+    assert devices.enable_compilation_cache() == ""
+    # And nobody else complains of it.
+    jax_config("compilation_cache_dir", str(file / "cache"))
+    jax_config("persistent_cache_min_compile_time_secs", 0.0)
+    compilation_cache.reset_cache()
+    assert len(list(make_fake_trainer(small_config(), tmp_path / "run").run())) == 8
+    found = capsys.readouterr()
+    assert f"compiling (as will every start: {file / 'cache'} cannot be written (Not a directory)) ..." in found.out
+    assert found.err == "" and not recwarn.list
+
+
+def test_a_jax_that_does_not_compile_is_refused(tmp_path: Path, jax_config, capsys) -> None:
+    jax_config("disable_jit", True)
+    assert cli.main(["train", "--preset", "debug", "--run-dir", str(tmp_path / "run")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("jaxrl-vis: JAX is told not to compile") and "unset JAX_DISABLE_JIT" in line
+    assert not (tmp_path / "run").exists()
+
+
+def test_matplotlib_does_not_complain_of_its_folder(caplog: pytest.LogCaptureFixture) -> None:
+    import jaxrl_vis.report  # noqa: F401 - what everything that draws imports
+
+    log = logging.getLogger("matplotlib")
+    log.warning("mkdir -p failed for path %s: %s", "/proc/nope", "why")
+    log.warning("Matplotlib created a temporary cache directory at %s because there was an issue with %s", "/tmp/x", "y")
+    log.warning("something else")
+    assert [record.getMessage() for record in caplog.records] == ["something else"]

@@ -5,6 +5,7 @@ import itertools
 import json
 import multiprocessing
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -14,8 +15,9 @@ from types import ModuleType
 
 import pytest
 
-from jaxrl_vis.errors import RequestError
+from jaxrl_vis.errors import RequestError, Terminated, WorkerError
 from jaxrl_vis.evaluation_pool import Kept, Record, code_of, evaluate_each, results_of
+from jaxrl_vis.run import signals
 
 
 def squared(offset: int, number: int) -> Record:
@@ -28,8 +30,20 @@ def broken(number: int) -> Record:
     return {"square": number * number}
 
 
+def slow(number: int) -> Record:
+    time.sleep(100 if number else 0)
+    return {}
+
+
 def killed(number: int) -> Record:
     os._exit(9)
+
+
+def signalled(number: int) -> Record:
+    """Signals itself, as somebody would who signals the whole group of processes."""
+    for each in signals.SIGNALS:
+        subprocess.run(["kill", f"-{each}", str(os.getpid())], check=True)
+    return {"ignored": sorted(signal.pthread_sigmask(signal.SIG_BLOCK, ()))}
 
 
 def total(records: list[Record]) -> Record:
@@ -52,8 +66,25 @@ def test_what_goes_wrong_in_a_process_is_told():
     found: dict[int, Record] = {}
     with pytest.raises(ValueError, match="number 2 is broken"):
         evaluate_each(broken, range(3), 2, found.__setitem__)
-    with pytest.raises(RequestError, match="was ended from outside"):
+    with pytest.raises(WorkerError, match="was ended from outside"):
         evaluate_each(killed, range(3), 2, found.__setitem__)
+
+
+def test_signals_to_the_whole_group_do_not_reach_processes():
+    """What the one that started them ends, and so also keeps, must not be ended beside it."""
+    found: dict[int, Record] = {}
+    evaluate_each(signalled, range(2), 2, found.__setitem__)
+    assert all(set(record["ignored"]) >= set(signals.SIGNALS) for record in found.values()) and len(found) == 2
+
+
+def test_a_signal_to_the_one_that_started_them_ends_processes():
+    before = set(multiprocessing.active_children())
+    started = time.monotonic()
+    with signals.Ending() as ending, pytest.raises(Terminated):
+        for _ in results_of(slow, itertools.count(), 2):
+            signal.raise_signal(signal.SIGTERM)
+    assert ending.signal == signal.SIGTERM and not set(multiprocessing.active_children()) - before
+    assert time.monotonic() - started < 60
 
 
 @pytest.mark.parametrize("workers", [1, 2])
@@ -70,7 +101,7 @@ def test_endless_numbers_are_taken_as_they_are_needed(workers: int):
 def test_what_goes_wrong_with_endless_numbers_is_told():
     with pytest.raises(ValueError, match="number 2 is broken"):
         list(results_of(broken, itertools.count(), 2))
-    with pytest.raises(RequestError, match="was ended from outside"):
+    with pytest.raises(WorkerError, match="was ended from outside"):
         list(results_of(killed, itertools.count(), 2))
 
 

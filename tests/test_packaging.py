@@ -14,14 +14,14 @@ ROOT = Path(__file__).resolve().parents[1]
 
 # Folders and single files of jaxrl_vis. A folder imports from earlier rows only; files of one row do not import each other.
 LAYERS: tuple[tuple[str, ...], ...] = (
-    ("errors", "methods"),
+    ("errors", "methods", "streams"),
     ("fields",),
     ("config", "types", "provenance", "files", "parameters"),
     ("devices", "processes", "resolved", "validation"),
-    ("evaluation_pool", "learner"),
+    ("learner",),
     ("report",),
     ("run",),
-    ("studies",),
+    ("evaluation_pool", "studies"),
     ("bench", "doctor", "phenotyping"),
     ("grasping",),
     ("cli",),

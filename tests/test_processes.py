@@ -167,8 +167,9 @@ def test_a_signal_to_one_process_saves_and_ends_all(tmp_path: Path) -> None:
     assert second is not None
     while not second.readline().startswith("report"):
         assert processes[1].poll() is None
-    processes[1].send_signal(signal.SIGTERM)
+    processes[1].send_signal(signal.SIGUSR2)
     ends = ended(processes)
-    assert [status for status, _, _ in ends] == [143, 143], ends
+    assert [status for status, _, _ in ends] == [128 + signal.SIGUSR2] * 2, ends
+    assert "SIGUSR2: saving" in ends[0][1]
     checkpoints = Checkpoints(tmp_path / "run" / "checkpoints", read_only=True)
     assert checkpoints.iterations("full")[-1] == checkpoints.iterations("light")[-1] > 0

@@ -1,5 +1,8 @@
 """SIGTERM, Ctrl-C and other violence against a run."""
 
+import contextlib
+import faulthandler
+import queue
 import signal
 import subprocess
 import sys
@@ -9,7 +12,9 @@ import jax
 import pytest
 from fake_program import make_fake_trainer, rows_without_time, small_config
 
+from jaxrl_vis import cli
 from jaxrl_vis.errors import NonFiniteError, StorageError, Terminated
+from jaxrl_vis.run import signals
 from jaxrl_vis.run.checkpoint import FULL, LIGHT, Checkpoints
 from jaxrl_vis.run.folder import read_config
 
@@ -192,3 +197,138 @@ def test_whatever_goes_wrong_a_save_is_attempted(tmp_path, monkeypatch):
     assert Checkpoints(path / "checkpoints", read_only=True).iterations(LIGHT) == [6]
     list(make_fake_trainer(small_config(full_checkpoint_interval=0), path, resume=True).run())
     assert [row["iteration"] for row in rows_without_time(path)] == [2, 2, 4, 4, 6, 6, 8, 8]
+
+
+ENDS = tuple(getattr(signal, f"SIG{name}") for name in ("HUP", "INT", "QUIT", "TERM", "USR1", "USR2", "ALRM", "XCPU"))
+
+
+@pytest.fixture
+def not_ignored():
+    """As for a process that nobody started with `nohup` or in the background of a script, whatever this one is."""
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in ENDS if number != signal.SIGINT}
+    before[signal.SIGINT] = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+def test_every_signal_that_ends_a_process_saves_and_is_named(tmp_path, capsys, not_ignored):
+    path = tmp_path / "my run"
+    config = small_config(env_steps=180, eval_interval=50, checkpoint_interval=50, full_checkpoint_interval=0)
+    for count, number in enumerate(ENDS):
+        trainer = make_fake_trainer(config, path, resume=count > 0)
+        with pytest.raises(KeyboardInterrupt if number == signal.SIGINT else Terminated) as stopped:
+            for report in trainer.run():
+                if report.iteration == 2 * count + 1:
+                    signal.raise_signal(number)
+        if number != signal.SIGINT:
+            assert stopped.value.code == 128 + number and stopped.value.signal == number
+        said = capsys.readouterr().out
+        assert f"{'Ctrl-C' if number == signal.SIGINT else number.name}: saving iteration {2 * count + 2}" in said
+        assert f"go on with --run-dir '{path}' --resume" in said
+        assert signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler)
+    restored = Checkpoints(path / "checkpoints", read_only=True).restore_for_resume(trainer.shapes)
+    assert restored.tier == FULL and restored.iteration == 2 * len(ENDS)
+
+
+def test_what_is_ignored_or_handled_by_the_caller_stays_so(tmp_path, not_ignored):
+    heard = []
+    with (tmp_path / "stacks").open("w+") as stacks:
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # nohup
+        signal.signal(signal.SIGUSR1, lambda number, _: heard.append(number))
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+        faulthandler.register(signal.SIGUSR2, stacks)  # in C, of which Python knows nothing
+        theirs = {number: signal.getsignal(number) for number in (*ENDS, signal.SIGPIPE)}
+        try:
+            for report in make_fake_trainer(small_config(), tmp_path / "run").run():
+                if report.iteration == 3:
+                    for number in (signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2, signal.SIGPIPE):
+                        signal.raise_signal(number)
+            assert theirs == {number: signal.getsignal(number) for number in theirs}
+        finally:
+            faulthandler.unregister(signal.SIGUSR2)
+            signal.signal(signal.SIGPIPE, signal.SIG_IGN)
+        stacks.seek(0)
+        assert report.iteration == 8 and heard == [signal.SIGUSR1] and "most recent call first" in stacks.read()
+
+
+def test_a_handler_of_the_callers_that_raises_leaves_the_networks_saved(tmp_path, not_ignored):
+    def leave(*_):
+        raise SystemExit(7)
+
+    signal.signal(signal.SIGTERM, leave)
+    path = tmp_path / "run"
+    trainer = make_fake_trainer(small_config(checkpoint_interval=100, full_checkpoint_interval=0), path)
+    evaluate = trainer.programs.evaluate
+
+    def evaluate_and_be_told(train, key=None):
+        signal.raise_signal(signal.SIGTERM)
+        return evaluate(train, key)
+
+    trainer.programs.evaluate = evaluate_and_be_told
+    with pytest.raises(SystemExit, match="7"):
+        list(trainer.run())
+    assert Checkpoints(path / "checkpoints", read_only=True).iterations(LIGHT) == [2]
+
+
+def test_signals_that_repeat_themselves_do_not_hurry_a_save(tmp_path, not_ignored):
+    """SIGXCPU comes every second, a closed terminal sends SIGHUP twice, and SIGTERM follows a scheduler's warning."""
+    path = tmp_path / "run"
+    trainer = make_fake_trainer(small_config(full_checkpoint_interval=0), path)
+    with pytest.raises(Terminated) as stopped:
+        for report in trainer.run():
+            if report.iteration == 3:
+                for number in (signal.SIGUSR1, signal.SIGXCPU, signal.SIGXCPU, signal.SIGHUP, signal.SIGHUP, signal.SIGTERM):
+                    signal.raise_signal(number)
+    assert stopped.value.signal == signal.SIGUSR1
+    assert Checkpoints(path / "checkpoints", read_only=True).iterations(FULL)[-1] >= 3
+
+
+def test_a_signal_after_the_last_iteration_is_told(tmp_path, capsys, monkeypatch, not_ignored):
+    trainer = make_fake_trainer(small_config(), tmp_path / "run")
+    finish = Checkpoints.wait
+
+    def told(self):
+        signal.raise_signal(signal.SIGHUP)
+        finish(self)
+
+    with pytest.raises(Terminated) as stopped:
+        for report in trainer.run():
+            if report.iteration == 8:
+                monkeypatch.setattr(Checkpoints, "wait", told)
+    assert stopped.value.code == 129
+    assert "SIGHUP: all is trained and saved" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("number", ENDS)
+def test_a_signal_ends_any_other_command_in_one_line(number, monkeypatch, capsys, not_ignored):
+    cleaned = []
+
+    def work(_):
+        try:
+            signal.raise_signal(number)
+        finally:
+            cleaned.append(True)
+
+    monkeypatch.setitem(cli.COMMANDS, "doctor", (cli.doctor.Doctor, work))
+    before = [signal.getsignal(each) for each in ENDS]
+    assert cli.main(["doctor"]) == 128 + number and cleaned
+    name = "Ctrl-C" if number == signal.SIGINT else number.name
+    assert capsys.readouterr().err.splitlines() == [f"jaxrl-vis: {name}: ended before it was done"]
+    assert [signal.getsignal(each) for each in ENDS] == before
+
+
+def test_a_command_that_does_not_look_up_is_ended(monkeypatch, not_ignored):
+    """XLA, say, which compiles for minutes; but not a run, which is given the time that it takes to save."""
+    monkeypatch.setattr(signals, "_PATIENCE_S", 0.1)
+    given_up: queue.Queue[int] = queue.Queue()
+    with signals.Ending(given_up.put):
+        with signals.Interruption() as interruption:
+            signal.raise_signal(signal.SIGHUP)
+            with pytest.raises(queue.Empty):
+                given_up.get(timeout=0.5)
+        assert interruption.signal == signal.SIGHUP
+        with contextlib.suppress(Terminated):
+            signal.raise_signal(signal.SIGTERM)
+        assert given_up.get(timeout=10) == signal.SIGTERM
+    assert signal.set_wakeup_fd(-1) == -1

@@ -19,7 +19,7 @@ from jaxrl_vis.run import loop as run_loop
 from jaxrl_vis.run import memory, metrics, trained, trainer
 from jaxrl_vis.run.checkpoint import Checkpoints
 from jaxrl_vis.run.folder import RunFolder, default_folder, read_config
-from jaxrl_vis.run.nonfinite import dump
+from jaxrl_vis.run.nonfinite import dump, made_by_simulation
 
 
 def test_a_run_reports_logs_and_draws(straight, capsys):
@@ -111,6 +111,36 @@ def test_a_non_finite_number_stops_the_run(tmp_path, break_state, capsys):
     shapes = make_fake_trainer(small_config(), None).shapes
     restored = Checkpoints(path / "checkpoints", read_only=True).restore_for_resume(shapes)
     assert restored.iteration == 4 and all(np.isfinite(leaf).all() for leaf in as_plain(restored.train))
+
+
+def test_numbers_that_the_simulation_made_are_told_from_those_of_the_learner(tmp_path):
+    with pytest.raises(trainer.NonFiniteError, match="not from the learner .achieved_state of environment 0"):
+        list(make_fake_trainer(small_config(), tmp_path / "simulated", nan_at=4, break_state=True).run())
+    with pytest.raises(trainer.NonFiniteError) as stopped:
+        list(make_fake_trainer(small_config(), tmp_path / "learned", nan_at=4).run())
+    assert "simulation" not in str(stopped.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "place", "said"),
+    [
+        ("states", (1, 3, 0), "achieved_state of environment 1 is not finite from step 0 on"),
+        ("states", (1, 3, 4), "achieved_state of environment 1 is not finite from step 4 on"),
+        ("states", (0, 2, 6), "achieved_state of environment 0 is not finite in its goal"),
+        ("observations", (0, 1, 5), "observation of environment 1 is not finite from step 5 on"),
+        ("actions", (0, 1, 3), None),
+    ],
+)
+def test_where_a_simulation_went_wrong(name, place, said):
+    made = make_fake_trainer(small_config(), None)
+    loop = made.init(made.run_keys)
+    episodes = loop.replay.episodes
+    episodes = episodes.replace(observations=episodes.states)
+    broken = getattr(episodes, name).at[place].set(np.inf)
+    after = episodes.states.at[place[0], place[1], 4:6].set(np.nan) if name == "actions" else episodes.states
+    episodes = episodes.replace(**({"states": after} | {name: broken}))
+    found = made_by_simulation(loop.replace(replay=loop.replay.replace(episodes=episodes)), 2)
+    assert found == (said and f"{said}, and all actions before it are")
 
 
 def test_bad_episodes_of_a_replay_that_devices_share_are_dumped(tmp_path):

@@ -55,7 +55,8 @@ def _without_remark() -> Iterator[None]:
             yield
     finally:
         kept = [line for line in printed.getvalue().splitlines(True) if not line.startswith(_REMARK)]
-        sys.stdout.write("".join(kept))
+        with contextlib.suppress(OSError, ValueError):  # nobody can read it; where there is no stdout, `print` does nothing
+            print("".join(kept), end="")
 
 
 _DURING = {"mujoco.mjx.warp": _without_remark, "mujoco.mjx._src.mesh": _without_mesh_libraries}

@@ -3,7 +3,8 @@
 Nothing here imports JAX until a command runs, so that help and mistakes are answered at once.
 
 Exit status: 0 done; 1 unexpected, or files could not be written; 2 the request was wrong (one line on stderr); 3 finished, with
-files skipped; 4 stopped on a number that is not finite; 130 Ctrl-C and 143 SIGTERM, both after saving.
+files skipped; 4 stopped on a number that is not finite; 128 + its number after a signal (130 Ctrl-C, 143 SIGTERM), and 141
+where the reader of what a command prints has left.
 """
 
 import inspect
@@ -34,7 +35,9 @@ from jaxrl_vis.cli import (
     train,
 )
 from jaxrl_vis.cli.parsing import PROGRAM, parse
-from jaxrl_vis.errors import NonFiniteError, RequestError, StorageError, Terminated, nearest
+from jaxrl_vis.errors import NonFiniteError, RequestError, StorageError, Terminated, WorkerError, nearest
+from jaxrl_vis.run.signals import Ending, name_of
+from jaxrl_vis.streams import SafeStream, let_go_of_broken_streams, reserve_standard_files, safe_streams
 
 DESCRIPTION = "Trains robots to reach goals that are given as images."
 COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
@@ -57,7 +60,10 @@ COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
 }
 
 # Of the errors that are told in one line.
-_STATUS: dict[type[Exception], int] = {RequestError: 2, StorageError: 1, NonFiniteError: 4}
+_STATUS: dict[type[Exception], int] = {RequestError: 2, StorageError: 1, WorkerError: 1, NonFiniteError: 4}
+# All other commands write files, and what they print is no more than a word about them.
+_PRINT_RESULTS = ("eval", "envs", "doctor", "phenotype eval", "grasp eval")
+_READER_LEFT = 141
 
 
 def overview(group: str = "") -> str:
@@ -71,11 +77,12 @@ def overview(group: str = "") -> str:
     return "\n".join([*lines, "", f"`{PROGRAM} COMMAND --help` lists the options of a command."])
 
 
-def main(words: Sequence[str] | None = None) -> int:
-    """Runs one command.
+def main(words: Sequence[str] | None = None, give_up: Callable[[int], None] | None = None) -> int:
+    """Runs one command. Nothing that is printed can end it, and signals end it in order.
 
     Args:
         words: The command line without the program's name; None: that of this process.
+        give_up: See `Ending`.
 
     Returns:
         The exit status.
@@ -84,16 +91,33 @@ def main(words: Sequence[str] | None = None) -> int:
         SystemExit: A command's help was asked for, and printed.
     """
     words = sys.argv[1:] if words is None else words
+    with safe_streams() as printed, Ending(give_up) as ending:
+        try:
+            status = _status_of(words, ending)
+        except SystemExit as end:
+            printed.flush()
+            if end.code or printed.failure is None:
+                raise
+            status = 0
+        printed.flush()
+        return _status_of_printing(words, printed) if status == 0 else status
+
+
+def _status_of(words: Sequence[str], ending: Ending) -> int:
     try:
         return _run(words)
     except tuple(_STATUS) as error:
+        if ending.signal is not None:  # which went to children as well, most likely
+            return _ended_by(ending.signal)
         print(f"{PROGRAM}: {' '.join(str(error).splitlines())}", file=sys.stderr)
         return next(status for kind, status in _STATUS.items() if isinstance(error, kind))
     except KeyboardInterrupt:
-        return 130
-    except Terminated as stop:
-        return int(stop.code or 0)
+        return 130 if ending.signal is None else _ended_by(ending.signal)
+    except Terminated as stop:  # from `Interruption`, where it was told what is saved
+        return 128 + stop.signal if ending.signal is None else _ended_by(ending.signal)
     except Exception:
+        if ending.signal is not None:
+            return _ended_by(ending.signal)
         if not processes.are_several():
             raise
         traceback.print_exc()
@@ -105,22 +129,34 @@ def main(words: Sequence[str] | None = None) -> int:
         return 1
 
 
+def _ended_by(number: int) -> int:
+    print(f"{PROGRAM}: {name_of(number)}: ended before it was done", file=sys.stderr)
+    return 128 + number
+
+
+def _status_of_printing(words: Sequence[str], printed: SafeStream) -> int:
+    """The exit status of a command that has done its work, as to what became of what it printed."""
+    prints_result = " ".join(words).startswith(_PRINT_RESULTS) or not words or {"-h", "--help", "--version"} & set(words)
+    if not isinstance(printed.failure, OSError) or not prints_result:
+        return 0
+    if isinstance(printed.failure, BrokenPipeError):  # has seen enough: `jaxrl-vis train --help | head`
+        return _READER_LEFT
+    print(f"{PROGRAM}: cannot write to stdout ({printed.failure.strerror}): send it elsewhere", file=sys.stderr)
+    return 1
+
+
 def entry() -> None:
     """The program: `main`, and the end of this process.
 
     After a signal the process ends at once: what was to be saved is saved, and threads that still write a checkpoint, which a
     second signal has given up, are not waited for.
     """
-    try:
-        status = main()
-        sys.stdout.flush()
-    except BrokenPipeError:  # whoever read what is printed has seen enough: `jaxrl-vis train --help | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what Python flushes at its end
-        status = 141
-    sys.stderr.flush()
+    reserve_standard_files()
+    status = main(give_up=lambda number: os._exit(_ended_by(number)))
+    let_go_of_broken_streams()
     if status == _STATUS[RequestError]:
         processes.leave_together()
-    if status in (130, 143) or (status and processes.are_several()):
+    if status > 128 or (status and processes.are_several()):
         os._exit(status)  # of several processes that failed, none must wait for the others
     sys.exit(status)
 

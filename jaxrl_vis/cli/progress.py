@@ -1,13 +1,17 @@
 """How far a command has come: a bar in a terminal, a line for each part elsewhere."""
 
 import contextlib
-from collections.abc import Callable, Iterator
+import sys
+from collections.abc import Callable, Iterator, Sequence
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import Task
+
+from jaxrl_vis.run.bar import FittingProgress
+from jaxrl_vis.streams import safe
 
 Done = Callable[[str, int, int], None]
 """Called with the name of a part, how much of it is done, and how much there is."""
+_SHORT_NAME = 20
 
 
 @contextlib.contextmanager
@@ -17,26 +21,28 @@ def progress(unit: str) -> Iterator[Done]:
     Args:
         unit: What is counted, in the plural.
     """
-    console = Console()
-    if not console.is_terminal:
+    stream = safe(sys.stdout)
+    if not stream.isatty():
 
         def say(name: str, done: int, of: int) -> None:
             if done == of:
-                print(f"{name}: {of} {unit}", flush=True)
+                print(f"{name}: {of} {unit}", flush=True, file=stream)
 
         yield say
         return
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn(unit),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-    )
+
+    def wordings(task: Task, elapsed: str, left: str) -> Sequence[Sequence[str]]:
+        count, name = f"{task.completed:.0f}/{task.total:.0f}", task.description
+        times = (f"{elapsed} elapsed", f"{left} left")
+        return [
+            (name, f"{count} {unit}", *times),
+            (name[:_SHORT_NAME], count, *times),
+            (count, *times),
+            (count, f"{elapsed}, {left} left"),
+        ]
+
     tasks = {}
-    with Progress(*columns, console=console) as bars:
+    with FittingProgress(stream, wordings) as bars:
 
         def draw(name: str, done: int, of: int) -> None:
             if name not in tasks:

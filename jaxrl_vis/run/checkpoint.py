@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from jaxrl_vis import processes
+from jaxrl_vis import processes, streams
 from jaxrl_vis.errors import RequestError, StorageError
 from jaxrl_vis.run.arrays import as_saved, check_structure, describe, host_specs, is_intact, rebuild, to_host, to_save
 from jaxrl_vis.types import LoopState, TrainState
@@ -112,7 +112,7 @@ class Checkpoints:
         read_only: Promise to save nothing: nothing is created or cleaned up.
     """
 
-    def __init__(self, folder: Path, say: Callable[[str], None] = print, read_only: bool = False):
+    def __init__(self, folder: Path, say: Callable[[str], None] = streams.say, read_only: bool = False):
         self._folder = folder.resolve()  # orbax refuses relative names
         self._say = say
         self._read_only = read_only

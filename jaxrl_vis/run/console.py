@@ -1,4 +1,4 @@
-"""What a run says while it runs: a progress bar on a terminal, plain lines everywhere else."""
+"""What a run says while it runs: a progress bar on a terminal, plain lines everywhere else. Nothing that is said can end it."""
 
 import statistics
 import sys
@@ -6,8 +6,10 @@ from collections.abc import Sequence
 from types import TracebackType
 from typing import Self
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import Task
+
+from jaxrl_vis import streams
+from jaxrl_vis.run.bar import FittingProgress
 
 
 def show_shares(values: Sequence[float]) -> str:
@@ -26,6 +28,24 @@ def show_seconds(seconds: float) -> str:
     return f"{whole // 3600} h {whole % 3600 // 60} min"
 
 
+def _wordings(task: Task, elapsed: str, left: str) -> list[tuple[str, ...]]:
+    count = f"{task.completed:.0f}/{task.total:.0f}"
+    success, distance, speed = (
+        f"success {task.fields['success']}",
+        f"distance {task.fields['distance']}",
+        f"{task.fields['speed']} steps/s",
+    )
+    iteration, times = f"iteration {count}", (f"{elapsed} elapsed", f"{left} left")
+    return [
+        (iteration, success, distance, speed, *times),
+        (iteration, success, distance, *times),
+        (iteration, success, *times),
+        (iteration, *times),
+        (count, f"{elapsed} elapsed, {left} left"),
+        (count, f"{elapsed}, {left} left"),
+    ]
+
+
 class RunConsole:
     """Shows a run's progress. A bar appears only where stdout is a terminal; lines are printed above it.
 
@@ -35,7 +55,7 @@ class RunConsole:
 
     def __init__(self, quiet: bool = False):
         self._quiet = quiet
-        self._bar: Progress | None = None
+        self._bar: FittingProgress | None = None
         self._task = None
 
     def say(self, line: str) -> None:
@@ -45,7 +65,7 @@ class RunConsole:
         if self._bar is not None:
             self._bar.console.print(line, markup=False, highlight=False, soft_wrap=True)
         else:
-            print(line, flush=True)
+            streams.say(line)
 
     def start(self, total: int, done: int) -> None:
         """Shows the bar, on a terminal.
@@ -54,20 +74,10 @@ class RunConsole:
             total: Iterations of the whole run.
             done: Iterations that an earlier part of the run has done.
         """
-        if self._quiet or not sys.stdout.isatty():
+        stream = streams.safe(sys.stdout)
+        if self._quiet or not stream.isatty():
             return
-        columns = (
-            TextColumn("[bold]training"),
-            BarColumn(bar_width=None),
-            MofNCompleteColumn(),
-            TextColumn("success [bold green]{task.fields[success]}"),
-            TextColumn("distance {task.fields[distance]}"),
-            TextColumn("{task.fields[speed]} steps/s"),
-            TimeElapsedColumn(),
-            TextColumn("left"),
-            TimeRemainingColumn(),
-        )
-        self._bar = Progress(*columns, console=Console(), refresh_per_second=4)
+        self._bar = FittingProgress(stream, _wordings, refresh_per_second=4)
         self._bar.start()
         self._task = self._bar.add_task("training", total=total, completed=done, success="-", distance="-", speed="-")
 

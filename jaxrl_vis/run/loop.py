@@ -38,6 +38,7 @@ from jaxrl_vis.run.progress import Progress
 from jaxrl_vis.run.results import Results, describe
 from jaxrl_vis.run.saving import Saver, import_what_saves
 from jaxrl_vis.run.signals import Interruption
+from jaxrl_vis.streams import reserve_standard_files
 from jaxrl_vis.types import LoopState
 
 _FILTERED_TOO_MUCH, _FILTERED_EVALUATIONS = 0.9, 3
@@ -96,6 +97,7 @@ class RunLoop:
 
     def reports(self, resume: bool, overwrite: bool) -> Iterator[Report]:
         """The whole run; see `Trainer.run`."""
+        reserve_standard_files()
         goes_on = self._folder.check(self._config, resume, overwrite)
         if resume and not goes_on:
             self._say(f"nothing to resume in {self._folder.path}: starting at the beginning")
@@ -119,10 +121,14 @@ class RunLoop:
                     yield from self._train(interruption)
                     self._finish(interruption)
                 self._checkpoints.close()
-            except (OSError, StorageError) as error:
+            except StorageError as error:
                 self._rescue()
                 raise self._saver.storage_error(error) from error
             except NonFiniteError:
+                raise
+            except (KeyboardInterrupt, SystemExit):
+                if not interruption:  # raised by a handler of the caller's own, which was left in charge
+                    self._rescue()
                 raise
             except Exception:
                 self._rescue()
@@ -172,7 +178,7 @@ class RunLoop:
             self._say("no usable checkpoint: starting at the beginning")
 
         started = time.monotonic()
-        self._say("compiling (once; the next start finds it in the cache) ...")
+        self._say(f"compiling ({programs.says_of_cache()}) ...")
         compiled = programs.compile(meanwhile=import_what_saves)
         self._compile_s = time.monotonic() - started
         self._progress.compile_s += self._compile_s
@@ -190,7 +196,8 @@ class RunLoop:
         self.has_begun = True
         damaged = self._checkpoints.set_aside_after(self._done) if goes_on else []
         if self._writes:
-            self._begin_log(goes_on, damaged)
+            with self._saver.writing():
+                self._begin_log(goes_on, damaged)
         processes.meet("begun")
         if self._loop is None:
             self._loop = self._programs.init(self._programs.run_keys)
@@ -256,7 +263,7 @@ class RunLoop:
             # Before the metrics are read, so that the device does not wait for the host meanwhile.
             outcome = self._begin_evaluation() if evaluation and self._evaluates_ahead else None
             report, waiting = self._read(*waiting), None
-            if processes.any_of(bool(interruption)):
+            if interruption.reached_any():
                 self._save_and_end(evaluation, interruption)
             if evaluation:
                 report = self._evaluate(report, self._begin_evaluation() if outcome is None else outcome)
@@ -265,7 +272,7 @@ class RunLoop:
             if full:
                 self._saver.full(self._loop, self._done, self._progress_now())
             # A signal that came during the evaluation must not wait for another iteration.
-            if self._done < self._total and processes.any_of(bool(interruption)):
+            if self._done < self._total and interruption.reached_any():
                 self._save_and_end(False, interruption)
             yield report
 
@@ -320,7 +327,8 @@ class RunLoop:
             counts["resume/replay_lost_at"] = progress.replay_lost_at
         if self._writes:
             rows = metrics.make_rows(self._programs.seeds, counts, values | means | rounded)
-            metrics.append_rows(self._folder.metrics, rows)
+            with self._saver.writing():
+                metrics.append_rows(self._folder.metrics, rows)
             self._loggers.rows(rows)
         progress.evaluation_due = False
         self._warn_if_filtered(means)
@@ -334,13 +342,15 @@ class RunLoop:
     def _show(self, values: PerSeed, speed: float) -> None:
         success, distance, unit = values["eval/success"], values["eval/goal_distance"], self._programs.env.distance_unit
         self._console.evaluated(success, distance, unit)
-        left = (self._total - self._done) * (time.monotonic() - self._begun_at) / max(1, self._done - self._begun)
         env_steps = self._done * self._program.steps_per_iteration
-        line = (
-            f"iteration {self._done}/{self._total}  {env_steps:,} steps  success {show_shares(success)}  "
-            f"distance {np.median(distance):.3f} {unit}  {speed:,.0f} steps/s"
-        )
-        self._say(line if self._done == self._total else f"{line}  about {show_seconds(left)} left")
+        words = [f"iteration {self._done}/{self._total}", f"{env_steps:,} steps", f"success {show_shares(success)}"]
+        words.append(f"distance {np.median(distance):.3f} {unit}")
+        if done := self._done - self._begun:  # none yet where an evaluation is made up for: nobody knows the speed
+            words.append(f"{speed:,.0f} steps/s")
+            if self._done < self._total:
+                left = (self._total - self._done) * (time.monotonic() - self._begun_at) / done
+                words.append(f"about {show_seconds(left)} left")
+        self._say("  ".join(words))
 
     def _warn_if_filtered(self, means: PerSeed) -> None:
         too_much = max(means.get("train/filtered_share", [0.0])) > _FILTERED_TOO_MUCH
@@ -370,7 +380,7 @@ class RunLoop:
         assert self._loop is not None
         self._console.stop()
         self._progress.evaluation_due = evaluation_due
-        self._saver.on_signal(self._loop, self._done, self._progress_now(), interruption.name)
+        self._saver.on_signal(self._loop, self._done, self._progress_now(), interruption)
         with contextlib.suppress(OSError):
             if self._writes:
                 self._results.draw_curve(self._done)
@@ -392,10 +402,12 @@ class RunLoop:
             self._saver.full(self._loop, self._done, self._progress_now())
         self._saver.finish()
         self._console.stop()
-        if processes.any_of(bool(interruption)):
+        if interruption.reached_any():
+            self._say(f"{interruption.name}: all is trained and saved; to draw the curve and the video, {self._saver.resume}")
             interruption.end()
         if self._programs.shows_images and not self._recorded:
             # Killed after the last evaluation, before this: resumed with nothing left to evaluate.
             _, self._recorded = self._programs.evaluate(self._loop.train)
         if self._writes:
-            self._results.show(self._done, self._progress_now, self._recorded)
+            with self._saver.writing():
+                self._results.show(self._done, self._progress_now, self._recorded)

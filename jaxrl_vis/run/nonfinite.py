@@ -23,6 +23,47 @@ def broken_leaves(loop: LoopState) -> dict[str, jax.Array]:
     return {name: ~jnp.isfinite(leaf).all() for name, leaf in _checked(loop).items()}
 
 
+def _episodes(loop: LoopState, *names: str) -> dict[str, np.ndarray]:
+    """Parts of all episodes of the replay, [S, N, T..., values] float32."""
+    episodes = {name: np.asarray(getattr(loop.replay.episodes, name)) for name in names}
+    # Where devices share a learner, episodes are numbered by rollout and environment (`sharding.Layout`).
+    return {name: array.reshape(len(array), -1, *array.shape[-2:]) for name, array in episodes.items()}
+
+
+def made_by_simulation(loop: LoopState, num_envs: int) -> str | None:
+    """What shows that the simulation has made a number that is not finite, in words; None where nothing shows that.
+
+    It did where such a number came before the first action that is not finite: what comes after that is the learner's fault.
+
+    Args:
+        loop: As of `dump`.
+        num_envs: Environments of a seed.
+    """
+    names = ["states"]
+    if jnp.issubdtype(loop.replay.episodes.observations.dtype, jnp.floating):
+        names.append("observations")
+    episodes = _episodes(loop, "actions", *names)
+    is_bad = {name: np.asarray(~np.isfinite(array).all(-1)) for name, array in episodes.items()}
+    horizon = is_bad["actions"].shape[-1]
+    first_action = _first(is_bad["actions"])
+    for name, quantity in (("states", "achieved_state"), ("observations", "observation")):
+        if name not in is_bad:
+            continue
+        step, goal = _first(is_bad[name][..., : horizon + 1]), is_bad[name][..., horizon + 1]
+        # An action leads from the state of its own number to the next one.
+        seeds, slots = np.nonzero(goal | (step <= np.minimum(first_action, horizon)))
+        if len(seeds):
+            seed, slot = seeds[0], slots[0]
+            where = "in its goal" if goal[seed, slot] else f"from step {step[seed, slot]} on"
+            return f"{quantity} of environment {slot % num_envs} is not finite {where}, and all actions before it are"
+    return None
+
+
+def _first(is_bad: np.ndarray) -> np.ndarray:
+    """Where along the last axis it is true first; the axis' length where it is nowhere."""
+    return np.where(is_bad.any(-1), is_bad.argmax(-1), is_bad.shape[-1])
+
+
 def dump(file: Path, loop: LoopState, values: PerSeed, leaves: list[str]) -> None:
     """Writes an .npz that shows where a non-finite number came from. Runs on the host alone: nothing is compiled here.
 
@@ -37,9 +78,7 @@ def dump(file: Path, loop: LoopState, values: PerSeed, leaves: list[str]) -> Non
         leaves: Names of the learner's leaves that are not finite.
     """
     found = {f"train.{name}": array for name, array in to_host(loop.train, copy=True).items()}
-    episodes = {name: np.asarray(getattr(loop.replay.episodes, name)) for name in ("states", "actions")}
-    # Where devices share a learner, episodes are numbered by rollout and environment (`sharding.Layout`).
-    episodes = {name: array.reshape(len(array), -1, *array.shape[-2:]) for name, array in episodes.items()}
+    episodes = _episodes(loop, "states", "actions")
     bad = ~(np.isfinite(episodes["states"]).all((-2, -1)) & np.isfinite(episodes["actions"]).all((-2, -1)))
     seeds, slots = (index[:_MAX_EPISODES] for index in np.nonzero(bad))
     found |= {"episodes.seed_index": seeds, "episodes.slot": slots}

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 
 from jaxrl_vis import processes
 from jaxrl_vis.config import Config
-from jaxrl_vis.devices import enable_compilation_cache
+from jaxrl_vis.devices import cache_fault, default_cache, enable_compilation_cache
 from jaxrl_vis.learner.parts import played_spec
 from jaxrl_vis.learner.rollout import Exploration
 from jaxrl_vis.report import videos
@@ -163,6 +163,13 @@ class Programs:
         self._those(self.names, meanwhile)
         return dict(self._compiled)
 
+    def says_of_cache(self) -> str:
+        """What the next start will find of what is compiled now, in words."""
+        folder, fault = enable_compilation_cache(), cache_fault()
+        if fault is not None:
+            return f"as will every start: {fault}"
+        return f"once; the next start finds it in {'the cache' if folder == str(default_cache()) else folder}"
+
     def _those(self, names: Sequence[str], meanwhile: Callable[[], None] = lambda: None) -> dict[str, Any]:
         """Programs by name; those that are not compiled yet are now."""
         if missing := [name for name in names if name not in self._compiled]:
@@ -172,7 +179,7 @@ class Programs:
     def _make(self, names: Sequence[str], meanwhile: Callable[[], None] = lambda: None) -> None:
         """Compiles programs, which then are `_compiled`."""
         cache = enable_compilation_cache() if self._caches else ""
-        if self._may_keep and (found := fingerprint(self.config, self.env)):
+        if cache and self._may_keep and (found := fingerprint(self.config, self.env)):
             self._kept = KeptPrograms(Path(cache) / "programs", found)
             try:
                 with trusting_kernels():

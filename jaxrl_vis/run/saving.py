@@ -7,8 +7,10 @@ of patience, or of disk, in between keeps the networks.
 
 import contextlib
 import dataclasses
+import errno
 import importlib
-from collections.abc import Callable
+import shlex
+from collections.abc import Callable, Iterator
 
 import jax
 import numpy as np
@@ -18,9 +20,10 @@ from jaxrl_vis.errors import NonFiniteError, StorageError
 from jaxrl_vis.run.checkpoint import FULL, LIGHT, Checkpoints
 from jaxrl_vis.run.folder import RunFolder
 from jaxrl_vis.run.metrics import PerSeed
-from jaxrl_vis.run.nonfinite import dump
+from jaxrl_vis.run.nonfinite import dump, made_by_simulation
 from jaxrl_vis.run.programs import Programs
 from jaxrl_vis.run.progress import Progress
+from jaxrl_vis.run.signals import Interruption
 from jaxrl_vis.types import LoopState
 
 
@@ -75,24 +78,24 @@ class Saver:
         if not self._keeps_full:
             self._checkpoints.retire_full(has_ended=True)
 
-    def on_signal(self, loop: LoopState, iteration: int, progress: Progress, signal_name: str) -> None:
+    def on_signal(self, loop: LoopState, iteration: int, progress: Progress, interruption: Interruption) -> None:
         """Saves the learner, then everything. A full disk in between leaves the light checkpoint, and says so.
 
         Raises:
             NonFiniteError, StorageError: As `light`.
         """
-        self._say(f"{signal_name}: saving iteration {iteration} (once more quits at once, without the replay) ...")
+        hint = f"{interruption.hurry} at once, without the replay"
+        self._say(f"{interruption.name}: saving iteration {iteration} ({hint}) ...")
         if not self.has(LIGHT, iteration) or progress.evaluation_due:
             self.light(loop, iteration, progress)
         self._checkpoints.wait()
-        resume = f"go on with --run-dir {self._folder.path} --resume"
         if not self.has(FULL, iteration) or progress.evaluation_due:
             try:
                 self.full(loop, iteration, progress)
             except StorageError as error:
-                self._say(f"the networks are saved, the replay is not: {error}; {resume}")
+                self._say(f"the networks are saved, the replay is not: {error}; {self.resume}")
                 return
-        self._say(f"saved; {resume}")
+        self._say(f"saved; {self.resume}")
 
     def rescue(self, loop: LoopState | None, iteration: int, progress: Progress) -> None:
         """Tries to save the learner after something unexpected went wrong; what stands in the way is not reported."""
@@ -105,14 +108,30 @@ class Saver:
                 self.light(loop, iteration, progress)
                 self._checkpoints.wait()
 
-    def storage_error(self, error: OSError | StorageError) -> StorageError:
+    @property
+    def resume(self) -> str:
+        """How to go on, for a shell."""
+        return f"go on with --run-dir {shlex.quote(str(self._folder.path))} --resume"
+
+    @contextlib.contextmanager
+    def writing(self) -> Iterator[None]:
+        """Turns what the system says of the run's files into a `StorageError`; what is called in here does nothing else."""
+        try:
+            yield
+        except OSError as error:
+            reason = error.strerror or type(error).__name__
+            raise StorageError(f"cannot write to {self._folder.path} ({reason})") from error
+
+    def storage_error(self, error: StorageError) -> StorageError:
         """What a run that could not write ends with: what failed, what there is, and how to go on."""
-        what = str(error)
-        if isinstance(error, OSError):
-            what = f"cannot write to {self._folder.path} ({error.strerror or type(error).__name__})"
+        if not self._folder.config.exists():
+            return StorageError(f"{error}; no run is there: if it was moved, go on where it is now, or else start it again")
         kept = self._checkpoints.newest()
         good = "there is no checkpoint yet" if kept is None else f"the last checkpoint is of iteration {kept}"
-        return StorageError(f"{what}; {good}: make room, then go on with --run-dir {self._folder.path} --resume")
+        cause = error.__cause__
+        is_full = "no space left" in str(error).lower() or getattr(cause, "errno", None) in (errno.ENOSPC, errno.EDQUOT)
+        mend = "make room" if is_full else "mend that"
+        return StorageError(f"{error}; {good}: {mend}, then {self.resume}")
 
     def _refuse_nonfinite(self, loop: LoopState, iteration: int) -> None:
         # The guard looks at losses and states; a parameter that broke in the very last update shows in the next iteration's.
@@ -129,10 +148,15 @@ class Saver:
         leaves = self._programs.broken_leaves(loop) if broken is None else broken
         leaves = [name.removeprefix("train.") for name in leaves if name.startswith("train.")]
         file = self._folder.nonfinite / f"iteration_{iteration}.npz"
+        simulated = None
         if not processes.are_several():
             dump(file, loop, values, leaves)
+            simulated = made_by_simulation(loop, self._programs.config.num_envs)
+            if simulated is None and not leaves and values and all(name.startswith("eval/") for name in values):
+                simulated = "the networks are finite"
         names = [name for name, row in values.items() if not np.isfinite(row).all()] + leaves
         shown = f" ({', '.join(names[:3])}{f' and {len(names) - 3} more' if len(names) > 3 else ''})" if names else ""
         good = "there is no checkpoint yet" if kept is None else f"the last good checkpoint is of iteration {kept}"
         dumped = "the state lies in several processes and is not kept" if processes.are_several() else f"state dumped to {file}"
-        raise NonFiniteError(f"non-finite numbers in {where}{shown}: {dumped}; {good}")
+        origin = f"they come from the simulation, not from the learner ({simulated}); " if simulated else ""
+        raise NonFiniteError(f"non-finite numbers in {where}{shown}: {origin}{dumped}; {good}")

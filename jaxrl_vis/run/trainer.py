@@ -136,15 +136,16 @@ class Trainer:
         """Trains to the end and yields a `Report` per iteration, one iteration late.
 
         Compiles; evaluates every ``eval_interval`` iterations and at the end; writes metrics, checkpoints, the curve and the
-        video into the run folder; and says on stdout what it does. SIGTERM and Ctrl-C (in the main thread) are acted upon
-        between two iterations. Whoever leaves the loop early keeps what was saved until then; the next call goes on from there.
+        video into the run folder; and says on stdout what it does, which cannot fail. Signals that would end the process are
+        acted upon between two iterations, in the main thread and where the caller has no handler of its own. Whoever leaves the
+        loop early keeps what was saved until then; the next call goes on from there.
 
         Raises:
             RequestError: The folder, the saved run or the memory does not suit the configuration, or another process writes
                 into the folder. Nothing was changed.
             NonFiniteError: A number is not finite any more. The state was dumped, and was not saved as a checkpoint.
             StorageError: A file could not be written. What was saved before is good.
-            Terminated: SIGTERM, after saving.
+            Terminated: A signal other than Ctrl-C, after saving.
             KeyboardInterrupt: Ctrl-C, after saving.
         """
         loop = RunLoop(self.programs, self.folder, self._log)

@@ -10,6 +10,7 @@ FIGURE.csv   the same figures, to compute with
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from jaxrl_vis import streams
 from jaxrl_vis.devices import list_devices, shared
 from jaxrl_vis.files import write_atomically
 from jaxrl_vis.studies import indicator, indicator_figures, ol_aux, ol_aux_figures
@@ -29,7 +30,7 @@ _SHOW: dict[str, Callable[..., Shown]] = {
 }
 
 
-def make_figure(request: Request, say: Callable[[str], None] = print) -> bool:
+def make_figure(request: Request, say: Callable[[str], None] = streams.say) -> bool:
     """Trains what is missing and draws what is finished.
 
     Returns:
@@ -38,7 +39,7 @@ def make_figure(request: Request, say: Callable[[str], None] = print) -> bool:
     Raises:
         RequestError: Something that was asked for cannot be, see `cells_of` and `run_cells`.
         KeyboardInterrupt: Ctrl-C; nothing was drawn.
-        Terminated: SIGTERM; nothing was drawn.
+        Terminated: Another signal; nothing was drawn.
     """
     study = request.study
     tasks, variants = request.tasks or tuple(study.steps), request.variants or study.variants

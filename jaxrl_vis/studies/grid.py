@@ -20,13 +20,14 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
+from jaxrl_vis import streams
 from jaxrl_vis.devices import Device
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.provenance import child_environment
 from jaxrl_vis.run.command import options_of
 from jaxrl_vis.run.console import show_seconds
 from jaxrl_vis.run.folder import RunFolder
-from jaxrl_vis.run.signals import Interruption
+from jaxrl_vis.run.signals import SIGNALS, Interruption
 from jaxrl_vis.studies.cells import Cell, contradiction, is_finished, latest_rows, show_budget
 
 _POLL_S = 0.2
@@ -94,7 +95,7 @@ def run_cells(
     find_devices: Callable[[], Sequence[Device]],
     seconds: float | None = None,
     command: Command = train_command,
-    say: Callable[[str], None] = print,
+    say: Callable[[str], None] = streams.say,
     start: Start = start_process,
 ) -> list[str]:
     """Trains the cells that are not finished; resumes those that were begun.
@@ -114,7 +115,7 @@ def run_cells(
     Raises:
         RequestError: No device was found, or the folder cannot be written to.
         KeyboardInterrupt: Ctrl-C, after all processes have saved and ended.
-        Terminated: SIGTERM, likewise.
+        Terminated: Another signal, likewise.
     """
     missing = [cell for cell in cells if not is_finished(cell, runs)]
     if not missing:
@@ -198,7 +199,7 @@ class _Grid:
         status, took = done.process.returncode, show_seconds(time.monotonic() - done.started)
         if status == 0 and is_finished(done.cell, self._runs):
             self._say(f"{done.cell.name}: done in {took}{_success(self._runs / done.cell.name)}")
-        elif self._is_stopping and status in (130, 143, -signal.SIGTERM, -signal.SIGINT):
+        elif self._is_stopping and (-status in SIGNALS or status - 128 in SIGNALS):
             self._say(f"{done.cell.name}: stopped after {took}; starting again goes on")
         else:
             why = "ended before it was finished" if status == 0 else f"failed with exit status {status}"

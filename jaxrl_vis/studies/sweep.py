@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from jaxrl_vis import streams
 from jaxrl_vis.config import preset
 from jaxrl_vis.devices import Device, list_devices
 from jaxrl_vis.errors import RequestError
@@ -64,7 +65,7 @@ def cells_of(request: Request) -> list[Cell]:
     return cells
 
 
-def run_sweep(request: Request, say: Callable[[str], None] = print) -> bool:
+def run_sweep(request: Request, say: Callable[[str], None] = streams.say) -> bool:
     """Trains what is missing, resumes what was begun, and prints a table.
 
     Returns:
