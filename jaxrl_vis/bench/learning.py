@@ -17,7 +17,6 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.files import write_atomically
 from jaxrl_vis.run.command import command_of
 from jaxrl_vis.run.folder import RunFolder, read_config, read_record
-from jaxrl_vis.run.metrics import read_rows
 
 FOLDER = "learning"
 NAME = "learning"
@@ -57,7 +56,7 @@ def keep(run: Path, name: str, results: Path) -> tuple[Path, Path]:
     about, config = read_record(run), read_config(run)
     rows = [
         {column: value for column, value in row.items() if column in _COLUMNS or column.startswith(_PREFIXES)}
-        for row in read_rows(folder.metrics)
+        for row in folder.rows()
     ]
     rows = [row for row in rows if any(column.startswith("eval/") for column in row)]
     if not rows:

@@ -9,7 +9,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.evaluate import num_recorded
 from jaxrl_vis.report import videos, viewer
 from jaxrl_vis.run.checkpoint import FULL, LIGHT, Checkpoints, Restored
-from jaxrl_vis.run.folder import read_config
+from jaxrl_vis.run.folder import read_config, read_run_id
 from jaxrl_vis.run.memory import check_compiled
 from jaxrl_vis.run.trainer import Trainer, make_trainer
 
@@ -40,7 +40,7 @@ def load(trainer: Trainer, run_dir: Path | str, checkpoint: int | None = None) -
     Raises:
         RequestError: There is none, or none that can be used.
     """
-    checkpoints = Checkpoints(Path(run_dir) / "checkpoints", read_only=True)
+    checkpoints = Checkpoints(Path(run_dir) / "checkpoints", read_only=True, run_id=read_run_id(Path(run_dir)))
     kept = sorted({*checkpoints.iterations(LIGHT), *checkpoints.iterations(FULL)})
     if checkpoint is not None and kept and checkpoint not in kept:
         there = ", ".join(map(str, kept))
