@@ -13,7 +13,7 @@ from pathlib import Path
 
 from jaxrl_vis import fields
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.files import user_cache
+from jaxrl_vis.files import make_private, user_cache
 from jaxrl_vis.provenance import child_environment
 
 _MOST_MEMORY = 0.9
@@ -79,12 +79,18 @@ def enable_compilation_cache() -> str:
     import jax
     from jax.experimental.compilation_cache import compilation_cache
 
+    from jaxrl_vis.cache_entries import mend_damaged_entries
+
     if not jax.config.jax_compilation_cache_dir:
-        jax.config.update("jax_compilation_cache_dir", str(user_cache() / "xla"))
+        folder = user_cache() / "xla"
+        with contextlib.suppress(OSError):
+            make_private(folder)  # it holds machine code, which runs
+        jax.config.update("jax_compilation_cache_dir", str(folder))
         # JAX decides at its first compilation whether it has a cache, and a notebook has compiled something by now.
         compilation_cache.reset_cache()
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+    mend_damaged_entries()
     return str(jax.config.jax_compilation_cache_dir)
 
 

@@ -62,7 +62,7 @@ def default_folder(config: Config) -> Path:
 
 def check_there(path: Path, resume: bool) -> None:
     """Raises a `RequestError` where a run is to go on in a folder that is not there."""
-    check_path(path)
+    check_path(path / "config.json")
     if resume and not path.exists():
         raise RequestError(f"nothing to resume: there is no folder {path}; leave out --resume to start a run there")
 

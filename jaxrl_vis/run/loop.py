@@ -26,7 +26,7 @@ import numpy as np
 
 from jaxrl_vis import processes
 from jaxrl_vis.errors import NonFiniteError, StorageError
-from jaxrl_vis.run import earlier, metrics
+from jaxrl_vis.run import earlier, metrics, trust
 from jaxrl_vis.run.checkpoint import FULL, LIGHT, Checkpoints, Restored
 from jaxrl_vis.run.console import RunConsole, show_seconds, show_shares
 from jaxrl_vis.run.folder import RunFolder, read_record, read_run_id
@@ -205,6 +205,8 @@ class RunLoop:
         self._evaluates_ahead = self._programs.evaluates_ahead and has_room
         if self._writes:
             self._folder.open(self._config, goes_on, overwrite, self._log)
+            if trust.is_own(self._config):  # and here it runs
+                trust.trust(self._folder.path, self._config, was_trained_here=True)
         processes.meet("opened")
         self._checkpoints.run_id = read_run_id(self._folder.path)
         self.has_begun = True
