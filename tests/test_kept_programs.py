@@ -1,6 +1,7 @@
 """Programs that an earlier process has traced: found again, equal, and only where nothing has changed."""
 
 import dataclasses
+import hashlib
 import os
 from pathlib import Path
 
@@ -93,7 +94,11 @@ def test_damaged_and_unsuitable_programs_are_traced_anew(folder, program):
     files["init"].write_bytes(b"")
     Programs(CONFIG, program, keep=True).compile()
     assert {path.name.partition("-")[0]: path.read_bytes() for path in folder.iterdir()} == good
-    files["learn"].write_bytes(good["play"])  # whole, but of something else
+    files["learn"].write_bytes(good["play"])  # whole, but renamed
+    Programs(CONFIG, program, keep=True).compile()
+    assert {path.name.partition("-")[0]: path.read_bytes() for path in folder.iterdir()} == good
+    data = good["play"][32:]  # of something else, by whoever knows what a digest is of
+    files["learn"].write_bytes(hashlib.sha256(files["learn"].name.encode() + b"\0" + data).digest() + data)
     unsuitable = Programs(CONFIG, program, keep=True)
     unsuitable.compile()
     assert_equal(results(unsuitable), results(Programs(CONFIG, program)))

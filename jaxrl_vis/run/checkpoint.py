@@ -129,7 +129,7 @@ class Checkpoints:
         run_id: str | None = ANY_RUN,
     ):
         self.run_id = run_id
-        self._folder = folder.resolve()  # orbax refuses relative names
+        self._folder = folder.absolute()  # orbax refuses relative names
         self._say = say
         self._read_only = read_only
         self._managers: dict[str, ocp.CheckpointManager] = {}

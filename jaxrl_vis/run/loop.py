@@ -93,6 +93,7 @@ class RunLoop:
         self._begun, self._begun_at = 0, self._mark
         self._marked_iteration, self._compile_s = 0, 0.0
         self._is_left_alone = False
+        self._evaluated_there: set[int] = set()  # seeds that have a row of the iteration that the run goes on from
         self._evaluates_ahead = False  # while the iteration before is still learned from
         self._owed_evaluation = False  # what was restored owes an evaluation, and would whenever it is restored
         self.has_begun = False  # the folder is this run's
@@ -230,9 +231,9 @@ class RunLoop:
             foreign: Those of other runs.
         """
         if goes_on:
-            last = self._done - self._progress.evaluation_due  # an evaluation that is due writes its rows again
-            if said := earlier.cut_back(self._folder, self._checkpoints, last, keeps_later=bool(damaged)):
+            if said := earlier.cut_back(self._folder, self._checkpoints, self._done, keeps_later=bool(damaged)):
                 self._say(said)
+            self._evaluated_there = {row["seed"] for row in self._folder.rows() if row["iteration"] == self._done}
         for path in damaged:
             self._say(f"kept for inspection: {path}")
         for path in foreign:
@@ -350,6 +351,8 @@ class RunLoop:
         if self._writes:
             self._check_ours()
             rows = metrics.make_rows(self._programs.seeds, counts, values | means | rounded, self._checkpoints.run_id)
+            if self._done == self._begun:  # an evaluation that was due: a kill or a disk may have left a part of its rows
+                rows = [row for row in rows if row["seed"] not in self._evaluated_there]
             metrics.append_rows(self._folder.metrics, rows)
             self._loggers.rows(rows)
         progress.evaluation_due = False
