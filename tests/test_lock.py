@@ -83,6 +83,7 @@ with lock.run_lock(Path({str(tmp_path)!r})):
         held.check()
     # A number that another process has by now does not keep it alive: when that started is compared, too.
     text = f"{marker(socket.gethostname(), os.getpid())}start=1\n"
+    tmp_path.mkdir(exist_ok=True)
     (tmp_path / FILE_NAME).write_text(text)
     with run_lock(tmp_path, said.append):
         assert "took over" in said[-1]

@@ -97,6 +97,7 @@ def evaluate(options: Eval) -> int:
         raise RequestError("--loops policy goes with --policy RUN, a run of VisualStalkReach")
     if options.policy is not None:
         check_run(options.policy)
+        may_run_code(options.policy, options.trust)
     check_extra("grasp", "grasping")
     if options.json is not None:
         check_writable(options.json, "--json")
@@ -175,7 +176,7 @@ def _policy(options: Eval) -> "tuple[Policy | None, str]":
     from jaxrl_vis.grasping.policy_loop import check_policy
     from jaxrl_vis.run.policy import load_policy
 
-    policy = load_policy(options.policy, options.policy_seed, trust=may_run_code(options.policy, options.trust))
+    policy = load_policy(options.policy, options.policy_seed)
     check_policy(policy)
     return policy, f"{options.policy.resolve().name} seed {policy.seed} iteration {policy.iteration}"
 
