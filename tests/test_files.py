@@ -4,7 +4,6 @@ import json
 import os
 import stat
 import threading
-from pathlib import Path
 
 import pytest
 

@@ -122,7 +122,9 @@ def test_a_process_of_another_host_that_does_not_is_taken_over(tmp_path, no_lock
         assert f"pid={os.getpid()}\n" in path.read_text()
 
 
-@pytest.mark.parametrize("leftover", [None, marker("elsewhere", 7), marker(socket.gethostname(), DEAD)], ids=["new", "old", "dead"])
+@pytest.mark.parametrize(
+    "leftover", [None, marker("elsewhere", 7), marker(socket.gethostname(), DEAD)], ids=["new", "old", "dead"]
+)
 def test_of_two_that_start_at_once_one_wins(tmp_path, no_locks, leftover):
     if leftover is not None:
         (tmp_path / FILE_NAME).write_text(leftover)

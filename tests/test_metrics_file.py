@@ -120,7 +120,9 @@ def test_everything_else_that_reads_rows_leaves_damaged_ones_out(tmp_path):
     whose = {"run_id": read_run_id(folder.path)}
     good = [row(each, seed, **whose) for each in (2, 4) for seed in (0, 1)]
     lines = [json.dumps(each).encode() for each in good]
-    folder.metrics.write_bytes(b"\n".join([*lines, *DAMAGED.values(), json.dumps(row(8, **whose, **{"eval/success": None})).encode(), b""]))
+    folder.metrics.write_bytes(
+        b"\n".join([*lines, *DAMAGED.values(), json.dumps(row(8, **whose, **{"eval/success": None})).encode(), b""])
+    )
     assert folder.rows()[:-1] == good
     cell = Cell("family", config)
     assert folder_of(cell, tmp_path) == folder.path and standing(cell, tmp_path) == "80 of 80 steps"

@@ -139,7 +139,9 @@ def test_a_folder_that_is_moved_is_told_where_it_is_and_goes_on_there(straight, 
     assert not old.exists()  # nothing that would look like a run
     list(make_fake_trainer(config, new, resume=True).run())
     assert rows_without_time(new) == rows_without_time(straight[0])
-    assert all((a == b).all() for a, b in zip(final_state(new, straight[1].shapes), final_state(straight[0], straight[1].shapes)))
+    assert all(
+        (a == b).all() for a, b in zip(final_state(new, straight[1].shapes), final_state(straight[0], straight[1].shapes))
+    )
 
 
 def test_a_folder_that_is_deleted_is_not_made_again(tmp_path):

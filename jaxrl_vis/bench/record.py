@@ -12,10 +12,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from jaxrl_vis import provenance
+from jaxrl_vis import files, provenance
 from jaxrl_vis.bench.conditions import why_not_comparable
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis import files
 from jaxrl_vis.files import user_cache, write_atomically
 
 SCHEMA = 1

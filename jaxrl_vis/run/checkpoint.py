@@ -28,6 +28,7 @@ from jaxrl_vis.errors import RequestError, StorageError
 from jaxrl_vis.files import read_json
 from jaxrl_vis.run.arrays import as_saved, check_structure, describe, host_specs, is_intact, rebuild, to_host, to_save
 from jaxrl_vis.run.metrics import RUN_ID
+from jaxrl_vis.run.progress import Progress
 from jaxrl_vis.types import LoopState, TrainState
 
 if TYPE_CHECKING:  # orbax takes a fifth of the time that this package does to import: whatever uses it imports it
@@ -40,6 +41,26 @@ _KEPT = 2
 _MANIFEST = "manifest/metadata"  # in a checkpoint's folder, where orbax writes it
 ANY_RUN = "*"
 DAMAGED, FOREIGN = "damaged", "foreign"
+
+
+def _is_manifest(value: Any) -> bool:
+    """Whether a value is what `Checkpoints` saves as a manifest, as far as it is relied on."""
+    if not isinstance(value, dict) or not isinstance(value.get("items"), dict) or "schema" not in value:
+        return False
+    arrays = [each for item in value["items"].values() for each in (item.values() if isinstance(item, dict) else [None])]
+    are_arrays = all(
+        isinstance(each, list)
+        and len(each) in (3, 4)
+        and isinstance(each[0], list)
+        and isinstance(each[1], str)
+        and all(isinstance(number, int) for number in (*each[0], *each[2:]))
+        for each in arrays
+    )
+    try:
+        Progress.from_dict(value.get("progress", value.get("memo", {})))
+    except (ValueError, AttributeError, TypeError):
+        return False
+    return are_arrays
 
 
 class _Damaged(Exception):
@@ -326,7 +347,7 @@ class Checkpoints:
         import orbax.checkpoint as ocp
 
         manifest = self._read(tier, iteration, {"manifest": ocp.args.JsonRestore()})["manifest"]
-        if not isinstance(manifest, dict) or not {"schema", "items"} <= set(manifest):
+        if not _is_manifest(manifest):
             raise _Damaged("its manifest is incomplete")
         templates = {"train": template.train} | ({"rest": _rest(template)} if with_rest else {})
         specs = {name: host_specs(tree) for name, tree in templates.items()}

@@ -27,9 +27,9 @@ def refuse_missing_rows(folder: RunFolder, restored: Restored) -> None:
     last = max((row["iteration"] for row in folder.rows()), default=0)
     if last < evaluated and not metrics.read_contents(folder.metrics).damaged:
         raise RequestError(
-            f"checkpoint {restored.tier}/{restored.iteration} of {folder.path} comes after an evaluation at iteration {evaluated}, "
-            f"but {folder.metrics.name} ends at {last}: put back the whole file, or move the checkpoints after iteration {last} "
-            "away to train those iterations again"
+            f"checkpoint {restored.tier}/{restored.iteration} of {folder.path} comes after an evaluation at iteration "
+            f"{evaluated}, but {folder.metrics.name} ends at {last}: put back the whole file, or move the checkpoints after "
+            f"iteration {last} away to train those iterations again"
         )
 
 

@@ -219,8 +219,8 @@ class RunFolder:
             except OSError as error:
                 what = error.filename or path
                 raise RequestError(
-                    f"the run in {self.path} cannot be deleted: {what} stays ({error.strerror or error}). No new run was started: "
-                    "delete it by hand, or choose another --run-dir"
+                    f"the run in {self.path} cannot be deleted: {what} stays ({error.strerror or error}). No new run was "
+                    "started: delete it by hand, or choose another --run-dir"
                 ) from error
 
 

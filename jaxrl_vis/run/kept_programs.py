@@ -175,7 +175,9 @@ class KeptPrograms:
             return False
         reason = stranger_to(status)
         if reason is not None:
-            _say_once(f"programs kept in {self._folder} are not used: that folder {reason}; JAX_COMPILATION_CACHE_DIR names another")
+            _say_once(
+                f"programs kept in {self._folder} are not used: it {reason}; JAX_COMPILATION_CACHE_DIR names another folder"
+            )
         return reason is None
 
 

@@ -70,8 +70,8 @@ class Held:
                 self.is_lost |= not os.path.samestat(path.stat(), status)
         if self.is_lost:
             raise FolderGoneError(
-                f"{self._folder / FILE_NAME} is lost: another process has taken this one for dead, as it stood still for long. What "
-                "was saved before is good, and nothing is saved any more; --resume goes on, unless another process does already"
+                f"{self._folder / FILE_NAME} is lost: another process has taken this one for dead, as it stood still for long. "
+                "What was saved before is good, and no more is saved; --resume goes on, unless another process does already"
             )
 
     def place(self) -> Path | None:
@@ -174,9 +174,7 @@ def _lock_by_marker(path: Path, held: Held, say: Callable[[str], None], stack: c
         OSError: It cannot be written.
     """
     if not _read(path).startswith(_MARKER):
-        say(
-            f"the file system of {path.parent} has no locks: {FILE_NAME} itself is the lock, and is touched every {HEARTBEAT_S:g} s"
-        )
+        say(f"the file system of {path.parent} has no locks: {FILE_NAME} is the lock itself, touched every {HEARTBEAT_S:g} s")
     lease = filelock.SoftFileLease(
         path,
         lease_duration=LEASE_S,
@@ -232,7 +230,7 @@ def _owner(text: str) -> tuple[str, int] | None:
         if not text.startswith(_MARKER):
             record = json.loads(text)
             return str(record["host"]), int(record["process"])
-        fields = dict(line.partition("=")[::2] for line in text.splitlines()[1:])
+        fields = {key: value for key, _, value in (line.partition("=") for line in text.splitlines()[1:])}
         return fields["host"].partition("?")[0], int(fields["pid"])  # after it: which of its containers
     return None
 

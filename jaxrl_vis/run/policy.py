@@ -112,9 +112,7 @@ class Policy:
             raise RequestError(f"{self.env_name}: {name} must be {spec.dtype}, not {dtype}")
 
 
-def load_policy(
-    run_dir: Path | str, seed: int | None = None, checkpoint: int | None = None, trust: bool = False
-) -> Policy:
+def load_policy(run_dir: Path | str, seed: int | None = None, checkpoint: int | None = None, trust: bool = False) -> Policy:
     """The policy that a run has trained, on whatever platform JAX runs on here.
 
     Args:

@@ -1,8 +1,8 @@
 """Whose code a run folder may run.
 
-A run on a task of somebody's own, ``module:Name``, names that module and the folder to import it from: whoever uses the run runs
-that code. Nothing else in a run folder is code. So a run is used only by a user who has trained it here, or who has said that
-its code can be trusted; both are remembered in the user's own cache, for the folder, the run's id, the task and the file:
+A run on a task of somebody's own, ``module:Name``, names that module and the folder to import it from: whoever uses the run
+runs that code. Nothing else in a run folder is code. So a run is used only by a user who has trained it here, or who has said
+that its code can be trusted; both are remembered in the user's own cache, for the folder, the run's id, the task and the file:
 
     ~/.cache/jaxrl-vis/trusted/<digest>      what was trusted, for people; the name says it for `is_trusted`
 """
