@@ -17,6 +17,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.files import write_atomically
 from jaxrl_vis.run.command import command_of
 from jaxrl_vis.run.folder import RunFolder, read_config, read_record
+from jaxrl_vis_envs.documents import parse_json
 
 FOLDER = "learning"
 NAME = "learning"
@@ -91,8 +92,8 @@ def load(name: str, results: Path) -> Evidence | None:
     if not (record_file.exists() and metrics_file.exists()):
         return None
     try:
-        rows = [json.loads(line) for line in metrics_file.read_text(encoding="utf-8").splitlines()]
-    except ValueError as error:
+        rows = [parse_json(line) for line in metrics_file.read_text(encoding="utf-8").splitlines()]
+    except (OSError, ValueError) as error:
         raise RequestError(f"{metrics_file} has a line that is not JSON ({error}): put back what it held") from error
     return Evidence(read_json(record_file), rows)
 
