@@ -74,11 +74,12 @@ class Broken(AssertionError):
 
 
 def rows_of(folder: Path) -> list[dict[str, Any]]:
-    """Rows of a run's metrics.jsonl without their times; a line that a kill cut off is left out."""
+    """Rows of a run's metrics.jsonl without their times and the run's id; a line that a kill cut off is left out."""
     rows = []
     for line in (folder / "metrics.jsonl").read_text().splitlines() if (folder / "metrics.jsonl").exists() else []:
         try:
-            rows.append({name: value for name, value in json.loads(line).items() if not name.startswith("time/")})
+            row = json.loads(line).items()
+            rows.append({name: value for name, value in row if not name.startswith("time/") and name != "run_id"})
         except ValueError:
             continue
     return rows

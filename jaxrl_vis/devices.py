@@ -15,7 +15,7 @@ from pathlib import Path
 
 from jaxrl_vis import fields
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.files import user_cache
+from jaxrl_vis.files import make_private, user_cache
 from jaxrl_vis.provenance import child_environment
 
 _MOST_MEMORY = 0.9
@@ -89,8 +89,12 @@ def enable_compilation_cache() -> str:
     import jax
     from jax.experimental.compilation_cache import compilation_cache
 
+    from jaxrl_vis.cache_entries import mend_damaged_entries
+
     default = default_cache()
     if not jax.config.jax_compilation_cache_dir and _why_not_writable(default) is None:
+        with contextlib.suppress(OSError):
+            make_private(default)  # it holds machine code, which runs
         jax.config.update("jax_compilation_cache_dir", str(default))
         # JAX decides at its first compilation whether it has a cache, and a notebook has compiled something by now.
         compilation_cache.reset_cache()
@@ -99,6 +103,8 @@ def enable_compilation_cache() -> str:
     folder = jax.config.jax_compilation_cache_dir
     if folder and cache_fault() is not None:
         warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache entry", UserWarning)
+    else:
+        mend_damaged_entries()
     return str(folder or "")
 
 

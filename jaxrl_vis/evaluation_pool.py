@@ -26,7 +26,7 @@ from types import ModuleType
 from typing import Any, Protocol, TypeVar
 
 from jaxrl_vis.errors import RequestError, WorkerError
-from jaxrl_vis.files import write_atomically
+from jaxrl_vis.files import read_json, write_atomically
 from jaxrl_vis.run.signals import heed_parent_only, shielded_children
 from jaxrl_vis_envs.cores import num_cores
 
@@ -228,7 +228,8 @@ class Kept:
         self._lines: dict[int, str] = {}
         if path is not None and path.exists():
             for record in _read(path, self._about):
-                self._keep(int(record["number"]), record)
+                self._keep(record["number"], record)
+            self._check(path)
 
     def __contains__(self, number: int) -> bool:
         return number in self.records
@@ -253,6 +254,15 @@ class Kept:
         lines = ",\n".join(f"    {self._lines[number]}" for number in ordered)
         write_atomically(self._path, f'{head[:-2]},\n  "each": [\n{lines}\n  ]\n}}\n')
 
+    def _check(self, path: Path) -> None:
+        """Raises a RequestError where records that were read are not such as they were written."""
+        try:
+            self._summary([self.records[number] for number in sorted(self.records)])
+        except Exception as error:  # whatever comes of computing with what somebody has changed
+            raise RequestError(
+                f"{path} holds a damaged record ({type(error).__name__}: {error}): delete it, or name another file with --json"
+            ) from error
+
     def _keep(self, number: int, record: Record) -> None:
         record = finite(record)
         # What is computed from a record must not depend on whether it was read from the file.
@@ -275,12 +285,11 @@ def _read(path: Path, about: Mapping[str, Any]) -> list[Record]:
     Raises:
         RequestError: It is about something else, or cannot be read.
     """
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        records = found["each"]
-        numbers = [each["number"] for each in records]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise RequestError(f"{path} holds no records to go on with: delete it, or name another file with --json") from error
+    mend = "delete it, or name another file with --json"
+    found = read_json(path, mend=f"it holds no records to go on with; {mend}")
+    records = found.get("each")
+    if not isinstance(records, list) or not all(isinstance(each, dict) and _is_count(each.get("number")) for each in records):
+        raise RequestError(f"{path} holds no records to go on with: {mend}")
     other = [name for name, value in about.items() if found.get(name) != value]
     if other:
         name = other[0]
@@ -288,8 +297,14 @@ def _read(path: Path, about: Mapping[str, Any]) -> list[Record]:
             f"{path} holds records of another evaluation ({name}: {_short(found.get(name))}, not {_short(about[name])}): "
             "name another file with --json"
         )
-    assert len(set(numbers)) == len(numbers)
+    numbers = [each["number"] for each in records]
+    if twice := sorted({number for number in numbers if numbers.count(number) > 1}):
+        raise RequestError(f"{path} holds number {twice[0]} twice: {mend}")
     return records
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**63
 
 
 def _short(value: Any) -> str:

@@ -20,6 +20,7 @@ from jaxrl_vis.learner.replay import make_replay
 from jaxrl_vis.learner.sharding import ONE_DEVICE
 from jaxrl_vis.run import metrics
 from jaxrl_vis.run.checkpoint import Checkpoints
+from jaxrl_vis.run.folder import read_run_id
 from jaxrl_vis.run.trainer import Trainer
 from jaxrl_vis.types import Episodes, LoopState, NormalizerState, ReplayState, TrainState
 
@@ -132,12 +133,13 @@ def interrupted_at(trainer: Trainer, iteration: int) -> None:
 
 def rows_without_time(path: Path) -> list[dict]:
     return [
-        {name: row[name] for name in row if not name.startswith("time/")} for row in metrics.read_rows(path / "metrics.jsonl")
+        {name: row[name] for name in row if not name.startswith("time/") and name != metrics.RUN_ID}
+        for row in metrics.read_rows(path / "metrics.jsonl")
     ]
 
 
 def final_state(path: Path, shapes) -> list[np.ndarray]:
-    checkpoints = Checkpoints(path / "checkpoints", read_only=True)
+    checkpoints = Checkpoints(path / "checkpoints", read_only=True, run_id=read_run_id(path))
     return as_plain(checkpoints.restore_for_resume(shapes).loop)
 
 

@@ -181,3 +181,29 @@ def test_other_code_is_told_apart(tmp_path: Path):
     assert code_of(package, leave_out=("training",)) == before != code_of(package)
     (tmp_path / "look.py").write_text("2")
     assert code_of(package, leave_out=("training",)) != before
+
+
+@pytest.mark.parametrize(
+    "each",
+    [
+        '{"number": 3}, {"number": 3}',
+        '{"number": "3"}',
+        '{"number": null}',
+        '{"number": true}',
+        '{"number": -1}',
+        '{"number": 1e400}',
+        "3",
+        '{"number": 3, "square": "text"}',
+        '{"number": 3, "square": null}',
+        '{"number": 3, "square": ' + "[" * 10**5,
+    ],
+)
+def test_records_that_somebody_has_changed_are_one_line(tmp_path: Path, each: str):
+    path = tmp_path / "kept.json"
+    kept = Kept(path, {}, total)
+    kept.add(3, {"square": 9})
+    before = json.dumps(json.loads(path.read_text())["each"])[1:-1]
+    path.write_text(path.read_text().replace("\n    " + before, "\n    " + each))
+    with pytest.raises(RequestError, match="delete it, or name another file with --json") as refused:
+        Kept(path, {}, total)
+    assert "\n" not in str(refused.value) and str(path) in str(refused.value)

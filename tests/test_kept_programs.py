@@ -1,6 +1,7 @@
 """Programs that an earlier process has traced: found again, equal, and only where nothing has changed."""
 
 import dataclasses
+import hashlib
 import os
 from pathlib import Path
 
@@ -8,9 +9,11 @@ import jax
 import numpy as np
 import pytest
 import small_program
+from jax.experimental.compilation_cache import compilation_cache
 
 from jaxrl_vis import cli
 from jaxrl_vis.config import preset
+from jaxrl_vis.devices import enable_compilation_cache
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.environment import make_env
 from jaxrl_vis.run import kept_programs, programs, trainer
@@ -93,7 +96,11 @@ def test_damaged_and_unsuitable_programs_are_traced_anew(folder, program):
     files["init"].write_bytes(b"")
     Programs(CONFIG, program, keep=True).compile()
     assert {path.name.partition("-")[0]: path.read_bytes() for path in folder.iterdir()} == good
-    files["learn"].write_bytes(good["play"])  # whole, but of something else
+    files["learn"].write_bytes(good["play"])  # whole, but renamed
+    Programs(CONFIG, program, keep=True).compile()
+    assert {path.name.partition("-")[0]: path.read_bytes() for path in folder.iterdir()} == good
+    data = good["play"][32:]  # of something else, by whoever knows what a digest is of
+    files["learn"].write_bytes(hashlib.sha256(files["learn"].name.encode() + b"\0" + data).digest() + data)
     unsuitable = Programs(CONFIG, program, keep=True)
     unsuitable.compile()
     assert_equal(results(unsuitable), results(Programs(CONFIG, program)))
@@ -206,3 +213,85 @@ def test_commands_keep_programs_and_scripts_do_not(tmp_path, monkeypatch, capsys
         trainer.make_trainer(CONFIG)
     assert asked == [True, False]
     assert "enough" in capsys.readouterr().err
+
+
+@pytest.fixture
+def kept(folder) -> kept_programs.KeptPrograms:
+    """A program that was kept, without any of JAX."""
+    made = kept_programs.KeptPrograms(folder, "0" * 64)
+    made._fresh["play"] = b"a program"
+    made.write()
+    kept_programs._say_once.cache_clear()
+    return made
+
+
+needs_owners = pytest.mark.skipif(os.name != "posix", reason="owners and modes are POSIX")
+
+
+@needs_owners
+def test_programs_are_kept_for_their_user_alone(folder, kept):
+    (path,) = folder.iterdir()
+    assert (folder.stat().st_mode & 0o777, path.stat().st_mode & 0o777) == (0o700, 0o600)
+    assert kept._read("play") == b"a program"
+    folder.chmod(0o777)  # as an umask of earlier versions may have left it
+    assert kept._read("play") == b"a program" and folder.stat().st_mode & 0o777 == 0o700
+    path.chmod(0o666)  # but what others could have changed in the meantime is not believed
+    assert kept._read("play") is None
+
+
+@needs_owners
+@pytest.mark.parametrize("whose", ["folder", "file", "link"])
+def test_another_users_programs_are_not_used(folder, kept, monkeypatch, capsys, whose):
+    (path,) = folder.iterdir()
+    stranger = os.geteuid() + 4000
+    if whose == "link":
+        path.rename(folder / "elsewhere")
+        path.symlink_to(folder / "elsewhere")
+    elif os.geteuid() == 0:
+        os.chown(folder if whose == "folder" else path, stranger, -1)
+    else:
+        monkeypatch.setattr(os, "geteuid", lambda: stranger)
+    before = path.read_bytes()
+    assert kept._read("play") is None and kept._read("play") is None
+    said = capsys.readouterr().err
+    if whose == "folder":
+        assert said.count("belongs to another user") == 1 and said.count("\n") == 1 and str(folder) in said
+        kept._fresh["play"] = b"another"
+        kept.write()
+        assert path.read_bytes() == before
+
+
+def test_a_program_under_another_ones_name_is_not_used(folder, kept):
+    (path,) = folder.iterdir()
+    path.rename(folder / path.name.replace("play", "learn"))
+    assert kept._read("learn") is None
+
+
+@pytest.mark.parametrize("damage", ["cut", "flipped", "empty"])
+def test_a_damaged_entry_of_xlas_cache_is_mended_and_not_told(tmp_path, recwarn, damage):
+    before = (jax.config.jax_compilation_cache_dir, jax.config.jax_persistent_cache_min_compile_time_secs)
+
+    def compile_anew() -> None:
+        def mended(x):
+            return jax.numpy.sin(x) @ x
+
+        jax.jit(mended).lower(np.ones((3, 3), np.float32)).compile()
+
+    try:
+        jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+        compilation_cache.reset_cache()
+        enable_compilation_cache()
+        compile_anew()
+        (entry,) = tmp_path.glob("jit_mended-*-cache")
+        whole = entry.read_bytes()
+        damaged = {"cut": whole[: len(whole) // 2], "flipped": bytes([whole[0] ^ 0xFF]) + whole[1:], "empty": b""}[damage]
+        entry.write_bytes(damaged)
+        jax.clear_caches()
+        compile_anew()
+        assert len(entry.read_bytes()) > len(whole) // 2 and entry.read_bytes() != damaged
+    finally:
+        for name, value in zip(("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs"), before):
+            jax.config.update(name, value)
+        compilation_cache.reset_cache()
+    assert not [warning for warning in recwarn if "compilation cache" in str(warning.message)]

@@ -124,6 +124,8 @@ def test_calibrations_state_the_cameras_but_for_their_error():
         ("a.json", '{"imaging": {"samples": 3}}', ["imaging.samples must be 1 or 4"]),
         ("a.json", '{"base": "dry"}', ["base must be one of training, shifted"]),
         ("a.json", "{", ["is not JSON"]),
+        ("a.json", "[" * 10**5, ["is not JSON", "levels deep"]),
+        ("a.toml", "stalks = " + "[" * 10**5, ["is not TOML"]),
         ("a.toml", "stalks = [", ["is not TOML"]),
         ("a.json", "[1]", ["must hold one table"]),
         ("missing.json", None, ["missing.json cannot be read"]),

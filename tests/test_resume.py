@@ -128,7 +128,7 @@ def test_a_broken_config_file_is_one_line(straight, tmp_path):
     with pytest.raises(RequestError, match="no run in"):
         read_config(tmp_path)
     (tmp_path / "config.json").write_text("{")
-    with pytest.raises(RequestError, match="cannot be read"):
+    with pytest.raises(RequestError, match="is not JSON .*: put back what it held, or train --overwrite"):
         make_fake_trainer(small_config(), tmp_path, resume=True)
     record = json.loads((straight[0] / "config.json").read_text())
     record["config"]["old_option"] = 1

@@ -192,12 +192,12 @@ def test_names_of_default_folders():
 
 def test_metrics_file_survives_a_torn_line(tmp_path):
     path = tmp_path / "metrics.jsonl"
-    rows = [{"seed": 0, "iteration": i, "x": float(i)} for i in range(4)]
+    rows = [{"seed": 0, "iteration": i, "updates": i, "env_steps": 10 * i, "x": float(i)} for i in range(4)]
     metrics.append_rows(path, rows)
     with path.open("a") as file:
         file.write('{"seed": 0, "iter')
     assert metrics.read_rows(path) == rows
-    metrics.cut_back(path, 1)
+    assert metrics.cut_back(path, 1, None, tmp_path / "aside.jsonl", keeps_later=False) is None
     assert path.read_text().count("\n") == 2 and metrics.read_rows(path) == rows[:2]
     assert metrics.make_rows([3], {"iteration": 1}, {"a": [float("nan")]}) == [{"seed": 3, "iteration": 1, "a": None}]
 

@@ -8,6 +8,7 @@ MyReach             as a package calls it that is installed, in its entry points
 """
 
 import importlib
+import importlib.machinery
 import importlib.metadata
 import sys
 import traceback
@@ -80,6 +81,20 @@ def load(module: str, folder: str | None = None, installed: bool = False) -> Mod
             "rename yours, or start another process"
         )
     return loaded
+
+
+def find(module: str, folder: str | None = None) -> Path | None:
+    """The file that `load` would import first, without importing anything; None where there is none.
+
+    Args:
+        module: Its name, with dots where it lies in a package: of one that is installed, the package's file is found.
+        folder: Where it was found before; may have gone.
+    """
+    for place in (folder, "."):
+        if place is not None and (file := _file_in(Path(place).resolve(), module)) is not None:
+            return file
+    spec = importlib.machinery.PathFinder.find_spec(module.partition(".")[0])
+    return Path(spec.origin).resolve() if spec is not None and spec.origin is not None else None
 
 
 def folder_of(module: ModuleType) -> str | None:

@@ -17,7 +17,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.files import write_atomically
 from jaxrl_vis.run.command import command_of
 from jaxrl_vis.run.folder import RunFolder, read_config, read_record
-from jaxrl_vis.run.metrics import read_rows
+from jaxrl_vis_envs.documents import parse_json
 
 FOLDER = "learning"
 NAME = "learning"
@@ -57,7 +57,7 @@ def keep(run: Path, name: str, results: Path) -> tuple[Path, Path]:
     about, config = read_record(run), read_config(run)
     rows = [
         {column: value for column, value in row.items() if column in _COLUMNS or column.startswith(_PREFIXES)}
-        for row in read_rows(folder.metrics)
+        for row in folder.rows()
     ]
     rows = [row for row in rows if any(column.startswith("eval/") for column in row)]
     if not rows:
@@ -92,8 +92,8 @@ def load(name: str, results: Path) -> Evidence | None:
     if not (record_file.exists() and metrics_file.exists()):
         return None
     try:
-        rows = [json.loads(line) for line in metrics_file.read_text(encoding="utf-8").splitlines()]
-    except ValueError as error:
+        rows = [parse_json(line) for line in metrics_file.read_text(encoding="utf-8").splitlines()]
+    except (OSError, ValueError) as error:
         raise RequestError(f"{metrics_file} has a line that is not JSON ({error}): put back what it held") from error
     return Evidence(read_json(record_file), rows)
 

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from jaxrl_vis import provenance
+from jaxrl_vis import files, provenance
 from jaxrl_vis.bench.conditions import why_not_comparable
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.files import user_cache, write_atomically
@@ -90,12 +90,7 @@ def read_json(path: Path) -> Any:
     Raises:
         RequestError: It holds something else, or cannot be read.
     """
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise RequestError(f"cannot read {path}: {error.strerror or error}") from error
-    except ValueError as error:
-        raise RequestError(f"{path} is not JSON ({error}): move it away, or put back what it held") from error
+    return files.read_json(path, object, "move it away, or put back what it held")
 
 
 def read_all(folder: Path) -> Iterator[tuple[Path, dict[str, Any]]]:

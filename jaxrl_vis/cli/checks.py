@@ -1,12 +1,16 @@
 """What several commands check before they start to work."""
 
 import importlib.util
+import sys
 from pathlib import Path
 
 from jaxrl_vis.cli.parsing import PROGRAM
 from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.files import check_path
 from jaxrl_vis.provenance import install_command
+from jaxrl_vis.run import trust as trusting
+from jaxrl_vis.run.folder import read_config
 from jaxrl_vis.run.signals import shielded_children
 
 # What an extra brings: module -> package.
@@ -53,8 +57,31 @@ def check_env(name: str, folder: str | None = None) -> None:
         raise RequestError(str(error)) from error
 
 
+def may_run_code(run_dir: Path, trust: bool) -> bool:
+    """Whether a run may run its own code: its user says so, has said so before, has trained it, or answers on a terminal.
+
+    Args:
+        run_dir: The run folder.
+        trust: ``--trust`` was given.
+
+    Raises:
+        RequestError: It may not, or there is no run.
+    """
+    config = read_config(run_dir)
+    if not trust and trusting.is_own(config) and not trusting.is_trusted(run_dir, config) and _is_at_terminal():
+        print(f"{trusting.question(run_dir, config)}. Run it? [y/N] ", end="", file=sys.stderr, flush=True)
+        trust = sys.stdin.readline().strip().lower() in ("y", "yes")
+    trusting.check(run_dir, config, trust, "say --trust")
+    return trust
+
+
+def _is_at_terminal() -> bool:
+    return all(stream is not None and stream.isatty() for stream in (sys.stdin, sys.stderr))
+
+
 def check_run(folder: Path) -> None:
     """Raises a `RequestError` unless ``folder`` holds a run."""
+    check_path(folder / "config.json")
     if not (folder / "config.json").exists():
         above = next((parent for parent in folder.parents if (parent / "config.json").exists()), None)
         if folder.exists() and above is not None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from jaxrl_vis import __version__
-from jaxrl_vis.cli.checks import check_counts, check_extra, check_run
+from jaxrl_vis.cli.checks import check_counts, check_extra, check_run, may_run_code
 from jaxrl_vis.cli.families import family_of
 from jaxrl_vis.cli.grasp import weights_of
 from jaxrl_vis.devices import check_devices, enable_compilation_cache
@@ -63,6 +63,8 @@ class Eval:
     there by a policy of VisualStalkReach (policy). With policy, all loops are compared on scenes like those of its task."""
     policy: Path | None = None
     """The run folder of that policy."""
+    trust: bool = False
+    """Run that run's own code without a question, where its task is module:Name and somebody else trained it."""
     policy_seed: int | None = None
     """Which of the run's seeds; the first if not given."""
     workers: int = 1
@@ -95,6 +97,7 @@ def evaluate(options: Eval) -> int:
         raise RequestError("--loops policy goes with --policy RUN, a run of VisualStalkReach")
     if options.policy is not None:
         check_run(options.policy)
+        may_run_code(options.policy, options.trust)
     check_extra("grasp", "grasping")
     if options.json is not None:
         check_writable(options.json, "--json")

@@ -1,7 +1,6 @@
 """``jaxrl-vis grasp run``."""
 
 import dataclasses
-import json
 import sys
 from pathlib import Path
 from typing import Annotated, Literal
@@ -13,6 +12,7 @@ from jaxrl_vis.cli.phenotype_run import SKIPPED, calibration_of
 from jaxrl_vis.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.errors import RequestError, StorageError
 from jaxrl_vis.report.outputs import check_writable
+from jaxrl_vis_envs.documents import parse_json
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,7 +104,7 @@ def _truth(image, folder, pair):
     from jaxrl_vis.phenotyping.images import read_image
 
     try:
-        count = int(json.loads((folder.folder / "plot.json").read_text(encoding="utf-8"))["count"])
+        count = int(parse_json((folder.folder / "plot.json").read_text(encoding="utf-8"))["count"])
         instance = read_image(folder.folder / "truth" / f"instance_{pair.name}.png").astype(int) - 1
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise RequestError(

@@ -4,7 +4,7 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated
 
-from jaxrl_vis.cli.checks import check_counts, check_run
+from jaxrl_vis.cli.checks import check_counts, check_run, may_run_code
 from jaxrl_vis.cli.parsing import ByPlaceToo
 from jaxrl_vis.errors import RequestError
 
@@ -24,6 +24,8 @@ class Play:
     """Show what auxiliary tasks predict, too: reconstruction, true and predicted optical flow, rotated image."""
     episodes: int = 6
     """Episodes to show."""
+    trust: bool = False
+    """Run the run's own code without a question, where its task is module:Name and somebody else trained it (docs/runs.md)."""
 
 
 def run(options: Play) -> int:
@@ -32,12 +34,20 @@ def run(options: Play) -> int:
     check_counts(episodes=options.episodes)
     if options.html and options.aux:
         raise RequestError("--html shows the robot, --aux its images: give one of them")
+    trust = may_run_code(options.run_dir, options.trust)
     out = options.out or options.run_dir / ("play.html" if options.html else "play_aux.gif" if options.aux else "play.gif")
     from jaxrl_vis.run import play_auxiliary, trained
 
     if options.aux:
-        play_auxiliary.play_auxiliary(options.run_dir, out, episodes=options.episodes)
+        play_auxiliary.play_auxiliary(options.run_dir, out, episodes=options.episodes, trust=trust)
     else:
-        trained.play_run(options.run_dir, out, episodes=options.episodes, three_dimensional=options.html, keep_programs=True)
+        trained.play_run(
+            options.run_dir,
+            out,
+            episodes=options.episodes,
+            three_dimensional=options.html,
+            keep_programs=True,
+            trust=trust,
+        )
     print(out)
     return 0

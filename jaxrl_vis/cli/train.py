@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from jaxrl_vis import processes
-from jaxrl_vis.cli.checks import check_counts, check_env
+from jaxrl_vis.cli.checks import check_counts, check_env, may_run_code
 from jaxrl_vis.cli.parsing import ByPlaceToo, ChangesOf, SayDefault
 from jaxrl_vis.config import PRESETS, Config, preset
 from jaxrl_vis.devices import check_devices, claim_memory, count_devices, guess_accelerator, start_devices
@@ -67,6 +67,8 @@ class Train:
     """Which of them this is, from 0; the first writes metrics and images."""
     start_timeout: int = processes.START_S
     """How long they wait for each other at the start, s."""
+    trust: bool = False
+    """With --resume: run the run's own code without a question, where its task is module:Name and somebody else began it."""
     log: tuple[LoggerName, ...] = ()
     """Show the run in TensorBoard or in Weights & Biases, too; those of the run if not given with --resume."""
 
@@ -119,11 +121,13 @@ def run(options: Train) -> int:
     if options.env is not None:
         check_env(options.env, options.changes.get("env_folder"))
     config = validate(training_config(options))
+    run_dir = options.run_dir or default_folder(config)
+    check_there(run_dir, options.resume)
+    if options.resume and options.env is None and "env_folder" not in options.changes and (run_dir / "config.json").exists():
+        may_run_code(run_dir, options.trust)  # its user named neither the task nor where it lies: the run does
     check_env(config.env, config.env_folder)
     from jaxrl_vis.run import trainer
 
-    run_dir = options.run_dir or default_folder(config)
-    check_there(run_dir, options.resume)
     check_writable(run_dir, "--run-dir", folder=True)
     made = trainer.make_trainer(
         config,

@@ -27,6 +27,7 @@ from jaxrl_vis.phenotyping.folders import PairFiles, PlotFolder, claim, read_odo
 from jaxrl_vis.phenotyping.images import write_image
 from jaxrl_vis.phenotyping.reading import Unusable, read_pair
 from jaxrl_vis.phenotyping.results import Row, write_rows
+from jaxrl_vis_envs.documents import parse_json
 from jaxrl_vis_envs.plants import Calibration
 
 Find = Callable[[np.ndarray, PlotFolder, PairFiles], np.ndarray]
@@ -122,7 +123,7 @@ def run(runs: list[PlotFolder], find: Find, request: Request, done: Callable[[Ro
         if not _is_done(path, made_of):
             record = {**_record(each, driven[each.name], find, request), "of": made_of}
             write_atomically(path, json.dumps(record) + "\n")
-        record = json.loads(path.read_text(encoding="utf-8"))
+        record = parse_json(path.read_text(encoding="utf-8"))
         rows, points, skipped = [*rows, record["row"]], points + record["points"], skipped + record["skipped"]
         write_rows(request.out / "runs.csv", RUN_COLUMNS, rows)
         write_rows(request.out / "points.csv", POINT_COLUMNS, points)
@@ -157,7 +158,7 @@ def _made_of(folder: PlotFolder) -> dict[str, Any]:
 def _is_done(path: Path, made_of: dict[str, Any]) -> bool:
     """Whether a record is of the files as they are now. One with skipped pairs, or without a word of its files, is not."""
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
+        record = parse_json(path.read_text(encoding="utf-8"))
     except (FileNotFoundError, ValueError):
         return False
     return not record["skipped"] and record.get("of") == made_of

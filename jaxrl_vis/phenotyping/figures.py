@@ -6,7 +6,6 @@ Everything says so.
 
 import csv
 import io
-import json
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ import numpy as np
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.files import write_atomically
 from jaxrl_vis.phenotyping.evaluate import PERSON_SD
+from jaxrl_vis_envs.documents import parse_json
 
 _INK, _GREY, _GREEN, _ORANGE = "#222222", "#9a9a9a", "#1a7f37", "#d1720c"
 _MOST_SHOWN = 60  # stalks of figure 3.5, as many as can be told apart
@@ -31,7 +31,7 @@ def read_evaluation(path: Path) -> dict[str, Any]:
         RequestError: The file is not what ``phenotype eval --json`` writes.
     """
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = parse_json(path.read_text(encoding="utf-8"))
         if data["synthetic"] is not True or not all(
             {"true", "counted", "widths_mm", "pairs"} <= each.keys() for each in data["each"]
         ):

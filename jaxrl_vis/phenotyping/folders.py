@@ -18,6 +18,7 @@ import numpy as np
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.files import write_atomically
+from jaxrl_vis_envs.documents import parse_json
 
 _IMAGES = {".png", ".jpg", ".jpeg", ".tif", ".tiff"}
 SAMPLE = Path(__file__).with_name("sample_row")
@@ -284,7 +285,7 @@ def claim(out: Path, about: Mapping[str, Any], begun: bool) -> None:
     path = out / "run.json"
     if begun and path.exists():
         try:
-            before = json.loads(path.read_text(encoding="utf-8"))
+            before = parse_json(path.read_text(encoding="utf-8"))
             differing = _differences(before, about)
         except (ValueError, AttributeError):
             differing = "run.json cannot be read"

@@ -6,6 +6,8 @@ from typing import Literal
 import cv2
 import numpy as np
 
+from jaxrl_vis.files import replacing
+
 ImageFormat = Literal["png", "tiff", "jpeg"]
 SUFFIX: dict[str, str] = {"png": ".png", "tiff": ".tiff", "jpeg": ".jpg"}
 _OPTIONS: dict[str, list[int]] = {
@@ -26,9 +28,8 @@ def write_image(path: Path, image: np.ndarray) -> None:
     encoded, data = cv2.imencode(suffix, ordered, _OPTIONS[suffix])
     if not encoded:
         raise OSError(f"{path}: the image could not be encoded")
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_bytes(data.tobytes())
-    temporary.replace(path)
+    with replacing(path, durable=False) as file:
+        file.write(data.tobytes())
 
 
 def read_image(path: Path) -> np.ndarray:

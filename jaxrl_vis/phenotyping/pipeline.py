@@ -44,6 +44,7 @@ from jaxrl_vis.phenotyping.results import (
 )
 from jaxrl_vis.phenotyping.sightings import NO_CALIBRATION, Sighting, find_with_ground, look
 from jaxrl_vis.phenotyping.track import Track
+from jaxrl_vis_envs.documents import parse_json
 from jaxrl_vis_envs.plants import Calibration
 
 Find = Callable[[np.ndarray, PlotFolder, PairFiles], list[Detection]]
@@ -133,7 +134,7 @@ def _run(
         for number, (name, record) in enumerate(each(functools.partial(_record, plot, find, request), missing), start=1):
             write_atomically(paths[name], json.dumps(record) + "\n")
             done(plot.name, len(plot.pairs) - len(missing) + number, len(plot.pairs))
-        records = [json.loads(paths[pair.name].read_text(encoding="utf-8")) for pair in plot.pairs]
+        records = [parse_json(paths[pair.name].read_text(encoding="utf-8")) for pair in plot.pairs]
         bad = [
             {"plot": plot.name, "pair": pair.name, "why": record["skipped"]}
             for pair, record in zip(plot.pairs, records)
@@ -171,7 +172,7 @@ def _claim(plots: list[PlotFolder], request: Request) -> None:
 def _is_done(path: Path, pair: PairFiles, calibration: Calibration | None) -> bool:
     """Whether a record is of the files as they are now. One that was skipped, or does not say of which it is, is not."""
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
+        record = parse_json(path.read_text(encoding="utf-8"))
     except (FileNotFoundError, ValueError):
         return False
     return "sightings" in record and record.get("of") == _made_of(pair, calibration)
@@ -246,7 +247,7 @@ def _draw_overlays(
     index = folder / "drawn.json"
     shown = {pair.name: _digest([record, names]) for (pair, record), names in zip(usable, labels)}
     try:
-        drawn = dict(json.loads(index.read_text(encoding="utf-8")))
+        drawn = dict(parse_json(index.read_text(encoding="utf-8")))
     except (FileNotFoundError, ValueError, TypeError):
         drawn = {}
     for name in drawn.keys() - shown.keys():

@@ -5,6 +5,7 @@ does not grow with their number; pictures of whole pairs are limited to about 20
 """
 
 import base64
+import codecs
 import dataclasses
 import html
 import math
@@ -18,6 +19,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from jaxrl_vis.files import replacing
 from jaxrl_vis.phenotyping.images import read_image
 from jaxrl_vis.phenotyping.overlay import scale_of
 from jaxrl_vis.phenotyping.qc_style import SCRIPT, STYLE
@@ -166,8 +168,8 @@ class Page:
             OSError: It cannot be written.
         """
         rows = [{**row, "plot": _Html(f'<a href="#{_safe(row["plot"])}">{_safe(row["plot"])}</a>')} for row in self._rows]
-        temporary = path.with_name(path.name + ".tmp")
-        with temporary.open("w", encoding="utf-8") as file:
+        with replacing(path) as encoded:
+            file = codecs.getwriter("utf-8")(encoded)
             file.write('<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>Stalks</title>')
             file.write(f'<meta name="viewport" content="width=device-width"><style>{STYLE}</style></head><body>')
             file.write("<h1>Stalks: what was counted and measured</h1>")
@@ -181,7 +183,6 @@ class Page:
             self._file.seek(0)
             shutil.copyfileobj(self._file, file)
             file.write(f"<script>{SCRIPT}</script></body></html>\n")
-        temporary.replace(path)
 
 
 class _Html(str):

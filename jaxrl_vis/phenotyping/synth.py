@@ -30,6 +30,7 @@ from jaxrl_vis.files import write_atomically
 from jaxrl_vis.phenotyping.annotations import coco, encode_mask
 from jaxrl_vis.phenotyping.calibration import write_calibration
 from jaxrl_vis.phenotyping.images import SUFFIX, ImageFormat, write_image
+from jaxrl_vis_envs.documents import parse_json
 from jaxrl_vis_envs.plants import Family, Plot, draw
 from jaxrl_vis_envs.plants.pairs import Pair, Sequence
 from jaxrl_vis_envs.plants.truth import BAND, HEIGHTS, StalkInView, stalks_in_view
@@ -198,6 +199,6 @@ def _summary(sequence: Sequence, seen: list[dict[str, Any]]) -> dict[str, Any]:
 
 def _without_version(text: str) -> dict[str, Any]:
     try:
-        return {name: value for name, value in json.loads(text).items() if name != "version"}
+        return {name: value for name, value in parse_json(text).items() if name != "version"}
     except (ValueError, AttributeError):
         return {}

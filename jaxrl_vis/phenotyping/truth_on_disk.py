@@ -1,7 +1,6 @@
 """Finds from the truth that `phenotype synth` wrote beside its images: what perfect networks would give."""
 
 import functools
-import json
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +10,7 @@ from jaxrl_vis.phenotyping.detector.finder import Detection
 from jaxrl_vis.phenotyping.folders import PairFiles, PlotFolder
 from jaxrl_vis.phenotyping.images import read_image
 from jaxrl_vis.phenotyping.perfect import perfect_detections
+from jaxrl_vis_envs.documents import parse_json
 
 
 def find_truth(image: np.ndarray, plot: PlotFolder, pair: PairFiles) -> list[Detection]:
@@ -33,6 +33,6 @@ def find_truth(image: np.ndarray, plot: PlotFolder, pair: PairFiles) -> list[Det
 def _seen(folder: Path) -> dict[int, list[dict]]:
     """What plot.json says of each pair."""
     of_pair: dict[int, list[dict]] = {}
-    for each in json.loads((folder / "plot.json").read_text(encoding="utf-8"))["seen"]:
+    for each in parse_json((folder / "plot.json").read_text(encoding="utf-8"))["seen"]:
         of_pair.setdefault(each["pair"], []).append(each)
     return of_pair

@@ -8,7 +8,8 @@ makes a folder appear under its final name only when it is complete; the checksu
 flipped byte in a data file would be restored without a word. The newest two of each tier are kept.
 
 A run goes on from the newest good checkpoint of either tier, and from the full one of two that are equally new. Nothing newer
-than that is ever deleted: a checkpoint that turns out to be damaged is moved to checkpoints/damaged/.
+than that is ever deleted: a checkpoint that turns out to be damaged is moved to checkpoints/damaged/, and one of another run,
+which its manifest tells by the run's id, to checkpoints/foreign/.
 """
 
 import contextlib
@@ -24,7 +25,10 @@ from typing import TYPE_CHECKING, Any
 
 from jaxrl_vis import processes, streams
 from jaxrl_vis.errors import RequestError, StorageError
+from jaxrl_vis.files import read_json
 from jaxrl_vis.run.arrays import as_saved, check_structure, describe, host_specs, is_intact, rebuild, to_host, to_save
+from jaxrl_vis.run.metrics import RUN_ID
+from jaxrl_vis.run.progress import Progress
 from jaxrl_vis.types import LoopState, TrainState
 
 if TYPE_CHECKING:  # orbax takes a fifth of the time that this package does to import: whatever uses it imports it
@@ -34,7 +38,29 @@ LIGHT, FULL = "light", "full"
 SCHEMA = 2
 _READABLE = (1, 2)  # schema 1 called the progress "memo"
 _KEPT = 2
-DAMAGED = "damaged"
+_MANIFEST = "manifest/metadata"  # in a checkpoint's folder, where orbax writes it
+ANY_RUN = "*"
+DAMAGED, FOREIGN = "damaged", "foreign"
+
+
+def _is_manifest(value: Any) -> bool:
+    """Whether a value is what `Checkpoints` saves as a manifest, as far as it is relied on."""
+    if not isinstance(value, dict) or not isinstance(value.get("items"), dict) or "schema" not in value:
+        return False
+    arrays = [each for item in value["items"].values() for each in (item.values() if isinstance(item, dict) else [None])]
+    are_arrays = all(
+        isinstance(each, list)
+        and len(each) in (3, 4)
+        and isinstance(each[0], list)
+        and isinstance(each[1], str)
+        and all(isinstance(number, int) for number in (*each[0], *each[2:]))
+        for each in arrays
+    )
+    try:
+        Progress.from_dict(value.get("progress", value.get("memo", {})))
+    except (ValueError, AttributeError, TypeError):
+        return False
+    return are_arrays
 
 
 class _Damaged(Exception):
@@ -110,10 +136,21 @@ class Checkpoints:
         folder: Where both tiers lie; made when something is saved.
         say: Called with one line about each checkpoint that cannot be used.
         read_only: Promise to save nothing: nothing is created or cleaned up.
+
+    Attributes:
+        run_id: Of the run, None for one of an earlier version: checkpoints of others are not there as far as this class goes,
+            but for `set_foreign_aside`. `ANY_RUN`: whatever there is.
     """
 
-    def __init__(self, folder: Path, say: Callable[[str], None] = streams.say, read_only: bool = False):
-        self._folder = folder.resolve()  # orbax refuses relative names
+    def __init__(
+        self,
+        folder: Path,
+        say: Callable[[str], None] = streams.say,
+        read_only: bool = False,
+        run_id: str | None = ANY_RUN,
+    ):
+        self.run_id = run_id
+        self._folder = folder.absolute()  # orbax refuses relative names
         self._say = say
         self._read_only = read_only
         self._managers: dict[str, ocp.CheckpointManager] = {}
@@ -137,11 +174,24 @@ class Checkpoints:
         return self._managers[tier]
 
     def iterations(self, tier: str) -> list[int]:
-        """Iterations of which ``tier`` has a checkpoint, ascending; damaged ones included."""
+        """Iterations of which ``tier`` has a checkpoint of this run, ascending; damaged ones included."""
+        return [iteration for iteration, is_ours in self._there(tier) if is_ours]
+
+    def _there(self, tier: str) -> list[tuple[int, bool]]:
+        """Iteration of each checkpoint of a tier, ascending, and whether it is of this run."""
         folder = self._folder / tier
         if not folder.is_dir():
             return []
-        return sorted(int(entry.name) for entry in folder.iterdir() if entry.is_dir() and entry.name.isdigit())
+        names = [entry.name for entry in folder.iterdir() if entry.name.isdecimal() and entry.is_dir()]
+        return sorted((int(name), self._is_ours(folder / name)) for name in names)
+
+    def _is_ours(self, checkpoint: Path) -> bool:
+        """Whether the manifest of a checkpoint says so; one that cannot be read is damaged, and may well be ours."""
+        try:
+            manifest = read_json(checkpoint / _MANIFEST)
+        except RequestError:
+            return True
+        return self.run_id in (ANY_RUN, manifest.get(RUN_ID))
 
     def newest(self) -> int | None:
         """The newest iteration of either tier; None where there is no checkpoint."""
@@ -167,7 +217,8 @@ class Checkpoints:
         import orbax.checkpoint as ocp
 
         described = {name: describe(arrays) for name, arrays in items.items()}
-        manifest = {"schema": SCHEMA, "iteration": iteration, "items": described, "progress": progress}
+        whose = {} if self.run_id in (None, ANY_RUN) else {RUN_ID: self.run_id}
+        manifest = {"schema": SCHEMA, **whose, "iteration": iteration, "items": described, "progress": progress}
         arguments: dict[str, Any] = {name: ocp.args.StandardSave(arrays) for name, arrays in items.items()}
         arguments["manifest"] = ocp.args.JsonSave(manifest)
         if processes.are_several():
@@ -233,17 +284,28 @@ class Checkpoints:
         Returns:
             Where they are now.
         """
+        tiers = {tier: self.iterations(tier) for tier in (LIGHT, FULL)}
+        later = {tier: [found for found in iterations if found > iteration] for tier, iterations in tiers.items()}
+        return self._move(later, DAMAGED)
+
+    def set_foreign_aside(self) -> list[Path]:
+        """Moves checkpoints of other runs to checkpoints/foreign/: they would be counted, and ours deleted for them.
+
+        Returns:
+            Where they are now.
+        """
+        foreign = {tier: [found for found, is_ours in self._there(tier) if not is_ours] for tier in (LIGHT, FULL)}
+        return self._move(foreign, FOREIGN)
+
+    def _move(self, iterations: dict[str, list[int]], folder: str) -> list[Path]:
         moved = []
-        for tier in (LIGHT, FULL):
-            for later in self.iterations(tier):
-                if later > iteration:
-                    self._forget(tier)
-                    moved.append(self._folder / DAMAGED / f"{tier}-{later}")
-                    if not processes.is_first():
-                        continue
-                    moved[-1].parent.mkdir(exist_ok=True)
-                    shutil.rmtree(moved[-1], ignore_errors=True)
-                    (self._folder / tier / str(later)).rename(moved[-1])
+        for tier, iteration in [(tier, iteration) for tier, found in iterations.items() for iteration in found]:
+            self._forget(tier)
+            moved.append(self._folder / folder / f"{tier}-{iteration}")
+            if processes.is_first():
+                moved[-1].parent.mkdir(exist_ok=True)
+                shutil.rmtree(moved[-1], ignore_errors=True)
+                (self._folder / tier / str(iteration)).rename(moved[-1])
         return moved
 
     def _forget(self, tier: str) -> None:
@@ -285,7 +347,7 @@ class Checkpoints:
         import orbax.checkpoint as ocp
 
         manifest = self._read(tier, iteration, {"manifest": ocp.args.JsonRestore()})["manifest"]
-        if not isinstance(manifest, dict) or not {"schema", "items"} <= set(manifest):
+        if not _is_manifest(manifest):
             raise _Damaged("its manifest is incomplete")
         templates = {"train": template.train} | ({"rest": _rest(template)} if with_rest else {})
         specs = {name: host_specs(tree) for name, tree in templates.items()}

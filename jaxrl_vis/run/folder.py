@@ -2,15 +2,19 @@
 
 The files:
 
-    config.json     schema, versions, device, git revision, configuration      metrics.jsonl   see `metrics`
+    config.json     schema, id, versions, device, git revision, configuration  metrics.jsonl   see `metrics`
     checkpoints/    see `checkpoint`      nonfinite/   what a run that went wrong held      curve.png   video.gif
     run.lock        while a process writes here, see `lock`      tensorboard/, wandb/, wandb.json   see `loggers`
+
+A run has an id, which is drawn when it starts and stays when it is resumed. Every row of metrics and every checkpoint carries
+it, and nothing that carries another one is resumed, counted or deleted. Runs of earlier versions have none, and keep none.
 """
 
 import dataclasses
 import json
+import secrets
 import shutil
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -18,11 +22,15 @@ from typing import Any
 from jaxrl_vis import provenance
 from jaxrl_vis.config import Config, config_from_dict
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.files import write_atomically
+from jaxrl_vis.files import check_path, is_temporary, read_json, write_atomically
 from jaxrl_vis.run.lock import FILE_NAME as LOCK_NAME
-from jaxrl_vis.run.lock import run_lock
+from jaxrl_vis.run.lock import FolderGoneError, Held, run_lock
+from jaxrl_vis.run.metrics import RUN_ID, read_rows
 
 SCHEMA = 1
+
+CHECKPOINT_FOLDERS = ("light", "full", "recent", "damaged", "foreign")
+"""What `checkpoint` leaves in its folder."""
 
 LOGGER_FOLDERS, WANDB_STATE = ("tensorboard", "wandb"), "wandb.json"
 """What `loggers` leave in a run folder."""
@@ -54,6 +62,7 @@ def default_folder(config: Config) -> Path:
 
 def check_there(path: Path, resume: bool) -> None:
     """Raises a `RequestError` where a run is to go on in a folder that is not there."""
+    check_path(path / "config.json")
     if resume and not path.exists():
         raise RequestError(f"nothing to resume: there is no folder {path}; leave out --resume to start a run there")
 
@@ -98,9 +107,42 @@ class RunFolder:
         """A few episodes of the trained policy."""
         return self.path / "video.gif"
 
-    def lock(self) -> AbstractContextManager[None]:
+    def lock(self, say: Callable[[str], None] = print) -> AbstractContextManager[Held]:
         """See `run_lock`."""
-        return run_lock(self.path)
+        return run_lock(self.path, say)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """The rows of metrics.jsonl that this run has written, in the order of their iterations, without damaged ones.
+
+        Where config.json cannot be read, these are all rows.
+
+        Raises:
+            RequestError: metrics.jsonl cannot be read.
+        """
+        rows = read_rows(self.metrics)
+        try:
+            run_id = read_run_id(self.path)
+        except RequestError:
+            return rows
+        return [row for row in rows if row.get(RUN_ID) == run_id]
+
+    def check_ours(self, run_id: str | None, held: Held) -> None:
+        """Checks that this is still the folder of a run, before something is written into it.
+
+        Args:
+            run_id: The run's.
+            held: What holds the folder.
+
+        Raises:
+            FolderGoneError: It was moved, deleted or taken over.
+        """
+        held.check()
+        try:
+            is_ours = read_run_id(self.path) == run_id
+        except RequestError:  # a file that cannot be read, for a moment or for good, is no reason to stop
+            is_ours = self.config.exists()
+        if not is_ours:
+            raise FolderGoneError(_where_gone(self.path, held.place()))
 
     def check(self, config: Config, resume: bool = False, overwrite: bool = False) -> bool:
         """Whether this folder may be used for ``config``. Changes nothing.
@@ -113,10 +155,14 @@ class RunFolder:
         """
         if resume and overwrite:
             raise RequestError("--resume and --overwrite contradict each other: give one of them")
+        check_there(self.path, resume)
         if self.path.exists() and not self.path.is_dir():
             raise RequestError(f"{self.path} is a file: choose another --run-dir")
-        check_there(self.path, resume)
-        if not self.path.exists() or all(entry.name == LOCK_NAME for entry in self.path.iterdir()):
+        try:
+            names = [entry.name for entry in self.path.iterdir()] if self.path.exists() else []
+        except OSError as error:
+            raise RequestError(f"{self.path} cannot be looked into ({error.strerror}): choose another --run-dir") from error
+        if all(name.startswith(LOCK_NAME) or is_temporary(name) for name in names):
             return False
         if not (resume or overwrite):
             raise RequestError(f"run folder {self.path} exists: --resume goes on with it, --overwrite starts again")
@@ -136,25 +182,64 @@ class RunFolder:
             True where an earlier run goes on.
 
         Raises:
-            RequestError: See `check`; or the folder cannot be written to.
+            RequestError: See `check`; or the folder cannot be written to, or something in it cannot be deleted.
         """
         goes_on = self.check(config, resume, overwrite)
+        run_id = read_run_id(self.path) if goes_on else secrets.token_hex(16)
+        if overwrite:
+            self._delete_run()
         try:
-            if overwrite:
-                for folder in (self.checkpoints, self.nonfinite, *(self.path / name for name in LOGGER_FOLDERS)):
-                    shutil.rmtree(folder, ignore_errors=True)
-                for file in (self.metrics, self.curve, self.video, self.path / WANDB_STATE):
-                    file.unlink(missing_ok=True)
             self.path.mkdir(parents=True, exist_ok=True)
-            write_atomically(self.config, json.dumps(_record(config, log), indent=2) + "\n")
+            for file in self.path.iterdir():
+                if is_temporary(file.name):  # of a process that was killed
+                    file.unlink()
+            write_atomically(self.config, json.dumps(_record(config, log, run_id), indent=2) + "\n")
         except OSError as error:
             raise RequestError(f"cannot write to {self.path} ({error.strerror}): choose another --run-dir") from error
         return goes_on
 
+    def _delete_run(self) -> None:
+        """Deletes what a run leaves, checkpoints first: what remains where something cannot be deleted is still a run.
 
-def _record(config: Config, log: tuple[str, ...]) -> dict[str, Any]:
+        Raises:
+            RequestError: Something cannot be deleted.
+        """
+        own = [self.checkpoints / name for name in CHECKPOINT_FOLDERS]
+        if not (self.checkpoints.is_symlink() and self.checkpoints.is_dir()):  # such a link stays: that disk was chosen
+            own.append(self.checkpoints)
+        folders = [self.nonfinite, *(self.path / name for name in LOGGER_FOLDERS)]
+        for path in (*own, *folders, self.metrics, self.curve, self.video, self.path / WANDB_STATE):
+            try:
+                if path.is_dir() and not path.is_symlink():
+                    shutil.rmtree(path)
+                else:
+                    path.unlink(missing_ok=True)
+            except NotADirectoryError:  # checkpoints is a file
+                continue
+            except OSError as error:
+                what = error.filename or path
+                raise RequestError(
+                    f"the run in {self.path} cannot be deleted: {what} stays ({error.strerror or error}). No new run was "
+                    "started: delete it by hand, or choose another --run-dir"
+                ) from error
+
+
+def _where_gone(path: Path, place: Path | None) -> str:
+    """Words for a run folder that is not where it was."""
+    lost = "what was trained since its last checkpoint is lost"
+    if place is None:
+        return f"{path} is gone: it was deleted, or moved away, while the run wrote there, and {lost}"
+    if place == path.resolve():
+        return (
+            f"{path / 'config.json'} is gone, or is that of another run: put it back, then go on with --run-dir {path} --resume"
+        )
+    return f"{path} was moved to {place} while the run wrote there, and {lost}: go on with --run-dir {place} --resume"
+
+
+def _record(config: Config, log: tuple[str, ...], run_id: str | None) -> dict[str, Any]:
     return {
         "schema": SCHEMA,
+        **({} if run_id is None else {RUN_ID: run_id}),
         "preset": config.preset,
         "git_revision": provenance.revision(),
         "versions": provenance.versions(),
@@ -171,22 +256,36 @@ def read_record(path: Path) -> dict[str, Any]:
         RequestError: There is no run in ``path``, or its config.json cannot be read.
     """
     file = RunFolder(path).config
-    try:
-        record = json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise RequestError(f"no run in {path}: there is no config.json") from error
-    except (OSError, ValueError) as error:
-        raise RequestError(f"{file} cannot be read ({type(error).__name__}): train --overwrite starts again") from error
-    if not isinstance(record, dict) or record.get("schema") != SCHEMA:
+    check_path(file)
+    if not file.exists():
+        raise RequestError(f"no run in {path}: there is no config.json")
+    record = read_json(file, mend="put back what it held, or train --overwrite")
+    if record.get("schema") != SCHEMA:
         raise RequestError(
             f"{file} is not of schema {SCHEMA}: it was written by another version; use that, or train --overwrite"
         )
     return record
 
 
+def read_run_id(path: Path) -> str | None:
+    """The id of the run in ``path``; None of one of an earlier version, which has none.
+
+    Raises:
+        RequestError: There is no run in ``path``, or its config.json cannot be read.
+    """
+    run_id = read_record(path).get(RUN_ID)
+    if not isinstance(run_id, str | None):
+        raise RequestError(f"{RUN_ID} in {RunFolder(path).config} must be a word, not {run_id!r}: put back what it held")
+    return run_id
+
+
 def read_log(path: Path) -> tuple[str, ...]:
     """The loggers that the run in ``path`` had; none where there is no run."""
-    return tuple(read_record(path).get("log", ())) if RunFolder(path).config.exists() else ()
+    check_path(path)
+    log = read_record(path).get("log", []) if RunFolder(path).config.exists() else []
+    if not isinstance(log, list) or not all(isinstance(name, str) for name in log):
+        raise RequestError(f"log in {RunFolder(path).config} must be a list of words, not {log!r}: put back what it held")
+    return tuple(log)
 
 
 def read_config(path: Path) -> Config:

@@ -7,6 +7,9 @@ A kept program is that of one fingerprint: the code of both packages, the versio
 settings and the device. It does not see what a process has replaced in its own modules (a patched loss, say). So only
 commands keep programs, not scripts and notebooks, and none of environments from elsewhere. ``JAXRL_VIS_KEEP_PROGRAMS=0`` turns
 it off.
+
+Whoever writes a kept program decides what a run computes. So folder and files are kept for the user alone, nothing is read that
+another user has written or could have written, and a file's digest is of its name, too.
 """
 
 import contextlib
@@ -17,6 +20,7 @@ import importlib.util
 import itertools
 import json
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -26,6 +30,7 @@ from jax import export
 from jax.extend.core import jaxpr_as_fun
 
 from jaxrl_vis.config import Config
+from jaxrl_vis.files import make_private, read_private, replacing, stranger_to
 from jaxrl_vis.provenance import device_record, versions
 from jaxrl_vis_envs.base import GoalEnv
 from jaxrl_vis_envs.compilation import env_jit, runs_gpu_kernels, target_platform, tracing_for_default_device
@@ -130,11 +135,10 @@ class KeptPrograms:
     def write(self) -> None:
         """Keeps what was traced; call it when it has been compiled. Where that cannot be written, nothing is kept."""
         with contextlib.suppress(OSError):
-            self._folder.mkdir(parents=True, exist_ok=True)
-            for name, data in self._fresh.items():
-                part = self._path(name).with_suffix(f".{os.getpid()}.tmp")
-                part.write_bytes(hashlib.sha256(data).digest() + data)
-                part.replace(self._path(name))
+            make_private(self._folder)
+            for name, data in self._fresh.items() if self._is_private() else ():
+                with replacing(self._path(name), durable=False, mode=0o600) as file:
+                    file.write(self._digest(name, data) + data)
             for path in sorted(self._folder.iterdir(), key=lambda path: path.stat().st_mtime)[:-MOST_FILES]:
                 path.unlink(missing_ok=True)
         self._fresh.clear()
@@ -150,10 +154,34 @@ class KeptPrograms:
         return self._folder / f"{name}-{self._fingerprint}.stablehlo"
 
     def _read(self, name: str) -> bytes | None:
-        """None for a program that is not there, or is damaged."""
-        try:
-            contents = self._path(name).read_bytes()
-        except OSError:
+        """None for a program that is not there, is damaged, or may be another user's."""
+        contents = read_private(self._path(name)) if self._is_private() else None
+        if contents is None:
             return None
         digest, data = contents[:_DIGEST_BYTES], contents[_DIGEST_BYTES:]
-        return data if hashlib.sha256(data).digest() == digest else None
+        return data if self._digest(name, data) == digest else None
+
+    def _digest(self, name: str, data: bytes) -> bytes:
+        return hashlib.sha256(self._path(name).name.encode() + b"\0" + data).digest()
+
+    def _is_private(self) -> bool:
+        """Whether the folder is this user's alone; of one that is this user's, others' rights are taken first."""
+        try:
+            status = self._folder.stat()
+            if stranger_to(status) is not None:
+                make_private(self._folder)
+                status = self._folder.stat()
+        except OSError:
+            return False
+        reason = stranger_to(status)
+        if reason is not None:
+            _say_once(
+                f"programs kept in {self._folder} are not used: it {reason}; JAX_COMPILATION_CACHE_DIR names another folder"
+            )
+        return reason is None
+
+
+@functools.cache
+def _say_once(line: str) -> None:
+    with contextlib.suppress(OSError, ValueError, AttributeError):  # a stream that is closed, or none
+        print(line, file=sys.stderr)

@@ -14,6 +14,7 @@ signals at boundaries only, where they wait for each other anyway.
 
 import contextlib
 import dataclasses
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,10 +26,11 @@ import numpy as np
 
 from jaxrl_vis import processes
 from jaxrl_vis.errors import NonFiniteError, StorageError
-from jaxrl_vis.run import metrics
+from jaxrl_vis.run import earlier, metrics, trust
 from jaxrl_vis.run.checkpoint import FULL, LIGHT, Checkpoints, Restored
 from jaxrl_vis.run.console import RunConsole, show_seconds, show_shares
-from jaxrl_vis.run.folder import RunFolder, read_record
+from jaxrl_vis.run.folder import RunFolder, read_record, read_run_id
+from jaxrl_vis.run.lock import FolderGoneError, Held
 from jaxrl_vis.run.loggers import Loggers
 from jaxrl_vis.run.memory import check_compiled, check_memory, fit_together
 from jaxrl_vis.run.metrics import PerSeed
@@ -79,7 +81,8 @@ class RunLoop:
         self._console = RunConsole(quiet=not self._writes)
         self._say = self._console.say
         self._checkpoints = Checkpoints(folder.checkpoints, self._say)
-        self._saver = Saver(programs, folder, self._checkpoints, self._say)
+        self._held: Held | None = None  # by the first process
+        self._saver = Saver(programs, folder, self._checkpoints, self._say, self._check_ours)
         self._log, self._loggers = log, Loggers(log if self._writes else (), folder.path, self._say)
         self._results = Results(programs, folder, self._loggers, self._say)
         self._total: int = self._program.num_iterations
@@ -91,6 +94,7 @@ class RunLoop:
         self._begun, self._begun_at = 0, self._mark
         self._marked_iteration, self._compile_s = 0, 0.0
         self._is_left_alone = False
+        self._evaluated_there: set[int] = set()  # seeds that have a row of the iteration that the run goes on from
         self._evaluates_ahead = False  # while the iteration before is still learned from
         self._owed_evaluation = False  # what was restored owes an evaluation, and would whenever it is restored
         self.has_begun = False  # the folder is this run's
@@ -106,8 +110,12 @@ class RunLoop:
         stacked = self._program.replay.frame_stack
         memory = check_memory(self._config, shapes, self._program.replay_bytes, steps, layout, stacked)
         processes.meet("checked")  # before the first of them writes anything that the others would find
-        with self._folder.lock() if self._writes else contextlib.nullcontext(), self._console:
+        if goes_on:
+            self._checkpoints.run_id = read_run_id(self._folder.path)
+        with self._folder.lock(self._say) if self._writes else contextlib.nullcontext() as self._held, self._console:
             if goes_on and self._is_finished():
+                if self._writes and (said := earlier.cut_back(self._folder, self._checkpoints, sys.maxsize, keeps_later=False)):
+                    self._say(said)
                 self._say(
                     f"{self._folder.path} is finished already ({self._total} iterations): ask for more --env-steps to go on"
                 )
@@ -122,6 +130,8 @@ class RunLoop:
                     self._finish(interruption)
                 self._checkpoints.close()
             except StorageError as error:
+                if gone := self._gone():
+                    raise gone from error
                 self._rescue()
                 raise self._saver.storage_error(error) from error
             except NonFiniteError:
@@ -130,7 +140,9 @@ class RunLoop:
                 if not interruption:  # raised by a handler of the caller's own, which was left in charge
                     self._rescue()
                 raise
-            except Exception:
+            except Exception as error:
+                if gone := self._gone():
+                    raise gone from error
                 self._rescue()
                 raise
             finally:
@@ -139,6 +151,20 @@ class RunLoop:
                     with contextlib.suppress(StorageError):
                         self._checkpoints.close()
                     self._loggers.close(in_a_hurry=bool(interruption))
+
+    def _check_ours(self) -> None:
+        """Raises a `FolderGoneError` where the run folder was moved, deleted or taken over; asked before each writing."""
+        if self._held is not None and self.has_begun:
+            self._folder.check_ours(self._checkpoints.run_id, self._held)
+
+    def _gone(self) -> FolderGoneError | None:
+        """Why nothing can be saved any more, if the run folder is not this run's any more."""
+        try:
+            self._check_ours()
+        except FolderGoneError as gone:
+            self._console.stop()
+            return gone
+        return None
 
     def _rescue(self) -> None:
         self._console.stop()
@@ -158,13 +184,7 @@ class RunLoop:
             self._say("the last checkpoint is not usable, so the run is not finished: going on from the last good one")
             return False
         files = [self._folder.curve, self._folder.video] if self._programs.shows_images else [self._folder.curve]
-        return self._is_evaluated(restored) and all(file.exists() for file in files)
-
-    def _is_evaluated(self, restored: Restored) -> bool:
-        """Whether the evaluation that a run ends with is there, if what was restored is its end."""
-        rows = metrics.read_rows(self._folder.metrics)
-        is_due = Progress.from_dict(restored.progress).evaluation_due
-        return not is_due and any(row["iteration"] == restored.iteration and "eval/success" in row for row in rows)
+        return earlier.is_evaluated(self._folder, self._programs.seeds, restored) and all(file.exists() for file in files)
 
     def _prepare(self, goes_on: bool, memory: str) -> dict[str, Any]:
         """Restores and compiles; the compiled programs by name. Nothing is written."""
@@ -173,6 +193,7 @@ class RunLoop:
         self._say(f"{self._total} iterations of {steps:,} environment steps per seed; files go to {self._folder.path}")
         restored = self._checkpoints.restore_for_resume(programs.shapes) if goes_on else None
         if restored is not None:
+            earlier.refuse_missing_rows(self._folder, restored)
             self._take_over(restored)
         elif goes_on:
             self._say("no usable checkpoint: starting at the beginning")
@@ -193,11 +214,16 @@ class RunLoop:
         self._evaluates_ahead = self._programs.evaluates_ahead and has_room
         if self._writes:
             self._folder.open(self._config, goes_on, overwrite, self._log)
+            if trust.is_own(self._config):  # and here it runs
+                trust.trust(self._folder.path, self._config, was_trained_here=True)
+        processes.meet("opened")
+        self._checkpoints.run_id = read_run_id(self._folder.path)
         self.has_begun = True
+        foreign = self._checkpoints.set_foreign_aside()
         damaged = self._checkpoints.set_aside_after(self._done) if goes_on else []
         if self._writes:
             with self._saver.writing():
-                self._begin_log(goes_on, damaged)
+                self._begin_log(goes_on, damaged, foreign)
         processes.meet("begun")
         if self._loop is None:
             self._loop = self._programs.init(self._programs.run_keys)
@@ -205,25 +231,31 @@ class RunLoop:
         self._set_mark()
         self._begun, self._begun_at = self._done, self._mark
 
-    def _begin_log(self, goes_on: bool, damaged: list[Path]) -> None:
+    def _begin_log(self, goes_on: bool, damaged: list[Path], foreign: list[Path]) -> None:
         """Cuts the metrics back to the iteration that the run goes on from, and opens the loggers.
 
         Args:
             goes_on: Whether it does.
             damaged: Checkpoints that were set aside.
+            foreign: Those of other runs.
         """
         if goes_on:
-            last = self._done - self._progress.evaluation_due  # an evaluation that is due writes its rows again
-            metrics.cut_back(self._folder.metrics, last, damaged[0].parent / "metrics.jsonl" if damaged else None)
-            for path in damaged:
-                self._say(f"kept for inspection: {path}")
-        self._loggers.open(read_record(self._folder.path), self._programs.seeds, metrics.read_rows(self._folder.metrics))
+            if said := earlier.cut_back(self._folder, self._checkpoints, self._done, keeps_later=bool(damaged)):
+                self._say(said)
+            self._evaluated_there = {row["seed"] for row in self._folder.rows() if row["iteration"] == self._done}
+        for path in damaged:
+            self._say(f"kept for inspection: {path}")
+        for path in foreign:
+            self._say(f"not of this run, and left out: {path}")
+        self._loggers.open(read_record(self._folder.path), self._programs.seeds, self._folder.rows())
 
     def _take_over(self, restored: Restored) -> None:
         self._progress = Progress.from_dict(restored.progress)
         self._done = restored.iteration
         # A run that has come far enough before it was evaluated, or that is asked for fewer steps than it has, ends with that.
-        self._progress.evaluation_due |= self._done >= self._total and not self._is_evaluated(restored)
+        self._progress.evaluation_due |= self._done >= self._total and not earlier.is_evaluated(
+            self._folder, self._programs.seeds, restored
+        )
         self._owed_evaluation = self._progress.evaluation_due
         if restored.loop is not None:
             self._loop = restored.loop
@@ -326,7 +358,10 @@ class RunLoop:
         if progress.replay_lost_at is not None:
             counts["resume/replay_lost_at"] = progress.replay_lost_at
         if self._writes:
-            rows = metrics.make_rows(self._programs.seeds, counts, values | means | rounded)
+            self._check_ours()
+            rows = metrics.make_rows(self._programs.seeds, counts, values | means | rounded, self._checkpoints.run_id)
+            if self._done == self._begun:  # an evaluation that was due: a kill or a disk may have left a part of its rows
+                rows = [row for row in rows if row["seed"] not in self._evaluated_there]
             with self._saver.writing():
                 metrics.append_rows(self._folder.metrics, rows)
             self._loggers.rows(rows)

@@ -2,11 +2,12 @@
 
 One line per seed and evaluation: seed, iteration, updates, env_steps (counts per seed, since the beginning), eval/*, the means
 of train/* since the last evaluation and a quotient of two of them (`with_precision`), resume/replay_lost_at (where a run went
-on from a light checkpoint: the last iteration at which its replay was lost), and time/wall_s (the run so far, with evaluation,
-compilation and what came before a resumption), time/compile_s (of that, compilation), time/env_steps_per_s (all seeds together,
-since the last evaluation).
+on from a light checkpoint: the last iteration at which its replay was lost), run_id (as in config.json), and time/wall_s (the
+run so far, with evaluation, compilation and what came before a resumption), time/compile_s (of that, compilation),
+time/env_steps_per_s (all seeds together, since the last evaluation).
 """
 
+import dataclasses
 import json
 import math
 import os
@@ -14,7 +15,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxrl_vis.run.folder import write_atomically
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.files import sync_folder, write_atomically
+from jaxrl_vis_envs.documents import parse_json
 
 PerSeed = dict[str, list[float]]
 """Name -> one number per seed."""
@@ -22,7 +25,13 @@ PerSeed = dict[str, list[float]]
 Row = Mapping[str, Any]
 """A line of the file."""
 
-_PLACE = ("seed", "iteration", "env_steps")  # of a row: where it belongs, not what it says
+RUN_ID = "run_id"
+"""Key of the run that a row, a checkpoint's manifest or a config.json is of; not there in those of earlier versions."""
+
+_PLACE = ("seed", "iteration", "env_steps", RUN_ID)  # of a row: where it belongs, not what it says
+_COUNTS = ("seed", "iteration", "updates", "env_steps")  # what no row is without
+_LARGEST = 2**63  # of a number in a row: beyond, arrays of whole numbers end
+_SHOWN = 8  # numbers of lines in a message
 
 
 def mean_of(history: Sequence[Mapping[str, Sequence[float]]]) -> PerSeed:
@@ -57,10 +66,13 @@ def _nine_digits(value: float) -> float:
     return float(f"{value:.9g}")
 
 
-def make_rows(seeds: Iterable[int], counts: Mapping[str, int], values: Mapping[str, Sequence[float]]) -> list[dict[str, Any]]:
-    """One row per seed: its number, then ``counts``, then its share of ``values``. A NaN or an infinity becomes None."""
+def make_rows(
+    seeds: Iterable[int], counts: Mapping[str, int], values: Mapping[str, Sequence[float]], run_id: str | None = None
+) -> list[dict[str, Any]]:
+    """One row per seed: its number, ``counts``, its share of ``values``, and whose it is. A NaN or an infinity becomes None."""
+    whose = {} if run_id is None else {RUN_ID: run_id}
     return [
-        {"seed": seed, **counts, **{name: row[i] if math.isfinite(row[i]) else None for name, row in values.items()}}
+        {"seed": seed, **counts, **{name: row[i] if math.isfinite(row[i]) else None for name, row in values.items()}, **whose}
         for i, seed in enumerate(seeds)
     ]
 
@@ -70,41 +82,127 @@ def scalars(row: Row) -> dict[str, float]:
     return {name: float(value) for name, value in row.items() if name not in _PLACE and value is not None}
 
 
+@dataclasses.dataclass(frozen=True)
+class Contents:
+    """What a metrics file holds.
+
+    Attributes:
+        rows: The rows, in the order of their iterations.
+        damaged: Number and bytes of every line that is no row, or a row that is there already. What a kill has left of the last
+            line does not count: that row was never whole.
+    """
+
+    rows: list[dict[str, Any]]
+    damaged: list[tuple[int, bytes]]
+
+
 def append_rows(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
     """Writes rows at the end of the file and sees to it that they are on the disk."""
-    with path.open("a", encoding="utf-8") as file:
-        file.writelines(json.dumps(row) + "\n" for row in rows)
+    _append(path, "".join(json.dumps(row) + "\n" for row in rows).encode())
+
+
+def _append(path: Path, contents: bytes) -> None:
+    is_new = not path.exists()
+    with path.open("ab") as file:
+        file.write(contents)
         file.flush()
         os.fsync(file.fileno())
+    if is_new:
+        sync_folder(path.parent)
+
+
+def read_contents(path: Path) -> Contents:
+    """All that a metrics file holds, whatever somebody or a disk has made of it; nothing where there is no file.
+
+    Raises:
+        RequestError: The file cannot be read.
+    """
+    try:
+        *lines, last = path.read_bytes().removeprefix(b"\xef\xbb\xbf").split(b"\n")
+    except FileNotFoundError:
+        return Contents([], [])
+    except OSError as error:
+        raise RequestError(f"cannot read {path} ({error.strerror or type(error).__name__})") from error
+    rows: dict[tuple[int, int, str | None], dict[str, Any]] = {}
+    damaged = []
+    for number, line in enumerate([*lines, last], 1):
+        is_last = number > len(lines)  # what no line break ends
+        row = _read_row(line)
+        place = None if row is None else (row["iteration"], row["seed"], row.get(RUN_ID))
+        if row is not None and place is not None and place not in rows:
+            rows[place] = row
+        elif line.strip() and not (is_last and row is None):
+            damaged.append((number, line))
+    return Contents(sorted(rows.values(), key=lambda row: row["iteration"]), damaged)
+
+
+def _read_row(line: bytes) -> dict[str, Any] | None:
+    """The row of a line; None where it is none that a run can have written."""
+    try:
+        row = parse_json(line.decode("utf-8"))
+    except ValueError:
+        return None
+    if not isinstance(row, dict) or not all(_is_count(row.get(name)) for name in _COUNTS):
+        return None
+    if not isinstance(row.get(RUN_ID), str | None):
+        return None
+    return row if all(name == RUN_ID or _is_figure(value) for name, value in row.items()) else None
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < _LARGEST
+
+
+def _is_figure(value: Any) -> bool:
+    if isinstance(value, int) and not isinstance(value, bool):
+        return abs(value) < _LARGEST
+    return value is None or (isinstance(value, float) and math.isfinite(value))
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
-    """All rows of a metrics file, or none where there is no file. A line that was cut off in the middle is left out."""
-    if not path.exists():
-        return []
-    rows = []
-    for line in path.read_text(encoding="utf-8").splitlines():
-        try:
-            row = json.loads(line)
-        except ValueError:
-            continue
-        if isinstance(row, dict) and "iteration" in row and "seed" in row:
-            rows.append(row)
-    return rows
+    """All rows of a metrics file, in the order of their iterations, or none where there is no file. Damaged lines are left out.
+
+    Raises:
+        RequestError: The file cannot be read.
+    """
+    return read_contents(path).rows
 
 
-def cut_back(path: Path, iteration: int, cut_to: Path | None = None) -> None:
-    """Takes out every row after ``iteration``: a resumed run writes those again.
+def cut_back(path: Path, iteration: int, run_id: str | None, aside: Path, keeps_later: bool) -> str | None:
+    """Takes out every row after ``iteration``, which a resumed run writes again, and all that is not this run's.
 
     Args:
         path: The file.
         iteration: The last one to keep.
-        cut_to: Append what is taken out to this file; None: it is dropped.
+        run_id: Of the run; None for one of an earlier version, which has none.
+        aside: To this file goes what is damaged, or of another run; nothing is ever dropped.
+        keeps_later: Rows after ``iteration``, too.
+
+    Returns:
+        A line on what is damaged or of another run; None where nothing is.
+
+    Raises:
+        OSError: A file cannot be written.
+        RequestError: The file cannot be read.
     """
     if not path.exists():
-        return
-    rows = read_rows(path)
-    later = [row for row in rows if row["iteration"] > iteration]
-    if cut_to is not None and later:
-        append_rows(cut_to, later)
-    write_atomically(path, "".join(json.dumps(row) + "\n" for row in rows if row["iteration"] <= iteration))
+        return None
+    contents = read_contents(path)
+    foreign = [row for row in contents.rows if row.get(RUN_ID) != run_id]
+    rows = [row for row in contents.rows if row.get(RUN_ID) == run_id]
+    later = [row for row in rows if keeps_later and row["iteration"] > iteration]
+    kept = [line for _, line in contents.damaged] + [json.dumps(row).encode() for row in (*foreign, *later)]
+    if kept:
+        aside.parent.mkdir(parents=True, exist_ok=True)
+        _append(aside, b"".join(line + b"\n" for line in kept))
+    text = "".join(json.dumps(row) + "\n" for row in rows if row["iteration"] <= iteration)
+    if text.encode() != path.read_bytes():
+        write_atomically(path, text)
+    what = [_describe(contents.damaged)] if contents.damaged else []
+    what += [f"{len(foreign)} row{'s' * (len(foreign) > 1)} of another run"] if foreign else []
+    return f"{path.name} held {' and '.join(what)}: kept in {aside}, and left out here" if what else None
+
+
+def _describe(damaged: Sequence[tuple[int, bytes]]) -> str:
+    numbers = ", ".join(str(number) for number, _ in damaged[:_SHOWN]) + (", ..." if len(damaged) > _SHOWN else "")
+    return f"{len(damaged)} damaged line{'s' * (len(damaged) > 1)} (line {numbers})"

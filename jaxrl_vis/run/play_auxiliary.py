@@ -22,7 +22,7 @@ SHOWN = ("autoencoder", "optical_flow", "egomotion")
 """The auxiliary tasks whose predictions can be drawn."""
 
 
-def play_auxiliary(run_dir: Path | str, out: Path | str, episodes: int = 6) -> None:
+def play_auxiliary(run_dir: Path | str, out: Path | str, episodes: int = 6, trust: bool = False) -> None:
     """Plays episodes with the first seed of the newest good checkpoint of a run, and draws what its auxiliary tasks predict.
 
     Observation, goal, reconstruction, true and predicted optical flow, and the rotated image with its angle stand side by side;
@@ -32,6 +32,7 @@ def play_auxiliary(run_dir: Path | str, out: Path | str, episodes: int = 6) -> N
         run_dir: The run folder.
         out: .gif, .mp4 (needs imageio-ffmpeg, the extra ``video``) or .html.
         episodes: How many to show.
+        trust: As of `trained.open_run`.
 
     Raises:
         RequestError: There is no run, nothing usable in it, no auxiliary task to show, or no way to write ``out``.
@@ -48,7 +49,7 @@ def play_auxiliary(run_dir: Path | str, out: Path | str, episodes: int = 6) -> N
             f"the run in {run_dir} predicts nothing that can be drawn ({', '.join(tasks)}): --aux shows {', '.join(SHOWN)}"
         )
     # A rollout is what it takes; its exploration is switched off.
-    trainer = open_run(run_dir, num_envs=episodes, random_action_probability=0.0, action_noise=0.0)
+    trainer = open_run(run_dir, trust=trust, num_envs=episodes, random_action_probability=0.0, action_noise=0.0)
     env, config, networks = trainer.env, trainer.config, trainer.program.networks
     train = jax.tree.map(lambda leaf: jnp.asarray(leaf[:1]), load(trainer, run_dir).train)
     enable_compilation_cache()

@@ -112,18 +112,20 @@ class Policy:
             raise RequestError(f"{self.env_name}: {name} must be {spec.dtype}, not {dtype}")
 
 
-def load_policy(run_dir: Path | str, seed: int | None = None, checkpoint: int | None = None) -> Policy:
+def load_policy(run_dir: Path | str, seed: int | None = None, checkpoint: int | None = None, trust: bool = False) -> Policy:
     """The policy that a run has trained, on whatever platform JAX runs on here.
 
     Args:
         run_dir: The run folder.
         seed: Which seed of a run with several; None: the first.
         checkpoint: The iteration of a checkpoint that the run keeps; None: the newest good one.
+        trust: The run may run its own code, which a run on ``module:Name`` does; not needed for one that was trained here.
 
     Raises:
-        RequestError: There is no run, no such seed or checkpoint, or none that can be used; or its task cannot be made here.
+        RequestError: There is no run, no such seed or checkpoint, or none that can be used; or its task cannot be made here, or
+            is code that nobody has trusted.
     """
-    trainer = open_run(run_dir)
+    trainer = open_run(run_dir, trust=trust)
     seed = trainer.config.seed if seed is None else seed
     if seed not in trainer.seeds:
         trained = f"seed {trainer.seeds[0]}" if len(trainer.seeds) == 1 else f"seeds {trainer.seeds[0]} to {trainer.seeds[-1]}"

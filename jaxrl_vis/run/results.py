@@ -5,7 +5,6 @@ from typing import Any
 
 from jaxrl_vis.config import Config
 from jaxrl_vis.report import videos
-from jaxrl_vis.run import metrics
 from jaxrl_vis.run.console import show_seconds
 from jaxrl_vis.run.folder import RunFolder
 from jaxrl_vis.run.loggers import Loggers
@@ -44,7 +43,7 @@ class Results:
         if self._programs.shows_images:
             videos.write_video(videos.first_seed(recorded), self._folder.video, self._programs.image_seconds)
             self._loggers.image("video", self._folder.video, self._env_steps(done))
-        rows = [row for row in metrics.read_rows(self._folder.metrics) if row["iteration"] == done]
+        rows = [row for row in self._folder.rows() if row["iteration"] == done and row.get("eval/success") is not None]
         success = ", ".join(f"seed {row['seed']}: {row['eval/success']:.3f}" for row in rows)
         written = [file.name for file in (self._folder.curve, self._folder.video) if file.exists()]
         progress = progress_now()
@@ -58,7 +57,7 @@ class Results:
 
         config, env = self._programs.config, self._programs.env
         plots.plot_run(
-            metrics.read_rows(self._folder.metrics),
+            self._folder.rows(),
             self._folder.curve,
             title=config.env,
             subtitle=f"{describe(config)}, {config.eval_episodes} episodes per evaluation"

@@ -41,10 +41,19 @@ class Saver:
         folder: Where its files go.
         checkpoints: Of that folder.
         say: Called with one line about what happens.
+        check: Raises a `StorageError` where the folder is not this run's any more; called before anything is written.
     """
 
-    def __init__(self, programs: Programs, folder: RunFolder, checkpoints: Checkpoints, say: Callable[[str], None]):
+    def __init__(
+        self,
+        programs: Programs,
+        folder: RunFolder,
+        checkpoints: Checkpoints,
+        say: Callable[[str], None],
+        check: Callable[[], None],
+    ):
         self._programs, self._folder, self._checkpoints, self._say = programs, folder, checkpoints, say
+        self._check = check
         self._keeps_full = programs.config.full_checkpoint_interval > 0
 
     def has(self, tier: str, iteration: int) -> bool:
@@ -58,6 +67,7 @@ class Saver:
             NonFiniteError: The state is not finite; it was dumped instead.
             StorageError: It cannot be written, or the one before could not.
         """
+        self._check()
         self._refuse_nonfinite(loop, iteration)
         self._checkpoints.save_light(iteration, loop.train, dataclasses.asdict(progress))
         if not self._keeps_full:
@@ -65,6 +75,7 @@ class Saver:
 
     def full(self, loop: LoopState, iteration: int, progress: Progress) -> None:
         """Saves everything, and returns when it is on the disk. Raises as `light`."""
+        self._check()
         self._refuse_nonfinite(loop, iteration)
         self._checkpoints.save_full(iteration, loop, dataclasses.asdict(progress))
 
@@ -75,6 +86,7 @@ class Saver:
             StorageError: Something could not be written.
         """
         self._checkpoints.wait()
+        self._check()
         if not self._keeps_full:
             self._checkpoints.retire_full(has_ended=True)
 

@@ -30,7 +30,11 @@ class TensorBoard:
     """
 
     def __init__(self, folder: Path, record: Mapping[str, Any], seeds: Sequence[int]):
-        shutil.rmtree(folder / LOGGER_FOLDERS[0], ignore_errors=True)
+        old = folder / LOGGER_FOLDERS[0]
+        if old.is_symlink():
+            old.unlink()
+        elif old.exists():
+            shutil.rmtree(old)  # or else what another run has left would be shown, too
         self._writers: dict[int, EventsWriter] = {}
         for seed in seeds:
             where = folder / LOGGER_FOLDERS[0] / f"seed{seed}"

@@ -9,23 +9,27 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.evaluate import num_recorded
 from jaxrl_vis.report import videos, viewer
 from jaxrl_vis.run.checkpoint import FULL, LIGHT, Checkpoints, Restored
-from jaxrl_vis.run.folder import read_config
+from jaxrl_vis.run.folder import read_config, read_run_id
 from jaxrl_vis.run.memory import check_compiled
 from jaxrl_vis.run.trainer import Trainer, make_trainer
+from jaxrl_vis.run.trust import check as check_trusted
 
 
-def open_run(run_dir: Path | str, keep_programs: bool = False, **changes: object) -> Trainer:
+def open_run(run_dir: Path | str, keep_programs: bool = False, trust: bool = False, **changes: object) -> Trainer:
     """The trainer of a run, on one device, with fields of its configuration changed; nothing in its folder is touched.
 
     Args:
         run_dir: The run folder.
         keep_programs: As of `make_trainer`; what training has traced is found then.
+        trust: The run may run its own code, where its task is not one of this project (`jaxrl_vis.run.trust`).
         **changes: Fields of `Config`.
 
     Raises:
-        RequestError: There is no run, or it cannot be made any more.
+        RequestError: There is no run, its code is not trusted, or it cannot be made any more.
     """
-    config = read_config(Path(run_dir)).replace(devices=1, data_devices=None, **changes)
+    saved = read_config(Path(run_dir))
+    check_trusted(Path(run_dir), saved, trust)
+    config = saved.replace(devices=1, data_devices=None, **changes)
     return make_trainer(config, keep_programs=keep_programs)
 
 
@@ -40,7 +44,7 @@ def load(trainer: Trainer, run_dir: Path | str, checkpoint: int | None = None) -
     Raises:
         RequestError: There is none, or none that can be used.
     """
-    checkpoints = Checkpoints(Path(run_dir) / "checkpoints", read_only=True)
+    checkpoints = Checkpoints(Path(run_dir) / "checkpoints", read_only=True, run_id=read_run_id(Path(run_dir)))
     kept = sorted({*checkpoints.iterations(LIGHT), *checkpoints.iterations(FULL)})
     if checkpoint is not None and kept and checkpoint not in kept:
         there = ", ".join(map(str, kept))
@@ -56,13 +60,15 @@ def load(trainer: Trainer, run_dir: Path | str, checkpoint: int | None = None) -
     return restored
 
 
-def evaluate_run(run_dir: Path | str, episodes: int | None = None, keep_programs: bool = False) -> dict[str, list[float]]:
+def evaluate_run(
+    run_dir: Path | str, episodes: int | None = None, keep_programs: bool = False, trust: bool = False
+) -> dict[str, list[float]]:
     """Evaluates the newest good checkpoint of a run.
 
     Args:
         run_dir: The run folder.
         episodes: How many; None: as many as during training.
-        keep_programs: As of `open_run`.
+        keep_programs, trust: As of `open_run`.
 
     Returns:
         ``eval/success``, ``eval/goal_distance`` and the like: one number per seed.
@@ -70,7 +76,7 @@ def evaluate_run(run_dir: Path | str, episodes: int | None = None, keep_programs
     Raises:
         RequestError: There is no run, nothing usable in it, or too little memory for so many episodes.
     """
-    trainer = open_run(run_dir, keep_programs, **({} if episodes is None else {"eval_episodes": episodes}))
+    trainer = open_run(run_dir, keep_programs, trust, **({} if episodes is None else {"eval_episodes": episodes}))
     restored = load(trainer, run_dir)
     check_compiled(trainer.programs.of_evaluation(), already_there=True)
     values = jax.device_get(trainer.evaluate(restored.train))
@@ -78,7 +84,12 @@ def evaluate_run(run_dir: Path | str, episodes: int | None = None, keep_programs
 
 
 def play_run(
-    run_dir: Path | str, out: Path | str, episodes: int = 6, three_dimensional: bool = False, keep_programs: bool = False
+    run_dir: Path | str,
+    out: Path | str,
+    episodes: int = 6,
+    three_dimensional: bool = False,
+    keep_programs: bool = False,
+    trust: bool = False,
 ) -> None:
     """Plays episodes with the first seed of the newest good checkpoint of a run, and writes them as a video.
 
@@ -88,14 +99,14 @@ def play_run(
         episodes: How many to show.
         three_dimensional: Write an .html page for brax's viewer (needs brax) instead of the robot's images; for state
             variants, too.
-        keep_programs: As of `open_run`.
+        keep_programs, trust: As of `open_run`.
 
     Raises:
         RequestError: There is no run, nothing usable in it, no image to show, or no way to write ``out``.
     """
     out = Path(out)
     (viewer.check_page if three_dimensional else videos.check_output)(out)
-    trainer = open_run(run_dir, keep_programs, eval_episodes=num_recorded(max(1, episodes)))
+    trainer = open_run(run_dir, keep_programs, trust, eval_episodes=num_recorded(max(1, episodes)))
     programs = trainer.programs
     if not (programs.shows_images or three_dimensional):
         raise RequestError(f"{trainer.config.env} shows the robot no images: play a run on a Visual task, or with --html")

@@ -1,8 +1,9 @@
 """Weights & Biases: a run for each seed, in a group that is named after the run folder.
 
 ``wandb.json`` in the run folder keeps the runs' ids and the last iteration that was sent of each: a run that is resumed goes on
-under the same ids, and sends nothing twice. What W&B stores itself is in ``wandb/``. Which account, project and server, and
-whether there is a network at all, is told to W&B in its own way (``wandb login``, ``WANDB_PROJECT``, ``WANDB_MODE=offline``).
+under the same ids, and sends nothing twice. What it says of another run than that of config.json is left out. What W&B stores
+itself is in ``wandb/``. Which account, project and server, and whether there is a network at all, is told to W&B in its own way
+(``wandb login``, ``WANDB_PROJECT``, ``WANDB_MODE=offline``).
 """
 
 import contextlib
@@ -17,9 +18,9 @@ from typing import Any
 import wandb
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.files import write_atomically
+from jaxrl_vis.files import read_json, write_atomically
 from jaxrl_vis.run.folder import WANDB_STATE
-from jaxrl_vis.run.metrics import Row, scalars
+from jaxrl_vis.run.metrics import RUN_ID, Row, scalars
 from jaxrl_vis.run.signals import shielded_children
 
 PROJECT = "jaxrl-vis"
@@ -42,6 +43,7 @@ class WeightsAndBiases:
 
     def __init__(self, folder: Path, record: Mapping[str, Any], seeds: Sequence[int], say: Callable[[str], None]):
         self._state_file = folder / WANDB_STATE
+        self._run_id = record.get(RUN_ID)
         self._state = self._read_state()
         self._runs: dict[int, Any] = {}
         mode = wandb.setup().settings.mode
@@ -73,10 +75,13 @@ class WeightsAndBiases:
     def _read_state(self) -> dict[str, dict[str, Any]]:
         if not self._state_file.exists():
             return {}
-        return json.loads(self._state_file.read_text(encoding="utf-8"))
+        state = read_json(self._state_file, mend="delete it to begin new runs there")
+        whose = state.pop(RUN_ID, None)
+        return state if whose == self._run_id else {}
 
     def _write_state(self) -> None:
-        write_atomically(self._state_file, json.dumps(self._state, indent=2) + "\n")
+        whose = {} if self._run_id is None else {RUN_ID: self._run_id}
+        write_atomically(self._state_file, json.dumps({**self._state, **whose}, indent=2) + "\n")
 
     def rows(self, rows: Sequence[Row]) -> None:
         """The figures of rows that were not sent before, against ``env_steps``; W&B's own step is the iteration."""

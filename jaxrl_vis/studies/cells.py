@@ -17,7 +17,6 @@ from typing import Any
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.run.folder import RunFolder, contradictions, read_config
-from jaxrl_vis.run.metrics import read_rows
 
 # A run of another length, read up to the steps of a cell, must have been evaluated like the cell.
 _MAY_DIFFER = ("preset", "env_folder", "env_steps", "checkpoint_interval", "full_checkpoint_interval")
@@ -91,7 +90,7 @@ def folder_of(cell: Cell, runs: Path) -> Path:
 def _reached(folder: Path, cell: Cell) -> int | None:
     """The first evaluation at or after the steps of the cell, in environment steps; None where there is none of all seeds."""
     steps: dict[int, set[int]] = {}
-    for row in read_rows(RunFolder(folder).metrics):
+    for row in RunFolder(folder).rows():
         if row["env_steps"] >= cell.config.env_steps and "eval/success" in row:
             steps.setdefault(row["env_steps"], set()).add(row["seed"])
     return min((each for each, seeds in steps.items() if seeds >= set(cell.seeds)), default=None)
@@ -134,7 +133,7 @@ def rows_of(cell: Cell, runs: Path, as_it_is: bool = False) -> list[dict[str, An
     end = _reached(folder, cell)
     if end is None or not (as_it_is or contradiction(cell, runs) is None):
         return []
-    return [row for row in read_rows(RunFolder(folder).metrics) if row["env_steps"] <= end]
+    return [row for row in RunFolder(folder).rows() if row["env_steps"] <= end]
 
 
 def standing(cell: Cell, runs: Path) -> str:
@@ -150,6 +149,6 @@ def standing(cell: Cell, runs: Path) -> str:
 
 def latest_rows(folder: Path) -> Sequence[dict[str, Any]]:
     """The rows of a run's last evaluation, one a seed; none before the first."""
-    rows = read_rows(RunFolder(folder).metrics)
+    rows = RunFolder(folder).rows()
     last = max((row["env_steps"] for row in rows), default=0)
     return [row for row in rows if row["env_steps"] == last]

@@ -1,16 +1,17 @@
 """Families from files. Loads no JAX."""
 
 import dataclasses
-import json
-import tomllib
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from jaxrl_vis_envs.documents import parse_json, parse_toml, read_text
 from jaxrl_vis_envs.names import nearest
 from jaxrl_vis_envs.plants.family import TRAINING, Family, is_number
 from jaxrl_vis_envs.plants.shifts import FAMILIES
+
+_MOST_BYTES = 1_000_000
 
 
 def read(path: Path | str, families: Mapping[str, Family] = FAMILIES) -> Family:
@@ -25,12 +26,15 @@ def read(path: Path | str, families: Mapping[str, Family] = FAMILIES) -> Family:
     """
     path = Path(path)
     try:
-        text = path.read_text(encoding="utf-8")
-        values = tomllib.loads(text) if path.suffix.lower() == ".toml" else json.loads(text)
+        text = read_text(path, _MOST_BYTES)
     except OSError as error:
         raise ValueError(f"{path} cannot be read: {error.strerror}") from error
-    except (UnicodeDecodeError, ValueError) as error:
-        kind = "TOML" if path.suffix.lower() == ".toml" else "JSON"
+    except ValueError as error:
+        raise ValueError(f"{path} cannot be read: it {error}") from error
+    kind, parse = ("TOML", parse_toml) if path.suffix.lower() == ".toml" else ("JSON", parse_json)
+    try:
+        values = parse(text)
+    except ValueError as error:
         raise ValueError(f"{path} is not {kind} (write .toml or .json): {' '.join(str(error).split())}") from error
     if not isinstance(values, dict):
         raise ValueError(f'{path} must hold one table of a family\'s fields, like {{"stalks": {{"lean_most": 15}}}}')

@@ -1,0 +1,186 @@
+"""Whose a checkpoint and a row are: nothing of another run is resumed, counted or deleted."""
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+from fake_program import FakeProgram, final_state, interrupted_at, make_fake_trainer, rows_without_time, small_config
+
+from jaxrl_vis import cli
+from jaxrl_vis.errors import RequestError, StorageError
+from jaxrl_vis.run import folder as folders
+from jaxrl_vis.run import metrics, trained, trainer
+from jaxrl_vis.run.checkpoint import FULL, LIGHT, Checkpoints
+from jaxrl_vis.run.folder import RunFolder, read_run_id
+
+
+def checkpoints_in(path: Path) -> list[str]:
+    return sorted(f"{each.parent.name}/{each.name}" for each in path.glob("checkpoints/*/*") if each.name.isdigit())
+
+
+def test_everything_that_a_run_writes_carries_its_id(tmp_path):
+    path = tmp_path / "run"
+    list(make_fake_trainer(small_config(env_steps=40), path).run())
+    run_id = read_run_id(path)
+    assert run_id is not None and len(run_id) == 32
+    list(make_fake_trainer(small_config(), path, resume=True).run())
+    assert read_run_id(path) == run_id and {row["run_id"] for row in metrics.read_rows(path / "metrics.jsonl")} == {run_id}
+    for manifest in path.glob("checkpoints/*/*/manifest/metadata"):
+        assert json.loads(manifest.read_text())["run_id"] == run_id
+    list(make_fake_trainer(small_config(env_steps=20), path, overwrite=True).run())
+    assert read_run_id(path) not in (None, run_id)
+
+
+def test_a_new_run_does_not_go_on_with_an_old_ones_checkpoints(straight, tmp_path, capsys):
+    """As where they could not be deleted: the new run is interrupted before it has come as far as they are."""
+    path = tmp_path / "run"
+    interrupted_at(make_fake_trainer(small_config(), path), 2)
+    for tier in (LIGHT, FULL):  # later than its own
+        shutil.copytree(straight[0] / "checkpoints" / tier, path / "checkpoints" / tier, dirs_exist_ok=True)
+    (path / "metrics.jsonl").open("a").write((straight[0] / "metrics.jsonl").read_text())
+    capsys.readouterr()
+    reports = list(make_fake_trainer(small_config(), path, resume=True).run())
+    said = capsys.readouterr().out
+    assert reports[0].iteration < 6 and "exactly" in said and "not of this run, and left out" in said
+    assert "metrics.jsonl held 8 rows of another run: kept in" in said
+    assert rows_without_time(path) == rows_without_time(straight[0])
+    kept = path / "checkpoints" / "foreign"
+    assert sorted(each.name for each in kept.iterdir()) == ["full-6", "full-8", "light-6", "light-8"]
+
+
+def test_what_uses_a_run_does_not_count_another_ones(straight, tmp_path, monkeypatch):
+    path = tmp_path / "run"
+    list(make_fake_trainer(small_config(env_steps=20), path).run())
+    shutil.copytree(straight[0] / "checkpoints" / LIGHT, path / "checkpoints" / LIGHT, dirs_exist_ok=True)
+    metrics.append_rows(path / "metrics.jsonl", metrics.read_rows(straight[0] / "metrics.jsonl"))
+    assert {row["iteration"] for row in RunFolder(path).rows()} == {2}
+    monkeypatch.setattr(trained, "make_trainer", lambda config, **_: trainer.Trainer(config, FakeProgram(config)))
+    opened = trained.open_run(path)
+    assert trained.load(opened, path).iteration == 2
+    with pytest.raises(RequestError, match="no checkpoint of iteration 8; it keeps 2"):
+        trained.load(opened, path, 8)
+
+
+def without_ids(path: Path) -> Path:
+    """Makes a run what an earlier version has written."""
+    for file in (path / "config.json", *path.glob("checkpoints/*/*/manifest/metadata")):
+        record = json.loads(file.read_text())
+        del record["run_id"]
+        file.write_text(json.dumps(record))
+    rows = metrics.read_rows(path / "metrics.jsonl")
+    text = "".join(json.dumps({name: value for name, value in row.items() if name != "run_id"}) + "\n" for row in rows)
+    (path / "metrics.jsonl").write_text(text)
+    return path
+
+
+def test_a_run_of_an_earlier_version_goes_on_as_it_was(straight, tmp_path):
+    path = tmp_path / "run"
+    list(make_fake_trainer(small_config(env_steps=40), path).run())
+    without_ids(path)
+    list(make_fake_trainer(small_config(), path, resume=True).run())
+    assert rows_without_time(path) == rows_without_time(straight[0])
+    assert read_run_id(path) is None and not any("run_id" in row for row in metrics.read_rows(path / "metrics.jsonl"))
+    checkpoints = Checkpoints(path / "checkpoints", run_id="0" * 32)
+    assert checkpoints.newest() is None  # nor is it anybody else's
+
+
+def test_overwriting_empties_what_a_link_leads_to_and_keeps_the_link(tmp_path):
+    path, scratch = tmp_path / "run", tmp_path / "scratch"
+    list(make_fake_trainer(small_config(), path).run())
+    (path / "checkpoints").rename(scratch)
+    (scratch / "thesis.txt").write_text("precious")
+    (path / "checkpoints").symlink_to(scratch)
+    (path / "nonfinite").symlink_to(scratch)
+    assert checkpoints_in(path) == ["full/6", "full/8", "light/6", "light/8"]
+    list(make_fake_trainer(small_config(seed=5, env_steps=20), path, overwrite=True).run())
+    assert checkpoints_in(path) == ["full/2", "light/2"] and (path / "checkpoints").is_symlink()
+    assert (scratch / "thesis.txt").read_text() == "precious" and not (path / "nonfinite").exists()
+    shutil.rmtree(scratch)  # a link that leads nowhere goes
+    list(make_fake_trainer(small_config(env_steps=20), path, overwrite=True).run())
+    assert checkpoints_in(path) == ["full/2", "light/2"] and not (path / "checkpoints").is_symlink()
+
+
+def test_what_cannot_be_deleted_is_told_before_a_new_run_starts(straight, tmp_path, monkeypatch):
+    path = Path(shutil.copytree(straight[0], tmp_path / "run"))
+    rmtree = shutil.rmtree
+
+    def busy(folder, *arguments, **options):  # as where NFS keeps a deleted file that somebody reads
+        if Path(folder).name == FULL and not options.get("ignore_errors"):
+            raise OSError(39, "Directory not empty", str(folder))
+        rmtree(folder, *arguments, **options)
+
+    monkeypatch.setattr(folders.shutil, "rmtree", busy)
+    with pytest.raises(RequestError, match="full stays .Directory not empty.. No new run was started: delete it") as refused:
+        list(make_fake_trainer(small_config(seed=5), path, overwrite=True).run())
+    assert "\n" not in str(refused.value)
+    monkeypatch.undo()
+    assert read_run_id(path) == read_run_id(straight[0]) and (path / "metrics.jsonl").exists()
+    assert list(make_fake_trainer(small_config(env_steps=100), path, resume=True).run())[0].iteration == 9
+
+
+def moved_at(trainer, iteration: int, act) -> StorageError:
+    """What a run ends with whose folder something happens to after ``iteration``."""
+    with pytest.raises(StorageError) as stopped:
+        for report in trainer.run():
+            if report.iteration == iteration:
+                act()
+    assert "\n" not in str(stopped.value)
+    return stopped.value
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="other systems do not say where a folder went")
+def test_a_folder_that_is_moved_is_told_where_it_is_and_goes_on_there(straight, tmp_path):
+    old, new = tmp_path / "old", tmp_path / "new"
+    config = small_config(full_checkpoint_interval=4, checkpoint_interval=4)
+    error = moved_at(make_fake_trainer(config, old), 5, lambda: old.rename(new))
+    assert f"{old} was moved to {new}" in str(error) and f"go on with --run-dir {new} --resume" in str(error)
+    assert not old.exists()  # nothing that would look like a run
+    list(make_fake_trainer(config, new, resume=True).run())
+    assert rows_without_time(new) == rows_without_time(straight[0])
+    assert all(
+        (a == b).all() for a, b in zip(final_state(new, straight[1].shapes), final_state(straight[0], straight[1].shapes))
+    )
+
+
+def test_a_folder_that_is_deleted_is_not_made_again(tmp_path):
+    path = tmp_path / "run"
+    error = moved_at(make_fake_trainer(small_config(), path), 3, lambda: shutil.rmtree(path))
+    assert f"{path} is gone" in str(error) and "make room" not in str(error)
+    assert not path.exists()
+
+
+def test_a_new_folder_of_the_same_name_is_left_alone(tmp_path):
+    path = tmp_path / "run"
+
+    def replace():
+        path.rename(tmp_path / "moved")
+        path.mkdir()
+        (path / "notes.txt").write_text("mine")
+
+    assert "was moved to" in str(moved_at(make_fake_trainer(small_config(), path), 3, replace)) or os.name != "posix"
+    assert [each.name for each in path.iterdir()] == ["notes.txt"]
+
+
+@pytest.mark.parametrize("name", ["a" * 300, "a/" + "b" * 300])
+@pytest.mark.parametrize(
+    "words",
+    [["eval"], ["play"], ["train", "Reacher", "--preset", "debug", "--run-dir"], ["train", "--resume", "--run-dir"]],
+    ids=["eval", "play", "train", "resume"],
+)
+def test_a_name_that_is_too_long_is_one_line(tmp_path, monkeypatch, capsys, words, name):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a").mkdir()
+    assert cli.main([*words, name]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "File name too long" in error and len(error) < 300
+
+
+@pytest.mark.parametrize("words", [["eval"], ["play"], ["train", "--resume", "--run-dir"]], ids=["eval", "play", "resume"])
+@pytest.mark.parametrize("contents", [b"[" * 10**5, b'{"schema": 1, "log": 5}', b'{"schema": 1, "run_id": 5}', b"\xff", b"[]"])
+def test_a_config_file_that_cannot_be_used_is_one_line(tmp_path, capsys, words, contents):
+    (tmp_path / "config.json").write_bytes(contents)
+    assert cli.main([*words, str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and len(error) < 600
