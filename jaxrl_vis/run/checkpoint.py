@@ -5,7 +5,8 @@
 
 Each also holds a manifest: names, shapes and types of all arrays, their checksums, and what the host has to remember. orbax
 makes a folder appear under its final name only when it is complete; the checksums find what went wrong later: without them, a
-flipped byte in a data file would be restored without a word. The newest two of each tier are kept.
+flipped byte in a data file would be restored without a word. Where the background has finished, SHA256SUMS (`sums`) follows,
+for `verification`: of what nobody restores, too. The newest two of each tier are kept.
 
 A run goes on from the newest good checkpoint of either tier, and from the full one of two that are equally new. Nothing newer
 than that is ever deleted: a checkpoint that turns out to be damaged is moved to checkpoints/damaged/.
@@ -24,6 +25,7 @@ from typing import TYPE_CHECKING, Any
 
 from jaxrl_vis import processes
 from jaxrl_vis.errors import RequestError, StorageError
+from jaxrl_vis.run import sums
 from jaxrl_vis.run.arrays import as_saved, check_structure, describe, host_specs, is_intact, rebuild, to_host, to_save
 from jaxrl_vis.types import LoopState, TrainState
 
@@ -118,6 +120,7 @@ class Checkpoints:
         self._read_only = read_only
         self._managers: dict[str, ocp.CheckpointManager] = {}
         self._reported: set[tuple[str, int]] = set()  # damaged ones
+        self._unsummed: set[tuple[str, int]] = set()  # saved, perhaps in the background still, and without `sums`
         self._unsilence: Callable[[], None] | None = None
 
     def _manager(self, tier: str) -> "ocp.CheckpointManager":
@@ -174,11 +177,21 @@ class Checkpoints:
             self.wait()  # of two tiers that are written at the same time, processes would take one for the other
         with self._writing(tier):
             manager = self._manager(tier)
-            manager.wait_until_finished()
+            self._wait(tier)
             if processes.any_of(iteration in self.iterations(tier)):  # orbax would quietly keep the old one
                 manager.delete(iteration)
             if not manager.save(iteration, args=ocp.args.Composite(**arguments), force=True):
                 raise RuntimeError(f"checkpoint {tier}/{iteration} was not written")
+            self._unsummed.add((tier, iteration))
+
+    def _wait(self, tier: str) -> None:
+        """Returns when the tier is on the disk, with the checksums of its files."""
+        self._managers[tier].wait_until_finished()
+        for saved in [saved for saved in self._unsummed if saved[0] == tier]:
+            folder = self._folder / tier / str(saved[1])
+            if processes.is_first() and folder.is_dir():
+                sums.write_sums(folder)
+            self._unsummed.discard(saved)
 
     @contextlib.contextmanager
     def _writing(self, tier: str) -> Iterator[None]:
@@ -200,14 +213,15 @@ class Checkpoints:
         Raises:
             StorageError: Something could not be written.
         """
-        for tier, manager in list(self._managers.items()):
+        for tier in list(self._managers):
             with self._writing(tier):
-                manager.wait_until_finished()
+                self._wait(tier)
 
     def close(self) -> None:
         """`wait`, then lets go of orbax's threads."""
         for tier, manager in list(self._managers.items()):
             with self._writing(tier):
+                self._wait(tier)
                 manager.close()
         self._managers.clear()
         if self._unsilence is not None:
