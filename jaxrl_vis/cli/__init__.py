@@ -32,6 +32,7 @@ from jaxrl_vis.cli import (
     play,
     sweep,
     train,
+    verify,
 )
 from jaxrl_vis.cli.parsing import PROGRAM, parse
 from jaxrl_vis.errors import NonFiniteError, RequestError, StorageError, Terminated, nearest
@@ -41,6 +42,7 @@ COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
     "train": (train.Train, train.run),
     "eval": (eval.Eval, eval.run),
     "play": (play.Play, play.run),
+    "verify": (verify.Verify, verify.run),
     "envs": (envs.Envs, envs.run),
     "doctor": (doctor.Doctor, doctor.run),
     "bench": (bench.Bench, bench.run),

@@ -62,7 +62,8 @@ class Restored:
     progress: dict[str, Any]
 
 
-def _rest(loop: LoopState) -> dict[str, Any]:
+def rest_of(loop: LoopState) -> dict[str, Any]:
+    """A loop state without its learner: what a full checkpoint holds more than a light one."""
     return {"replay": loop.replay, "key": loop.key, "iteration": loop.iteration}
 
 
@@ -162,7 +163,7 @@ class Checkpoints:
 
     def save_full(self, iteration: int, loop: LoopState, progress: dict[str, Any]) -> None:
         """Writes everything, and returns when it is on the disk: a second copy of the replay would need memory for two."""
-        items = {"train": to_save(loop.train, copy=False), "rest": to_save(_rest(loop), copy=False)}
+        items = {"train": to_save(loop.train, copy=False), "rest": to_save(rest_of(loop), copy=False)}
         self._save(FULL, iteration, items, progress)
         self.wait()
 
@@ -280,6 +281,31 @@ class Checkpoints:
         """The learner alone, of the newest good checkpoint of either tier, or of ``iteration``. See `restore_for_resume`."""
         return self._newest_good(template, with_rest=False, only=iteration)
 
+    def manifest(self, tier: str, iteration: int) -> dict[str, Any]:
+        """What a checkpoint says of itself: ``schema``, ``iteration``, ``items`` (`arrays.describe`), and ``progress``.
+
+        Raises:
+            RequestError: It is damaged, or of another schema.
+        """
+        with self._told(tier, iteration):
+            return self._manifest(tier, iteration)
+
+    def restore(self, tier: str, iteration: int, template: LoopState) -> Restored:
+        """One checkpoint, with all that it holds, compared with its checksums.
+
+        Raises:
+            RequestError: It is damaged, or has another structure.
+        """
+        with self._told(tier, iteration):
+            return self._restore(tier, iteration, template, tier == FULL)
+
+    @contextlib.contextmanager
+    def _told(self, tier: str, iteration: int) -> Iterator[None]:
+        try:
+            yield
+        except _Damaged as damage:
+            raise RequestError(f"checkpoint {tier}/{iteration} is damaged ({damage})") from None
+
     def _newest_good(self, template: LoopState, with_rest: bool, only: int | None = None) -> Restored | None:
         found = [
             (iteration, tier) for tier in (FULL, LIGHT) for iteration in self.iterations(tier) if only in (None, iteration)
@@ -295,17 +321,24 @@ class Checkpoints:
                 self._reported.add((tier, iteration))
         return None
 
-    def _restore(self, tier: str, iteration: int, template: LoopState, with_rest: bool) -> Restored:
+    def _manifest(self, tier: str, iteration: int) -> dict[str, Any]:
         import orbax.checkpoint as ocp
 
         manifest = self._read(tier, iteration, {"manifest": ocp.args.JsonRestore()})["manifest"]
         if not isinstance(manifest, dict) or not {"schema", "items"} <= set(manifest):
             raise _Damaged("its manifest is incomplete")
-        templates = {"train": template.train} | ({"rest": _rest(template)} if with_rest else {})
+        if manifest["schema"] not in _READABLE:
+            where = self._folder / tier / str(iteration)
+            raise RequestError(f"{where} is of schema {manifest['schema']}, not {SCHEMA}: use the version that wrote it")
+        return manifest
+
+    def _restore(self, tier: str, iteration: int, template: LoopState, with_rest: bool) -> Restored:
+        import orbax.checkpoint as ocp
+
+        manifest = self._manifest(tier, iteration)
+        templates = {"train": template.train} | ({"rest": rest_of(template)} if with_rest else {})
         specs = {name: host_specs(tree) for name, tree in templates.items()}
         where = self._folder / tier / str(iteration)
-        if manifest["schema"] not in _READABLE:
-            raise RequestError(f"{where} is of schema {manifest['schema']}, not {SCHEMA}: use the version that wrote it")
         for name, spec in specs.items():
             check_structure(where, manifest["items"].get(name, {}), spec)
             specs[name] = {leaf: as_saved(manifest["items"][name][leaf][0], expected) for leaf, expected in spec.items()}
