@@ -290,14 +290,15 @@ class Checkpoints:
         with self._told(tier, iteration):
             return self._manifest(tier, iteration)
 
-    def restore(self, tier: str, iteration: int, template: LoopState) -> Restored:
-        """One checkpoint, with all that it holds, compared with its checksums.
+    def restore(self, tier: str, manifest: dict[str, Any], template: LoopState) -> Restored:
+        """One checkpoint with all that it holds, compared with the checksums in its manifest.
 
         Raises:
             RequestError: It is damaged, or has another structure.
         """
+        iteration = manifest["iteration"]
         with self._told(tier, iteration):
-            return self._restore(tier, iteration, template, tier == FULL)
+            return self._restored(tier, iteration, template, tier == FULL, manifest)
 
     @contextlib.contextmanager
     def _told(self, tier: str, iteration: int) -> Iterator[None]:
@@ -333,9 +334,11 @@ class Checkpoints:
         return manifest
 
     def _restore(self, tier: str, iteration: int, template: LoopState, with_rest: bool) -> Restored:
+        return self._restored(tier, iteration, template, with_rest, self._manifest(tier, iteration))
+
+    def _restored(self, tier: str, iteration: int, template: LoopState, with_rest: bool, manifest: dict[str, Any]) -> Restored:
         import orbax.checkpoint as ocp
 
-        manifest = self._manifest(tier, iteration)
         templates = {"train": template.train} | ({"rest": rest_of(template)} if with_rest else {})
         specs = {name: host_specs(tree) for name, tree in templates.items()}
         where = self._folder / tier / str(iteration)

@@ -137,7 +137,12 @@ class _Verifier:
     def _say_origin(self) -> None:
         record, report = self._record, self._report
         device, versions = _mapping(record.get("device")), _mapping(record.get("versions"))
-        here = {"revision": provenance.revision(), **provenance.versions(), **_flat(provenance.device_record())}
+        name = provenance.device_name()
+        here = {
+            "revision": provenance.revision(),
+            **provenance.versions(),
+            **_flat(provenance.device_record() | {"name": name}),
+        }
         there = {"revision": record.get("git_revision"), **versions, **_flat(device)}
         named = f", run {self._expected.run_id}" if self._expected.run_id else ""
         self._say(f"{self._folder.path}: {self._config.env}, {describe(self._config)}{named}")
@@ -173,8 +178,8 @@ class _Verifier:
             try:
                 differences = compare_sums(self._folder.checkpoints / tier / str(number))
                 manifest = self._checkpoints.manifest(tier, number)
-                if tier == LIGHT:
-                    self._checkpoints.restore(tier, number, self._programs.shapes)
+                if tier == LIGHT and manifest.get("iteration") == number:
+                    self._checkpoints.restore(tier, manifest, self._programs.shapes)
             except (RequestError, OSError) as error:
                 if self._is_there(tier, number):
                     problems.append(
@@ -223,15 +228,16 @@ class _Verifier:
 
     def _repeat_after(self, number: int, repeater: Repeater, iterations: int | None) -> None:
         """Repeats what follows a full checkpoint, unless that is damaged, which is told."""
+        manifest = self._manifests[FULL, number]
         try:
-            restored = self._checkpoints.restore(FULL, number, self._programs.shapes)
+            restored = self._checkpoints.restore(FULL, manifest, self._programs.shapes)
         except RequestError as error:
             if self._is_there(FULL, number):
                 self._report.problems.append(str(error))
                 del self._manifests[FULL, number]
             return
         assert restored.loop is not None
-        progress = progress_of(self._manifests[FULL, number])
+        progress = progress_of(manifest)
         places = self._plan(number, progress, iterations)
         if places:
             repeater.repeat(f"checkpoint full/{number}", number, progress, restored.loop, places)
