@@ -192,10 +192,12 @@ def test_recipes_apply_and_work(tmp_path: Path) -> None:
     for block in blocks(page):
         if block.language == "diff":
             doc_blocks.apply_diff(block.text, tmp_path)
+    (tmp_path / "runs").mkdir()
     lines = [words for block in blocks(page) if block.mark.startswith("after ") for words in doc_blocks.commands(block)]
     code = f"""
-import dataclasses
+import dataclasses, importlib, pkgutil
 import jax, jax.numpy as jnp
+import jaxrl_vis
 from jaxrl_vis import cli
 from jaxrl_vis.cli.parsing import parse
 from jaxrl_vis.cli.train import Train, training_config
@@ -232,6 +234,15 @@ def one_step(key):
 
 
 jax.eval_shape(one_step, jax.random.key(0))
+
+for module in pkgutil.walk_packages(jaxrl_vis.__path__, "jaxrl_vis."):
+    if not module.name.endswith("__main__"):
+        try:
+            importlib.import_module(module.name)
+        except ModuleNotFoundError as error:  # of an extra
+            assert error.name.partition(".")[0] != "jaxrl_vis", error
+for figure in ("5.1", "5.4"):  # of no runs: status 3
+    assert cli.main(["figure", figure, "--quick", "--draw-only", "--runs", "runs"]) == 3
 """
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(tmp_path), str(ROOT / "envs")))}
     done = subprocess.run([sys.executable, "-c", code], env=environment, cwd=tmp_path, capture_output=True, text=True)

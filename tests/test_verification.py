@@ -20,7 +20,6 @@ from jaxrl_vis.run.sums import compare_sums
 from jaxrl_vis.run.trainer import Trainer
 from jaxrl_vis.run.verification import Verification, verify
 
-
 EXPECTED = Expected(seeds=[0, 1], updates=3, env_steps=10, eval_interval=2, run_id=None)
 
 
