@@ -32,6 +32,7 @@ from jaxrl_vis.cli.parsing import parse
 from jaxrl_vis.cli.train import Train, training_config
 from jaxrl_vis.config import Config
 from jaxrl_vis.learner.environment import make_env
+from jaxrl_vis.learner.train_step import make_train_step
 from jaxrl_vis.run import metrics, trainer
 from jaxrl_vis.run.folder import MAY_CHANGE
 from jaxrl_vis.validation import validate
@@ -155,6 +156,16 @@ def test_python_blocks_run(
     for block in blocks(page):
         if block.language == "python" and not block.mark:
             run_block(page, block, names, capsys)
+
+
+@pytest.mark.parametrize("page", [ROOT / "README.md", DOCS / "index.md"], ids=name_of)
+def test_what_is_typed_first_suits_a_laptop(page: Path) -> None:
+    text = next(block.text for block in blocks(page) if "jaxrl_vis.preset(" in block.text)
+    call = re.search(r"jaxrl_vis\.preset\(.*?\)", text)
+    assert call is not None
+    asked = eval(call[0], {"jaxrl_vis": jaxrl_vis})
+    program = make_train_step(make_env(asked), asked)
+    assert asked.seeds * program.replay_bytes < 2**30
 
 
 def checked_environment(env: str, env_options: tuple[str, ...], randomize: tuple[str, ...]) -> None:
