@@ -420,6 +420,25 @@ def test_the_site_builds_and_loads_nothing_from_elsewhere(tmp_path: Path) -> Non
         assert f'.{name}"' in (site / "api" / "training.html").read_text()
 
 
+def test_columns_of_the_site_are_wide_enough_to_read() -> None:
+    """Code that may break anywhere, beside cells that may not break at all, was set one letter a line."""
+    style = (DOCS / "site.css").read_text()
+    assert "nowrap" not in style
+    assert re.search(r"table:not\(\[class\]\) code \{[^}]*word-break: normal", style)
+    assert float(re.search(r"td\.long \{ min-width: ([\d.]+)rem", style)[1]) >= 8  # type: ignore[index]
+    fit = load_tool("hooks").fit_cells
+    assert fit("<td>short</td><th>x</th>") == "<td>short</td><th>x</th>"
+    sentence = "a sentence that takes more than one line of a column, &lt;here&gt;"
+    assert (
+        fit(f'<td style="text-align: left;">{sentence}</td>') == f'<td style="text-align: left;" class="long">{sentence}</td>'
+    )
+    assert fit("<td>" + "<br>".join(["a short line"] * 9) + "</td>").startswith("<td>")
+    assert fit("<td><code>a_long.name_that(is_longer=than_it)</code> a_b</td>") == (
+        "<td><code>a_<wbr>long.<wbr>name_<wbr>that(<wbr>is_<wbr>longer=<wbr>than_<wbr>it)</code> a_b</td>"
+    )
+    assert fit("<td><code>image_size 16</code></td>") == "<td><code>image_size 16</code></td>"
+
+
 def test_pages_of_the_site_name_files_that_it_does_not_hold() -> None:
     hooks = load_tool("hooks")
     assert (
