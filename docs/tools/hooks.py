@@ -43,6 +43,8 @@ def fit_cells(content: str) -> str:
     def breakable(code: re.Match[str]) -> str:
         parts = re.split(r"(\s+)", code[1])
         parts = [re.sub(r"(?<=[._/=(,])(?=.)", "<wbr>", part) if len(part) > _LONG_NAME else part for part in parts]
+        # An option is typed as it is read: it must not end in two hyphens.
+        parts = [re.sub(r"^(--[\w-]+)", r'<span class="option">\1</span>', part) for part in parts]
         return f"<code>{''.join(parts)}</code>"
 
     def fitted(cell: re.Match[str]) -> str:
