@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import importlib
+import pickle
 import re
 import sys
 import warnings
@@ -60,6 +61,10 @@ class ReacherWithoutPhysics(reacher.Reacher):
         return self.configuration(data.qpos + action)
 
 
+def build_turned(config: Any) -> ReacherWithoutPhysics:
+    return ReacherWithoutPhysics(config, lambda model: image_observer(model, "above", config))
+
+
 @pytest.fixture
 def registered(monkeypatch):
     """What `registry.register` and Gymnasium learn in a test, they forget after it."""
@@ -69,10 +74,7 @@ def registered(monkeypatch):
 
 
 def test_gymnasium_checks_an_environment_that_it_made_by_name(registered):
-    def build(config: Any) -> Any:
-        return ReacherWithoutPhysics(config, lambda model: image_observer(model, "above", config))
-
-    registry.register("TurnedReacher", build, registry.config_class("VisualReacher"))
+    registry.register("TurnedReacher", build_turned, registry.config_class("VisualReacher"))
     register_all()
     name, settings = "jaxrl_vis/TurnedReacher-v0", {"image_size": 16, "pixels": "depth", "render_size": 24}
     env = gymnasium.make(name, render_mode="rgb_array", **settings)
@@ -144,6 +146,30 @@ def test_a_seed_settles_this_episode_and_the_next():
     first = goals_of(env, 5)
     assert first == goals_of(GymnasiumEnv(told()), 5) == goals_of(env, 5)
     assert len({*first, *goals_of(env, 6)}) == 4
+
+
+def test_environments_are_pickled_in_the_middle_of_an_episode(registered):
+    registry.register("TurnedReacher", build_turned, registry.config_class("VisualReacher"))
+    register_all()
+    settings = {"image_size": 16, "pixels": "depth", "render_size": 24, "render_mode": "rgb_array"}
+    single = gymnasium.make("jaxrl_vis/TurnedReacher-v0", **settings)
+    several = GymnasiumVectorEnv(told(), num_envs=3, reward="dense")
+    for env in (single, several):
+        assert pickle.loads(pickle.dumps(env)).reset(seed=3)[0].keys() == env.reset(seed=3)[0].keys()
+        actions = actions_of(env, 2)
+        env.step(actions[0])
+        copy = pickle.loads(pickle.dumps(env))
+        jax.tree.map(np.testing.assert_array_equal, copy.step(actions[1]), env.step(actions[1]))
+        jax.tree.map(np.testing.assert_array_equal, copy.reset(), env.reset())
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(single)).render(), single.render())
+
+
+@pytest.mark.parametrize("reward", ["oracle", "dense"])
+def test_brax_environments_are_pickled(reward):
+    env = BraxEnv(told(), reward=reward)
+    copy = pickle.loads(pickle.dumps(env))
+    states = [each.step(each.reset(jax.random.key(2)), jnp.ones(1)) for each in (env, copy)]
+    jax.tree.map(np.testing.assert_array_equal, *states)
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])

@@ -10,12 +10,13 @@ import pytest
 from jaxrl_vis.config import preset
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import auxtasks
-from jaxrl_vis.learner.auxiliary import make_auxiliary
+from jaxrl_vis.learner.auxiliary import Auxiliary, make_auxiliary
 from jaxrl_vis.learner.auxtasks import optical_flow
 from jaxrl_vis.learner.ddpg import make_ddpg
 from jaxrl_vis.learner.networks import Networks
 from jaxrl_vis.learner.replay import Indices, Replay
 from jaxrl_vis.learner.sampling import Choice, Sampler
+from jaxrl_vis.learner.weighting import make_weighting
 from jaxrl_vis.resolved import resolve
 from jaxrl_vis.types import Episodes
 from jaxrl_vis.validation import validate
@@ -259,3 +260,18 @@ def test_an_actor_learns_the_logarithm_of_value_and_penalty_together_where_asked
     penalty = weight * float(metrics["train/action_size"]) ** 2
     assert penalty > 1000.0  # else the value, which is near 0 here, would matter
     np.testing.assert_allclose(metrics["train/actor_loss"], np.log(penalty), atol=0.2)
+
+
+def test_a_head_begins_alike_wherever_its_task_stands_in_the_list(monkeypatch):
+    """Runs of the thesis's five tasks repeat themselves, and a task from elsewhere needs no place among them."""
+    key = jax.random.key(3)
+    before = [*ALL]
+    monkeypatch.setattr(auxtasks, "NAMES", ("new_one", *reversed(before)))
+    tasks = {
+        name: auxtasks.AuxTask(name, frozenset(), lambda key: {"key": jax.random.key_data(key)}, lambda *_: 0.0, lambda *_: 0.0)
+        for name in ("new_one", *before, "another")
+    }
+    heads = Auxiliary(tasks, make_weighting("balance")).init_heads(key)
+    for number, name in enumerate(before):
+        np.testing.assert_array_equal(heads[name]["key"], jax.random.key_data(jax.random.fold_in(key, number)))
+    assert len({tuple(head["key"].tolist()) for head in heads.values()}) == 7

@@ -32,6 +32,7 @@ from jaxrl_vis.cli.parsing import parse
 from jaxrl_vis.cli.train import Train, training_config
 from jaxrl_vis.config import Config
 from jaxrl_vis.learner.environment import make_env
+from jaxrl_vis.learner.train_step import make_train_step
 from jaxrl_vis.run import metrics, trainer
 from jaxrl_vis.run.folder import MAY_CHANGE
 from jaxrl_vis.validation import validate
@@ -157,6 +158,16 @@ def test_python_blocks_run(
             run_block(page, block, names, capsys)
 
 
+@pytest.mark.parametrize("page", [ROOT / "README.md", DOCS / "index.md"], ids=name_of)
+def test_what_is_typed_first_suits_a_laptop(page: Path) -> None:
+    text = next(block.text for block in blocks(page) if "jaxrl_vis.preset(" in block.text)
+    call = re.search(r"jaxrl_vis\.preset\(.*?\)", text)
+    assert call is not None
+    asked = eval(call[0], {"jaxrl_vis": jaxrl_vis})
+    program = make_train_step(make_env(asked), asked)
+    assert asked.seeds * program.replay_bytes < 2**30
+
+
 def checked_environment(env: str, env_options: tuple[str, ...], randomize: tuple[str, ...]) -> None:
     make_env(Config(env=env, env_options=env_options, randomize=randomize))  # type: ignore[arg-type]
 
@@ -192,10 +203,12 @@ def test_recipes_apply_and_work(tmp_path: Path) -> None:
     for block in blocks(page):
         if block.language == "diff":
             doc_blocks.apply_diff(block.text, tmp_path)
+    (tmp_path / "runs").mkdir()
     lines = [words for block in blocks(page) if block.mark.startswith("after ") for words in doc_blocks.commands(block)]
     code = f"""
-import dataclasses
+import dataclasses, importlib, pkgutil
 import jax, jax.numpy as jnp
+import jaxrl_vis
 from jaxrl_vis import cli
 from jaxrl_vis.cli.parsing import parse
 from jaxrl_vis.cli.train import Train, training_config
@@ -232,6 +245,15 @@ def one_step(key):
 
 
 jax.eval_shape(one_step, jax.random.key(0))
+
+for module in pkgutil.walk_packages(jaxrl_vis.__path__, "jaxrl_vis."):
+    if not module.name.endswith("__main__"):
+        try:
+            importlib.import_module(module.name)
+        except ModuleNotFoundError as error:  # of an extra
+            assert error.name.partition(".")[0] != "jaxrl_vis", error
+for figure in ("5.1", "5.4"):  # of no runs: status 3
+    assert cli.main(["figure", figure, "--quick", "--draw-only", "--runs", "runs"]) == 3
 """
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(tmp_path), str(ROOT / "envs")))}
     done = subprocess.run([sys.executable, "-c", code], env=environment, cwd=tmp_path, capture_output=True, text=True)
@@ -396,6 +418,26 @@ def test_the_site_builds_and_loads_nothing_from_elsewhere(tmp_path: Path) -> Non
     assert "lunr" in (site / "assets" / "local-iframe-worker.js").read_text()
     for name in ("make_trainer", "preset", "RequestError"):
         assert f'.{name}"' in (site / "api" / "training.html").read_text()
+
+
+def test_columns_of_the_site_are_wide_enough_to_read() -> None:
+    """Code that may break anywhere, beside cells that may not break at all, was set one letter a line."""
+    style = (DOCS / "site.css").read_text()
+    assert not re.search(r"td[^{]*\{[^}]*nowrap", style)
+    assert re.search(r"table:not\(\[class\]\) code \{[^}]*word-break: normal", style)
+    assert float(re.search(r"td\.long \{ min-width: ([\d.]+)rem", style)[1]) >= 8  # type: ignore[index]
+    fit = load_tool("hooks").fit_cells
+    assert fit("<td>short</td><th>x</th>") == "<td>short</td><th>x</th>"
+    sentence = "a sentence that takes more than one line of a column, &lt;here&gt;"
+    assert (
+        fit(f'<td style="text-align: left;">{sentence}</td>') == f'<td style="text-align: left;" class="long">{sentence}</td>'
+    )
+    assert fit("<td>" + "<br>".join(["a short line"] * 9) + "</td>").startswith("<td>")
+    assert fit("<td><code>a_long.name_that(is_longer=than_it)</code> a_b</td>") == (
+        "<td><code>a_<wbr>long.<wbr>name_<wbr>that(<wbr>is_<wbr>longer=<wbr>than_<wbr>it)</code> a_b</td>"
+    )
+    assert fit("<td><code>x --env-steps 1</code></td>") == '<td><code>x <span class="option">--env-steps</span> 1</code></td>'
+    assert fit("<td><code>image_size 16</code></td>") == "<td><code>image_size 16</code></td>"
 
 
 def test_pages_of_the_site_name_files_that_it_does_not_hold() -> None:

@@ -1,10 +1,13 @@
 """Imports run one way, and what is shipped works outside the checkout."""
 
 import ast
+import fnmatch
 import graphlib
 import os
+import re
 import subprocess
 import sys
+import tarfile
 import zipfile
 from pathlib import Path
 
@@ -177,14 +180,34 @@ def test_pins_carry_no_address_and_every_hash() -> None:
         assert text.count("--hash=sha256:") >= len(pins)
 
 
+def test_notice_says_where_each_file_comes_from_that_is_not_code() -> None:
+    entries = re.findall(r"((?:^\S+/\S+\n)+)((?:    .*\n)+)", (ROOT / "NOTICE").read_text(), re.MULTILINE)
+    assert all("    Licence: " in text for _, text in entries)
+    patterns = [pattern for files, _ in entries for pattern in files.split()]
+    shipped = [
+        path.relative_to(ROOT).as_posix()
+        for folder, _ in PACKAGES.values()
+        for path in folder.rglob("*")
+        if path.is_file() and path.suffix not in (".py", ".pyc", ".typed")
+    ]
+    assert shipped and [name for name in shipped if not any(fnmatch.fnmatch(name, pattern) for pattern in patterns)] == []
+    assert [pattern for pattern in patterns if not fnmatch.filter(shipped, pattern)] == []
+
+
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip("build")
     folder = tmp_path_factory.mktemp("wheel")
-    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder), str(ROOT)]
+    command = [sys.executable, "-m", "build", "--wheel", "--sdist", "--no-isolation", "--outdir", str(folder), str(ROOT)]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     return next(folder.glob("*.whl"))
+
+
+def test_sdist_holds_the_licence_and_the_notice(wheel: Path) -> None:
+    with tarfile.open(next(wheel.parent.glob("*.tar.gz"))) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    assert {"LICENSE", "NOTICE", "pyproject.toml", "README.md"} <= names
 
 
 def test_wheel_holds_both_packages_and_nothing_else(wheel: Path) -> None:
@@ -193,6 +216,7 @@ def test_wheel_holds_both_packages_and_nothing_else(wheel: Path) -> None:
     here = {path.relative_to(ROOT / "envs").as_posix() for path in (ROOT / "envs").rglob("*.xml")}
     assert here and here <= set(names)
     assert "jaxrl_vis/studies/data/ol_aux_curves.csv" in names
+    assert [name.rpartition("/")[2] for name in names if "/licenses/" in name] == ["LICENSE", "NOTICE"]
     # Without these, type checkers take no notice of the annotations of an installed package.
     assert {"jaxrl_vis/py.typed", "jaxrl_vis_envs/py.typed"} <= set(names)
 

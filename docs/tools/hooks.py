@@ -3,9 +3,13 @@
 Links that leave docs/ (to a notebook, a record, a test) work in the checkout. The site does not hold these files, so there
 the path takes the place of the link.
 
+Columns of tables get no narrower than their text can be read in: `site.css` looks for the class ``long``. Long names in code
+may be broken at their dots and underscores.
+
 Search runs in a worker, which browsers refuse to start from a file: a page without a server starts one from the worker's text.
 """
 
+import html
 import json
 import re
 from pathlib import Path
@@ -27,6 +31,35 @@ def name_files_outside(markdown: str) -> str:
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Called by mkdocs for the text of every page."""
     return markdown if page.file.src_uri.startswith("api/") else name_files_outside(markdown)
+
+
+_CELL = re.compile(r"<(t[dh])\b([^>]*)>(.*?)</\1>", re.DOTALL)
+_LONG_TEXT, _LONG_NAME = 40, 24  # letters
+
+
+def fit_cells(content: str) -> str:
+    """HTML with a class for cells that hold sentences, and with places in long names of code where a line may end."""
+
+    def breakable(code: re.Match[str]) -> str:
+        parts = re.split(r"(\s+)", code[1])
+        parts = [re.sub(r"(?<=[._/=(,])(?=.)", "<wbr>", part) if len(part) > _LONG_NAME else part for part in parts]
+        # An option is typed as it is read: it must not end in two hyphens.
+        parts = [re.sub(r"^(--[\w-]+)", r'<span class="option">\1</span>', part) for part in parts]
+        return f"<code>{''.join(parts)}</code>"
+
+    def fitted(cell: re.Match[str]) -> str:
+        lines = re.split(r"<br ?/?>", cell[3])
+        longest = max(len(html.unescape(re.sub(r"<[^>]*>", "", line))) for line in lines)
+        kind = ' class="long"' if longest > _LONG_TEXT else ""
+        inside = re.sub(r"<code>(.*?)</code>", breakable, cell[3], flags=re.DOTALL)
+        return f"<{cell[1]}{cell[2]}{kind}>{inside}</{cell[1]}>"
+
+    return _CELL.sub(fitted, content)
+
+
+def on_page_content(html: str, page: Any, **_: Any) -> str:
+    """Called by mkdocs for the HTML of every page."""
+    return html if page.file.src_uri.startswith("api/") else fit_cells(html)
 
 
 _WORKER = """if (location.protocol === "file:") {

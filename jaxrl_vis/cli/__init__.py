@@ -33,6 +33,7 @@ from jaxrl_vis.cli import (
     play,
     sweep,
     train,
+    verify,
 )
 from jaxrl_vis.cli.parsing import PROGRAM, parse
 from jaxrl_vis.errors import NonFiniteError, RequestError, StorageError, Terminated, WorkerError, nearest
@@ -44,6 +45,7 @@ COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
     "train": (train.Train, train.run),
     "eval": (eval.Eval, eval.run),
     "play": (play.Play, play.run),
+    "verify": (verify.Verify, verify.run),
     "envs": (envs.Envs, envs.run),
     "doctor": (doctor.Doctor, doctor.run),
     "bench": (bench.Bench, bench.run),

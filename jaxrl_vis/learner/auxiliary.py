@@ -61,8 +61,7 @@ class Auxiliary:
 
     def init_heads(self, key: jax.Array) -> dict[str, Params]:
         """Fresh parameters of all heads, by task."""
-        # A task's head begins alike whichever others are there.
-        return {name: task.init(jax.random.fold_in(key, auxtasks.NAMES.index(name))) for name, task in self.tasks.items()}
+        return {name: task.init(jax.random.fold_in(key, auxtasks.head_number(name))) for name, task in self.tasks.items()}
 
     def init_state(self, encoder: Params) -> WeightingState | None:
         """The weighting's state; None where there is nothing to weight and nothing to remember.

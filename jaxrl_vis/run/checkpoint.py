@@ -5,7 +5,8 @@
 
 Each also holds a manifest: names, shapes and types of all arrays, their checksums, and what the host has to remember. orbax
 makes a folder appear under its final name only when it is complete; the checksums find what went wrong later: without them, a
-flipped byte in a data file would be restored without a word. The newest two of each tier are kept.
+flipped byte in a data file would be restored without a word. Where the background has finished, SHA256SUMS (`sums`) follows,
+for `verification`: of what nobody restores, too. The newest two of each tier are kept.
 
 A run goes on from the newest good checkpoint of either tier, and from the full one of two that are equally new. Nothing newer
 than that is ever deleted: a checkpoint that turns out to be damaged is moved to checkpoints/damaged/, and one of another run,
@@ -26,6 +27,7 @@ from typing import TYPE_CHECKING, Any
 from jaxrl_vis import processes, streams
 from jaxrl_vis.errors import RequestError, StorageError
 from jaxrl_vis.files import read_json
+from jaxrl_vis.run import sums
 from jaxrl_vis.run.arrays import as_saved, check_structure, describe, host_specs, is_intact, rebuild, to_host, to_save
 from jaxrl_vis.run.metrics import RUN_ID
 from jaxrl_vis.run.progress import Progress
@@ -86,7 +88,8 @@ class Restored:
     progress: dict[str, Any]
 
 
-def _rest(loop: LoopState) -> dict[str, Any]:
+def rest_of(loop: LoopState) -> dict[str, Any]:
+    """A loop state without its learner: what a full checkpoint holds more than a light one."""
     return {"replay": loop.replay, "key": loop.key, "iteration": loop.iteration}
 
 
@@ -155,6 +158,7 @@ class Checkpoints:
         self._read_only = read_only
         self._managers: dict[str, ocp.CheckpointManager] = {}
         self._reported: set[tuple[str, int]] = set()  # damaged ones
+        self._unsummed: set[tuple[str, int]] = set()  # saved, perhaps in the background still, and without `sums`
         self._unsilence: Callable[[], None] | None = None
 
     def _manager(self, tier: str) -> "ocp.CheckpointManager":
@@ -209,7 +213,7 @@ class Checkpoints:
 
     def save_full(self, iteration: int, loop: LoopState, progress: dict[str, Any]) -> None:
         """Writes everything, and returns when it is on the disk: a second copy of the replay would need memory for two."""
-        items = {"train": to_save(loop.train, copy=False), "rest": to_save(_rest(loop), copy=False)}
+        items = {"train": to_save(loop.train, copy=False), "rest": to_save(rest_of(loop), copy=False)}
         self._save(FULL, iteration, items, progress)
         self.wait()
 
@@ -225,11 +229,21 @@ class Checkpoints:
             self.wait()  # of two tiers that are written at the same time, processes would take one for the other
         with self._writing(tier):
             manager = self._manager(tier)
-            manager.wait_until_finished()
+            self._wait(tier)
             if processes.any_of(iteration in self.iterations(tier)):  # orbax would quietly keep the old one
                 manager.delete(iteration)
             if not manager.save(iteration, args=ocp.args.Composite(**arguments), force=True):
                 raise RuntimeError(f"checkpoint {tier}/{iteration} was not written")
+            self._unsummed.add((tier, iteration))
+
+    def _wait(self, tier: str) -> None:
+        """Returns when the tier is on the disk, with the checksums of its files."""
+        self._managers[tier].wait_until_finished()
+        for saved in [saved for saved in self._unsummed if saved[0] == tier]:
+            folder = self._folder / tier / str(saved[1])
+            if processes.is_first() and folder.is_dir():
+                sums.write_sums(folder)
+            self._unsummed.discard(saved)
 
     @contextlib.contextmanager
     def _writing(self, tier: str) -> Iterator[None]:
@@ -251,14 +265,15 @@ class Checkpoints:
         Raises:
             StorageError: Something could not be written.
         """
-        for tier, manager in list(self._managers.items()):
+        for tier in list(self._managers):
             with self._writing(tier):
-                manager.wait_until_finished()
+                self._wait(tier)
 
     def close(self) -> None:
         """`wait`, then lets go of orbax's threads."""
         for tier, manager in list(self._managers.items()):
             with self._writing(tier):
+                self._wait(tier)
                 manager.close()
         self._managers.clear()
         if self._unsilence is not None:
@@ -328,6 +343,32 @@ class Checkpoints:
         """The learner alone, of the newest good checkpoint of either tier, or of ``iteration``. See `restore_for_resume`."""
         return self._newest_good(template, with_rest=False, only=iteration)
 
+    def manifest(self, tier: str, iteration: int) -> dict[str, Any]:
+        """What a checkpoint says of itself: ``schema``, ``iteration``, ``items`` (`arrays.describe`), and ``progress``.
+
+        Raises:
+            RequestError: It is damaged, or of another schema.
+        """
+        with self._told(tier, iteration):
+            return self._manifest(tier, iteration)
+
+    def restore(self, tier: str, manifest: dict[str, Any], template: LoopState) -> Restored:
+        """One checkpoint with all that it holds, compared with the checksums in its manifest.
+
+        Raises:
+            RequestError: It is damaged, or has another structure.
+        """
+        iteration = manifest["iteration"]
+        with self._told(tier, iteration):
+            return self._restored(tier, iteration, template, tier == FULL, manifest)
+
+    @contextlib.contextmanager
+    def _told(self, tier: str, iteration: int) -> Iterator[None]:
+        try:
+            yield
+        except _Damaged as damage:
+            raise RequestError(f"checkpoint {tier}/{iteration} is damaged ({damage})") from None
+
     def _newest_good(self, template: LoopState, with_rest: bool, only: int | None = None) -> Restored | None:
         found = [
             (iteration, tier) for tier in (FULL, LIGHT) for iteration in self.iterations(tier) if only in (None, iteration)
@@ -343,17 +384,26 @@ class Checkpoints:
                 self._reported.add((tier, iteration))
         return None
 
-    def _restore(self, tier: str, iteration: int, template: LoopState, with_rest: bool) -> Restored:
+    def _manifest(self, tier: str, iteration: int) -> dict[str, Any]:
         import orbax.checkpoint as ocp
 
         manifest = self._read(tier, iteration, {"manifest": ocp.args.JsonRestore()})["manifest"]
         if not _is_manifest(manifest):
             raise _Damaged("its manifest is incomplete")
-        templates = {"train": template.train} | ({"rest": _rest(template)} if with_rest else {})
+        if manifest["schema"] not in _READABLE:
+            where = self._folder / tier / str(iteration)
+            raise RequestError(f"{where} is of schema {manifest['schema']}, not {SCHEMA}: use the version that wrote it")
+        return manifest
+
+    def _restore(self, tier: str, iteration: int, template: LoopState, with_rest: bool) -> Restored:
+        return self._restored(tier, iteration, template, with_rest, self._manifest(tier, iteration))
+
+    def _restored(self, tier: str, iteration: int, template: LoopState, with_rest: bool, manifest: dict[str, Any]) -> Restored:
+        import orbax.checkpoint as ocp
+
+        templates = {"train": template.train} | ({"rest": rest_of(template)} if with_rest else {})
         specs = {name: host_specs(tree) for name, tree in templates.items()}
         where = self._folder / tier / str(iteration)
-        if manifest["schema"] not in _READABLE:
-            raise RequestError(f"{where} is of schema {manifest['schema']}, not {SCHEMA}: use the version that wrote it")
         for name, spec in specs.items():
             check_structure(where, manifest["items"].get(name, {}), spec)
             specs[name] = {leaf: as_saved(manifest["items"][name][leaf][0], expected) for leaf, expected in spec.items()}

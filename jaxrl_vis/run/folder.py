@@ -243,7 +243,7 @@ def _record(config: Config, log: tuple[str, ...], run_id: str | None) -> dict[st
         "preset": config.preset,
         "git_revision": provenance.revision(),
         "versions": provenance.versions(),
-        "device": provenance.device_record(),
+        "device": {**provenance.device_record(), "name": provenance.device_name()},
         "log": list(log),
         "config": dataclasses.asdict(config),
     }

@@ -321,7 +321,7 @@ class RunLoop:
         Raises:
             NonFiniteError: A guard has counted something.
         """
-        values = {name: self._per_seed(value) for name, value in pending.read().items()}
+        values = pending.read_per_seed(self._config.seeds)
         guards = [values.pop(name) for name in list(values) if name.startswith(GUARD)]
         bad = sorted({self._config.seed + seed for counts in guards for seed, count in enumerate(counts) if count != 0})
         if bad:
@@ -329,10 +329,6 @@ class RunLoop:
         self._progress.since_evaluation.append(values)
         self._console.advance(iteration, self._speed(iteration))
         return self._report(iteration, values)
-
-    def _per_seed(self, value: Any) -> list[float]:
-        array = np.broadcast_to(np.asarray(value, np.float32), (self._config.seeds,))
-        return [float(str(number)) for number in array]  # the shortest decimal that reads back as the same float32
 
     def _begin_evaluation(self) -> Pending:
         """Evaluates the learner; `_evaluate` waits for the outcome."""
@@ -344,7 +340,7 @@ class RunLoop:
     def _evaluate(self, report: Report, outcome: Pending) -> Report:
         """Reads what an evaluation has found, writes a line per seed, and adds the figures to the report."""
         progress, speed = self._progress, self._speed(self._done)
-        values = {name: self._per_seed(value) for name, value in outcome.read().items()}
+        values = outcome.read_per_seed(self._config.seeds)
         if not all(np.isfinite(row).all() for row in values.values()):
             self._stop_nonfinite(f"the evaluation after iteration {self._done}", values)
         means = metrics.with_precision(metrics.mean_of(progress.since_evaluation))

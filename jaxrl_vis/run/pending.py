@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxrl_vis.run.metrics import PerSeed
 from jaxrl_vis.types import Metrics
 
 
@@ -37,3 +38,8 @@ class Pending:
     def read(self) -> dict[str, np.ndarray]:
         """Waits for them; [S] float32 each, by name."""
         return dict(zip(self._names, np.asarray(self._rows), strict=True))
+
+    def read_per_seed(self, seeds: int) -> PerSeed:
+        """Waits for them; of each, one number per seed: the shortest decimal that reads back as the same float32."""
+        spread = {name: np.broadcast_to(np.asarray(row, np.float32), (seeds,)) for name, row in self.read().items()}
+        return {name: [float(str(number)) for number in row] for name, row in spread.items()}

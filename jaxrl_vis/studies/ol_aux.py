@@ -9,18 +9,24 @@ Every figure also has a run without auxiliary losses, which speed-ups refer to. 
 """
 
 from collections.abc import Sequence
-from typing import Any, get_args
+from typing import Any
 
 from jaxrl_vis.config import OF_TASK, PRESETS
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.methods import AuxTaskName
 from jaxrl_vis.studies.study import Family, Study, Variant
 
-AUX_TASKS: tuple[str, ...] = get_args(AuxTaskName)
+_AUX_COLOURS: dict[AuxTaskName, str] = {
+    "forward_dynamics": "#3b5bdb",
+    "inverse_dynamics": "#a61e8c",
+    "egomotion": "#b4531f",
+    "autoencoder": "#6b7a1f",
+    "optical_flow": "#1f8fb0",
+}
+AUX_TASKS: tuple[AuxTaskName, ...] = tuple(_AUX_COLOURS)
+"""The auxiliary tasks of the thesis, in its order. Others that a learner may have are in none of these figures."""
+
 _ALL: dict[str, Any] = {"aux_tasks": AUX_TASKS}
-
-
-_AUX_COLOURS = dict(zip(AUX_TASKS, ("#3b5bdb", "#a61e8c", "#b4531f", "#6b7a1f", "#1f8fb0"), strict=True))
 
 VARIANTS: dict[str, Variant] = {
     "none": Variant("no auxiliary losses", {}, "#5b626c"),

@@ -131,16 +131,29 @@ class Environments:
     ) -> None:
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
-        self.env = _made(env, overrides)
-        self.programs = _programs(self.env)
+        self._given, self._render_size = (env, overrides), None if render_mode is None else render_size
+        self._make()
         self.score = reward_function(reward, self.env.threshold)
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": max(1, round(1 / self.env.control_period))}
         self.action_space = spaces.Box(-1.0, 1.0, (self.env.action_size,), np.float32)
         self.steps = 0
-        self._camera = None if render_mode is None else _camera(self.env, render_size)
         self._state: State | None = None
         self._goal_pixels: Observations = {}
         self._view: tuple[np.ndarray, np.ndarray] | None = None
+
+    def _make(self) -> None:
+        """Makes the environment and what is compiled for it, or takes those that there are with the same settings."""
+        self.env = _made(*self._given)
+        self.programs = _programs(self.env)
+        self._camera = None if self._render_size is None else _camera(self.env, self._render_size)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Compiled programs stay in their process: whoever gets this makes them anew. Episodes go on where they are.
+        return {name: value for name, value in vars(self).items() if name not in ("env", "programs", "_camera")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._make()
 
     @property
     def is_over(self) -> bool:

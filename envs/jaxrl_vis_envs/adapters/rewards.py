@@ -1,5 +1,6 @@
 """Which reward an adapter pays. The libraries it serves choose it once, when an environment is made."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, Literal, get_args
 
@@ -11,7 +12,7 @@ RewardFunction = Callable[[Any, Any], Any]
 
 
 def reward_function(reward: Reward, threshold: float) -> RewardFunction:
-    """The function that scores states.
+    """The function that scores states; it can be pickled.
 
     Args:
         reward: ``oracle`` pays 0 within ``threshold`` of the goal and -1 elsewhere (`goals.oracle_reward`); ``dense`` pays
@@ -23,6 +24,8 @@ def reward_function(reward: Reward, threshold: float) -> RewardFunction:
     """
     if reward not in get_args(Reward):
         raise ValueError(f"reward must be one of {', '.join(get_args(Reward))}, got {reward!r}")
-    if reward == "dense":
-        return lambda achieved_state, goal_state: -goals.goal_distance(achieved_state, goal_state)
-    return lambda achieved_state, goal_state: goals.oracle_reward(achieved_state, goal_state, threshold)
+    return _dense_reward if reward == "dense" else functools.partial(goals.oracle_reward, threshold=threshold)
+
+
+def _dense_reward(achieved_state: Any, goal_state: Any) -> Any:
+    return -goals.goal_distance(achieved_state, goal_state)

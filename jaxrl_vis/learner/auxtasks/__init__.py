@@ -12,6 +12,7 @@ they can be computed for every batch that is sampled, or once for every transiti
 """
 
 import dataclasses
+import zlib
 from collections.abc import Callable, Collection, Sequence
 from typing import get_args
 
@@ -23,10 +24,25 @@ from jaxrl_vis.learner.auxtasks.task import AuxTask, Spec, View
 from jaxrl_vis.methods import AuxTaskName
 from jaxrl_vis.types import Replaceable
 
-__all__ = ["NAMES", "RELEASE", "AuxTask", "Options", "Spec", "Targets", "View", "make", "make_targets", "needs_of"]
+__all__ = [
+    "NAMES",
+    "RELEASE",
+    "AuxTask",
+    "Options",
+    "Spec",
+    "Targets",
+    "View",
+    "head_number",
+    "make",
+    "make_targets",
+    "needs_of",
+]
 
 NAMES: tuple[str, ...] = get_args(AuxTaskName)
-"""The tasks, in the order of the thesis."""
+"""The tasks; first those of the thesis, in its order."""
+
+# Heads of these have begun with these numbers since there were runs.
+_NUMBERS = {"forward_dynamics": 0, "inverse_dynamics": 1, "egomotion": 2, "autoencoder": 3, "optical_flow": 4}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,6 +100,11 @@ def make(names: Sequence[str], spec: Spec, options: Options = Options()) -> dict
             f"{shape[0]} numbers: choose a task that shows images (its name begins with Visual), or no auxiliary tasks"
         )
     return {name: _MAKERS[name](spec, options) for name in names}
+
+
+def head_number(name: str) -> int:
+    """What is folded into a key for a task's head, uint32: so it begins alike whichever other tasks there are, and wherever."""
+    return _NUMBERS[name] if name in _NUMBERS else zlib.crc32(name.encode())
 
 
 def needs_of(tasks: dict[str, AuxTask]) -> frozenset[str]:

@@ -1,0 +1,235 @@
+"""A run folder, looked at without computing anything: what is missing in it, damaged, or not this run's. Nothing is written."""
+
+import collections
+import dataclasses
+import json
+import math
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from jaxrl_vis.config import Config
+from jaxrl_vis.run.checkpoint import DAMAGED, FULL, LIGHT
+from jaxrl_vis.run.folder import LOGGER_FOLDERS, WANDB_STATE, RunFolder
+from jaxrl_vis.run.lock import FILE_NAME as LOCK_NAME
+
+RUN_ID, LOST = "run_id", "resume/replay_lost_at"
+"""Keys of a row: which run wrote it, and the last iteration at which that went on without its replay."""
+
+_PLACE = ("seed", "iteration", "updates", "env_steps")
+_PLAYED = ("play.gif", "play.mp4", "play.html", "play.png", "play_aux.gif")
+_SHOWN = 5  # of a list in a line
+
+
+@dataclasses.dataclass
+class Findings:
+    """Lines about a run folder.
+
+    Attributes:
+        problems: What no run leaves behind that nobody has touched.
+        notes: What else there is to know.
+    """
+
+    problems: list[str] = dataclasses.field(default_factory=list)
+    notes: list[str] = dataclasses.field(default_factory=list)
+
+
+@dataclasses.dataclass(frozen=True)
+class Expected:
+    """What must hold for every row of a run.
+
+    Attributes:
+        seeds: Of the run, in order.
+        updates, env_steps: Gradient steps and environment steps in an iteration, per seed.
+        eval_interval: Iterations between evaluations.
+        run_id: Of the run; None where its config.json names none.
+    """
+
+    seeds: Sequence[int]
+    updates: int
+    env_steps: int
+    eval_interval: int
+    run_id: str | None
+
+
+def listed(values: Iterable[Any]) -> str:
+    """The first few of some values, and how many more there are."""
+    words = [str(value) for value in values]
+    return ", ".join(words[:_SHOWN]) + (f" and {len(words) - _SHOWN} more" if len(words) > _SHOWN else "")
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+
+
+def _is_figure(value: Any) -> bool:
+    return value is None or (isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value))
+
+
+def _read_line(line: bytes) -> dict[str, Any] | str:
+    """A row, or what is wrong with it."""
+    try:
+        row = json.loads(line.decode("utf-8"))
+    except (ValueError, RecursionError):  # UnicodeDecodeError and JSONDecodeError are ValueErrors
+        return "is damaged"
+    if not isinstance(row, dict) or not all(_is_count(row.get(name)) for name in _PLACE):
+        return f"is no row: {', '.join(_PLACE)} must be numbers"
+    return row
+
+
+def read_file(path: Path, expected: Expected, is_written: bool, findings: Findings) -> list[dict[str, Any]]:
+    """The rows of a metrics file that belong to a run, in the order of the file; what is wrong with others is found.
+
+    Args:
+        path: metrics.jsonl.
+        expected: What must hold for each row.
+        is_written: Another process may be writing now, so that the last line may be half there.
+        findings: Is added to.
+    """
+    *lines, rest = path.read_bytes().split(b"\n") if path.exists() else [b""]
+    if rest and not is_written:
+        findings.problems.append(f"{path.name}: the last line is cut off")
+    rows: list[dict[str, Any]] = []
+    for number, line in enumerate(lines, 1):
+        row = _read_line(line)
+        fault = row if isinstance(row, str) else _fault(row, expected)
+        if fault:
+            findings.problems.append(f"{path.name}, line {number}: {fault}")
+        elif isinstance(row, dict):
+            rows.append(row)
+    _check_order(path.name, rows, expected, findings)
+    return rows
+
+
+def _fault(row: Mapping[str, Any], expected: Expected) -> str:
+    """What contradicts the configuration in a row; empty if nothing does."""
+    iteration = row["iteration"]
+    if expected.run_id is not None and row.get(RUN_ID) != expected.run_id:
+        return f"is another run's ({row[RUN_ID]})" if RUN_ID in row else "names no run"
+    if row["seed"] not in expected.seeds:
+        return f"is of seed {row['seed']}, which config.json does not have"
+    for name, each in (("updates", expected.updates), ("env_steps", expected.env_steps)):
+        if row[name] != iteration * each:
+            return f"{name} is {row[name]}, not {iteration * each}, which config.json makes of {iteration} iterations"
+    if LOST in row and not (_is_count(row[LOST]) and row[LOST] <= iteration):
+        return f"{LOST} is {row[LOST]!r}, which does not fit iteration {iteration}"
+    wrong = [name for name, value in row.items() if name != RUN_ID and not _is_figure(value)]
+    if wrong or "eval/success" not in row:
+        return f"{', '.join(wrong)}: no number" if wrong else "holds no evaluation"
+    return ""
+
+
+def _check_order(name: str, rows: Sequence[Mapping[str, Any]], expected: Expected, findings: Findings) -> None:
+    places = [(row["iteration"], row["seed"]) for row in rows]
+    twice = sorted(place for place, count in collections.Counter(places).items() if count > 1)
+    for iteration, seed in twice:
+        findings.problems.append(f"{name}: iteration {iteration}, seed {seed} is there more than once")
+    unique = list(dict.fromkeys(places))
+    if unique != sorted(unique):
+        first = next(after for before, after in zip(unique, unique[1:], strict=False) if after < before)
+        findings.problems.append(f"{name}: iteration {first[0]}, seed {first[1]} is out of order")
+    lost = [row[LOST] for row in rows if LOST in row]
+    if lost != sorted(lost) or (lost and any(LOST not in row for row in rows if row["iteration"] > lost[0])):
+        findings.problems.append(f"{name}: {LOST} goes back")
+
+
+def missing_rows(
+    rows: Sequence[Mapping[str, Any]],
+    expected: Expected,
+    reached: int,
+    total: int,
+    without: Collection[int],
+    is_written: bool,
+) -> list[str]:
+    """Rows that must be there and are not, as lines.
+
+    Args:
+        rows: Those that are there.
+        expected: Which there must be.
+        reached: The last iteration whose rows were written, as checkpoints tell, or 0.
+        total: Iterations of the run; the last one ends with an evaluation.
+        without: Scheduled iterations that had none.
+        is_written: Another process may be writing rows of the last iteration now.
+    """
+    there: dict[int, set[int]] = {}
+    for row in rows:
+        there.setdefault(row["iteration"], set()).add(row["seed"])
+    last = max([reached, *there])
+    scheduled = set(range(expected.eval_interval, last + 1, expected.eval_interval)) - set(without)
+    scheduled |= {total} if reached == total else set()
+    absent = sorted(scheduled - set(there))
+    lines = []
+    if absent:
+        lines.append(
+            f"metrics.jsonl: rows of iteration {listed(absent)} are missing (every {expected.eval_interval}, "
+            "unless a part of the run before a resumption had another eval_interval)"
+        )
+    for iteration, seeds in sorted(there.items()):
+        if seeds < set(expected.seeds) and not (is_written and iteration == max(there)):
+            lines.append(
+                f"metrics.jsonl: iteration {iteration} has no row of seed {listed(sorted(set(expected.seeds) - seeds))}"
+            )
+    return lines
+
+
+def check_record(record: Mapping[str, Any], config: Config, findings: Findings) -> None:
+    """Finds what contradicts itself in config.json, or is not said there.
+
+    Args:
+        record: Its contents.
+        config: The configuration in it.
+        findings: Is added to.
+    """
+    if record.get("preset") != config.preset:
+        findings.problems.append(
+            f"config.json: preset is {record.get('preset')!r} above and {config.preset!r} in the configuration"
+        )
+    device = record.get("device")
+    count = device.get("count") if isinstance(device, Mapping) else None
+    if count is None:
+        findings.problems.append("config.json: does not say on which device the run was")
+    elif _is_count(count) and config.devices > count:
+        findings.problems.append(f"config.json: the run is on {config.devices} devices, of which there were {count}")
+    if not isinstance(record.get("versions"), Mapping):
+        findings.problems.append("config.json: does not say which versions of the libraries made the run")
+    saved = record.get("config")
+    unsaid = sorted({field.name for field in dataclasses.fields(Config)} - set(saved if isinstance(saved, Mapping) else ()))
+    if unsaid:
+        findings.notes.append(
+            f"config.json does not say {listed(unsaid)}: taken to be as by default, or saved by an older name"
+        )
+
+
+def check_files(folder: RunFolder, is_finished: bool, shows_images: bool, findings: Findings) -> None:
+    """Finds files that a run does not write, half-written and set aside checkpoints, and what a finished run lacks.
+
+    Args:
+        folder: The run folder.
+        is_finished: The run has come to its end.
+        shows_images: It has a video, then.
+        findings: Is added to.
+    """
+    files = (folder.config, folder.metrics, folder.curve, folder.video)
+    of_run = {file.name for file in files} | {LOCK_NAME, WANDB_STATE, *_PLAYED}
+    of_run |= {folder.checkpoints.name, folder.nonfinite.name, *LOGGER_FOLDERS}
+    foreign = [entry.name for entry in folder.path.iterdir() if entry.name not in of_run]
+    if folder.checkpoints.is_dir():
+        foreign += [
+            f"checkpoints/{entry.name}" for entry in folder.checkpoints.iterdir() if entry.name not in (LIGHT, FULL, DAMAGED)
+        ]
+        for tier in (LIGHT, FULL):
+            entries = list((folder.checkpoints / tier).iterdir()) if (folder.checkpoints / tier).is_dir() else []
+            names = {entry.name for entry in entries if not (entry.is_dir() and entry.name.isdigit())}
+            half = sorted(name for name in names if ".orbax-checkpoint-tmp" in name)
+            findings.notes += [f"checkpoints/{tier}/{name} is half-written" for name in half]
+            foreign += [f"checkpoints/{tier}/{name}" for name in names - set(half)]
+        if (folder.checkpoints / DAMAGED).is_dir():
+            aside = sorted(entry.name for entry in (folder.checkpoints / DAMAGED).iterdir())
+            findings.notes.append(f"set aside as damaged before: {listed(aside)}")
+    if folder.nonfinite.is_dir():
+        findings.notes.append(f"the run has met a number that is not finite: {folder.nonfinite.name}/ has its state")
+    if foreign:
+        findings.notes.append(f"no files of a run: {listed(sorted(foreign))}")
+    if is_finished:
+        wanted = [folder.curve, *([folder.video] if shows_images else [])]
+        findings.problems += [f"{file.name} is missing, though the run is finished" for file in wanted if not file.exists()]

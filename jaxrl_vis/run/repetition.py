@@ -1,0 +1,238 @@
+"""Iterations of a run, made again and compared with its rows and checkpoints; see `verification`."""
+
+import dataclasses
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+from jaxrl_vis.run import metrics
+from jaxrl_vis.run.arrays import is_intact, to_host
+from jaxrl_vis.run.checkpoint import FULL, LIGHT, rest_of
+from jaxrl_vis.run.inspection import RUN_ID, Expected, Findings, listed
+from jaxrl_vis.run.loop import GUARD
+from jaxrl_vis.run.metrics import PerSeed
+from jaxrl_vis.run.programs import Programs
+from jaxrl_vis.run.progress import Progress
+from jaxrl_vis.types import LoopState
+
+NOT_REPEATED = (RUN_ID, "time/", "resume/")
+"""What names begin with that no repetition can be expected to write again."""
+
+Row = dict[str, Any]
+
+_OTHER_BEGINS = 20
+
+
+@dataclasses.dataclass
+class Verification(Findings):
+    """Findings about a run folder, and what came of repeating its iterations.
+
+    Attributes:
+        rows, numbers: How many were repeated, and are equal or not.
+        checkpoints: Names of those that were compared with the state of a repetition.
+        differences: Lines about rows and checkpoints that are not what the repetition arrives at; among the problems, too.
+        largest: The largest relative difference of a number.
+        unverified: Lines about what was not repeated, and why.
+        elsewhere: In what this machine or its software is not that of the run, so that bit equality is not promised.
+    """
+
+    rows: int = 0
+    numbers: int = 0
+    checkpoints: list[str] = dataclasses.field(default_factory=list)
+    differences: list[str] = dataclasses.field(default_factory=list)
+    largest: float = 0.0
+    unverified: list[str] = dataclasses.field(default_factory=list)
+    elsewhere: list[str] = dataclasses.field(default_factory=list)
+
+    @property
+    def is_equal(self) -> bool:
+        """Whether something was repeated, all of that is equal, and nothing is missing, damaged or another run's."""
+        return self.rows > 0 and not self.problems
+
+
+class Repeater:
+    """Repeats parts of one run.
+
+    Args:
+        programs: Of the run.
+        expected: What holds for its rows.
+        rows: Of its file.
+        manifests: Of its checkpoints, by tier and iteration.
+        report: Is told what comes of it.
+        say: Called with a line about each step.
+
+    Attributes:
+        repeated: Iterations whose rows were compared.
+        without_evaluation: Iterations that had no evaluation, as the means of the next one tell.
+    """
+
+    def __init__(
+        self,
+        programs: Programs,
+        expected: Expected,
+        rows: Sequence[Row],
+        manifests: Mapping[tuple[str, int], dict[str, Any]],
+        report: Verification,
+        say: Callable[[str], None],
+    ):
+        self._programs, self._expected, self._rows = programs, expected, rows
+        self._manifests, self._report, self._say = manifests, report, say
+        self.repeated: set[int] = set()
+        self.without_evaluation: set[int] = set()
+
+    def repeat(self, name: str, begin: int, progress: Progress, loop: LoopState, places: Sequence[int]) -> None:
+        """Repeats iterations, and compares.
+
+        Args:
+            name: Of the beginning, for people.
+            begin: Iterations done.
+            progress: What the host remembered then.
+            loop: The state; donated.
+            places: Iterations whose rows are compared, ascending; the last one is where it ends.
+        """
+        self._say(f"repeating iterations {begin + 1} to {places[-1]} from {name} ...")
+        history = {begin - back: values for back, values in enumerate(reversed(progress.since_evaluation))}
+        if begin in places:
+            self._compare(name, begin, loop, history)
+        for iteration in range(begin + 1, places[-1] + 1):
+            loop, values = self._programs.train_iteration(loop)
+            read = self._programs.pending(values).read_per_seed(len(self._expected.seeds))
+            broken = [key for key, counts in read.items() if key.startswith(GUARD) and any(counts)]
+            if broken:
+                self._differ(f"iteration {iteration}: the repetition from {name} meets numbers that are not finite")
+                return
+            history[iteration] = {key: each for key, each in read.items() if not key.startswith(GUARD)}
+            if iteration in places:
+                self._compare(name, iteration, loop, history)
+            self._compare_checkpoints(iteration, progress.replay_lost_at, loop)
+
+    def _differ(self, line: str) -> None:
+        self._report.differences.append(line)
+        self._report.problems.append(line)
+        self._say(f"  {line}")
+
+    def _compare(self, name: str, iteration: int, loop: LoopState, history: Mapping[int, PerSeed]) -> None:
+        """Compares the rows of an iteration with what the repetition makes of it."""
+        there = [row for row in self._rows if row["iteration"] == iteration]
+        outcome, _ = self._programs.evaluate(loop.train)
+        evaluated = self._programs.pending(outcome).read_per_seed(len(self._expected.seeds))
+        best: list[tuple[int, str, Any, Any]] | None = None
+        for begin in self._begins(iteration, history):
+            made = self._rows_of(iteration, evaluated, [history[number] for number in range(begin + 1, iteration + 1)])
+            differences = [
+                (row["seed"], key, value, again) for row in there for key, value, again in _differences(row, made[row["seed"]])
+            ]
+            if best is None:
+                best, numbers = differences, sum(len(_compared(row)) for row in there)
+            if not differences:
+                if best:
+                    self.without_evaluation.update(range(begin + 1, iteration))
+                    self._report.notes.append(
+                        f"iteration {iteration} has means since iteration {begin}: eval_interval was another one then"
+                    )
+                best = differences
+                break
+        assert best is not None
+        if iteration not in self.repeated:
+            self.repeated.add(iteration)
+            self._report.rows += len(there)
+            self._report.numbers += numbers
+        if best:
+            self._tell(name, iteration, best)
+        else:
+            self._say(f"  iteration {iteration}: {numbers} numbers of {len(there)} seeds, all equal")
+
+    def _tell(self, name: str, iteration: int, differences: Sequence[tuple[int, str, Any, Any]]) -> None:
+        self._report.largest = max([self._report.largest, *(_relative(value, again) for _, _, value, again in differences)])
+        shown = listed(f"seed {seed} {key} is {value} in the file, {again} here" for seed, key, value, again in differences)
+        hint = ""
+        if all(key.startswith("eval/") for _, key, _, _ in differences):
+            hint = " (or eval_episodes was another one then)"
+        self._differ(f"iteration {iteration}, from {name}: {shown}{hint}")
+
+    def _begins(self, iteration: int, history: Mapping[int, PerSeed]) -> list[int]:
+        """After which iterations the means in a row may begin, the one that eval_interval says first."""
+        interval, earliest = self._expected.eval_interval, min(history, default=iteration + 1) - 1
+        scheduled = max((iteration - 1) // interval * interval, earliest)
+        evaluated = sorted({row["iteration"] for row in self._rows if earliest <= row["iteration"] < iteration}, reverse=True)
+        return list(dict.fromkeys([scheduled, *evaluated[:_OTHER_BEGINS], earliest]))
+
+    def _rows_of(self, iteration: int, evaluated: PerSeed, history: Sequence[PerSeed]) -> dict[int, Row]:
+        """What a run writes of an iteration, by seed, less what is not repeated."""
+        counts = {
+            "iteration": iteration,
+            "updates": iteration * self._expected.updates,
+            "env_steps": iteration * self._expected.env_steps,
+        }
+        means = metrics.with_precision(metrics.mean_of(history))
+        return {row["seed"]: row for row in metrics.make_rows(self._expected.seeds, counts, evaluated | means)}
+
+    def _compare_checkpoints(self, iteration: int, mark: int | None, loop: LoopState) -> None:
+        """Compares the state with checkpoints of the same iteration, by their checksums."""
+        for tier in (LIGHT, FULL):
+            manifest = self._manifests.get((tier, iteration))
+            if manifest is None or progress_of(manifest).replay_lost_at != mark:
+                continue
+            state = {"train": loop.train} | ({"rest": rest_of(loop)} if tier == FULL else {})
+            differing = []
+            for item, tree in state.items():
+                described = manifest["items"].get(item, {})
+                arrays = to_host(tree, copy=False)
+                differing += [
+                    leaf
+                    for leaf, array in arrays.items()
+                    if leaf not in described
+                    or (list(array.shape) == described[leaf][0] and not is_intact(array, described[leaf]))
+                ]
+                del arrays  # a view would make the next donation a copy
+            if (checkpoint := f"{tier}/{iteration}") not in self._report.checkpoints:
+                self._report.checkpoints.append(checkpoint)
+            if differing:
+                self._differ(f"checkpoint {tier}/{iteration} is not what the repetition arrives at: {listed(differing)} differ")
+            else:
+                self._say(f"  checkpoint {tier}/{iteration}: equal")
+
+
+def progress_of(manifest: Mapping[str, Any]) -> Progress:
+    """What the host remembered with a checkpoint."""
+    return Progress.from_dict(manifest.get("progress", manifest.get("memo", {})))
+
+
+def has_progress(manifest: Mapping[str, Any], seeds: int) -> bool:
+    """Whether a manifest says what the host remembered, in the types that it had.
+
+    Args:
+        manifest: Of a checkpoint.
+        seeds: How many the run has.
+    """
+    try:
+        progress = progress_of(manifest)
+        names = {name for values in progress.since_evaluation for name in values}
+        figures = [number for values in progress.since_evaluation for name in names for number in values[name]]
+        counts = [len(row) for values in progress.since_evaluation for row in values.values()]
+    except (AttributeError, KeyError, TypeError):
+        return False
+    is_mark = progress.replay_lost_at is None or isinstance(progress.replay_lost_at, int)
+    is_history = all(isinstance(number, float) for number in figures) and set(counts) <= {seeds}
+    return is_mark and is_history and isinstance(progress.evaluation_due, bool)
+
+
+def _compared(row: Mapping[str, Any]) -> Row:
+    return {name: value for name, value in row.items() if not name.startswith(NOT_REPEATED)}
+
+
+def _differences(row: Mapping[str, Any], made: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
+    """Names whose values are not written alike, with both."""
+    compared = _compared(row)
+    for name in dict.fromkeys([*compared, *made]):
+        value, again = compared.get(name, "nothing"), made.get(name, "nothing")
+        if json.dumps(value) != json.dumps(again):
+            yield name, value, again
+
+
+def _relative(value: Any, again: Any) -> float:
+    """The difference of two numbers, as a share of the larger; infinite where one is no number."""
+    if not (isinstance(value, int | float) and isinstance(again, int | float)):
+        return math.inf
+    return abs(value - again) / max(abs(value), abs(again)) if value != again else 0.0

@@ -1,0 +1,297 @@
+"""A run, made again from its seed and from its full checkpoints, and compared with its files bit for bit. Nothing is written.
+
+    report = verify_run("runs/mine")
+    report.is_equal, report.rows, report.problems, report.unverified
+
+Rows of metrics.jsonl are written where a run is evaluated, so the repetition goes from evaluation to evaluation. On the way it
+compares its state with each checkpoint that it passes. All but times and the run's id must be equal on the same platform with
+the same versions and code; elsewhere floating-point numbers may be rounded otherwise, and the report says by how much.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from jaxrl_vis import provenance
+from jaxrl_vis.config import config_from_dict
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.run.checkpoint import FULL, LIGHT, Checkpoints
+from jaxrl_vis.run.folder import RunFolder, read_record
+from jaxrl_vis.run.inspection import (
+    LOST,
+    RUN_ID,
+    Expected,
+    check_files,
+    check_record,
+    listed,
+    missing_rows,
+    read_file,
+)
+from jaxrl_vis.run.lock import FILE_NAME as LOCK_NAME
+from jaxrl_vis.run.memory import check_compiled, check_memory
+from jaxrl_vis.run.progress import Progress
+from jaxrl_vis.run.repetition import Repeater, Row, Verification, has_progress, progress_of
+from jaxrl_vis.run.results import describe
+from jaxrl_vis.run.sums import FILE_NAME as SUMS_NAME
+from jaxrl_vis.run.sums import compare_sums
+from jaxrl_vis.run.trainer import Trainer, make_trainer
+
+__all__ = ["Verification", "verify", "verify_run"]
+
+EVALUATIONS = 2
+"""How many are repeated where nobody says: the second shows that the first has left nothing behind."""
+
+
+def verify_run(
+    run_dir: Path | str,
+    iterations: int | None = None,
+    keep_programs: bool = False,
+    say: Callable[[str], None] = lambda line: None,
+) -> Verification:
+    """Repeats the beginning of a run, and what follows each of its full checkpoints; nothing in its folder is touched.
+
+    Args:
+        run_dir: The run folder; the run may still be going on.
+        iterations: How many to repeat from each of these; None: up to the second evaluation.
+        keep_programs: As of `jaxrl_vis.run.trainer.make_trainer`.
+        say: Called with a line about each step.
+
+    Raises:
+        RequestError: There is no run, or it cannot be made any more, or needs more memory than there is.
+    """
+    path = Path(run_dir)
+    record = read_record(path)
+    try:
+        config = config_from_dict(record.get("config", {}))
+    except RequestError as error:
+        raise RequestError(f"the run in {path} cannot be verified: {error}") from error
+    findings = Verification()
+    check_record(record, config, findings)
+    devices = jax.local_device_count()
+    if config.devices > devices:
+        findings.elsewhere.append(f"the run was on {config.devices} devices, and is repeated on one")
+        config = config.replace(devices=1, data_devices=None)
+    trainer = make_trainer(config, keep_programs=keep_programs)
+    return verify(trainer, path, record, iterations, findings, say)
+
+
+def verify(
+    trainer: Trainer,
+    path: Path,
+    record: Mapping[str, Any],
+    iterations: int | None,
+    report: Verification,
+    say: Callable[[str], None],
+) -> Verification:
+    """`verify_run`, with a trainer of the run's configuration and the contents of its config.json."""
+    return _Verifier(trainer, RunFolder(path), record, report, say).verify(iterations)
+
+
+class _Verifier:
+    def __init__(
+        self, trainer: Trainer, folder: RunFolder, record: Mapping[str, Any], report: Verification, say: Callable[[str], None]
+    ):
+        self._programs, self._config, self._folder = trainer.programs, trainer.config, folder
+        self._record, self._report, self._say = record, report, say
+        program = trainer.program
+        self._expected = Expected(
+            seeds=list(trainer.seeds),
+            updates=program.updates_per_iteration,
+            env_steps=program.steps_per_iteration,
+            eval_interval=self._config.eval_interval,
+            run_id=record.get(RUN_ID),
+        )
+        self._total: int = program.num_iterations
+        self._checkpoints = Checkpoints(folder.checkpoints, self._say, read_only=True)
+        self._manifests: dict[tuple[str, int], dict[str, Any]] = {}
+        self._rows: list[Row] = []
+
+    def verify(self, iterations: int | None) -> Verification:
+        """See `verify_run`."""
+        try:
+            self._say_origin()
+            is_written = (self._folder.path / LOCK_NAME).exists()
+            if is_written:
+                self._report.notes.append("another process may be writing into the folder: verified as far as it is there")
+            # Rows are on the disk before the checkpoint that follows: read first, they might lack what that tells of.
+            self._read_manifests()
+            self._rows = read_file(self._folder.metrics, self._expected, is_written, self._report)
+            repeater = self._repeat_all(iterations)
+            due = {number for (_, number), manifest in self._manifests.items() if progress_of(manifest).evaluation_due}
+            reached = max((number - (number in due) for _, number in self._manifests), default=0)
+            self._report.problems += missing_rows(
+                self._rows, self._expected, reached, self._total, repeater.without_evaluation, is_written
+            )
+            is_finished = reached >= self._total and not is_written
+            check_files(self._folder, is_finished, self._programs.shows_images, self._report)
+            self._check_presence(is_written)
+            return self._report
+        finally:
+            self._checkpoints.close()
+
+    # -- Where it comes from
+
+    def _say_origin(self) -> None:
+        record, report = self._record, self._report
+        device, versions = _mapping(record.get("device")), _mapping(record.get("versions"))
+        name = provenance.device_name()
+        here = {
+            "revision": provenance.revision(),
+            **provenance.versions(),
+            **_flat(provenance.device_record() | {"name": name}),
+        }
+        there = {"revision": record.get("git_revision"), **versions, **_flat(device)}
+        named = f", run {self._expected.run_id}" if self._expected.run_id else ""
+        self._say(f"{self._folder.path}: {self._config.env}, {describe(self._config)}{named}")
+        libraries = ", ".join(f"{name} {versions[name]}" for name in ("jax", "jaxlib", "python") if name in versions)
+        where = f"{device.get('count')} {device.get('kind')}, {device.get('cpu_count')} cores"
+        self._say(f"made by revision {there['revision'] or 'unknown'}, {libraries or 'unknown versions'}, on {where}")
+        other = [name for name in there if there[name] != here.get(name)]
+        report.elsewhere += [f"{name} {there[name]} then, {here.get(name)} now" for name in other]
+        if there["revision"] is None:
+            report.elsewhere.append("config.json names no revision")
+        elif str(there["revision"]).endswith("-dirty"):
+            report.elsewhere.append("the revision had changes that were not committed")
+        if here["platform"] != "cpu":
+            report.elsewhere.append("only on a CPU are the same numbers promised each time")
+
+    # -- Checkpoints
+
+    def _names(self) -> list[tuple[str, int]]:
+        return sorted(
+            ((tier, number) for tier in (LIGHT, FULL) for number in self._checkpoints.iterations(tier)),
+            key=lambda name: name[::-1],
+        )
+
+    def _is_there(self, tier: str, number: int) -> bool:
+        """Whether a checkpoint was not deleted meanwhile by the run itself, which keeps the newest two."""
+        return (self._folder.checkpoints / tier / str(number)).is_dir()
+
+    def _read_manifests(self) -> None:
+        """Reads and checks all checkpoints, but for the arrays of full ones, which are looked at where they are restored."""
+        problems = self._report.problems
+        for tier, number in self._names():
+            name = f"checkpoint {tier}/{number}"
+            try:
+                differences = compare_sums(self._folder.checkpoints / tier / str(number))
+                manifest = self._checkpoints.manifest(tier, number)
+                if tier == LIGHT and manifest.get("iteration") == number:
+                    self._checkpoints.restore(tier, manifest, self._programs.shapes)
+            except (RequestError, OSError) as error:
+                if self._is_there(tier, number):
+                    problems.append(
+                        str(error) if isinstance(error, RequestError) else f"{name} cannot be read ({error.strerror})"
+                    )
+                continue
+            if differences:
+                problems.append(f"{name}: {listed(differences)}")
+                continue
+            if differences is None:
+                self._report.notes.append(f"{name} has no {SUMS_NAME}: only its arrays are compared with their checksums")
+            if manifest.get("iteration") != number:
+                problems.append(f"{name} says that it is of iteration {manifest.get('iteration')}")
+            elif self._expected.run_id is not None and manifest.get(RUN_ID) != self._expected.run_id:
+                problems.append(f"{name} is another run's ({manifest.get(RUN_ID, 'it names none')})")
+            elif not has_progress(manifest, len(self._expected.seeds)):
+                problems.append(f"{name} is damaged (its manifest does not say how far the run was)")
+            else:
+                self._manifests[tier, number] = manifest
+
+    def _check_presence(self, is_written: bool) -> None:
+        """Finds that there is no checkpoint though the run has come far enough to have one."""
+        last = max((row["iteration"] for row in self._rows), default=0)
+        interval = self._config.checkpoint_interval
+        # An evaluation's rows are written before the checkpoint of the same iteration is.
+        wanted = last >= self._total or (interval > 0 and last > interval)
+        if wanted and not is_written and not self._names():
+            self._report.problems.append(f"checkpoints are missing: the run has come to iteration {last}")
+
+    # -- Repeating
+
+    def _repeat_all(self, iterations: int | None) -> Repeater:
+        """Repeats what follows the seed, and what follows each full checkpoint."""
+        programs, seed = self._programs, Progress()
+        repeater = Repeater(programs, self._expected, self._rows, self._manifests, self._report, self._say)
+        places = self._plan(0, seed, iterations)
+        starts = [number for tier, number in self._manifests if tier == FULL]
+        if places or starts:
+            self._compile()
+        if places:
+            repeater.repeat("the seed", 0, seed, programs.init(programs.run_keys), places)
+        for number in starts:
+            self._repeat_after(number, repeater, iterations)
+        self._say_rest(repeater.repeated)
+        return repeater
+
+    def _repeat_after(self, number: int, repeater: Repeater, iterations: int | None) -> None:
+        """Repeats what follows a full checkpoint, unless that is damaged, which is told."""
+        manifest = self._manifests[FULL, number]
+        try:
+            restored = self._checkpoints.restore(FULL, manifest, self._programs.shapes)
+        except RequestError as error:
+            if self._is_there(FULL, number):
+                self._report.problems.append(str(error))
+                del self._manifests[FULL, number]
+            return
+        assert restored.loop is not None
+        progress = progress_of(manifest)
+        places = self._plan(number, progress, iterations)
+        if places:
+            repeater.repeat(f"checkpoint full/{number}", number, progress, restored.loop, places)
+        else:
+            self._report.unverified.append(f"checkpoint full/{number} is intact, but there is no row after it yet")
+
+    def _compile(self) -> None:
+        program, layout = self._programs.program, self._programs.layout
+        check_memory(
+            self._config,
+            self._programs.shapes,
+            program.replay_bytes,
+            program.steps_per_iteration,
+            layout,
+            program.replay.frame_stack,
+        )
+        self._say("compiling ...")
+        check_compiled(self._programs.compile(), already_there=False, layout=layout)
+
+    def _plan(self, begin: int, progress: Progress, iterations: int | None) -> list[int]:
+        """Iterations whose rows can be repeated from a state after ``begin`` iterations."""
+        mark, first = progress.replay_lost_at, begin if progress.evaluation_due else begin + 1
+        # Up to the next loss of the replay: what follows has no start that was kept.
+        losses = [row[LOST] for row in self._rows if LOST in row and row[LOST] != mark and row[LOST] >= begin]
+        last = min(losses, default=math.inf)
+        places = sorted({row["iteration"] for row in self._rows if first <= row["iteration"] <= last})
+        if iterations is None:
+            return places[:EVALUATIONS]
+        near = [place for place in places if place <= begin + iterations]
+        return near or places[:1]
+
+    def _say_rest(self, repeated: set[int]) -> None:
+        """Notes which rows and checkpoints no repetition has come to."""
+        unverified = self._report.unverified
+        rest = [row["iteration"] for row in self._rows if row["iteration"] not in repeated]
+        if rest:
+            unverified.append(
+                f"rows of {len(set(rest))} evaluations, of iterations {min(rest)} to {max(rest)}: looked at, but not repeated"
+            )
+        lost = min((row[LOST] for row in self._rows if LOST in row), default=None)
+        if lost is not None:
+            unverified.append(
+                f"after iteration {lost} the run went on from a light checkpoint, without its replay: rows after it follow "
+                "from full checkpoints only, not from the seed"
+            )
+        compared = self._report.checkpoints
+        others = [name for tier, number in self._manifests if (name := f"{tier}/{number}") not in compared]
+        if others:
+            unverified.append(f"checkpoints {listed(others)}: intact, but no repetition has come to them")
+
+
+def _mapping(value: Any) -> Mapping[str, Any]:
+    return value if isinstance(value, Mapping) else {}
+
+
+def _flat(device: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: device[name] for name in ("platform", "kind", "cpu_count", "name") if name in device}
