@@ -5,6 +5,7 @@ The files:
     config.json     schema, versions, device, git revision, configuration      metrics.jsonl   see `metrics`
     checkpoints/    see `checkpoint`      nonfinite/   what a run that went wrong held      curve.png   video.gif
     run.lock        while a process writes here, see `lock`      tensorboard/, wandb/, wandb.json   see `loggers`
+    processes.jsonl     see `goodput`
 """
 
 import dataclasses
@@ -79,8 +80,13 @@ class RunFolder:
         return self.path / "metrics.jsonl"
 
     @property
+    def processes(self) -> Path:
+        """One line per process: how many iterations it has begun."""
+        return self.path / "processes.jsonl"
+
+    @property
     def checkpoints(self) -> Path:
-        """The two tiers of checkpoints."""
+        """The tiers of checkpoints."""
         return self.path / "checkpoints"
 
     @property
@@ -143,7 +149,7 @@ class RunFolder:
             if overwrite:
                 for folder in (self.checkpoints, self.nonfinite, *(self.path / name for name in LOGGER_FOLDERS)):
                     shutil.rmtree(folder, ignore_errors=True)
-                for file in (self.metrics, self.curve, self.video, self.path / WANDB_STATE):
+                for file in (self.metrics, self.processes, self.curve, self.video, self.path / WANDB_STATE):
                     file.unlink(missing_ok=True)
             self.path.mkdir(parents=True, exist_ok=True)
             write_atomically(self.config, json.dumps(_record(config, log), indent=2) + "\n")

@@ -15,12 +15,13 @@ import numpy as np
 
 from jaxrl_vis import processes
 from jaxrl_vis.errors import NonFiniteError, StorageError
-from jaxrl_vis.run.checkpoint import FULL, LIGHT, Checkpoints
+from jaxrl_vis.run.checkpoint import FULL, LIGHT, RECENT, Checkpoints
 from jaxrl_vis.run.folder import RunFolder
 from jaxrl_vis.run.metrics import PerSeed
 from jaxrl_vis.run.nonfinite import dump
 from jaxrl_vis.run.programs import Programs
 from jaxrl_vis.run.progress import Progress
+from jaxrl_vis.run.recent import is_cheap
 from jaxrl_vis.types import LoopState
 
 
@@ -43,6 +44,7 @@ class Saver:
     def __init__(self, programs: Programs, folder: RunFolder, checkpoints: Checkpoints, say: Callable[[str], None]):
         self._programs, self._folder, self._checkpoints, self._say = programs, folder, checkpoints, say
         self._keeps_full = programs.config.full_checkpoint_interval > 0
+        self._keeps_recent = programs.layout.mesh is None and is_cheap(programs.shapes.replay)
 
     def has(self, tier: str, iteration: int) -> bool:
         """Whether there is a checkpoint of that tier and iteration; several processes agree on it."""
@@ -65,8 +67,26 @@ class Saver:
         self._refuse_nonfinite(loop, iteration)
         self._checkpoints.save_full(iteration, loop, dataclasses.asdict(progress))
 
+    def is_recent_due(self, light: bool) -> bool:
+        """Whether `recent` is to be called after this iteration: it is cheap, and was not called for long enough.
+
+        Args:
+            light: Whether a light checkpoint is written, which must not be the newest, for it would be gone on from.
+        """
+        return self._keeps_recent and self._checkpoints.recent.is_due(light)
+
+    def recent(self, loop: LoopState, iteration: int, progress: Progress) -> None:
+        """Keeps the state up to date for a process that is killed; see `jaxrl_vis.run.recent`.
+
+        Raises:
+            NonFiniteError: As `light`.
+        """
+        self._refuse_nonfinite(loop, iteration)
+        num_envs = self._programs.program.replay.num_envs
+        self._checkpoints.recent.save(iteration, loop, num_envs, dataclasses.asdict(progress))
+
     def finish(self) -> None:
-        """Returns when everything is on the disk, and deletes full checkpoints of a run that keeps none: it has ended.
+        """Returns when everything is on the disk, and deletes what only a run that has not ended goes on from.
 
         Raises:
             StorageError: Something could not be written.
@@ -74,6 +94,8 @@ class Saver:
         self._checkpoints.wait()
         if not self._keeps_full:
             self._checkpoints.retire_full(has_ended=True)
+        if processes.is_first():
+            self._checkpoints.recent.clear()
 
     def on_signal(self, loop: LoopState, iteration: int, progress: Progress, signal_name: str) -> None:
         """Saves the learner, then everything. A full disk in between leaves the light checkpoint, and says so.
@@ -90,8 +112,11 @@ class Saver:
             try:
                 self.full(loop, iteration, progress)
             except StorageError as error:
-                self._say(f"the networks are saved, the replay is not: {error}; {resume}")
+                is_kept = self.has(RECENT, iteration)
+                self._say(f"the networks are saved, {'' if is_kept else 'the replay is not'}: {error}; {resume}")
                 return
+        if processes.is_first():
+            self._checkpoints.recent.clear()
         self._say(f"saved; {resume}")
 
     def rescue(self, loop: LoopState | None, iteration: int, progress: Progress) -> None:
@@ -100,10 +125,14 @@ class Saver:
             return
         with contextlib.suppress(Exception):
             self._checkpoints.wait()
+        if iteration <= (self._checkpoints.newest() or 0):
+            return
         with contextlib.suppress(Exception):
-            if iteration > (self._checkpoints.newest() or 0):
-                self.light(loop, iteration, progress)
-                self._checkpoints.wait()
+            if self.is_recent_due(light=True):
+                self.recent(loop, iteration, progress)
+        with contextlib.suppress(Exception):
+            self.light(loop, iteration, progress)
+            self._checkpoints.wait()
 
     def storage_error(self, error: OSError | StorageError) -> StorageError:
         """What a run that could not write ends with: what failed, what there is, and how to go on."""
