@@ -91,7 +91,8 @@ class Recent:
         self._cost = time.monotonic() - self._saved_at
 
     def _write(self, iteration: int, loop: LoopState, num_envs: int, progress: dict[str, Any]) -> None:
-        self._folder.mkdir(parents=True, exist_ok=True)
+        for folder in (self._folder.parent, self._folder):  # but not the run's own, which may have been moved
+            folder.mkdir(exist_ok=True)
         replay = to_host({"replay": loop.replay}, copy=False)
         episodes = {name: array for name, array in replay.items() if name.startswith(_EPISODES)}
         arrays = to_host({"train": loop.train, "key": loop.key, "iteration": loop.iteration}, copy=False)

@@ -1,8 +1,8 @@
 """What a run saves, when it may, and in which order.
 
-A checkpoint holds finite numbers only, and metrics.jsonl is on the disk before a checkpoint of the same iteration is. On a
-signal the light checkpoint is written first, which takes seconds, and the full one, with the replay, after it: whoever runs out
-of patience, or of disk, in between keeps the networks.
+A checkpoint holds finite numbers only, and metrics.jsonl is on the disk before a checkpoint of the same iteration is (but for
+a recent state, whose evaluation may be due still). On a signal the light checkpoint is written first, which takes seconds, and
+the full one, with the replay, after it: whoever runs out of patience, or of disk, in between keeps the networks.
 """
 
 import contextlib
@@ -104,6 +104,8 @@ class Saver:
             NonFiniteError, StorageError: As `light`.
         """
         self._say(f"{signal_name}: saving iteration {iteration} (once more quits at once, without the replay) ...")
+        if self.is_recent_due(light=True):  # for whoever does not wait
+            self.recent(loop, iteration, progress)
         if not self.has(LIGHT, iteration) or progress.evaluation_due:
             self.light(loop, iteration, progress)
         self._checkpoints.wait()
@@ -112,8 +114,8 @@ class Saver:
             try:
                 self.full(loop, iteration, progress)
             except StorageError as error:
-                is_kept = self.has(RECENT, iteration)
-                self._say(f"the networks are saved, {'' if is_kept else 'the replay is not'}: {error}; {resume}")
+                what = "there is no full checkpoint" if self.has(RECENT, iteration) else "the replay is not"
+                self._say(f"the networks are saved, {what}: {error}; {resume}")
                 return
         if processes.is_first():
             self._checkpoints.recent.clear()
