@@ -111,6 +111,18 @@ def test_another_structure_is_refused(kept):
         Recent(kept, print).restore(7, make_fake_trainer(small_config(image_size=8), None).shapes)
 
 
+def test_another_runs_states_are_not_there(states, tmp_path):
+    theirs, ours = Recent(tmp_path / RECENT, print), Recent(tmp_path / RECENT, print)
+    theirs.run_id, ours.run_id = "theirs", "ours"
+    theirs.save(5, states[0][5], E, {})
+    assert theirs.iterations() == [5] and ours.iterations() == []
+    assert not theirs.set_foreign_aside(tmp_path / "foreign" / RECENT) and ours.set_foreign_aside(tmp_path / "foreign" / RECENT)
+    ours.save(1, states[0][1], E, {})
+    assert ours.iterations() == [1] and theirs.iterations() == []
+    kept = Recent(tmp_path / "foreign" / RECENT, print)
+    assert all(map(np.array_equal, as_plain(kept.restore(5, states[1])[0]), as_plain(states[0][5])))
+
+
 def test_no_room_is_said_once_and_ends_nothing(states, tmp_path, monkeypatch):
     lines: list[str] = []
     keeper = Recent(tmp_path / RECENT, lines.append)

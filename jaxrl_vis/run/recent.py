@@ -14,6 +14,7 @@ when it is complete. The newest two states are kept.
 
 import contextlib
 import json
+import shutil
 import time
 import zlib
 from collections.abc import Callable, Iterator
@@ -29,6 +30,7 @@ from jaxrl_vis.run.arrays import Arrays, check_structure, describe, host_specs, 
 from jaxrl_vis.types import LoopState, ReplayState
 
 SCHEMA = 1
+ANY_RUN, _RUN_ID = "*", "run_id"
 _KEPT = 2
 _MOST_BYTES = 2**30  # of a replay
 _SHARE = 0.02  # of the time, which saving may take
@@ -50,10 +52,15 @@ class Recent:
     Args:
         folder: Where they lie; made when something is saved.
         say: Called with one line, when there is no more room for them.
+
+    Attributes:
+        run_id: Of the run, None for one that has none: states of others are not there as far as this class goes, but for
+            `set_foreign_aside`. `ANY_RUN`: whatever there is.
     """
 
     def __init__(self, folder: Path, say: Callable[[str], None]):
         self._folder, self._say = folder, say
+        self.run_id: str | None = ANY_RUN
         self._rollouts: dict[int, int] = {}  # those that are known to be there, and their checksums
         self._cost, self._saved_at, self._is_off = 0.0, -np.inf, False
 
@@ -66,8 +73,24 @@ class Recent:
         return not self._is_off and (in_any_case or time.monotonic() - self._saved_at >= self._cost / _SHARE)
 
     def iterations(self) -> list[int]:
-        """Iterations of which there is a state, ascending; damaged ones included."""
-        return sorted(_numbers(self._folder, "state"))
+        """Iterations of which there is a state of this run, ascending; damaged ones included."""
+        return sorted(iteration for iteration in _numbers(self._folder, "state") if self._is_ours(iteration))
+
+    def _is_ours(self, iteration: int) -> bool:
+        """Whether the first line of a state says so; one that cannot be read is damaged, and may well be ours."""
+        try:
+            return self.run_id in (ANY_RUN, self._header(iteration).get(_RUN_ID))
+        except Unusable:
+            return True
+
+    def set_foreign_aside(self, to: Path) -> bool:
+        """Moves everything, if there is a state of another run; whether there was one."""
+        is_foreign = any(not self._is_ours(iteration) for iteration in _numbers(self._folder, "state"))
+        if is_foreign:
+            to.parent.mkdir(exist_ok=True)
+            shutil.rmtree(to, ignore_errors=True)
+            self._folder.rename(to)
+        return is_foreign
 
     def save(self, iteration: int, loop: LoopState, num_envs: int, progress: dict[str, Any]) -> None:
         """Writes a state, and what it needs that is not there; where there is no room, it is said, and nothing more is saved.
@@ -109,6 +132,7 @@ class Recent:
             rollouts[number] = self._rollouts[number]
         header = {
             **{"schema": SCHEMA, "iteration": iteration, "items": describe(arrays)},
+            **({} if self.run_id in (None, ANY_RUN) else {_RUN_ID: self.run_id}),
             "episodes": {name: [list(array.shape), str(array.dtype)] for name, array in episodes.items()},
             **{"rollouts": {str(number): checksum for number, checksum in rollouts.items()}, "progress": progress},
         }
