@@ -129,7 +129,8 @@ def _jumping_clock(folder: Path, dice: random.Random) -> int | None:
             time.sleep(dice.uniform(0.1, 0.5))
         status = part.stop()
         part.check_words()
-        walls = [json.loads(line)["time/wall_s"] for line in (folder / "metrics.jsonl").read_text().splitlines()]
+        file = folder / "metrics.jsonl"
+        walls = [json.loads(line)["time/wall_s"] for line in (file.read_text() if file.exists() else "").splitlines()]
         if walls != sorted(walls) or any(wall > 86400.0 for wall in walls):
             raise Broken(f"seconds follow the clock: {walls}")
         return status or None
@@ -283,7 +284,7 @@ FAULTS: dict[str, Fault] = {
     "SIGKILL in a save": Fault(
         _killed_in_a_save, f"goes on from what was saved before the half-written checkpoint, and {EXACT}", (-signal.SIGKILL,)
     ),
-    "full disk": Fault(_full_disk, "status 1 and one line; goes on when there is room again", (1,)),
+    "full disk": Fault(_full_disk, "status 1 (2 before it has begun) and one line; goes on when there is room again", (1, 2)),
     "stalled disk": Fault(_stalled_disk, f"waits for the disk, and {EXACT}", (143,)),
     "damaged checkpoint": Fault(
         _damaged, "one line; goes on from the one before, and keeps the damaged one for inspection", (143,)

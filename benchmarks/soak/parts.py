@@ -25,6 +25,10 @@ class Broken(AssertionError):
     """A promise was not kept."""
 
 
+LAST = threading.local()
+"""Of the process that this thread has seen the end of last: ``lines``, what it said."""
+
+
 def environment() -> dict[str, str]:
     """Variables for a run of the checkout, on the CPU; programs that were traced once are kept, as for any user."""
     root = Path(__file__).parents[2]
@@ -120,6 +124,7 @@ class Part:
             self.process.wait()
             raise Broken(f"did not end within {seconds:g} s: {self.lines[-3:]}") from None
         self.reader.join(5.0)
+        LAST.lines = self.lines
         return status
 
     def send(self, number: int) -> int:

@@ -12,7 +12,7 @@ from typing import Any
 
 from benchmarks.soak.alone import ALONE, References, strike_alone
 from benchmarks.soak.faults import FAULTS
-from benchmarks.soak.parts import Broken, Part, checkpoints_of, killed_afterwards, rows_of
+from benchmarks.soak.parts import LAST, Broken, Part, checkpoints_of, killed_afterwards, rows_of
 from benchmarks.soak.record import Record
 from jaxrl_vis.run.goodput import account, read_processes
 
@@ -28,10 +28,13 @@ class Soak:
         seed: Of what happens when.
         seconds: After so long no fault begins any more.
         note: Called with the record after each fault.
+        alone: Whether there are faults with folders of their own, too, which take longer.
     """
 
-    def __init__(self, folder: Path, faults: int, seed: int, seconds: float, note: Callable[[Record], None]):
-        self._folder, self._seed, self._note, self._left = folder, seed, note, faults
+    def __init__(
+        self, folder: Path, faults: int, seed: int, seconds: float, note: Callable[[Record], None], alone: bool = True
+    ):
+        self._folder, self._seed, self._note, self._left, self._alone = folder, seed, note, faults, alone
         self._started = time.monotonic()
         self._deadline = self._started + seconds
         self._decks: dict[str, list[str]] = {}
@@ -87,7 +90,7 @@ class Soak:
             faults: list[str] = []
             try:
                 # Workers begin with different things, for all kinds are to be met in a short soak, too.
-                if (turn + worker) % 2:
+                if self._alone and (turn + worker) % 2:
                     going = self._one_alone(place, dice, faults)
                 else:
                     going = self._one_run(place, dice, faults)
@@ -122,7 +125,7 @@ class Soak:
                 self._again(FAULTS, faults.pop())
                 break
             if status not in FAULTS[fault].statuses:
-                raise Broken(f"status {status}")
+                raise Broken(f"status {status}: {LAST.lines[-4:]}")
             spoilt |= FAULTS[fault].spoils
             if folder.exists() and not FAULTS[fault].spoils:
                 self._check_kept(folder, before, good[-1][0] if good else 0)
