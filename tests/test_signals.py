@@ -1,6 +1,7 @@
 """SIGTERM, Ctrl-C and other violence against a run."""
 
 import contextlib
+import errno
 import faulthandler
 import queue
 import signal
@@ -15,8 +16,9 @@ from fake_program import make_fake_trainer, rows_without_time, small_config
 from jaxrl_vis import cli
 from jaxrl_vis.errors import NonFiniteError, StorageError, Terminated
 from jaxrl_vis.run import signals
-from jaxrl_vis.run.checkpoint import FULL, LIGHT, Checkpoints
+from jaxrl_vis.run.checkpoint import FULL, LIGHT, RECENT, Checkpoints
 from jaxrl_vis.run.folder import read_config
+from jaxrl_vis.run.recent import Recent
 
 FAKE = Path(__file__).with_name("fake_program.py")
 
@@ -147,7 +149,7 @@ first.kill(), second.kill()
     assert done.returncode == 0, done.stderr.decode()
 
 
-def test_a_second_signal_during_the_full_save_leaves_the_light_one(tmp_path, monkeypatch):
+def test_a_second_signal_during_the_full_save_leaves_the_light_one_and_the_replay(tmp_path, monkeypatch):
     path = tmp_path / "run"
     trainer = make_fake_trainer(small_config(full_checkpoint_interval=0), path)
     save_full = Checkpoints.save_full
@@ -163,7 +165,7 @@ def test_a_second_signal_during_the_full_save_leaves_the_light_one(tmp_path, mon
                 signal.raise_signal(signal.SIGTERM)
     checkpoints = Checkpoints(path / "checkpoints", read_only=True)
     assert checkpoints.iterations(FULL) == [] and checkpoints.iterations(LIGHT)[-1] >= 3
-    assert checkpoints.restore_for_resume(trainer.shapes).tier == LIGHT
+    assert checkpoints.restore_for_resume(trainer.shapes).tier == RECENT
 
 
 def test_no_room_for_the_replay_leaves_the_networks(tmp_path, monkeypatch, capsys):
@@ -173,7 +175,11 @@ def test_no_room_for_the_replay_leaves_the_networks(tmp_path, monkeypatch, capsy
     def no_room(*_):
         raise StorageError("cannot write a full checkpoint (no space left on the device)")
 
+    def no_room_either(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
     monkeypatch.setattr(Checkpoints, "save_full", no_room)
+    monkeypatch.setattr(Recent, "_write", no_room_either)
     with pytest.raises(Terminated):
         for report in trainer.run():
             if report.iteration == 3:

@@ -2,15 +2,16 @@
 
     checkpoints/light/<iteration>/   train         networks, targets, optimisers, statistics: enough for eval and play
     checkpoints/full/<iteration>/    train, rest   and the replay, keys and iteration: a resumed run repeats itself exactly
+    checkpoints/recent/                            the same for a process that is killed, where it costs little, see `recent`
 
 Each also holds a manifest: names, shapes and types of all arrays, their checksums, and what the host has to remember. orbax
 makes a folder appear under its final name only when it is complete; the checksums find what went wrong later: without them, a
 flipped byte in a data file would be restored without a word. Where the background has finished, SHA256SUMS (`sums`) follows,
 for `verification`: of what nobody restores, too. The newest two of each tier are kept.
 
-A run goes on from the newest good checkpoint of either tier, and from the full one of two that are equally new. Nothing newer
-than that is ever deleted: a checkpoint that turns out to be damaged is moved to checkpoints/damaged/, and one of another run,
-which its manifest tells by the run's id, to checkpoints/foreign/.
+A run goes on from the newest good one of all these, and of those that are equally new from the full, the recent or the light
+one, in this order. Nothing newer than that is ever deleted: a checkpoint that turns out to be damaged is moved to
+checkpoints/damaged/, and one of another run, which its manifest tells by the run's id, to checkpoints/foreign/.
 """
 
 import contextlib
@@ -31,17 +32,18 @@ from jaxrl_vis.run import sums
 from jaxrl_vis.run.arrays import as_saved, check_structure, describe, host_specs, is_intact, rebuild, to_host, to_save
 from jaxrl_vis.run.metrics import RUN_ID
 from jaxrl_vis.run.progress import Progress
+from jaxrl_vis.run.recent import ANY_RUN, Recent, Unusable
 from jaxrl_vis.types import LoopState, TrainState
 
 if TYPE_CHECKING:  # orbax takes a fifth of the time that this package does to import: whatever uses it imports it
     import orbax.checkpoint as ocp
 
-LIGHT, FULL = "light", "full"
+LIGHT, FULL, RECENT = "light", "full", "recent"
+_PRECEDENCE = (FULL, RECENT, LIGHT)  # for a run that goes on, of those that are equally new
 SCHEMA = 2
 _READABLE = (1, 2)  # schema 1 called the progress "memo"
 _KEPT = 2
 _MANIFEST = "manifest/metadata"  # in a checkpoint's folder, where orbax writes it
-ANY_RUN = "*"
 DAMAGED, FOREIGN = "damaged", "foreign"
 
 
@@ -74,7 +76,7 @@ class Restored:
     """What a checkpoint held.
 
     Attributes:
-        tier: `LIGHT` or `FULL`.
+        tier: `LIGHT`, `FULL` or `RECENT`.
         iteration: Iterations that the run had done.
         train: The learner, [S, ...].
         loop: Everything; None from the light tier.
@@ -152,14 +154,24 @@ class Checkpoints:
         read_only: bool = False,
         run_id: str | None = ANY_RUN,
     ):
-        self.run_id = run_id
         self._folder = folder.absolute()  # orbax refuses relative names
         self._say = say
         self._read_only = read_only
+        self.recent = Recent(self._folder / RECENT, say)
+        self.run_id = run_id
         self._managers: dict[str, ocp.CheckpointManager] = {}
         self._reported: set[tuple[str, int]] = set()  # damaged ones
         self._unsummed: set[tuple[str, int]] = set()  # saved, perhaps in the background still, and without `sums`
         self._unsilence: Callable[[], None] | None = None
+
+    @property
+    def run_id(self) -> str | None:
+        """See the class."""
+        return self.recent.run_id
+
+    @run_id.setter
+    def run_id(self, run_id: str | None) -> None:
+        self.recent.run_id = run_id
 
     def _manager(self, tier: str) -> "ocp.CheckpointManager":
         import orbax.checkpoint as ocp
@@ -179,6 +191,8 @@ class Checkpoints:
 
     def iterations(self, tier: str) -> list[int]:
         """Iterations of which ``tier`` has a checkpoint of this run, ascending; damaged ones included."""
+        if tier == RECENT:
+            return self.recent.iterations()
         return [iteration for iteration, is_ours in self._there(tier) if is_ours]
 
     def _there(self, tier: str) -> list[tuple[int, bool]]:
@@ -198,8 +212,8 @@ class Checkpoints:
         return self.run_id in (ANY_RUN, manifest.get(RUN_ID))
 
     def newest(self) -> int | None:
-        """The newest iteration of either tier; None where there is no checkpoint."""
-        return max([*self.iterations(LIGHT), *self.iterations(FULL)], default=None)
+        """The newest iteration that a run could go on from; None where there is none."""
+        return max((iteration for tier in _PRECEDENCE for iteration in self.iterations(tier)), default=None)
 
     def save_light(self, iteration: int, train: TrainState, progress: dict[str, Any]) -> None:
         """Copies the learner to the host and writes it in the background; ``train`` may be donated as soon as this returns.
@@ -299,7 +313,7 @@ class Checkpoints:
         Returns:
             Where they are now.
         """
-        tiers = {tier: self.iterations(tier) for tier in (LIGHT, FULL)}
+        tiers = {tier: self.iterations(tier) for tier in (LIGHT, FULL, RECENT)}
         later = {tier: [found for found in iterations if found > iteration] for tier, iterations in tiers.items()}
         return self._move(later, DAMAGED)
 
@@ -310,7 +324,11 @@ class Checkpoints:
             Where they are now.
         """
         foreign = {tier: [found for found, is_ours in self._there(tier) if not is_ours] for tier in (LIGHT, FULL)}
-        return self._move(foreign, FOREIGN)
+        moved = self._move(foreign, FOREIGN)
+        recent = self._folder / FOREIGN / RECENT
+        if processes.is_first() and self.recent.set_foreign_aside(recent):
+            moved.append(recent)
+        return moved
 
     def _move(self, iterations: dict[str, list[int]], folder: str) -> list[Path]:
         moved = []
@@ -319,6 +337,9 @@ class Checkpoints:
             moved.append(self._folder / folder / f"{tier}-{iteration}")
             if processes.is_first():
                 moved[-1].parent.mkdir(exist_ok=True)
+                if tier == RECENT:
+                    self.recent.set_aside(iteration, moved[-1])
+                    continue
                 shutil.rmtree(moved[-1], ignore_errors=True)
                 (self._folder / tier / str(iteration)).rename(moved[-1])
         return moved
@@ -329,7 +350,7 @@ class Checkpoints:
             self._managers.pop(tier).close()
 
     def restore_for_resume(self, template: LoopState) -> Restored | None:
-        """The newest good checkpoint of either tier, full before light where both are equally new; None where there is none.
+        """The newest good checkpoint of any tier, full before recent before light; None where there is none.
 
         Args:
             template: Shapes and types of the loop state, as `jax.eval_shape` makes them.
@@ -370,19 +391,26 @@ class Checkpoints:
             raise RequestError(f"checkpoint {tier}/{iteration} is damaged ({damage})") from None
 
     def _newest_good(self, template: LoopState, with_rest: bool, only: int | None = None) -> Restored | None:
-        found = [
-            (iteration, tier) for tier in (FULL, LIGHT) for iteration in self.iterations(tier) if only in (None, iteration)
-        ]
-        # Of two tiers the light one is read where the learner alone is wanted, for it is smaller.
-        first = FULL if with_rest else LIGHT
-        for iteration, tier in sorted(found, key=lambda item: (item[0], item[1] == first), reverse=True):
+        # The light one is smaller; and a recent one may vanish while somebody reads it to play with what it has learned.
+        tiers = _PRECEDENCE if with_rest else (LIGHT, FULL)
+        found = [(iteration, tier) for tier in tiers for iteration in self.iterations(tier) if only in (None, iteration)]
+        for iteration, tier in sorted(found, key=lambda item: (-item[0], tiers.index(item[1]))):
             try:
+                if tier == RECENT:
+                    return self._restore_recent(iteration, template)
                 return self._restore(tier, iteration, template, with_rest and tier == FULL)
             except _Damaged as damage:
                 if (tier, iteration) not in self._reported:
                     self._say(f"checkpoint {tier}/{iteration} is damaged ({damage}); trying the one before")
                 self._reported.add((tier, iteration))
         return None
+
+    def _restore_recent(self, iteration: int, template: LoopState) -> Restored:
+        try:
+            loop, progress = self.recent.restore(iteration, template)
+        except Unusable as error:
+            raise _Damaged(str(error)) from None
+        return Restored(RECENT, iteration, loop.train, loop, progress)
 
     def _manifest(self, tier: str, iteration: int) -> dict[str, Any]:
         import orbax.checkpoint as ocp

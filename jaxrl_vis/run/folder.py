@@ -5,6 +5,7 @@ The files:
     config.json     schema, id, versions, device, git revision, configuration  metrics.jsonl   see `metrics`
     checkpoints/    see `checkpoint`      nonfinite/   what a run that went wrong held      curve.png   video.gif
     run.lock        while a process writes here, see `lock`      tensorboard/, wandb/, wandb.json   see `loggers`
+    processes.jsonl     see `goodput`
 
 A run has an id, which is drawn when it starts and stays when it is resumed. Every row of metrics and every checkpoint carries
 it, and nothing that carries another one is resumed, counted or deleted. Runs of earlier versions have none, and keep none.
@@ -88,8 +89,13 @@ class RunFolder:
         return self.path / "metrics.jsonl"
 
     @property
+    def processes(self) -> Path:
+        """One line per process: how many iterations it has begun."""
+        return self.path / "processes.jsonl"
+
+    @property
     def checkpoints(self) -> Path:
-        """The two tiers of checkpoints."""
+        """The tiers of checkpoints."""
         return self.path / "checkpoints"
 
     @property
@@ -208,7 +214,7 @@ class RunFolder:
         if not (self.checkpoints.is_symlink() and self.checkpoints.is_dir()):  # such a link stays: that disk was chosen
             own.append(self.checkpoints)
         folders = [self.nonfinite, *(self.path / name for name in LOGGER_FOLDERS)]
-        for path in (*own, *folders, self.metrics, self.curve, self.video, self.path / WANDB_STATE):
+        for path in (*own, *folders, self.metrics, self.processes, self.curve, self.video, self.path / WANDB_STATE):
             try:
                 if path.is_dir() and not path.is_symlink():
                     shutil.rmtree(path)

@@ -14,6 +14,7 @@ signals at boundaries only, where they wait for each other anyway.
 
 import contextlib
 import dataclasses
+import math
 import sys
 import time
 from collections.abc import Iterator
@@ -27,9 +28,10 @@ import numpy as np
 from jaxrl_vis import processes
 from jaxrl_vis.errors import NonFiniteError, StorageError
 from jaxrl_vis.run import earlier, metrics, trust
-from jaxrl_vis.run.checkpoint import FULL, LIGHT, Checkpoints, Restored
+from jaxrl_vis.run.checkpoint import FULL, LIGHT, RECENT, Checkpoints, Restored
 from jaxrl_vis.run.console import RunConsole, show_seconds, show_shares
 from jaxrl_vis.run.folder import RunFolder, read_record, read_run_id
+from jaxrl_vis.run.goodput import Goodput
 from jaxrl_vis.run.lock import FolderGoneError, Held
 from jaxrl_vis.run.loggers import Loggers
 from jaxrl_vis.run.memory import check_compiled, check_memory, fit_together
@@ -87,7 +89,10 @@ class RunLoop:
         self._results = Results(programs, folder, self._loggers, self._say)
         self._total: int = self._program.num_iterations
         self._progress = Progress()
+        self._goodput = Goodput(folder.processes)
         self._done = 0
+        self._recent_at: int | None = None  # what this process has gone on from, if it was a recent state
+        self._replay_lost = False  # by this process, which has gone on from a light checkpoint
         self._loop: LoopState | None = None
         self._recorded: dict[str, jax.Array] = {}
         self._started = self._mark = time.monotonic()
@@ -151,6 +156,7 @@ class RunLoop:
                     with contextlib.suppress(StorageError):
                         self._checkpoints.close()
                     self._loggers.close(in_a_hurry=bool(interruption))
+                self._goodput.close()
 
     def _check_ours(self) -> None:
         """Raises a `FolderGoneError` where the run folder was moved, deleted or taken over; asked before each writing."""
@@ -177,7 +183,7 @@ class RunLoop:
 
     def _is_finished(self) -> bool:
         """Whether an earlier part has trained to the end: a good checkpoint, a row for it, and what it draws."""
-        if (self._checkpoints.newest() or 0) < self._total:
+        if max([0, *self._checkpoints.iterations(LIGHT), *self._checkpoints.iterations(FULL)]) < self._total:
             return False
         restored = self._checkpoints.restore_train(self._programs.shapes)
         if restored is None or restored.iteration < self._total:
@@ -223,6 +229,8 @@ class RunLoop:
         damaged = self._checkpoints.set_aside_after(self._done) if goes_on else []
         if self._writes:
             with self._saver.writing():
+                self._checkpoints.recent.go_on_from(self._recent_at)
+                self._goodput.begin(self._done, self._replay_lost)
                 self._begin_log(goes_on, damaged, foreign)
         processes.meet("begun")
         if self._loop is None:
@@ -259,6 +267,7 @@ class RunLoop:
         self._owed_evaluation = self._progress.evaluation_due
         if restored.loop is not None:
             self._loop = restored.loop
+            self._recent_at = restored.iteration if restored.tier == RECENT else None
             self._say(f"resumed at iteration {self._done} of {self._total}, exactly")
             return
         # A light checkpoint has no replay. Networks, optimisers, statistics and the iteration go on (and with it the random
@@ -268,10 +277,10 @@ class RunLoop:
         iteration = self._programs.layout.put(jnp.asarray(self._done, fresh.iteration.dtype), self._programs.layout.everywhere)
         self._loop = fresh.replace(train=restored.train, iteration=iteration)
         if self._done < self._total:
-            self._progress.replay_lost_at = self._done
+            self._progress.replay_lost_at, self._replay_lost = self._done, True
         self._say(
-            f"resumed at iteration {self._done} of {self._total} from a light checkpoint: networks go on, but the replay was "
-            "not saved and fills up anew, so this is not an exact continuation (--full-checkpoint-interval saves the replay)"
+            f"resumed at iteration {self._done} of {self._total} from a light checkpoint: replay lost; networks go on, but the "
+            "replay fills up anew, so this is not an exact continuation (--full-checkpoint-interval saves the replay)"
         )
 
     # -- During
@@ -285,20 +294,27 @@ class RunLoop:
             assert self._loop is not None
             self._loop, values = self._programs.train_iteration(self._loop)
             self._done += 1
+            self._goodput.count()
             before, waiting = waiting, (self._done, self._programs.pending(values))
             if before is not None:
                 yield self._read(*before)
             evaluation = self._is_due(config.eval_interval) or self._done == self._total
             light, full = self._is_due(config.checkpoint_interval), self._is_due(config.full_checkpoint_interval)
-            if not (evaluation or light or full or (interruption and not processes.are_several())):
+            recent = self._saver.is_recent_due(light)
+            if not (evaluation or light or full or recent or (interruption and not processes.are_several())):
                 continue
             # Before the metrics are read, so that the device does not wait for the host meanwhile.
             outcome = self._begin_evaluation() if evaluation and self._evaluates_ahead else None
             report, waiting = self._read(*waiting), None
             if interruption.reached_any():
                 self._save_and_end(evaluation, interruption)
+            if recent:  # and once more after an evaluation, which takes so long that a process may be killed meanwhile
+                self._progress.evaluation_due = evaluation
+                self._saver.recent(self._loop, self._done, self._progress_now())
             if evaluation:
                 report = self._evaluate(report, self._begin_evaluation() if outcome is None else outcome)
+            if recent and evaluation:
+                self._saver.recent(self._loop, self._done, self._progress_now())
             if light:
                 self._saver.light(self._loop, self._done, self._progress_now())
             if full:
@@ -348,6 +364,7 @@ class RunLoop:
             "time/wall_s": progress.wall_s + time.monotonic() - self._started,
             "time/compile_s": progress.compile_s,
             "time/env_steps_per_s": speed,
+            "time/goodput": self._goodput.account(self._done).goodput or math.nan,
         }
         rounded = {name: [round(value, 3)] * self._config.seeds for name, value in times.items()}
         counts = {"iteration": self._done, "updates": report.updates, "env_steps": report.env_steps}
@@ -440,5 +457,6 @@ class RunLoop:
             # Killed after the last evaluation, before this: resumed with nothing left to evaluate.
             _, self._recorded = self._programs.evaluate(self._loop.train)
         if self._writes:
+            self._say(self._goodput.account(self._done).describe(self._program.updates_per_iteration))
             with self._saver.writing():
                 self._results.show(self._done, self._progress_now, self._recorded)

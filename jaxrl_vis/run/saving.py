@@ -1,8 +1,8 @@
 """What a run saves, when it may, and in which order.
 
-A checkpoint holds finite numbers only, and metrics.jsonl is on the disk before a checkpoint of the same iteration is. On a
-signal the light checkpoint is written first, which takes seconds, and the full one, with the replay, after it: whoever runs out
-of patience, or of disk, in between keeps the networks.
+A checkpoint holds finite numbers only, and metrics.jsonl is on the disk before a checkpoint of the same iteration is (but for
+a recent state, whose evaluation may be due still). On a signal the light checkpoint is written first, which takes seconds, and
+the full one, with the replay, after it: whoever runs out of patience, or of disk, in between keeps the networks.
 """
 
 import contextlib
@@ -17,12 +17,13 @@ import numpy as np
 
 from jaxrl_vis import processes
 from jaxrl_vis.errors import NonFiniteError, StorageError
-from jaxrl_vis.run.checkpoint import FULL, LIGHT, Checkpoints
+from jaxrl_vis.run.checkpoint import FULL, LIGHT, RECENT, Checkpoints
 from jaxrl_vis.run.folder import RunFolder
 from jaxrl_vis.run.metrics import PerSeed
 from jaxrl_vis.run.nonfinite import dump, made_by_simulation
 from jaxrl_vis.run.programs import Programs
 from jaxrl_vis.run.progress import Progress
+from jaxrl_vis.run.recent import is_cheap
 from jaxrl_vis.run.signals import Interruption
 from jaxrl_vis.types import LoopState
 
@@ -55,6 +56,7 @@ class Saver:
         self._programs, self._folder, self._checkpoints, self._say = programs, folder, checkpoints, say
         self._check = check
         self._keeps_full = programs.config.full_checkpoint_interval > 0
+        self._keeps_recent = programs.layout.mesh is None and is_cheap(programs.shapes.replay)
 
     def has(self, tier: str, iteration: int) -> bool:
         """Whether there is a checkpoint of that tier and iteration; several processes agree on it."""
@@ -79,8 +81,26 @@ class Saver:
         self._refuse_nonfinite(loop, iteration)
         self._checkpoints.save_full(iteration, loop, dataclasses.asdict(progress))
 
+    def is_recent_due(self, light: bool) -> bool:
+        """Whether `recent` is to be called after this iteration: it is cheap, and was not called for long enough.
+
+        Args:
+            light: Whether a light checkpoint is written, which must not be the newest, for it would be gone on from.
+        """
+        return self._keeps_recent and self._checkpoints.recent.is_due(light)
+
+    def recent(self, loop: LoopState, iteration: int, progress: Progress) -> None:
+        """Keeps the state up to date for a process that is killed; see `jaxrl_vis.run.recent`.
+
+        Raises:
+            NonFiniteError: As `light`.
+        """
+        self._refuse_nonfinite(loop, iteration)
+        num_envs = self._programs.program.replay.num_envs
+        self._checkpoints.recent.save(iteration, loop, num_envs, dataclasses.asdict(progress))
+
     def finish(self) -> None:
-        """Returns when everything is on the disk, and deletes full checkpoints of a run that keeps none: it has ended.
+        """Returns when everything is on the disk, and deletes what only a run that has not ended goes on from.
 
         Raises:
             StorageError: Something could not be written.
@@ -89,6 +109,8 @@ class Saver:
         self._check()
         if not self._keeps_full:
             self._checkpoints.retire_full(has_ended=True)
+        if processes.is_first():
+            self._checkpoints.recent.clear()
 
     def on_signal(self, loop: LoopState, iteration: int, progress: Progress, interruption: Interruption) -> None:
         """Saves the learner, then everything. A full disk in between leaves the light checkpoint, and says so.
@@ -98,6 +120,8 @@ class Saver:
         """
         hint = f"{interruption.hurry} at once, without the replay"
         self._say(f"{interruption.name}: saving iteration {iteration} ({hint}) ...")
+        if self.is_recent_due(light=True):  # for whoever does not wait
+            self.recent(loop, iteration, progress)
         if not self.has(LIGHT, iteration) or progress.evaluation_due:
             self.light(loop, iteration, progress)
         self._checkpoints.wait()
@@ -105,8 +129,11 @@ class Saver:
             try:
                 self.full(loop, iteration, progress)
             except StorageError as error:
-                self._say(f"the networks are saved, the replay is not: {error}; {self.resume}")
+                what = "there is no full checkpoint" if self.has(RECENT, iteration) else "the replay is not"
+                self._say(f"the networks are saved, {what}: {error}; {self.resume}")
                 return
+        if processes.is_first():
+            self._checkpoints.recent.clear()
         self._say(f"saved; {self.resume}")
 
     def rescue(self, loop: LoopState | None, iteration: int, progress: Progress) -> None:
@@ -115,10 +142,14 @@ class Saver:
             return
         with contextlib.suppress(Exception):
             self._checkpoints.wait()
+        if iteration <= (self._checkpoints.newest() or 0):
+            return
         with contextlib.suppress(Exception):
-            if iteration > (self._checkpoints.newest() or 0):
-                self.light(loop, iteration, progress)
-                self._checkpoints.wait()
+            if self.is_recent_due(light=True):
+                self.recent(loop, iteration, progress)
+        with contextlib.suppress(Exception):
+            self.light(loop, iteration, progress)
+            self._checkpoints.wait()
 
     @property
     def resume(self) -> str:

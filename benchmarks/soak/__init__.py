@@ -1,0 +1,1 @@
+"""Random faults over small real runs; see `__main__`."""

@@ -1,0 +1,309 @@
+"""Faults with a run, a study or plots of their own: a number that is not finite, and workers of pools that are killed.
+
+Each is a function of an empty folder, dice and what undisturbed commands have left; it raises `Broken`.
+"""
+
+import dataclasses
+import json
+import os
+import random
+import re
+import shutil
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.soak.parts import Broken, Part, checkpoints_of, killed_afterwards, rows_of
+
+TASK = """
+import dataclasses
+import os
+
+import jax
+import jax.numpy as jnp
+from jaxrl_vis_envs.registry import register
+from jaxrl_vis_envs.tasks.reacher import Reacher, ReacherConfig
+
+PROBABILITY = float(os.environ.get("SOAK_NAN", "0"))  # of a broken sensor, in each episode
+
+
+@dataclasses.dataclass(frozen=True)
+class BrokenConfig(ReacherConfig):
+    pass
+
+
+class BrokenReach(Reacher):
+    def __init__(self, config: BrokenConfig):
+        super().__init__(config)
+
+    def sample_start(self, key):
+        start = super().sample_start(key)
+        broken = jax.random.uniform(jax.random.fold_in(key, 7)) < PROBABILITY
+        return start.replace(qpos=jnp.where(broken, jnp.nan, start.qpos))
+
+
+register("BrokenReach", BrokenReach, BrokenConfig)
+"""
+FEW_STALKS = {
+    "layout": {"rows_behind": 0, "stalks_mean": 5, "stalks_sd": 0, "tillers": 0, "plot_length": 0.5, "spacing_minimum": 0.06},
+    "leaves": {"density": 0.2, "litter": 0},
+    "stalks": {"diameter_mean": 0.03},
+}
+FEW_TO_GRASP = {
+    "layout": {"rows_behind": 0, "stalks_mean": 7, "stalks_sd": 0, "tillers": 0, "spacing_minimum": 0.08, "plot_length": 1.0},
+    "leaves": {"density": 0.4, "litter": 10},
+    "stalks": {"diameter_mean": 0.024, "diameter_sd": 0.002, "lean_sd": [1, 1]},
+    "imaging": {"samples": 1},
+}
+_CLI = (sys.executable, "-m", "jaxrl_vis")
+
+
+def _command(words: Sequence[str], folder: Path, **variables: str) -> Part:
+    return Part.command([*_CLI, *words], folder, variables)
+
+
+def _finished(part: Part, *statuses: int) -> Part:
+    with killed_afterwards(part):
+        status = part.end()
+    part.check_words()
+    if status not in statuses:
+        raise Broken(f"ended with {status}, not {statuses}: {part.lines[-6:]}")
+    return part
+
+
+def nan_on_one_seed(folder: Path, dice: random.Random, _: "References") -> None:
+    folder.mkdir()
+    (folder / "broken_task.py").write_text(TASK)
+    run, steps = folder / "run", 4 * 50
+    options = ["broken_task:BrokenReach", "--env-folder", str(folder), "--preset", "debug", "--seeds", "2"]
+    options += ["--env-steps", str(400 * steps), "--seed", str(dice.randrange(10**6)), "--checkpoint-interval", "3"]
+    part = Part.start(run, {"SOAK_NAN": str(1.0 / dice.uniform(100, 800))}, options)
+    _finished(part, 4)
+    (line,) = [line for line in part.lines if "non-finite" in line]
+    seeds = re.search(r"seeds? ([\d, ]+)", line)
+    if seeds is None or "," in seeds.group(1):
+        raise Broken(f"not one seed is named: {line}")
+    if not list((run / "nonfinite").glob("*.npz")):
+        raise Broken(f"nothing was dumped: {line}")
+    saved = checkpoints_of(run)
+    if not saved:
+        return  # in the very first iterations: there is nothing to go on from, and the line says so
+    rows = rows_of(run)
+    again = _finished(Part.start(run, None, ["--env-steps", str((saved[-1][0] + 6) * steps)]), 0)
+    if not again.count("resumed at iteration"):
+        raise Broken(f"it did not go on from the last good checkpoint: {again.lines}")
+    if [row for row in rows_of(run) if row in rows] != rows:
+        raise Broken("rows were lost")
+
+
+def _children(process: int) -> list[int]:
+    """All processes below one."""
+    found = []
+    for task in Path(f"/proc/{process}/task").glob("*/children"):
+        try:
+            own = [int(word) for word in task.read_text().split()]
+        except OSError:
+            continue
+        found += own + [other for child in own for other in _children(child)]
+    return found
+
+
+def _is(process: int, words: str) -> bool:
+    try:
+        return words.encode() in Path(f"/proc/{process}/cmdline").read_bytes().replace(b"\0", b" ")
+    except OSError:
+        return False
+
+
+def _kill_a_worker(part: Part, words: str, dice: random.Random, delay: float, is_ready: Callable[[], bool]) -> bool:
+    """Kills a process below a part that was started with these words, a while after there are any; whether there was one."""
+
+    def workers() -> list[int]:
+        return [process for process in _children(part.process.pid) if _is(process, words)]
+
+    part.wait_for(lambda: bool(workers()) and is_ready())
+    time.sleep(dice.uniform(0.0, delay))
+    found = workers()
+    if not found or not part.runs():
+        return False
+    try:
+        os.kill(dice.choice(found), signal.SIGKILL)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def _of_one_line(part: Part, words: str) -> None:
+    if sum(words in line for line in part.lines) != 1:
+        raise Broken(f"not one line says {words!r}: {part.lines[-8:]}")
+
+
+def worker_of_a_study(folder: Path, dice: random.Random, references: "References", executor: Sequence[str] = ()) -> None:
+    """Two cells; one is killed, the other goes on, and the next start finishes both: with the rows of undisturbed ones."""
+    words = _sweep(folder, executor)
+    part = _command(words, folder)
+    with killed_afterwards(part):
+        cells = folder / "runs"
+        struck = _kill_a_worker(part, "jaxrl_vis train", dice, 1.0, lambda: bool(list(cells.glob("*/checkpoints"))))
+        part.end()
+    part.check_words()
+    if struck:
+        if part.process.returncode == 0:
+            raise NotStruck
+        if part.process.returncode not in (1, 3):
+            raise Broken(f"ended with {part.process.returncode}: {part.lines[-5:]}")
+        _of_one_line(part, "failed with exit status")
+    _finished(_command(words, folder), 0)
+    if _rows_of_cells(folder) != references.study():
+        raise Broken(f"rows differ from those of an undisturbed study: {part.lines}")
+    if not struck:
+        raise NotStruck
+
+
+def _sweep(folder: Path, executor: Sequence[str] = ()) -> list[str]:
+    words = ["sweep", "Reacher", "--preset", "debug", "--seeds", "2", "--seeds-per-run", "1", "--env-steps", "24000"]
+    return [*words, "--updates-per-iteration", "20", "--eval-interval", "20", "--runs", str(folder / "runs"), *executor]
+
+
+def _rows_of_cells(folder: Path) -> dict[str, list]:
+    return {path.parent.name: rows_of(path.parent) for path in sorted((folder / "runs").glob("*/metrics.jsonl"))}
+
+
+def job_of_a_study(folder: Path, dice: random.Random, references: "References") -> None:
+    worker_of_a_study(folder, dice, references, ("--executor", "local"))
+
+
+def _phenotype(folder: Path, plots: Path) -> list[str]:
+    return ["phenotype", "run", str(plots), "--out", str(folder / "out"), "--masks", "truth", "--workers", "2"]
+
+
+def _tables(out: Path) -> dict[str, bytes]:
+    return {file.name: file.read_bytes() for file in sorted(out.glob("*.csv"))}
+
+
+def worker_of_phenotyping(folder: Path, dice: random.Random, references: "References") -> None:
+    plots, tables = references.phenotyping()
+    words = _phenotype(folder, plots)
+    _pool(words, folder, dice)
+    if _tables(folder / "out") != tables:
+        raise Broken("tables differ from those of an undisturbed run")
+
+
+def _grasp(folder: Path, spec: Path) -> list[str]:
+    words = ["grasp", "eval", "--masks", "truth", "--width", "256", "--frames", "3", "--runs", "3", "--spec", str(spec)]
+    return [*words, "--workers", "2", "--json", str(folder / "eval.json")]
+
+
+def worker_of_grasping(folder: Path, dice: random.Random, references: "References") -> None:
+    spec, figures = references.grasping()
+    words = _grasp(folder, spec)
+    _pool(words, folder, dice)
+    if json.loads((folder / "eval.json").read_text())["each"] != figures:
+        raise Broken("figures differ from those of an undisturbed evaluation")
+
+
+class NotStruck(Exception):
+    """It was over before the fault came."""
+
+
+def _pool(words: Sequence[str], folder: Path, dice: random.Random) -> None:
+    """Kills a worker of a pool; then the same command finishes."""
+    folder.mkdir(exist_ok=True)
+    part = _command(words, folder)
+    with killed_afterwards(part):
+        struck = _kill_a_worker(part, "spawn_main", dice, 4.0, lambda: True)
+        part.end()
+    part.check_words()
+    if struck and part.process.returncode == 0:
+        raise NotStruck  # the worker had done all it had to
+    if struck:
+        if part.process.returncode not in (1, 2):
+            raise Broken(f"ended with {part.process.returncode}: {part.lines[-5:]}")
+        _of_one_line(part, "processes was ended from outside")
+    _finished(_command(words, folder), 0)
+    if not struck:
+        raise NotStruck
+
+
+class References:
+    """What undisturbed commands leave, made when it is first asked for.
+
+    Args:
+        folder: Where it lies.
+    """
+
+    def __init__(self, folder: Path):
+        self._folder, self._lock = folder, threading.Lock()
+        self._made: dict[str, Any] = {}
+
+    def _once(self, name: str, make: Callable[[Path], Any]) -> Any:
+        with self._lock:
+            if name not in self._made:
+                (self._folder / name).mkdir(parents=True)
+                self._made[name] = make(self._folder / name)
+            return self._made[name]
+
+    def study(self) -> dict[str, list]:
+        """Rows by the names of cells."""
+
+        def make(folder: Path) -> dict[str, list]:
+            _finished(_command(_sweep(folder), folder), 0)
+            return _rows_of_cells(folder)
+
+        return self._once("study", make)
+
+    def phenotyping(self) -> tuple[Path, dict[str, bytes]]:
+        """Plots, and tables of them."""
+
+        def make(folder: Path) -> tuple[Path, dict[str, bytes]]:
+            (folder / "few.json").write_text(json.dumps(FEW_STALKS))
+            words = ["phenotype", "synth", str(folder / "plots"), "--spec", str(folder / "few.json"), "--width", "422"]
+            _finished(_command([*words, "--frames", "4", "--plots", "2"], folder), 0)
+            _finished(_command(_phenotype(folder, folder / "plots"), folder), 0)
+            return folder / "plots", _tables(folder / "out")
+
+        return self._once("phenotyping", make)
+
+    def grasping(self) -> tuple[Path, list]:
+        """The file of a family, and figures of its runs."""
+
+        def make(folder: Path) -> tuple[Path, list]:
+            spec = folder / "few.json"
+            spec.write_text(json.dumps(FEW_TO_GRASP))
+            _finished(_command(_grasp(folder, spec), folder), 0)
+            return spec, json.loads((folder / "eval.json").read_text())["each"]
+
+        return self._once("grasping", make)
+
+
+@dataclasses.dataclass(frozen=True)
+class Alone:
+    """A kind of fault with a folder of its own; see the module."""
+
+    strike: Callable[[Path, random.Random, References], None]
+    promise: str
+
+
+ALONE: dict[str, Alone] = {
+    "NaN on one of two seeds": Alone(
+        nan_on_one_seed, "status 4, names the seed, keeps the state; goes on from the last good checkpoint"
+    ),
+    "killed run of a sweep": Alone(worker_of_a_study, "one line, the others go on; starting again writes the undisturbed rows"),
+    "killed job of a sweep": Alone(job_of_a_study, "the same where runs are jobs of submitit"),
+    "killed worker of phenotype run": Alone(worker_of_phenotyping, "one line; starting again writes the undisturbed tables"),
+    "killed worker of grasp eval": Alone(worker_of_grasping, "one line; starting again gives the undisturbed figures"),
+}
+
+
+def strike_alone(name: str, folder: Path, dice: random.Random, references: References) -> bool:
+    """Lets a fault of `ALONE` happen in a new folder; whether it did."""
+    try:
+        ALONE[name].strike(folder, dice, references)
+    except NotStruck:
+        return False
+    shutil.rmtree(folder, ignore_errors=True)
+    return True

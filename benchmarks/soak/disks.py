@@ -1,0 +1,97 @@
+"""Disks that are nearly full, and disks that stand still: small file systems, which only root can mount."""
+
+import contextlib
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+
+def _run(*command: str) -> bool:
+    try:
+        return subprocess.run(command, capture_output=True).returncode == 0
+    except FileNotFoundError:
+        return False
+
+
+@contextlib.contextmanager
+def _moved_to(folder: Path, disk: Path) -> Iterator[Path]:
+    """The run folder on another disk; what is there afterwards is put back."""
+    there = disk / "run"
+    if folder.exists():
+        shutil.copytree(folder, there)
+    yield there
+    if folder.exists():
+        shutil.rmtree(folder)
+    if there.exists():
+        shutil.copytree(there, folder)
+
+
+@contextlib.contextmanager
+def small_disk(folder: Path) -> Iterator[tuple[Path, Callable[[], bool]]]:
+    """A small disk.
+
+    Yields:
+        The run folder on it, and what fills all that is left: it says whether that can be done here.
+    """
+    used = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+    disk = folder.with_name(f"{folder.name}-disk")
+    disk.mkdir()
+    mounted = _run("mount", "-t", "tmpfs", "-o", f"size={used // 1024 + 16_000}k", "tmpfs", str(disk))
+
+    def fill() -> bool:
+        if not mounted:
+            return False
+        with contextlib.suppress(OSError), (disk / "other").open("ab", buffering=0) as file:
+            for size in (2**20, 2**12, 1):
+                with contextlib.suppress(OSError):
+                    while file.write(bytes(size)) == size:
+                        pass
+        return True
+
+    try:
+        if not mounted:
+            yield folder, fill
+            return
+        with _moved_to(folder, disk) as there:
+            yield there, fill
+    finally:
+        if mounted:
+            subprocess.run(["umount", "-l", str(disk)], check=True)
+        disk.rmdir()
+
+
+@contextlib.contextmanager
+def freezing_disk(folder: Path) -> Iterator[tuple[Path, Callable[[bool], bool]]]:
+    """A file system that can stand still.
+
+    Yields:
+        The run folder on it, and what lets it stand still (True) or go on (False): it says whether that can be done here.
+    """
+    disk, image = folder.with_name(f"{folder.name}-ice"), folder.with_name(f"{folder.name}-ice.img")
+    disk.mkdir()
+    with image.open("wb") as file:
+        file.truncate(128 * 2**20)
+    mounted = _run("mkfs.ext4", "-q", str(image)) and _run("mount", "-o", "loop", str(image), str(disk))
+    is_frozen = False
+
+    def freeze(still: bool) -> bool:
+        nonlocal is_frozen
+        if not mounted or not _run("fsfreeze", "-f" if still else "-u", str(disk)):
+            return False
+        is_frozen = still
+        return True
+
+    try:
+        if not mounted:
+            yield folder, freeze
+            return
+        with _moved_to(folder, disk) as there:
+            yield there, freeze
+    finally:
+        if is_frozen:
+            freeze(False)
+        if mounted:
+            subprocess.run(["umount", "-l", str(disk)], check=True)
+        disk.rmdir()
+        image.unlink()

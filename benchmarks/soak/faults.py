@@ -1,0 +1,303 @@
+"""What strikes a run, and what must hold then. `FAULTS` has them all.
+
+A strike lets its fault happen at a random moment of training and returns the exit status that the process ended with, or None
+where the run was over before. It raises `Broken` where what the fault itself promises was not kept; what all must keep
+(`Soak`) is looked at afterwards.
+"""
+
+import contextlib
+import dataclasses
+import json
+import os
+import random
+import shutil
+import signal
+import socket
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from benchmarks.soak.disks import freezing_disk, small_disk
+from benchmarks.soak.parts import Broken, Part, checkpoints_of, environment, killed_afterwards, rows_of
+
+SITE = Path(__file__).with_name("site")
+Strike = Callable[[Path, random.Random], int | None]
+
+
+@dataclasses.dataclass(frozen=True)
+class Fault:
+    """One kind of fault.
+
+    Attributes:
+        strike: Of a run folder and dice.
+        promise: What must hold, for the table.
+        statuses: What the process may end with.
+        spoils: Whether a row of metrics.jsonl, or the run itself, may be gone afterwards.
+    """
+
+    strike: Strike
+    promise: str
+    statuses: tuple[int, ...]
+    spoils: bool = False
+
+
+def _started(folder: Path, dice: random.Random, variables: dict[str, str] | None = None, file_bytes: int | None = None) -> Part:
+    """A part that is in the middle of training, or was over before."""
+    part = Part.start(folder, variables, file_bytes=file_bytes)
+    part.wait_for(part.is_training)
+    time.sleep(dice.uniform(0.0, 0.8))
+    return part
+
+
+def _signalled(*numbers: int, to_group: bool = False) -> Strike:
+    def strike(folder: Path, dice: random.Random) -> int | None:
+        with killed_afterwards(_started(folder, dice)) as part:
+            for number in numbers:
+                if not part.runs():
+                    break
+                with contextlib.suppress(ProcessLookupError):
+                    (os.killpg if to_group else os.kill)(part.process.pid, number)
+                time.sleep(dice.uniform(0.0, 0.3) if len(numbers) > 1 else 0.0)
+            return _ended(part)
+
+    return strike
+
+
+def _ended(part: Part) -> int | None:
+    status = part.end()
+    part.check_words()
+    return status or None
+
+
+def _killed_in_a_save(folder: Path, dice: random.Random) -> int | None:
+    with killed_afterwards(_started(folder, dice)) as part:
+        part.wait_for(part.is_saving, 20.0)
+        return part.send(signal.SIGKILL) or None
+
+
+def _second_process(folder: Path, dice: random.Random) -> int | None:
+    with killed_afterwards(Part.start(folder)) as part:
+        # Another process takes seconds to start; the first holds the folder from before it compiles.
+        part.wait_for(part.is_compiling)
+        rows = rows_of(folder)
+        with killed_afterwards(Part.start(folder)) as other:
+            status = other.end()
+            other.check_words()
+        if not part.runs():
+            return part.end() or None
+        if status != 2 or other.count("in use by process") != 1:
+            raise Broken(f"a second process ended with {status}: {other.lines[-3:]}")
+        if rows_of(folder)[: len(rows)] != rows:
+            raise Broken("a second process changed the rows of the first")
+        part.wait_for(part.is_training)
+        return part.stop() or None
+
+
+def _full_disk(folder: Path, dice: random.Random) -> int | None:
+    """Somebody fills the disk, and all that is given back on it; where none can be mounted, no file may be large."""
+    with small_disk(folder) as (place, fill):
+        limit = None if fill() and (place.parent / "other").unlink() is None else 100_000
+        with killed_afterwards(_started(place, dice, file_bytes=limit)) as part:
+            while part.runs() and limit is None:
+                fill()
+                time.sleep(0.05)
+            return _ended(part)
+
+
+def _stalled_disk(folder: Path, dice: random.Random) -> int | None:
+    with freezing_disk(folder) as (place, freeze), killed_afterwards(_started(place, dice)) as part:
+        still = dice.uniform(1.0, 4.0)
+        part.wait_for(part.is_saving, 5.0)
+        if freeze(True):
+            time.sleep(still)
+            freeze(False)
+        elif part.runs():
+            part.process.send_signal(signal.SIGSTOP)
+            time.sleep(still)
+            part.process.send_signal(signal.SIGCONT)
+        time.sleep(0.5)
+        return part.stop() or None
+
+
+def _jumping_clock(folder: Path, dice: random.Random) -> int | None:
+    clock = folder.with_name(f"{folder.name}.clock")
+    clock.unlink(missing_ok=True)
+    variables = {"SOAK_CLOCK": str(clock), "PYTHONPATH": os.pathsep.join((str(SITE), environment()["PYTHONPATH"]))}
+    with killed_afterwards(_started(folder, dice, variables)) as part:
+        for _ in range(3):
+            clock.write_text(str(dice.choice((-1, 1)) * dice.uniform(60.0, 30 * 86400.0)))
+            time.sleep(dice.uniform(0.1, 0.5))
+        status = part.stop()
+        part.check_words()
+        file = folder / "metrics.jsonl"
+        walls = [json.loads(line)["time/wall_s"] for line in (file.read_text() if file.exists() else "").splitlines()]
+        if walls != sorted(walls) or any(wall > 86400.0 for wall in walls):
+            raise Broken(f"seconds follow the clock: {walls}")
+        return status or None
+
+
+def _killed(folder: Path, dice: random.Random) -> bool:
+    """SIGKILL in the middle of training; whether the run was still on, and has something saved."""
+    with killed_afterwards(_started(folder, dice)) as part:
+        part.wait_for(lambda: len(checkpoints_of(folder)) > 1, 20.0)
+        return part.send(signal.SIGKILL) != 0 and bool(checkpoints_of(folder))
+
+
+def _resumed(folder: Path, dice: random.Random, variables: dict[str, str] | None = None) -> tuple[int, Part]:
+    """Resumes, and stops again in the middle of training; the exit status."""
+    with killed_afterwards(_started(folder, dice, variables)) as part:
+        status = part.stop()
+        part.check_words()
+        if status not in (0, 143):
+            raise Broken(f"resumed, it ended with {status}: {part.lines[-4:]}")
+        return status, part
+
+
+def _damaged(folder: Path, dice: random.Random) -> int | None:
+    if not _killed(folder, dice):
+        return None
+    *_, (_, tier, path) = checkpoints_of(folder)
+    if path.is_dir():
+        files = sorted((file for file in path.rglob("*") if file.is_file()), key=lambda file: file.stat().st_size)
+        how = dice.choice(("truncate", "no manifest", "no learner"))
+        for file in files if how == "truncate" else []:
+            file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+        if how != "truncate":
+            shutil.rmtree(path / ("manifest" if how == "no manifest" else "train"))
+    else:
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    status, part = _resumed(folder, dice)
+    if part.count(f"checkpoint {tier}/") != 1 or part.count("is damaged") != 1:
+        raise Broken(f"nothing was said about a damaged checkpoint: {part.lines}")
+    return status or None
+
+
+def flip_a_bit(file: Path, dice: random.Random) -> int:
+    """Flips one bit of a file; which byte it is in."""
+    contents = bytearray(file.read_bytes())
+    place = dice.randrange(len(contents))
+    contents[place] ^= 1 << dice.randrange(8)
+    file.write_bytes(bytes(contents))
+    return place
+
+
+def _bit_in_a_checkpoint(folder: Path, dice: random.Random) -> int | None:
+    if not _killed(folder, dice):
+        return None
+    iteration, tier, path = dice.choice([found for found in checkpoints_of(folder)[-2:]])
+    files = [file for file in path.rglob("*") if file.is_file() and file.stat().st_size] if path.is_dir() else [path]
+    if tier == "recent":
+        files += list(path.parent.glob("*.rollout"))
+    flip_a_bit(dice.choices(files, [file.stat().st_size for file in files])[0], dice)
+    # Either it is found, or it says nothing about what the run goes on from: rows are compared at the end.
+    return _resumed(folder, dice)[0] or None
+
+
+def _bit_in_metrics(folder: Path, dice: random.Random) -> int | None:
+    if not _killed(folder, dice) or not rows_of(folder):
+        return None
+    before, file = rows_of(folder), folder / "metrics.jsonl"
+    place = flip_a_bit(file, dice)
+    number = file.read_bytes()[:place].count(b"\n")
+    row = file.read_bytes().splitlines()[number] if number < len(file.read_bytes().splitlines()) else b""
+    done = max((iteration for iteration, *_ in checkpoints_of(folder)), default=0)
+    status, part = _resumed(folder, dice)
+    # What was in the same line, and the one after it where the line's end was hit, may be gone; all others stay.
+    others = [each for i, each in enumerate(before) if i not in (number, number + 1) and each["iteration"] <= done]
+    if missing := [each["iteration"] for each in others if each not in rows_of(folder)]:
+        raise Broken(f"rows {missing} were lost with row {number}: {part.lines}")
+    try:
+        json.loads(row)
+    except ValueError:
+        if not part.count("metrics.jsonl"):
+            raise Broken(f"nothing was said about a damaged row, {row!r}: {part.lines}") from None
+    return status or None
+
+
+def _moved(folder: Path, dice: random.Random) -> int | None:
+    there = folder.with_name(f"{folder.name}-moved")
+    with killed_afterwards(_started(folder, dice)) as part:
+        rows = rows_of(folder)
+        if not part.runs():
+            return part.end() or None
+        folder.rename(there)
+        status = part.end()
+        part.check_words()
+    if (folder / "checkpoints").exists():
+        raise Broken(f"half a run was left at the old place: {sorted(folder.rglob('*'))[:5]}; {part.lines[-2:]}")
+    if folder.exists():
+        shutil.rmtree(folder)
+    there.rename(folder)
+    if rows_of(folder)[: len(rows)] != rows:
+        raise Broken("rows were lost in a folder that was moved")
+    return status or None
+
+
+def _vanished(folder: Path, dice: random.Random) -> int | None:
+    trash = folder.with_name(f"{folder.name}-trash")
+    with killed_afterwards(_started(folder, dice)) as part:
+        if not part.runs():
+            return part.end() or None
+        folder.rename(trash)
+        shutil.rmtree(trash)
+        status = part.end()
+        part.check_words()
+    if (folder / "checkpoints").exists():
+        raise Broken(f"half a run was left in its place: {sorted(folder.rglob('*'))[:5]}; {part.lines[-2:]}")
+    if folder.exists():
+        shutil.rmtree(folder)
+    return status or None
+
+
+def _lock_of_the_dead(folder: Path, dice: random.Random) -> int | None:
+    """Where there are no locks, a lease must run out, which takes a minute: seldom."""
+    no_locks = dice.random() < 0.15
+    variables = {"PYTHONPATH": os.pathsep.join((str(SITE), environment()["PYTHONPATH"]))} | (
+        {"SOAK_NO_LOCKS": "1"} if no_locks else {}
+    )
+    with killed_afterwards(_started(folder, dice, variables)) as part:
+        if part.send(signal.SIGKILL) == 0:
+            return None
+    lock = folder / "run.lock"
+    if not lock.exists():
+        raise Broken("a process that was killed left no run.lock")
+    lock.write_text(lock.read_text().replace(socket.gethostname(), "elsewhere"))
+    os.utime(lock, (time.time() - 3600.0, time.time() - 3600.0))
+    return _resumed(folder, dice, variables)[0] or None
+
+
+EXACT = "goes on exactly"
+FAULTS: dict[str, Fault] = {
+    "SIGTERM": Fault(_signalled(signal.SIGTERM), f"status 143, saved with the replay, {EXACT}", (143,)),
+    "SIGINT": Fault(_signalled(signal.SIGINT), f"status 130, saved with the replay, {EXACT}", (130,)),
+    "SIGHUP": Fault(_signalled(signal.SIGHUP), f"status 129, saved with the replay, {EXACT}", (129,)),
+    "SIGTERM to the group": Fault(
+        _signalled(signal.SIGTERM, to_group=True), "as SIGTERM, though children get the signal, too", (143,)
+    ),
+    "two signals": Fault(
+        _signalled(signal.SIGTERM, signal.SIGTERM),
+        "status 143 at once; the networks are saved",
+        (143, -signal.SIGTERM),  # the second may find the run saved, and its handler gone
+    ),
+    "second process": Fault(_second_process, "status 2 and one line; the first process goes on undisturbed", (143,)),
+    "SIGKILL": Fault(_signalled(signal.SIGKILL), f"loses an iteration or two, {EXACT}", (-signal.SIGKILL,)),
+    "SIGKILL in a save": Fault(
+        _killed_in_a_save, f"goes on from what was saved before the half-written checkpoint, and {EXACT}", (-signal.SIGKILL,)
+    ),
+    "full disk": Fault(_full_disk, "status 1 (2 before it has begun) and one line; goes on when there is room again", (1, 2)),
+    "stalled disk": Fault(_stalled_disk, f"waits for the disk, and {EXACT}", (143,)),
+    "damaged checkpoint": Fault(
+        _damaged, "one line; goes on from the one before, and keeps the damaged one for inspection", (143,)
+    ),
+    "bit flipped in a checkpoint": Fault(_bit_in_a_checkpoint, "is found, or lies in nothing that is read", (143,)),
+    "bit flipped in metrics.jsonl": Fault(
+        _bit_in_metrics, "all other rows stay; a row that is none any more is put aside, and said", (143,), spoils=True
+    ),
+    "folder moved": Fault(
+        _moved, "status 1 and one line; nothing is left behind, and the folder goes on at its new place", (1,)
+    ),
+    "folder gone": Fault(_vanished, "status 1 and one line; no half of a run takes its place", (1,)),
+    "lock of a dead process elsewhere": Fault(_lock_of_the_dead, "is taken over", (143,)),
+    "clock jumps by up to a month": Fault(_jumping_clock, f"no duration follows it; {EXACT}", (143,)),
+}
+"""Those of a training run."""

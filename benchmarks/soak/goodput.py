@@ -1,0 +1,106 @@
+"""A long run that is killed once a minute, and one that is left alone for the same number of steps."""
+
+import dataclasses
+import json
+import shutil
+import signal
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.soak.parts import Broken, Part, killed_afterwards, rows_of
+from jaxrl_vis.run.goodput import account, read_processes
+
+_FOREVER = 10**9  # environment steps
+
+
+@dataclasses.dataclass(frozen=True)
+class Killed:
+    """What became of a run that was killed again and again.
+
+    Attributes:
+        env_steps: Those of its networks, per seed.
+        kills: How often it was killed.
+        minutes: How long it went on.
+        goodput: Gradient steps in its networks over gradient steps computed.
+        replays_lost: How often it was resumed without its replay.
+        success: At the end, one number per seed.
+    """
+
+    env_steps: int
+    kills: int
+    minutes: float
+    goodput: float
+    replays_lost: int
+    success: list[float]
+
+
+def _success(folder: Path) -> list[float]:
+    rows = rows_of(folder)
+    return [row["eval/success"] for row in rows if row["iteration"] == rows[-1]["iteration"]]
+
+
+def killed_every(folder: Path, every: float, minutes: float, options: Sequence[str]) -> Killed:
+    """Trains for so many minutes, killed every so many seconds; then what is there is evaluated.
+
+    Where the folder holds such a run already, it goes on: so an hour can be had in pieces, whose kills and minutes are added.
+
+    Args:
+        folder: The run's.
+        every: Seconds of a process.
+        minutes: In all.
+        options: Of ``train``: task and preset.
+    """
+    notes = folder.with_name(f"{folder.name}.kills.json")
+    earlier: dict[str, float] = json.loads(notes.read_text()) if notes.exists() else {"kills": 0, "minutes": 0.0}
+    started, kills = time.monotonic(), int(earlier["kills"])
+    asked = [*options, "--env-steps", str(_FOREVER)]
+    while True:
+        left = started + 60.0 * minutes - time.monotonic()
+        with killed_afterwards(Part.start(folder, options=asked)) as part:
+            part.wait_for(lambda: False, min(every, left))
+            if not part.runs():
+                raise Broken(f"it ended by itself: {part.lines[-3:]}")
+            if left > every:
+                part.send(signal.SIGKILL)
+                kills += 1
+                lines = read_processes(folder / "processes.jsonl")
+                print(f"kill {kills}: {len(lines)} processes, iterations begun {lines[-1]}", flush=True)
+                continue
+            if part.stop() not in (0, 143):
+                raise Broken(f"SIGTERM was not heeded: {part.lines[-3:]}")
+            break
+    wall = earlier["minutes"] + (time.monotonic() - started) / 60.0
+    notes.write_text(json.dumps({"kills": kills, "minutes": wall}))
+    # A copy is evaluated: the run itself has not ended, and may go on with its replay.
+    copy = folder.with_name(f"{folder.name}-evaluated")
+    shutil.rmtree(copy, ignore_errors=True)
+    shutil.copytree(folder, copy)
+    with killed_afterwards(Part.start(copy, options=["--env-steps", "1"])) as part:
+        if part.end() != 0:
+            raise Broken(f"it could not be evaluated: {part.lines[-3:]}")
+    last = rows_of(copy)[-1]
+    total = account(read_processes(folder / "processes.jsonl"), last["iteration"])
+    if total.goodput is None:
+        raise Broken("processes.jsonl is damaged")
+    return Killed(last["env_steps"], kills, round(wall, 2), total.goodput, total.replays_lost, _success(copy))
+
+
+def undisturbed(folder: Path, env_steps: int, options: Sequence[str]) -> list[float]:
+    """Success at the end of a run that is left alone, per seed; one that is there already is not trained again."""
+    with killed_afterwards(Part.start(folder, options=[*options, "--env-steps", str(env_steps)])) as part:
+        if part.end(86400.0) != 0:
+            raise Broken(f"the undisturbed run ended early: {part.lines[-3:]}")
+    return _success(folder)
+
+
+def report(killed: Killed, every: float, reference: Sequence[float] | None) -> dict[str, Any]:
+    """Prints what was found, and returns it for a file."""
+    print(
+        f"goodput {killed.goodput:.4f} over {killed.env_steps:,} environment steps and {killed.minutes:g} minutes, killed "
+        f"{killed.kills} times, every {every:g} s; replay lost {killed.replays_lost} times; success at the end "
+        f"{' '.join(f'{value:.3f}' for value in killed.success)}"
+        + ("" if reference is None else f", undisturbed {' '.join(f'{value:.3f}' for value in reference)}")
+    )
+    return dataclasses.asdict(killed) | {"every": every, "undisturbed": None if reference is None else list(reference)}

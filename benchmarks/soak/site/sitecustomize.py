@@ -1,0 +1,31 @@
+"""Read by each Python that has this folder on its path: a clock that jumps, and a file system without locks.
+
+SOAK_CLOCK names a file: as soon as it is there, the clock is so many seconds off as it says. What measures durations
+(`time.monotonic`) is right, as on any computer whose clock is set. SOAK_NO_LOCKS lets `flock` fail as some network file
+systems do.
+"""
+
+import errno
+import os
+import time
+
+if clock := os.environ.get("SOAK_CLOCK", ""):
+    right, right_ns = time.time, time.time_ns
+
+    def offset() -> float:
+        try:
+            with open(clock) as file:
+                return float(file.read() or 0.0)
+        except (OSError, ValueError):
+            return 0.0
+
+    time.time = lambda: right() + offset()
+    time.time_ns = lambda: right_ns() + int(1e9 * offset())
+
+if os.environ.get("SOAK_NO_LOCKS"):
+    import fcntl
+
+    def flock(*_: object) -> None:
+        raise OSError(errno.ENOSYS, "Function not implemented")
+
+    fcntl.flock = flock

@@ -1,0 +1,174 @@
+"""Runs, each struck by several faults, resumed after each, and compared with an undisturbed one."""
+
+import itertools
+import random
+import shutil
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from benchmarks.soak.alone import ALONE, References, strike_alone
+from benchmarks.soak.faults import FAULTS
+from benchmarks.soak.parts import LAST, Broken, Part, checkpoints_of, killed_afterwards, rows_of
+from benchmarks.soak.record import Record
+from jaxrl_vis.run.goodput import account, read_processes
+
+FAULTS_PER_RUN = 8
+
+
+class Soak:
+    """All faults; several runs go on at the same time.
+
+    Args:
+        folder: Where runs lie.
+        faults: How many there are to be at most.
+        seed: Of what happens when.
+        seconds: After so long no fault begins any more.
+        note: Called with the record after each fault.
+        alone: Whether there are faults with folders of their own, too, which take longer.
+    """
+
+    def __init__(
+        self, folder: Path, faults: int, seed: int, seconds: float, note: Callable[[Record], None], alone: bool = True
+    ):
+        self._folder, self._seed, self._note, self._left, self._alone = folder, seed, note, faults, alone
+        self._started = time.monotonic()
+        self._deadline = self._started + seconds
+        self._decks: dict[str, list[str]] = {}
+        self._dice = random.Random(seed)
+        self._lock = threading.Lock()
+        self._references = References(folder / "references")
+        self.record = Record(seed=seed)
+        self.reference: list[dict[str, Any]] = []
+
+    def undisturbed(self) -> None:
+        """The run that others are compared with."""
+        with killed_afterwards(Part.start(self._folder / "reference")) as part:
+            if part.end() != 0:
+                raise Broken("\n".join(part.lines))
+        self.reference = rows_of(part.folder)
+
+    def _next(self, kinds: dict[str, Any]) -> str | None:
+        """The next fault of these kinds, each as often as the others; None where it is time to end."""
+        with self._lock:
+            if self._left <= 0 or time.monotonic() > self._deadline:
+                return None
+            self._left -= 1
+            deck = self._decks.setdefault(next(iter(kinds)), [])
+            if not deck:
+                deck += self._dice.sample(list(kinds), len(kinds))
+            return deck.pop()
+
+    def _again(self, kinds: dict[str, Any], fault: str) -> None:
+        """Puts back a fault that has found nothing to strike any more."""
+        with self._lock:
+            self._left += 1
+            self._decks[next(iter(kinds))].insert(0, fault)
+
+    def _struck(self, where: str, fault: str, outcome: str) -> None:
+        with self._lock:
+            self.record.faults[fault] += 1
+            self.record.minutes = round((time.monotonic() - self._started) / 60.0, 2)
+            print(f"{self.record.total:4}  {where:8} {fault:32} {outcome}", flush=True)
+            self._note(self.record)
+
+    def _broke(self, where: Path, faults: list[str], error: Exception) -> None:
+        text = str(error) if isinstance(error, Broken) else traceback.format_exc()
+        with self._lock:
+            self.record.broken.append(f"{where.name}, {faults}: {text}")
+            print(f"BROKEN in {where}, after {faults}: {text}", flush=True)
+            self._note(self.record)
+
+    def work(self, worker: int) -> None:
+        """A run, then a fault with a folder of its own, and so on until it is time to end."""
+        for turn in itertools.count():
+            number = 1000 * worker + turn
+            dice, place = random.Random(f"{self._seed} {number}"), self._folder / f"run{number}"
+            faults: list[str] = []
+            try:
+                # Workers begin with different things, for all kinds are to be met in a short soak, too.
+                if self._alone and (turn + worker) % 2:
+                    going = self._one_alone(place, dice, faults)
+                else:
+                    going = self._one_run(place, dice, faults)
+            except Exception as error:  # the others go on; the folder stays as it is
+                self._broke(place, faults, error)
+                going = True
+            if not going:
+                return
+
+    def _one_alone(self, place: Path, dice: random.Random, faults: list[str]) -> bool:
+        fault = self._next(ALONE)
+        if fault is None:
+            return False
+        faults.append(fault)
+        if strike_alone(fault, place, dice, self._references):
+            self._struck(place.name, fault, "")
+        else:
+            self._again(ALONE, fault)
+        return True
+
+    def _one_run(self, folder: Path, dice: random.Random, faults: list[str]) -> bool:
+        """One run to its end; False where no fault is left for it."""
+        spoilt = False
+        while len(faults) < FAULTS_PER_RUN:
+            fault = self._next(FAULTS)
+            if fault is None:
+                break
+            faults.append(fault)
+            before, good = rows_of(folder), checkpoints_of(folder)
+            status = FAULTS[fault].strike(folder, dice)
+            if status is None:  # the run was over before
+                self._again(FAULTS, faults.pop())
+                break
+            if status not in FAULTS[fault].statuses:
+                raise Broken(f"status {status}: {LAST.lines[-4:]}")
+            spoilt |= FAULTS[fault].spoils
+            if folder.exists() and not FAULTS[fault].spoils:
+                self._check_kept(folder, before, good[-1][0] if good else 0)
+            self._struck(folder.name, fault, f"status {status}")
+        if not faults:
+            return False
+        with killed_afterwards(Part.start(folder)) as part:
+            if (status := part.end()) != 0:
+                raise Broken(f"it did not finish: status {status}, {part.lines[-5:]}")
+            part.check_words()
+        self._check_end(folder, spoilt)
+        return True
+
+    def _check_kept(self, folder: Path, before: list[dict[str, Any]], kept: int) -> None:
+        """Looks whether something is lost.
+
+        Args:
+            folder: The run.
+            before: The rows that there were when its last part began.
+            kept: The iteration of the newest checkpoint at that time.
+        """
+        old = [row for row in before if row["iteration"] <= kept]
+        if rows_of(folder)[: len(old)] != old:
+            raise Broken(f"rows from before iteration {kept} were lost")
+        newest = max((iteration for iteration, *_ in checkpoints_of(folder)), default=0)
+        if newest < kept - 1:  # a recent state may have been given up for want of room, and one that is damaged is put aside
+            raise Broken(f"the newest checkpoint was of iteration {kept}, and is of {newest}")
+
+    def _check_end(self, folder: Path, spoilt: bool) -> None:
+        rows = rows_of(folder)
+        total = account(read_processes(folder / "processes.jsonl"), self.reference[-1]["iteration"])
+        if not spoilt and [row["iteration"] for row in rows] != [row["iteration"] for row in self.reference]:
+            raise Broken(f"rows {[row['iteration'] for row in rows]}")
+        exact = rows == self.reference
+        if not exact and not spoilt and not total.replays_lost:
+            raise Broken("metrics.jsonl differs from the undisturbed run's, though no replay was lost")
+        if total.begun is None:
+            raise Broken("processes.jsonl is damaged")
+        with self._lock:
+            record = self.record
+            record.runs, record.exact = record.runs + 1, record.exact + exact
+            record.done, record.begun = record.done + total.done, record.begun + total.begun
+            record.resumes += total.resumes
+            record.replays_lost += total.replays_lost
+            self._note(record)
+        shutil.rmtree(folder)

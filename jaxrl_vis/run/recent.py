@@ -1,0 +1,283 @@
+"""The state of a run on a CPU, kept up to date for a process that is killed: every frame is written once.
+
+    checkpoints/recent/<iteration>.state     learner, keys, iteration, and the checksums of the rollouts that go with it
+    checkpoints/recent/<iteration>.rollout   the episodes that were collected last when so many iterations were done
+
+A rollout lies in the replay until the ring comes round to it, so a state needs a few files of earlier iterations and one new
+one: some milliseconds, where a full checkpoint writes the whole replay. That is worth it on a CPU, where a copy costs nothing
+to get at, and as long as the replay is of a moderate size: `is_cheap`.
+
+Nothing is forced onto the disk. Whatever kills a process leaves what it has written; a power cut may not, and then checksums
+find it, and the run goes on from a light or a full checkpoint, which do wait for the disk. A file appears under its name only
+when it is complete. The newest two states are kept.
+"""
+
+import contextlib
+import json
+import shutil
+import time
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import IO, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxrl_vis.learner.replay import num_bytes
+from jaxrl_vis.run.arrays import Arrays, check_structure, describe, host_specs, is_intact, rebuild, to_host
+from jaxrl_vis.run.metrics import RUN_ID
+from jaxrl_vis.types import LoopState, ReplayState
+
+SCHEMA = 1
+ANY_RUN = "*"
+_KEPT = 2
+_MOST_BYTES = 2**30  # of a replay
+_SHARE = 0.02  # of the time, which saving may take
+_EPISODES = "replay.episodes."
+
+
+def is_cheap(replay: ReplayState) -> bool:
+    """Whether little time and disk are needed to keep this replay (or one of these shapes) up to date in files."""
+    return jax.default_backend() == "cpu" and num_bytes(replay) <= _MOST_BYTES
+
+
+class Unusable(Exception):
+    """A state cannot be trusted, or one of its rollouts cannot. The message says why, in a few words."""
+
+
+class Recent:
+    """The recent states of one run.
+
+    Args:
+        folder: Where they lie; made when something is saved.
+        say: Called with one line, when there is no more room for them.
+
+    Attributes:
+        run_id: Of the run, None for one that has none: states of others are not there as far as this class goes, but for
+            `set_foreign_aside`. `ANY_RUN`: whatever there is.
+    """
+
+    def __init__(self, folder: Path, say: Callable[[str], None]):
+        self._folder, self._say = folder, say
+        self.run_id: str | None = ANY_RUN
+        self._rollouts: dict[int, int] = {}  # those that are known to be there, and their checksums
+        self._cost, self._saved_at, self._is_off = 0.0, -np.inf, False
+
+    def is_due(self, in_any_case: bool) -> bool:
+        """Whether so much time has passed since the last one that saving takes a small share of it.
+
+        Args:
+            in_any_case: Do not look at the time.
+        """
+        return not self._is_off and (in_any_case or time.monotonic() - self._saved_at >= self._cost / _SHARE)
+
+    def iterations(self) -> list[int]:
+        """Iterations of which there is a state of this run, ascending; damaged ones included."""
+        return sorted(iteration for iteration in _numbers(self._folder, "state") if self._is_ours(iteration))
+
+    def _is_ours(self, iteration: int) -> bool:
+        """Whether the first line of a state says so; one that cannot be read is damaged, and may well be ours."""
+        try:
+            return self.run_id in (ANY_RUN, self._header(iteration).get(RUN_ID))
+        except Unusable:
+            return True
+
+    def set_foreign_aside(self, to: Path) -> bool:
+        """Moves everything, if there is a state of another run; whether there was one."""
+        is_foreign = any(not self._is_ours(iteration) for iteration in _numbers(self._folder, "state"))
+        if is_foreign:
+            to.parent.mkdir(exist_ok=True)
+            shutil.rmtree(to, ignore_errors=True)
+            self._folder.rename(to)
+        return is_foreign
+
+    def save(self, iteration: int, loop: LoopState, num_envs: int, progress: dict[str, Any]) -> None:
+        """Writes a state, and what it needs that is not there; where there is no room, it is said, and nothing more is saved.
+
+        Args:
+            iteration: Iterations done.
+            loop: The state, on one device.
+            num_envs: E, episodes that one iteration adds to the replay.
+            progress: Anything that JSON can hold.
+        """
+        self._saved_at = time.monotonic()
+        try:
+            self._write(iteration, loop, num_envs, progress)
+        except OSError as error:
+            self._is_off = True
+            self.clear()
+            self._say(
+                f"the replay is not kept up to date any more ({error.strerror or type(error).__name__}): "
+                "if this process is killed, the run goes on without it"
+            )
+        self._cost = time.monotonic() - self._saved_at
+
+    def _write(self, iteration: int, loop: LoopState, num_envs: int, progress: dict[str, Any]) -> None:
+        for folder in (self._folder.parent, self._folder):  # but not the run's own, which may have been moved
+            folder.mkdir(exist_ok=True)
+        replay = to_host({"replay": loop.replay}, copy=False)
+        episodes = {name: array for name, array in replay.items() if name.startswith(_EPISODES)}
+        arrays = to_host({"train": loop.train, "key": loop.key, "iteration": loop.iteration}, copy=False)
+        arrays["replay.size"] = replay["replay.size"]
+        num_rollouts = next(iter(episodes.values())).shape[1] // num_envs
+        stored = int(arrays["replay.size"].max()) // num_envs
+        rollouts = {}
+        for number in range(iteration - stored + 1, iteration + 1):
+            if number not in self._rollouts:
+                start = (number - 1) % num_rollouts * num_envs
+                self._rollouts[number] = self._write_rollout(
+                    number, {name: array[:, start : start + num_envs] for name, array in episodes.items()}
+                )
+            rollouts[number] = self._rollouts[number]
+        header = {
+            **{"schema": SCHEMA, "iteration": iteration, "items": describe(arrays)},
+            **({} if self.run_id in (None, ANY_RUN) else {RUN_ID: self.run_id}),
+            "episodes": {name: [list(array.shape), str(array.dtype)] for name, array in episodes.items()},
+            **{"rollouts": {str(number): checksum for number, checksum in rollouts.items()}, "progress": progress},
+        }
+        text = json.dumps(header)
+        with _appearing(self._path(iteration, "state")) as file:
+            file.write(f"{zlib.crc32(text.encode()):08x} {text}\n".encode())
+            for array in arrays.values():
+                file.write(_bytes(array))
+        self._tidy()
+
+    def _write_rollout(self, number: int, parts: Arrays) -> int:
+        """Writes the episodes of one rollout, [S, E, ...] each, one array after the other; their checksum."""
+        checksum = 0
+        with _appearing(self._path(number, "rollout")) as file:
+            for part in parts.values():
+                contents = _bytes(part)
+                checksum = zlib.crc32(contents, checksum)
+                file.write(contents)
+        return checksum
+
+    def _tidy(self) -> None:
+        """Deletes all states but the newest, and rollouts that none of these needs: the oldest ones."""
+        for number in self.iterations()[:-_KEPT]:
+            self._path(number, "state").unlink(missing_ok=True)
+        first = min(self._rollouts, default=0)
+        with contextlib.suppress(Unusable, IndexError):
+            first = min(self._header(self.iterations()[0])["rollouts"], key=int)
+        for number in _numbers(self._folder, "rollout"):
+            if number < int(first):
+                self._path(number, "rollout").unlink(missing_ok=True)
+        self._rollouts = {number: checksum for number, checksum in self._rollouts.items() if number >= int(first)}
+
+    def restore(self, iteration: int, template: LoopState) -> tuple[LoopState, dict[str, Any]]:
+        """One state, and the progress that was saved with it.
+
+        Args:
+            iteration: One of `iterations`.
+            template: Shapes and types of the loop state.
+
+        Raises:
+            Unusable: It is damaged, or a rollout of it is missing or damaged.
+            RequestError: It has another structure.
+        """
+        header, path = self._header(iteration), self._path(iteration, "state")
+        tree = {name: getattr(template, name) for name in ("train", "replay", "key", "iteration")}
+        specs = host_specs(tree)
+        check_structure(path, header["items"] | header["episodes"], specs)
+        contents = self._read(path)
+        place = contents.index(b"\n") + 1
+        found = {}
+        for name, described in header["items"].items():  # in the order in which they were written
+            found[name], place = _array(contents, place, specs[name].shape, specs[name].dtype)
+            if not is_intact(found[name], described):
+                raise Unusable(f"wrong checksum of {name}")
+        episodes = {name: np.zeros(shape, specs[name].dtype) for name, (shape, _) in header["episodes"].items()}
+        self._read_rollouts(header["rollouts"], episodes)
+        # Copies: what numpy owns could not be donated.
+        loop = LoopState(**rebuild(tree, {name: jnp.array(array) for name, array in (found | episodes).items()}))
+        return loop, header["progress"]
+
+    def _read_rollouts(self, checksums: dict[str, int], episodes: Arrays) -> None:
+        """Fills ``episodes``, [S, N, ...] each, with what rollouts hold."""
+        num_episodes = next(iter(episodes.values())).shape[1]
+        for number, checksum in checksums.items():
+            contents = self._read(self._path(int(number), "rollout"))
+            if zlib.crc32(contents) != checksum:
+                raise Unusable(f"wrong checksum of rollout {number}")
+            size = sum(array.nbytes for array in episodes.values()) // num_episodes  # of an episode of every seed
+            num_envs = len(contents) // size
+            start, place = (int(number) - 1) % (num_episodes // num_envs) * num_envs, 0
+            for array in episodes.values():
+                shape = (len(array), num_envs, *array.shape[2:])
+                array[:, start : start + num_envs], place = _array(contents, place, shape, array.dtype)
+
+    def go_on_from(self, iteration: int | None) -> None:
+        """Keeps the state of an iteration, and what is older, as a past to go on from; None: there is none, begin anew."""
+        if iteration is None:
+            self.clear()
+            return
+        self._rollouts = {int(number): checksum for number, checksum in self._header(iteration)["rollouts"].items()}
+        for number in _numbers(self._folder, "rollout"):
+            if number > iteration:
+                self._path(number, "rollout").unlink(missing_ok=True)
+
+    def clear(self) -> None:
+        """Deletes everything: a full checkpoint takes its place, or the run has ended."""
+        self._rollouts = {}
+        with contextlib.suppress(OSError):
+            for file in self._folder.iterdir():
+                if file.suffix in (".state", ".rollout", ".tmp"):
+                    file.unlink(missing_ok=True)
+            self._folder.rmdir()
+
+    def set_aside(self, iteration: int, to: Path) -> None:
+        """Moves the state of an iteration."""
+        self._path(iteration, "state").replace(to)
+
+    def _header(self, iteration: int) -> dict[str, Any]:
+        try:
+            with self._path(iteration, "state").open("rb") as file:
+                checksum, _, text = file.readline().rstrip(b"\n").partition(b" ")
+            if int(checksum, 16) != zlib.crc32(text):
+                raise Unusable("wrong checksum of its first line")
+            header = json.loads(text)
+        except (OSError, ValueError) as error:
+            raise Unusable(f"{type(error).__name__}: its first line") from None
+        if header["schema"] != SCHEMA:
+            raise Unusable(f"it is of schema {header['schema']}, not {SCHEMA}")
+        return header
+
+    def _read(self, path: Path) -> bytes:
+        try:
+            return path.read_bytes()
+        except OSError as error:
+            raise Unusable(f"{path.name}: {error.strerror or type(error).__name__}") from None
+
+    def _path(self, iteration: int, kind: str) -> Path:
+        return self._folder / f"{iteration}.{kind}"
+
+
+def _numbers(folder: Path, kind: str) -> list[int]:
+    try:
+        return [int(file.stem) for file in folder.iterdir() if file.suffix == f".{kind}" and file.stem.isdigit()]
+    except OSError:
+        return []
+
+
+@contextlib.contextmanager
+def _appearing(path: Path) -> Iterator[IO[bytes]]:
+    """A file that gets its name when it is complete. It is not forced onto the disk, see the module."""
+    temporary = path.with_name(path.name + ".tmp")
+    with temporary.open("wb") as file:
+        yield file
+    temporary.replace(path)
+
+
+def _bytes(array: np.ndarray) -> memoryview:
+    return np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
+
+
+def _array(contents: bytes, place: int, shape: tuple[int, ...], dtype: Any) -> tuple[np.ndarray, int]:
+    """The array of that shape that begins at ``place``, and where it ends."""
+    count = int(np.prod(shape))
+    end = place + count * np.dtype(dtype).itemsize
+    if end > len(contents):
+        raise Unusable("it ends too early")
+    return np.frombuffer(contents, dtype, count, place).reshape(shape), end

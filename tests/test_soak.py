@@ -1,0 +1,56 @@
+"""A sample of the soak (benchmarks/soak): real runs, struck by a few faults of any kind and resumed; and how records are added."""
+
+import concurrent.futures
+import dataclasses
+import json
+
+import pytest
+
+from benchmarks.soak.record import BEGIN, END, PROMISES, Record, added, put_into
+from benchmarks.soak.soak import Soak
+
+FAULTS, SECONDS, WORKERS = 8, 50.0, 2
+
+
+def test_a_minute_of_faults(tmp_path):
+    """Other faults at each call, so that the suite sees all of them in the end; a failure says which seed it was."""
+    seed = int(tmp_path.stat().st_mtime) % 100_000
+    soak = Soak(tmp_path, FAULTS, seed, SECONDS, note=lambda record: None, alone=False)
+    soak.undisturbed()
+    with concurrent.futures.ThreadPoolExecutor(WORKERS) as pool:
+        list(pool.map(soak.work, range(WORKERS)))
+    assert not soak.record.broken, f"seed {seed}: {soak.record.broken}"
+    assert 1 <= soak.record.total <= FAULTS and soak.record.done <= soak.record.begun
+
+
+def record(seed: int, **changes) -> Record:
+    machine = {"commit": "abc", "versions": {}, "cores": 16, "root": True}
+    faults = dict.fromkeys(PROMISES, 1) | {"SIGKILL": 10}
+    base = Record(machine, seed, 9.0, faults, runs=6, exact=5, done=1000, begun=1010, resumes=48, replays_lost=1)
+    return dataclasses.replace(base, **changes)
+
+
+def test_pieces_are_added(tmp_path):
+    for seed in (1, 2):
+        record(seed).write(tmp_path / f"{seed}.json")
+    total = added([Record.read(tmp_path / "1.json"), Record.read(tmp_path / "2.json")])
+    assert total.faults["SIGKILL"] == 20 and total.total == 2 * (len(PROMISES) - 1 + 10) and len(PROMISES) >= 15
+    assert (total.minutes, total.runs, total.exact, total.resumes, total.replays_lost) == (18.0, 12, 10, 96, 2)
+    table = total.table()
+    assert "| SIGKILL | 20 |" in table and "goodput 0.990 at 96 resumptions, replay lost 2 times" in table
+    page = tmp_path / "page.md"
+    page.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n")
+    put_into(page, table)
+    assert page.read_text() == f"before\n{BEGIN}\n{table}{END}\nafter\n"
+    assert json.loads((tmp_path / "1.json").read_text())["machine"]["commit"] == "abc"
+
+
+def test_what_cannot_be_added_is_refused():
+    with pytest.raises(ValueError, match="different commits"):
+        added([record(1), record(2, machine={"commit": "def"})])
+    with pytest.raises(ValueError, match="same piece twice"):
+        added([record(1), record(1)])
+
+
+def test_a_promise_that_was_broken_is_in_the_table():
+    assert "**1 times it did not**" in record(1, broken=["run3, ['SIGKILL']: rows were lost"]).table()
