@@ -59,9 +59,11 @@ def render_planes(
 
     Args:
         scene: What is drawn, and from which camera.
-        data: Poses of one environment: `mjx.Data` or `mujoco.MjData` after forward kinematics, or anything with ``geom_xpos``
-            [ngeom, 3], ``geom_xmat`` [ngeom, 3, 3] or [ngeom, 9], and likewise ``cam_xpos``, ``cam_xmat`` and, for the lights,
-            ``xpos``, ``xmat``. A geom whose pose is not finite is not drawn.
+        data: Poses of one environment: `mjx.Data` or `mujoco.MjData` after forward kinematics (`mjx.kinematics` is enough), or
+            anything with ``geom_xpos`` [ngeom, 3], ``geom_xmat`` [ngeom, 3, 3] or [ngeom, 9], and likewise ``site_xpos``,
+            ``site_xmat`` where sites are drawn. Cameras and lights are placed from the bodies: those that ride on one, follow
+            it or aim at it need ``xpos`` and ``xmat``, those of a centre of mass ``xipos``. A geom whose pose is not finite is
+            not drawn.
         rgb: Whether to shade.
         depth: Whether to return the planar depth.
         segmentation: Whether to say which object each pixel sees.
@@ -73,7 +75,8 @@ def render_planes(
         The planes that were asked for.
 
     Raises:
-        ValueError: ``scene`` is no scene, or ``data`` has no poses, those of several environments, or those of another model.
+        ValueError: ``scene`` is no scene, or ``data`` has no poses, none that kinematics have filled in (which is seen where
+            they are numbers, not in a function that is being traced), those of several environments, or those of another model.
     """
     outputs = Outputs(rgb, depth, segmentation, normals, distance, quantized)
     check_poses(scene, data, rgb)

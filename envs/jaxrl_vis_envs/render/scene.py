@@ -15,6 +15,7 @@ import jax
 import mujoco
 import numpy as np
 
+from jaxrl_vis_envs.render import mounts
 from jaxrl_vis_envs.render.model import meshes, reading, textures
 
 
@@ -45,14 +46,20 @@ class Scene:
         focal: [2] float32, metres, of a camera with a sensor size.
         principal: [2] float32, metres, of a camera with a sensor size: where the axis meets the sensor, from its middle.
         sensor: [2] float32, metres, width and height of the sensor.
-        camera_shift: [3] float32, metres in the camera's own frame (right, up, back), added to the pose in the data. Of a free
-            camera, which is not in the data: its position in the world.
-        camera_turn: [3] float32, radians, a rotation vector in the camera's own frame, applied to the pose in the data. Of a
-            free camera: its rotation in the world.
+        camera_position: [3] float32, metres, in the frame of the body that the camera is fixed to, or along the world's axes
+            from what it follows.
+        camera_axes: [3, 3] float32 whose columns are the camera's axes (right, up, back), in the body's frame, or in the
+            world's where it follows. Not read for a camera that aims at a body.
+        camera_shift: [3] float32, metres in the camera's own frame (right, up, back), added to its pose. Of a free camera: its
+            position in the world.
+        camera_turn: [3] float32, radians, a rotation vector in the camera's own frame, applied to its pose. Of a free camera:
+            its rotation in the world.
+        body_mass: [nbody] float32, kg, where the camera or a light follows a centre of mass, else [0].
         znear: [] float32, metres. What is nearer than this is cut away.
         zfar: [] float32, metres. What is further is not drawn, and it is the depth of the sky.
-        light_position: [L, 3] float32, metres, in the light's frame (see `lights.light_poses`).
-        light_direction: [L, 3] float32, unit, in the light's frame.
+        light_position: [L, 3] float32, metres, in the frame of the body that it is fixed to, or along the world's axes from what it
+            follows.
+        light_direction: [L, 3] float32, unit, in the same frame. Not read for a light that aims at a body.
         light_ambient: [L, 3] float32.
         light_diffuse: [L, 3] float32.
         light_specular: [L, 3] float32.
@@ -75,13 +82,13 @@ class Scene:
         transparent: Which of the G objects let light through: 0 not, 1 yes, 2 a plane that does so from behind.
         geom_count: ngeom of the model.
         camera_id: The camera's index in the model; `reading.FREE_CAMERA` for a free one.
+        camera_mount: What the camera is fixed to.
+        body_parents: nbody indices of the bodies that bodies hang on, where ``body_mass`` holds their masses, else none.
         projection: "perspective", "intrinsic" (a perspective camera with a sensor) or "orthographic".
         height: H, pixels.
         width: W, pixels.
         light_types: L values of `mujoco.mjtLightType`.
-        light_modes: L values of `mujoco.mjtCamLight`.
-        light_bodies: L body indices.
-        light_targets: L body indices, -1 for none.
+        light_mounts: What each of the L lights is fixed to.
         light_highlights: L + 1 booleans, the last for the headlight: whether the light makes highlights at all. One that has
             no specular colour in the model never does, and costs less.
         light_shadows: L booleans: whether the light casts shadows (none does unless shadows are asked for).
@@ -101,8 +108,11 @@ class Scene:
     focal: jax.Array = _leaf()
     principal: jax.Array = _leaf()
     sensor: jax.Array = _leaf()
+    camera_position: jax.Array = _leaf()
+    camera_axes: jax.Array = _leaf()
     camera_shift: jax.Array = _leaf()
     camera_turn: jax.Array = _leaf()
+    body_mass: jax.Array = _leaf()
     znear: jax.Array = _leaf()
     zfar: jax.Array = _leaf()
     light_position: jax.Array = _leaf()
@@ -128,13 +138,13 @@ class Scene:
     transparent: tuple[int, ...] = _static()
     geom_count: int = _static()
     camera_id: int = _static()
+    camera_mount: mounts.Mount = _static()
+    body_parents: tuple[int, ...] = _static()
     projection: str = _static()
     height: int = _static()
     width: int = _static()
     light_types: tuple[int, ...] = _static()
-    light_modes: tuple[int, ...] = _static()
-    light_bodies: tuple[int, ...] = _static()
-    light_targets: tuple[int, ...] = _static()
+    light_mounts: tuple[mounts.Mount, ...] = _static()
     light_highlights: tuple[bool, ...] = _static()
     light_shadows: tuple[bool, ...] = _static()
     headlight: bool = _static()
@@ -203,6 +213,8 @@ class Scene:
         leaves = {**appearance, **lights, **reading.camera_parameters(mj_model, camera_id, camera)}
         leaves["sky_top"], leaves["sky_bottom"] = reading.sky_colours(mj_model)
         leaves["haze_colour"] = mj_model.vis.rgba.haze[:3]
+        camera_mount = reading.camera_mount(mj_model, camera_id)
+        leaves["body_mass"], parents = reading.weights(mj_model, (camera_mount, *light_facts["light_mounts"]))
         seen_through = reading.planes_seen_through(mj_model, camera_id, camera, plane_backs)[ids]
         arrays = {name: np.asarray(value, np.float32) for name, value in leaves.items()}
         arrays |= {"texels": texels, **meshes.build_triangles(mj_model, ids)}
@@ -214,6 +226,8 @@ class Scene:
             transparent=reading.transparency(appearance["rgba"][ids, 3], seen_through),
             geom_count=mj_model.ngeom,
             camera_id=camera_id,
+            camera_mount=camera_mount,
+            body_parents=parents,
             projection=reading.projection(mj_model, camera_id, camera),
             height=int(height),
             width=int(width),

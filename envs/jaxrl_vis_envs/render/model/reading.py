@@ -7,6 +7,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from jaxrl_vis_envs.render.mounts import Mount
+
 SUPPORTED_TYPES = (
     mujoco.mjtGeom.mjGEOM_PLANE,
     mujoco.mjtGeom.mjGEOM_HFIELD,
@@ -99,14 +101,23 @@ def camera_parameters(mj_model: mujoco.MjModel, camera_id: int, camera: Camera) 
     if camera_id == FREE_CAMERA:
         position, turn = free_camera_pose(free_camera(mj_model, camera))
         lens = dict(fovy=mj_model.vis.global_.fovy, focal=np.zeros(2), principal=np.zeros(2), sensor=np.zeros(2))
-        lens |= dict(camera_shift=position, camera_turn=turn)
+        lens |= dict(camera_position=np.zeros(3), camera_axes=np.eye(3), camera_shift=position, camera_turn=turn)
     else:
         intrinsic = mj_model.cam_intrinsic[camera_id]
+        position, axes = mj_model.cam_pos[camera_id], np.zeros(9)
+        mujoco.mju_quat2Mat(axes, mj_model.cam_quat[camera_id])
+        # A camera that follows keeps its orientation and its offset of the initial pose.
+        if mj_model.cam_mode[camera_id] == mujoco.mjtCamLight.mjCAMLIGHT_TRACK:
+            position, axes = mj_model.cam_pos0[camera_id], mj_model.cam_mat0[camera_id]
+        elif mj_model.cam_mode[camera_id] == mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM:
+            position, axes = mj_model.cam_poscom0[camera_id], mj_model.cam_mat0[camera_id]
         lens = dict(
             fovy=mj_model.cam_fovy[camera_id],
             focal=intrinsic[:2],
             principal=intrinsic[2:],
             sensor=mj_model.cam_sensorsize[camera_id],
+            camera_position=position,
+            camera_axes=axes.reshape(3, 3),
             camera_shift=np.zeros(3),
             camera_turn=np.zeros(3),
         )
@@ -115,6 +126,21 @@ def camera_parameters(mj_model: mujoco.MjModel, camera_id: int, camera: Camera) 
         znear=mj_model.vis.map.znear * mj_model.stat.extent,
         zfar=mj_model.vis.map.zfar * mj_model.stat.extent,
     )
+
+
+def camera_mount(mj_model: mujoco.MjModel, camera_id: int) -> Mount:
+    """What the camera is fixed to; a free one, to the world."""
+    if camera_id == FREE_CAMERA:
+        return Mount(int(mujoco.mjtCamLight.mjCAMLIGHT_FIXED), 0, -1)
+    facts = (mj_model.cam_mode, mj_model.cam_bodyid, mj_model.cam_targetbodyid)
+    return Mount(*(int(fact[camera_id]) for fact in facts))
+
+
+def weights(mj_model: mujoco.MjModel, mounts: Iterable[Mount]) -> tuple[np.ndarray, tuple[int, ...]]:
+    """Masses of the bodies and what each one hangs on, if any mount follows a centre of mass; otherwise nothing."""
+    if all(mount.weighed < 0 for mount in mounts):
+        return np.zeros(0), ()
+    return mj_model.body_mass, tuple(mj_model.body_parentid.tolist())
 
 
 def drawn_objects(
@@ -364,9 +390,9 @@ def lights(mj_model: mujoco.MjModel, material_specular: np.ndarray, shadows: boo
     highlights = [shiny and bool(np.any(colour > 0)) for colour in (*mj_model.light_specular[active], head.specular)]
     facts = dict(
         light_types=tuple(mj_model.light_type[active].tolist()),
-        light_modes=tuple(mj_model.light_mode[active].tolist()),
-        light_bodies=tuple(mj_model.light_bodyid[active].tolist()),
-        light_targets=tuple(mj_model.light_targetbodyid[active].tolist()),
+        light_mounts=tuple(
+            Mount(int(mj_model.light_mode[i]), int(mj_model.light_bodyid[i]), int(mj_model.light_targetbodyid[i])) for i in active
+        ),
         light_highlights=tuple(highlights),
         light_shadows=tuple((mj_model.light_castshadow[active].astype(bool) & shadows).tolist()),
     )
