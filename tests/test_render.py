@@ -225,16 +225,17 @@ def test_an_empty_scene_is_sky(ball):
     assert np.all(np.asarray(frame.segmentation) == -1)
 
 
-def test_what_cannot_be_drawn_is_refused_by_name():
+def test_a_signed_distance_field_is_drawn_through_its_mesh():
     xml = """<mujoco><asset><mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset><worldbody>
-      <geom name="statue" type="sdf" mesh="m" group="{group}"/><camera name="front"/></worldbody></mujoco>"""
-    model = mujoco.MjModel.from_xml_string(xml.format(group=0))
-    with pytest.raises(ValueError, match="statue.*sdf") as refusal:
-        Scene.from_mjmodel(model, "front")
-    assert "\n" not in str(refusal.value)
-    assert Scene.from_mjmodel(model, "front", leave_out=("statue",)).object_ids == ()
-    hidden = Scene.from_mjmodel(mujoco.MjModel.from_xml_string(xml.format(group=3)), "front")
-    assert hidden.object_ids == ()
+      <geom name="statue" type="{kind}" mesh="m"/><camera name="front" pos=".2 .2 3"/></worldbody></mujoco>"""
+    shown = []
+    for kind in ("sdf", "mesh"):
+        mj_model = mujoco.MjModel.from_xml_string(xml.format(kind=kind))
+        mj_data = mujoco.MjData(mj_model)
+        mujoco.mj_forward(mj_model, mj_data)
+        shown.append(render(Scene.from_mjmodel(mj_model, "front", 16, 16), mj_data))
+    assert np.any(np.asarray(shown[0].segmentation) == 0)
+    jax.tree.map(np.testing.assert_array_equal, *shown)
 
 
 def test_an_unknown_camera_is_refused_with_the_names_there_are(ball):

@@ -35,7 +35,7 @@ class _View(NamedTuple):
     rotation: jax.Array
     unit: shapes.UnitShapes
     table: jax.Array
-    lights: list[lights.Light]
+    lights: jax.Array
 
 
 class _Path(NamedTuple):
@@ -146,19 +146,18 @@ def _draw(outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.Unit
     beyond_depth = outputs.rgb or outputs.segmentation or outputs.normals
     if not (beyond_depth or blocks.tiled(scene) or any(scene.transparent)):
         far = blocks.scan(lambda rays: raycast.nearest_distance(scene, unit, rays), rays)
-        near = length = None
+        depth = length = None
         if outputs.depth:
-            near = blocks.restore(scene, layout, far)
+            depth = blocks.restore(scene, layout, far)
         if outputs.distance:
             along = jnp.where(far < scene.zfar, far * camera.ray_length(scene, rays), scene.zfar)
             length = blocks.restore(scene, layout, along)
-        return Planes(None, near, None, None, length)
-    key, triangle = blocks.nearest(scene, unit, rays)
+        return Planes(None, depth, None, None, length)
     # Barriers here too: each output would otherwise look for the nearest object again.
-    key, triangle = jax.lax.optimization_barrier((key, triangle))
+    near = jax.lax.optimization_barrier(blocks.nearest(scene, unit, rays))
     rows = lookup.object_table(scene, unit)
-    view = _View(rotation, unit, rows, lights.unpack(scene, light_table) if outputs.rgb else [])
-    pixels = blocks.joined((rays, key, triangle))
+    view = _View(rotation, unit, rows, light_table)
+    pixels = blocks.joined((rays, near))
     planes = blocks.scan(lambda *block: _finish(scene, view, outputs, *block), *pixels)
     planes = jax.lax.optimization_barrier(planes)
     planes = jax.tree.map(lambda plane: blocks.restore(scene, layout, plane), planes)
@@ -177,34 +176,47 @@ def _barrier_tangents(primals: tuple, tangents: tuple) -> tuple:
     return _barrier(*primals), tangents[0]
 
 
-def _finish(scene: Scene, view: _View, outputs: Outputs, rays: Rays, key: Any, triangle: Any) -> Planes:
+def _finish(scene: Scene, view: _View, outputs: Outputs, rays: Rays, nearest: blocks.Nearest) -> Planes:
     """The wanted planes of a block of pixels whose nearest objects are known, [P] each; colours and normals in three."""
-    near, index = raycast.decode(scene, key)
+    near, index = raycast.decode(scene, nearest.key, nearest.row)
     sees = index >= 0
     far = near
     colour: Any = None
     normal: Any = None
     length = labels = None
+    shown = _declared_last(scene, view, rays, nearest, index) if outputs.segmentation and scene.reordered else index
     if outputs.rgb or outputs.depth or outputs.normals or outputs.distance or any(scene.transparent):
         row = lookup.fetch(view.table, index)
-        hit = surface.meet(scene, row, lookup.fetch_triangle(scene, triangle), rays, near)
+        hit = surface.meet(scene, row, lookup.fetch_triangle(scene, nearest.triangle), rays, near)
         far = jnp.where(sees, hit.depth, scene.zfar)
         normal = tuple(jnp.where(sees, component, 0.0) for component in hit.normal)
         sheets = transparent.sheets(scene, view.unit, view.table, rays, far)
         if outputs.rgb:
-            front = shade.shade(scene, view.unit, view.lights, row, hit, rays)
+            front = shade.shade(scene, view.unit, lights.unpack(scene, view.lights), row, hit, rays)
             background = shade.sky(scene, view.rotation, rays)
             colour = tuple(jnp.where(sees, one, other) for one, other in zip(front, background, strict=True))
             if scene.haze[0] >= 0:
                 colour = shade.haze(scene, view.unit, rays, far, colour)
-            colour = transparent.blend(scene, view.unit, view.lights, sheets, rays, colour)
-        far, index, normal = transparent.nearest(sheets, far, index, normal)
+            colour = transparent.blend(scene, view.unit, view.table, view.lights, sheets, rays, far, colour)
+        far, shown, normal = transparent.nearest(sheets, far, shown, normal)
     if outputs.distance:
-        length = jnp.where(index >= 0, far * camera.ray_length(scene, rays), scene.zfar)
+        length = jnp.where(shown >= 0, far * camera.ray_length(scene, rays), scene.zfar)
     if outputs.segmentation:
         # One entry more than there are drawn objects, so that -1 finds the sky's label at the end.
-        labels = jnp.asarray(np.array([*scene.object_ids, -1], np.int32))[index]
+        labels = jnp.asarray(np.array([*scene.object_ids, -1], np.int32))[shown]
     return Planes(colour, far if outputs.depth else None, labels, normal if outputs.normals else None, length)
+
+
+def _declared_last(scene: Scene, view: _View, rays: Rays, nearest: blocks.Nearest, index: jax.Array) -> jax.Array:
+    """The rows ``index`` [P], but of the object that reflects where it coincides with one that comes before it in the model.
+
+    MuJoCo's colours are those of the other one there, and its labels are not.
+    """
+    mask = raycast.code_mask(scene)
+    last = len(scene.object_ids) - 1
+    key = raycast.object_key(scene, jax.lax.stop_gradient(view.unit), last, rays, jnp.full_like(nearest.key, -1), mask)
+    before = np.append(np.array(scene.object_ids[:-1]) < scene.object_ids[-1], [False, False])  # itself, and the sky
+    return jnp.where(((key ^ nearest.key) & ~mask == 0) & jnp.asarray(before)[index], last, index)
 
 
 def _draw_nothing(scene: Scene, data: Any, outputs: Outputs) -> Planes:

@@ -76,7 +76,7 @@ def _check_kind(data: Any, kind: str, count: int, is_exact: bool = False) -> Non
 
 
 def _check_array(data: Any, name: str, shapes_of_one: tuple[tuple[int, ...], ...], count: int, is_exact: bool) -> None:
-    """Refuses ``data`` unless it has ``name``, an array of ``count`` rows of one of the shapes, or more where that is not exact."""
+    """Refuses ``data`` without an array ``name`` of ``count`` rows of one of the shapes, or more where that is not exact."""
     if not hasattr(data, name):
         mend = ", such as state.data" if hasattr(getattr(data, "data", None), name) else ""
         raise ValueError(f"poses are read from mjx.Data or mujoco.MjData{mend}; {type(data).__name__} has no {name}")
@@ -96,9 +96,7 @@ def _check_filled(data: Any) -> None:
         return
     if np.any(np.asarray(rotations)):
         return
-    raise ValueError(
-        "all poses are zero: run mjx.kinematics or mjx.forward on mjx.Data, or mujoco.mj_forward on mujoco.MjData, before drawing"
-    )
+    raise ValueError("all poses are zero: run mjx.kinematics on mjx.Data, or mujoco.mj_forward on MjData, before drawing")
 
 
 @functools.partial(jax.jit, static_argnums=0)
