@@ -42,9 +42,11 @@ def camera_pose(scene: Scene, data: Any) -> tuple[jax.Array, jax.Array, jax.Arra
         Position [3] float32 in metres, rotation [3, 3] float32 whose columns are the camera's axes, and whether both are finite
         ([] bool). A pose that is not finite comes back as the identity.
     """
+    # A pose that the compiler knew would be folded into all that follows, which would round otherwise than for one that moves.
+    fixed = barrier((scene.camera_position, scene.camera_axes))
     bodies = mounts.Bodies(scene.body_mass, scene.body_parents)
-    position, frame = mounts.place(bodies, data, scene.camera_mount, scene.camera_position)
-    rotation = scene.camera_axes
+    position, frame = mounts.place(bodies, data, scene.camera_mount, fixed[0])
+    rotation = fixed[1]
     # Written out rather than as matrix products, which accelerators would do at low precision.
     if scene.camera_mount.aims:
         rotation = mounts.looking(position, mounts.target(bodies, data, scene.camera_mount))
@@ -56,6 +58,17 @@ def camera_pose(scene: Scene, data: Any) -> tuple[jax.Array, jax.Array, jax.Arra
     position = jnp.where(finite, position, 0.0)
     rotation = jnp.where(finite, rotation, jnp.eye(3, dtype=jnp.float32))
     return position, rotation, finite
+
+
+@jax.custom_jvp
+def barrier(tree: Any) -> Any:
+    """What XLA computes once, and not again for every use. JAX 0.11 cannot transpose its own."""
+    return jax.lax.optimization_barrier(tree)
+
+
+@barrier.defjvp
+def _barrier_tangents(primals: tuple, tangents: tuple) -> tuple:
+    return barrier(*primals), tangents[0]
 
 
 def _rotation(vector: jax.Array) -> jax.Array:

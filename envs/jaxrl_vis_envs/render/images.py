@@ -142,7 +142,7 @@ def _draw(outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.Unit
     layout = blocks.layout(scene)
     rays = camera.pixel_rays(scene, layout.rows, layout.columns)
     # A barrier, because XLA would otherwise redo the work per object in every pixel.
-    unit = _barrier(unit)
+    unit = camera.barrier(unit)
     beyond_depth = outputs.rgb or outputs.segmentation or outputs.normals
     if not (beyond_depth or blocks.tiled(scene) or any(scene.transparent)):
         far = blocks.scan(lambda rays: raycast.nearest_distance(scene, unit, rays), rays)
@@ -163,17 +163,6 @@ def _draw(outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.Unit
     planes = jax.tree.map(lambda plane: blocks.restore(scene, layout, plane), planes)
     vectors = {name: jnp.stack(vector) for name in ("rgb", "normals") if (vector := getattr(planes, name)) is not None}
     return _quantized(outputs, planes._replace(**vectors))
-
-
-@jax.custom_jvp
-def _barrier(tree: Any) -> Any:
-    """What XLA computes once, and not again for every use. JAX 0.11 cannot transpose its own."""
-    return jax.lax.optimization_barrier(tree)
-
-
-@_barrier.defjvp
-def _barrier_tangents(primals: tuple, tangents: tuple) -> tuple:
-    return _barrier(*primals), tangents[0]
 
 
 def _finish(scene: Scene, view: _View, outputs: Outputs, rays: Rays, nearest: blocks.Nearest) -> Planes:
