@@ -16,8 +16,6 @@ from jaxrl_vis_envs.render.model import meshes, reading
 from jaxrl_vis_envs.render.pixel import shapes
 from jaxrl_vis_envs.render.scene import Scene
 
-# How far outside of its edges, as a share of them, a triangle is still met, so that no ray slips between two.
-_SEAM = 1e-5
 _NUMBER = meshes.CLUSTER - 1  # the lowest bits of a depth, that hold the number of a triangle in its cluster
 
 
@@ -136,5 +134,5 @@ def _meet_each(scene: Scene, unit: shapes.UnitShapes, cluster: jax.Array, rays: 
         from_ = tuple(begin[number, axis] + offset[axis] for axis in range(3))
         t = -from_[2] / jnp.where(ray[2] < 0.0, ray[2], -1.0)
         first, second = from_[0] + t * ray[0], from_[1] + t * ray[1]
-        inside = jnp.minimum(jnp.minimum(first, second), 1.0 - first - second) >= -_SEAM
+        inside = jnp.minimum(jnp.minimum(first, second), 1.0 - first - second) >= -meshes.SEAM
         yield t, inside & (ray[2] < 0.0) & (t > scene.znear)
