@@ -2,7 +2,8 @@
 
     MUJOCO_GL=egl python benchmarks/render_images.py [SHEET ...]
 
-Each sheet is a PNG in docs/renderer/. The models are those of tests/render_models.py, in their first random pose.
+Each sheet is a PNG in docs/renderer/. The models are those of tests/render_models.py, in their first random pose; on the sheet
+`limits` they are those of tests/render_limits.py.
 """
 
 import argparse
@@ -16,10 +17,12 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
 import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
+import render_limits  # noqa: E402
 import render_models  # noqa: E402
 from PIL import Image, ImageDraw, ImageFont  # noqa: E402
 from render_features import FEATURES  # noqa: E402
 
+from jaxrl_vis_envs.render import Scene  # noqa: E402
 from jaxrl_vis_envs.render.reference import ReferenceRenderer  # noqa: E402
 
 FOLDER = ROOT / "docs" / "renderer"
@@ -33,31 +36,56 @@ def sheets() -> dict[str, list[str]]:
     groups: dict[str, list[str]] = {}
     for name in FEATURES:
         groups.setdefault(FEATURES[name].sheet, []).append(name)
+    groups["limits"] = list(render_limits.LIMITS)
     groups["models"] = [name for name, entry in render_models.MODELS.items() if entry.source != "feature"]
     return groups
 
 
 def panel(name: str) -> tuple[str, Image.Image]:
     """Title, and the three images of one model side by side."""
+    if name in render_limits.LIMITS:
+        return limit_panel(name)
     entry = render_models.MODELS[name]
     mj_model, camera = render_models.build(name)
     mj_data = mujoco.MjData(mj_model)
     render_models.set_pose(mj_model, mj_data, 0)
     with ReferenceRenderer(render_models.build(name, truth=True)[0], SIZE, SIZE, site_groups=entry.site_groups) as reference:
         theirs = np.asarray(reference(mj_data, camera).rgb)
-    row = np.full((SIZE, 3 * SIZE + 2 * GAP, 3), 255, np.uint8)
-    row[:, SIZE + GAP : 2 * SIZE + GAP] = theirs
     title = FEATURES[name].title if name in FEATURES else name
     try:
         scene = render_models.make_scene(name, mj_model, camera, SIZE, SIZE)
     except ValueError:
-        row[:, :SIZE] = row[:, 2 * (SIZE + GAP) :] = MISSING
-        return f"{title} (refused)", Image.fromarray(row)
+        blank = np.full((SIZE, SIZE, 3), MISSING, np.uint8)
+        return f"{title} (refused)", side_by_side(blank, theirs, blank)
     ours = np.asarray(render_models.draw(scene, [render_models.poses_of(mj_data)])[0].rgb)
-    row[:, :SIZE] = ours
-    difference = GAIN * np.abs(ours.astype(int) - theirs)
-    row[:, 2 * (SIZE + GAP) :] = np.minimum(difference, 255)
-    return title, Image.fromarray(row)
+    return title, side_by_side(ours, theirs, difference(ours, theirs))
+
+
+def limit_panel(name: str) -> tuple[str, Image.Image]:
+    """The same of a scene of `render_limits`, which MuJoCo draws as it does by default, but for its edges."""
+    title, xml, effects = render_limits.LIMITS[name]
+    mj_model = mujoco.MjModel.from_xml_string(xml)
+    mj_model.vis.quality.offsamples = 0
+    mj_data = mujoco.MjData(mj_model)
+    mujoco.mj_forward(mj_model, mj_data)  # tendons too
+    with ReferenceRenderer(mj_model, SIZE, SIZE, effects=effects) as reference:
+        theirs = np.asarray(reference(mj_data, "cam").rgb)
+    scene = Scene.from_mjmodel(mj_model, "cam", SIZE, SIZE, plane_backs=False)
+    ours = np.asarray(render_models.draw(scene, [render_models.poses_of(mj_data)], quick=True)[0].rgb)
+    return title, side_by_side(ours, theirs, difference(ours, theirs))
+
+
+def difference(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
+    """Of two images [H, W, 3] uint8, times `GAIN`."""
+    return np.minimum(GAIN * np.abs(ours.astype(int) - theirs), 255).astype(np.uint8)
+
+
+def side_by_side(*images: np.ndarray) -> Image.Image:
+    """Images [SIZE, SIZE, 3] uint8, with gaps between them."""
+    row = np.full((SIZE, len(images) * (SIZE + GAP) - GAP, 3), 255, np.uint8)
+    for number, image in enumerate(images):
+        row[:, number * (SIZE + GAP) : number * (SIZE + GAP) + SIZE] = image
+    return Image.fromarray(row)
 
 
 def sheet(names: list[str], columns: int = 2) -> Image.Image:

@@ -1,11 +1,13 @@
 """Compares our renderer with MuJoCo's own on many models, live, and prints a table. Needs a GL library.
 
     MUJOCO_GL=egl python benchmarks/render_parity.py [MODEL ...] [--poses N] [--size PIXELS] [--out FILE] [--print | --page]
+    MUJOCO_GL=egl python benchmarks/render_parity.py FOLDER [--size PIXELS] [--pictures FOLDER]
 
 Every model of tests/render_models.py is drawn in N seeded random poses by both, with shadows, reflections and multisampling
 off. What is measured, and the bounds, are in tests/render_comparison.py. The exit status is 1 where a bound does not hold. A
 model that our renderer refuses is a row of the table like any other, with the reason. `--page` writes the table of the rows
-that --out holds into docs/renderer_parity.md.
+that --out holds into docs/renderer_parity.md. With a FOLDER of anyone's models (MJCF or URDF, at any depth) these are
+compared, each at its start and in a scattered pose: see `render_folder`.
 """
 
 import argparse
@@ -19,6 +21,8 @@ from typing import Any
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "envs"), str(ROOT / "tests")]
+if __name__ == "__main__" and sys.platform == "linux" and "DISPLAY" not in os.environ:
+    os.environ.setdefault("MUJOCO_GL", "egl")  # without a screen nothing else will do
 os.environ.setdefault("JAX_PLATFORMS", "cpu")  # the images are few, and MuJoCo's renderer is what takes the time
 
 import jax  # noqa: E402
@@ -27,6 +31,7 @@ import numpy as np  # noqa: E402
 import render_models  # noqa: E402
 from render_comparison import BOUNDS, Tally, surface_kinds  # noqa: E402
 
+from benchmarks import render_folder  # noqa: E402
 from jaxrl_vis_envs.render.reference import ReferenceRenderer  # noqa: E402
 
 TARGET = ROOT / "benchmarks" / "results" / "render_parity.json"
@@ -121,13 +126,18 @@ def table(rows: Iterable[dict[str, Any]]) -> str:
 def main() -> int:
     """Compares the models that were named, or all."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("models", nargs="*", metavar="MODEL", help="all if none is named")
+    parser.add_argument("models", nargs="*", metavar="MODEL", help="all if none is named; or the path of one folder of models")
     parser.add_argument("--poses", type=int, default=200)
-    parser.add_argument("--size", type=int, default=128, help="height and width in pixels")
+    parser.add_argument("--size", type=int, help="height and width in pixels (default: 128, of a folder 96)")
     parser.add_argument("--out", type=pathlib.Path, default=TARGET, help="rows of other models that this file holds are kept")
     parser.add_argument("--print", action="store_true", help="only print the rows that --out holds")
     parser.add_argument("--page", action="store_true", help=f"only write the rows that --out holds into {PAGE.name}")
+    parser.add_argument(
+        "--pictures", type=pathlib.Path, help="of a folder: where to write images (ours, MuJoCo's, difference x 8)"
+    )
     options = parser.parse_args()
+    if len(options.models) == 1 and pathlib.Path(options.models[0]).is_dir():
+        return render_folder.report(pathlib.Path(options.models[0]), options.size or 96, options.pictures)
     unknown = set(options.models) - set(render_models.MODELS)
     if unknown:
         parser.error(f"no model {', '.join(sorted(unknown))}; there are {', '.join(render_models.MODELS)}")
@@ -142,7 +152,7 @@ def main() -> int:
         return int(any(row["failures"] for row in rows.values()))
     print(table_head())
     for name in options.models or render_models.MODELS:
-        rows[name] = compare(name, options.poses, options.size)
+        rows[name] = compare(name, options.poses, options.size or 128)
         failed += bool(rows[name]["failures"])
         print(table_row(rows[name]), flush=True)
         ordered = [rows[model] for model in render_models.MODELS if model in rows]

@@ -235,7 +235,7 @@ def _orbit(position: np.ndarray, quaternion: np.ndarray, rng: np.random.Generato
 
 def poses_of(mj_data: mujoco.MjData) -> dict[str, np.ndarray]:
     """What the renderer reads of MjData, as a dictionary that `jax.vmap` understands."""
-    names = ("geom_xpos", "geom_xmat", "site_xpos", "site_xmat", "cam_xpos", "cam_xmat", "xpos", "xmat", "subtree_com")
+    names = ("geom_xpos", "geom_xmat", "site_xpos", "site_xmat", "cam_xpos", "cam_xmat", "xpos", "xmat", "xipos")
     return {name: np.array(getattr(mj_data, name), np.float32) for name in names}
 
 

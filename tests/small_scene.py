@@ -62,6 +62,6 @@ def small_scene(
     mj_model = mujoco.MjModel.from_xml_string(_SCENE.format(lens=lens, objects=_FEW if few else _ALL, more=more))
     mj_data = mujoco.MjData(mj_model)
     mujoco.mj_forward(mj_model, mj_data)
-    names = ("geom_xpos", "geom_xmat", "site_xpos", "site_xmat", "cam_xpos", "cam_xmat", "xpos", "xmat", "subtree_com")
+    names = ("geom_xpos", "geom_xmat", "site_xpos", "site_xmat", "cam_xpos", "cam_xmat", "xpos", "xmat", "xipos")
     poses = SimpleNamespace(**{name: jnp.asarray(getattr(mj_data, name), jnp.float32) for name in names})
     return Scene.from_mjmodel(mj_model, "front", height, width, site_groups=(0,), **scene_options), poses

@@ -12,6 +12,7 @@ from mujoco import mjx
 
 from jaxrl_vis_envs.compilation import env_jit
 from jaxrl_vis_envs.render import Scene, render, render_planes
+from jaxrl_vis_envs.render.mounts import Mount
 from jaxrl_vis_envs.render.reference import ReferenceRenderer
 
 REFERENCES = pathlib.Path(__file__).parent / "data" / "render_references.npz"
@@ -124,8 +125,7 @@ def test_accepts_mjx_data_and_vmap_equals_a_loop(ball):
     shifts = jnp.linspace(-0.3, 0.3, 3)
 
     def drawn(shift):
-        moved = mjx.kinematics(model, data.replace(qpos=data.qpos.at[0].set(shift)))
-        return render(scene, mjx.camlight(model, moved))
+        return render(scene, mjx.kinematics(model, data.replace(qpos=data.qpos.at[0].set(shift))))
 
     batch = env_jit(jax.vmap(drawn))(shifts)
     one = env_jit(drawn)
@@ -143,8 +143,8 @@ def test_runs_inside_scan(ball):
     poses = poses_of(mj_data)
 
     def body(height, _):
-        moved = poses | {"cam_xpos": poses["cam_xpos"] + jnp.array([0.0, 0.0, 1.0]) * height}
-        return height + 0.1, render_planes(scene, SimpleNamespace(**moved), rgb=False).depth
+        moved = scene.replace(camera_position=scene.camera_position + jnp.array([0.0, 0.0, 1.0]) * height)
+        return height + 0.1, render_planes(moved, SimpleNamespace(**poses), rgb=False).depth
 
     depths = env_jit(lambda: jax.lax.scan(body, 0.0, None, length=3)[1])()
     assert depths.shape == (3, 33, 33)
@@ -177,9 +177,7 @@ def test_a_geom_with_a_nan_pose_is_not_drawn(ball, broken):
 
 def test_a_nan_camera_sees_only_sky(ball):
     _, mj_data, scene = ball
-    poses = poses_of(mj_data)
-    poses["cam_xpos"][:] = np.nan
-    frame = draw(scene, poses)
+    frame = draw(scene.replace(camera_position=np.full(3, np.nan)), poses_of(mj_data))
     assert np.all(np.asarray(frame.segmentation) == -1)
     np.testing.assert_array_equal(frame.depth, float(scene.zfar))
 
@@ -187,8 +185,7 @@ def test_a_nan_camera_sees_only_sky(ball):
 def test_the_view_from_inside_a_geom_goes_through_it(ball):
     _, mj_data, scene = ball
     poses = poses_of(mj_data)
-    poses["cam_xpos"][:] = poses["geom_xpos"][0]
-    assert int(draw(scene, poses).segmentation[16, 16]) == 2
+    assert int(draw(scene.replace(camera_position=poses["geom_xpos"][0]), poses).segmentation[16, 16]) == 2
 
 
 def test_gradient_of_depth_with_respect_to_a_pose(ball):
@@ -228,16 +225,17 @@ def test_an_empty_scene_is_sky(ball):
     assert np.all(np.asarray(frame.segmentation) == -1)
 
 
-def test_what_cannot_be_drawn_is_refused_by_name():
+def test_a_signed_distance_field_is_drawn_through_its_mesh():
     xml = """<mujoco><asset><mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset><worldbody>
-      <geom name="statue" type="sdf" mesh="m" group="{group}"/><camera name="front"/></worldbody></mujoco>"""
-    model = mujoco.MjModel.from_xml_string(xml.format(group=0))
-    with pytest.raises(ValueError, match="statue.*sdf") as refusal:
-        Scene.from_mjmodel(model, "front")
-    assert "\n" not in str(refusal.value)
-    assert Scene.from_mjmodel(model, "front", leave_out=("statue",)).object_ids == ()
-    hidden = Scene.from_mjmodel(mujoco.MjModel.from_xml_string(xml.format(group=3)), "front")
-    assert hidden.object_ids == ()
+      <geom name="statue" type="{kind}" mesh="m"/><camera name="front" pos=".2 .2 3"/></worldbody></mujoco>"""
+    shown = []
+    for kind in ("sdf", "mesh"):
+        mj_model = mujoco.MjModel.from_xml_string(xml.format(kind=kind))
+        mj_data = mujoco.MjData(mj_model)
+        mujoco.mj_forward(mj_model, mj_data)
+        shown.append(render(Scene.from_mjmodel(mj_model, "front", 16, 16), mj_data))
+    assert np.any(np.asarray(shown[0].segmentation) == 0)
+    jax.tree.map(np.testing.assert_array_equal, *shown)
 
 
 def test_an_unknown_camera_is_refused_with_the_names_there_are(ball):
@@ -292,8 +290,11 @@ def test_groups_come_in_any_collection(ball):
         (lambda scene, data: (scene, SimpleNamespace(**poses_of(data, 2))), r"\(3, 3\), got \(2, 3, 3\); jax.vmap"),
         (lambda scene, data: (scene, SimpleNamespace(**poses_of(data) | {"geom_xpos": np.zeros((2, 3))})), "models differ"),
         (
-            lambda scene, data: (scene, SimpleNamespace(**poses_of(data) | {"cam_xpos": np.zeros((0, 3))})),
-            "at least 1",
+            lambda scene, data: (
+                scene.replace(camera_mount=Mount(0, 1, -1)),
+                SimpleNamespace(**poses_of(data) | {"xpos": np.zeros((1, 3))}),
+            ),
+            "at least 2",
         ),
     ],
 )

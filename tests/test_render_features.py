@@ -111,11 +111,8 @@ def test_the_camera_of_the_scene_can_be_moved():
     mujoco.mju_axisAngle2Quat(turn, np.array([0.1, -0.2, 0.5]) / np.sqrt(0.3), np.sqrt(0.3))
     rotation = np.zeros(9)
     mujoco.mju_quat2Mat(rotation, turn)
-    mj_data.cam_xpos[0] += [0.2, -0.1, 0.3]
-    mj_data.cam_xmat[0] = rotation
-    expected = shown(scene, mj_data)
-    mj_data.cam_xmat[0] = np.eye(3).reshape(-1)
-    mj_data.cam_xpos[0] -= [0.2, -0.1, 0.3]
+    position = scene.camera_position + jnp.array([0.2, -0.1, 0.3])
+    expected = shown(scene.replace(camera_position=position, camera_axes=rotation.reshape(3, 3)), mj_data)
     np.testing.assert_allclose(shown(moved, mj_data).depth, expected.depth, atol=1e-5)
 
 

@@ -37,7 +37,7 @@ def operations_per_pixel(scene: Scene, tests: np.ndarray, coloured: bool = True)
         return None
     pixels = jax.ShapeDtypeStruct((_PIXELS,), jnp.float32)
     count = len(scene.object_ids)
-    unit = shapes.UnitShapes(*(jnp.ones((count, *shape)) for shape in ((3,), (3, 3), (), (), (4,))))
+    unit = shapes.UnitShapes(*(jnp.ones((count, *shape)) for shape in ((3,), (3, 3), (), (), (4,), ())))
     total = 0.0
     for row, geom in enumerate(scene.object_ids):
 

@@ -12,7 +12,7 @@ from jaxrl_vis.errors import RequestError
 
 SCENES = ("finger", "fetch_reach", "primitives")
 POSES = ("geom_xpos", "geom_xmat", "site_xpos", "site_xmat", "cam_xpos", "cam_xmat", "light_xpos", "light_xdir")
-POSES += ("xpos", "xmat", "subtree_com")
+POSES += ("xpos", "xmat", "xipos")
 FREE_METRES, FREE_RADIANS, BALL_RADIANS, SLIDE_METRES = 0.2, 0.5, 1.0, 0.3
 SPREADS = {"scattered": 1.0, "start": 0.01}
 """How far joints are scattered, as a share of `scatter_joints`: at the start just enough that no two images are the same."""

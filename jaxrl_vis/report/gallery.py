@@ -95,11 +95,9 @@ class _Poses(NamedTuple):
     geom_xmat: jax.Array
     site_xpos: jax.Array
     site_xmat: jax.Array
-    cam_xpos: jax.Array
-    cam_xmat: jax.Array
     xpos: jax.Array
     xmat: jax.Array
-    subtree_com: jax.Array
+    xipos: jax.Array
 
 
 def image_environments() -> list[str]:

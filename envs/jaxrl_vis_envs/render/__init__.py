@@ -8,6 +8,7 @@ Example::
 
 Where things are, in the order in which data passes through; a file imports only from rows above its own::
 
+    mounts       where cameras and lights are, from the poses of bodies
     model/       reads an `mujoco.MjModel` into NumPy arrays: colours, lights, lens, triangles, the atlas of textures
     scene        `Scene`, a pytree of all that; `outputs`: which planes are asked for, and what comes back
     camera       the camera's pose and the rays of the pixels

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis_envs.render.model.reading import FREE_CAMERA
+from jaxrl_vis_envs.render import mounts
 from jaxrl_vis_envs.render.scene import Scene
 
 _DEGREES = np.pi / 180.0
@@ -35,25 +35,40 @@ def camera_pose(scene: Scene, data: Any) -> tuple[jax.Array, jax.Array, jax.Arra
 
     Args:
         scene: The scene.
-        data: `mjx.Data`, `mujoco.MjData` or anything with ``cam_xpos`` [ncam, 3] and ``cam_xmat`` [ncam, 3, 3] or [ncam, 9];
-            not read for a free camera.
+        data: `mjx.Data`, `mujoco.MjData` or anything with the poses of bodies that `mounts.place` reads. A camera that is fixed
+            to the world needs none.
 
     Returns:
         Position [3] float32 in metres, rotation [3, 3] float32 whose columns are the camera's axes, and whether both are finite
         ([] bool). A pose that is not finite comes back as the identity.
     """
-    if scene.camera_id == FREE_CAMERA:
-        position, rotation = jnp.zeros(3, jnp.float32), jnp.eye(3, dtype=jnp.float32)
-    else:
-        position = jnp.asarray(data.cam_xpos, jnp.float32)[scene.camera_id]
-        rotation = jnp.asarray(data.cam_xmat, jnp.float32).reshape(-1, 3, 3)[scene.camera_id]
+    # A pose that the compiler knew would be folded into all that follows, which would round otherwise than for one that moves.
+    fixed = barrier((scene.camera_position, scene.camera_axes))
+    bodies = mounts.Bodies(scene.body_mass, scene.body_parents)
+    position, frame = mounts.place(bodies, data, scene.camera_mount, fixed[0])
+    rotation = fixed[1]
     # Written out rather than as matrix products, which accelerators would do at low precision.
+    if scene.camera_mount.aims:
+        rotation = mounts.looking(position, mounts.target(bodies, data, scene.camera_mount))
+    elif frame is not None:
+        rotation = jnp.sum(frame[:, :, None] * rotation[None], axis=1)
     position = position + jnp.sum(rotation * scene.camera_shift, axis=1)
     rotation = jnp.sum(rotation[:, :, None] * _rotation(scene.camera_turn)[None], axis=1)
     finite = jnp.all(jnp.isfinite(position)) & jnp.all(jnp.isfinite(rotation))
     position = jnp.where(finite, position, 0.0)
     rotation = jnp.where(finite, rotation, jnp.eye(3, dtype=jnp.float32))
     return position, rotation, finite
+
+
+@jax.custom_jvp
+def barrier(tree: Any) -> Any:
+    """What XLA computes once, and not again for every use. JAX 0.11 cannot transpose its own."""
+    return jax.lax.optimization_barrier(tree)
+
+
+@barrier.defjvp
+def _barrier_tangents(primals: tuple, tangents: tuple) -> tuple:
+    return barrier(*primals), tangents[0]
 
 
 def _rotation(vector: jax.Array) -> jax.Array:

@@ -35,7 +35,7 @@ class _View(NamedTuple):
     rotation: jax.Array
     unit: shapes.UnitShapes
     table: jax.Array
-    lights: list[lights.Light]
+    lights: jax.Array
 
 
 class _Path(NamedTuple):
@@ -59,9 +59,11 @@ def render_planes(
 
     Args:
         scene: What is drawn, and from which camera.
-        data: Poses of one environment: `mjx.Data` or `mujoco.MjData` after forward kinematics, or anything with ``geom_xpos``
-            [ngeom, 3], ``geom_xmat`` [ngeom, 3, 3] or [ngeom, 9], and likewise ``cam_xpos``, ``cam_xmat`` and, for the lights,
-            ``xpos``, ``xmat``. A geom whose pose is not finite is not drawn.
+        data: Poses of one environment: `mjx.Data` or `mujoco.MjData` after forward kinematics (`mjx.kinematics` is enough), or
+            anything with ``geom_xpos`` [ngeom, 3], ``geom_xmat`` [ngeom, 3, 3] or [ngeom, 9], and likewise ``site_xpos``,
+            ``site_xmat`` where sites are drawn. Cameras and lights are placed from the bodies: those that ride on one, follow
+            it or aim at it need ``xpos`` and ``xmat``, those of a centre of mass ``xipos``. A geom whose pose is not finite is
+            not drawn.
         rgb: Whether to shade.
         depth: Whether to return the planar depth.
         segmentation: Whether to say which object each pixel sees.
@@ -73,7 +75,8 @@ def render_planes(
         The planes that were asked for.
 
     Raises:
-        ValueError: ``scene`` is no scene, or ``data`` has no poses, those of several environments, or those of another model.
+        ValueError: ``scene`` is no scene, or ``data`` has no poses, none that kinematics have filled in (which is seen where
+            they are numbers, not in a function that is being traced), those of several environments, or those of another model.
     """
     outputs = Outputs(rgb, depth, segmentation, normals, distance, quantized)
     check_poses(scene, data, rgb)
@@ -139,23 +142,22 @@ def _draw(outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.Unit
     layout = blocks.layout(scene)
     rays = camera.pixel_rays(scene, layout.rows, layout.columns)
     # A barrier, because XLA would otherwise redo the work per object in every pixel.
-    unit = _barrier(unit)
+    unit = camera.barrier(unit)
     beyond_depth = outputs.rgb or outputs.segmentation or outputs.normals
     if not (beyond_depth or blocks.tiled(scene) or any(scene.transparent)):
         far = blocks.scan(lambda rays: raycast.nearest_distance(scene, unit, rays), rays)
-        near = length = None
+        depth = length = None
         if outputs.depth:
-            near = blocks.restore(scene, layout, far)
+            depth = blocks.restore(scene, layout, far)
         if outputs.distance:
             along = jnp.where(far < scene.zfar, far * camera.ray_length(scene, rays), scene.zfar)
             length = blocks.restore(scene, layout, along)
-        return Planes(None, near, None, None, length)
-    key, triangle = blocks.nearest(scene, unit, rays)
+        return Planes(None, depth, None, None, length)
     # Barriers here too: each output would otherwise look for the nearest object again.
-    key, triangle = jax.lax.optimization_barrier((key, triangle))
+    near = jax.lax.optimization_barrier(blocks.nearest(scene, unit, rays))
     rows = lookup.object_table(scene, unit)
-    view = _View(rotation, unit, rows, lights.unpack(scene, light_table) if outputs.rgb else [])
-    pixels = blocks.joined((rays, key, triangle))
+    view = _View(rotation, unit, rows, light_table)
+    pixels = blocks.joined((rays, near))
     planes = blocks.scan(lambda *block: _finish(scene, view, outputs, *block), *pixels)
     planes = jax.lax.optimization_barrier(planes)
     planes = jax.tree.map(lambda plane: blocks.restore(scene, layout, plane), planes)
@@ -163,45 +165,47 @@ def _draw(outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.Unit
     return _quantized(outputs, planes._replace(**vectors))
 
 
-@jax.custom_jvp
-def _barrier(tree: Any) -> Any:
-    """What XLA computes once, and not again for every use. JAX 0.11 cannot transpose its own."""
-    return jax.lax.optimization_barrier(tree)
-
-
-@_barrier.defjvp
-def _barrier_tangents(primals: tuple, tangents: tuple) -> tuple:
-    return _barrier(*primals), tangents[0]
-
-
-def _finish(scene: Scene, view: _View, outputs: Outputs, rays: Rays, key: Any, triangle: Any) -> Planes:
+def _finish(scene: Scene, view: _View, outputs: Outputs, rays: Rays, nearest: blocks.Nearest) -> Planes:
     """The wanted planes of a block of pixels whose nearest objects are known, [P] each; colours and normals in three."""
-    near, index = raycast.decode(scene, key)
+    near, index = raycast.decode(scene, nearest.key, nearest.row)
     sees = index >= 0
     far = near
     colour: Any = None
     normal: Any = None
     length = labels = None
+    shown = _declared_last(scene, view, rays, nearest, index) if outputs.segmentation and scene.reordered else index
     if outputs.rgb or outputs.depth or outputs.normals or outputs.distance or any(scene.transparent):
         row = lookup.fetch(view.table, index)
-        hit = surface.meet(scene, row, lookup.fetch_triangle(scene, triangle), rays, near)
+        hit = surface.meet(scene, row, lookup.fetch_triangle(scene, nearest.triangle), rays, near)
         far = jnp.where(sees, hit.depth, scene.zfar)
         normal = tuple(jnp.where(sees, component, 0.0) for component in hit.normal)
         sheets = transparent.sheets(scene, view.unit, view.table, rays, far)
         if outputs.rgb:
-            front = shade.shade(scene, view.unit, view.lights, row, hit, rays)
+            front = shade.shade(scene, view.unit, lights.unpack(scene, view.lights), row, hit, rays)
             background = shade.sky(scene, view.rotation, rays)
             colour = tuple(jnp.where(sees, one, other) for one, other in zip(front, background, strict=True))
             if scene.haze[0] >= 0:
                 colour = shade.haze(scene, view.unit, rays, far, colour)
-            colour = transparent.blend(scene, view.unit, view.lights, sheets, rays, colour)
-        far, index, normal = transparent.nearest(sheets, far, index, normal)
+            colour = transparent.blend(scene, view.unit, view.table, view.lights, sheets, rays, far, colour)
+        far, shown, normal = transparent.nearest(sheets, far, shown, normal)
     if outputs.distance:
-        length = jnp.where(index >= 0, far * camera.ray_length(scene, rays), scene.zfar)
+        length = jnp.where(shown >= 0, far * camera.ray_length(scene, rays), scene.zfar)
     if outputs.segmentation:
         # One entry more than there are drawn objects, so that -1 finds the sky's label at the end.
-        labels = jnp.asarray(np.array([*scene.object_ids, -1], np.int32))[index]
+        labels = jnp.asarray(np.array([*scene.object_ids, -1], np.int32))[shown]
     return Planes(colour, far if outputs.depth else None, labels, normal if outputs.normals else None, length)
+
+
+def _declared_last(scene: Scene, view: _View, rays: Rays, nearest: blocks.Nearest, index: jax.Array) -> jax.Array:
+    """The rows ``index`` [P], but of the object that reflects where it coincides with one that comes before it in the model.
+
+    MuJoCo's colours are those of the other one there, and its labels are not.
+    """
+    mask = raycast.code_mask(scene)
+    last = len(scene.object_ids) - 1
+    key = raycast.object_key(scene, jax.lax.stop_gradient(view.unit), last, rays, jnp.full_like(nearest.key, -1), mask)
+    before = np.append(np.array(scene.object_ids[:-1]) < scene.object_ids[-1], [False, False])  # itself, and the sky
+    return jnp.where(((key ^ nearest.key) & ~mask == 0) & jnp.asarray(before)[index], last, index)
 
 
 def _draw_nothing(scene: Scene, data: Any, outputs: Outputs) -> Planes:

@@ -22,6 +22,7 @@ class ReferenceRenderer:
         width: W, pixels.
         effects: Whether to draw what `render` does not: shadows, reflections, haze, tendons, skins, flexes and rangefinders.
         site_groups: Site groups that are drawn.
+        haze: Whether to draw the horizon's haze all the same.
 
     Raises:
         ValueError: The image is larger than the model's offscreen buffer, or a size is no positive integer.
@@ -29,7 +30,13 @@ class ReferenceRenderer:
     """
 
     def __init__(
-        self, mj_model: mujoco.MjModel, height: int, width: int, effects: bool = False, site_groups: tuple[int, ...] = ()
+        self,
+        mj_model: mujoco.MjModel,
+        height: int,
+        width: int,
+        effects: bool = False,
+        site_groups: tuple[int, ...] = (),
+        haze: bool = False,
     ):
         check_size(height=height, width=width)
         buffer = mj_model.vis.global_
@@ -49,10 +56,10 @@ class ReferenceRenderer:
         marks = mujoco.mjtVisFlag
         for mark in (marks.mjVIS_TENDON, marks.mjVIS_RANGEFINDER, marks.mjVIS_SKIN, marks.mjVIS_FLEXEDGE, marks.mjVIS_FLEXSKIN):
             self._options.flags[mark] = effects
-        if not effects:
-            flags = mujoco.mjtRndFlag
-            for flag in (flags.mjRND_SHADOW, flags.mjRND_REFLECTION, flags.mjRND_HAZE):
-                self._renderer.scene.flags[flag] = False
+        flags = mujoco.mjtRndFlag
+        for flag in (flags.mjRND_SHADOW, flags.mjRND_REFLECTION):
+            self._renderer.scene.flags[flag] = effects
+        self._renderer.scene.flags[flags.mjRND_HAZE] = effects or haze
 
     def __call__(self, mj_data: mujoco.MjData, camera: Camera) -> Frame:
         """The image as NumPy arrays: a `Frame` of rgb [H, W, 3] uint8, depth [H, W] float32 and segmentation [H, W] int32.

@@ -15,6 +15,7 @@ import jax
 import mujoco
 import numpy as np
 
+from jaxrl_vis_envs.render import mounts
 from jaxrl_vis_envs.render.model import meshes, reading, textures
 
 
@@ -35,6 +36,7 @@ class Scene:
 
     Attributes:
         size: [N, 3] float32, metres, as `mjModel.geom_size` means it for each type (endless planes: a very large half-size).
+        bound: [N] float32, metres, of a ball around each object, by which what is transparent is sorted.
         rgba: [N, 4] float32 in [0, 1], the geom's own colour or its material's. Alpha counts only for the objects in
             ``transparent``, which is settled when the scene is made.
         emission: [N] float32, the part of the colour that needs no light.
@@ -45,14 +47,20 @@ class Scene:
         focal: [2] float32, metres, of a camera with a sensor size.
         principal: [2] float32, metres, of a camera with a sensor size: where the axis meets the sensor, from its middle.
         sensor: [2] float32, metres, width and height of the sensor.
-        camera_shift: [3] float32, metres in the camera's own frame (right, up, back), added to the pose in the data. Of a free
-            camera, which is not in the data: its position in the world.
-        camera_turn: [3] float32, radians, a rotation vector in the camera's own frame, applied to the pose in the data. Of a
-            free camera: its rotation in the world.
+        camera_position: [3] float32, metres, in the frame of the body that the camera is fixed to, or along the world's axes
+            from what it follows.
+        camera_axes: [3, 3] float32 whose columns are the camera's axes (right, up, back), in the body's frame, or in the
+            world's where it follows. Not read for a camera that aims at a body.
+        camera_shift: [3] float32, metres in the camera's own frame (right, up, back), added to its pose. Of a free camera: its
+            position in the world.
+        camera_turn: [3] float32, radians, a rotation vector in the camera's own frame, applied to its pose. Of a free camera:
+            its rotation in the world.
+        body_mass: [nbody] float32, kg, where the camera or a light follows a centre of mass, else [0].
         znear: [] float32, metres. What is nearer than this is cut away.
         zfar: [] float32, metres. What is further is not drawn, and it is the depth of the sky.
-        light_position: [L, 3] float32, metres, in the light's frame (see `lights.light_poses`).
-        light_direction: [L, 3] float32, unit, in the light's frame.
+        light_position: [L, 3] float32, metres, in the frame of the body that it is fixed to, or along the world's axes from
+            what it follows.
+        light_direction: [L, 3] float32, unit, in the same frame. Not read for a light that aims at a body.
         light_ambient: [L, 3] float32.
         light_diffuse: [L, 3] float32.
         light_specular: [L, 3] float32.
@@ -69,19 +77,21 @@ class Scene:
         triangles: [R, 36] float32, the triangles of all meshes and height fields, see `meshes.build_triangles`.
         clusters: [K, 4] float32, metres: balls around the clusters of triangles that are drawn.
         cluster_places: [K, 2] int32: which of the G objects each cluster belongs to, and the first row of its triangles.
-        object_ids: G indices of the drawn objects, the last of the model first (of two at the same depth MuJoCo shows the
-            later one, and the renderer the one that comes first here).
+        object_ids: G indices of the drawn objects, those that MuJoCo draws last first (of two at the same depth it shows the
+            later one, and the renderer the one that comes first here): the last of the model, but one that reflects at the end.
         object_types: G values of `mujoco.mjtGeom`.
         transparent: Which of the G objects let light through: 0 not, 1 yes, 2 a plane that does so from behind.
+        reordered: Whether an object that reflects is drawn before others that come before it in the model. In segmentations
+            MuJoCo keeps to the model's order.
         geom_count: ngeom of the model.
         camera_id: The camera's index in the model; `reading.FREE_CAMERA` for a free one.
+        camera_mount: What the camera is fixed to.
+        body_parents: nbody indices of the bodies that bodies hang on, where ``body_mass`` holds their masses, else none.
         projection: "perspective", "intrinsic" (a perspective camera with a sensor) or "orthographic".
         height: H, pixels.
         width: W, pixels.
         light_types: L values of `mujoco.mjtLightType`.
-        light_modes: L values of `mujoco.mjtCamLight`.
-        light_bodies: L body indices.
-        light_targets: L body indices, -1 for none.
+        light_mounts: What each of the L lights is fixed to.
         light_highlights: L + 1 booleans, the last for the headlight: whether the light makes highlights at all. One that has
             no specular colour in the model never does, and costs less.
         light_shadows: L booleans: whether the light casts shadows (none does unless shadows are asked for).
@@ -92,6 +102,7 @@ class Scene:
     """
 
     size: jax.Array = _leaf()
+    bound: jax.Array = _leaf()
     rgba: jax.Array = _leaf()
     emission: jax.Array = _leaf()
     specular: jax.Array = _leaf()
@@ -101,8 +112,11 @@ class Scene:
     focal: jax.Array = _leaf()
     principal: jax.Array = _leaf()
     sensor: jax.Array = _leaf()
+    camera_position: jax.Array = _leaf()
+    camera_axes: jax.Array = _leaf()
     camera_shift: jax.Array = _leaf()
     camera_turn: jax.Array = _leaf()
+    body_mass: jax.Array = _leaf()
     znear: jax.Array = _leaf()
     zfar: jax.Array = _leaf()
     light_position: jax.Array = _leaf()
@@ -126,15 +140,16 @@ class Scene:
     object_ids: tuple[int, ...] = _static()
     object_types: tuple[int, ...] = _static()
     transparent: tuple[int, ...] = _static()
+    reordered: bool = _static()
     geom_count: int = _static()
     camera_id: int = _static()
+    camera_mount: mounts.Mount = _static()
+    body_parents: tuple[int, ...] = _static()
     projection: str = _static()
     height: int = _static()
     width: int = _static()
     light_types: tuple[int, ...] = _static()
-    light_modes: tuple[int, ...] = _static()
-    light_bodies: tuple[int, ...] = _static()
-    light_targets: tuple[int, ...] = _static()
+    light_mounts: tuple[mounts.Mount, ...] = _static()
     light_highlights: tuple[bool, ...] = _static()
     light_shadows: tuple[bool, ...] = _static()
     headlight: bool = _static()
@@ -156,6 +171,7 @@ class Scene:
         haze: bool = False,
         plane_backs: bool | None = None,
         leave_out: tuple[str, ...] = (),
+        lights: str = "all",
     ) -> Self:
         """Reads what is drawn from ``mj_model``.
 
@@ -176,44 +192,55 @@ class Scene:
                 sides, which is cheaper. None: those are that the camera is behind of in the model's initial pose, which is
                 right for cameras and planes that do not pass each other.
             leave_out: Names of geoms that are not drawn, and "skin" and "flex" for all of these.
+            lights: "all" lights with all lights but images, which are left out as MuJoCo leaves them out. "mujoco" leaves out
+                point lights too, which MuJoCo's renderer does not know: for images as it draws them.
 
         Returns:
             The scene. Objects with alpha 0 and objects of other groups are left out; tendons are not drawn.
 
         Raises:
             ValueError: ``mj_model`` is no `mujoco.MjModel`, the camera or a geom to be left out does not exist, a size is no
-                positive integer, groups are no numbers, or something that would be seen cannot be drawn (skins, flexes,
-                signed distance fields, lights that are images, shadows of meshes).
+                positive integer, groups are no numbers, ``lights`` is no choice, or something that would be seen cannot be
+                drawn (skins, flexes, shadows of meshes).
         """
         reading.check_model(mj_model)
         reading.check_size(height=height, width=width)
         groups = reading.group_numbers("groups", groups)
         site_groups = reading.group_numbers("site_groups", site_groups)
         reading.check_names(mj_model, leave_out)
+        reading.check_lights(lights)
         camera_id = reading.find_camera(mj_model, camera)
         appearance = reading.object_appearance(mj_model)
-        types = np.concatenate([mj_model.geom_type, mj_model.site_type])
+        types = reading.object_types(mj_model)
         drawn = reading.drawn_objects(mj_model, appearance["rgba"], groups, site_groups, leave_out)
         reading.refuse_unsupported(mj_model, types, drawn, groups, leave_out, shadows)
-        ids = np.flatnonzero(drawn)[::-1]
-        atlas, texels, sky = textures.build_atlas(mj_model, ids, textured)
+        seen_through = reading.planes_seen_through(mj_model, camera_id, camera, plane_backs)
+        transparency = reading.transparency(appearance["rgba"][:, 3], seen_through)
+        ids, reordered = reading.drawing_order(mj_model, types, np.flatnonzero(drawn), transparency[drawn] == reading.SOLID)
+        atlas, texels, sky = textures.build_atlas(mj_model, ids, types[ids], textured)
         if not textured:
-            appearance["rgba"][:, :3] *= reading.mean_texture_colours(mj_model)
-        lights, light_facts = reading.lights(mj_model, appearance["specular"][ids], shadows)
-        leaves = {**appearance, **lights, **reading.camera_parameters(mj_model, camera_id, camera)}
+            appearance["rgba"] *= reading.mean_texture_colours(mj_model)
+        light_leaves, light_facts = reading.lights(mj_model, appearance["specular"][ids], shadows, points=lights == "all")
+        leaves = {"bound": reading.bounds(mj_model), **appearance, **light_leaves}
+        leaves |= reading.camera_parameters(mj_model, camera_id, camera)
         leaves["sky_top"], leaves["sky_bottom"] = reading.sky_colours(mj_model)
         leaves["haze_colour"] = mj_model.vis.rgba.haze[:3]
-        seen_through = reading.planes_seen_through(mj_model, camera_id, camera, plane_backs)[ids]
+        camera_mount = reading.camera_mount(mj_model, camera_id)
+        leaves["body_mass"], parents = reading.weights(mj_model, (camera_mount, *light_facts["light_mounts"]))
         arrays = {name: np.asarray(value, np.float32) for name, value in leaves.items()}
-        arrays |= {"texels": texels, **meshes.build_triangles(mj_model, ids)}
+        clear = transparency[ids] == reading.CLEAR
+        arrays |= {"texels": texels, **meshes.build_triangles(mj_model, ids, types[ids], clear)}
         return cls(
             # All at once: `jnp.asarray` compiles a program for each shape.
             **jax.device_put(arrays),
             object_ids=tuple(ids.tolist()),
             object_types=tuple(types[ids].tolist()),
-            transparent=reading.transparency(appearance["rgba"][ids, 3], seen_through),
+            transparent=tuple(transparency[ids].tolist()),
+            reordered=reordered,
             geom_count=mj_model.ngeom,
             camera_id=camera_id,
+            camera_mount=camera_mount,
+            body_parents=parents,
             projection=reading.projection(mj_model, camera_id, camera),
             height=int(height),
             width=int(width),

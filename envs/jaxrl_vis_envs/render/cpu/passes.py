@@ -34,9 +34,11 @@ _NORMAL_STEPS = 32767.0
 def takes(scene: Scene, outputs: Outputs) -> bool:
     """Whether these passes draw these planes on the platform that is being traced for.
 
-    They are for CPUs, and draw opaque primitives without haze, with colours of 8 bits, and neither normals nor distances.
+    They are for CPUs, and draw opaque primitives without haze, with colours of 8 bits, and neither normals nor distances, nor
+    labels where what reflects may coincide with something else.
     """
     plain = not any(scene.transparent) and scene.haze[0] < 0 and not _FINE & set(scene.object_types)
+    plain = plain and not (outputs.segmentation and scene.reordered)
     return targets_cpu() and plain and (outputs.quantized or not outputs.rgb) and not (outputs.normals or outputs.distance)
 
 
@@ -58,11 +60,12 @@ def draw(outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.UnitS
     # Where nothing but depths is wanted, no bit of the keys is needed for anything else.
     labelled = outputs.rgb or outputs.segmentation
     colouring = _Colouring(scene, unit, rotation, light_table) if outputs.rgb else None
-    key, packed = (blocks.restore(scene, layout, plane) for plane in _tiles(scene, unit, colouring, labelled, rays))
+    planes = _tiles(scene, unit, colouring, labelled, rays)
+    key, packed, row = jax.tree.map(lambda plane: blocks.restore(scene, layout, plane), planes)
     colours = _unpack(packed) if outputs.rgb else None
     if not labelled:
         return Planes(colours, jax.lax.bitcast_convert_type(key, jnp.float32), None)
-    near, index = raycast.decode(scene, key)
+    near, index = raycast.decode(scene, key, row)
     far = labels = None
     if outputs.depth:
         # A key's depth has lost its lowest bits: half of them come back.
@@ -74,10 +77,14 @@ def draw(outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.UnitS
 
 
 class _Tile(NamedTuple):
-    """What is computed of a tile, int32 [P] each: keys, colours, and what leads to them. The next tile's takes its memory."""
+    """What is computed of a tile, int32 [P] each: keys, colours, and what leads to them. The next tile's takes its memory.
+
+    Rows are only there where they are no part of the keys.
+    """
 
     key: jax.Array
     colour: jax.Array
+    row: jax.Array | None
     own_keys: tuple[jax.Array, ...]
     normal: jax.Array
     texture: jax.Array
@@ -85,38 +92,46 @@ class _Tile(NamedTuple):
 
 def _tiles(
     scene: Scene, unit: shapes.UnitShapes, colouring: "_Colouring | None", labelled: bool, rays: Rays
-) -> tuple[jax.Array, jax.Array]:
-    """Keys and packed colours of all pixels, [tiles, P] int32 each, one tile after the other."""
+) -> tuple[jax.Array, ...]:
+    """Keys, packed colours and rows (or None) of all pixels, [tiles, P] int32 each, one tile after the other."""
     seen = tiles.seen_in_tiles(scene, unit, rays)
 
     def draw_tile(carry: tuple, pixels: tuple) -> tuple:
-        number, tile, keys, colours = carry
+        number, tile, results = carry
         # What goes straight into the results of a loop is computed on one core: it is copied there a round later.
         before = jnp.maximum(number - 1, 0)
-        keys, colours = keys.at[before].set(tile.key), colours.at[before].set(tile.colour)
+        results = jax.tree.map(lambda whole, own: whole.at[before].set(own), results, (tile.key, tile.colour, tile.row))
         rays, seen = pixels
-        key, own_keys = tiles.nearest_key(scene, unit, rays, seen, tile.own_keys, labelled)
-        tile = tile._replace(key=key, own_keys=own_keys)
+        key, row, own_keys = tiles.nearest_key(scene, unit, rays, seen, tile.own_keys, labelled)
+        tile = tile._replace(key=key, row=row, own_keys=own_keys)
         if colouring is not None:
             tile = colouring.colour(tile, rays, jnp.any(seen[np.array(tiles.solids(scene), int)]))
-        return (number + 1, tile, keys, colours), None
+        return (number + 1, tile, results), None
 
     shape = rays.u.shape
     empty = jnp.zeros(shape[1:], jnp.int32)
     # Zeros that XLA does not know to be the same: it would fill one array on one core, and copy it.
-    results = [jnp.zeros(shape, jnp.int32) + (0.0 * unit.origin[0, axis]).astype(jnp.int32) for axis in range(2)]
-    first = _Tile(empty, empty, tiles.memory(scene, empty), empty, empty)
-    (_, last, keys, colours), _ = jax.lax.scan(draw_tile, (jnp.int32(0), first, *results), (rays, seen))
-    return keys.at[shape[0] - 1].set(last.key), colours.at[shape[0] - 1].set(last.colour)
+    keeps_rows = labelled and raycast.keeps_rows(scene)
+    results = [
+        jnp.zeros(shape, jnp.int32) + (0.0 * unit.origin[0, axis]).astype(jnp.int32) if axis < 2 or keeps_rows else None
+        for axis in range(3)
+    ]
+    first = _Tile(empty, empty, empty if keeps_rows else None, tiles.memory(scene, empty), empty, empty)
+    (_, last, found), _ = jax.lax.scan(draw_tile, (jnp.int32(0), first, tuple(results)), (rays, seen))
+    return jax.tree.map(lambda whole, own: whole.at[shape[0] - 1].set(own), found, (last.key, last.colour, last.row))
 
 
 class _Seen(NamedTuple):
-    """What a pass starts from: rows of the objects that may be seen, `lookup.object_table`, and rays and keys, [P] each."""
+    """What a pass starts from: rows of the objects that may be seen, `lookup.object_table`, and rays and keys, [P] each.
+
+    And the rows that keys are of, where they are no part of them.
+    """
 
     rows: list[int]
     table: jax.Array
     rays: Rays
     key: jax.Array
+    row: jax.Array | None
 
 
 class _Colouring:
@@ -135,7 +150,9 @@ class _Colouring:
         def seeing(rows: list[int], what: Callable, *more: jax.Array | None) -> Callable[[jax.Array], jax.Array]:
             def see(zero: jax.Array) -> jax.Array:
                 # Everything depends on the zero, or XLA would compute and store parts of it for every tile.
-                seen, packed = jax.tree.map(lambda leaf: leaf + zero.astype(leaf.dtype), ((self.table, rays, tile.key), more))
+                seen, packed = jax.tree.map(
+                    lambda leaf: leaf + zero.astype(leaf.dtype), ((self.table, rays, tile.key, tile.row), more)
+                )
                 return what(_Seen(rows, *seen), *packed)
 
             return see
@@ -173,13 +190,13 @@ class _Colouring:
 
     def _met(self, seen: _Seen) -> tuple[lookup.Row, surface.Hit]:
         """The object that each pixel sees, and where."""
-        depth, index = raycast.decode(self.scene, seen.key)
+        depth, index = raycast.decode(self.scene, seen.key, seen.row)
         row = _row(seen.table, seen.rows, index)
         return row, surface.meet(self.scene, row, None, seen.rays, depth, refined=False)
 
     def _in_front(self, seen: _Seen, colour: Vector, sky: Vector) -> Vector:
         """The colours of pixels that see an object, the sky's elsewhere."""
-        sees = raycast.decode(self.scene, seen.key)[1] >= 0
+        sees = raycast.decode(self.scene, seen.key, seen.row)[1] >= 0
         return tuple(jnp.where(sees, front, back) for front, back in zip(colour, sky, strict=True))
 
 

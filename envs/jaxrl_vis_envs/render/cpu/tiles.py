@@ -70,7 +70,7 @@ def nearest_key(
     seen: jax.Array,
     own: tuple[jax.Array, ...],
     labelled: bool,
-) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+) -> tuple[jax.Array, jax.Array | None, tuple[jax.Array, ...]]:
     """`raycast.nearest_key` of one tile.
 
     Args:
@@ -82,10 +82,13 @@ def nearest_key(
         labelled: Whether the keys say which object it is, or are nothing but the bits of its depth.
 
     Returns:
-        The keys [P] int32, and the memory for the next tile.
+        The keys [P] int32, the rows [P] int32 where the scene `raycast.keeps_rows` and they are wanted (otherwise None), and
+        the memory for the next tile.
     """
     if not _culls(scene):
-        return raycast.nearest_key(scene, unit, rays, labelled), own
+        if labelled and raycast.keeps_rows(scene):
+            return *raycast.nearest_row(scene, unit, rays), own
+        return raycast.nearest_key(scene, unit, rays, labelled), None, own
     mask = raycast.code_mask(scene) if labelled else 0
     sky = raycast.sky_key(scene, mask)
     rows = solids(scene)
@@ -104,7 +107,7 @@ def nearest_key(
             best = jnp.minimum(best, raycast.object_key(scene, unit, row, rays, sky, mask))
     for row, key in zip(rows, own, strict=True):
         best = jnp.minimum(best, jnp.where(seen[row], key, sky))
-    return best, own
+    return best, None, own
 
 
 def once(condition: jax.Array, function: Callable[[jax.Array], jax.Array], otherwise: jax.Array) -> jax.Array:

@@ -49,9 +49,11 @@ _TYPES = {shapes.PLANE, shapes.SPHERE, shapes.CAPSULE, shapes.ELLIPSOID, shapes.
 
 
 def takes(scene: Scene, outputs: Outputs) -> bool:
-    """Whether the kernel draws these planes on the platform that is being traced for: any of a scene that it supports."""
-    del outputs
-    return supports(scene) and runs_gpu_kernels(probe)
+    """Whether the kernel draws these planes on the platform that is being traced for: any of a scene that it supports.
+
+    But for labels where what reflects may coincide with something else.
+    """
+    return supports(scene) and not (outputs.segmentation and scene.reordered) and runs_gpu_kernels(probe)
 
 
 def supports(scene: Scene) -> bool:
@@ -144,8 +146,8 @@ class _Refs(NamedTuple):
     ids: Any
 
 
-def _nearest(scene: Scene, refs: _Refs, place: Any, rays: Rays, znear: Any, best: jax.Array) -> jax.Array:
-    """The least key of the objects of a tile."""
+def _nearest(scene: Scene, refs: _Refs, place: Any, rays: Rays, znear: Any, best: tuple) -> tuple:
+    """The least key of the objects of a tile, given ``best``: (key,), or (bits of the depth, row) where rows are kept apart."""
     mask = raycast.code_mask(scene)
     start, direction, inverse_square = camera.ray_parts(scene, rays)
     kinds = sorted(scene.object_types)
@@ -173,8 +175,13 @@ def _nearest(scene: Scene, refs: _Refs, place: Any, rays: Rays, znear: Any, best
                 t, meets = raycast.entry(kind, values, start, direction, inverse_square)
                 if raycast.culls(scene, kind):
                     meets = meets & raycast.one_sided(refs.origin[index, 2], refs.axes[index, 2, 2])
-                key = (jax.lax.bitcast_convert_type(t, jnp.int32) & ~mask) | index
-                return left & (left - 1), jnp.minimum(best, jnp.where(meets & (t > znear), key, best))
+                bits = jax.lax.bitcast_convert_type(t, jnp.int32)
+                if len(best) == 1:
+                    key = (bits & ~mask) | index
+                    return left & (left - 1), (jnp.minimum(best[0], jnp.where(meets & (t > znear), key, best[0])),)
+                nearest, row = best
+                nearer = meets & (t > znear) & ((bits < nearest) | ((bits == nearest) & (index < row)))
+                return left & (left - 1), (jnp.where(nearer, bits, nearest), jnp.where(nearer, index, row))
 
             _, best = jax.lax.while_loop(lambda carry: carry[0] != 0, one_object, (bits & own, best))
     return best
@@ -199,10 +206,16 @@ def _kernel(*refs, scene: Scene, outputs: Outputs, tile: tuple[int, int]):
 
     mask = raycast.code_mask(scene)
     sky_key = (jax.lax.bitcast_convert_type(zfar, jnp.int32) & ~mask) | mask
-    best = _nearest(scene, refs, place, rays, znear, jnp.broadcast_to(sky_key, (_PIXELS,)))
-    index = best & mask
+    sky = jnp.broadcast_to(sky_key, (_PIXELS,))
+    if raycast.keeps_rows(scene):
+        none = len(scene.object_ids)
+        best, index = _nearest(scene, refs, place, rays, znear, (sky, jnp.full((_PIXELS,), none, jnp.int32)))
+        sees = index != none
+    else:
+        (best,) = _nearest(scene, refs, place, rays, znear, (sky,))
+        index = best & mask
+        sees = index != mask
     near = jax.lax.bitcast_convert_type(best & ~mask, jnp.float32)
-    sees = index != mask
     pixel = row * scene.width + column
 
     def store(value, plane=None):

@@ -11,6 +11,9 @@ import numpy as np
 CLUSTER = 8
 """Triangles in a cluster; the last of a mesh's are filled up with ones that no ray meets."""
 
+SEAM = 1e-5
+"""How far outside of its edges, as a share of them, a triangle is still met, so that no ray slips between two."""
+
 # Columns of `Scene.triangles`.
 MAP = slice(0, 12)  # three rows of four: first and second barycentric coordinate, height
 NORMALS = slice(12, 21)  # of the three corners
@@ -21,10 +24,19 @@ COLUMNS = 36
 _HFIELD, _MESH = int(mujoco.mjtGeom.mjGEOM_HFIELD), int(mujoco.mjtGeom.mjGEOM_MESH)
 # MuJoCo smooths a corner only where the smooth normal is within this cosine of the triangle's own.
 _SMOOTH = 0.8
+# Of the square of a triangle's longest side: one with less area has no normal that float32 knows of.
+_LEAST_AREA = 1e-9
 
 
-def build_triangles(mj_model: mujoco.MjModel, ids: np.ndarray) -> dict[str, np.ndarray]:
+def build_triangles(mj_model: mujoco.MjModel, ids: np.ndarray, types: np.ndarray, clear: np.ndarray) -> dict[str, np.ndarray]:
     """Triangles of all meshes and height fields among the objects ``ids``. Keys as in `Scene`.
+
+    Args:
+        mj_model: The model.
+        ids: The drawn objects.
+        types: Of each of them, as it is drawn.
+        clear: Whether each of them lets light through. Its triangles are laid over each other in the order in which MuJoCo
+            draws them, so that is the order of their rows; others are grouped by where they are.
 
     Returns:
         ``triangles`` [R, 36] float32, metres, in the frame of their geom, `CLUSTER` rows to a cluster; ``clusters`` [K, 4]
@@ -33,16 +45,16 @@ def build_triangles(mj_model: mujoco.MjModel, ids: np.ndarray) -> dict[str, np.n
         triangles once, and its clusters once per geom.
     """
     rows: list[np.ndarray] = []
-    found: dict[tuple[int, int], tuple[int, np.ndarray]] = {}
+    found: dict[tuple[int, int, bool], tuple[int, np.ndarray]] = {}
     clusters, places = [np.zeros((0, 4))], [np.zeros((0, 2), np.int64)]
     for row, index in enumerate(ids):
-        if index >= mj_model.ngeom or mj_model.geom_type[index] not in (_HFIELD, _MESH):
+        if types[row] not in (_HFIELD, _MESH):
             continue
-        key = (int(mj_model.geom_type[index]), int(mj_model.geom_dataid[index]))
+        key = (int(types[row]), int(mj_model.geom_dataid[index]), bool(clear[row]))
         if key not in found:
             triangles = _hfield(mj_model, key[1]) if key[0] == _HFIELD else _mesh(mj_model, key[1])
             first = sum(map(len, rows))
-            table, balls = _clustered(*triangles)
+            table, balls = _clustered(*triangles, ordered=key[2])
             rows.append(table)
             found[key] = first, balls
         first, balls = found[key]
@@ -58,14 +70,15 @@ def build_triangles(mj_model: mujoco.MjModel, ids: np.ndarray) -> dict[str, np.n
 def _mesh(mj_model: mujoco.MjModel, mesh: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Corners [T, 3, 3], normals [T, 3, 3] and texture coordinates [T, 3, 2] of a mesh."""
     faces = slice(mj_model.mesh_faceadr[mesh], mj_model.mesh_faceadr[mesh] + mj_model.mesh_facenum[mesh])
-    corners = mj_model.mesh_vert[mj_model.mesh_vertadr[mesh] + mj_model.mesh_face[faces]].astype(np.float64)
-    normals = mj_model.mesh_normal[mj_model.mesh_normaladr[mesh] + mj_model.mesh_facenormal[faces]].astype(np.float64)
+    corners = mj_model.mesh_vert[mj_model.mesh_vertadr[mesh] + mj_model.mesh_face[faces]]
+    normals = mj_model.mesh_normal[mj_model.mesh_normaladr[mesh] + mj_model.mesh_facenormal[faces]]
     if mj_model.mesh_texcoordadr[mesh] >= 0:
         where = mj_model.mesh_texcoordadr[mesh] + mj_model.mesh_facetexcoord[faces]
-        return corners, normals, mj_model.mesh_texcoord[where].astype(np.float64)
-    flat = _flat_normals(corners)[:, None]
-    normals = np.where(np.sum(normals * flat, -1, keepdims=True) < _SMOOTH, flat, normals)
-    return corners, normals, np.zeros((len(corners), 3, 2))
+        return corners.astype(np.float64), normals.astype(np.float64), mj_model.mesh_texcoord[where].astype(np.float64)
+    flat = _single_normals(corners)[:, None]
+    cosine = (normals[..., 0] * flat[..., 0] + normals[..., 1] * flat[..., 1]) + normals[..., 2] * flat[..., 2]
+    normals = np.where((cosine.astype(np.float64) < _SMOOTH)[..., None], flat, normals)
+    return corners.astype(np.float64), normals.astype(np.float64), np.zeros((len(corners), 3, 2))
 
 
 def _hfield(mj_model: mujoco.MjModel, hfield: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -89,8 +102,8 @@ def _hfield(mj_model: mujoco.MjModel, hfield: int) -> tuple[np.ndarray, np.ndarr
     ends = floor[[0, 0, -1, -1], [0, -1, 0, -1]].reshape(2, 2, 3)
     quads.append(_strip_quads(ends[1:], ends[:1]))
     quads_ = np.concatenate(quads)
-    # MuJoCo cuts every cell from its first corner to the one opposite.
-    corners = np.concatenate([quads_[:, [2, 0, 3]], quads_[:, [0, 1, 3]]])
+    # MuJoCo cuts every cell from its first corner to the one opposite, and draws cell by cell.
+    corners = np.stack([quads_[:, [2, 0, 3]], quads_[:, [0, 1, 3]]], axis=1).reshape(-1, 3, 3)
     normals = np.broadcast_to(_flat_normals(corners)[:, None], corners.shape)
     return corners, normals, np.zeros((len(corners), 3, 2))
 
@@ -106,20 +119,36 @@ def _flat_normals(corners: np.ndarray) -> np.ndarray:
     return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
 
 
-def _clustered(corners: np.ndarray, normals: np.ndarray, coordinates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _single_normals(corners: np.ndarray) -> np.ndarray:
+    """`_flat_normals` of [T, 3, 3] float32, operation by operation as MuJoCo computes them.
+
+    What it compares has 32 bits, and slopes of 3:4:5, whose cosine is the very bound, are common.
+    """
+    x, y, z = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).T
+    length = np.sqrt((x * x + y * y) + z * z)
+    scale = np.float32(1.0) / np.maximum(length, np.float32(1e-30))
+    return np.stack([x * scale, y * scale, z * scale], axis=1)
+
+
+def _clustered(
+    corners: np.ndarray, normals: np.ndarray, coordinates: np.ndarray, ordered: bool
+) -> tuple[np.ndarray, np.ndarray]:
     """Rows [K * CLUSTER, COLUMNS] of the triangles, cluster by cluster, and the balls [K, 4]. Without area: left out."""
     flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    kept = np.linalg.norm(flat, axis=1) > 1e-14
+    longest = np.max(np.sum(np.square(corners - np.roll(corners, 1, axis=1)), axis=2), axis=1)
+    kept = np.linalg.norm(flat, axis=1) > _LEAST_AREA * longest
     corners, normals, coordinates = corners[kept], normals[kept], coordinates[kept]
     unit = _flat_normals(corners)
-    basis = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], unit], axis=2)
+    met = _apart(corners) if ordered else corners
+    basis = np.stack([met[:, 1] - met[:, 0], met[:, 2] - met[:, 0], unit], axis=2)
     inverse = np.linalg.inv(basis)
-    offset = -np.einsum("tij,tj->ti", inverse, corners[:, 0])
+    offset = -np.einsum("tij,tj->ti", inverse, met[:, 0])
     maps = np.concatenate([inverse, offset[:, :, None]], axis=2)
     count = len(corners)
     parts = (maps.reshape(count, 12), normals.reshape(count, 9), coordinates.reshape(count, 6), corners.reshape(count, 9))
     table = np.concatenate(parts, axis=1)
-    groups = _grouped(corners.mean(1), np.arange(count))
+    order = np.arange(count)
+    groups = np.split(order, order[CLUSTER::CLUSTER]) if ordered and count else _grouped(corners.mean(1), order)
     # No ray meets a triangle whose height is 1 everywhere.
     rows = np.zeros((len(groups), CLUSTER, COLUMNS))
     rows[:, :, 11] = 1.0
@@ -134,6 +163,19 @@ def _clustered(corners: np.ndarray, normals: np.ndarray, coordinates: np.ndarray
     middles = 0.5 * (points.min(1) + points.max(1))
     radii = np.linalg.norm(points - middles[:, None], axis=2).max(1)
     return rows.reshape(-1, COLUMNS), np.concatenate([middles, radii[:, None]], axis=1)
+
+
+def _apart(corners: np.ndarray) -> np.ndarray:
+    """Corners [T, 3, 3] of triangles that are smaller by twice `SEAM` at every edge that belongs to their neighbour.
+
+    A ray that meets a common edge then meets one of the two, as in OpenGL. The neighbour runs along the edge the other way.
+    """
+    number = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)[1].reshape(-1, 3)
+    # The least share that each corner has in a point of the triangle: 0 on the edge that is opposite to it.
+    least = 2.0 * SEAM * (np.roll(number, -1, axis=1) > np.roll(number, -2, axis=1))
+    shares = np.repeat(least[:, None], 3, axis=1)
+    shares[:, range(3), range(3)] = 1.0 - (least.sum(1, keepdims=True) - least)
+    return shares @ corners
 
 
 def _grouped(middles: np.ndarray, members: np.ndarray) -> list[np.ndarray]:

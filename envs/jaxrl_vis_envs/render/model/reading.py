@@ -7,16 +7,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
-SUPPORTED_TYPES = (
-    mujoco.mjtGeom.mjGEOM_PLANE,
-    mujoco.mjtGeom.mjGEOM_HFIELD,
-    mujoco.mjtGeom.mjGEOM_SPHERE,
-    mujoco.mjtGeom.mjGEOM_CAPSULE,
-    mujoco.mjtGeom.mjGEOM_ELLIPSOID,
-    mujoco.mjtGeom.mjGEOM_CYLINDER,
-    mujoco.mjtGeom.mjGEOM_BOX,
-    mujoco.mjtGeom.mjGEOM_MESH,
-)
+from jaxrl_vis_envs.render.mounts import Mount
+
+_SDF, _MESH, _BOX, _PLANE = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("SDF", "MESH", "BOX", "PLANE"))
 
 # MuJoCo's half-size 0 of a plane means "without end" along that axis; this is far beyond any clip distance.
 ENDLESS = 1e10
@@ -27,6 +20,9 @@ SOLID, CLEAR, CLEAR_FROM_BEHIND = range(3)
 # OpenGL has eight lights; MuJoCo's renderer takes the headlight and then the model's in their order.
 MOST_LIGHTS = 8
 
+
+LIGHTS = ("all", "mujoco")
+"""Which lights count: all but images, or only those that MuJoCo's renderer knows, which are no points either."""
 
 FREE_CAMERA = -1
 """In the place of a camera's index, as MuJoCo has it: the free camera, which is not part of the model."""
@@ -99,14 +95,23 @@ def camera_parameters(mj_model: mujoco.MjModel, camera_id: int, camera: Camera) 
     if camera_id == FREE_CAMERA:
         position, turn = free_camera_pose(free_camera(mj_model, camera))
         lens = dict(fovy=mj_model.vis.global_.fovy, focal=np.zeros(2), principal=np.zeros(2), sensor=np.zeros(2))
-        lens |= dict(camera_shift=position, camera_turn=turn)
+        lens |= dict(camera_position=np.zeros(3), camera_axes=np.eye(3), camera_shift=position, camera_turn=turn)
     else:
         intrinsic = mj_model.cam_intrinsic[camera_id]
+        position, axes = mj_model.cam_pos[camera_id], np.zeros(9)
+        mujoco.mju_quat2Mat(axes, mj_model.cam_quat[camera_id])
+        # A camera that follows keeps its orientation and its offset of the initial pose.
+        if mj_model.cam_mode[camera_id] == mujoco.mjtCamLight.mjCAMLIGHT_TRACK:
+            position, axes = mj_model.cam_pos0[camera_id], mj_model.cam_mat0[camera_id]
+        elif mj_model.cam_mode[camera_id] == mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM:
+            position, axes = mj_model.cam_poscom0[camera_id], mj_model.cam_mat0[camera_id]
         lens = dict(
             fovy=mj_model.cam_fovy[camera_id],
             focal=intrinsic[:2],
             principal=intrinsic[2:],
             sensor=mj_model.cam_sensorsize[camera_id],
+            camera_position=position,
+            camera_axes=axes.reshape(3, 3),
             camera_shift=np.zeros(3),
             camera_turn=np.zeros(3),
         )
@@ -115,6 +120,21 @@ def camera_parameters(mj_model: mujoco.MjModel, camera_id: int, camera: Camera) 
         znear=mj_model.vis.map.znear * mj_model.stat.extent,
         zfar=mj_model.vis.map.zfar * mj_model.stat.extent,
     )
+
+
+def camera_mount(mj_model: mujoco.MjModel, camera_id: int) -> Mount:
+    """What the camera is fixed to; a free one, to the world."""
+    if camera_id == FREE_CAMERA:
+        return Mount(int(mujoco.mjtCamLight.mjCAMLIGHT_FIXED), 0, -1)
+    facts = (mj_model.cam_mode, mj_model.cam_bodyid, mj_model.cam_targetbodyid)
+    return Mount(*(int(fact[camera_id]) for fact in facts))
+
+
+def weights(mj_model: mujoco.MjModel, mounts: Iterable[Mount]) -> tuple[np.ndarray, tuple[int, ...]]:
+    """Masses of the bodies and what each one hangs on, if any mount follows a centre of mass; otherwise nothing."""
+    if all(mount.weighed < 0 for mount in mounts):
+        return np.zeros(0), ()
+    return mj_model.body_mass, tuple(mj_model.body_parentid.tolist())
 
 
 def drawn_objects(
@@ -165,6 +185,12 @@ def group_numbers(name: str, groups: Any) -> tuple[int, ...]:
     return tuple(map(int, listed))
 
 
+def check_lights(lights: Any) -> None:
+    """Raises a ValueError where ``lights`` is neither of the two choices there are."""
+    if lights not in LIGHTS:
+        raise ValueError(f"lights must be one of {', '.join(map(repr, LIGHTS))}, got {lights!r}")
+
+
 def check_names(mj_model: mujoco.MjModel, leave_out: tuple[str, ...]) -> None:
     """Raises a ValueError that names whatever is to be left out and is neither a geom's name nor "skin" nor "flex"."""
     if isinstance(leave_out, str) or not isinstance(leave_out, Iterable):
@@ -176,6 +202,47 @@ def check_names(mj_model: mujoco.MjModel, leave_out: tuple[str, ...]) -> None:
         raise ValueError(f"cannot leave out {', '.join(map(repr, unknown))}: the model's geoms are: {names}; or skin, flex")
 
 
+def object_types(mj_model: mujoco.MjModel) -> np.ndarray:
+    """[ngeom + nsite] `mujoco.mjtGeom` as objects are drawn: a signed distance field by the mesh that MuJoCo has made of it."""
+    types = np.concatenate([mj_model.geom_type, mj_model.site_type])
+    return np.where(types == _SDF, _MESH, types)
+
+
+def drawing_order(mj_model: mujoco.MjModel, types: np.ndarray, ids: np.ndarray, opaque: np.ndarray) -> tuple[np.ndarray, bool]:
+    """The objects ``ids`` as MuJoCo draws them, the last one first, because it is the one that is seen where several coincide.
+
+    It draws them as they are declared, but the first that reflects before all others, also where reflections are off. In
+    segmentations it does not.
+
+    Args:
+        mj_model: The model.
+        types: `object_types`.
+        ids: Indices of the drawn objects, ascending.
+        opaque: Whether each of these is.
+
+    Returns:
+        The indices, and whether that is another order than that of the declarations, reversed.
+    """
+    material = object_materials(mj_model)[ids]
+    reflectance = np.append(mj_model.mat_reflectance, 0.0)[material]
+    reflecting = np.flatnonzero(np.isin(types[ids], (_BOX, _PLANE)) & opaque & (reflectance > 0))
+    first = reflecting[0] if len(reflecting) else 0
+    order = np.concatenate([ids[first : first + 1], np.delete(ids, slice(first, first + 1))])
+    return order[::-1], bool(first > 0)
+
+
+def bounds(mj_model: mujoco.MjModel) -> np.ndarray:
+    """[ngeom + nsite] metres: radii of the balls around objects that MuJoCo sorts what is transparent by."""
+    x, y, z = mj_model.site_size.reshape(-1, 3).T
+    kinds = mj_model.site_type
+    sites = np.sqrt(x * x + y * y + z * z)
+    sites = np.where(kinds == mujoco.mjtGeom.mjGEOM_SPHERE, x, sites)
+    sites = np.where(kinds == mujoco.mjtGeom.mjGEOM_CAPSULE, x + y, sites)
+    sites = np.where(kinds == mujoco.mjtGeom.mjGEOM_CYLINDER, np.sqrt(x * x + y * y), sites)
+    sites = np.where(kinds == mujoco.mjtGeom.mjGEOM_ELLIPSOID, np.maximum(np.maximum(x, y), z), sites)
+    return np.concatenate([mj_model.geom_rbound, sites])
+
+
 def refuse_unsupported(
     mj_model: mujoco.MjModel,
     types: np.ndarray,
@@ -185,13 +252,6 @@ def refuse_unsupported(
     shadows: bool,
 ) -> None:
     """Raises a ValueError of one line that names everything that would be seen and cannot be drawn, and what to do."""
-    refused = []
-    for index in np.flatnonzero(drawn & ~np.isin(types, SUPPORTED_TYPES)):
-        refused.append(f"{object_name(mj_model, int(index))} ({_type_name(types[index])})")
-    if refused:
-        raise ValueError(
-            f"cannot draw {', '.join(refused)}: use a mesh or primitives, a group that is not drawn, alpha 0, or leave_out"
-        )
     deformables = (
         ("skin", mj_model.skin_group, mujoco.mjtObj.mjOBJ_SKIN),
         ("flex", mj_model.flex_group, mujoco.mjtObj.mjOBJ_FLEX),
@@ -201,10 +261,6 @@ def refuse_unsupported(
         if seen:
             names = ", ".join(f"{kind} {mujoco.mj_id2name(mj_model, accessor, i) or f'number {i}'}" for i in seen)
             raise ValueError(f"cannot draw {names}: use a group that is not drawn, or leave_out=({kind!r},)")
-    images = np.flatnonzero((mj_model.light_type == mujoco.mjtLightType.mjLIGHT_IMAGE) & mj_model.light_active.astype(bool))
-    if len(images):
-        names = ", ".join(f"light {mj_model.light(i).name or f'number {i}'}" for i in images)
-        raise ValueError(f"cannot light with images ({names}): make it inactive, or a directional, point or spot light")
     if shadows:
         fine = np.isin(types, (mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_HFIELD))
         casting = [object_name(mj_model, int(index)) for index in np.flatnonzero(drawn & fine)]
@@ -218,10 +274,6 @@ def object_name(mj_model: mujoco.MjModel, index: int) -> str:
     number = int(index if is_geom else index - mj_model.ngeom)
     name = (mj_model.geom(number) if is_geom else mj_model.site(number)).name or f"number {number}"
     return f"{'geom' if is_geom else 'site'} {name}"
-
-
-def _type_name(kind: int) -> str:
-    return mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower()
 
 
 def object_materials(mj_model: mujoco.MjModel) -> np.ndarray:
@@ -278,12 +330,12 @@ def texture_pixels(mj_model: mujoco.MjModel, texture: int) -> np.ndarray:
 
 
 def mean_texture_colours(mj_model: mujoco.MjModel) -> np.ndarray:
-    """[N, 3] in [0, 1], of every geom and site; ones where there is no texture."""
-    means = np.ones((mj_model.ntex + 1, 3))  # the last row is for no texture
+    """[N, 4] in [0, 1], of every geom and site, alpha last; ones where there is no texture."""
+    means = np.ones((mj_model.ntex + 1, 4))  # the last row is for no texture
     for texture in range(mj_model.ntex):
         pixels = texture_pixels(mj_model, texture)
         colour = pixels.reshape(-1, pixels.shape[-1]).mean(0) / 255.0
-        means[texture] = colour[:3] if len(colour) >= 3 else colour[0]
+        means[texture, : max(3, len(colour))] = colour if len(colour) >= 3 else colour[0]
     return means[object_textures(mj_model)]
 
 
@@ -323,9 +375,9 @@ def planes_seen_through(mj_model: mujoco.MjModel, camera_id: int, camera: Camera
     return np.concatenate([planes, np.zeros(mj_model.nsite, bool)])
 
 
-def transparency(alpha: np.ndarray, seen_through: np.ndarray) -> tuple[int, ...]:
+def transparency(alpha: np.ndarray, seen_through: np.ndarray) -> np.ndarray:
     """Of objects [N]: CLEAR by their alpha, CLEAR_FROM_BEHIND where they are planes that are ``seen_through``, else SOLID."""
-    return tuple(np.where(alpha < OPAQUE, CLEAR, np.where(seen_through, CLEAR_FROM_BEHIND, SOLID)).tolist())
+    return np.where(alpha < OPAQUE, CLEAR, np.where(seen_through, CLEAR_FROM_BEHIND, SOLID))
 
 
 def haze_plane(mj_model: mujoco.MjModel, drawn: np.ndarray) -> tuple[int, float]:
@@ -337,10 +389,18 @@ def haze_plane(mj_model: mujoco.MjModel, drawn: np.ndarray) -> tuple[int, float]
     return int(found[0]), float(mj_model.vis.map.haze)
 
 
-def lights(mj_model: mujoco.MjModel, material_specular: np.ndarray, shadows: bool) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Leaves of the lights that are drawn with, and the static facts about them. Keys as in `Scene`."""
+def lights(
+    mj_model: mujoco.MjModel, material_specular: np.ndarray, shadows: bool, points: bool
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Leaves of the lights that are drawn with, and the static facts about them. Keys as in `Scene`.
+
+    MuJoCo's renderer knows no lights that are images, and none that are points: the latter only count if ``points``.
+    """
     head = mj_model.vis.headlight
-    active = np.flatnonzero(mj_model.light_active)[: MOST_LIGHTS - bool(head.active)]
+    known = mj_model.light_type != mujoco.mjtLightType.mjLIGHT_IMAGE
+    if not points:
+        known &= mj_model.light_type != mujoco.mjtLightType.mjLIGHT_POINT
+    active = np.flatnonzero(mj_model.light_active.astype(bool) & known)[: MOST_LIGHTS - bool(head.active)]
     modes = mj_model.light_mode[active][:, None]
     # A tracking light keeps its orientation and its offset of the initial pose; the others are given in their body's frame.
     track, track_com = mujoco.mjtCamLight.mjCAMLIGHT_TRACK, mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM
@@ -364,9 +424,10 @@ def lights(mj_model: mujoco.MjModel, material_specular: np.ndarray, shadows: boo
     highlights = [shiny and bool(np.any(colour > 0)) for colour in (*mj_model.light_specular[active], head.specular)]
     facts = dict(
         light_types=tuple(mj_model.light_type[active].tolist()),
-        light_modes=tuple(mj_model.light_mode[active].tolist()),
-        light_bodies=tuple(mj_model.light_bodyid[active].tolist()),
-        light_targets=tuple(mj_model.light_targetbodyid[active].tolist()),
+        light_mounts=tuple(
+            Mount(int(mj_model.light_mode[i]), int(mj_model.light_bodyid[i]), int(mj_model.light_targetbodyid[i]))
+            for i in active
+        ),
         light_highlights=tuple(highlights),
         light_shadows=tuple((mj_model.light_castshadow[active].astype(bool) & shadows).tolist()),
     )

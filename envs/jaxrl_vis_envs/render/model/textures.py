@@ -2,8 +2,8 @@
 
 All images at all resolutions are in one array.
 
-A row of the array holds a texel and its neighbours to the right, below, and both, each as red + 256 green + 65536 blue: one
-lookup gives all that a bilinear mean needs.
+A row of the array holds a texel and its neighbours to the right, below, and both, each as red + 256 green + 65536 blue, with
+alpha in the bits above these where the image has any: one lookup gives all that a bilinear mean needs.
 """
 
 from typing import NamedTuple
@@ -33,6 +33,7 @@ class Atlas(NamedTuple):
         mappings: For each of the G drawn objects, how its texture lies on it.
         images: For each of the G drawn objects, its texture; None for none.
         uniform: For each of the G drawn objects, whether the texture repeats per metre and not per object.
+        alpha: For each of the G drawn objects, whether its texture has alpha, which counts on what is transparent.
         sky: The texture of the sky, None for a plain one.
     """
 
@@ -40,6 +41,7 @@ class Atlas(NamedTuple):
     mappings: tuple[int, ...]
     images: tuple[Image | None, ...]
     uniform: tuple[bool, ...]
+    alpha: tuple[bool, ...]
     sky: Image | None
 
     @property
@@ -48,8 +50,8 @@ class Atlas(NamedTuple):
         return any(mapping != NONE for mapping in self.mappings)
 
 
-def build_atlas(mj_model: mujoco.MjModel, ids: np.ndarray, textured: bool) -> tuple[Atlas, np.ndarray, str]:
-    """Gathers the textures of the objects ``ids`` and of the sky.
+def build_atlas(mj_model: mujoco.MjModel, ids: np.ndarray, types: np.ndarray, textured: bool) -> tuple[Atlas, np.ndarray, str]:
+    """Gathers the textures of the objects ``ids``, drawn as these types, and of the sky.
 
     Returns:
         The atlas, the texels [T, 4] uint32 (T at least 1), and "plain" or "texture" for the sky.
@@ -69,24 +71,26 @@ def build_atlas(mj_model: mujoco.MjModel, ids: np.ndarray, textured: bool) -> tu
 
     material = reading.object_materials(mj_model)[ids]
     texture = reading.object_textures(mj_model)[ids]
-    mappings = [_mapping(mj_model, int(i), int(t)) if textured else NONE for i, t in zip(ids, texture, strict=True)]
+    facts = zip(ids.tolist(), types.tolist(), texture.tolist(), strict=True)
+    mappings = [_mapping(mj_model, *fact) if textured else NONE for fact in facts]
     placed = tuple(place(int(t)) if how != NONE else None for how, t in zip(mappings, texture, strict=True))
     uniform = tuple(bool(how != NONE and mj_model.mat_texuniform[m]) for how, m in zip(mappings, material, strict=True))
+    alpha = tuple(bool(how != NONE and mj_model.tex_nchannel[t] == 4) for how, t in zip(mappings, texture, strict=True))
     skybox = reading.skybox(mj_model)
     sky = None
     if textured and skybox >= 0 and not _is_plain_sky(mj_model, skybox):
         sky = place(skybox)
     texels = np.concatenate(parts) if parts else np.zeros((1, 4), np.uint32)
-    atlas = Atlas(tuple(levels), tuple(mappings), placed, uniform, sky)
+    atlas = Atlas(tuple(levels), tuple(mappings), placed, uniform, alpha, sky)
     return atlas, texels, "texture" if sky is not None else "plain"
 
 
-def _mapping(mj_model: mujoco.MjModel, index: int, texture: int) -> int:
-    """How ``texture`` lies on object ``index``."""
+def _mapping(mj_model: mujoco.MjModel, index: int, kind: int, texture: int) -> int:
+    """How ``texture`` lies on object ``index``, drawn as ``kind``."""
     if texture < 0 or mj_model.tex_nchannel[texture] not in (3, 4):
         return NONE
     flat = mj_model.tex_type[texture] == mujoco.mjtTexture.mjTEXTURE_2D
-    if index < mj_model.ngeom and mj_model.geom_type[index] == mujoco.mjtGeom.mjGEOM_MESH:
+    if kind == mujoco.mjtGeom.mjGEOM_MESH:
         mesh = mj_model.geom_dataid[index]
         if mj_model.mesh_texcoordadr[mesh] >= 0:
             return UNWRAPPED if flat else NONE  # a cube has no use for a mesh's own coordinates, and MuJoCo shows none
@@ -94,12 +98,12 @@ def _mapping(mj_model: mujoco.MjModel, index: int, texture: int) -> int:
 
 
 def _faces(mj_model: mujoco.MjModel, texture: int) -> np.ndarray:
-    """[faces, height, width, 3] uint8 or float64, in [0, 255]."""
-    pixels = reading.texture_pixels(mj_model, texture)[..., :3]
+    """[faces, height, width, 3 or 4] uint8 or float64, in [0, 255]."""
+    pixels = reading.texture_pixels(mj_model, texture)
     if mj_model.tex_type[texture] == mujoco.mjtTexture.mjTEXTURE_2D:
         return pixels[None]
     edge = pixels.shape[1]
-    return pixels.reshape(-1, edge, edge, 3)
+    return pixels.reshape(-1, edge, edge, pixels.shape[-1])
 
 
 def _pyramid(faces: np.ndarray, repeats: bool) -> list[tuple[np.ndarray, tuple[int, int]]]:
@@ -131,6 +135,8 @@ def _quads(faces: np.ndarray, repeats: bool) -> np.ndarray:
     # Half added and the rest cut off: the nearest byte. The faces of skies are large, and signed numbers are converted faster.
     red, green, blue = ((faces[..., index] + 0.5).astype(np.int32) for index in range(3))
     packed = (red + (green << 8) + (blue << 16)).astype(np.uint32)
+    if faces.shape[-1] == 4:
+        packed += (faces[..., 3] + 0.5).astype(np.uint32) << 24
 
     def neighbour(values: np.ndarray, axis: int) -> np.ndarray:
         shifted = np.roll(values, -1, axis)
@@ -146,7 +152,7 @@ def _quads(faces: np.ndarray, repeats: bool) -> np.ndarray:
 
 def _is_plain_sky(mj_model: mujoco.MjModel, texture: int) -> bool:
     """Whether the sky is nothing but MuJoCo's gradient between two colours (also where both are the same)."""
-    faces = _faces(mj_model, texture)
+    faces = _faces(mj_model, texture)[..., :3]
     if len(faces) != 6:
         return False
     edge = faces.shape[1]

@@ -95,15 +95,15 @@ def scan(function: Callable, *pixels: Any) -> Any:
 
 
 def scan_one(function: Callable, *pixels: Any) -> jax.Array:
-    """`scan` for a function with one result, [P] int32, on all cores of a CPU.
+    """`scan` for a function with one result, int32, on all cores of a CPU.
 
     What goes straight into the stacked results of a loop, XLA computes on one thread. What is carried, on all of them: so
     results are carried a round before they are stacked.
     """
-    count, *shape = _shape(pixels)
+    count = _shape(pixels)[0]
     if count == 1 or not targets_cpu():
         return scan(function, *pixels)
-    empty = jnp.zeros(shape, jnp.int32)
+    empty = jnp.zeros(jax.eval_shape(function, *jax.tree.map(lambda plane: plane[0], pixels)).shape, jnp.int32)
     if count == 2:
         halves, _ = jax.lax.scan(lambda halves, block: ((halves[1], function(*block)), None), (empty, empty), pixels)
         return jnp.stack(halves)
@@ -127,21 +127,38 @@ def tiled(scene: Scene) -> bool:
     return scene.clusters.shape[-2] > 0 or len(raycast.primitive_rows(scene, transparent=False)) > raycast.UNROLLED
 
 
-def nearest(scene: Scene, unit: shapes.UnitShapes, rays: Rays) -> tuple[jax.Array, jax.Array | None]:
-    """Keys of the nearest opaque objects [blocks, P] int32, and rows of their triangles [blocks, P] int32 (-1: a primitive).
+class Nearest(NamedTuple):
+    """What is nearest along rays, [blocks, P] int32 each.
 
-    The triangles are None in a scene without any.
+    Attributes:
+        key: See `raycast`.
+        row: Of the object, -1 for the sky; None where it is part of the key.
+        triangle: Row of the triangle, -1 where a primitive is nearest; None in a scene without triangles.
     """
-    key = scan_one(lambda rays: raycast.nearest_key(scene, unit, rays), rays)
-    if not scene.clusters.shape[-2]:
-        return key, None
 
-    def add_triangles(rays: Rays, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        depth, row, owner = triangles.nearest_triangle(scene, unit, rays, raycast.decode(scene, key)[0])
+    key: jax.Array
+    row: jax.Array | None
+    triangle: jax.Array | None
+
+
+def nearest(scene: Scene, unit: shapes.UnitShapes, rays: Rays) -> Nearest:
+    """The nearest opaque objects along rays [blocks, P]."""
+    row = None
+    if raycast.keeps_rows(scene):
+        both = scan_one(lambda rays: raycast.nearest_row(scene, unit, rays), rays)
+        key, row = both[:, 0], both[:, 1]
+    else:
+        key = scan_one(lambda rays: raycast.nearest_key(scene, unit, rays), rays)
+    if not scene.clusters.shape[-2]:
+        return Nearest(key, row, None)
+
+    def add_triangles(rays: Rays, key: jax.Array, row: jax.Array | None) -> Nearest:
+        depth, triangle, owner = triangles.nearest_triangle(scene, unit, rays, raycast.decode(scene, key, row)[0])
         mask = raycast.code_mask(scene)
-        met = (jax.lax.bitcast_convert_type(depth, jnp.int32) & ~mask) | owner
-        return jnp.where(row >= 0, met, key), row
+        met = (jax.lax.bitcast_convert_type(depth, jnp.int32) & ~mask) | (owner & mask)
+        seen = triangle >= 0
+        return Nearest(jnp.where(seen, met, key), None if row is None else jnp.where(seen, owner, row), triangle)
 
     # Nothing here is differentiated: `surface.meet` is.
     unit = jax.lax.stop_gradient(unit)
-    return scan(add_triangles, rays, key)
+    return scan(add_triangles, rays, key, row)

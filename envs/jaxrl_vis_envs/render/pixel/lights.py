@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from jaxrl_vis_envs.render import mounts
 from jaxrl_vis_envs.render.pixel.arithmetic import Vector, dot, larger, normalized, power
 from jaxrl_vis_envs.render.scene import Scene
 
@@ -33,33 +34,24 @@ class Light(NamedTuple):
 
 
 def light_poses(scene: Scene, data: Any) -> tuple[jax.Array, jax.Array]:
-    """World poses of the scene's lights, from body poses, because `mjx.Data` carries none.
+    """World poses of the scene's lights.
 
     Args:
         scene: The scene.
-        data: Has ``xpos`` [nbody, 3] and ``xmat`` [nbody, 3, 3] or [nbody, 9], and ``subtree_com`` [nbody, 3] where a light
-            follows a centre of mass.
+        data: Has the poses of bodies that `mounts.place` reads.
 
     Returns:
         Positions [L, 3] in metres and unit directions [L, 3], float32.
     """
-    modes = mujoco.mjtCamLight
-    body_position = jnp.asarray(data.xpos, jnp.float32)
-    body_rotation = jnp.asarray(data.xmat, jnp.float32).reshape(-1, 3, 3)
+    bodies = mounts.Bodies(scene.body_mass, scene.body_parents)
     positions, directions = [], []
-    for index, (mode, body, target) in enumerate(zip(scene.light_modes, scene.light_bodies, scene.light_targets, strict=True)):
-        position, direction = scene.light_position[index], scene.light_direction[index]
-        if mode == modes.mjCAMLIGHT_TRACK:
-            position = body_position[body] + position
-        elif mode == modes.mjCAMLIGHT_TRACKCOM:
-            position = jnp.asarray(data.subtree_com, jnp.float32)[body] + position
-        else:
-            position = body_position[body] + jnp.sum(body_rotation[body] * position, -1)
-            direction = jnp.sum(body_rotation[body] * direction, -1)
-        if target >= 0 and mode in (modes.mjCAMLIGHT_TARGETBODY, modes.mjCAMLIGHT_TARGETBODYCOM):
-            by_body = mode == modes.mjCAMLIGHT_TARGETBODY
-            aim = body_position[target] if by_body else jnp.asarray(data.subtree_com, jnp.float32)[target]
-            direction = aim - position
+    for index, mount in enumerate(scene.light_mounts):
+        position, frame = mounts.place(bodies, data, mount, scene.light_position[index])
+        direction = scene.light_direction[index]
+        if mount.aims:
+            direction = mounts.target(bodies, data, mount) - position
+        elif frame is not None:
+            direction = jnp.sum(frame * direction, -1)
         positions.append(position)
         directions.append(direction * jax.lax.rsqrt(jnp.sum(jnp.square(direction)) + 1e-20))
     return jnp.stack(positions), jnp.stack(directions)

@@ -6,7 +6,12 @@ culled back faces. A plane is seen from both sides.
 The answer is one integer per pixel, a key: the bits of the depth (which order as the depths do), with the lowest bits replaced
 by the row of the object. The nearest object is then the least key, one operation per object, and XLA on a CPU, which computes a
 loop anew for each of its outputs, computes it once. `surface` makes the depth exact again, and differentiable.
+
+With many objects the row would take so many bits that thin layers could not be told apart any more: 0.24 mm at 3 m with 600 of
+them. Then (`keeps_rows`) a key is nothing but the bits of the depth, and the row is a second integer.
 """
+
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,9 +32,18 @@ UNROLLED = 48
 _FEW = 3
 
 
+# Up to so many objects have their row in the key: 6 bits, 0.015 mm at 3 m.
+_MOST_IN_KEY = 63
+
+
+def keeps_rows(scene: Scene) -> bool:
+    """Whether rows are kept beside keys, because there are too many of them to be part of one."""
+    return len(scene.object_ids) > _MOST_IN_KEY
+
+
 def code_mask(scene: Scene) -> int:
-    """The lowest bits of a key, that hold the row of the object; all ones is the sky."""
-    return (1 << int(len(scene.object_ids)).bit_length()) - 1
+    """The lowest bits of a key, that hold the row of the object (all ones is the sky); 0 where rows are kept beside keys."""
+    return 0 if keeps_rows(scene) else (1 << int(len(scene.object_ids)).bit_length()) - 1
 
 
 def primitive_rows(scene: Scene, transparent: bool) -> list[int]:
@@ -57,8 +71,16 @@ def _solid_entry(scene: Scene, unit: shapes.UnitShapes, row: int, rays: Rays) ->
     return t, meets
 
 
-def decode(scene: Scene, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Depth (m, float32, a few millionths too small, not differentiable) and row (-1 for the sky, int32) of keys."""
+def decode(scene: Scene, key: jax.Array, row: jax.Array | None) -> tuple[jax.Array, jax.Array]:
+    """Depth (m, float32, a few millionths too small, not differentiable) and row (-1 for the sky, int32) of keys.
+
+    Args:
+        scene: The scene.
+        key: [P] int32.
+        row: [P] int32 where the scene `keeps_rows`, otherwise None.
+    """
+    if row is not None:
+        return jax.lax.bitcast_convert_type(key, jnp.float32), row
     mask = code_mask(scene)
     row = key & mask
     return jax.lax.bitcast_convert_type(key & ~mask, jnp.float32), jnp.where(row == mask, -1, row)
@@ -134,6 +156,8 @@ def object_key(scene: Scene, unit: shapes.UnitShapes, row: int, rays: Rays, miss
 def nearest_key(scene: Scene, unit: shapes.UnitShapes, rays: Rays, labelled: bool = True) -> jax.Array:
     """The key of the nearest opaque primitive along every ray, [P] int32; not ``labelled``, only the bits of its depth.
 
+    Where the scene `keeps_rows` it is the latter in any case, and `nearest_row` finds both.
+
     Few objects are unrolled into one pass. Of many, those of a type whose balls touch the pyramid of the rays are counted
     through, and a loop runs up to their count; the rays should then lie close together.
     """
@@ -157,33 +181,99 @@ def _rows_by_type(scene: Scene, rows: list[int]) -> dict[int, np.ndarray]:
     return {kind: found for kind, found in counted.items() if len(found) > _FEW}
 
 
+def nearest_row(scene: Scene, unit: shapes.UnitShapes, rays: Rays) -> jax.Array:
+    """Bits of the depth of the nearest opaque primitive along every ray, and its row (-1 for the sky): [2, P] int32."""
+    unit, rays = jax.lax.stop_gradient((unit, rays))
+    best = jnp.broadcast_to(sky_key(scene, 0), rays.u.shape)
+    row = jnp.full(rays.u.shape, len(scene.object_ids), jnp.int32)
+    rows = np.array(primitive_rows(scene, transparent=False), int)
+    kinds = np.array(scene.object_types)[rows]
+    for kind in np.unique(kinds).tolist():
+        best, row = _nearest_row_listed(scene, unit, kind, rows[kinds == kind], rays, best, row)
+    return jnp.stack([best, jnp.where(row == len(scene.object_ids), -1, row)])
+
+
+class _Listed(NamedTuple):
+    """Objects of one type that rays may meet.
+
+    Attributes:
+        table: [objects, 15] float32, those that may be met first: origin, axes, extra, extra_square, row.
+        count: [] int32, how many of them may be.
+        bare_ball: Whether the type is a ball without a texture.
+    """
+
+    table: jax.Array
+    count: jax.Array
+    bare_ball: bool
+
+
+def _listed(scene: Scene, unit: shapes.UnitShapes, kind: int, rows: np.ndarray, rays: Rays) -> _Listed:
+    """Those objects among ``rows``, all of one type, that the rays may meet."""
+    ball = unit.ball[rows]
+    bare_ball = kind == shapes.SPHERE and not any(scene.atlas.mappings[row] for row in rows)
+    # The k-th object that touches is the number of these counts that are at most k. All of them are brought to the front of a
+    # table at once: whatever is done in the loop, but for the pixels, costs more than it does.
+    seen = camera.in_view(scene, ball[:, :3], ball[:, 3], rays, None)
+    if kind == shapes.PLANE:
+        if culls(scene, kind):
+            seen = seen & one_sided(unit.origin[rows, 2], unit.axes[rows, 2, 2])
+        from_behind = np.array(scene.transparent)[rows] == CLEAR_FROM_BEHIND
+        seen = seen & ~(from_behind & (unit.origin[rows, 2] < 0.0))
+    counts = jnp.cumsum(seen.astype(jnp.int32), dtype=jnp.int32)
+    order = jnp.sum(counts[None, :] <= np.arange(len(rows), dtype=np.int32)[:, None], axis=1, dtype=jnp.int32)
+    columns = [unit.origin[rows], unit.axes[rows].reshape(-1, 9), unit.extra[rows, None], unit.extra_square[rows, None]]
+    table = jnp.concatenate([*columns, jnp.asarray(rows, jnp.float32)[:, None]], axis=1)
+    return _Listed(table.at[jnp.minimum(order, len(rows) - 1)].get(mode="promise_in_bounds"), counts[-1], bare_ball)
+
+
+def _meet_listed(scene: Scene, kind: int, listed: _Listed, step: jax.Array, rays: Rays) -> tuple:
+    """t and whether it counts, [P] each, of the object at one place of the table; and its row, [] int32."""
+    start, direction, inverse_square = camera.ray_parts(scene, rays)
+    values = jax.lax.dynamic_slice(listed.table, (step, np.int32(0)), (1, listed.table.shape[1]))[0]
+    origin, axes = [values[i] for i in range(3)], [[values[3 + 3 * i + j] for j in range(3)] for i in range(3)]
+    form = (origin, None if listed.bare_ball else axes, values[12], values[13])
+    t, meets = entry(kind, form, start, direction, inverse_square)
+    return t, meets & (t > scene.znear) & (step < listed.count), values[14].astype(jnp.int32)
+
+
 def _nearest_listed(
     scene: Scene, unit: shapes.UnitShapes, kind: int, rows: np.ndarray, rays: Rays, best: jax.Array, mask: int
 ) -> jax.Array:
     """The least of ``best`` [P] and the keys of those objects among ``rows``, all of one type, that the rays may meet."""
-    ball = unit.ball[rows]
-    start, direction, inverse_square = camera.ray_parts(scene, rays)
-    bare_ball = kind == shapes.SPHERE and not any(scene.atlas.mappings[row] for row in rows)
-    # The k-th object that touches is the number of these counts that are at most k. All of them are brought to the front of a
-    # table at once: whatever is done in the loop, but for the pixels, costs more than it does.
-    counts = jnp.cumsum(camera.in_view(scene, ball[:, :3], ball[:, 3], rays, None).astype(jnp.int32), dtype=jnp.int32)
-    total = counts[-1]
-    order = jnp.sum(counts[None, :] <= np.arange(len(rows), dtype=np.int32)[:, None], axis=1, dtype=jnp.int32)
-    columns = [unit.origin[rows], unit.axes[rows].reshape(-1, 9), unit.extra[rows, None], unit.extra_square[rows, None]]
-    table = jnp.concatenate([*columns, jnp.asarray(rows, jnp.float32)[:, None]], axis=1)
-    table = table.at[jnp.minimum(order, len(rows) - 1)].get(mode="promise_in_bounds")
+    listed = _listed(scene, unit, kind, rows, rays)
 
     def advance(state: tuple) -> tuple:
         step, best = state
-        values = jax.lax.dynamic_slice(table, (step, np.int32(0)), (1, table.shape[1]))[0]
-        origin, axes = [values[i] for i in range(3)], [[values[3 + 3 * i + j] for j in range(3)] for i in range(3)]
-        form = (origin, None if bare_ball else axes, values[12], values[13])
-        t, meets = entry(kind, form, start, direction, inverse_square)
-        key = (jax.lax.bitcast_convert_type(t, jnp.int32) & ~mask) | (values[14].astype(jnp.int32) & mask)
-        meets = meets & (t > scene.znear) & (step < total)
+        t, meets, row = _meet_listed(scene, kind, listed, step, rays)
+        key = (jax.lax.bitcast_convert_type(t, jnp.int32) & ~mask) | (row & mask)
         return step + 1, jnp.minimum(best, jnp.where(meets, key, best))
 
-    return jax.lax.while_loop(lambda state: state[0] < total, advance, (jnp.zeros((), jnp.int32), best))[1]
+    return jax.lax.while_loop(lambda state: state[0] < listed.count, advance, (jnp.zeros((), jnp.int32), best))[1]
+
+
+def _nearest_row_listed(
+    scene: Scene, unit: shapes.UnitShapes, kind: int, rows: np.ndarray, rays: Rays, best: jax.Array, row: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Bits of the least depth [P] and its row [P], of those so far and of those objects among ``rows``, all of one type.
+
+    Of objects at the same depth it is the one with the lesser row.
+    """
+    listed = _listed(scene, unit, kind, rows, rays)
+    none = jnp.full(rays.u.shape, np.iinfo(np.int32).max, jnp.int32)
+
+    def advance(state: tuple) -> tuple:
+        step, best, row, met, own = state
+        # What the last round met is weighed only now: a CPU would otherwise meet it again for each of these two.
+        nearer = (met < best) | ((met == best) & (own < row))
+        best, row = jnp.where(nearer, met, best), jnp.where(nearer, own, row)
+        t, meets, own = _meet_listed(scene, kind, listed, jnp.minimum(step, len(rows) - 1), rays)
+        met = jnp.where(meets & (step < listed.count), jax.lax.bitcast_convert_type(t, jnp.int32), none)
+        return step + 1, best, row, met, own
+
+    zero = jnp.zeros((), jnp.int32)
+    # One round more than there are objects, to weigh what the last one met.
+    state = jax.lax.while_loop(lambda state: state[0] <= listed.count, advance, (zero, best, row, none, zero))
+    return state[1], state[2]
 
 
 def nearest_distance(scene: Scene, unit: shapes.UnitShapes, rays: Rays) -> jax.Array:

@@ -65,6 +65,7 @@ def sample(
     place: tuple[jax.Array, jax.Array],
     spread_square: jax.Array,
     repeats: jax.Array | bool,
+    alpha: bool = False,
 ) -> tuple[jax.Array, ...]:
     """Colours of textures at many places.
 
@@ -76,21 +77,24 @@ def sample(
         place: Coordinates across and down, [P] float32 each; 0 to 1 is the whole image.
         spread_square: [P] float32, the square of how many texels (of the finest level) a pixel spans.
         repeats: [P] bool or a bool: whether the image goes on beyond its border, or its border does.
+        alpha: Whether alpha is wanted too.
 
     Returns:
-        Red, green and blue, [P] float32 each, in [0, 1].
+        Red, green and blue, and alpha if it is wanted, [P] float32 each, in [0, 1].
     """
     level = jnp.clip(0.5 * jnp.log2(jnp.maximum(spread_square, 1e-12)), 0.0, level_count - 1.0)
     fine = jnp.floor(level)
     weight = level - fine
     fine = fine.astype(jnp.int32)
     coarse = jnp.minimum(fine + 1, level_count - 1)
-    near = _bilinear(texels, first_level + fine, face, place, repeats)
-    far = _bilinear(texels, first_level + coarse, face, place, repeats)
+    near = _bilinear(texels, first_level + fine, face, place, repeats, alpha)
+    far = _bilinear(texels, first_level + coarse, face, place, repeats, alpha)
     return tuple(a + weight * (b - a) for a, b in zip(near, far, strict=True))
 
 
-def _bilinear(texels: Texels, level: jax.Array, face: jax.Array | int, place: tuple, repeats: jax.Array | bool) -> tuple:
+def _bilinear(
+    texels: Texels, level: jax.Array, face: jax.Array | int, place: tuple, repeats: jax.Array | bool, alpha: bool
+) -> tuple:
     first, *shape = texels.level(level)
     lows, shares = [], []
     for axis in range(2):
@@ -101,7 +105,16 @@ def _bilinear(texels: Texels, level: jax.Array, face: jax.Array | int, place: tu
         shares.append(at - low)
         lows.append((low - count * jnp.floor(low / count)).astype(jnp.int32))
     index = first + (face * shape[1] + lows[1]) * shape[0] + lows[0]
-    return (_mixed if texels.differentiable else _mix)(texels.quad(index), *shares)
+    quad = texels.quad(index)
+    colour = (_mixed if texels.differentiable else _mix)(quad, *shares)
+    return (*colour, _mix_alpha(quad, *shares)) if alpha else colour
+
+
+def _mix_alpha(corners: tuple, right: jax.Array, below: jax.Array) -> jax.Array:
+    """Alpha between four texels."""
+    one, two, three, four = ((corner >> 24).astype(jnp.int32).astype(jnp.float32) / 255.0 for corner in corners)
+    upper, lower = one + right * (two - one), three + right * (four - three)
+    return upper + below * (lower - upper)
 
 
 def _mix(corners: tuple, right: jax.Array, below: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:

@@ -26,6 +26,8 @@ MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
 
 # Objects that are not drawn go this far behind the camera, in metres: no ray meets them, and no NaN is left.
 _BEHIND = 1e6
+# Metres: where MuJoCo sorts planes to.
+FAR_AWAY = 1e10
 # Metres: what is thinner is drawn as thin as this, so that a sheet is neither divided by 0 nor lost between two float32.
 _THINNEST = 1e-5
 
@@ -39,6 +41,7 @@ class UnitShapes(NamedTuple):
         extra: [G] float32. Sphere: radius in metres. Capsule: half-length over radius. Otherwise unused.
         extra_square: [G] float32. Sphere and capsule: squared radius in square metres. Otherwise unused.
         ball: [G, 4] float32, metres: a ball around the object, middle in the camera's frame and radius. A mesh's is not used.
+        distance: [G] float32, metres, from the camera to the ball that MuJoCo sorts transparent objects by; [0] without any.
     """
 
     origin: jax.Array
@@ -46,6 +49,7 @@ class UnitShapes(NamedTuple):
     extra: jax.Array
     extra_square: jax.Array
     ball: jax.Array
+    distance: jax.Array
 
 
 def unit_shapes(
@@ -84,7 +88,16 @@ def unit_shapes(
     # Where: a size that means nothing for a type may be 0.
     extra = jnp.where(capsules, size[:, 1] / jnp.where(capsules, size[:, 0], 1.0), size[:, 0])
     ball = jnp.concatenate([offset, _radii(kinds[:, 0], size)[:, None]], axis=1)
-    return UnitShapes(origin, axes, extra, jnp.square(size[:, 0]), ball)
+    distance = _distances(scene, away) if any(scene.transparent) else jnp.zeros(0, jnp.float32)
+    return UnitShapes(origin, axes, extra, jnp.square(size[:, 0]), ball, distance)
+
+
+def _distances(scene: Scene, away: jax.Array) -> jax.Array:
+    """[G] metres, computed as MuJoCo does it, so that what is equally far for it is so here: planes are all far away."""
+    # The bound keeps a compiler from rounding two of the squares once and the third twice.
+    x, y, z = (jnp.minimum(away[:, axis] * away[:, axis], 1e37) for axis in range(3))
+    near = jnp.sqrt(x + y + z) - scene.bound[np.array(scene.object_ids)]
+    return jax.lax.stop_gradient(jnp.where(np.array(scene.object_types) == PLANE, FAR_AWAY, near))
 
 
 def _added(term: Callable[[int], jax.Array]) -> jax.Array:

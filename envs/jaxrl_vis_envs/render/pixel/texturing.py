@@ -12,20 +12,23 @@ from jaxrl_vis_envs.render.pixel.surface import Hit
 from jaxrl_vis_envs.render.scene import Scene
 
 
-def texture_colour(scene: Scene, row: Row, hit: Hit) -> Vector | None:
-    """Red, green and blue that the colour is multiplied with, [P] each in [0, 1]; None in a scene without textures."""
+def texture_colour(scene: Scene, row: Row, hit: Hit, alpha: bool = False) -> Vector | None:
+    """Red, green and blue that the colour is multiplied with, [P] each in [0, 1]; None in a scene without textures.
+
+    With ``alpha`` there is a fourth, for textures that all have it.
+    """
     if not scene.atlas.used:
         return None
     texture = row.texture
     assert texture is not None
     if not sampling.texels_of(scene).few_textures:
-        return _texture_colour(scene, row, texture, hit)
+        return _texture_colour(scene, row, texture, hit, alpha)
     plain = (jnp.ones_like(hit.depth),) * 3
     any_texture = jnp.max(texture.mapping) > 0.0
-    return jax.lax.cond(any_texture, lambda: _texture_colour(scene, row, texture, hit), lambda: plain)
+    return jax.lax.cond(any_texture, lambda: _texture_colour(scene, row, texture, hit, False), lambda: plain)
 
 
-def _texture_colour(scene: Scene, row: Row, texture: TextureRow, hit: Hit) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _texture_colour(scene: Scene, row: Row, texture: TextureRow, hit: Hit, alpha: bool) -> Vector:
     """`texture_colour` of a scene that has textures."""
     changes = _changes(scene, row, hit)
     flat = {kind for kind, how in zip(scene.object_types, scene.atlas.mappings, strict=True) if how == textures.FLAT}
@@ -68,9 +71,9 @@ def _texture_colour(scene: Scene, row: Row, texture: TextureRow, hit: Hit) -> tu
         place,
         jnp.maximum(spreads[0], spreads[1]),
         repeats,
+        alpha,
     )
-    red, green, blue = (jnp.where(texture.mapping > 0.0, value, 1.0) for value in colour)
-    return red, green, blue
+    return tuple(jnp.where(texture.mapping > 0.0, value, 1.0) for value in colour)
 
 
 def _changes(scene: Scene, row: Row, hit: Hit) -> list[Vector]:

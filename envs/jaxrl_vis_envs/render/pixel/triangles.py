@@ -4,6 +4,8 @@ Clusters of triangles whose ball does not touch the pyramid of a block of pixels
 and a loop runs up to that count. Under `jax.vmap` it runs up to the greatest count in the batch.
 """
 
+from collections.abc import Iterator
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,8 +16,6 @@ from jaxrl_vis_envs.render.model import meshes, reading
 from jaxrl_vis_envs.render.pixel import shapes
 from jaxrl_vis_envs.render.scene import Scene
 
-# How far outside of its edges, as a share of them, a triangle is still met, so that no ray slips between two.
-_SEAM = 1e-5
 _NUMBER = meshes.CLUSTER - 1  # the lowest bits of a depth, that hold the number of a triangle in its cluster
 
 
@@ -72,8 +72,53 @@ def _touching(scene: Scene, unit: shapes.UnitShapes, rays: Rays, depth: jax.Arra
     return touching & jnp.asarray(opaque)[owner]
 
 
+def next_triangle(
+    scene: Scene, unit: shapes.UnitShapes, rays: Rays, depth: jax.Array, only: int, after: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """The next triangle of an object, in the order in which MuJoCo draws them, that is not behind ``depth``.
+
+    Args:
+        scene: The scene.
+        unit: The drawn objects.
+        rays: [P]. The pixels should lie close together.
+        depth: [P] float32, metres.
+        only: Row of the object, one that lets light through.
+        after: [P] int32, the row in `Scene.triangles` after which it is looked for; -1 for the first.
+
+    Returns:
+        The depth [P] float32 of the triangle, and its row [P] int32, -1 where there is none.
+    """
+    counts = jnp.cumsum(_touching(scene, unit, rays, depth, only).astype(jnp.int32), dtype=jnp.int32)
+    last = counts.shape[0] - 1
+    most = np.iinfo(np.int32).max
+
+    def advance(state: tuple) -> tuple:
+        step, depths, rows = state
+        cluster = jnp.minimum(jnp.sum((counts <= step).astype(jnp.int32), dtype=jnp.int32), last)
+        first = scene.cluster_places[cluster][1]
+        # Clusters come in the order of their triangles: what was found in one before is not after what is in this one.
+        for number, (t, meets) in enumerate(_meet_each(scene, unit, cluster, rays)):
+            taken = meets & (t <= depth) & (first + number > after) & (rows == most)
+            depths, rows = jnp.where(taken, t, depths), jnp.where(taken, first + number, rows)
+        return step + 1, depths, rows
+
+    start = (jnp.zeros((), jnp.int32), jnp.ones_like(depth), jnp.full(rays.u.shape, most, jnp.int32))
+    _, depths, rows = jax.lax.while_loop(lambda state: state[0] < counts[last], advance, start)
+    return depths, jnp.where(rows == most, -1, rows)
+
+
 def _meet_cluster(scene: Scene, unit: shapes.UnitShapes, cluster: jax.Array, rays: Rays) -> jax.Array:
     """Depth of the nearest triangle of one cluster, its number in the lowest bits, infinite for none; [P] float32."""
+    best = jnp.full(rays.u.shape, np.iinfo(np.int32).max, jnp.int32)
+    for number, (t, meets) in enumerate(_meet_each(scene, unit, cluster, rays)):
+        key = (jax.lax.bitcast_convert_type(t, jnp.int32) & ~_NUMBER) | number
+        best = jnp.minimum(best, jnp.where(meets, key, best))
+    infinite = np.float32(np.inf).view(np.int32)
+    return jax.lax.bitcast_convert_type(jnp.minimum(best, infinite), jnp.float32)
+
+
+def _meet_each(scene: Scene, unit: shapes.UnitShapes, cluster: jax.Array, rays: Rays) -> Iterator[tuple[jax.Array, jax.Array]]:
+    """Depth of each triangle of one cluster, and whether it is met from before the near plane; [P] each."""
     place = scene.cluster_places[cluster]
     axes, origin = unit.axes[place[0]], unit.origin[place[0]]
     columns = scene.triangles.shape[1]
@@ -83,16 +128,11 @@ def _meet_cluster(scene: Scene, unit: shapes.UnitShapes, cluster: jax.Array, ray
     turned = jnp.sum(maps[:, :, :3, None] * axes[None, None], axis=2)
     begin = jnp.sum(maps[:, :, :3] * origin, axis=2) + maps[:, :, 3]
     start, direction, _ = camera.ray_parts(scene, rays)
-    best = jnp.full(rays.u.shape, np.iinfo(np.int32).max, jnp.int32)
     for number in range(meshes.CLUSTER):
         ray = camera.mapped(turned[number], direction)
         offset = camera.mapped(turned[number], start)
         from_ = tuple(begin[number, axis] + offset[axis] for axis in range(3))
         t = -from_[2] / jnp.where(ray[2] < 0.0, ray[2], -1.0)
         first, second = from_[0] + t * ray[0], from_[1] + t * ray[1]
-        inside = jnp.minimum(jnp.minimum(first, second), 1.0 - first - second) >= -_SEAM
-        meets = inside & (ray[2] < 0.0) & (t > scene.znear)
-        key = (jax.lax.bitcast_convert_type(t, jnp.int32) & ~_NUMBER) | number
-        best = jnp.minimum(best, jnp.where(meets, key, best))
-    infinite = np.float32(np.inf).view(np.int32)
-    return jax.lax.bitcast_convert_type(jnp.minimum(best, infinite), jnp.float32)
+        inside = jnp.minimum(jnp.minimum(first, second), 1.0 - first - second) >= -meshes.SEAM
+        yield t, inside & (ray[2] < 0.0) & (t > scene.znear)
