@@ -252,7 +252,7 @@ def test_networks_learn_to_find_and_outline(trained, tmp_path):
     params, steps, said = trained
     assert steps == 160 and said[0][0] == 8
     assert np.mean([sum(losses.values()) for _, losses in said[-4:]]) < 0.6 * sum(said[0][1].values())
-    path = tmp_path / "weights.npz"
+    path = tmp_path / "weights.safetensors"
     write_weights(path, params, TINY, {"origin": "drawings"})
     restored, settings, about = read_weights(path)
     assert settings == TINY and about == {"origin": "drawings"}
@@ -331,16 +331,16 @@ def test_what_fails_to_make_examples_is_told():
 
 @pytest.mark.parametrize("text", [b"", b"no weights", b"PK\x03\x04 half of it"])
 def test_files_that_hold_no_weights(tmp_path, text):
-    path = tmp_path / "weights.npz"
+    path = tmp_path / "weights.safetensors"
     path.write_bytes(text)
     with pytest.raises(RequestError, match="holds no weights"):
         read_weights(path)
     with pytest.raises(RequestError, match="cannot read the weights"):
-        read_weights(tmp_path / "missing.npz")
+        read_weights(tmp_path / "missing.safetensors")
 
 
 def test_weights_whose_numbers_meant_something_else(tmp_path):
-    path = tmp_path / "weights.npz"
+    path = tmp_path / "weights.safetensors"
     write_parameters(path, {"detector": {"bias": np.zeros(3)}}, {"schema": 1, "settings": dataclasses.asdict(TINY)})
     with pytest.raises(RequestError, match="of another version: train them again with `jaxrl-vis phenotype train`"):
         read_weights(path)

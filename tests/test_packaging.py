@@ -29,7 +29,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
 )
 # The same for the environments.
 ENVIRONMENT_LAYERS: tuple[tuple[str, ...], ...] = (
-    ("checks", "compilation", "cores", "goals", "gpu_kernels", "names", "mjx_imports"),
+    ("checks", "compilation", "cores", "documents", "goals", "gpu_kernels", "names", "mjx_imports"),
     ("physics", "plants", "render", "task_modules"),
     ("randomization",),
     ("base",),
