@@ -6,6 +6,7 @@ import stat
 import tomllib
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 MOST_LEVELS = 100
 """Of lists and tables within each other: what goes deeper was made to do harm, or by mistake."""
@@ -81,3 +82,41 @@ def _shallow(parse: Any, text: Any) -> Any:
         if not level:
             return value
     raise ValueError(f"nested more than {MOST_LEVELS} levels deep")
+
+
+def parse_xml(text: str | bytes) -> ElementTree.Element:
+    """The root of a document of XML.
+
+    Raises:
+        ValueError: It is not XML, goes deeper than `MOST_LEVELS`, or declares a document type, as those with entities do.
+    """
+    parser = ElementTree.XMLParser(target=_Builder())
+    try:
+        parser.feed(text)
+        return parser.close()
+    except (ElementTree.ParseError, LookupError, RecursionError) as error:  # no XML, or in an encoding that nobody knows
+        raise ValueError(f"no XML: {error}") from error
+
+
+class _Builder(ElementTree.TreeBuilder):
+    """Builds what `parse_xml` allows."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._levels = 0
+
+    def start(self, tag: Any, attrs: dict[Any, Any], /) -> ElementTree.Element:
+        """Refuses what is too deep."""
+        self._levels += 1
+        if self._levels > MOST_LEVELS:
+            raise ValueError(f"nested more than {MOST_LEVELS} levels deep")
+        return super().start(tag, attrs)
+
+    def end(self, tag: str, /) -> ElementTree.Element:
+        """Comes back from a level."""
+        self._levels -= 1
+        return super().end(tag)
+
+    def doctype(self, name: str, pubid: str, system: str) -> None:
+        """Refuses a document type."""
+        raise ValueError(f"declares a document type ({name})")
