@@ -105,8 +105,12 @@ def read(label: str, hint: Any, words: Sequence[str]) -> Any:
         return None
     try:
         value = _TRUTH.get(word.lower(), word) if one is bool else one(word) if one in (int, float, Path) else word
+        if one is Path:
+            value.exists()
     except ValueError:
         _refuse(label, one, word)
+    except OSError as error:  # a name of more letters than there can be, a folder that is closed to us
+        raise RequestError(f"{label} {word[:60]}{'...' if len(word) > 60 else ''}: {error.strerror or error}") from error
     return check(label, one, value)
 
 

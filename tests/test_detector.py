@@ -11,7 +11,7 @@ from tiny_detector import TINY
 
 from jaxrl_vis.errors import NonFiniteError, RequestError
 from jaxrl_vis.parameters import write_parameters
-from jaxrl_vis.phenotyping.annotations import decode_counts, read_annotations
+from jaxrl_vis.phenotyping.annotations import read_annotations
 from jaxrl_vis.phenotyping.detector.anchors import anchors_of, decode, encode
 from jaxrl_vis.phenotyping.detector.boxes import band_overlap, overlap, roi_align, suppress
 from jaxrl_vis.phenotyping.detector.detect import Settings, best_proposals
@@ -21,6 +21,7 @@ from jaxrl_vis.phenotyping.detector.losses import NOTHING, STALK, UNCLEAR, assig
 from jaxrl_vis.phenotyping.detector.snips import cut, put_back, snip_shape
 from jaxrl_vis.phenotyping.detector.weights import read_weights, write_weights
 from jaxrl_vis.phenotyping.images import rgb8
+from jaxrl_vis.phenotyping.masks import decode_counts
 from jaxrl_vis.phenotyping.training.augment import move, vary_snips
 from jaxrl_vis.phenotyping.training.examples import (
     MOST,

@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 LAYERS: tuple[tuple[str, ...], ...] = (
     ("errors", "methods"),
     ("fields",),
-    ("config", "types", "provenance", "files", "parameters"),
+    ("config", "types", "provenance", "files", "parameters", "spreadsheets"),
     ("devices", "processes", "resolved", "validation"),
     ("evaluation_pool", "learner"),
     ("report",),

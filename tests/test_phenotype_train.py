@@ -12,10 +12,11 @@ from tiny_detector import IMAGE, TINY
 
 from jaxrl_vis import cli
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.phenotyping.annotations import encode_mask, outlined_mask, read_annotations
+from jaxrl_vis.phenotyping.annotations import read_annotations
 from jaxrl_vis.phenotyping.detector.detect import initial
 from jaxrl_vis.phenotyping.detector.networks import Segmenter
 from jaxrl_vis.phenotyping.detector.weights import read_weights, write_weights
+from jaxrl_vis.phenotyping.masks import encode_mask, outlined_mask
 from jaxrl_vis.phenotyping.training.examples import annotated_examples, settings_for
 
 

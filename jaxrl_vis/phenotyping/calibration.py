@@ -52,7 +52,7 @@ def read_calibration(path: Path, unit: Unit | None = None) -> Calibration:
     matrices, sizes = [], []
     for place, side in enumerate(_SIDES):
         store = stores[min(place, len(stores) - 1)]
-        names = (f"P{place + 1}",) if len(stores) == 1 else ("projection_matrix", "P")
+        names = (f"P{place + 1}",) if len(stores) == 1 else ("projection_matrix", "P", "p")
         matrices.append(_matrix(store, names, files[min(place, len(files) - 1)], side))
         sizes.append(_size(store, files[min(place, len(files) - 1)]))
     if sizes[0] != sizes[1]:
@@ -137,8 +137,9 @@ def _matrix(store: dict[str, Any], names: tuple[str, ...], path: Path, side: str
             f"{path} has no projection matrix of the {side} camera ({' or '.join(names)}): rectify the pair first"
         )
     data = value.get("data") if isinstance(value, dict) else value
-    numbers = data if isinstance(data, list) and len(data) == 12 else []
-    if not numbers or not all(isinstance(each, float) and math.isfinite(each) for each in numbers):
+    rows = data if isinstance(data, list) else []
+    numbers = [each for row in rows for each in row] if rows and all(isinstance(row, list) for row in rows) else rows
+    if len(numbers) != 12 or not all(isinstance(each, float) and math.isfinite(each) for each in numbers):
         raise RequestError(f"{path}: {names[0]} of the {side} camera must be 3 x 4 numbers")
     return np.array(numbers).reshape(3, 4)
 

@@ -1,7 +1,6 @@
 """Finds from the truth that `phenotype synth` wrote beside its images: what perfect networks would give."""
 
 import functools
-import json
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +8,9 @@ import numpy as np
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.phenotyping.detector.finder import Detection
 from jaxrl_vis.phenotyping.folders import PairFiles, PlotFolder
-from jaxrl_vis.phenotyping.images import read_image
+from jaxrl_vis.phenotyping.images import image_size, read_image
 from jaxrl_vis.phenotyping.perfect import perfect_detections
+from jaxrl_vis_envs.documents import read_json
 
 
 def find_truth(image: np.ndarray, plot: PlotFolder, pair: PairFiles) -> list[Detection]:
@@ -21,18 +21,20 @@ def find_truth(image: np.ndarray, plot: PlotFolder, pair: PairFiles) -> list[Det
     """
     try:
         seen = _seen(plot.folder).get(int(pair.name), [])
-        instance = read_image(plot.folder / "truth" / f"instance_{pair.name}.png").astype(np.int64) - 1
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        truth = plot.folder / "truth" / f"instance_{pair.name}.png"
+        if image_size(truth) != image.shape[:2]:
+            raise ValueError("masks of another image")
+        return perfect_detections(seen, read_image(truth).astype(np.int64) - 1)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError) as error:
         raise RequestError(
             f"{plot.folder} holds no true masks: write it with `jaxrl-vis phenotype synth --truth all`, or use --masks network"
         ) from error
-    return perfect_detections(seen, instance)
 
 
 @functools.lru_cache(maxsize=4)
 def _seen(folder: Path) -> dict[int, list[dict]]:
     """What plot.json says of each pair."""
     of_pair: dict[int, list[dict]] = {}
-    for each in json.loads((folder / "plot.json").read_text(encoding="utf-8"))["seen"]:
+    for each in read_json(folder / "plot.json")["seen"]:
         of_pair.setdefault(each["pair"], []).append(each)
     return of_pair
