@@ -1,6 +1,7 @@
 """Images to masks by a trained generator, and its weights in a file."""
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -128,8 +129,14 @@ def read_weights(path: Path) -> tuple[dict[str, Any], Settings, dict[str, Any]]:
         check_range(path, "channels", settings.channels, 8, 1024, 8)
         if len(settings.channels) > _MOST_LEVELS:
             raise RequestError(f"{path}: its network must have {_MOST_LEVELS} levels at most, not {len(settings.channels)}")
-        image = jax.ShapeDtypeStruct((1, settings.multiple, settings.multiple, 3), jnp.float32)
-        generator = settings.generator(jnp.float32)
-        return settings, jax.eval_shape(lambda key: generator.lazy_init(key, image), jax.random.key(0))
+        return settings, declared(settings)
 
     return read_parameters(path, _COMMAND, declare)
+
+
+@functools.lru_cache(maxsize=4)
+def declared(settings: Settings) -> Any:
+    """Shapes of the parameters of a generator: nested dictionaries, nothing of which is computed."""
+    image = jax.ShapeDtypeStruct((1, settings.multiple, settings.multiple, 3), jnp.float32)
+    generator = settings.generator(jnp.float32)
+    return jax.eval_shape(lambda key: generator.lazy_init(key, image), jax.random.key(0))

@@ -1,6 +1,7 @@
 """Weights of the networks that find stalks, with their settings and their origin."""
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -64,7 +65,7 @@ def read_weights(path: Path) -> tuple[dict[str, Any], Settings, dict[str, Any]]:
         if about.pop("schema") != SCHEMA or not values.keys() <= _HINTS.keys():
             raise RequestError(f"{path} holds weights of another version: train them again with `{_COMMAND}`")
         settings = _checked(path, values)
-        return settings, jax.eval_shape(lambda key: _initial(settings, key), jax.random.key(0))
+        return settings, declared(settings)
 
     return read_parameters(path, _COMMAND, declare)
 
@@ -84,6 +85,12 @@ def _checked(path: Path, values: dict[str, Any]) -> Settings:
     return settings
 
 
-def _initial(settings: Settings, key: jax.Array) -> dict[str, Any]:
+@functools.lru_cache(maxsize=4)
+def declared(settings: Settings) -> dict[str, Any]:
+    """Shapes of the parameters that the networks of these settings have: nested dictionaries, nothing of which is computed."""
     snips = jax.ShapeDtypeStruct((1, settings.snip_lines, settings.snip_columns, 3), jnp.float32)
-    return {"detector": initial(settings, key), "segmenter": Segmenter(settings.segmenter).lazy_init(key, snips)}
+
+    def draw(key: jax.Array) -> dict[str, Any]:
+        return {"detector": initial(settings, key), "segmenter": Segmenter(settings.segmenter).lazy_init(key, snips)}
+
+    return jax.eval_shape(draw, jax.random.key(0))
