@@ -1,7 +1,7 @@
 """Law of all readers of files from outside: whatever the bytes, a value or one line of an error of one's own, soon, in 200 MB.
 
-Valid files are spoilt (`mutations`) and read in another process (`readers_worker`), so that a crash is told as one. Of each kind
-at least a third of the examples come past the parser. `make fuzz` tries many more, and other ones each time.
+Valid files are spoilt (`mutations`) and read in another process (`readers_worker`), so that a crash is told as one. Of each
+kind at least a third of the examples come past the parser. `make fuzz` tries many more, and other ones each time.
 """
 
 import json

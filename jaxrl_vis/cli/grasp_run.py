@@ -106,7 +106,7 @@ def _truth(image, folder, pair):
     try:
         count = int(read_json(folder.folder / "plot.json")["count"])
         truth = folder.folder / "truth" / f"instance_{pair.name}.png"
-        if image_size(truth) != image.shape[:2]:
+        if pair.left is None or image_size(truth) != image_size(pair.left):
             raise ValueError("masks of another image")
         instance = read_image(truth).astype(int) - 1
     except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:

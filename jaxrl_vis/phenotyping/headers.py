@@ -5,7 +5,8 @@ from typing import BinaryIO
 
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
-_PNG = b"\x89PNG\r\n\x1a\n"
+PNG = b"\x89PNG\r\n\x1a\n"
+_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
 _PFM = re.compile(rb"P[Ff]\s+(\d{1,9})\s+(\d{1,9})\s")
 _FRAMES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # markers of JPEG after which the size stands
 _ALONE = {0x01, *range(0xD0, 0xD9)}  # those without a length
@@ -21,7 +22,7 @@ def size_in(file: BinaryIO) -> tuple[int, int] | None:
     """
     begin = file.read(64)
     file.seek(0)
-    if begin.startswith(_PNG):
+    if begin.startswith(PNG):
         sides = int.from_bytes(begin[20:24], "big"), int.from_bytes(begin[16:20], "big")
         return sides if begin[12:16] == b"IHDR" and min(sides) > 0 else None
     if begin.startswith(b"\xff\xd8"):
@@ -30,6 +31,25 @@ def size_in(file: BinaryIO) -> tuple[int, int] | None:
         return _tiff(file)
     match = _PFM.match(begin)
     return (int(match[2]), int(match[1])) if match and int(match[1]) and int(match[2]) else None
+
+
+def plain_png(data: bytes) -> bytes | None:
+    """A PNG with nothing in it but its pixels and their colours; None where it is damaged.
+
+    OpenCV takes as much memory as a chunk says that it needs, and what other chunks hold is of no use here.
+    """
+    parts, place = [PNG], len(PNG)
+    while place + 12 <= len(data):
+        end = place + 12 + int.from_bytes(data[place : place + 4], "big")
+        kind = data[place + 4 : place + 8]
+        if end > len(data):
+            return None
+        if kind in _CHUNKS:
+            parts.append(data[place:end])
+        if kind == b"IEND":
+            return b"".join(parts)
+        place = end
+    return None
 
 
 def _jpeg(data: bytes) -> tuple[int, int] | None:

@@ -6,7 +6,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from jaxrl_vis.phenotyping.headers import size_in
+from jaxrl_vis.phenotyping.headers import PNG, plain_png, size_in
 
 ImageFormat = Literal["png", "tiff", "jpeg"]
 SUFFIX: dict[str, str] = {"png": ".png", "tiff": ".tiff", "jpeg": ".jpg"}
@@ -115,8 +115,11 @@ def _decoded(path: Path) -> np.ndarray | None:
         OSError: The file cannot be read, is no image, or one that no camera takes.
     """
     size = image_size(path)
+    data: bytes | None = path.read_bytes()
+    if data.startswith(PNG):
+        data = plain_png(data)
     try:
-        image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
     except cv2.error:
         return None
     return image if image is not None and image.shape[:2] == size else None

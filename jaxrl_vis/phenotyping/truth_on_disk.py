@@ -12,6 +12,8 @@ from jaxrl_vis.phenotyping.images import image_size, read_image
 from jaxrl_vis.phenotyping.perfect import perfect_detections
 from jaxrl_vis_envs.documents import read_json
 
+_FARTHEST = 1e6  # pixels
+
 
 def find_truth(image: np.ndarray, plot: PlotFolder, pair: PairFiles) -> list[Detection]:
     """The stalks of a pair of a synthetic plot.
@@ -36,5 +38,10 @@ def _seen(folder: Path) -> dict[int, list[dict]]:
     """What plot.json says of each pair."""
     of_pair: dict[int, list[dict]] = {}
     for each in read_json(folder / "plot.json")["seen"]:
-        of_pair.setdefault(each["pair"], []).append(each)
+        box = each["band_box"]
+        if box is not None and (len(box) != 4 or not all(abs(float(edge)) < _FARTHEST for edge in box)):
+            raise ValueError("a box is none")
+        of_pair.setdefault(each["pair"], []).append(
+            {**each, "band_box": None if box is None else [float(edge) for edge in box]}
+        )
     return of_pair
