@@ -38,7 +38,7 @@ def read(path: Path | str, families: Mapping[str, Family] = FAMILIES) -> Family:
         raise ValueError(f'{path} must hold one table of a family\'s fields, like {{"stalks": {{"lean_most": 15}}}}')
     base = values.pop("base", TRAINING.name)
     if not isinstance(base, str) or base not in families:
-        raise ValueError(f"{path}: base must be one of {', '.join(families)}, got {reprlib.repr(base)}")
+        raise ValueError(f"{path}: base must be one of {', '.join(families)}, got {_said(base)}")
     name = values.get("name", path.stem)
     try:
         # Its own random numbers, so that a file that repeats a family's values still draws other plots.
@@ -55,10 +55,10 @@ def _changed(where: str, record: Any, values: dict[str, Any]) -> Any:
     for name, value in values.items():
         label = f"{where}{name}"
         if name not in known:
-            raise ValueError(f"unknown key {reprlib.repr(label)}{nearest(name[:100], known)}")
+            raise ValueError(f"unknown key {_said(label)}{nearest(name[:100], known)}")
         if dataclasses.is_dataclass(known[name]):
             if not isinstance(value, dict):
-                raise ValueError(f"{label} must be a table, got {reprlib.repr(value)}")
+                raise ValueError(f"{label} must be a table, got {_said(value)}")
             changes[name] = _changed(f"{label}.", known[name], value)
         else:
             changes[name] = _like(label, known[name], value)
@@ -69,16 +69,24 @@ def _like(label: str, example: Any, value: Any) -> Any:
     """A value of the kind that the example is of."""
     if isinstance(example, tuple):
         if not isinstance(value, list | tuple) or len(value) != 2 or not all(map(is_number, value)):
-            raise ValueError(f"{label} must be a range of two numbers, [low, high], got {reprlib.repr(value)}")
+            raise ValueError(f"{label} must be a range of two numbers, [low, high], got {_said(value)}")
         return (float(value[0]), float(value[1]))
     if isinstance(example, str):
         if not isinstance(value, str) or not value:
-            raise ValueError(f"{label} must be a word, got {reprlib.repr(value)}")
+            raise ValueError(f"{label} must be a word, got {_said(value)}")
         return value
     if not is_number(value):
-        raise ValueError(f"{label} must be a number, got {reprlib.repr(value)}")
+        raise ValueError(f"{label} must be a number, got {_said(value)}")
     if isinstance(example, int):
         if not float(value).is_integer():
-            raise ValueError(f"{label} must be a whole number, got {reprlib.repr(value)}")
+            raise ValueError(f"{label} must be a whole number, got {_said(value)}")
         return int(value)
     return float(value)
+
+
+def _said(value: Any) -> str:
+    """A value in a message."""
+    try:
+        return reprlib.repr(value)
+    except ValueError:
+        return "a number of thousands of digits"
