@@ -12,6 +12,8 @@ RUN_DIR ?= runs/seed$(SEED)-$(shell date +%Y%m%d-%H%M%S)
 ARGS ?=
 RESULTS ?=
 WORKERS ?= 2
+EXAMPLES ?= 2000
+FUZZED := tests/test_readers.py tests/test_readers_of_runs.py tests/test_reader_bounds.py tests/test_laws.py
 PYTHON ?= >=3.11,<3.14
 
 # Evaluated once: `:=` would run them for `make help` too, so each sits in the recipe that needs it.
@@ -22,7 +24,7 @@ BIN := .venv/bin
 STAMPS := .venv/stamps
 ACCELERATOR := $(shell nvidia-smi -L >/dev/null 2>&1 && echo gpu || echo base)
 
-.PHONY: help train test docs lint format bench-cpu pins clean
+.PHONY: help train test fuzz docs lint format bench-cpu pins clean
 .DEFAULT_GOAL := help
 
 help: ## Show this list
@@ -35,6 +37,9 @@ train: $(STAMPS)/$(ACCELERATOR) ## Train on VisualFetchReach; curve.png and vide
 
 test: $(STAMPS)/dev ## Run the tests
 	@$(BIN)/python -m pytest -n $(WORKERS) $(ARGS)
+
+fuzz: $(STAMPS)/dev ## Try EXAMPLES=2000 spoilt files of each kind on their readers, other ones each time
+	@EXAMPLES=$(EXAMPLES) $(BIN)/python -m pytest -q -rP --hypothesis-profile=fuzz $(FUZZED) $(ARGS)
 
 docs: $(STAMPS)/docs ## Build the documentation's site into build/site/
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet

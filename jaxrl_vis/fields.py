@@ -13,6 +13,7 @@ from typing import Any, Literal, NoReturn
 
 from jaxrl_vis.errors import RequestError, nearest
 
+_LONGEST = 200  # letters of a value that a message repeats
 _TRUTH = {"true": True, "false": False}
 _KINDS = {bool: "true or false", int: "a whole number", float: "a finite number", str: "a word", Path: "a path"}
 
@@ -68,11 +69,11 @@ def check(label: str, hint: Any, value: Any) -> Any:
         return None
     if several:
         if not isinstance(value, list | tuple):
-            raise RequestError(f"{label} must be a list, not {value!r}")
+            raise RequestError(f"{label} must be a list, not {_said(value)}")
         return tuple(check(label, one, each) for each in value)
     if typing.get_origin(one) is Literal:
         if value not in typing.get_args(one):
-            raise RequestError(f"{label} cannot be {value!r}{nearest(str(value), typing.get_args(one))}")
+            raise RequestError(f"{label} cannot be {_said(value)}{nearest(str(value)[:_LONGEST], typing.get_args(one))}")
         return value
     if isinstance(value, bool):  # which is an int as well
         if one is bool:
@@ -105,8 +106,12 @@ def read(label: str, hint: Any, words: Sequence[str]) -> Any:
         return None
     try:
         value = _TRUTH.get(word.lower(), word) if one is bool else one(word) if one in (int, float, Path) else word
+        if one is Path:
+            value.exists()
     except ValueError:
         _refuse(label, one, word)
+    except OSError as error:  # a name of more letters than there can be, a folder that is closed to us
+        raise RequestError(f"{label} {word[:60]}{'...' if len(word) > 60 else ''}: {error.strerror or error}") from error
     return check(label, one, value)
 
 
@@ -118,7 +123,13 @@ def _is_finite(value: Any) -> bool:
 
 
 def _refuse(label: str, one: Any, value: Any) -> NoReturn:
-    raise RequestError(f"{label} must be {_KINDS[one]}, not {value!r}{_mend(one, value)}")
+    raise RequestError(f"{label} must be {_KINDS[one]}, not {_said(value)}{_mend(one, value)}")
+
+
+def _said(value: Any) -> str:
+    """A value in a message of one line."""
+    text = repr(value)
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
 
 
 def _mend(one: Any, value: Any) -> str:

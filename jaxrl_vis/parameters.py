@@ -1,25 +1,33 @@
-"""Parameters of networks in a file of plain arrays: NumPy's npz, read without pickle, with what they are beside them."""
+"""Parameters of networks in a file of plain arrays: safetensors, with what they are in its metadata."""
 
 import json
 import os
-import zipfile
-from collections.abc import Mapping
+import sys
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
+import safetensors
+from safetensors.numpy import save
 
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis_envs.documents import parse_json
 
+SUFFIX = ".safetensors"
 _ABOUT = "about"
+_KINDS = {"F16": np.float16, "F32": np.float32}
+_LONGEST_HEADER = 1 << 20  # bytes; those of our networks have some 15,000
+
+Settings = TypeVar("Settings")
 
 
 def write_parameters(path: Path, params: Mapping[str, Any], about: Mapping[str, Any], half: bool = True) -> None:
     """Writes parameters. Nobody sees half of them.
 
     Args:
-        path: The file, .npz.
+        path: The file, .safetensors.
         params: Nested dictionaries of arrays.
         about: What they are and where they come from; anything that JSON holds.
         half: Keep 16 bits of each number.
@@ -27,40 +35,75 @@ def write_parameters(path: Path, params: Mapping[str, Any], about: Mapping[str, 
     Raises:
         OSError: The file cannot be written.
     """
-    leaves = jax.tree_util.tree_flatten_with_path(params)[0]
-    arrays = {"/".join(str(part.key) for part in names): np.asarray(leaf) for names, leaf in leaves}
-    if half:
-        arrays = {name: array.astype(np.float16) for name, array in arrays.items()}
+    kind = np.float16 if half else np.float32
+    _write(path, {name: np.asarray(leaf).astype(kind) for name, leaf in _named(params).items()}, about)
+
+
+def _write(path: Path, arrays: Mapping[str, np.ndarray], about: Mapping[str, Any]) -> None:
+    """Writes arrays under their names, as they are."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    whole: dict[str, Any] = {_ABOUT: np.frombuffer(json.dumps(dict(about)).encode(), np.uint8), **arrays}
     temporary = path.with_name(path.name + ".tmp")
     with temporary.open("wb") as file:
-        np.savez_compressed(file, **whole)
+        whole = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+        file.write(save(whole, {_ABOUT: json.dumps(dict(about))}))
         file.flush()
         os.fsync(file.fileno())
     temporary.replace(path)
 
 
-def read_parameters(path: Path, command: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Reads what `write_parameters` wrote: parameters, float32, and what was said about them.
+def _named(params: Any) -> dict[str, Any]:
+    """Leaves of nested dictionaries, by their path: ``detector/params/stem/kernel``."""
+    return {"/".join(str(part.key) for part in names): leaf for names, leaf in jax.tree_util.tree_flatten_with_path(params)[0]}
+
+
+def read_parameters(
+    path: Path, command: str, declare: Callable[[dict[str, Any]], tuple[Settings, Any]]
+) -> tuple[dict[str, Any], Settings, dict[str, Any]]:
+    """Reads what `write_parameters` wrote. No array is read before names, shapes and types are those of the network.
 
     Args:
         path: The file.
         command: What makes such files, for messages.
+        declare: From what the file says about its parameters to settings and the parameters' shapes (nested dictionaries of
+            anything with a ``shape``); it may take entries away. It raises a RequestError that names the file, or a KeyError or
+            ValueError where it is not spoken of networks at all.
+
+    Returns:
+        Parameters, float32; settings; and what else is said about them.
 
     Raises:
-        RequestError: There is no such file, or it holds no parameters.
+        RequestError: There is no such file, or it holds no parameters, or those of another network.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        about = json.loads(arrays.pop(_ABOUT).tobytes().decode())
-        if not isinstance(about, dict):
-            raise ValueError
+        if path.suffix.lower() == ".npz" and path.is_file():
+            raise RequestError(
+                f"{path} is of an earlier version: convert it with `python -m jaxrl_vis.parameters {path} "
+                f"{path.with_suffix(SUFFIX)}`, and name that"
+            )
+        _check_header(path)
+        with safetensors.safe_open(path, framework="numpy") as file:
+            about = parse_json((file.metadata() or {})[_ABOUT])
+            if not isinstance(about, dict):
+                raise ValueError(f"{_ABOUT} is no table")
+            settings, shapes = declare(about)
+            names = set(file.keys())
+            wanted = {name: tuple(leaf.shape) for name, leaf in _named(shapes).items()}
+            if names != wanted.keys():
+                raise RequestError(_other_network(path, f"{min(names ^ wanted.keys())} is missing or too many", command))
+            for name, shape in wanted.items():
+                part = file.get_slice(name)
+                if tuple(part.get_shape()) != shape or part.get_dtype() not in _KINDS:
+                    raise RequestError(_other_network(path, f"{name} is not {shape} numbers of 16 or 32 bits", command))
+            arrays = {name: file.get_tensor(name) for name in wanted}
     except OSError as error:
         raise RequestError(f"cannot read the weights {path}: {error.strerror or error}") from error
-    except (ValueError, KeyError, EOFError, zipfile.BadZipFile, AttributeError) as error:
+    except (ValueError, KeyError, safetensors.SafetensorError) as error:
+        if isinstance(error, RequestError):
+            raise
         raise RequestError(f"{path} holds no weights: name a file that `{command}` wrote") from error
+    unsound = next((name for name, array in arrays.items() if not np.isfinite(array).all()), None)
+    if unsound is not None:
+        raise RequestError(f"{path} holds numbers that are not finite ({unsound}): train the weights again with `{command}`")
     params: dict[str, Any] = {}
     for name, array in arrays.items():
         place = params
@@ -68,4 +111,60 @@ def read_parameters(path: Path, command: str) -> tuple[dict[str, Any], dict[str,
         for folder in folders:
             place = place.setdefault(folder, {})
         place[last] = array.astype(np.float32)  # by NumPy: JAX would compile a program for each shape
-    return jax.device_put(params), about
+    return jax.device_put(params), settings, about
+
+
+def _check_header(path: Path) -> None:
+    """Raises a ValueError where what comes before the arrays is not of the size that it says, or too long to be ours."""
+    size = path.stat().st_size
+    if not path.is_file():
+        raise ValueError("no ordinary file")  # a pipe would never open
+    with path.open("rb") as file:
+        if not 2 <= int.from_bytes(file.read(8), "little") <= min(_LONGEST_HEADER, size - 8):
+            raise ValueError("no header")
+
+
+def check_range(path: Path, name: str, values: tuple[float, ...], low: float, high: float, step: int = 1) -> None:
+    """Checks a setting of a network before anything is built by it.
+
+    Args:
+        path: The file that it is from.
+        name: What it is called.
+        values: One number, or several.
+        low, high: What each must lie between.
+        step: What each must be a multiple of, if it is a whole number.
+
+    Raises:
+        RequestError: It is not so.
+    """
+    unfit = next((each for each in values if not low <= each <= high or (step > 1 and each % step)), None)
+    if unfit is not None or not 1 <= len(values) <= 16:
+        kind = f"multiples of {step} " if step > 1 else ""
+        said = f"{len(values)} numbers" if unfit is None else f"{unfit:g}"
+        raise RequestError(f"{path}: {name} of its network must be {kind}from {low:g} to {high:g}, 16 at most, not {said}")
+
+
+def _other_network(path: Path, why: str, command: str) -> str:
+    return f"{path} holds weights of another network ({why}): train them again with `{command}`"
+
+
+def convert(old: Path, new: Path) -> None:
+    """Writes the weights of an earlier version, .npz, as this version reads them; no bit of theirs changes.
+
+    Raises:
+        OSError: A file cannot be read or written.
+        ValueError: It holds no weights.
+    """
+    with np.load(old, allow_pickle=False) as file:
+        arrays = {name: file[name] for name in file.files}
+    about = json.loads(arrays.pop(_ABOUT).tobytes())
+    if {array.dtype for array in arrays.values()} - {np.dtype(kind) for kind in _KINDS.values()}:
+        raise ValueError("weights have 16 or 32 bits")
+    _write(new, arrays, about)
+
+
+if __name__ == "__main__":
+    try:
+        convert(*map(Path, sys.argv[1:]))
+    except Exception as error:  # an old file of one's own, which may be anything
+        sys.exit(f"cannot convert {' '.join(sys.argv[1:])}: {' '.join(str(error).split())}")

@@ -32,8 +32,28 @@ os.environ["XLA_FLAGS"] = " ".join(
     )
 )
 
+import hypothesis
 import jax
 import pytest
+
+# The suite tries the same examples each time, so that a failure is of the change that is tested; `make fuzz` tries others.
+hypothesis.settings.register_profile(
+    "suite",
+    max_examples=40,
+    derandomize=True,
+    database=None,
+    deadline=None,
+    phases=[hypothesis.Phase.explicit, hypothesis.Phase.generate, hypothesis.Phase.shrink],
+    suppress_health_check=[hypothesis.HealthCheck.too_slow, hypothesis.HealthCheck.data_too_large],
+)
+hypothesis.settings.register_profile(
+    "fuzz",
+    hypothesis.settings.get_profile("suite"),
+    max_examples=int(os.environ.get("EXAMPLES", "2000")),
+    derandomize=False,
+    print_blob=True,
+)
+hypothesis.settings.load_profile("suite")
 
 # Tracing makes millions of small objects, few of them garbage: looked for as often as by default, it costs a tenth of it all.
 gc.set_threshold(100_000, 20, 20)

@@ -11,7 +11,7 @@ from tiny_detector import TINY
 
 from jaxrl_vis.errors import NonFiniteError, RequestError
 from jaxrl_vis.parameters import write_parameters
-from jaxrl_vis.phenotyping.annotations import decode_counts, read_annotations
+from jaxrl_vis.phenotyping.annotations import read_annotations
 from jaxrl_vis.phenotyping.detector.anchors import anchors_of, decode, encode
 from jaxrl_vis.phenotyping.detector.boxes import band_overlap, overlap, roi_align, suppress
 from jaxrl_vis.phenotyping.detector.detect import Settings, best_proposals
@@ -21,6 +21,7 @@ from jaxrl_vis.phenotyping.detector.losses import NOTHING, STALK, UNCLEAR, assig
 from jaxrl_vis.phenotyping.detector.snips import cut, put_back, snip_shape
 from jaxrl_vis.phenotyping.detector.weights import read_weights, write_weights
 from jaxrl_vis.phenotyping.images import rgb8
+from jaxrl_vis.phenotyping.masks import decode_counts
 from jaxrl_vis.phenotyping.training.augment import move, vary_snips
 from jaxrl_vis.phenotyping.training.examples import (
     MOST,
@@ -252,7 +253,7 @@ def test_networks_learn_to_find_and_outline(trained, tmp_path):
     params, steps, said = trained
     assert steps == 160 and said[0][0] == 8
     assert np.mean([sum(losses.values()) for _, losses in said[-4:]]) < 0.6 * sum(said[0][1].values())
-    path = tmp_path / "weights.npz"
+    path = tmp_path / "weights.safetensors"
     write_weights(path, params, TINY, {"origin": "drawings"})
     restored, settings, about = read_weights(path)
     assert settings == TINY and about == {"origin": "drawings"}
@@ -331,16 +332,16 @@ def test_what_fails_to_make_examples_is_told():
 
 @pytest.mark.parametrize("text", [b"", b"no weights", b"PK\x03\x04 half of it"])
 def test_files_that_hold_no_weights(tmp_path, text):
-    path = tmp_path / "weights.npz"
+    path = tmp_path / "weights.safetensors"
     path.write_bytes(text)
     with pytest.raises(RequestError, match="holds no weights"):
         read_weights(path)
     with pytest.raises(RequestError, match="cannot read the weights"):
-        read_weights(tmp_path / "missing.npz")
+        read_weights(tmp_path / "missing.safetensors")
 
 
 def test_weights_whose_numbers_meant_something_else(tmp_path):
-    path = tmp_path / "weights.npz"
+    path = tmp_path / "weights.safetensors"
     write_parameters(path, {"detector": {"bias": np.zeros(3)}}, {"schema": 1, "settings": dataclasses.asdict(TINY)})
     with pytest.raises(RequestError, match="of another version: train them again with `jaxrl-vis phenotype train`"):
         read_weights(path)

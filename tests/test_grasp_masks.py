@@ -13,6 +13,7 @@ from jaxrl_vis.grasping.masks.examples import Example
 from jaxrl_vis.grasping.masks.loop import Plan, crops, train
 from jaxrl_vis.grasping.masks.painter import Painter, Settings, read_weights, write_weights
 from jaxrl_vis.grasping.masks.variation import vary
+from jaxrl_vis.parameters import write_parameters
 
 
 def striped(seed: int) -> Example:
@@ -61,7 +62,7 @@ def test_generators_learn_to_paint_stripes(loss, tmp_path):
     plan = Plan(steps=100, images=4, first=4, batch=4, crop=32, rate=2e-2, average=0.9)
     params, steps = train([map(striped, range(4))], settings, plan, lambda *parts: reports.append(parts), every=0.0)
     assert steps == 100 and reports and all(np.isfinite(list(report[3].values())).all() for report in reports)
-    path = tmp_path / "w.npz"
+    path = tmp_path / "w.safetensors"
     write_weights(path, params, settings, {"origin": "stripes"})
     back, read_settings, about = read_weights(path)
     assert read_settings == settings and about == {"origin": "stripes"}
@@ -89,10 +90,10 @@ def test_training_tells_what_goes_wrong():
 
 def test_files_that_hold_no_masks_are_told(tmp_path):
     with pytest.raises(RequestError, match="cannot read the weights"):
-        read_weights(tmp_path / "missing.npz")
-    (tmp_path / "text.npz").write_text("no weights")
-    np.savez(tmp_path / "other.npz", about=np.frombuffer(b"{}", np.uint8))
-    for name in ("text.npz", "other.npz"):
+        read_weights(tmp_path / "missing.safetensors")
+    (tmp_path / "text.safetensors").write_text("no weights")
+    write_parameters(tmp_path / "other.safetensors", {"a": np.zeros(1)}, {})
+    for name in ("text.safetensors", "other.safetensors"):
         with pytest.raises(RequestError, match="holds no weights"):
             read_weights(tmp_path / name)
 

@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[1]
 LAYERS: tuple[tuple[str, ...], ...] = (
     ("errors", "methods", "streams"),
     ("fields",),
-    ("cache_entries", "config", "types", "provenance", "files", "parameters"),
+    ("cache_entries", "config", "types", "provenance", "files", "parameters", "spreadsheets"),
     ("devices", "processes", "resolved", "validation"),
     ("learner",),
     ("report",),

@@ -226,6 +226,19 @@ def test_a_run_that_was_killed_gives_the_same_tables(plots, results, tmp_path, c
     assert not list(out.rglob("*.tmp"))
 
 
+def test_a_plot_whose_name_is_not_utf8_is_measured_to_the_end(plots, results, tmp_path, capsys):
+    """As an archive of another system leaves it; OpenCV, which writes it on each overlay, does not survive such a text."""
+    plot = tmp_path / os.fsdecode(b"=t\xe9t\xe9")
+    shutil.copytree(plots / "plot_0000", plot)
+    os.rename(plot / "right_003.png", plot / os.fsdecode(b"r\xe9.png"))
+    assert run(plot, tmp_path / "out") == 3
+    (row,), (whole, _) = table(tmp_path / "out" / "plots.csv"), table(results / "plots.csv")
+    assert row["plot"] == "'=tété" and float(row["width_mean_mm"]) == pytest.approx(float(whole["width_mean_mm"]), rel=0.05)
+    assert "skipped =tété/003: there is no right image" in capsys.readouterr().err
+    assert "=tété" in (tmp_path / "out" / "qc.html").read_text(encoding="utf-8")
+    assert (tmp_path / "out" / "overlays" / "=tété" / "000.png").exists()
+
+
 def test_widths_without_ground_say_so(plots, tmp_path, capsys):
     """Everything below 8 inches is cut off: stalks are counted, but nobody knows how high a width was taken."""
     plot = tmp_path / "plot_0000"

@@ -12,10 +12,11 @@ from tiny_detector import IMAGE, TINY
 
 from jaxrl_vis import cli
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.phenotyping.annotations import encode_mask, outlined_mask, read_annotations
+from jaxrl_vis.phenotyping.annotations import read_annotations
 from jaxrl_vis.phenotyping.detector.detect import initial
 from jaxrl_vis.phenotyping.detector.networks import Segmenter
 from jaxrl_vis.phenotyping.detector.weights import read_weights, write_weights
+from jaxrl_vis.phenotyping.masks import encode_mask, outlined_mask
 from jaxrl_vis.phenotyping.training.examples import annotated_examples, settings_for
 
 
@@ -38,7 +39,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("weights") / "tiny.npz"
+    path = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
     detector, segmenter = jax.random.split(jax.random.key(3))
     params = {
         "detector": initial(TINY, detector),
@@ -60,15 +61,15 @@ def train(out: Path, folder: Path, *words: str) -> int:
 
 
 def test_training_goes_on_from_weights_and_boxes_leave_masks_alone(folder, weights, tmp_path, capsys):
-    assert train(tmp_path / "none.npz", folder, "--start", str(weights), "--steps", "1", "--rate", "1e-9") == 0
-    assert max(differences(tmp_path / "none.npz", weights).values()) < 1e-3  # they are kept in 16 bits
-    assert train(tmp_path / "more.npz", folder, "--start", str(weights), "--steps", "3", "--rate", "1") == 0
+    assert train(tmp_path / "none.safetensors", folder, "--start", str(weights), "--steps", "1", "--rate", "1e-9") == 0
+    assert max(differences(tmp_path / "none.safetensors", weights).values()) < 1e-3  # they are kept in 16 bits
+    assert train(tmp_path / "more.safetensors", folder, "--start", str(weights), "--steps", "3", "--rate", "1") == 0
     said = capsys.readouterr().out
     assert f"from {weights}" in said and "masks stay as they are" in said
-    _, settings, about = read_weights(tmp_path / "more.npz")
+    _, settings, about = read_weights(tmp_path / "more.safetensors")
     assert settings == TINY  # all the candidates of a new training
     assert about["origin"] == f"annotated images, from {weights}"
-    changes = differences(tmp_path / "more.npz", weights)
+    changes = differences(tmp_path / "more.safetensors", weights)
     assert changes["detector"] > 1e-3 and changes["segmenter"] == 0.0
 
 
@@ -82,19 +83,19 @@ def test_outlines_teach_masks(folder, weights, tmp_path):
     for image in folder.glob("*.png"):
         (outlined / image.name).write_bytes(image.read_bytes())
     (outlined / "annotations.json").write_text(json.dumps(data))
-    assert train(tmp_path / "out.npz", outlined, "--start", str(weights), "--steps", "3", "--rate", "1") == 0
-    assert differences(tmp_path / "out.npz", weights)["segmenter"] > 1e-3
+    assert train(tmp_path / "out.safetensors", outlined, "--start", str(weights), "--steps", "3", "--rate", "1") == 0
+    assert differences(tmp_path / "out.safetensors", weights)["segmenter"] > 1e-3
 
 
 def test_boxes_of_another_size_start_from_random_weights_or_are_refused(folder, tmp_path, capsys):
     # So small an image is not reduced: 30 lines, where the weights that ship know 135.
-    assert train(tmp_path / "out.npz", folder, "--start", "shipped", "--steps", "1") == 2
+    assert train(tmp_path / "out.safetensors", folder, "--start", "shipped", "--steps", "1") == 2
     refusal = capsys.readouterr().err
     assert "30 pixels tall" in refusal and "135" in refusal and "--start random" in refusal
-    assert not (tmp_path / "out.npz").exists()
-    assert cli.main(["phenotype", "train", str(tmp_path / "out.npz"), "--start", "missing.npz"]) == 2
+    assert not (tmp_path / "out.safetensors").exists()
+    assert cli.main(["phenotype", "train", str(tmp_path / "out.safetensors"), "--start", "missing.safetensors"]) == 2
     assert "cannot read the weights" in capsys.readouterr().err
-    assert cli.main(["phenotype", "train", str(tmp_path / "out.npz"), "--rate", "0"]) == 2
+    assert cli.main(["phenotype", "train", str(tmp_path / "out.safetensors"), "--rate", "0"]) == 2
     assert "--rate must be more than 0" in capsys.readouterr().err
 
 

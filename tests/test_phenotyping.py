@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
-from jaxrl_vis.phenotyping.annotations import decode_mask, encode_mask
 from jaxrl_vis.phenotyping.contrast import settle
 from jaxrl_vis.phenotyping.ground import _plane, find_ground
 from jaxrl_vis.phenotyping.images import read_disparity, read_image, write_image
+from jaxrl_vis.phenotyping.masks import decode_mask, encode_mask
 from jaxrl_vis.phenotyping.measure import measure
 from jaxrl_vis.phenotyping.metric import diameter_mm, tilt_of
 from jaxrl_vis.phenotyping.stereo import match_rows, match_sgbm

@@ -1,6 +1,7 @@
 """Calibrations of stereo cameras as files of OpenCV and ROS hold them, and what is wrong with others."""
 
 import dataclasses
+import os
 from pathlib import Path
 
 import cv2
@@ -9,6 +10,7 @@ import pytest
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.phenotyping.calibration import check_size, read_calibration, write_calibration
+from jaxrl_vis.phenotyping.storage import parse_storage
 from jaxrl_vis_envs.plants import Calibration
 
 CAMERAS = Calibration(640, 480, 500.0, (319.5, 239.5), 0.1)
@@ -100,7 +102,7 @@ def test_bad_calibrations_are_told_in_one_line(tmp_path, arguments, part):
         (None, "there is no calibration"),
         ("", "neither P1 and P2"),
         ("a: [1, 2", "not a calibration"),
-        ("\x00\x01\x02", "neither P1 and P2"),
+        ("\x00\x01\x02", "neither YAML nor XML"),
         ("K: [1, 2, 3]", "neither P1 and P2"),
         ("- 1\n- 2", "it holds a list"),
         ("[1, 2]", "it holds a list"),
@@ -115,6 +117,19 @@ def test_bad_calibrations_are_told_in_one_line(tmp_path, arguments, part):
         (f"P1: {LEFT}\nP2: {LEFT}\nimage_width: 640\nimage_height: .Inf", "image_width and image_height must be numbers"),
         (f"P1: {LEFT}\nP2: {LEFT}\nimage_size: [640, x]", "image_size must be numbers"),
         (f"P1: {LEFT}\nP2: {LEFT}\nimage_size: [640, 480]\nunit: 5", "unit must be m or mm"),
+        (f"P1: {LEFT}\nP2: {LEFT}\nimage_size: [1e9, 480]", "image_size must be numbers"),
+        (f"P1: {LEFT}\nP2: {LEFT}\nimage_size: [640.5, 480]", "image_size must be numbers"),
+        ("P2: &a [1]\nP1: *a", "a reference to another place"),
+        ("[1]: 2", "a name that is no word"),
+        ("{" * 100_000, "a name that is no word"),
+        ("a: 1\n\tb: 2", "line 2"),
+        ('<!DOCTYPE a [<!ENTITY b "c">]><opencv_storage>&b;</opencv_storage>', "declares a document type"),
+        ("<opencv_storage><P1>", "neither YAML nor XML"),
+        ("# " + "x" * 2_000_000, "larger than 2 MB"),
+        *(
+            (opening * 100_000, "nested more than 100 levels deep")
+            for opening in ("[", "a: [", "{a: ", "- ", '{"a": ', '{"a": [', "<a>", "<opencv_storage><_>")
+        ),
     ],
 )
 def test_files_that_are_no_calibration(tmp_path, text, part):
@@ -134,3 +149,38 @@ def test_calibrations_are_for_images_of_one_size(tmp_path):
     (tmp_path / "right.yaml").write_text(ros(CAMERAS, 0.1))
     with pytest.raises(RequestError, match="320 x 480"):
         read_calibration(tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["yaml", "xml", "json"])
+def test_files_are_read_as_opencv_reads_them(tmp_path, kind):
+    """Numbers in every way that it writes them, in tables, lists and matrices."""
+    path = tmp_path / f"any.{kind}"
+    store = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    matrix = np.random.default_rng(0).normal(size=(3, 4)) * 10.0 ** np.arange(-6, 6).reshape(3, 4)
+    for name, value in (("whole", 7), ("real", -1.5e-300), ("text", "in words"), ("digits", "640"), ("matrix", matrix)):
+        store.write(name, value)
+    store.startWriteStruct("list", cv2.FileNode_SEQ)
+    for value in (1, 2.5, 1e30):
+        store.write("", value)
+    store.endWriteStruct()
+    store.release()
+    found = parse_storage(path.read_text())
+    store = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    assert [found[name] for name in ("whole", "real")] == [store.getNode(name).real() for name in ("whole", "real")]
+    assert [found[name] for name in ("text", "digits")] == [store.getNode(name).string() for name in ("text", "digits")]
+    np.testing.assert_array_equal(np.reshape(found["matrix"]["data"], (3, 4)), store.getNode("matrix").mat())
+    assert found["list"] == [store.getNode("list").at(place).real() for place in range(3)]
+
+
+def test_a_calibration_may_be_a_stream_of_documents(tmp_path):
+    """As `rostopic echo` prints it: the first message counts."""
+    path = tmp_path / "rig.yaml"
+    write_calibration(path, CAMERAS)
+    path.write_text(path.read_text() + "---\nP1: 7\n")
+    assert read_calibration(path) == CAMERAS
+
+
+def test_what_is_no_ordinary_file_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "rig.yaml")
+    with pytest.raises(RequestError, match="it is no ordinary file"):
+        read_calibration(tmp_path / "rig.yaml")

@@ -327,9 +327,9 @@ def test_synth_writes_plots_and_goes_on_where_it_was(tmp_path, capsys):
     assert cli.main(["phenotype", "synth", str(out), "--family", "shifted"]) == 2
     assert "another family" in capsys.readouterr().err
 
-    from jaxrl_vis.phenotyping.annotations import decode_mask
     from jaxrl_vis.phenotyping.calibration import read_calibration
     from jaxrl_vis.phenotyping.images import read_image
+    from jaxrl_vis.phenotyping.masks import decode_mask
 
     plot = out / "plot_0005"
     truth, coco = (json.loads((plot / name).read_text()) for name in ("plot.json", "annotations.json"))

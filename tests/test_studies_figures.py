@@ -12,6 +12,7 @@ from PIL import Image
 
 from jaxrl_vis import cli
 from jaxrl_vis.run.folder import SCHEMA
+from jaxrl_vis.spreadsheets import to_csv
 from jaxrl_vis.studies import indicator, indicator_figures
 from jaxrl_vis.studies.authors import mean_difference, released_curves
 from jaxrl_vis.studies.cells import Cell, contradiction, is_finished
@@ -20,7 +21,7 @@ from jaxrl_vis.studies.ol_aux import AUX_TASKS, FETCH, FINGER, HAND, LEVELS, STU
 from jaxrl_vis.studies.results import Line, Reached, mean_weight, reached
 from jaxrl_vis.studies.show import Request
 from jaxrl_vis.studies.study import Scope, cells_of
-from jaxrl_vis.studies.tables import Named, steps_table, to_csv, weights_table
+from jaxrl_vis.studies.tables import Named, steps_table, weights_table
 from jaxrl_vis.validation import validate
 from jaxrl_vis_envs import registry
 

@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+MOST_BYTES = 100_000_000
+"""Of a file of text, where nothing less is said."""
 MOST_LEVELS = 100
 """Of lists and tables within each other: what goes deeper was made to do harm, or by mistake."""
 _MOST_DOTS = 200  # in a line of TOML, whose keys of n parts take the time of n * n
 
 
-def read_bytes(path: Path, most: int) -> bytes:
+def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
     """The contents of a file of at most ``most`` bytes.
 
     Raises:
@@ -32,7 +34,7 @@ def read_bytes(path: Path, most: int) -> bytes:
     return data
 
 
-def read_text(path: Path, most: int) -> str:
+def read_text(path: Path, most: int = MOST_BYTES) -> str:
     """A file of at most ``most`` bytes of UTF-8, without the mark of byte order that editors of Windows begin with.
 
     Raises:
@@ -43,6 +45,16 @@ def read_text(path: Path, most: int) -> str:
         return read_bytes(path, most).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise ValueError("is no text in UTF-8") from error
+
+
+def read_json(path: Path, most: int = MOST_BYTES) -> Any:
+    """What a file of JSON of at most ``most`` bytes says.
+
+    Raises:
+        OSError: It cannot be read, or is no ordinary file.
+        ValueError: It is larger, not JSON, or goes deeper than `MOST_LEVELS`.
+    """
+    return parse_json(read_text(path, most))
 
 
 def parse_json(text: str | bytes) -> Any:
@@ -88,7 +100,7 @@ def parse_xml(text: str | bytes) -> ElementTree.Element:
     """The root of a document of XML.
 
     Raises:
-        ValueError: It is not XML, goes deeper than `MOST_LEVELS`, or declares a type, as documents with entities of their own do.
+        ValueError: It is not XML, goes deeper than `MOST_LEVELS`, or declares a document type, as those with entities do.
     """
     parser = ElementTree.XMLParser(target=_Builder())
     try:

@@ -14,10 +14,8 @@ from jaxrl_vis.run.folder import read_config
 from jaxrl_vis.run.signals import shielded_children
 
 # What an extra brings: module -> package.
-_EXTRAS = {
-    "phenotyping": {"cv2": "opencv-python-headless", "scipy": "scipy", "tifffile": "tifffile", "pandas": "pandas"},
-    "grasping": {"cv2": "opencv-python-headless", "scipy": "scipy"},
-}
+_GRASPING = {"cv2": "opencv-python-headless", "scipy": "scipy", "yaml": "pyyaml"}
+_EXTRAS = {"phenotyping": {**_GRASPING, "tifffile": "tifffile", "pandas": "pandas"}, "grasping": _GRASPING}
 
 
 def check_extra(command: str, extra: str) -> None:

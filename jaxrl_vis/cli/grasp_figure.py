@@ -8,7 +8,7 @@ from jaxrl_vis.cli.grasp import painter_of
 from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.report.outputs import check_writable
-from jaxrl_vis_envs.documents import parse_json
+from jaxrl_vis_envs.documents import read_json
 
 NAMES = ("4.4", "4.5", "4.6")
 OPTIONS = ("wind", "video", "evaluation")
@@ -101,11 +101,11 @@ def _draw_grasps(out: Path, seed: int, options: FigureOptions) -> None:
     if options.evaluation is None:
         evaluate(Eval(runs=RUNS, seed=seed, reach=True, wind=(options.wind,), json=path))
     try:
-        found = parse_json(path.read_text(encoding="utf-8"))
+        found = read_json(path)
         shown = [each for each in found["each"] if each["number"] >= seed][:RUNS]
         known = set.intersection(*(set(each["reaches"]) for each in shown))
         family, masks = found["family"], found["masks"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise RequestError(
             f"{path} is not what `grasp eval --reach --json` writes, or holds no run from seed {seed}"
         ) from error

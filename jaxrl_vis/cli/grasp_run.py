@@ -101,12 +101,16 @@ def _truth(image, folder, pair):
         RequestError: The run is not synthetic, or was written without masks.
     """
     from jaxrl_vis.grasping.masks.examples import true_mask
-    from jaxrl_vis.phenotyping.images import read_image
+    from jaxrl_vis.phenotyping.images import image_size, read_image
+    from jaxrl_vis_envs.documents import read_json
 
     try:
-        count = int(parse_json((folder.folder / "plot.json").read_text(encoding="utf-8"))["count"])
-        instance = read_image(folder.folder / "truth" / f"instance_{pair.name}.png").astype(int) - 1
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        count = int(read_json(folder.folder / "plot.json")["count"])
+        truth = folder.folder / "truth" / f"instance_{pair.name}.png"
+        if pair.left is None or image_size(truth) != image_size(pair.left):
+            raise ValueError("masks of another image")
+        instance = read_image(truth).astype(int) - 1
+    except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
         raise RequestError(
             f"{folder.folder} holds no true masks: write it with `jaxrl-vis grasp synth`, or use --masks segmentation"
         ) from error

@@ -28,7 +28,7 @@ class Train:
     """Train the network that paints stalks red, on synthetic rows: against a discriminator, or as a plain segmentation."""
 
     out: Annotated[Path, ByPlaceToo()]
-    """The file to write, .npz; give it to `grasp run` and `grasp eval` as --weights."""
+    """The file to write, .safetensors; give it to `grasp run` and `grasp eval` as --weights."""
     loss: Literal["gan", "segmentation"] = "segmentation"
     """What it learns by: a discriminator as in pix2pix, or cross entropy and Dice of the mask."""
     family: Literal["training", "shifted"] = "training"
@@ -71,8 +71,8 @@ def train(options: Train) -> int:
         raise RequestError(f"--rate must be more than 0, not {options.rate:g}")
     if options.crop % 64:
         raise RequestError(f"--crop must be a multiple of 64, not {options.crop}")
-    if options.out.suffix != ".npz":
-        raise RequestError(f"the weights go into a file that ends in .npz, not {options.out}")
+    if options.out.suffix != ".safetensors":
+        raise RequestError(f"the weights go into a file that ends in .safetensors, not {options.out}")
     check_extra("grasp", "grasping")
     check_writable(options.out, "OUT")
     family = family_of(_Drawn(options.family, options.spec, options.width), "grasping")

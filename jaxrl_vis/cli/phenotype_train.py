@@ -27,7 +27,7 @@ class Train:
     """Train the networks that find and outline stalks, on synthetic plots or on your own annotated images."""
 
     out: Annotated[Path, ByPlaceToo()]
-    """The file to write, .npz; give it to `phenotype run` as --weights."""
+    """The file to write, .safetensors; give it to `phenotype run` as --weights."""
     data: Path | None = None
     """A folder of annotated images (annotations.json of COCO, or .xml of Pascal VOC or .json of LabelMe beside each image), in
     place of synthetic plots."""
@@ -73,8 +73,8 @@ def train(options: Train) -> int:
         raise RequestError(f"--minutes must be more than 0, not {options.minutes:g}")
     if options.rate is not None and not options.rate > 0:
         raise RequestError(f"--rate must be more than 0, not {options.rate:g}")
-    if options.out.suffix != ".npz":
-        raise RequestError(f"the weights go into a file that ends in .npz, not {options.out}")
+    if options.out.suffix != ".safetensors":
+        raise RequestError(f"the weights go into a file that ends in .safetensors, not {options.out}")
     check_extra("phenotype", "phenotyping")
     check_writable(options.out, "OUT")
     if options.workers > 1:

@@ -25,9 +25,10 @@ from jaxrl_vis.grasping.cloud import Mount
 from jaxrl_vis.grasping.perceive import Perception, View, Ways, perceive
 from jaxrl_vis.phenotyping.folders import PairFiles, PlotFolder, claim, read_odometries, stamp, stamps
 from jaxrl_vis.phenotyping.images import write_image
+from jaxrl_vis.phenotyping.names import file_name
 from jaxrl_vis.phenotyping.reading import Unusable, read_pair
 from jaxrl_vis.phenotyping.results import Row, write_rows
-from jaxrl_vis_envs.documents import parse_json
+from jaxrl_vis_envs.documents import read_json
 from jaxrl_vis_envs.plants import Calibration
 
 Find = Callable[[np.ndarray, PlotFolder, PairFiles], np.ndarray]
@@ -118,7 +119,7 @@ def run(runs: list[PlotFolder], find: Find, request: Request, done: Callable[[Ro
     skipped: list[Row] = []
     (request.out / "runs").mkdir(exist_ok=True)
     for each in runs:
-        path = request.out / "runs" / f"{each.name}.json"
+        path = request.out / "runs" / file_name(f"{each.name}.json")
         made_of = _made_of(each)  # before the files are read: they may be replaced meanwhile
         if not _is_done(path, made_of):
             record = {**_record(each, driven[each.name], find, request), "of": made_of}
@@ -158,10 +159,11 @@ def _made_of(folder: PlotFolder) -> dict[str, Any]:
 def _is_done(path: Path, made_of: dict[str, Any]) -> bool:
     """Whether a record is of the files as they are now. One with skipped pairs, or without a word of its files, is not."""
     try:
-        record = parse_json(path.read_text(encoding="utf-8"))
-    except (FileNotFoundError, ValueError):
+        record = read_json(path)
+        whole = record["row"].keys() == set(RUN_COLUMNS) and all(each.keys() == set(POINT_COLUMNS) for each in record["points"])
+        return whole and record["skipped"] == [] and record["of"] == made_of
+    except (FileNotFoundError, ValueError, KeyError, TypeError, AttributeError):
         return False
-    return not record["skipped"] and record.get("of") == made_of
 
 
 def _record(folder: PlotFolder, driven: dict[str, float] | None, find: Find, request: Request) -> dict[str, Any]:
@@ -183,7 +185,7 @@ def _record(folder: PlotFolder, driven: dict[str, float] | None, find: Find, req
     )
     (request.out / "overlays").mkdir(exist_ok=True)
     overlay = draw_points(views[-1].left, perception, calibration, request.mount)
-    write_image(request.out / "overlays" / f"{folder.name}.png", overlay)
+    write_image(request.out / "overlays" / file_name(f"{folder.name}.png"), overlay)
     points = _points(folder, request, perception)
     return {"row": _row(folder, request, len(skipped), perception, views), "points": points, "skipped": skipped}
 

@@ -3,92 +3,26 @@
 Columns and lines of boxes and outlines are continuous: the first pixel spans from 0 to 1, with its middle at 0.5.
 """
 
-import json
-from collections.abc import Callable, Sequence
-from pathlib import Path
+import reprlib
+from collections.abc import Callable
+from pathlib import Path, PureWindowsPath
 from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.phenotyping.images import MOST_PIXELS
+from jaxrl_vis.phenotyping.masks import box_around_runs, covering, decode_counts
+from jaxrl_vis.phenotyping.names import readable
+from jaxrl_vis_envs.documents import parse_xml, read_bytes, read_json
 
 STALK = 1
 """Category of stalks."""
-
-
-def encode_mask(mask: np.ndarray, corner: tuple[int, int], size: tuple[int, int]) -> dict[str, Any]:
-    """A mask as COCO's uncompressed runs, which go down the columns and begin with what is outside.
-
-    Args:
-        mask: [h, w] bool, of a part of the image.
-        corner: Line and column of its first pixel.
-        size: Height and width of the image.
-
-    Returns:
-        ``size`` and ``counts``; an image of which all is outside has one run.
-    """
-    height, width = size
-    column, line = np.nonzero(mask.T)
-    place = (column + corner[1]) * height + line + corner[0]
-    breaks = np.flatnonzero(np.diff(place) > 1)
-    starts = place[np.concatenate([[0], breaks + 1])] if place.size else place
-    ends = place[np.concatenate([breaks, [place.size - 1]])] + 1 if place.size else place
-    edges = np.concatenate([[0], np.stack([starts, ends], axis=1).ravel(), [height * width]])
-    counts = np.diff(edges).tolist()
-    if counts and counts[-1] == 0:
-        counts.pop()
-    return {"size": [height, width], "counts": [int(count) for count in counts]}
-
-
-def decode_mask(runs: dict[str, Any]) -> np.ndarray:
-    """The mask [H, W] bool that `encode_mask` wrote.
-
-    Raises:
-        ValueError: The runs do not cover the image.
-    """
-    height, width = runs["size"]
-    counts = _covering(runs["counts"], height, width)
-    return np.repeat(np.arange(counts.size) % 2 == 1, counts).reshape(width, height).T
-
-
-def _covering(counts: Sequence[float], height: int, width: int) -> np.ndarray:
-    """Runs [N] int64 that are known to cover the image.
-
-    Raises:
-        ValueError: They do not.
-    """
-    numbers = np.asarray(counts, np.int64)
-    if numbers.ndim != 1 or (numbers < 0).any() or numbers.sum() != height * width:
-        raise ValueError(f"runs of {numbers.sum()} pixels do not cover an image of {width} x {height}")
-    return numbers
-
-
-def outlined_mask(outlines: list[list[float]], size: tuple[int, int]) -> np.ndarray:
-    """The mask [H, W] bool of polygons: those pixels whose middle lies inside one of them.
-
-    As many pixels belong to a strip as it is wide, on the mean over its lines; to fill up to and with the boundary, as OpenCV
-    does, would make it a pixel wider.
-
-    Args:
-        outlines: Of each polygon column, line, column, line, ... of its corners, which may lie beyond the image.
-        size: Height and width of the image.
-    """
-    height, width = size
-    mask = np.zeros(size, bool)
-    for outline in outlines:
-        here = np.reshape(np.asarray(outline, float), (-1, 2))
-        ahead = np.roll(here, -1, axis=0)
-        first, last = np.clip(np.ceil([here[:, 1].min() - 0.5, here[:, 1].max() - 0.5]), 0, height).astype(int)
-        middles = np.arange(first, last) + 0.5
-        edge, line = np.nonzero((here[:, 1:] <= middles) != (ahead[:, 1:] <= middles))
-        share = (middles[line] - here[edge, 1]) / (ahead[edge, 1] - here[edge, 1])
-        crossing = here[edge, 0] + share * (ahead[edge, 0] - here[edge, 0])
-        # Right of an odd number of crossings is inside.
-        crossings = np.zeros((len(middles), width + 1), np.int32)
-        np.add.at(crossings, (line, np.clip(np.ceil(crossing - 0.5), 0, width).astype(int)), 1)
-        mask[first:last] |= np.cumsum(crossings[:, :width], axis=1) % 2 == 1
-    return mask
+_MOST_BYTES = 10_000_000  # of a file of one image
+_FARTHEST = 1e7  # pixels
+_WRONG = (ValueError, KeyError, TypeError, AttributeError, OverflowError)
+"""What a file raises that is of another form."""
 
 
 def coco(images: list[dict[str, Any]], annotations: list[dict[str, Any]], about: dict[str, Any]) -> dict[str, Any]:
@@ -103,29 +37,6 @@ def coco(images: list[dict[str, Any]], annotations: list[dict[str, Any]], about:
     numbered = [{"id": place + 1, "category_id": STALK, "iscrowd": 0, **each} for place, each in enumerate(annotations)]
     categories = [{"id": STALK, "name": "stalk", "supercategory": "plant"}]
     return {"info": about, "images": images, "annotations": numbered, "categories": categories}
-
-
-def decode_counts(text: str) -> list[int]:
-    """The runs that COCO's tools write as text: five bits a character, and from the third run on the difference to the last but
-    one.
-
-    Raises:
-        ValueError: The text ends in the middle of a number.
-    """
-    counts: list[int] = []
-    place = 0
-    while place < len(text):
-        value, shift, more = 0, 0, True
-        while more:
-            if place >= len(text):
-                raise ValueError("runs of a mask end in the middle of a number")
-            bits = ord(text[place]) - 48
-            value |= (bits & 0x1F) << shift
-            more, shift, place = bool(bits & 0x20), shift + 5, place + 1
-            if not more and bits & 0x10:
-                value -= 1 << shift
-        counts.append(value + (counts[-2] if len(counts) > 2 else 0))
-    return counts
 
 
 def read_annotations(folder: Path) -> dict[str, Any]:
@@ -157,17 +68,17 @@ def read_annotations(folder: Path) -> dict[str, Any]:
 
 def _coco_of(path: Path) -> dict[str, Any]:
     try:
-        data = json.loads(path.read_text(encoding="utf-8-sig"))
+        data = read_json(path)
         names = {each["id"]: str(each["name"]) for each in data.get("categories", [])}
         annotations = []
         for place, each in enumerate(data["annotations"]):
-            source = f"{path}: annotation {each.get('id', place + 1)}"
+            source = f"{path}: annotation {str(each.get('id', place + 1))[:60]}"
             annotations.append({**each, "name": names.get(each.get("category_id"), ""), "source": source})
         return {"images": [{**each, "source": str(path)} for each in data["images"]], "annotations": annotations}
     except OSError as error:
         raise RequestError(f"cannot read {path}: {error.strerror or error}") from error
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise RequestError(f"{path} is not COCO: it needs images and annotations") from error
+    except _WRONG as error:
+        raise RequestError(f"{path} is not COCO: it needs images and annotations{_reason(error)}") from error
 
 
 _Read = Callable[[Path], tuple[str, int, int, list[dict[str, Any]]]]
@@ -182,9 +93,9 @@ def _together(files: list[Path], read: _Read) -> dict[str, Any]:
             name, width, height, found = read(file)
         except OSError as error:
             raise RequestError(f"cannot read {file}: {error.strerror or error}") from error
-        except (ValueError, KeyError, TypeError, AttributeError, ElementTree.ParseError) as error:
+        except _WRONG as error:
             kind = "Pascal VOC" if file.suffix == ".xml" else "LabelMe"
-            raise RequestError(f"{file} is no annotation of {kind}") from error
+            raise RequestError(f"{file} is no annotation of {kind}{_reason(error)}") from error
         images.append({"id": number, "file_name": name, "width": width, "height": height, "source": str(file)})
         annotations += [
             {"image_id": number, "source": f"{file}: annotation {place + 1}", **each} for place, each in enumerate(found)
@@ -192,8 +103,14 @@ def _together(files: list[Path], read: _Read) -> dict[str, Any]:
     return {"images": images, "annotations": annotations}
 
 
+def _reason(error: Exception) -> str:
+    """What a reader said, where it said it in words."""
+    words = " ".join(str(error).split()) if isinstance(error, ValueError) else ""
+    return f" ({words[:200]})" if words else ""
+
+
 def _voc(path: Path) -> tuple[str, int, int, list[dict[str, Any]]]:
-    root = ElementTree.parse(path).getroot()
+    root = parse_xml(read_bytes(path, _MOST_BYTES))
 
     def text(node: ElementTree.Element, name: str) -> str:
         value = node.findtext(name)
@@ -211,7 +128,7 @@ def _voc(path: Path) -> tuple[str, int, int, list[dict[str, Any]]]:
 
 
 def _labelme(path: Path) -> tuple[str, int, int, list[dict[str, Any]]]:
-    data = json.loads(path.read_text(encoding="utf-8-sig"))
+    data = read_json(path, _MOST_BYTES)
     found = []
     for shape in data["shapes"]:
         points = np.asarray(shape["points"], float).reshape(-1, 2)
@@ -220,7 +137,8 @@ def _labelme(path: Path) -> tuple[str, int, int, list[dict[str, Any]]]:
             continue
         low, high = points.min(axis=0), points.max(axis=0)
         outline = points if kind == "polygon" else np.array([low, (high[0], low[1]), high, (low[0], high[1])])
-        box = [*map(float, low), *map(float, high - low)]
+        with np.errstate(over="ignore", invalid="ignore"):
+            box = [*map(float, low), *map(float, high - low)]
         found.append({"name": str(shape["label"]), "bbox": box, "segmentation": [outline.ravel().tolist()]})
     # The path is as its writer's machine spelled it.
     return (
@@ -238,6 +156,9 @@ def _kept(data: dict[str, Any], path: Path) -> dict[str, Any]:
     if not data["images"] or not data["annotations"]:
         raise RequestError(f"{path} annotates nothing: name a folder with annotated images")
     images = [_checked_image(each, place) for place, each in enumerate(data["images"])]
+    twice = len(images) - len({each["id"] for each in images})
+    if twice:
+        raise RequestError(f"{path}: {twice} images have the id of another one, so nobody can tell whose annotations are whose")
     sizes = {each["id"]: (each["height"], each["width"]) for each in images}
     annotations = []
     for each in data["annotations"]:
@@ -256,11 +177,26 @@ def _checked_image(image: dict[str, Any], place: int) -> dict[str, Any]:
     """
     if not isinstance(image.get("id"), (int, str)) or not isinstance(image.get("file_name"), str):
         raise RequestError(f"{image['source']}: image number {place + 1} needs an id and a file_name")
+    name = image["file_name"]
+    if not _is_inside(name):
+        raise RequestError(
+            f"{image['source']}: image number {place + 1} has the file_name {reprlib.repr(name)}: name a file in that folder"
+        )
     sides = _numbers([image.get("width"), image.get("height")])
-    if sides is None or min(sides) < 1:
-        said = f"{image.get('width')} and {image.get('height')}"
-        raise RequestError(f"{image['source']}: image {image['file_name']} needs a width and a height in pixels, not {said}")
+    if sides is None or min(sides) < 1 or any(side % 1 for side in sides):
+        said = f"{reprlib.repr(image.get('width'))} and {reprlib.repr(image.get('height'))}"
+        raise RequestError(f"{image['source']}: image {name} needs a width and a height in pixels, not {said}")
+    if sides[0] * sides[1] > MOST_PIXELS:
+        most = f"more than {MOST_PIXELS // 10**6} million pixels"
+        raise RequestError(f"{image['source']}: image {name} is said to have {sides[0]:g} x {sides[1]:g}, {most}")
     return {**image, "width": int(sides[0]), "height": int(sides[1])}
+
+
+def _is_inside(name: str) -> bool:
+    """Whether a file's name, as it stands in annotations, leads to nowhere but into their folder, on any system."""
+    path = PureWindowsPath(name)  # which knows both separators
+    steps = path.parts
+    return bool(steps) and not path.anchor and ".." not in steps and name == readable(name)
 
 
 def _checked_annotation(annotation: dict[str, Any], sizes: dict[int | str, tuple[int, int]]) -> dict[str, Any]:
@@ -275,7 +211,7 @@ def _checked_annotation(annotation: dict[str, Any], sizes: dict[int | str, tuple
     """
     number = annotation.get("image_id")
     if not isinstance(number, (int, str)) or number not in sizes:
-        raise ValueError(f"has the image_id {number!r}, which no image has")
+        raise ValueError(f"has the image_id {reprlib.repr(number)}, which no image has")
     height, width = sizes[number]
     segmentation = _checked_segmentation(annotation.get("segmentation"), (height, width))
     if annotation.get("bbox") is not None:
@@ -286,6 +222,8 @@ def _checked_annotation(annotation: dict[str, Any], sizes: dict[int | str, tuple
         raise ValueError("has neither a bbox nor a segmentation")
     if box is None or len(box) != 4:
         raise ValueError("has a bbox that is not 4 numbers (left, top, width, height)")
+    if max(map(abs, box)) > _FARTHEST:
+        raise ValueError("has a bbox that lies nowhere near an image")
     left, top, wide, tall = box
     if not (wide > 0 and tall > 0):
         raise ValueError(f"has a box of {wide:g} x {tall:g} pixels")
@@ -312,7 +250,7 @@ def _checked_segmentation(segmentation: Any, size: tuple[int, int]) -> dict[str,
             numbers = decode_counts(counts) if isinstance(counts, str) else _numbers(counts)
             if numbers is None:
                 raise ValueError("counts are not numbers")
-            runs = _covering(numbers, *size)
+            runs = covering(numbers, *size)
         except (ValueError, OverflowError) as error:
             raise ValueError(f"has a mask that cannot be read ({error})") from error
         if not runs[1::2].any():
@@ -322,6 +260,8 @@ def _checked_segmentation(segmentation: Any, size: tuple[int, int]) -> dict[str,
     corners = [each for each in outlines if each is not None and len(each) >= 6 and len(each) % 2 == 0]
     if len(corners) < len(outlines):
         raise ValueError("has a polygon that is not column, line, column, line, ... of 3 corners or more")
+    if any(abs(corner) > _FARTHEST for outline in corners for corner in outline):
+        raise ValueError("has a polygon that lies nowhere near an image")
     return corners
 
 
@@ -329,7 +269,7 @@ def _numbers(values: Any) -> list[float] | None:
     """A list of finite numbers; None where it is anything else."""
     try:
         numbers = np.asarray(values, float)
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError):
         return None
     return numbers.tolist() if numbers.ndim == 1 and np.isfinite(numbers).all() else None
 
@@ -337,9 +277,7 @@ def _numbers(values: Any) -> list[float] | None:
 def _box_around(segmentation: dict[str, Any] | list[list[float]]) -> list[float]:
     """The box (left, top, width, height) around what was checked."""
     if isinstance(segmentation, dict):
-        line, column = np.nonzero(decode_mask(segmentation))
-        low, high = np.array([column.min(), line.min()]), np.array([column.max(), line.max()]) + 1
-    else:
-        corners = np.concatenate([np.reshape(each, (-1, 2)) for each in segmentation])
-        low, high = corners.min(axis=0), corners.max(axis=0)
+        return box_around_runs(np.array(segmentation["counts"], np.int64), segmentation["size"][0])
+    corners = np.concatenate([np.reshape(each, (-1, 2)) for each in segmentation])
+    low, high = corners.min(axis=0), corners.max(axis=0)
     return [*map(float, low), *map(float, high - low)]

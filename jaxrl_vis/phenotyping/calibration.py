@@ -9,20 +9,26 @@ thing that files do not say is the unit of the baseline: metres in ROS, and in O
 
 import dataclasses
 import math
+import reprlib
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.files import write_atomically
+from jaxrl_vis.phenotyping.storage import parse_storage
+from jaxrl_vis_envs.documents import read_text
 from jaxrl_vis_envs.plants import Calibration
 
 Unit = Literal["m", "mm"]
 _METRES: dict[str, float] = {"m": 1.0, "mm": 1e-3}
 _BASELINES = (0.008, 2.0)  # m: of stereo pairs that look at plants from a robot
 _SIDES = ("left", "right")
+_NO_STORAGE = "it is neither YAML nor XML as OpenCV and ROS write it"
+_MOST_BYTES = 2_000_000  # of a file
+_MOST_PIXELS = 100_000  # along a side of an image
 
 
 def read_calibration(path: Path, unit: Unit | None = None) -> Calibration:
@@ -38,7 +44,7 @@ def read_calibration(path: Path, unit: Unit | None = None) -> Calibration:
     """
     if path.is_dir():
         files = [_beside(path / "left.yaml", side) for side in _SIDES]
-    elif _storage(path).getNode("P2").empty():
+    elif _storage(path).get("P2") is None:
         files = [_beside(path, side) for side in _SIDES]
     else:
         files = [path]
@@ -46,15 +52,15 @@ def read_calibration(path: Path, unit: Unit | None = None) -> Calibration:
     matrices, sizes = [], []
     for place, side in enumerate(_SIDES):
         store = stores[min(place, len(stores) - 1)]
-        names = (f"P{place + 1}",) if len(stores) == 1 else ("projection_matrix", "P")
+        names = (f"P{place + 1}",) if len(stores) == 1 else ("projection_matrix", "P", "p")
         matrices.append(_matrix(store, names, files[min(place, len(files) - 1)], side))
         sizes.append(_size(store, files[min(place, len(files) - 1)]))
     if sizes[0] != sizes[1]:
         raise RequestError(f"{path}: the left image has {_times(sizes[0])} pixels and the right one {_times(sizes[1])}")
-    node = stores[0].getNode("unit")
-    said = node.string()
-    if (said or not node.empty()) and said not in _METRES:
-        raise RequestError(f"{path}: unit must be m or mm, not {said or 'something that is no text'}")
+    said = stores[0].get("unit")
+    if said is not None and (not isinstance(said, str) or said not in _METRES):
+        told = reprlib.repr(said) if isinstance(said, str) else "something that is no text"
+        raise RequestError(f"{path}: unit must be m or mm, not {told}")
     return _checked(path, matrices[0], matrices[1], sizes[0], unit or said or "m")
 
 
@@ -105,66 +111,53 @@ def _beside(path: Path, side: str) -> Path:
     return found
 
 
-def _storage(path: Path) -> cv2.FileStorage:
-    """The file, opened. ROS writes YAML without the line by which OpenCV knows its own."""
+def _storage(path: Path) -> dict[str, Any]:
+    """What the file holds, by its names."""
     try:
-        text = path.read_text(encoding="utf-8-sig")  # editors of Windows begin a file with a mark that OpenCV does not know
+        store = parse_storage(read_text(path, _MOST_BYTES))
     except OSError as error:
-        raise RequestError(f"there is no calibration {path}: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise RequestError(f"{path} is not a calibration: it is no text") from error
-    if not text.lstrip().startswith(("%YAML", "<?xml", "{")):
-        text = "%YAML:1.0\n---\n" + text
-    try:
-        store = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-        root = store.root()
-    except (SystemError, cv2.error) as error:
-        raise RequestError(f"{path} is not a calibration: it is neither YAML nor XML that OpenCV reads") from error
-    if not root.empty() and not root.isMap():
+        raise RequestError(f"there is no calibration {path}: {error.strerror or error}") from error
+    except ValueError as error:
+        why = " ".join(str(error).split())
+        raise RequestError(
+            f"{path} is not a calibration: it is neither YAML nor XML as OpenCV and ROS write it ({why})"
+        ) from error
+    if isinstance(store, list):
         raise RequestError(f"{path} is not a calibration: it holds a list, not names with values such as P1 and P2")
+    if not isinstance(store, dict):
+        raise RequestError(f"{path} is not a calibration: {_NO_STORAGE}")
     return store
 
 
-def _matrix(store: cv2.FileStorage, names: tuple[str, ...], path: Path, side: str) -> np.ndarray:
+def _matrix(store: dict[str, Any], names: tuple[str, ...], path: Path, side: str) -> np.ndarray:
     """The projection matrix [3, 4] under the first of the names that is there."""
-    node = next((store.getNode(name) for name in names if not store.getNode(name).empty()), None)
-    if node is None:
+    value = next((store[name] for name in names if store.get(name) is not None), None)
+    if value is None:
         raise RequestError(
             f"{path} has no projection matrix of the {side} camera ({' or '.join(names)}): rectify the pair first"
         )
-    values = _numbers(node)
-    if values is None or values.size != 12 or not np.isfinite(values).all():
+    data = value.get("data") if isinstance(value, dict) else value
+    rows = data if isinstance(data, list) else []
+    numbers = [each for row in rows for each in row] if rows and all(isinstance(row, list) for row in rows) else rows
+    if len(numbers) != 12 or not all(isinstance(each, float) and math.isfinite(each) for each in numbers):
         raise RequestError(f"{path}: {names[0]} of the {side} camera must be 3 x 4 numbers")
-    return values.reshape(3, 4)
+    return np.array(numbers).reshape(3, 4)
 
 
-def _numbers(node: cv2.FileNode) -> np.ndarray | None:
-    """The numbers [N] float64 of a list, or of a matrix of ROS or OpenCV; None where it is none of these.
-
-    Not by ``node.mat()``: of a matrix without rows, or with text in its data, OpenCV writes where it must not, and the program
-    ends.
-    """
-    data = node.getNode("data") if node.isMap() else node
-    each = [data.at(place) for place in range(int(data.size()))] if data.isSeq() else []
-    # Of a text, OpenCV gives the greatest number that there is.
-    return np.array([one.real() for one in each], float) if all(one.isReal() or one.isInt() for one in each) else None
-
-
-def _size(store: cv2.FileStorage, path: Path) -> tuple[int, int]:
+def _size(store: dict[str, Any], path: Path) -> tuple[int, int]:
     """Width and height of the images that were calibrated, pixels."""
+    both = store.get("image_size")
     for names in (("image_width", "image_height"), ("width", "height")):
-        nodes = [store.getNode(name) for name in names]
-        if not any(node.empty() for node in nodes):
-            return _whole(nodes, path, " and ".join(names))
-    node = store.getNode("image_size")
-    if not node.empty() and node.isSeq() and node.size() == 2:
-        return _whole([node.at(0), node.at(1)], path, "image_size")
+        values = [store.get(name) for name in names]
+        if None not in values:
+            return _whole(values, path, " and ".join(names))
+    if isinstance(both, list) and len(both) == 2:
+        return _whole(both, path, "image_size")
     raise RequestError(f"{path} does not say for which images it is: add image_width and image_height")
 
 
-def _whole(nodes: list[cv2.FileNode], path: Path, names: str) -> tuple[int, int]:
-    values = [node.real() if node.isReal() or node.isInt() else math.nan for node in nodes]
-    if not all(math.isfinite(value) and value >= 1 for value in values):
+def _whole(values: list[Any], path: Path, names: str) -> tuple[int, int]:
+    if not all(isinstance(value, float) and 1 <= value <= _MOST_PIXELS and value.is_integer() for value in values):
         raise RequestError(f"{path}: {names} must be numbers of pixels, without quotation marks")
     return int(values[0]), int(values[1])
 

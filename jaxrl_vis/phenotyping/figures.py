@@ -4,8 +4,6 @@ What people did is the thesis's: their times are quoted, and their measurements 
 Everything says so.
 """
 
-import csv
-import io
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +12,8 @@ import numpy as np
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.files import write_atomically
 from jaxrl_vis.phenotyping.evaluate import PERSON_SD
-from jaxrl_vis_envs.documents import parse_json
+from jaxrl_vis.spreadsheets import to_csv
+from jaxrl_vis_envs.documents import read_json
 
 _INK, _GREY, _GREEN, _ORANGE = "#222222", "#9a9a9a", "#1a7f37", "#d1720c"
 _MOST_SHOWN = 60  # stalks of figure 3.5, as many as can be told apart
@@ -31,7 +30,7 @@ def read_evaluation(path: Path) -> dict[str, Any]:
         RequestError: The file is not what ``phenotype eval --json`` writes.
     """
     try:
-        data = parse_json(path.read_text(encoding="utf-8"))
+        data = read_json(path)
         if data["synthetic"] is not True or not all(
             {"true", "counted", "widths_mm", "pairs"} <= each.keys() for each in data["each"]
         ):
@@ -156,8 +155,4 @@ def _write_tables(out: Path, note: str, rows: list[dict[str, Any]]) -> None:
     lines = [note, "", "| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]
     lines += ["| " + " | ".join(str(each[column]) for column in columns) + " |" for each in rows]
     write_atomically(out.with_suffix(".md"), "\n".join(lines) + "\n")
-    text = io.StringIO()
-    writer = csv.DictWriter(text, columns, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_atomically(out.with_suffix(".csv"), text.getvalue())
+    write_atomically(out.with_suffix(".csv"), to_csv(rows))

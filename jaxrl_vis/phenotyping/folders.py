@@ -8,21 +8,24 @@ odometry.csv                         distance_m, or time_s, with the name of the
 
 import csv
 import dataclasses
+import io
 import json
+import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.files import write_atomically
-from jaxrl_vis_envs.documents import parse_json
+from jaxrl_vis.phenotyping.names import check_length, readable
+from jaxrl_vis.spreadsheets import text_of
+from jaxrl_vis_envs.documents import read_json, read_text
 
 _IMAGES = {".png", ".jpg", ".jpeg", ".tif", ".tiff"}
 SAMPLE = Path(__file__).with_name("sample_row")
 """A short synthetic row that comes with the package."""
+_MOST_ODOMETRY = 8_000_000  # bytes
 _DISPARITIES = {".pfm", ".png", ".tif", ".tiff"}
 _WORD = re.compile(r"(?<![a-z])(left|right)(?![a-z])", re.IGNORECASE)
 _LETTER = re.compile(r"(?<![a-z])[lr](?![a-z])", re.IGNORECASE)
@@ -64,43 +67,68 @@ def find_plots(folder: Path) -> list[PlotFolder]:
     """The plots in a folder: the folder itself if it holds pairs, else its subfolders that do.
 
     Raises:
-        RequestError: There is no such folder, or there are no pairs in it.
+        RequestError: There is no such folder, there are no pairs in it, or nobody can tell which of two files is meant.
     """
     if not folder.is_dir():
         raise RequestError(f"there is no folder {folder}: name one with stereo pairs")
     own = _pairs(folder)
-    plots = [PlotFolder(folder.resolve().name, folder, own)] if own else []
+    folders = {folder.resolve(): own} if own else {}
     if not own:
-        for each in sorted(path for path in folder.iterdir() if path.is_dir()):
-            pairs = _pairs(each)
-            if pairs:
-                plots.append(PlotFolder(each.name, each, pairs))
+        folders = {each: _pairs(each) for each in sorted(path for path in folder.iterdir() if path.is_dir())}
+    plots: dict[str, PlotFolder] = {}
+    for path, pairs in folders.items():
+        if pairs:
+            check_length(path)
+            name = readable(path.name) or "plot"
+            if name in plots:
+                raise RequestError(f"{readable(str(folder))} holds two plots called {name}: rename one of them")
+            plots[name] = PlotFolder(name, folder if own else path, pairs)
     if not plots:
         raise RequestError(
             f"{folder} holds no stereo pairs: name images left_000.png and right_000.png, or put them into left/ and right/"
         )
-    return plots
+    return list(plots.values())
+
+
+_Sides = dict[str, dict[str, Path]]
+"""Files by the name of their pair and what they are of it: left, right or disparity."""
 
 
 def _pairs(folder: Path) -> tuple[PairFiles, ...]:
     sides = _by_folder(folder) or {}
     for name, each in _by_name(folder).items():
-        sides.setdefault(name, {}).update(each)
+        for side, path in each.items():
+            _put(sides, name, side, path)
     stored = _folder_of(folder, ("disparity",))
     inside = [] if stored is None else _images(stored, _DISPARITIES)
     for path in [*inside, *_images(folder, _DISPARITIES)]:
         beside = path.parent == folder
-        name = re.sub("disparity", "", path.stem, flags=re.IGNORECASE).strip("_-. ") if beside else path.stem
-        if name in sides and (not beside or "disparity" in path.stem.lower()):
-            sides[name]["disparity"] = path
+        stem = readable(path.stem)
+        name = re.sub("disparity", "", stem, flags=re.IGNORECASE).strip("_-. ") if beside else stem
+        if name in sides and (not beside or "disparity" in stem.lower()):
+            _put(sides, name, "disparity", path)
     found = [PairFiles(name, each.get("left"), each.get("right"), each.get("disparity")) for name, each in sides.items()]
     return tuple(sorted(found, key=lambda pair: _natural(pair.name)))
 
 
-def _by_folder(folder: Path) -> dict[str, dict[str, Path]]:
+def _put(sides: _Sides, name: str, side: str, path: Path) -> None:
+    """Notes a file.
+
+    Raises:
+        RequestError: There is another one in its place, or its name is too long.
+    """
+    check_length(path)
+    other = sides.setdefault(name, {}).setdefault(side, path)
+    if other != path:
+        both = " and ".join(readable(str(each)) for each in (other, path))
+        what = "disparity" if side == "disparity" else f"{side} image"
+        raise RequestError(f"{both} are both the {what} of pair {name}: rename one of them, or move it elsewhere")
+
+
+def _by_folder(folder: Path) -> _Sides:
     """Images in two folders, one for each side, by the name of their pair and their side."""
     nested = {side: _folder_of(folder, (side, side[0])) for side in ("left", "right")}
-    sides: dict[str, dict[str, Path]] = {}
+    sides: _Sides = {}
     if all(nested.values()):
         for side, path in nested.items():
             assert path is not None
@@ -108,20 +136,21 @@ def _by_folder(folder: Path) -> dict[str, dict[str, Path]]:
             if any(len(each) == 2 for each in _by_name(path).values()):
                 return {}
             for image in _images(path):
-                sides.setdefault(image.stem, {})[side] = image
+                _put(sides, readable(image.stem), side, image)
     return sides
 
 
-def _by_name(folder: Path) -> dict[str, dict[str, Path]]:
+def _by_name(folder: Path) -> _Sides:
     """Images that say in their names which side they show, by the name of their pair and their side."""
-    images = [path for path in _images(folder) if "disparity" not in path.stem.lower()]
-    stems = {path.stem.lower() for path in images}
-    sides: dict[str, dict[str, Path]] = {}
-    for image in images:
-        word = _side_in(image.stem, stems)
+    images = {path: readable(path.stem) for path in _images(folder)}
+    images = {path: stem for path, stem in images.items() if "disparity" not in stem.lower()}
+    stems = {stem.lower() for stem in images.values()}
+    sides: _Sides = {}
+    for image, stem in images.items():
+        word = _side_in(stem, stems)
         if word is not None:
-            name = (image.stem[: word.start()] + image.stem[word.end() :]).strip("_-. ") or "pair"
-            sides.setdefault(name, {})["left" if word.group().lower().startswith("l") else "right"] = image
+            name = (stem[: word.start()] + stem[word.end() :]).strip("_-. ") or "pair"
+            _put(sides, name, "left" if word.group().lower().startswith("l") else "right", image)
     return sides
 
 
@@ -153,12 +182,13 @@ def _folder_of(folder: Path, names: tuple[str, ...]) -> Path | None:
 def _images(folder: Path, suffixes: set[str] = _IMAGES) -> list[Path]:
     if not folder.is_dir():
         return []
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() in suffixes and path.is_file())
+    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in suffixes and path.is_file())
+    return [path for path in paths if not path.name.startswith(".")]  # beside each image, macOS leaves ._ and its name
 
 
 def _natural(name: str) -> list[tuple[int, int, str]]:
     """Sorts 2 before 10."""
-    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", name) if part]
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", name) if part]
 
 
 def read_odometries(plots: Sequence[PlotFolder], speed: float | None) -> dict[str, dict[str, float] | None]:
@@ -191,24 +221,34 @@ def read_odometry(plot: PlotFolder, speed: float | None = None) -> dict[str, flo
         raise RequestError(f"{path} needs a column distance_m, or time_s and --speed")
     if "distance_m" not in columns and speed is None:
         return None
+    wanted = {readable(pair.left.name): pair.name for pair in plot.pairs if pair.left}
+    where = columns.index("distance_m" if "distance_m" in columns else "time_s")
+    named = columns.index("left") if "left" in columns else None
+    driven: dict[str, float] = {}
+    values: list[float] = []
+    count = 0
     try:
-        if "distance_m" in columns:
-            values = [float(row["distance_m"]) for row in rows]
-        else:
-            values = [(speed or 0.0) * float(row["time_s"]) for row in rows]
-        if not np.isfinite(values).all():
-            raise ValueError
-    except (ValueError, TypeError) as error:
+        for row in rows:
+            value = float(row[where]) * (1.0 if "distance_m" in columns else speed or 0.0)
+            if not math.isfinite(value):
+                raise ValueError
+            count += 1
+            if named is not None:
+                name = re.split(r"[/\\]", text_of(row[named].strip()) if named < len(row) else "")[-1]
+                if name in wanted:
+                    driven[wanted[name]] = value
+            elif count <= len(plot.pairs):
+                values.append(value)
+    except csv.Error as error:
+        raise RequestError(f"{path} is no table: save it as CSV in UTF-8 ({error})") from error
+    except (ValueError, IndexError) as error:
         raise RequestError(f"{path} holds something that is no number: distances and times must be finite numbers") from error
-    if "left" in columns:
-        of_file = {Path((row["left"] or "").strip()).name: value for row, value in zip(rows, values)}
-        return {pair.name: of_file[pair.left.name] for pair in plot.pairs if pair.left and pair.left.name in of_file}
-    if len(values) != len(plot.pairs):
+    if named is None and count != len(plot.pairs):
         raise RequestError(
-            f"{path} has {len(values)} rows for {len(plot.pairs)} pairs, so nobody can tell which is which: "
+            f"{path} has {count} rows for {len(plot.pairs)} pairs, so nobody can tell which is which: "
             "add a column left with the names of the left images"
         )
-    return {pair.name: value for pair, value in zip(plot.pairs, values)}
+    return driven if named is not None else {pair.name: value for pair, value in zip(plot.pairs, values)}
 
 
 def why_no_odometry(plot: PlotFolder, driven: Mapping[str, float] | None, pairs: Sequence[PairFiles]) -> str | None:
@@ -222,7 +262,7 @@ def why_no_odometry(plot: PlotFolder, driven: Mapping[str, float] | None, pairs:
     path = plot.folder / "odometry.csv"
     if driven is None:
         return f"{path} holds times only: give the robot's speed with --speed" if path.exists() else f"there is no {path}"
-    unknown = [pair.name if pair.left is None else pair.left.name for pair in pairs if pair.name not in driven]
+    unknown = [pair.name if pair.left is None else readable(pair.left.name) for pair in pairs if pair.name not in driven]
     if not unknown:
         return None
     others = f" and {len(unknown) - 3} others" if len(unknown) > 3 else ""
@@ -235,21 +275,19 @@ def _holds_times_only(plot: PlotFolder) -> bool:
     return "time_s" in columns and "distance_m" not in columns
 
 
-def _read_table(path: Path) -> tuple[list[str], list[dict[str, str]]]:
-    """The columns and the rows of a CSV file.
+def _read_table(path: Path) -> tuple[list[str], Iterator[list[str]]]:
+    """The columns of a CSV file, and its rows, which raise a `csv.Error` where they are none.
 
     Raises:
         RequestError: It cannot be read.
     """
     try:
         # Spreadsheets write a mark of the byte order before the first column's name.
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            reader = csv.DictReader(file, skipinitialspace=True)
-            reader.fieldnames = [name.strip() for name in reader.fieldnames or []]
-            return list(reader.fieldnames), list(reader)
+        reader = csv.reader(io.StringIO(read_text(path, _MOST_ODOMETRY), newline=""), skipinitialspace=True)
+        return [text_of(name.strip()) for name in next(reader, [])], (row for row in reader if row)
     except OSError as error:
         raise RequestError(f"cannot read {path}: {error.strerror or error}") from error
-    except (csv.Error, UnicodeDecodeError) as error:
+    except (csv.Error, ValueError) as error:
         raise RequestError(f"{path} is no table: save it as CSV in UTF-8 ({error})") from error
 
 
@@ -285,7 +323,7 @@ def claim(out: Path, about: Mapping[str, Any], begun: bool) -> None:
     path = out / "run.json"
     if begun and path.exists():
         try:
-            before = parse_json(path.read_text(encoding="utf-8"))
+            before = read_json(path)
             differing = _differences(before, about)
         except (ValueError, AttributeError):
             differing = "run.json cannot be read"

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from jaxrl_vis.files import replacing
+from jaxrl_vis.phenotyping.headers import PNG, plain_png, size_in
 
 ImageFormat = Literal["png", "tiff", "jpeg"]
 SUFFIX: dict[str, str] = {"png": ".png", "tiff": ".tiff", "jpeg": ".jpg"}
@@ -15,6 +16,9 @@ _OPTIONS: dict[str, list[int]] = {
     ".tiff": [],
     ".jpg": [cv2.IMWRITE_JPEG_QUALITY, 95],
 }
+MOST_PIXELS = 100_000_000
+"""Of an image that is read."""
+_MOST_BYTES, _MOST_BESIDES = 16, 1 << 26  # of a file, for each pixel and for what else cameras write down
 
 
 def write_image(path: Path, image: np.ndarray) -> None:
@@ -30,6 +34,27 @@ def write_image(path: Path, image: np.ndarray) -> None:
         raise OSError(f"{path}: the image could not be encoded")
     with replacing(path, durable=False) as file:
         file.write(data.tobytes())
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Height and width of an image, from its header: nothing is decoded.
+
+    Raises:
+        OSError: It cannot be read, is no image, or one that no camera takes. One line that names it.
+    """
+    if not path.is_file():
+        path.stat()
+        raise _unreadable(path, "is no ordinary file")
+    with path.open("rb") as file:
+        size = size_in(file)
+    if size is None:
+        raise _unreadable(path, "is not an image, or only a part of one")
+    pixels = size[0] * size[1]
+    if pixels > MOST_PIXELS:
+        raise _unreadable(path, f"has {size[1]} x {size[0]} pixels, more than {MOST_PIXELS // 10**6} million")
+    if path.stat().st_size > _MOST_BESIDES + _MOST_BYTES * pixels:
+        raise _unreadable(path, f"is larger than {size[1]} x {size[0]} pixels can be")
+    return size
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -87,13 +112,17 @@ def _decoded(path: Path) -> np.ndarray | None:
     """What a file holds, [H, W] or [H, W, channels] of any type, blue first; None where OpenCV cannot tell.
 
     Raises:
-        OSError: The file cannot be read.
+        OSError: The file cannot be read, is no image, or one that no camera takes.
     """
-    data = np.fromfile(path, np.uint8)
+    size = image_size(path)
+    data: bytes | None = path.read_bytes()
+    if data.startswith(PNG):
+        data = plain_png(data)
     try:
-        return cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
     except cv2.error:
         return None
+    return image if image is not None and image.shape[:2] == size else None
 
 
 def _unreadable(path: Path, why: str) -> OSError:

@@ -5,6 +5,7 @@ import math
 import cv2
 import numpy as np
 
+from jaxrl_vis.phenotyping.names import readable
 from jaxrl_vis.phenotyping.sightings import Sighting
 
 COUNTED, REJECTED, MEASURED = (70, 235, 100), (255, 105, 75), (255, 225, 60)
@@ -35,7 +36,7 @@ def draw_overlay(image: np.ndarray, sightings: list[Sighting], labels: list[str 
     for each, label in zip(sightings, labels):
         _outline(canvas, each, COUNTED if label is not None else REJECTED, scale, thick)
     writer = _Writer(canvas, max(size[0] / 2200, 0.3), thick)
-    writer.legend(title)
+    writer.legend(readable(title))  # OpenCV does not survive a lone surrogate
     for each, label in sorted(zip(sightings, labels), key=lambda pair: pair[0].column):
         width = "" if each.diameter_mm is None else f"{each.diameter_mm:.1f} mm"
         text = " ".join(filter(None, (f"#{label}" if label else "", width))) or "no width"

@@ -29,6 +29,7 @@ from jaxrl_vis.phenotyping.direction import follow_either_way
 from jaxrl_vis.phenotyping.folders import PairFiles, PlotFolder, claim, read_odometries, stamps, why_no_odometry
 from jaxrl_vis.phenotyping.images import write_image
 from jaxrl_vis.phenotyping.measure import Method
+from jaxrl_vis.phenotyping.names import file_name
 from jaxrl_vis.phenotyping.overlay import draw_overlay
 from jaxrl_vis.phenotyping.pairing import wrong_with
 from jaxrl_vis.phenotyping.qc import Page, PlotResult
@@ -44,7 +45,7 @@ from jaxrl_vis.phenotyping.results import (
 )
 from jaxrl_vis.phenotyping.sightings import NO_CALIBRATION, Sighting, find_with_ground, look
 from jaxrl_vis.phenotyping.track import Track
-from jaxrl_vis_envs.documents import parse_json
+from jaxrl_vis_envs.documents import read_json
 from jaxrl_vis_envs.plants import Calibration
 
 Find = Callable[[np.ndarray, PlotFolder, PairFiles], list[Detection]]
@@ -125,9 +126,9 @@ def _run(
     rows: list[Row] = []
     skipped: list[Row] = []
     for plot in plots:
-        folder = request.out / "pairs" / plot.name
+        folder = request.out / "pairs" / file_name(plot.name)
         folder.mkdir(parents=True, exist_ok=True)
-        paths = {pair.name: folder / f"{pair.name}.json" for pair in plot.pairs}
+        paths = {pair.name: folder / file_name(f"{pair.name}.json") for pair in plot.pairs}
         missing = [pair for pair in plot.pairs if not _is_done(paths[pair.name], pair, request.calibrations[plot.name])]
         for number in range(1, len(plot.pairs) - len(missing) + 1):
             done(plot.name, number, len(plot.pairs))
@@ -172,10 +173,13 @@ def _claim(plots: list[PlotFolder], request: Request) -> None:
 def _is_done(path: Path, pair: PairFiles, calibration: Calibration | None) -> bool:
     """Whether a record is of the files as they are now. One that was skipped, or does not say of which it is, is not."""
     try:
-        record = parse_json(path.read_text(encoding="utf-8"))
-    except (FileNotFoundError, ValueError):
+        record = read_json(path)
+        lines, columns = record["size"]
+        for values in record["sightings"]:
+            Sighting.read(values)
+        return isinstance(lines, int) and isinstance(columns, int) and record["of"] == _made_of(pair, calibration)
+    except (FileNotFoundError, ValueError, KeyError, TypeError, AttributeError):
         return False
-    return "sightings" in record and record.get("of") == _made_of(pair, calibration)
 
 
 def _made_of(pair: PairFiles, calibration: Calibration | None) -> dict[str, Any]:
@@ -234,7 +238,7 @@ def _finish(
         labels = labels_of(frames, tracks)
         start = float(path.places[0])
         stalks, row = rows_of(frames, tracks, path, skipped, origin)
-    _draw_overlays(plot.name, request.out / "overlays" / plot.name, usable, labels, each)
+    _draw_overlays(plot.name, request.out / "overlays" / file_name(plot.name), usable, labels, each)
     width = usable[0][1]["size"][1] if usable else 0
     return PlotResult(row, stalks, [pair.name for pair, _ in usable], frames, tracks, start, width)
 
@@ -247,15 +251,15 @@ def _draw_overlays(
     index = folder / "drawn.json"
     shown = {pair.name: _digest([record, names]) for (pair, record), names in zip(usable, labels)}
     try:
-        drawn = dict(parse_json(index.read_text(encoding="utf-8")))
+        drawn = dict(read_json(index))
     except (FileNotFoundError, ValueError, TypeError):
         drawn = {}
     for name in drawn.keys() - shown.keys():
-        (folder / f"{name}.png").unlink(missing_ok=True)  # of a pair that cannot be used any more
+        (folder / file_name(f"{name}.png")).unlink(missing_ok=True)  # of a pair that cannot be used any more
     missing = [
-        (folder / f"{pair.name}.png", pair, [Sighting.read(values) for values in record["sightings"]], names)
+        (folder / file_name(f"{pair.name}.png"), pair, [Sighting.read(values) for values in record["sightings"]], names)
         for (pair, record), names in zip(usable, labels)
-        if drawn.get(pair.name) != shown[pair.name] or not (folder / f"{pair.name}.png").exists()
+        if drawn.get(pair.name) != shown[pair.name] or not (folder / file_name(f"{pair.name}.png")).exists()
     ]
     if drawn != shown:
         # Before anything is drawn: what is drawn anew must not be taken for the old one, if this is stopped.

@@ -21,6 +21,7 @@ import numpy as np
 
 from jaxrl_vis.files import replacing
 from jaxrl_vis.phenotyping.images import read_image
+from jaxrl_vis.phenotyping.names import file_name
 from jaxrl_vis.phenotyping.overlay import scale_of
 from jaxrl_vis.phenotyping.qc_style import SCRIPT, STYLE
 from jaxrl_vis.phenotyping.results import NO_GROUND
@@ -125,7 +126,7 @@ class Page:
         name = plot.row["plot"]
         rejected = [track for track in plot.tracks if not track.counted]
         self._rows.append({**plot.row, "rejected": len(rejected) if plot.tracks else ""})
-        pictures = _Pictures(self._overlays / name, plot)
+        pictures = _Pictures(self._overlays / file_name(name), plot)
         counted = [track for track in plot.tracks if track.counted]
         tables = [
             {"picture": pictures.of(track), **{column: row[column] for column in _STALK_COLUMNS}}
@@ -243,7 +244,7 @@ class _Pictures:
             wanted.setdefault(frame, []).append((place, sighting))
         self._found: dict[int, _Html] = {}
         for frame, tracks in wanted.items():
-            overlay = read_image(folder / f"{plot.pairs[frame]}.png")
+            overlay = read_image(folder / file_name(f"{plot.pairs[frame]}.png"))
             for place, sighting in tracks:
                 name = f"pair {plot.pairs[frame]}"
                 self._found[place] = picture(self._crop(overlay, plot.frames[frame][sighting]), name, "stalk")
@@ -274,7 +275,7 @@ class _Pictures:
         """Pictures of whole pairs, spread over the plot."""
         pairs = self._plot.pairs
         for place in np.unique(np.linspace(0, len(pairs) - 1, min(most, len(pairs))).round()).astype(int):
-            overlay = read_image(self._folder / f"{pairs[place]}.png")
+            overlay = read_image(self._folder / file_name(f"{pairs[place]}.png"))
             shrink = min(_THUMB / overlay.shape[1], 1.0)
             small = cv2.resize(overlay, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
             name = f"pair {pairs[place]}"

@@ -1,8 +1,6 @@
 """What is told of plots: one row per stalk, one row per plot, tidy, with units in the header."""
 
-import csv
 import dataclasses
-import io
 import math
 from pathlib import Path
 from typing import Any
@@ -14,6 +12,7 @@ from jaxrl_vis.phenotyping.heights import StalkWidths, widths_of
 from jaxrl_vis.phenotyping.sightings import Sighting
 from jaxrl_vis.phenotyping.track import Path as Driven
 from jaxrl_vis.phenotyping.track import Track
+from jaxrl_vis.spreadsheets import to_csv
 
 STALK_COLUMNS = (
     "plot",
@@ -188,8 +187,4 @@ def write_rows(path: Path, columns: tuple[str, ...], rows: list[Row]) -> None:
     Raises:
         OSError: It cannot be written.
     """
-    text = io.StringIO()
-    writer = csv.DictWriter(text, columns, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_atomically(path, text.getvalue())
+    write_atomically(path, to_csv(rows, columns))

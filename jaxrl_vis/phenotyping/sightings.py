@@ -4,11 +4,12 @@ import dataclasses
 import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, get_args, get_origin
 
 import cv2
 import numpy as np
 
+from jaxrl_vis import fields
 from jaxrl_vis.phenotyping.detector.finder import Detection
 from jaxrl_vis.phenotyping.ground import Ground, find_ground
 from jaxrl_vis.phenotyping.measure import Measurement, Method, measure
@@ -75,10 +76,34 @@ class Sighting:
 
     @classmethod
     def read(cls, values: dict[str, Any]) -> "Sighting":
-        """From what JSON kept of `dataclasses.asdict`."""
-        upper = values.get("upper_place")
-        parts = {"box": tuple(values["box"]), "axis": tuple(values["axis"]), "upper_place": upper and tuple(upper)}
-        return cls(**{**values, **parts})
+        """From what JSON kept of `dataclasses.asdict`.
+
+        Raises:
+            ValueError: Something is missing, unknown, or of another kind.
+        """
+        parts: dict[str, Any] = {}
+        for name, (kind, optional, length) in _KINDS.items():
+            if name not in values:
+                continue
+            value = parts[name] = tuple(values[name]) if isinstance(values[name], list) else values[name]
+            if value is None and optional:
+                continue
+            several = value if isinstance(value, tuple) else (value,)
+            if len(several) != length or not all(isinstance(each, kind) for each in several):
+                raise ValueError(f"{name} is not of its kind")
+        if len(parts) != len(values) or not {"box", "axis", "score", "line", "column"} <= parts.keys():
+            raise ValueError("something is missing or too many")
+        return cls(**parts)
+
+
+def _kind_of(hint: Any) -> tuple[type | tuple[type, ...], bool, int]:
+    """What a value of a field is, whether it may be None, and how many there are."""
+    one, optional, several = fields.unwrap(hint)
+    length = next((len(get_args(part)) for part in (hint, *get_args(hint)) if get_origin(part) is tuple), 1)
+    return (int, float) if one is float else one, optional, length if several else 1
+
+
+_KINDS = {name: _kind_of(hint) for name, hint in fields.hints(Sighting).items()}
 
 
 def grey_of(image: np.ndarray) -> np.ndarray:

@@ -14,9 +14,7 @@ A plot that is whole is not drawn again, so a command that was stopped goes on w
 than is asked for is.
 """
 
-import csv
 import dataclasses
-import io
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -27,9 +25,11 @@ import numpy as np
 import jaxrl_vis
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.files import write_atomically
-from jaxrl_vis.phenotyping.annotations import coco, encode_mask
+from jaxrl_vis.phenotyping.annotations import coco
 from jaxrl_vis.phenotyping.calibration import write_calibration
 from jaxrl_vis.phenotyping.images import SUFFIX, ImageFormat, write_image
+from jaxrl_vis.phenotyping.masks import encode_mask
+from jaxrl_vis.spreadsheets import to_csv
 from jaxrl_vis_envs.documents import parse_json
 from jaxrl_vis_envs.plants import Family, Plot, draw
 from jaxrl_vis_envs.plants.pairs import Pair, Sequence
@@ -70,7 +70,7 @@ def write_plots(
     about = {"schema": SCHEMA, "synthetic": True, "version": jaxrl_vis.__version__, **dataclasses.asdict(family)}
     text = json.dumps(about, indent=2) + "\n"
     index = folder / "family.json"
-    if index.exists() and _without_version(index.read_text()) != _without_version(text):
+    if index.exists() and _without_version(index.read_text(encoding="utf-8", errors="replace")) != _without_version(text):
         raise RequestError(f"{folder} holds plots of another family: choose another folder")
     write_atomically(index, text)
     present = 0
@@ -153,12 +153,11 @@ def _annotation(frame: int, stalk: StalkInView, instance: np.ndarray, with_mask:
 
 
 def _odometry(sequence: Sequence, suffix: str) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["pair", "left", "right", "time_s", "distance_m"])
+    rows = []
     for frame, (time, distance) in enumerate(zip(sequence.drive.times, sequence.drive.odometry)):
-        writer.writerow([frame, f"left_{frame:03d}{suffix}", f"right_{frame:03d}{suffix}", f"{time:.4f}", f"{distance:.5f}"])
-    return text.getvalue()
+        images = {side: f"{side}_{frame:03d}{suffix}" for side in ("left", "right")}
+        rows.append({"pair": frame, **images, "time_s": f"{time:.4f}", "distance_m": f"{distance:.5f}"})
+    return to_csv(rows)
 
 
 def _summary(sequence: Sequence, seen: list[dict[str, Any]]) -> dict[str, Any]:

@@ -13,13 +13,13 @@ from pathlib import Path
 from jaxrl_vis import streams
 from jaxrl_vis.devices import list_devices, shared
 from jaxrl_vis.files import write_atomically
+from jaxrl_vis.spreadsheets import to_csv
 from jaxrl_vis.studies import indicator, indicator_figures, ol_aux, ol_aux_figures
 from jaxrl_vis.studies.drawing import draw_panels
 from jaxrl_vis.studies.grid import run_cells
 from jaxrl_vis.studies.results import Line, read_lines
 from jaxrl_vis.studies.show import Request, Shown
 from jaxrl_vis.studies.study import Study, cells_of
-from jaxrl_vis.studies.tables import to_csv
 
 STUDIES: dict[str, Study] = {**indicator.STUDIES, **ol_aux.STUDIES}
 """Figure -> what it shows."""

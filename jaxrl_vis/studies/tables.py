@@ -1,8 +1,6 @@
 """The table beside a figure, as Markdown and as CSV: steps to levels of success, and speed-ups over a baseline."""
 
-import csv
 import dataclasses
-import io
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -39,7 +37,7 @@ def steps_table(
         levels: Task -> shares of success.
 
     Returns:
-        Lines of Markdown, one table a task; and rows for `to_csv`.
+        Lines of Markdown, one table a task; and rows for `spreadsheets.to_csv`.
     """
     text: list[str] = []
     rows: list[dict[str, Any]] = []
@@ -138,16 +136,6 @@ def _correlation(weights: Sequence[float], gains: Sequence[float], wanted: int) 
         return "Rank correlation of mean weight and gain alone: not defined, since all are equal."
     rho = float(spearmanr(weights, gains).statistic)
     return f"Rank correlation of mean weight and gain alone: {rho:+.2f} (of {len(gains)} losses)."
-
-
-def to_csv(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Rows of the same keys as CSV; None is an empty field."""
-    file = io.StringIO()
-    if rows:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-    return file.getvalue()
 
 
 def table_row(cells: Sequence[str]) -> str:

@@ -218,7 +218,10 @@ class Imaging:
 
 def is_number(value: Any) -> bool:
     """Whether a value is a finite number, and not true or false."""
-    return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
+    try:
+        return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
+    except OverflowError:  # a whole number of more digits than a float holds
+        return False
 
 
 def _check_value(label: str, example: Any, value: Any) -> None:

@@ -1,6 +1,7 @@
 """Images to masks by a trained generator, and its weights in a file."""
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -9,15 +10,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxrl_vis import fields
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.grasping.cloud import RED, redness
 from jaxrl_vis.grasping.masks.networks import Generator
-from jaxrl_vis.parameters import read_parameters, write_parameters
+from jaxrl_vis.parameters import check_range, read_parameters, write_parameters
 
 Loss = Literal["gan", "segmentation"]
 SHIPPED: dict[str, Path] = {
-    "gan": Path(__file__).with_name("stalks_gan.npz"),
-    "segmentation": Path(__file__).with_name("stalks_segmentation.npz"),
+    "gan": Path(__file__).with_name("stalks_gan.safetensors"),
+    "segmentation": Path(__file__).with_name("stalks_segmentation.safetensors"),
 }
 """Weights that come with the package, trained on synthetic stalks."""
 SCHEMA = 1
@@ -44,6 +46,10 @@ class Settings:
     def generator(self, dtype: Any) -> Generator:
         """The network."""
         return Generator(self.channels, 3 if self.loss == "gan" else 1, dtype)
+
+
+_HINTS = fields.hints(Settings)
+_MOST_LEVELS = 10  # each of them halves the image
 
 
 def normalise(images: jax.Array) -> jax.Array:
@@ -110,13 +116,27 @@ def read_weights(path: Path) -> tuple[dict[str, Any], Settings, dict[str, Any]]:
     """Reads what `write_weights` wrote: parameters, settings, and where they come from.
 
     Raises:
-        RequestError: There is no such file, or it holds no generator.
+        RequestError: There is no such file, or it holds no generator, or not the one that it speaks of.
     """
-    params, about = read_parameters(path, _COMMAND)
-    try:
+
+    def declare(about: dict[str, Any]) -> tuple[Settings, Any]:
         values = about.pop("generator")
-        if about.pop("schema") != SCHEMA or values["loss"] not in SHIPPED:
+        if not isinstance(values, dict):
+            raise ValueError("the generator is no table")
+        if about.pop("schema") != SCHEMA or values.keys() != _HINTS.keys() or values["loss"] not in ("gan", "segmentation"):
             raise RequestError(f"{path} holds weights of another version: train them again with `{_COMMAND}`")
-        return params, Settings(values["loss"], tuple(map(int, values["channels"]))), about
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise RequestError(f"{path} holds no weights of masks: name a file that `{_COMMAND}` wrote") from error
+        settings = Settings(**{name: fields.check(f"{path}: {name}", _HINTS[name], value) for name, value in values.items()})
+        check_range(path, "channels", settings.channels, 8, 1024, 8)
+        if len(settings.channels) > _MOST_LEVELS:
+            raise RequestError(f"{path}: its network must have {_MOST_LEVELS} levels at most, not {len(settings.channels)}")
+        return settings, declared(settings)
+
+    return read_parameters(path, _COMMAND, declare)
+
+
+@functools.lru_cache(maxsize=4)
+def declared(settings: Settings) -> Any:
+    """Shapes of the parameters of a generator: nested dictionaries, nothing of which is computed."""
+    image = jax.ShapeDtypeStruct((1, settings.multiple, settings.multiple, 3), jnp.float32)
+    generator = settings.generator(jnp.float32)
+    return jax.eval_shape(lambda key: generator.lazy_init(key, image), jax.random.key(0))

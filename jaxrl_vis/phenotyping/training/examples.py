@@ -11,12 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.phenotyping.annotations import decode_mask, outlined_mask, read_annotations
+from jaxrl_vis.phenotyping.annotations import read_annotations
 from jaxrl_vis.phenotyping.detector.detect import Settings
 from jaxrl_vis.phenotyping.detector.finder import higher_up, reduce
 from jaxrl_vis.phenotyping.detector.losses import NOTHING, STALK, UNCLEAR
 from jaxrl_vis.phenotyping.detector.snips import cut, snip_shape
-from jaxrl_vis.phenotyping.images import read_image, rgb8
+from jaxrl_vis.phenotyping.images import image_size, read_image, rgb8
+from jaxrl_vis.phenotyping.masks import decode_mask, outlined_mask
 from jaxrl_vis_envs.plants import Calibration, Family, draw
 from jaxrl_vis_envs.plants.cameras import Pose
 from jaxrl_vis_envs.plants.field import Plot
@@ -164,29 +165,38 @@ def annotated_examples(folder: Path, settings: Settings) -> Iterator[Example]:
     for annotation in data["annotations"]:
         of_image.setdefault(annotation["image_id"], []).append(annotation)
     for number, about in enumerate(data["images"]):
+        size, path = (about["height"], about["width"]), folder / about["file_name"]
         try:
-            image = rgb8(read_image(folder / about["file_name"]))
+            there = image_size(path)
+            image = rgb8(read_image(path)) if there == size else None
         except OSError as error:
             raise RequestError(f"the annotations in {folder} name an image that cannot be read: {error}") from error
-        size = about["height"], about["width"]
-        if image.shape[:2] != size:
+        if image is None or image.shape[:2] != size:
             # Where it is larger or smaller than what was annotated, boxes lie where no stalk is.
             raise RequestError(
-                f"{folder / about['file_name']} has {image.shape[1]} x {image.shape[0]} pixels, but {about['source']} is for "
+                f"{path} has {there[1]} x {there[0]} pixels, but {about['source']} is for "
                 f"{size[1]} x {size[0]}: save the image at the size at which it was annotated"
             )
-        found = [_of_annotation(each, size) for each in of_image.get(about["id"], [])]
-        stalks = np.array([stalk for stalk, _ in found], np.float32).reshape(-1, 6)
-        masks = [mask for _, mask in found]
+        found = of_image.get(about["id"], [])
+        stalks = np.array([_stalk_of(each, size) for each in found], np.float32).reshape(-1, 6)
         kinds = np.full(len(found), STALK, np.int32)
         rng = np.random.default_rng([number, 18])
-        yield _example(image, stalks, kinds, functools.partial(_own_masks, masks), settings, rng)
+        yield _example(image, stalks, kinds, functools.partial(_own_masks, found, size), settings, rng)
 
 
-def _own_masks(masks: list[np.ndarray], parts: np.ndarray, places: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Masks of the snips of some stalks, cut out of the mask [H, W] bool of each: they may overlap."""
-    snips = [cut(jnp.asarray(masks[part]), places[place : place + 1], shape) for place, part in enumerate(parts)]
-    return np.concatenate(jax.device_get(snips))
+def _own_masks(
+    annotations: list[dict[str, Any]],
+    size: tuple[int, int],
+    parts: np.ndarray,
+    places: np.ndarray,
+    shape: tuple[int, int],
+) -> np.ndarray:
+    """Masks of the snips of some stalks, cut out of the mask of each: they may overlap, and together fill the memory."""
+    snips = [
+        np.asarray(cut(jnp.asarray(_mask_of(annotations[part], size)), places[place : place + 1], shape))
+        for place, part in enumerate(parts)
+    ]
+    return np.concatenate(snips)
 
 
 def settings_for(folder: Path, settings: Settings) -> Settings:
@@ -208,18 +218,23 @@ def any_outlined(folder: Path) -> bool:
     return any(each["segmentation"] for each in read_annotations(folder)["annotations"])
 
 
-def _of_annotation(annotation: dict[str, Any], size: tuple[int, int]) -> tuple[list[float], np.ndarray]:
-    """Box and axis of one annotation, and its mask [H, W] bool; all of the box where there is no mask."""
-    left, top, wide, tall = annotation["bbox"]
+def _mask_of(annotation: dict[str, Any], size: tuple[int, int]) -> np.ndarray:
+    """The mask [H, W] bool of one annotation; all of the box where there is none."""
     segmentation = annotation["segmentation"]
-    right, bottom = left + wide, top + tall
     if isinstance(segmentation, dict):
-        mask = decode_mask(segmentation)
-    else:
-        mask = outlined_mask(segmentation or [[left, top, right, top, right, bottom, left, bottom]], size)
-    line, column = np.nonzero(mask)
+        return decode_mask(segmentation)
+    left, top, wide, tall = annotation["bbox"]
+    right, bottom = left + wide, top + tall
+    return outlined_mask(segmentation or [[left, top, right, top, right, bottom, left, bottom]], size)
+
+
+def _stalk_of(annotation: dict[str, Any], size: tuple[int, int]) -> list[float]:
+    """Box and axis [6] of one annotation."""
+    left, top, wide, tall = annotation["bbox"]
+    right, bottom = left + wide, top + tall
+    line, column = np.nonzero(_mask_of(annotation, size))
     axis = [left + wide / 2] * 2
     if line.size > 50 and np.ptp(line) > 8:
         slope, offset = np.polyfit(line + 0.5, column + 0.5, 1)
         axis = [float(np.clip(offset + slope * each, left, right)) for each in (top, bottom)]
-    return [left, top, right, bottom, *axis], mask
+    return [left, top, right, bottom, *axis]

@@ -1,0 +1,85 @@
+"""How large an image is, from the first bytes of its file: known before a decoder asks for the memory."""
+
+import re
+from typing import BinaryIO
+
+from PIL.TiffImagePlugin import ImageFileDirectory_v2
+
+PNG = b"\x89PNG\r\n\x1a\n"
+_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
+_PFM = re.compile(rb"P[Ff]\s+(\d{1,9})\s+(\d{1,9})\s")
+_FRAMES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # markers of JPEG after which the size stands
+_ALONE = {0x01, *range(0xD0, 0xD9)}  # those without a length
+_WIDTH, _HEIGHT, _TILE_WIDTH, _TILE_HEIGHT = 256, 257, 322, 323  # tags of TIFF
+_FINEST_TILES = 1024  # pixels along the sides of tiles that are larger than their image
+
+
+def size_in(file: BinaryIO) -> tuple[int, int] | None:
+    """Height and width of the image in a file of PNG, JPEG, TIFF or PFM; None where it is none of these, or damaged.
+
+    Args:
+        file: At its beginning, able to seek.
+    """
+    begin = file.read(64)
+    file.seek(0)
+    if begin.startswith(PNG):
+        sides = int.from_bytes(begin[20:24], "big"), int.from_bytes(begin[16:20], "big")
+        return sides if begin[12:16] == b"IHDR" and min(sides) > 0 else None
+    if begin.startswith(b"\xff\xd8"):
+        return _jpeg(file.read())
+    if begin[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
+        return _tiff(file)
+    match = _PFM.match(begin)
+    return (int(match[2]), int(match[1])) if match and int(match[1]) and int(match[2]) else None
+
+
+def plain_png(data: bytes) -> bytes | None:
+    """A PNG with nothing in it but its pixels and their colours; None where it is damaged.
+
+    OpenCV takes as much memory as a chunk says that it needs, and what other chunks hold is of no use here.
+    """
+    parts, place = [PNG], len(PNG)
+    while place + 12 <= len(data):
+        end = place + 12 + int.from_bytes(data[place : place + 4], "big")
+        kind = data[place + 4 : place + 8]
+        if end > len(data):
+            return None
+        if kind in _CHUNKS:
+            parts.append(data[place:end])
+        if kind == b"IEND":
+            return b"".join(parts)
+        place = end
+    return None
+
+
+def _jpeg(data: bytes) -> tuple[int, int] | None:
+    place = 2
+    while True:
+        place = data.find(b"\xff", place)  # decoders pass over what is between markers
+        while 0 <= place < len(data) - 1 and data[place + 1] == 0xFF:
+            place += 1
+        if place < 0 or place + 9 > len(data):
+            return None
+        marker, length = data[place + 1], int.from_bytes(data[place + 2 : place + 4], "big")
+        if marker in _FRAMES:
+            sides = int.from_bytes(data[place + 5 : place + 7], "big"), int.from_bytes(data[place + 7 : place + 9], "big")
+            return sides if min(sides) > 0 else None
+        if marker in (0xD9, 0xDA):  # the end, or pixels before anybody said how many
+            return None
+        place += 2 if marker in _ALONE or marker == 0 else 2 + length
+
+
+def _tiff(file: BinaryIO) -> tuple[int, int] | None:
+    """The size in the first directory; None where it is not there once, or where tiles are much larger than the image."""
+    try:
+        head = file.read(8)
+        directory = ImageFileDirectory_v2(head + (file.read(8) if head[2:4] in (b"+\0", b"\0+") else b""))
+        file.seek(directory.next)
+        directory.load(file)
+        width, height = (int(directory[tag]) for tag in (_WIDTH, _HEIGHT))
+        tiles = [int(directory.get(tag, 0)) for tag in (_TILE_WIDTH, _TILE_HEIGHT)]
+    except Exception:  # Pillow's readers raise SyntaxError, struct.error, KeyError, OverflowError and more
+        return None
+    if min(width, height) < 1 or any(tile > max(side, _FINEST_TILES) for tile, side in zip(tiles, (width, height))):
+        return None
+    return height, width

@@ -1,0 +1,233 @@
+"""How each kind of file from outside is read, for `readers_worker`: the reader, what its values are like, and its errors."""
+
+import csv
+import io
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+from readers_worker import Reader
+
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis_envs import documents
+
+ANNOTATED = (48, 64)
+"""Height and width of images that annotations are of."""
+IMAGE = (12, 20)
+PAIRS = ("000", "001", "002")
+
+
+def _only(folder: Path) -> Path:
+    (path,) = folder.iterdir()
+    return path
+
+
+def _parses(parse):
+    def past(folder: Path) -> bool:
+        try:
+            parse(sorted(folder.rglob("*.*"))[0])
+        except Exception:
+            return False
+        return True
+
+    return past
+
+
+def read_calibration(folder: Path) -> None:
+    from jaxrl_vis.phenotyping.calibration import read_calibration
+
+    files = list(folder.iterdir())
+    found = read_calibration(files[0] if len(files) == 1 else folder)
+    numbers = [found.focal, *found.centre, found.baseline, found.offset]
+    assert all(math.isfinite(each) for each in numbers) and found.focal > 0 and 0.008 <= found.baseline <= 2.0
+    assert type(found.width) is int and 1 <= found.width <= 100_000 and 1 <= found.height <= 100_000
+
+
+def _storage(path: Path) -> None:
+    from jaxrl_vis.phenotyping.storage import parse_storage
+
+    parse_storage(documents.read_text(path, 2_000_000))
+
+
+def read_annotations(folder: Path) -> None:
+    from jaxrl_vis.phenotyping.annotations import read_annotations
+    from jaxrl_vis.phenotyping.training.examples import _mask_of, _stalk_of
+
+    data = read_annotations(folder)
+    sizes = {each["id"]: (each["height"], each["width"]) for each in data["images"]}
+    for each in data["images"]:
+        assert (folder / each["file_name"]).resolve().is_relative_to(folder.resolve())
+    for each in data["annotations"]:
+        height, width = sizes[each["image_id"]]
+        left, top, wide, tall = each["bbox"]
+        assert wide > 0 and tall > 0 and left < width and top < height and left + wide > 0 and top + tall > 0
+        if (height, width) == ANNOTATED:  # others are compared with their image, and refused
+            mask = _mask_of(each, (height, width))
+            assert mask.shape == ANNOTATED and mask.dtype == bool
+            assert np.isfinite(_stalk_of(each, (height, width))).all()
+
+
+def read_odometry(folder: Path) -> None:
+    from jaxrl_vis.phenotyping.folders import PairFiles, PlotFolder, read_odometries
+
+    pairs = tuple(PairFiles(name, folder / f"left_{name}.png", folder / f"right_{name}.png") for name in PAIRS)
+    plot = PlotFolder("plot", folder, pairs)
+    try:
+        driven = read_odometries([plot], 0.3)["plot"]
+    except RequestError as error:
+        if "--speed goes with" not in str(error):
+            raise
+        driven = read_odometries([plot], None)["plot"]
+    assert driven is None or (driven.keys() <= set(PAIRS) and all(map(math.isfinite, driven.values())))
+
+
+def _table(path: Path) -> None:
+    assert "distance_m" in next(csv.reader(io.StringIO(path.read_bytes().decode("utf-8-sig"), newline="")))
+
+
+def read_image(folder: Path) -> None:
+    from jaxrl_vis.phenotyping.folders import PairFiles
+    from jaxrl_vis.phenotyping.images import rgb8
+    from jaxrl_vis.phenotyping.reading import Unusable, read_pair, read_side
+    from jaxrl_vis_envs.plants import Calibration
+
+    path = _only(folder)
+    pair = PairFiles("a", path, path)
+    try:
+        left, right = read_pair(pair, Calibration(IMAGE[1], IMAGE[0], 20.0, (10.0, 6.0), 0.1))
+    except Unusable as error:
+        if "black" not in str(error):
+            raise
+        left = right = read_side(pair, "left")
+    assert left.shape == right.shape == (*IMAGE, 3) and left.dtype == np.uint8 and (rgb8(left) == left).all()
+
+
+def read_disparity(folder: Path) -> None:
+    from jaxrl_vis.phenotyping.folders import PairFiles
+    from jaxrl_vis.phenotyping.reading import known_disparity
+
+    found = known_disparity(PairFiles("a", None, None, _only(folder)), np.zeros((*IMAGE, 3), np.uint8), 64.0)
+    assert found is not None and found.shape == IMAGE and found.dtype == np.float32
+    assert (np.isnan(found) | ((found > 0) & np.isfinite(found))).all()
+
+
+def _has_size(path: Path) -> None:
+    from jaxrl_vis.phenotyping.images import image_size
+
+    image_size(path)
+
+
+def read_detector(folder: Path) -> None:
+    from jaxrl_vis.phenotyping.detector.weights import read_weights
+
+    params, settings, _ = read_weights(_only(folder))
+    assert params.keys() == {"detector", "segmenter"} and len(settings.channels) == 4
+
+
+def read_painter(folder: Path) -> None:
+    from jaxrl_vis.grasping.masks.painter import read_weights
+
+    params, settings, _ = read_weights(_only(folder))
+    assert params.keys() == {"params"} and settings.loss in ("gan", "segmentation")
+
+
+def _safetensors(path: Path) -> None:
+    import safetensors
+
+    with safetensors.safe_open(path, framework="numpy") as file:
+        file.metadata()
+
+
+def read_family(folder: Path) -> None:
+    from jaxrl_vis_envs.plants import Family, read
+
+    found = read(_only(folder))
+    assert isinstance(found, Family) and isinstance(found.name, str) and found.name
+
+
+def _document(path: Path) -> None:
+    text = documents.read_text(path, 100_000)
+    (documents.parse_toml if path.suffix == ".toml" else documents.parse_json)(text)
+
+
+def read_evaluation(folder: Path) -> None:
+    from jaxrl_vis.phenotyping.figures import read_evaluation
+
+    read_evaluation(_only(folder))
+
+
+def read_truth(folder: Path) -> None:
+    from jaxrl_vis.phenotyping.folders import PairFiles, PlotFolder
+    from jaxrl_vis.phenotyping.truth_on_disk import _seen, find_truth
+
+    _seen.cache_clear()
+    image = np.zeros((*ANNOTATED, 3), np.uint8)
+    for each in find_truth(image, PlotFolder("plot", folder, ()), PairFiles("0", None, None)):
+        assert each.mask.dtype == bool and np.isfinite(each.box).all()
+
+
+def read_records(folder: Path) -> None:
+    """What `phenotype run` kept of a pair: as good as new, or computed again."""
+    from jaxrl_vis.phenotyping.folders import PairFiles
+    from jaxrl_vis.phenotyping.pipeline import _is_done
+    from jaxrl_vis.phenotyping.sightings import Sighting
+
+    path = _only(folder)
+    if _is_done(path, PairFiles("0", None, None), None):
+        record = json.loads(path.read_bytes())
+        assert all(len(Sighting.read(each).box) == 4 for each in record["sightings"])
+
+
+def read_model(folder: Path) -> None:
+    import mujoco
+
+    from jaxrl_vis_envs.render import Scene
+
+    path, mark = _only(folder), folder.parent / "loading"
+    mark.touch()
+    try:
+        model = mujoco.MjModel.from_xml_string(path.read_text())
+        mujoco.mj_forward(model, mujoco.MjData(model))
+    except Exception:
+        return
+    finally:
+        mark.unlink(missing_ok=True)
+    for camera in (None, *range(min(model.ncam, 2))):
+        scene = Scene.from_mjmodel(model, camera, 8, 8)
+        assert scene.height == scene.width == 8
+
+
+def _loads(path: Path) -> None:
+    import mujoco
+
+    mark = path.parent.parent / "loading"
+    mark.touch()
+    mujoco.MjModel.from_xml_string(path.read_text())
+    mark.unlink()
+
+
+def _pair_errors() -> tuple[type[Exception], ...]:
+    from jaxrl_vis.phenotyping.reading import Unusable
+
+    return (Unusable,)
+
+
+_REQUEST = (RequestError,)
+READERS = {
+    "calibration": Reader(read_calibration, _parses(_storage), _REQUEST),
+    "coco": Reader(read_annotations, _parses(documents.read_json), _REQUEST),
+    "voc": Reader(read_annotations, _parses(lambda path: documents.parse_xml(path.read_bytes())), _REQUEST),
+    "labelme": Reader(read_annotations, _parses(documents.read_json), _REQUEST),
+    "odometry": Reader(read_odometry, _parses(_table), _REQUEST),
+    "image": Reader(read_image, _parses(_has_size), _pair_errors()),
+    "disparity": Reader(read_disparity, _parses(_has_size), _pair_errors()),
+    "detector": Reader(read_detector, _parses(_safetensors), _REQUEST),
+    "painter": Reader(read_painter, _parses(_safetensors), _REQUEST),
+    "family": Reader(read_family, _parses(_document), (ValueError,)),
+    "evaluation": Reader(read_evaluation, _parses(documents.read_json), _REQUEST),
+    "truth": Reader(read_truth, _parses(documents.read_json), _REQUEST),
+    "record": Reader(read_records, _parses(documents.read_json), ()),
+    "model": Reader(read_model, _parses(_loads), (ValueError,)),
+}
+"""By name."""

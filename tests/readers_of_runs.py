@@ -1,0 +1,56 @@
+"""How the files of a run's folder are read, for `readers_worker`."""
+
+import json
+from pathlib import Path
+
+from readers_worker import Reader
+
+from jaxrl_vis.errors import RequestError
+
+
+def read_config(folder: Path) -> None:
+    from jaxrl_vis.config import Config
+    from jaxrl_vis.run.folder import read_config, read_log, read_record
+
+    record = read_record(folder)
+    assert isinstance(record, dict)
+    assert all(isinstance(each, str) for each in read_log(folder))
+    assert isinstance(read_config(folder), Config)
+
+
+def read_rows(folder: Path) -> None:
+    from jaxrl_vis.run.metrics import cut_back, read_rows, scalars
+
+    path = folder / "metrics.jsonl"
+    rows = read_rows(path)
+    for row in rows:
+        assert isinstance(row, dict)
+        scalars(row)
+    cut_back(path, 2)
+    assert all(row["iteration"] <= 2 for row in read_rows(path))
+
+
+def _json(path: Path) -> bool:
+    try:
+        json.loads(path.read_bytes())
+    except (ValueError, RecursionError):
+        return False
+    return True
+
+
+def _some_lines(path: Path) -> bool:
+    lines = path.read_bytes().splitlines()
+    kinds = []
+    for line in lines:
+        try:
+            kinds.append(isinstance(json.loads(line), dict))
+        except (ValueError, RecursionError):
+            kinds.append(False)
+    return any(kinds)
+
+
+READERS: dict[str, Reader] = {
+    "config": Reader(read_config, lambda folder: _json(folder / "config.json"), (RequestError,)),
+    "metrics": Reader(read_rows, lambda folder: _some_lines(folder / "metrics.jsonl"), (RequestError,)),
+}
+"""By name."""

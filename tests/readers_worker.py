@@ -1,0 +1,189 @@
+"""Readers of files from outside, one call each, in a process of their own: what is written in C may end it, and that is told.
+
+    worker = Worker()
+    outcome = worker.read("calibration", {"rig.yaml": b"..."})
+
+A reader is a function of a folder. Time is that of the processor, so that a busy machine fails nothing, and memory is the
+highest that the call reached above what was there before.
+"""
+
+import contextlib
+import dataclasses
+import os
+import pickle
+import resource
+import shutil
+import signal
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+SECONDS, MEGABYTES = 1.0, 200.0
+_PATIENCE = 60  # s of the clock after which a call is taken to hang
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What came of a call.
+
+    Attributes:
+        kind: ``value``, ``refused`` (one of the reader's own errors), or ``fault``.
+        past: Whether the file was what its parser takes.
+        text: Of the error; of a fault, the traceback.
+        seconds, megabytes: What it took.
+    """
+
+    kind: str
+    past: bool
+    text: str = ""
+    seconds: float = 0.0
+    megabytes: float = 0.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Reader:
+    """How a kind of file is read.
+
+    Attributes:
+        read: From the folder that holds the files to a value, which it checks.
+        past: Whether the files are what the parser takes.
+        own: Errors that it may raise.
+    """
+
+    read: Callable[[Path], Any]
+    past: Callable[[Path], bool]
+    own: tuple[type[Exception], ...]
+
+
+def call(reader: Reader, folder: Path) -> Outcome:
+    """One call, in this process."""
+    import traceback
+
+    past = reader.past(folder)
+    before = _reset_peak()
+    started = time.process_time()
+    try:
+        reader.read(folder)
+        kind, text = "value", ""
+    except BaseException as error:
+        seconds = time.process_time() - started
+        own = type(error) in reader.own or isinstance(error, tuple(set(reader.own) - {ValueError}))
+        text = str(error)
+        kind = "refused" if own else "fault"
+        if own and (len(text.splitlines()) != 1 or len(text) > 2000):
+            kind, text = "fault", f"not one line: {text[:300]!r}"
+        elif not own:
+            text = traceback.format_exc()[-3000:]
+    else:
+        seconds = time.process_time() - started
+    return Outcome(kind, past, text, seconds, max(_peak() - before, 0.0))
+
+
+def _reset_peak() -> float:
+    """The memory in use, MB; from here on, its peak is counted anew where the system can do that."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+        return _peak()
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def _peak() -> float:
+    with contextlib.suppress(OSError, StopIteration):
+        lines = Path("/proc/self/status").read_text().splitlines()
+        return int(next(line.split()[1] for line in lines if line.startswith("VmHWM"))) / 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def write_files(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Makes the folder anew, with these files in it."""
+    shutil.rmtree(folder, ignore_errors=True)
+    for name, data in files.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data)
+
+
+class Worker:
+    """A process that reads; it is started when it is first needed, and again where it ended."""
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[bytes] | None = None
+        self._folder = Path(tempfile.mkdtemp(prefix="readers-"))
+
+    def close(self) -> None:
+        """Ends it."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.communicate()
+        self._process = None
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def read(self, name: str, files: Mapping[str, bytes]) -> Outcome:
+        """What comes of reading these files; a process that ended is a fault, and starts anew."""
+        if os.environ.get("JAXRL_VIS_READERS_HERE"):  # so that coverage sees them
+            write_files(self._folder / "files", files)
+            return dataclasses.replace(call(readers()[name], self._folder / "files"), seconds=0.0, megabytes=0.0)
+        if self._process is None:
+            self._process = subprocess.Popen(
+                [sys.executable, __file__, str(self._folder)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=(self._folder / "stderr").open("wb"),
+                env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "OPENCV_LOG_LEVEL": "OFF"},
+            )
+        process = self._process
+        assert process.stdin is not None and process.stdout is not None
+        message = pickle.dumps((name, dict(files)))
+        try:
+            process.stdin.write(struct.pack("<Q", len(message)) + message)
+            process.stdin.flush()
+            size = process.stdout.read(8)
+            if len(size) == 8:
+                return pickle.loads(process.stdout.read(struct.unpack("<Q", size)[0]))
+        except BrokenPipeError:
+            pass
+        code = process.wait()
+        self._process = None
+        said = (self._folder / "stderr").read_bytes()[-2000:].decode(errors="replace")
+        past = not (self._folder / "loading").exists()
+        why = "hung" if code == -signal.SIGALRM else f"ended with {code}"
+        # What MuJoCo's own parser does is not ours.
+        return Outcome("fault" if past else "refused", past, f"the process {why}: {said}")
+
+
+def serve(folder: Path) -> None:
+    """Answers what comes by the standard input, until it ends."""
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # libraries print
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    known, warm = readers(), set()
+    while len(size := sys.stdin.buffer.read(8)) == 8:
+        name, files = pickle.loads(sys.stdin.buffer.read(struct.unpack("<Q", size)[0]))
+        write_files(folder / "files", files)
+        signal.alarm(_PATIENCE)
+        if name not in warm:
+            call(known[name], folder / "files")  # which imports what it needs
+            warm.add(name)
+        outcome = pickle.dumps(call(known[name], folder / "files"))
+        signal.alarm(0)
+        answers.write(struct.pack("<Q", len(outcome)) + outcome)
+        answers.flush()
+
+
+def readers() -> dict[str, Reader]:
+    """All readers by name."""
+    import readers_of_files
+    import readers_of_runs
+
+    return {**readers_of_files.READERS, **readers_of_runs.READERS}
+
+
+if __name__ == "__main__":
+    import readers_worker  # by its name: what is pickled says where it is from
+
+    readers_worker.serve(Path(sys.argv[1]))
