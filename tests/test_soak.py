@@ -1,4 +1,4 @@
-"""A sample of the soak (benchmarks/soak): real runs, struck by a few faults of any kind and resumed; and how records are added."""
+"""A sample of the soak (benchmarks/soak): real runs, struck by faults and resumed; and how records are added."""
 
 import concurrent.futures
 import dataclasses

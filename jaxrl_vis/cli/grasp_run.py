@@ -12,7 +12,6 @@ from jaxrl_vis.cli.phenotype_run import SKIPPED, calibration_of
 from jaxrl_vis.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.errors import RequestError, StorageError
 from jaxrl_vis.report.outputs import check_writable
-from jaxrl_vis_envs.documents import parse_json
 
 
 @dataclasses.dataclass(frozen=True)

@@ -124,7 +124,7 @@ def run(runs: list[PlotFolder], find: Find, request: Request, done: Callable[[Ro
         if not _is_done(path, made_of):
             record = {**_record(each, driven[each.name], find, request), "of": made_of}
             write_atomically(path, json.dumps(record) + "\n")
-        record = parse_json(path.read_text(encoding="utf-8"))
+        record = read_json(path)
         rows, points, skipped = [*rows, record["row"]], points + record["points"], skipped + record["skipped"]
         write_rows(request.out / "runs.csv", RUN_COLUMNS, rows)
         write_rows(request.out / "points.csv", POINT_COLUMNS, points)

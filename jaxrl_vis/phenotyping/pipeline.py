@@ -135,7 +135,7 @@ def _run(
         for number, (name, record) in enumerate(each(functools.partial(_record, plot, find, request), missing), start=1):
             write_atomically(paths[name], json.dumps(record) + "\n")
             done(plot.name, len(plot.pairs) - len(missing) + number, len(plot.pairs))
-        records = [parse_json(paths[pair.name].read_text(encoding="utf-8")) for pair in plot.pairs]
+        records = [read_json(paths[pair.name]) for pair in plot.pairs]
         bad = [
             {"plot": plot.name, "pair": pair.name, "why": record["skipped"]}
             for pair, record in zip(plot.pairs, records)

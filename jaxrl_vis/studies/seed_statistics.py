@@ -4,6 +4,7 @@ The definitions are those of Agarwal et al., "Deep Reinforcement Learning at the
 section 4): the interquartile mean is taken over all scores of all tasks, and seeds are resampled within their task.
 """
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -52,4 +53,5 @@ def permutation_p_value(first: np.ndarray, second: np.ndarray) -> float:
     def difference(a: np.ndarray, b: np.ndarray, axis: int) -> np.ndarray:
         return np.mean(a, axis=axis) - np.mean(b, axis=axis)
 
-    return float(scipy.stats.permutation_test((first, second), difference, n_resamples=np.inf, vectorized=True).pvalue)
+    count = math.comb(len(first) + len(second), len(first))
+    return float(scipy.stats.permutation_test((first, second), difference, n_resamples=count, vectorized=True).pvalue)
