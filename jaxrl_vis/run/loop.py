@@ -194,9 +194,9 @@ class RunLoop:
         if self._writes:
             self._folder.open(self._config, goes_on, overwrite, self._log)
         self.has_begun = True
-        damaged = self._checkpoints.set_aside_after(self._done) if goes_on else []
-        if self._writes:
-            with self._saver.writing():
+        with self._saver.writing():
+            damaged = self._checkpoints.set_aside_after(self._done) if goes_on else []
+            if self._writes:
                 self._begin_log(goes_on, damaged)
         processes.meet("begun")
         if self._loop is None:
