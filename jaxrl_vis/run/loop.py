@@ -38,7 +38,7 @@ from jaxrl_vis.run.progress import Progress
 from jaxrl_vis.run.results import Results, describe
 from jaxrl_vis.run.saving import Saver, import_what_saves
 from jaxrl_vis.run.signals import Interruption
-from jaxrl_vis.streams import reserve_standard_files
+from jaxrl_vis.streams import reserve_standard_files, safe_streams
 from jaxrl_vis.types import LoopState
 
 _FILTERED_TOO_MUCH, _FILTERED_EVALUATIONS = 0.9, 3
@@ -114,7 +114,8 @@ class RunLoop:
                 return
             interruption = Interruption()
             try:
-                compiled = self._prepare(goes_on, memory)
+                with safe_streams():  # libraries that warn as they compile
+                    compiled = self._prepare(goes_on, memory)
                 # Not before: while XLA compiles, no Python runs that could look at a flag, and there is nothing to save.
                 with interruption:
                     self._begin(compiled, goes_on, overwrite)
