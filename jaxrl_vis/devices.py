@@ -80,8 +80,7 @@ def enable_compilation_cache() -> str:
     """Keeps compiled programs in a folder, so that the second start takes seconds.
 
     A folder that was chosen already (JAX_COMPILATION_CACHE_DIR, or jax.config) is left as it is; otherwise it is
-    ``jaxrl-vis/xla`` in the user's cache folder, if that can be made. `cache_fault` says what is wrong with it, and JAX, which
-    would say so of each program, does not.
+    ``jaxrl-vis/xla`` in the user's cache folder, if that can be made. `cache_fault` says what is wrong with it.
 
     Returns:
         The folder; empty where there is none.
@@ -100,12 +99,17 @@ def enable_compilation_cache() -> str:
         compilation_cache.reset_cache()
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
-    folder = jax.config.jax_compilation_cache_dir
-    if folder and cache_fault() is not None:
+    hush_cache()
+    mend_damaged_entries()
+    return str(jax.config.jax_compilation_cache_dir or "")
+
+
+def hush_cache() -> None:
+    """Lets JAX be silent about a cache with a fault, which the run says once; JAX would warn of each program."""
+    import jax
+
+    if jax.config.jax_compilation_cache_dir and cache_fault() is not None:
         warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache entry", UserWarning)
-    else:
-        mend_damaged_entries()
-    return str(folder or "")
 
 
 def default_cache() -> Path:

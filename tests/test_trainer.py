@@ -1,6 +1,7 @@
 """The training run: exact resumption, signals, bad input, memory, non-finite numbers."""
 
 import dataclasses
+import errno
 import itertools
 import json
 import runpy
@@ -119,6 +120,15 @@ def test_numbers_that_the_simulation_made_are_told_from_those_of_the_learner(tmp
     with pytest.raises(trainer.NonFiniteError) as stopped:
         list(make_fake_trainer(small_config(), tmp_path / "learned", nan_at=4).run())
     assert "simulation" not in str(stopped.value)
+
+
+def test_a_state_that_cannot_be_dumped_hides_no_non_finite_number(tmp_path, monkeypatch):
+    def no_room(*_, **__):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(np, "savez_compressed", no_room)
+    with pytest.raises(trainer.NonFiniteError, match="in iteration 5.*cannot be written to .* .No space left on device"):
+        list(make_fake_trainer(small_config(), tmp_path / "run", nan_at=4).run())
 
 
 @pytest.mark.parametrize(

@@ -254,10 +254,11 @@ def _compiles(probe: Callable[[], object]) -> bool:
             pool.submit(compile_it).result()
     except Exception as error:  # Pallas, Triton, ptxas and XLA each have their own
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-        print(
-            f"jaxrl-vis: a GPU kernel ({probe.__module__}) does not compile on {gpu.device_kind}, so plain JAX takes its place "
-            f"({KERNELS_VARIABLE}=0 does so without trying): {reason}",
-            file=sys.stderr,
-        )
+        with contextlib.suppress(OSError, ValueError):  # nobody can read it
+            print(
+                f"jaxrl-vis: a GPU kernel ({probe.__module__}) does not compile on {gpu.device_kind}, so plain JAX takes its "
+                f"place ({KERNELS_VARIABLE}=0 does so without trying): {reason}",
+                file=sys.stderr,
+            )
         return False
     return True

@@ -42,7 +42,7 @@ from jaxrl_vis.run.progress import Progress
 from jaxrl_vis.run.results import Results, describe
 from jaxrl_vis.run.saving import Saver, import_what_saves
 from jaxrl_vis.run.signals import Interruption
-from jaxrl_vis.streams import reserve_standard_files
+from jaxrl_vis.streams import reserve_standard_files, safe_streams
 from jaxrl_vis.types import LoopState
 
 _FILTERED_TOO_MUCH, _FILTERED_EVALUATIONS = 0.9, 3
@@ -127,7 +127,8 @@ class RunLoop:
                 return
             interruption = Interruption()
             try:
-                compiled = self._prepare(goes_on, memory)
+                with safe_streams():  # libraries that warn as they compile
+                    compiled = self._prepare(goes_on, memory)
                 # Not before: while XLA compiles, no Python runs that could look at a flag, and there is nothing to save.
                 with interruption:
                     self._begin(compiled, goes_on, overwrite)
@@ -225,10 +226,10 @@ class RunLoop:
         processes.meet("opened")
         self._checkpoints.run_id = read_run_id(self._folder.path)
         self.has_begun = True
-        foreign = self._checkpoints.set_foreign_aside()
-        damaged = self._checkpoints.set_aside_after(self._done) if goes_on else []
-        if self._writes:
-            with self._saver.writing():
+        with self._saver.writing():
+            foreign = self._checkpoints.set_foreign_aside()
+            damaged = self._checkpoints.set_aside_after(self._done) if goes_on else []
+            if self._writes:
                 self._checkpoints.recent.go_on_from(self._recent_at)
                 self._goodput.begin(self._done, self._replay_lost)
                 self._begin_log(goes_on, damaged, foreign)

@@ -191,15 +191,18 @@ class Saver:
         leaves = self._programs.broken_leaves(loop) if broken is None else broken
         leaves = [name.removeprefix("train.") for name in leaves if name.startswith("train.")]
         file = self._folder.nonfinite / f"iteration_{iteration}.npz"
-        simulated = None
+        simulated, dumped = None, "the state lies in several processes and is not kept"
         if not processes.are_several():
-            dump(file, loop, values, leaves)
+            try:
+                dump(file, loop, values, leaves)
+                dumped = f"state dumped to {file}"
+            except OSError as error:
+                dumped = f"the state cannot be written to {file} ({error.strerror or type(error).__name__})"
             simulated = made_by_simulation(loop, self._programs.config.num_envs)
             if simulated is None and not leaves and values and all(name.startswith("eval/") for name in values):
                 simulated = "the networks are finite"
         names = [name for name, row in values.items() if not np.isfinite(row).all()] + leaves
         shown = f" ({', '.join(names[:3])}{f' and {len(names) - 3} more' if len(names) > 3 else ''})" if names else ""
         good = "there is no checkpoint yet" if kept is None else f"the last good checkpoint is of iteration {kept}"
-        dumped = "the state lies in several processes and is not kept" if processes.are_several() else f"state dumped to {file}"
         origin = f"they come from the simulation, not from the learner ({simulated}); " if simulated else ""
         raise NonFiniteError(f"non-finite numbers in {where}{shown}: {origin}{dumped}; {good}")

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxrl_vis.config import Config
-from jaxrl_vis.devices import check_devices, enable_compilation_cache, start_devices
+from jaxrl_vis.devices import check_devices, enable_compilation_cache, hush_cache, start_devices
 from jaxrl_vis.errors import NonFiniteError, RequestError, Terminated
 from jaxrl_vis.learner.environment import locate_env, make_env
 from jaxrl_vis.learner.train_step import make_train_step
@@ -25,6 +25,7 @@ from jaxrl_vis.run.folder import RunFolder, default_folder, read_log
 from jaxrl_vis.run.loop import Report, RunLoop
 from jaxrl_vis.run.programs import Programs
 from jaxrl_vis.run.signals import shielded_children
+from jaxrl_vis.streams import safe_streams
 from jaxrl_vis.types import LoopState, Metrics, TrainState
 from jaxrl_vis_envs.registry import is_built_in
 
@@ -188,10 +189,13 @@ def make_trainer(
     loggers.check(log or ())
     if run_dir is not None:
         RunFolder(Path(run_dir)).check(config, resume, overwrite)  # building an environment takes a while: refuse before
-    with shielded_children():  # threads that JAX starts with its first use of a device never see signals
-        start_devices()
-        if is_built_in(config.env):
-            locate_env(config)  # imports MuJoCo, meanwhile
-        check_devices()
-    config = locate_env(config)
-    return Trainer(config, make_train_step(make_env(config), config), run_dir, resume, overwrite, log, keep_programs)
+    with safe_streams():  # libraries that print, or warn, as they are imported and compile
+        hush_cache()
+        with shielded_children():  # threads that JAX starts with its first use of a device never see signals
+            start_devices()
+            if is_built_in(config.env):
+                locate_env(config)  # imports MuJoCo, meanwhile
+            check_devices()
+        config = locate_env(config)
+        program = make_train_step(make_env(config), config)
+    return Trainer(config, program, run_dir, resume, overwrite, log, keep_programs)
