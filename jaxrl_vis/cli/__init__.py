@@ -6,6 +6,7 @@ Exit status: 0 done; 1 unexpected, or files could not be written; 2 the request 
 files skipped; 4 stopped on a number that is not finite; 130 Ctrl-C and 143 SIGTERM, both after saving.
 """
 
+import errno
 import inspect
 import os
 import sys
@@ -93,7 +94,10 @@ def main(words: Sequence[str] | None = None) -> int:
         return 130
     except Terminated as stop:
         return int(stop.code or 0)
-    except Exception:
+    except Exception as error:
+        if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:  # wherever a path was first looked at
+            print(f"{PROGRAM}: {str(error.filename)[:80]}... cannot be used ({error.strerror})", file=sys.stderr)
+            return _STATUS[RequestError]
         if not processes.are_several():
             raise
         traceback.print_exc()
