@@ -166,8 +166,16 @@ def test_a_new_folder_of_the_same_name_is_left_alone(tmp_path):
 @pytest.mark.parametrize("name", ["a" * 300, "a/" + "b" * 300])
 @pytest.mark.parametrize(
     "words",
-    [["eval"], ["play"], ["train", "Reacher", "--preset", "debug", "--run-dir"], ["train", "--resume", "--run-dir"]],
-    ids=["eval", "play", "train", "resume"],
+    [
+        ["eval"],
+        ["play"],
+        ["train", "Reacher", "--preset", "debug", "--run-dir"],
+        ["train", "--resume", "--run-dir"],
+        ["figure", "5.4", "--draw-only", "--runs"],
+        ["grasp", "eval", "--reach", "--loops", "policy", "--policy"],
+        ["grasp", "run"],
+    ],
+    ids=["eval", "play", "train", "resume", "figure", "policy", "grasp"],
 )
 def test_a_name_that_is_too_long_is_one_line(tmp_path, monkeypatch, capsys, words, name):
     monkeypatch.chdir(tmp_path)

@@ -118,7 +118,8 @@ def test_whoever_has_trained_a_run_is_not_asked(here, cache, monkeypatch):
     assert trust.is_trusted(run, config)
     monkeypatch.chdir("/")
     assert trust.is_trusted(run, config)
-    assert not trust.is_trusted(run, config.replace(env_folder=str(run)))  # where somebody else may have put it
+    (run / "mine.py").write_text("")  # as somebody else may put it there
+    assert not trust.is_trusted(run, config.replace(env_folder=str(run)))
 
 
 def test_a_cache_that_cannot_be_written_is_no_hindrance(stranger, cache):

@@ -94,7 +94,10 @@ def find(module: str, folder: str | None = None) -> Path | None:
         if place is not None and (file := _file_in(Path(place).resolve(), module)) is not None:
             return file
     spec = importlib.machinery.PathFinder.find_spec(module.partition(".")[0])
-    return Path(spec.origin).resolve() if spec is not None and spec.origin is not None else None
+    if spec is None:
+        return None
+    places = [spec.origin] if spec.origin is not None else spec.submodule_search_locations or []  # without a file of its own
+    return next((Path(place).resolve() for place in places), None)
 
 
 def folder_of(module: ModuleType) -> str | None:

@@ -7,6 +7,7 @@ files skipped; 4 stopped on a number that is not finite; 128 + its number after 
 where the reader of what a command prints has left.
 """
 
+import errno
 import inspect
 import os
 import sys
@@ -117,9 +118,12 @@ def _status_of(words: Sequence[str], ending: Ending) -> int:
         return 130 if ending.signal is None else _ended_by(ending.signal)
     except Terminated as stop:  # from `Interruption`, where it was told what is saved
         return 128 + stop.signal if ending.signal is None else _ended_by(ending.signal)
-    except Exception:
+    except Exception as error:
         if ending.signal is not None:
             return _ended_by(ending.signal)
+        if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:  # wherever a path was first looked at
+            print(f"{PROGRAM}: {str(error.filename)[:80]}... cannot be used ({error.strerror})", file=sys.stderr)
+            return _STATUS[RequestError]
         if not processes.are_several():
             raise
         traceback.print_exc()

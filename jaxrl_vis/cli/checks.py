@@ -63,9 +63,12 @@ def may_run_code(run_dir: Path, trust: bool) -> bool:
         trust: ``--trust`` was given.
 
     Raises:
-        RequestError: It may not, or there is no run.
+        RequestError: It may not.
     """
-    config = read_config(run_dir)
+    try:
+        config = read_config(run_dir)
+    except RequestError:  # which is told by who uses the run, and then nothing runs
+        return trust
     if not trust and trusting.is_own(config) and not trusting.is_trusted(run_dir, config) and _is_at_terminal():
         print(f"{trusting.question(run_dir, config)}. Run it? [y/N] ", end="", file=sys.stderr, flush=True)
         trust = sys.stdin.readline().strip().lower() in ("y", "yes")

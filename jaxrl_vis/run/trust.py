@@ -29,12 +29,12 @@ def is_own(config: Config) -> bool:
 
 
 def is_trusted(run_dir: Path, config: Config) -> bool:
-    """Whether the code of a run's task was trusted before, and is the same as far as it can be told.
+    """Whether the code of a run's task was trusted before, and is the same as far as it can be told; or there is none.
 
     Raises:
         RequestError: There is no run in ``run_dir``, or its task is not written ``module:Name``.
     """
-    return any(name in _trusted_here or _is_kept(name) for name in _names(run_dir, config))
+    return _file(config) is None or any(name in _trusted_here or _is_kept(name) for name in _names(run_dir, config))
 
 
 def trust(run_dir: Path, config: Config, was_trained_here: bool = False) -> None:
@@ -78,8 +78,7 @@ def check(run_dir: Path, config: Config, may: bool, mend: str = "pass trust=True
 
 def question(run_dir: Path, config: Config) -> str:
     """Words for what is to be trusted."""
-    place = _file(config) or "wherever Python finds it"
-    return f"the run in {run_dir} runs code that is not of this project: its task {config.env} is imported from {place}"
+    return f"the run in {run_dir} runs code that is not of this project: its task {config.env} is imported from {_file(config)}"
 
 
 def _folder() -> Path:

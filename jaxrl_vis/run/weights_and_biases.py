@@ -51,7 +51,8 @@ class WeightsAndBiases:
             raise RequestError("nobody is logged in: `wandb login`, or WANDB_MODE=offline")
         group = folder.resolve().name
         for seed in seeds:
-            known = self._state.setdefault(str(seed), {"id": uuid.uuid4().hex[:8], "iteration": 0})
+            whose = {} if self._run_id is None else {RUN_ID: self._run_id}
+            known = self._state.setdefault(str(seed), {"id": uuid.uuid4().hex[:8], "iteration": 0, **whose})
             with shielded_children():  # W&B's own process must outlive a Ctrl-C, to be told the end
                 run = wandb.init(
                     project=os.environ.get("WANDB_PROJECT", PROJECT),
@@ -76,12 +77,10 @@ class WeightsAndBiases:
         if not self._state_file.exists():
             return {}
         state = read_json(self._state_file, mend="delete it to begin new runs there")
-        whose = state.pop(RUN_ID, None)
-        return state if whose == self._run_id else {}
+        return {seed: known for seed, known in state.items() if isinstance(known, dict) and known.get(RUN_ID) == self._run_id}
 
     def _write_state(self) -> None:
-        whose = {} if self._run_id is None else {RUN_ID: self._run_id}
-        write_atomically(self._state_file, json.dumps({**self._state, **whose}, indent=2) + "\n")
+        write_atomically(self._state_file, json.dumps(self._state, indent=2) + "\n")
 
     def rows(self, rows: Sequence[Row]) -> None:
         """The figures of rows that were not sent before, against ``env_steps``; W&B's own step is the iteration."""
