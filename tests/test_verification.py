@@ -16,7 +16,7 @@ from jaxrl_vis.config import Config
 from jaxrl_vis.run import verification
 from jaxrl_vis.run.folder import read_config, read_record
 from jaxrl_vis.run.inspection import Expected, Findings, check_record, missing_rows, read_file
-from jaxrl_vis.run.sums import compare_sums
+from jaxrl_vis.run.sums import compare_sums, write_sums
 from jaxrl_vis.run.trainer import Trainer
 from jaxrl_vis.run.verification import Verification, verify
 
@@ -130,9 +130,13 @@ def test_a_checkpoint_of_another_state_is_found(copy, verified, trainer_of, tmp_
     """One that is whole, with checksums that fit, but that this run does not arrive at."""
     other = tmp_path / "other"
     list(trainer_of(small_config(seed=5, env_steps=60), other).run())
+    whose = {name: value for name, value in read_record(copy).items() if name == verification.RUN_ID}
     for tier in ("light", "full"):
         shutil.rmtree(copy / "checkpoints" / tier / "6")
         shutil.copytree(other / "checkpoints" / tier / "6", copy / "checkpoints" / tier / "6")
+        manifest = copy / "checkpoints" / tier / "6" / "manifest" / "metadata"
+        manifest.write_text(json.dumps(json.loads(manifest.read_text()) | whose))
+        write_sums(copy / "checkpoints" / tier / "6")
     report = verified(copy, iterations=8)
     assert any("light/6 is not what the repetition arrives at" in line for line in report.problems)
 
@@ -188,8 +192,9 @@ def test_rows_and_checkpoints_of_another_run_are_found(copy, verified):
 def test_what_is_missing_contradicts_or_is_foreign_is_said(copy, verified):
     (copy / "notes.txt").write_text("mine")
     (copy / "checkpoints" / "light" / "9.orbax-checkpoint-tmp-7").mkdir()
+    (copy / "checkpoints" / "damaged" / "full-9").mkdir(parents=True)
     report = verified(copy)
-    assert report.is_equal
+    assert report.is_equal and "set aside before as damaged: full-9" in report.notes
     assert (
         "no files of a run: notes.txt" in report.notes
         and "checkpoints/light/9.orbax-checkpoint-tmp-7 is half-written" in report.notes

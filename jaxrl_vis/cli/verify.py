@@ -40,7 +40,7 @@ def run(options: Verify) -> int:
         by = "no number" if math.isinf(report.largest) else f"{report.largest:.1e}"
         print(f"numbers need not be the same here, see elsewhere; the largest relative difference: {by}")
     if report.problems:
-        print(f"not as the run left it: {len(report.problems)} things are wrong; {report.rows} rows were repeated")
+        print(f"not as the run left it: see what is wrong above; {report.rows} rows were repeated")
         return 1
     if not report.rows:
         raise RequestError(

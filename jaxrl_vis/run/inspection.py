@@ -18,6 +18,7 @@ RUN_ID, LOST = "run_id", "resume/replay_lost_at"
 
 _PLACE = ("seed", "iteration", "updates", "env_steps")
 _PLAYED = ("play.gif", "play.mp4", "play.html", "play.png", "play_aux.gif")
+_ASIDE = {DAMAGED: "damaged", "foreign": "another run's"}
 _SHOWN = 5  # of a list in a line
 
 
@@ -104,7 +105,7 @@ def read_file(path: Path, expected: Expected, is_written: bool, findings: Findin
 def _fault(row: Mapping[str, Any], expected: Expected) -> str:
     """What contradicts the configuration in a row; empty if nothing does."""
     iteration = row["iteration"]
-    if expected.run_id is not None and row.get(RUN_ID) != expected.run_id:
+    if row.get(RUN_ID) != expected.run_id:
         return f"is another run's ({row[RUN_ID]})" if RUN_ID in row else "names no run"
     if row["seed"] not in expected.seeds:
         return f"is of seed {row['seed']}, which config.json does not have"
@@ -214,18 +215,18 @@ def check_files(folder: RunFolder, is_finished: bool, shows_images: bool, findin
     of_run |= {folder.checkpoints.name, folder.nonfinite.name, *LOGGER_FOLDERS}
     foreign = [entry.name for entry in folder.path.iterdir() if entry.name not in of_run]
     if folder.checkpoints.is_dir():
-        foreign += [
-            f"checkpoints/{entry.name}" for entry in folder.checkpoints.iterdir() if entry.name not in (LIGHT, FULL, DAMAGED)
-        ]
+        names = [entry.name for entry in folder.checkpoints.iterdir()]
+        foreign += [f"checkpoints/{name}" for name in names if name not in (LIGHT, FULL, *_ASIDE)]
         for tier in (LIGHT, FULL):
             entries = list((folder.checkpoints / tier).iterdir()) if (folder.checkpoints / tier).is_dir() else []
             names = {entry.name for entry in entries if not (entry.is_dir() and entry.name.isdigit())}
             half = sorted(name for name in names if ".orbax-checkpoint-tmp" in name)
             findings.notes += [f"checkpoints/{tier}/{name} is half-written" for name in half]
             foreign += [f"checkpoints/{tier}/{name}" for name in names - set(half)]
-        if (folder.checkpoints / DAMAGED).is_dir():
-            aside = sorted(entry.name for entry in (folder.checkpoints / DAMAGED).iterdir())
-            findings.notes.append(f"set aside as damaged before: {listed(aside)}")
+        for name, why in _ASIDE.items():
+            if (folder.checkpoints / name).is_dir():
+                aside = sorted(entry.name for entry in (folder.checkpoints / name).iterdir())
+                findings.notes.append(f"set aside before as {why}: {listed(aside)}")
     if folder.nonfinite.is_dir():
         findings.notes.append(f"the run has met a number that is not finite: {folder.nonfinite.name}/ has its state")
     if foreign:

@@ -141,7 +141,9 @@ class Repeater:
         if best:
             self._tell(name, iteration, best)
         else:
-            self._say(f"  iteration {iteration}: {numbers} numbers of {len(there)} seeds, all equal")
+            self._say(
+                f"  iteration {iteration}: {numbers} numbers of {len(there)} {'seed' if len(there) == 1 else 'seeds'}, all equal"
+            )
 
     def _tell(self, name: str, iteration: int, differences: Sequence[tuple[int, str, Any, Any]]) -> None:
         self._report.largest = max([self._report.largest, *(_relative(value, again) for _, _, value, again in differences)])

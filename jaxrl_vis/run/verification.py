@@ -193,7 +193,7 @@ class _Verifier:
                 self._report.notes.append(f"{name} has no {SUMS_NAME}: only its arrays are compared with their checksums")
             if manifest.get("iteration") != number:
                 problems.append(f"{name} says that it is of iteration {manifest.get('iteration')}")
-            elif self._expected.run_id is not None and manifest.get(RUN_ID) != self._expected.run_id:
+            elif manifest.get(RUN_ID) != self._expected.run_id:
                 problems.append(f"{name} is another run's ({manifest.get(RUN_ID, 'it names none')})")
             elif not has_progress(manifest, len(self._expected.seeds)):
                 problems.append(f"{name} is damaged (its manifest does not say how far the run was)")
