@@ -42,9 +42,15 @@ class Fault:
 
 
 def _started(folder: Path, dice: random.Random, variables: dict[str, str] | None = None, file_bytes: int | None = None) -> Part:
-    """A part that is in the middle of training, or was over before."""
+    """A part that is in the middle of training, or was over before.
+
+    Raises:
+        Broken: It did not come so far.
+    """
     part = Part.start(folder, variables, file_bytes=file_bytes)
-    part.wait_for(part.is_training)
+    if not part.wait_for(part.is_training) and (part.runs() or part.end() != 0):
+        with killed_afterwards(part):
+            raise Broken(f"it did not begin to train: {part.lines[-4:]}")
     time.sleep(dice.uniform(0.0, 0.8))
     return part
 

@@ -175,6 +175,8 @@ class RunLoop:
 
     def _rescue(self) -> None:
         self._console.stop()
+        if not self.has_begun:  # nothing was learned since the last checkpoint, and the folder may be another's, or gone
+            return
         if processes.are_several():
             self._is_left_alone = True  # whatever went wrong, the others may have ended, and saving would wait for them
             return

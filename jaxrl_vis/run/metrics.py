@@ -4,7 +4,7 @@ One line per seed and evaluation: seed, iteration, updates, env_steps (counts pe
 of train/* since the last evaluation and a quotient of two of them (`with_precision`), resume/replay_lost_at (where a run went
 on from a light checkpoint: the last iteration at which its replay was lost), run_id (as in config.json), and time/wall_s (the
 run so far, with evaluation, compilation and what came before a resumption), time/compile_s (of that, compilation),
-time/env_steps_per_s (all seeds together, since the last evaluation).
+time/env_steps_per_s (all seeds together, since the last evaluation), and time/goodput (`goodput`).
 """
 
 import dataclasses

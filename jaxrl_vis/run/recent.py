@@ -93,7 +93,9 @@ class Recent:
             self._folder.rename(to)
         return is_foreign
 
-    def save(self, iteration: int, loop: LoopState, num_envs: int, progress: dict[str, Any]) -> None:
+    def save(
+        self, iteration: int, loop: LoopState, num_envs: int, progress: dict[str, Any], started: float | None = None
+    ) -> None:
         """Writes a state, and what it needs that is not there; where there is no room, it is said, and nothing more is saved.
 
         Args:
@@ -101,8 +103,9 @@ class Recent:
             loop: The state, on one device.
             num_envs: E, episodes that one iteration adds to the replay.
             progress: Anything that JSON can hold.
+            started: When the work for it began (`time.monotonic`), checks included; None: now.
         """
-        self._saved_at = time.monotonic()
+        self._saved_at = time.monotonic() if started is None else started
         try:
             self._write(iteration, loop, num_envs, progress)
         except OSError as error:

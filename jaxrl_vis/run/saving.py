@@ -8,8 +8,10 @@ the full one, with the replay, after it: whoever runs out of patience, or of dis
 import contextlib
 import dataclasses
 import errno
+import functools
 import importlib
 import shlex
+import time
 from collections.abc import Callable, Iterator
 
 import jax
@@ -56,7 +58,6 @@ class Saver:
         self._programs, self._folder, self._checkpoints, self._say = programs, folder, checkpoints, say
         self._check = check
         self._keeps_full = programs.config.full_checkpoint_interval > 0
-        self._keeps_recent = programs.layout.mesh is None and is_cheap(programs.shapes.replay)
 
     def has(self, tier: str, iteration: int) -> bool:
         """Whether there is a checkpoint of that tier and iteration; several processes agree on it."""
@@ -81,6 +82,10 @@ class Saver:
         self._refuse_nonfinite(loop, iteration)
         self._checkpoints.save_full(iteration, loop, dataclasses.asdict(progress))
 
+    @functools.cached_property
+    def _keeps_recent(self) -> bool:
+        return self._programs.layout.mesh is None and is_cheap(self._programs.shapes.replay)
+
     def is_recent_due(self, light: bool) -> bool:
         """Whether `recent` is to be called after this iteration: it is cheap, and was not called for long enough.
 
@@ -93,11 +98,13 @@ class Saver:
         """Keeps the state up to date for a process that is killed; see `jaxrl_vis.run.recent`.
 
         Raises:
-            NonFiniteError: As `light`.
+            NonFiniteError, StorageError: As `light`.
         """
+        started = time.monotonic()
+        self._check()
         self._refuse_nonfinite(loop, iteration)
         num_envs = self._programs.program.replay.num_envs
-        self._checkpoints.recent.save(iteration, loop, num_envs, dataclasses.asdict(progress))
+        self._checkpoints.recent.save(iteration, loop, num_envs, dataclasses.asdict(progress), started)
 
     def finish(self) -> None:
         """Returns when everything is on the disk, and deletes what only a run that has not ended goes on from.
