@@ -175,7 +175,7 @@ def test_paper_among_many_geoms_stays_on_the_desk(papers, way, monkeypatch):
 
 
 def test_slopes_of_3_to_4_are_as_smooth_as_32_bits_have_them():
-    """The cosine of their angle is the bound from which on MuJoCo shades a corner smoothly: the rounding of its bits decides."""
+    """The cosine of their angle is the bound from which on MuJoCo shades a corner smoothly: rounding of bits decides."""
     ridge = "-.2 0 0 .2 0 0 -.2 .8 .6 .2 .8 .6 -.2 1.6 0 .2 1.6 0 -.2 .8 -.05 .2 .8 -.05"
     faces = "0 1 3 0 3 2 2 3 5 2 5 4 0 6 7 0 7 1 4 5 7 4 7 6 0 2 6 2 4 6 1 7 3 3 7 5"
     xml = f"""<mujoco><asset><mesh name="ridge" vertex="{ridge}" face="{faces}"/></asset>
