@@ -111,7 +111,7 @@ def test_alpha_of_a_texture_counts_on_what_is_transparent_and_nowhere_else():
     body = '<geom type="plane" size=".4 .4 .1" pos="-.8 0 0" material="leaf"/>'
     body += '<geom type="box" size=".3 .3 .1" pos=".8 0 0" material="leaf"/>'
     body += '<geom type="plane" size=".4 .4 .1" pos="0 .9 0" material="solid leaf"/>'
-    places = [(-1.0, 0.0), (-0.6, 0.0), (0.7, 0.0), (0.9, 0.0), (-0.2, 0.9), (0.2, 0.9)]
+    places = [(-1.0, 0.0), (-0.6, 0.0), (0.7, 0.0), (1.15, 0.0), (-0.2, 0.9), (0.2, 0.9)]
     seen = colours_at(body, places, 63)
     leaf = np.array([200, 100, 50]) / 255
     expected = [BACK, laid(leaf, alpha=0.9)] * 2 + [leaf] * 2
