@@ -1,0 +1,51 @@
+"""The verdict on models of other people: what `benchmarks/render_parity.py FOLDER` calls a pass. No GL is needed."""
+
+import mujoco
+import numpy as np
+
+from benchmarks import render_folder
+from jaxrl_vis_envs.render import Frame
+
+
+def frame(labels: np.ndarray, colour: int = 100, depth: float = 2.0) -> Frame:
+    """An image of what ``labels`` [H, W] say, of one colour and depth."""
+    rgb = np.full((*labels.shape, 3), colour, np.uint8)
+    return Frame(rgb, np.full(labels.shape, depth, np.float32), labels)  # pyright: ignore[reportArgumentType]
+
+
+def verdict(ours: Frame, theirs: Frame, hidden: np.ndarray | None = None) -> list[str]:
+    return render_folder.measure(ours, theirs, np.zeros((32, 32), bool) if hidden is None else hidden).failures()
+
+
+def test_images_pass_where_they_are_the_same_and_fail_by_what_is_not() -> None:
+    labels = np.full((32, 32), -1, np.int32)
+    labels[4:28, 4:28] = 0
+    small = labels.copy()
+    small[10:16, 10:16] = 1
+    assert verdict(frame(labels), frame(labels)) == []
+    assert verdict(frame(labels, colour=106), frame(labels)) == ["rgb"]
+    assert verdict(frame(labels, colour=120), frame(labels), np.ones((32, 32), bool)) == []
+    assert verdict(frame(labels, depth=2.1), frame(labels)) == ["depth"]
+    assert "missing (1,)" in verdict(frame(labels, depth=2.1), frame(small))
+    # Where depth and colour are the same, either of two objects will do.
+    assert verdict(frame(labels), frame(small)) == []
+
+
+def test_rows_of_a_model_are_its_cameras_its_sites_and_its_haze() -> None:
+    xml = """<mujoco><asset><texture type="skybox" builtin="flat" width="4" height="4"/></asset>
+      <worldbody><geom type="plane" size="0 0 1"/><site/><camera name="{name}"/></worldbody></mujoco>"""
+    for name, titles in (
+        ("cam", ["cam", "cam + sites", "cam + haze"]),
+        ("eye", ["free", "eye", "free + sites", "free + haze"]),
+    ):
+        mj_model = mujoco.MjModel.from_xml_string(xml.format(name=name))
+        assert [view.title(mj_model) for view in render_folder.views(mj_model)] == titles
+
+
+def test_what_is_no_model_has_a_verdict_of_its_own(tmp_path, capsys) -> None:
+    (tmp_path / "deep").mkdir()
+    (tmp_path / "deep" / "broken.xml").write_text("<mujoco><worldbody>")
+    (tmp_path / "notes.txt").write_text("not looked at")
+    assert render_folder.report(tmp_path, 32, None) == 0
+    shown = capsys.readouterr().out
+    assert "| deep/broken.xml |" in shown and "not loaded: " in shown and "1 rows of 1 files, 0 failed" in shown
