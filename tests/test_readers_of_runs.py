@@ -4,7 +4,7 @@ import json
 import shutil
 from collections import Counter
 
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from mutations import json_text, texts, trees
 from test_checkpoint import saved, saved_once, states  # noqa: F401 - fixtures
@@ -44,6 +44,7 @@ def test_manifests_of_checkpoints(states, saved):  # noqa: F811
     valid = json.loads(file.read_text())
     tally: Counter[str] = Counter()
 
+    @settings(max_examples=max(settings().max_examples // 4, 1))  # each of them opens the folder of checkpoints
     @given(also_as_text(trees(valid, 2).map(json_text), json_text(valid)))
     def law(data):
         file.write_bytes(data)
