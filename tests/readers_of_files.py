@@ -92,8 +92,8 @@ def read_image(folder: Path) -> None:
     from jaxrl_vis.phenotyping.reading import Unusable, read_pair, read_side
     from jaxrl_vis_envs.plants import Calibration
 
-    path = _only(folder)
-    pair = PairFiles("a", path, path)
+    sides = sorted(folder.iterdir())
+    pair = PairFiles("a", sides[0], sides[-1] if sides[-1].stat().st_size else None)
     try:
         left, right = read_pair(pair, Calibration(IMAGE[1], IMAGE[0], 20.0, (10.0, 6.0), 0.1))
     except Unusable as error:
@@ -101,6 +101,20 @@ def read_image(folder: Path) -> None:
             raise
         left = right = read_side(pair, "left")
     assert left.shape == right.shape == (*IMAGE, 3) and left.dtype == np.uint8 and (rgb8(left) == left).all()
+
+
+def read_names(folder: Path) -> None:
+    """Plots of a folder of empty files: each image is at most one side of one pair, and what is not found is no pair's."""
+    from jaxrl_vis.phenotyping.folders import find_plots, read_odometries
+
+    plots = find_plots(folder)
+    pairs = [(plot, pair) for plot in plots for pair in plot.pairs]
+    files = [path for _, pair in pairs for path in (pair.left, pair.right, pair.disparity) if path is not None]
+    assert files and len(set(files)) == len(files) and all(path.is_file() for path in files)
+    assert len({(plot.name, pair.name) for plot, pair in pairs}) == len(pairs)
+    for plot, pair in pairs:
+        assert (plot.name + pair.name).encode() and len(f"{plot.name}{pair.name}".splitlines()) == 1
+    assert read_odometries(plots, None).keys() == {plot.name for plot in plots}
 
 
 def read_disparity(folder: Path) -> None:
@@ -221,6 +235,7 @@ READERS = {
     "labelme": Reader(read_annotations, _parses(documents.read_json), _REQUEST),
     "odometry": Reader(read_odometry, _parses(_table), _REQUEST),
     "image": Reader(read_image, _parses(_has_size), _pair_errors()),
+    "names": Reader(read_names, lambda folder: True, _REQUEST),
     "disparity": Reader(read_disparity, _parses(_has_size), _pair_errors()),
     "detector": Reader(read_detector, _parses(_safetensors), _REQUEST),
     "painter": Reader(read_painter, _parses(_safetensors), _REQUEST),

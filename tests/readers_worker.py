@@ -102,10 +102,12 @@ def _peak() -> float:
 def write_files(folder: Path, files: Mapping[str, bytes]) -> None:
     """Makes the folder anew, with these files in it."""
     shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True, exist_ok=True)
     for name, data in files.items():
         path = folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(data)
+        with contextlib.suppress(FileExistsError, NotADirectoryError, IsADirectoryError):  # two that cannot both be there
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(data)
 
 
 class Worker:
