@@ -1,7 +1,6 @@
 """Parameters of networks in a file of plain arrays: safetensors, with what they are in its metadata."""
 
 import json
-import os
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -13,6 +12,7 @@ import safetensors
 from safetensors.numpy import save
 
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.files import write_atomically
 from jaxrl_vis_envs.documents import parse_json
 
 SUFFIX = ".safetensors"
@@ -41,14 +41,8 @@ def write_parameters(path: Path, params: Mapping[str, Any], about: Mapping[str, 
 
 def _write(path: Path, arrays: Mapping[str, np.ndarray], about: Mapping[str, Any]) -> None:
     """Writes arrays under their names, as they are."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".tmp")
-    with temporary.open("wb") as file:
-        whole = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-        file.write(save(whole, {_ABOUT: json.dumps(dict(about))}))
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
+    whole = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    write_atomically(path, save(whole, {_ABOUT: json.dumps(dict(about))}))
 
 
 def _named(params: Any) -> dict[str, Any]:

@@ -5,7 +5,7 @@ import math
 from pathlib import Path
 from typing import Annotated
 
-from jaxrl_vis.cli.checks import check_counts, check_run
+from jaxrl_vis.cli.checks import check_counts, check_run, may_run_code
 from jaxrl_vis.cli.parsing import ByPlaceToo
 from jaxrl_vis.errors import RequestError
 
@@ -22,15 +22,18 @@ class Verify:
     """The run folder; the run may still be going on."""
     iterations: int | None = None
     """Iterations to repeat, from the seed and from each full checkpoint; up to the second evaluation if not given."""
+    trust: bool = False
+    """Run the run's own code without a question, where its task is module:Name and somebody else trained it (docs/runs.md)."""
 
 
 def run(options: Verify) -> int:
     """Verifies a run, and prints what was found."""
     check_run(options.run_dir)
+    trust = may_run_code(options.run_dir, options.trust)
     check_counts(iterations=options.iterations)
     from jaxrl_vis.run.verification import verify_run
 
-    report = verify_run(options.run_dir, options.iterations, keep_programs=True, say=print)
+    report = verify_run(options.run_dir, options.iterations, keep_programs=True, say=print, trust=trust)
     for title, lines in (("not verified", report.unverified), ("note", report.notes), ("elsewhere", report.elsewhere)):
         for line in lines:
             print(f"{title}: {line}")

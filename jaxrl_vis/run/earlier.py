@@ -1,6 +1,7 @@
 """The files that an earlier part of a run has left: whether it was finished, and whether they belong together."""
 
 from collections.abc import Collection
+from pathlib import Path
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.run import metrics
@@ -17,7 +18,8 @@ def is_evaluated(folder: RunFolder, seeds: Collection[int], restored: Restored) 
 
 
 def refuse_missing_rows(folder: RunFolder, restored: Restored) -> None:
-    """Checks that metrics.jsonl has what was evaluated before a checkpoint was saved; damaged lines may have been that.
+    """Checks that metrics.jsonl has what was evaluated before a checkpoint was saved; damaged lines may have been that, those
+    of an earlier resumption too, which lie with the damaged checkpoints.
 
     Raises:
         RequestError: It ends earlier.
@@ -25,7 +27,7 @@ def refuse_missing_rows(folder: RunFolder, restored: Restored) -> None:
     since = restored.progress.get("since_evaluation")
     evaluated = 0 if since is None else restored.iteration - len(since)
     last = max((row["iteration"] for row in folder.rows()), default=0)
-    if last < evaluated and not metrics.read_contents(folder.metrics).damaged:
+    if last < evaluated and not metrics.read_contents(folder.metrics).damaged and not _aside(folder).exists():
         raise RequestError(
             f"checkpoint {restored.tier}/{restored.iteration} of {folder.path} comes after an evaluation at iteration "
             f"{evaluated}, but {folder.metrics.name} ends at {last}: put back the whole file, or move the checkpoints after "
@@ -35,5 +37,8 @@ def refuse_missing_rows(folder: RunFolder, restored: Restored) -> None:
 
 def cut_back(folder: RunFolder, checkpoints: Checkpoints, last: int, keeps_later: bool) -> str | None:
     """Keeps rows of the run up to an iteration in metrics.jsonl; `metrics.cut_back` has the rest."""
-    aside = folder.checkpoints / DAMAGED / folder.metrics.name
-    return metrics.cut_back(folder.metrics, last, checkpoints.run_id, aside, keeps_later)
+    return metrics.cut_back(folder.metrics, last, checkpoints.run_id, _aside(folder), keeps_later)
+
+
+def _aside(folder: RunFolder) -> Path:
+    return folder.checkpoints / DAMAGED / folder.metrics.name

@@ -9,16 +9,17 @@ from pathlib import Path
 from typing import Any
 
 from jaxrl_vis.config import Config
-from jaxrl_vis.run.checkpoint import DAMAGED, FULL, LIGHT
+from jaxrl_vis.run.checkpoint import DAMAGED, FOREIGN, FULL, LIGHT, RECENT
 from jaxrl_vis.run.folder import LOGGER_FOLDERS, WANDB_STATE, RunFolder
 from jaxrl_vis.run.lock import FILE_NAME as LOCK_NAME
+from jaxrl_vis.run.metrics import RUN_ID
 
-RUN_ID, LOST = "run_id", "resume/replay_lost_at"
-"""Keys of a row: which run wrote it, and the last iteration at which that went on without its replay."""
+LOST = "resume/replay_lost_at"
+"""Key of a row: the last iteration at which the run went on without its replay."""
 
 _PLACE = ("seed", "iteration", "updates", "env_steps")
 _PLAYED = ("play.gif", "play.mp4", "play.html", "play.png", "play_aux.gif")
-_ASIDE = {DAMAGED: "damaged", "foreign": "another run's"}
+_ASIDE = {DAMAGED: "damaged", FOREIGN: "another run's"}
 _SHOWN = 5  # of a list in a line
 
 
@@ -210,13 +211,13 @@ def check_files(folder: RunFolder, is_finished: bool, shows_images: bool, findin
         shows_images: It has a video, then.
         findings: Is added to.
     """
-    files = (folder.config, folder.metrics, folder.curve, folder.video)
+    files = (folder.config, folder.metrics, folder.processes, folder.curve, folder.video)
     of_run = {file.name for file in files} | {LOCK_NAME, WANDB_STATE, *_PLAYED}
     of_run |= {folder.checkpoints.name, folder.nonfinite.name, *LOGGER_FOLDERS}
     foreign = [entry.name for entry in folder.path.iterdir() if entry.name not in of_run]
     if folder.checkpoints.is_dir():
         names = [entry.name for entry in folder.checkpoints.iterdir()]
-        foreign += [f"checkpoints/{name}" for name in names if name not in (LIGHT, FULL, *_ASIDE)]
+        foreign += [f"checkpoints/{name}" for name in names if name not in (LIGHT, FULL, RECENT, *_ASIDE)]
         for tier in (LIGHT, FULL):
             entries = list((folder.checkpoints / tier).iterdir()) if (folder.checkpoints / tier).is_dir() else []
             names = {entry.name for entry in entries if not (entry.is_dir() and entry.name.isdigit())}

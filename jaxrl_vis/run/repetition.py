@@ -9,9 +9,9 @@ from typing import Any
 from jaxrl_vis.run import metrics
 from jaxrl_vis.run.arrays import is_intact, to_host
 from jaxrl_vis.run.checkpoint import FULL, LIGHT, rest_of
-from jaxrl_vis.run.inspection import RUN_ID, Expected, Findings, listed
+from jaxrl_vis.run.inspection import Expected, Findings, listed
 from jaxrl_vis.run.loop import GUARD
-from jaxrl_vis.run.metrics import PerSeed
+from jaxrl_vis.run.metrics import RUN_ID, PerSeed
 from jaxrl_vis.run.programs import Programs
 from jaxrl_vis.run.progress import Progress
 from jaxrl_vis.types import LoopState
@@ -141,9 +141,8 @@ class Repeater:
         if best:
             self._tell(name, iteration, best)
         else:
-            self._say(
-                f"  iteration {iteration}: {numbers} numbers of {len(there)} {'seed' if len(there) == 1 else 'seeds'}, all equal"
-            )
+            seeds = "1 seed" if len(there) == 1 else f"{len(there)} seeds"
+            self._say(f"  iteration {iteration}: {numbers} numbers of {seeds}, all equal")
 
     def _tell(self, name: str, iteration: int, differences: Sequence[tuple[int, str, Any, Any]]) -> None:
         self._report.largest = max([self._report.largest, *(_relative(value, again) for _, _, value, again in differences)])
@@ -213,7 +212,7 @@ def has_progress(manifest: Mapping[str, Any], seeds: int) -> bool:
         names = {name for values in progress.since_evaluation for name in values}
         figures = [number for values in progress.since_evaluation for name in names for number in values[name]]
         counts = [len(row) for values in progress.since_evaluation for row in values.values()]
-    except (AttributeError, KeyError, TypeError):
+    except (AttributeError, KeyError, TypeError, ValueError):
         return False
     is_mark = progress.replay_lost_at is None or isinstance(progress.replay_lost_at, int)
     is_history = all(isinstance(number, float) for number in figures) and set(counts) <= {seeds}

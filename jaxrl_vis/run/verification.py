@@ -22,7 +22,6 @@ from jaxrl_vis.run.checkpoint import FULL, LIGHT, Checkpoints
 from jaxrl_vis.run.folder import RunFolder, read_record
 from jaxrl_vis.run.inspection import (
     LOST,
-    RUN_ID,
     Expected,
     check_files,
     check_record,
@@ -32,12 +31,14 @@ from jaxrl_vis.run.inspection import (
 )
 from jaxrl_vis.run.lock import FILE_NAME as LOCK_NAME
 from jaxrl_vis.run.memory import check_compiled, check_memory
+from jaxrl_vis.run.metrics import RUN_ID
 from jaxrl_vis.run.progress import Progress
 from jaxrl_vis.run.repetition import Repeater, Row, Verification, has_progress, progress_of
 from jaxrl_vis.run.results import describe
 from jaxrl_vis.run.sums import FILE_NAME as SUMS_NAME
 from jaxrl_vis.run.sums import compare_sums
 from jaxrl_vis.run.trainer import Trainer, make_trainer
+from jaxrl_vis.run.trust import check as check_trusted
 
 __all__ = ["Verification", "verify", "verify_run"]
 
@@ -50,6 +51,7 @@ def verify_run(
     iterations: int | None = None,
     keep_programs: bool = False,
     say: Callable[[str], None] = lambda line: None,
+    trust: bool = False,
 ) -> Verification:
     """Repeats the beginning of a run, and what follows each of its full checkpoints; nothing in its folder is touched.
 
@@ -58,9 +60,10 @@ def verify_run(
         iterations: How many to repeat from each of these; None: up to the second evaluation.
         keep_programs: As of `jaxrl_vis.run.trainer.make_trainer`.
         say: Called with a line about each step.
+        trust: Run the run's own code, where its task is module:Name and somebody else trained it.
 
     Raises:
-        RequestError: There is no run, or it cannot be made any more, or needs more memory than there is.
+        RequestError: There is no run, or it cannot be made any more, needs more memory than there is, or is not trusted.
     """
     path = Path(run_dir)
     record = read_record(path)
@@ -68,6 +71,7 @@ def verify_run(
         config = config_from_dict(record.get("config", {}))
     except RequestError as error:
         raise RequestError(f"the run in {path} cannot be verified: {error}") from error
+    check_trusted(path, config, trust)
     findings = Verification()
     check_record(record, config, findings)
     devices = jax.local_device_count()
