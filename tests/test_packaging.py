@@ -19,8 +19,8 @@ ROOT = Path(__file__).resolve().parents[1]
 LAYERS: tuple[tuple[str, ...], ...] = (
     ("errors", "methods", "streams"),
     ("fields",),
-    ("cache_entries", "config", "types", "provenance", "files", "parameters", "spreadsheets"),
-    ("devices", "processes", "resolved", "validation"),
+    ("cache_entries", "config", "types", "provenance", "files", "spreadsheets"),
+    ("devices", "parameters", "processes", "resolved", "validation"),
     ("learner",),
     ("report",),
     ("run",),
