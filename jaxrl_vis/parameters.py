@@ -1,6 +1,7 @@
 """Parameters of networks in a file of plain arrays: safetensors, with what they are in its metadata."""
 
 import json
+import reprlib
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -134,7 +135,7 @@ def check_range(path: Path, name: str, values: tuple[float, ...], low: float, hi
     unfit = next((each for each in values if not low <= each <= high or (step > 1 and each % step)), None)
     if unfit is not None or not 1 <= len(values) <= 16:
         kind = f"multiples of {step} " if step > 1 else ""
-        said = f"{len(values)} numbers" if unfit is None else f"{unfit:g}"
+        said = f"{len(values)} numbers" if unfit is None else reprlib.repr(unfit)  # which may have hundreds of digits
         raise RequestError(f"{path}: {name} of its network must be {kind}from {low:g} to {high:g}, 16 at most, not {said}")
 
 

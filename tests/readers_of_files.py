@@ -83,7 +83,8 @@ def read_odometry(folder: Path) -> None:
 
 
 def _table(path: Path) -> None:
-    assert "distance_m" in next(csv.reader(io.StringIO(path.read_bytes().decode("utf-8-sig"), newline="")))
+    head = next(csv.reader(io.StringIO(path.read_bytes().decode("utf-8-sig"), newline="")))
+    assert {"distance_m", "time_s", "left"} & set(head)
 
 
 def read_image(folder: Path) -> None:

@@ -302,6 +302,7 @@ def weights(**changes) -> bytes:
     ("data", "part"),
     [
         (weights(generator={**SETTINGS, "channels": [10**9]}), "channels of its network must be multiples of 8 from 8 to 1024"),
+        (weights(generator={**SETTINGS, "channels": [10**400]}), "channels of its network must be multiples of 8"),
         (weights(generator={**SETTINGS, "channels": [8] * 12}), "10 levels at most"),
         (weights(generator={**SETTINGS, "channels": "x"}), "channels must be a list"),
         (weights(generator={**SETTINGS, "loss": ["gan"]}), "another version"),
