@@ -158,7 +158,9 @@ def test_only_the_first_process_writes_and_speaks(pair: tuple[Path, list, list, 
     run_dir, _, ((_, first, _), (_, second, _)), _ = pair
     assert "success at the end" in first and "success" not in second
     assert [row["iteration"] for row in rows_without_time(run_dir)] == [2, 4]
-    assert sorted(path.name for path in run_dir.iterdir()) == ["checkpoints", "config.json", "curve.png", "metrics.jsonl"]
+    names = ["checkpoints", "config.json", "curve.png", "metrics.jsonl", "processes.jsonl"]
+    assert sorted(path.name for path in run_dir.iterdir()) == names
+    assert len((run_dir / "processes.jsonl").read_text().splitlines()) == 2  # of the first one, before and after
 
 
 def test_a_signal_to_one_process_saves_and_ends_all(tmp_path: Path) -> None:
