@@ -149,6 +149,24 @@ def test_of_two_that_start_at_once_one_wins(tmp_path, no_locks, leftover):
     assert outcomes.count("won") == 1 and sum("in use by process" in outcome for outcome in outcomes) == 3
 
 
+def test_a_file_without_words_is_waited_for(tmp_path, no_locks):
+    """A holder makes its file and then writes into it, unless it dies in between."""
+    path = tmp_path / FILE_NAME
+    path.touch()
+    writing = threading.Timer(0.3, path.write_text, [marker("elsewhere", 7)])
+    writing.start()
+    with pytest.raises(RequestError, match="in use by process 7 on elsewhere: wait"), run_lock(tmp_path, lambda _: None):
+        pass
+    writing.join()
+    path.write_text("")
+    with pytest.raises(RequestError, match=f"in use by another process: if there is none, delete {path}, else wait"):
+        with run_lock(tmp_path, lambda _: None):
+            pass
+    path.unlink()
+    with run_lock(tmp_path, lambda _: None):
+        pass
+
+
 def test_whoever_was_taken_for_dead_saves_nothing_any_more(tmp_path, no_locks):
     with run_lock(tmp_path, lambda _: None) as held:
         held.check()

@@ -134,7 +134,7 @@ def _lock_by_system(path: Path, stack: contextlib.ExitStack) -> bool:
     try:
         lock.acquire(blocking=False)
     except filelock.Timeout:
-        raise _in_use(path) from None
+        raise _in_use(path, _read(path)) from None
     if _read(path).startswith(_MARKER):  # by a process that was faster, and finds no locks here
         lock.release()
         return False
@@ -183,26 +183,27 @@ def _lock_by_marker(path: Path, held: Held, say: Callable[[str], None], stack: c
         thread_local=False,
     )
     seen: tuple[float, int] | None = None
+    seen_at = 0.0
     while True:
         before = _read(path)
         if before and not before.startswith(_MARKER) and _is_alive_or_elsewhere(before):
-            raise _in_use(path, f"if that has ended, delete {path}, else ")
+            raise _in_use(path, before, f"if that has ended, delete {path}, else ")
         try:
             with shielded_children():
                 lease.acquire(blocking=False)
             break
         except filelock.Timeout:
-            now = _touched(path)
-            if not before and now is not None:
-                raise _in_use(path, f"if there is none, delete {path}, else ") from None
+            now, text = _touched(path), _read(path)
             if seen is None and now is not None:
-                say(f"{path} is that of {_holder(before)}: waiting up to {LEASE_S:g} s for a sign of life of it")
-                seen = now
-            elif now is not None and now != seen:
-                raise _in_use(path) from None
+                say(f"{path} is that of {_holder(text)}: waiting up to {LEASE_S:g} s for a sign of life of it")
+                seen, seen_at = now, time.monotonic()
+            elif now is not None and now != seen and text:  # empty until its holder, who has just made it, writes into it
+                raise _in_use(path, text) from None
+            elif now is not None and not text and time.monotonic() - seen_at > LEASE_S:  # which `filelock` never takes over
+                raise _in_use(path, text, f"if there is none, delete {path}, else ") from None
             time.sleep(_POLL_S)
         except filelock.LeaseSettingsMismatch:
-            raise _in_use(path) from None
+            raise _in_use(path, _read(path)) from None
     stack.callback(lease.release)
     held.watch(path)
     if before:
@@ -257,8 +258,8 @@ def _is_alive_or_elsewhere(text: str) -> bool:
     return True
 
 
-def _in_use(path: Path, mend: str = "") -> RequestError:
-    return RequestError(f"{path.parent} is in use by {_holder(_read(path))}: {mend}{_MEND}")
+def _in_use(path: Path, text: str, mend: str = "") -> RequestError:
+    return RequestError(f"{path.parent} is in use by {_holder(text)}: {mend}{_MEND}")
 
 
 def _unwritable(folder: Path, error: OSError) -> RequestError:
