@@ -188,7 +188,7 @@ def test_no_room_for_the_replay_leaves_the_networks(tmp_path, monkeypatch, capsy
     assert Checkpoints(path / "checkpoints", read_only=True).iterations(LIGHT)[-1] >= 3
 
 
-def test_whatever_goes_wrong_a_save_is_attempted(tmp_path, monkeypatch):
+def test_whatever_goes_wrong_a_save_is_attempted(straight, tmp_path, monkeypatch):
     path = tmp_path / "run"
     trainer = make_fake_trainer(small_config(checkpoint_interval=100, full_checkpoint_interval=0), path)
 
@@ -202,7 +202,7 @@ def test_whatever_goes_wrong_a_save_is_attempted(tmp_path, monkeypatch):
     monkeypatch.undo()
     assert Checkpoints(path / "checkpoints", read_only=True).iterations(LIGHT) == [6]
     list(make_fake_trainer(small_config(full_checkpoint_interval=0), path, resume=True).run())
-    assert [row["iteration"] for row in rows_without_time(path)] == [2, 2, 4, 4, 6, 6, 8, 8]
+    assert rows_without_time(path) == rows_without_time(straight[0])
 
 
 ENDS = tuple(getattr(signal, f"SIG{name}") for name in ("HUP", "INT", "QUIT", "TERM", "USR1", "USR2", "ALRM", "XCPU"))
@@ -258,7 +258,7 @@ def test_what_is_ignored_or_handled_by_the_caller_stays_so(tmp_path, not_ignored
         assert report.iteration == 8 and heard == [signal.SIGUSR1] and "most recent call first" in stacks.read()
 
 
-def test_a_handler_of_the_callers_that_raises_leaves_the_networks_saved(tmp_path, not_ignored):
+def test_a_handler_of_the_callers_that_raises_leaves_the_networks_saved(straight, tmp_path, not_ignored):
     def leave(*_):
         raise SystemExit(7)
 
@@ -275,6 +275,10 @@ def test_a_handler_of_the_callers_that_raises_leaves_the_networks_saved(tmp_path
     with pytest.raises(SystemExit, match="7"):
         list(trainer.run())
     assert Checkpoints(path / "checkpoints", read_only=True).iterations(LIGHT) == [2]
+    list(make_fake_trainer(small_config(full_checkpoint_interval=0), path, resume=True).run())
+    assert [row["train/success"] for row in rows_without_time(path)] == [
+        row["train/success"] for row in rows_without_time(straight[0])
+    ]
 
 
 def test_signals_that_repeat_themselves_do_not_hurry_a_save(tmp_path, not_ignored):

@@ -94,6 +94,7 @@ class RunLoop:
         self._recent_at: int | None = None  # what this process has gone on from, if it was a recent state
         self._replay_lost = False  # by this process, which has gone on from a light checkpoint
         self._loop: LoopState | None = None
+        self._unread: list[tuple[int, Pending]] = []  # iterations whose metrics the device may still be working on
         self._recorded: dict[str, jax.Array] = {}
         self._started = self._mark = time.monotonic()
         self._begun, self._begun_at = 0, self._mark
@@ -180,7 +181,11 @@ class RunLoop:
         if processes.are_several():
             self._is_left_alone = True  # whatever went wrong, the others may have ended, and saving would wait for them
             return
-        self._saver.rescue(self._loop, self._done, self._progress_now())
+        with contextlib.suppress(Exception):
+            while self._unread:
+                self._read()
+        if not self._unread:
+            self._saver.rescue(self._loop, self._done, self._progress_now())
 
     # -- Before
 
@@ -292,15 +297,14 @@ class RunLoop:
         config = self._config
         if self._progress.evaluation_due:
             yield self._evaluate(self._report(self._done, {}), self._begin_evaluation())
-        waiting: tuple[int, Pending] | None = None  # an iteration that the device may still be working on
         while self._done < self._total:
             assert self._loop is not None
             self._loop, values = self._programs.train_iteration(self._loop)
             self._done += 1
             self._goodput.count()
-            before, waiting = waiting, (self._done, self._programs.pending(values))
-            if before is not None:
-                yield self._read(*before)
+            self._unread.append((self._done, self._programs.pending(values)))
+            if len(self._unread) > 1:
+                yield self._read()
             evaluation = self._is_due(config.eval_interval) or self._done == self._total
             light, full = self._is_due(config.checkpoint_interval), self._is_due(config.full_checkpoint_interval)
             recent = self._saver.is_recent_due(light)
@@ -308,7 +312,7 @@ class RunLoop:
                 continue
             # Before the metrics are read, so that the device does not wait for the host meanwhile.
             outcome = self._begin_evaluation() if evaluation and self._evaluates_ahead else None
-            report, waiting = self._read(*waiting), None
+            report = self._read()
             if interruption.reached_any():
                 self._save_and_end(evaluation, interruption)
             if recent:  # and once more after an evaluation, which takes so long that a process may be killed meanwhile
@@ -334,18 +338,20 @@ class RunLoop:
         env_steps, updates = self._program.steps_per_iteration, self._program.updates_per_iteration
         return Report(iteration, iteration * env_steps, iteration * updates, values)
 
-    def _read(self, iteration: int, pending: Pending) -> Report:
-        """Waits for an iteration's metrics and takes them in.
+    def _read(self) -> Report:
+        """Waits for the metrics of the first iteration that are not read yet, and takes them in.
 
         Raises:
             NonFiniteError: A guard has counted something.
         """
+        iteration, pending = self._unread[0]
         values = pending.read_per_seed(self._config.seeds)
         guards = [values.pop(name) for name in list(values) if name.startswith(GUARD)]
         bad = sorted({self._config.seed + seed for counts in guards for seed, count in enumerate(counts) if count != 0})
         if bad:
             self._stop_nonfinite(f"iteration {iteration}, seed {', '.join(map(str, bad))}", values)
         self._progress.since_evaluation.append(values)
+        del self._unread[0]
         self._console.advance(iteration, self._speed(iteration))
         return self._report(iteration, values)
 
