@@ -14,6 +14,7 @@ it, and nothing that carries another one is resumed, counted or deleted. Runs of
 import dataclasses
 import json
 import secrets
+import shlex
 import shutil
 from collections.abc import Callable, Collection
 from contextlib import AbstractContextManager
@@ -235,11 +236,11 @@ def _where_gone(path: Path, place: Path | None) -> str:
     lost = "what was trained since its last checkpoint is lost"
     if place is None:
         return f"{path} is gone: it was deleted, or moved away, while the run wrote there, and {lost}"
-    if place == path.resolve():
-        return (
-            f"{path / 'config.json'} is gone, or is that of another run: put it back, then go on with --run-dir {path} --resume"
-        )
-    return f"{path} was moved to {place} while the run wrote there, and {lost}: go on with --run-dir {place} --resume"
+    is_there = place == path.resolve()
+    resume = f"go on with --run-dir {shlex.quote(str(path if is_there else place))} --resume"
+    if is_there:
+        return f"{path / 'config.json'} is gone, or is that of another run: put it back, then {resume}"
+    return f"{path} was moved to {place} while the run wrote there, and {lost}: {resume}"
 
 
 def _record(config: Config, log: tuple[str, ...], run_id: str | None) -> dict[str, Any]:

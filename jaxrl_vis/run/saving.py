@@ -174,8 +174,6 @@ class Saver:
 
     def storage_error(self, error: StorageError) -> StorageError:
         """What a run that could not write ends with: what failed, what there is, and how to go on."""
-        if not self._folder.config.exists():
-            return StorageError(f"{error}; no run is there: if it was moved, go on where it is now, or else start it again")
         kept = self._checkpoints.newest()
         good = "there is no checkpoint yet" if kept is None else f"the last checkpoint is of iteration {kept}"
         cause = error.__cause__
