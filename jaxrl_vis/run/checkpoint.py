@@ -16,11 +16,7 @@ checkpoints/damaged/, and one of another run, which its manifest tells by the ru
 
 import contextlib
 import dataclasses
-import gc
-import logging
 import shutil
-import sys
-import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,10 +24,10 @@ from typing import TYPE_CHECKING, Any
 from jaxrl_vis import processes, streams
 from jaxrl_vis.errors import RequestError, StorageError
 from jaxrl_vis.files import read_json
-from jaxrl_vis.run import sums
+from jaxrl_vis.run import hush, sums
 from jaxrl_vis.run.arrays import as_saved, check_structure, describe, host_specs, is_intact, rebuild, to_host, to_save
+from jaxrl_vis.run.manifest import FILE, READABLE, SCHEMA, is_manifest, progress_in
 from jaxrl_vis.run.metrics import RUN_ID
-from jaxrl_vis.run.progress import Progress
 from jaxrl_vis.run.recent import ANY_RUN, Recent, Unusable
 from jaxrl_vis.types import LoopState, TrainState
 
@@ -40,31 +36,8 @@ if TYPE_CHECKING:  # orbax takes a fifth of the time that this package does to i
 
 LIGHT, FULL, RECENT = "light", "full", "recent"
 _PRECEDENCE = (FULL, RECENT, LIGHT)  # for a run that goes on, of those that are equally new
-SCHEMA = 2
-_READABLE = (1, 2)  # schema 1 called the progress "memo"
 _KEPT = 2
-_MANIFEST = "manifest/metadata"  # in a checkpoint's folder, where orbax writes it
 DAMAGED, FOREIGN = "damaged", "foreign"
-
-
-def _is_manifest(value: Any) -> bool:
-    """Whether a value is what `Checkpoints` saves as a manifest, as far as it is relied on."""
-    if not isinstance(value, dict) or not isinstance(value.get("items"), dict) or "schema" not in value:
-        return False
-    arrays = [each for item in value["items"].values() for each in (item.values() if isinstance(item, dict) else [None])]
-    are_arrays = all(
-        isinstance(each, list)
-        and len(each) in (3, 4)
-        and isinstance(each[0], list)
-        and isinstance(each[1], str)
-        and all(isinstance(number, int) for number in (*each[0], *each[2:]))
-        for each in arrays
-    )
-    try:
-        Progress.from_dict(value.get("progress", value.get("memo", {})))
-    except (ValueError, AttributeError, TypeError):
-        return False
-    return are_arrays
 
 
 class _Damaged(Exception):
@@ -93,45 +66,6 @@ class Restored:
 def rest_of(loop: LoopState) -> dict[str, Any]:
     """A loop state without its learner: what a full checkpoint holds more than a light one."""
     return {"replay": loop.replay, "key": loop.key, "iteration": loop.iteration}
-
-
-@contextlib.contextmanager
-def _hushed() -> Iterator[None]:
-    """Keeps orbax from printing pages about a checkpoint that we are about to describe in one line."""
-    absl, before = logging.getLogger("absl"), sys.unraisablehook
-    disabled = absl.disabled
-    absl.disabled, sys.unraisablehook = True, lambda _: None
-    try:
-        yield
-    finally:
-        gc.collect()  # abandoned coroutines complain when they are collected
-        absl.disabled, sys.unraisablehook = disabled, before
-
-
-def _silence_orbax() -> Callable[[], None]:
-    """Keeps orbax and tensorstore from printing, in threads of their own, what they also raise; returns what undoes that."""
-
-    def is_not_orbax(record: logging.LogRecord) -> bool:
-        return "orbax" not in record.pathname
-
-    def hook(unraisable: Any) -> None:
-        # From another thread it is tensorstore, which wants to tell an event loop that has failed, and is gone.
-        if threading.current_thread() is threading.main_thread():
-            before(unraisable)
-
-    def undo() -> None:
-        absl.removeFilter(is_not_orbax)
-        if sys.unraisablehook is hook:
-            sys.unraisablehook = before
-
-    absl, before = logging.getLogger("absl"), sys.unraisablehook
-    absl.addFilter(is_not_orbax)
-    sys.unraisablehook = hook
-    return undo
-
-
-def _stay_silent() -> None:
-    """In the place of what undoes `_silence_orbax`."""
 
 
 class Checkpoints:
@@ -179,7 +113,7 @@ class Checkpoints:
 
         if tier not in self._managers:
             if self._unsilence is None:
-                self._unsilence = _silence_orbax()
+                self._unsilence = hush.silence_orbax()
             options = ocp.CheckpointManagerOptions(
                 preservation_policy=None if self._read_only else LatestN(_KEPT),
                 cleanup_tmp_directories=not self._read_only,
@@ -206,7 +140,7 @@ class Checkpoints:
     def _is_ours(self, checkpoint: Path) -> bool:
         """Whether the manifest of a checkpoint says so; one that cannot be read is damaged, and may well be ours."""
         try:
-            manifest = read_json(checkpoint / _MANIFEST)
+            manifest = read_json(checkpoint / FILE)
         except RequestError:
             return True
         return self.run_id in (ANY_RUN, manifest.get(RUN_ID))
@@ -268,7 +202,7 @@ class Checkpoints:
             # A manager whose writing failed in the background reports it again and again: start with a new one. Its threads go
             # on failing for a while, so from here on the process stays silent about them.
             self._managers.pop(tier, None)
-            self._unsilence = _stay_silent
+            self._unsilence = hush.stay_silent
             text = " ".join(str(error).split())
             shown = "no space left on the device" if "No space left" in text else f"{type(error).__name__}: {text[:160]}"
             raise StorageError(f"cannot write a {tier} checkpoint into {self._folder} ({shown})") from error
@@ -416,9 +350,9 @@ class Checkpoints:
         import orbax.checkpoint as ocp
 
         manifest = self._read(tier, iteration, {"manifest": ocp.args.JsonRestore()})["manifest"]
-        if not _is_manifest(manifest):
+        if not is_manifest(manifest):
             raise _Damaged("its manifest is incomplete")
-        if manifest["schema"] not in _READABLE:
+        if manifest["schema"] not in READABLE:
             where = self._folder / tier / str(iteration)
             raise RequestError(f"{where} is of schema {manifest['schema']}, not {SCHEMA}: use the version that wrote it")
         return manifest
@@ -443,17 +377,17 @@ class Checkpoints:
                     raise _Damaged(f"wrong checksum of {leaf_name}")
             trees[name] = rebuild(tree, read[name])
         loop = LoopState(train=trees["train"], **trees["rest"]) if with_rest else None
-        return Restored(tier, iteration, trees["train"], loop, manifest.get("progress", manifest.get("memo", {})))
+        return Restored(tier, iteration, trees["train"], loop, progress_in(manifest))
 
     def _read(self, tier: str, iteration: int, arguments: dict[str, Any]) -> Any:
         import orbax.checkpoint as ocp
 
         try:
-            manager = self._manager(tier)  # first, for `_hushed` puts back the hooks that it finds
-            with _hushed():
+            manager = self._manager(tier)  # first, for `hushed` puts back the hooks that it finds
+            with hush.hushed():
                 return manager.restore(iteration, args=ocp.args.Composite(**arguments))
         # orbax and tensorstore report damage as whatever exception they run into, plain Exception included.
         except Exception as error:
-            self._unsilence = _stay_silent  # as after a failed write: threads of this reading may complain later
+            self._unsilence = hush.stay_silent  # as after a failed write: threads of this reading may complain later
             text = " ".join(str(error).split())[:80]
             raise _Damaged(f"{type(error).__name__}: {text}") from None

@@ -1,13 +1,43 @@
-"""The files that an earlier part of a run has left: whether it was finished, and whether they belong together."""
+"""What an earlier part of a run has left: whether it was finished, whether its files belong together, and how to go on."""
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from pathlib import Path
+
+import jax.numpy as jnp
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.run import metrics
-from jaxrl_vis.run.checkpoint import DAMAGED, Checkpoints, Restored
+from jaxrl_vis.run.checkpoint import DAMAGED, FULL, LIGHT, Checkpoints, Restored
 from jaxrl_vis.run.folder import RunFolder
+from jaxrl_vis.run.programs import Programs
 from jaxrl_vis.run.progress import Progress
+from jaxrl_vis.types import LoopState
+
+
+def is_finished(
+    folder: RunFolder, checkpoints: Checkpoints, programs: Programs, total: int, say: Callable[[str], None]
+) -> bool:
+    """Whether a run was trained for ``total`` iterations: a good checkpoint, a row for it, and what it draws."""
+    if max([0, *checkpoints.iterations(LIGHT), *checkpoints.iterations(FULL)]) < total:
+        return False
+    restored = checkpoints.restore_train(programs.shapes)
+    if restored is None or restored.iteration < total:
+        say("the last checkpoint is not usable, so the run is not finished: going on from the last good one")
+        return False
+    files = [folder.curve, folder.video] if programs.shows_images else [folder.curve]
+    return is_evaluated(folder, programs.seeds, restored) and all(file.exists() for file in files)
+
+
+def without_replay(programs: Programs, restored: Restored) -> LoopState:
+    """The state that a run goes on with from a light checkpoint, which has no replay.
+
+    Networks, optimisers, statistics and the iteration go on (and with it the random draws); the replay starts empty, and knows
+    that it is. Until it has filled up again, updates see fewer and newer episodes than they would have: a sound run, but not
+    the one that was interrupted.
+    """
+    fresh, layout = programs.init(programs.run_keys), programs.layout
+    iteration = layout.put(jnp.asarray(restored.iteration, fresh.iteration.dtype), layout.everywhere)
+    return fresh.replace(train=restored.train, iteration=iteration)
 
 
 def is_evaluated(folder: RunFolder, seeds: Collection[int], restored: Restored) -> bool:

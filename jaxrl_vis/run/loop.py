@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxrl_vis import processes
@@ -36,6 +35,7 @@ from jaxrl_vis.run.lock import FolderGoneError, Held
 from jaxrl_vis.run.loggers import Loggers
 from jaxrl_vis.run.memory import check_compiled, check_memory, fit_together
 from jaxrl_vis.run.metrics import PerSeed
+from jaxrl_vis.run.pace import Pace
 from jaxrl_vis.run.pending import Pending
 from jaxrl_vis.run.programs import Programs
 from jaxrl_vis.run.progress import Progress
@@ -96,9 +96,8 @@ class RunLoop:
         self._loop: LoopState | None = None
         self._unread: list[tuple[int, Pending]] = []  # iterations whose metrics the device may still be working on
         self._recorded: dict[str, jax.Array] = {}
-        self._started = self._mark = time.monotonic()
-        self._begun, self._begun_at = 0, self._mark
-        self._marked_iteration, self._compile_s = 0, 0.0
+        self._started, self._compile_s = time.monotonic(), 0.0
+        self._pace = Pace(self._program.steps_per_iteration * self._config.seeds)
         self._is_left_alone = False
         self._evaluated_there: set[int] = set()  # seeds that have a row of the iteration that the run goes on from
         self._evaluates_ahead = False  # while the iteration before is still learned from
@@ -119,7 +118,7 @@ class RunLoop:
         if goes_on:
             self._checkpoints.run_id = read_run_id(self._folder.path)
         with self._folder.lock(self._say) if self._writes else contextlib.nullcontext() as self._held, self._console:
-            if goes_on and self._is_finished():
+            if goes_on and earlier.is_finished(self._folder, self._checkpoints, self._programs, self._total, self._say):
                 if self._writes and (said := earlier.cut_back(self._folder, self._checkpoints, sys.maxsize, keeps_later=False)):
                     self._say(said)
                 self._say(
@@ -189,17 +188,6 @@ class RunLoop:
 
     # -- Before
 
-    def _is_finished(self) -> bool:
-        """Whether an earlier part has trained to the end: a good checkpoint, a row for it, and what it draws."""
-        if max([0, *self._checkpoints.iterations(LIGHT), *self._checkpoints.iterations(FULL)]) < self._total:
-            return False
-        restored = self._checkpoints.restore_train(self._programs.shapes)
-        if restored is None or restored.iteration < self._total:
-            self._say("the last checkpoint is not usable, so the run is not finished: going on from the last good one")
-            return False
-        files = [self._folder.curve, self._folder.video] if self._programs.shows_images else [self._folder.curve]
-        return earlier.is_evaluated(self._folder, self._programs.seeds, restored) and all(file.exists() for file in files)
-
     def _prepare(self, goes_on: bool, memory: str) -> dict[str, Any]:
         """Restores and compiles; the compiled programs by name. Nothing is written."""
         programs, steps = self._programs, self._program.steps_per_iteration
@@ -244,8 +232,7 @@ class RunLoop:
         if self._loop is None:
             self._loop = self._programs.init(self._programs.run_keys)
         self._console.start(self._total, self._done)
-        self._set_mark()
-        self._begun, self._begun_at = self._done, self._mark
+        self._pace.begin(self._done)
 
     def _begin_log(self, goes_on: bool, damaged: list[Path], foreign: list[Path]) -> None:
         """Cuts the metrics back to the iteration that the run goes on from, and opens the loggers.
@@ -278,12 +265,7 @@ class RunLoop:
             self._recent_at = restored.iteration if restored.tier == RECENT else None
             self._say(f"resumed at iteration {self._done} of {self._total}, exactly")
             return
-        # A light checkpoint has no replay. Networks, optimisers, statistics and the iteration go on (and with it the random
-        # draws); the replay starts empty, and knows that it is. Until it has filled up again, updates see fewer and newer
-        # episodes than they would have: a sound run, but not the one that was interrupted.
-        fresh = self._programs.init(self._programs.run_keys)
-        iteration = self._programs.layout.put(jnp.asarray(self._done, fresh.iteration.dtype), self._programs.layout.everywhere)
-        self._loop = fresh.replace(train=restored.train, iteration=iteration)
+        self._loop = earlier.without_replay(self._programs, restored)
         if self._done < self._total:
             self._progress.replay_lost_at, self._replay_lost = self._done, True
         self._say(
@@ -352,7 +334,7 @@ class RunLoop:
             self._stop_nonfinite(f"iteration {iteration}, seed {', '.join(map(str, bad))}", values)
         self._progress.since_evaluation.append(values)
         del self._unread[0]
-        self._console.advance(iteration, self._speed(iteration))
+        self._console.advance(iteration, self._pace.speed(iteration))
         return self._report(iteration, values)
 
     def _begin_evaluation(self) -> Pending:
@@ -364,7 +346,7 @@ class RunLoop:
 
     def _evaluate(self, report: Report, outcome: Pending) -> Report:
         """Reads what an evaluation has found, writes a line per seed, and adds the figures to the report."""
-        progress, speed = self._progress, self._speed(self._done)
+        progress, speed = self._progress, self._pace.speed(self._done)
         values = outcome.read_per_seed(self._config.seeds)
         if not all(np.isfinite(row).all() for row in values.values()):
             self._stop_nonfinite(f"the evaluation after iteration {self._done}", values)
@@ -382,7 +364,7 @@ class RunLoop:
         if self._writes:
             self._check_ours()
             rows = metrics.make_rows(self._programs.seeds, counts, values | means | rounded, self._checkpoints.run_id)
-            if self._done == self._begun:  # an evaluation that was due: a kill or a disk may have left a part of its rows
+            if self._done == self._pace.begun:  # an evaluation that was due: a kill or a disk may have left a part of its rows
                 rows = [row for row in rows if row["seed"] not in self._evaluated_there]
             with self._saver.writing():
                 metrics.append_rows(self._folder.metrics, rows)
@@ -393,7 +375,7 @@ class RunLoop:
         if self._is_due(self._config.eval_interval):
             progress.since_evaluation = []
         self._show(values, speed)
-        self._set_mark()
+        self._pace.mark(self._done)
         return dataclasses.replace(report, metrics=report.metrics | values)
 
     def _show(self, values: PerSeed, speed: float) -> None:
@@ -402,11 +384,10 @@ class RunLoop:
         env_steps = self._done * self._program.steps_per_iteration
         words = [f"iteration {self._done}/{self._total}", f"{env_steps:,} steps", f"success {show_shares(success)}"]
         words.append(f"distance {np.median(distance):.3f} {unit}")
-        if done := self._done - self._begun:  # none yet where an evaluation is made up for: nobody knows the speed
+        if self._done > self._pace.begun:  # none yet where an evaluation is made up for: nobody knows the speed
             words.append(f"{speed:,.0f} steps/s")
             if self._done < self._total:
-                left = (self._total - self._done) * (time.monotonic() - self._begun_at) / done
-                words.append(f"about {show_seconds(left)} left")
+                words.append(f"about {show_seconds(self._pace.seconds_left(self._done, self._total))} left")
         self._say("  ".join(words))
 
     def _warn_if_filtered(self, means: PerSeed) -> None:
@@ -418,14 +399,6 @@ class RunLoop:
                 f"{_FILTERED_EVALUATIONS} evaluations: Q lies above q0 almost everywhere and cannot come down; "
                 "check reward_positive, reward_negative and filter_threshold"
             )
-
-    def _speed(self, iteration: int) -> float:
-        """Environment steps of all seeds per second since the last evaluation; updates included, evaluations not."""
-        steps = (iteration - self._marked_iteration) * self._program.steps_per_iteration * self._config.seeds
-        return max(0, steps) / max(1e-9, time.monotonic() - self._mark)
-
-    def _set_mark(self) -> None:
-        self._mark, self._marked_iteration = time.monotonic(), self._done
 
     # -- Saving
 
