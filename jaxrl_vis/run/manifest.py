@@ -1,5 +1,6 @@
 """The manifest of a checkpoint: what it says of its arrays, and what the host has to remember."""
 
+from collections.abc import Mapping
 from typing import Any
 
 from jaxrl_vis.run.progress import Progress
@@ -10,7 +11,7 @@ FILE = "manifest/metadata"
 """In a checkpoint's folder, where orbax writes it."""
 
 
-def progress_in(manifest: dict[str, Any]) -> Any:
+def progress_in(manifest: Mapping[str, Any]) -> Any:
     """What the host has to remember, as `Progress.from_dict` takes it; schema 1 called it "memo"."""
     return manifest.get("progress", manifest.get("memo", {}))
 

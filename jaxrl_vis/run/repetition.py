@@ -11,6 +11,7 @@ from jaxrl_vis.run.arrays import is_intact, to_host
 from jaxrl_vis.run.checkpoint import FULL, LIGHT, rest_of
 from jaxrl_vis.run.inspection import Expected, Findings, listed
 from jaxrl_vis.run.loop import GUARD
+from jaxrl_vis.run.manifest import progress_in
 from jaxrl_vis.run.metrics import RUN_ID, PerSeed
 from jaxrl_vis.run.programs import Programs
 from jaxrl_vis.run.progress import Progress
@@ -197,7 +198,7 @@ class Repeater:
 
 def progress_of(manifest: Mapping[str, Any]) -> Progress:
     """What the host remembered with a checkpoint."""
-    return Progress.from_dict(manifest.get("progress", manifest.get("memo", {})))
+    return Progress.from_dict(progress_in(manifest))
 
 
 def has_progress(manifest: Mapping[str, Any], seeds: int) -> bool:
