@@ -157,6 +157,18 @@ def test_what_is_transparent_lets_what_is_behind_through():
     assert np.abs(drawn(body + ABOVE, assets=mesh).rgb[8, 8] - frame.rgb[8, 8].astype(int)).max() <= 2
 
 
+def test_common_edges_and_corners_of_clear_triangles_are_covered_once():
+    """Pixels look at lines of the grid and at diagonals of its cells; hills and hollows are where these cross."""
+    heights = " ".join(str((3 * row + 5 * column) % 7 / 7) for row in range(5) for column in range(5))
+    assets = f'<hfield name="h" nrow="5" ncol="5" size=".5 .5 .01 .1" elevation="{heights}"/>'
+    body = '<geom type="plane" size="2 2 .1" pos="0 0 -.2" rgba="0 0 1 1"/><geom type="hfield" hfield="h" rgba="1 0 0 .25"/>'
+    for turn in ("0 0 0", "0 0 90", "0 0 180"):
+        camera = f'<camera name="above" pos="0 0 2" euler="{turn}" projection="orthographic" fovy="1.0625"/>'
+        frame = drawn(body + camera, assets=assets)
+        inner = frame.rgb[1:16, 1:16]  # 1/16 m apart: each fourth one on a line of the grid
+        assert np.all(frame.segmentation[1:16, 1:16] == 1) and np.ptp(inner.reshape(-1, 3).astype(int), axis=0).max() <= 1
+
+
 def test_planes_are_half_transparent_from_behind():
     body = '<geom type="plane" size="1 1 .1" rgba="1 0 0 1"/><geom type="sphere" size=".2" pos="0 0 .5" rgba="0 0 1 1"/>'
     body += '<camera name="below" pos="0 0 -2" xyaxes="1 0 0 0 -1 0"/><camera name="above" pos="0 0 2"/>'
