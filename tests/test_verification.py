@@ -14,13 +14,17 @@ from fake_program import FakeProgram, interrupted_at, small_config
 from jaxrl_vis import cli
 from jaxrl_vis.config import Config
 from jaxrl_vis.run import verification
-from jaxrl_vis.run.folder import read_config, read_record
+from jaxrl_vis.run.folder import read_config, read_record, read_run_id
 from jaxrl_vis.run.inspection import Expected, Findings, check_record, missing_rows, read_file
+from jaxrl_vis.run.metrics import RUN_ID
 from jaxrl_vis.run.sums import compare_sums, write_sums
 from jaxrl_vis.run.trainer import Trainer
 from jaxrl_vis.run.verification import Verification, verify
 
-EXPECTED = Expected(seeds=[0, 1], updates=3, env_steps=10, eval_interval=2, run_id=None)
+
+def expected_in(path: Path) -> Expected:
+    """What must hold for the rows of the run of eight iterations."""
+    return Expected(seeds=[0, 1], updates=3, env_steps=10, eval_interval=2, run_id=read_run_id(path))
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +134,7 @@ def test_a_checkpoint_of_another_state_is_found(copy, verified, trainer_of, tmp_
     """One that is whole, with checksums that fit, but that this run does not arrive at."""
     other = tmp_path / "other"
     list(trainer_of(small_config(seed=5, env_steps=60), other).run())
-    whose = {name: value for name, value in read_record(copy).items() if name == verification.RUN_ID}
+    whose = {name: value for name, value in read_record(copy).items() if name == RUN_ID}
     for tier in ("light", "full"):
         shutil.rmtree(copy / "checkpoints" / tier / "6")
         shutil.copytree(other / "checkpoints" / tier / "6", copy / "checkpoints" / tier / "6")
@@ -158,9 +162,9 @@ def test_a_checkpoint_of_another_state_is_found(copy, verified, trainer_of, tmp_
 )
 def test_rows_that_do_not_fit_are_found(straight, tmp_path, change, problem):
     write_rows(tmp_path, change(rows_in(straight[0])))
-    findings = Findings()
-    rows = read_file(tmp_path / "metrics.jsonl", EXPECTED, False, findings)
-    missing = missing_rows(rows, EXPECTED, reached=8, total=8, without=(), is_written=False)
+    findings, expected = Findings(), expected_in(straight[0])
+    rows = read_file(tmp_path / "metrics.jsonl", expected, False, findings)
+    missing = missing_rows(rows, expected, reached=8, total=8, without=(), is_written=False)
     assert problem in "; ".join(findings.problems + missing)
 
 
@@ -170,18 +174,18 @@ def test_rows_that_are_none_are_found(straight, tmp_path):
     lines[6] = lines[6][:9] + b"\xff" + lines[6][9:]
     file.write_bytes(b"".join(lines) + b'{"seed": 0, "itera')
     findings = Findings()
-    assert len(read_file(file, EXPECTED, False, findings)) == 7
+    assert len(read_file(file, expected_in(straight[0]), False, findings)) == 7
     assert findings.problems == ["metrics.jsonl: the last line is cut off", "metrics.jsonl, line 7: is damaged"]
 
 
 def test_rows_and_checkpoints_of_another_run_are_found(copy, verified):
     record = json.loads((copy / "config.json").read_text())
-    (copy / "config.json").write_text(json.dumps(record | {verification.RUN_ID: "mine"}))
-    rows = [row | {verification.RUN_ID: "mine"} for row in rows_in(copy)]
-    write_rows(copy, [*rows[:-1], rows[-1] | {verification.RUN_ID: "other"}])
+    (copy / "config.json").write_text(json.dumps(record | {RUN_ID: "mine"}))
+    rows = [row | {RUN_ID: "mine"} for row in rows_in(copy)]
+    write_rows(copy, [*rows[:-1], rows[-1] | {RUN_ID: "other"}])
     for file in (copy / "checkpoints").glob("*/*/manifest/metadata"):
         name = "other" if file.parts[-4:-2] == ("light", "6") else "mine"
-        file.write_text(json.dumps(json.loads(file.read_text()) | {verification.RUN_ID: name}))
+        file.write_text(json.dumps(json.loads(file.read_text()) | {RUN_ID: name}))
     for sums in (copy / "checkpoints").glob("*/*/SHA256SUMS"):
         sums.unlink()
     problems = "; ".join(verified(copy).problems)
@@ -248,7 +252,7 @@ def test_an_exactly_resumed_run_is_equal_whatever_its_interval_was(verified, tra
 
 def test_the_command_says_what_it_found(copy, verified, monkeypatch, capsys):
     monkeypatch.setattr(
-        verification, "verify_run", lambda path, iterations, keep_programs, say: verified(path, iterations, say)
+        verification, "verify_run", lambda path, iterations, keep_programs, say, trust: verified(path, iterations, say)
     )
     assert cli.main(["verify", str(copy)]) == 0
     out = capsys.readouterr().out
