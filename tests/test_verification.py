@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import random
 import shutil
 from collections.abc import Callable
@@ -13,7 +14,8 @@ from fake_program import FakeProgram, interrupted_at, small_config
 
 from jaxrl_vis import cli
 from jaxrl_vis.config import Config
-from jaxrl_vis.run import verification
+from jaxrl_vis.run import recent, verification
+from jaxrl_vis.run.checkpoint import Checkpoints
 from jaxrl_vis.run.folder import read_config, read_record, read_run_id
 from jaxrl_vis.run.inspection import Expected, Findings, check_record, missing_rows, read_file
 from jaxrl_vis.run.metrics import RUN_ID
@@ -214,6 +216,59 @@ def test_what_is_missing_contradicts_or_is_foreign_is_said(copy, verified):
     assert any(line.startswith("jax 0.1 then, ") for line in report.elsewhere)
     shutil.rmtree(copy / "checkpoints")
     assert "checkpoints are missing: the run has come to iteration 8" in "; ".join(verified(copy).problems)
+
+
+@pytest.fixture
+def killed(trainer_of, tmp_path, monkeypatch) -> Path:
+    """A run that kept a recent state after each iteration, and nothing else, and was killed after the sixth."""
+    monkeypatch.setattr(recent, "_SHARE", math.inf)
+    path = tmp_path / "killed"
+    reports = trainer_of(small_config(checkpoint_interval=0, full_checkpoint_interval=0), path).run()
+    for report in reports:
+        if report.iteration == 6:
+            break
+    saved = shutil.copytree(path, tmp_path / "then")
+    reports.close()
+    (saved / "run.lock").unlink()
+    return saved
+
+
+def test_recent_states_of_a_killed_run_are_compared_too(killed, verified):
+    assert {file.name for file in (killed / "checkpoints").iterdir()} == {"recent"}
+    before = contents(killed)
+    report = verified(killed, iterations=6)
+    assert report.is_equal and report.rows == 6 and report.checkpoints == ["recent/5", "recent/6"]
+    assert not any("no files of a run" in line or "missing" in line for line in report.notes + report.unverified)
+    assert contents(killed) == before
+    rows = rows_in(killed)
+    assert all("time/goodput" in row for row in rows)
+    write_rows(killed, [row | {"time/goodput": None} for row in rows])  # where it is not known
+    assert verified(killed).is_equal
+    write_rows(killed, rows[:4])
+    assert "rows of iteration 6 are missing" in "; ".join(verified(killed).problems)
+
+
+def test_what_is_wrong_with_recent_states_is_found(killed, verified, trainer_of):
+    folder = killed / "checkpoints" / "recent"
+    state = folder / "6.state"
+    data = bytearray(state.read_bytes())
+    data[-1] ^= 1
+    state.write_bytes(data)
+    (folder / "7.state.tmp").touch()
+    (folder / "7.old").touch()
+    (killed / "processes.jsonl").write_text("{")
+    report = verified(killed, iterations=6)
+    # A power cut may leave that behind.
+    assert report.is_equal and any("recent/6 cannot be used (wrong checksum" in line for line in report.notes)
+    assert "no files of a run: checkpoints/recent/7.old" in report.notes
+    assert any("goodput of the run is not known" in line for line in report.notes)
+    checkpoints = Checkpoints(killed / "checkpoints", run_id=read_run_id(killed))
+    loop, progress = checkpoints.recent.restore(5, trainer_of(small_config()).programs.shapes)
+    loop = loop.replace(train=loop.train.replace(updates=loop.train.updates + 1))
+    for run_id, problem in (("other", "recent/5 is another run's (other)"), (read_run_id(killed), "recent/5 is not what")):
+        checkpoints.run_id = run_id
+        checkpoints.recent.save(5, loop, 2, progress)
+        assert problem in "; ".join(verified(killed, iterations=6).problems)
 
 
 def test_a_run_that_is_still_written_is_verified_as_far_as_it_is_there(copy, verified):
