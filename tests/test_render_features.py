@@ -157,6 +157,19 @@ def test_what_is_transparent_lets_what_is_behind_through():
     assert np.abs(drawn(body + ABOVE, assets=mesh).rgb[8, 8] - frame.rgb[8, 8].astype(int)).max() <= 2
 
 
+@pytest.mark.parametrize("turn", ["0 0 0", "180 0 0", "90 0 0", "-90 0 0", "0 90 0", "0 -90 0"])
+def test_common_edges_and_corners_of_clear_triangles_are_covered_once(turn):
+    """An octahedron, from each side: middles of pixels lie on its nearest corner, and on all edges that end there."""
+    corners = ".3 0 0 -.3 0 0 0 .35 0 0 -.35 0 0 0 .4 0 0 -.4"
+    body = '<geom type="plane" size="2 2 .1" pos="0 0 -.6" rgba="0 0 1 1"/>'
+    body += f'<geom type="mesh" mesh="m" rgba="1 0 0 .25" euler="{turn}"/>'
+    body += '<camera name="above" pos="0 0 2" projection="orthographic" fovy="1"/>'
+    frame = drawn(body, assets=f'<mesh name="m" vertex="{corners}"/>')
+    seen = frame.segmentation == 1
+    assert seen[8, 4:13].all() and seen[4:13, 8].all()
+    assert np.ptp(frame.rgb[seen].astype(int), axis=0).max() <= 1
+
+
 def test_planes_are_half_transparent_from_behind():
     body = '<geom type="plane" size="1 1 .1" rgba="1 0 0 1"/><geom type="sphere" size=".2" pos="0 0 .5" rgba="0 0 1 1"/>'
     body += '<camera name="below" pos="0 0 -2" xyaxes="1 0 0 0 -1 0"/><camera name="above" pos="0 0 2"/>'

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import random
 import shutil
 from collections.abc import Callable
@@ -13,14 +14,19 @@ from fake_program import FakeProgram, interrupted_at, small_config
 
 from jaxrl_vis import cli
 from jaxrl_vis.config import Config
-from jaxrl_vis.run import verification
-from jaxrl_vis.run.folder import read_config, read_record
+from jaxrl_vis.run import recent, verification
+from jaxrl_vis.run.checkpoint import Checkpoints
+from jaxrl_vis.run.folder import read_config, read_record, read_run_id
 from jaxrl_vis.run.inspection import Expected, Findings, check_record, missing_rows, read_file
+from jaxrl_vis.run.metrics import RUN_ID
 from jaxrl_vis.run.sums import compare_sums, write_sums
 from jaxrl_vis.run.trainer import Trainer
 from jaxrl_vis.run.verification import Verification, verify
 
-EXPECTED = Expected(seeds=[0, 1], updates=3, env_steps=10, eval_interval=2, run_id=None)
+
+def expected_in(path: Path) -> Expected:
+    """What must hold for the rows of the run of eight iterations."""
+    return Expected(seeds=[0, 1], updates=3, env_steps=10, eval_interval=2, run_id=read_run_id(path))
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +136,7 @@ def test_a_checkpoint_of_another_state_is_found(copy, verified, trainer_of, tmp_
     """One that is whole, with checksums that fit, but that this run does not arrive at."""
     other = tmp_path / "other"
     list(trainer_of(small_config(seed=5, env_steps=60), other).run())
-    whose = {name: value for name, value in read_record(copy).items() if name == verification.RUN_ID}
+    whose = {name: value for name, value in read_record(copy).items() if name == RUN_ID}
     for tier in ("light", "full"):
         shutil.rmtree(copy / "checkpoints" / tier / "6")
         shutil.copytree(other / "checkpoints" / tier / "6", copy / "checkpoints" / tier / "6")
@@ -158,9 +164,9 @@ def test_a_checkpoint_of_another_state_is_found(copy, verified, trainer_of, tmp_
 )
 def test_rows_that_do_not_fit_are_found(straight, tmp_path, change, problem):
     write_rows(tmp_path, change(rows_in(straight[0])))
-    findings = Findings()
-    rows = read_file(tmp_path / "metrics.jsonl", EXPECTED, False, findings)
-    missing = missing_rows(rows, EXPECTED, reached=8, total=8, without=(), is_written=False)
+    findings, expected = Findings(), expected_in(straight[0])
+    rows = read_file(tmp_path / "metrics.jsonl", expected, False, findings)
+    missing = missing_rows(rows, expected, reached=8, total=8, without=(), is_written=False)
     assert problem in "; ".join(findings.problems + missing)
 
 
@@ -170,18 +176,18 @@ def test_rows_that_are_none_are_found(straight, tmp_path):
     lines[6] = lines[6][:9] + b"\xff" + lines[6][9:]
     file.write_bytes(b"".join(lines) + b'{"seed": 0, "itera')
     findings = Findings()
-    assert len(read_file(file, EXPECTED, False, findings)) == 7
+    assert len(read_file(file, expected_in(straight[0]), False, findings)) == 7
     assert findings.problems == ["metrics.jsonl: the last line is cut off", "metrics.jsonl, line 7: is damaged"]
 
 
 def test_rows_and_checkpoints_of_another_run_are_found(copy, verified):
     record = json.loads((copy / "config.json").read_text())
-    (copy / "config.json").write_text(json.dumps(record | {verification.RUN_ID: "mine"}))
-    rows = [row | {verification.RUN_ID: "mine"} for row in rows_in(copy)]
-    write_rows(copy, [*rows[:-1], rows[-1] | {verification.RUN_ID: "other"}])
+    (copy / "config.json").write_text(json.dumps(record | {RUN_ID: "mine"}))
+    rows = [row | {RUN_ID: "mine"} for row in rows_in(copy)]
+    write_rows(copy, [*rows[:-1], rows[-1] | {RUN_ID: "other"}])
     for file in (copy / "checkpoints").glob("*/*/manifest/metadata"):
         name = "other" if file.parts[-4:-2] == ("light", "6") else "mine"
-        file.write_text(json.dumps(json.loads(file.read_text()) | {verification.RUN_ID: name}))
+        file.write_text(json.dumps(json.loads(file.read_text()) | {RUN_ID: name}))
     for sums in (copy / "checkpoints").glob("*/*/SHA256SUMS"):
         sums.unlink()
     problems = "; ".join(verified(copy).problems)
@@ -210,6 +216,59 @@ def test_what_is_missing_contradicts_or_is_foreign_is_said(copy, verified):
     assert any(line.startswith("jax 0.1 then, ") for line in report.elsewhere)
     shutil.rmtree(copy / "checkpoints")
     assert "checkpoints are missing: the run has come to iteration 8" in "; ".join(verified(copy).problems)
+
+
+@pytest.fixture
+def killed(trainer_of, tmp_path, monkeypatch) -> Path:
+    """A run that kept a recent state after each iteration, and nothing else, and was killed after the sixth."""
+    monkeypatch.setattr(recent, "_SHARE", math.inf)
+    path = tmp_path / "killed"
+    reports = trainer_of(small_config(checkpoint_interval=0, full_checkpoint_interval=0), path).run()
+    for report in reports:
+        if report.iteration == 6:
+            break
+    saved = shutil.copytree(path, tmp_path / "then")
+    reports.close()
+    (saved / "run.lock").unlink()
+    return saved
+
+
+def test_recent_states_of_a_killed_run_are_compared_too(killed, verified):
+    assert {file.name for file in (killed / "checkpoints").iterdir()} == {"recent"}
+    before = contents(killed)
+    report = verified(killed, iterations=6)
+    assert report.is_equal and report.rows == 6 and report.checkpoints == ["recent/5", "recent/6"]
+    assert not any("no files of a run" in line or "missing" in line for line in report.notes + report.unverified)
+    assert contents(killed) == before
+    rows = rows_in(killed)
+    assert all("time/goodput" in row for row in rows)
+    write_rows(killed, [row | {"time/goodput": None} for row in rows])  # where it is not known
+    assert verified(killed).is_equal
+    write_rows(killed, rows[:4])
+    assert "rows of iteration 6 are missing" in "; ".join(verified(killed).problems)
+
+
+def test_what_is_wrong_with_recent_states_is_found(killed, verified, trainer_of):
+    folder = killed / "checkpoints" / "recent"
+    state = folder / "6.state"
+    data = bytearray(state.read_bytes())
+    data[-1] ^= 1
+    state.write_bytes(data)
+    (folder / "7.state.tmp").touch()
+    (folder / "7.old").touch()
+    (killed / "processes.jsonl").write_text("{")
+    report = verified(killed, iterations=6)
+    # A power cut may leave that behind.
+    assert report.is_equal and any("recent/6 cannot be used (wrong checksum" in line for line in report.notes)
+    assert "no files of a run: checkpoints/recent/7.old" in report.notes
+    assert any("goodput of the run is not known" in line for line in report.notes)
+    checkpoints = Checkpoints(killed / "checkpoints", run_id=read_run_id(killed))
+    loop, progress = checkpoints.recent.restore(5, trainer_of(small_config()).programs.shapes)
+    loop = loop.replace(train=loop.train.replace(updates=loop.train.updates + 1))
+    for run_id, problem in (("other", "recent/5 is another run's (other)"), (read_run_id(killed), "recent/5 is not what")):
+        checkpoints.run_id = run_id
+        checkpoints.recent.save(5, loop, 2, progress)
+        assert problem in "; ".join(verified(killed, iterations=6).problems)
 
 
 def test_a_run_that_is_still_written_is_verified_as_far_as_it_is_there(copy, verified):
@@ -248,7 +307,7 @@ def test_an_exactly_resumed_run_is_equal_whatever_its_interval_was(verified, tra
 
 def test_the_command_says_what_it_found(copy, verified, monkeypatch, capsys):
     monkeypatch.setattr(
-        verification, "verify_run", lambda path, iterations, keep_programs, say: verified(path, iterations, say)
+        verification, "verify_run", lambda path, iterations, keep_programs, say, trust: verified(path, iterations, say)
     )
     assert cli.main(["verify", str(copy)]) == 0
     out = capsys.readouterr().out

@@ -173,15 +173,11 @@ def _side_in(stem: str, stems: set[str]) -> re.Match[str] | None:
 
 def _folder_of(folder: Path, names: tuple[str, ...]) -> Path | None:
     """The folder in a folder that has one of some names, whatever their case; the first name goes before the others."""
-    found = (
-        [path for path in sorted(folder.iterdir()) if path.name.lower() in names and path.is_dir()] if folder.is_dir() else []
-    )
+    found = [path for path in sorted(folder.iterdir()) if path.name.lower() in names and path.is_dir()]
     return min(found, key=lambda path: names.index(path.name.lower()), default=None)
 
 
 def _images(folder: Path, suffixes: set[str] = _IMAGES) -> list[Path]:
-    if not folder.is_dir():
-        return []
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in suffixes and path.is_file())
     return [path for path in paths if not path.name.startswith(".")]  # beside each image, macOS leaves ._ and its name
 

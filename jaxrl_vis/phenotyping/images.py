@@ -71,9 +71,7 @@ def read_image(path: Path) -> np.ndarray:
         raise _unreadable(path, f"holds {image.dtype} pixels: save it with 8 or 16 bits")
     if image.ndim == 2:
         return image
-    if image.shape[2] < 3:
-        raise _unreadable(path, f"has {image.shape[2]} channels: save it with 1 or 3")
-    return cv2.cvtColor(image[..., :3], cv2.COLOR_BGR2RGB)
+    return cv2.cvtColor(image[..., :3], cv2.COLOR_BGR2RGB)  # OpenCV's decoders give 1, 3 or 4 channels
 
 
 def rgb8(image: np.ndarray) -> np.ndarray:

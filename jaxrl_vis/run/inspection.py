@@ -11,8 +11,10 @@ from typing import Any
 from jaxrl_vis.config import Config
 from jaxrl_vis.run.checkpoint import DAMAGED, FOREIGN, FULL, LIGHT, RECENT
 from jaxrl_vis.run.folder import LOGGER_FOLDERS, WANDB_STATE, RunFolder
+from jaxrl_vis.run.goodput import read_processes
 from jaxrl_vis.run.lock import FILE_NAME as LOCK_NAME
 from jaxrl_vis.run.metrics import RUN_ID
+from jaxrl_vis.run.recent import names_of_others
 
 LOST = "resume/replay_lost_at"
 """Key of a row: the last iteration at which the run went on without its replay."""
@@ -224,10 +226,13 @@ def check_files(folder: RunFolder, is_finished: bool, shows_images: bool, findin
             half = sorted(name for name in names if ".orbax-checkpoint-tmp" in name)
             findings.notes += [f"checkpoints/{tier}/{name} is half-written" for name in half]
             foreign += [f"checkpoints/{tier}/{name}" for name in names - set(half)]
+        foreign += [f"checkpoints/{RECENT}/{name}" for name in names_of_others(folder.checkpoints / RECENT)]
         for name, why in _ASIDE.items():
             if (folder.checkpoints / name).is_dir():
                 aside = sorted(entry.name for entry in (folder.checkpoints / name).iterdir())
                 findings.notes.append(f"set aside before as {why}: {listed(aside)}")
+    if None in read_processes(folder.processes):
+        findings.notes.append(f"{folder.processes.name} has a damaged line: the goodput of the run is not known")
     if folder.nonfinite.is_dir():
         findings.notes.append(f"the run has met a number that is not finite: {folder.nonfinite.name}/ has its state")
     if foreign:

@@ -169,6 +169,14 @@ class Recent:
                 self._path(number, "rollout").unlink(missing_ok=True)
         self._rollouts = {number: checksum for number, checksum in self._rollouts.items() if number >= int(first)}
 
+    def manifest(self, iteration: int) -> dict[str, Any]:
+        """What a state says of itself: ``iteration``, ``items`` (`arrays.describe`), ``progress``, and whose it is.
+
+        Raises:
+            Unusable: It is damaged.
+        """
+        return self._header(iteration)
+
     def restore(self, iteration: int, template: LoopState) -> tuple[LoopState, dict[str, Any]]:
         """One state, and the progress that was saved with it.
 
@@ -255,6 +263,14 @@ class Recent:
 
     def _path(self, iteration: int, kind: str) -> Path:
         return self._folder / f"{iteration}.{kind}"
+
+
+def names_of_others(folder: Path) -> list[str]:
+    """Names of what lies in a folder of recent states and is no part of one; nothing where there is no folder."""
+    kinds = (".state", ".rollout")
+    entries = folder.iterdir() if folder.is_dir() else ()
+    bare = {entry.name: Path(entry.name.removesuffix(".tmp")) for entry in entries}
+    return sorted(name for name, path in bare.items() if not (path.suffix in kinds and path.stem.isdigit()))
 
 
 def _numbers(folder: Path, kind: str) -> list[int]:

@@ -8,7 +8,7 @@ from typing import Any
 
 from jaxrl_vis.run import metrics
 from jaxrl_vis.run.arrays import is_intact, to_host
-from jaxrl_vis.run.checkpoint import FULL, LIGHT, rest_of
+from jaxrl_vis.run.checkpoint import FULL, LIGHT, RECENT, rest_of
 from jaxrl_vis.run.inspection import Expected, Findings, listed
 from jaxrl_vis.run.loop import GUARD
 from jaxrl_vis.run.manifest import progress_in
@@ -172,14 +172,12 @@ class Repeater:
 
     def _compare_checkpoints(self, iteration: int, mark: int | None, loop: LoopState) -> None:
         """Compares the state with checkpoints of the same iteration, by their checksums."""
-        for tier in (LIGHT, FULL):
+        for tier in (LIGHT, FULL, RECENT):
             manifest = self._manifests.get((tier, iteration))
             if manifest is None or progress_of(manifest).replay_lost_at != mark:
                 continue
-            state = {"train": loop.train} | ({"rest": rest_of(loop)} if tier == FULL else {})
             differing = []
-            for item, tree in state.items():
-                described = manifest["items"].get(item, {})
+            for described, tree in _saved(tier, manifest, loop):
                 arrays = to_host(tree, copy=False)
                 differing += [
                     leaf
@@ -194,6 +192,18 @@ class Repeater:
                 self._differ(f"checkpoint {tier}/{iteration} is not what the repetition arrives at: {listed(differing)} differ")
             else:
                 self._say(f"  checkpoint {tier}/{iteration}: equal")
+
+
+def _saved(tier: str, manifest: Mapping[str, Any], loop: LoopState) -> Iterator[tuple[Mapping[str, Any], Any]]:
+    """What a manifest says of arrays, and the arrays of a state that it should say that of, one part after the other."""
+    items = manifest["items"]
+    if tier == RECENT:
+        kept = {"train": loop.train, "key": loop.key, "iteration": loop.iteration, "replay": {"size": loop.replay.size}}
+        yield items, kept
+        return
+    yield items.get("train", {}), loop.train
+    if tier == FULL:
+        yield items.get("rest", {}), rest_of(loop)
 
 
 def progress_of(manifest: Mapping[str, Any]) -> Progress:

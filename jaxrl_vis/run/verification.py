@@ -18,7 +18,7 @@ import jax
 from jaxrl_vis import provenance
 from jaxrl_vis.config import config_from_dict
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.run.checkpoint import FULL, LIGHT, Checkpoints
+from jaxrl_vis.run.checkpoint import FULL, LIGHT, RECENT, Checkpoints
 from jaxrl_vis.run.folder import RunFolder, read_record
 from jaxrl_vis.run.inspection import (
     LOST,
@@ -33,6 +33,7 @@ from jaxrl_vis.run.lock import FILE_NAME as LOCK_NAME
 from jaxrl_vis.run.memory import check_compiled, check_memory
 from jaxrl_vis.run.metrics import RUN_ID
 from jaxrl_vis.run.progress import Progress
+from jaxrl_vis.run.recent import Unusable
 from jaxrl_vis.run.repetition import Repeater, Row, Verification, has_progress, progress_of
 from jaxrl_vis.run.results import describe
 from jaxrl_vis.run.sums import FILE_NAME as SUMS_NAME
@@ -122,6 +123,7 @@ class _Verifier:
                 self._report.notes.append("another process may be writing into the folder: verified as far as it is there")
             # Rows are on the disk before the checkpoint that follows: read first, they might lack what that tells of.
             self._read_manifests()
+            self._read_recent()
             self._rows = read_file(self._folder.metrics, self._expected, is_written, self._report)
             repeater = self._repeat_all(iterations)
             due = {number for (_, number), manifest in self._manifests.items() if progress_of(manifest).evaluation_due}
@@ -195,14 +197,36 @@ class _Verifier:
                 continue
             if differences is None:
                 self._report.notes.append(f"{name} has no {SUMS_NAME}: only its arrays are compared with their checksums")
-            if manifest.get("iteration") != number:
-                problems.append(f"{name} says that it is of iteration {manifest.get('iteration')}")
-            elif manifest.get(RUN_ID) != self._expected.run_id:
-                problems.append(f"{name} is another run's ({manifest.get(RUN_ID, 'it names none')})")
-            elif not has_progress(manifest, len(self._expected.seeds)):
-                problems.append(f"{name} is damaged (its manifest does not say how far the run was)")
-            else:
+            if self._check_manifest(f"{tier}/{number}", number, manifest):
                 self._manifests[tier, number] = manifest
+
+    def _read_recent(self) -> None:
+        """Reads and checks recent states. Nothing forces these onto the disk: a damaged one is what a power cut leaves."""
+        recent = self._checkpoints.recent
+        for number in recent.iterations():
+            name = f"{RECENT}/{number}"
+            try:
+                manifest = recent.manifest(number)
+                recent.restore(number, self._programs.shapes)
+            except (Unusable, RequestError) as error:
+                if number in recent.iterations():  # the run itself replaces them all the time
+                    self._report.notes.append(f"checkpoint {name} cannot be used ({error}), as after a power cut")
+                continue
+            if self._check_manifest(name, number, manifest):
+                self._manifests[RECENT, number] = manifest
+
+    def _check_manifest(self, name: str, number: int, manifest: Mapping[str, Any]) -> bool:
+        """Whether a manifest is of this run and of the iteration that the checkpoint is named after; what is wrong is found."""
+        problems = self._report.problems
+        if manifest.get("iteration") != number:
+            problems.append(f"checkpoint {name} says that it is of iteration {manifest.get('iteration')}")
+        elif manifest.get(RUN_ID) != self._expected.run_id:
+            problems.append(f"checkpoint {name} is another run's ({manifest.get(RUN_ID, 'it names none')})")
+        elif not has_progress(manifest, len(self._expected.seeds)):
+            problems.append(f"checkpoint {name} is damaged (its manifest does not say how far the run was)")
+        else:
+            return True
+        return False
 
     def _check_presence(self, is_written: bool) -> None:
         """Finds that there is no checkpoint though the run has come far enough to have one."""
@@ -210,7 +234,7 @@ class _Verifier:
         interval = self._config.checkpoint_interval
         # An evaluation's rows are written before the checkpoint of the same iteration is.
         wanted = last >= self._total or (interval > 0 and last > interval)
-        if wanted and not is_written and not self._names():
+        if wanted and not is_written and not self._names() and not self._checkpoints.recent.iterations():
             self._report.problems.append(f"checkpoints are missing: the run has come to iteration {last}")
 
     # -- Repeating

@@ -11,9 +11,6 @@ import numpy as np
 CLUSTER = 8
 """Triangles in a cluster; the last of a mesh's are filled up with ones that no ray meets."""
 
-SEAM = 1e-5
-"""How far outside of its edges, as a share of them, a triangle is still met, so that no ray slips between two."""
-
 # Columns of `Scene.triangles`.
 MAP = slice(0, 12)  # three rows of four: first and second barycentric coordinate, height
 NORMALS = slice(12, 21)  # of the three corners
@@ -139,10 +136,9 @@ def _clustered(
     kept = np.linalg.norm(flat, axis=1) > _LEAST_AREA * longest
     corners, normals, coordinates = corners[kept], normals[kept], coordinates[kept]
     unit = _flat_normals(corners)
-    met = _apart(corners) if ordered else corners
-    basis = np.stack([met[:, 1] - met[:, 0], met[:, 2] - met[:, 0], unit], axis=2)
+    basis = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], unit], axis=2)
     inverse = np.linalg.inv(basis)
-    offset = -np.einsum("tij,tj->ti", inverse, met[:, 0])
+    offset = -np.einsum("tij,tj->ti", inverse, corners[:, 0])
     maps = np.concatenate([inverse, offset[:, :, None]], axis=2)
     count = len(corners)
     parts = (maps.reshape(count, 12), normals.reshape(count, 9), coordinates.reshape(count, 6), corners.reshape(count, 9))
@@ -163,19 +159,6 @@ def _clustered(
     middles = 0.5 * (points.min(1) + points.max(1))
     radii = np.linalg.norm(points - middles[:, None], axis=2).max(1)
     return rows.reshape(-1, COLUMNS), np.concatenate([middles, radii[:, None]], axis=1)
-
-
-def _apart(corners: np.ndarray) -> np.ndarray:
-    """Corners [T, 3, 3] of triangles that are smaller by twice `SEAM` at every edge that belongs to their neighbour.
-
-    A ray that meets a common edge then meets one of the two, as in OpenGL. The neighbour runs along the edge the other way.
-    """
-    number = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)[1].reshape(-1, 3)
-    # The least share that each corner has in a point of the triangle: 0 on the edge that is opposite to it.
-    least = 2.0 * SEAM * (np.roll(number, -1, axis=1) > np.roll(number, -2, axis=1))
-    shares = np.repeat(least[:, None], 3, axis=1)
-    shares[:, range(3), range(3)] = 1.0 - (least.sum(1, keepdims=True) - least)
-    return shares @ corners
 
 
 def _grouped(middles: np.ndarray, members: np.ndarray) -> list[np.ndarray]:

@@ -16,6 +16,11 @@ from jaxrl_vis_envs.render.model import meshes, reading
 from jaxrl_vis_envs.render.pixel import shapes
 from jaxrl_vis_envs.render.scene import Scene
 
+# How far outside of its edges, as a share of them, a triangle is still met, so that no ray slips between two.
+_SEAM = 1e-5
+# Across and up, as a share of half the image's height: where `next_triangle` looks, instead of the pixel's very middle. Few
+# edges run in that direction, and it is far beyond what rounding moves an edge by.
+_ASIDE = (2e-5, -6e-6)
 _NUMBER = meshes.CLUSTER - 1  # the lowest bits of a depth, that hold the number of a triangle in its cluster
 
 
@@ -77,6 +82,9 @@ def next_triangle(
 ) -> tuple[jax.Array, jax.Array]:
     """The next triangle of an object, in the order in which MuJoCo draws them, that is not behind ``depth``.
 
+    A ray through a common edge or corner meets exactly one of the triangles around it, as in OpenGL: the one that a ray a hair
+    aside meets.
+
     Args:
         scene: The scene.
         unit: The drawn objects.
@@ -91,14 +99,17 @@ def next_triangle(
     counts = jnp.cumsum(_touching(scene, unit, rays, depth, only).astype(jnp.int32), dtype=jnp.int32)
     last = counts.shape[0] - 1
     most = np.iinfo(np.int32).max
+    half_height = jax.lax.stop_gradient(camera.lens(scene)[3])
+    aside = Rays(rays.u + _ASIDE[0] * half_height, rays.v + _ASIDE[1] * half_height)
 
     def advance(state: tuple) -> tuple:
         step, depths, rows = state
         cluster = jnp.minimum(jnp.sum((counts <= step).astype(jnp.int32), dtype=jnp.int32), last)
         first = scene.cluster_places[cluster][1]
         # Clusters come in the order of their triangles: what was found in one before is not after what is in this one.
-        for number, (t, meets) in enumerate(_meet_each(scene, unit, cluster, rays)):
-            taken = meets & (t <= depth) & (first + number > after) & (rows == most)
+        crossings = zip(_meet_each(scene, unit, cluster, rays), _meet_each(scene, unit, cluster, aside), strict=True)
+        for number, ((t, _, before), (_, margin, before_aside)) in enumerate(crossings):
+            taken = before & before_aside & (margin >= 0.0) & (t <= depth) & (first + number > after) & (rows == most)
             depths, rows = jnp.where(taken, t, depths), jnp.where(taken, first + number, rows)
         return step + 1, depths, rows
 
@@ -110,15 +121,21 @@ def next_triangle(
 def _meet_cluster(scene: Scene, unit: shapes.UnitShapes, cluster: jax.Array, rays: Rays) -> jax.Array:
     """Depth of the nearest triangle of one cluster, its number in the lowest bits, infinite for none; [P] float32."""
     best = jnp.full(rays.u.shape, np.iinfo(np.int32).max, jnp.int32)
-    for number, (t, meets) in enumerate(_meet_each(scene, unit, cluster, rays)):
+    for number, (t, margin, before) in enumerate(_meet_each(scene, unit, cluster, rays)):
+        meets = before & (margin >= -_SEAM)
         key = (jax.lax.bitcast_convert_type(t, jnp.int32) & ~_NUMBER) | number
         best = jnp.minimum(best, jnp.where(meets, key, best))
     infinite = np.float32(np.inf).view(np.int32)
     return jax.lax.bitcast_convert_type(jnp.minimum(best, infinite), jnp.float32)
 
 
-def _meet_each(scene: Scene, unit: shapes.UnitShapes, cluster: jax.Array, rays: Rays) -> Iterator[tuple[jax.Array, jax.Array]]:
-    """Depth of each triangle of one cluster, and whether it is met from before the near plane; [P] each."""
+def _meet_each(
+    scene: Scene, unit: shapes.UnitShapes, cluster: jax.Array, rays: Rays
+) -> Iterator[tuple[jax.Array, jax.Array, jax.Array]]:
+    """Depth of each triangle's plane, the least barycentric coordinate there, and whether it faces the ray; [P] each.
+
+    The triangles are those of one cluster. A coordinate is negative outside. One before the near plane does not face the ray.
+    """
     place = scene.cluster_places[cluster]
     axes, origin = unit.axes[place[0]], unit.origin[place[0]]
     columns = scene.triangles.shape[1]
@@ -134,5 +151,4 @@ def _meet_each(scene: Scene, unit: shapes.UnitShapes, cluster: jax.Array, rays: 
         from_ = tuple(begin[number, axis] + offset[axis] for axis in range(3))
         t = -from_[2] / jnp.where(ray[2] < 0.0, ray[2], -1.0)
         first, second = from_[0] + t * ray[0], from_[1] + t * ray[1]
-        inside = jnp.minimum(jnp.minimum(first, second), 1.0 - first - second) >= -meshes.SEAM
-        yield t, inside & (ray[2] < 0.0) & (t > scene.znear)
+        yield t, jnp.minimum(jnp.minimum(first, second), 1.0 - first - second), (ray[2] < 0.0) & (t > scene.znear)
