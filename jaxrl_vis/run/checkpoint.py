@@ -116,8 +116,8 @@ class Checkpoints:
         if tier not in self._managers:
             if self._unsilence is None:
                 self._unsilence = hush.silence_orbax()
-            # orbax measures its timeouts with the computer's clock: where that is set meanwhile, a good save would be given up. A
-            # process alone waits for its own disk, however long; of several, one that hangs must be noticed.
+            # orbax measures its timeouts with the computer's clock: where that is set meanwhile, a good save would be given up.
+            # A process alone waits for its own disk, however long; of several, one that hangs must be noticed.
             patient = AsyncOptions(timeout_secs=_TIMEOUT_S, create_directories_asynchronously=False)
             options = ocp.CheckpointManagerOptions(
                 async_options=None if processes.are_several() else patient,
