@@ -189,6 +189,23 @@ def test_a_folder_that_goes_at_the_very_end_is_not_made_again(tmp_path, monkeypa
     assert not path.exists() and "see curve" not in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("other", [None, "notes.txt", "checkpoints/light/2/manifest"])
+def test_what_a_save_makes_again_of_a_deleted_folder_is_deleted_too(tmp_path, other):
+    path = tmp_path / "run"
+
+    def delete():
+        shutil.rmtree(path)
+        half = path / "checkpoints" / LIGHT / "2.orbax-checkpoint-tmp" / "train.orbax-checkpoint-tmp"
+        half.mkdir(parents=True)  # as threads of tensorstore do, which make all folders that they need
+        (half / "manifest.ocdbt").touch()
+        if other is not None:
+            (path / other).parent.mkdir(exist_ok=True)
+            (path / other).touch()
+
+    assert "is gone" in str(moved_at(make_fake_trainer(small_config(), path), 3, delete))
+    assert path.exists() == (other is not None) and (other is None or (path / other).exists())
+
+
 def test_checksums_do_not_make_a_folder_again(tmp_path):
     with pytest.raises(OSError):
         write_sums(tmp_path / "gone")

@@ -11,6 +11,7 @@ A run has an id, which is drawn when it starts and stays when it is resumed. Eve
 it, and nothing that carries another one is resumed, counted or deleted. Runs of earlier versions have none, and keep none.
 """
 
+import contextlib
 import dataclasses
 import json
 import secrets
@@ -33,6 +34,8 @@ SCHEMA = 1
 
 CHECKPOINT_FOLDERS = ("light", "full", "recent", "damaged", "foreign")
 """What `checkpoint` leaves in its folder."""
+
+_UNFINISHED = "orbax-checkpoint-tmp"  # in the name of a checkpoint that is being written
 
 LOGGER_FOLDERS, WANDB_STATE = ("tensorboard", "wandb"), "wandb.json"
 """What `loggers` leave in a run folder."""
@@ -164,6 +167,16 @@ class RunFolder:
         if not is_ours:
             when = "while the run wrote there, and what was trained since its last checkpoint is lost"
             raise FolderGoneError(_where_gone(self.path, held.place(), when))
+
+    def remove_remains(self) -> None:
+        """Deletes what threads that were writing a checkpoint have made again of a folder that was moved or deleted under them.
+
+        A folder with anything else in it is somebody's, and stays.
+        """
+        with contextlib.suppress(OSError):
+            unfinished = [_UNFINISHED in path.name for path in self.checkpoints.glob("*/*")]
+            if all(unfinished) and [entry.name for entry in self.path.iterdir()] == [self.checkpoints.name]:
+                shutil.rmtree(self.path)
 
     def check(self, config: Config, resume: bool = False, overwrite: bool = False) -> bool:
         """Whether this folder may be used for ``config``. Changes nothing.
