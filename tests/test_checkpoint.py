@@ -1,5 +1,6 @@
 """Checkpoints: round trips, damage, kills while writing."""
 
+import itertools
 import os
 import shutil
 import signal
@@ -76,6 +77,21 @@ def test_a_light_save_survives_donation(tmp_path):
         loop, _ = trainer.train_iteration(loop)
     checkpoints.wait()
     assert all(map(np.array_equal, as_plain(checkpoints.restore_train(trainer.shapes).train), expected))
+    checkpoints.close()
+
+
+def test_a_clock_that_is_set_stops_no_save(tmp_path, monkeypatch):
+    """By a day whenever somebody looks at it: orbax measures its timeouts with it."""
+    trainer = make_fake_trainer(small_config(), None)
+    loop, _ = trainer.train_iteration(trainer.init(jax.random.key(0)))
+    checkpoints, days, right = Checkpoints(tmp_path), itertools.count(), time.time
+    monkeypatch.setattr(time, "time", lambda: right() + 86400.0 * next(days))
+    checkpoints.save_light(1, loop.train, {})
+    checkpoints.save_full(1, loop, {})
+    checkpoints.wait()
+    assert next(days) > 5
+    monkeypatch.undo()
+    assert checkpoints.restore_for_resume(trainer.shapes).tier == FULL
     checkpoints.close()
 
 

@@ -14,6 +14,10 @@ from jaxrl_vis.run import folder as folders
 from jaxrl_vis.run import metrics, trained, trainer
 from jaxrl_vis.run.checkpoint import FULL, LIGHT, Checkpoints
 from jaxrl_vis.run.folder import RunFolder, read_run_id
+from jaxrl_vis.run.lock import FolderGoneError
+from jaxrl_vis.run.programs import Programs
+from jaxrl_vis.run.saving import Saver
+from jaxrl_vis.run.sums import write_sums
 
 
 def checkpoints_in(path: Path) -> list[str]:
@@ -149,6 +153,63 @@ def test_a_folder_that_is_deleted_is_not_made_again(tmp_path):
     error = moved_at(make_fake_trainer(small_config(), path), 3, lambda: shutil.rmtree(path))
     assert f"{path} is gone" in str(error) and "make room" not in str(error)
     assert not path.exists()
+
+
+@pytest.mark.parametrize("resume", [False, True])
+@pytest.mark.parametrize("is_moved", [False, True])
+def test_a_folder_that_goes_while_the_run_compiles_is_not_made_again(straight, tmp_path, monkeypatch, resume, is_moved):
+    """The lock went with it: another run could begin in a new one."""
+    path, there = tmp_path / "run", tmp_path / "there"
+    if resume:
+        shutil.copytree(straight[0], path)
+    trainer = make_fake_trainer(small_config(env_steps=100), path, resume=resume)
+    compile_all = Programs.compile
+
+    def compile_slowly(*arguments, **options):
+        compiled = compile_all(*arguments, **options)
+        path.rename(there)
+        if not is_moved:
+            shutil.rmtree(there)
+        return compiled
+
+    monkeypatch.setattr(Programs, "compile", compile_slowly)
+    with pytest.raises(FolderGoneError) as stopped:
+        list(trainer.run())
+    words = str(stopped.value)
+    assert "before the run began" in words and "\n" not in words and "lost" not in words
+    assert f"{path} is gone" in words or (is_moved and f"{path} was moved to {there} " in words)
+    assert not path.exists() and there.exists() == is_moved
+
+
+def test_a_folder_that_goes_at_the_very_end_is_not_made_again(tmp_path, monkeypatch, capsys):
+    path = tmp_path / "run"
+    monkeypatch.setattr(Saver, "finish", lambda saver: shutil.rmtree(path))
+    with pytest.raises(FolderGoneError, match="is gone"):
+        list(make_fake_trainer(small_config(env_steps=20), path).run())
+    assert not path.exists() and "see curve" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("other", [None, "notes.txt", "checkpoints/light/2/manifest"])
+def test_what_a_save_makes_again_of_a_deleted_folder_is_deleted_too(tmp_path, other):
+    path = tmp_path / "run"
+
+    def delete():
+        shutil.rmtree(path)
+        half = path / "checkpoints" / LIGHT / "2.orbax-checkpoint-tmp" / "train.orbax-checkpoint-tmp"
+        half.mkdir(parents=True)  # as threads of tensorstore do, which make all folders that they need
+        (half / "manifest.ocdbt").touch()
+        if other is not None:
+            (path / other).parent.mkdir(exist_ok=True)
+            (path / other).touch()
+
+    assert "is gone" in str(moved_at(make_fake_trainer(small_config(), path), 3, delete))
+    assert path.exists() == (other is not None) and (other is None or (path / other).exists())
+
+
+def test_checksums_do_not_make_a_folder_again(tmp_path):
+    with pytest.raises(OSError):
+        write_sums(tmp_path / "gone")
+    assert not (tmp_path / "gone").exists()
 
 
 def test_a_new_folder_of_the_same_name_is_left_alone(tmp_path):

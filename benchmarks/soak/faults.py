@@ -16,12 +16,14 @@ import socket
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from benchmarks.soak.disks import freezing_disk, small_disk
 from benchmarks.soak.parts import Broken, Part, checkpoints_of, environment, killed_afterwards, rows_of
 
 SITE = Path(__file__).with_name("site")
 Strike = Callable[[Path, random.Random], int | None]
+Checkpoint = tuple[int, str, Path]  # iteration, tier, file or folder
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,12 +35,14 @@ class Fault:
         promise: What must hold, for the table.
         statuses: What the process may end with.
         spoils: Whether a row of metrics.jsonl, or the run itself, may be gone afterwards.
+        goes_back: Whether a run may go on from an older checkpoint than the newest; `strike` looks whether it is the right one.
     """
 
     strike: Strike
     promise: str
     statuses: tuple[int, ...]
     spoils: bool = False
+    goes_back: bool = False
 
 
 def _started(folder: Path, dice: random.Random, variables: dict[str, str] | None = None, file_bytes: int | None = None) -> Part:
@@ -159,10 +163,30 @@ def _resumed(folder: Path, dice: random.Random, variables: dict[str, str] | None
         return status, part
 
 
+def _check_went_back(folder: Path, before: list[dict[str, Any]], all_before: list[Checkpoint], good: list[Checkpoint]) -> None:
+    """Looks whether a run that may have gone back before a damaged checkpoint went on from the newest good one.
+
+    Args:
+        folder: The run, resumed and stopped again.
+        before: Its rows before that.
+        all_before: Its checkpoints before that.
+        good: Those of them that were not damaged.
+    """
+    newest, kept, last = (
+        max((iteration for iteration, *_ in found), default=0) for found in (checkpoints_of(folder), good, all_before)
+    )
+    if newest < kept:
+        raise Broken(f"a good checkpoint was of iteration {kept}, and the newest is of {newest}")
+    rows = rows_of(folder) + rows_of(folder, "checkpoints/damaged/metrics.jsonl")
+    if lost := [row["iteration"] for row in before if row not in rows and row["iteration"] <= last]:
+        raise Broken(f"rows {lost} are neither in metrics.jsonl nor kept for inspection")
+
+
 def _damaged(folder: Path, dice: random.Random) -> int | None:
     if not _killed(folder, dice):
         return None
-    *_, (_, tier, path) = checkpoints_of(folder)
+    rows, there = rows_of(folder), checkpoints_of(folder)
+    *good, (_, tier, path) = there
     if path.is_dir():
         files = sorted((file for file in path.rglob("*") if file.is_file()), key=lambda file: file.stat().st_size)
         how = dice.choice(("truncate", "no manifest", "no learner"))
@@ -175,6 +199,7 @@ def _damaged(folder: Path, dice: random.Random) -> int | None:
     status, part = _resumed(folder, dice)
     if part.count(f"checkpoint {tier}/") != 1 or part.count("is damaged") != 1:
         raise Broken(f"nothing was said about a damaged checkpoint: {part.lines}")
+    _check_went_back(folder, rows, there, good)
     return status or None
 
 
@@ -190,13 +215,17 @@ def flip_a_bit(file: Path, dice: random.Random) -> int:
 def _bit_in_a_checkpoint(folder: Path, dice: random.Random) -> int | None:
     if not _killed(folder, dice):
         return None
-    iteration, tier, path = dice.choice([found for found in checkpoints_of(folder)[-2:]])
+    rows, there = rows_of(folder), checkpoints_of(folder)
+    _, tier, path = dice.choice(there[-2:])
     files = [file for file in path.rglob("*") if file.is_file() and file.stat().st_size] if path.is_dir() else [path]
     if tier == "recent":
         files += list(path.parent.glob("*.rollout"))
     flip_a_bit(dice.choices(files, [file.stat().st_size for file in files])[0], dice)
     # Either it is found, or it says nothing about what the run goes on from: rows are compared at the end.
-    return _resumed(folder, dice)[0] or None
+    status = _resumed(folder, dice)[0]
+    good = [found for found in there if found[2] != path and not tier == found[1] == "recent"]  # recent ones share rollouts
+    _check_went_back(folder, rows, there, good)
+    return status or None
 
 
 def _bit_in_metrics(folder: Path, dice: random.Random) -> int | None:
@@ -293,9 +322,11 @@ FAULTS: dict[str, Fault] = {
     "full disk": Fault(_full_disk, "status 1 (2 before it has begun) and one line; goes on when there is room again", (1, 2)),
     "stalled disk": Fault(_stalled_disk, f"waits for the disk, and {EXACT}", (143,)),
     "damaged checkpoint": Fault(
-        _damaged, "one line; goes on from the one before, and keeps the damaged one for inspection", (143,)
+        _damaged, "one line; goes on from the one before, and keeps the damaged one for inspection", (143,), goes_back=True
     ),
-    "bit flipped in a checkpoint": Fault(_bit_in_a_checkpoint, "is found, or lies in nothing that is read", (143,)),
+    "bit flipped in a checkpoint": Fault(
+        _bit_in_a_checkpoint, "is found, or lies in nothing that is read", (143,), goes_back=True
+    ),
     "bit flipped in metrics.jsonl": Fault(
         _bit_in_metrics, "all other rows stay; a row that is none any more is put aside, and said", (143,), spoils=True
     ),

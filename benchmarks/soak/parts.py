@@ -21,6 +21,10 @@ OPTIONS = [
 ]
 
 
+PRECEDENCE = ("light", "recent", "full")
+"""Tiers of checkpoints; of those of the same iteration, a run goes on from the last."""
+
+
 class Broken(AssertionError):
     """A promise was not kept."""
 
@@ -32,15 +36,15 @@ LAST = threading.local()
 def environment() -> dict[str, str]:
     """Variables for a run of the checkout, on the CPU; programs that were traced once are kept, as for any user."""
     root = Path(__file__).parents[2]
-    paths = os.pathsep.join((str(root), str(root / "envs")))
+    paths = os.pathsep.join(filter(None, (str(root), str(root / "envs"), os.environ.get("PYTHONPATH"))))
     kept = {name: value for name, value in os.environ.items() if name != "JAXRL_VIS_KEEP_PROGRAMS"}
     return {**kept, "JAX_PLATFORMS": "cpu", "PYTHONPATH": paths}
 
 
-def rows_of(folder: Path) -> list[dict[str, Any]]:
-    """Rows of a run's metrics.jsonl without their times and the run's id; a line that is not one is left out."""
+def rows_of(folder: Path, name: str = "metrics.jsonl") -> list[dict[str, Any]]:
+    """Rows of a run's metrics without their times and the run's id; a line that is not one is left out."""
     rows = []
-    file = folder / "metrics.jsonl"
+    file = folder / name
     for line in file.read_bytes().splitlines() if file.exists() else []:
         try:
             row = json.loads(line)
@@ -52,10 +56,11 @@ def rows_of(folder: Path) -> list[dict[str, Any]]:
 
 
 def checkpoints_of(folder: Path) -> list[tuple[int, str, Path]]:
-    """Finished checkpoints, ascending: iteration, tier, file or folder."""
-    places = [path for path in folder.glob("checkpoints/*/*") if path.parent.name in ("light", "full", "recent")]
+    """Finished checkpoints, iteration, tier, file or folder; the last one is what a run goes on from, if it is good."""
+    places = [path for path in folder.glob("checkpoints/*/*") if path.parent.name in PRECEDENCE]
     names = [(path.name.removesuffix(".state"), path) for path in places]
-    return sorted((int(name), path.parent.name, path) for name, path in names if name.isdigit())
+    there = [(int(name), path.parent.name, path) for name, path in names if name.isdigit()]
+    return sorted(there, key=lambda checkpoint: (checkpoint[0], PRECEDENCE.index(checkpoint[1])))
 
 
 @dataclasses.dataclass

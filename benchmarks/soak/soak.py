@@ -127,7 +127,7 @@ class Soak:
             if status not in FAULTS[fault].statuses:
                 raise Broken(f"status {status}: {LAST.lines[-4:]}")
             spoilt |= FAULTS[fault].spoils
-            if folder.exists() and not FAULTS[fault].spoils:
+            if folder.exists() and not (FAULTS[fault].spoils or FAULTS[fault].goes_back):
                 self._check_kept(folder, before, good[-1][0] if good else 0)
             self._struck(folder.name, fault, f"status {status}")
         if not faults:

@@ -37,6 +37,7 @@ if TYPE_CHECKING:  # orbax takes a fifth of the time that this package does to i
 LIGHT, FULL, RECENT = "light", "full", "recent"
 _PRECEDENCE = (FULL, RECENT, LIGHT)  # for a run that goes on, of those that are equally new
 _KEPT = 2
+_TIMEOUT_S = 10**9
 DAMAGED, FOREIGN = "damaged", "foreign"
 
 
@@ -110,11 +111,16 @@ class Checkpoints:
     def _manager(self, tier: str) -> "ocp.CheckpointManager":
         import orbax.checkpoint as ocp
         from orbax.checkpoint.checkpoint_managers import LatestN
+        from orbax.checkpoint.options import AsyncOptions
 
         if tier not in self._managers:
             if self._unsilence is None:
                 self._unsilence = hush.silence_orbax()
+            # orbax measures its timeouts with the computer's clock: where that is set meanwhile, a good save would be given up.
+            # A process alone waits for its own disk, however long; of several, one that hangs must be noticed.
+            patient = AsyncOptions(timeout_secs=_TIMEOUT_S, create_directories_asynchronously=False)
             options = ocp.CheckpointManagerOptions(
+                async_options=None if processes.are_several() else patient,
                 preservation_policy=None if self._read_only else LatestN(_KEPT),
                 cleanup_tmp_directories=not self._read_only,
                 read_only=self._read_only,

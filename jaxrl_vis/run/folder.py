@@ -11,6 +11,7 @@ A run has an id, which is drawn when it starts and stays when it is resumed. Eve
 it, and nothing that carries another one is resumed, counted or deleted. Runs of earlier versions have none, and keep none.
 """
 
+import contextlib
 import dataclasses
 import json
 import secrets
@@ -33,6 +34,8 @@ SCHEMA = 1
 
 CHECKPOINT_FOLDERS = ("light", "full", "recent", "damaged", "foreign")
 """What `checkpoint` leaves in its folder."""
+
+_UNFINISHED = "orbax-checkpoint-tmp"  # in the name of a checkpoint that is being written
 
 LOGGER_FOLDERS, WANDB_STATE = ("tensorboard", "wandb"), "wandb.json"
 """What `loggers` leave in a run folder."""
@@ -133,6 +136,19 @@ class RunFolder:
             return rows
         return [row for row in rows if row.get(RUN_ID) == run_id]
 
+    def check_place(self, held: Held) -> None:
+        """Checks that the folder still lies where it was when it was locked, before a run begins there.
+
+        Args:
+            held: What holds the folder.
+
+        Raises:
+            FolderGoneError: It was moved, deleted or taken over.
+        """
+        held.check()
+        if not held.is_in_place():
+            raise FolderGoneError(_where_gone(self.path, held.place(), "before the run began"))
+
     def check_ours(self, run_id: str | None, held: Held) -> None:
         """Checks that this is still the folder of a run, before something is written into it.
 
@@ -145,11 +161,22 @@ class RunFolder:
         """
         held.check()
         try:
-            is_ours = read_run_id(self.path) == run_id
+            is_ours = held.is_in_place() and read_run_id(self.path) == run_id
         except RequestError:  # a file that cannot be read, for a moment or for good, is no reason to stop
             is_ours = self.config.exists()
         if not is_ours:
-            raise FolderGoneError(_where_gone(self.path, held.place()))
+            when = "while the run wrote there, and what was trained since its last checkpoint is lost"
+            raise FolderGoneError(_where_gone(self.path, held.place(), when))
+
+    def remove_remains(self) -> None:
+        """Deletes what threads that were writing a checkpoint have made again of a folder that was moved or deleted under them.
+
+        A folder with anything else in it is somebody's, and stays.
+        """
+        with contextlib.suppress(OSError):
+            unfinished = [_UNFINISHED in path.name for path in self.checkpoints.glob("*/*")]
+            if all(unfinished) and [entry.name for entry in self.path.iterdir()] == [self.checkpoints.name]:
+                shutil.rmtree(self.path)
 
     def check(self, config: Config, resume: bool = False, overwrite: bool = False) -> bool:
         """Whether this folder may be used for ``config``. Changes nothing.
@@ -231,16 +258,15 @@ class RunFolder:
                 ) from error
 
 
-def _where_gone(path: Path, place: Path | None) -> str:
+def _where_gone(path: Path, place: Path | None, when: str) -> str:
     """Words for a run folder that is not where it was."""
-    lost = "what was trained since its last checkpoint is lost"
     if place is None:
-        return f"{path} is gone: it was deleted, or moved away, while the run wrote there, and {lost}"
+        return f"{path} is gone: it was deleted, or moved away, {when}"
     is_there = place == path.resolve()
     resume = f"go on with --run-dir {shlex.quote(str(path if is_there else place))} --resume"
     if is_there:
         return f"{path / 'config.json'} is gone, or is that of another run: put it back, then {resume}"
-    return f"{path} was moved to {place} while the run wrote there, and {lost}: {resume}"
+    return f"{path} was moved to {place} {when}: {resume}"
 
 
 def _record(config: Config, log: tuple[str, ...], run_id: str | None) -> dict[str, Any]:

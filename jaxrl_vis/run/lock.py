@@ -74,6 +74,14 @@ class Held:
                 "What was saved before is good, and no more is saved; --resume goes on, unless another process does already"
             )
 
+    def is_in_place(self) -> bool:
+        """Whether the folder still lies under its name, and not another one, or none."""
+        if (self._folder / FILE_NAME).exists():
+            return True
+        with contextlib.suppress(OSError):  # the folder may be there, and the lock's file deleted by hand
+            return self._descriptor is not None and os.path.samestat(self._folder.stat(), os.fstat(self._descriptor))
+        return False
+
     def place(self) -> Path | None:
         """Where the folder lies now, if it was moved; None where it was deleted, or the system does not say."""
         if self._descriptor is None:

@@ -25,7 +25,7 @@ import jax
 import numpy as np
 
 from jaxrl_vis import processes
-from jaxrl_vis.errors import NonFiniteError, StorageError
+from jaxrl_vis.errors import NonFiniteError, RequestError, StorageError
 from jaxrl_vis.run import earlier, metrics, trust
 from jaxrl_vis.run.checkpoint import FULL, LIGHT, RECENT, Checkpoints, Restored
 from jaxrl_vis.run.console import RunConsole, show_seconds, show_shares
@@ -135,6 +135,9 @@ class RunLoop:
                     yield from self._train(interruption)
                     self._finish(interruption)
                 self._checkpoints.close()
+            except FolderGoneError:
+                self._console.stop()
+                raise
             except StorageError as error:
                 if gone := self._gone():
                     raise gone from error
@@ -157,6 +160,8 @@ class RunLoop:
                     with contextlib.suppress(StorageError):
                         self._checkpoints.close()
                     self._loggers.close(in_a_hurry=bool(interruption))
+                    if self.has_begun and self._held is not None and not self._held.is_in_place():
+                        self._folder.remove_remains()
                 self._goodput.close()
 
     def _check_ours(self) -> None:
@@ -215,7 +220,7 @@ class RunLoop:
         has_room = not processes.any_of(not fit_together(compiled, is_there, layout))  # and all have come here
         self._evaluates_ahead = self._programs.evaluates_ahead and has_room
         if self._writes:
-            self._folder.open(self._config, goes_on, overwrite, self._log)
+            self._open(goes_on, overwrite)
             if trust.is_own(self._config):  # and here it runs
                 trust.trust(self._folder.path, self._config, was_trained_here=True)
         processes.meet("opened")
@@ -233,6 +238,16 @@ class RunLoop:
             self._loop = self._programs.init(self._programs.run_keys)
         self._console.start(self._total, self._done)
         self._pace.begin(self._done)
+
+    def _open(self, goes_on: bool, overwrite: bool) -> None:
+        """Makes the folder ready, unless it was moved or deleted since it was locked: compiling takes a while."""
+        assert self._held is not None
+        self._folder.check_place(self._held)
+        try:
+            self._folder.open(self._config, goes_on, overwrite, self._log)
+        except RequestError:
+            self._folder.check_place(self._held)
+            raise
 
     def _begin_log(self, goes_on: bool, damaged: list[Path], foreign: list[Path]) -> None:
         """Cuts the metrics back to the iteration that the run goes on from, and opens the loggers.
@@ -411,8 +426,9 @@ class RunLoop:
         self._console.stop()
         self._progress.evaluation_due = evaluation_due
         self._saver.on_signal(self._loop, self._done, self._progress_now(), interruption)
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError, FolderGoneError):
             if self._writes:
+                self._check_ours()
                 self._results.draw_curve(self._done)
         interruption.end()
 
@@ -440,5 +456,6 @@ class RunLoop:
             _, self._recorded = self._programs.evaluate(self._loop.train)
         if self._writes:
             self._say(self._goodput.account(self._done).describe(self._program.updates_per_iteration))
+            self._check_ours()
             with self._saver.writing():
                 self._results.show(self._done, self._progress_now, self._recorded)

@@ -3,7 +3,7 @@
 import hashlib
 from pathlib import Path
 
-from jaxrl_vis.files import write_atomically
+from jaxrl_vis.files import replacing
 
 FILE_NAME = "SHA256SUMS"
 
@@ -25,7 +25,9 @@ def write_sums(folder: Path) -> None:
     Raises:
         OSError: A file cannot be read, or the checksums cannot be written.
     """
-    write_atomically(folder / FILE_NAME, "".join(f"{_sum(folder / name)}  {name}\n" for name in _files(folder)))
+    text = "".join(f"{_sum(folder / name)}  {name}\n" for name in _files(folder))
+    with replacing(folder / FILE_NAME) as file:  # which makes no folder: this one may have been deleted meanwhile
+        file.write(text.encode())
 
 
 def compare_sums(folder: Path) -> list[str] | None:
