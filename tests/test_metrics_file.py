@@ -66,7 +66,7 @@ def test_what_a_kill_has_left_of_the_last_line_is_not_told(tmp_path, torn):
     path = tmp_path / "metrics.jsonl"
     metrics.append_rows(path, [row(1)])
     path.write_bytes(path.read_bytes() + torn)
-    assert metrics.read_contents(path) == metrics.Contents([row(1)], [])
+    assert metrics.read_contents(path) == metrics.Contents([row(1)], [], torn)
     assert metrics.cut_back(path, 9, None, tmp_path / "aside", keeps_later=False) is None
     assert path.read_text() == json.dumps(row(1)) + "\n" and not (tmp_path / "aside").exists()
 
@@ -111,6 +111,23 @@ def test_a_finished_run_that_lost_its_last_row_is_evaluated_again(straight, tmp_
     assert "1 damaged line (line 8)" in capsys.readouterr().out
     *expected, restored = rows_without_time(straight[0])  # what it was trained with since the evaluation before is not kept
     assert rows_without_time(path) == [*expected, {name: restored[name] for name in restored if not name.startswith("train/")}]
+
+
+@pytest.mark.parametrize(("env_steps", "number"), [(60, 5), (60, 6), (80, 5)])
+def test_a_torn_last_row_that_was_whole_is_kept_aside_and_told(tmp_path, capsys, env_steps, number):
+    path = tmp_path / "run"
+    list(make_fake_trainer(small_config(env_steps=60), path).run())
+    file = path / "metrics.jsonl"
+    lines = file.read_bytes().splitlines()
+    assert len(lines) == 6  # the last two are of one iteration
+    torn = lines[number - 1][:-30]
+    file.write_bytes(b"\n".join([*lines[: number - 1], torn]))
+    for _ in range(2):  # a second time it has nothing to say
+        list(make_fake_trainer(small_config(env_steps=env_steps), path, resume=True).run())
+    said = capsys.readouterr().out
+    assert said.count(f"metrics.jsonl held 1 damaged line (line {number}): kept in") == 1
+    assert (path / "checkpoints" / "damaged" / "metrics.jsonl").read_bytes() == torn + b"\n"
+    assert [each["iteration"] for each in rows_without_time(path)][-2:] == [env_steps // 10] * 2
 
 
 def test_everything_else_that_reads_rows_leaves_damaged_ones_out(tmp_path):

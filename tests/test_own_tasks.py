@@ -143,6 +143,7 @@ WRONG = (
     ("my_taks:MyReach", "there is no module my_taks, in "),
     ("my_taks:MyReach", "did you mean my_task?"),
     ("my_task.py:MyReach", "names a file, not a module: write my_task:MyReach"),
+    ("../my_task:MyReach", "names a file, not a module: write my_task:MyReach"),
     ("sub/my_task.py:MyReach", "write sub.my_task:MyReach"),
     ("my_task.MyReach", "unknown environment 'my_task.MyReach'; a task of your own is written module:Name"),
     ("my_task:", "is no task: a task of your own is written module:Name"),

@@ -246,6 +246,15 @@ def test_a_name_that_is_too_long_is_one_line(tmp_path, monkeypatch, capsys, word
     assert error.count("\n") == 1 and "File name too long" in error and len(error) < 300
 
 
+@pytest.mark.parametrize(
+    "words", [["figure", "quadratic", "--out"], ["sweep", "Reacher", "--preset", "debug", "--runs"]], ids=["file", "folder"]
+)
+def test_a_place_for_results_that_no_system_knows_is_one_line(capsys, words):
+    assert cli.main([*words, "a\0b.png"]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "'a\\x00b.png' cannot be used" in error
+
+
 @pytest.mark.parametrize("words", [["eval"], ["play"], ["train", "--resume", "--run-dir"]], ids=["eval", "play", "resume"])
 @pytest.mark.parametrize("contents", [b"[" * 10**5, b'{"schema": 1, "log": 5}', b'{"schema": 1, "run_id": 5}', b"\xff", b"[]"])
 def test_a_config_file_that_cannot_be_used_is_one_line(tmp_path, capsys, words, contents):

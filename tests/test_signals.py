@@ -138,7 +138,7 @@ with shielded_children():
 with ThreadPoolExecutor(initializer=shield_this_thread) as pool:
     second = pool.submit(subprocess.Popen, ["sleep", "30"]).result()
 third = subprocess.Popen(["sleep", "30"])
-with Interruption() as interruption:
+with signals.Interruption() as interruption:
     os.killpg(0, signal.SIGTERM)
     time.sleep(0.5)
     assert interruption
@@ -206,6 +206,9 @@ def test_whatever_goes_wrong_a_save_is_attempted(straight, tmp_path, monkeypatch
 
 
 ENDS = tuple(getattr(signal, f"SIG{name}") for name in ("HUP", "INT", "QUIT", "TERM", "USR1", "USR2", "ALRM", "XCPU"))
+# Signals that leave a process as it was, that stop it, that no handler gets, and faults.
+HARMLESS = ("CHLD", "CONT", "URG", "WINCH", "PIPE", "XFSZ", "TSTP", "TTIN", "TTOU", "STOP", "KILL")
+FAULTS = ("SEGV", "BUS", "ABRT", "FPE", "ILL", "SYS", "TRAP")
 
 
 @pytest.fixture
@@ -235,6 +238,16 @@ def test_every_signal_that_ends_a_process_saves_and_is_named(tmp_path, capsys, n
         assert signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler)
     restored = Checkpoints(path / "checkpoints", read_only=True).restore_for_resume(trainer.shapes)
     assert restored.tier == FULL and restored.iteration == 2 * len(ENDS)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have other signals")
+def test_no_signal_that_ends_a_process_is_left_out(not_ignored):
+    left_out = {getattr(signal, f"SIG{name}") for name in (*HARMLESS, *FAULTS)}
+    assert set(signals.SIGNALS) == set(signal.valid_signals()) - left_out
+    with signals.Interruption() as interruption:
+        signal.raise_signal(signal.SIGRTMIN + 3)
+        assert interruption.signal == signal.SIGRTMIN + 3 and interruption.name == "SIGRTMIN+3"
+    assert [signals.name_of(number) for number in (signal.SIGRTMIN, signal.SIGRTMAX)] == ["SIGRTMIN", "SIGRTMAX"]
 
 
 def test_what_is_ignored_or_handled_by_the_caller_stays_so(tmp_path, not_ignored):

@@ -4,6 +4,7 @@ import tempfile
 from pathlib import Path
 
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.files import check_path
 
 
 def check_writable(path: Path, option: str = "", folder: bool = False) -> None:
@@ -20,6 +21,7 @@ def check_writable(path: Path, option: str = "", folder: bool = False) -> None:
         RequestError: It cannot.
     """
     wanted = f"{option} {path}".strip()
+    check_path(path)
     try:
         if path.exists() and path.is_dir() != folder:
             raise RequestError(f"{wanted} is a {'file: name a folder' if folder else 'folder: name a file'}")

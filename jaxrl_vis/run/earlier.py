@@ -47,6 +47,12 @@ def is_evaluated(folder: RunFolder, seeds: Collection[int], restored: Restored) 
     return not is_due and {row["seed"] for row in rows} >= set(seeds)
 
 
+def last_evaluation(restored: Restored) -> int:
+    """The last iteration that a checkpoint knows to have been evaluated; 0 for none."""
+    since = restored.progress.get("since_evaluation")
+    return 0 if since is None else restored.iteration - len(since)
+
+
 def refuse_missing_rows(folder: RunFolder, restored: Restored) -> None:
     """Checks that metrics.jsonl has what was evaluated before a checkpoint was saved; damaged lines may have been that, those
     of an earlier resumption too, which lie with the damaged checkpoints.
@@ -54,10 +60,10 @@ def refuse_missing_rows(folder: RunFolder, restored: Restored) -> None:
     Raises:
         RequestError: It ends earlier.
     """
-    since = restored.progress.get("since_evaluation")
-    evaluated = 0 if since is None else restored.iteration - len(since)
+    evaluated = last_evaluation(restored)
     last = max((row["iteration"] for row in folder.rows()), default=0)
-    if last < evaluated and not metrics.read_contents(folder.metrics).damaged and not _aside(folder).exists():
+    contents = metrics.read_contents(folder.metrics)
+    if last < evaluated and not contents.damaged and not contents.torn and not _aside(folder).exists():
         raise RequestError(
             f"checkpoint {restored.tier}/{restored.iteration} of {folder.path} comes after an evaluation at iteration "
             f"{evaluated}, but {folder.metrics.name} ends at {last}: put back the whole file, or move the checkpoints after "
@@ -65,9 +71,9 @@ def refuse_missing_rows(folder: RunFolder, restored: Restored) -> None:
         )
 
 
-def cut_back(folder: RunFolder, checkpoints: Checkpoints, last: int, keeps_later: bool) -> str | None:
+def cut_back(folder: RunFolder, checkpoints: Checkpoints, last: int, keeps_later: bool, evaluated: int = 0) -> str | None:
     """Keeps rows of the run up to an iteration in metrics.jsonl; `metrics.cut_back` has the rest."""
-    return metrics.cut_back(folder.metrics, last, checkpoints.run_id, _aside(folder), keeps_later)
+    return metrics.cut_back(folder.metrics, last, checkpoints.run_id, _aside(folder), keeps_later, evaluated)
 
 
 def _aside(folder: RunFolder) -> Path:

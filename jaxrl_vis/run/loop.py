@@ -101,6 +101,7 @@ class RunLoop:
         self._is_left_alone = False
         self._evaluated_there: set[int] = set()  # seeds that have a row of the iteration that the run goes on from
         self._evaluates_ahead = False  # while the iteration before is still learned from
+        self._evaluated_at = 0  # the last evaluation that what was restored knows of
         self._owed_evaluation = False  # what was restored owes an evaluation, and would whenever it is restored
         self.has_begun = False  # the folder is this run's
 
@@ -258,7 +259,7 @@ class RunLoop:
             foreign: Those of other runs.
         """
         if goes_on:
-            if said := earlier.cut_back(self._folder, self._checkpoints, self._done, keeps_later=bool(damaged)):
+            if said := earlier.cut_back(self._folder, self._checkpoints, self._done, bool(damaged), self._evaluated_at):
                 self._say(said)
             self._evaluated_there = {row["seed"] for row in self._folder.rows() if row["iteration"] == self._done}
         for path in damaged:
@@ -269,7 +270,7 @@ class RunLoop:
 
     def _take_over(self, restored: Restored) -> None:
         self._progress = Progress.from_dict(restored.progress)
-        self._done = restored.iteration
+        self._done, self._evaluated_at = restored.iteration, earlier.last_evaluation(restored)
         # A run that has come far enough before it was evaluated, or that is asked for fewer steps than it has, ends with that.
         self._progress.evaluation_due |= self._done >= self._total and not earlier.is_evaluated(
             self._folder, self._programs.seeds, restored

@@ -88,12 +88,13 @@ class Contents:
 
     Attributes:
         rows: The rows, in the order of their iterations.
-        damaged: Number and bytes of every line that is no row, or a row that is there already. What a kill has left of the last
-            line does not count: that row was never whole.
+        damaged: Number and bytes of every line that is no row, or a row that is there already.
+        torn: What is left of a last line that no line break ends. It is not in ``damaged``: after a kill, that row was never whole.
     """
 
     rows: list[dict[str, Any]]
     damaged: list[tuple[int, bytes]]
+    torn: bytes = b""
 
 
 def append_rows(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
@@ -124,16 +125,18 @@ def read_contents(path: Path) -> Contents:
     except OSError as error:
         raise RequestError(f"cannot read {path} ({error.strerror or type(error).__name__})") from error
     rows: dict[tuple[int, int, str | None], dict[str, Any]] = {}
-    damaged = []
+    damaged, torn = [], b""
     for number, line in enumerate([*lines, last], 1):
         is_last = number > len(lines)  # what no line break ends
         row = _read_row(line)
         place = None if row is None else (row["iteration"], row["seed"], row.get(RUN_ID))
         if row is not None and place is not None and place not in rows:
             rows[place] = row
-        elif line.strip() and not (is_last and row is None):
+        elif is_last and row is None:
+            torn = line.strip()
+        elif line.strip():
             damaged.append((number, line))
-    return Contents(sorted(rows.values(), key=lambda row: row["iteration"]), damaged)
+    return Contents(sorted(rows.values(), key=lambda row: row["iteration"]), damaged, torn)
 
 
 def _read_row(line: bytes) -> dict[str, Any] | None:
@@ -168,7 +171,7 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
     return read_contents(path).rows
 
 
-def cut_back(path: Path, iteration: int, run_id: str | None, aside: Path, keeps_later: bool) -> str | None:
+def cut_back(path: Path, iteration: int, run_id: str | None, aside: Path, keeps_later: bool, evaluated: int = 0) -> str | None:
     """Takes out every row after ``iteration``, which a resumed run writes again, and all that is not this run's.
 
     Args:
@@ -177,6 +180,8 @@ def cut_back(path: Path, iteration: int, run_id: str | None, aside: Path, keeps_
         run_id: Of the run; None for one of an earlier version, which has none.
         aside: To this file goes what is damaged, or of another run; nothing is ever dropped.
         keeps_later: Rows after ``iteration``, too.
+        evaluated: The last iteration that is known to have had a row of each seed, or 0: where one is missing, a torn line was
+            that.
 
     Returns:
         A line on what is damaged or of another run; None where nothing is.
@@ -191,14 +196,18 @@ def cut_back(path: Path, iteration: int, run_id: str | None, aside: Path, keeps_
     foreign = [row for row in contents.rows if row.get(RUN_ID) != run_id]
     rows = [row for row in contents.rows if row.get(RUN_ID) == run_id]
     later = [row for row in rows if keeps_later and row["iteration"] > iteration]
-    kept = [line for _, line in contents.damaged] + [json.dumps(row).encode() for row in (*foreign, *later)]
+    damaged = list(contents.damaged)
+    evaluated_there = {row["seed"] for row in rows if row["iteration"] == evaluated}
+    if contents.torn and evaluated and (not evaluated_there or evaluated_there < {row["seed"] for row in rows}):
+        damaged.append((path.read_bytes().count(b"\n") + 1, contents.torn))
+    kept = [line for _, line in damaged] + [json.dumps(row).encode() for row in (*foreign, *later)]
     if kept:
         aside.parent.mkdir(parents=True, exist_ok=True)
         _append(aside, b"".join(line + b"\n" for line in kept))
     text = "".join(json.dumps(row) + "\n" for row in rows if row["iteration"] <= iteration)
     if text.encode() != path.read_bytes():
         write_atomically(path, text)
-    what = [_describe(contents.damaged)] if contents.damaged else []
+    what = [_describe(damaged)] if damaged else []
     what += [f"{len(foreign)} row{'s' * (len(foreign) > 1)} of another run"] if foreign else []
     return f"{path.name} held {' and '.join(what)}: kept in {aside}, and left out here" if what else None
 

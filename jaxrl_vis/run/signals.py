@@ -25,19 +25,24 @@ _NAMES = (
     *("SIGHUP", "SIGINT", "SIGQUIT", "SIGTERM", "SIGUSR1", "SIGUSR2", "SIGALRM", "SIGXCPU"),
     *("SIGVTALRM", "SIGPROF", "SIGPOLL", "SIGPWR", "SIGSTKFLT", "SIGBREAK"),
 )
-SIGNALS: tuple[int, ...] = tuple(int(getattr(signal, name)) for name in _NAMES if hasattr(signal, name))
+_REAL_TIME = range(signal.SIGRTMIN, signal.SIGRTMAX + 1) if hasattr(signal, "SIGRTMIN") else range(0)
+SIGNALS: tuple[int, ...] = (*(int(getattr(signal, name)) for name in _NAMES if hasattr(signal, name)), *_REAL_TIME)
 """All that end a process unless it has a handler, but for faults, SIGKILL, and what Python ignores (SIGPIPE, SIGXFSZ)."""
 
 # These are sent by somebody who wants an end, and a second time by somebody who does not want to wait. Of all others a second
 # one says nothing new: SIGXCPU comes every second, and a closed terminal sends SIGHUP by the kernel and by the shell.
-_DELIBERATE = tuple(number for number in SIGNALS if signal.Signals(number).name in ("SIGINT", "SIGTERM", "SIGQUIT", "SIGBREAK"))
+_DELIBERATE = tuple(
+    int(getattr(signal, name)) for name in ("SIGINT", "SIGTERM", "SIGQUIT", "SIGBREAK") if hasattr(signal, name)
+)
 # Libraries install handlers in C for these two (JAX's notice of preemption, for one), which may be replaced.
 _TAKEN_FROM_LIBRARIES = (signal.SIGINT, signal.SIGTERM)
 _PATIENCE_S = 10.0  # after a signal a command has so long to end by itself: XLA, which compiles, may not look up for minutes
 
 
 def name_of(number: int) -> str:
-    """What to call a signal in a message: ``SIGHUP``, or ``Ctrl-C``."""
+    """What to call a signal in a message: ``SIGHUP``, ``SIGRTMIN+2``, or ``Ctrl-C``."""
+    if number in _REAL_TIME[1:-1]:  # Python has names for the first and the last of these
+        return f"SIGRTMIN+{number - _REAL_TIME[0]}"
     return "Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name
 
 
