@@ -23,7 +23,7 @@ import jaxrl_vis_envs
 from jaxrl_vis.bench.render_scenes import forward, scatter_joints
 from jaxrl_vis_envs.compilation import compiler_options
 from jaxrl_vis_envs.render import Frame, Scene, render
-from jaxrl_vis_envs.render.model.reading import FREE_CAMERA
+from jaxrl_vis_envs.render.model.cameras import FREE_CAMERA
 
 SEED = 0
 # OpenGL draws polygons where a ray caster draws balls, and lights their corners: with fine ones the two mean the same.

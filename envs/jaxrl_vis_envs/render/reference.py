@@ -9,7 +9,8 @@ from typing import Any, Self
 import mujoco
 import numpy as np
 
-from jaxrl_vis_envs.render.model.reading import FREE_CAMERA, Camera, check_size
+from jaxrl_vis_envs.render.model.cameras import FREE_CAMERA, Camera
+from jaxrl_vis_envs.render.model.reading import check_size
 from jaxrl_vis_envs.render.outputs import Frame
 
 

@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 
 from jaxrl_vis_envs.render import mounts
-from jaxrl_vis_envs.render.model import meshes, reading, textures
+from jaxrl_vis_envs.render.model import cameras, meshes, reading, textures
 
 
 def _leaf() -> Any:
@@ -84,7 +84,7 @@ class Scene:
         reordered: Whether an object that reflects is drawn before others that come before it in the model. In segmentations
             MuJoCo keeps to the model's order.
         geom_count: ngeom of the model.
-        camera_id: The camera's index in the model; `reading.FREE_CAMERA` for a free one.
+        camera_id: The camera's index in the model; `cameras.FREE_CAMERA` for a free one.
         camera_mount: What the camera is fixed to.
         body_parents: nbody indices of the bodies that bodies hang on, where ``body_mass`` holds their masses, else none.
         projection: "perspective", "intrinsic" (a perspective camera with a sensor) or "orthographic".
@@ -161,7 +161,7 @@ class Scene:
     def from_mjmodel(
         cls,
         mj_model: mujoco.MjModel,
-        camera: reading.Camera = None,
+        camera: cameras.Camera = None,
         height: int = 64,
         width: int = 64,
         groups: tuple[int, ...] = (0, 1, 2),
@@ -209,7 +209,7 @@ class Scene:
         site_groups = reading.group_numbers("site_groups", site_groups)
         reading.check_names(mj_model, leave_out)
         reading.check_lights(lights)
-        camera_id = reading.find_camera(mj_model, camera)
+        camera_id = cameras.find_camera(mj_model, camera)
         appearance = reading.object_appearance(mj_model)
         types = reading.object_types(mj_model)
         drawn = reading.drawn_objects(mj_model, appearance["rgba"], groups, site_groups, leave_out)
@@ -222,10 +222,10 @@ class Scene:
             appearance["rgba"] *= reading.mean_texture_colours(mj_model)
         light_leaves, light_facts = reading.lights(mj_model, appearance["specular"][ids], shadows, points=lights == "all")
         leaves = {"bound": reading.bounds(mj_model), **appearance, **light_leaves}
-        leaves |= reading.camera_parameters(mj_model, camera_id, camera)
+        leaves |= cameras.camera_parameters(mj_model, camera_id, camera)
         leaves["sky_top"], leaves["sky_bottom"] = reading.sky_colours(mj_model)
         leaves["haze_colour"] = mj_model.vis.rgba.haze[:3]
-        camera_mount = reading.camera_mount(mj_model, camera_id)
+        camera_mount = cameras.camera_mount(mj_model, camera_id)
         leaves["body_mass"], parents = reading.weights(mj_model, (camera_mount, *light_facts["light_mounts"]))
         arrays = {name: np.asarray(value, np.float32) for name, value in leaves.items()}
         clear = transparency[ids] == reading.CLEAR
@@ -241,7 +241,7 @@ class Scene:
             camera_id=camera_id,
             camera_mount=camera_mount,
             body_parents=parents,
-            projection=reading.projection(mj_model, camera_id, camera),
+            projection=cameras.projection(mj_model, camera_id, camera),
             height=int(height),
             width=int(width),
             **light_facts,
