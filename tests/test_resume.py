@@ -112,8 +112,13 @@ def test_overwrite_deletes_the_run_and_nothing_else(tmp_path):
     path = tmp_path / "run"
     list(make_fake_trainer(small_config(env_steps=20), path).run())
     (path / "notes.txt").write_text("mine")
+    (path / "checkpoints" / "notes.txt").write_text("mine")
     assert len(list(make_fake_trainer(small_config(seed=5, env_steps=20), path, overwrite=True).run())) == 2
-    assert (path / "notes.txt").exists() and {row["seed"] for row in rows_without_time(path)} == {5, 6}
+    assert (
+        (path / "notes.txt").exists()
+        and (path / "checkpoints" / "notes.txt").exists()
+        and {row["seed"] for row in rows_without_time(path)} == {5, 6}
+    )
 
 
 def test_a_contradicting_config_is_named(straight):

@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
@@ -244,6 +245,29 @@ def test_a_name_that_is_too_long_is_one_line(tmp_path, monkeypatch, capsys, word
     assert cli.main([*words, name]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and "File name too long" in error and len(error) < 300
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["eval"],
+        ["play"],
+        ["verify"],
+        ["train", "--resume", "--run-dir"],
+        ["train", "Reacher", "--preset", "debug", "--run-dir"],
+    ],
+    ids=["eval", "play", "verify", "resume", "train"],
+)
+def test_a_run_folder_whose_name_is_not_utf8_is_refused_before_work_is_lost(straight, tmp_path, monkeypatch, capsys, words):
+    monkeypatch.chdir(tmp_path)
+    if "Reacher" not in words:
+        shutil.copytree(straight[0], "run\udcff")
+    before = sorted(Path().rglob("*"))
+    assert cli.main([*words, "run\udcff"]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "'run\\udcff' cannot be a run folder" in error
+    assert sorted(Path().rglob("*")) == before
 
 
 @pytest.mark.parametrize(

@@ -38,9 +38,8 @@ def split(name: str) -> tuple[str, str]:
     """
     module, _, task = name.partition(":")
     if "/" in module or "\\" in module or module.endswith(".py"):
-        dotted = ".".join(
-            part for part in module.removesuffix(".py").replace("\\", "/").split("/") if part not in ("", ".", "..")
-        )
+        parts = module.removesuffix(".py").replace("\\", "/").split("/")
+        dotted = ".".join(part for part in parts if part not in ("", ".", ".."))
         raise TaskModuleError(
             f"{name!r} names a file, not a module: write {dotted}:{task or 'Name'}, in the folder it starts from"
         )

@@ -67,9 +67,21 @@ def default_folder(config: Config) -> Path:
 
 def check_there(path: Path, resume: bool) -> None:
     """Raises a `RequestError` where a run is to go on in a folder that is not there."""
-    check_path(path / "config.json")
+    _check_run_path(path)
     if resume and not path.exists():
         raise RequestError(f"nothing to resume: there is no folder {path}; leave out --resume to start a run there")
+
+
+def _check_run_path(path: Path) -> None:
+    """Checks that a run can lie in ``path``: what writes checkpoints takes only names that are UTF-8."""
+    check_path(path / "config.json")
+    try:
+        str(path.resolve()).encode()
+    except UnicodeEncodeError as error:
+        raise RequestError(
+            f"{str(path)!r} cannot be a run folder, as its whole name is not UTF-8: rename it, or choose another --run-dir "
+            "(where that name looks right elsewhere, the locale is not UTF-8: LC_ALL=C.UTF-8)"
+        ) from error
 
 
 @dataclasses.dataclass(frozen=True)
@@ -239,7 +251,7 @@ class RunFolder:
             RequestError: Something cannot be deleted.
         """
         own = [self.checkpoints / name for name in CHECKPOINT_FOLDERS]
-        if not (self.checkpoints.is_symlink() and self.checkpoints.is_dir()):  # such a link stays: that disk was chosen
+        if not self.checkpoints.is_dir():  # a file, or a link to nothing; a link to a folder stays: that disk was chosen
             own.append(self.checkpoints)
         folders = [self.nonfinite, *(self.path / name for name in LOGGER_FOLDERS)]
         for path in (*own, *folders, self.metrics, self.processes, self.curve, self.video, self.path / WANDB_STATE):
@@ -256,6 +268,9 @@ class RunFolder:
                     f"the run in {self.path} cannot be deleted: {what} stays ({error.strerror or error}). No new run was "
                     "started: delete it by hand, or choose another --run-dir"
                 ) from error
+        if not self.checkpoints.is_symlink():
+            with contextlib.suppress(OSError):  # somebody else's files are in there, or it is not there
+                self.checkpoints.rmdir()
 
 
 def _where_gone(path: Path, place: Path | None, when: str) -> str:
@@ -289,7 +304,7 @@ def read_record(path: Path) -> dict[str, Any]:
         RequestError: There is no run in ``path``, or its config.json cannot be read.
     """
     file = RunFolder(path).config
-    check_path(file)
+    _check_run_path(path)
     if not file.exists():
         raise RequestError(f"no run in {path}: there is no config.json")
     record = read_json(file, mend="put back what it held, or train --overwrite")

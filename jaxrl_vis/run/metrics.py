@@ -89,7 +89,7 @@ class Contents:
     Attributes:
         rows: The rows, in the order of their iterations.
         damaged: Number and bytes of every line that is no row, or a row that is there already.
-        torn: What is left of a last line that no line break ends. It is not in ``damaged``: after a kill, that row was never whole.
+        torn: What is left of a last line that no line break ends. After a kill, that row was never whole.
     """
 
     rows: list[dict[str, Any]]
