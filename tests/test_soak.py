@@ -10,7 +10,7 @@ import pytest
 from benchmarks.soak.record import BEGIN, END, PROMISES, Record, added, put_into
 from benchmarks.soak.soak import Soak
 
-FAULTS, WORKERS = 6, 2
+FAULTS, WORKERS = 4, 2
 
 
 def test_a_minute_of_faults(tmp_path):
@@ -20,7 +20,7 @@ def test_a_minute_of_faults(tmp_path):
         list(pool.map(soak.work, range(WORKERS)))
     assert not soak.record.broken
     assert soak.record.total == FAULTS and len([count for count in soak.record.faults.values() if count]) == FAULTS
-    assert soak.record.runs >= 1 and 0 < soak.record.done <= soak.record.begun and soak.record.resumes >= 5
+    assert soak.record.runs >= 1 and 0 < soak.record.done <= soak.record.begun and soak.record.resumes >= FAULTS - 1
 
 
 def record(seed: int, **changes) -> Record:
