@@ -138,7 +138,7 @@ with shielded_children():
 with ThreadPoolExecutor(initializer=shield_this_thread) as pool:
     second = pool.submit(subprocess.Popen, ["sleep", "30"]).result()
 third = subprocess.Popen(["sleep", "30"])
-with signals.Interruption() as interruption:
+with Interruption() as interruption:
     os.killpg(0, signal.SIGTERM)
     time.sleep(0.5)
     assert interruption
