@@ -4,15 +4,17 @@ import concurrent.futures
 import dataclasses
 import json
 import math
+import os
 
 import pytest
 
 from benchmarks.soak.record import BEGIN, END, PROMISES, Record, added, put_into
 from benchmarks.soak.soak import Soak
 
-FAULTS, WORKERS = 4, 2
+FAULTS, WORKERS = 2, 2
 
 
+@pytest.mark.skipif("JAXRL_VIS_SOAK" not in os.environ, reason="takes both cores for a minute: JAXRL_VIS_SOAK=1 runs it")
 def test_a_minute_of_faults(tmp_path):
     soak = Soak(tmp_path, FAULTS, 0, math.inf, note=lambda record: None, alone=False)
     soak.undisturbed()
