@@ -41,7 +41,7 @@ DEFORMABLES = ("skin", "flex")
 
 @dataclasses.dataclass(frozen=True)
 class Measures:
-    """How far two images are apart, away from edges; the worst over the poses of a row.
+    """Differences of two images, away from edges; the worst over the poses of a row.
 
     Attributes:
         segmentation: Share of pixels that show the same object.
@@ -62,7 +62,7 @@ class Measures:
     missing: tuple[int, ...] = ()
 
     def failures(self) -> list[str]:
-        """What does not hold of the criterion for a pass."""
+        """Parts of the pass criterion that do not hold."""
         held = {
             "seg": self.segmentation >= 0.99,
             "depth": self.depth >= 0.995,
@@ -169,7 +169,7 @@ class Comparison:
             yield scattered
 
     def our_poses(self) -> list[dict[str, np.ndarray]]:
-        """What we draw from: where something that sees or lights moves, from MJX's kinematics alone."""
+        """Poses that we draw from: where something that sees or lights moves, from MJX's kinematics alone."""
         moving = np.any(self.mj_model.cam_bodyid > 0) or np.any(self.mj_model.light_bodyid > 0)
         moving |= np.any(self.mj_model.cam_targetbodyid >= 0) or np.any(self.mj_model.light_targetbodyid >= 0)
         if moving and not self.mj_model.nmocap:  # MJX leaves what hangs on a mocap body behind
@@ -286,7 +286,7 @@ class Comparison:
 
 
 def seen_points(scene: Scene, frame: Frame, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
-    """Where the camera is [3] (m), and where from there what each pixel sees is, [3, H, W] (m); in the world's frame."""
+    """Position of the camera [3] (m), and points seen by each pixel from there, [3, H, W] (m); in the world's frame."""
     position, rotation, _ = camera_pose(scene, data)
     start, direction, _ = ray_parts(scene, pixel_rays(scene, *np.indices(frame.depth.shape)))
     seen = [np.asarray(s + frame.depth * d) * np.ones(frame.depth.shape) for s, d in zip(start, direction, strict=True)]

@@ -76,7 +76,7 @@ def limit_panel(name: str) -> tuple[str, Image.Image]:
 
 
 def difference(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
-    """Of two images [H, W, 3] uint8, times `GAIN`."""
+    """Difference of two images [H, W, 3] uint8, times `GAIN`."""
     return np.minimum(GAIN * np.abs(ours.astype(int) - theirs), 255).astype(np.uint8)
 
 

@@ -121,7 +121,7 @@ def task_table(task: str, groups: dict[tuple[str, str, float], Group]) -> list[s
 
 
 def comparison_table(groups: dict[tuple[str, str, float], Group]) -> list[str]:
-    """What OL-AUX-5 adds at each decay: difference of means with an exact permutation test."""
+    """Table of what OL-AUX-5 adds at each decay: means, and the p-value of an exact permutation test."""
     lines = ["| task | decay | without | OL-AUX-5 | seeds | p |", "|---|---|---|---|---|---|"]
     for task, (title, _, budget) in TASKS.items():
         for decay in sorted({key[2] for key in groups if key[0] == task}, reverse=True):

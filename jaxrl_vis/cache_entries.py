@@ -48,7 +48,7 @@ def _delete_damaged(program: str) -> bool:
 
 
 def _is_whole(entry: Path) -> bool:
-    """Whether an entry can be unpacked, by the library that JAX takes, which is there if an entry is of it."""
+    """Returns whether an entry can be unpacked, by the library that JAX takes, which is there if an entry is of it."""
     try:
         contents = entry.read_bytes()
         if not contents.startswith(_ZSTANDARD):

@@ -70,7 +70,7 @@ def replacing(path: Path, durable: bool = True, mode: int = 0o666) -> Iterator[I
 
 
 def is_temporary(name: str) -> bool:
-    """Whether a file's name is that of a file which `replacing` had not finished."""
+    """Returns whether a file's name is that of a file which `replacing` had not finished."""
     return _TEMPORARY.fullmatch(name) is not None
 
 
@@ -146,7 +146,7 @@ def make_private(folder: Path) -> None:
 
 
 def stranger_to(status: os.stat_result) -> str | None:
-    """Who, beside this user and root, could have written a file or a folder, in words; None for nobody, and on Windows.
+    """Name who, beside this user and root, could have written a file or a folder; None for nobody, and on Windows.
 
     Args:
         status: From `os.stat`, or of the opened file from `os.fstat`.

@@ -29,7 +29,7 @@ def to_csv(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = No
 
 
 def cell(value: Any) -> Any:
-    """What stands in a cell for a value: text that could be computed gets an apostrophe; see `text_of`."""
+    """Text of a cell: one that a spreadsheet would compute gets an apostrophe; see `text_of`."""
     # One that is there already must not be taken for ours.
     return f"'{value}" if isinstance(value, str) and _needs_mark(value) else value
 

@@ -54,18 +54,18 @@ class SafeStream:
                 self.failure = self.failure or error
 
     def isatty(self) -> bool:
-        """Whether this is a terminal."""
+        """Returns whether this is a terminal."""
         with contextlib.suppress(Exception):
             return bool(self._below.isatty())
         return False
 
     @property
     def encoding(self) -> str:
-        """Of what lies below."""
+        """Encoding of the stream below."""
         return getattr(self._below, "encoding", None) or "utf-8"
 
     def fileno(self) -> int:
-        """Of what lies below.
+        """Number of the file below.
 
         Raises:
             OSError: It has none.

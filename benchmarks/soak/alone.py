@@ -76,6 +76,7 @@ def _finished(part: Part, *statuses: int) -> Part:
 
 
 def nan_on_one_seed(folder: Path, dice: random.Random, _: "References") -> None:
+    """Makes a reward NaN on one of two seeds: the run stops, names the seed, and goes on from its last good checkpoint."""
     folder.mkdir()
     (folder / "broken_task.py").write_text(TASK)
     run, steps = folder / "run", 4 * 50
@@ -174,6 +175,7 @@ def _rows_of_cells(folder: Path) -> dict[str, list]:
 
 
 def job_of_a_study(folder: Path, dice: random.Random, references: "References") -> None:
+    """Kills a run of a sweep whose runs are jobs of submitit; then the sweep finishes."""
     worker_of_a_study(folder, dice, references, ("--executor", "local"))
 
 
@@ -186,9 +188,9 @@ def _tables(out: Path) -> dict[str, bytes]:
 
 
 def worker_of_phenotyping(folder: Path, dice: random.Random, references: "References") -> None:
+    """Kills a worker of ``phenotype run``; then the same tables are written."""
     plots, tables = references.phenotyping()
-    words = _phenotype(folder, plots)
-    _pool(words, folder, dice)
+    _pool(_phenotype(folder, plots), folder, dice)
     if _tables(folder / "out") != tables:
         raise Broken("tables differ from those of an undisturbed run")
 
@@ -199,7 +201,7 @@ def _grasp(folder: Path, spec: Path) -> list[str]:
 
 
 def _figures(file: Path) -> list[dict[str, Any]]:
-    """What was found in each run, without how long it took."""
+    """Results of each run, without durations."""
     each = json.loads(file.read_text())["each"]
     for record in each:
         del record["score"]["seconds"]
@@ -207,9 +209,9 @@ def _figures(file: Path) -> list[dict[str, Any]]:
 
 
 def worker_of_grasping(folder: Path, dice: random.Random, references: "References") -> None:
+    """Kills a worker of ``grasp eval``; then the same figures are found."""
     spec, figures = references.grasping()
-    words = _grasp(folder, spec)
-    _pool(words, folder, dice)
+    _pool(_grasp(folder, spec), folder, dice)
     if _figures(folder / "eval.json") != figures:
         raise Broken("figures differ from those of an undisturbed evaluation")
 
@@ -238,7 +240,7 @@ def _pool(words: Sequence[str], folder: Path, dice: random.Random) -> None:
 
 
 class References:
-    """What undisturbed commands leave, made when it is first asked for.
+    """Results of undisturbed commands, made when first asked for.
 
     Args:
         folder: Where it lies.

@@ -15,16 +15,24 @@ def _run(*command: str) -> bool:
 
 
 @contextlib.contextmanager
-def _moved_to(folder: Path, disk: Path) -> Iterator[Path]:
-    """The run folder on another disk; what is there afterwards is put back."""
+def _moved_to(folder: Path, disk: Path, mounted: bool) -> Iterator[Path]:
+    """The run folder on another disk, put back and unmounted afterwards; ``folder`` itself where nothing is mounted."""
     there = disk / "run"
-    if folder.exists():
-        shutil.copytree(folder, there)
-    yield there
-    if folder.exists():
-        shutil.rmtree(folder)
-    if there.exists():
-        shutil.copytree(there, folder)
+    try:
+        if not mounted:
+            yield folder
+            return
+        if folder.exists():
+            shutil.copytree(folder, there)
+        yield there
+        if folder.exists():
+            shutil.rmtree(folder)
+        if there.exists():
+            shutil.copytree(there, folder)
+    finally:
+        if mounted:
+            subprocess.run(["umount", "-l", str(disk)], check=True)
+        disk.rmdir()
 
 
 @contextlib.contextmanager
@@ -49,16 +57,8 @@ def small_disk(folder: Path) -> Iterator[tuple[Path, Callable[[], bool]]]:
                         pass
         return True
 
-    try:
-        if not mounted:
-            yield folder, fill
-            return
-        with _moved_to(folder, disk) as there:
-            yield there, fill
-    finally:
-        if mounted:
-            subprocess.run(["umount", "-l", str(disk)], check=True)
-        disk.rmdir()
+    with _moved_to(folder, disk, mounted) as there:
+        yield there, fill
 
 
 @contextlib.contextmanager
@@ -82,16 +82,10 @@ def freezing_disk(folder: Path) -> Iterator[tuple[Path, Callable[[bool], bool]]]
         is_frozen = still
         return True
 
-    try:
-        if not mounted:
-            yield folder, freeze
-            return
-        with _moved_to(folder, disk) as there:
+    with _moved_to(folder, disk, mounted) as there:
+        try:
             yield there, freeze
-    finally:
-        if is_frozen:
-            freeze(False)
-        if mounted:
-            subprocess.run(["umount", "-l", str(disk)], check=True)
-        disk.rmdir()
-        image.unlink()
+        finally:
+            if is_frozen:
+                freeze(False)
+    image.unlink()

@@ -1,4 +1,4 @@
-"""What strikes a run, and what must hold then. `FAULTS` has them all.
+"""Faults that strike a run, and what must hold then. `FAULTS` has them all.
 
 A strike lets its fault happen at a random moment of training and returns the exit status that the process ended with, or None
 where the run was over before. It raises `Broken` where what the fault itself promises was not kept; what all must keep
@@ -129,10 +129,15 @@ def _stalled_disk(folder: Path, dice: random.Random) -> int | None:
         return part.stop() or None
 
 
+def _with_site(**variables: str) -> dict[str, str]:
+    """Variables of a process that imports `site/sitecustomize.py` as it starts."""
+    return {**variables, "PYTHONPATH": os.pathsep.join((str(SITE), environment()["PYTHONPATH"]))}
+
+
 def _jumping_clock(folder: Path, dice: random.Random) -> int | None:
     clock = folder.with_name(f"{folder.name}.clock")
     clock.unlink(missing_ok=True)
-    variables = {"SOAK_CLOCK": str(clock), "PYTHONPATH": os.pathsep.join((str(SITE), environment()["PYTHONPATH"]))}
+    variables = _with_site(SOAK_CLOCK=str(clock))
     with killed_afterwards(_started(folder, dice, variables)) as part:
         for _ in range(3):
             clock.write_text(str(dice.choice((-1, 1)) * dice.uniform(60.0, 30 * 86400.0)))
@@ -285,11 +290,9 @@ def _vanished(folder: Path, dice: random.Random) -> int | None:
 
 
 def _lock_of_the_dead(folder: Path, dice: random.Random) -> int | None:
-    """Where there are no locks, a lease must run out, which takes a minute: seldom."""
+    """Leave a dead process's lock. Where there are no locks a lease must run out, which takes a minute: seldom."""
     no_locks = dice.random() < 0.15
-    variables = {"PYTHONPATH": os.pathsep.join((str(SITE), environment()["PYTHONPATH"]))} | (
-        {"SOAK_NO_LOCKS": "1"} if no_locks else {}
-    )
+    variables = _with_site(SOAK_NO_LOCKS="1") if no_locks else _with_site()
     with killed_afterwards(_started(folder, dice, variables)) as part:
         if part.send(signal.SIGKILL) == 0:
             return None

@@ -17,7 +17,7 @@ _FOREVER = 10**9  # environment steps
 
 @dataclasses.dataclass(frozen=True)
 class Killed:
-    """What became of a run that was killed again and again.
+    """Outcome of a run that was killed again and again.
 
     Attributes:
         env_steps: Those of its networks, per seed.

@@ -142,7 +142,7 @@ class Part:
         return self.send(signal.SIGTERM) if self.runs() else self.end()
 
     def runs(self) -> bool:
-        """Whether the process has not ended yet."""
+        """Returns whether the process has not ended yet."""
         return self.process.poll() is None
 
     def wait_for(self, condition: Callable[[], bool], seconds: float = 180.0) -> bool:
@@ -155,15 +155,15 @@ class Part:
         return condition()
 
     def is_compiling(self) -> bool:
-        """Whether compilation has begun."""
+        """Returns whether compilation has begun."""
         return any(line.startswith("compiling") for line in self.lines)
 
     def is_training(self) -> bool:
-        """Whether compilation is over."""
+        """Returns whether compilation is over."""
         return any(line.startswith("compiled in") for line in self.lines)
 
     def is_saving(self) -> bool:
-        """Whether a checkpoint is half written."""
+        """Returns whether a checkpoint is half written."""
         return any("tmp" in path.name for path in self.folder.glob("checkpoints/*/*"))
 
     def count(self, words: str) -> int:

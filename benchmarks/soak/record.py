@@ -1,4 +1,4 @@
-"""What a soak has seen, as a file; and several of these as one table."""
+"""Record of a soak as a file, and several of them as one table."""
 
 import dataclasses
 import json
@@ -28,7 +28,7 @@ def _machine() -> dict[str, Any]:
 
 @dataclasses.dataclass
 class Record:
-    """Of one soak, or of several.
+    """Results of one soak, or of several.
 
     Attributes:
         machine: Commit, versions, cores.
@@ -71,7 +71,7 @@ class Record:
         return cls(**json.loads(path.read_text()))
 
     def table(self) -> str:
-        """What happened, as Markdown."""
+        """Table of all faults, as Markdown."""
         lines = ["| fault | times | what must hold |", "|---|---|---|"]
         lines += [f"| {name} | {self.faults.get(name, 0)} | {promise} |" for name, promise in PROMISES.items()]
         share = self.done / self.begun if self.begun else 1.0

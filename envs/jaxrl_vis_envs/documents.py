@@ -48,7 +48,7 @@ def read_text(path: Path, most: int = MOST_BYTES) -> str:
 
 
 def read_json(path: Path, most: int = MOST_BYTES) -> Any:
-    """What a file of JSON of at most ``most`` bytes says.
+    """Read a JSON file of at most ``most`` bytes.
 
     Raises:
         OSError: It cannot be read, or is no ordinary file.
@@ -58,7 +58,7 @@ def read_json(path: Path, most: int = MOST_BYTES) -> Any:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """What a text of JSON says.
+    """Parse a text of JSON.
 
     Raises:
         ValueError: It is not JSON, or goes deeper than `MOST_LEVELS`.
@@ -67,7 +67,7 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """What a text of TOML says.
+    """Parse a text of TOML.
 
     Raises:
         ValueError: It is not TOML, or goes deeper than `MOST_LEVELS`.

@@ -56,7 +56,7 @@ def check_env(name: str, folder: str | None = None) -> None:
 
 
 def may_run_code(run_dir: Path, trust: bool) -> bool:
-    """Whether a run may run its own code: its user says so, has said so before, has trained it, or answers on a terminal.
+    """Returns whether a run may run its own code: its user says so now or before, trained it, or answers on a terminal.
 
     Args:
         run_dir: The run folder.

@@ -104,7 +104,7 @@ def _together(files: list[Path], read: _Read) -> dict[str, Any]:
 
 
 def _reason(error: Exception) -> str:
-    """What a reader said, where it said it in words."""
+    """Message of a reader's error, where it has one in words."""
     words = " ".join(str(error).split()) if isinstance(error, ValueError) else ""
     return f" ({words[:200]})" if words else ""
 
@@ -193,7 +193,7 @@ def _checked_image(image: dict[str, Any], place: int) -> dict[str, Any]:
 
 
 def _is_inside(name: str) -> bool:
-    """Whether a file's name, as it stands in annotations, leads to nowhere but into their folder, on any system."""
+    """Returns whether a file's name, as it stands in annotations, leads to nowhere but into their folder, on any system."""
     path = PureWindowsPath(name)  # which knows both separators
     steps = path.parts
     return bool(steps) and not path.anchor and ".." not in steps and name == readable(name)

@@ -112,7 +112,7 @@ def _beside(path: Path, side: str) -> Path:
 
 
 def _storage(path: Path) -> dict[str, Any]:
-    """What the file holds, by its names."""
+    """Contents of the file, by name."""
     try:
         store = parse_storage(read_text(path, _MOST_BYTES))
     except OSError as error:

@@ -1,4 +1,4 @@
-"""How large an image is, from the first bytes of its file: known before a decoder asks for the memory."""
+"""Sizes of images from the first bytes of their files, known before a decoder asks for memory."""
 
 import re
 from typing import BinaryIO

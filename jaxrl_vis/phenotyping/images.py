@@ -107,7 +107,7 @@ def read_disparity(path: Path, scale: float = 256.0) -> np.ndarray:
 
 
 def _decoded(path: Path) -> np.ndarray | None:
-    """What a file holds, [H, W] or [H, W, channels] of any type, blue first; None where OpenCV cannot tell.
+    """Pixels of a file, [H, W] or [H, W, channels] of any type, blue first; None where OpenCV cannot decode it.
 
     Raises:
         OSError: The file cannot be read, is no image, or one that no camera takes.

@@ -57,7 +57,7 @@ def read_side(pair: PairFiles, side: Side) -> np.ndarray:
 
 
 def _of_side(pair: PairFiles, side: Side, read: Callable[[Path], T]) -> T:
-    """What ``read`` says of one image of a pair.
+    """Result of ``read`` for one image of a pair.
 
     Raises:
         Unusable: There is none, or it cannot be used.

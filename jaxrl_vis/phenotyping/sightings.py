@@ -97,7 +97,7 @@ class Sighting:
 
 
 def _kind_of(hint: Any) -> tuple[type | tuple[type, ...], bool, int]:
-    """What a value of a field is, whether it may be None, and how many there are."""
+    """Type of a field's values, whether it may be None, and the number of values."""
     one, optional, several = fields.unwrap(hint)
     length = next((len(get_args(part)) for part in (hint, *get_args(hint)) if get_origin(part) is tuple), 1)
     return (int, float) if one is float else one, optional, length if several else 1

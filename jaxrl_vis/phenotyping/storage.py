@@ -19,7 +19,7 @@ _SPECIAL = {".nan": math.nan, ".inf": math.inf, "+.inf": math.inf, "-.inf": -mat
 
 
 def parse_storage(text: str) -> Any:
-    """What a file holds: numbers are float, and what is in quotation marks is text. A matrix is a table with ``data``.
+    """Parse a file of OpenCV's storage: numbers are float, quoted values are text. A matrix is a table with ``data``.
 
     Raises:
         ValueError: It is neither YAML nor XML nor JSON as OpenCV and ROS write them.

@@ -47,7 +47,7 @@ class _Damaged(Exception):
 
 @dataclasses.dataclass(frozen=True)
 class Restored:
-    """What a checkpoint held.
+    """Contents of a checkpoint.
 
     Attributes:
         tier: `LIGHT`, `FULL` or `RECENT`.
@@ -144,7 +144,7 @@ class Checkpoints:
         return sorted((int(name), self._is_ours(folder / name)) for name in names)
 
     def _is_ours(self, checkpoint: Path) -> bool:
-        """Whether the manifest of a checkpoint says so; one that cannot be read is damaged, and may well be ours."""
+        """Returns whether the manifest of a checkpoint says so; one that cannot be read is damaged, and may well be ours."""
         try:
             manifest = read_json(checkpoint / FILE)
         except RequestError:
@@ -305,7 +305,7 @@ class Checkpoints:
         return self._newest_good(template, with_rest=False, only=iteration)
 
     def manifest(self, tier: str, iteration: int) -> dict[str, Any]:
-        """What a checkpoint says of itself: ``schema``, ``iteration``, ``items`` (`arrays.describe`), and ``progress``.
+        """Manifest of a checkpoint: ``schema``, ``iteration``, ``items`` (`arrays.describe`), and ``progress``.
 
         Raises:
             RequestError: It is damaged, or of another schema.

@@ -1,4 +1,4 @@
-"""What a run says while it runs: a progress bar on a terminal, plain lines everywhere else. Nothing that is said can end it."""
+"""Output of a run: a progress bar on a terminal, plain lines everywhere else. Nothing that is printed can end it."""
 
 import statistics
 import sys

@@ -1,4 +1,4 @@
-"""What an earlier part of a run has left: whether it was finished, whether its files belong together, and how to go on."""
+"""Leftovers of an earlier part of a run: was it finished, do its files belong together, and how it goes on."""
 
 from collections.abc import Callable, Collection
 from pathlib import Path
@@ -17,7 +17,7 @@ from jaxrl_vis.types import LoopState
 def is_finished(
     folder: RunFolder, checkpoints: Checkpoints, programs: Programs, total: int, say: Callable[[str], None]
 ) -> bool:
-    """Whether a run was trained for ``total`` iterations: a good checkpoint, a row for it, and what it draws."""
+    """Returns whether a run was trained for ``total`` iterations: a good checkpoint, a row for it, and what it draws."""
     if max([0, *checkpoints.iterations(LIGHT), *checkpoints.iterations(FULL)]) < total:
         return False
     restored = checkpoints.restore_train(programs.shapes)
@@ -41,7 +41,7 @@ def without_replay(programs: Programs, restored: Restored) -> LoopState:
 
 
 def is_evaluated(folder: RunFolder, seeds: Collection[int], restored: Restored) -> bool:
-    """Whether the evaluation that a run ends with is there, of all seeds, if what was restored is its end."""
+    """Returns whether the evaluation that a run ends with is there, of all seeds, if what was restored is its end."""
     rows = [row for row in folder.rows() if row["iteration"] == restored.iteration and "eval/success" in row]
     is_due = Progress.from_dict(restored.progress).evaluation_due
     return not is_due and {row["seed"] for row in rows} >= set(seeds)

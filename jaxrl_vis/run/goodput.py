@@ -39,7 +39,7 @@ class Process:
 
 @dataclasses.dataclass(frozen=True)
 class Account:
-    """What became of the iterations of a run.
+    """Account of the iterations of a run.
 
     Attributes:
         done: Iterations that are in the networks.

@@ -40,7 +40,7 @@ class Findings:
 
 @dataclasses.dataclass(frozen=True)
 class Expected:
-    """What must hold for every row of a run.
+    """Conditions that every row of a run must meet.
 
     Attributes:
         seeds: Of the run, in order.
@@ -106,7 +106,7 @@ def read_file(path: Path, expected: Expected, is_written: bool, findings: Findin
 
 
 def _fault(row: Mapping[str, Any], expected: Expected) -> str:
-    """What contradicts the configuration in a row; empty if nothing does."""
+    """Contradiction between a row and the configuration; empty if there is none."""
     iteration = row["iteration"]
     if row.get(RUN_ID) != expected.run_id:
         return f"is another run's ({row[RUN_ID]})" if RUN_ID in row else "names no run"

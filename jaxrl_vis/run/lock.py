@@ -75,7 +75,7 @@ class Held:
             )
 
     def is_in_place(self) -> bool:
-        """Whether the folder still lies under its name, and not another one, or none."""
+        """Returns whether the folder still lies under its name, and not another one, or none."""
         if (self._folder / FILE_NAME).exists():
             return True
         with contextlib.suppress(OSError):  # the folder may be there, and the lock's file deleted by hand
@@ -83,7 +83,7 @@ class Held:
         return False
 
     def place(self) -> Path | None:
-        """Where the folder lies now, if it was moved; None where it was deleted, or the system does not say."""
+        """Present path of the folder, if it was moved; None where it was deleted, or the system does not say."""
         if self._descriptor is None:
             return None
         with contextlib.suppress(OSError):
@@ -153,7 +153,7 @@ def _lock_by_system(path: Path, stack: contextlib.ExitStack) -> bool:
 
 
 def _has_locks(folder: Path) -> bool:
-    """Whether files there can be locked, asked of one that nobody else sees: a lock file would be taken for a holder's."""
+    """Returns whether files there can be locked, tried on one that nobody else sees: a lock file would look held."""
     with tempfile.TemporaryFile(dir=folder) as file:
         try:
             filelock.lock_descriptor(file.fileno(), blocking=False)
@@ -250,7 +250,7 @@ def _holder(text: str) -> str:
 
 
 def _is_alive_or_elsewhere(text: str) -> bool:
-    """Whether the process that a system's lock names may still run, asked where that lock cannot be."""
+    """Returns whether the process that a system's lock names may still run, asked where that lock cannot be."""
     owner = _owner(text)
     if owner is None:
         return False

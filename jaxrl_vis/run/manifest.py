@@ -12,12 +12,12 @@ FILE = "manifest/metadata"
 
 
 def progress_in(manifest: Mapping[str, Any]) -> Any:
-    """What the host has to remember, as `Progress.from_dict` takes it; schema 1 called it "memo"."""
+    """Progress in a manifest, as `Progress.from_dict` takes it; schema 1 called it "memo"."""
     return manifest.get("progress", manifest.get("memo", {}))
 
 
 def is_manifest(value: Any) -> bool:
-    """Whether a value is what `checkpoint` saves as a manifest, as far as it is relied on."""
+    """Returns whether a value is what `checkpoint` saves as a manifest, as far as it is relied on."""
     if not isinstance(value, dict) or not isinstance(value.get("items"), dict) or "schema" not in value:
         return False
     arrays = [each for item in value["items"].values() for each in (item.values() if isinstance(item, dict) else [None])]

@@ -84,7 +84,7 @@ def scalars(row: Row) -> dict[str, float]:
 
 @dataclasses.dataclass(frozen=True)
 class Contents:
-    """What a metrics file holds.
+    """Contents of a metrics file.
 
     Attributes:
         rows: The rows, in the order of their iterations.

@@ -31,7 +31,7 @@ def _episodes(loop: LoopState, *names: str) -> dict[str, np.ndarray]:
 
 
 def made_by_simulation(loop: LoopState, num_envs: int) -> str | None:
-    """What shows that the simulation has made a number that is not finite, in words; None where nothing shows that.
+    """Describe the evidence that the simulation made a non-finite number; None where there is none.
 
     It did where such a number came before the first action that is not finite: what comes after that is the learner's fault.
 
@@ -60,7 +60,7 @@ def made_by_simulation(loop: LoopState, num_envs: int) -> str | None:
 
 
 def _first(is_bad: np.ndarray) -> np.ndarray:
-    """Where along the last axis it is true first; the axis' length where it is nowhere."""
+    """Index of the first true value along the last axis; the axis' length where there is none."""
     return np.where(is_bad.any(-1), is_bad.argmax(-1), is_bad.shape[-1])
 
 

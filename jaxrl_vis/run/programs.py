@@ -164,7 +164,7 @@ class Programs:
         return dict(self._compiled)
 
     def says_of_cache(self) -> str:
-        """What the next start will find of what is compiled now, in words."""
+        """Describe what the next start will find in the cache of what is compiled now."""
         folder, fault = enable_compilation_cache(), cache_fault()
         if fault is not None:
             return f"as will every start: {fault}"

@@ -39,7 +39,7 @@ _EPISODES = "replay.episodes."
 
 
 def is_cheap(replay: ReplayState) -> bool:
-    """Whether little time and disk are needed to keep this replay (or one of these shapes) up to date in files."""
+    """Returns whether little time and disk are needed to keep this replay (or one of these shapes) up to date in files."""
     return jax.default_backend() == "cpu" and num_bytes(replay) <= _MOST_BYTES
 
 
@@ -66,7 +66,7 @@ class Recent:
         self._cost, self._saved_at, self._is_off = 0.0, -np.inf, False
 
     def is_due(self, in_any_case: bool) -> bool:
-        """Whether so much time has passed since the last one that saving takes a small share of it.
+        """Returns whether so much time has passed since the last one that saving takes a small share of it.
 
         Args:
             in_any_case: Do not look at the time.
@@ -78,7 +78,7 @@ class Recent:
         return sorted(iteration for iteration in _numbers(self._folder, "state") if self._is_ours(iteration))
 
     def _is_ours(self, iteration: int) -> bool:
-        """Whether the first line of a state says so; one that cannot be read is damaged, and may well be ours."""
+        """Returns whether the first line of a state says so; one that cannot be read is damaged, and may well be ours."""
         try:
             return self.run_id in (ANY_RUN, self._header(iteration).get(RUN_ID))
         except Unusable:
@@ -170,7 +170,7 @@ class Recent:
         self._rollouts = {number: checksum for number, checksum in self._rollouts.items() if number >= int(first)}
 
     def manifest(self, iteration: int) -> dict[str, Any]:
-        """What a state says of itself: ``iteration``, ``items`` (`arrays.describe`), ``progress``, and whose it is.
+        """Manifest of a state: ``iteration``, ``items`` (`arrays.describe`), ``progress``, and the run's id.
 
         Raises:
             Unusable: It is damaged.

@@ -48,7 +48,7 @@ class Verification(Findings):
 
     @property
     def is_equal(self) -> bool:
-        """Whether something was repeated, all of that is equal, and nothing is missing, damaged or another run's."""
+        """Returns whether something was repeated, all of that is equal, and nothing is missing, damaged or another run's."""
         return self.rows > 0 and not self.problems
 
 
@@ -161,7 +161,7 @@ class Repeater:
         return list(dict.fromkeys([scheduled, *evaluated[:_OTHER_BEGINS], earliest]))
 
     def _rows_of(self, iteration: int, evaluated: PerSeed, history: Sequence[PerSeed]) -> dict[int, Row]:
-        """What a run writes of an iteration, by seed, less what is not repeated."""
+        """Rows that a run writes for an iteration, by seed, without columns that are not repeated."""
         counts = {
             "iteration": iteration,
             "updates": iteration * self._expected.updates,
@@ -195,7 +195,7 @@ class Repeater:
 
 
 def _saved(tier: str, manifest: Mapping[str, Any], loop: LoopState) -> Iterator[tuple[Mapping[str, Any], Any]]:
-    """What a manifest says of arrays, and the arrays of a state that it should say that of, one part after the other."""
+    """Pairs of a manifest's items and the arrays of a state that they describe, part by part."""
     items = manifest["items"]
     if tier == RECENT:
         kept = {"train": loop.train, "key": loop.key, "iteration": loop.iteration, "replay": {"size": loop.replay.size}}
@@ -207,12 +207,12 @@ def _saved(tier: str, manifest: Mapping[str, Any], loop: LoopState) -> Iterator[
 
 
 def progress_of(manifest: Mapping[str, Any]) -> Progress:
-    """What the host remembered with a checkpoint."""
+    """Progress that the host saved with a checkpoint."""
     return Progress.from_dict(progress_in(manifest))
 
 
 def has_progress(manifest: Mapping[str, Any], seeds: int) -> bool:
-    """Whether a manifest says what the host remembered, in the types that it had.
+    """Returns whether a manifest says what the host remembered, in the types that it had.
 
     Args:
         manifest: Of a checkpoint.

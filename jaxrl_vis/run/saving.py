@@ -1,4 +1,4 @@
-"""What a run saves, when it may, and in which order.
+"""Contents, occasions and order of what a run saves.
 
 A checkpoint holds finite numbers only, and metrics.jsonl is on the disk before a checkpoint of the same iteration is (but for
 a recent state, whose evaluation may be due still). On a signal the light checkpoint is written first, which takes seconds, and
@@ -87,7 +87,7 @@ class Saver:
         return self._programs.layout.mesh is None and is_cheap(self._programs.shapes.replay)
 
     def is_recent_due(self, light: bool) -> bool:
-        """Whether `recent` is to be called after this iteration: it is cheap, and was not called for long enough.
+        """Returns whether `recent` is to be called after this iteration: it is cheap, and was not called for long enough.
 
         Args:
             light: Whether a light checkpoint is written, which must not be the newest, for it would be gone on from.
@@ -160,7 +160,7 @@ class Saver:
 
     @property
     def resume(self) -> str:
-        """How to go on, for a shell."""
+        """Command line that goes on with the run, quoted for a shell."""
         return f"go on with --run-dir {shlex.quote(str(self._folder.path))} --resume"
 
     @contextlib.contextmanager

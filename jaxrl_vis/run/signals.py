@@ -40,7 +40,7 @@ _PATIENCE_S = 10.0  # after a signal a command has so long to end by itself: XLA
 
 
 def name_of(number: int) -> str:
-    """What to call a signal in a message: ``SIGHUP``, ``SIGRTMIN+2``, or ``Ctrl-C``."""
+    """Name of a signal for a message: ``SIGHUP``, ``SIGRTMIN+2``, or ``Ctrl-C``."""
     if number in _REAL_TIME[1:-1]:  # Python has names for the first and the last of these
         return f"SIGRTMIN+{number - _REAL_TIME[0]}"
     return "Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name
@@ -97,7 +97,7 @@ class _Handlers:
 
 
 def _is_free(number: int, caught_in_c: int) -> bool:
-    """Whether a signal would end this process, or is taken care of by the classes of this module."""
+    """Returns whether a signal would end this process, or is taken care of by the classes of this module."""
     handler = signal.getsignal(number)
     if handler is signal.default_int_handler or isinstance(getattr(handler, "__self__", None), _Handlers):
         return True
@@ -139,19 +139,19 @@ class Interruption(_Handlers):
         return self.signal is not None
 
     def reached_any(self) -> bool:
-        """Whether this process, or another of several that all ask here, was told to end; they then agree on the signal."""
+        """Returns whether any of several processes, which all ask here, was told to end; they then agree on the signal."""
         if number := processes.greatest(self.signal or 0):
             self.signal = number
         return bool(number)
 
     @property
     def name(self) -> str:
-        """What to call the signal in a message."""
+        """Name of the signal for a message."""
         return name_of(self.signal or signal.SIGTERM)
 
     @property
     def hurry(self) -> str:
-        """What would end the process without waiting, in a message."""
+        """Words for what would end the process without waiting."""
         return "once more quits" if self.signal in _DELIBERATE else "Ctrl-C or SIGTERM, twice, quits"
 
     def _note(self, number: int, _: FrameType | None) -> None:

@@ -1,4 +1,4 @@
-"""Whose code a run folder may run.
+"""Trust in the code that a run folder names.
 
 A run on a task of somebody's own, ``module:Name``, names that module and the folder to import it from: whoever uses the run
 runs that code. Nothing else in a run folder is code. So a run is used only by a user who has trained it here, or who has said
@@ -24,12 +24,12 @@ _trusted_here: set[str] = set()  # by this process, where the cache cannot be wr
 
 
 def is_own(config: Config) -> bool:
-    """Whether the task of a configuration is somebody's own code."""
+    """Returns whether the task of a configuration is somebody's own code."""
     return task_modules.is_own(config.env)
 
 
 def is_trusted(run_dir: Path, config: Config) -> bool:
-    """Whether the code of a run's task was trusted before, and is the same as far as it can be told; or there is none.
+    """Returns whether the code of a run's task was trusted before, and is the same as far as it can be told; or there is none.
 
     Raises:
         RequestError: There is no run in ``run_dir``, or its task is not written ``module:Name``.
@@ -93,7 +93,7 @@ def _is_kept(name: str) -> bool:
 
 
 def _file(config: Config) -> Path | None:
-    """Where the module of a task lies that would be imported, without importing anything; None where it is not there."""
+    """Path of a task's module, found without importing anything; None where there is none."""
     try:
         module, _ = task_modules.split(config.env)
         return task_modules.find(module, config.env_folder)

@@ -173,7 +173,7 @@ class _Verifier:
         )
 
     def _is_there(self, tier: str, number: int) -> bool:
-        """Whether a checkpoint was not deleted meanwhile by the run itself, which keeps the newest two."""
+        """Returns whether a checkpoint was not deleted meanwhile by the run itself, which keeps the newest two."""
         return (self._folder.checkpoints / tier / str(number)).is_dir()
 
     def _read_manifests(self) -> None:
@@ -216,7 +216,7 @@ class _Verifier:
                 self._manifests[RECENT, number] = manifest
 
     def _check_manifest(self, name: str, number: int, manifest: Mapping[str, Any]) -> bool:
-        """Whether a manifest is of this run and of the iteration that the checkpoint is named after; what is wrong is found."""
+        """Returns whether a manifest is of this run and of its checkpoint's iteration; reports what is wrong."""
         problems = self._report.problems
         if manifest.get("iteration") != number:
             problems.append(f"checkpoint {name} says that it is of iteration {manifest.get('iteration')}")

@@ -62,7 +62,7 @@ def camera_pose(scene: Scene, data: Any) -> tuple[jax.Array, jax.Array, jax.Arra
 
 @jax.custom_jvp
 def barrier(tree: Any) -> Any:
-    """What XLA computes once, and not again for every use. JAX 0.11 cannot transpose its own."""
+    """Keep XLA from computing a value again for every use. JAX 0.11 cannot transpose its own barrier."""
     return jax.lax.optimization_barrier(tree)
 
 

@@ -1,4 +1,4 @@
-"""Where cameras and lights are, from the poses of bodies alone.
+"""Poses of cameras and lights, from the poses of bodies alone.
 
 `mjx.Data` has no poses of lights, and those of cameras only after `mjx.forward`: what `mjx.kinematics` leaves behind is where
 they were at some other time. So the five modes of MuJoCo's cameras and lights are computed here.
@@ -20,7 +20,7 @@ _ROUNDING = 4e-7
 
 
 class Mount(NamedTuple):
-    """What a camera or a light is fixed to: a static part of the scene.
+    """Attachment of a camera or a light to a body: a static part of the scene.
 
     Attributes:
         mode: A value of `mujoco.mjtCamLight`.
@@ -34,7 +34,7 @@ class Mount(NamedTuple):
 
     @property
     def aims(self) -> bool:
-        """Whether the target decides where it looks."""
+        """Returns whether the target decides where it looks."""
         return self.target >= 0 and self.mode in (_MODES.mjCAMLIGHT_TARGETBODY, _MODES.mjCAMLIGHT_TARGETBODYCOM)
 
     @property
@@ -53,7 +53,7 @@ class Mount(NamedTuple):
 
 
 class Bodies(NamedTuple):
-    """What the masses of a scene's bodies are, for mounts that follow centres of mass.
+    """Masses of a scene's bodies, for mounts that follow centres of mass.
 
     Attributes:
         mass: [nbody] float32, kg.
@@ -65,7 +65,7 @@ class Bodies(NamedTuple):
 
 
 def place(bodies: Bodies, data: Any, mount: Mount, offset: jax.Array) -> tuple[jax.Array, jax.Array | None]:
-    """Where a mount is in the world.
+    """Position of a mount in the world.
 
     Args:
         bodies: Of the scene.
@@ -91,14 +91,14 @@ def place(bodies: Bodies, data: Any, mount: Mount, offset: jax.Array) -> tuple[j
 
 
 def target(bodies: Bodies, data: Any, mount: Mount) -> jax.Array:
-    """What a mount that aims looks at, [3] float32 (m)."""
+    """Point that a mount aims at, [3] float32 (m)."""
     if mount.mode == _MODES.mjCAMLIGHT_TARGETBODYCOM:
         return centre_of_mass(bodies, data, mount.target)
     return jnp.zeros(3, jnp.float32) if mount.target == _WORLD else jnp.asarray(data.xpos, jnp.float32)[mount.target]
 
 
 def centre_of_mass(bodies: Bodies, data: Any, body: int) -> jax.Array:
-    """Of a body and all that hangs on it, [3] float32 (m); without any mass, the body's own."""
+    """Centre of mass of a body's subtree, [3] float32 (m); without any mass, the body's own."""
     members = np.array(_subtree(bodies.parents, body))
     own = jnp.asarray(data.xipos, jnp.float32)
     mass = bodies.mass[members]

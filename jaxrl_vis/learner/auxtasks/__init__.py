@@ -103,7 +103,7 @@ def make(names: Sequence[str], spec: Spec, options: Options = Options()) -> dict
 
 
 def head_number(name: str) -> int:
-    """What is folded into a key for a task's head, uint32: so it begins alike whichever other tasks there are, and wherever."""
+    """Number folded into the key of a task's head, uint32: heads start alike whichever other tasks there are, in any order."""
     return _NUMBERS[name] if name in _NUMBERS else zlib.crc32(name.encode())
 
 

@@ -32,7 +32,7 @@ _NORMAL_STEPS = 32767.0
 
 
 def takes(scene: Scene, outputs: Outputs) -> bool:
-    """Whether these passes draw these planes on the platform that is being traced for.
+    """Returns whether these passes draw these planes on the platform that is being traced for.
 
     They are for CPUs, and draw opaque primitives without haze, with colours of 8 bits, and neither normals nor distances, nor
     labels where what reflects may coincide with something else.
@@ -77,7 +77,7 @@ def draw(outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.UnitS
 
 
 class _Tile(NamedTuple):
-    """What is computed of a tile, int32 [P] each: keys, colours, and what leads to them. The next tile's takes its memory.
+    """Intermediate values of a tile, int32 [P] each: keys, colours, and what leads to them. The next tile's takes its memory.
 
     Rows are only there where they are no part of the keys.
     """
@@ -122,7 +122,7 @@ def _tiles(
 
 
 class _Seen(NamedTuple):
-    """What a pass starts from: rows of the objects that may be seen, `lookup.object_table`, and rays and keys, [P] each.
+    """Inputs of a pass: rows of the objects that may be seen, `lookup.object_table`, and rays and keys, [P] each.
 
     And the rows that keys are of, where they are no part of them.
     """

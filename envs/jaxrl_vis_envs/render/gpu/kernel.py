@@ -49,7 +49,7 @@ _TYPES = {shapes.PLANE, shapes.SPHERE, shapes.CAPSULE, shapes.ELLIPSOID, shapes.
 
 
 def takes(scene: Scene, outputs: Outputs) -> bool:
-    """Whether the kernel draws these planes on the platform that is being traced for: any of a scene that it supports.
+    """Returns whether the kernel draws these planes on the platform that is being traced for: any of a scene that it supports.
 
     But for labels where what reflects may coincide with something else.
     """

@@ -55,7 +55,7 @@ def free_camera(mj_model: mujoco.MjModel, camera: Camera) -> mujoco.MjvCamera:
 
 
 def free_camera_pose(camera: mujoco.MjvCamera) -> tuple[np.ndarray, np.ndarray]:
-    """Where a free camera stands, [3] m, and its rotation as a vector, [3] radians; both in the world's frame."""
+    """Position of a free camera, [3] m, and its rotation vector, [3] radians; both in the world's frame."""
     azimuth, elevation = np.deg2rad([camera.azimuth, camera.elevation])
     ahead = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
     right = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
@@ -66,7 +66,7 @@ def free_camera_pose(camera: mujoco.MjvCamera) -> tuple[np.ndarray, np.ndarray]:
 
 
 def projection(mj_model: mujoco.MjModel, camera_id: int, camera: Camera) -> str:
-    """How the camera maps space to the image, as in `Scene`."""
+    """Projection of a camera from space to the image, as in `Scene`."""
     if camera_id == FREE_CAMERA:
         return "orthographic" if free_camera(mj_model, camera).orthographic else "perspective"
     if mj_model.cam_projection[camera_id] == mujoco.mjtProjection.mjPROJ_ORTHOGRAPHIC:
@@ -107,7 +107,7 @@ def camera_parameters(mj_model: mujoco.MjModel, camera_id: int, camera: Camera) 
 
 
 def camera_mount(mj_model: mujoco.MjModel, camera_id: int) -> Mount:
-    """What the camera is fixed to; a free one, to the world."""
+    """Mount of the camera; that of a free one is the world."""
     if camera_id == FREE_CAMERA:
         return Mount(int(mujoco.mjtCamLight.mjCAMLIGHT_FIXED), 0, -1)
     facts = (mj_model.cam_mode, mj_model.cam_bodyid, mj_model.cam_targetbodyid)

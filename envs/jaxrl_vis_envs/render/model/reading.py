@@ -1,4 +1,4 @@
-"""What MuJoCo's visualiser makes of a model: colours, lights, and what cannot be drawn. NumPy only."""
+"""Appearance of a model as MuJoCo's visualiser sees it: colours, lights, and what cannot be drawn. NumPy only."""
 
 import numbers
 from collections.abc import Iterable

@@ -26,7 +26,7 @@ class Image(NamedTuple):
 
 
 class Atlas(NamedTuple):
-    """Where each texture is. Hashable, for it is a static part of the scene.
+    """Places of all textures. Hashable, for it is a static part of the scene.
 
     Attributes:
         levels: First row in the texels, width and height (of one face) of every image at every resolution.
@@ -86,7 +86,7 @@ def build_atlas(mj_model: mujoco.MjModel, ids: np.ndarray, types: np.ndarray, te
 
 
 def _mapping(mj_model: mujoco.MjModel, index: int, kind: int, texture: int) -> int:
-    """How ``texture`` lies on object ``index``, drawn as ``kind``."""
+    """Mapping of ``texture`` onto object ``index``, drawn as ``kind``."""
     if texture < 0 or mj_model.tex_nchannel[texture] not in (3, 4):
         return NONE
     flat = mj_model.tex_type[texture] == mujoco.mjtTexture.mjTEXTURE_2D

@@ -128,7 +128,7 @@ def tiled(scene: Scene) -> bool:
 
 
 class Nearest(NamedTuple):
-    """What is nearest along rays, [blocks, P] int32 each.
+    """Nearest object along rays, [blocks, P] int32 each.
 
     Attributes:
         key: See `raycast`.

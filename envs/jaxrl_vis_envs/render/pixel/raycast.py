@@ -1,4 +1,4 @@
-"""Which object each pixel sees: analytic intersections of rays with unit shapes.
+"""Visible object of each pixel: analytic intersections of rays with unit shapes.
 
 An object counts where a ray enters it in front of the near plane: from inside an object one looks through it, as with OpenGL's
 culled back faces. A plane is seen from both sides.
@@ -37,7 +37,7 @@ _MOST_IN_KEY = 63
 
 
 def keeps_rows(scene: Scene) -> bool:
-    """Whether rows are kept beside keys, because there are too many of them to be part of one."""
+    """Returns whether rows are kept beside keys, because there are too many of them to be part of one."""
     return len(scene.object_ids) > _MOST_IN_KEY
 
 

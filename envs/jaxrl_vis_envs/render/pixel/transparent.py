@@ -36,7 +36,7 @@ class Sheet(NamedTuple):
 
 
 class Film(NamedTuple):
-    """What an object makes of the colour c that is behind it: ``colour + share * c``, [P] each, the colour of three."""
+    """Effect of an object on the colour c behind it: ``colour + share * c``, [P] each, the colour of three."""
 
     colour: tuple
     share: jax.Array
@@ -65,7 +65,7 @@ def sheets(scene: Scene, unit: shapes.UnitShapes, rows: jax.Array, rays: Rays, d
 
 
 def _reach(depth: jax.Array) -> jax.Array:
-    """How far transparent objects are seen, given the depth of what is opaque, [P] metres each."""
+    """Distances up to which transparent objects are seen, given the depth of opaque ones, [P] metres each."""
     return jax.lax.stop_gradient(depth) * (1.0 + _SAME)
 
 
@@ -175,7 +175,7 @@ def _lay_face(
 
 @_faces.defjvp
 def _slopes(index: int, primals: tuple, tangents: tuple) -> tuple[Film, Film]:
-    """Of the first faces: a loop that ends where the image says has no transpose."""
+    """Differentiate through the first faces: a loop that ends where the image says has no transpose."""
 
     def few(scene: Scene, unit: shapes.UnitShapes, *others: Any) -> Film:
         rows, light_table, rays, depth = others
