@@ -52,7 +52,26 @@ def test_a_new_run_does_not_go_on_with_an_old_ones_checkpoints(straight, tmp_pat
     assert "metrics.jsonl held 8 rows of another run: kept in" in said
     assert rows_without_time(path) == rows_without_time(straight[0])
     kept = path / "checkpoints" / "foreign"
-    assert sorted(each.name for each in kept.iterdir()) == ["full-6", "full-8", "light-6", "light-8"]
+    foreign = ["full-6", "full-8", "light-6", "light-8", "metrics.jsonl"]
+    assert sorted(each.name for each in kept.iterdir()) == foreign
+    assert metrics.read_rows(kept / "metrics.jsonl") == metrics.read_rows(straight[0] / "metrics.jsonl")
+
+
+def test_starting_again_deletes_nothing_of_another_run(straight, tmp_path, capsys):
+    path = tmp_path / "run"
+    for repetition in range(2):
+        interrupted_at(make_fake_trainer(small_config(), path, overwrite=repetition > 0), 2)
+        for tier in (LIGHT, FULL):
+            shutil.copytree(straight[0] / "checkpoints" / tier, path / "checkpoints" / tier, dirs_exist_ok=True)
+        (path / "metrics.jsonl").open("a").write((straight[0] / "metrics.jsonl").read_text())
+    capsys.readouterr()
+    list(make_fake_trainer(small_config(env_steps=20), path, overwrite=True).run())
+    assert capsys.readouterr().out.count("not of this run, and left out") == 4
+    kept = path / "checkpoints" / "foreign"
+    names = ["full-6", "full-8", "light-6", "light-8"]
+    assert sorted(each.name for each in kept.iterdir()) == sorted([*names, *(f"{name}-2" for name in names), "metrics.jsonl"])
+    assert (kept / "metrics.jsonl").read_text() == (straight[0] / "metrics.jsonl").read_text() * 2
+    assert checkpoints_in(path) == ["full/2", "light/2"]
 
 
 def test_what_uses_a_run_does_not_count_another_ones(straight, tmp_path, monkeypatch):

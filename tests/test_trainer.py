@@ -207,7 +207,8 @@ def test_metrics_file_survives_a_torn_line(tmp_path):
     with path.open("a") as file:
         file.write('{"seed": 0, "iter')
     assert metrics.read_rows(path) == rows
-    assert metrics.cut_back(path, 1, None, tmp_path / "aside.jsonl", keeps_later=False) is None
+    aside = tmp_path / "aside.jsonl"
+    assert metrics.cut_back(path, 1, None, aside, aside, keeps_later=False) is None and not aside.exists()
     assert path.read_text().count("\n") == 2 and metrics.read_rows(path) == rows[:2]
     assert metrics.make_rows([3], {"iteration": 1}, {"a": [float("nan")]}) == [{"seed": 3, "iteration": 1, "a": None}]
 

@@ -16,6 +16,7 @@ checkpoints/damaged/, and one of another run, which its manifest tells by the ru
 
 import contextlib
 import dataclasses
+import itertools
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -62,6 +63,12 @@ class Restored:
     train: TrainState
     loop: LoopState | None
     progress: dict[str, Any]
+
+
+def _free(path: Path) -> Path:
+    """Returns a path that nothing has yet: ``path`` itself, or the first of path-2, path-3, ... that is free."""
+    numbered = (path.with_name(f"{path.name}-{number}") for number in itertools.count(2))
+    return next(choice for choice in itertools.chain([path], numbered) if not choice.exists())
 
 
 def rest_of(loop: LoopState) -> dict[str, Any]:
@@ -265,7 +272,7 @@ class Checkpoints:
         """
         foreign = {tier: [found for found, is_ours in self._there(tier) if not is_ours] for tier in (LIGHT, FULL)}
         moved = self._move(foreign, FOREIGN)
-        recent = self._folder / FOREIGN / RECENT
+        recent = _free(self._folder / FOREIGN / RECENT)
         if processes.is_first() and self.recent.set_foreign_aside(recent):
             moved.append(recent)
         return moved
@@ -274,13 +281,12 @@ class Checkpoints:
         moved = []
         for tier, iteration in [(tier, iteration) for tier, found in iterations.items() for iteration in found]:
             self._forget(tier)
-            moved.append(self._folder / folder / f"{tier}-{iteration}")
+            moved.append(_free(self._folder / folder / f"{tier}-{iteration}"))
             if processes.is_first():
                 moved[-1].parent.mkdir(exist_ok=True)
                 if tier == RECENT:
                     self.recent.set_aside(iteration, moved[-1])
                     continue
-                shutil.rmtree(moved[-1], ignore_errors=True)
                 (self._folder / tier / str(iteration)).rename(moved[-1])
         return moved
 

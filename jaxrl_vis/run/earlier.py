@@ -1,5 +1,6 @@
 """Leftovers of an earlier part of a run: was it finished, do its files belong together, and how it goes on."""
 
+import sys
 from collections.abc import Callable, Collection
 from pathlib import Path
 
@@ -7,8 +8,8 @@ import jax.numpy as jnp
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.run import metrics
-from jaxrl_vis.run.checkpoint import DAMAGED, FULL, LIGHT, Checkpoints, Restored
-from jaxrl_vis.run.folder import RunFolder
+from jaxrl_vis.run.checkpoint import DAMAGED, FOREIGN, FULL, LIGHT, Checkpoints, Restored
+from jaxrl_vis.run.folder import RunFolder, read_run_id
 from jaxrl_vis.run.programs import Programs
 from jaxrl_vis.run.progress import Progress
 from jaxrl_vis.types import LoopState
@@ -73,7 +74,24 @@ def refuse_missing_rows(folder: RunFolder, restored: Restored) -> None:
 
 def cut_back(folder: RunFolder, checkpoints: Checkpoints, last: int, keeps_later: bool, evaluated: int = 0) -> str | None:
     """Keeps rows of the run up to an iteration in metrics.jsonl; `metrics.cut_back` has the rest."""
-    return metrics.cut_back(folder.metrics, last, checkpoints.run_id, _aside(folder), keeps_later, evaluated)
+    others = folder.checkpoints / FOREIGN / folder.metrics.name
+    return metrics.cut_back(folder.metrics, last, checkpoints.run_id, _aside(folder), others, keeps_later, evaluated)
+
+
+def set_others_aside(folder: RunFolder, checkpoints: Checkpoints) -> list[str]:
+    """Keeps what other runs left in this folder before the run in it is deleted; lines that say so."""
+    try:
+        checkpoints.run_id = read_run_id(folder.path)
+    except RequestError:  # so nothing tells whose anything is
+        return []
+    moved = checkpoints.set_foreign_aside()
+    said = cut_back(folder, checkpoints, sys.maxsize, keeps_later=False)
+    return [*map(say_foreign, moved), *([said] if said else [])]
+
+
+def say_foreign(path: Path) -> str:
+    """Words for what another run left, and where it is now."""
+    return f"not of this run, and left out: {path}"
 
 
 def _aside(folder: RunFolder) -> Path:

@@ -32,7 +32,7 @@ from jaxrl_vis.run.metrics import RUN_ID, read_rows
 
 SCHEMA = 1
 
-CHECKPOINT_FOLDERS = ("light", "full", "recent", "damaged", "foreign")
+CHECKPOINT_FOLDERS = ("light", "full", "recent", "damaged")
 """What `checkpoint` leaves in its folder."""
 
 _UNFINISHED = "orbax-checkpoint-tmp"  # in the name of a checkpoint that is being written

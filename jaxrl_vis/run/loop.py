@@ -245,6 +245,10 @@ class RunLoop:
         assert self._held is not None
         self._folder.check_place(self._held)
         try:
+            if overwrite and self._folder.config.exists():
+                with self._saver.writing():
+                    for line in earlier.set_others_aside(self._folder, self._checkpoints):
+                        self._say(line)
             self._folder.open(self._config, goes_on, overwrite, self._log)
         except RequestError:
             self._folder.check_place(self._held)
@@ -265,7 +269,7 @@ class RunLoop:
         for path in damaged:
             self._say(f"kept for inspection: {path}")
         for path in foreign:
-            self._say(f"not of this run, and left out: {path}")
+            self._say(earlier.say_foreign(path))
         self._loggers.open(read_record(self._folder.path), self._programs.seeds, self._folder.rows())
 
     def _take_over(self, restored: Restored) -> None:

@@ -171,14 +171,17 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
     return read_contents(path).rows
 
 
-def cut_back(path: Path, iteration: int, run_id: str | None, aside: Path, keeps_later: bool, evaluated: int = 0) -> str | None:
+def cut_back(
+    path: Path, iteration: int, run_id: str | None, aside: Path, others: Path, keeps_later: bool, evaluated: int = 0
+) -> str | None:
     """Takes out every row after ``iteration``, which a resumed run writes again, and all that is not this run's.
 
     Args:
         path: The file.
         iteration: The last one to keep.
         run_id: Of the run; None for one of an earlier version, which has none.
-        aside: To this file goes what is damaged, or of another run; nothing is ever dropped.
+        aside: To this file goes what is damaged; nothing is ever dropped.
+        others: To this one goes what is of another run.
         keeps_later: Rows after ``iteration``, too.
         evaluated: The last iteration that is known to have had a row of each seed, or 0: where one is missing, a torn line was
             that.
@@ -200,16 +203,20 @@ def cut_back(path: Path, iteration: int, run_id: str | None, aside: Path, keeps_
     evaluated_there = {row["seed"] for row in rows if row["iteration"] == evaluated}
     if contents.torn and evaluated and (not evaluated_there or evaluated_there < {row["seed"] for row in rows}):
         damaged.append((path.read_bytes().count(b"\n") + 1, contents.torn))
-    kept = [line for _, line in damaged] + [json.dumps(row).encode() for row in (*foreign, *later)]
-    if kept:
-        aside.parent.mkdir(parents=True, exist_ok=True)
-        _append(aside, b"".join(line + b"\n" for line in kept))
+    _keep(aside, [line for _, line in damaged] + [json.dumps(row).encode() for row in later])
+    _keep(others, [json.dumps(row).encode() for row in foreign])
     text = "".join(json.dumps(row) + "\n" for row in rows if row["iteration"] <= iteration)
     if text.encode() != path.read_bytes():
         write_atomically(path, text)
-    what = [_describe(damaged)] if damaged else []
-    what += [f"{len(foreign)} row{'s' * (len(foreign) > 1)} of another run"] if foreign else []
-    return f"{path.name} held {' and '.join(what)}: kept in {aside}, and left out here" if what else None
+    what = [f"{_describe(damaged)}: kept in {aside}"] if damaged else []
+    what += [f"{len(foreign)} row{'s' * (len(foreign) > 1)} of another run: kept in {others}"] if foreign else []
+    return f"{path.name} held {', and '.join(what)}; left out here" if what else None
+
+
+def _keep(path: Path, lines: Sequence[bytes]) -> None:
+    if lines:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _append(path, b"".join(line + b"\n" for line in lines))
 
 
 def _describe(damaged: Sequence[tuple[int, bytes]]) -> str:

@@ -14,7 +14,6 @@ when it is complete. The newest two states are kept.
 
 import contextlib
 import json
-import shutil
 import time
 import zlib
 from collections.abc import Callable, Iterator
@@ -89,7 +88,6 @@ class Recent:
         is_foreign = any(not self._is_ours(iteration) for iteration in _numbers(self._folder, "state"))
         if is_foreign:
             to.parent.mkdir(exist_ok=True)
-            shutil.rmtree(to, ignore_errors=True)
             self._folder.rename(to)
         return is_foreign
 
