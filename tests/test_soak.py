@@ -8,7 +8,8 @@ import os
 
 import pytest
 
-from benchmarks.soak.record import BEGIN, END, PROMISES, Record, added, put_into
+from benchmarks.ledger.markers import fill
+from benchmarks.soak.record import PROMISES, Record, added
 from benchmarks.soak.soak import Soak
 
 FAULTS, WORKERS = 2, 2
@@ -40,10 +41,8 @@ def test_pieces_are_added(tmp_path):
     assert (total.minutes, total.runs, total.exact, total.resumes, total.replays_lost) == (18.0, 12, 10, 96, 2)
     table = total.table()
     assert "| SIGKILL | 20 |" in table and "goodput 0.990 at 96 resumptions, replay lost 2 times" in table
-    page = tmp_path / "page.md"
-    page.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n")
-    put_into(page, table)
-    assert page.read_text() == f"before\n{BEGIN}\n{table}{END}\nafter\n"
+    begin, end = "<!-- soak: begin -->\n", "<!-- soak: end -->\n"
+    assert fill(f"before\n{begin}old\n{end}after\n", "soak", table) == f"before\n{begin}{table}{end}after\n"
     assert json.loads((tmp_path / "1.json").read_text())["machine"]["commit"] == "abc"
 
 

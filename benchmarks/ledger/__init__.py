@@ -1,0 +1,16 @@
+"""Ledger: the stored records in benchmarks/results, the tables that are written from them, and their age.
+
+    records          read records                       evidence     training runs behind learning figures; keep_run stores one
+    readme_rows      rows of the README's tables        staleness    records that are older than the code they measured
+    readme_tables    the README's tables                ablations    learning curves of the ablations, one compressed table
+    scaling_table    table of docs/scaling.md           pages        every page with tables from records; markers: where they go
+
+    python -m benchmarks.ledger tables     write the tables of README and docs (`make tables`)
+    python -m benchmarks.ledger stale      list stale records, rows without a record, and outdated tables (`make stale`)
+
+Neither pyperf nor asv replaces it. pyperf repeats every figure in fresh worker processes, each of which would compile its JAX
+programs again (tens of seconds for a figure of milliseconds), and its metadata know no GPU. asv measures a range of commits in
+environments of their own; here a GPU is available once, and the question is which records the code has left behind, without
+measuring again. Both store seconds, while the tables here show rates, ratios and learning curves. The parts that they could
+replace (`jaxrl_vis.bench.timing` and `conditions`, 250 lines) are no longer than the glue to them.
+"""
