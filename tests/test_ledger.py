@@ -13,7 +13,7 @@ import pytest
 from test_provenance import commit
 
 from benchmarks.ledger import __main__ as ledger
-from benchmarks.ledger import check, evidence, pages, records, staleness
+from benchmarks.ledger import ablations, check, evidence, pages, records, staleness
 from benchmarks.ledger import readme_tables as tables
 from benchmarks.ledger.readme_rows import DEVICES, LEARNING, Figure, Learning
 from jaxrl_vis.cli.parsing import parse
@@ -345,3 +345,23 @@ def test_a_damaged_file_of_records_is_named(tmp_path: Path, capsys: pytest.Captu
         file.write('{"seed": 0, "env_')
     with pytest.raises(RequestError, match="discs.metrics.jsonl has a line that is not JSON"):
         evidence.load("discs", tmp_path)
+
+
+def test_curves_of_ablations_have_an_origin_and_whole_rows() -> None:
+    stored = ablations.read_curves()
+    assert len(stored) == 144 and sum(len(curve.rows) for curve in stored.values()) == 16_522
+    for name, curve in stored.items():
+        assert curve.name == name and curve.stored
+        assert curve.page is None or (records.CHECKOUT / curve.page).exists()
+        points = success_curve(curve.rows)
+        assert points and all(0.0 <= value <= 1.0 for _, value in points)
+    hand = stored["hand_shared"]
+    assert dict(success_curve(hand.rows))[300_000] == pytest.approx(0.49, abs=0.005)  # docs/learner.md
+    assert hand.command is not None and hand.command.startswith("jaxrl-vis train VisualHandReach --preset fast --seeds 3 ")
+    assert stored["fetch_s"].command is None
+    row = next(line for line in ablations.index_table().splitlines() if line.startswith("| fetch_s |"))
+    assert row.count("unknown") == 3
+
+
+def success_curve(rows: list[dict[str, Any]]) -> list[tuple[int, float]]:
+    return curves.curve(rows, "eval/success")

@@ -1,9 +1,10 @@
 """Ledger: the stored records in benchmarks/results, the tables that are written from them, and their age.
 
-    records          read records                       evidence     training runs behind learning figures; keep_run stores one
-    readme_rows      rows of the README's tables        staleness    records that are older than the code they measured
-    readme_tables    the README's tables                ablations    learning curves of the ablations, one compressed table
-    scaling_table    table of docs/scaling.md           pages        every page with tables from records; markers: where they go
+    records          reading of records                      evidence     training runs behind learning figures; keep_run
+    readme_rows      rows of the README's tables             staleness    records that are older than the measured code
+    readme_tables    tables of the README                    ablations    learning curves of the ablations, one table
+    scaling_table    tables of docs/scaling.md               pages        every page with tables from records
+    check            all complaints about the records        markers      position of a table in its page
 
     python -m benchmarks.ledger tables     write the tables of README and docs (`make tables`)
     python -m benchmarks.ledger stale      list stale records, rows without a record, and outdated tables (`make stale`)

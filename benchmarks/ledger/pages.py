@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from benchmarks import target_decay
-from benchmarks.ledger import readme_tables, scaling_table
+from benchmarks.ledger import ablations, readme_tables, scaling_table
 from benchmarks.ledger.markers import fill
 from benchmarks.ledger.records import CHECKOUT, RESULTS
 from jaxrl_vis.errors import RequestError
@@ -34,6 +34,7 @@ PAGES: dict[str, dict[str, Writer]] = {
     "docs/scaling.md": {"devices": scaling_table.devices_table, "processes": scaling_table.processes_table},
     "docs/reliability.md": {"soak": soak},
     "docs/renderer_parity.md": {"table": renderer_parity},
+    "docs/lab/ablations.md": {"curves": ablations.index_table},
     "docs/lab/target_decay.md": {"tables": target_decay.tables},
 }
 """Writers of a page's tables by the name in their markers."""
