@@ -338,6 +338,15 @@ def test_the_table_of_models_is_that_of_the_record(checkout: Path) -> None:
 # -- Links and the site
 
 
+@pytest.mark.parametrize("page", [*doc_blocks.PAGES, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"], ids=name_of)
+def test_scripts_that_are_named_exist(page: Path) -> None:
+    text = page.read_text()
+    for script in re.findall(r"benchmarks/[\w/]+\.py", text):
+        assert (ROOT / script).exists(), script
+    for module in re.findall(r"-m (benchmarks[.\w]*\w)", text):
+        assert module == "benchmarks.peers.NAME" or importlib.util.find_spec(module) is not None, module
+
+
 @pytest.mark.parametrize("page", doc_blocks.PAGES, ids=name_of)
 def test_links_and_images_lead_somewhere(page: Path) -> None:
     text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)

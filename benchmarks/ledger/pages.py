@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from benchmarks import target_decay
-from benchmarks.ledger import ablations, readme_tables, scaling_table
+from benchmarks.ledger import ablations, readme_tables, render_table, scaling_table
 from benchmarks.ledger.markers import fill
 from benchmarks.ledger.records import CHECKOUT, RESULTS
 from jaxrl_vis.errors import RequestError
@@ -32,6 +32,7 @@ def soak(results: Path) -> str | None:
 PAGES: dict[str, dict[str, Writer]] = {
     "README.md": {"results table": readme_tables.results_table, "speed table": readme_tables.speed_table},
     "docs/scaling.md": {"devices": scaling_table.devices_table, "processes": scaling_table.processes_table},
+    "docs/renderer_speed.md": {"warp": render_table.warp_table, "mujoco": render_table.mujoco_table},
     "docs/reliability.md": {"soak": soak},
     "docs/renderer_parity.md": {"table": renderer_parity},
     "docs/lab/ablations.md": {"curves": ablations.index_table},
