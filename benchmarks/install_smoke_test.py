@@ -1,4 +1,4 @@
-"""Types what a stranger types, on a machine where nothing is prepared, and says what each command came to.
+"""Smoke test of the installation: the commands of a new user on an unprepared machine, with the result of each.
 
     python benchmarks/install_smoke_test.py [--python python3.12 python3.13] [--ways wheel clone notebooks] [--whole]
 
@@ -7,7 +7,7 @@ clone      clones the repository, `make train`, then the commands of the README;
 notebooks  a Jupyter without this project, and the notebooks in a folder of their own: without an address they stop, with one
            that cannot be cloned too, and with that of a clone they run
 
-Each way has a home folder, a virtual environment and caches of its own, all new and empty; packages come from the registry
+Each of them has a home folder, a virtual environment and caches of its own, all new and empty; packages come from the registry
 that pip is configured for. Settings are tiny (the robots learn nothing), except for notebooks with ``--whole``. Each command is
 printed with its exit status and its time. Exits with 1 where a status is not the one expected, where a mistake is answered with
 more than one line, or where a text that a command should show is missing. Takes about ten minutes a Python on two idle cores.
@@ -36,7 +36,7 @@ _SHOWN_LINES = 4  # of a command's output
 
 @dataclasses.dataclass
 class Shell:
-    """A stranger's terminal.
+    """Terminal of a new user.
 
     Attributes:
         folder: The current folder.
@@ -84,7 +84,7 @@ class Shell:
         return output
 
     def activate(self, environment: Path) -> None:
-        """What ``source .venv/bin/activate`` does."""
+        """Activate the virtual environment, as ``source .venv/bin/activate`` does."""
         self.environment["PATH"] = f"{environment / 'bin'}{os.pathsep}{self.environment['PATH']}"
         self.environment["VIRTUAL_ENV"] = str(environment)
 
@@ -97,11 +97,11 @@ def new_shell(folder: Path, python: Path) -> Shell:
     for name in ("python3", python.name):
         if not (folder / "bin" / name).exists():
             (folder / "bin" / name).symlink_to(python)
-    kept = {name: value for name, value in os.environ.items() if any(part in name.upper() for part in _KEPT)}
+    inherited = {name: value for name, value in os.environ.items() if any(part in name.upper() for part in _KEPT)}
     return Shell(
         folder / "work",
         {
-            **kept,
+            **inherited,
             "HOME": str(folder / "home"),
             "PATH": os.pathsep.join([str(folder / "bin"), "/usr/local/bin", "/usr/bin", "/bin"]),
             "LANG": "C.UTF-8",
@@ -251,24 +251,24 @@ def main(arguments: list[str] | None = None) -> int:
         "--folder", type=Path, help="where to work, and keep what comes of it; default: a folder that is removed"
     )
     options = parser.parse_args(arguments)
-    found = {name: shutil.which(name) for name in options.python}
-    for name, path in found.items():
+    interpreters = {name: shutil.which(name) for name in options.python}
+    for name, path in interpreters.items():
         if path is None:
             parser.error(f"there is no {name} on this machine")
     top = Path(tempfile.mkdtemp(prefix="stranger-")) if options.folder is None else options.folder.resolve()
     failures = []
-    for path in found.values():
-        for way in options.ways:
+    for path in interpreters.values():
+        for method in options.ways:
             python = Path(str(path)).resolve()
-            print(f"\n== {way}, {python.name} ==", flush=True)
-            shell = new_shell(top / f"{way}-{python.name}", python)
-            if way == "wheel":
+            print(f"\n== {method}, {python.name} ==", flush=True)
+            shell = new_shell(top / f"{method}-{python.name}", python)
+            if method == "wheel":
                 wheel(shell, python)
-            elif way == "clone":
+            elif method == "clone":
                 clone(shell, python)
             else:
                 notebooks(shell, python, options.whole)
-            failures += [f"{way}, {python.name}: {failure}" for failure in shell.failures]
+            failures += [f"{method}, {python.name}: {failure}" for failure in shell.failures]
     print(f"\n{len(failures)} commands were not as expected" if failures else "\nall as expected")
     for failure in failures:
         print(f"  {failure}")

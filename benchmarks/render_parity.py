@@ -89,7 +89,7 @@ def compare(name: str, poses: int, size: int) -> dict[str, Any]:
 
 
 def named(mj_model: mujoco.MjModel, worst: tuple[float, int, int]) -> dict[str, Any]:
-    """Where the worst of a measure was found."""
+    """Name the model and pose with the worst value of a measure."""
     _, number, pose = worst
     return {"object": number, "name": mj_model.geom(number).name if 0 <= number < mj_model.ngeom else "", "pose": pose}
 
@@ -135,7 +135,7 @@ def main() -> int:
     parser.add_argument("models", nargs="*", metavar="MODEL", help="all if none is named; or the path of one folder of models")
     parser.add_argument("--poses", type=int, default=200)
     parser.add_argument("--size", type=int, help="height and width in pixels (default: 128, of a folder 96)")
-    parser.add_argument("--out", type=pathlib.Path, default=TARGET, help="rows of other models that this file holds are kept")
+    parser.add_argument("--out", type=pathlib.Path, default=TARGET, help="rows of other models that this file holds are stored")
     parser.add_argument("--print", action="store_true", help="only print the rows that --out holds")
     parser.add_argument("--page", action="store_true", help=f"only write the rows that --out holds into {PAGE.name}")
     parser.add_argument(
@@ -147,8 +147,8 @@ def main() -> int:
     unknown = set(options.models) - set(render_models.MODELS)
     if unknown:
         parser.error(f"no model {', '.join(sorted(unknown))}; there are {', '.join(render_models.MODELS)}")
-    kept = json.loads(options.out.read_text()) if options.out.exists() else {"rows": []}
-    rows = {row["model"]: row for row in kept["rows"] if row["model"] in render_models.MODELS}
+    stored = json.loads(options.out.read_text()) if options.out.exists() else {"rows": []}
+    rows = {row["model"]: row for row in stored["rows"] if row["model"] in render_models.MODELS}
     versions = render_models.versions()  # first: a package may be missing
     failed = 0
     if options.page:

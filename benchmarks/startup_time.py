@@ -1,4 +1,4 @@
-"""What the start of a run consists of: imports, environment, then tracing, lowering and compiling of every program.
+"""Startup time of a run: imports, environment, then tracing, lowering and compiling of every program.
 
     python benchmarks/startup_time.py [ENV] [--preset P] [--seeds S] [--json FILE]
 
@@ -92,8 +92,8 @@ def parts(clock: Clock, options: argparse.Namespace) -> None:
         "insert": (shapes.train, shapes.replay, episodes, keys, shapes.iteration),
         "update_many": (shapes.train, shapes.replay, keys, shapes.iteration),
     }
-    for name, each in arguments.items():
-        traced = getattr(program, name).trace(*each)
+    for name, inputs in arguments.items():
+        traced = getattr(program, name).trace(*inputs)
         clock.lap(f"{name}: trace again" if name == "rollout" else f"{name}: trace")
         lowered = traced.lower()
         clock.lap(f"{name}: lower")
@@ -102,7 +102,7 @@ def parts(clock: Clock, options: argparse.Namespace) -> None:
 
 
 def start(clock: Clock, options: argparse.Namespace) -> None:
-    """As a run starts."""
+    """Start as a run does."""
     import jax
 
     programs = imported(clock, options)
@@ -152,13 +152,13 @@ def main() -> None:
         MODES[options.mode](clock, options)
         print(json.dumps(clock.laps))
         return
-    found = {}
+    laps = {}
     with tempfile.TemporaryDirectory() as own, tempfile.TemporaryDirectory() as shared:
         for mode in MODES:
-            found[mode] = measured(mode, own if mode == "parts" else shared, options)
-            show(mode, found[mode])
+            laps[mode] = measured(mode, own if mode == "parts" else shared, options)
+            show(mode, laps[mode])
     if options.json:
-        options.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+        options.json.write_text(json.dumps(laps, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

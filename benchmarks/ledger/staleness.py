@@ -220,8 +220,8 @@ class _Plain(ast.NodeTransformer):
         super().generic_visit(node)
         body = getattr(node, "body", None)
         if isinstance(body, list):
-            kept = [part for part in body if not _is_text(part) and not isinstance(part, ast.Import | ast.ImportFrom)]
-            node.body = kept or [ast.Pass()]  # pyright: ignore[reportAttributeAccessIssue]
+            statements = [part for part in body if not _is_text(part) and not isinstance(part, ast.Import | ast.ImportFrom)]
+            node.body = statements or [ast.Pass()]  # pyright: ignore[reportAttributeAccessIssue]
         return node
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.AST:

@@ -95,9 +95,9 @@ def measure(program: TrainStep, asked: argparse.Namespace, options: dict[str, An
     del loop
     compiled = {}
     for part in dict.fromkeys([*(["rollout"] if "insert" in parts else []), *parts]):
-        function, given, _, _ = arguments[part]
+        function, inputs, _, _ = arguments[part]
         with rarely_collecting_garbage():
-            compiled[part] = function.lower(*given).compile(options)
+            compiled[part] = function.lower(*inputs).compile(options)
         if hlo is not None:
             hlo.mkdir(parents=True, exist_ok=True)
             (hlo / f"{part}.txt").write_text(compiled[part].as_text(), encoding="utf-8")
@@ -119,7 +119,7 @@ def measure(program: TrainStep, asked: argparse.Namespace, options: dict[str, An
         report(f"{what} of {program.config.seeds} learners", lambda part=part: call(part), turns, asked.rows, asked.in_order)
 
 
-def options_of(words: list[str]) -> dict[str, Any]:
+def parse_compiler_options(words: list[str]) -> dict[str, Any]:
     """Compiler options, NAME=VALUE each.
 
     Raises:
@@ -131,7 +131,7 @@ def options_of(words: list[str]) -> dict[str, Any]:
     return {name: {"true": True, "false": False}.get(value.lower(), value) for name, _, value in pairs}
 
 
-def config_of(options: argparse.Namespace) -> Config:
+def parse_config(options: argparse.Namespace) -> Config:
     """The configuration that the options ask for.
 
     Raises:
@@ -167,9 +167,9 @@ def main() -> int:
         check_devices()
         if jax.default_backend() != "gpu":
             raise RequestError("kernels are seen on an NVIDIA GPU only, and JAX computes on something else here")
-        config = config_of(options)
+        config = parse_config(options)
         enable_compilation_cache()
-        sets = {" ".join(words) or "as it is": options_of(words) for words in ([], *options.options)}
+        sets = {" ".join(words) or "as it is": parse_compiler_options(words) for words in ([], *options.options)}
         program = make_train_step(make_env(config), config)
         for name, compiler_options in sets.items():
             print(f"-- {name}")

@@ -84,11 +84,11 @@ class Problem:
         """The main loss, and one for each name."""
         value = self.networks.value(params["critic"], latents, batch["action"])
         both = jnp.concatenate([latents[0], latents[1]], axis=-1).astype(jnp.bfloat16)
-        found = {MAIN: jnp.mean(jnp.square(value - batch["value"]))}
+        losses = {MAIN: jnp.mean(jnp.square(value - batch["value"]))}
         for name, target in zip(self.names, batch["targets"], strict=True):
             predicted = (both @ params["heads"][name].astype(jnp.bfloat16)).astype(jnp.float32)
-            found[name] = jnp.mean(jnp.square(predicted - target))
-        return found
+            losses[name] = jnp.mean(jnp.square(predicted - target))
+        return losses
 
     def make_steps(self, weighting: Weighting, way: Any) -> Any:
         """(params, weighting's state, batches) -> the first two after `STEPS` gradient steps, and their weights."""
@@ -104,9 +104,9 @@ class Problem:
         def steps(params: Any, state: Any, batches: dict[str, jax.Array]) -> tuple[Any, Any, Any]:
             def step(carry: tuple[Any, Any], number: jax.Array) -> tuple[tuple[Any, Any], Any]:
                 params, state = carry
-                found = find(params, state, jax.tree.map(lambda leaf: leaf[number % leaf.shape[0]], batches))
-                params = jax.tree.map(lambda leaf, slope: leaf - LEARNING_RATE * slope, params, found.gradient)
-                return (params, found.state), found.weights
+                result = find(params, state, jax.tree.map(lambda leaf: leaf[number % leaf.shape[0]], batches))
+                params = jax.tree.map(lambda leaf, slope: leaf - LEARNING_RATE * slope, params, result.gradient)
+                return (params, result.state), result.weights
 
             (params, state), weights = jax.lax.scan(step, (params, state), jnp.arange(STEPS))
             return params, state, weights
@@ -146,17 +146,17 @@ def main() -> int:
     networks = Networks(preset("paper", image_size=options.image_size), spec, 4, 0.0)
     rows = []
     print(f"{'way':12}{'losses':>8}{'fixed, us':>12}{'OL-AUX-5, us':>14}{'added, us':>12}   on {jax.devices()[0].device_kind}")
-    for way in options.ways:
+    for method in options.ways:
         for count in options.losses:
             problem = Problem(networks, options.batch_size, tuple(f"loss_{number}" for number in range(count)))
             weightings = {"fixed": make_weighting("balance"), "learned": make_weighting("ol_aux", interval=5)}
-            found = {name: time_step(problem, weighting, way) for name, weighting in weightings.items()}
-            seconds = {name: step for name, (step, _) in found.items()}
+            timed = {name: time_step(problem, weighting, method) for name, weighting in weightings.items()}
+            seconds = {name: step for name, (step, _) in timed.items()}
             added = seconds["learned"] - seconds["fixed"]
-            compiling = {f"compile_{name}": round(compile_s, 1) for name, (_, compile_s) in found.items()}
-            rows.append({"way": way, "losses": count, **seconds, "added": added, **compiling})
+            compiling = {f"compile_{name}": round(compile_s, 1) for name, (_, compile_s) in timed.items()}
+            rows.append({"way": method, "losses": count, **seconds, "added": added, **compiling})
             print(
-                f"{way:12}{count:8}{1e6 * seconds['fixed']:12.0f}{1e6 * seconds['learned']:14.0f}{1e6 * added:12.0f}",
+                f"{method:12}{count:8}{1e6 * seconds['fixed']:12.0f}{1e6 * seconds['learned']:14.0f}{1e6 * added:12.0f}",
                 flush=True,
             )
     if options.json is not None:

@@ -76,21 +76,21 @@ class Measures:
     def worse(self, other: "Measures") -> "Measures":
         """The worse of each."""
         least, most = ("segmentation", "depth", "matched"), ("rgb", "most", "loud")
-        found: dict[str, Any] = {name: min(getattr(self, name), getattr(other, name)) for name in least}
-        found |= {name: max(getattr(self, name), getattr(other, name)) for name in most}
-        return Measures(**found, missing=tuple(sorted({*self.missing, *other.missing})))
+        values: dict[str, Any] = {name: min(getattr(self, name), getattr(other, name)) for name in least}
+        values |= {name: max(getattr(self, name), getattr(other, name)) for name in most}
+        return Measures(**values, missing=tuple(sorted({*self.missing, *other.missing})))
 
 
 def measure(ours: Frame, theirs: Frame, hidden: np.ndarray) -> Measures:
     """Compares two images of NumPy arrays; where ``hidden`` [H, W] is true, colours do not count."""
-    kept = ~(near_edges(ours.segmentation) | near_edges(theirs.segmentation))
-    solid = kept & ((ours.segmentation >= 0) | (theirs.segmentation >= 0))
+    inside = ~(near_edges(ours.segmentation) | near_edges(theirs.segmentation))
+    solid = inside & ((ours.segmentation >= 0) | (theirs.segmentation >= 0))
     difference = np.max(np.abs(ours.rgb.astype(np.int16) - theirs.rgb), axis=-1)
-    coloured = kept & ~hidden
+    coloured = inside & ~hidden
     # Of two surfaces that coincide MuJoCo labels one by chance, and so do we: where depth and colour agree, either will do.
     either = (np.abs(ours.depth - theirs.depth) <= 1e-4 * np.maximum(1.0, theirs.depth)) & (difference <= 4)
     near = np.abs(ours.depth - theirs.depth) <= np.maximum(1e-3, 1e-3 * theirs.depth)
-    labels, counts = np.unique(theirs.segmentation[kept & ~either], return_counts=True)
+    labels, counts = np.unique(theirs.segmentation[inside & ~either], return_counts=True)
     missing = [
         int(label)
         for label in labels[(labels >= 0) & (counts >= SEEN_PIXELS)]
@@ -98,7 +98,7 @@ def measure(ours: Frame, theirs: Frame, hidden: np.ndarray) -> Measures:
     ]
     mean = np.abs(ours.rgb.astype(np.int16) - theirs.rgb)[coloured].mean() if coloured.any() else 0.0
     return Measures(
-        segmentation=_share(kept & ((ours.segmentation == theirs.segmentation) | either), kept),
+        segmentation=_share(inside & ((ours.segmentation == theirs.segmentation) | either), inside),
         depth=_share(solid & near, solid),
         rgb=float(mean),
         most=int(difference[coloured].max(initial=0)),
@@ -130,13 +130,13 @@ def views(mj_model: mujoco.MjModel) -> list[View]:
     """The rows of a model."""
     named = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_CAMERA, "cam")
     cameras = [named] if named >= 0 else [None, *range(mj_model.ncam)]
-    found = [View(camera) for camera in cameras]
+    rows = [View(camera) for camera in cameras]
     if mj_model.nsite:
-        found.append(View(cameras[0], sites=True))
+        rows.append(View(cameras[0], sites=True))
     endless = (mj_model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) & np.all(mj_model.geom_size[:, :2] == 0, axis=1)
     if np.any(endless) and np.any(mj_model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX):
-        found.append(View(cameras[0], haze=True))
-    return found
+        rows.append(View(cameras[0], haze=True))
+    return rows
 
 
 class Comparison:
@@ -210,12 +210,12 @@ class Comparison:
         ours = render_models.draw(scene, self.our_poses(), quick=True)
         total = Measures()
         for our, their, data in zip(ours, theirs, self.data, strict=True):
-            found = measure(our, their, np.zeros(their.depth.shape, bool))
+            measures = measure(our, their, np.zeros(their.depth.shape, bool))
             for limit, hidden in self.limits(scene, their, data).items():
-                if found.failures() and np.any(hidden):
-                    found = measure(our, their, hidden)
+                if measures.failures() and np.any(hidden):
+                    measures = measure(our, their, hidden)
                     remark += f", without {limit} (limit)" if limit not in remark else ""
-            total = total.worse(found)
+            total = total.worse(measures)
         if pictures is not None:
             for number, (our, their) in enumerate(zip(ours, theirs, strict=True)):
                 difference = np.minimum(8 * np.abs(our.rgb.astype(np.int16) - their.rgb), 255).astype(np.uint8)
@@ -289,8 +289,8 @@ def seen_points(scene: Scene, frame: Frame, data: mujoco.MjData) -> tuple[np.nda
     """Position of the camera [3] (m), and points seen by each pixel from there, [3, H, W] (m); in the world's frame."""
     position, rotation, _ = camera_pose(scene, data)
     start, direction, _ = ray_parts(scene, pixel_rays(scene, *np.indices(frame.depth.shape)))
-    seen = [np.asarray(s + frame.depth * d) * np.ones(frame.depth.shape) for s, d in zip(start, direction, strict=True)]
-    return np.asarray(position), np.tensordot(np.asarray(rotation), np.stack(seen), axes=1)
+    points = [np.asarray(s + frame.depth * d) * np.ones(frame.depth.shape) for s, d in zip(start, direction, strict=True)]
+    return np.asarray(position), np.tensordot(np.asarray(rotation), np.stack(points), axes=1)
 
 
 def report(folder: pathlib.Path, size: int, pictures: pathlib.Path | None) -> int:
@@ -302,7 +302,7 @@ def report(folder: pathlib.Path, size: int, pictures: pathlib.Path | None) -> in
         name = str(path.relative_to(folder))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # what MuJoCo says about other people's models
-            for title, measures, verdict, seconds in rows_of(path, name, size, pictures):
+            for title, measures, verdict, seconds in folder_rows(path, name, size, pictures):
                 rows, failed = rows + 1, failed + ("FAIL" in verdict)
                 figures = (
                     " | | | | |"
@@ -317,7 +317,7 @@ def report(folder: pathlib.Path, size: int, pictures: pathlib.Path | None) -> in
     return int(failed > 0)
 
 
-def rows_of(
+def folder_rows(
     path: pathlib.Path, name: str, size: int, pictures: pathlib.Path | None
 ) -> Iterator[tuple[str, Measures | None, str, float]]:
     """View, measures, verdict and seconds of each row of a file."""

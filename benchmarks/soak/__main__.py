@@ -57,9 +57,9 @@ def _goodput(options: argparse.Namespace, folder: Path) -> int:
     what = [options.env, "--preset", options.preset, "--seed", str(options.seed)]
     killed = killed_every(folder / "killed", options.sigkill_every, options.minutes, what)
     reference = None if options.no_reference else undisturbed(folder / "undisturbed", killed.env_steps, what)
-    found = report(killed, options.sigkill_every, reference)
+    figures = report(killed, options.sigkill_every, reference)
     if options.json is not None:
-        options.json.write_text(json.dumps(Record(seed=options.seed).machine | found, indent=1) + "\n")
+        options.json.write_text(json.dumps(Record(seed=options.seed).machine | figures, indent=1) + "\n")
     return 0
 
 

@@ -29,13 +29,13 @@ def look(scene: Scene, painter: Painter) -> Perception:
 
 
 def make(path: Path) -> tuple[Once, int]:
-    """What a process does with the runs in a file."""
+    """Make the work of a process on the runs in a file."""
     scenes = pickle.loads(path.read_bytes())
     params, settings, _ = read_weights(SHIPPED["segmentation"])
     painter = Painter(params, settings)
 
     def once(number: int) -> list[float]:
-        return [float(each) for point in look(scenes[number], painter).points for each in point.point]
+        return [float(value) for point in look(scenes[number], painter).points for value in point.point]
 
     return once, len(scenes)
 

@@ -25,5 +25,5 @@ if __name__ == "__main__":
         cv2.imwrite(str(path), cv2.imread(str(path)), options)
     (SAMPLE / "truth").rmdir()
     about = json.loads((SAMPLE / "plot.json").read_text())
-    kept = ("schema", "synthetic", "family", "seed", "count", "plot_length", "stalks")
-    (SAMPLE / "plot.json").write_text(json.dumps({name: about[name] for name in kept}) + "\n")
+    fields = ("schema", "synthetic", "family", "seed", "count", "plot_length", "stalks")
+    (SAMPLE / "plot.json").write_text(json.dumps({name: about[name] for name in fields}) + "\n")

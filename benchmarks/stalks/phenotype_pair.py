@@ -29,7 +29,7 @@ from jaxrl_vis_envs.plants.truth import stalks_in_view
 
 
 def make(path: Path, stated: Calibration) -> tuple[Once, int]:
-    """What a process does with the pairs in a file."""
+    """Make the work of a process on the pairs in a file."""
     images = list(np.load(path).values())
     pairs = list(zip(images[::2], images[1::2]))
     params, settings, _ = read_weights(SHIPPED)
@@ -38,7 +38,7 @@ def make(path: Path, stated: Calibration) -> tuple[Once, int]:
     def once(number: int) -> list[float]:
         left, right = pairs[number]
         detections, ground = find_with_ground(finder, left, right, stated)
-        return [each.diameter_mm or 0.0 for each in look(detections, left, right, stated, ground=ground)]
+        return [sighting.diameter_mm or 0.0 for sighting in look(detections, left, right, stated, ground=ground)]
 
     return once, len(pairs)
 
@@ -53,14 +53,14 @@ if __name__ == "__main__":
     finder = Finder(params, settings)
 
     def once() -> tuple[Any, Any, list[Any]]:
-        """What a pair says: finds, ground and sightings."""
+        """Process one pair: finds, ground and sightings."""
         detections, ground = find_with_ground(finder, left, right, stated)
         return detections, ground, look(detections, left, right, stated, ground=ground)
 
     started = time.perf_counter()
     detections, ground, sightings = once()
     first = time.perf_counter() - started
-    measured = sum(each.diameter_mm is not None for each in sightings)
+    measured = sum(sighting.diameter_mm is not None for sighting in sightings)
     whole = timed(once, asked.repeats)
     print(f"{left.shape[1]} x {left.shape[0]}, {len(detections)} finds, {measured} measured, on {device_name()}")
     print(f"{np.median(whole):.3f} s a pair (least {min(whole):.3f}); the first one, which compiles, {first:.1f} s")
@@ -81,7 +81,7 @@ if __name__ == "__main__":
     truth = np.asarray(pair.instance), np.asarray(pair.depth)
     others = {
         "drawing both images, with their truth": lambda: jax.block_until_ready((sequence[15].left, sequence[15].right)),
-        "images and truth to the host": lambda: jax.device_get([jnp.copy(each) for each in on_device]),
+        "images and truth to the host": lambda: jax.device_get([jnp.copy(array) for array in on_device]),
         "truth of the stalks": lambda: stalks_in_view(sequence.plot, pair.pose, sequence.drive.true, *truth),
     }
     for name, part in others.items():
@@ -91,6 +91,6 @@ if __name__ == "__main__":
         some = [sequence[frame] for frame in (5, 12, 19, 26)]
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "pairs.npz"
-            np.savez(path, *[np.asarray(image) for each in some for image in (each.left, each.right)])
+            np.savez(path, *[np.asarray(image) for pair in some for image in (pair.left, pair.right)])
             for workers in asked.workers:
                 print_rate(functools.partial(make, path, stated), workers, asked.seconds)

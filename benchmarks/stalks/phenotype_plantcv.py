@@ -24,7 +24,7 @@ Masks = tuple[list[np.ndarray], list[tuple[float, ...]]]
 """Masks, packed, and of each: seed, stalk, its shape, mm per pixel, our width and the true one in mm, lean in degrees."""
 
 
-def masks_of(options: argparse.Namespace, seed: int) -> tuple[int, Masks]:
+def plot_masks(options: argparse.Namespace, seed: int) -> tuple[int, Masks]:
     """Draws a plot: its seed, and the masks of what is measured at 12 inches with our width and the truth."""
     import dataclasses
 
@@ -47,11 +47,11 @@ def masks_of(options: argparse.Namespace, seed: int) -> tuple[int, Masks]:
     stated, true = sequence.drive.stated, sequence.drive.true
     for pair in sequence:
         left, right, instance = np.asarray(pair.left), np.asarray(pair.right), np.asarray(pair.instance)
-        seen = stalks_in_view(sequence.plot, pair.pose, true, instance, np.asarray(pair.depth))
-        ideal = perfect_detections(map(dataclasses.asdict, seen), instance)
+        views = stalks_in_view(sequence.plot, pair.pose, true, instance, np.asarray(pair.depth))
+        ideal = perfect_detections(map(dataclasses.asdict, views), instance)
         finds, ground = find_with_ground((lambda image, ideal=ideal: ideal) if options.truth else finder, left, right, stated)
         sightings = look(finds, left, right, stated, ground=ground)
-        owners, _ = match(finds, seen)
+        owners, _ = match(finds, views)
         for find, sighting, owner in zip(finds, sightings, owners):
             at = sighting.height_m
             if owner is None or sighting.diameter_mm is None or at is None or abs(at - HEIGHTS[0]) > 0.0127:
@@ -72,13 +72,13 @@ def keep_masks(options: argparse.Namespace) -> None:
         share_accelerator()
     plots: list[tuple[int, Masks]] = []
     seeds = range(options.seed, options.seed + options.plots)
-    for seed, masks in results_of(functools.partial(masks_of, options), seeds, options.workers):
+    for seed, masks in results_of(functools.partial(plot_masks, options), seeds, options.workers):
         plots.append((seed, masks))
         print(f"plot {seed}: {len(masks[1])} masks", flush=True)
     plots.sort(key=lambda plot: plot[0])
     packed = [mask for _, (masks, _) in plots for mask in masks]
     rows = [row for _, (_, about) in plots for row in about]
-    ends = np.cumsum([len(each) for each in packed])
+    ends = np.cumsum([len(mask) for mask in packed])
     drawn = f"{options.plots} synthetic plots of family {options.family}"
     about = f"{drawn}, {options.frames} pairs each, {options.width} pixels wide"
     masks = np.concatenate(packed) if packed else np.zeros(0, np.uint8)
@@ -109,16 +109,16 @@ def compare(file: Path) -> None:
     except ImportError:
         sys.exit("PlantCV is not here: `pip install plantcv` in an environment of its own, and run this again there")
     pcv.params.debug, pcv.params.verbose = None, False
-    kept = np.load(file)
-    rows, starts = kept["rows"], np.concatenate([[0], kept["ends"][:-1]])
+    stored = np.load(file)
+    rows, starts = stored["rows"], np.concatenate([[0], stored["ends"][:-1]])
     theirs = []
-    for row, start, end in zip(rows, starts, kept["ends"]):
+    for row, start, end in zip(rows, starts, stored["ends"]):
         shape = int(row[2]), int(row[3])
-        mask = np.unpackbits(kept["masks"][start:end], count=shape[0] * shape[1]).reshape(shape).astype(bool)
+        mask = np.unpackbits(stored["masks"][start:end], count=shape[0] * shape[1]).reshape(shape).astype(bool)
         theirs.append(plantcv_width(pcv, mask) * row[4])
     theirs = np.array(theirs)
     both = np.isfinite(theirs)
-    print(f"{kept['about']}; {both.sum()} masks, {(~both).sum()} without a width by PlantCV; errors in mm")
+    print(f"{stored['about']}; {both.sum()} masks, {(~both).sum()} without a width by PlantCV; errors in mm")
     print("| | PlantCV: mean absolute | bias | ours: mean absolute | bias | n |\n|---|---|---|---|---|---|")
     ours, truth, lean = rows[both, 5], rows[both, 6], np.abs(rows[both, 7])
     theirs, stalks = theirs[both], rows[both][:, :2]
@@ -131,13 +131,13 @@ def compare(file: Path) -> None:
         _print(name, theirs[some], ours[some], truth[some])
     names, which = np.unique(stalks, axis=0, return_inverse=True)
     groups = [which.ravel() == place for place in range(len(names))]
-    medians = [np.array([np.median(each[group]) for group in groups]) for each in (theirs, ours, truth)]
+    medians = [np.array([np.median(widths[group]) for group in groups]) for widths in (theirs, ours, truth)]
     _print("each stalk, median over its pairs", *medians)
 
 
 def _print(name: str, theirs: np.ndarray, ours: np.ndarray, truth: np.ndarray) -> None:
     if len(truth):
-        cells = [f"{np.abs(each - truth).mean():.2f} | {(each - truth).mean():+.2f}" for each in (theirs, ours)]
+        cells = [f"{np.abs(widths - truth).mean():.2f} | {(widths - truth).mean():+.2f}" for widths in (theirs, ours)]
         print(f"| {name} | {cells[0]} | {cells[1]} | {len(truth)} |")
 
 

@@ -31,9 +31,9 @@ def scenes(arms: int, seed: int = 0) -> tuple[Any, np.ndarray]:
     """Stands and targets [arms, 3] (m): stalks of a few plots at heights of 0.5 to 0.9 m, masts within 0.1 m of them."""
     rng = np.random.default_rng(seed)
     plots = [draw(TRAINING, seed * _PLOTS + index) for index in range(_PLOTS)]
-    each = [plots[rng.integers(_PLOTS)] for _ in range(arms)]
-    targets = np.array([plot.measured[rng.integers(len(plot.measured))].at_height(rng.uniform(0.5, 0.9))[0] for plot in each])
-    return stands_at(each, targets[:, 0] + rng.uniform(-0.1, 0.1, arms), targets), targets
+    chosen = [plots[rng.integers(_PLOTS)] for _ in range(arms)]
+    targets = np.array([plot.measured[rng.integers(len(plot.measured))].at_height(rng.uniform(0.5, 0.9))[0] for plot in chosen])
+    return stands_at(chosen, targets[:, 0] + rng.uniform(-0.1, 0.1, arms), targets), targets
 
 
 def main() -> int:

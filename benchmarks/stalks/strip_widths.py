@@ -42,15 +42,15 @@ def mean_errors(estimate, ratio: float, lean: float, soft: bool, places: int, wi
     rng = np.random.default_rng(0)
     errors = []
     for width in widths:
-        found = [estimate(ideal_strip(width, ratio, lean, tuple(rng.uniform(-0.5, 0.5, 2)), soft)) for _ in range(places)]
-        errors.append(np.mean([np.nan if each is None else each / width - 1.0 for each in found]))
+        estimates = [estimate(ideal_strip(width, ratio, lean, tuple(rng.uniform(-0.5, 0.5, 2)), soft)) for _ in range(places)]
+        errors.append(np.mean([np.nan if estimated is None else estimated / width - 1.0 for estimated in estimates]))
     return np.array(errors)
 
 
 def strip(mask: np.ndarray) -> float | None:
     """Width by `strip_width`, in the middle."""
-    found = strip_width(mask)
-    return None if found is None else found.width()
+    strip = strip_width(mask)
+    return None if strip is None else strip.width()
 
 
 def table(places: int = 12, widths: tuple[float, ...] = (20.0, 27.5, 38.9)) -> list[str]:
@@ -64,8 +64,8 @@ def table(places: int = 12, widths: tuple[float, ...] = (20.0, 27.5, 38.9)) -> l
         for soft in (True, False) if name == "strip" else (False,):
             for lean in LEANS if name == "strip" else (0.0, 20.0):
                 errors = [mean_errors(estimate, ratio, lean, soft, places, widths) for ratio in RATIOS]
-                worst = [each[np.nanargmax(np.abs(each))] if np.isfinite(each).any() else np.nan for each in errors]
-                cells = " | ".join(f"{100 * each:+.2f} %" for each in worst)
+                worst = [row[np.nanargmax(np.abs(row))] if np.isfinite(row).any() else np.nan for row in errors]
+                cells = " | ".join(f"{100 * error:+.2f} %" for error in worst)
                 lines.append(f"| {name} | {'soft' if soft else 'hard'} | {lean:g} | {cells} |")
     return lines
 

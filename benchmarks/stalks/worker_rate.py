@@ -1,4 +1,4 @@
-"""How often something is done in a second where several processes do it side by side; for the scripts beside this one."""
+"""Rate of a job that several processes do at the same time; for the other scripts of this folder."""
 
 import argparse
 import functools
@@ -25,7 +25,7 @@ def timed(run: Callable[[], object], repeats: int) -> list[float]:
 
 
 def options() -> argparse.Namespace:
-    """What the scripts are asked for; one that asks for several processes shares its GPU with them."""
+    """Parse the options of the scripts; several processes share the GPU."""
     parser = argparse.ArgumentParser(description="Time and memory for one synthetic pair.")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument(
@@ -33,10 +33,10 @@ def options() -> argparse.Namespace:
     )
     parser.add_argument("--seconds", type=float, default=10.0, help="how long each number of them is timed")
     parser.add_argument("--width", type=int, help="of an image, pixels, in place of the family's")
-    found = parser.parse_args()
-    if found.workers:
+    parsed = parser.parse_args()
+    if parsed.workers:
         share_accelerator()
-    return found
+    return parsed
 
 
 def print_rate(make: Callable[[], tuple[Once, int]], workers: int, seconds: float, each_is: float = 1.0) -> None:
@@ -49,14 +49,14 @@ def print_rate(make: Callable[[], tuple[Once, int]], workers: int, seconds: floa
         each_is: How many pairs are looked at each time.
     """
     with tempfile.TemporaryDirectory() as folder:
-        with processes(workers) as each:
-            counts = list(each(functools.partial(_work, make, Path(folder), workers, seconds), range(workers)))
+        with processes(workers) as pool:
+            counts = list(pool(functools.partial(_work, make, Path(folder), workers, seconds), range(workers)))
     pairs = sum(counts) * each_is
     print(f"{workers} processes: {seconds / pairs:.4f} s a pair ({pairs:.0f} pairs in {seconds:.0f} s)")
 
 
 def _work(make: Callable[[], tuple[Once, int]], folder: Path, workers: int, seconds: float, index: int) -> int:
-    """What one process does, and how often it came to an end."""
+    """Do the work of one process, and count how often it finished."""
     once, inputs = make()
     results = {tuple(once(number)) for number in range(inputs)}
     assert len(results) > 1 or inputs < 2, "all pairs gave the same"

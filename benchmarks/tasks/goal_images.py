@@ -1,4 +1,4 @@
-"""What goal images show: whether what matters can be seen in each, and whether two different goals ever look the same.
+"""Content of goal images: visibility of the relevant parts, and different goals with the same image.
 
     python -m benchmarks.tasks.goal_images [ENV ...] [--goals 1000] [--image-size 100] [--save FOLDER]
 
@@ -75,7 +75,12 @@ def visible_pixels(env: Any, labels: np.ndarray, geoms: tuple[str, ...]) -> np.n
 
 
 def compare(goals: Goals, threshold: float) -> tuple[int, int, int, tuple[int, int]]:
-    """Of pairs of goals: identical ones more than a threshold apart; pairs just over it; their least difference; and where."""
+    """Compare pairs of goals that are more than a threshold apart.
+
+    Returns:
+        Pairs with identical images, pairs up to `_NEAR` thresholds apart, the fewest bytes in which these images differ,
+        and the indices of that pair; -1 without such pairs.
+    """
     distance = np.linalg.norm(goals.states[:, None] - goals.states[None], axis=-1)
     flat = goals.images.reshape(len(goals.images), -1)
     kinds = np.unique(flat, axis=0, return_inverse=True)[1].reshape(-1)

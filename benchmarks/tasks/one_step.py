@@ -136,7 +136,7 @@ def our_step(env: Any, visited: Visited, iterations: Iterations) -> np.ndarray:
 
 
 class MujocoStep(NamedTuple):
-    """What C MuJoCo makes of N states."""
+    """Result of C MuJoCo for N states."""
 
     qvel: np.ndarray  # [N, nv], after one step
     contacts: np.ndarray  # [N], how many there were

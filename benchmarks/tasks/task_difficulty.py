@@ -1,4 +1,4 @@
-"""How hard the tasks are before anything is learned: the figures of `jaxrl-vis envs`.
+"""Difficulty of the tasks before learning: the figures of `jaxrl-vis envs`.
 
     python -m benchmarks.tasks.task_difficulty [ENV ...] [--episodes 1000]
 

@@ -248,10 +248,10 @@ class Learner:
             else:
                 after = self._encode(critic, goal_and_after[size:])
             latents = after, goal
-            seen = latents
+            actor_latents = latents
             if not rules.shared_encoder:
-                seen = self._encode_pair(target_actor if rules.target_encoder else actor, goal_and_after)[::-1]
-            value = self._value(target_critic, latents, self._act(target_actor, seen))
+                actor_latents = self._encode_pair(target_actor if rules.target_encoder else actor, goal_and_after)[::-1]
+            value = self._value(target_critic, latents, self._act(target_actor, actor_latents))
             return (reward + rules.discount * value).clamp(rules.target_minimum, rules.target_maximum)
 
         def critic_loss(learned: Tensors) -> tuple[Any, Any]:
@@ -261,8 +261,8 @@ class Learner:
             return (keep * (value - td_target(fixed[1])).square()).sum() / keep.sum().clamp(min=1.0), fixed
 
         def actor_loss(actor: Tensors) -> Any:
-            seen = latents if rules.shared_encoder else self._encode_pair(actor, before_and_goal)
-            chosen = self._act(actor, seen)
+            actor_latents = latents if rules.shared_encoder else self._encode_pair(actor, before_and_goal)
+            chosen = self._act(actor, actor_latents)
             return rules.action_penalty * chosen.square().mean() - self._value(critic, latents, chosen).mean()
 
         critic_gradients, (critic_error, latents) = torch.func.grad_and_value(critic_loss, has_aux=True)(critic)
