@@ -3,9 +3,7 @@
 import dataclasses
 import json
 import re
-import runpy
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +11,7 @@ import pytest
 from test_provenance import commit
 
 from benchmarks.ledger import __main__ as ledger
-from benchmarks.ledger import ablations, check, evidence, pages, records, staleness
+from benchmarks.ledger import ablations, evidence, pages, records, staleness
 from benchmarks.ledger import readme_tables as tables
 from benchmarks.ledger.readme_rows import DEVICES, LEARNING, Figure, Learning
 from jaxrl_vis.cli.parsing import parse
@@ -135,7 +133,7 @@ def test_code_of_the_other_kind_of_device_does_not_count(discs: Path, monkeypatc
 
 def test_without_git_it_says_so_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "disc.json").write_text(json.dumps([kept()]))
-    assert check.check(tmp_path, tmp_path) == []
+    assert ledger.main(["stale", "--results", str(tmp_path)], checkout=tmp_path) == 0
     (line,) = capsys.readouterr().out.splitlines()
     assert "not a git checkout" in line
 
@@ -256,11 +254,9 @@ def make_run(folder: Path, rows: list[dict[str, Any]], **overrides: Any) -> Path
     return folder
 
 
-def test_a_run_is_kept_small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_is_kept_small(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = make_run(tmp_path / "run", rows_of([0.5, 0.9]), seeds=3, hidden_sizes=(8, 8), clip_targets_above=False)
-    monkeypatch.setattr(sys, "argv", ["keep_run", str(run), "discs", "--results", str(tmp_path)])
-    with pytest.raises(SystemExit, match="0"):
-        runpy.run_module("benchmarks.ledger.keep_run", run_name="__main__")
+    assert ledger.main(["keep", str(run), "discs", "--results", str(tmp_path)]) == 0
     assert [Path(line).name for line in capsys.readouterr().out.splitlines()] == ["discs.json", "discs.metrics.jsonl"]
     stored = evidence.load("discs", tmp_path)
     assert stored is not None

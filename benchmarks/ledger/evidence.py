@@ -3,7 +3,7 @@
     benchmarks/results/learning/NAME.json             schema, name, configuration, command, device, versions, revision, date
     benchmarks/results/learning/NAME.metrics.jsonl    the run's metrics.jsonl, reduced to evaluations and times
 
-`keep_run` stores a run. `jaxrl_vis.report.learning` defines "X by N steps".
+`python -m benchmarks.ledger keep` stores a run. `jaxrl_vis.report.learning` defines "X by N steps".
 """
 
 import dataclasses

@@ -43,7 +43,7 @@ class Speed:
 
 @dataclasses.dataclass(frozen=True)
 class Learning:
-    """A row of the results table: runs that `keep_run` stored.
+    """A row of the results table: runs with stored evidence.
 
     Attributes:
         label: Text of the first column.

@@ -102,7 +102,7 @@ def load_runs(row: Learning, results: Path) -> list[Evidence]:
             differing = [field for field in names if getattr(made_with, field) != getattr(config, field)]
             raise RequestError(
                 f"evidence {name} was made by `{run.record['command']}`, and the README says `{command_of(config)}`, "
-                f"which has other {', '.join(differing)}: train again, then python -m benchmarks.ledger.keep_run"
+                f"which has other {', '.join(differing)}: train again, then python -m benchmarks.ledger keep"
             )
         runs.append(run)
     return runs
