@@ -307,11 +307,34 @@ def test_a_config_file_that_cannot_be_used_is_one_line(tmp_path, capsys, words, 
     assert error.count("\n") == 1 and len(error) < 600
 
 
-@pytest.mark.parametrize("names, goes", [(["_CHECKPOINT_METADATA", "SHA256SUMS"], True), (["manifest"], False)])
-def test_what_a_thread_made_of_a_folder_that_was_moved_goes(tmp_path, names, goes):
-    checkpoint = tmp_path / "run" / "checkpoints" / LIGHT / "4"
-    checkpoint.mkdir(parents=True)
-    for name in names:
-        (checkpoint / name).touch()
-    RunFolder(tmp_path / "run").remove_remains()
+@pytest.mark.parametrize(
+    "contents, goes",
+    [
+        ({"_CHECKPOINT_METADATA": "", "SHA256SUMS": ""}, True),
+        ({"manifest/metadata": '{"run_id": "ours"}'}, True),
+        ({"manifest/metadata": '{"run_id": "theirs"}'}, False),
+        ({"manifest/metadata": "{"}, False),
+    ],
+)
+def test_what_a_thread_made_of_a_folder_that_was_moved_goes(tmp_path, contents, goes):
+    for name, text in contents.items():
+        file = tmp_path / "run" / "checkpoints" / LIGHT / "4" / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text)
+    RunFolder(tmp_path / "run").remove_remains("ours")
     assert (tmp_path / "run").exists() != goes
+
+
+def test_a_row_whose_id_has_a_wrong_bit_is_put_aside(straight, tmp_path, capsys):
+    path = tmp_path / "run"
+    interrupted_at(make_fake_trainer(small_config(), path), 4)
+    file = path / "metrics.jsonl"
+    *lines, last = file.read_text().splitlines(keepends=True)
+    run_id = read_run_id(path)
+    assert run_id is not None and run_id in last
+    spoilt = last.replace(run_id, ("1" if run_id[0] == "0" else "0") + run_id[1:])
+    file.write_text("".join([*lines, spoilt]))
+    list(make_fake_trainer(small_config(), path, resume=True).run())
+    assert "metrics.jsonl held 1 row of another run: kept in" in capsys.readouterr().out
+    assert (path / "checkpoints" / "foreign" / "metrics.jsonl").read_text() == spoilt
+    assert rows_without_time(path)[-2:] == rows_without_time(straight[0])[-2:]

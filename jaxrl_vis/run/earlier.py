@@ -55,16 +55,19 @@ def last_evaluation(restored: Restored) -> int:
 
 
 def refuse_missing_rows(folder: RunFolder, restored: Restored) -> None:
-    """Checks that metrics.jsonl has what was evaluated before a checkpoint was saved; damaged lines may have been that, those
-    of an earlier resumption too, which lie with the damaged checkpoints.
+    """Checks that metrics.jsonl has what was evaluated before a checkpoint was saved.
+
+    Damaged lines and rows of another run may have been that: one wrong bit makes either. So may those of an earlier
+    resumption, which lie with the damaged and the foreign checkpoints.
 
     Raises:
         RequestError: It ends earlier.
     """
     evaluated = last_evaluation(restored)
-    last = max((row["iteration"] for row in folder.rows()), default=0)
-    contents = metrics.read_contents(folder.metrics)
-    if last < evaluated and not contents.damaged and not contents.torn and not _aside(folder).exists():
+    rows, contents = folder.rows(), metrics.read_contents(folder.metrics)
+    last = max((row["iteration"] for row in rows), default=0)
+    has_others = len(contents.rows) > len(rows) or any(aside.exists() for aside in _asides(folder))
+    if last < evaluated and not (contents.damaged or contents.torn or has_others):
         raise RequestError(
             f"checkpoint {restored.tier}/{restored.iteration} of {folder.path} comes after an evaluation at iteration "
             f"{evaluated}, but {folder.metrics.name} ends at {last}: put back the whole file, or move the checkpoints after "
@@ -74,8 +77,7 @@ def refuse_missing_rows(folder: RunFolder, restored: Restored) -> None:
 
 def cut_back(folder: RunFolder, checkpoints: Checkpoints, last: int, keeps_later: bool, evaluated: int = 0) -> str | None:
     """Keeps rows of the run up to an iteration in metrics.jsonl; `metrics.cut_back` has the rest."""
-    others = folder.checkpoints / FOREIGN / folder.metrics.name
-    return metrics.cut_back(folder.metrics, last, checkpoints.run_id, _aside(folder), others, keeps_later, evaluated)
+    return metrics.cut_back(folder.metrics, last, checkpoints.run_id, *_asides(folder), keeps_later, evaluated)
 
 
 def set_others_aside(folder: RunFolder, checkpoints: Checkpoints) -> list[str]:
@@ -94,5 +96,6 @@ def say_foreign(path: Path) -> str:
     return f"not of this run, and left out: {path}"
 
 
-def _aside(folder: RunFolder) -> Path:
-    return folder.checkpoints / DAMAGED / folder.metrics.name
+def _asides(folder: RunFolder) -> tuple[Path, Path]:
+    """Files of lines that are damaged, and of rows of other runs."""
+    return folder.checkpoints / DAMAGED / folder.metrics.name, folder.checkpoints / FOREIGN / folder.metrics.name

@@ -180,18 +180,17 @@ class RunFolder:
             when = "while the run wrote there, and what was trained since its last checkpoint is lost"
             raise FolderGoneError(_where_gone(self.path, held.place(), when))
 
-    def remove_remains(self) -> None:
+    def remove_remains(self, run_id: str | None) -> None:
         """Deletes what threads that were writing a checkpoint have made again of a folder that was moved or deleted under them.
 
         A folder with anything else in it is somebody's, and stays.
+
+        Args:
+            run_id: The run's; a checkpoint may even have become complete.
         """
         with contextlib.suppress(OSError):
-            # A folder that went between two steps of a writing thread may even get its final name, but never a manifest.
-            unfinished = [
-                _UNFINISHED in path.name or (path.name.isdigit() and not (path / "manifest").exists())
-                for path in self.checkpoints.glob("*/*")
-            ]
-            if all(unfinished) and [entry.name for entry in self.path.iterdir()] == [self.checkpoints.name]:
+            remains = [_UNFINISHED in path.name or _is_remainder(path, run_id) for path in self.checkpoints.glob("*/*")]
+            if all(remains) and [entry.name for entry in self.path.iterdir()] == [self.checkpoints.name]:
                 shutil.rmtree(self.path)
 
     def check(self, config: Config, resume: bool = False, overwrite: bool = False) -> bool:
@@ -275,6 +274,16 @@ class RunFolder:
         if not self.checkpoints.is_symlink():
             with contextlib.suppress(OSError):  # somebody else's files are in there, or it is not there
                 self.checkpoints.rmdir()
+
+
+def _is_remainder(checkpoint: Path, run_id: str | None) -> bool:
+    """Returns whether a checkpoint without its run's folder is half of one, or of the run ``run_id``."""
+    manifest = checkpoint / "manifest"
+    try:
+        is_ours = not manifest.exists() or json.loads((manifest / "metadata").read_bytes()).get(RUN_ID) == run_id
+        return is_ours and checkpoint.name.isdigit()
+    except (OSError, ValueError, AttributeError):
+        return False
 
 
 def _where_gone(path: Path, place: Path | None, when: str) -> str:

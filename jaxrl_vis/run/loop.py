@@ -162,7 +162,7 @@ class RunLoop:
                         self._checkpoints.close()
                     self._loggers.close(in_a_hurry=bool(interruption))
                     if self.has_begun and self._held is not None and not self._held.is_in_place():
-                        self._folder.remove_remains()
+                        self._folder.remove_remains(self._checkpoints.run_id)
                 self._goodput.close()
 
     def _check_ours(self) -> None:

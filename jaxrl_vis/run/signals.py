@@ -11,6 +11,7 @@ import contextlib
 import os
 import signal
 import socket
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -157,6 +158,7 @@ class Interruption(_Handlers):
     def _note(self, number: int, _: FrameType | None) -> None:
         if number in _DELIBERATE and self._was_asked:
             self.signal, self.is_urgent = number, True
+            _ignore_half_made_loops()
             self.end()
         self._was_asked |= number in _DELIBERATE
         if self.signal is None:
@@ -165,6 +167,17 @@ class Interruption(_Handlers):
     def end(self) -> None:
         """Raises what the signal stands for: `Terminated` or KeyboardInterrupt."""
         _raise(self.signal or signal.SIGTERM)
+
+
+def _ignore_half_made_loops() -> None:
+    """Silences asyncio (orbax saves with it) about an event loop that a raising handler has kept from being made."""
+    before = sys.unraisablehook
+
+    def hook(unraisable: "sys.UnraisableHookArgs") -> None:
+        if getattr(unraisable.object, "__qualname__", "") != "BaseEventLoop.__del__":
+            before(unraisable)
+
+    sys.unraisablehook = hook
 
 
 def _raise(number: int) -> None:
