@@ -244,7 +244,7 @@ def test_environments_with_the_same_settings_are_compiled_once(registered):
     [
         (lambda: GymnasiumEnv("Reachr"), "did you mean Reacher"),
         (lambda: GymnasiumEnv("Reacher", horizn=3), "did you mean horizon"),
-        (lambda: GymnasiumEnv(told(), horizon=3), "horizon: options go with the name"),
+        (lambda: GymnasiumEnv(told(), horizon=3), "horizon: options can be changed for a named environment"),
         (lambda: GymnasiumEnv(told(), reward="sparse"), "reward must be one of oracle, dense, got 'sparse'"),
         (lambda: GymnasiumEnv(told(), render_mode="human"), "rgb_array"),
         (lambda: GymnasiumEnv(told(), render_mode="rgb_array"), "no MuJoCo model"),
@@ -252,15 +252,15 @@ def test_environments_with_the_same_settings_are_compiled_once(registered):
         (lambda: GymnasiumVectorEnv(told(), "3"), "num_envs must be a whole number of at least 1, got '3'"),
         (lambda: GymnasiumVectorEnv(told(), 2.0), "num_envs must be a whole number of at least 1, got 2.0"),
         (lambda: GymnasiumVectorEnv(told(), 2).reset(seed=1.5), "one for each of 2 environments, got 1.5"),
-        (lambda: GymnasiumEnv(None), "the name of an environment, or a GoalEnv that is made already, got a NoneType"),
+        (lambda: GymnasiumEnv(None), "the name of an environment, or an existing GoalEnv, got a NoneType"),
         (lambda: GymnasiumEnv(probes.GoWhereTold), "got the class GoWhereTold"),
         (lambda: GymnasiumEnv("Reacher", horizon={}), "horizon must be a whole number of at least 1, got {}"),
         (lambda: GymnasiumEnv("VisualReacher", depth_range=np.ones(2)), "depth_range must be 2 finite numbers, got array"),
-        (lambda: BraxEnv(None), "the name of an environment, or a GoalEnv that is made already, got a NoneType"),
+        (lambda: BraxEnv(None), "the name of an environment, or an existing GoalEnv, got a NoneType"),
         (lambda: GymnasiumVectorEnv(told(), 2, autoreset_mode="Disabled"), "NextStep or SameStep"),
         (lambda: GymnasiumVectorEnv(told(), 2).reset(seed=[1]), "each of 2"),
         (lambda: BraxEnv(told(), reward="sparse"), "oracle, dense"),
-        (lambda: BraxEnv(told(), horizon=3), "horizon: options go with the name"),
+        (lambda: BraxEnv(told(), horizon=3), "horizon: options can be changed for a named environment"),
     ],
 )
 def test_bad_settings_are_refused_in_one_line(make, message):

@@ -351,7 +351,7 @@ def test_register(monkeypatch):
     with pytest.raises(ValueError, match="TaskConfig.horizon of 'Other' needs a default"):
         registry.register("Other", lambda config: environments.make("Reacher"), TaskConfig)
     registry.register("Nothing", lambda config: None, config_class)
-    with pytest.raises(ValueError, match="Nothing is no environment but None: its factory"):
+    with pytest.raises(ValueError, match="Nothing is not an environment but None: its factory"):
         jaxrl_vis_envs.make("Nothing")
 
 

@@ -136,8 +136,8 @@ def test_a_built_in_name_cannot_be_taken(here: Path) -> None:
 
 WRONG = (
     ("my_task:MyRech", "my_task has no MyRech; did you mean MyReach?"),
-    ("my_task:helper", "my_task:helper is no environment but of type int"),
-    ("my_task:MyConfig", "my_task:MyConfig is no environment but a class: it must be a subclass of jaxrl_vis_envs.GoalEnv"),
+    ("my_task:helper", "my_task:helper is not an environment but of type int"),
+    ("my_task:MyConfig", "my_task:MyConfig is not an environment but a class: it must be a subclass of jaxrl_vis_envs.GoalEnv"),
     ("my_task:Unfinished", "my_task:Unfinished is not complete: it must define advance, observe"),
     ("my_task:Untyped", "the settings of my_task:Untyped are unknown: annotate 'config'"),
     ("my_taks:MyReach", "there is no module my_taks, in "),
@@ -146,8 +146,8 @@ WRONG = (
     ("../my_task:MyReach", "names a file, not a module: write my_task:MyReach"),
     ("sub/my_task.py:MyReach", "write sub.my_task:MyReach"),
     ("my_task.MyReach", "unknown environment 'my_task.MyReach'; a task of your own is written module:Name"),
-    ("my_task:", "is no task: a task of your own is written module:Name"),
-    ("a:b:c", "is no task"),
+    ("my_task:", "is not a task: a task of your own is written module:Name"),
+    ("a:b:c", "is not a task"),
     ("types:MyReach", "types has no MyReach"),
     ("needs:X", "No module named 'nothing_like_it' (needs.py, line 2); install nothing_like_it"),
     ("divides:X", "divides cannot be imported: ZeroDivisionError: division by zero (divides.py, line 1)"),
@@ -184,7 +184,7 @@ def test_wrong_names_get_one_line(
     ("name", "complaint"),
     [
         ("my_task:Fails", "my_task:Fails cannot be built: AttributeError: 'Fails' object has no attribute 'nothing'"),
-        ("my_task:Silent", "my_task:Silent has no threshold: every environment says what its horizon, action_size"),
+        ("my_task:Silent", "my_task:Silent has no threshold: every environment must define horizon, action_size"),
         ("my_task:OldReset", "my_task:OldReset: reset must take (key), not ()"),
     ],
 )
@@ -235,7 +235,8 @@ def test_a_run_is_found_again_from_another_folder(
     forget()
     assert cli.main(["eval", str(run)]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert f"my_task was imported from {here}, which holds it no longer" in line and "run this in the folder that does" in line
+    assert f"my_task was imported from {here}, which no longer contains it" in line
+    assert "run this in the folder that does" in line
     monkeypatch.chdir(tmp_path)
     resumed = jaxrl_vis.make_trainer(preset("debug", env=my_task, env_folder=str(here)))
     assert resumed.config.env_folder == str(tmp_path)  # where it lies now
@@ -245,7 +246,7 @@ def test_another_module_of_that_name_is_not_taken_for_it(my_task: str, tmp_path:
     jaxrl_vis_envs.make(my_task)
     (tmp_path / "my_task.py").write_text(TASK)
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(jaxrl_vis_envs.TaskModuleError, match="has loaded another my_task already.*start another process"):
+    with pytest.raises(jaxrl_vis_envs.TaskModuleError, match="has loaded another my_task already.*start a new process"):
         jaxrl_vis_envs.make(my_task)
 
 
@@ -278,7 +279,7 @@ def test_broken_packages_do_not_break_the_list(package: Callable[..., None], cap
     for name, complaint in (
         ("BadReach", "badworks cannot be imported: RuntimeError: out of order"),
         ("WorseReach", "there is no module nowhere"),
-        ("Twice", "several installed packages have a Twice: ask for goodworks:MyReach or samename:MyReach"),
+        ("Twice", "several installed packages have a Twice: request goodworks:MyReach or samename:MyReach"),
     ):
         assert any(line.startswith(f"{name} cannot be used: ") and complaint in line for line in lines), name
         assert cli.main(["train", name, "--preset", "debug"]) == 2

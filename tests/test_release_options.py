@@ -31,7 +31,7 @@ def poses(name: str, **options: Any) -> tuple[Any, Any, np.ndarray]:
 
     def sample(key: jax.Array) -> tuple[Any, Any, jax.Array]:
         goal = env.sample_goal(key)
-        return env.sample_start(key), goal, env.goal_state_of(key, goal)
+        return env.sample_start(key), goal, env.goal_state(key, goal)
 
     return jax.device_get(env_jit(jax.vmap(sample))(KEYS))
 

@@ -32,7 +32,7 @@ def target_stalks() -> np.ndarray:
 
 def test_the_goal_is_a_stalk_between_the_jaws():
     env, (state, goal) = make(), starts()
-    layout = bending.layout_of(env.mj_model)
+    layout = bending.read_layout(env.mj_model)
     heights = np.asarray(goal.qpos)[:, 0]
     places = np.asarray(jax.vmap(lambda data: bending.at_height(data, layout, data.qpos[0]))(goal))
     np.testing.assert_allclose(places[np.arange(COUNT), target_stalks()], state.goal_state, atol=1e-4)
@@ -50,7 +50,7 @@ def test_the_distance_is_that_from_where_the_stalk_is_now():
     env, (state, _) = make(), starts()
     for _ in range(3):
         state = environments.advance(env, state, np.zeros((COUNT, 3)))
-    layout = bending.layout_of(env.mj_model)
+    layout = bending.read_layout(env.mj_model)
     now = np.asarray(jax.vmap(lambda data: bending.at_height(data, layout, data.qpos[0]))(state.data))
     now = now[np.arange(COUNT), target_stalks()]
     grip = np.asarray(stalk_arm.grip_at(state.data.qpos[:, :3]))

@@ -101,7 +101,7 @@ def add_stalks(spec: mujoco.MjSpec, stalks: int, pushed_by: tuple[str, ...], kne
             pair.solref, pair.solimp = [0.008, 1], [0.9, 0.98, 0.001, 0.5, 2]
 
 
-def layout_of(mj_model: mujoco.MjModel) -> Layout:
+def read_layout(mj_model: mujoco.MjModel) -> Layout:
     """Where `add_stalks` has put the stalks of a model."""
     names = [mj_model.body(body).name for body in range(mj_model.nbody)]
     count = sum(name.startswith("foot_") for name in names)
