@@ -226,7 +226,7 @@ def test_the_gpu_kernel_draws_varied_scenes(monkeypatch: pytest.MonkeyPatch) -> 
         return jnp.concatenate([planes.rgb, planes.depth[None]])
 
     plain = np.asarray(env_jit(jax.vmap(draw))(start.data, start.domain))
-    monkeypatch.setattr(kernel, "takes", lambda scene, outputs: kernel.supports(scene))
+    monkeypatch.setattr(kernel, "can_render", lambda scene, outputs: kernel.supports(scene))
     monkeypatch.setattr(kernel, "draw", functools.partial(kernel.draw, interpret=True))
     by_kernel = np.asarray(jax.vmap(draw)(start.data, start.domain))
     assert (np.abs(plain - by_kernel).max(axis=1) < 1e-3).mean() > 0.98  # but for pixels on an edge

@@ -265,8 +265,8 @@ def test_what_is_left_out_must_be_there(ball):
         (lambda model: (mjx.put_model(model),), "not from a Model; mjx.put_model was given one"),
         (lambda model: (model, ("front", "side")), "a scene has one camera: .* got a tuple"),
         (lambda model: (model, 0.5), "a scene has one camera: .* got a float"),
-        (lambda model: (model, None, 4, 4, "all"), "groups must be numbers of groups.*'all'"),
-        (lambda model: (model, None, 4, 4, (0,), None), "site_groups must be numbers of groups.*None"),
+        (lambda model: (model, None, 4, 4, "all"), "groups must be group numbers.*'all'"),
+        (lambda model: (model, None, 4, 4, (0,), None), "site_groups must be group numbers.*None"),
         (lambda model: (model, None, 4, 4, (0,), (), True, False, False, None, "ball"), "leave_out must be .*'ball'"),
     ],
 )
@@ -284,7 +284,7 @@ def test_groups_come_in_any_collection(ball):
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        (lambda scene, data: (data, scene), "a scene comes first, .* got MjData"),
+        (lambda scene, data: (data, scene), "the scene, .* comes first, .* got MjData"),
         (lambda scene, _: (scene, None), "mjx.Data or mujoco.MjData; NoneType has no geom_xpos"),
         (lambda scene, data: (scene, SimpleNamespace(data=data)), "such as state.data; SimpleNamespace has no geom_xpos"),
         (lambda scene, data: (scene, SimpleNamespace(**poses_of(data, 2))), r"\(3, 3\), got \(2, 3, 3\); jax.vmap"),

@@ -19,7 +19,7 @@ from jaxrl_vis_envs.render.pixel.prepare import prepare
 @pytest.fixture
 def plainly(monkeypatch):
     """Makes `render_planes` draw without the passes from here on."""
-    return lambda: monkeypatch.setattr(passes, "takes", lambda scene, outputs: False)
+    return lambda: monkeypatch.setattr(passes, "can_render", lambda scene, outputs: False)
 
 
 @pytest.mark.parametrize(
@@ -35,7 +35,7 @@ def plainly(monkeypatch):
 def test_the_passes_draw_the_same_image(lens, more, shape, options, plainly):
     height, width = shape
     scene, poses = small_scene(lens, more, height, width, **options)
-    assert passes.takes(scene, Outputs(rgb=True, depth=True, segmentation=True, quantized=True))
+    assert passes.can_render(scene, Outputs(rgb=True, depth=True, segmentation=True, quantized=True))
 
     def draw_all(places):
         def draw(geom_xpos):
@@ -81,7 +81,7 @@ def test_tiles_see_what_is_in_them():
     scene, poses = small_scene(height=64, width=64)
     layout = tiles.layout(scene)
     rays = camera.pixel_rays(scene, layout.rows, layout.columns)
-    seen = np.asarray(tiles.seen_in_tiles(scene, prepare(scene, poses).unit, rays))
+    seen = np.asarray(tiles.visible_in_tiles(scene, prepare(scene, poses).unit, rays))
     labels = np.asarray(render_planes(scene, poses, rgb=False, segmentation=True).segmentation)
     for tile, (rows, columns) in enumerate(zip(layout.rows, layout.columns, strict=True)):
         shown = set(labels[rows, columns].tolist()) - {-1}

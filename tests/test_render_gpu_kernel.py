@@ -19,7 +19,7 @@ def with_kernel(monkeypatch):
     """Makes `render_planes` take the kernel from here on."""
 
     def switch() -> None:
-        monkeypatch.setattr(kernel, "takes", lambda scene, outputs: kernel.supports(scene))
+        monkeypatch.setattr(kernel, "can_render", lambda scene, outputs: kernel.supports(scene))
         monkeypatch.setattr(kernel, "draw", functools.partial(kernel.draw, interpret=True))
 
     return switch

@@ -82,7 +82,7 @@ def test_cameras_of_all_modes_stand_where_mujoco_has_them(moved):
 
 def test_lights_of_all_modes_shine_from_where_mujoco_has_them(moved, monkeypatch):
     mj_model, data, batch = moved
-    monkeypatch.setattr("jaxrl_vis_envs.render.model.reading.MOST_LIGHTS", mj_model.nlight + 1)
+    monkeypatch.setattr("jaxrl_vis_envs.render.model.reading.MAX_LIGHTS", mj_model.nlight + 1)
     scene = Scene.from_mjmodel(mj_model, 0, 4, 4)
     positions, directions = env_jit(jax.vmap(lambda one: lights.light_poses(scene, one)))(batch)
     for row, truth in enumerate(data):
@@ -99,7 +99,7 @@ def test_the_centre_of_a_body_without_mass_is_its_own():
 
 @pytest.mark.parametrize(("place", "up"), [((0.1, 0.2, 3.0), 1.0), ((0.1, 0.2, -3.0), -1.0)])
 def test_a_camera_that_looks_straight_down_or_up_has_its_right_along_x(place, up):
-    rotation = mounts.looking(jnp.array(place), jnp.array([0.1, 0.2, 0.0]))
+    rotation = mounts.look_at(jnp.array(place), jnp.array([0.1, 0.2, 0.0]))
     np.testing.assert_allclose(rotation, [[1, 0, 0], [0, up, 0], [0, 0, up]], atol=1e-6)
 
 

@@ -136,7 +136,7 @@ def test_what_reflects_is_drawn_first_and_labelled_in_its_turn():
     # Only the first one reflects in MuJoCo.
     assert frame.segmentation[15, 15] == 2 and frame.segmentation[15, 23] == 4
     np.testing.assert_allclose(frame.rgb[15, [15, 23]] / 255, [RED, RED], atol=3e-3)
-    assert scene.reordered and not passes.takes(scene, Outputs(True, True, True, quantized=True))
+    assert scene.reordered and not passes.can_render(scene, Outputs(True, True, True, quantized=True))
 
 
 THIN = 3e-5  # m
@@ -162,7 +162,7 @@ def test_paper_among_many_geoms_stays_on_the_desk(papers, way, monkeypatch):
     assert len(scene.object_ids) > 63
     if way == "kernel":
         assert kernel.supports(scene)
-        monkeypatch.setattr(kernel, "takes", lambda scene, outputs: True)
+        monkeypatch.setattr(kernel, "can_render", lambda scene, outputs: True)
         monkeypatch.setattr(kernel, "draw", functools.partial(kernel.draw, interpret=True))
     draw = env_jit(lambda: render_planes(scene, mj_data, segmentation=True, quantized=way == "passes"))
     labels = np.asarray(draw().segmentation)

@@ -137,7 +137,7 @@ def visual_variant(name: str) -> str | None:
 
 
 def load(name: str, folder: str | None = None) -> str | None:
-    """Import the module of an environment and return its folder, so that it can be task_class again from another one.
+    """Import the module of an environment and return its folder, so that it can be found again from another one.
 
     Args:
         name: Name of an environment.

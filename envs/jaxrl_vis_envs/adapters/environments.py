@@ -22,7 +22,5 @@ def goal_env(env: Any, overrides: dict[str, Any]) -> GoalEnv:
         kind = f"the class {env.__name__}" if isinstance(env, type) else f"a {type(env).__name__}"
         raise ValueError(f"env must be the name of an environment, or an existing GoalEnv, got {kind}")
     if overrides:
-        raise ValueError(
-            f"{', '.join(overrides)}: options can be changed for a named environment, not for an existing one"
-        )
+        raise ValueError(f"{', '.join(overrides)}: options can be changed for a named environment, not for an existing one")
     return env
