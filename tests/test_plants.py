@@ -371,7 +371,7 @@ def test_a_stalk_height_of_twelve_inches(plots):
 def test_tiles_drawn_side_by_side_are_those_drawn_one_by_one(sequence):
     """What an accelerator runs draws the same image as what a CPU runs."""
     true, pose = sequence.drive.true, sequence.drive.poses[16]
-    view = tables.see(sequence.surfaces, pose, true)
+    view = tables.build_view(sequence.surfaces, pose, true)
     numbers = (true.focal, true.centre, (0.0, 0.0), pose.rotation, pose.position, (0.05, -0.1, 0.0), (1.0, 0.01, 0.8))
     shot = drawing.Shot(*(jnp.asarray(number, jnp.float32) for number in numbers))
     one, many = (drawing.draw(view, shot, true.width, true.height, 1, at_once) for at_once in (1, 20))
