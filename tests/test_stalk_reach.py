@@ -46,7 +46,7 @@ def test_the_goal_is_a_stalk_between_the_jaws():
     assert (swayed > 1e-4).mean() > 0.9
 
 
-def test_the_distance_is_that_from_where_the_stalk_is_now():
+def test_distance_is_to_the_current_position_of_the_stalk():
     env, (state, _) = make(), starts()
     for _ in range(3):
         state = environments.advance(env, state, np.zeros((COUNT, 3)))
@@ -81,7 +81,7 @@ def test_the_arm_pushes_stalks():
     assert (pushed > 2 * still).mean() > 0.5
 
 
-def test_stalks_come_back():
+def test_stalks_spring_back():
     env, (state, _) = make(), starts()
     bent = np.array(state.data.qpos)
     bent[:, 3:] += 0.1
