@@ -95,8 +95,8 @@ def test_stalks_spring_back():
     ("override", "value", "message"),
     [
         ("stalks", 5, "stalks must be from 1 to 4"),
-        ("spacing", (0.1, 0.05), "spacing must run"),
-        ("goal_heights", (0.2, 0.9), "goal_heights must run"),
+        ("spacing", (0.1, 0.05), "spacing must be within"),
+        ("goal_heights", (0.2, 0.9), "goal_heights must be within"),
         ("lean", 30.0, "lean must be from 0 to 20"),
         ("wind", -0.01, "wind"),
         ("substeps", 4, "substeps"),
