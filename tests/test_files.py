@@ -18,7 +18,7 @@ DEEP = 10**5
     ("contents", "part"),
     [
         (b"{", "is not JSON"),
-        (b'{"a": "\xff"}', "no text in UTF-8"),
+        (b'{"a": "\xff"}', "is not UTF-8 text"),
         (b"[" * DEEP, "levels deep"),
         (b'{"a":' * 500 + b"1" + b"}" * 500, "levels deep"),
         (b'{"a": ' + b"9" * 5000 + b"}", "is not JSON"),

@@ -231,7 +231,7 @@ RUNS = {"size": [10**6, 10**6], "counts": [10, 10**12 - 10]}
         ({"annotations.json": b'{"a":' * 100_000}, "nested more than 100 levels deep"),
         ({"annotations.json": b"[" * 100_000}, "nested more than 100 levels deep"),
         ({"annotations.json": b'{"images": [], "annotations": [], "a": ' + b"1" * 5000 + b"}"}, "is not COCO"),
-        ({"annotations.json": "{}".encode("utf-16")}, "no text in UTF-8"),
+        ({"annotations.json": "{}".encode("utf-16")}, "is not UTF-8 text"),
     ],
 )
 def test_annotations_of_coco_that_ask_for_too_much(worker, files, part):
@@ -364,7 +364,7 @@ def test_weights_of_an_earlier_version_are_converted_bit_for_bit(tmp_path):
         ("a.json", "[" * 100_000, "nested more than 100 levels deep"),
         ("a.json", '{"a":' * 90_000, "is not JSON"),
         ("a.toml", "a = " + "[" * 90_000, "nested more than 100 levels deep"),
-        ("a.toml", "a." * 40_000 + "b = 1", "more than 200 points in a line"),
+        ("a.toml", "a." * 40_000 + "b = 1", "more than 200 dots in a line"),
         ("a.toml", "layout.plot_length = 0x" + "f" * 9_000, "plot_length"),
         ("a.json", '{"layout": {"plot_length": 1e400}}', "plot_length"),
         ("a.json", '{"name": "\\ud800"}', "a.json"),
