@@ -147,13 +147,13 @@ def test_what_a_run_says_of_the_cache_is_true(
     assert said() == f"once; the next start finds it in {elsewhere}" and elsewhere.is_dir()
     jax_config("persistent_cache_min_compile_time_secs", 30.0)
     monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "30")
-    assert said() == "as will every start: only what takes 30 s to compile is kept"
+    assert said() == "as will every start: only programs that take 30 s or more to compile are cached"
     jax_config("enable_compilation_cache", False)
-    assert said() == "as will every start: JAX is told to keep no compiled programs"
+    assert said() == "as will every start: the compilation cache is disabled in JAX"
     jax_config("enable_compilation_cache", True)
     monkeypatch.setenv("XDG_CACHE_HOME", str(file))
     jax_config("compilation_cache_dir", None)
-    assert said().endswith("cannot be written (Not a directory); set JAX_COMPILATION_CACHE_DIR to a folder that can")
+    assert said().endswith("cannot be written (Not a directory); set JAX_COMPILATION_CACHE_DIR to a writable folder")
     assert devices.enable_compilation_cache() == ""
     # And nobody else complains of it.
     jax_config("compilation_cache_dir", str(file / "cache"))
@@ -169,7 +169,7 @@ def test_a_jax_that_does_not_compile_is_refused(tmp_path: Path, jax_config, caps
     jax_config("disable_jit", True)
     assert cli.main(["train", "--preset", "debug", "--run-dir", str(tmp_path / "run")]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("jaxrl-vis: JAX is told not to compile") and "unset JAX_DISABLE_JIT" in line
+    assert line.startswith("jaxrl-vis: compilation is disabled in JAX") and "unset JAX_DISABLE_JIT" in line
     assert not (tmp_path / "run").exists()
 
 

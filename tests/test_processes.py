@@ -17,7 +17,7 @@ from fake_program import as_plain, rows_without_time
 from jaxrl_vis import cli
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.train_step import make_train_step
-from jaxrl_vis.processes import Place, find_place
+from jaxrl_vis.processes import Rank, find_rank
 from jaxrl_vis.run.checkpoint import Checkpoints
 from jaxrl_vis.run.folder import read_config
 from jaxrl_vis.run.programs import Programs
@@ -27,14 +27,14 @@ MPIRUN = {"OMPI_COMM_WORLD_SIZE": "2", "OMPI_COMM_WORLD_RANK": "1", "OMPI_MCA_or
 
 
 def test_place_by_options_and_by_launchers() -> None:
-    assert find_place(variables={}) is None
-    assert find_place("node1:1234", 2, 1, variables=SRUN) == Place("node1:1234", 2, 1)
-    assert find_place("node1:1234", 1, 0, variables={}) is None
-    assert find_place(variables=SRUN) == Place(None, 4, 3)
-    assert find_place(variables=MPIRUN) == Place(None, 2, 1)
-    assert find_place(variables=SRUN | {"SLURM_STEP_NUM_TASKS": "1"}) is None
+    assert find_rank(variables={}) is None
+    assert find_rank("node1:1234", 2, 1, variables=SRUN) == Rank("node1:1234", 2, 1)
+    assert find_rank("node1:1234", 1, 0, variables={}) is None
+    assert find_rank(variables=SRUN) == Rank(None, 4, 3)
+    assert find_rank(variables=MPIRUN) == Rank(None, 2, 1)
+    assert find_rank(variables=SRUN | {"SLURM_STEP_NUM_TASKS": "1"}) is None
     # In a batch script, without srun, there is no step.
-    assert find_place(variables={"SLURM_NTASKS": "4", "SLURM_PROCID": "0"}) is None
+    assert find_rank(variables={"SLURM_NTASKS": "4", "SLURM_PROCID": "0"}) is None
 
 
 @pytest.mark.parametrize(
@@ -50,7 +50,7 @@ def test_place_by_options_and_by_launchers() -> None:
 )
 def test_options_that_make_no_sense(options: tuple, message: str) -> None:
     with pytest.raises(RequestError, match=message):
-        find_place(*options, variables={})
+        find_rank(*options, variables={})
 
 
 def test_a_process_that_cannot_reach_the_first(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

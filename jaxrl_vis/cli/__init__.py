@@ -39,7 +39,7 @@ from jaxrl_vis.cli import (
 from jaxrl_vis.cli.parsing import PROGRAM, parse
 from jaxrl_vis.errors import NonFiniteError, RequestError, StorageError, Terminated, WorkerError, nearest
 from jaxrl_vis.run.signals import Ending, name_of
-from jaxrl_vis.streams import SafeStream, let_go_of_broken_streams, reserve_standard_files, safe_streams
+from jaxrl_vis.streams import SafeStream, detach_broken_streams, reserve_standard_files, safe_streams
 
 DESCRIPTION = "Trains robots to reach goals that are given as images."
 COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
@@ -159,7 +159,7 @@ def entry() -> None:
     """
     reserve_standard_files()
     status = main(give_up=lambda number: os._exit(_ended_by(number)))
-    let_go_of_broken_streams()
+    detach_broken_streams()
     if status == _STATUS[RequestError]:
         processes.leave_together()
     if status > 128 or (status and processes.are_several()):

@@ -13,7 +13,7 @@ from jaxrl_vis.cli.families import family_of
 from jaxrl_vis.cli.parsing import ByPlaceToo
 from jaxrl_vis.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.evaluation_pool import results_of, share_accelerator
+from jaxrl_vis.evaluation_pool import map_unordered, share_accelerator
 from jaxrl_vis.report.outputs import check_writable
 
 _FIRST_SEED = 100_000
@@ -103,7 +103,7 @@ def _train(options: Train, family) -> int:
     first = _FIRST_SEED * (1 + options.seed)
     draw = functools.partial(synthetic_examples, family)
     sources: list[Iterator[Example]] = [
-        itertools.chain.from_iterable(results_of(draw, itertools.count(first), options.workers))
+        itertools.chain.from_iterable(map_unordered(draw, itertools.count(first), options.workers))
     ]
     settings = Settings(options.loss)
     plan = Plan(

@@ -109,9 +109,9 @@ def run(options: Train) -> int:
     """Trains; every report has already been shown and saved by the trainer."""
     check_counts(start_timeout=options.start_timeout)
     claim_memory()
-    place = processes.find_place(options.coordinator, options.num_processes, options.process_id)
-    if place is not None:
-        processes.start(place, options.start_timeout)
+    rank = processes.find_rank(options.coordinator, options.num_processes, options.process_id)
+    if rank is not None:
+        processes.start(rank, options.start_timeout)
         options = dataclasses.replace(options, devices=options.devices or "all")
     if options.resume and options.overwrite:
         raise RequestError("--resume and --overwrite contradict each other; give one of them")

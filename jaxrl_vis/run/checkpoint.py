@@ -191,7 +191,7 @@ class Checkpoints:
         with self._writing(tier):
             manager = self._manager(tier)
             self._wait(tier)
-            if processes.any_of(iteration in self.iterations(tier)):  # orbax would quietly keep the old one
+            if processes.any_process(iteration in self.iterations(tier)):  # orbax would quietly keep the old one
                 manager.delete(iteration)
             if not manager.save(iteration, args=ocp.args.Composite(**arguments), force=True):
                 raise RuntimeError(f"checkpoint {tier}/{iteration} was not written")

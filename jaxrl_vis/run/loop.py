@@ -218,7 +218,7 @@ class RunLoop:
         self._say(f"compiled in {show_seconds(self._compile_s)}")
         is_there, layout = self._loop is not None, self._programs.layout
         check_compiled(compiled, is_there, layout)
-        has_room = not processes.any_of(not fit_together(compiled, is_there, layout))  # and all have come here
+        has_room = not processes.any_process(not fit_together(compiled, is_there, layout))  # and all have come here
         self._evaluates_ahead = self._programs.evaluates_ahead and has_room
         if self._writes:
             self._open(goes_on, overwrite)

@@ -61,7 +61,7 @@ class Saver:
 
     def has(self, tier: str, iteration: int) -> bool:
         """Whether there is a checkpoint of that tier and iteration; several processes agree on it."""
-        return processes.any_of(iteration in self._checkpoints.iterations(tier))
+        return processes.any_process(iteration in self._checkpoints.iterations(tier))
 
     def light(self, loop: LoopState, iteration: int, progress: Progress) -> None:
         """Saves the learner in the background.

@@ -140,7 +140,7 @@ class Interruption(_Handlers):
 
     def reached_any(self) -> bool:
         """Returns whether any of several processes, which all ask here, was told to end; they then agree on the signal."""
-        if number := processes.greatest(self.signal or 0):
+        if number := processes.max_over_processes(self.signal or 0):
             self.signal = number
         return bool(number)
 
