@@ -23,7 +23,7 @@ from jaxrl_vis.config import PRESETS, Config, preset
 from jaxrl_vis.errors import NonFiniteError, StorageError, Terminated
 from jaxrl_vis.methods import METHODS, MethodName
 from jaxrl_vis.report.outputs import check_writable
-from jaxrl_vis.run.command import options_of
+from jaxrl_vis.run.command import training_options
 
 
 def one_line(capsys: pytest.CaptureFixture[str], status: int) -> str:
@@ -161,7 +161,7 @@ def test_the_command_of_a_configuration_gives_that_configuration(method: MethodN
     choices: list[dict[str, Any]] = [{}, {"trivial_goals": 1.0}, {"hidden_sizes": (8, 8), "clip_targets_above": False}]
     for changes in choices:
         config = preset("fast", env="VisualFingerTurn", method=method, **changes)
-        assert training_config(parse(Train, options_of(config))) == config
+        assert training_config(parse(Train, training_options(config))) == config
 
 
 def test_a_task_is_named_by_its_place_or_by_its_name(capsys: pytest.CaptureFixture[str]) -> None:

@@ -129,7 +129,7 @@ def test_a_checkpoint_can_be_chosen(runs: dict[str, Path], tmp_path: Path) -> No
         file.unlink()
     with pytest.raises(RequestError, match="checkpoint 2 of the run in .* is damaged"):
         jaxrl_vis.load_policy(run, checkpoint=2)
-    with pytest.raises(RequestError, match="keeps no checkpoint of iteration 9; it keeps 2, 3"):
+    with pytest.raises(RequestError, match="has no checkpoint of iteration 9, only of 2, 3"):
         jaxrl_vis.load_policy(run, checkpoint=9)
 
 

@@ -96,7 +96,7 @@ def test_resume_of_nothing_starts(tmp_path, capsys):
 
 
 def test_an_existing_folder_is_refused(straight, tmp_path):
-    with pytest.raises(RequestError, match="--resume goes on with it, --overwrite starts again"):
+    with pytest.raises(RequestError, match="--resume continues it, --overwrite starts again"):
         make_fake_trainer(small_config(), straight[0])
     with pytest.raises(RequestError, match="contradict each other"):
         make_fake_trainer(small_config(), straight[0], resume=True, overwrite=True)

@@ -83,7 +83,7 @@ def test_what_uses_a_run_does_not_count_another_ones(straight, tmp_path, monkeyp
     monkeypatch.setattr(trained, "make_trainer", lambda config, **_: trainer.Trainer(config, FakeProgram(config)))
     opened = trained.open_run(path)
     assert trained.load(opened, path).iteration == 2
-    with pytest.raises(RequestError, match="no checkpoint of iteration 8; it keeps 2"):
+    with pytest.raises(RequestError, match="no checkpoint of iteration 8, only of 2"):
         trained.load(opened, path, 8)
 
 

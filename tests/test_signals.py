@@ -247,7 +247,7 @@ def test_no_signal_that_ends_a_process_is_left_out(not_ignored):
     with signals.Interruption() as interruption:
         signal.raise_signal(signal.SIGRTMIN + 3)
         assert interruption.signal == signal.SIGRTMIN + 3 and interruption.name == "SIGRTMIN+3"
-    assert [signals.name_of(number) for number in (signal.SIGRTMIN, signal.SIGRTMAX)] == ["SIGRTMIN", "SIGRTMAX"]
+    assert [signals.signal_name(number) for number in (signal.SIGRTMIN, signal.SIGRTMAX)] == ["SIGRTMIN", "SIGRTMAX"]
 
 
 def test_what_is_ignored_or_handled_by_the_caller_stays_so(tmp_path, not_ignored):

@@ -206,7 +206,7 @@ def test_what_is_no_fault_of_the_disk_is_not_told_as_one(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     ("number", "mend", "is_moved"),
-    [(errno.ENOSPC, "make room", False), (errno.EACCES, "mend that", False), (errno.ENOENT, "", True)],
+    [(errno.ENOSPC, "make room", False), (errno.EACCES, "fix that", False), (errno.ENOENT, "", True)],
 )
 def test_advice_after_a_fault_of_the_disk_can_be_followed(tmp_path, monkeypatch, number, mend, is_moved):
     if is_moved and not Path("/proc/self/fd").exists():

@@ -86,7 +86,7 @@ def test_a_run_that_nobody_touched_is_equal_and_stays_as_it_is(copy, verified):
     # Two evaluations from the seed, one from full/6; and the states on the way.
     assert report.rows == 6 and report.checkpoints == ["light/8", "full/8"]
     assert contents(copy) == before
-    assert "of iterations 6 to 6: looked at, but not repeated" in " ".join(report.unverified)
+    assert "of iterations 6 to 6: checked, but not repeated" in " ".join(report.unverified)
     write_rows(copy, [row | {"time/wall_s": 5.0} for row in rows_in(copy)])  # times are left out
     whole = verified(copy, iterations=8)
     assert whole.is_equal and whole.rows == 8 and {"light/6", "full/6"} <= set(whole.checkpoints)
@@ -144,7 +144,7 @@ def test_a_checkpoint_of_another_state_is_found(copy, verified, trainer_of, tmp_
         manifest.write_text(json.dumps(json.loads(manifest.read_text()) | whose))
         write_sums(copy / "checkpoints" / tier / "6")
     report = verified(copy, iterations=8)
-    assert any("light/6 is not what the repetition arrives at" in line for line in report.problems)
+    assert any("light/6 differs from the repetition" in line for line in report.problems)
 
 
 @pytest.mark.parametrize(
@@ -154,11 +154,11 @@ def test_a_checkpoint_of_another_state_is_found(copy, verified, trainer_of, tmp_
         (lambda rows: rows[:-2], "rows of iteration 8 are missing"),
         (lambda rows: [], "rows of iteration 2, 4, 6, 8 are missing"),
         (lambda rows: rows[:5] + rows[6:], "iteration 6 has no row of seed 1"),
-        (lambda rows: [*rows[:3], rows[2], *rows[3:]], "iteration 4, seed 0 is there more than once"),
+        (lambda rows: [*rows[:3], rows[2], *rows[3:]], "iteration 4, seed 0 occurs more than once"),
         (lambda rows: [*rows[:4], *rows[6:], *rows[4:6]], "iteration 6, seed 0 is out of order"),
         (lambda rows: [*rows[:6], rows[6] | {"seed": 9}, rows[7]], "is of seed 9"),
         (lambda rows: [*rows[:6], rows[6] | {"env_steps": 81}, rows[7]], "env_steps is 81, not 80"),
-        (lambda rows: [*rows[:6], rows[6] | {"train/success": "0.5"}, rows[7]], "train/success: no number"),
+        (lambda rows: [*rows[:6], rows[6] | {"train/success": "0.5"}, rows[7]], "train/success: not a number"),
         (lambda rows: [*rows[:6], rows[6] | {"resume/replay_lost_at": 11}, rows[7]], "does not fit iteration 8"),
     ],
 )
@@ -202,7 +202,7 @@ def test_what_is_missing_contradicts_or_is_foreign_is_said(copy, verified):
     report = verified(copy)
     assert report.is_equal and "set aside before as damaged: full-9" in report.notes
     assert (
-        "no files of a run: notes.txt" in report.notes
+        "not files of a run: notes.txt" in report.notes
         and "checkpoints/light/9.orbax-checkpoint-tmp-7 is half-written" in report.notes
     )
     record = json.loads((copy / "config.json").read_text())
@@ -238,7 +238,7 @@ def test_recent_states_of_a_killed_run_are_compared_too(killed, verified):
     before = contents(killed)
     report = verified(killed, iterations=6)
     assert report.is_equal and report.rows == 6 and report.checkpoints == ["recent/5", "recent/6"]
-    assert not any("no files of a run" in line or "missing" in line for line in report.notes + report.unverified)
+    assert not any("not files of a run" in line or "missing" in line for line in report.notes + report.unverified)
     assert contents(killed) == before
     rows = rows_in(killed)
     assert all("time/goodput" in row for row in rows)
@@ -260,12 +260,12 @@ def test_what_is_wrong_with_recent_states_is_found(killed, verified, trainer_of)
     report = verified(killed, iterations=6)
     # A power cut may leave that behind.
     assert report.is_equal and any("recent/6 cannot be used (wrong checksum" in line for line in report.notes)
-    assert "no files of a run: checkpoints/recent/7.old" in report.notes
-    assert any("goodput of the run is not known" in line for line in report.notes)
+    assert "not files of a run: checkpoints/recent/7.old" in report.notes
+    assert any("goodput of the run is unknown" in line for line in report.notes)
     checkpoints = Checkpoints(killed / "checkpoints", run_id=read_run_id(killed))
     loop, progress = checkpoints.recent.restore(5, trainer_of(small_config()).programs.shapes)
     loop = loop.replace(train=loop.train.replace(updates=loop.train.updates + 1))
-    for run_id, problem in (("other", "recent/5 is another run's (other)"), (read_run_id(killed), "recent/5 is not what")):
+    for run_id, problem in (("other", "recent/5 is another run's (other)"), (read_run_id(killed), "recent/5 differs from")):
         checkpoints.run_id = run_id
         checkpoints.recent.save(5, loop, 2, progress)
         assert problem in "; ".join(verified(killed, iterations=6).problems)
@@ -287,8 +287,8 @@ def test_a_run_that_lost_its_replay_is_verified_up_to_there_and_after_full_check
     list(trainer_of(config.replace(env_steps=80), path, resume=True).run())
     report = verified(path, iterations=8)
     assert report.is_equal and report.rows == 4
-    assert any("after iteration 4 the run went on from a light checkpoint" in line for line in report.unverified)
-    assert any("of iterations 6 to 8: looked at" in line for line in report.unverified)
+    assert any("after iteration 4 the run resumed from a light checkpoint" in line for line in report.unverified)
+    assert any("of iterations 6 to 8: checked" in line for line in report.unverified)
     interrupted_at(trainer_of(config.replace(env_steps=100), path, resume=True), 9)
     list(trainer_of(config.replace(env_steps=120, full_checkpoint_interval=2), path, resume=True).run())
     report = verified(path, iterations=12)

@@ -17,7 +17,7 @@ from jaxrl_vis.config import config_from_dict
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.files import write_atomically
 from jaxrl_vis.report.learning import curve, steps_to
-from jaxrl_vis.run.command import command_of
+from jaxrl_vis.run.command import training_command
 
 MISSING = "not measured yet"
 
@@ -102,7 +102,8 @@ def evidence_of(row: Learning, results: Path) -> list[learning.Evidence]:
             names = [field.name for field in dataclasses.fields(config)]
             differ = [each for each in names if getattr(made_with, each) != getattr(config, each)]
             raise RequestError(
-                f"evidence {name} was made by `{evidence.record['command']}`, and the README says `{command_of(config)}`, "
+                f"evidence {name} was made by `{evidence.record['command']}`, "
+                f"and the README says `{training_command(config)}`, "
                 f"which has other {', '.join(differ)}: train it anew, then benchmarks/keep_learning.py"
             )
         found.append(evidence)
@@ -149,7 +150,7 @@ def results_table(results: Path) -> str:
     lines = ["| what | machine | figure | command |", "|---|---|---|---|"]
     for row in LEARNING:
         found = evidence_of(row, results)
-        command = row.command or command_of(next(iter(row.runs.values())))
+        command = row.command or training_command(next(iter(row.runs.values())))
         machine = _machine(found[0].record["device"]) if found else ""
         lines.append(f"| {row.label} | {machine} | {learning_text(row, found) if found else MISSING} | `{command}` |")
     return "\n".join(lines)

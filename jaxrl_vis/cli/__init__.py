@@ -38,7 +38,7 @@ from jaxrl_vis.cli import (
 )
 from jaxrl_vis.cli.parsing import PROGRAM, parse
 from jaxrl_vis.errors import NonFiniteError, RequestError, StorageError, Terminated, WorkerError, nearest
-from jaxrl_vis.run.signals import Ending, name_of
+from jaxrl_vis.run.signals import Ending, signal_name
 from jaxrl_vis.streams import SafeStream, detach_broken_streams, reserve_standard_files, safe_streams
 
 DESCRIPTION = "Trains robots to reach goals that are given as images."
@@ -136,7 +136,7 @@ def _status_of(words: Sequence[str], ending: Ending) -> int:
 
 
 def _ended_by(number: int) -> int:
-    print(f"{PROGRAM}: {name_of(number)}: ended before it was done", file=sys.stderr)
+    print(f"{PROGRAM}: {signal_name(number)}: ended before it was done", file=sys.stderr)
     return 128 + number
 
 

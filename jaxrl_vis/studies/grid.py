@@ -24,7 +24,7 @@ from jaxrl_vis import streams
 from jaxrl_vis.devices import Device
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.provenance import child_environment
-from jaxrl_vis.run.command import options_of
+from jaxrl_vis.run.command import training_options
 from jaxrl_vis.run.console import show_seconds
 from jaxrl_vis.run.folder import RunFolder
 from jaxrl_vis.run.signals import SIGNALS, Interruption
@@ -76,7 +76,7 @@ def start_process(words: Sequence[str], log: Path, environment: Mapping[str, str
 
 def train_command(cell: Cell, folder: Path, goes_on: bool) -> list[str]:
     """The command that trains a cell."""
-    words = [sys.executable, "-m", "jaxrl_vis", "train", *options_of(cell.config), "--run-dir", str(folder)]
+    words = [sys.executable, "-m", "jaxrl_vis", "train", *training_options(cell.config), "--run-dir", str(folder)]
     return [*words, "--resume"] if goes_on else words
 
 
