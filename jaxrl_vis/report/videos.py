@@ -145,8 +145,7 @@ def draw_frames(episodes: EpisodeImages, frame_seconds: float, max_episodes: int
 
 
 def _gif_bytes(images: list[Image.Image], seconds: list[float]) -> bytes:
-    """Encodes a looping GIF. All frames share one palette, without dithering, to avoid flicker and compress equal frames
-    well."""
+    """Encodes a looping GIF. All frames share one palette, without dithering: no flicker, and good compression."""
     samples = images[:: max(1, len(images) // 16)] + images[-1:]
     # Swatches reserve palette entries for the colours of borders and texts, however colourful the images are.
     swatches = (REACHED, MISSED, PLAIN, BACKGROUND, TEXT, FAINT)

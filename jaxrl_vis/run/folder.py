@@ -159,7 +159,7 @@ class RunFolder:
         """
         held.check()
         if not held.is_in_place():
-            raise FolderGoneError(_where_gone(self.path, held.place(), "before the run began"))
+            raise FolderGoneError(_where_gone(self.path, held.current_path(), "before the run began"))
 
     def check_ours(self, run_id: str | None, held: Held) -> None:
         """Checks that the folder still belongs to a run, before something is written into it.
@@ -178,7 +178,7 @@ class RunFolder:
             is_ours = self.config.exists()
         if not is_ours:
             when = "while the run wrote there, and what was trained since its last checkpoint is lost"
-            raise FolderGoneError(_where_gone(self.path, held.place(), when))
+            raise FolderGoneError(_where_gone(self.path, held.current_path(), when))
 
     def remove_remains(self) -> None:
         """Deletes files that checkpoint threads have recreated in a folder after it was moved or deleted.
