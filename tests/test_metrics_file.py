@@ -11,7 +11,7 @@ from jaxrl_vis.report.learning import curve
 from jaxrl_vis.run import metrics
 from jaxrl_vis.run.folder import RunFolder, read_run_id
 from jaxrl_vis.run.loggers import Loggers
-from jaxrl_vis.studies.cells import Cell, folder_of, latest_rows, standing
+from jaxrl_vis.studies.cells import Cell, describe_progress, find_folder, latest_rows
 
 
 def row(iteration: int, seed: int = 0, **changes) -> dict:
@@ -142,7 +142,7 @@ def test_everything_else_that_reads_rows_leaves_damaged_ones_out(tmp_path):
     )
     assert folder.rows()[:-1] == good
     cell = Cell("family", config)
-    assert folder_of(cell, tmp_path) == folder.path and standing(cell, tmp_path) == "80 of 80 steps"
+    assert find_folder(cell, tmp_path) == folder.path and describe_progress(cell, tmp_path) == "80 of 80 steps"
     assert [each["seed"] for each in latest_rows(folder.path)] == [0]
     assert curve(folder.rows(), "eval/success") == [(20, 0.5), (40, 0.5)]
     said: list[str] = []
