@@ -176,10 +176,10 @@ def test_a_task_is_named_by_its_place_or_by_its_name(capsys: pytest.CaptureFixtu
         for words in (["runs/mine"], ["--run-dir", "runs/mine"]):
             assert parse(command, words).run_dir == Path("runs/mine")
     for words in (["train", "Reacher", "--env", "FetchReach"], ["bench", "env", "Reacher", "--env", "FetchReach"]):
-        assert "env is given twice, FetchReach by --env and Reacher by its place; give it once" in one_line(
+        assert "env is given twice, FetchReach by --env and Reacher by position; give it once" in one_line(
             capsys, cli.main(words)
         )
-    assert "run_dir is given twice, a by --run-dir and b by its place" in one_line(
+    assert "run_dir is given twice, a by --run-dir and b by position" in one_line(
         capsys, cli.main(["eval", "b", "--run-dir", "a"])
     )
     assert "env is given twice" in one_line(capsys, cli.main(["envs", "Reacher", "--env", "FetchReach", "Reacher"]))

@@ -180,7 +180,7 @@ def test_shell_blocks_could_be_typed(page: Path, reader: Path) -> None:
             if words[0] != "jaxrl-vis":
                 doc_blocks.check_other(words)
                 continue
-            name, rest = (words[1], words[2:]) if words[1].startswith("-") else cli.command_of(words[1:])
+            name, rest = (words[1], words[2:]) if words[1].startswith("-") else cli.split_command(words[1:])
             there = name != "eval" or Path(rest[0]).exists()  # a page may evaluate what it has trained
             if name in EXECUTED and there and "--gallery" not in rest:
                 assert cli.main([*name.split(), *rest]) == 0, f"{page}:{block.line}"

@@ -324,5 +324,5 @@ def test_the_command_says_what_it_found(copy, verified, monkeypatch, capsys):
     (copy / "metrics.jsonl").unlink()
     shutil.rmtree(copy / "checkpoints")
     assert cli.main(["verify", str(copy)]) == 2
-    assert "let the run come to an evaluation" in capsys.readouterr().err
+    assert "let the run reach an evaluation" in capsys.readouterr().err
     assert cli.main(["verify", str(copy / "nowhere")]) == 2

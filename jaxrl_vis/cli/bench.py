@@ -7,7 +7,7 @@ from typing import Annotated, Literal, get_args
 import tyro
 
 from jaxrl_vis.cli.checks import check_counts, check_env
-from jaxrl_vis.cli.parsing import ByPlaceToo
+from jaxrl_vis.cli.parsing import AlsoPositional
 from jaxrl_vis.config import Pixels
 from jaxrl_vis.devices import check_devices, claim_memory, count_devices
 from jaxrl_vis.errors import RequestError
@@ -30,7 +30,7 @@ class Bench:
     """Measure nothing: list records whose code has changed since, and rows of the README that have no record."""
     tables: bool = False
     """Measure nothing: write the tables of the README from the records."""
-    env: Annotated[str, ByPlaceToo()] = "VisualFetchReach"
+    env: Annotated[str, AlsoPositional()] = "VisualFetchReach"
     """The environment; module:Name is one of your own."""
     preset: Literal["paper", "fast", "cpu", "debug"] | None = None
     """Whose networks and gradient steps (update, train); fast on accelerators and cpu on a CPU if not given."""

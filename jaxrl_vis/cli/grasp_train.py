@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 from jaxrl_vis.cli.checks import check_counts, check_extra
 from jaxrl_vis.cli.families import family_of
-from jaxrl_vis.cli.parsing import ByPlaceToo
+from jaxrl_vis.cli.parsing import AlsoPositional
 from jaxrl_vis.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.evaluation_pool import map_unordered, share_accelerator
@@ -27,7 +27,7 @@ _RATES = {"segmentation": 1e-3, "gan": 4e-4}
 class Train:
     """Train the network that paints stalks red, on synthetic rows: against a discriminator, or as a plain segmentation."""
 
-    out: Annotated[Path, ByPlaceToo()]
+    out: Annotated[Path, AlsoPositional()]
     """The file to write, .safetensors; give it to `grasp run` and `grasp eval` as --weights."""
     loss: Literal["gan", "segmentation"] = "segmentation"
     """What it learns by: a discriminator as in pix2pix, or cross entropy and Dice of the mask."""

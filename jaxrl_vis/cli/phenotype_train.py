@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from jaxrl_vis.cli.checks import check_counts, check_extra
-from jaxrl_vis.cli.parsing import ByPlaceToo
+from jaxrl_vis.cli.parsing import AlsoPositional
 from jaxrl_vis.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.evaluation_pool import map_unordered, share_accelerator
@@ -26,7 +26,7 @@ _FIRST_SEED = 100_000
 class Train:
     """Train the networks that find and outline stalks, on synthetic plots or on your own annotated images."""
 
-    out: Annotated[Path, ByPlaceToo()]
+    out: Annotated[Path, AlsoPositional()]
     """The file to write, .safetensors; give it to `phenotype run` as --weights."""
     data: Path | None = None
     """A folder of annotated images (annotations.json of COCO, or .xml of Pascal VOC or .json of LabelMe beside each image), in
