@@ -27,7 +27,7 @@ from jaxrl_vis.run.command import training_options
 
 
 def one_line(capsys: pytest.CaptureFixture[str], status: int) -> str:
-    """What a wrong request was told: exactly one line, on stderr, with exit status 2."""
+    """Checks the report of a wrong request: exactly one line, on stderr, with exit status 2."""
     output = capsys.readouterr()
     assert status == 2
     assert output.out == ""

@@ -1,4 +1,4 @@
-"""What JAX computes on: told in one line where it is not there, and guessed where help must not wait for JAX."""
+"""Devices that JAX computes on: reported in one line if missing, and guessed for help that must not wait for JAX."""
 
 import json
 import logging
@@ -103,17 +103,17 @@ def test_sizes_are_all_in_one_unit() -> None:
     assert sizes == ["under 0.001 GiB", "under 0.001 GiB", "0.005 GiB", "0.1 GiB", "3.0 GiB", "32768.0 GiB"]
 
 
-@pytest.mark.parametrize("given", [{}, {"XLA_CLIENT_MEM_FRACTION": "0.5"}, {"XLA_PYTHON_CLIENT_MEM_FRACTION": "0.4"}])
-def test_training_claims_most_of_a_gpu_unless_told_how_much(given: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("variables", [{}, {"XLA_CLIENT_MEM_FRACTION": "0.5"}, {"XLA_PYTHON_CLIENT_MEM_FRACTION": "0.4"}])
+def test_training_claims_most_of_a_gpu_unless_told_how_much(variables: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
     names = ("XLA_CLIENT_MEM_FRACTION", "XLA_PYTHON_CLIENT_MEM_FRACTION")
     for name in names:
         monkeypatch.setenv(name, "")  # so that what is set here ends with the test
         monkeypatch.delenv(name)
-    for name, value in given.items():
+    for name, value in variables.items():
         monkeypatch.setenv(name, value)
     devices.claim_memory()
     # JAX refuses to start with both.
-    assert {name: os.environ[name] for name in names if name in os.environ} == (given or {names[1]: "0.9"})
+    assert {name: os.environ[name] for name in names if name in os.environ} == (variables or {names[1]: "0.9"})
 
 
 @pytest.fixture
@@ -160,9 +160,9 @@ def test_what_a_run_says_of_the_cache_is_true(
     jax_config("persistent_cache_min_compile_time_secs", 0.0)
     compilation_cache.reset_cache()
     assert len(list(make_fake_trainer(small_config(), tmp_path / "run").run())) == 8
-    found = capsys.readouterr()
-    assert f"compiling (as will every start: {file / 'cache'} cannot be written (Not a directory)) ..." in found.out
-    assert found.err == "" and not recwarn.list
+    printed = capsys.readouterr()
+    assert f"compiling (as will every start: {file / 'cache'} cannot be written (Not a directory)) ..." in printed.out
+    assert printed.err == "" and not recwarn.list
 
 
 def test_a_jax_that_does_not_compile_is_refused(tmp_path: Path, jax_config, capsys) -> None:

@@ -41,8 +41,8 @@ def killed(number: int) -> Record:
 
 def signalled(number: int) -> Record:
     """Signals itself, as somebody would who signals the whole group of processes."""
-    for each in signals.SIGNALS:
-        subprocess.run(["kill", f"-{each}", str(os.getpid())], check=True)
+    for item in signals.SIGNALS:
+        subprocess.run(["kill", f"-{item}", str(os.getpid())], check=True)
     return {"ignored": sorted(signal.pthread_sigmask(signal.SIG_BLOCK, ()))}
 
 
@@ -51,10 +51,10 @@ def total(records: list[Record]) -> Record:
 
 
 def test_results_are_the_same_in_one_process_and_in_several():
-    found: list[dict[int, Record]] = [{}, {}]
-    for workers, into in zip((1, 2), found):
+    results: list[dict[int, Record]] = [{}, {}]
+    for workers, into in zip((1, 2), results):
         evaluate_all(functools.partial(squared, 7), range(6), workers, into.__setitem__)
-    one, two = found
+    one, two = results
     assert {number: record["square"] for number, record in one.items()} == {number: number**2 + 7 for number in range(6)}
     assert {number: record["square"] for number, record in two.items()} == {number: number**2 + 7 for number in range(6)}
     assert {record["process"] for record in one.values()} == {os.getpid()}
@@ -63,18 +63,18 @@ def test_results_are_the_same_in_one_process_and_in_several():
 
 
 def test_what_goes_wrong_in_a_process_is_told():
-    found: dict[int, Record] = {}
+    results: dict[int, Record] = {}
     with pytest.raises(ValueError, match="number 2 is broken"):
-        evaluate_all(broken, range(3), 2, found.__setitem__)
+        evaluate_all(broken, range(3), 2, results.__setitem__)
     with pytest.raises(WorkerError, match="was killed from outside"):
-        evaluate_all(killed, range(3), 2, found.__setitem__)
+        evaluate_all(killed, range(3), 2, results.__setitem__)
 
 
 def test_signals_to_the_whole_group_do_not_reach_processes():
-    """What the one that started them ends, and so also keeps, must not be ended beside it."""
-    found: dict[int, Record] = {}
-    evaluate_all(signalled, range(2), 2, found.__setitem__)
-    assert all(set(record["ignored"]) >= set(signals.SIGNALS) for record in found.values()) and len(found) == 2
+    """Workers ignore signals to the process group: only their parent ends them."""
+    results: dict[int, Record] = {}
+    evaluate_all(signalled, range(2), 2, results.__setitem__)
+    assert all(set(record["ignored"]) >= set(signals.SIGNALS) for record in results.values()) and len(results) == 2
 
 
 def test_a_signal_to_the_one_that_started_them_ends_processes():
@@ -136,7 +136,7 @@ def wait_until(holds: Callable[[], bool], seconds: float) -> None:
 
 
 def runs(process: int) -> bool:
-    """Whether a process does anything; one that has ended may still be listed."""
+    """Returns True if a process runs; an ended one may still be listed."""
     try:
         os.kill(process, 0)
         status = Path(f"/proc/{process}/stat")
@@ -157,9 +157,9 @@ def test_a_file_goes_on_where_it_was_and_holds_one_evaluation(tmp_path: Path):
         == {1: {"number": 1, "square": 1, "room": 0.5}, 3: {"number": 3, "square": 9, "room": None}}
     )
     again.add_all({2: {"square": 4}})
-    found = json.loads(path.read_text())
-    assert found["total"] == 14 and found["nothing"] is None and found["family"] == "training"
-    assert [each["number"] for each in found["each"]] == [1, 2, 3]
+    results = json.loads(path.read_text())
+    assert results["total"] == 14 and results["nothing"] is None and results["family"] == "training"
+    assert [item["number"] for item in results["each"]] == [1, 2, 3]
     with pytest.raises(RequestError, match='another evaluation \\(method: "default", not "thesis"\\)'):
         RecordFile(path, {**about, "method": "thesis"}, total)
     path.write_text("{}")
@@ -184,7 +184,7 @@ def test_other_code_is_told_apart(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    "each",
+    "item",
     [
         '{"number": 3}, {"number": 3}',
         '{"number": "3"}',
@@ -198,12 +198,12 @@ def test_other_code_is_told_apart(tmp_path: Path):
         '{"number": 3, "square": ' + "[" * 10**5,
     ],
 )
-def test_records_that_somebody_has_changed_are_one_line(tmp_path: Path, each: str):
+def test_records_that_somebody_has_changed_are_one_line(tmp_path: Path, item: str):
     path = tmp_path / "kept.json"
     records = RecordFile(path, {}, total)
     records.add(3, {"square": 9})
     before = json.dumps(json.loads(path.read_text())["each"])[1:-1]
-    path.write_text(path.read_text().replace("\n    " + before, "\n    " + each))
+    path.write_text(path.read_text().replace("\n    " + before, "\n    " + item))
     with pytest.raises(RequestError, match="delete it, or name another file with --json") as refused:
         RecordFile(path, {}, total)
     assert "\n" not in str(refused.value) and str(path) in str(refused.value)

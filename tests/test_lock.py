@@ -33,7 +33,7 @@ def no_locks(monkeypatch):
 
 
 def marker(host: str, process: int) -> str:
-    """What a holder writes where there are no locks."""
+    """Returns the lock file of a holder on a file system without locks."""
     return f"filelock/2\npid={process}\nhost={host}\nmode=lease\ntoken={'0' * 32}\nduration=1.0\n"
 
 

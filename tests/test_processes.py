@@ -83,13 +83,13 @@ def start(run_dir: Path, count: int, devices: int, *options: str) -> list[subpro
 
 
 def ended(processes: Sequence[subprocess.Popen], seconds: float = 120.0) -> list[tuple[int, str, str]]:
-    """Exit status and output of each."""
+    """Exit status and output of process."""
     try:
-        told = [each.communicate(timeout=seconds) for each in processes]
+        outputs = [process.communicate(timeout=seconds) for process in processes]
     finally:
-        for each in processes:
-            each.kill()
-    return [(each.returncode, *words) for each, words in zip(processes, told, strict=True)]
+        for process in processes:
+            process.kill()
+    return [(process.returncode, *words) for process, words in zip(processes, outputs, strict=True)]
 
 
 @pytest.fixture(scope="module")
@@ -127,13 +127,13 @@ def test_two_processes_learn_and_save_what_one_does(pair: tuple[Path, list, list
     shapes = Programs(config, make_train_step(probes.GoWhereTold(), config)).shapes
     folders = [path / "checkpoints" for path in (run_dir, tmp_path / "one")]
     saved = [Checkpoints(folder, read_only=True).restore_for_resume(shapes) for folder in folders]
-    assert [each.iteration for each in saved if each is not None and each.loop is not None] == [4, 4]
-    for ours, theirs in zip(*(as_plain(each.loop) for each in saved if each is not None), strict=True):
+    assert [restored.iteration for restored in saved if restored is not None and restored.loop is not None] == [4, 4]
+    for ours, theirs in zip(*(as_plain(restored.loop) for restored in saved if restored is not None), strict=True):
         np.testing.assert_allclose(ours, theirs, atol=1e-4)
 
 
 def two_trainings(*words: str) -> list[tuple[int, str, str]]:
-    """How `jaxrl-vis train Reacher` ends in two processes of a device each: exit status and output."""
+    """Runs `jaxrl-vis train Reacher` in two processes with one device each; returns exit statuses and outputs."""
     train = [sys.executable, "-m", "jaxrl_vis", "train", "Reacher", "--preset", "debug", "--env-steps", "800", *words]
     place = ["--coordinator", f"127.0.0.1:{free_port()}", "--num-processes", "2", "--process-id"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}

@@ -225,9 +225,9 @@ def test_a_damaged_final_checkpoint_is_not_a_finished_run(straight, tmp_path, ca
     assert [report.iteration for report in reports] == [7, 8] and "not finished" in out
     assert out.count("light/8 is damaged") == 1 and "finished already" not in out
     assert rows_without_time(path) == rows_without_time(straight[0])
-    kept = path / "checkpoints" / "damaged"
-    assert sorted(entry.name for entry in kept.iterdir()) == ["full-8", "light-8", "metrics.jsonl"]
-    assert [row["iteration"] for row in metrics.read_rows(kept / "metrics.jsonl")] == [8, 8]
+    damaged = path / "checkpoints" / "damaged"
+    assert sorted(entry.name for entry in damaged.iterdir()) == ["full-8", "light-8", "metrics.jsonl"]
+    assert [row["iteration"] for row in metrics.read_rows(damaged / "metrics.jsonl")] == [8, 8]
 
 
 def test_nothing_usable_keeps_what_was_there(straight, tmp_path, capsys):

@@ -93,14 +93,14 @@ def test_every_variant_can_be_made_with_every_preset(preset: str) -> None:
 
 def test_families_keep_configurations_apart() -> None:
     """Two cells of one name are one cell."""
-    seen: dict[str, Cell] = {}
+    cells_by_name: dict[str, Cell] = {}
     for preset in ("paper", "fast"):
         for options in ((), ("view=fingertips",), ("view=fingertips", "tip_marks=faint")):
             for figure in STUDIES:
                 changes = {"env_options": options}
                 for parts in all_cells(figure, variants=tuple(VARIANTS), preset=preset, changes=changes).values():
                     assert parts[0].config.env_options == options
-                    assert seen.setdefault(parts[0].name, parts[0]) == parts[0]
+                    assert cells_by_name.setdefault(parts[0].name, parts[0]) == parts[0]
 
 
 def test_settings_of_an_environment_are_shown_and_name_one_folder(tmp_path: Path) -> None:
@@ -140,8 +140,8 @@ def line(values: list[list[float]], task: str = FETCH, variant: str = "ol_aux_5"
 
 
 def test_levels_are_reached_by_the_rule_of_three() -> None:
-    found = reached(line([[0.1, 0.6, 0.4, 0.6, 0.7, 0.8]] * 3), 0.5)
-    assert found == Reached(0.5, 80_000, 80_000.0, 80_000.0, 120_000) and str(found) == "80 k (80 k to 80 k)"
+    result = reached(line([[0.1, 0.6, 0.4, 0.6, 0.7, 0.8]] * 3), 0.5)
+    assert result == Reached(0.5, 80_000, 80_000.0, 80_000.0, 120_000) and str(result) == "80 k (80 k to 80 k)"
     # The last two evaluations have nothing after them.
     assert str(reached(line([[0.1, 0.1, 0.1, 0.1, 0.9, 0.9]]), 0.5)) == "> 120 k"
     one_never = reached(line([[0.9] * 6, [0.1, 0.9, 0.9, 0.9, 0.9, 0.9], [0.1] * 6]), 0.5)

@@ -128,12 +128,12 @@ def test_every_device_has_one_process_at_a_time(tmp_path: Path) -> None:
     cells = [make_cell(name) for name in "abcde"]
     devices = [Device(f"GPU {number}", {"CUDA_VISIBLE_DEVICES": str(number)}) for number in (3, 5)]
     assert run(cells, tmp_path, Script(), devices)[0] == []
-    found = sorted((tuple(seen(tmp_path, cell)[0][:1]), seen(tmp_path, cell)[0][2]) for cell in cells)
-    assert {device for (device,), _ in found} == {"3", "5"}
+    order = sorted((tuple(seen(tmp_path, cell)[0][:1]), seen(tmp_path, cell)[0][2]) for cell in cells)
+    assert {device for (device,), _ in order} == {"3", "5"}
     for one in ("3", "5"):
-        starts = [at for (device,), at in found if device == one]
+        starts = [at for (device,), at in order if device == one]
         assert len(starts) >= 2 and all(later - before > 0.29 for before, later in zip(starts, starts[1:]))
-    first = sorted(at for _, at in found)[:2]
+    first = sorted(at for _, at in order)[:2]
     assert first[1] - first[0] < 0.29  # side by side
 
 
@@ -178,7 +178,7 @@ except KeyboardInterrupt:
 
 def test_a_second_signal_does_not_wait(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Not even for a process that does not listen; and it leaves none behind."""
-    monkeypatch.setattr("jaxrl_vis.studies.grid._HURRY_S", 0.5)
+    monkeypatch.setattr("jaxrl_vis.studies.grid._GRACE_S", 0.5)
     cell = make_cell("a")
     pids: list[int] = []
 
@@ -273,8 +273,8 @@ def test_the_engine_starts_no_jax(clean_environment: dict[str, str]) -> None:
     subprocess.run([sys.executable, "-c", code], env=clean_environment, check=True)
 
 
-def answer(monkeypatch: pytest.MonkeyPatch, found: object, status: int = 0) -> None:
-    done = subprocess.CompletedProcess([], status, json.dumps(found), "jaxlib grumbles\nJAX finds no such device\n")
+def answer(monkeypatch: pytest.MonkeyPatch, order: object, status: int = 0) -> None:
+    done = subprocess.CompletedProcess([], status, json.dumps(order), "jaxlib grumbles\nJAX finds no such device\n")
     monkeypatch.setattr("jaxrl_vis.devices.subprocess.run", lambda *_, **__: done)
 
 

@@ -90,7 +90,7 @@ class Repeater:
             begin: Iterations completed at the start.
             progress: Progress of the host at the start.
             loop: State at the start; donated.
-            places: Iterations whose rows are compared, ascending; the repetition ends at the last one.
+            compared_iterations: Iterations whose rows are compared, ascending; the repetition ends at the last one.
         """
         self._say(f"repeating iterations {begin + 1} to {compared_iterations[-1]} from {name} ...")
         history = {begin - back: values for back, values in enumerate(reversed(progress.since_evaluation))}
