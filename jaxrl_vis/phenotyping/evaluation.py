@@ -1,6 +1,6 @@
 """An evaluation of many plots, as `evaluation_pool` goes through them: what is done with one, and what is kept of it.
 
-    Task, seed -> evaluate_plot -> record -> `Kept`: the file, written after each plot -> scores_of -> summary
+    Task, seed -> evaluate_plot -> record -> `RecordFile`: the file, written after each plot -> scores_of -> summary
 
 A score is rounded when it is made, so that what the file keeps is what was scored. Which process scores a plot does not matter.
 """

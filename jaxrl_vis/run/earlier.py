@@ -55,8 +55,9 @@ def last_evaluation(restored: Restored) -> int:
 
 
 def refuse_missing_rows(folder: RunFolder, restored: Restored) -> None:
-    """Checks that metrics.jsonl has the evaluations before a checkpoint. Damaged lines, now or in an earlier resumption, may
-    have been these; the latter lie with the damaged checkpoints.
+    """Checks that metrics.jsonl has the evaluations before a checkpoint.
+
+    Damaged lines may have been these evaluations, including lines that an earlier resumption moved to the damaged checkpoints.
 
     Raises:
         RequestError: The file ends earlier.
