@@ -88,13 +88,13 @@ def test_the_guess_follows_what_is_asked_for_installed_and_there(
 ) -> None:
     monkeypatch.setenv("JAX_PLATFORMS", asked)
     monkeypatch.setattr(devices, "_is_installed", lambda _: packages)
-    monkeypatch.setattr(devices, "_is_there", lambda _: there)
+    monkeypatch.setattr(devices, "_exists", lambda _: there)
     assert devices.guess_accelerator() is expected
 
 
 def test_a_gpu_without_its_packages_is_mended_by_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(devices, "_is_installed", lambda _: False)
-    monkeypatch.setattr(devices, "_is_there", lambda _: True)
+    monkeypatch.setattr(devices, "_exists", lambda _: True)
     assert devices._mend("cuda") == "; install this project with the extra cuda12 or cuda13"
 
 
