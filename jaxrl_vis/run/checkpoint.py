@@ -244,10 +244,14 @@ class Checkpoints:
     def retire_full(self, has_ended: bool = False) -> None:
         """Deletes full checkpoints older than a light one that is safely on the disk: they are no longer needed for resuming.
 
+        Recent states that are not kept up to date any more go likewise.
+
         Args:
             has_ended: Also delete equally new ones: the run is complete.
         """
         newest = max(self.iterations(LIGHT), default=-1)
+        if processes.is_first():
+            self.recent.retire(newest)
         for iteration in self.iterations(FULL):
             if iteration < newest + has_ended:
                 self._forget(FULL)
