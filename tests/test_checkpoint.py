@@ -26,11 +26,11 @@ FAKE = Path(__file__).with_name("fake_program.py")
 def states():
     """Loop states after 1, 2 and 3 iterations of the fake program, and its shapes."""
     trainer = make_fake_trainer(small_config(), None)
-    loop, found = trainer.init(jax.random.key(7)), []
+    loop, snapshots = trainer.init(jax.random.key(7)), []
     for _ in range(3):
         loop, _ = trainer.train_iteration(loop)
-        found.append(jax.tree.map(jnp.copy, loop))
-    return found, trainer.shapes
+        snapshots.append(jax.tree.map(jnp.copy, loop))
+    return snapshots, trainer.shapes
 
 
 @pytest.fixture(scope="module")

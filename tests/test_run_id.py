@@ -1,4 +1,4 @@
-"""Whose a checkpoint and a row are: nothing of another run is resumed, counted or deleted."""
+"""Run ids of checkpoints and rows: nothing of another run is resumed, counted or deleted."""
 
 import json
 import os
@@ -22,7 +22,7 @@ from jaxrl_vis.run.sums import write_sums
 
 
 def checkpoints_in(path: Path) -> list[str]:
-    return sorted(f"{each.parent.name}/{each.name}" for each in path.glob("checkpoints/*/*") if each.name.isdigit())
+    return sorted(f"{entry.parent.name}/{entry.name}" for entry in path.glob("checkpoints/*/*") if entry.name.isdigit())
 
 
 def test_everything_that_a_run_writes_carries_its_id(tmp_path):
@@ -51,10 +51,10 @@ def test_a_new_run_does_not_go_on_with_an_old_ones_checkpoints(straight, tmp_pat
     assert reports[0].iteration < 6 and "exactly" in said and "not of this run, and left out" in said
     assert "metrics.jsonl held 8 rows of another run: kept in" in said
     assert rows_without_time(path) == rows_without_time(straight[0])
-    kept = path / "checkpoints" / "foreign"
+    aside = path / "checkpoints" / "foreign"
     foreign = ["full-6", "full-8", "light-6", "light-8", "metrics.jsonl"]
-    assert sorted(each.name for each in kept.iterdir()) == foreign
-    assert metrics.read_rows(kept / "metrics.jsonl") == metrics.read_rows(straight[0] / "metrics.jsonl")
+    assert sorted(entry.name for entry in aside.iterdir()) == foreign
+    assert metrics.read_rows(aside / "metrics.jsonl") == metrics.read_rows(straight[0] / "metrics.jsonl")
 
 
 def test_starting_again_deletes_nothing_of_another_run(straight, tmp_path, capsys):
@@ -67,10 +67,12 @@ def test_starting_again_deletes_nothing_of_another_run(straight, tmp_path, capsy
     capsys.readouterr()
     list(make_fake_trainer(small_config(env_steps=20), path, overwrite=True).run())
     assert capsys.readouterr().out.count("not of this run, and left out") == 4
-    kept = path / "checkpoints" / "foreign"
+    aside = path / "checkpoints" / "foreign"
     names = ["full-6", "full-8", "light-6", "light-8"]
-    assert sorted(each.name for each in kept.iterdir()) == sorted([*names, *(f"{name}-2" for name in names), "metrics.jsonl"])
-    assert (kept / "metrics.jsonl").read_text() == (straight[0] / "metrics.jsonl").read_text() * 2
+    assert sorted(entry.name for entry in aside.iterdir()) == sorted(
+        [*names, *(f"{name}-2" for name in names), "metrics.jsonl"]
+    )
+    assert (aside / "metrics.jsonl").read_text() == (straight[0] / "metrics.jsonl").read_text() * 2
     assert checkpoints_in(path) == ["full/2", "light/2"]
 
 
@@ -83,7 +85,7 @@ def test_what_uses_a_run_does_not_count_another_ones(straight, tmp_path, monkeyp
     monkeypatch.setattr(trained, "make_trainer", lambda config, **_: trainer.Trainer(config, FakeProgram(config)))
     opened = trained.open_run(path)
     assert trained.load(opened, path).iteration == 2
-    with pytest.raises(RequestError, match="no checkpoint of iteration 8; it keeps 2"):
+    with pytest.raises(RequestError, match="no checkpoint of iteration 8, only of 2"):
         trained.load(opened, path, 8)
 
 
@@ -145,7 +147,7 @@ def test_what_cannot_be_deleted_is_told_before_a_new_run_starts(straight, tmp_pa
 
 
 def moved_at(trainer, iteration: int, act) -> StorageError:
-    """What a run ends with whose folder something happens to after ``iteration``."""
+    """Returns the error of a run that ends because its folder changes after ``iteration``."""
     with pytest.raises(StorageError) as stopped:
         for report in trainer.run():
             if report.iteration == iteration:
@@ -241,7 +243,7 @@ def test_a_new_folder_of_the_same_name_is_left_alone(tmp_path):
         (path / "notes.txt").write_text("mine")
 
     assert "was moved to" in str(moved_at(make_fake_trainer(small_config(), path), 3, replace)) or os.name != "posix"
-    assert [each.name for each in path.iterdir()] == ["notes.txt"]
+    assert [entry.name for entry in path.iterdir()] == ["notes.txt"]
 
 
 @pytest.mark.parametrize("name", ["a" * 300, "a/" + "b" * 300])
