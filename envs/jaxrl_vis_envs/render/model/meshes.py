@@ -79,7 +79,7 @@ def _mesh(mj_model: mujoco.MjModel, mesh: int) -> tuple[np.ndarray, np.ndarray, 
 
 
 def _hfield(mj_model: mujoco.MjModel, hfield: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return corners, normals and texture coordinates of a height field: its surface, four sides and bottom, all flat-shaded."""
+    """Return corners, normals and texture coordinates of a height field: surface, four sides and bottom, all flat-shaded."""
     rows, columns = int(mj_model.hfield_nrow[hfield]), int(mj_model.hfield_ncol[hfield])
     start = mj_model.hfield_adr[hfield]
     heights = mj_model.hfield_data[start : start + rows * columns].reshape(rows, columns).astype(np.float64)
