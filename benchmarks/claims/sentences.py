@@ -94,7 +94,8 @@ def _weightings() -> Iterator[Sentence]:
     yield Sentence(LAB, f"better than `paper` ({_p(several, ten, 240_000)})", several.name)
     first_five = float(np.median(ten.at(100_000)[:5]))
     three = (_median(none[FETCH], 100_000), _median(learning("fetch_reach_paper"), 100_000), first_five)
-    yield Sentence(LAB, "have {:.2f}, {:.2f} and {:.2f} at 100 k steps".format(*three), ten.name)
+    for page in (LAB, "README.md"):
+        yield Sentence(page, "have {:.2f}, {:.2f} and {:.2f} at 100 k steps".format(*three), ten.name)
 
 
 def _single_tasks() -> Iterator[Sentence]:

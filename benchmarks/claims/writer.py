@@ -57,7 +57,8 @@ def made_by(records: Sequence[Record]) -> str:
         revision, _, device = text.partition(" on ")
         devices[device].add(revision)
     parts = [f"{', '.join(sorted(revisions))} on {device}" for device, revisions in sorted(devices.items())]
-    return f"Made by {'; '.join(parts)}." if parts else ""
+    some = "" if all(record.made for record in records) else " (records that say so)"
+    return f"Made by {'; '.join(parts)}{some}." if parts else ""
 
 
 def _line(cells: Sequence[str]) -> str:
