@@ -56,13 +56,15 @@ def plain(text: str) -> str:
 
 def differences(sentences: Sequence[Sentence]) -> Iterator[str]:
     """List sentences that their pages or records do not have, and decimal fractions that are in no registered sentence."""
-    texts = {page: plain((ROOT / page).read_text(encoding="utf-8")) for page in OTHERS}
+    pages = {*OTHERS, *(each.page for each in sentences)}
+    texts = {page: plain((ROOT / page).read_text(encoding="utf-8")) for page in sorted(pages)}
     for each in sentences:
         if each.quote not in texts[each.page]:
             yield f"{each.page} does not say, as {each.record} does: {each.quote}"
         if not each.holds:
             yield f"{each.page}: {each.record} does not say: {each.quote}"
-    for page, text in texts.items():
+    for page in OTHERS:
+        text = texts[page]
         quotes = [*(each.quote for each in sentences if each.page == page), *OTHERS[page], *_TESTS]
         for quote in sorted(quotes, key=len, reverse=True):
             text = text.replace(quote, " ")

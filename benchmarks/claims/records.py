@@ -122,6 +122,14 @@ def study(family: str, stem: str, fresh: bool = False, budget: int = 0) -> Recor
     return _joined(f"studies/{family}/{stem}", (_read_run(folder) for _, folder in sorted(folders.items())))
 
 
+def fresh_variants(task: str) -> list[str]:
+    """Return the variants of the study of auxiliary losses that were run with fresh seeds and the release's decay."""
+    names = [folder.name for family in ("ol_aux", "target_decay") for folder in (RESULTS / "studies" / family).iterdir()]
+    pattern = rf"{re.escape(task)}-(\w+)-paper(?:-decay0\.98)?-seeds(\d+)to\d+(?:-.*)?"
+    matches = [match for name in names if (match := re.fullmatch(pattern, name))]
+    return sorted({match[1] for match in matches if int(match[2]) >= FIRST_FRESH_SEED})
+
+
 def _folders(family: str, stem: str) -> dict[int, Path]:
     """First seed -> the longest run of that seed."""
     found: dict[int, tuple[int, Path]] = {}

@@ -258,6 +258,12 @@ def _fast() -> Iterator[Sentence]:
     yield Sentence(FAST, quote, finger.name, level == {"sum", "fixed_10"} and "worse" not in found.values())
 
 
+def _devices() -> Iterator[Sentence]:
+    four, one = (ablation(f"fetch_28_environments_on_{each}") for each in ("four_gpus", "one_gpu"))
+    quote = "is at 0.97 by {} steps, and by {} on one".format(*(c.steps_cell(record, 0.97) for record in (four, one)))
+    yield Sentence("docs/scaling.md", quote, four.name, c.verdict(four, one) == "level")
+
+
 def _decays() -> Iterator[Sentence]:
     """The sentences of the page on target networks, whose tables have a command of their own."""
 
@@ -295,5 +301,5 @@ def _decays() -> Iterator[Sentence]:
 
 def sentences() -> list[Sentence]:
     """All registered sentences."""
-    parts = (_weightings, _single_tasks, _indicator, _parts_of_the_method, _choices, _options, _fast, _decays)
+    parts = (_weightings, _single_tasks, _indicator, _parts_of_the_method, _choices, _options, _fast, _devices, _decays)
     return [sentence for part in parts for sentence in part()]

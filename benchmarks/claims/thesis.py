@@ -68,6 +68,7 @@ class Claim:
         interval: Intervals and p-values.
         source: Link to figure and table.
         records: Runs that it rests on.
+        main: Whether the short form has it.
     """
 
     claim: str
@@ -76,6 +77,7 @@ class Claim:
     interval: str
     source: str
     records: Sequence[Record]
+    main: bool = True
 
 
 def _ol_aux(first: str, second: str, tasks: Mapping[str, int]) -> list[Comparison]:
@@ -325,10 +327,14 @@ CLAIMS: tuple[Callable[[], Claim], ...] = (
 )
 
 
+DETAILS = (_balance_and_none, _best_single_task, _ablation, _order, CLAIMS[-2])
+"""Claims that the short form leaves out."""
+
+
 @functools.cache
 def claims() -> tuple[Claim, ...]:
     """All claims, computed."""
-    return tuple(make() for make in CLAIMS)
+    return tuple(dataclasses.replace(make(), main=make not in DETAILS) for make in CLAIMS)
 
 
 def _seeds(claim: Claim) -> str:
@@ -348,7 +354,7 @@ def _table() -> str:
 
 def _short(prefix: str) -> str:
     lines = ["| claim of the thesis | here | what we find |", "|---|---|---|"]
-    lines += [f"| {each.claim} | {each.answer} | {each.found} |" for each in claims()]
+    lines += [f"| {each.claim} | {each.answer} | {each.found} |" for each in claims() if each.main]
     return "\n".join([*lines, "", f"Intervals, p-values, seeds and figures: [Claims of the thesis]({prefix}claims.md)."])
 
 
