@@ -2,35 +2,33 @@
 
 python benchmarks/check_claims.py    # exit 1 if anything differs
 
-Covered are the README's table of results, docs/lab/target_decay.md, all tables between `<!-- tables: begin NAME -->` and
-`<!-- tables: end -->`, and the numbers in sentences of README.md, docs/index.md and the pages of the studies
+Covered are the README's table of results, docs/lab/target_decay.md and docs/lab/ablations.md, all tables of
+`benchmarks.claims.pages`, and the numbers in sentences of README.md, docs/index.md and the pages of the studies
 (`benchmarks.claims.sentences`).
 """
 
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 
-import target_decay
-from claims import pages, prose, sentences, writer
+from benchmarks.claims import pages, prose, sentences
+from benchmarks.ledger import pages as ledger
+from benchmarks.ledger.records import CHECKOUT
 
-import jaxrl_vis.bench.tables as readme_tables
+OF_LEARNING = {"README.md": "results table", "docs/lab/target_decay.md": "tables", "docs/lab/ablations.md": "curves"}
+"""Tables of the ledger that come from records of learning."""
 
-RESULTS = Path(__file__).parent / "results"
 
-
-def other_differences() -> Iterator[str]:
-    """List tables with a command of their own that are not those of the records."""
-    text = (writer.ROOT / "README.md").read_text(encoding="utf-8")
-    if readme_tables.results_table(RESULTS) not in text:
-        yield "README.md: the table of results is not that of the records: jaxrl-vis bench --tables"
-    if target_decay.tables() not in target_decay.PAGE.read_text(encoding="utf-8"):
-        yield "docs/lab/target_decay.md: tables are not those of the records: python benchmarks/target_decay.py"
+def ledger_differences() -> Iterator[str]:
+    """List tables of the ledger that differ from the records."""
+    for page, name in OF_LEARNING.items():
+        text = (CHECKOUT / page).read_text(encoding="utf-8")
+        if ledger.filled(text, {name: ledger.PAGES[page][name]}) != text:
+            yield f"{page}: the table {name!r} differs from the records: make tables"
 
 
 def main() -> int:
-    """Print all differences."""
-    found = [*other_differences(), *writer.differences(pages.tables()), *prose.differences(sentences.sentences())]
+    """Print all differences; return the exit status."""
+    found = [*ledger_differences(), *pages.differences(), *prose.differences(sentences.sentences())]
     print("\n".join(found) if found else "all figures are those of the records")
     return int(bool(found))
 

@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.claims import columns, prose, writer
+from benchmarks.claims import columns, pages, prose
+from benchmarks.claims.markdown import Row, table
 from benchmarks.claims.prose import Sentence
 from benchmarks.claims.records import Record, study
-from benchmarks.claims.writer import Row
+from jaxrl_vis.errors import RequestError
 
 ROOT = Path(__file__).parent.parent
 
@@ -49,26 +50,26 @@ def test_cells_say_what_can_be_counted_by_hand():
 
 
 def test_a_row_without_a_record_says_so():
-    text = writer.table(["run"], [Row("kept", record("kept", [0.25])), Row("lost", None)], [columns.at(10), columns.names()])
+    text = table(["run"], [Row("kept", record("kept", [0.25])), Row("lost", None)], [columns.at(10), columns.names()])
     assert text.splitlines()[2:4] == ["| kept | 0.25 | `` |", "| lost | no record kept | |"]
     assert text.endswith("Made by abc on a GPU.")
 
 
-def test_an_edited_table_is_found_and_written_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(writer, "ROOT", tmp_path)
+def test_an_edited_table_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(pages, "CHECKOUT", tmp_path)
+    monkeypatch.setattr(pages, "tables", lambda: {"page.md": {"one": "| 0.80 |"}})
     page = tmp_path / "page.md"
-    page.write_text("before\n<!-- tables: begin one -->\n| 0.82 |\n<!-- tables: end -->\nafter\n")
-    pages = {"page.md": {"one": "| 0.80 |"}}
-    assert [line for line in writer.differences(pages) if line.startswith(("-|", "+|"))] == ["-| 0.82 |", "+| 0.80 |"]
-    assert writer.write(pages) == ["page.md"]
-    assert page.read_text() == "before\n<!-- tables: begin one -->\n| 0.80 |\n<!-- tables: end -->\nafter\n"
-    assert not list(writer.differences(pages)) and not writer.write(pages)
-    with pytest.raises(LookupError, match="two"):
-        writer.filled("page.md", {"two": ""})
+    page.write_text("before\n<!-- one: begin (make tables) -->\n| 0.82 |\n<!-- one: end -->\nafter\n")
+    assert [line for line in pages.differences() if line.startswith(("-|", "+|"))] == ["-| 0.82 |", "+| 0.80 |"]
+    page.write_text(page.read_text().replace("0.82", "0.80"))
+    assert not list(pages.differences())
+    page.write_text("no markers")
+    with pytest.raises(RequestError, match="one"):
+        list(pages.differences())
 
 
 def test_an_edited_sentence_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(prose, "ROOT", tmp_path)
+    monkeypatch.setattr(prose, "CHECKOUT", tmp_path)
     monkeypatch.setattr(prose, "OTHERS", {"page.md": ("a discount of 0.98",)})
     page = tmp_path / "page.md"
     page.write_text("With a discount of 0.98 it has\n0.75 of them (`--x 0.3`).\n\n| 0.11 |\n")

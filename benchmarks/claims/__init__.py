@@ -8,8 +8,8 @@
     thesis       claims of the thesis beside the records, for docs/claims.md and in short for README and index
     prose        sentences that quote numbers, compared with their pages
     sentences    these sentences, computed
-    pages        all tables of all pages
-    writer       pages and their markers
+    pages        all tables, by page and marker
+    markdown     rows of records as a table in Markdown
 
-`python -m benchmarks.claims` writes the tables, `python benchmarks/check_claims.py` checks them and the sentences.
+`make tables` writes the tables (`benchmarks.ledger.pages`), `python benchmarks/check_claims.py` checks them and the sentences.
 """

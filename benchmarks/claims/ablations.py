@@ -2,9 +2,9 @@
 
 from collections.abc import Sequence
 
-from . import columns as c
-from .records import DISTANCE, ablation, learning, study
-from .writer import Row, table
+from benchmarks.claims import columns as c
+from benchmarks.claims.markdown import Row, table
+from benchmarks.claims.records import DISTANCE, ablation, learning, study
 
 GUIDE, OPTIONS, FAST = "docs/learner.md", "docs/lab/learner_options.md", "docs/lab/weightings_fast.md"
 _K = 1_000

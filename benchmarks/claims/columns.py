@@ -6,11 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from benchmarks.claims.records import DISTANCE, SUCCESS, Record
 from jaxrl_vis.report.plots import show_steps
 from jaxrl_vis.studies.authors import mean_difference, released_curves
 from jaxrl_vis.studies.seed_statistics import bootstrap_interval, interquartile_mean, permutation_p_value
-
-from .records import DISTANCE, SUCCESS, Record
 
 SIGNIFICANT = 0.05
 AUTHORS = "authors"

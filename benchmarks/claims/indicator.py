@@ -3,12 +3,11 @@
 import functools
 from collections.abc import Mapping, Sequence
 
+from benchmarks.claims import columns as c
+from benchmarks.claims.markdown import Row, table
+from benchmarks.claims.records import DISTANCE, SUCCESS, Record, study
 from jaxrl_vis.report.plots import show_steps
 from jaxrl_vis.studies.indicator import FETCH, FINGER, HAND, REACHER, SAWYER
-
-from . import columns as c
-from .records import DISTANCE, SUCCESS, Record, study
-from .writer import Row, table
 
 LAB, GUIDE = "docs/lab/indicator.md", "docs/indicator_rewards.md"
 OURS = "indicator_balance_filter"
@@ -137,13 +136,13 @@ def tables() -> dict[str, dict[str, str]]:
     return {
         GUIDE: {"main": _main()},
         LAB: {
-            "figure_5.1_reacher": _ends(REACHER, METHODS, "oracle", "the oracle"),
-            "figure_5.1_fetch": _ends(FETCH, METHODS, "oracle", "the oracle"),
+            "figure_5_1_reacher": _ends(REACHER, METHODS, "oracle", "the oracle"),
+            "figure_5_1_fetch": _ends(FETCH, METHODS, "oracle", "the oracle"),
             "parts_reacher": _ends(REACHER, _PARTS, OURS, "the whole method"),
             "parts_fetch": _ends(FETCH, _PARTS, OURS, "the whole method"),
             "states_reacher": _ends("Reacher", states, "oracle", "the oracle"),
             "states_fetch": _ends("FetchReach", states, "oracle", "the oracle"),
-            "figure_5.2": _ends(SAWYER, sawyer, "oracle", "the oracle"),
+            "figure_5_2": _ends(SAWYER, sawyer, "oracle", "the oracle"),
             "hand": _ends(HAND, METHODS, "oracle", "the oracle"),
             "hand_rewards": _rewards(HAND, precision=True),
             "finger": _ends(FINGER, METHODS, "oracle", "the oracle"),

@@ -6,11 +6,10 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.stats import spearmanr
 
+from benchmarks.claims import columns as c
+from benchmarks.claims.markdown import Row, table
+from benchmarks.claims.records import FIRST_FRESH_SEED, Record, ablation, fresh_variants, study
 from jaxrl_vis.studies.ol_aux import AUX_TASKS, FETCH, FINGER, HAND
-
-from . import columns as c
-from .records import FIRST_FRESH_SEED, Record, ablation, fresh_variants, study
-from .writer import Row, table
 
 LAB, GUIDE = "docs/lab/ol_aux.md", "docs/auxiliary_losses.md"
 VIEW = "view=fingertips-tip_marks=faint-depth_encoding=zbuffer"
@@ -182,16 +181,16 @@ def tables() -> dict[str, dict[str, str]]:
     return {
         GUIDE: {"main": _main()},
         LAB: {
-            "figure_5.4_fetch": _figure_5_4(FETCH, four, (0.5, 0.9), 240_000, [240_000]),
-            "figure_5.4_hand": _figure_5_4(HAND, four, (0.2, 0.3, 0.4, 0.65), 2_000_000, [1_000_000, 2_000_000]),
-            "figure_5.4_hand_view": _figure_5_4(HAND, ("none", "ol_aux_5"), (0.2, 0.3, 0.4), 2_000_000, [2_000_000], VIEW),
-            "figure_5.4_finger": _figure_5_4(FINGER, four, (0.3, 0.5, 0.9), 1_480_000, [1_480_000, 2_480_000]),
-            "figure_5.5_fetch": _figure_5_5(FETCH, (0.5, 0.9), [100_000]),
-            "figure_5.5_hand": _figure_5_5(HAND, (0.4,), [1_000_000]),
-            "figure_5.5_finger": _figure_5_5(FINGER, (0.3,), [1_000_000]),
-            "figure_5.6": _weights(),
-            "figure_5.7_fetch": _figure_5_7(FETCH, 240_000, [c.steps_to(0.9, run(FETCH, "none"))]),
-            "figure_5.7_hand": _figure_5_7(HAND, 600_000, [c.success_at(600_000)]),
+            "figure_5_4_fetch": _figure_5_4(FETCH, four, (0.5, 0.9), 240_000, [240_000]),
+            "figure_5_4_hand": _figure_5_4(HAND, four, (0.2, 0.3, 0.4, 0.65), 2_000_000, [1_000_000, 2_000_000]),
+            "figure_5_4_hand_view": _figure_5_4(HAND, ("none", "ol_aux_5"), (0.2, 0.3, 0.4), 2_000_000, [2_000_000], VIEW),
+            "figure_5_4_finger": _figure_5_4(FINGER, four, (0.3, 0.5, 0.9), 1_480_000, [1_480_000, 2_480_000]),
+            "figure_5_5_fetch": _figure_5_5(FETCH, (0.5, 0.9), [100_000]),
+            "figure_5_5_hand": _figure_5_5(HAND, (0.4,), [1_000_000]),
+            "figure_5_5_finger": _figure_5_5(FINGER, (0.3,), [1_000_000]),
+            "figure_5_6": _weights(),
+            "figure_5_7_fetch": _figure_5_7(FETCH, 240_000, [c.steps_to(0.9, run(FETCH, "none"))]),
+            "figure_5_7_hand": _figure_5_7(HAND, 600_000, [c.success_at(600_000)]),
             "fresh_fetch": _fresh(FETCH),
             "fresh_hand": _fresh(HAND),
             "fresh_finger": _fresh(FINGER),

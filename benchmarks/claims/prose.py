@@ -8,7 +8,7 @@ import dataclasses
 import re
 from collections.abc import Iterator, Sequence
 
-from .writer import ROOT
+from benchmarks.ledger.records import CHECKOUT
 
 _TESTS = ("p at most .05", "p is at most .05", "has p of at most .05", "cannot be less than .008")
 OTHERS: dict[str, tuple[str, ...]] = {
@@ -57,7 +57,7 @@ def plain(text: str) -> str:
 def differences(sentences: Sequence[Sentence]) -> Iterator[str]:
     """List sentences that their pages or records do not have, and decimal fractions that are in no registered sentence."""
     pages = {*OTHERS, *(each.page for each in sentences)}
-    texts = {page: plain((ROOT / page).read_text(encoding="utf-8")) for page in sorted(pages)}
+    texts = {page: plain((CHECKOUT / page).read_text(encoding="utf-8")) for page in sorted(pages)}
     for each in sentences:
         if each.quote not in texts[each.page]:
             yield f"{each.page} does not say, as {each.record} does: {each.quote}"

@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.ledger.ablations import read_curves
+from benchmarks.ledger.records import RESULTS
 from jaxrl_vis.report.learning import curve, steps_to
 from jaxrl_vis.run.folder import read_record
 
-RESULTS = Path(__file__).resolve().parent.parent / "results"
 SUCCESS, DISTANCE = "eval/success", "eval/goal_distance"
 FIRST_FRESH_SEED = 100  # seeds below are used for tuning
 
@@ -80,10 +81,15 @@ def _evaluations(file: Path) -> tuple[dict[str, Any], ...]:
     return tuple(row for row in rows if SUCCESS in row)
 
 
+_curves = functools.cache(read_curves)
+
+
 @functools.cache
 def ablation(name: str) -> Record:
-    """Return a run of benchmarks/results/ablations, which keep neither configuration nor revision."""
-    return Record(f"ablations/{name}", _evaluations(RESULTS / "ablations" / f"{name}.metrics.jsonl"))
+    """Return a curve of the table of ablations, whose revision and device are kept as far as the docs stated them."""
+    curve = _curves()[name]
+    made = frozenset({f"{curve.revision} on {curve.device}"} if curve.revision and curve.device else ())
+    return Record(f"ablations/{name}", tuple(row for row in curve.rows if SUCCESS in row), made)
 
 
 @functools.cache

@@ -5,17 +5,16 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from benchmarks.claims import columns as c
+from benchmarks.claims import indicator, ol_aux, thesis
+from benchmarks.claims.ablations import FAST, OPTIONS
+from benchmarks.claims.indicator import LAB as RULES
+from benchmarks.claims.indicator import OURS, REACHER, SAWYER
+from benchmarks.claims.ol_aux import LAB
+from benchmarks.claims.prose import Sentence
+from benchmarks.claims.records import DISTANCE, Record, ablation, learning, study
 from jaxrl_vis.studies.authors import mean_difference, released_curves
 from jaxrl_vis.studies.ol_aux import AUX_TASKS, FETCH, FINGER, HAND
-
-from . import columns as c
-from . import indicator, ol_aux, thesis
-from .ablations import FAST, OPTIONS
-from .indicator import LAB as RULES
-from .indicator import OURS, REACHER, SAWYER
-from .ol_aux import LAB
-from .prose import Sentence
-from .records import DISTANCE, Record, ablation, learning, study
 
 DECAY, GUIDE, REWARDS = "docs/lab/target_decay.md", ol_aux.GUIDE, indicator.GUIDE
 

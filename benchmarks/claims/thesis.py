@@ -9,13 +9,12 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from benchmarks.claims import columns as c
+from benchmarks.claims import indicator, ol_aux
+from benchmarks.claims.indicator import OURS, REACHER, SAWYER
+from benchmarks.claims.markdown import made_by
+from benchmarks.claims.records import DISTANCE, SUCCESS, Record, study
 from jaxrl_vis.studies.ol_aux import AUX_TASKS, FETCH, FINGER, HAND
-
-from . import columns as c
-from . import indicator, ol_aux
-from .indicator import OURS, REACHER, SAWYER
-from .records import DISTANCE, SUCCESS, Record, study
-from .writer import made_by
 
 PAGE = "docs/claims.md"
 SHORT = {
