@@ -134,7 +134,7 @@ def _gaps() -> str:
     ]
     rows = [Row(label, record) for label, record in [*hand, *finger]]
     at_end = {id(record): 600_000 for _, record in hand} | {id(record): 1_400_000 for _, record in finger}
-    success = c.Column("success", lambda record: f"{np.median(record.at(at_end[id(record)])):.2f}")
+    success = c.Column("success", lambda record: f"{record.median(at_end[id(record)]):.2f}")
     steps = c.Column("environment steps", lambda record: c.show_steps(at_end[id(record)]))
     return table(["undone"], rows, [c.seeds(), steps, success, c.names()])
 

@@ -59,6 +59,17 @@ class Record:
             return None
         return np.array([values[seed] for seed in self.seeds])
 
+    def median(self, steps: int | None = None, metric: str = SUCCESS) -> float:
+        """Return the median over seeds at one evaluation, the last if none is named.
+
+        Raises:
+            ValueError: Not all seeds were evaluated then.
+        """
+        values = self.at(self.end if steps is None else steps, metric)
+        if values is None:
+            raise ValueError(f"{self.name} has no evaluation of all seeds at {steps} steps")
+        return float(np.median(values))
+
     def means(self, budget: int | None = None, metric: str = SUCCESS) -> np.ndarray:
         """Return the mean of a metric over the evaluations up to ``budget`` environment steps, [S].
 

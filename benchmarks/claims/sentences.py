@@ -19,17 +19,6 @@ from jaxrl_vis.studies.ol_aux import AUX_TASKS, FETCH, FINGER, HAND
 DECAY, GUIDE, REWARDS = "docs/lab/target_decay.md", ol_aux.GUIDE, indicator.GUIDE
 
 
-def _median(record: Record, steps: int, metric: str = "eval/success") -> float:
-    values = record.at(steps, metric)
-    if values is None:
-        raise ValueError(f"{record.name} has no evaluation of all seeds at {steps} steps")
-    return float(np.median(values))
-
-
-def _end(record: Record, metric: str = "eval/success") -> float:
-    return _median(record, record.end, metric)
-
-
 def _all(verdict: str, records: Sequence[Record], reference: Record) -> bool:
     return all(c.verdict(record, reference) == verdict for record in records)
 
@@ -61,8 +50,8 @@ def _weightings() -> Iterator[Sentence]:
         f"on FetchReach ({_p(ours[FETCH], balance[FETCH], 240_000)}), on the finger "
         f"({_p(ours[FINGER], balance[FINGER], 1_480_000)}) and on the hand to 1 M steps "
         f"({_p(ours[HAND], balance[HAND], 1_000_000)}). Over 2 M steps it is better on the hand "
-        f"({_p(ours[HAND], balance[HAND], 2_000_000)}): {_median(ours[HAND], 2_000_000):.3f} against "
-        f"{_median(balance[HAND], 2_000_000):.3f} at the end",
+        f"({_p(ours[HAND], balance[HAND], 2_000_000)}): {ours[HAND].median(2_000_000):.3f} against "
+        f"{balance[HAND].median(2_000_000):.3f} at the end",
         balance[HAND].name,
     )
     yield Sentence(
@@ -70,13 +59,13 @@ def _weightings() -> Iterator[Sentence]:
     )
     authors = c.authors(HAND, "none", 2_000_000)
     yield Sentence(
-        LAB, f"{_median(none[HAND], 2_000_000):.3f} against {_median(authors, 2_000_000):.3f} at 2 M steps", none[HAND].name
+        LAB, f"{none[HAND].median(2_000_000):.3f} against {authors.median(2_000_000):.3f} at 2 M steps", none[HAND].name
     )
     view = run(HAND, "none", ol_aux.VIEW)
     yield Sentence(LAB, f"falls from {_distance(none[HAND], HAND)} to {_distance(view, HAND)}.", view.name)
     authors = c.authors(FINGER, "none", 2_480_000)
     yield Sentence(
-        LAB, f"{_median(none[FINGER], 2_480_000):.3f} against {_median(authors, 2_480_000):.3f} at 2.48 M", none[FINGER].name
+        LAB, f"{none[FINGER].median(2_480_000):.3f} against {authors.median(2_480_000):.3f} at 2.48 M", none[FINGER].name
     )
     share = np.median(none[FINGER].means(metric="train/positive_share"))
     yield Sentence(LAB, f"{share:.0%}".replace("%", " %") + " of its relabelled goals are reached already", none[FINGER].name)
@@ -92,7 +81,7 @@ def _weightings() -> Iterator[Sentence]:
     yield Sentence(LAB, f"level with `paper` ({_p(cross, ten, 240_000)})", cross.name)
     yield Sentence(LAB, f"better than `paper` ({_p(several, ten, 240_000)})", several.name)
     first_five = float(np.median(ten.at(100_000)[:5]))
-    three = (_median(none[FETCH], 100_000), _median(learning("fetch_reach_paper"), 100_000), first_five)
+    three = (none[FETCH].median(100_000), learning("fetch_reach_paper").median(100_000), first_five)
     for page in (LAB, "README.md"):
         yield Sentence(page, "have {:.2f}, {:.2f} and {:.2f} at 100 k steps".format(*three), ten.name)
 
@@ -103,7 +92,7 @@ def _single_tasks() -> Iterator[Sentence]:
     p = {task: _p(ours[task], alone[task], ol_aux.BUDGETS[task]) for task in ours}
     yield Sentence(LAB, f"on FetchReach ({p[FETCH]}) and on the hand ({p[HAND]})**", alone[HAND].name)
     yield Sentence(LAB, f"level with it on the finger ({p[FINGER]})", alone[FINGER].name)
-    ends = [_median(each[HAND], 1_000_000) for each in (ours, alone)]
+    ends = [each[HAND].median(1_000_000) for each in (ours, alone)]
     below = all(a < b for (_, a), (_, b) in zip(ours[HAND].points[:25], alone[HAND].points, strict=True))
     quote = "is below that of inverse dynamics at every evaluation to 1 M steps, where they have {:.3f} and {:.3f}".format(
         *ends
@@ -127,15 +116,18 @@ def _single_tasks() -> Iterator[Sentence]:
 def _indicator() -> Iterator[Sentence]:
     run = indicator.run
     ours, oracle = ({task: run(task, each) for task in (REACHER, FETCH, SAWYER, HAND, FINGER)} for each in (OURS, "oracle"))
-    ends = {each: _median(each, each.end) for each in (*ours.values(), *oracle.values())}
-    yield Sentence(RULES, f"more slowly than the oracle ({_p(ours[FETCH], oracle[FETCH])}), ends about as successful "
-                   f"({ends[ours[FETCH]]:.3f} against {ends[oracle[FETCH]]:.3f})", ours[FETCH].name)  # fmt: skip
+    ends = {each: each.median() for each in (*ours.values(), *oracle.values())}
+    quote = (
+        f"more slowly than the oracle ({_p(ours[FETCH], oracle[FETCH])}), ends about as successful "
+        f"({ends[ours[FETCH]]:.3f} against {ends[oracle[FETCH]]:.3f})"
+    )
+    yield Sentence(RULES, quote, ours[FETCH].name)
     nxt, relabelled = ({task: run(task, each) for task in (REACHER, FETCH)} for each in ("all_next", "all_relabelled"))
     ps = {_p(nxt[task], ours[task]) for task in nxt}
     yield Sentence(RULES, f"worse on both ({' and '.join(sorted(ps))})", nxt[FETCH].name)
     yield Sentence(
         RULES,
-        f"({_p(relabelled[FETCH], ours[FETCH])}) but not lost, {_end(relabelled[FETCH]):.3f} at the end; on "
+        f"({_p(relabelled[FETCH], ours[FETCH])}) but not lost, {relabelled[FETCH].median():.3f} at the end; on "
         f"Reacher success over training is level ({_p(relabelled[REACHER], ours[REACHER])})",
         relabelled[FETCH].name,
     )
@@ -147,7 +139,7 @@ def _indicator() -> Iterator[Sentence]:
     )
     yield Sentence(RULES, f"level over training ({_p(ours[SAWYER], run(SAWYER, 'indicator'))})", ours[SAWYER].name)
     hand = ours[HAND]
-    precision, chance = (_median(hand, hand.end, f"train/{each}") for each in ("filter_precision", "false_negative_share"))
+    precision, chance = (hand.median(metric=f"train/{each}") for each in ("filter_precision", "false_negative_share"))
     dropped, false = (np.median(hand.means(metric=f"train/{each}")) for each in ("filtered_share", "filtered_false_share"))
     yield Sentence(
         RULES,
@@ -155,10 +147,10 @@ def _indicator() -> Iterator[Sentence]:
         f"training it was {false / dropped:.3f}",
         hand.name,
     )
-    positive = _median(oracle[FINGER], oracle[FINGER].end, "train/positive_share")
+    positive = oracle[FINGER].median(metric="train/positive_share")
     yield Sentence(RULES, "four of five relabelled rewards are positive", oracle[FINGER].name, 0.78 < positive < 0.85)
     fast = learning("finger_turn_oracle")
-    yield Sentence(RULES, f"the oracle is at {_median(fast, 500_000):.2f} by then", fast.name)
+    yield Sentence(RULES, f"the oracle is at {fast.median(500_000):.2f} by then", fast.name)
     p = {each: _p(run(FETCH, each), oracle[FETCH]) for each in ("false_positives", "clutter", "state_noise")}
     yield Sentence(
         RULES,
@@ -170,7 +162,7 @@ def _indicator() -> Iterator[Sentence]:
 
 def _options() -> Iterator[Sentence]:
     hand = learning("hand_reach_oracle")
-    yield Sentence(OPTIONS, f"the median is {_median(hand, 2_000_000):.2f}", hand.name)
+    yield Sentence(OPTIONS, f"the median is {hand.median(2_000_000):.2f}", hand.name)
     twenty = ablation("fetch_25_20seeds_base")
     fives = np.median(twenty.at(15_000).reshape(4, 5), axis=1)
     quote = f"the four fives of the first row below have medians from {fives.min():.2f} to {fives.max():.2f} at 15 k steps"
@@ -186,14 +178,14 @@ def _parts_of_the_method() -> Iterator[Sentence]:
     pairs = [c.verdict(run(task, OURS), run(task, "balance_only")) for task in (REACHER, FETCH)]
     yield Sentence(RULES, quote, run(FETCH, "balance_only").name, pairs == ["level"] * 2)
     ours, fetch = run(FETCH, OURS), "FetchReach"
-    false = _median(ours, ours.end, "train/false_negative_share")
-    value = _median(ours, ours.end, "train/value_at_goals")
+    false = ours.median(metric="train/false_negative_share")
+    value = ours.median(metric="train/value_at_goals")
     quote = f"up to {false:.0%} of FetchReach's are false".replace("%", " %")
     yield Sentence(RULES, quote, ours.name)
     yield Sentence(RULES, f"value at goals stays near {value:.0f}, half of q₀ = 49", ours.name)
-    ratio = _end(run(REACHER, "all_relabelled"), DISTANCE) / _end(run(REACHER, OURS), DISTANCE)
+    ratio = run(REACHER, "all_relabelled").median(metric=DISTANCE) / run(REACHER, OURS).median(metric=DISTANCE)
     yield Sentence(RULES, f"the distance at the end is {ratio:.0f} times that of the whole method", run(REACHER, OURS).name)
-    ratio = _end(run(fetch, "oracle"), DISTANCE) / _end(run(fetch, OURS), DISTANCE)
+    ratio = run(fetch, "oracle").median(metric=DISTANCE) / run(fetch, OURS).median(metric=DISTANCE)
     yield Sentence(RULES, f"{ratio:.0f} times as precisely as by the oracle", run(fetch, OURS).name)
     states = [run("Reacher", each) for each in ("indicator", OURS)]
     quote = "On Reacher indicator methods are level with the oracle over training"
@@ -230,8 +222,8 @@ def _choices() -> Iterator[Sentence]:
     yield Sentence(GUIDE, quote, claim(HAND, "inverse_dynamics").name, alone == ["better", "better", "level"])
     ours = {task: indicator.run(task, OURS) for task in (REACHER, FETCH, SAWYER)}
     oracle = {task: indicator.run(task, "oracle") for task in ours}
-    nearer = [_end(ours[task], DISTANCE) < _end(oracle[task], DISTANCE) for task in (FETCH, SAWYER)]
-    near = all(abs(_end(ours[task]) - _end(oracle[task])) < 0.05 for task in ours)
+    nearer = [ours[task].median(metric=DISTANCE) < oracle[task].median(metric=DISTANCE) for task in (FETCH, SAWYER)]
+    near = all(abs(ours[task].median() - oracle[task].median()) < 0.05 for task in ours)
     quote = (
         "FetchReach, the Sawyer and Reacher end about as successful as with true states, and on the first two nearer to the "
         "goal"

@@ -225,7 +225,7 @@ def _order() -> Claim:
 def _ends(task: str, variants: Sequence[str], metric: str = SUCCESS) -> str:
     """Medians at the end, the second record's after ``against``."""
     records = [indicator.run(task, variant) for variant in variants]
-    return f"{SHORT[task]} " + " against ".join(f"{np.median(record.at(record.end, metric)):.3f}" for record in records)
+    return f"{SHORT[task]} " + " against ".join(f"{record.median(metric=metric):.3f}" for record in records)
 
 
 def _oracle() -> Claim:
@@ -251,7 +251,7 @@ def filtered_share(task: str) -> float:
 def _filter() -> Claim:
     shares = {task: filtered_share(task) for task in (REACHER, FETCH, SAWYER, HAND)}
     hand = indicator.run(HAND, OURS)
-    precision, chance = (np.median(hand.at(hand.end, f"train/{name}")) for name in ("filter_precision", "false_negative_share"))
+    precision, chance = (hand.median(metric=f"train/{name}") for name in ("filter_precision", "false_negative_share"))
     active = [task for task, share in shares.items() if share >= 0.01]
     comparisons = _rewards(OURS, "balance_only", (REACHER, FETCH))
     return Claim(
@@ -288,7 +288,7 @@ def _finger() -> Claim:
         dataclasses.replace(each, place=f"finger, {what}")
         for each, what in zip(comparisons, ("indicator, balanced and filtered", "autoencoder"), strict=True)
     ]
-    ends = [np.median(indicator.run(FINGER, each).at(500_000)) for each in (OURS, "oracle", "autoencoder")]
+    ends = [indicator.run(FINGER, each).median() for each in (OURS, "oracle", "autoencoder")]
     note = (
         "Success at the end {:.3f}, {:.3f} with the oracle, {:.3f} with the autoencoder; 0.16 to 0.19 by doing nothing".format(
             *ends
