@@ -28,9 +28,9 @@ def ledger_differences() -> Iterator[str]:
 
 def main() -> int:
     """Print all differences; return the exit status."""
-    found = [*ledger_differences(), *pages.differences(), *prose.differences(sentences.sentences())]
-    print("\n".join(found) if found else "all figures are those of the records")
-    return int(bool(found))
+    differences = [*ledger_differences(), *pages.differences(), *prose.differences(sentences.sentences())]
+    print("\n".join(differences) if differences else "all figures are those of the records")
+    return int(bool(differences))
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ _K = 1_000
 
 
 def _at(*thousands: float) -> list[c.Column]:
-    return [c.at(round(each * _K)) for each in thousands]
+    return [c.at(round(count * _K)) for count in thousands]
 
 
 def _rows(labels: Sequence[tuple[str, str]]) -> list[Row]:
@@ -136,7 +136,7 @@ def _cpu() -> str:
         Row("16 environments, one encoder, `--random-shift 1`", None),
         Row("the same with `--balance-probability 0.3 --relabel-probability 0.8`: `cpu`", seeds),
     ]
-    return table(["VisualFetchReach, preset `cpu`"], rows, [c.each(round(each * _K)) for each in (12.8, 19.2, 25.6)])
+    return table(["VisualFetchReach, preset `cpu`"], rows, [c.of_seeds(round(count * _K)) for count in (12.8, 19.2, 25.6)])
 
 
 def _finger() -> str:
@@ -238,7 +238,12 @@ def _fast(task: str, prefix: str, step: float, last: int) -> str:
     """Table of all weightings on a task; their means are up to the shortest run's end."""
     rows = _rows([(label, f"{prefix}_fast_{name}") for label, name in _WEIGHTINGS.items()])
     best, end = ablation(f"{prefix}_fast_ol_aux_5"), min(row.record.end for row in rows if row.record)
-    columns = [*_at(*(step * each for each in range(1, last + 1))), c.mean_success(end), c.p(best, "OL-AUX-5", end), c.names()]
+    columns = [
+        *_at(*(step * count for count in range(1, last + 1))),
+        c.mean_success(end),
+        c.p(best, "OL-AUX-5", end),
+        c.names(),
+    ]
     return table([f"{task}, `fast`, seeds 0 to 4"], rows, columns)
 
 
@@ -269,7 +274,7 @@ def _actor_loss() -> str:
 
 
 def _options() -> str:
-    """What a reader chooses by: a few settings on three tasks."""
+    """Main table of the guide: a few settings on three tasks."""
     hand, fetch, finger = 500 * _K, 20 * _K, 500 * _K
     settings = [
         ("VisualHandReach", "no shifts, 500 environments", ablation("hand_shared"), hand),

@@ -53,10 +53,10 @@ def speed_up(record: Record, reference: Record, level: float) -> str:
     """Number of times the steps of ``record`` that ``reference`` takes to a level, or a bound; empty where ``record`` did not
     reach it.
     """
-    ours, theirs = record.steps_to(level), reference.steps_to(level)
-    if not ours:
+    steps, baseline = record.steps_to(level), reference.steps_to(level)
+    if not steps:
         return ""
-    return f"{'' if theirs else '> '}{(theirs or reference.points[-1][0]) / ours:.1f}"
+    return f"{'' if baseline else '> '}{(baseline or reference.points[-1][0]) / steps:.1f}"
 
 
 def steps_cell(record: Record, level: float) -> str:
@@ -96,7 +96,7 @@ def steps_to(level: float, *references: Record) -> Column:
     """Steps to a level of success, with the speed-up over the reference of the same source in parentheses."""
 
     def cell(record: Record) -> str:
-        same = [each for each in references if _source(each) == _source(record)]
+        same = [reference for reference in references if _source(reference) == _source(record)]
         factor = "" if not same or record in references else speed_up(record, same[0], level)
         return steps_cell(record, level) + (f" ({factor})" if factor else "")
 
@@ -113,7 +113,7 @@ def at(steps: int, digits: int = 2, metric: str = SUCCESS, title: str | None = N
     return Column(title or show_steps(steps), cell)
 
 
-def each(steps: int, digits: int = 2) -> Column:
+def of_seeds(steps: int, digits: int = 2) -> Column:
     """Success of every seed at one evaluation."""
 
     def cell(record: Record) -> str:

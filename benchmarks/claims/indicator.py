@@ -37,7 +37,7 @@ def _rows(task: str, labels: Mapping[str, str]) -> list[Row]:
 
 
 def _ends(task: str, labels: Mapping[str, str], reference: str, label: str, more: Sequence[c.Column] = ()) -> str:
-    """Table of what evaluations say at the end and over training, with a test against one of the rows."""
+    """Table of evaluations at the end and over training, with a test against one of the rows."""
     base = run(task, reference)
     columns = [
         c.final(),
@@ -50,7 +50,7 @@ def _ends(task: str, labels: Mapping[str, str], reference: str, label: str, more
 
 
 def _rewards(task: str, precision: bool) -> str:
-    """Table of what rewards say about themselves, over training and at the end."""
+    """Table of the shares that are logged about rewards, over training and at the end."""
     pairs = [("positive rewards", "train/positive_share"), ("negatives that are false", "train/false_negative_share")]
     if precision:
         pairs = [("negatives dropped", "train/filtered_share"), pairs[1]]
@@ -101,7 +101,7 @@ def _cameras() -> str:
 
 
 def _main() -> str:
-    """What a reader chooses by: success and distance at the end on five tasks."""
+    """Main table of the guide: success and distance at the end on five tasks."""
     rows, oracles = [], {}
     for task in (REACHER, FETCH, SAWYER, HAND, FINGER):
         for variant, label in METHODS.items():

@@ -42,11 +42,11 @@ def _figure_5_4(
 ) -> str:
     records = {variant: run(task, variant, view) for variant in variants}
     last = max(record.end for record in records.values())
-    theirs = {variant: c.authors(task, variant, last) for variant in ("none", "ol_aux_5")}
+    released = {variant: c.authors(task, variant, last) for variant in ("none", "ol_aux_5")}
     rows = [Row(LABELS[variant], record) for variant, record in records.items()]
-    rows += [Row(f"the authors' release: {LABELS[variant]}", record) for variant, record in theirs.items()]
+    rows += [Row(f"the authors' release: {LABELS[variant]}", record) for variant, record in released.items()]
     columns = [
-        *(c.steps_to(level, records["none"], theirs["none"]) for level in levels),
+        *(c.steps_to(level, records["none"], released["none"]) for level in levels),
         c.mean_success(budget),
         c.p(records["none"], "without", budget),
         *([c.p(records["ol_aux_5"], "OL-AUX-5", budget)] if len(variants) > 2 else []),
@@ -111,7 +111,7 @@ def _departures() -> str:
         c.distance_to_authors(FETCH, "none"),
         c.mean_success(budget),
         c.p(base, "`paper`", budget),
-        *(c.mean_at(round(each * 1000)) for each in (60, 80, 100, 120, 160, 200)),
+        *(c.mean_at(count * 1000) for count in (60, 80, 100, 120, 160, 200)),
         c.names(),
     ]
     return table(["VisualFetchReach, seeds 0 to 9"], rows, columns)
@@ -140,7 +140,7 @@ def _gaps() -> str:
 
 
 def _fresh(task: str) -> str:
-    """Everything that was run with seeds from 100 on, whatever it is."""
+    """All variants that were run with seeds from 100 on."""
     budget = BUDGETS[task]
     records = {variant: claim(task, variant) for variant in fresh_variants(task)}
     records = {variant: record for variant, record in records.items() if record.seeds[0] >= FIRST_FRESH_SEED}
@@ -154,7 +154,7 @@ def _fresh(task: str) -> str:
 
 
 def _main() -> str:
-    """What a reader chooses by: four ways on three tasks, with the freshest seeds."""
+    """Main table of the guide: four choices on three tasks, with the freshest seeds."""
     rows, base = [], {}
     for task in (FETCH, HAND, FINGER):
         for variant in ("none", "balance", "inverse_dynamics", "ol_aux_5"):

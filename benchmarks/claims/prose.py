@@ -38,8 +38,8 @@ class Sentence:
     Attributes:
         page: Page below the root.
         quote: Words with the computed numbers.
-        record: Where the numbers come from.
-        holds: Whether the records say what the words say.
+        record: Source of the numbers.
+        holds: True if the records say the same as the words.
     """
 
     page: str
@@ -56,16 +56,16 @@ def plain(text: str) -> str:
 
 def differences(sentences: Sequence[Sentence]) -> Iterator[str]:
     """List sentences that their pages or records do not have, and decimal fractions that are in no registered sentence."""
-    pages = {*OTHERS, *(each.page for each in sentences)}
+    pages = {*OTHERS, *(sentence.page for sentence in sentences)}
     texts = {page: plain((CHECKOUT / page).read_text(encoding="utf-8")) for page in sorted(pages)}
-    for each in sentences:
-        if each.quote not in texts[each.page]:
-            yield f"{each.page} does not say, as {each.record} does: {each.quote}"
-        if not each.holds:
-            yield f"{each.page}: {each.record} does not say: {each.quote}"
+    for sentence in sentences:
+        if sentence.quote not in texts[sentence.page]:
+            yield f"{sentence.page} does not say, as {sentence.record} does: {sentence.quote}"
+        if not sentence.holds:
+            yield f"{sentence.page}: {sentence.record} does not say: {sentence.quote}"
     for page in OTHERS:
         text = texts[page]
-        quotes = [*(each.quote for each in sentences if each.page == page), *OTHERS[page], *_TESTS]
+        quotes = [*(sentence.quote for sentence in sentences if sentence.page == page), *OTHERS[page], *_TESTS]
         for quote in sorted(quotes, key=len, reverse=True):
             text = text.replace(quote, " ")
         for match in re.finditer(r"(?<![\w.])[01]?\.\d+\b", re.sub(r"`[^`]*`", "", text)):

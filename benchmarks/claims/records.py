@@ -78,8 +78,8 @@ class Record:
         """
         if (budget or 0) > self.end:
             raise ValueError(f"{self.name} ends at {self.end} steps, before {budget}")
-        kept = [row for row in self.rows if row.get(metric) is not None and row["env_steps"] <= (budget or self.end)]
-        return np.array([np.mean([row[metric] for row in kept if row["seed"] == seed]) for seed in self.seeds])
+        rows = [row for row in self.rows if row.get(metric) is not None and row["env_steps"] <= (budget or self.end)]
+        return np.array([np.mean([row[metric] for row in rows if row["seed"] == seed]) for seed in self.seeds])
 
 
 def _joined(name: str, parts: Iterable[Record]) -> Record:
@@ -121,7 +121,7 @@ def study(family: str, stem: str, fresh: bool = False, budget: int = 0) -> Recor
     Args:
         family: Folder below benchmarks/results/studies.
         stem: Beginning of the folders' names, before the seeds: ``VisualFetchReach-none-paper``.
-        fresh: Whether runs with seeds from 100 on are taken in the place of seeds 0 to 4, where there are any.
+        fresh: True for runs with seeds from 100 on in the place of seeds 0 to 4, where there are any.
         budget: Environment steps that fresh runs must have come to.
 
     Raises:
@@ -131,9 +131,9 @@ def study(family: str, stem: str, fresh: bool = False, budget: int = 0) -> Recor
     if fresh:
         # The study of target networks ran the release's decay with fresh seeds, which is the same configuration.
         candidates = {**_folders("target_decay", f"{stem}-decay0.98"), **folders}
-        long_enough = {first: each for first, each in candidates.items() if _read_run(each).end >= budget}
-        folders = {first: each for first, each in long_enough.items() if first >= FIRST_FRESH_SEED} or folders
-    folders = {first: each for first, each in folders.items() if fresh or first < FIRST_FRESH_SEED}
+        long_enough = {first: folder for first, folder in candidates.items() if _read_run(folder).end >= budget}
+        folders = {first: folder for first, folder in long_enough.items() if first >= FIRST_FRESH_SEED} or folders
+    folders = {first: folder for first, folder in folders.items() if fresh or first < FIRST_FRESH_SEED}
     if not folders:
         raise LookupError(f"no run {stem} with seeds is kept in {RESULTS / 'studies' / family}")
     return _joined(f"studies/{family}/{stem}", (_read_run(folder) for _, folder in sorted(folders.items())))
@@ -149,12 +149,12 @@ def fresh_variants(task: str) -> list[str]:
 
 def _folders(family: str, stem: str) -> dict[int, Path]:
     """First seed -> the longest run of that seed."""
-    found: dict[int, tuple[int, Path]] = {}
+    longest: dict[int, tuple[int, Path]] = {}
     for folder in (RESULTS / "studies" / family).glob(f"{stem}-seeds*"):
         match = re.fullmatch(rf"{re.escape(stem)}-seeds(\d+)to\d+(?:-.*)?", folder.name)
         if match:
-            found[int(match[1])] = max(found.get(int(match[1]), (0, folder)), (_read_run(folder).end, folder))
-    return {first: folder for first, (_, folder) in found.items()}
+            longest[int(match[1])] = max(longest.get(int(match[1]), (0, folder)), (_read_run(folder).end, folder))
+    return {first: folder for first, (_, folder) in longest.items()}
 
 
 @functools.cache

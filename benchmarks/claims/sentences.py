@@ -34,7 +34,7 @@ def _distance(record: Record, task: str) -> str:
 def _weightings() -> Iterator[Sentence]:
     run = ol_aux.run
     none, ours, balance = (
-        {task: run(task, each) for task in (FETCH, HAND, FINGER)} for each in ("none", "ol_aux_5", "balance")
+        {task: run(task, name) for task in (FETCH, HAND, FINGER)} for name in ("none", "ol_aux_5", "balance")
     )
     verdicts = [c.verdict(ours[task], none[task], budget) for task, budget in ol_aux.BUDGETS.items()]
     quote = "**OL-AUX-5 is better than no auxiliary losses on all three tasks**"
@@ -73,7 +73,7 @@ def _weightings() -> Iterator[Sentence]:
     yield Sentence(
         LAB, f"the distance falls from {_distance(none[FINGER], FINGER)} to {_distance(faster, FINGER)}", faster.name
     )
-    ten, cross, several = (ablation(f"fetch_paper_10seeds_{each}") for each in ("none", "cross", "all"))
+    ten, cross, several = (ablation(f"fetch_paper_10seeds_{name}") for name in ("none", "cross", "all"))
     yield Sentence(
         LAB, f"{_distance(none[FETCH], FETCH)} with seeds 0 to 4, and {_distance(ten, FETCH)} with seeds 0 to 9", ten.name
     )
@@ -88,41 +88,41 @@ def _weightings() -> Iterator[Sentence]:
 
 def _single_tasks() -> Iterator[Sentence]:
     run = ol_aux.run
-    ours, alone = ({task: run(task, each) for task in (FETCH, HAND, FINGER)} for each in ("ol_aux_5", "inverse_dynamics"))
+    ours, alone = ({task: run(task, name) for task in (FETCH, HAND, FINGER)} for name in ("ol_aux_5", "inverse_dynamics"))
     p = {task: _p(ours[task], alone[task], ol_aux.BUDGETS[task]) for task in ours}
     yield Sentence(LAB, f"on FetchReach ({p[FETCH]}) and on the hand ({p[HAND]})**", alone[HAND].name)
     yield Sentence(LAB, f"level with it on the finger ({p[FINGER]})", alone[FINGER].name)
-    ends = [each[HAND].median(1_000_000) for each in (ours, alone)]
+    ends = [runs[HAND].median(1_000_000) for runs in (ours, alone)]
     below = all(a < b for (_, a), (_, b) in zip(ours[HAND].points[:25], alone[HAND].points, strict=True))
     quote = "is below that of inverse dynamics at every evaluation to 1 M steps, where they have {:.3f} and {:.3f}".format(
         *ends
     )
     yield Sentence(LAB, quote, ours[HAND].name, below)
-    others = {each: c.verdict(ours[FETCH], run(FETCH, each), 240_000) for each in AUX_TASKS}
+    others = {name: c.verdict(ours[FETCH], run(FETCH, name), 240_000) for name in AUX_TASKS}
     quote = "On FetchReach OL-AUX-5 is level with forward dynamics, autoencoder and optical flow, and better than egomotion"
-    level = [others[each] for each in ("forward_dynamics", "autoencoder", "optical_flow")]
+    level = [others[name] for name in ("forward_dynamics", "autoencoder", "optical_flow")]
     yield Sentence(LAB, quote, ours[FETCH].name, level == ["level"] * 3 and others["egomotion"] == "better")
     forward = run(HAND, "forward_dynamics")
     quote = "on the hand two of five seeds learn next to nothing with it"
     yield Sentence(LAB, quote, forward.name, int((forward.at(1_000_000) < 0.05).sum()) == 2)
     ps = [
-        c.p_value(run(task, each), run(task, "ol_aux_5"), budget)
+        c.p_value(run(task, name), run(task, "ol_aux_5"), budget)
         for task, budget in ((FETCH, 240_000), (HAND, 600_000))
-        for each in ("ol_aux_1", "ol_aux_5_ablation")
+        for name in ("ol_aux_1", "ol_aux_5_ablation")
     ]
     yield Sentence(LAB, f"(p from {min(ps):.3f} to {max(ps):.3f})", run(HAND, "ol_aux_1").name)
 
 
 def _indicator() -> Iterator[Sentence]:
     run = indicator.run
-    ours, oracle = ({task: run(task, each) for task in (REACHER, FETCH, SAWYER, HAND, FINGER)} for each in (OURS, "oracle"))
-    ends = {each: each.median() for each in (*ours.values(), *oracle.values())}
+    ours, oracle = ({task: run(task, name) for task in (REACHER, FETCH, SAWYER, HAND, FINGER)} for name in (OURS, "oracle"))
+    ends = {record: record.median() for record in (*ours.values(), *oracle.values())}
     quote = (
         f"more slowly than the oracle ({_p(ours[FETCH], oracle[FETCH])}), ends about as successful "
         f"({ends[ours[FETCH]]:.3f} against {ends[oracle[FETCH]]:.3f})"
     )
     yield Sentence(RULES, quote, ours[FETCH].name)
-    nxt, relabelled = ({task: run(task, each) for task in (REACHER, FETCH)} for each in ("all_next", "all_relabelled"))
+    nxt, relabelled = ({task: run(task, name) for task in (REACHER, FETCH)} for name in ("all_next", "all_relabelled"))
     ps = {_p(nxt[task], ours[task]) for task in nxt}
     yield Sentence(RULES, f"worse on both ({' and '.join(sorted(ps))})", nxt[FETCH].name)
     yield Sentence(
@@ -139,8 +139,8 @@ def _indicator() -> Iterator[Sentence]:
     )
     yield Sentence(RULES, f"level over training ({_p(ours[SAWYER], run(SAWYER, 'indicator'))})", ours[SAWYER].name)
     hand = ours[HAND]
-    precision, chance = (hand.median(metric=f"train/{each}") for each in ("filter_precision", "false_negative_share"))
-    dropped, false = (np.median(hand.means(metric=f"train/{each}")) for each in ("filtered_share", "filtered_false_share"))
+    precision, chance = (hand.median(metric=f"train/{name}") for name in ("filter_precision", "false_negative_share"))
+    dropped, false = (np.median(hand.means(metric=f"train/{name}")) for name in ("filtered_share", "filtered_false_share"))
     yield Sentence(
         RULES,
         f"at the end {precision:.3f} of what it drops is false, twice the share among all negatives, {chance:.3f}. Over "
@@ -151,7 +151,7 @@ def _indicator() -> Iterator[Sentence]:
     yield Sentence(RULES, "four of five relabelled rewards are positive", oracle[FINGER].name, 0.78 < positive < 0.85)
     fast = learning("finger_turn_oracle")
     yield Sentence(RULES, f"the oracle is at {fast.median(500_000):.2f} by then", fast.name)
-    p = {each: _p(run(FETCH, each), oracle[FETCH]) for each in ("false_positives", "clutter", "state_noise")}
+    p = {name: _p(run(FETCH, name), oracle[FETCH]) for name in ("false_positives", "clutter", "state_noise")}
     yield Sentence(
         RULES,
         f"anywhere ({p['false_positives']}) or in a quarter of the workspace only ({p['clutter']})",
@@ -171,7 +171,7 @@ def _options() -> Iterator[Sentence]:
 
 def _parts_of_the_method() -> Iterator[Sentence]:
     run = indicator.run
-    others = [run(REACHER, each) for each in ("autoencoder", "indicator", OURS)]
+    others = [run(REACHER, name) for name in ("autoencoder", "indicator", OURS)]
     quote = "On Reacher the four are level"
     yield Sentence(RULES, quote, others[2].name, _all("level", others, run(REACHER, "oracle")))
     quote = "with and without it the method is level on both"
@@ -187,11 +187,11 @@ def _parts_of_the_method() -> Iterator[Sentence]:
     yield Sentence(RULES, f"the distance at the end is {ratio:.0f} times that of the whole method", run(REACHER, OURS).name)
     ratio = run(fetch, "oracle").median(metric=DISTANCE) / run(fetch, OURS).median(metric=DISTANCE)
     yield Sentence(RULES, f"{ratio:.0f} times as precisely as by the oracle", run(fetch, OURS).name)
-    states = [run("Reacher", each) for each in ("indicator", OURS)]
+    states = [run("Reacher", name) for name in ("indicator", OURS)]
     quote = "On Reacher indicator methods are level with the oracle over training"
     yield Sentence(RULES, quote, states[1].name, _all("level", states, run("Reacher", "oracle")))
     ablated = ("all_next", "all_relabelled")
-    worse = all(_all("worse", [run(task, each) for each in ablated], run(task, "oracle")) for task in ("Reacher", fetch))
+    worse = all(_all("worse", [run(task, name) for name in ablated], run(task, "oracle")) for task in ("Reacher", fetch))
     yield Sentence(RULES, "Both ablations are worse than the oracle on either task", run(fetch, OURS).name, worse)
     level = [
         c.verdict(run(FETCH, f"{who}_{how}"), run(FETCH, plain))
@@ -205,7 +205,7 @@ def _parts_of_the_method() -> Iterator[Sentence]:
 
 
 def _choices() -> Iterator[Sentence]:
-    """What the guides advise, which rests on the freshest seeds."""
+    """Advice of the guides, which rests on the freshest seeds."""
     claim, tasks = ol_aux.claim, ol_aux.BUDGETS
     against = {
         other: [c.verdict(claim(task, "balance"), claim(task, other), tasks[task]) for task in tasks]
@@ -215,7 +215,7 @@ def _choices() -> Iterator[Sentence]:
     holds = against["none"] == ["better"] * 3 and against["ol_aux_5"] == ["level"] * 3
     yield Sentence(GUIDE, quote, claim(HAND, "balance").name, holds)
     quote = "over 2 M steps it is better than balancing on the hand"
-    long = [claim(HAND, each, 2_000_000) for each in ("ol_aux_5", "balance")]
+    long = [claim(HAND, name, 2_000_000) for name in ("ol_aux_5", "balance")]
     yield Sentence(GUIDE, quote, long[0].name, c.verdict(*long, 2_000_000) == "better")
     alone = [c.verdict(claim(task, "inverse_dynamics"), claim(task, "ol_aux_5"), tasks[task]) for task in (FETCH, HAND, FINGER)]
     quote = "is better than OL-AUX-5 with all five on FetchReach and the hand, level on the finger"
@@ -233,24 +233,24 @@ def _choices() -> Iterator[Sentence]:
 
 def _fast() -> Iterator[Sentence]:
     base = learning("fetch_reach_oracle")
-    names = {each: ablation(f"fetch_fast_now_{each}") for each in ("ol_aux_5", "sum", "fixed_01", "fixed_1", "fixed_10")}
-    verdicts = {each: c.verdict(record, base, 25_000) for each, record in names.items()}
+    names = {name: ablation(f"fetch_fast_now_{name}") for name in ("ol_aux_5", "sum", "fixed_01", "fixed_1", "fixed_10")}
+    verdicts = {name: c.verdict(record, base, 25_000) for name, record in names.items()}
     quote = "all but fixed weights of 10, which are worse, are level with no auxiliary losses"
     yield Sentence(FAST, quote, base.name, [*verdicts.values()] == ["level"] * 4 + ["worse"])
     rest = ("none", "sum", "fixed_01", "fixed_1", "fixed_10")
     hand = ablation("hand_fast_ol_aux_5")
     quote = "OL-AUX-5 is better than every fixed weight that was tried, than the plain sum and than none"
-    holds = all(c.verdict(hand, ablation(f"hand_fast_{each}"), 300_000) == "better" for each in rest)
+    holds = all(c.verdict(hand, ablation(f"hand_fast_{name}"), 300_000) == "better" for name in rest)
     yield Sentence(FAST, quote, hand.name, holds)
     finger = ablation("finger_fast_ol_aux_5")
-    found = {each: c.verdict(finger, ablation(f"finger_fast_{each}"), 125_000) for each in rest}
+    verdicts = {name: c.verdict(finger, ablation(f"finger_fast_{name}"), 125_000) for name in rest}
     quote = "OL-AUX-5 is level with fixed weights of 10 and with the plain sum, and better than the others"
-    level = {each for each, verdict in found.items() if verdict == "level"}
-    yield Sentence(FAST, quote, finger.name, level == {"sum", "fixed_10"} and "worse" not in found.values())
+    level = {name for name, verdict in verdicts.items() if verdict == "level"}
+    yield Sentence(FAST, quote, finger.name, level == {"sum", "fixed_10"} and "worse" not in verdicts.values())
 
 
 def _devices() -> Iterator[Sentence]:
-    four, one = (ablation(f"fetch_28_environments_on_{each}") for each in ("four_gpus", "one_gpu"))
+    four, one = (ablation(f"fetch_28_environments_on_{name}") for name in ("four_gpus", "one_gpu"))
     quote = "is at 0.97 by {} steps, and by {} on one".format(*(c.steps_cell(record, 0.97) for record in (four, one)))
     yield Sentence("docs/scaling.md", quote, four.name, c.verdict(four, one) == "level")
 

@@ -1,4 +1,4 @@
-"""Claims of the thesis beside what the records say: docs/claims.md, and in short README.md and docs/index.md.
+"""Claims of the thesis beside the findings of the records: docs/claims.md, and in short README.md and docs/index.md.
 
 Verdicts are computed: ``better`` and ``worse`` where the exact permutation test says so, else ``level``.
 """
@@ -61,18 +61,18 @@ class Claim:
     """A row of the table.
 
     Attributes:
-        claim: What the thesis says.
+        claim: Statement of the thesis.
         answer: One of `HOLDS`, `PARTLY` and `FAILS`.
-        found: What the records say.
+        finding: Verdicts and figures of the records.
         interval: Intervals and p-values.
         source: Link to figure and table.
-        records: Runs that it rests on.
-        main: Whether the short form has it.
+        records: Runs of the comparisons.
+        main: True if the short form has it.
     """
 
     claim: str
     answer: str
-    found: str
+    finding: str
     interval: str
     source: str
     records: Sequence[Record]
@@ -96,23 +96,25 @@ def _rewards(first: str, second: str, tasks: Sequence[str]) -> list[Comparison]:
 
 
 def _answer(comparisons: Sequence[Comparison], wanted: Sequence[str] = ("better",)) -> str:
-    right = [each.verdict in wanted for each in comparisons]
+    right = [comparison.verdict in wanted for comparison in comparisons]
     return HOLDS if all(right) else PARTLY if any(right) else FAILS
 
 
-def _found(comparisons: Sequence[Comparison]) -> str:
+def _findings(comparisons: Sequence[Comparison]) -> str:
     verdicts: dict[str, list[str]] = {}
-    for each in comparisons:
-        verdicts.setdefault(each.verdict, []).append(each.place)
+    for comparison in comparisons:
+        verdicts.setdefault(comparison.verdict, []).append(comparison.place)
     return "; ".join(f"{verdict}: {', '.join(places)}" for verdict, places in verdicts.items())
 
 
 def _compared(
     claim: str, comparisons: Sequence[Comparison], source: str, wanted: Sequence[str] = ("better",), note: str = ""
 ) -> Claim:
-    records = [record for each in comparisons for record in (each.first, each.second)]
-    found = _found(comparisons) + (f". {note}" if note else "")
-    return Claim(claim, _answer(comparisons, wanted), found, "; ".join(each.text for each in comparisons), source, records)
+    records = [record for comparison in comparisons for record in (comparison.first, comparison.second)]
+    finding = _findings(comparisons) + (f". {note}" if note else "")
+    return Claim(
+        claim, _answer(comparisons, wanted), finding, "; ".join(comparison.text for comparison in comparisons), source, records
+    )
 
 
 def _better_than_none() -> Claim:
@@ -143,7 +145,7 @@ def _speed_ups() -> Claim:
     factors = {task: (speed_up(task, level, 0.98), speed_up(task, level, 0.95)) for task, level in LEVELS.items()}
     records = [decayed(task, variant, decay) for task in LEVELS for variant in ("none", "ol_aux_5") for decay in (0.98, 0.95)]
     words = {FETCH: "Fetch", HAND: "hand as the authors saw it", FINGER: "finger"}
-    found = "; ".join(f"{words[task]} to {LEVELS[task]:g}: {slow} and {fast} times" for task, (slow, fast) in factors.items())
+    finding = "; ".join(f"{words[task]} to {LEVELS[task]:g}: {slow} and {fast} times" for task, (slow, fast) in factors.items())
     comparisons = []
     for task, label in words.items():
         budget = ol_aux.BUDGETS[task]
@@ -152,8 +154,8 @@ def _speed_ups() -> Claim:
     return Claim(
         "OL-AUX-5 needs 2 times fewer steps on Fetch, about 3 times fewer on hand and finger",
         _answer(comparisons),
-        f"{found}, with target networks that keep 0.98 (the release's script) and 0.95 (OpenAI Baselines' default)",
-        "; ".join(each.text for each in comparisons),
+        f"{finding}, with target networks that keep 0.98 (the release's script) and 0.95 (OpenAI Baselines' default)",
+        "; ".join(comparison.text for comparison in comparisons),
         "[Speed of the target networks](lab/target_decay.md)",
         records,
     )
@@ -211,11 +213,11 @@ def _ablation() -> Claim:
 
 def _order() -> Claim:
     values = {task: ol_aux.rank_correlation(task) for task in (HAND, FINGER, FETCH)}
-    found = ", ".join(f"{SHORT[task]} {value:+.1f}" for task, value in values.items())
+    finding = ", ".join(f"{SHORT[task]} {value:+.1f}" for task, value in values.items())
     return Claim(
         "Learned weights often align with what tasks gain alone",
         PARTLY,
-        f"Rank correlation of mean weight and gain alone: {found}",
+        f"Rank correlation of mean weight and gain alone: {finding}",
         "of five tasks; only +1.0 differs from 0 (p < .05)",
         f"[5.6]({_LAB}#figure-56)",
         [ol_aux.run(task, "ol_aux_5") for task in values],
@@ -259,7 +261,7 @@ def _filter() -> Claim:
         PARTLY if active else FAILS,
         f"Inactive but on the hand; share of negatives dropped: {', '.join(f'{SHORT[t]} {v:.3f}' for t, v in shares.items())}. "
         f"On the hand {precision:.2f} of these are false at the end, {chance:.2f} of all negatives",
-        "without the filter, " + "; ".join(each.text for each in comparisons),
+        "without the filter, " + "; ".join(comparison.text for comparison in comparisons),
         f"[the hand]({_INDICATOR}#the-hand)",
         [indicator.run(task, OURS) for task in shares],
     )
@@ -268,8 +270,8 @@ def _filter() -> Claim:
 def _false_positives() -> Claim:
     comparisons = _rewards("false_positives", "oracle", (FETCH,)) + _rewards("clutter", "oracle", (FETCH,))
     named = [
-        dataclasses.replace(each, place=f"Fetch, {where}")
-        for each, where in zip(comparisons, ("anywhere", "in a cluttered quarter"), strict=True)
+        dataclasses.replace(comparison, place=f"Fetch, {place}")
+        for comparison, place in zip(comparisons, ("anywhere", "in a cluttered quarter"), strict=True)
     ]
     claim = "False positives of a state estimator harm (here one in ten negatives is paid as a positive)"
     return _compared(claim, named, f"[estimators]({_INDICATOR}#state-estimators-that-err)", ("worse",))
@@ -285,21 +287,21 @@ def _ablated(variant: str, claim: str) -> Claim:
 def _finger() -> Claim:
     comparisons = _rewards(OURS, "oracle", (FINGER,)) + _rewards("autoencoder", "oracle", (FINGER,))
     named = [
-        dataclasses.replace(each, place=f"finger, {what}")
-        for each, what in zip(comparisons, ("indicator, balanced and filtered", "autoencoder"), strict=True)
+        dataclasses.replace(comparison, place=f"finger, {method}")
+        for comparison, method in zip(comparisons, ("indicator, balanced and filtered", "autoencoder"), strict=True)
     ]
-    ends = [indicator.run(FINGER, each).median() for each in (OURS, "oracle", "autoencoder")]
+    ends = [indicator.run(FINGER, variant).median() for variant in (OURS, "oracle", "autoencoder")]
     note = (
         "Success at the end {:.3f}, {:.3f} with the oracle, {:.3f} with the autoencoder; 0.16 to 0.19 by doing nothing".format(
             *ends
         )
     )
-    records = [record for each in named for record in (each.first, each.second)]
+    records = [record for comparison in named for record in (comparison.first, comparison.second)]
     return Claim(
         "Indicator rewards work from images alone (the thesis did not try the finger)",
         _answer(named[:1], ("better", "level")),
-        f"{_found(named)}. {note}",
-        "; ".join(each.text for each in named),
+        f"{_findings(named)}. {note}",
+        "; ".join(comparison.text for comparison in named),
         f"[the finger]({_INDICATOR}#the-finger)",
         records,
     )
@@ -344,16 +346,15 @@ def _seeds(claim: Claim) -> str:
 def _table() -> str:
     lines = ["| claim of the thesis | | what we find | interval | seeds | figure |", "|---|---|---|---|---|---|"]
     lines += [
-        f"| {each.claim} | {each.answer} | {each.found} | {each.interval} | {_seeds(each)} | {each.source} |"
-        for each in claims()
+        f"| {row.claim} | {row.answer} | {row.finding} | {row.interval} | {_seeds(row)} | {row.source} |" for row in claims()
     ]
-    made = made_by([record for each in claims() for record in each.records])
+    made = made_by([record for row in claims() for record in row.records])
     return "\n".join([*lines, "", made])
 
 
 def _short(prefix: str) -> str:
     lines = ["| claim of the thesis | here | what we find |", "|---|---|---|"]
-    lines += [f"| {each.claim} | {each.answer} | {each.found} |" for each in claims() if each.main]
+    lines += [f"| {row.claim} | {row.answer} | {row.finding} |" for row in claims() if row.main]
     return "\n".join([*lines, "", f"Intervals, p-values, seeds and figures: [Claims of the thesis]({prefix}claims.md)."])
 
 
