@@ -2,6 +2,7 @@
 
     peers/        other renderers, physics and learners, measured beside ours
     ledger/       stored records: tables of README and docs (`make tables`), records older than their code (`make stale`)
+    claims/       tables of the learning studies and claims of the thesis; check_claims.py compares sentences, too
     parity.py     tasks against recordings of the originals, which record_originals.py makes
     rendering/    the renderer against MuJoCo's own, with render_parity.py
     tasks/        solvability, difficulty, goal images and physics of the tasks

@@ -76,7 +76,7 @@ def read_groups(studies: Path) -> dict[tuple[str, str, float], Group]:
         folders[task, variant, float(decay)].append(folder)
     for task, variant in itertools.product(TASKS, VARIANTS):
         env, _, view = task.partition("-")
-        name = f"{env}-{variant}-paper-{view and view + '-*-'}seeds*"
+        name = f"{env}-{variant}-paper-{view and view + '-*-'}seeds[0-9]to*"
         folders.setdefault((task, variant, RELEASED_DECAY), sorted((studies / "ol_aux").glob(name)))
     return {key: _read_group(key[2], parts) for key, parts in folders.items()}
 

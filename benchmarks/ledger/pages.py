@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from benchmarks import target_decay
+from benchmarks.claims import pages as claims
 from benchmarks.ledger import ablations, readme_tables, render_table, scaling_table
 from benchmarks.ledger.markers import fill
 from benchmarks.ledger.records import CHECKOUT, RESULTS
@@ -38,16 +39,24 @@ PAGES: dict[str, dict[str, Writer]] = {
     "docs/lab/ablations.md": {"curves": ablations.index_table},
     "docs/lab/target_decay.md": {"tables": target_decay.tables},
 }
-"""Writers of a page's tables by the name in their markers."""
+"""Writers of a page's tables by the name in their markers; those of the learning studies: `benchmarks.claims.pages`."""
 
 
-def filled(text: str, writers: dict[str, Writer], results: Path = RESULTS) -> str:
+def writers(results: Path) -> dict[str, dict[str, Writer]]:
+    """Return the writers of `PAGES`, and those of the learning studies where ``results`` is this checkout's."""
+    merged = {page: dict(of_page) for page, of_page in PAGES.items()}
+    for page, texts in claims.tables().items() if results.resolve() == RESULTS else ():
+        merged.setdefault(page, {}).update({name: lambda _, text=text: text for name, text in texts.items()})
+    return merged
+
+
+def filled(text: str, of_page: dict[str, Writer], results: Path = RESULTS) -> str:
     """Return the text of a page with its tables written from the records.
 
     Raises:
         RequestError: A marker is missing, evidence contradicts its row, or records cannot be read.
     """
-    for name, write in writers.items():
+    for name, write in of_page.items():
         table = write(results)
         if table is not None:
             text = fill(text, name, table)
@@ -60,12 +69,12 @@ def write_pages(results: Path = RESULTS, checkout: Path = CHECKOUT) -> Iterator[
     Raises:
         RequestError: See `filled`; or a page is missing.
     """
-    for name, writers in PAGES.items():
+    for name, of_page in writers(results).items():
         page = checkout / name
         if not page.exists():
             raise RequestError(f"there is no {page}: tables are written in a checkout")
         before = page.read_text(encoding="utf-8")
-        after = filled(before, writers, results)
+        after = filled(before, of_page, results)
         if after != before:
             write_atomically(page, after)
         yield page, after != before
@@ -77,13 +86,13 @@ def outdated(results: Path = RESULTS, checkout: Path = CHECKOUT) -> Iterator[str
     Raises:
         RequestError: There is no folder of records, or a file in it cannot be read.
     """
-    for name, writers in PAGES.items():
+    for name, of_page in writers(results).items():
         page = checkout / name
         if not page.exists():
             continue
         text = page.read_text(encoding="utf-8")
         try:
-            if filled(text, writers, results) != text:
+            if filled(text, of_page, results) != text:
                 yield f"{name}: its tables differ from the records: make tables"
         except RequestError as error:
             yield f"{name}: {error}"

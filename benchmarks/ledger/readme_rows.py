@@ -139,7 +139,7 @@ SPEED = (
     ),
     Speed(
         "`python -m benchmarks.peers.torch`: the same gradient steps in PyTorch, compiled with max-autotune "
-        "([more](docs/learner.md))",
+        "([more](docs/lab/gradient_step.md))",
         {
             "H100": (
                 _peer_update("paper", "{ours_over_peer} times PyTorch's {value} updates/s (`paper`)"),

@@ -1,0 +1,37 @@
+"""Computes every published figure that comes from records of learning again, and lists those that differ.
+
+python benchmarks/check_claims.py    # exit 1 if anything differs
+
+Covered are the README's table of results, docs/lab/target_decay.md and docs/lab/ablations.md, all tables of
+`benchmarks.claims.pages`, and the numbers in sentences of README.md, docs/index.md and the pages of the studies
+(`benchmarks.claims.sentences`).
+"""
+
+import sys
+from collections.abc import Iterator
+
+from benchmarks.claims import pages, prose, sentences
+from benchmarks.ledger import pages as ledger
+from benchmarks.ledger.records import CHECKOUT
+
+OF_LEARNING = {"README.md": "results table", "docs/lab/target_decay.md": "tables", "docs/lab/ablations.md": "curves"}
+"""Tables of the ledger that come from records of learning."""
+
+
+def ledger_differences() -> Iterator[str]:
+    """List tables of the ledger that differ from the records."""
+    for page, name in OF_LEARNING.items():
+        text = (CHECKOUT / page).read_text(encoding="utf-8")
+        if ledger.filled(text, {name: ledger.PAGES[page][name]}) != text:
+            yield f"{page}: the table {name!r} differs from the records: make tables"
+
+
+def main() -> int:
+    """Print all differences; return the exit status."""
+    differences = [*ledger_differences(), *pages.differences(), *prose.differences(sentences.sentences())]
+    print("\n".join(differences) if differences else "all figures are those of the records")
+    return int(bool(differences))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

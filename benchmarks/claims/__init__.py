@@ -1,0 +1,15 @@
+"""Tables and claims of the documentation, computed from the kept records of learning.
+
+    records      kept runs, by the names that tables use
+    columns      statistics of a record as cells of a table
+    ol_aux       tables of the study of auxiliary losses (figures 5.4 to 5.7)
+    indicator    tables of the study of rewards without ground truth (figures 5.1, 5.2, estimators, cameras)
+    ablations    tables of single runs with one option changed
+    thesis       claims of the thesis beside the records, for docs/claims.md and in short for README and index
+    prose        sentences that quote numbers, compared with their pages
+    sentences    these sentences, computed
+    pages        all tables, by page and marker
+    markdown     rows of records as a table in Markdown
+
+`make tables` writes the tables (`benchmarks.ledger.pages`), `python benchmarks/check_claims.py` checks them and the sentences.
+"""

@@ -1,0 +1,260 @@
+"""Statistics of a record over its seeds as cells of a table; a cell is empty where the run has no such evaluation."""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from benchmarks.claims.records import DISTANCE, SUCCESS, Record
+from jaxrl_vis.report.plots import show_steps
+from jaxrl_vis.studies.authors import mean_difference, released_curves
+from jaxrl_vis.studies.seed_statistics import bootstrap_interval, interquartile_mean, permutation_p_value
+
+SIGNIFICANT = 0.05
+AUTHORS = "authors"
+_TRUTH, _FILTERED = "train/filtered_false_share", "train/filtered_share"
+_ACTIVE = 0.01  # share of dropped negatives below which a filter counts as inactive, and has no precision
+
+
+class Column(NamedTuple):
+    """A column of a table: its title, and the cell of a record."""
+
+    title: str
+    cell: Callable[[Record], str]
+
+
+def band(values: np.ndarray, digits: int = 3) -> str:
+    """Median and quartiles, ``0.665 (0.635 to 0.685)``; the median alone where all three are printed alike."""
+    low, median, high = (f"{value:.{digits}f}" for value in np.percentile(values, [25, 50, 75]))
+    return median if low == median == high else f"{median} ({low} to {high})"
+
+
+def interval(values: np.ndarray, digits: int = 3) -> str:
+    """Interquartile mean and its 95 % bootstrap interval."""
+    low, high = bootstrap_interval([values])
+    return f"{interquartile_mean([values]):.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
+
+
+@functools.cache
+def p_value(first: Record, second: Record, budget: int | None = None) -> float:
+    """Exact two-sided permutation test of two records' mean success up to a budget."""
+    return permutation_p_value(first.means(budget), second.means(budget))
+
+
+def verdict(record: Record, reference: Record, budget: int | None = None) -> str:
+    """``better``, ``worse`` or ``level``: the first two only where the permutation test says so."""
+    if p_value(record, reference, budget) > SIGNIFICANT:
+        return "level"
+    return "better" if record.means(budget).mean() > reference.means(budget).mean() else "worse"
+
+
+def speed_up(record: Record, reference: Record, level: float) -> str:
+    """Number of times the steps of ``record`` that ``reference`` takes to a level, or a bound; empty where ``record`` did not
+    reach it.
+    """
+    steps, baseline = record.steps_to(level), reference.steps_to(level)
+    if not steps:
+        return ""
+    return f"{'' if baseline else '> '}{(baseline or reference.points[-1][0]) / steps:.1f}"
+
+
+def steps_cell(record: Record, level: float) -> str:
+    """Environment steps to a level, or the budget within which it was not reached."""
+    steps = record.steps_to(level)
+    return f"> {show_steps(record.points[-1][0])}" if steps is None else show_steps(steps)
+
+
+def _source(record: Record) -> str:
+    return AUTHORS if record.name.startswith(AUTHORS) else "here"
+
+
+@functools.cache
+def authors(task: str, variant: str, budget: int) -> Record:
+    """The authors' released curve up to a budget, as a record of one seed."""
+    points = [point for point in released_curves()[task, variant] if point[0] <= budget]
+    return Record(f"{AUTHORS}/{task}-{variant}", tuple({"seed": 0, "env_steps": at, SUCCESS: value} for at, value in points))
+
+
+def show_seeds(record: Record) -> str:
+    """First and last seed; nothing for a published curve."""
+    if _source(record) == AUTHORS:
+        return ""
+    return f"{record.seeds[0]} to {record.seeds[-1]}" if len(record.seeds) > 1 else str(record.seeds[0])
+
+
+def _of_seeds(record: Record, text: Callable[[], str]) -> str:
+    return text() if len(record.seeds) > 1 else ""
+
+
+def seeds() -> Column:
+    """First and last seed."""
+    return Column("seeds", show_seeds)
+
+
+def steps_to(level: float, *references: Record) -> Column:
+    """Steps to a level of success, with the speed-up over the reference of the same source in parentheses."""
+
+    def cell(record: Record) -> str:
+        same = [reference for reference in references if _source(reference) == _source(record)]
+        factor = "" if not same or record in references else speed_up(record, same[0], level)
+        return steps_cell(record, level) + (f" ({factor})" if factor else "")
+
+    return Column(f"steps to {level:g}", cell)
+
+
+def at(steps: int, digits: int = 2, metric: str = SUCCESS, title: str | None = None) -> Column:
+    """Median at one evaluation."""
+
+    def cell(record: Record) -> str:
+        values = record.at(steps, metric)
+        return "" if values is None else f"{np.median(values):.{digits}f}"
+
+    return Column(title or show_steps(steps), cell)
+
+
+def of_seeds(steps: int, digits: int = 2) -> Column:
+    """Success of every seed at one evaluation."""
+
+    def cell(record: Record) -> str:
+        values = record.at(steps)
+        return "" if values is None else ", ".join(f"{value:.{digits}f}" for value in values)
+
+    return Column(show_steps(steps), cell)
+
+
+def least(steps: int) -> Column:
+    """Least success of any seed at one evaluation."""
+
+    def cell(record: Record) -> str:
+        values = record.at(steps)
+        return "" if values is None else f"{values.min():.2f}"
+
+    return Column(f"least at {show_steps(steps)}", cell)
+
+
+def mean_at(steps: int) -> Column:
+    """Mean over seeds at one evaluation."""
+
+    def cell(record: Record) -> str:
+        values = record.at(steps)
+        return "" if values is None else f"{values.mean():.2f}"
+
+    return Column(show_steps(steps), cell)
+
+
+def success_at(steps: int) -> Column:
+    """Median success and middle half of the seeds at one evaluation."""
+
+    def cell(record: Record) -> str:
+        values = record.at(steps)
+        return "" if values is None else band(values)
+
+    return Column(f"success at {show_steps(steps)}", cell)
+
+
+def final(metric: str = SUCCESS, title: str = "success at the end", digits: int = 3) -> Column:
+    """Median and middle half of the seeds at the last evaluation."""
+
+    def cell(record: Record) -> str:
+        values = record.at(record.end, metric)
+        return "" if values is None else band(values, digits)
+
+    return Column(title, cell)
+
+
+def final_distance() -> Column:
+    """Median and middle half of the final distance at the last evaluation."""
+    return final(DISTANCE, "distance at the end")
+
+
+def final_median(metric: str, title: str, digits: int = 3) -> Column:
+    """Median at the last evaluation; 0 where there is none of it."""
+
+    def cell(record: Record) -> str:
+        values = record.at(record.end, metric)
+        return "" if values is None else f"{np.median(values):.{digits}f}"
+
+    return Column(title, cell)
+
+
+def training_mean(metric: str, title: str, digits: int = 3) -> Column:
+    """Mean over training, in the median over seeds."""
+    return Column(title, lambda record: f"{np.median(record.means(metric=metric)):.{digits}f}")
+
+
+def mean_success(budget: int | None = None) -> Column:
+    """Interquartile mean over seeds of the mean success up to a budget, with its bootstrap interval."""
+    title = f"mean success to {show_steps(budget)}" if budget else "mean success over training"
+    return Column(f"{title}, IQM (95 %)", lambda record: _of_seeds(record, lambda: interval(record.means(budget))))
+
+
+def p(reference: Record, label: str, budget: int | None = None) -> Column:
+    """p-value of the permutation test of mean success against a reference."""
+
+    def cell(record: Record) -> str:
+        return "" if record is reference else _of_seeds(record, lambda: f"{p_value(record, reference, budget):.3f}")
+
+    return Column(f"p against {label}", cell)
+
+
+def training_precision() -> Column:
+    """Share of dropped negatives that were false over training; empty where the filter was inactive."""
+
+    def cell(record: Record) -> str:
+        dropped = np.median(record.means(metric=_FILTERED))
+        return f"{np.median(record.means(metric=_TRUTH)) / dropped:.3f}" if dropped >= _ACTIVE else ""
+
+    return Column("of them false, over training", cell)
+
+
+def final_precision() -> Column:
+    """Median over seeds of the filter's precision at the end; empty where the filter was inactive over training."""
+
+    def cell(record: Record) -> str:
+        if np.median(record.means(metric=_FILTERED)) < _ACTIVE:
+            return ""
+        precision = record.at(record.end, "train/filter_precision")
+        return "" if precision is None else f"{np.median(precision):.3f}"
+
+    return Column("of them false, at the end", cell)
+
+
+def distance_to_authors(task: str, variant: str) -> Column:
+    """Mean absolute distance of the median to the authors' released curve."""
+    curve = released_curves()[task, variant]
+
+    def cell(record: Record) -> str:
+        if _source(record) == AUTHORS:
+            return ""
+        low, high = np.quantile([mean_difference(points, curve) for points in _resampled_medians(record)], [0.025, 0.975])
+        return f"{mean_difference(record.points, curve):.3f} ({low:.3f} to {high:.3f})"
+
+    return Column("distance to the authors' curve (95 %)", cell)
+
+
+def _resampled_medians(record: Record, count: int = 2_000) -> list[list[tuple[int, float]]]:
+    """Median curves of seeds drawn with replacement."""
+    steps = [at for at, _ in record.points]
+    success = np.stack([record.at(at) for at in steps])
+    draws = np.random.default_rng(0).integers(len(record.seeds), size=(count, len(record.seeds)))
+    return [list(zip(steps, median, strict=True)) for median in np.median(success[:, draws], axis=-1).T]
+
+
+def names() -> Column:
+    """Place of the record below benchmarks/results, without the folder that the page names."""
+    return Column("record", lambda record: "" if _source(record) == AUTHORS else f"`{record.name.partition('/')[2]}`")
+
+
+def weights(losses: Sequence[str]) -> list[Column]:
+    """Mean weight of each auxiliary loss over training, in the median over seeds."""
+    return [
+        Column(
+            loss.replace("_", " "), lambda record, loss=loss: _weight(np.median(record.means(metric=f"train/weight/{loss}")))
+        )
+        for loss in losses
+    ]
+
+
+def _weight(value: float) -> str:
+    return f"{value:.0f}" if value >= 10 else f"{value:.1f}"

@@ -1,0 +1,56 @@
+"""Rows of records as a table in Markdown."""
+
+import collections
+import dataclasses
+from collections.abc import Sequence
+
+from benchmarks.claims.columns import Column
+from benchmarks.claims.records import Record
+
+NO_RECORD = "no record kept"
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """A row of a table.
+
+    Attributes:
+        label: First cell.
+        record: Run that the other cells are computed from; None where no record is kept.
+        more: Cells between the label and the computed ones.
+    """
+
+    label: str
+    record: Record | None
+    more: Sequence[str] = ()
+
+
+def table(heads: Sequence[str], rows: Sequence[Row], columns: Sequence[Column]) -> str:
+    """A table in Markdown, and below it the revision and device of the records where these are kept.
+
+    Args:
+        heads: Titles of the label and of the cells in ``more``.
+        rows: Rows.
+        columns: Computed columns.
+    """
+    lines = [_line([*heads, *(column.title for column in columns)]), "|" + "---|" * (len(heads) + len(columns))]
+    for row in rows:
+        cells = [NO_RECORD, *[""] * (len(columns) - 1)] if row.record is None else [c.cell(row.record) for c in columns]
+        lines.append(_line([row.label, *row.more, *cells]))
+    made = made_by([row.record for row in rows if row.record is not None])
+    return "\n".join([*lines, *(["", made] if made else [])])
+
+
+def made_by(records: Sequence[Record]) -> str:
+    """Sentence on the revisions and devices of some records; empty where none is kept."""
+    devices = collections.defaultdict(set)
+    for text in {text for record in records for text in record.made}:
+        revision, _, device = text.partition(" on ")
+        devices[device].add(revision)
+    parts = [f"{', '.join(sorted(revisions))} on {device}" for device, revisions in sorted(devices.items())]
+    some = "" if all(record.made for record in records) else " (records that say so)"
+    return f"Made by {'; '.join(parts)}{some}." if parts else ""
+
+
+def _line(cells: Sequence[str]) -> str:
+    return "|" + "".join(f" {cell} |" if cell else " |" for cell in cells)
