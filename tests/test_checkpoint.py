@@ -17,7 +17,7 @@ import pytest
 from fake_program import FakeProgram, as_plain, make_fake_trainer, small_config
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.run.checkpoint import FULL, LIGHT, Checkpoints
+from jaxrl_vis.run.checkpoint import FULL, LIGHT, RECENT, Checkpoints
 
 FAKE = Path(__file__).with_name("fake_program.py")
 
@@ -227,6 +227,7 @@ def test_kill_while_saving_keeps_the_checkpoint_before(tmp_path, clean_environme
         process.wait()
     assert caught and process.returncode == -signal.SIGKILL
     newest = max(int(name) for name in done)
+    shutil.rmtree(run_dir / "checkpoints" / RECENT, ignore_errors=True)  # which may be newer, and would be restored
     config = small_config(env_steps=10**7, replay_transitions=50_000, num_envs=1000, full_checkpoint_interval=1)
     lines = []
     trainer = make_fake_trainer(config, None)
