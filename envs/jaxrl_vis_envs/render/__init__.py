@@ -19,7 +19,7 @@ Where things are, in the order in which data passes through; a file imports only
     reference    MuJoCo's own OpenGL renderer behind the same `Frame`, for tests and videos
 
 Each fast path computes what the plain path in `pixel` computes, for the scenes that it takes, and has its derivatives. The
-choice follows the platform that a program is compiled for (`jaxrl_vis_envs.compilation.by_platform`).
+choice follows the platform that a program is compiled for (`jaxrl_vis_envs.compiling.compilation.dispatch_by_platform`).
 """
 
 from jaxrl_vis_envs.render.images import quantize, render, render_planes
