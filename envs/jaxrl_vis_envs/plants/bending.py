@@ -16,8 +16,8 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mujoco.mjx._src import math
 
+from jaxrl_vis_envs.physics import rotations
 from jaxrl_vis_envs.plants.stand import KNEE, TOP, Stands
 
 MODULUS = 2e9
@@ -142,8 +142,8 @@ def fit(model: Any, layout: Layout, shape: Shape) -> Any:
     """A `mjx.Model` with these stalks; where they stand is in `placed`."""
     leg, up, shin = _pieces(shape)
     lengths = jnp.stack([jnp.linalg.norm(leg, axis=-1), jnp.linalg.norm(shin, axis=-1)], axis=-1)
-    from_leg = jax.vmap(math.quat_inv)(_between(up, leg))
-    turn = _between(up, jax.vmap(math.rotate)(shin, from_leg))
+    from_leg = jax.vmap(rotations.quat_inv)(_between(up, leg))
+    turn = _between(up, jax.vmap(rotations.rotate)(shin, from_leg))
     bodies, geoms = (layout.lower, layout.upper), (layout.lower_geom, layout.upper_geom)
     changes = {
         name: getattr(model, name)
