@@ -7,7 +7,7 @@
 
 An environment object holds only constants (model, camera, configuration); a `State` holds everything that changes, so every
 method is a pure function that can be jitted, vmapped, scanned and differentiated through: forwards and in reverse, on a GPU
-within ``compilation.kernels(False)``, for physics has no derivatives in its kernels. Episodes have a fixed length
+within ``compiling.compilation.kernels(False)``, for physics has no derivatives in its kernels. Episodes have a fixed length
 (`GoalEnv.horizon`), ``done`` is always 0, and nothing resets by itself: no final observation is ever lost.
 """
 
