@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 from side_by_side import Once, options, print_rate
 
-from jaxrl_vis.grasping.evaluate import Scene, draw_scene
-from jaxrl_vis.grasping.masks.painter import SHIPPED, Painter, read_weights
-from jaxrl_vis.grasping.perceive import Perception, perceive
 from jaxrl_vis.provenance import device_name
+from jaxrl_vis.stalks.grasping.evaluation.scoring import Scene, draw_scene
+from jaxrl_vis.stalks.grasping.masks.painter import SHIPPED, Painter, read_weights
+from jaxrl_vis.stalks.grasping.perception.perceive import Perception, perceive
 from jaxrl_vis_envs.plants.grasping import GRASPING_FAMILIES
 
 

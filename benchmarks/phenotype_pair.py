@@ -17,12 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 from side_by_side import Once, options, print_rate, timed
 
-from jaxrl_vis.phenotyping.detector.detect import detect, pad
-from jaxrl_vis.phenotyping.detector.finder import Finder, reduce
-from jaxrl_vis.phenotyping.detector.weights import SHIPPED, read_weights
-from jaxrl_vis.phenotyping.ground import find_ground
-from jaxrl_vis.phenotyping.sightings import find_with_ground, grey_of, look
 from jaxrl_vis.provenance import device_name
+from jaxrl_vis.stalks.phenotyping.detector.detect import detect, pad
+from jaxrl_vis.stalks.phenotyping.detector.finder import Finder, reduce
+from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights
+from jaxrl_vis.stalks.phenotyping.measure.ground import find_ground
+from jaxrl_vis.stalks.phenotyping.track.sightings import find_with_ground, grey_of, look
 from jaxrl_vis_envs.plants import SHIFTED, Calibration, draw
 from jaxrl_vis_envs.plants.pairs import Sequence
 from jaxrl_vis_envs.plants.truth import stalks_in_view

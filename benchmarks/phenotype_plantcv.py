@@ -28,11 +28,11 @@ def masks_of(options: argparse.Namespace, seed: int) -> tuple[int, Masks]:
     """Draws a plot: its seed, and the masks of what is measured at 12 inches with our width and the truth."""
     import dataclasses
 
-    from jaxrl_vis.phenotyping.detector.finder import Finder
-    from jaxrl_vis.phenotyping.detector.weights import SHIPPED, read_weights
-    from jaxrl_vis.phenotyping.evaluate import match, true_diameter
-    from jaxrl_vis.phenotyping.perfect import perfect_detections
-    from jaxrl_vis.phenotyping.sightings import find_with_ground, look
+    from jaxrl_vis.stalks.phenotyping.detector.finder import Finder
+    from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights
+    from jaxrl_vis.stalks.phenotyping.evaluation.perfect import perfect_detections
+    from jaxrl_vis.stalks.phenotyping.evaluation.scoring import match, true_diameter
+    from jaxrl_vis.stalks.phenotyping.track.sightings import find_with_ground, look
     from jaxrl_vis_envs.plants import FAMILIES, draw
     from jaxrl_vis_envs.plants.pairs import Sequence
     from jaxrl_vis_envs.plants.truth import HEIGHTS, stalks_in_view

@@ -11,19 +11,20 @@ from tiny_detector import TINY
 
 from jaxrl_vis.errors import NonFiniteError, RequestError
 from jaxrl_vis.parameters import write_parameters
-from jaxrl_vis.phenotyping.annotations import read_annotations
-from jaxrl_vis.phenotyping.detector.anchors import anchors_of, decode, encode
-from jaxrl_vis.phenotyping.detector.boxes import band_overlap, overlap, roi_align, suppress
-from jaxrl_vis.phenotyping.detector.detect import Settings, best_proposals
-from jaxrl_vis.phenotyping.detector.doubles import found_once
-from jaxrl_vis.phenotyping.detector.finder import Finder
-from jaxrl_vis.phenotyping.detector.losses import NOTHING, STALK, UNCLEAR, assign
-from jaxrl_vis.phenotyping.detector.snips import cut, put_back, snip_shape
-from jaxrl_vis.phenotyping.detector.weights import read_weights, write_weights
-from jaxrl_vis.phenotyping.images import rgb8
-from jaxrl_vis.phenotyping.masks import decode_counts
-from jaxrl_vis.phenotyping.training.augment import move, vary_snips
-from jaxrl_vis.phenotyping.training.examples import (
+from jaxrl_vis.stalks.phenotyping.detector.anchors import anchors_of, decode, encode
+from jaxrl_vis.stalks.phenotyping.detector.boxes import band_overlap, overlap, roi_align, suppress
+from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, best_proposals
+from jaxrl_vis.stalks.phenotyping.detector.doubles import found_once
+from jaxrl_vis.stalks.phenotyping.detector.finder import Finder
+from jaxrl_vis.stalks.phenotyping.detector.losses import NOTHING, STALK, UNCLEAR, assign
+from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import cut, put_back, snip_shape
+from jaxrl_vis.stalks.phenotyping.detector.weights import read_weights, write_weights
+from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
+from jaxrl_vis.stalks.phenotyping.io.images import rgb8
+from jaxrl_vis.stalks.phenotyping.io.masks import decode_counts
+from jaxrl_vis.stalks.phenotyping.training.augment import move, vary_snips
+from jaxrl_vis.stalks.phenotyping.training.detector_training import Plan, train
+from jaxrl_vis.stalks.phenotyping.training.examples import (
     MOST,
     Example,
     _instance_masks,
@@ -31,7 +32,6 @@ from jaxrl_vis.phenotyping.training.examples import (
     settings_for,
     synthetic_examples,
 )
-from jaxrl_vis.phenotyping.training.loop import Plan, train
 from jaxrl_vis_envs.plants import family
 
 # One program each, in place of one for every operation in them.

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from jaxrl_vis.errors import NonFiniteError, RequestError
-from jaxrl_vis.grasping.cloud import redness
-from jaxrl_vis.grasping.masks.examples import Example
-from jaxrl_vis.grasping.masks.loop import Plan, crops, train
-from jaxrl_vis.grasping.masks.painter import Painter, Settings, read_weights, write_weights
-from jaxrl_vis.grasping.masks.variation import vary
 from jaxrl_vis.parameters import write_parameters
+from jaxrl_vis.stalks.grasping.masks.examples import Example
+from jaxrl_vis.stalks.grasping.masks.mask_training import Plan, crops, train
+from jaxrl_vis.stalks.grasping.masks.painter import Painter, Settings, read_weights, write_weights
+from jaxrl_vis.stalks.grasping.masks.variation import vary
+from jaxrl_vis.stalks.grasping.perception.cloud import redness
 
 
 def striped(seed: int) -> Example:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest
 
-from jaxrl_vis.grasping import metric
-from jaxrl_vis.grasping.metric import Attempt, Standing, match, score, thesis_ratio, wilson
+from jaxrl_vis.stalks.grasping.evaluation import grasp_score
+from jaxrl_vis.stalks.grasping.evaluation.grasp_score import Attempt, Standing, match, score, thesis_ratio, wilson
 
 
 def held(*stalks: int) -> frozenset[int]:
@@ -155,5 +155,5 @@ def test_what_does_not_belong_together_is_refused():
 def test_an_empty_row_says_none():
     found = score([], [])
     assert str(found.of_sent) == "attempts: exactly the target held: none" and found.runs == 0
-    assert "50.0% (1 of 2; " in str(metric.Share("x", 1, 2))
+    assert "50.0% (1 of 2; " in str(grasp_score.Share("x", 1, 2))
     assert len({each.name for each in found.shares}) == len(found.shares)

@@ -14,12 +14,13 @@ from PIL import Image
 
 import jaxrl_vis_envs
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.grasping import arm, video, way
-from jaxrl_vis.grasping.attempts import follow, wind_keys
-from jaxrl_vis.grasping.choice import LEAST_ROOM, choose, choose_nearest
-from jaxrl_vis.grasping.lines import GraspPoint
-from jaxrl_vis.grasping.policy_loop import STALKS, check_policy, reach_by_policy
-from jaxrl_vis.grasping.reach import LOOK, ReachResult, Sight, arms_among, reach
+from jaxrl_vis.stalks.grasping.arm import approach, control
+from jaxrl_vis.stalks.grasping.arm.choice import LEAST_ROOM, choose, choose_nearest
+from jaxrl_vis.stalks.grasping.arm.policy_loop import STALKS, check_policy, reach_by_policy
+from jaxrl_vis.stalks.grasping.arm.reach import LOOK, ReachResult, Sight, arms_among, reach
+from jaxrl_vis.stalks.grasping.evaluation.attempts import follow, wind_keys
+from jaxrl_vis.stalks.grasping.perception.lines import GraspPoint
+from jaxrl_vis.stalks.grasping.report import path_figure, video
 from jaxrl_vis_envs.plants import TRAINING, bending, draw
 from jaxrl_vis_envs.plants.field import Plot, Stalk
 from jaxrl_vis_envs.plants.stand import KNEE, MAST_DISTANCE, Stands, origin_of, stand_of_lines, stands_at
@@ -112,13 +113,13 @@ def test_the_model_has_the_dimensions_that_the_formulas_have():
 )
 def test_what_can_be_reached_is_what_the_geometry_allows(place: tuple[float, float, float], can: bool):
     rail = origin_of(1.7)
-    assert bool(arm.reachable(rail, rail + np.array(place))) is can
+    assert bool(approach.reachable(rail, rail + np.array(place))) is can
 
 
 def test_the_way_is_a_straight_line_out_of_the_shoulder():
-    timing, target = arm.Timing(), jnp.array([0.2, 0.05, 0.9])
+    timing, target = control.Timing(), jnp.array([0.2, 0.05, 0.9])
     times = jnp.linspace(timing.turn, timing.reach, 30)
-    way = np.asarray(jax.vmap(lambda time: arm.planned(target, jnp.asarray(arm.HOME), time, timing))(times))
+    way = np.asarray(jax.vmap(lambda time: control.planned(target, jnp.asarray(control.HOME), time, timing))(times))
     np.testing.assert_allclose(way[-1], target, atol=1e-5)
     away, line = way[:, :2] - stalk_arm.SHOULDER, np.asarray(target)[:2] - stalk_arm.SHOULDER
     assert np.abs(away[:, 0] * line[1] - away[:, 1] * line[0]).max() < 1e-5
@@ -130,7 +131,7 @@ def test_room_is_the_least_distance_of_the_open_gripper_from_others():
     target = np.array([[0.0, 0.0, HEIGHT]])
 
     def beside(x: float, y: float = 0.0, whole_way: bool = False) -> float:
-        return float(arm.room(target, np.array([[[x, y]]]), np.array([[0.006]]), whole_way).max())
+        return float(approach.room(target, np.array([[[x, y]]]), np.array([[0.006]]), whole_way).max())
 
     assert beside(np.nan) == np.inf
     assert beside(0.06) > beside(0.045) > beside(0.03)
@@ -143,7 +144,7 @@ def test_the_folded_arm_needs_room_as_it_turns():
     target = np.array([[-0.42, -0.1, HEIGHT]])
 
     def beside(x: float, y: float, whole_way: bool = True) -> float:
-        return float(arm.room(target, np.array([[[x, y]]]), np.array([[0.006]]), whole_way).max())
+        return float(approach.room(target, np.array([[[x, y]]]), np.array([[0.006]]), whole_way).max())
 
     assert beside(-0.12, -0.22) < 0 < beside(0.12, -0.22)  # it turns to the left
     assert beside(-0.12, -0.1) > 0.005  # behind where it turns
@@ -154,15 +155,15 @@ def test_the_way_with_most_room_is_taken():
     origins = np.array([origin_of(x) for x in (-0.35, 0.0, 0.35)])
     target = np.array([0.0, 0.0, HEIGHT])
 
-    def best(*others: tuple[float, float]) -> arm.Way:
-        return arm.best_way(origins, target, np.array(others).reshape(-1, 2), np.full(len(others), 0.006))
+    def best(*others: tuple[float, float]) -> approach.Approach:
+        return approach.best_approach(origins, target, np.array(others).reshape(-1, 2), np.full(len(others), 0.006))
 
     assert best()[::2] == (1, np.inf)  # straight ahead, which is shortest
     assert best((0.0, -0.1)).stop in (0, 2) and best((0.0, -0.1)).room > 0.005
     assert best((0.0, -0.1), (-0.06, -0.1)).stop == 2
     assert best((0.0, -0.1), (0.06, -0.1)).stop == 0
     assert best((0.015, 0.0)).room < 0  # there is no room from anywhere
-    assert arm.best_way(origins, np.array([2.0, 0.0, HEIGHT]), np.zeros((0, 2)), np.zeros(0)).stop == -1
+    assert approach.best_approach(origins, np.array([2.0, 0.0, HEIGHT]), np.zeros((0, 2)), np.zeros(0)).stop == -1
 
 
 def test_stands_pass_through_the_stalks_of_their_plot():
@@ -255,14 +256,14 @@ def test_an_arm_is_not_sent_where_it_cannot_go():
     found = still_air()
     np.testing.assert_array_equal(found.reachable, [True, True, True, True, True, False, True, True])
     assert np.isnan(found.error[5]) and not found.held[5].any()
-    np.testing.assert_allclose(found.taken[5], np.tile(origin_of(1.0) + arm.HOME, (found.taken.shape[1], 1)), atol=2e-3)
+    np.testing.assert_allclose(found.taken[5], np.tile(origin_of(1.0) + control.HOME, (found.taken.shape[1], 1)), atol=2e-3)
 
 
 def test_the_way_taken_is_the_one_planned():
     found = still_air()
-    assert found.interval * found.path.shape[1] == pytest.approx(arm.Timing().reach + arm.Timing().close)
+    assert found.interval * found.path.shape[1] == pytest.approx(control.Timing().reach + control.Timing().close)
     away = np.linalg.norm(found.path - found.taken, axis=-1)[ALONE]
-    end = round(arm.Timing().reach / found.interval) - 1
+    end = round(control.Timing().reach / found.interval) - 1
     assert away.max() < 0.03 and away[:, end].max() < 0.002
     np.testing.assert_allclose(found.path[ALONE, end], TARGETS[ALONE], atol=1e-4)
 
@@ -406,8 +407,8 @@ def test_requests_that_make_no_sense_are_refused():
 
 def test_the_figure_shows_both_ways(tmp_path: Path):
     found = still_air()
-    way.draw_path(tmp_path / "new" / "way.png", stands(), TARGETS, found, 1)
-    way.draw_path(tmp_path / "unreachable.png", stands(), TARGETS, found, 5)
+    path_figure.draw_path(tmp_path / "new" / "way.png", stands(), TARGETS, found, 1)
+    path_figure.draw_path(tmp_path / "unreachable.png", stands(), TARGETS, found, 5)
     assert Image.open(tmp_path / "new" / "way.png").size[0] > 600
 
 

@@ -11,18 +11,18 @@ import pytest
 from PIL import Image
 
 from jaxrl_vis import cli
-from jaxrl_vis.cli.families import family_of
-from jaxrl_vis.cli.grasp_train import _Drawn as Drawn
 from jaxrl_vis.evaluation_pool import finite
-from jaxrl_vis.grasping.cloud import Mount
-from jaxrl_vis.grasping.evaluate import draw_scene, score_scene, summary
-from jaxrl_vis.grasping.figure import draw_figure
-from jaxrl_vis.grasping.perceive import ORIGINAL, OURS, Ways
-from jaxrl_vis.grasping.pipeline import Request, run
-from jaxrl_vis.grasping.reach_figures import draw_reach
-from jaxrl_vis.grasping.records import Conditions, evaluate_run
-from jaxrl_vis.phenotyping.calibration import read_calibration
-from jaxrl_vis.phenotyping.folders import find_plots
+from jaxrl_vis.stalks.cli.grasp_train import _Drawn as Drawn
+from jaxrl_vis.stalks.cli.options import family_of
+from jaxrl_vis.stalks.grasping.evaluation.records import Conditions, evaluate_run
+from jaxrl_vis.stalks.grasping.evaluation.scoring import draw_scene, score_scene, summary
+from jaxrl_vis.stalks.grasping.perception.cloud import Mount
+from jaxrl_vis.stalks.grasping.perception.perceive import ORIGINAL, OURS, Ways
+from jaxrl_vis.stalks.grasping.pipeline import Request, run
+from jaxrl_vis.stalks.grasping.report.perception_figure import draw_figure
+from jaxrl_vis.stalks.grasping.report.reach_figures import draw_reach
+from jaxrl_vis.stalks.phenotyping.io.calibration import read_calibration
+from jaxrl_vis.stalks.phenotyping.io.folders import find_plots
 from jaxrl_vis_envs.plants import draw, read
 from jaxrl_vis_envs.plants.grasping import GRASPING_FAMILIES
 

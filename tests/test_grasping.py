@@ -6,14 +6,14 @@ import math
 import numpy as np
 import pytest
 
-from jaxrl_vis.grasping.chords import chords_of, joined
-from jaxrl_vis.grasping.cloud import Cloud, Mount, match, organised, redness, thinned
-from jaxrl_vis.grasping.evaluate import RunScore, match_stalks, stitch_error, summary, true_motion
-from jaxrl_vis.grasping.lines import grasp_points
-from jaxrl_vis.grasping.perceive import View, perceive
-from jaxrl_vis.grasping.sight import Sight
-from jaxrl_vis.grasping.slices import slice_at, slice_points
-from jaxrl_vis.grasping.stitch import DEFAULT, THESIS, Motion, Thinned, rigid, stitch
+from jaxrl_vis.stalks.grasping.evaluation.scoring import RunScore, match_stalks, stitch_error, summary, true_motion
+from jaxrl_vis.stalks.grasping.perception.cloud import Cloud, Mount, match, organised, redness, thinned
+from jaxrl_vis.stalks.grasping.perception.lines import grasp_points
+from jaxrl_vis.stalks.grasping.perception.perceive import View, perceive
+from jaxrl_vis.stalks.grasping.perception.slices import slice_at, slice_points
+from jaxrl_vis.stalks.grasping.perception.stalk_segments import chords_of, joined
+from jaxrl_vis.stalks.grasping.perception.stitch import DEFAULT, THESIS, Motion, Thinned, rigid, stitch
+from jaxrl_vis.stalks.grasping.perception.visibility import Sight
 from jaxrl_vis_envs.plants import Calibration, Pose, draw, drive
 from jaxrl_vis_envs.plants.grasping import GRASPING, GRASPING_FAMILIES, GRASPING_SHIFTED, LEAST_RANGE
 

@@ -14,10 +14,10 @@ import pytest
 from phenotype_plots import run, table
 
 from jaxrl_vis import cli
-from jaxrl_vis.phenotyping.detector.finder import Detection
-from jaxrl_vis.phenotyping.images import read_image, write_image
-from jaxrl_vis.phenotyping.pairing import wrong_with
-from jaxrl_vis.phenotyping.sightings import look
+from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
+from jaxrl_vis.stalks.phenotyping.io.images import read_image, write_image
+from jaxrl_vis.stalks.phenotyping.track.pairing import wrong_with
+from jaxrl_vis.stalks.phenotyping.track.sightings import look
 from jaxrl_vis_envs.plants import Calibration
 
 BLANK = np.full((12, 16, 3), 80, np.uint8)

@@ -8,7 +8,7 @@ import pytest
 from phenotype_plots import run, table
 
 from jaxrl_vis import cli
-from jaxrl_vis.phenotyping.images import read_image
+from jaxrl_vis.stalks.phenotyping.io.images import read_image
 
 
 def test_run_counts_and_measures(plots, results):

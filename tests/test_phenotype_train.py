@@ -12,12 +12,12 @@ from tiny_detector import IMAGE, TINY
 
 from jaxrl_vis import cli
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.phenotyping.annotations import read_annotations
-from jaxrl_vis.phenotyping.detector.detect import initial
-from jaxrl_vis.phenotyping.detector.networks import Segmenter
-from jaxrl_vis.phenotyping.detector.weights import read_weights, write_weights
-from jaxrl_vis.phenotyping.masks import encode_mask, outlined_mask
-from jaxrl_vis.phenotyping.training.examples import annotated_examples, settings_for
+from jaxrl_vis.stalks.phenotyping.detector.detect import initial
+from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
+from jaxrl_vis.stalks.phenotyping.detector.weights import read_weights, write_weights
+from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
+from jaxrl_vis.stalks.phenotyping.io.masks import encode_mask, outlined_mask
+from jaxrl_vis.stalks.phenotyping.training.examples import annotated_examples, settings_for
 
 
 @pytest.fixture(scope="module")

@@ -8,14 +8,14 @@ import cv2
 import numpy as np
 import pytest
 
-from jaxrl_vis.phenotyping.contrast import settle
-from jaxrl_vis.phenotyping.ground import _plane, find_ground
-from jaxrl_vis.phenotyping.images import read_disparity, read_image, write_image
-from jaxrl_vis.phenotyping.masks import decode_mask, encode_mask
-from jaxrl_vis.phenotyping.measure import measure
-from jaxrl_vis.phenotyping.metric import diameter_mm, tilt_of
-from jaxrl_vis.phenotyping.stereo import match_rows, match_sgbm
-from jaxrl_vis.phenotyping.width import ELLIPSE_FITS, ellipse_width, strip_near, strip_width
+from jaxrl_vis.stalks.phenotyping.io.images import read_disparity, read_image, write_image
+from jaxrl_vis.stalks.phenotyping.io.masks import decode_mask, encode_mask
+from jaxrl_vis.stalks.phenotyping.measure.diameter import diameter_mm, tilt_of
+from jaxrl_vis.stalks.phenotyping.measure.edges import settle
+from jaxrl_vis.stalks.phenotyping.measure.ground import _plane, find_ground
+from jaxrl_vis.stalks.phenotyping.measure.stalk import measure
+from jaxrl_vis.stalks.phenotyping.measure.stereo import match_rows, match_sgbm
+from jaxrl_vis.stalks.phenotyping.measure.width import ELLIPSE_FITS, ellipse_width, strip_near, strip_width
 from jaxrl_vis_envs.plants import Calibration
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.phenotyping.calibration import check_size, read_calibration, write_calibration
-from jaxrl_vis.phenotyping.storage import parse_storage
+from jaxrl_vis.stalks.phenotyping.io.calibration import check_size, read_calibration, write_calibration
+from jaxrl_vis.stalks.phenotyping.io.file_storage import parse_storage
 from jaxrl_vis_envs.plants import Calibration
 
 CAMERAS = Calibration(640, 480, 500.0, (319.5, 239.5), 0.1)

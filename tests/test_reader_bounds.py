@@ -19,16 +19,16 @@ from safetensors.numpy import save
 
 from jaxrl_vis import cli, parameters
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.grasping.masks import painter
-from jaxrl_vis.phenotyping import masks
-from jaxrl_vis.phenotyping.annotations import read_annotations
-from jaxrl_vis.phenotyping.detector.weights import SCHEMA, SHIPPED, read_weights
-from jaxrl_vis.phenotyping.folders import find_plots, read_odometry
-from jaxrl_vis.phenotyping.images import image_size, read_image, write_image
-from jaxrl_vis.phenotyping.names import file_name, readable
-from jaxrl_vis.phenotyping.overlay import draw_overlay
-from jaxrl_vis.phenotyping.results import write_rows
 from jaxrl_vis.spreadsheets import cell, text_of, to_csv
+from jaxrl_vis.stalks.grasping.masks import painter
+from jaxrl_vis.stalks.phenotyping.detector.weights import SCHEMA, SHIPPED, read_weights
+from jaxrl_vis.stalks.phenotyping.io import masks
+from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
+from jaxrl_vis.stalks.phenotyping.io.folders import find_plots, read_odometry
+from jaxrl_vis.stalks.phenotyping.io.images import image_size, read_image, write_image
+from jaxrl_vis.stalks.phenotyping.io.names import file_name, readable
+from jaxrl_vis.stalks.phenotyping.report.overlay import draw_overlay
+from jaxrl_vis.stalks.phenotyping.report.tables import write_rows
 from jaxrl_vis_envs.plants import read
 
 LATIN = os.fsdecode(b"t\xe9t\xe9")

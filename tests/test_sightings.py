@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.phenotyping.detector.finder import Detection
-from jaxrl_vis.phenotyping.direction import follow_either_way
-from jaxrl_vis.phenotyping.evaluate import PlotScore, average_precision, match, summary
-from jaxrl_vis.phenotyping.folders import find_plots, read_odometries, read_odometry, why_no_odometry
-from jaxrl_vis.phenotyping.heights import USUAL_TAPER, robust_width, widths_of
-from jaxrl_vis.phenotyping.measure import Measurement
-from jaxrl_vis.phenotyping.sightings import Sighting, _hidden_edges
-from jaxrl_vis.phenotyping.thesis import count_by_length, mean_widths
-from jaxrl_vis.phenotyping.track import Track, follow
+from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
+from jaxrl_vis.stalks.phenotyping.evaluation.scoring import PlotScore, average_precision, match, summary
+from jaxrl_vis.stalks.phenotyping.evaluation.thesis import count_by_length, mean_widths
+from jaxrl_vis.stalks.phenotyping.io.folders import find_plots, read_odometries, read_odometry, why_no_odometry
+from jaxrl_vis.stalks.phenotyping.measure.stalk import Measurement
+from jaxrl_vis.stalks.phenotyping.track.direction import follow_either_way
+from jaxrl_vis.stalks.phenotyping.track.follow import Track, follow
+from jaxrl_vis.stalks.phenotyping.track.heights import USUAL_TAPER, robust_width, widths_of
+from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting, _hidden_edges
 from jaxrl_vis_envs.plants import Calibration
 from jaxrl_vis_envs.plants.truth import StalkInView
 

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from jaxrl_vis.cli import grasp_figure
 from jaxrl_vis.cli.checks import check_counts
-from jaxrl_vis.cli.phenotype_figure import NAMES as CHAPTER_3
-from jaxrl_vis.cli.phenotype_figure import make_figure
 from jaxrl_vis.config import PRESETS
 from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError, nearest
 from jaxrl_vis.report.outputs import check_writable
+from jaxrl_vis.stalks.cli import grasp_figure
+from jaxrl_vis.stalks.cli.phenotype_figure import NAMES as CHAPTER_3
+from jaxrl_vis.stalks.cli.phenotype_figure import make_figure
 
 if TYPE_CHECKING:
     from jaxrl_vis.studies.show import Request

@@ -1,0 +1,296 @@
+"""From grasp points to attempts: where the robot stops for each, which way the arm goes, and what comes of it.
+
+The robot stops where it took its pairs, and knows these places by its stitches. `choice` says from which of them, and how, it
+tries each grasp point. The truth is used only to see what the jaws hold, and what they could have held.
+
+open    the arm goes to where the grasp point was seen, and does not look again
+again   every tenth of a second the pair at the stop finds the stalk anew; the arm follows to where it will be
+policy  a policy of VisualStalkReach brings it there, by images from over the arm's shoulder (`policy_loop`)
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterable, Iterator
+from typing import Literal
+
+import jax
+import numpy as np
+
+from jaxrl_vis.run.policy import Policy
+from jaxrl_vis.stalks.grasping.arm import approach
+from jaxrl_vis.stalks.grasping.arm.choice import Choice, choose, choose_nearest, radii_of
+from jaxrl_vis.stalks.grasping.arm.policy_loop import HEIGHTS as POLICY_HEIGHTS
+from jaxrl_vis.stalks.grasping.arm.policy_loop import STALKS as POLICY_STALKS
+from jaxrl_vis.stalks.grasping.arm.policy_loop import reach_by_policy
+from jaxrl_vis.stalks.grasping.arm.reach import ReachResult, Sight, reach
+from jaxrl_vis.stalks.grasping.evaluation.grasp_score import Attempt, Standing, match
+from jaxrl_vis.stalks.grasping.evaluation.scoring import RADIUS, Scene, stretch_of
+from jaxrl_vis.stalks.grasping.perception.lines import PREFERRED, GraspPoint
+from jaxrl_vis.stalks.grasping.perception.perceive import Perception
+from jaxrl_vis.stalks.grasping.perception.stalk_segments import Chords, chords_of
+from jaxrl_vis.stalks.grasping.perception.stitch import Motion
+from jaxrl_vis_envs.plants import Plot
+from jaxrl_vis_envs.plants.stand import MAST_DISTANCE, STALKS, Stands, concatenated, origin_of, stand_of_lines, stands_at
+
+Loop = Literal["open", "again", "policy"]
+
+_MOST = 1024  # arms in a program
+_AROUND = 0.1  # m: above and below the grasp a pair is asked for the stalk again; so far a line is as good as straight
+_BESIDE = 0.015  # m: what it shows further away from the line is another stalk
+_LEAST = 5  # chords
+_AHEAD = 1.5  # looks: a stalk is expected to go on as it did for so long after it was seen
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """The attempts of one run, before the arm moves.
+
+    Attributes:
+        run: Its number.
+        targets: [B, 3] float64, m in the plot's frame.
+        stalks: [B] int, the stalk that each is matched with; -1 for none.
+        errors: [B] float64, horizontal distance from that stalk, m; nan for none.
+        sides: [B] float64, 1 or -1: which solution the arm takes.
+        refused: [B] bool, whether other stalks are in the way of the arm, so that it is not sent.
+        again: [B, 2] float64, by how much the pair at the stop alone is wrong about where the stalk is, along and across the
+            row, m; nan where it does not show it.
+        stands: The true stalks around the arm, from where it tries each.
+        standing: The stalks of the stretch.
+        seen: The stalks that were found around the arm, as `stands` without truth; None where nothing asks for them.
+    """
+
+    run: int
+    targets: np.ndarray
+    stalks: np.ndarray
+    errors: np.ndarray
+    sides: np.ndarray
+    refused: np.ndarray
+    again: np.ndarray
+    stands: Stands
+    standing: tuple[Standing, ...]
+    seen: Stands | None = None
+
+
+def plan(scene: Scene, perception: Perception, number: int, for_policy: bool = False) -> Plan:
+    """What the arm is to try in a run.
+
+    Args:
+        scene: The run.
+        perception: What was made of it.
+        number: Of the run, in the metric.
+        for_policy: As the task that a policy has learned: from the stop that is nearest to the stalk, at one of its heights,
+            among as many stalks; and nothing is refused.
+    """
+    plot, poses = scene.plot, scene.drive.poses
+    low, high = stretch_of(plot)
+    masts, found = masts_of(perception), perception.points
+    chosen = choose_nearest(found, masts, POLICY_HEIGHTS) if for_policy else choose(found, masts)
+    targets = np.array([_from_stop(each, scene, perception) for each in chosen]).reshape(-1, 3)
+    places = np.array([[stalk.at_height(target[2])[0][:2] for stalk in plot.measured] for target in targets])
+    places = places.reshape(len(targets), len(plot.measured), 2)
+    stalks = match(targets[:, :2], places, RADIUS)
+    origins = np.array([origin_of(pose.position[0]) for pose in poses])
+    standing = _standing(plot, origins, number)
+    known = {each.stalk for each in standing}
+    kept = [
+        place
+        for place, (target, stalk) in enumerate(zip(targets, stalks))
+        if (stalk in known if stalk >= 0 else low <= target[0] <= high)
+    ]
+    off = np.array([_off(targets[each], places[each], stalks[each]) for each in kept]).reshape(-1, 2)
+    chords = {stop: chords_of(perception.clouds[stop], scene.drive.stated, scene.mount, stop) for stop in range(len(poses))}
+    again = [off[index] + _found_again(chosen[place], found[place], perception, chords) for index, place in enumerate(kept)]
+    at = origins[[chosen[each].stop for each in kept], 0]
+    seen = [_seen(chosen[place], x, targets[place], scene, perception) for x, place in zip(at, kept)]
+    return Plan(
+        run=number,
+        targets=targets[kept],
+        stalks=stalks[kept],
+        errors=np.linalg.norm(off, axis=-1),
+        sides=np.array([chosen[each].side for each in kept], float),
+        refused=np.array([chosen[each].is_blocked and not for_policy for each in kept], bool),
+        again=np.array(again, float).reshape(-1, 2),
+        stands=stands_at(plot, at, targets[kept], POLICY_STALKS if for_policy else STALKS),
+        standing=standing,
+        seen=concatenated(seen) if for_policy and seen else None,
+    )
+
+
+def masts_of(perception: Perception) -> np.ndarray:
+    """[S, 3], `Stands.origin` of the places where the pairs were taken, as the stitches say, in the last one's frame, m."""
+    return np.array([motion(np.array([0.0, MAST_DISTANCE, 0.0])) for motion in perception.to_last]) * [1.0, 1.0, 0.0]
+
+
+def _from_stop(choice: Choice, scene: Scene, perception: Perception, points: np.ndarray | None = None) -> np.ndarray:
+    """Where the arm goes [3], m in the plot's frame: at the stop, the robot knows the point, or others, from there."""
+    from_there = perception.to_last[choice.stop].inverse()(choice.point if points is None else points)
+    return scene.drive.poses[choice.stop].to_world(scene.mount.pose.to_camera(from_there))
+
+
+def _seen(choice: Choice, x: float, target: np.ndarray, scene: Scene, perception: Perception) -> Stands:
+    """The stalks that were found around an arm with its mast ``x`` m along the row, for a target [3] in the plot's frame."""
+    height = float(choice.point[2])
+    ends = np.array([each.at_height(np.array([height, height + _AROUND])) for each in perception.points])
+    ends = _from_stop(choice, scene, perception, ends)
+    return stand_of_lines(ends[:, 0], ends[:, 1] - ends[:, 0], radii_of(perception.points, height), x, target, POLICY_STALKS)
+
+
+def _off(target: np.ndarray, places: np.ndarray, stalk: int) -> np.ndarray:
+    """By how much [2] m a target is beside its stalk; nan without one."""
+    return target[:2] - places[stalk] if stalk >= 0 else np.full(2, np.nan)
+
+
+def _found_again(choice: Choice, point: GraspPoint, perception: Perception, chords: dict[int, Chords]) -> np.ndarray:
+    """By how much [2] m the pair at the stop alone shows the stalk beside where all pairs do; nan where it does not show it.
+
+    Axes are those of the robot at the last pair, from which those at other stops and of the plot differ by little.
+    """
+    if choice.stop < 0:
+        return np.full(2, np.nan)
+    motion: Motion = perception.to_last[choice.stop]
+    seen = motion(chords[choice.stop].middle)
+    beside = (seen - point.at_height(seen[:, 2]))[:, :2]
+    near = (np.abs(seen[:, 2] - choice.point[2]) < _AROUND) & (np.linalg.norm(beside, axis=1) < _BESIDE)
+    return np.median(beside[near], axis=0) if near.sum() >= _LEAST else np.full(2, np.nan)
+
+
+def from_any_stop(points: np.ndarray, stops: np.ndarray) -> np.ndarray:
+    """Which points the arm can go to from any of the places where the left camera was, as far as its geometry goes.
+
+    Args:
+        points: [B, 3], m in the robot frame of one pair.
+        stops: [S, 3], where the robot frames of all pairs begin in that frame, m.
+
+    Returns:
+        [B] bool.
+    """
+    masts = (stops + [0.0, MAST_DISTANCE, 0.0]) * [1.0, 1.0, 0.0]
+    return np.asarray(approach.reachable(masts[:, None], points[None]).any(axis=0))
+
+
+def _standing(plot: Plot, origins: np.ndarray, number: int) -> tuple[Standing, ...]:
+    """The true stalks of the stretch, and whether and how freely they could be reached at the preferred height."""
+    low, high = stretch_of(plot)
+    middles = np.array([stalk.at_height(PREFERRED)[0] for stalk in plot.measured]).reshape(-1, 3)
+    radii = np.array([0.5 * stalk.diameter(PREFERRED) for stalk in plot.measured])
+    found = []
+    for index, middle in enumerate(middles):
+        if not low <= middle[0] <= high:
+            continue
+        others = np.arange(len(middles)) != index
+        way = approach.best_approach(origins, middle, middles[others, :2], radii[others], enough=np.inf)
+        beside = np.linalg.norm(middles[others, :2] - middle[:2], axis=1)
+        found.append(Standing(number, index, way.stop >= 0, way.room, float(beside.min(initial=np.inf))))
+    return tuple(found)
+
+
+def carry_out(
+    plans: Iterable[Plan], wind_mm: float, loop: Loop = "open", policy: Policy | None = None, seed: int = 0
+) -> list[Attempt]:
+    """Sends an arm to each target of all runs that is not refused, side by side.
+
+    Args:
+        plans: One for each run.
+        wind_mm: How far stalks sway, mm. What wind an arm meets depends neither on other runs nor on the loop.
+        loop: Whether the arm looks again.
+        policy: For that loop, and plans that were made for it.
+        seed: Of the wind.
+    """
+    attempts: list[Attempt] = []
+    for block in _blocks(list(plans)):
+        numbers = np.repeat([each.run for each in block], [len(each.targets) for each in block])
+        places = np.concatenate([np.arange(len(each.targets)) for each in block])
+        targets, stalks, errors, sides, refused, again = (
+            np.concatenate([getattr(each, name) for each in block])
+            for name in ("targets", "stalks", "errors", "sides", "refused", "again")
+        )
+        stands = concatenated([each.stands for each in block])
+        keys = wind_keys(numbers, places, seed)
+        if loop == "policy":
+            seen = [each.seen for each in block if each.seen is not None]
+            assert policy is not None and len(seen) == len(block)
+            result = reach_by_policy(stands, concatenated(seen), targets, policy, keys, wind_mm)
+        else:
+            look = follow(stands, stalks, again) if loop == "again" else None
+            result = reach(stands, targets, keys, wind_mm, sides=sides, look=look)
+        attempts += attempts_of(stands, result, numbers, stalks, errors, refused)
+    return attempts
+
+
+def wind_keys(runs: np.ndarray, places: np.ndarray, seed: int = 0) -> jax.Array:
+    """Keys [B] of the winds over the attempts in some ``places`` of some ``runs``, both [B] int."""
+    of_runs = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(seed), runs)
+    return jax.vmap(jax.random.fold_in)(of_runs, places)
+
+
+def attempts_of(
+    stands: Stands, result: ReachResult, runs: np.ndarray, stalks: np.ndarray, errors: np.ndarray, refused: np.ndarray
+) -> list[Attempt]:
+    """What came of B reaches, for the metric.
+
+    Args:
+        stands: The stalks around each arm.
+        result: What came of it.
+        runs, stalks, errors, refused: [B], see `Plan`.
+    """
+    attempts = []
+    for place in range(len(stands)):
+        sent = not refused[place]
+        others = (stands.stalk[place] != stalks[place]) & sent
+        attempts.append(
+            Attempt(
+                run=int(runs[place]),
+                stalk=int(stalks[place]) if stalks[place] >= 0 else None,
+                held=frozenset(stands.stalk[place][result.held[place] & sent].tolist()),
+                reachable=bool(result.reachable[place]),
+                refused=bool(refused[place]),
+                collided=bool((result.touched[place] & others).any()),
+                brushed=bool((result.brushed[place] & others).any()),
+                aim_error=float(errors[place]),
+            )
+        )
+    return attempts
+
+
+def follow(stands: Stands, stalks: np.ndarray, again: np.ndarray) -> Callable[[Sight], np.ndarray]:
+    """What the arm makes of looking again: targets [B, 3] from what there is to see, for `reach`.
+
+    The pair at the stop stands still. What it finds is where the stalk is, plus the error that it alone made with this stalk
+    at rest; what it did not show at rest it does not find again. A result is there one look later, and the stalk is expected
+    to go on as it did between the last two. That the arm itself may hide the stalk is left out.
+
+    Args:
+        stands: The stalks around each arm.
+        stalks: [B] int, which one each is for.
+        again: [B, 2], see `Plan`.
+    """
+    known = (stands.stalk == stalks[:, None]) & (stalks >= 0)[:, None]
+    slot = known.argmax(axis=1)
+    error = np.where(known.any(axis=1)[:, None], again, np.nan)
+    seen: list[np.ndarray] = []
+
+    def look(sight: Sight) -> np.ndarray:
+        place = sight.stalks[np.arange(len(slot)), slot]
+        place[:, :2] += error
+        seen.append(place)
+        if len(seen) < 3:
+            return np.full_like(place, np.nan)
+        before, last = seen[-3:-1]
+        ahead = _AHEAD * (last - before)
+        ahead[:, 2] = 0.0  # the height of the grasp stays what it was chosen to be
+        return last + ahead
+
+    return look
+
+
+def _blocks(plans: list[Plan]) -> Iterator[list[Plan]]:
+    """Plans that are carried out together: as many as have at most `_MOST` targets, but at least one."""
+    block: list[Plan] = []
+    for each in plans:
+        if not len(each.targets):
+            continue
+        if block and sum(len(other.targets) for other in block) + len(each.targets) > _MOST:
+            yield block
+            block = []
+        block.append(each)
+    if block:
+        yield block

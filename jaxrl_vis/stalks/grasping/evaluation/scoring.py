@@ -1,0 +1,254 @@
+"""How good masks, stitches and grasp points are, against the exact truth of synthetic rows that are drawn for it.
+
+row -> five pairs -> perception -> grasp points         as `run` does, without files
+    -> true stalks, poses and masks                     from the row itself
+
+Only the half metre that the robot drives along counts: the stalks that stand there at the preferred height. A grasp point hits
+the stalk that it is matched with, one to one, if it lies within 30 mm of that stalk's middle at its own height.
+"""
+
+import dataclasses
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import cv2
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from jaxrl_vis.stalks.grasping.masks.examples import true_mask
+from jaxrl_vis.stalks.grasping.perception.cloud import Mount
+from jaxrl_vis.stalks.grasping.perception.lines import PREFERRED
+from jaxrl_vis.stalks.grasping.perception.perceive import OURS, Mask, Perception, View, Ways, perceive
+from jaxrl_vis.stalks.grasping.perception.stitch import Motion
+from jaxrl_vis_envs.plants import Drive, Family, Plot, Pose, draw
+from jaxrl_vis_envs.plants.pairs import Sequence
+
+RADIUS = 0.03
+"""How far a grasp point may be from the stalk that it is matched with, m: half the mean spacing."""
+
+
+@dataclasses.dataclass(frozen=True)
+class MaskScore:
+    """How well masks fit, over the pairs of a run.
+
+    Attributes:
+        hits, painted, true: Pixels that are rightly painted, painted, and of stalks.
+        boundary: Mean distance between the outlines of both masks, in both directions, pixels; not a number without outlines.
+    """
+
+    hits: int
+    painted: int
+    true: int
+    boundary: float
+
+
+@dataclasses.dataclass(frozen=True)
+class RunScore:
+    """One run.
+
+    Attributes:
+        seed: Of the row.
+        true: Stalks in the stretch.
+        found: Grasp points in the stretch, and those that are matched with a stalk in it.
+        errors: [K] float64, horizontal distance of each matched grasp point from its stalk, mm.
+        stitches: [S] float64, horizontal error of each stitch, mm.
+        refused: Stitches that were refused.
+        seconds: Time per pair, by stage, s.
+        mask: How well masks fit; None for true masks.
+        notes: What was not as it should be.
+    """
+
+    seed: int
+    true: int
+    found: int
+    errors: np.ndarray
+    stitches: np.ndarray
+    refused: int
+    seconds: dict[str, float]
+    mask: MaskScore | None
+    notes: tuple[str, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """One run, drawn.
+
+    Attributes:
+        plot: What stands there.
+        drive: How the cameras passed it.
+        mount: How they are mounted, nominally.
+        views: The pairs.
+        masks: [F, H, W] bool, true masks.
+    """
+
+    plot: Plot
+    drive: Drive
+    mount: Mount
+    views: tuple[View, ...]
+    masks: np.ndarray
+
+
+def draw_scene(family: Family, seed: int) -> Scene:
+    """Draws the pairs of a row."""
+    sequence = Sequence.of(draw(family, seed))
+    views, masks = [], []
+    for pair in sequence:
+        driven = float(sequence.drive.odometry[pair.frame])
+        views.append(View(pair.frame, np.asarray(pair.left), np.asarray(pair.right), driven))
+        masks.append(true_mask(pair.instance, len(sequence.plot.measured)))
+    return Scene(sequence.plot, sequence.drive, Mount.of(family.rig), tuple(views), np.stack(masks))
+
+
+def score_scene(scene: Scene, mask: Mask | None = None, ways: Ways = OURS) -> tuple[RunScore, Perception]:
+    """Runs everything on a scene and compares.
+
+    Args:
+        scene: What is seen.
+        mask: What finds the pixels of stalks; None for true masks.
+        ways: Which steps go as in the thesis.
+    """
+    painted: dict[int, np.ndarray] = {}
+
+    def remembered(image: np.ndarray, number: int) -> np.ndarray:
+        painted[number] = scene.masks[number] if mask is None else mask(image, number)
+        return painted[number]
+
+    perception = perceive(scene.views, remembered, scene.drive.stated, scene.mount, ways)
+    targets = in_world(perception, scene)
+    true, found, errors = match_stalks(targets, scene.plot)
+    poses = scene.drive.poses
+    errors_of_stitches = [
+        stitch_error(each.motion, poses[place], poses[place + 1], scene.mount) for place, each in enumerate(perception.stitches)
+    ]
+    count = len(scene.views)
+    score = RunScore(
+        seed=scene.plot.seed,
+        true=true,
+        found=found,
+        errors=1e3 * errors,
+        stitches=1e3 * np.array(errors_of_stitches),
+        refused=sum(bool(each.refused) for each in perception.stitches),
+        seconds={name: value / count for name, value in perception.seconds.items()},
+        mask=None if mask is None else _mask_score([(painted[number], scene.masks[number]) for number in painted]),
+        notes=perception.notes,
+    )
+    return score, perception
+
+
+def in_world(perception: Perception, scene: Scene) -> np.ndarray:
+    """Grasp points [B, 3] in the plot's frame, m: the robot stands where the last pair was taken, and is mounted as stated."""
+    points = np.array([each.point for each in perception.points]).reshape(-1, 3)
+    return scene.drive.poses[-1].to_world(scene.mount.pose.to_camera(points))
+
+
+def stretch_of(plot: Plot) -> tuple[float, float]:
+    """Where along the row the robot drives, m."""
+    length = plot.family.layout.plot_length
+    stretch = plot.family.rig.stretch or length
+    return 0.5 * (length - stretch), 0.5 * (length + stretch)
+
+
+def match_stalks(targets: np.ndarray, plot: Plot) -> tuple[int, int, np.ndarray]:
+    """Matches grasp points with stalks of the near row, one to one.
+
+    Args:
+        targets: [B, 3] in the plot's frame, m.
+        plot: What stands there.
+
+    Returns:
+        How many stalks there are in the stretch, how many grasp points, without those of stalks beyond it, and the distances
+        [K] of those that hit, m.
+    """
+    low, high = stretch_of(plot)
+    inside = np.array([low <= stalk.at_height(PREFERRED)[0][0] <= high for stalk in plot.measured], bool)
+    distance = np.array(
+        [[math.dist(target[:2], stalk.at_height(target[2])[0][:2]) for stalk in plot.measured] for target in targets]
+    ).reshape(len(targets), len(plot.measured))
+    rows, columns = linear_sum_assignment(np.minimum(distance, RADIUS))
+    near = distance[rows, columns] < RADIUS
+    of_target = dict(zip(rows[near].tolist(), columns[near].tolist()))
+    errors = [distance[row, column] for row, column in of_target.items() if inside[column]]
+    false = sum(row not in of_target and low <= target[0] <= high for row, target in enumerate(targets))
+    return int(inside.sum()), len(errors) + int(false), np.array(errors)
+
+
+def true_motion(before: Pose, after: Pose, mount: Mount) -> Motion:
+    """How the robot frame of one pair lies in that of another one, by the true poses of their cameras."""
+    nominal = mount.pose
+    rotation = nominal.rotation.T @ after.rotation @ before.rotation.T @ nominal.rotation
+    origin = nominal.to_world(after.to_camera(before.to_world(nominal.to_camera(np.zeros(3)))))
+    return Motion(rotation, origin)
+
+
+def stitch_error(motion: Motion, before: Pose, after: Pose, mount: Mount) -> float:
+    """Mean horizontal distance in m between where a stitch puts places of the row, and where they are."""
+    away = float(0.5 * (before.position[1] + after.position[1]))
+    places = np.array([[x, -away, z] for x in (-0.2, 0.0, 0.2) for z in (0.5, 0.75, 1.0)])
+    difference = motion(places) - true_motion(before, after, mount)(places)
+    return float(np.linalg.norm(difference[:, :2], axis=1).mean())
+
+
+def _mask_score(masks: list[tuple[np.ndarray, np.ndarray]]) -> MaskScore:
+    """Compares painted masks with true ones."""
+    far = [_between_outlines(*each) for each in masks]
+    return MaskScore(
+        hits=int(sum((painted & true).sum() for painted, true in masks)),
+        painted=int(sum(painted.sum() for painted, _ in masks)),
+        true=int(sum(true.sum() for _, true in masks)),
+        boundary=float(np.nanmean(far)) if np.isfinite(far).any() else math.nan,
+    )
+
+
+def _between_outlines(painted: np.ndarray, true: np.ndarray) -> float:
+    """Mean distance of the outlines of two masks, in both directions, pixels; not a number where one has none."""
+    outlines = [each.astype(np.uint8) - cv2.erode(each.astype(np.uint8), np.ones((3, 3), np.uint8)) for each in (painted, true)]
+    if not all(each.any() for each in outlines):
+        return math.nan
+    far = [cv2.distanceTransform(1 - each, cv2.DIST_L2, 5) for each in outlines]
+    return 0.5 * float(far[0][outlines[1] > 0].mean() + far[1][outlines[0] > 0].mean())
+
+
+def summary(scores: Iterable[RunScore]) -> dict[str, Any]:
+    """What the scores of runs say together.
+
+    Returns:
+        ``f1``, ``precision`` and ``recall`` of stalks, ``point_median_mm`` and ``point_p95_mm``, ``stitch_median_mm`` and
+        ``stitch_p95_mm``, ``stitches_refused``, ``seconds_per_pair`` and its parts, for networks ``mask_f1`` and
+        ``mask_boundary_px``, and how much there was of each. Not a number where there was nothing.
+    """
+    scores = list(scores)
+    true, found = sum(each.true for each in scores), sum(each.found for each in scores)
+    errors = np.concatenate([each.errors for each in scores] or [np.zeros(0)])
+    stitches = np.concatenate([each.stitches for each in scores] or [np.zeros(0)])
+    hits = len(errors)
+    seconds = {
+        name: float(np.median([each.seconds[name] for each in scores])) for name in (scores[0].seconds if scores else ())
+    }
+    figures = {
+        "runs": len(scores),
+        "stalks": true,
+        "grasp_points": found,
+        "hits": hits,
+        "precision": hits / found if found else math.nan,
+        "recall": hits / true if true else math.nan,
+        "f1": 2.0 * hits / (true + found) if true + found else math.nan,
+        "point_median_mm": _quantile(errors, 0.5),
+        "point_p95_mm": _quantile(errors, 0.95),
+        "stitches": len(stitches),
+        "stitches_refused": sum(each.refused for each in scores),
+        "stitch_median_mm": _quantile(stitches, 0.5),
+        "stitch_p95_mm": _quantile(stitches, 0.95),
+        "seconds_per_pair": float(np.median([sum(each.seconds.values()) for each in scores])) if scores else math.nan,
+        **{f"seconds_{name}": value for name, value in seconds.items()},
+    }
+    masks = [each.mask for each in scores if each.mask is not None]
+    if masks:
+        painted, wanted = sum(each.painted for each in masks), sum(each.true for each in masks)
+        figures["mask_f1"] = 2.0 * sum(each.hits for each in masks) / (painted + wanted) if painted + wanted else math.nan
+        figures["mask_boundary_px"] = float(np.nanmean([each.boundary for each in masks]))
+    return figures
+
+
+def _quantile(values: np.ndarray, share: float) -> float:
+    return float(np.quantile(values, share)) if values.size else math.nan

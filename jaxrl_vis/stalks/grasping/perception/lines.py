@@ -1,0 +1,254 @@
+"""Grasp points from a line per stalk: what several pairs agree on.
+
+Pieces of stalks give lines; chords of all pairs that lie along a line belong to it, above and below what hides the rest; a
+stalk is a line that enough chords of enough pairs support. Its grasp point lies where most of it is seen, at a height at which
+the gripper works. Lines bend: half a metre below the grasp point a straight one is 12 mm beside the stalk, a bent one 2 mm.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxrl_vis.stalks.grasping.perception.stalk_segments import Chords
+from jaxrl_vis.stalks.grasping.perception.visibility import Sight
+
+HEIGHTS = (0.45, 1.05)
+"""Heights at which stalks are grasped, m above the ground."""
+PREFERRED = 0.75
+"""The one that is taken if all are as good, m."""
+
+
+@dataclasses.dataclass(frozen=True)
+class GraspPoint:
+    """One stalk that can be grasped.
+
+    Attributes:
+        point: [3] float64, middle of the stalk where it is to be grasped, in the robot frame of the last pair, m.
+        direction: [3] float64, unit vector along the stalk there, upwards.
+        thickness: Diameter there, m; not a number where it was not measured.
+        frames: How many pairs show it.
+        spread: Standard deviation of what was seen around the line, horizontally, m; not a number where unknown.
+        bend: How much it turns, x and y, per m.
+        taper: By how much its diameter grows for each m upwards, m.
+    """
+
+    point: np.ndarray
+    direction: np.ndarray
+    thickness: float
+    frames: int
+    spread: float
+    bend: tuple[float, float] = (0.0, 0.0)
+    taper: float = 0.0
+
+    def at_height(self, height: float | np.ndarray) -> np.ndarray:
+        """Where the stalk's line is at heights [...] in m: [..., 3], m."""
+        up = np.asarray(height - self.point[2])[..., None]
+        return self.point + self.direction * (up / self.direction[2]) + np.array([*self.bend, 0.0]) * up**2
+
+    def thickness_at(self, height: float) -> float:
+        """Diameter at a height in m, m; no less than half of what it is at the grasp point."""
+        return max(self.thickness + self.taper * (height - self.point[2]), 0.5 * self.thickness)
+
+
+_NEAR = 0.009  # m: chords so near a line belong to it
+_LONG = 0.3  # m: of a stalk that shows how it bends
+_USUAL_TAPER = -0.01  # m per m
+_OPENING = 0.03  # by how much more for each m beyond what is known of the line
+_LEAST_PIECE = 0.03  # m
+_STEEPEST = 0.6  # m per m
+_BIN = 0.02  # m: heights that are counted as one
+_LEAST_SUPPORT = 0.12  # m, over all pairs
+_WINDOW = 0.10  # m: above and below the grasp point
+_AROUND = 0.2  # m: above and below the grasp point pairs are asked what they show
+_LEAST_SHOWN = 4  # places, of a pair that shows it
+_LEAST_SHARE = 0.4  # of the pairs and places that show it or see through it
+_APART = 0.012  # m: lines that come nearer are one stalk
+_BEND = 0.04  # by how much more for each m between the heights at which they were seen
+_REST_WITHIN, _REST_SPREAD = 0.025, 0.003  # m
+_LEVEL = 0.002  # m: chords of one pair that differ less in height are of one line of its image
+_LEAST_BESIDE, _SHARE_BESIDE = 20, 0.2  # chords that lie beside each other, of two stalks that do
+_APART_BESIDE = 0.008  # m
+
+
+class _Found(NamedTuple):
+    """A line, the chords that it is made of, and how often pairs show it."""
+
+    point: GraspPoint
+    members: np.ndarray
+    shown: int
+
+
+def grasp_points(chords: Chords, sight: Sight, heights: tuple[float, float] = HEIGHTS) -> list[GraspPoint]:
+    """Stalks and where to grasp them, from left to right.
+
+    Args:
+        chords: Of all pairs, in one robot frame.
+        sight: What all pairs say of a place.
+        heights: Lowest and highest grasp, m above the ground.
+    """
+    free = np.ones(len(chords), bool)
+    found: list[_Found] = []
+    for seed in _seeds(chords):
+        members = seed[free[seed]]
+        if np.ptp(chords.middle[members, 2]) < _LEAST_PIECE if len(members) else True:
+            continue
+        members = _grow(chords, members, free)
+        if not len(members):
+            continue
+        free[members] = False
+        point = _grasp(chords, members, min(2, len(sight.clouds)), heights)
+        if point is None:
+            continue
+        count = _agreed(point, sight)
+        if count:
+            found.append(_Found(point, members, count))
+    found.sort(key=lambda each: -each.shown)
+    return sorted((each.point for each in _distinct(found, chords)), key=lambda point: float(point.point[0]))
+
+
+def _seeds(chords: Chords) -> list[np.ndarray]:
+    """Chords of each piece, tall pieces first."""
+    order = np.argsort(chords.piece, kind="stable")
+    parts = np.split(order, np.flatnonzero(np.diff(chords.piece[order])) + 1) if len(order) else []
+    parts = [part for part in parts if len(part) >= 5]
+    return sorted(parts, key=lambda part: -float(np.ptp(chords.middle[part, 2])))
+
+
+def _fit(points: np.ndarray, weights: np.ndarray, bent: bool) -> tuple[np.ndarray, float]:
+    """Coefficients [K, 2] of x and y as polynomials of the height from the middle one, and that height."""
+    middle = float(weights @ points[:, 2] / weights.sum())
+    height = points[:, 2] - middle
+    powers = np.stack([np.ones_like(height), height, height**2][: 3 if bent else 2], axis=1)
+    # Stalks are nearly straight: little is believed of a bend that a short piece shows.
+    stiff = np.diag([0.0, 1e-4, 0.02][: powers.shape[1]]) * weights.sum() * 1e-2
+    normal = powers.T @ (powers * weights[:, None]) + stiff
+    return np.linalg.solve(normal, powers.T @ (points[:, :2] * weights[:, None])), middle
+
+
+def _offsets(points: np.ndarray, coefficients: np.ndarray, middle: float) -> np.ndarray:
+    """Horizontal distance [N] of points from a line."""
+    height = points[:, 2] - middle
+    powers = np.stack([np.ones_like(height), height, height**2][: len(coefficients)], axis=1)
+    return np.linalg.norm(points[:, :2] - powers @ coefficients, axis=1)
+
+
+def _robust(points: np.ndarray, bent: bool) -> tuple[np.ndarray, float]:
+    weights = np.ones(len(points))
+    coefficients, middle = _fit(points, weights, bent)
+    for _ in range(4):
+        offset = _offsets(points, coefficients, middle)
+        weights = 1.0 / (1.0 + (offset / 0.004) ** 2)
+        coefficients, middle = _fit(points, weights, bent)
+    return coefficients, middle
+
+
+def _grow(chords: Chords, members: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """All free chords along the line through some of them; none where that is no stalk."""
+    candidates = np.flatnonzero(free)
+    points = chords.middle[candidates]
+    for _ in range(6):
+        known = chords.middle[members]
+        low, high = known[:, 2].min(), known[:, 2].max()
+        coefficients, middle = _robust(known, bent=high - low > _LONG)
+        if np.abs(coefficients[1]).max() > _STEEPEST:
+            return members[:0]
+        beyond = np.maximum(np.maximum(low - points[:, 2], points[:, 2] - high), 0.0)
+        # Further away than a stalk is long at the known bend, nothing is believed.
+        near = _offsets(points, coefficients, middle) < _NEAR + _OPENING * beyond
+        near &= beyond < max(0.15, 1.0 * (high - low))
+        grown = candidates[near]
+        if len(grown) < 5 or (len(grown) == len(members) and (grown == members).all()):
+            break
+        members = grown
+    return members
+
+
+def _support(chords: Chords, members: np.ndarray) -> tuple[float, int]:
+    """Length that is seen, summed over pairs, in m, and the number of pairs that see at least two heights of it."""
+    bins = np.floor(chords.middle[members, 2] / _BIN).astype(int)
+    seen = np.unique(np.stack([chords.frame[members], bins], axis=1), axis=0)
+    frames, counts = np.unique(seen[:, 0], return_counts=True)
+    return _BIN * len(seen), int((counts >= 2).sum())
+
+
+def _grasp(chords: Chords, members: np.ndarray, least_frames: int, heights: tuple[float, float]) -> GraspPoint | None:
+    """Where to grasp a stalk; None where too little of it is seen."""
+    length, frames = _support(chords, members)
+    if length < _LEAST_SUPPORT or frames < least_frames:
+        return None
+    points = chords.middle[members]
+    places = np.arange(heights[0], heights[1] + 1e-9, _BIN)
+    within = np.abs(points[None, :, 2] - places[:, None]) < _WINDOW
+    count = within.sum(axis=1) * np.exp(-0.5 * ((places - PREFERRED) / 0.3) ** 2)
+    best = int(np.argmax(count))
+    if within[best].sum() < 8:
+        return None
+    near = np.flatnonzero(within[best])
+    local, middle = _robust(points[near], bent=False)
+    x, y = local[0] + local[1] * (places[best] - middle)
+    spread = float(np.sqrt(np.mean(np.minimum(_offsets(points[near], local, middle), _NEAR) ** 2)))
+    thickness = float(np.median(chords.thickness[members[near]]))
+    # Where it goes from there, all of it says.
+    whole, middle = _robust(points, bent=np.ptp(points[:, 2]) > _LONG)
+    bend = whole[2] if len(whole) > 2 else np.zeros(2)
+    direction = np.array([*(whole[1] + 2.0 * bend * (places[best] - middle)), 1.0])
+    return GraspPoint(
+        np.array([x, y, places[best]]),
+        direction / np.linalg.norm(direction),
+        thickness,
+        frames,
+        spread,
+        (float(bend[0]), float(bend[1])),
+        _taper(points[:, 2], chords.thickness[members]),
+    )
+
+
+def _taper(heights: np.ndarray, thickness: np.ndarray) -> float:
+    """By how much a diameter grows for each m upwards, m: from the lower half of what is seen to the upper one."""
+    if np.ptp(heights) < _LONG:
+        return _USUAL_TAPER
+    upper = heights > 0.5 * (heights.min() + heights.max())
+    parts = [(np.median(heights[half]), np.median(thickness[half])) for half in (upper, ~upper)]
+    return float((parts[0][1] - parts[1][1]) / (parts[0][0] - parts[1][0]))
+
+
+def _agreed(point: GraspPoint, sight: Sight) -> int:
+    """How often pairs show the stalk along its line; 0 where fewer than two do, or too many see through it."""
+    places = point.point[2] + np.arange(-_AROUND, _AROUND, 0.5 * _BIN)
+    shown, through = sight.look(point.at_height(places))
+    count = int(shown.sum())
+    frames = int((shown.sum(axis=1) >= _LEAST_SHOWN).sum())
+    agreed = frames >= min(2, len(sight.clouds)) and count >= _LEAST_SHARE * (count + through.sum())
+    return count if agreed else 0
+
+
+def _distinct(found: list[_Found], chords: Chords) -> list[_Found]:
+    """Without lines that are the same stalk as one before them."""
+    kept: list[_Found] = []
+    for each in found:
+        if not any(_same(each.point, other.point) and not _beside(chords, each, other) for other in kept):
+            kept.append(each)
+    return kept
+
+
+def _same(point: GraspPoint, other: GraspPoint) -> bool:
+    """Whether a line is likely the same stalk as another one that is seen better."""
+    up = point.point[2] - other.point[2]
+    distance = float(np.linalg.norm((point.point - other.at_height(point.point[2]))[:2]))
+    # What is left of a stalk beside its line is near it, and scatters.
+    return distance < _APART + _BEND * abs(up) or (distance < _REST_WITHIN and point.spread > _REST_SPREAD)
+
+
+def _beside(chords: Chords, one: _Found, other: _Found) -> bool:
+    """Whether pairs show two lines beside each other at the same heights: then they are two stalks, however near."""
+    apart = [np.zeros(0)]
+    for frame in np.intersect1d(chords.frame[one.members], chords.frame[other.members]):
+        mine, theirs = (chords.middle[each.members[chords.frame[each.members] == frame]] for each in (one, other))
+        theirs = theirs[np.argsort(theirs[:, 2])]
+        place = np.searchsorted(0.5 * (theirs[1:, 2] + theirs[:-1, 2]), mine[:, 2])
+        level = np.abs(theirs[place, 2] - mine[:, 2]) < _LEVEL
+        apart.append(np.linalg.norm((theirs[place] - mine)[level, :2], axis=1))
+    found = np.concatenate(apart)
+    enough = max(_LEAST_BESIDE, _SHARE_BESIDE * min(len(one.members), len(other.members)))
+    return len(found) >= enough and float(np.median(found)) > _APART_BESIDE

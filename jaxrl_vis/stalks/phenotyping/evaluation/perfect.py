@@ -1,0 +1,46 @@
+"""Finds as perfect networks would give them: true boxes and masks of synthetic pairs, to see what the rest makes of them."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from jaxrl_vis.stalks.phenotyping.detector.finder import Detection, higher_up
+
+
+def perfect_detections(seen: Iterable[Mapping[str, Any]], instance: np.ndarray, least: float = 0.3) -> list[Detection]:
+    """The stalks that an image shows, from left to right.
+
+    Args:
+        seen: With ``stalk``, ``band_box`` and ``band_visible``, as of `truth.StalkInView` or plot.json.
+        instance: [H, W] whole numbers: which stalk each pixel shows.
+        least: Share of a stalk's part in the band that must be seen.
+    """
+    found = []
+    height, width = instance.shape
+    for each in seen:
+        if each["band_box"] is None or each["band_visible"] < least:
+            continue
+        left, top, right, bottom = each["band_box"]
+        first, last = max(round(left) - 3, 0), min(round(right) + 4, width)
+        upper, lower = max(round(top), 0), min(round(bottom) + 1, height)
+        mask = instance[upper:lower, first:last] == each["stalk"]
+        line, column = np.nonzero(mask)
+        if line.size < 50 or np.ptp(line) < 4:
+            continue
+        slope, offset = np.polyfit(line + upper, column + first, 1)
+        axis = (float(offset + slope * top), float(offset + slope * bottom))
+        above = _upper(np.array([left, top, right, bottom, *axis]) + 0.5, instance, each["stalk"])
+        found.append(Detection((left, top, right, bottom), axis, 1.0, mask, (upper, first), above))
+    return sorted(found, key=lambda each: sum(each.axis))
+
+
+def _upper(stalk: np.ndarray, instance: np.ndarray, index: int) -> tuple[np.ndarray, tuple[int, int]] | None:
+    """True mask of a stalk's piece around the upper height, and its corner; None where the image does not show it."""
+    left, top, right, bottom = higher_up(stalk)[:4]
+    beside = right - left  # it may bend
+    first, last = max(round(left - beside), 0), min(round(right + beside), instance.shape[1])
+    if top <= 0 or last <= first:
+        return None
+    lines = slice(round(top), round(bottom))
+    return instance[lines, first:last] == index, (lines.start, first)

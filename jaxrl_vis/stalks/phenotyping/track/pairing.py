@@ -1,0 +1,57 @@
+"""Why a right image shows hardly any stalk of its left one: the two may be swapped, or not rectified."""
+
+import dataclasses
+
+import numpy as np
+
+from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
+from jaxrl_vis.stalks.phenotyping.measure.stalk import measure
+from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting, grey_of
+from jaxrl_vis_envs.plants import Calibration
+
+_ENOUGH = 4
+_FEW, _MANY = 0.25, 0.6
+_LINES = (6, 12, 24, 48)  # how far two images lie apart that are not rectified, pixels of an image 3376 wide
+
+
+def wrong_with(
+    detections: list[Detection], sightings: list[Sighting], left: np.ndarray, right: np.ndarray, calibration: Calibration
+) -> str | None:
+    """What is wrong with a pair, in words; None if nothing is, or too little was found to tell.
+
+    Args:
+        detections: In the left image.
+        sightings: What came of them.
+        left, right: [H, W, 3] uint8.
+        calibration: Of the cameras.
+    """
+    measured = sum(each.diameter_mm is not None for each in sightings)
+    if len(detections) < _ENOUGH or measured > _FEW * len(detections):
+        return None
+    grey_left, grey_right = grey_of(left), grey_of(right)
+    # Seen in a mirror, a pair that is swapped is one that is not.
+    mirror = dataclasses.replace(calibration, centre=(calibration.width - 1 - calibration.centre[0], calibration.centre[1]))
+    turned = [
+        dataclasses.replace(
+            each,
+            mask=each.mask[:, ::-1],
+            corner=(each.corner[0], left.shape[1] - each.corner[1] - each.mask.shape[1]),
+            strip=None,
+        )
+        for each in detections
+    ]
+    if _share(turned, grey_left[:, ::-1], grey_right[:, ::-1], mirror) >= _MANY:
+        return "left and right are swapped: exchange their names"
+    for lines in sorted({max(round(each * calibration.width / 3376), 3) for each in _LINES}):
+        for shift in (lines, -lines):
+            if _share(detections, grey_left, np.roll(grey_right, shift, axis=0), calibration) >= _MANY:
+                return f"the right image lies about {lines} lines too {'high' if shift > 0 else 'low'}: rectify the pair"
+    return None
+
+
+def _share(detections: list[Detection], left: np.ndarray, right: np.ndarray, calibration: Calibration) -> float:
+    """Share of finds, ten at most, that the right image shows."""
+    some = detections[:: -(-len(detections) // 10)]
+    left, right = np.ascontiguousarray(left), np.ascontiguousarray(right)
+    found = [measure(each.mask, each.corner, left, right, calibration).diameter_mm is not None for each in some]
+    return sum(found) / len(found)
