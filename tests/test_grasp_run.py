@@ -12,10 +12,10 @@ from PIL import Image
 
 from jaxrl_vis import cli
 from jaxrl_vis.evaluation_pool import finite
-from jaxrl_vis.stalks.cli.grasp_train import _Drawn as Drawn
-from jaxrl_vis.stalks.cli.options import family_of
+from jaxrl_vis.stalks.cli.options import PlantOptions
 from jaxrl_vis.stalks.grasping.evaluation.records import Conditions, evaluate_run
 from jaxrl_vis.stalks.grasping.evaluation.scoring import draw_scene, score_scene, summary
+from jaxrl_vis.stalks.grasping.evaluation.truth_on_disk import find_truth
 from jaxrl_vis.stalks.grasping.perception.cloud import Mount
 from jaxrl_vis.stalks.grasping.perception.perceive import ORIGINAL, OURS, Ways
 from jaxrl_vis.stalks.grasping.pipeline import Request, run
@@ -138,7 +138,7 @@ def test_clouds_that_do_not_stitch_and_an_arm_that_reaches_nothing_are_told(runs
     assert int(row["stitches_refused"]) >= 1 and row["reachable"] == "0"
     shutil.copy(runs / "plot_0000" / "odometry.csv", folder)
     truth = {
-        path.name[9:12]: cli.grasp_run._truth(None, find_plots(folder)[0], pair)
+        path.name[9:12]: find_truth(None, find_plots(folder)[0], pair)
         for path, pair in zip(sorted((folder / "truth").glob("instance_*")), find_plots(folder)[0].pairs)
     }
     request = dataclasses.replace(request, out=tmp_path / "far")
@@ -162,7 +162,7 @@ def test_eval_of_rows_and_of_an_empty_one(spec, tmp_path, capsys):
     said = capsys.readouterr().out
     assert "simulated runs of family few" in said and "the arm, again, wind 5 mm:" in said
     # A run is the same in this process, and is not evaluated again.
-    family = family_of(Drawn("training", spec, 256, (), 3), "grasping")
+    family = PlantOptions(spec=spec, width=256, frames=3).read_family("grasping")
     here = json.loads(json.dumps(finite(evaluate_run(Conditions(family), 1))))
     there = figures["each"][1]
     assert here["plan"]["stalks"] == there["plan"]["stalks"] and here["hits"] == there["hits"]
@@ -172,7 +172,7 @@ def test_eval_of_rows_and_of_an_empty_one(spec, tmp_path, capsys):
     said = capsys.readouterr().out
     assert "evaluated before: 2 of 2 runs" in said and "run 1" not in said
     assert json.loads(out.read_text()) == figures and out.stat().st_mtime_ns >= before
-    figure = ["figure", "4.6", "--evaluation", str(out), "--out", str(tmp_path / "figure.png")]
+    figure = ["grasp", "figure", "4.6", "--evaluation", str(out), "--out", str(tmp_path / "figure.png")]
     assert cli.main([*figure, "--wind", "5"]) == 0 and (tmp_path / "figure.png").stat().st_size > 20_000
     assert cli.main([*figure, "--wind", "7"]) == 2
     assert "holds no reaches of the kind `again, wind 7 mm`" in capsys.readouterr().err
@@ -235,6 +235,11 @@ def test_masks_are_compared_with_the_truth_and_the_figure_is_drawn(spec, tmp_pat
         (["run", ".", "--pitch", "99"], "--pitch must be from -60 to 60"),
         (["run", ".", "--height", "0"], "--height must be from 0.05 to 3"),
         (["run", ".", "--speed", "0"], "--speed must be more than 0"),
+        (["figure"], "grasp figure what? Choose one of 4.4, 4.5, 4.6"),
+        (["figure", "4.9"], "unknown command 'grasp figure 4.9'"),
+        (["figure", "4.4", "--video", "a.gif"], "unknown option --video"),
+        (["figure", "4.5", "--wind", "101"], "--wind must be from 0 to 100 mm, not 101"),
+        (["figure", "4.6", "--out", "a.txt"], "a figure is a file that ends in .png, .pdf or .svg"),
     ],
 )
 def test_wrong_requests(tmp_path, monkeypatch, capsys, words, part):

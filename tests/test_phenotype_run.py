@@ -151,7 +151,7 @@ def evaluation(tmp_path_factory) -> Path:
 @pytest.mark.parametrize("figure", ["3.4", "3.5", "table3.1"])
 def test_figures_of_chapter_3(evaluation, tmp_path, figure):
     out = tmp_path / "new" / ("table.md" if figure == "table3.1" else "figure.png")
-    assert cli.main(["figure", figure, "--out", str(out), "--evaluation", str(evaluation)]) == 0
+    assert cli.main(["phenotype", "figure", figure, "--out", str(out), "--evaluation", str(evaluation)]) == 0
     text, rows = out.with_suffix(".md").read_text(), table(out.with_suffix(".csv"))
     assert "ynthetic" in text and len(rows) == 3
     if figure == "table3.1":
@@ -168,15 +168,15 @@ def test_figures_of_chapter_3(evaluation, tmp_path, figure):
     ("words", "part"),
     [
         (["3.4", "--out", "a.txt"], "3.4 is a file that ends in .png or .pdf or .svg"),
-        (["3.4", "--preset", "cpu"], "--preset goes with figures of training runs, not with 3.4"),
+        (["3.4", "--preset", "cpu"], "unknown option --preset"),
         (["3.4", "--evaluation", "missing.json"], "cannot read missing.json"),
         (["3.5", "--evaluation", "missing.json", "--plots", "2"], "leave out --plots and --quick"),
-        (["5.4", "--plots", "2"], "--plots goes with figures 3.4, 3.5 and table3.1"),
+        (["5.4"], "unknown figure '5.4'"),
     ],
 )
 def test_wrong_requests_of_figures(tmp_path, monkeypatch, capsys, words, part):
     monkeypatch.chdir(tmp_path)
-    assert cli.main(["figure", *words]) == 2
+    assert cli.main(["phenotype", "figure", *words]) == 2
     assert part in capsys.readouterr().err
 
 
@@ -184,5 +184,5 @@ def test_what_is_no_evaluation(tmp_path, capsys):
     path = tmp_path / "eval.json"
     for text in ("", "{}", '{"synthetic": true, "each": [{}]}'):
         path.write_text(text)
-        assert cli.main(["figure", "3.4", "--out", str(tmp_path / "a.png"), "--evaluation", str(path)]) == 2
+        assert cli.main(["phenotype", "figure", "3.4", "--out", str(tmp_path / "a.png"), "--evaluation", str(path)]) == 2
         assert "holds no evaluation" in capsys.readouterr().err

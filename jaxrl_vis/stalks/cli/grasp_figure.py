@@ -1,118 +1,121 @@
-"""The figures of chapter 4: ``jaxrl-vis figure 4.4 | 4.5 | 4.6``."""
+"""``jaxrl-vis grasp figure``: the figures of chapter 4."""
 
+import dataclasses
 from pathlib import Path
-from typing import Any, Protocol
+from typing import ClassVar
 
-from jaxrl_vis.cli.checks import check_extra
 from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.report.outputs import check_writable
-from jaxrl_vis.stalks.cli.grasp_synth import painter_of
-from jaxrl_vis_envs.documents import read_json
-
-NAMES = ("4.4", "4.5", "4.6")
-OPTIONS = ("wind", "video", "evaluation")
-"""Options of some of them."""
-_MOST_WIND = 100.0  # mm
+from jaxrl_vis.report.outputs import check_figure, check_writable
+from jaxrl_vis.stalks.cli.grasp_eval import Eval, check_wind, evaluate
+from jaxrl_vis.stalks.cli.options import check_extra
 
 
-class FigureOptions(Protocol):
-    """The options of the command that are used here."""
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Figure:
+    """Options of all figures."""
 
-    @property
-    def seed(self) -> int | None:
-        """Of the run, or of the first one."""
-        ...
+    name: ClassVar[str]
 
-    @property
-    def wind(self) -> float:
-        """How far stalks sway, mm."""
-        ...
+    out: Path | None = None
+    """A .png, .pdf or .svg file; figure_FIGURE.png in the current folder if not given."""
+    seed: int = 0
+    """Seed of the run, or of the first run."""
 
-    @property
-    def video(self) -> Path | None:
-        """A file for the video of figure 4.5."""
-        ...
+    def check(self) -> Path:
+        """Check the options, the packages and the devices, and return the file of the figure.
 
-    @property
-    def evaluation(self) -> Path | None:
-        """What ``grasp eval --reach --json`` wrote."""
-        ...
+        Raises:
+            RequestError: An option makes no sense, a package is missing, or no device works.
+        """
+        if self.seed < 0:
+            raise RequestError(f"--seed must be at least 0, not {self.seed}")
+        out = self.out or Path(f"figure_{self.name}.png")
+        check_figure(out)
+        check_extra("grasping")
+        check_devices()
+        return out
 
 
-def make_figure(name: str, out: Path, options: FigureOptions) -> int:
-    """Draws one of them, with the masks of the networks that are shipped.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PerceptionFigure(_Figure):
+    """Draw figure 4.4: from a stereo pair of a synthetic run to grasp points."""
 
-    Args:
-        name: Of `NAMES`.
-        out: The file.
-        options: Of the command.
+    name: ClassVar[str] = "4.4"
 
-    Raises:
-        RequestError: An option makes no sense.
-    """
-    seed = options.seed or 0
-    if seed < 0:
-        raise RequestError(f"--seed must be at least 0, not {seed}")
-    if not 0 <= options.wind <= _MOST_WIND:
-        raise RequestError(f"--wind must be from 0 to {_MOST_WIND:g} mm, not {options.wind:g}")
-    check_extra(f"figure {name}", "grasping")
+    weights: Path | None = None
+    """Weights of masks, from `grasp train`; the shipped segmentation if not given. The thesis shows `--loss gan`."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PathFigure(_Figure):
+    """Draw figure 4.5: the planned path of the grip to a stalk of a synthetic run, and the path taken."""
+
+    name: ClassVar[str] = "4.5"
+
+    wind: float = 10.0
+    """Amplitude of the stalks' sway in the wind, mm."""
+    video: Path | None = None
+    """A .gif, .mp4 or .html file of all reaches of the run."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class GraspsFigure(_Figure):
+    """Draw figure 4.6: attempts and grasps of 16 runs of half a metre."""
+
+    name: ClassVar[str] = "4.6"
+
+    wind: float = 10.0
+    """Amplitude of the stalks' sway in the wind, mm."""
+    evaluation: Path | None = None
+    """A file that `grasp eval --reach --json` wrote; if not given, runs are evaluated first, and the file goes beside the
+    figure."""
+
+
+def draw_perception(options: PerceptionFigure) -> int:
+    """Draws figure 4.4."""
+    out = options.check()
+    from jaxrl_vis.stalks.grasping.masks.loading import load_painter, resolve_weights
+    from jaxrl_vis.stalks.grasping.report.perception_figure import draw_figure
+    from jaxrl_vis_envs.plants.grasping import GRASPING
+
+    weights, name = resolve_weights(options.weights, "segmentation")
+    painter = load_painter(weights)
+    draw_figure(out, GRASPING, options.seed, lambda image, _: painter(image), name)
+    print(out)
+    return 0
+
+
+def draw_path(options: PathFigure) -> int:
+    """Draws figure 4.5, and the video."""
+    check_wind(options.wind)
     if options.video is not None:
         from jaxrl_vis.report.videos import check_output
 
         check_writable(options.video, "--video")
         check_output(options.video)
-    check_devices()
-    if name == "4.6":
-        _draw_grasps(out, seed, options)
-    else:
-        _draw_run(name, out, seed, options)
+    out = options.check()
+    from jaxrl_vis.stalks.grasping.masks.loading import load_painter, resolve_weights
+    from jaxrl_vis.stalks.grasping.report.reach_figures import draw_reach
+    from jaxrl_vis_envs.plants.grasping import GRASPING
+
+    painter = load_painter(resolve_weights(None, "segmentation")[0])
+    draw_reach(out, GRASPING, options.seed, lambda image, _: painter(image), options.wind, options.video)
+    if options.video is not None:
+        print(options.video)
     print(out)
     return 0
 
 
-def _draw_run(name: str, out: Path, seed: int, options: FigureOptions) -> None:
-    """Figure 4.4 or 4.5."""
-    from jaxrl_vis.stalks.grasping.report.perception_figure import draw_figure
-    from jaxrl_vis.stalks.grasping.report.reach_figures import draw_reach
-    from jaxrl_vis_envs.plants.grasping import GRASPING
-
-    loss = "gan" if name == "4.4" else "segmentation"  # what the thesis shows, and what the commands use
-    painter, named = painter_of(None, loss)
-
-    def mask(image: Any, number: int) -> Any:
-        return painter(image)
-
-    if name == "4.4":
-        draw_figure(out, GRASPING, seed, mask, named)
-    else:
-        draw_reach(out, GRASPING, seed, mask, options.wind, options.video)
-        if options.video is not None:
-            print(options.video)
-
-
-def _draw_grasps(out: Path, seed: int, options: FigureOptions) -> None:
-    """Figure 4.6, from an evaluation, or after one."""
-    from jaxrl_vis.stalks.cli.grasp_eval import Eval, evaluate
-    from jaxrl_vis.stalks.grasping.evaluation import records
-    from jaxrl_vis.stalks.grasping.report.reach_figures import RUNS, draw_grasps
+def draw_grasps(options: GraspsFigure) -> int:
+    """Draws figure 4.6, from an evaluation, or after one."""
+    check_wind(options.wind)
+    out = options.check()
+    from jaxrl_vis.stalks.grasping.report import reach_figures
 
     path = options.evaluation or out.with_suffix(".json")
     if options.evaluation is None:
-        evaluate(Eval(runs=RUNS, seed=seed, reach=True, wind=(options.wind,), json=path))
-    try:
-        found = read_json(path)
-        shown = [each for each in found["each"] if each["number"] >= seed][:RUNS]
-        known = set.intersection(*(set(each["reaches"]) for each in shown))
-        family, masks = found["family"], found["masks"]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise RequestError(
-            f"{path} is not what `grasp eval --reach --json` writes, or holds no run from seed {seed}"
-        ) from error
-    name = str(records.Reaches("again", options.wind))
-    if name not in known:
-        raise RequestError(
-            f"{path} holds no reaches of the kind `{name}`, only {', '.join(sorted(known))}: choose another --wind"
-        )
-    title = f"Simulated: family {family}, masks: {masks}, {options.wind:g} mm of wind, {len(shown)} runs; the arm looks again."
-    draw_grasps(out, shown, name, records.grasp_score(shown, name), title)
+        evaluate(Eval(runs=reach_figures.RUNS, seed=options.seed, reach=True, wind=(options.wind,), json=path))
+    reach_figures.draw_evaluation(out, path, options.seed, options.wind)
+    print(out)
+    return 0

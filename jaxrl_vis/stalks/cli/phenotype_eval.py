@@ -1,146 +1,112 @@
 """``jaxrl-vis phenotype eval``."""
 
 import dataclasses
-import functools
 import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from jaxrl_vis.cli.checks import check_counts, check_extra
+from jaxrl_vis.cli.checks import check_counts
 from jaxrl_vis.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.evaluation_pool import Kept, Record, evaluate_each, finite, share_accelerator
+from jaxrl_vis.evaluation_pool import Record, finite, share_accelerator
 from jaxrl_vis.report.outputs import check_writable
-from jaxrl_vis.stalks.cli.options import family_of
-from jaxrl_vis.stalks.cli.phenotype_run import networks, weights_of
+from jaxrl_vis.stalks.cli.options import EvaluationOptions, check_extra, check_masks
 
 if TYPE_CHECKING:
-    from jaxrl_vis.stalks.phenotyping.evaluation.records import Task
     from jaxrl_vis_envs.plants import Family
 
 
-@dataclasses.dataclass(frozen=True)
-class Eval:
-    """Compare finds, counts and widths with the exact truth of synthetic plots, which are drawn for it."""
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Eval(EvaluationOptions):
+    """Compare detections, counts and widths with the exact truth of synthetic plots, which are drawn for it."""
 
-    weights: Path | None = None
-    """Weights from `phenotype train`; those that are shipped if not given."""
     masks: Literal["network", "truth"] = "network"
-    """What finds stalks: the networks, or the truth, to see what the rest makes of it."""
-    family: Literal["training", "shifted"] | None = None
-    """What plots are drawn from; shifted, if no --spec says otherwise."""
-    shift: tuple[str, ...] = ()
-    """Shift only these factors of the family: flash, lean, rig, noise, leaves, textures."""
-    spec: Path | None = None
-    """A JSON or TOML file with the values of a family of your own."""
+    """Source of masks: the networks, or the truth, to see how good everything after the masks is."""
     plots: int = 10
-    """How many plots."""
-    seed: int = 0
-    """Seed of the first plot; the others have the numbers that follow."""
-    frames: int | None = None
-    """Pairs of a plot, in place of the family's 34."""
-    width: int | None = None
-    """Width of an image in pixels, in place of the family's 3376."""
+    """Number of plots."""
     method: Literal["strip", "ellipse"] = "strip"
-    """How widths are taken."""
+    """Method of widths."""
     least_score: float = 0.5
-    """What the networks are less sure of is no stalk, 0 to 1."""
+    """Lowest score of a detection that counts as a stalk, 0 to 1."""
     thesis: bool = False
-    """Also what the thesis's ways (ellipses, semi-global matching, stalks per metre of image) make of the same finds."""
+    """Score the thesis's methods too (ellipses, semi-global matching, stalks per metre of image), on the same detections."""
     each_factor: bool = False
-    """A table: the training family, each factor of the world shifted alone, and all of them; --plots of each."""
-    workers: int = 1
-    """How many processes score plots, each a plot of its own; they share the GPUs that there are. About one for each core, if
-    there is memory: 2 GB each. Figures do not depend on it, times do."""
-    json: Path | None = None
-    """A file for the figures of all plots together and of each; written after each plot. Plots that it holds already, of the
-    same conditions, are not scored again. With --each-factor, the table; the files of the factors go beside it."""
+    """A table: the training family, each factor of the world shifted alone, and all of them; --plots of each. --json names the
+    file of the table; the files of the factors go beside it."""
 
 
 def evaluate(options: Eval) -> int:
     """Prints the figures."""
-    check_counts(plots=options.plots, frames=options.frames, width=options.width, workers=options.workers)
-    if options.seed < 0:
-        raise RequestError(f"--seed must be at least 0, not {options.seed}")
+    check_counts(plots=options.plots)
+    options.check()
     if not 0.0 <= options.least_score <= 1.0:
         raise RequestError(f"--least-score must be from 0 to 1, not {options.least_score:g}")
-    if options.masks == "truth" and options.weights is not None:
-        raise RequestError("--masks truth uses no weights: leave out --weights")
-    check_extra("phenotype", "phenotyping")
+    check_masks(options.masks, options.weights)
+    check_extra("phenotyping")
     if options.json is not None:
         check_writable(options.json, "--json")
     if options.each_factor and (options.family or options.shift or options.spec):
         raise RequestError("--each-factor goes through the families by itself: leave out --family, --shift and --spec")
-    family = family_of(options, "phenotyping", "shifted")
+    family = options.read_family("phenotyping", "shifted")
     if options.workers > 1:
         share_accelerator()
     check_devices()
     enable_compilation_cache()
     weights, name = None, "truth"
     if options.masks == "network":
-        networks(options.weights, options.least_score)  # says what is wrong with the weights
-        weights, name = weights_of(options.weights)
-    from jaxrl_vis.stalks.phenotyping.evaluation.records import Task
+        from jaxrl_vis.stalks.phenotyping.detector.loading import detector_name, load_finder, resolve_weights
 
-    families = _factors(options) if options.each_factor else {"": family}
-    tasks = {
-        factor: Task(each, weights, options.method, options.least_score, options.thesis, options.workers)
-        for factor, each in families.items()
-    }
-    figures = _evaluate(options, tasks, name)
+        weights = resolve_weights(options.weights)
+        load_finder(weights, options.least_score)  # reports what is wrong with the weights
+        name = detector_name(weights)
+    figures = _evaluate(options, _factors(options) if options.each_factor else {"": family}, weights, name)
     if options.each_factor:
         _write_table(options, name, figures)
         return 0
     print(f"synthetic plots of family {family.name}, {name}, {options.method}:")
-    for each, value in figures[""].items():
-        print(f"  {each:24} {value if isinstance(value, int) else f'{value:.4f}'}")
+    for figure, value in figures[""].items():
+        print(f"  {figure:24} {value if isinstance(value, int) else f'{value:.4f}'}")
     return 0
 
 
 def _factors(options: Eval) -> "dict[str, Family]":
-    """The training family, each factor shifted alone, and all of them, by name."""
+    """Return the training family, each factor shifted alone, and all of them, by name."""
     from jaxrl_vis_envs.plants import SHIFTS
 
     alone = {factor: dataclasses.replace(options, family="training", shift=(factor,)) for factor in SHIFTS}
     none, all_of_them = (dataclasses.replace(options, family=name) for name in ("training", "shifted"))
-    return {factor: family_of(drawn, "phenotyping") for factor, drawn in {"none": none, **alone, "all": all_of_them}.items()}
+    shifted = {"none": none, **alone, "all": all_of_them}
+    return {factor: changed.read_family("phenotyping") for factor, changed in shifted.items()}
 
 
-def _evaluate(options: Eval, tasks: "Mapping[str, Task]", name: str) -> dict[str, dict[str, Any]]:
-    """Figures of all plots of each task together; says something of each plot, and keeps the files."""
-    from jaxrl_vis.stalks.phenotyping.evaluation import records as evaluation
+def _evaluate(options: Eval, families: "Mapping[str, Family]", weights: Path | None, name: str) -> dict[str, dict[str, Any]]:
+    """Evaluate all plots of each family, print a line per plot, and return the figures of each family."""
+    from jaxrl_vis.stalks.phenotyping.evaluation import records
 
-    summary_of = functools.partial(evaluation.summary_of, options.least_score)
-    wanted = range(options.seed, options.seed + options.plots)
-    kept = {
-        factor: Kept(_path(options.json, factor), {**evaluation.conditions(task), "finder": name}, summary_of)
-        for factor, task in tasks.items()
+    tasks = {
+        factor: records.Task(family, weights, name, options.method, options.least_score, options.thesis, options.workers)
+        for factor, family in families.items()
     }
-    there = sum(seed in each for each in kept.values() for seed in wanted)
-    if there:
-        print(f"evaluated before: {there} of {len(tasks) * len(wanted)} plots, in {options.json}", flush=True)
-    factors = list(tasks)
-    jobs = [(place, seed) for place, factor in enumerate(factors) for seed in wanted if seed not in kept[factor]]
 
-    def done(number: int, record: Record) -> None:
-        place, seed = jobs[number]
-        kept[factors[place]].add(seed, record)
-        one = summary_of([kept[factors[place]].records[seed]])
+    def started(count: int) -> None:
+        if count:
+            print(f"evaluated before: {count} of {len(tasks) * options.plots} plots, in {options.json}", flush=True)
+
+    def done(factor: str, seed: int, record: Record) -> None:
+        one = records.summary_of(options.least_score, [record])
         print(
-            f"{factors[place]} plot {seed}: {record['counted']} of {record['true']} stalks, ".lstrip()
+            f"{factor} plot {seed}: {record['counted']} of {record['true']} stalks, ".lstrip()
             + f"width error {one['width_mae_mm']:.2f} mm, F1 {one['f1']:.3f}",
             flush=True,
         )
 
-    evaluate_each(
-        functools.partial(evaluation.evaluate_job, list(tasks.values()), jobs), range(len(jobs)), options.workers, done
-    )
-    return {factor: summary_of([each.records[seed] for seed in wanted]) for factor, each in kept.items()}
+    seeds = range(options.seed, options.seed + options.plots)
+    return records.evaluate_tasks(tasks, seeds, {factor: _path(options.json, factor) for factor in tasks}, started, done)
 
 
 def _path(path: Path | None, factor: str) -> Path | None:
-    """The file of one factor: beside that of the table."""
+    """Return the file of one factor, which lies beside that of the table."""
     return path.with_name(f"{path.stem}-{factor}.json") if path and factor else path
 
 
@@ -148,7 +114,7 @@ _COLUMNS = ("count_r2", "count_mae", "count_bias", "width_mae_mm", "width_bias_m
 
 
 def _write_table(options: Eval, name: str, figures: Mapping[str, dict[str, Any]]) -> None:
-    """Prints a line of Markdown for each factor that is shifted alone, and writes the file."""
+    """Print a line of Markdown for each factor that is shifted alone, and write the file."""
     from jaxrl_vis.files import write_atomically
 
     if options.json is not None:

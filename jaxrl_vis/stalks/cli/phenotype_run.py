@@ -2,73 +2,64 @@
 
 import dataclasses
 import functools
-import hashlib
 import sys
 from pathlib import Path
-from typing import Annotated, Literal, Protocol
+from typing import Annotated, Literal
 
-from jaxrl_vis.cli.checks import check_counts, check_extra
+from jaxrl_vis.cli.checks import check_counts
 from jaxrl_vis.cli.parsing import ByPlaceToo
 from jaxrl_vis.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.errors import RequestError, StorageError
 from jaxrl_vis.evaluation_pool import share_accelerator
 from jaxrl_vis.report.outputs import check_writable
+from jaxrl_vis.stalks.cli.options import CameraOptions, check_extra, check_masks, check_speed
 from jaxrl_vis.stalks.cli.progress import progress
 
 SKIPPED = 3
 """Exit status where files were skipped."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Run:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Run(CameraOptions):
     """Count and measure the stalks in folders of stereo pairs: tables per stalk and per plot, and an overlay per image."""
 
     folder: Annotated[Path | None, ByPlaceToo()] = None
     """A plot's folder of pairs (left_000.png, right_000.png, ...), or a folder of such folders; the short synthetic row that
     comes with the package if not given."""
     out: Path = Path("phenotype_results")
-    """Folder for the results; a command that was stopped goes on where it was."""
-    calibration: Path | None = None
-    """Calibration of all plots (OpenCV, or ROS left.yaml and right.yaml); if not given, calibration.yaml of each plot's folder.
-    Without one there are no millimetres."""
-    calibration_unit: Literal["m", "mm"] | None = None
-    """Unit of the calibration's baseline, where the file does not say it."""
+    """Folder for the results; a command that was stopped continues where it was."""
     weights: Path | None = None
-    """Weights from `phenotype train`; those that are shipped if not given."""
+    """Weights from `phenotype train`; the shipped ones if not given."""
     masks: Literal["network", "truth"] = "network"
-    """What finds stalks: the networks, or the truth of synthetic plots, to see what the rest makes of it."""
+    """Source of masks: the networks, or the truth of synthetic plots, to see how good everything after the masks is."""
     method: Literal["strip", "ellipse"] = "strip"
-    """How widths are taken: between two edges, or by ellipses as in the thesis."""
+    """Method of widths: between two edges, or by ellipses as in the thesis."""
     least_score: float = 0.5
-    """What the networks are less sure of is no stalk, 0 to 1."""
-    speed: float | None = None
-    """Speed of the robot in m/s, for an odometry.csv that holds times only."""
+    """Lowest score of a detection that counts as a stalk, 0 to 1."""
     disparity_scale: float = 256.0
-    """What disparities in files of 16 bits (disparity_000.png beside the images) are divided by to be pixels: 256 as KITTI
-    writes them, 64 as `phenotype synth` does."""
+    """Divisor that makes pixels of disparities in files of 16 bits (disparity_000.png beside the images): 256 as KITTI writes
+    them, 64 as `phenotype synth` does."""
     workers: int = 1
-    """How many processes look at pairs side by side; they share the GPUs and cores that there are. 1 to 2 GB each."""
+    """Number of processes that look at pairs side by side; they share the GPUs and cores, and take 1 to 2 GB each."""
 
 
 def run(options: Run) -> int:
     """Writes tables and overlays."""
     if not 0.0 <= options.least_score <= 1.0:
         raise RequestError(f"--least-score must be from 0 to 1, not {options.least_score:g}")
-    if options.speed is not None and not options.speed > 0:
-        raise RequestError(f"--speed must be more than 0, not {options.speed:g}")
+    check_speed(options.speed)
     if not options.disparity_scale > 0:
         raise RequestError(f"--disparity-scale must be more than 0, not {options.disparity_scale:g}")
-    if options.masks == "truth" and options.weights is not None:
-        raise RequestError("--masks truth uses no weights: leave out --weights")
+    check_masks(options.masks, options.weights)
     check_counts(workers=options.workers)
-    check_extra("phenotype", "phenotyping")
+    check_extra("phenotyping")
     check_writable(options.out, "--out", folder=True)
     from jaxrl_vis.stalks.phenotyping.io.folders import SAMPLE, find_plots
 
     plots = find_plots(options.folder or SAMPLE)
     if options.folder is None:
         print("no folder given: this is the short synthetic row that comes with jaxrl-vis")
-    calibrations = {plot.name: calibration_of(plot.folder, options) for plot in plots}
+    calibrations = {plot.name: options.read_calibration(plot.folder) for plot in plots}
     if options.workers > 1:
         share_accelerator()
     check_devices()
@@ -81,8 +72,12 @@ def run(options: Run) -> int:
 
         find, name = find_truth, "truth"
     else:
-        _, name = networks(options.weights, options.least_score)  # says what is wrong with the weights
-        find = functools.partial(_find, weights_of(options.weights)[0], options.least_score)
+        from jaxrl_vis.stalks.phenotyping.detector.loading import detector_name, find_stalks, load_finder, resolve_weights
+
+        weights = resolve_weights(options.weights)
+        load_finder(weights, options.least_score)  # reports what is wrong with the weights
+        name = f"{detector_name(weights)}, least score {options.least_score:g}"
+        find = functools.partial(find_stalks, weights, options.least_score)
 
     request = Request(options.out, options.method, name, calibrations, options.speed, options.disparity_scale)
     for plot in plots:
@@ -113,70 +108,3 @@ def run(options: Run) -> int:
         print(f"skipped {row['plot']}/{row['pair']}: {row['why']}", file=sys.stderr)
     print(f"{options.out}: stalks.csv, plots.csv, qc.html and overlays (plots: {len(plots)}, pairs skipped: {len(skipped)})")
     return SKIPPED if skipped else 0
-
-
-def _find(weights: Path, least_score: float, image, plot, pair):
-    """Finds the stalks of an image, in any process."""
-    return _finder(weights, least_score)(image)
-
-
-@functools.cache
-def _finder(weights: Path, least_score: float):
-    return networks(weights, least_score)[0]
-
-
-def networks(weights: Path | None, least_score: float):
-    """What finds stalks in an image, by networks, and its name, which changes with its weights.
-
-    Raises:
-        RequestError: The weights cannot be read.
-    """
-    from jaxrl_vis.stalks.phenotyping.detector.finder import Finder
-    from jaxrl_vis.stalks.phenotyping.detector.weights import read_weights
-
-    path, name = weights_of(weights)
-    params, settings, _ = read_weights(path)
-    return Finder(params, settings, least_score), f"{name}, least score {least_score:g}"
-
-
-def weights_of(weights: Path | None) -> tuple[Path, str]:
-    """The file of the networks' weights, the shipped one if none is named, and what tells the networks apart.
-
-    Raises:
-        RequestError: There is no such file.
-    """
-    from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED
-
-    path = SHIPPED if weights is None else weights
-    if weights is None and not path.exists():
-        raise RequestError(
-            "no weights come with this version: make some with `jaxrl-vis phenotype train`, and name them with --weights"
-        )
-    if not path.is_file():
-        raise RequestError(f"cannot read the weights {path}: no such file")
-    return path, f"networks {hashlib.sha256(path.read_bytes()).hexdigest()[:12]}"
-
-
-class CalibrationOptions(Protocol):
-    """The options of a command that say what is known of the cameras."""
-
-    @property
-    def calibration(self) -> Path | None:
-        """File or folder."""
-        ...
-
-    @property
-    def calibration_unit(self) -> Literal["m", "mm"] | None:
-        """Of the baseline."""
-        ...
-
-
-def calibration_of(folder: Path, options: CalibrationOptions):
-    """Calibration of one folder of pairs; None where there is none."""
-    from jaxrl_vis.stalks.phenotyping.io.calibration import read_calibration
-
-    if options.calibration is not None:
-        return read_calibration(options.calibration, options.calibration_unit)
-    own = [folder / name for name in ("calibration.yaml", "calibration.yml", "calibration.xml")]
-    found = next((path for path in own if path.exists()), None)
-    return None if found is None else read_calibration(found, options.calibration_unit)

@@ -6,14 +6,14 @@ import itertools
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-from jaxrl_vis.cli.checks import check_counts, check_extra
-from jaxrl_vis.cli.parsing import ByPlaceToo
+from jaxrl_vis.cli.checks import check_counts
 from jaxrl_vis.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.evaluation_pool import results_of, share_accelerator
 from jaxrl_vis.report.outputs import check_writable
+from jaxrl_vis.stalks.cli.options import TrainingOptions, check_extra
 
 if TYPE_CHECKING:
     from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
@@ -22,60 +22,34 @@ _FIRST_SEED = 100_000
 """Of the plots that networks learn from: evaluations use the seeds below."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Train:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Train(TrainingOptions):
     """Train the networks that find and outline stalks, on synthetic plots or on your own annotated images."""
 
-    out: Annotated[Path, ByPlaceToo()]
-    """The file to write, .safetensors; give it to `phenotype run` as --weights."""
     data: Path | None = None
     """A folder of annotated images (annotations.json of COCO, or .xml of Pascal VOC or .json of LabelMe beside each image), in
     place of synthetic plots."""
-    spec: Path | None = None
-    """A JSON or TOML file with the values of a synthetic family of your own."""
     start: str | None = None
-    """Weights to go on from: a file of an earlier training, `shipped` for those of the package, or `random`; if not given,
+    """Weights to start from: a file of an earlier training, `shipped` for those of the package, or `random`; if not given,
     `shipped` where the boxes of --data are about as tall as those that these weights find, as a few images are too few to learn
     everything from, and `random` otherwise."""
-    minutes: float | None = None
-    """Most minutes; the weights are written at the end, and every half minute before."""
-    steps: int = 20000
-    """Most updates."""
-    images: int = 800
-    """How many images to learn from."""
     batch: int = 8
     """Images per update."""
     snips: int = 32
     """Strips at full resolution per update, for the masks."""
-    rate: float | None = None
-    """Highest learning rate; 0.001 if not given, and 0.0003 where --start names weights."""
-    workers: int = 4
-    """How many processes draw synthetic plots while the networks learn; 1: a thread of this one."""
-    width: int | None = None
-    """Width of a synthetic image in pixels, in place of the family's 3376; what is seen stays the same."""
-    seed: int = 0
-    """Of everything random."""
 
 
 def train(options: Train) -> int:
     """Trains the networks and writes their weights."""
-    check_counts(
-        steps=options.steps,
-        images=options.images,
-        batch=options.batch,
-        snips=options.snips,
-        workers=options.workers,
-        width=options.width,
-    )
-    if options.data is not None and (options.spec is not None or options.width is not None):
-        raise RequestError("--data takes images of your own: leave out --spec and --width, which describe synthetic ones")
-    if options.minutes is not None and not options.minutes > 0:
-        raise RequestError(f"--minutes must be more than 0, not {options.minutes:g}")
-    if options.rate is not None and not options.rate > 0:
-        raise RequestError(f"--rate must be more than 0, not {options.rate:g}")
-    if options.out.suffix != ".safetensors":
-        raise RequestError(f"the weights go into a file that ends in .safetensors, not {options.out}")
-    check_extra("phenotype", "phenotyping")
+    check_counts(snips=options.snips)
+    options.check()
+    drawn = (options.family, options.shift, options.spec, options.frames, options.width)
+    if options.data is not None and any(drawn):
+        raise RequestError(
+            "--data takes images of your own: leave out --spec and --width, --family, --shift and --frames, which describe "
+            "synthetic ones"
+        )
+    check_extra("phenotyping")
     check_writable(options.out, "OUT")
     if options.workers > 1:
         share_accelerator()
@@ -89,7 +63,6 @@ def _train(options: Train) -> int:
     from jaxrl_vis.stalks.phenotyping.detector.weights import write_weights
     from jaxrl_vis.stalks.phenotyping.training.detector_training import Plan, train
     from jaxrl_vis.stalks.phenotyping.training.examples import Example, annotated_examples, any_outlined, synthetic_examples
-    from jaxrl_vis_envs.plants import TRAINING, read
 
     before, settings, origin_before = _start(options)
     left_alone = {}
@@ -102,11 +75,7 @@ def _train(options: Train) -> int:
         sources = [annotated_examples(options.data, settings)]
         origin = "annotated images"
     else:
-        try:
-            family = TRAINING if options.spec is None else read(options.spec)
-            family = family if options.width is None else family.at_width(options.width)
-        except ValueError as error:
-            raise RequestError(str(error)) from error
+        family = options.read_family("phenotyping")
         first = _FIRST_SEED * (1 + options.seed)
         draw = functools.partial(synthetic_examples, family, settings)
         sources = [itertools.chain.from_iterable(results_of(draw, itertools.count(first), options.workers))]

@@ -5,19 +5,23 @@ Everything that follows is computed from what was kept, so that it is the same w
 
 import dataclasses
 import functools
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from jaxrl_vis.evaluation_pool import Kept, Record
+import jaxrl_vis
+import jaxrl_vis.stalks.grasping
+import jaxrl_vis_envs.plants
+from jaxrl_vis.evaluation_pool import Kept, Record, code_of, evaluate_each
 from jaxrl_vis.provenance import device_name
 from jaxrl_vis.run.policy import Policy
+from jaxrl_vis.stalks.digests import value_digest
 from jaxrl_vis.stalks.grasping.evaluation.attempts import Loop, Plan, carry_out, plan
 from jaxrl_vis.stalks.grasping.evaluation.grasp_score import Attempt, Score, Standing, score
 from jaxrl_vis.stalks.grasping.evaluation.scoring import MaskScore, RunScore, draw_scene, score_scene, summary
-from jaxrl_vis.stalks.grasping.masks.painter import Painter, read_weights
+from jaxrl_vis.stalks.grasping.masks.loading import load_painter
 from jaxrl_vis.stalks.grasping.perception.perceive import Ways
 from jaxrl_vis_envs.plants import Family
 from jaxrl_vis_envs.plants.stand import Stands
@@ -25,23 +29,73 @@ from jaxrl_vis_envs.plants.stand import Stands
 SCHEMA = 2
 """Of the records: those of another one cannot be gone on with."""
 _DIGITS = 6  # of lengths in m
+# Files and folders that train networks or draw figures and videos.
+_CHANGES_NO_RECORD = ("examples.py", "mask_training.py", "variation.py", "report")
 
 
 @dataclasses.dataclass(frozen=True)
 class Conditions:
-    """Under what conditions runs are evaluated.
+    """Conditions under which runs are evaluated.
 
     Attributes:
-        family: What rows are drawn from.
-        weights: Of the network that finds the pixels of stalks; None for true masks.
+        family: Family that rows are drawn from.
+        weights: File of the weights of the network of masks; None for true masks.
+        masks: Name of that network, or ``truth``.
         ways: Which steps go as in the thesis.
-        workers: How many processes share the machine; what is kept says so, as it bears on the time that a pair takes.
+        workers: Number of processes that share the machine; records state it, as it bears on the time that a pair takes.
     """
 
     family: Family
     weights: Path | None = None
+    masks: str = "truth"
     ways: Ways = dataclasses.field(default_factory=Ways)
     workers: int = 1
+
+
+def evaluate_runs(
+    conditions: Conditions,
+    numbers: Sequence[int],
+    path: Path | None,
+    started: Callable[[int], None],
+    done: Callable[[int, Record], None],
+) -> Kept:
+    """Evaluate runs, side by side in several processes, before an arm moves.
+
+    Args:
+        conditions: For all runs.
+        numbers: Seeds of the rows.
+        path: JSON file of the records, which is written after each run; None for no file. Runs that it holds already are not
+            evaluated again.
+        started: Called once with the number of runs that the file holds already.
+        done: Called after each run with its number and its record.
+
+    Returns:
+        The records of all runs.
+
+    Raises:
+        RequestError: The file holds records of another evaluation, or cannot be read.
+        WorkerError: A process was ended from outside.
+    """
+    about = {
+        "synthetic": True,
+        "version": jaxrl_vis.__version__,
+        "schema": SCHEMA,
+        "code": code_of(jaxrl_vis_envs.plants, jaxrl_vis.stalks.grasping, leave_out=_CHANGES_NO_RECORD),
+        "family": conditions.family.name,
+        "family_digest": value_digest(dataclasses.asdict(conditions.family)),
+        "masks": conditions.masks,
+        "method": str(conditions.ways),
+    }
+    table = Kept(path, about, summary_of)
+    missing = [number for number in numbers if number not in table]
+    started(len(numbers) - len(missing))
+
+    def keep(number: int, record: Record) -> None:
+        table.add(number, record)
+        done(number, table.records[number])
+
+    evaluate_each(functools.partial(evaluate_run, conditions), missing, conditions.workers, keep)
+    return table
 
 
 def evaluate_run(conditions: Conditions, number: int) -> Record:
@@ -52,7 +106,7 @@ def evaluate_run(conditions: Conditions, number: int) -> Record:
         number: Seed of the row.
     """
     scene = draw_scene(conditions.family, number)
-    painter = None if conditions.weights is None else _painter(conditions.weights)
+    painter = None if conditions.weights is None else load_painter(conditions.weights)
     found, perception = score_scene(scene, None if painter is None else lambda image, _: painter(image), conditions.ways)
     return {
         "stalks": found.true,
@@ -64,13 +118,6 @@ def evaluate_run(conditions: Conditions, number: int) -> Record:
         "plan": _plan_record(plan(scene, perception, number)),
         "plan_for_policy": _plan_record(plan(scene, perception, number, for_policy=True)),
     }
-
-
-@functools.cache
-def _painter(weights: Path) -> Painter:
-    """One network for all runs of a process."""
-    params, settings, _ = read_weights(weights)
-    return Painter(params, settings)
 
 
 def summary_of(records: Sequence[Record]) -> dict[str, Any]:

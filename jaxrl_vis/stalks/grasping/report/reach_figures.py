@@ -14,11 +14,12 @@ from jaxrl_vis.stalks.grasping.arm.approach import reachable
 from jaxrl_vis.stalks.grasping.arm.reach import reach
 from jaxrl_vis.stalks.grasping.evaluation.attempts import follow, plan, wind_keys
 from jaxrl_vis.stalks.grasping.evaluation.grasp_score import Score
-from jaxrl_vis.stalks.grasping.evaluation.records import attempts_in
+from jaxrl_vis.stalks.grasping.evaluation.records import Reaches, attempts_in, grasp_score
 from jaxrl_vis.stalks.grasping.evaluation.scoring import draw_scene, score_scene
 from jaxrl_vis.stalks.grasping.perception.perceive import Mask
 from jaxrl_vis.stalks.grasping.report.path_figure import draw_path
 from jaxrl_vis.stalks.grasping.report.video import write_reaches
+from jaxrl_vis_envs.documents import read_json
 from jaxrl_vis_envs.plants import Family
 
 THESIS_RATIO, CORNBOT_SHARE = 0.7413, 43 / 48
@@ -57,6 +58,37 @@ def draw_reach(
     draw_path(out, made.stands, made.targets, result, int(sent[len(sent) // 2]))
     if video is not None:
         write_reaches(video, made.stands, result, made.stalks.tolist(), sent.tolist(), size)
+
+
+def draw_evaluation(out: Path, evaluation: Path, seed: int, wind_mm: float) -> None:
+    """Figure 4.6, from a file that ``grasp eval --reach --json`` wrote; the arm finds stalks again on the way.
+
+    Args:
+        out: The file of the figure.
+        evaluation: The file of records.
+        seed: Number of the first run.
+        wind_mm: Amplitude of the stalks' sway in the wind, mm.
+
+    Raises:
+        RequestError: The file is not such a file, or holds no such reaches.
+        OSError: The figure cannot be written.
+    """
+    try:
+        data = read_json(evaluation)
+        shown = [record for record in data["each"] if record["number"] >= seed][:RUNS]
+        known = set.intersection(*(set(record["reaches"]) for record in shown))
+        family, masks = data["family"], data["masks"]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise RequestError(
+            f"{evaluation} is not what `grasp eval --reach --json` writes, or holds no run from seed {seed}"
+        ) from error
+    name = str(Reaches("again", wind_mm))
+    if name not in known:
+        raise RequestError(
+            f"{evaluation} holds no reaches of the kind `{name}`, only {', '.join(sorted(known))}: choose another --wind"
+        )
+    title = f"Simulated: family {family}, masks: {masks}, {wind_mm:g} mm of wind, {len(shown)} runs; the arm looks again."
+    draw_grasps(out, shown, name, grasp_score(shown, name), title)
 
 
 def draw_grasps(out: Path, records: Sequence[Record], name: str, score: Score, title: str) -> None:

@@ -6,10 +6,9 @@ A score is rounded when it is made, so that what the file keeps is what was scor
 """
 
 import dataclasses
-import hashlib
-import json
+import functools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +17,9 @@ import numpy as np
 import jaxrl_vis
 import jaxrl_vis.stalks.phenotyping
 import jaxrl_vis_envs.plants
-from jaxrl_vis.evaluation_pool import Record, code_of
+from jaxrl_vis.evaluation_pool import Kept, Record, code_of, evaluate_each
 from jaxrl_vis.provenance import device_name, revision
+from jaxrl_vis.stalks.digests import file_digest, value_digest
 from jaxrl_vis.stalks.phenotyping.evaluation.scoring import PlotScore, ThesisScore, score_plot, summary
 from jaxrl_vis.stalks.phenotyping.measure.stalk import Method
 from jaxrl_vis_envs.plants import Family
@@ -31,26 +31,25 @@ KEPT_SCORE = 0.05
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """What is scored, and how; the same for all plots of an evaluation.
+    """Plots to score and methods to score, the same for all plots of an evaluation.
 
     Attributes:
-        family: What plots are drawn from.
+        family: Family that plots are drawn from.
         weights: File of the networks' weights; None for true boxes and masks.
-        method: How widths are taken.
-        least_score: What counts as a find.
-        thesis: Score the thesis's ways on the same finds, too.
-        workers: How many processes share the machine; what is kept says so, as it bears on the time that a pair takes.
+        finder: Name of the networks, or ``truth``.
+        method: Method of widths.
+        least_score: Lowest score of a detection that counts.
+        thesis: Score the thesis's methods on the same detections, too.
+        workers: Number of processes that share the machine; records state it, as it bears on the time that a pair takes.
     """
 
     family: Family
     weights: Path | None
+    finder: str = "truth"
     method: Method = "strip"
     least_score: float = 0.5
     thesis: bool = False
     workers: int = 1
-
-
-_FINDERS: dict[tuple[Path, str], Any] = {}
 
 
 def evaluate_plot(task: Task, seed: int) -> Record:
@@ -62,28 +61,12 @@ def evaluate_plot(task: Task, seed: int) -> Record:
     """
     find = None
     if task.weights is not None:
-        from jaxrl_vis.stalks.phenotyping.detector.finder import Finder
-        from jaxrl_vis.stalks.phenotyping.detector.weights import read_weights
+        from jaxrl_vis.stalks.phenotyping.detector.loading import load_finder
 
-        key = task.weights, fingerprint(task.weights)
-        if key not in _FINDERS:
-            params, settings, _ = read_weights(task.weights)
-            _FINDERS[key] = Finder(params, settings, KEPT_SCORE)
-        find = _FINDERS[key]
+        find = load_finder(task.weights, KEPT_SCORE)
     score = score_plot(task.family, seed, find, task.method, task.least_score, task.thesis)
     where = {"device": device_name(), "workers": task.workers, "revision": revision()}
     return {**where, **_record(score, task.family.rig.frames)}
-
-
-def evaluate_job(tasks: Sequence[Task], jobs: Sequence[tuple[int, int]], number: int) -> Record:
-    """The same for one of several evaluations: job ``number`` is a task and a seed."""
-    task, seed = jobs[number]
-    return evaluate_plot(tasks[task], seed)
-
-
-def fingerprint(weights: Path) -> str:
-    """What tells weights apart: 12 hexadecimal digits."""
-    return hashlib.sha256(weights.read_bytes()).hexdigest()[:12]
 
 
 def conditions(task: Task) -> dict[str, Any]:
@@ -98,12 +81,58 @@ def conditions(task: Task) -> dict[str, Any]:
         # What trains networks and draws figures changes no score.
         "code": code_of(jaxrl_vis_envs.plants, jaxrl_vis.stalks.phenotyping, leave_out=("training", "figures.py")),
         "platform": jax.default_backend(),
-        "family_digest": hashlib.sha256(json.dumps(dataclasses.asdict(task.family), sort_keys=True).encode()).hexdigest()[:12],
-        "weights": None if task.weights is None else fingerprint(task.weights),
+        "family_digest": value_digest(dataclasses.asdict(task.family)),
+        "finder": task.finder,
+        "weights": None if task.weights is None else file_digest(task.weights),
         "method": task.method,
         "least_score": task.least_score,
         "thesis": task.thesis,
     }
+
+
+def evaluate_tasks(
+    tasks: Mapping[str, Task],
+    seeds: Sequence[int],
+    paths: Mapping[str, Path | None],
+    started: Callable[[int], None],
+    done: Callable[[str, int, Record], None],
+) -> dict[str, dict[str, Any]]:
+    """Evaluate the same plots for several tasks, side by side in the tasks' number of processes.
+
+    Args:
+        tasks: Name -> task; they agree on `Task.workers` and `Task.least_score`.
+        seeds: Seeds of the plots.
+        paths: Name -> JSON file of the task's records, which is written after each plot; None for no file. Plots that it holds
+            already are not evaluated again.
+        started: Called once with the number of plots that the files hold already.
+        done: Called after each plot with the task's name, the seed and the record.
+
+    Returns:
+        Name -> figures of all plots together, see `scoring.summary`.
+
+    Raises:
+        RequestError: A file holds records of another evaluation, or cannot be read.
+        WorkerError: A process was ended from outside.
+    """
+    names = list(tasks)
+    first = tasks[names[0]]
+    summarise = functools.partial(summary_of, first.least_score)
+    tables = {name: Kept(paths[name], conditions(task), summarise) for name, task in tasks.items()}
+    started(sum(seed in table for table in tables.values() for seed in seeds))
+    jobs = [(name, seed) for name in names for seed in seeds if seed not in tables[name]]
+
+    def keep(number: int, record: Record) -> None:
+        name, seed = jobs[number]
+        tables[name].add(seed, record)
+        done(name, seed, tables[name].records[seed])
+
+    evaluate_each(functools.partial(_evaluate_job, dict(tasks), jobs), range(len(jobs)), first.workers, keep)
+    return {name: summarise([table.records[seed] for seed in seeds]) for name, table in tables.items()}
+
+
+def _evaluate_job(tasks: Mapping[str, Task], jobs: Sequence[tuple[str, int]], number: int) -> Record:
+    name, seed = jobs[number]
+    return evaluate_plot(tasks[name], seed)
 
 
 def scores_of(records: Iterable[Record]) -> list[PlotScore]:

@@ -75,7 +75,7 @@ def write_plots(
     write_atomically(index, text)
     present = 0
     for seed in seeds:
-        whole = folder / name_of(seed) / "plot.json"
+        whole = folder / plot_name(seed) / "plot.json"
         if whole.exists():
             if _holds(whole.parent, truth, family.rig.frames):
                 present += 1
@@ -84,7 +84,7 @@ def write_plots(
             whole.unlink()  # until all is there again
             for image in [*whole.parent.glob("left_*.*"), *whole.parent.glob("right_*.*")]:
                 image.unlink()  # they may be of another format
-        write_plot(folder / name_of(seed), draw(family, seed), image_format, truth, done)
+        write_plot(folder / plot_name(seed), draw(family, seed), image_format, truth, done)
     return present
 
 
@@ -95,7 +95,7 @@ def _holds(folder: Path, truth: Truth, frames: int) -> bool:
     return all(path.exists() for path in wanted)
 
 
-def name_of(seed: int) -> str:
+def plot_name(seed: int) -> str:
     """Folder of the plot of a seed."""
     return f"plot_{seed:04d}"
 
