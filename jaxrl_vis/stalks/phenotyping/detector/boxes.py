@@ -1,7 +1,7 @@
 """Boxes: overlap, non-maximum suppression and RoIAlign as pure functions of arrays with static shapes.
 
-A box is (left, top, right, bottom) in continuous coordinates: the first pixel spans 0 to 1. Both operators give the numbers of
-torchvision.ops (tests/data/torchvision_boxes.npz holds what it gave; tests/make_torchvision_boxes.py recorded it).
+A box is (left, top, right, bottom) in continuous coordinates: the first pixel spans 0 to 1. Both operators return the numbers
+of torchvision.ops, recorded in tests/stalks/data/torchvision_boxes.npz by tests/stalks/make_torchvision_boxes.py.
 """
 
 import jax

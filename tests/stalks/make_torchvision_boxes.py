@@ -1,4 +1,6 @@
-"""Records what torchvision.ops gives for random boxes in data/torchvision_boxes.npz: `python tests/make_torchvision_boxes.py`.
+"""Records results of torchvision.ops for random boxes in data/torchvision_boxes.npz.
+
+    python tests/stalks/make_torchvision_boxes.py
 
 torchvision is no dependency: install it beside (2.15 and 0.29 were used), and run this once.
 """

@@ -18,7 +18,7 @@ from jaxrl_vis.stalks.phenotyping.measure.stereo import match_rows, match_sgbm
 from jaxrl_vis.stalks.phenotyping.measure.width import ELLIPSE_FITS, ellipse_width, strip_near, strip_width
 from jaxrl_vis_envs.plants import Calibration
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 STRIPS = runpy.run_path(str(ROOT / "benchmarks" / "strip_widths.py"))
 CAMERAS = Calibration(640, 480, 500.0, (319.5, 239.5), 0.1)
 
