@@ -185,11 +185,12 @@ def read_truth(folder: Path) -> None:
 def read_records(folder: Path) -> None:
     """What `phenotype run` kept of a pair: as good as new, or computed again."""
     from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles
-    from jaxrl_vis.stalks.phenotyping.pipeline import _is_done
+    from jaxrl_vis.stalks.phenotyping.pipeline import _is_whole, _sources
     from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting
+    from jaxrl_vis.stalks.results_folder import is_current
 
     path = _only(folder)
-    if _is_done(path, PairFiles("0", None, None), None):
+    if is_current(path, _sources(PairFiles("0", None, None), None), _is_whole):
         record = json.loads(path.read_bytes())
         assert all(len(Sighting.read(each).box) == 4 for each in record["sightings"])
 

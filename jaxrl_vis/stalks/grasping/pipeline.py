@@ -10,7 +10,6 @@ Tables are always made from the files under runs/. One run is in memory at a tim
 """
 
 import dataclasses
-import json
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -20,14 +19,14 @@ import cv2
 import numpy as np
 
 import jaxrl_vis
-from jaxrl_vis.files import write_atomically
 from jaxrl_vis.stalks.grasping.perception.cloud import Mount
 from jaxrl_vis.stalks.grasping.perception.perceive import Perception, View, Ways, perceive
-from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder, claim, read_odometries, stamp, stamps
+from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder, read_odometries
 from jaxrl_vis.stalks.phenotyping.io.images import write_image
 from jaxrl_vis.stalks.phenotyping.io.names import file_name
 from jaxrl_vis.stalks.phenotyping.io.pair_reading import Unusable, read_pair
 from jaxrl_vis.stalks.phenotyping.report.tables import Row, write_rows
+from jaxrl_vis.stalks.results_folder import claim, file_state, is_current, pair_state, write_record
 from jaxrl_vis_envs.documents import read_json
 from jaxrl_vis_envs.plants import Calibration
 
@@ -113,17 +112,29 @@ def run(runs: list[PlotFolder], find: Find, request: Request, done: Callable[[Ro
         OSError: A file cannot be written.
     """
     driven = read_odometries(runs, request.speed)
-    _claim(runs, request)
+    claim(
+        request.out,
+        "runs",
+        runs,
+        request.calibrations,
+        {
+            "method": request.method,
+            "finder": request.finder,
+            "speed": request.speed,
+            "mount": dataclasses.asdict(request.mount),
+            "reachable": request.reachable is not None,
+        },
+        any(request.out.glob("runs/*.json")),
+    )
     rows: list[Row] = []
     points: list[Row] = []
     skipped: list[Row] = []
     (request.out / "runs").mkdir(exist_ok=True)
     for each in runs:
         path = request.out / "runs" / file_name(f"{each.name}.json")
-        made_of = _made_of(each)  # before the files are read: they may be replaced meanwhile
-        if not _is_done(path, made_of):
-            record = {**_record(each, driven[each.name], find, request), "of": made_of}
-            write_atomically(path, json.dumps(record) + "\n")
+        sources = _sources(each)  # before the files are read: they may be replaced meanwhile
+        if not is_current(path, sources, _is_whole):
+            write_record(path, _record(each, driven[each.name], find, request), sources)
         record = read_json(path)
         rows, points, skipped = [*rows, record["row"]], points + record["points"], skipped + record["skipped"]
         write_rows(request.out / "runs.csv", RUN_COLUMNS, rows)
@@ -133,37 +144,18 @@ def run(runs: list[PlotFolder], find: Find, request: Request, done: Callable[[Ro
     return skipped
 
 
-def _claim(runs: list[PlotFolder], request: Request) -> None:
-    """Writes down what is asked for, or checks that it is the same as before."""
-    about = {
-        "version": jaxrl_vis.__version__,
-        "method": request.method,
-        "finder": request.finder,
-        "speed": request.speed,
-        "mount": dataclasses.asdict(request.mount),
-        "reachable": request.reachable is not None,
-        "calibrations": {name: dataclasses.asdict(each) for name, each in request.calibrations.items()},
-        "runs": {each.name: str(each.folder.resolve()) for each in runs},
-    }
-    claim(request.out, about, any(request.out.glob("runs/*.json")))
-
-
-def _made_of(folder: PlotFolder) -> dict[str, Any]:
-    """What a record depends on, beside what the whole folder of results does."""
+def _sources(folder: PlotFolder) -> dict[str, Any]:
+    """Return the state of everything that the record of a run depends on, beside the request."""
     return {
-        "odometry": stamp(folder.folder / "odometry.csv"),
-        "pairs": {pair.name: stamps(pair) for pair in folder.pairs},
+        "odometry": file_state(folder.folder / "odometry.csv"),
+        "pairs": {pair.name: pair_state(pair) for pair in folder.pairs},
     }
 
 
-def _is_done(path: Path, made_of: dict[str, Any]) -> bool:
-    """Whether a record is of the files as they are now. One with skipped pairs, or without a word of its files, is not."""
-    try:
-        record = read_json(path)
-        whole = record["row"].keys() == set(RUN_COLUMNS) and all(each.keys() == set(POINT_COLUMNS) for each in record["points"])
-        return whole and record["skipped"] == [] and record["of"] == made_of
-    except (FileNotFoundError, ValueError, KeyError, TypeError, AttributeError):
-        return False
+def _is_whole(record: dict[str, Any]) -> bool:
+    """Return True for a record with all columns and without skipped pairs, which are tried again."""
+    known = record["row"].keys() == set(RUN_COLUMNS) and all(row.keys() == set(POINT_COLUMNS) for row in record["points"])
+    return known and record["skipped"] == []
 
 
 def _record(folder: PlotFolder, driven: dict[str, float] | None, find: Find, request: Request) -> dict[str, Any]:

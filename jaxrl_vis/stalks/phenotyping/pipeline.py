@@ -13,7 +13,6 @@ processes look at pairs. Each of them has one pair in memory at a time.
 
 import dataclasses
 import functools
-import hashlib
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -24,8 +23,9 @@ import numpy as np
 import jaxrl_vis
 from jaxrl_vis.evaluation_pool import Each, processes
 from jaxrl_vis.files import write_atomically
+from jaxrl_vis.stalks.digests import value_digest
 from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
-from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder, claim, read_odometries, stamps, why_no_odometry
+from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder, read_odometries, why_no_odometry
 from jaxrl_vis.stalks.phenotyping.io.images import write_image
 from jaxrl_vis.stalks.phenotyping.io.names import file_name
 from jaxrl_vis.stalks.phenotyping.io.pair_reading import Unusable, known_disparity, read_pair, read_side
@@ -45,6 +45,7 @@ from jaxrl_vis.stalks.phenotyping.track.direction import follow_either_way
 from jaxrl_vis.stalks.phenotyping.track.follow import Track
 from jaxrl_vis.stalks.phenotyping.track.pairing import wrong_with
 from jaxrl_vis.stalks.phenotyping.track.sightings import NO_CALIBRATION, Sighting, find_with_ground, look
+from jaxrl_vis.stalks.results_folder import claim, is_current, pair_state, write_record
 from jaxrl_vis_envs.documents import read_json
 from jaxrl_vis_envs.plants import Calibration
 
@@ -102,7 +103,19 @@ def run(
         OSError: A file cannot be written.
     """
     driven = read_odometries(plots, request.speed)
-    _claim(plots, request)
+    claim(
+        request.out,
+        "plots",
+        plots,
+        request.calibrations,
+        {
+            "method": request.method,
+            "finder": request.finder,
+            "speed": request.speed,
+            "disparity_scale": request.disparity_scale,
+        },
+        any(request.out.glob("pairs/*/*.json")),
+    )
     about = [
         f"jaxrl-vis {jaxrl_vis.__version__}; finds by {request.finder}; widths by the method {request.method}.",
         "Tables: stalks.csv, plots.csv and skipped.csv; all pairs: overlays/.",
@@ -129,11 +142,13 @@ def _run(
         folder = request.out / "pairs" / file_name(plot.name)
         folder.mkdir(parents=True, exist_ok=True)
         paths = {pair.name: folder / file_name(f"{pair.name}.json") for pair in plot.pairs}
-        missing = [pair for pair in plot.pairs if not _is_done(paths[pair.name], pair, request.calibrations[plot.name])]
+        calibration = request.calibrations[plot.name]
+        missing = [pair for pair in plot.pairs if not is_current(paths[pair.name], _sources(pair, calibration), _is_whole)]
         for number in range(1, len(plot.pairs) - len(missing) + 1):
             done(plot.name, number, len(plot.pairs))
-        for number, (name, record) in enumerate(each(functools.partial(_record, plot, find, request), missing), start=1):
-            write_atomically(paths[name], json.dumps(record) + "\n")
+        made = each(functools.partial(_record, plot, find, request), missing)
+        for number, (name, record, sources) in enumerate(made, start=1):
+            write_record(paths[name], record, sources)
             done(plot.name, len(plot.pairs) - len(missing) + number, len(plot.pairs))
         records = [read_json(paths[pair.name]) for pair in plot.pairs]
         bad = [
@@ -154,64 +169,45 @@ def _run(
     return rows, skipped
 
 
-def _claim(plots: list[PlotFolder], request: Request) -> None:
-    """Writes down what is asked for, or checks that it is the same as before."""
-    about = {
-        "version": jaxrl_vis.__version__,
-        "method": request.method,
-        "finder": request.finder,
-        "speed": request.speed,
-        "disparity_scale": request.disparity_scale,
-        "calibrations": {
-            name: None if each is None else dataclasses.asdict(each) for name, each in request.calibrations.items()
-        },
-        "plots": {plot.name: str(plot.folder.resolve()) for plot in plots},
-    }
-    claim(request.out, about, any(request.out.glob("pairs/*/*.json")))
+def _is_whole(record: dict[str, Any]) -> bool:
+    """Return True for a record of sightings; a pair that was skipped is tried again."""
+    lines, columns = record["size"]
+    for values in record["sightings"]:
+        Sighting.read(values)
+    return isinstance(lines, int) and isinstance(columns, int)
 
 
-def _is_done(path: Path, pair: PairFiles, calibration: Calibration | None) -> bool:
-    """Whether a record is of the files as they are now. One that was skipped, or does not say of which it is, is not."""
-    try:
-        record = read_json(path)
-        lines, columns = record["size"]
-        for values in record["sightings"]:
-            Sighting.read(values)
-        return isinstance(lines, int) and isinstance(columns, int) and record["of"] == _made_of(pair, calibration)
-    except (FileNotFoundError, ValueError, KeyError, TypeError, AttributeError):
-        return False
+def _sources(pair: PairFiles, calibration: Calibration | None) -> dict[str, Any]:
+    """Return the state of everything that the record of a pair depends on, beside the request."""
+    return {**pair_state(pair), "calibration": None if calibration is None else value_digest(dataclasses.asdict(calibration))}
 
 
-def _made_of(pair: PairFiles, calibration: Calibration | None) -> dict[str, Any]:
-    """What a record depends on, beside what the whole folder of results does."""
-    return {**stamps(pair), "calibration": None if calibration is None else _digest(dataclasses.asdict(calibration))}
-
-
-def _digest(value: Any) -> str:
-    return hashlib.sha256(json.dumps(value).encode()).hexdigest()[:16]
-
-
-def _record(plot: PlotFolder, find: Find, request: Request, pair: PairFiles) -> tuple[str, dict[str, Any]]:
-    """The name of a pair, and what is kept of it."""
+def _record(plot: PlotFolder, find: Find, request: Request, pair: PairFiles) -> tuple[str, dict[str, Any], dict[str, Any]]:
+    """Return the name of a pair, its record, and the state of the record's sources."""
     calibration = request.calibrations[plot.name]
-    made_of = _made_of(pair, calibration)  # before the files are read: they may be replaced meanwhile
+    sources = _sources(pair, calibration)  # before the files are read: they may be replaced meanwhile
+    return pair.name, _sightings_record(plot, find, request, pair), sources
+
+
+def _sightings_record(plot: PlotFolder, find: Find, request: Request, pair: PairFiles) -> dict[str, Any]:
+    """Return the record of a pair: its sightings, or why it was skipped."""
+    calibration = request.calibrations[plot.name]
     try:
         left, right = read_pair(pair, calibration, pair.disparity is None)
         disparity = known_disparity(pair, left, request.disparity_scale)
         detections, ground = find_with_ground(lambda image: find(image, plot, pair), left, right, calibration, disparity)
     except Unusable as problem:
-        return pair.name, {"skipped": str(problem)}
+        return {"skipped": str(problem)}
     sightings = look(detections, left, right, calibration, request.method, ground, disparity)
     wrong = (
         None if calibration is None or disparity is not None else wrong_with(detections, sightings, left, right, calibration)
     )
     if wrong is not None:
-        return pair.name, {"skipped": wrong}
-    return pair.name, {
+        return {"skipped": wrong}
+    return {
         "size": list(left.shape[:2]),
         "camera_height_m": None if ground is None else round(ground.camera_height, 4),
         "sightings": [dataclasses.asdict(each) for each in sightings],
-        "of": made_of,
     }
 
 
@@ -249,7 +245,7 @@ def _draw_overlays(
     """Writes the overlays of a plot that are missing or show something else."""
     folder.mkdir(parents=True, exist_ok=True)
     index = folder / "drawn.json"
-    shown = {pair.name: _digest([record, names]) for (pair, record), names in zip(usable, labels)}
+    shown = {pair.name: value_digest([record, names]) for (pair, record), names in zip(usable, labels)}
     try:
         drawn = dict(read_json(index))
     except (FileNotFoundError, ValueError, TypeError):

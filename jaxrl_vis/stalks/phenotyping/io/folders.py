@@ -9,18 +9,15 @@ odometry.csv                         distance_m, or time_s, with the name of the
 import csv
 import dataclasses
 import io
-import json
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.files import write_atomically
 from jaxrl_vis.spreadsheets import text_of
 from jaxrl_vis.stalks.phenotyping.io.names import check_length, readable
-from jaxrl_vis_envs.documents import read_json, read_text
+from jaxrl_vis_envs.documents import read_text
 
 _IMAGES = {".png", ".jpg", ".jpeg", ".tif", ".tiff"}
 SAMPLE = Path(__file__).parents[1] / "sample_row"
@@ -285,66 +282,3 @@ def _read_table(path: Path) -> tuple[list[str], Iterator[list[str]]]:
         raise RequestError(f"cannot read {path}: {error.strerror or error}") from error
     except (csv.Error, ValueError) as error:
         raise RequestError(f"{path} is no table: save it as CSV in UTF-8 ({error})") from error
-
-
-def stamp(path: Path | None) -> list[int] | None:
-    """What changes with a file's contents: its size in bytes and when it was changed, ns; None where there is no file."""
-    try:
-        about = None if path is None else path.stat()
-    except OSError:
-        return None
-    return None if about is None else [about.st_size, about.st_mtime_ns]
-
-
-def stamps(pair: PairFiles) -> dict[str, list[int] | None]:
-    """The `stamp` of each file of a pair; what was computed of a pair holds as long as they are the same."""
-    return {"left": stamp(pair.left), "right": stamp(pair.right), "disparity": stamp(pair.disparity)}
-
-
-def claim(out: Path, about: Mapping[str, Any], begun: bool) -> None:
-    """Writes down in a folder of results what they are results of, or checks that it is the same as before.
-
-    A folder that holds no results yet may be claimed for something else, and a plot that had no calibration may get one:
-    that is what messages advise.
-
-    Args:
-        out: The folder; made if it is missing.
-        about: What is asked for.
-        begun: Whether it holds results.
-
-    Raises:
-        RequestError: The folder holds the results of another request.
-    """
-    about = json.loads(json.dumps(about))
-    path = out / "run.json"
-    if begun and path.exists():
-        try:
-            before = read_json(path)
-            differing = _differences(before, about)
-        except (ValueError, AttributeError):
-            differing = "run.json cannot be read"
-        if differing:
-            raise RequestError(
-                f"{out} holds the results of another request ({differing}): choose another folder with --out, or remove it"
-            )
-    out.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, json.dumps(about, indent=2) + "\n")
-
-
-def _differences(before: Mapping[str, Any], about: Mapping[str, Any]) -> str:
-    """In what two requests differ, in words; empty if in nothing that matters."""
-    told = []
-    for name in dict.fromkeys([*about, *before]):
-        old, new = before.get(name), about.get(name)
-        if name == "calibrations" and isinstance(old, dict) and isinstance(new, dict):
-            # Records of plots say which calibration they are of, so one that comes later makes them again.
-            old = {plot: new.get(plot) if each is None else each for plot, each in old.items()}
-        if old == new:
-            continue
-        if isinstance(old, dict) or isinstance(new, dict):
-            old, new = old or {}, new or {}
-            parts = [part for part in dict.fromkeys([*old, *new]) if old.get(part) != new.get(part)]
-            told.append(f"{name}: other values of {', '.join(parts[:3])}{' and others' if len(parts) > 3 else ''}")
-        else:
-            told.append(f"{name}: {json.dumps(old)}, not {json.dumps(new)}")
-    return "; ".join(told)
