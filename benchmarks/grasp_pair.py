@@ -29,7 +29,7 @@ def look(scene: Scene, painter: Painter) -> Perception:
 def make(path: Path) -> tuple[Once, int]:
     """What a process does with the runs in a file."""
     scenes = pickle.loads(path.read_bytes())
-    params, settings, _ = read_weights(SHIPPED["segmentation"])
+    params, settings, _ = read_weights(SHIPPED)
     painter = Painter(params, settings)
 
     def once(number: int) -> list[float]:
@@ -43,7 +43,7 @@ if __name__ == "__main__":
     family = GRASPING_FAMILIES["shifted"]
     family = family if asked.width is None else family.at_width(asked.width)
     scenes = [draw_scene(family, seed) for seed in range(3)]
-    params, settings, _ = read_weights(SHIPPED["segmentation"])
+    params, settings, _ = read_weights(SHIPPED)
     painter = Painter(params, settings)
     started = time.perf_counter()
     look(scenes[0], painter)

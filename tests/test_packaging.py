@@ -252,6 +252,11 @@ def test_wheel_holds_both_packages_and_nothing_else(wheel: Path) -> None:
     assert {"jaxrl_vis/py.typed", "jaxrl_vis_envs/py.typed"} <= set(names)
 
 
+def test_wheel_is_small(wheel: Path) -> None:
+    assert wheel.stat().st_size <= 6_000_000
+    assert max(file.file_size for file in zipfile.ZipFile(wheel).infolist()) <= 5_000_000
+
+
 def test_wheel_works_outside_the_checkout(wheel: Path, tmp_path: Path) -> None:
     site = tmp_path / "site"
     zipfile.ZipFile(wheel).extractall(site)

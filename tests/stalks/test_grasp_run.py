@@ -17,7 +17,7 @@ from jaxrl_vis.stalks.grasping.evaluation.records import Conditions, evaluate_ru
 from jaxrl_vis.stalks.grasping.evaluation.scoring import draw_scene, score_scene, summary
 from jaxrl_vis.stalks.grasping.evaluation.truth_on_disk import find_truth
 from jaxrl_vis.stalks.grasping.perception.cloud import Mount
-from jaxrl_vis.stalks.grasping.perception.perceive import ORIGINAL, OURS, Ways
+from jaxrl_vis.stalks.grasping.perception.perceive import DEFAULT_VARIANT, THESIS_VARIANT, Variant
 from jaxrl_vis.stalks.grasping.pipeline import Request, run
 from jaxrl_vis.stalks.grasping.report.perception_figure import draw_figure
 from jaxrl_vis.stalks.grasping.report.reach_figures import draw_reach
@@ -130,7 +130,13 @@ def test_clouds_that_do_not_stitch_and_an_arm_that_reaches_nothing_are_told(runs
         return np.zeros(image.shape[:2], bool)
 
     request = Request(
-        tmp_path / "out", OURS, "nothing", {"plot_0000": calibration}, Mount(), None, lambda points, stops: points[:, 0] > 9
+        tmp_path / "out",
+        DEFAULT_VARIANT,
+        "nothing",
+        {"plot_0000": calibration},
+        Mount(),
+        None,
+        lambda points, stops: points[:, 0] > 9,
     )
     run(find_plots(folder), find, request)
     (row,) = table(tmp_path / "out" / "runs.csv")
@@ -195,11 +201,11 @@ def test_masks_are_compared_with_the_truth_and_the_figure_is_drawn(spec, tmp_pat
     assert score.mask is not None and 0.3 < score.mask.boundary < 1.5
     assert 0.6 < 2.0 * score.mask.hits / (score.mask.painted + score.mask.true) < 0.97
     assert summary([score])["mask_f1"] < 1.0 and len(perception.clouds) == 3
-    thesis, _ = score_scene(scene, None, ORIGINAL)
+    thesis, _ = score_scene(scene, None, THESIS_VARIANT)
     assert thesis.mask is None and np.median(thesis.stitches) > np.median(score.stitches)
-    mixed, _ = score_scene(scene, None, Ways(points=True))
+    mixed, _ = score_scene(scene, None, Variant(points=True))
     np.testing.assert_allclose(mixed.stitches, score.stitches, atol=1e-9)
-    assert [str(each) for each in (OURS, ORIGINAL, Ways(True), Ways(False, True))] == [
+    assert [str(each) for each in (DEFAULT_VARIANT, THESIS_VARIANT, Variant(True), Variant(False, True))] == [
         "default",
         "thesis",
         "stitches of the thesis",
@@ -226,6 +232,7 @@ def test_masks_are_compared_with_the_truth_and_the_figure_is_drawn(spec, tmp_pat
         (["eval", "--seed", "-1"], "--seed must be at least 0"),
         (["eval", "--weights", "missing.safetensors"], "cannot read the weights"),
         (["eval", "--masks", "truth", "--weights", "w.safetensors"], "leave out --weights"),
+        (["eval", "--masks", "gan"], "train them on a GPU with `jaxrl-vis grasp train gan.safetensors --loss gan"),
         (["eval", "--wind", "5"], "--wind goes with --reach"),
         (["eval", "--loops", "open"], "--loops goes with --reach"),
         (["eval", "--thesis", "--points", "default"], "leave out --thesis or --points default"),

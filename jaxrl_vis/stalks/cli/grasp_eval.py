@@ -23,7 +23,8 @@ class Eval(EvaluationOptions):
     """Compare masks, stitches and grasp points with the exact truth of synthetic runs, which are drawn for it."""
 
     masks: Literal["gan", "segmentation", "truth"] = "segmentation"
-    """Source of masks: one of the networks that are shipped, or the truth, to see how good everything after the masks is."""
+    """Source of masks: the segmentation that ships, a GAN that you have trained (--weights), or the truth, to see how good
+    everything after the masks is."""
     thesis: bool = False
     """Stitch and find grasp points as the thesis describes it: --stitch thesis --points thesis."""
     stitch: Literal["default", "thesis"] | None = None
@@ -94,11 +95,11 @@ def evaluate(options: Eval) -> int:
     enable_compilation_cache()
     from jaxrl_vis.stalks.grasping.evaluation import records
     from jaxrl_vis.stalks.grasping.masks.loading import resolve_weights
-    from jaxrl_vis.stalks.grasping.perception.perceive import Ways
+    from jaxrl_vis.stalks.grasping.perception.perceive import Variant
 
     weights, name = (None, "truth") if options.masks == "truth" else resolve_weights(options.weights, options.masks)
-    ways = Ways(*(options.thesis or method == "thesis" for method in (options.stitch, options.points)))
-    conditions = records.Conditions(family, weights, name, ways, options.workers)
+    variant = Variant(*(options.thesis or method == "thesis" for method in (options.stitch, options.points)))
+    conditions = records.Conditions(family, weights, name, variant, options.workers)
     numbers = range(options.seed, options.seed + options.runs)
 
     def started(count: int) -> None:
@@ -106,7 +107,7 @@ def evaluate(options: Eval) -> int:
             print(f"evaluated before: {count} of {len(numbers)} runs, in {options.json}")
 
     table = records.evaluate_runs(conditions, numbers, options.json, started, _print_run)
-    print(f"simulated runs of family {family.name}, masks: {name}, {ways}:")
+    print(f"simulated runs of family {family.name}, masks: {name}, {variant}:")
     perceived = [{**table.records[number], "reaches": {}} for number in numbers]
     for figure, value in records.summary_of(perceived).items():
         print(f"  {figure:20} {f'{value:.4f}' if isinstance(value, float) else value}")
@@ -159,7 +160,7 @@ def _print_run(number: int, record: Record) -> None:
     score = records.score_of(record)
     one = summary([score])
     print(
-        f"run {number}: {len(score.errors)} of {score.true} stalks, {score.found - len(score.errors)} false, "
+        f"run {number}: {len(score.errors)} of {score.true} stalks, {score.detected - len(score.errors)} false, "
         f"grasp points {one['point_median_mm']:.1f} mm, stitches {one['stitch_median_mm']:.1f} mm"
         + "".join(f"; {note}" for note in score.notes),
         flush=True,

@@ -28,7 +28,7 @@ class Run(CameraOptions):
     weights: Path | None = None
     """Weights from `grasp train`; the shipped ones if not given."""
     masks: Literal["gan", "segmentation", "truth"] = "segmentation"
-    """Source of masks: one of the networks that are shipped, or the truth of synthetic runs."""
+    """Source of masks: the segmentation that ships, a GAN that you have trained (--weights), or the truth of synthetic runs."""
     thesis: bool = False
     """Stitch and find grasp points as the thesis describes it."""
 
@@ -46,15 +46,15 @@ def run(options: Run) -> int:
     from jaxrl_vis.stalks.phenotyping.io.folders import find_plots
 
     runs = find_plots(options.folder)
-    calibrations = {each.name: options.read_calibration(each.folder) for each in runs}
-    for name, each in calibrations.items():
-        if each is None:
+    calibrations = {folder.name: options.read_calibration(folder.folder) for folder in runs}
+    for name, calibration in calibrations.items():
+        if calibration is None:
             raise RequestError(f"{name} has no calibration, without which there are no metres: name one with --calibration")
     check_devices()
     enable_compilation_cache()
     from jaxrl_vis.stalks.grasping.evaluation.attempts import from_any_stop
     from jaxrl_vis.stalks.grasping.perception.cloud import Mount
-    from jaxrl_vis.stalks.grasping.perception.perceive import ORIGINAL, OURS
+    from jaxrl_vis.stalks.grasping.perception.perceive import DEFAULT_VARIANT, THESIS_VARIANT
     from jaxrl_vis.stalks.grasping.pipeline import Request, run
 
     if options.masks == "truth":
@@ -70,9 +70,9 @@ def run(options: Run) -> int:
         def find(image, folder, pair):
             return painter(image)
 
-    known = {name: each for name, each in calibrations.items() if each is not None}
-    ways, mount = ORIGINAL if options.thesis else OURS, Mount(options.height, options.pitch)
-    request = Request(options.out, ways, name, known, mount, options.speed, from_any_stop)
+    known = {name: calibration for name, calibration in calibrations.items() if calibration is not None}
+    variant, mount = THESIS_VARIANT if options.thesis else DEFAULT_VARIANT, Mount(options.height, options.pitch)
+    request = Request(options.out, variant, name, known, mount, options.speed, from_any_stop)
 
     def say(row) -> None:
         print(f"{row['run']}: {row['grasp_points']} grasp points in {row['pairs']} pairs: {row['flag']}", flush=True)

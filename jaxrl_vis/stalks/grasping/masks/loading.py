@@ -12,17 +12,18 @@ def resolve_weights(weights: Path | None, loss: Loss) -> tuple[Path, str]:
     """Return the file of the network's weights and a name of the network, which changes with the contents of the file.
 
     Args:
-        weights: File from ``grasp train``; None for the shipped one.
-        loss: Loss of the shipped network.
+        weights: File from ``grasp train``; None for the shipped one, which is a segmentation.
+        loss: Loss of the network that is wanted where ``weights`` is None.
 
     Raises:
-        RequestError: The weights cannot be read.
+        RequestError: The weights cannot be read, or do not ship.
     """
-    path = SHIPPED[loss] if weights is None else weights
-    if weights is None and not path.exists():
+    if weights is None and loss == "gan":
         raise RequestError(
-            "no weights of masks come with this version: make some with `jaxrl-vis grasp train`, and name them with --weights"
+            "weights of the GAN do not ship: train them on a GPU with `jaxrl-vis grasp train gan.safetensors --loss gan "
+            "--minutes 5`, and name them with --weights gan.safetensors"
         )
+    path = SHIPPED if weights is None else weights
     _, settings, _ = read_weights(path)
     return path, f"{settings.loss} {file_digest(path)}"
 

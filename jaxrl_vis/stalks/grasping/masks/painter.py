@@ -17,11 +17,8 @@ from jaxrl_vis.stalks.grasping.masks.mask_networks import Generator
 from jaxrl_vis.stalks.grasping.perception.cloud import RED, redness
 
 Loss = Literal["gan", "segmentation"]
-SHIPPED: dict[str, Path] = {
-    "gan": Path(__file__).with_name("stalks_gan.safetensors"),
-    "segmentation": Path(__file__).with_name("stalks_segmentation.safetensors"),
-}
-"""Weights that come with the package, trained on synthetic stalks."""
+SHIPPED = Path(__file__).with_name("stalks_segmentation.safetensors")
+"""Weights that come with the package: a plain segmentation, trained on synthetic stalks."""
 SCHEMA = 1
 _COMMAND = "jaxrl-vis grasp train"
 
@@ -103,13 +100,15 @@ class Painter:
         return np.asarray(self._paint(self._params, np.pad(image, [*more, (0, 0)], mode="edge")))[:height, :width]
 
 
-def write_weights(path: Path, params: Mapping[str, Any], settings: Settings, about: Mapping[str, Any]) -> None:
-    """Writes a generator: its parameters, with 16 bits each, what it is, and where it comes from.
+def write_weights(
+    path: Path, params: Mapping[str, Any], settings: Settings, about: Mapping[str, Any], bits: Literal[10, 16, 32] = 16
+) -> None:
+    """Write a generator: its parameters, with so many bits each (`write_parameters`), its settings, and its origin.
 
     Raises:
         OSError: The file cannot be written.
     """
-    write_parameters(path, params, {"schema": SCHEMA, "generator": dataclasses.asdict(settings), **about})
+    write_parameters(path, params, {"schema": SCHEMA, "generator": dataclasses.asdict(settings), **about}, bits)
 
 
 def read_weights(path: Path) -> tuple[dict[str, Any], Settings, dict[str, Any]]:

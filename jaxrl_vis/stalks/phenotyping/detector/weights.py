@@ -4,7 +4,7 @@ import dataclasses
 import functools
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -34,21 +34,21 @@ _SANE: dict[str, tuple[float, float, int]] = {
 
 
 def write_weights(
-    path: Path, params: Mapping[str, Any], settings: Settings, about: Mapping[str, Any], half: bool = True
+    path: Path, params: Mapping[str, Any], settings: Settings, about: Mapping[str, Any], bits: Literal[10, 16, 32] = 16
 ) -> None:
-    """Writes parameters. Nobody sees half of them.
+    """Write parameters to a file, which is complete whenever it can be read.
 
     Args:
         path: The file, .safetensors.
         params: Nested dictionaries of arrays.
         settings: What they go with.
         about: Where they come from; anything that JSON holds.
-        half: Keep 16 bits of each number.
+        bits: Bits of a number, see `write_parameters`.
 
     Raises:
         OSError: The file cannot be written.
     """
-    write_parameters(path, params, {"schema": SCHEMA, "settings": dataclasses.asdict(settings), **about}, half)
+    write_parameters(path, params, {"schema": SCHEMA, "settings": dataclasses.asdict(settings), **about}, bits)
 
 
 def read_weights(path: Path) -> tuple[dict[str, Any], Settings, dict[str, Any]]:
