@@ -20,7 +20,7 @@ import numpy as np
 
 import jaxrl_vis
 from jaxrl_vis.stalks.grasping.perception.cloud import Mount
-from jaxrl_vis.stalks.grasping.perception.perceive import Perception, View, Ways, perceive
+from jaxrl_vis.stalks.grasping.perception.perceive import Perception, Variant, View, perceive
 from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder, read_odometries
 from jaxrl_vis.stalks.phenotyping.io.images import write_image
 from jaxrl_vis.stalks.phenotyping.io.names import file_name
@@ -82,7 +82,7 @@ class Request:
     """
 
     out: Path
-    ways: Ways
+    variant: Variant
     finder: str
     calibrations: dict[str, Calibration]
     mount: Mount
@@ -92,7 +92,7 @@ class Request:
     @property
     def method(self) -> str:
         """In the tables."""
-        return str(self.ways)
+        return str(self.variant)
 
 
 def run(runs: list[PlotFolder], find: Find, request: Request, done: Callable[[Row], None] = lambda row: None) -> list[Row]:
@@ -130,11 +130,11 @@ def run(runs: list[PlotFolder], find: Find, request: Request, done: Callable[[Ro
     points: list[Row] = []
     skipped: list[Row] = []
     (request.out / "runs").mkdir(exist_ok=True)
-    for each in runs:
-        path = request.out / "runs" / file_name(f"{each.name}.json")
-        sources = _sources(each)  # before the files are read: they may be replaced meanwhile
+    for folder in runs:
+        path = request.out / "runs" / file_name(f"{folder.name}.json")
+        sources = _sources(folder)  # before the files are read: they may be replaced meanwhile
         if not is_current(path, sources, _is_whole):
-            write_record(path, _record(each, driven[each.name], find, request), sources)
+            write_record(path, _record(folder, driven[folder.name], find, request), sources)
         record = read_json(path)
         rows, points, skipped = [*rows, record["row"]], points + record["points"], skipped + record["skipped"]
         write_rows(request.out / "runs.csv", RUN_COLUMNS, rows)
@@ -173,7 +173,7 @@ def _record(folder: PlotFolder, driven: dict[str, float] | None, find: Find, req
     if not views:
         return {"row": _row(folder, request, len(skipped), None, views), "points": [], "skipped": skipped}
     perception = perceive(
-        views, lambda image, number: find(image, folder, folder.pairs[number]), calibration, request.mount, request.ways
+        views, lambda image, number: find(image, folder, folder.pairs[number]), calibration, request.mount, request.variant
     )
     (request.out / "overlays").mkdir(exist_ok=True)
     overlay = draw_points(views[-1].left, perception, calibration, request.mount)
@@ -186,7 +186,7 @@ def _can_reach(request: Request, perception: Perception) -> np.ndarray | None:
     """[B] bool, which grasp points the arm can go to; None where nothing is known of an arm."""
     if request.reachable is None:
         return None
-    points = np.array([each.point for each in perception.points]).reshape(-1, 3)
+    points = np.array([point.point for point in perception.points]).reshape(-1, 3)
     stops = np.array([motion.shift for motion in perception.to_last])
     return np.asarray(request.reachable(points, stops), bool)
 
@@ -199,7 +199,7 @@ def _row(folder: PlotFolder, request: Request, skipped: int, perception: Percept
     if perception is None:
         return row | {"flag": "no usable pairs"}
     known = [view.driven for view in views if view.driven is not None]
-    residuals = [each.residual for each in perception.stitches if math.isfinite(each.residual)]
+    residuals = [step.residual for step in perception.stitches if math.isfinite(step.residual)]
     can = _can_reach(request, perception)
     notes = ([f"pairs skipped: {skipped}"] if skipped else []) + list(perception.notes)
     if can is not None and len(can) and not can.any():
@@ -207,7 +207,7 @@ def _row(folder: PlotFolder, request: Request, skipped: int, perception: Percept
     return row | {
         "driven_m": f"{max(known) - min(known):.4f}" if len(known) == len(views) else "",
         "stitches": len(perception.stitches),
-        "stitches_refused": sum(bool(each.refused) for each in perception.stitches),
+        "stitches_refused": sum(bool(step.refused) for step in perception.stitches),
         "stitch_residual_mm": f"{1e3 * np.median(residuals):.2f}" if residuals else "",
         "grasp_points": len(perception.points),
         "reachable": "" if can is None else int(can.sum()),
@@ -220,8 +220,8 @@ def _points(folder: PlotFolder, request: Request, perception: Perception) -> lis
     """The rows of the grasp points of a run, in the robot frame of its last pair."""
     can = _can_reach(request, perception)
     rows = []
-    for place, each in enumerate(perception.points):
-        x, y, z = each.point
+    for place, point in enumerate(perception.points):
+        x, y, z = point.point
         rows.append(
             {
                 "run": folder.name,
@@ -229,10 +229,10 @@ def _points(folder: PlotFolder, request: Request, perception: Perception) -> lis
                 "x_m": f"{x:.4f}",
                 "y_m": f"{y:.4f}",
                 "z_m": f"{z:.4f}",
-                "lean_deg": f"{math.degrees(math.acos(min(float(each.direction[2]), 1.0))):.1f}",
-                "diameter_mm": f"{1e3 * each.thickness:.1f}" if math.isfinite(each.thickness) else "",
-                "pairs": each.frames or "",
-                "spread_mm": f"{1e3 * each.spread:.2f}" if math.isfinite(each.spread) else "",
+                "lean_deg": f"{math.degrees(math.acos(min(float(point.direction[2]), 1.0))):.1f}",
+                "diameter_mm": f"{1e3 * point.thickness:.1f}" if math.isfinite(point.thickness) else "",
+                "pairs": point.frames or "",
+                "spread_mm": f"{1e3 * point.spread:.2f}" if math.isfinite(point.spread) else "",
                 "reachable": "" if can is None else "yes" if can[place] else "no",
                 "method": request.method,
                 "version": jaxrl_vis.__version__,
@@ -247,8 +247,8 @@ def draw_points(left: np.ndarray, perception: Perception, calibration: Calibrati
     red = perception.clouds[-1].red
     image[red] = (0.4 * image[red] + 0.6 * np.array([255, 0, 0])).astype(np.uint8)
     size = max(image.shape[1] // 170, 3)
-    for place, each in enumerate(perception.points):
-        x, y, z = mount.pose.to_camera(each.point)
+    for place, point in enumerate(perception.points):
+        x, y, z = mount.pose.to_camera(point.point)
         column, line = calibration.focal * x / z + calibration.centre[0], calibration.focal * y / z + calibration.centre[1]
         middle = (round(column), round(line))
         cv2.circle(image, middle, size, (255, 255, 0), -1, cv2.LINE_AA)

@@ -120,8 +120,8 @@ def run(
         f"jaxrl-vis {jaxrl_vis.__version__}; finds by {request.finder}; widths by the method {request.method}.",
         "Tables: stalks.csv, plots.csv and skipped.csv; all pairs: overlays/.",
     ]
-    with processes(workers) as each, Page(about, request.out / "overlays", len(plots)) as page:
-        return _run(plots, find, request, driven, page, done, say, each)
+    with processes(workers) as run_all, Page(about, request.out / "overlays", len(plots)) as page:
+        return _run(plots, find, request, driven, page, done, say, run_all)
 
 
 def _run(
@@ -132,7 +132,7 @@ def _run(
     page: Page,
     done: Callable[[str, int, int], None],
     say: Callable[[str, str], None],
-    each: Each,
+    run_all: Each,
 ) -> tuple[list[Row], list[Row]]:
     """Plot by plot; see `run`."""
     stalks: list[Row] = []
@@ -146,7 +146,7 @@ def _run(
         missing = [pair for pair in plot.pairs if not is_current(paths[pair.name], _sources(pair, calibration), _is_whole)]
         for number in range(1, len(plot.pairs) - len(missing) + 1):
             done(plot.name, number, len(plot.pairs))
-        made = each(functools.partial(_record, plot, find, request), missing)
+        made = run_all(functools.partial(_record, plot, find, request), missing)
         for number, (name, record, sources) in enumerate(made, start=1):
             write_record(paths[name], record, sources)
             done(plot.name, len(plot.pairs) - len(missing) + number, len(plot.pairs))
@@ -156,7 +156,7 @@ def _run(
             for pair, record in zip(plot.pairs, records)
             if "skipped" in record
         ]
-        result = _finish(plot, records, driven[plot.name], request, each)
+        result = _finish(plot, records, driven[plot.name], request, run_all)
         if result.row["stalks"] == "":
             why = why_no_odometry(plot, driven[plot.name], plot.pairs) if result.row["flag"] == NO_ODOMETRY else None
             say(plot.name, result.row["flag"] + ("" if why is None else f" ({why})"))
@@ -207,12 +207,12 @@ def _sightings_record(plot: PlotFolder, find: Find, request: Request, pair: Pair
     return {
         "size": list(left.shape[:2]),
         "camera_height_m": None if ground is None else round(ground.camera_height, 4),
-        "sightings": [dataclasses.asdict(each) for each in sightings],
+        "sightings": [dataclasses.asdict(sighting) for sighting in sightings],
     }
 
 
 def _finish(
-    plot: PlotFolder, records: list[dict[str, Any]], driven: dict[str, float] | None, request: Request, each: Each
+    plot: PlotFolder, records: list[dict[str, Any]], driven: dict[str, float] | None, request: Request, run_all: Each
 ) -> PlotResult:
     """Follows the stalks of a plot, and draws its overlays."""
     usable = [(pair, record) for pair, record in zip(plot.pairs, records) if "sightings" in record]
@@ -223,24 +223,24 @@ def _finish(
     known = driven is not None and all(pair.name in driven for pair, _ in usable)
     why, tracks, start = _what_is_missing(len(usable), calibration), [], 0.0
     labels: list[list[str | None]] = [[None] * len(frame) for frame in frames]
-    found = None
+    drive = None
     if calibration is not None and driven is not None and known and len(usable) >= 2:
-        found = follow_either_way(frames, np.array([driven[pair.name] for pair, _ in usable]), calibration)
+        drive = follow_either_way(frames, np.array([driven[pair.name] for pair, _ in usable]), calibration)
         why = NO_FIT
-    if found is None or not found.fits:
+    if drive is None or not drive.fits:
         stalks, row = rows_without_path(frames, skipped, origin, why)
     else:
-        tracks, path = found.tracks, found.path
+        tracks, path = drive.tracks, drive.path
         labels = labels_of(frames, tracks)
         start = float(path.places[0])
         stalks, row = rows_of(frames, tracks, path, skipped, origin)
-    _draw_overlays(plot.name, request.out / "overlays" / file_name(plot.name), usable, labels, each)
+    _draw_overlays(plot.name, request.out / "overlays" / file_name(plot.name), usable, labels, run_all)
     width = usable[0][1]["size"][1] if usable else 0
     return PlotResult(row, stalks, [pair.name for pair, _ in usable], frames, tracks, start, width)
 
 
 def _draw_overlays(
-    plot: str, folder: Path, usable: list[tuple[PairFiles, dict[str, Any]]], labels: list[list[str | None]], each: Each
+    plot: str, folder: Path, usable: list[tuple[PairFiles, dict[str, Any]]], labels: list[list[str | None]], run_all: Each
 ) -> None:
     """Writes the overlays of a plot that are missing or show something else."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -261,7 +261,7 @@ def _draw_overlays(
         # Before anything is drawn: what is drawn anew must not be taken for the old one, if this is stopped.
         current = {name: digest for name, digest in drawn.items() if digest == shown.get(name)}
         write_atomically(index, json.dumps(current) + "\n")
-    for _ in each(functools.partial(_draw_overlay, plot), missing):
+    for _ in run_all(functools.partial(_draw_overlay, plot), missing):
         pass
     if drawn != shown:
         write_atomically(index, json.dumps(shown) + "\n")
@@ -285,7 +285,7 @@ def _what_is_missing(pairs: int, calibration: Calibration | None) -> str:
 def labels_of(frames: list[list[Sighting]], tracks: list[Track]) -> list[list[str | None]]:
     """The number of the stalk that each sighting shows, as in the table; None for those of stalks that do not count."""
     labels: list[list[str | None]] = [[None] * len(frame) for frame in frames]
-    for number, track in enumerate((each for each in tracks if each.counted), start=1):
+    for number, track in enumerate((track for track in tracks if track.counted), start=1):
         for frame, place in track.sightings:
             labels[frame][place] = str(number)
     return labels

@@ -57,7 +57,7 @@ def room(target: np.ndarray, others: np.ndarray, radii: np.ndarray, whole_way: b
         radius = np.concatenate([np.full((len(target), _TURN_POINTS), FOLDED), radius], axis=1)
         bearing = bearing * np.concatenate([turned, np.ones(_ROOM_POINTS)])
     place = np.stack([-np.sin(bearing), np.cos(bearing)], axis=-1) * radius[..., None]
-    found = []
+    gaps = []
     for side in (1.0, -1.0):
         angles = stalk_arm.angles_at(place, np.full(radius.shape, side), np)
         turn = angles.sum(axis=-1)
@@ -69,8 +69,8 @@ def room(target: np.ndarray, others: np.ndarray, radii: np.ndarray, whole_way: b
         if whole_way:
             gap = np.minimum(gap, _to_box(aside, ahead, stalk_arm.FOREARM_RADIUS, -stalk_arm.FOREARM, 0.0))
         gap = np.where(np.isnan(gap), np.inf, gap - np.asarray(radii)[:, None])
-        found.append(gap.min(axis=(1, 2), initial=np.inf))
-    return np.stack(found, axis=-1)
+        gaps.append(gap.min(axis=(1, 2), initial=np.inf))
+    return np.stack(gaps, axis=-1)
 
 
 class Approach(NamedTuple):

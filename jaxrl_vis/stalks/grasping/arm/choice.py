@@ -52,16 +52,16 @@ def choose(points: Sequence[GraspPoint], stops: np.ndarray, heights: tuple[float
         heights: Lowest and highest grasp, m above the ground.
     """
     chosen = []
-    for each in points:
-        best, worth = Choice(-1, 1, -np.inf, each.point), -np.inf
+    for point in points:
+        best, worth = Choice(-1, 1, -np.inf, point.point), -np.inf
         for step in _STEPS:
-            height = float(np.clip(each.point[2] + step, *heights))
-            way = _way(each, points, stops, height)
-            if way.stop < 0:
+            height = float(np.clip(point.point[2] + step, *heights))
+            path = _way(point, points, stops, height)
+            if path.stop < 0:
                 continue
-            value = min(way.room, _ENOUGH) - _UNSURE * abs(height - each.point[2])
+            value = min(path.room, _ENOUGH) - _UNSURE * abs(height - point.point[2])
             if value > worth:
-                best, worth = Choice(way.stop, way.side, way.room, each.at_height(height)), value
+                best, worth = Choice(path.stop, path.side, path.room, point.at_height(height)), value
         chosen.append(best)
     return chosen
 
@@ -73,12 +73,12 @@ def choose_nearest(points: Sequence[GraspPoint], stops: np.ndarray, heights: tup
         points, stops, heights: See `choose`.
     """
     chosen = []
-    for each in points:
-        height = float(np.clip(each.point[2], *heights))
-        target = each.at_height(height)
+    for point in points:
+        height = float(np.clip(point.point[2], *heights))
+        target = point.at_height(height)
         stop = int(np.argmin(np.abs(stops[:, 0] - target[0])))
-        way = _way(each, points, stops[stop : stop + 1], height)
-        chosen.append(Choice(stop if way.stop >= 0 else -1, way.side, way.room, target))
+        path = _way(point, points, stops[stop : stop + 1], height)
+        chosen.append(Choice(stop if path.stop >= 0 else -1, path.side, path.room, target))
     return chosen
 
 
@@ -91,6 +91,6 @@ def _way(point: GraspPoint, points: Sequence[GraspPoint], stops: np.ndarray, hei
 
 def radii_of(points: Sequence[GraspPoint], height: float | None = None) -> np.ndarray:
     """Radii [B] of stalks at a height, or at their grasp points, m: a usual one where a thickness is not known."""
-    thickness = [each.thickness if height is None else each.thickness_at(height) for each in points]
+    thickness = [point.thickness if height is None else point.thickness_at(height) for point in points]
     radii = 0.5 * np.array(thickness, float)
     return np.where(np.isfinite(radii), radii, _USUAL)

@@ -50,13 +50,13 @@ class _Moving(NamedTuple):
 
 
 def reach_by_policy(
-    stands: Stands, seen: Stands, targets: np.ndarray, policy: Policy, key: jax.Array, wind_mm: float
+    stands: Stands, detected: Stands, targets: np.ndarray, policy: Policy, key: jax.Array, wind_mm: float
 ) -> ReachResult:
     """Lets the policy bring each arm to its target, and closes the jaws there.
 
     Args:
         stands: The true stalks around each of B arms.
-        seen: The stalks that were found there, in the same order of arms.
+        detected: The stalks that were found there, in the same order of arms.
         targets: [B, 3] float32, where the jaws should close, m in the plot's frame; only the goal pictures know them.
         policy: Of a run of VisualStalkReach.
         key: [B], typed: the winds.
@@ -70,23 +70,23 @@ def reach_by_policy(
     count = len(stands)
     fill = np.concatenate([np.arange(count), np.zeros(max(8, 1 << (count - 1).bit_length()) - count, int)])
     local = np.where(can[:, None], targets - stands.origin, np.array(HOME))[fill].astype(np.float32)
-    shapes = [jax.tree.map(lambda part: jnp.asarray(part[fill]), bending.shapes(each)) for each in (stands, seen)]
+    shapes = [jax.tree.map(lambda part: jnp.asarray(part[fill]), bending.shapes(stalks)) for stalks in (stands, detected)]
     winds = jnp.full(len(fill), wind_mm / 1000, jnp.float32)
     draw, episode = _programs(policy)
     goals = draw(shapes[1], local)
-    found = jax.tree.map(lambda part: np.asarray(part)[:count], episode(*shapes[:1], goals, key[fill], winds))
+    result = jax.tree.map(lambda part: np.asarray(part)[:count], episode(*shapes[:1], goals, key[fill], winds))
     steps = round(Timing().reach / policy.env.control_period)
-    error = np.linalg.norm(found["taken"][:, steps - 1] - (targets - stands.origin), axis=-1)
+    error = np.linalg.norm(result["taken"][:, steps - 1] - (targets - stands.origin), axis=-1)
     mine = can[:, None] & stands.present
     return ReachResult(
-        held=found["held"] & mine,
-        path=found["path"] + stands.origin[:, None],
-        taken=found["taken"] + stands.origin[:, None],
-        touched=found["touched"] & mine,
-        brushed=found["brushed"] & mine,
+        held=result["held"] & mine,
+        path=result["path"] + stands.origin[:, None],
+        taken=result["taken"] + stands.origin[:, None],
+        touched=result["touched"] & mine,
+        brushed=result["brushed"] & mine,
         reachable=can,
         error=np.where(can, error, np.nan).astype(np.float32),
-        poses=found["poses"],
+        poses=result["poses"],
         interval=policy.env.control_period,
     )
 
@@ -132,7 +132,7 @@ def _programs(policy: Policy) -> tuple[Any, Any]:
         with jax.default_matmul_precision("highest"):
             start = _Moving(begin(arms, scene, HOME), jnp.asarray(HOME, jnp.float32))
             steps = round((timing.reach + timing.close) / env.control_period)
-            (reaching, _), seen = jax.lax.scan(step, start, length=steps)
-        return {**seen, "held": held_by(arms, reaching.data), "touched": reaching.touched, "brushed": reaching.brushed}
+            (reaching, _), history = jax.lax.scan(step, start, length=steps)
+        return {**history, "held": held_by(arms, reaching.data), "touched": reaching.touched, "brushed": reaching.brushed}
 
     return env_jit(jax.vmap(draw)), env_jit(jax.vmap(episode))

@@ -190,8 +190,8 @@ def reach(
             targets = _looked(look, stands, targets, can, call * LOOK, parts[-1])
         if call < _calls(timing.reach):
             aimed_at = targets
-        reaching, seen = advance(scene, reaching, (targets - stands.origin)[fill])
-        parts.append(jax.tree.map(lambda part: np.asarray(part)[:count], seen))
+        reaching, report = advance(scene, reaching, (targets - stands.origin)[fill])
+        parts.append(jax.tree.map(lambda part: np.asarray(part)[:count], report))
     paths = {name: np.concatenate([part[name] for part in parts], axis=1) for name in ("path", "taken", "poses")}
     closing = parts[_calls(timing.reach) - 1]
     error = np.linalg.norm(closing["taken"][:, -1] - (aimed_at - stands.origin), axis=-1)
@@ -209,16 +209,16 @@ def reach(
 
 
 def _looked(
-    look: Callable[[Sight], np.ndarray], stands: Stands, targets: np.ndarray, can: np.ndarray, time: float, seen: dict
+    look: Callable[[Sight], np.ndarray], stands: Stands, targets: np.ndarray, can: np.ndarray, time: float, report: dict
 ) -> np.ndarray:
     """Targets [B, 3] after another look; those of before where there is no new one, or the arm cannot go there."""
-    places = np.where(stands.present[..., None], seen["stalks"], np.nan) + stands.origin[:, None]
-    found = np.asarray(look(Sight(time, seen["taken"][:, -1] + stands.origin, places)), np.float32)
-    if found.shape != targets.shape:
-        raise ValueError(f"a look must return targets {list(targets.shape)}, got {list(found.shape)}")
-    there = np.all(np.isfinite(found), axis=-1)
-    there &= can & reachable(stands.origin, np.where(there[:, None], found, 0.0))
-    return np.where(there[:, None], found, targets)
+    places = np.where(stands.present[..., None], report["stalks"], np.nan) + stands.origin[:, None]
+    updated = np.asarray(look(Sight(time, report["taken"][:, -1] + stands.origin, places)), np.float32)
+    if updated.shape != targets.shape:
+        raise ValueError(f"a look must return targets {list(targets.shape)}, got {list(updated.shape)}")
+    there = np.all(np.isfinite(updated), axis=-1)
+    there &= can & reachable(stands.origin, np.where(there[:, None], updated, 0.0))
+    return np.where(there[:, None], updated, targets)
 
 
 def _calls(seconds: float) -> int:
@@ -277,15 +277,15 @@ def _advance(
         return reaching, {"path": path, "taken": stalk_arm.grip_at(data.qpos[:3]), "poses": data.qpos}
 
     with jax.default_matmul_precision("highest"):
-        reaching, seen = jax.lax.scan(point, reaching, length=_POINTS_A_CALL)
+        reaching, report = jax.lax.scan(point, reaching, length=_POINTS_A_CALL)
     data = mjx_model.kinematics(model, reaching.data)
-    seen |= {
+    report |= {
         "held": held_by(arms, data),
         "touched": reaching.touched,
         "brushed": reaching.brushed,
         "stalks": bending.at_height(data, arms.layout, target[2]),
     }
-    return reaching._replace(data=data), seen
+    return reaching._replace(data=data), report
 
 
 def period(

@@ -67,7 +67,7 @@ class Plan:
     again: np.ndarray
     stands: Stands
     standing: tuple[Standing, ...]
-    seen: Stands | None = None
+    detected: Stands | None = None
 
 
 def plan(scene: Scene, perception: Perception, number: int, for_policy: bool = False) -> Plan:
@@ -82,36 +82,36 @@ def plan(scene: Scene, perception: Perception, number: int, for_policy: bool = F
     """
     plot, poses = scene.plot, scene.drive.poses
     low, high = stretch_of(plot)
-    masts, found = masts_of(perception), perception.points
-    chosen = choose_nearest(found, masts, POLICY_HEIGHTS) if for_policy else choose(found, masts)
-    targets = np.array([_from_stop(each, scene, perception) for each in chosen]).reshape(-1, 3)
+    masts, points = masts_of(perception), perception.points
+    chosen = choose_nearest(points, masts, POLICY_HEIGHTS) if for_policy else choose(points, masts)
+    targets = np.array([_from_stop(choice, scene, perception) for choice in chosen]).reshape(-1, 3)
     places = np.array([[stalk.at_height(target[2])[0][:2] for stalk in plot.measured] for target in targets])
     places = places.reshape(len(targets), len(plot.measured), 2)
     stalks = match(targets[:, :2], places, RADIUS)
     origins = np.array([origin_of(pose.position[0]) for pose in poses])
     standing = _standing(plot, origins, number)
-    known = {each.stalk for each in standing}
-    kept = [
+    known = {stalk.stalk for stalk in standing}
+    scored = [
         place
         for place, (target, stalk) in enumerate(zip(targets, stalks))
         if (stalk in known if stalk >= 0 else low <= target[0] <= high)
     ]
-    off = np.array([_off(targets[each], places[each], stalks[each]) for each in kept]).reshape(-1, 2)
+    off = np.array([_off(targets[place], places[place], stalks[place]) for place in scored]).reshape(-1, 2)
     chords = {stop: chords_of(perception.clouds[stop], scene.drive.stated, scene.mount, stop) for stop in range(len(poses))}
-    again = [off[index] + _found_again(chosen[place], found[place], perception, chords) for index, place in enumerate(kept)]
-    at = origins[[chosen[each].stop for each in kept], 0]
-    seen = [_seen(chosen[place], x, targets[place], scene, perception) for x, place in zip(at, kept)]
+    again = [off[index] + _found_again(chosen[place], points[place], perception, chords) for index, place in enumerate(scored)]
+    at = origins[[chosen[place].stop for place in scored], 0]
+    detected = [_seen(chosen[place], x, targets[place], scene, perception) for x, place in zip(at, scored)]
     return Plan(
         run=number,
-        targets=targets[kept],
-        stalks=stalks[kept],
+        targets=targets[scored],
+        stalks=stalks[scored],
         errors=np.linalg.norm(off, axis=-1),
-        sides=np.array([chosen[each].side for each in kept], float),
-        refused=np.array([chosen[each].is_blocked and not for_policy for each in kept], bool),
+        sides=np.array([chosen[place].side for place in scored], float),
+        refused=np.array([chosen[place].is_blocked and not for_policy for place in scored], bool),
         again=np.array(again, float).reshape(-1, 2),
-        stands=stands_at(plot, at, targets[kept], POLICY_STALKS if for_policy else STALKS),
+        stands=stands_at(plot, at, targets[scored], POLICY_STALKS if for_policy else STALKS),
         standing=standing,
-        seen=concatenated(seen) if for_policy and seen else None,
+        detected=concatenated(detected) if for_policy and detected else None,
     )
 
 
@@ -129,7 +129,7 @@ def _from_stop(choice: Choice, scene: Scene, perception: Perception, points: np.
 def _seen(choice: Choice, x: float, target: np.ndarray, scene: Scene, perception: Perception) -> Stands:
     """The stalks that were found around an arm with its mast ``x`` m along the row, for a target [3] in the plot's frame."""
     height = float(choice.point[2])
-    ends = np.array([each.at_height(np.array([height, height + _AROUND])) for each in perception.points])
+    ends = np.array([point.at_height(np.array([height, height + _AROUND])) for point in perception.points])
     ends = _from_stop(choice, scene, perception, ends)
     return stand_of_lines(ends[:, 0], ends[:, 1] - ends[:, 0], radii_of(perception.points, height), x, target, POLICY_STALKS)
 
@@ -147,9 +147,9 @@ def _found_again(choice: Choice, point: GraspPoint, perception: Perception, chor
     if choice.stop < 0:
         return np.full(2, np.nan)
     motion: Motion = perception.to_last[choice.stop]
-    seen = motion(chords[choice.stop].middle)
-    beside = (seen - point.at_height(seen[:, 2]))[:, :2]
-    near = (np.abs(seen[:, 2] - choice.point[2]) < _AROUND) & (np.linalg.norm(beside, axis=1) < _BESIDE)
+    middles_here = motion(chords[choice.stop].middle)
+    beside = (middles_here - point.at_height(middles_here[:, 2]))[:, :2]
+    near = (np.abs(middles_here[:, 2] - choice.point[2]) < _AROUND) & (np.linalg.norm(beside, axis=1) < _BESIDE)
     return np.median(beside[near], axis=0) if near.sum() >= _LEAST else np.full(2, np.nan)
 
 
@@ -172,15 +172,15 @@ def _standing(plot: Plot, origins: np.ndarray, number: int) -> tuple[Standing, .
     low, high = stretch_of(plot)
     middles = np.array([stalk.at_height(PREFERRED)[0] for stalk in plot.measured]).reshape(-1, 3)
     radii = np.array([0.5 * stalk.diameter(PREFERRED) for stalk in plot.measured])
-    found = []
+    standing = []
     for index, middle in enumerate(middles):
         if not low <= middle[0] <= high:
             continue
         others = np.arange(len(middles)) != index
-        way = approach.best_approach(origins, middle, middles[others, :2], radii[others], enough=np.inf)
+        best = approach.best_approach(origins, middle, middles[others, :2], radii[others], enough=np.inf)
         beside = np.linalg.norm(middles[others, :2] - middle[:2], axis=1)
-        found.append(Standing(number, index, way.stop >= 0, way.room, float(beside.min(initial=np.inf))))
-    return tuple(found)
+        standing.append(Standing(number, index, best.stop >= 0, best.room, float(beside.min(initial=np.inf))))
+    return tuple(standing)
 
 
 def carry_out(
@@ -197,18 +197,18 @@ def carry_out(
     """
     attempts: list[Attempt] = []
     for block in _blocks(list(plans)):
-        numbers = np.repeat([each.run for each in block], [len(each.targets) for each in block])
-        places = np.concatenate([np.arange(len(each.targets)) for each in block])
+        numbers = np.repeat([plan.run for plan in block], [len(plan.targets) for plan in block])
+        places = np.concatenate([np.arange(len(plan.targets)) for plan in block])
         targets, stalks, errors, sides, refused, again = (
-            np.concatenate([getattr(each, name) for each in block])
+            np.concatenate([getattr(plan, name) for plan in block])
             for name in ("targets", "stalks", "errors", "sides", "refused", "again")
         )
-        stands = concatenated([each.stands for each in block])
+        stands = concatenated([plan.stands for plan in block])
         keys = wind_keys(numbers, places, seed)
         if loop == "policy":
-            seen = [each.seen for each in block if each.seen is not None]
-            assert policy is not None and len(seen) == len(block)
-            result = reach_by_policy(stands, concatenated(seen), targets, policy, keys, wind_mm)
+            detected = [plan.detected for plan in block if plan.detected is not None]
+            assert policy is not None and len(detected) == len(block)
+            result = reach_by_policy(stands, concatenated(detected), targets, policy, keys, wind_mm)
         else:
             look = follow(stands, stalks, again) if loop == "again" else None
             result = reach(stands, targets, keys, wind_mm, sides=sides, look=look)
@@ -266,15 +266,15 @@ def follow(stands: Stands, stalks: np.ndarray, again: np.ndarray) -> Callable[[S
     known = (stands.stalk == stalks[:, None]) & (stalks >= 0)[:, None]
     slot = known.argmax(axis=1)
     error = np.where(known.any(axis=1)[:, None], again, np.nan)
-    seen: list[np.ndarray] = []
+    places: list[np.ndarray] = []
 
     def look(sight: Sight) -> np.ndarray:
         place = sight.stalks[np.arange(len(slot)), slot]
         place[:, :2] += error
-        seen.append(place)
-        if len(seen) < 3:
+        places.append(place)
+        if len(places) < 3:
             return np.full_like(place, np.nan)
-        before, last = seen[-3:-1]
+        before, last = places[-3:-1]
         ahead = _AHEAD * (last - before)
         ahead[:, 2] = 0.0  # the height of the grasp stays what it was chosen to be
         return last + ahead
@@ -285,12 +285,12 @@ def follow(stands: Stands, stalks: np.ndarray, again: np.ndarray) -> Callable[[S
 def _blocks(plans: list[Plan]) -> Iterator[list[Plan]]:
     """Plans that are carried out together: as many as have at most `_MOST` targets, but at least one."""
     block: list[Plan] = []
-    for each in plans:
-        if not len(each.targets):
+    for plan in plans:
+        if not len(plan.targets):
             continue
-        if block and sum(len(other.targets) for other in block) + len(each.targets) > _MOST:
+        if block and sum(len(other.targets) for other in block) + len(plan.targets) > _MOST:
             yield block
             block = []
-        block.append(each)
+        block.append(plan)
     if block:
         yield block

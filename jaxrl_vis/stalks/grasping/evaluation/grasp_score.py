@@ -199,16 +199,16 @@ def match(points: np.ndarray, stalks: np.ndarray, gate: float) -> np.ndarray:
     points, stalks = np.asarray(points, float).reshape(-1, 2), np.asarray(stalks, float)
     if stalks.ndim == 2:
         stalks = np.broadcast_to(stalks, (len(points), *stalks.shape))
-    found = np.full(len(points), -1)
+    matched = np.full(len(points), -1)
     if not points.size or not stalks.size:
-        return found
+        return matched
     distance = np.linalg.norm(points[:, None] - stalks, axis=-1)
     # A pair beyond the gate costs more than any number of pairs within it.
     cost = np.where(distance <= gate, distance, gate * (min(distance.shape) + 1.0))
     for point, stalk in zip(*linear_sum_assignment(cost)):
         if distance[point, stalk] <= gate:
-            found[point] = stalk
-    return found
+            matched[point] = stalk
+    return matched
 
 
 def score(attempts: Iterable[Attempt], stalks: Iterable[Standing], tolerance: float = 0.015) -> Score:
@@ -223,8 +223,8 @@ def score(attempts: Iterable[Attempt], stalks: Iterable[Standing], tolerance: fl
         ValueError: Two attempts of a run are for one stalk, a stalk is listed twice, or an attempt is for an unknown stalk.
     """
     attempts, stalks = list(attempts), list(stalks)
-    known = Counter((each.run, each.stalk) for each in stalks)
-    tried = Counter((each.run, each.stalk) for each in attempts if each.stalk is not None)
+    known = Counter((stalk.run, stalk.stalk) for stalk in stalks)
+    tried = Counter((attempt.run, attempt.stalk) for attempt in attempts if attempt.stalk is not None)
     for what, counted in (("stalk is listed", known), ("stalk has an attempt", tried)):
         twice = [place for place, count in counted.items() if count > 1]
         if twice:
@@ -232,39 +232,43 @@ def score(attempts: Iterable[Attempt], stalks: Iterable[Standing], tolerance: fl
     strange = sorted(set(tried) - set(known))
     if strange:
         raise ValueError(f"an attempt is for stalk {strange[0][1]} of run {strange[0][0]}, which is not among the stalks")
-    by_place = {(each.run, each.stalk): each for each in attempts if each.stalk is not None}
-    stage_of = [_stage(by_place.get((each.run, each.stalk)), tolerance) for each in stalks]
-    reachable = [(each, stage) for each, stage in zip(stalks, stage_of) if each.reachable]
-    sent = [each for each in attempts if each.sent]
+    by_place = {(attempt.run, attempt.stalk): attempt for attempt in attempts if attempt.stalk is not None}
+    stage_of = [_stage(by_place.get((stalk.run, stalk.stalk)), tolerance) for stalk in stalks]
+    reachable = [(stalk, stage) for stalk, stage in zip(stalks, stage_of) if stalk.reachable]
+    sent = [attempt for attempt in attempts if attempt.sent]
 
     def grasped(name: str, chosen: Sequence[str]) -> Share:
         return Share(name, sum(stage == "grasped" for stage in chosen), len(chosen))
 
-    outcomes = Counter(each.outcome for each in attempts)
+    outcomes = Counter(attempt.outcome for attempt in attempts)
     stages = Counter(stage for _, stage in reachable)
     ratio, runs = thesis_ratio(attempts)
     return Score(
         of_sent=Share("attempts: exactly the target held", outcomes["success"], len(sent)),
-        with_room=grasped("reachable stalks with room", [stage for each, stage in reachable if not each.crowded]),
-        crowded=grasped("reachable stalks, crowded", [stage for each, stage in reachable if each.crowded]),
+        with_room=grasped("reachable stalks with room", [stage for stalk, stage in reachable if not stalk.crowded]),
+        crowded=grasped("reachable stalks, crowded", [stage for stalk, stage in reachable if stalk.crowded]),
         of_reachable=grasped("all reachable stalks", [stage for _, stage in reachable]),
         of_all=grasped("all stalks", stage_of),
         outcomes=tuple(Share(f"attempts: {name}", outcomes[name], len(attempts)) for name in OUTCOMES),
         stages=tuple(Share(f"reachable stalks: {name}", stages[name], len(reachable)) for name in STAGES),
-        false_targets=Share("attempts: no stalk there", sum(each.stalk is None for each in attempts), len(attempts)),
-        collisions=Share("attempts: links touched another stalk", sum(each.collided for each in sent), len(sent)),
-        brushes=Share("attempts: jaws touched another stalk", sum(each.brushed for each in sent), len(sent)),
-        touches=Share("attempts: links or jaws did", sum(each.collided or each.brushed for each in sent), len(sent)),
+        false_targets=Share("attempts: no stalk there", sum(attempt.stalk is None for attempt in attempts), len(attempts)),
+        collisions=Share("attempts: links touched another stalk", sum(attempt.collided for attempt in sent), len(sent)),
+        brushes=Share("attempts: jaws touched another stalk", sum(attempt.brushed for attempt in sent), len(sent)),
+        touches=Share("attempts: links or jaws did", sum(attempt.collided or attempt.brushed for attempt in sent), len(sent)),
         by_neighbour=tuple(
             grasped(
                 _class_name(low, high),
-                [stage for each, stage in reachable if low <= each.neighbour and (each.neighbour < high or math.isinf(high))],
+                [
+                    stage
+                    for stalk, stage in reachable
+                    if low <= stalk.neighbour and (stalk.neighbour < high or math.isinf(high))
+                ],
             )
             for low, high in zip(NEIGHBOUR_EDGES, NEIGHBOUR_EDGES[1:])
         ),
         thesis_ratio=ratio,
         runs=runs,
-        aim_errors=np.array([each.aim_error for each in attempts if each.stalk is not None], float),
+        aim_errors=np.array([attempt.aim_error for attempt in attempts if attempt.stalk is not None], float),
     )
 
 
@@ -272,10 +276,10 @@ def thesis_ratio(attempts: Iterable[Attempt]) -> tuple[float, int]:
     """The thesis's metric, mean over the runs in which the arm was sent, and the number of these; nan for none."""
     sent: Counter[int] = Counter()
     held: Counter[int] = Counter()
-    for each in attempts:
-        if each.sent:
-            sent[each.run] += 1
-            held[each.run] += len(each.held)
+    for attempt in attempts:
+        if attempt.sent:
+            sent[attempt.run] += 1
+            held[attempt.run] += len(attempt.held)
     ratios = [1 - abs(held[run] - count) / count for run, count in sent.items()]
     return (float(np.mean(ratios)) if ratios else math.nan), len(ratios)
 

@@ -22,7 +22,7 @@ from jaxrl_vis.stalks.grasping.evaluation.attempts import Loop, Plan, carry_out,
 from jaxrl_vis.stalks.grasping.evaluation.grasp_score import Attempt, Score, Standing, score
 from jaxrl_vis.stalks.grasping.evaluation.scoring import MaskScore, RunScore, draw_scene, score_scene, summary
 from jaxrl_vis.stalks.grasping.masks.loading import load_painter
-from jaxrl_vis.stalks.grasping.perception.perceive import Ways
+from jaxrl_vis.stalks.grasping.perception.perceive import Variant
 from jaxrl_vis_envs.plants import Family
 from jaxrl_vis_envs.plants.stand import Stands
 
@@ -48,7 +48,7 @@ class Conditions:
     family: Family
     weights: Path | None = None
     masks: str = "truth"
-    ways: Ways = dataclasses.field(default_factory=Ways)
+    variant: Variant = dataclasses.field(default_factory=Variant)
     workers: int = 1
 
 
@@ -84,7 +84,7 @@ def evaluate_runs(
         "family": conditions.family.name,
         "family_digest": value_digest(dataclasses.asdict(conditions.family)),
         "masks": conditions.masks,
-        "method": str(conditions.ways),
+        "method": str(conditions.variant),
     }
     table = Kept(path, about, summary_of)
     missing = [number for number in numbers if number not in table]
@@ -107,14 +107,14 @@ def evaluate_run(conditions: Conditions, number: int) -> Record:
     """
     scene = draw_scene(conditions.family, number)
     painter = None if conditions.weights is None else load_painter(conditions.weights)
-    found, perception = score_scene(scene, None if painter is None else lambda image, _: painter(image), conditions.ways)
+    score, perception = score_scene(scene, None if painter is None else lambda image, _: painter(image), conditions.variant)
     return {
-        "stalks": found.true,
-        "grasp_points": found.found,
-        "hits": len(found.errors),
+        "stalks": score.true,
+        "grasp_points": score.detected,
+        "hits": len(score.errors),
         "device": device_name(),
         "workers": conditions.workers,
-        "score": _score_record(found),
+        "score": _score_record(score),
         "plan": _plan_record(plan(scene, perception, number)),
         "plan_for_policy": _plan_record(plan(scene, perception, number, for_policy=True)),
     }
@@ -131,10 +131,10 @@ def summary_of(records: Sequence[Record]) -> dict[str, Any]:
     return figures
 
 
-def figures_of(found: Score) -> dict[str, Any]:
+def figures_of(score: Score) -> dict[str, Any]:
     """A score as JSON."""
-    shares = {each.name: {"count": each.count, "of": each.of, "interval": each.interval} for each in found.shares}
-    return {"thesis_ratio": found.thesis_ratio, "shares": shares}
+    shares = {share.name: {"count": share.count, "of": share.of, "interval": share.interval} for share in score.shares}
+    return {"thesis_ratio": score.thesis_ratio, "shares": shares}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -165,39 +165,40 @@ class Reaches:
         return "plan_for_policy" if self.for_policy else "plan"
 
 
-def reach_all(kept: Kept, numbers: Iterable[int], reaches: Reaches) -> None:
+def reach_all(table: Kept, numbers: Iterable[int], reaches: Reaches) -> None:
     """Sends the arm to all targets of the runs that were not carried out in this way yet, and keeps what came of it.
 
     Args:
-        kept: The records of all runs.
+        table: The records of all runs.
         numbers: Which runs.
         reaches: How.
     """
     name = str(reaches)
-    missing = [number for number in numbers if name not in kept.records[number].get("reaches", {})]
-    plans = [plan_of(number, kept.records[number], reaches.plan) for number in missing]
+    missing = [number for number in numbers if name not in table.records[number].get("reaches", {})]
+    plans = [plan_of(number, table.records[number], reaches.plan) for number in missing]
     attempts = carry_out(plans, reaches.wind_mm, reaches.loop, reaches.policy)
     changed = {}
     for number in missing:
-        record = kept.records[number]
-        mine = {"plan": reaches.plan, "attempts": [_attempt_record(each) for each in attempts if each.run == number]}
+        record = table.records[number]
+        mine = {"plan": reaches.plan, "attempts": [_attempt_record(attempt) for attempt in attempts if attempt.run == number]}
         changed[number] = {**record, "reaches": {**record.get("reaches", {}), name: mine}}
-    kept.add_all(changed)
+    table.add_all(changed)
 
 
 def grasp_score(records: Iterable[Record], name: str) -> Score:
     """The score of what came of all reaches of one kind, named as `Reaches` are."""
     attempts, standing = [], []
     for record in records:
-        number, found = int(record["number"]), record["reaches"][name]
+        number, reaches = int(record["number"]), record["reaches"][name]
         attempts += attempts_in(record, name)
-        standing += plan_of(number, record, found["plan"]).standing
+        standing += plan_of(number, record, reaches["plan"]).standing
     return score(attempts, standing)
 
 
-def _score_record(found: RunScore) -> Record:
-    values = dataclasses.asdict(found)
-    return {name: each.round(4).tolist() if isinstance(each, np.ndarray) else each for name, each in values.items()}
+def _score_record(score: RunScore) -> Record:
+    values = dataclasses.asdict(score)
+    values["found"] = values.pop("detected")
+    return {name: value.round(4).tolist() if isinstance(value, np.ndarray) else value for name, value in values.items()}
 
 
 def score_of(record: Record) -> RunScore:
@@ -206,7 +207,7 @@ def score_of(record: Record) -> RunScore:
     return RunScore(
         seed=values["seed"],
         true=values["true"],
-        found=values["found"],
+        detected=values["found"],
         errors=np.array(values["errors"], float),
         stitches=np.array(values["stitches"], float),
         refused=values["refused"],
@@ -218,7 +219,7 @@ def score_of(record: Record) -> RunScore:
 
 def _stands_record(stands: Stands) -> Record:
     arrays = {field.name: getattr(stands, field.name) for field in dataclasses.fields(Stands)}
-    return {name: each.astype(float).round(_DIGITS).tolist() for name, each in arrays.items()}
+    return {name: array.astype(float).round(_DIGITS).tolist() for name, array in arrays.items()}
 
 
 def _plan_record(made: Plan) -> Record:
@@ -230,9 +231,10 @@ def _plan_record(made: Plan) -> Record:
         "refused": made.refused.tolist(),
         "again": made.again.round(_DIGITS).tolist(),
         "stands": _stands_record(made.stands),
-        "seen": None if made.seen is None else _stands_record(made.seen),
+        "seen": None if made.detected is None else _stands_record(made.detected),
         "standing": [
-            [each.stalk, each.reachable, round(each.room, _DIGITS), round(each.neighbour, _DIGITS)] for each in made.standing
+            [stalk.stalk, stalk.reachable, round(stalk.room, _DIGITS), round(stalk.neighbour, _DIGITS)]
+            for stalk in made.standing
         ],
     }
 
@@ -256,10 +258,10 @@ def plan_of(number: int, record: Record, name: str = "plan") -> Plan:
         again=np.array(values["again"], float).reshape(-1, 2),
         stands=_stands_of(values["stands"]),
         standing=tuple(
-            Standing(number, stalk, reachable, *(np.inf if each is None else each for each in (room, neighbour)))
+            Standing(number, stalk, reachable, *(np.inf if length is None else length for length in (room, neighbour)))
             for stalk, reachable, room, neighbour in values["standing"]
         ),
-        seen=None if values["seen"] is None else _stands_of(values["seen"]),
+        detected=None if values["seen"] is None else _stands_of(values["seen"]),
     )
 
 
@@ -271,15 +273,15 @@ def _stands_of(values: Record) -> Stands:
     return Stands(stalk=stalk, **arrays, origin=np.array(values["origin"], np.float32).reshape(-1, 3))
 
 
-def _attempt_record(each: Attempt) -> Record:
-    values = dataclasses.asdict(each)
+def _attempt_record(attempt: Attempt) -> Record:
+    values = dataclasses.asdict(attempt)
     del values["run"]
-    return {**values, "held": sorted(each.held)}
+    return {**values, "held": sorted(attempt.held)}
 
 
 def attempts_in(record: Record, name: str) -> list[Attempt]:
     """What came of the reaches of one kind in a run."""
-    return [_attempt_of(int(record["number"]), each) for each in record["reaches"][name]["attempts"]]
+    return [_attempt_of(int(record["number"]), values) for values in record["reaches"][name]["attempts"]]
 
 
 def _attempt_of(number: int, values: Record) -> Attempt:

@@ -19,7 +19,7 @@ from scipy.optimize import linear_sum_assignment
 from jaxrl_vis.stalks.grasping.masks.examples import true_mask
 from jaxrl_vis.stalks.grasping.perception.cloud import Mount
 from jaxrl_vis.stalks.grasping.perception.lines import PREFERRED
-from jaxrl_vis.stalks.grasping.perception.perceive import OURS, Mask, Perception, View, Ways, perceive
+from jaxrl_vis.stalks.grasping.perception.perceive import DEFAULT_VARIANT, Mask, Perception, Variant, View, perceive
 from jaxrl_vis.stalks.grasping.perception.stitch import Motion
 from jaxrl_vis_envs.plants import Drive, Family, Plot, Pose, draw
 from jaxrl_vis_envs.plants.pairs import Sequence
@@ -61,7 +61,7 @@ class RunScore:
 
     seed: int
     true: int
-    found: int
+    detected: int
     errors: np.ndarray
     stitches: np.ndarray
     refused: int
@@ -100,13 +100,13 @@ def draw_scene(family: Family, seed: int) -> Scene:
     return Scene(sequence.plot, sequence.drive, Mount.of(family.rig), tuple(views), np.stack(masks))
 
 
-def score_scene(scene: Scene, mask: Mask | None = None, ways: Ways = OURS) -> tuple[RunScore, Perception]:
+def score_scene(scene: Scene, mask: Mask | None = None, variant: Variant = DEFAULT_VARIANT) -> tuple[RunScore, Perception]:
     """Runs everything on a scene and compares.
 
     Args:
         scene: What is seen.
         mask: What finds the pixels of stalks; None for true masks.
-        ways: Which steps go as in the thesis.
+        variant: Which steps go as in the thesis.
     """
     painted: dict[int, np.ndarray] = {}
 
@@ -114,21 +114,22 @@ def score_scene(scene: Scene, mask: Mask | None = None, ways: Ways = OURS) -> tu
         painted[number] = scene.masks[number] if mask is None else mask(image, number)
         return painted[number]
 
-    perception = perceive(scene.views, remembered, scene.drive.stated, scene.mount, ways)
+    perception = perceive(scene.views, remembered, scene.drive.stated, scene.mount, variant)
     targets = in_world(perception, scene)
-    true, found, errors = match_stalks(targets, scene.plot)
+    true, detected, errors = match_stalks(targets, scene.plot)
     poses = scene.drive.poses
     errors_of_stitches = [
-        stitch_error(each.motion, poses[place], poses[place + 1], scene.mount) for place, each in enumerate(perception.stitches)
+        stitch_error(stitch.motion, poses[place], poses[place + 1], scene.mount)
+        for place, stitch in enumerate(perception.stitches)
     ]
     count = len(scene.views)
     score = RunScore(
         seed=scene.plot.seed,
         true=true,
-        found=found,
+        detected=detected,
         errors=1e3 * errors,
         stitches=1e3 * np.array(errors_of_stitches),
-        refused=sum(bool(each.refused) for each in perception.stitches),
+        refused=sum(bool(stitch.refused) for stitch in perception.stitches),
         seconds={name: value / count for name, value in perception.seconds.items()},
         mask=None if mask is None else _mask_score([(painted[number], scene.masks[number]) for number in painted]),
         notes=perception.notes,
@@ -138,7 +139,7 @@ def score_scene(scene: Scene, mask: Mask | None = None, ways: Ways = OURS) -> tu
 
 def in_world(perception: Perception, scene: Scene) -> np.ndarray:
     """Grasp points [B, 3] in the plot's frame, m: the robot stands where the last pair was taken, and is mounted as stated."""
-    points = np.array([each.point for each in perception.points]).reshape(-1, 3)
+    points = np.array([point.point for point in perception.points]).reshape(-1, 3)
     return scene.drive.poses[-1].to_world(scene.mount.pose.to_camera(points))
 
 
@@ -191,7 +192,7 @@ def stitch_error(motion: Motion, before: Pose, after: Pose, mount: Mount) -> flo
 
 def _mask_score(masks: list[tuple[np.ndarray, np.ndarray]]) -> MaskScore:
     """Compares painted masks with true ones."""
-    far = [_between_outlines(*each) for each in masks]
+    far = [_between_outlines(*both) for both in masks]
     return MaskScore(
         hits=int(sum((painted & true).sum() for painted, true in masks)),
         painted=int(sum(painted.sum() for painted, _ in masks)),
@@ -202,10 +203,10 @@ def _mask_score(masks: list[tuple[np.ndarray, np.ndarray]]) -> MaskScore:
 
 def _between_outlines(painted: np.ndarray, true: np.ndarray) -> float:
     """Mean distance of the outlines of two masks, in both directions, pixels; not a number where one has none."""
-    outlines = [each.astype(np.uint8) - cv2.erode(each.astype(np.uint8), np.ones((3, 3), np.uint8)) for each in (painted, true)]
-    if not all(each.any() for each in outlines):
+    outlines = [mask.astype(np.uint8) - cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) for mask in (painted, true)]
+    if not all(outline.any() for outline in outlines):
         return math.nan
-    far = [cv2.distanceTransform(1 - each, cv2.DIST_L2, 5) for each in outlines]
+    far = [cv2.distanceTransform(1 - outline, cv2.DIST_L2, 5) for outline in outlines]
     return 0.5 * float(far[0][outlines[1] > 0].mean() + far[1][outlines[0] > 0].mean())
 
 
@@ -218,35 +219,35 @@ def summary(scores: Iterable[RunScore]) -> dict[str, Any]:
         ``mask_boundary_px``, and how much there was of each. Not a number where there was nothing.
     """
     scores = list(scores)
-    true, found = sum(each.true for each in scores), sum(each.found for each in scores)
-    errors = np.concatenate([each.errors for each in scores] or [np.zeros(0)])
-    stitches = np.concatenate([each.stitches for each in scores] or [np.zeros(0)])
+    true, detected = sum(score.true for score in scores), sum(score.detected for score in scores)
+    errors = np.concatenate([score.errors for score in scores] or [np.zeros(0)])
+    stitches = np.concatenate([score.stitches for score in scores] or [np.zeros(0)])
     hits = len(errors)
     seconds = {
-        name: float(np.median([each.seconds[name] for each in scores])) for name in (scores[0].seconds if scores else ())
+        name: float(np.median([score.seconds[name] for score in scores])) for name in (scores[0].seconds if scores else ())
     }
     figures = {
         "runs": len(scores),
         "stalks": true,
-        "grasp_points": found,
+        "grasp_points": detected,
         "hits": hits,
-        "precision": hits / found if found else math.nan,
+        "precision": hits / detected if detected else math.nan,
         "recall": hits / true if true else math.nan,
-        "f1": 2.0 * hits / (true + found) if true + found else math.nan,
+        "f1": 2.0 * hits / (true + detected) if true + detected else math.nan,
         "point_median_mm": _quantile(errors, 0.5),
         "point_p95_mm": _quantile(errors, 0.95),
         "stitches": len(stitches),
-        "stitches_refused": sum(each.refused for each in scores),
+        "stitches_refused": sum(score.refused for score in scores),
         "stitch_median_mm": _quantile(stitches, 0.5),
         "stitch_p95_mm": _quantile(stitches, 0.95),
-        "seconds_per_pair": float(np.median([sum(each.seconds.values()) for each in scores])) if scores else math.nan,
+        "seconds_per_pair": float(np.median([sum(score.seconds.values()) for score in scores])) if scores else math.nan,
         **{f"seconds_{name}": value for name, value in seconds.items()},
     }
-    masks = [each.mask for each in scores if each.mask is not None]
+    masks = [score.mask for score in scores if score.mask is not None]
     if masks:
-        painted, wanted = sum(each.painted for each in masks), sum(each.true for each in masks)
-        figures["mask_f1"] = 2.0 * sum(each.hits for each in masks) / (painted + wanted) if painted + wanted else math.nan
-        figures["mask_boundary_px"] = float(np.nanmean([each.boundary for each in masks]))
+        painted, wanted = sum(mask.painted for mask in masks), sum(mask.true for mask in masks)
+        figures["mask_f1"] = 2.0 * sum(mask.hits for mask in masks) / (painted + wanted) if painted + wanted else math.nan
+        figures["mask_boundary_px"] = float(np.nanmean([mask.boundary for mask in masks]))
     return figures
 
 

@@ -44,7 +44,7 @@ def synthetic_examples(family: Family, seed: int, frames: int = 2) -> list[Examp
     sequence = Sequence.of(draw(family, seed))
     length = len(sequence)
     examples = []
-    for frame in sorted({round(each) for each in np.linspace(0, length - 1, min(frames, length))}):
+    for frame in sorted({round(place) for place in np.linspace(0, length - 1, min(frames, length))}):
         image, instance, _ = sequence.left(frame)
         examples.append(Example(np.asarray(image), true_mask(instance, len(sequence.plot.measured))))
     return examples

@@ -74,7 +74,7 @@ def crops(examples: list[Example], rng: np.random.Generator, count: int, size: i
     masks = np.zeros((count, size, size), bool)
     for place, number in enumerate(rng.integers(len(examples), size=count)):
         example = examples[number]
-        top, left = (int(rng.integers(max(each - size, 0) + 1)) for each in example.mask.shape)
+        top, left = (int(rng.integers(max(length - size, 0) + 1)) for length in example.mask.shape)
         part = example.image[top : top + size, left : left + size]
         images[place, : part.shape[0], : part.shape[1]] = part
         masks[place, : part.shape[0], : part.shape[1]] = example.mask[top : top + size, left : left + size]
@@ -110,18 +110,18 @@ def _update(state: Any, batch: Any, key: jax.Array, rates: tuple[jax.Array, jax.
         return (generator, average, None, (first, None)), parts
 
     def of_discriminator(params: Any) -> jax.Array:
-        verdicts = [judge.apply(params, values, each) for each in (true, jax.lax.stop_gradient(painted))]
+        verdicts = [judge.apply(params, values, painting) for painting in (true, jax.lax.stop_gradient(painted))]
         losses = [
             optax.sigmoid_binary_cross_entropy(verdict, jnp.full_like(verdict, wanted)).mean()  # pyright: ignore
             for verdict, wanted in zip(verdicts, (1.0, 0.0))
         ]
         return 0.5 * (losses[0] + losses[1])
 
-    told, gradients = jax.value_and_grad(of_discriminator)(discriminator)
+    judged, gradients = jax.value_and_grad(of_discriminator)(discriminator)
     updates, second = _optimiser().update(gradients, moments[1], discriminator)
     # As in pix2pix, the discriminator learns at half the speed.
     discriminator = jax.tree.map(lambda old, change: old + 0.5 * rate * change, discriminator, updates)
-    return (generator, average, discriminator, (first, second)), {**parts, "told": told}
+    return (generator, average, discriminator, (first, second)), {**parts, "told": judged}
 
 
 def _optimiser() -> optax.GradientTransformation:

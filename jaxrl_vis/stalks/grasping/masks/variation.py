@@ -31,13 +31,13 @@ def vary(images: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Array
     strength = jax.random.uniform(keys["strength"], (count,), minval=0.3)
     strength = jnp.where(jax.random.bernoulli(keys["kept"], _AS_IT_IS, (count,)), 0.0, strength)
     values, masks = _moved(images.astype(jnp.float32) / 255.0, masks, strength, keys["place"])
-    each = strength[:, None, None, None]
-    values = values * _textures(values.shape, each, keys["texture"])
-    values = _coloured(values, each, keys["colour"])
-    values = _lit(values, each, keys["light"])
+    share = strength[:, None, None, None]
+    values = values * _textures(values.shape, share, keys["texture"])
+    values = _coloured(values, share, keys["colour"])
+    values = _lit(values, share, keys["light"])
     values = _blurred(values, strength, keys["blur"])
     level, shot = jax.random.split(keys["noise"])
-    amount = 0.06 * each * jax.random.uniform(level, each.shape)
+    amount = 0.06 * share * jax.random.uniform(level, share.shape)
     values = values + amount * jnp.sqrt(jnp.maximum(values, 0.05)) * jax.random.normal(shot, values.shape)
     return jnp.round(255.0 * jnp.clip(values, 0.0, 1.0)).astype(jnp.uint8), masks
 
@@ -121,7 +121,7 @@ def _blurred(values: jax.Array, strength: jax.Array, key: jax.Array) -> jax.Arra
     taps = jnp.exp(-0.5 * (jnp.arange(-_TAPS, _TAPS + 1) / deviation[:, None]) ** 2)
     taps = taps / taps.sum(axis=1, keepdims=True)
     for axis in (1, 2):
-        padded = jnp.pad(values, [(_TAPS, _TAPS) if each == axis else (0, 0) for each in range(4)], mode="edge")
+        padded = jnp.pad(values, [(_TAPS, _TAPS) if other == axis else (0, 0) for other in range(4)], mode="edge")
         size = values.shape[axis]
         parts = [jax.lax.slice_in_dim(padded, k, k + size, axis=axis) for k in range(2 * _TAPS + 1)]
         values = sum((taps[:, k, None, None, None] * part for k, part in enumerate(parts)), jnp.zeros_like(values))

@@ -101,8 +101,8 @@ def match(left: np.ndarray, right: np.ndarray, calibration: Calibration, mount: 
         preFilterCap=31,
         mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )
-    found = matcher.compute(*padded)[:, low + count :].astype(np.float32) / 16.0
-    return np.where(found >= low, found, np.float32(np.nan))
+    disparity = matcher.compute(*padded)[:, low + count :].astype(np.float32) / 16.0
+    return np.where(disparity >= low, disparity, np.float32(np.nan))
 
 
 _BLOCK = 5

@@ -88,7 +88,7 @@ def grasp_points(chords: Chords, sight: Sight, heights: tuple[float, float] = HE
         heights: Lowest and highest grasp, m above the ground.
     """
     free = np.ones(len(chords), bool)
-    found: list[_Found] = []
+    lines: list[_Found] = []
     for seed in _seeds(chords):
         members = seed[free[seed]]
         if np.ptp(chords.middle[members, 2]) < _LEAST_PIECE if len(members) else True:
@@ -102,9 +102,9 @@ def grasp_points(chords: Chords, sight: Sight, heights: tuple[float, float] = HE
             continue
         count = _agreed(point, sight)
         if count:
-            found.append(_Found(point, members, count))
-    found.sort(key=lambda each: -each.shown)
-    return sorted((each.point for each in _distinct(found, chords)), key=lambda point: float(point.point[0]))
+            lines.append(_Found(point, members, count))
+    lines.sort(key=lambda line: -line.shown)
+    return sorted((line.point for line in _distinct(lines, chords)), key=lambda point: float(point.point[0]))
 
 
 def _seeds(chords: Chords) -> list[np.ndarray]:
@@ -167,9 +167,9 @@ def _grow(chords: Chords, members: np.ndarray, free: np.ndarray) -> np.ndarray:
 def _support(chords: Chords, members: np.ndarray) -> tuple[float, int]:
     """Length that is seen, summed over pairs, in m, and the number of pairs that see at least two heights of it."""
     bins = np.floor(chords.middle[members, 2] / _BIN).astype(int)
-    seen = np.unique(np.stack([chords.frame[members], bins], axis=1), axis=0)
-    frames, counts = np.unique(seen[:, 0], return_counts=True)
-    return _BIN * len(seen), int((counts >= 2).sum())
+    occupied = np.unique(np.stack([chords.frame[members], bins], axis=1), axis=0)
+    frames, counts = np.unique(occupied[:, 0], return_counts=True)
+    return _BIN * len(occupied), int((counts >= 2).sum())
 
 
 def _grasp(chords: Chords, members: np.ndarray, least_frames: int, heights: tuple[float, float]) -> GraspPoint | None:
@@ -223,13 +223,13 @@ def _agreed(point: GraspPoint, sight: Sight) -> int:
     return count if agreed else 0
 
 
-def _distinct(found: list[_Found], chords: Chords) -> list[_Found]:
+def _distinct(lines: list[_Found], chords: Chords) -> list[_Found]:
     """Without lines that are the same stalk as one before them."""
-    kept: list[_Found] = []
-    for each in found:
-        if not any(_same(each.point, other.point) and not _beside(chords, each, other) for other in kept):
-            kept.append(each)
-    return kept
+    distinct: list[_Found] = []
+    for line in lines:
+        if not any(_same(line.point, other.point) and not _beside(chords, line, other) for other in distinct):
+            distinct.append(line)
+    return distinct
 
 
 def _same(point: GraspPoint, other: GraspPoint) -> bool:
@@ -244,11 +244,11 @@ def _beside(chords: Chords, one: _Found, other: _Found) -> bool:
     """Whether pairs show two lines beside each other at the same heights: then they are two stalks, however near."""
     apart = [np.zeros(0)]
     for frame in np.intersect1d(chords.frame[one.members], chords.frame[other.members]):
-        mine, theirs = (chords.middle[each.members[chords.frame[each.members] == frame]] for each in (one, other))
+        mine, theirs = (chords.middle[line.members[chords.frame[line.members] == frame]] for line in (one, other))
         theirs = theirs[np.argsort(theirs[:, 2])]
         place = np.searchsorted(0.5 * (theirs[1:, 2] + theirs[:-1, 2]), mine[:, 2])
         level = np.abs(theirs[place, 2] - mine[:, 2]) < _LEVEL
         apart.append(np.linalg.norm((theirs[place] - mine)[level, :2], axis=1))
-    found = np.concatenate(apart)
+    distances = np.concatenate(apart)
     enough = max(_LEAST_BESIDE, _SHARE_BESIDE * min(len(one.members), len(other.members)))
-    return len(found) >= enough and float(np.median(found)) > _APART_BESIDE
+    return len(distances) >= enough and float(np.median(distances)) > _APART_BESIDE

@@ -70,7 +70,7 @@ class Perception:
 
 
 @dataclasses.dataclass(frozen=True)
-class Ways:
+class Variant:
     """Which steps go as the thesis describes them, in place of the default.
 
     Attributes:
@@ -87,10 +87,12 @@ class Ways:
         return f"{'stitches' if self.stitch else 'grasp points'} of the thesis"
 
 
-OURS, ORIGINAL = Ways(), Ways(True, True)
+DEFAULT_VARIANT, THESIS_VARIANT = Variant(), Variant(True, True)
 
 
-def perceive(views: Iterable[View], mask: Mask, calibration: Calibration, mount: Mount, ways: Ways = OURS) -> Perception:
+def perceive(
+    views: Iterable[View], mask: Mask, calibration: Calibration, mount: Mount, variant: Variant = DEFAULT_VARIANT
+) -> Perception:
     """Grasp points of a run.
 
     Args:
@@ -98,7 +100,7 @@ def perceive(views: Iterable[View], mask: Mask, calibration: Calibration, mount:
         mask: What finds the pixels of stalks.
         calibration: Of the pair, as far as it is known.
         mount: Of the pair.
-        ways: Which steps go as in the thesis.
+        variant: Which steps go as in the thesis.
 
     Raises:
         ValueError: There is no pair.
@@ -109,7 +111,7 @@ def perceive(views: Iterable[View], mask: Mask, calibration: Calibration, mount:
     if not views:
         raise ValueError("there is no pair to perceive anything in")
     notes = []
-    if not ways.stitch and len(views) > 1 and any(view.driven is None for view in views):
+    if not variant.stitch and len(views) > 1 and any(view.driven is None for view in views):
         views, notes = views[-1:], ["no odometry: only the last pair was used"]
     with _threads(len(views)) as side_by_side:
         with clock("match"):
@@ -119,28 +121,28 @@ def perceive(views: Iterable[View], mask: Mask, calibration: Calibration, mount:
                 painted = [mask(view.left, view.number) for view in views]
             clouds = list(side_by_side(lambda disparity, red: organised(disparity, red, calibration, mount), matched, painted))
         with clock("stitch"):
-            method = THESIS if ways.stitch else DEFAULT
+            method = THESIS if variant.stitch else DEFAULT
             whole = list(side_by_side(lambda cloud: Thinned.of(cloud, method), clouds))
-            driven = [_driven(*each) for each in itertools.pairwise(views)]
+            driven = [_driven(*neighbours) for neighbours in itertools.pairwise(views)]
             stitches = list(
                 side_by_side(lambda here, there, far: stitch(here, there, far, method), whole[:-1], whole[1:], driven)
             )
         notes += [
-            f"pair {views[place].number} does not stitch to the next, odometry was used: {each.refused}"
-            for place, each in enumerate(stitches)
-            if each.refused
+            f"pair {views[place].number} does not stitch to the next, odometry was used: {step.refused}"
+            for place, step in enumerate(stitches)
+            if step.refused
         ]
         to_last = [Motion.along(0.0)]
-        for each in reversed(stitches):
-            to_last.insert(0, to_last[0].after(each.motion))
+        for step in reversed(stitches):
+            to_last.insert(0, to_last[0].after(step.motion))
         with clock("points"):
-            if ways.points:
+            if variant.points:
                 points = slice_points(np.concatenate([motion(cloud.red_points()) for motion, cloud in zip(to_last, clouds)]))
             else:
-                found = side_by_side(
+                segments = side_by_side(
                     lambda cloud, frame: chords_of(cloud, calibration, mount, frame), clouds, range(len(clouds))
                 )
-                parts = [dataclasses.replace(part, middle=motion(part.middle)) for motion, part in zip(to_last, found)]
+                parts = [dataclasses.replace(part, middle=motion(part.middle)) for motion, part in zip(to_last, segments)]
                 points = grasp_points(joined(parts), Sight(tuple(clouds), tuple(to_last), calibration, mount))
     if not points:
         notes.append("no stalk was found")

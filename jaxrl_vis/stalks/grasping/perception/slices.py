@@ -70,6 +70,6 @@ def slice_points(points: np.ndarray) -> list[GraspPoint]:
     Args:
         points: [N, 3] red points of all pairs, in the robot frame of the last one, m.
     """
-    found = slice_at(points, PREFERRED - 0.5 * THICKNESS).middles
+    middles = slice_at(points, PREFERRED - 0.5 * THICKNESS).middles
     upwards = np.array([0.0, 0.0, 1.0])
-    return [GraspPoint(middle, upwards, np.nan, 0, np.nan) for middle in found[np.argsort(found[:, 0])]]
+    return [GraspPoint(middle, upwards, np.nan, 0, np.nan) for middle in middles[np.argsort(middles[:, 0])]]

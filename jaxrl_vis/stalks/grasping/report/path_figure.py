@@ -46,8 +46,8 @@ def draw_path(path: Path, stands: Stands, targets: np.ndarray, result: ReachResu
     for axes in (above, apart):
         axes.axvline(control.Timing().reach, color=FAINT, linewidth=0.8, linestyle=":")
         axes.grid(alpha=0.25)
-    held = sorted(int(each) for each in stands.stalk[index][result.held[index]])
-    holds = f"the jaws hold {', '.join(f'stalk {each}' for each in held) or 'nothing'}"
+    held = sorted(int(stalk) for stalk in stands.stalk[index][result.held[index]])
+    holds = f"the jaws hold {', '.join(f'stalk {stalk}' for stalk in held) or 'nothing'}"
     figure.text(0.03, 0.955, "Planned path and path taken", fontsize=14, weight="bold", color=INK, va="center")
     error = (
         f"{1000 * result.error[index]:.1f} mm off when the jaws close" if result.reachable[index] else "out of reach: not sent"

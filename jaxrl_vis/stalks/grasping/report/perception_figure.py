@@ -67,7 +67,7 @@ def _cloud(axes: Any, whole: np.ndarray | None, red: np.ndarray, title: str, per
         pale = perception is not None
         axes.scatter(x, y, z, s=0.6, c="#e8b0b0" if pale else "#d62728", linewidths=0)
     if perception is not None and perception.points:
-        x, y, z = np.array([each.point for each in perception.points]).T
+        x, y, z = np.array([point.point for point in perception.points]).T
         axes.scatter(x, y, z, s=40, c="#b01010", depthshade=False)
     limits = dict(zip(("xlim", "ylim", "zlim"), zip(_LOW, _HIGH)))
     axes.set(xlabel="along the row, m", ylabel="away, m", title=title, **limits)
@@ -102,8 +102,8 @@ def _slice(above: Any, below: Any, red: np.ndarray, scene: Scene, perception: Pe
     below.plot(x, y, "o", ms=9, mfc="none", mec=_INK, label="true stalks of the stretch")
     x, y, _ = slice_.middles.T
     below.plot(x, y, "x", ms=6, c="black", label="middles of regions (thesis)")
-    found = np.array([each.at_height(PREFERRED) for each in perception.points]).reshape(-1, 3)
-    below.plot(found[:, 0], found[:, 1], "+", ms=9, c="#b01010", label="lines of several pairs (default)")
+    middles = np.array([point.at_height(PREFERRED) for point in perception.points]).reshape(-1, 3)
+    below.plot(middles[:, 0], middles[:, 1], "+", ms=9, c="#b01010", label="lines of several pairs (default)")
     below.set(title="regions and middles", xlabel="along the row, m", ylabel="away, m")
     for axes in (above, below):
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")

@@ -124,9 +124,9 @@ def draw_grasps(out: Path, records: Sequence[Record], name: str, score: Score, t
 
 def _counts(record: Record, name: str) -> tuple[int, int, int, int]:
     """Stalks of a run, attempts sent, those that hold exactly their target, and stalks held in the other ones."""
-    attempts = [each for each in attempts_in(record, name) if each.sent]
-    alone = sum(each.outcome == "success" for each in attempts)
-    return int(record["stalks"]), len(attempts), alone, sum(len(each.held) for each in attempts) - alone
+    attempts = [attempt for attempt in attempts_in(record, name) if attempt.sent]
+    alone = sum(attempt.outcome == "success" for attempt in attempts)
+    return int(record["stalks"]), len(attempts), alone, sum(len(attempt.held) for attempt in attempts) - alone
 
 
 def _beside(figure: Figure, score: Score) -> None:

@@ -43,7 +43,7 @@ def write_reaches(
     images, seconds = [], []
     for index in chosen:
         frames = reach_frames(stands, result, index, size)
-        held = {int(each) for each in stands.stalk[index][result.held[index]]}
+        held = {int(stalk) for stalk in stands.stalk[index][result.held[index]]}
         is_alone = held == {int(targets[index])}
         for place, frame in enumerate(frames):
             time = (1 + place * _EVERY) * result.interval

@@ -42,15 +42,15 @@ def suppress(overlaps: jax.Array, scores: jax.Array, threshold: float, valid: ja
     # All at once, again and again: who is removed by those that are kept. What is right stays right, and each round makes at
     # least the next one right; a few rounds do where one at a time takes as many steps as there are boxes.
     def unsettled(state: tuple[jax.Array, jax.Array]) -> jax.Array:
-        kept, before = state
-        return (kept != before).any()
+        selected, before = state
+        return (selected != before).any()
 
     def again(state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        kept, _ = state
-        return there & ~(better & kept[:, None]).any(axis=0), kept
+        selected, _ = state
+        return there & ~(better & selected[:, None]).any(axis=0), selected
 
-    kept, _ = jax.lax.while_loop(unsettled, again, again((there, ~there)))
-    return jnp.zeros(scores.shape, bool).at[order].set(kept)
+    selected, _ = jax.lax.while_loop(unsettled, again, again((there, ~there)))
+    return jnp.zeros(scores.shape, bool).at[order].set(selected)
 
 
 def band_overlap(first: jax.Array, second: jax.Array, lines: int = 8) -> jax.Array:
@@ -121,10 +121,10 @@ def roi_align(
         extent = high - low if aligned else jnp.maximum(high - low, 1.0)
         share = (jnp.arange(cells * samples) + 0.5) / (cells * samples)
         place = low[..., None] + extent[..., None] * share
-        seen = (place >= -1.0) & (place <= length)
+        inside = (place >= -1.0) & (place <= length)
         place = jnp.clip(place, 0.0, length - 1.0)
-        each = jnp.maximum(1.0 - jnp.abs(place[..., None] - jnp.arange(length)), 0.0) * seen[..., None]
-        return each.reshape(*low.shape, cells, samples, length).mean(axis=-2)
+        weight = jnp.maximum(1.0 - jnp.abs(place[..., None] - jnp.arange(length)), 0.0) * inside[..., None]
+        return weight.reshape(*low.shape, cells, samples, length).mean(axis=-2)
 
     lines = weights(scaled[:, 1], scaled[:, 3], size[0], height)
     # Interpolation is separable. The lines go first: a stalk is taller than it is wide, so that leaves less to do.

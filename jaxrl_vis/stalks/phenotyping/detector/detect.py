@@ -123,9 +123,9 @@ def best_proposals(
     scores, places = jax.lax.top_k(logits, count)
     stalks = within(decode(codes[places], anchors[places]), shape)
     size = stalks[:, 2:4] - stalks[:, :2]
-    kept = suppress(band_overlap(stalks, stalks), scores, settings.proposal_threshold)
-    kept &= (size[:, 0] > 2.0) & (size[:, 1] > 8.0)
-    scores = jnp.where(kept, scores, -jnp.inf)
+    selected = suppress(band_overlap(stalks, stalks), scores, settings.proposal_threshold)
+    selected &= (size[:, 0] > 2.0) & (size[:, 1] > 8.0)
+    scores = jnp.where(selected, scores, -jnp.inf)
     best, places = jax.lax.top_k(scores, min(settings.proposals, count))
     return stalks[places], best, jnp.isfinite(best)
 
@@ -155,8 +155,8 @@ def judge(
     logits, codes = heads(network, params, regions_of(features, proposals), "judge_all")
     stalks, scores = decode(codes, proposals), jax.nn.sigmoid(logits)
     valid = valid & (scores >= settings.least_score)
-    kept = suppress(band_overlap(stalks, stalks), jnp.where(valid, scores, -1.0), settings.threshold, valid)
-    best, places = jax.lax.top_k(jnp.where(kept, scores, -1.0), min(settings.most, scores.shape[0]))
+    selected = suppress(band_overlap(stalks, stalks), jnp.where(valid, scores, -1.0), settings.threshold, valid)
+    best, places = jax.lax.top_k(jnp.where(selected, scores, -1.0), min(settings.most, scores.shape[0]))
     return Found(stalks[places], jnp.maximum(best, 0.0), best > 0.0)
 
 

@@ -28,15 +28,15 @@ def found_once(pieces: Sequence[Piece], scores: np.ndarray, most_shared: float =
         [N] bool.
     """
     inside = [np.asarray(mask) >= 0.5 for mask, _ in pieces]
-    sizes = [int(np.count_nonzero(each)) for each in inside]
-    kept: list[int] = []
+    sizes = [int(np.count_nonzero(mask)) for mask in inside]
+    selected: list[int] = []
     for place in np.argsort(-np.asarray(scores), kind="stable").tolist():
         corner = pieces[place][1]
-        shared = (_shared(inside[place], corner, inside[other], pieces[other][1]) for other in kept)
-        least = (min(sizes[place], sizes[other]) for other in kept)
+        shared = (_shared(inside[place], corner, inside[other], pieces[other][1]) for other in selected)
+        least = (min(sizes[place], sizes[other]) for other in selected)
         if not any(common > most_shared * size for common, size in zip(shared, least)):
-            kept.append(place)
-    return np.isin(np.arange(len(pieces)), kept)
+            selected.append(place)
+    return np.isin(np.arange(len(pieces)), selected)
 
 
 def _shared(first: np.ndarray, corner: tuple[int, int], second: np.ndarray, other: tuple[int, int]) -> int:

@@ -107,26 +107,26 @@ class Finder:
         """Stalks of an image [H, W, 3] uint8, from left to right, each of them once."""
         settings = self._settings
         reduced, scale = reduce(image, settings.width)
-        found = jax.device_get(detect(self._params["detector"], pad(reduced), settings, self.dtype))
-        kept = np.flatnonzero(found.valid & (found.scores >= self._least))
-        stalks, scores = in_image(found.stalks[kept], scale), found.scores[kept]
+        stalks_found = jax.device_get(detect(self._params["detector"], pad(reduced), settings, self.dtype))
+        selected = np.flatnonzero(stalks_found.valid & (stalks_found.scores >= self._least))
+        stalks, scores = in_image(stalks_found.stalks[selected], scale), stalks_found.scores[selected]
         on_device = jnp.asarray(image)
         pieces = self._pieces(on_device, stalks, self._settings.snip_lines)
         once = np.flatnonzero(found_once(pieces, scores))
         stalks, scores, pieces = stalks[once], scores[once], [pieces[place] for place in once]
         strips = [strip_width(mask) if mask.size else None for mask, _ in pieces]
         higher = [_follow(stalk, strip, corner) for stalk, strip, (_, corner) in zip(stalks, strips, pieces)]
-        seen = [place for place, each in enumerate(higher) if each is not None]
-        some = np.array([higher[place] for place in seen], np.float32).reshape(-1, 6)
-        upper = dict(zip(seen, self._pieces(on_device, some, self._settings.snip_lines // 2)))
+        shown = [place for place, upper in enumerate(higher) if upper is not None]
+        some = np.array([higher[place] for place in shown], np.float32).reshape(-1, 6)
+        upper = dict(zip(shown, self._pieces(on_device, some, self._settings.snip_lines // 2)))
         detections = []
         for place, (stalk, score, (mask, corner)) in enumerate(zip(stalks, scores, pieces)):
             if mask.size:
-                left, top, right, bottom, above, below = (float(each) - 0.5 for each in stalk)
+                left, top, right, bottom, above, below = (float(edge) - 0.5 for edge in stalk)
                 box = (left, top, right, bottom)
                 axis = (above, below)
                 detections.append(Detection(box, axis, float(score), mask, corner, upper.get(place), strips[place]))
-        return sorted(detections, key=lambda each: sum(each.axis))
+        return sorted(detections, key=lambda detection: sum(detection.axis))
 
     def _pieces(self, image: jax.Array, stalks: np.ndarray, lines: int) -> list[tuple[np.ndarray, tuple[int, int]]]:
         """Masks and their corners of the snips of stalks [N, 6], which have ``lines`` lines in an image of full width."""

@@ -63,7 +63,7 @@ def detector_loss(
 
     def of_image(features, logits, codes, truth, kinds, key):
         which, shows, none = assign(overlap(anchors[:, :4], truth[:, :4]), kinds, 0.5, 0.3)
-        found = _focal(logits, shows, none) / jnp.maximum(shows.sum(), 1)
+        loss = _focal(logits, shows, none) / jnp.maximum(shows.sum(), 1)
         placed = _distance(codes, encode(truth[which], anchors), shows)
 
         proposals, _, valid = best_proposals(*jax.lax.stop_gradient((logits, codes)), anchors, settings, shape)
@@ -80,7 +80,7 @@ def detector_loss(
         right = optax.sigmoid_binary_cross_entropy(judged, shows.astype(jnp.float32))
         judgement = (right * weight).sum() / jnp.maximum(weight.sum(), 1.0)
         refinement = _distance(refined, encode(truth[which], proposals), shows)
-        return found, placed, 2.0 * judgement, 2.0 * refinement
+        return loss, placed, 2.0 * judgement, 2.0 * refinement
 
     keys = jax.random.split(key, images.shape[0])
     parts = jax.vmap(of_image)(features, logits, codes, truth, kinds, keys)
@@ -90,14 +90,14 @@ def detector_loss(
 
 def _focal(logits: jax.Array, shows: jax.Array, none: jax.Array) -> jax.Array:
     """Cross entropy of the anchors that say something, less for those that are easy; their sum."""
-    each = optax.sigmoid_focal_loss(logits, shows.astype(jnp.float32), alpha=0.5, gamma=2.0)
-    return (each * (shows | none)).sum()
+    loss = optax.sigmoid_focal_loss(logits, shows.astype(jnp.float32), alpha=0.5, gamma=2.0)
+    return (loss * (shows | none)).sum()
 
 
 def _distance(codes: jax.Array, wanted: jax.Array, shows: jax.Array) -> jax.Array:
     """Mean Huber loss of codes [K, 6] of the boxes that show a stalk."""
-    each = optax.huber_loss(codes, jnp.clip(wanted, -20.0, 20.0), delta=1.0).sum(axis=-1)
-    return (each * shows).sum() / jnp.maximum(shows.sum(), 1)
+    loss = optax.huber_loss(codes, jnp.clip(wanted, -20.0, 20.0), delta=1.0).sum(axis=-1)
+    return (loss * shows).sum() / jnp.maximum(shows.sum(), 1)
 
 
 def segmenter_loss(params: Any, snips: jax.Array, masks: jax.Array, settings: Settings, dtype: Any) -> jax.Array:

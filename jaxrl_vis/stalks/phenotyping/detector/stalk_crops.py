@@ -90,7 +90,7 @@ def put_back(snip: np.ndarray, stalk: np.ndarray, size: tuple[int, int]) -> tupl
     Returns:
         [h, w] float32, 0 where the snip holds nothing, and line and column of its first pixel in the image.
     """
-    top, left = (each[0] for each in places_of(stalk[None], (snip.shape[0], snip.shape[1])))
+    top, left = (edge[0] for edge in places_of(stalk[None], (snip.shape[0], snip.shape[1])))
     columns = snip.shape[1]
     used = np.flatnonzero((top + np.arange(snip.shape[0]) >= 0) & (top + np.arange(snip.shape[0]) < size[0]))
     begin, end = max(int(left.min()), 0), min(int(left.max()) + columns, size[1])

@@ -8,31 +8,31 @@ import numpy as np
 from jaxrl_vis.stalks.phenotyping.detector.finder import Detection, higher_up
 
 
-def perfect_detections(seen: Iterable[Mapping[str, Any]], instance: np.ndarray, least: float = 0.3) -> list[Detection]:
+def perfect_detections(stalks: Iterable[Mapping[str, Any]], instance: np.ndarray, least: float = 0.3) -> list[Detection]:
     """The stalks that an image shows, from left to right.
 
     Args:
-        seen: With ``stalk``, ``band_box`` and ``band_visible``, as of `truth.StalkInView` or plot.json.
+        stalks: With ``stalk``, ``band_box`` and ``band_visible``, as of `truth.StalkInView` or plot.json.
         instance: [H, W] whole numbers: which stalk each pixel shows.
         least: Share of a stalk's part in the band that must be seen.
     """
-    found = []
+    detections = []
     height, width = instance.shape
-    for each in seen:
-        if each["band_box"] is None or each["band_visible"] < least:
+    for stalk in stalks:
+        if stalk["band_box"] is None or stalk["band_visible"] < least:
             continue
-        left, top, right, bottom = each["band_box"]
+        left, top, right, bottom = stalk["band_box"]
         first, last = max(round(left) - 3, 0), min(round(right) + 4, width)
         upper, lower = max(round(top), 0), min(round(bottom) + 1, height)
-        mask = instance[upper:lower, first:last] == each["stalk"]
+        mask = instance[upper:lower, first:last] == stalk["stalk"]
         line, column = np.nonzero(mask)
         if line.size < 50 or np.ptp(line) < 4:
             continue
         slope, offset = np.polyfit(line + upper, column + first, 1)
         axis = (float(offset + slope * top), float(offset + slope * bottom))
-        above = _upper(np.array([left, top, right, bottom, *axis]) + 0.5, instance, each["stalk"])
-        found.append(Detection((left, top, right, bottom), axis, 1.0, mask, (upper, first), above))
-    return sorted(found, key=lambda each: sum(each.axis))
+        above = _upper(np.array([left, top, right, bottom, *axis]) + 0.5, instance, stalk["stalk"])
+        detections.append(Detection((left, top, right, bottom), axis, 1.0, mask, (upper, first), above))
+    return sorted(detections, key=lambda detection: sum(detection.axis))
 
 
 def _upper(stalk: np.ndarray, instance: np.ndarray, index: int) -> tuple[np.ndarray, tuple[int, int]] | None:

@@ -137,7 +137,7 @@ def _evaluate_job(tasks: Mapping[str, Task], jobs: Sequence[tuple[str, int]], nu
 
 def scores_of(records: Iterable[Record]) -> list[PlotScore]:
     """The scores that records hold."""
-    return [_read(each) for each in records]
+    return [_read(record) for record in records]
 
 
 def summary_of(least_score: float, records: Iterable[Record]) -> dict[str, Any]:
@@ -158,7 +158,7 @@ def _record(score: PlotScore, pairs: int) -> Record:
         "pairs": pairs,
         "stalks_in_view": score.stalks,
         "scores": score.finds[:, 0].round(4).tolist(),
-        "right": "".join("1" if each else "0" for each in score.finds[:, 1]),
+        "right": "".join("1" if right else "0" for right in score.finds[:, 1]),
         "thesis": thesis and {"counted": round(thesis.counted, 4), "widths_mm": thesis.widths.round(4).tolist()},
     }
 
@@ -170,12 +170,13 @@ def _read(record: Record) -> PlotScore:
         return np.array(values, float).reshape(-1, 2)
 
     thesis = record["thesis"]
+    right = np.array([digit == "1" for digit in record["right"]], float)
     return PlotScore(
         seed=record["seed"],
         true=record["true"],
         counted=record["counted"],
         widths=pairs(record["widths_mm"]),
-        finds=np.stack([np.array(record["scores"], float), np.array([each == "1" for each in record["right"]], float)], axis=1),
+        finds=np.stack([np.array(record["scores"], float), right], axis=1),
         stalks=record["stalks_in_view"],
         upper=pairs(record["widths_24in_mm"]),
         seconds=math.nan if record["seconds_per_pair"] is None else record["seconds_per_pair"],

@@ -98,20 +98,20 @@ def score_plot(
     total, seconds = 0, []
     for pair in sequence:
         left, right, instance = np.asarray(pair.left), np.asarray(pair.right), np.asarray(pair.instance)
-        seen = stalks_in_view(plot, pair.pose, drive.true, instance, np.asarray(pair.depth))
+        stalks = stalks_in_view(plot, pair.pose, drive.true, instance, np.asarray(pair.depth))
         started = time.monotonic()
-        finder = find or functools.partial(_perfectly, seen, instance)
+        finder = find or functools.partial(_perfectly, stalks, instance)
         detections, ground = find_with_ground(finder, left, right, drive.stated)
-        kept = [place for place, each in enumerate(detections) if each.score >= least_score]
-        finds_kept = [detections[place] for place in kept]
+        selected = [place for place, detection in enumerate(detections) if detection.score >= least_score]
+        finds_kept = [detections[place] for place in selected]
         frames.append(look(finds_kept, left, right, drive.stated, method, ground))
         seconds.append(time.monotonic() - started)
         if with_thesis:
             as_thesis.append(look_as_thesis(finds_kept, left, right, drive.stated))
-        matched, scored = match(detections, seen)
-        total += sum(each.band_box is not None and each.band_visible >= LEAST_VISIBLE for each in seen)
+        matched, scored = match(detections, stalks)
+        total += sum(stalk.band_box is not None and stalk.band_visible >= LEAST_VISIBLE for stalk in stalks)
         finds += scored
-        owners.append([matched[place] for place in kept])
+        owners.append([matched[place] for place in selected])
     tracks, _ = follow(frames, drive.odometry, drive.stated)
     widths, upper = [], []
     counted = [track for track in tracks if track.counted]
@@ -138,9 +138,9 @@ def score_plot(
     )
 
 
-def _perfectly(seen: list[StalkInView], instance: np.ndarray, image: np.ndarray) -> list[Detection]:
+def _perfectly(stalks: list[StalkInView], instance: np.ndarray, image: np.ndarray) -> list[Detection]:
     """True boxes and masks, as a finder that needs no image."""
-    return perfect_detections(map(dataclasses.asdict, seen), instance, LEAST_VISIBLE)
+    return perfect_detections(map(dataclasses.asdict, stalks), instance, LEAST_VISIBLE)
 
 
 def _thesis_score(frames: list[list[Sighting]], owners: list[list[int | None]], sequence: Sequence) -> ThesisScore:
@@ -153,22 +153,22 @@ def _thesis_score(frames: list[list[Sighting]], owners: list[list[int | None]], 
 def true_diameter(stalk: Stalk, height: float = HEIGHTS[0]) -> float:
     """Diameter of a stalk at a height in m as the cameras face it, mm; beside a node, the stalk above and below it is meant."""
     beside = (0.02, -0.02) if stalk.node_distance(height) < 0.01 else (0.0,)
-    return 1e3 * float(np.mean([stalk.diameter(height + each) for each in beside]))
+    return 1e3 * float(np.mean([stalk.diameter(height + offset) for offset in beside]))
 
 
-def match(detections: list[Detection], seen: list[StalkInView]) -> tuple[list[int | None], list[tuple[float, float]]]:
+def match(detections: list[Detection], stalks: list[StalkInView]) -> tuple[list[int | None], list[tuple[float, float]]]:
     """Which stalk each find shows, by COCO's rules: the best find first, each stalk once, at an overlap of boxes of 0.5.
 
     Returns:
         The stalk of each find, or None; and score and success of each find, less those of stalks that are too hidden to count.
     """
-    there = [each for each in seen if each.band_box is not None]
-    clear = np.array([each.band_visible >= LEAST_VISIBLE for each in there], bool)
-    boxes = np.array([each.band_box for each in there], float).reshape(-1, 4)
+    there = [stalk for stalk in stalks if stalk.band_box is not None]
+    clear = np.array([stalk.band_visible >= LEAST_VISIBLE for stalk in there], bool)
+    boxes = np.array([stalk.band_box for stalk in there], float).reshape(-1, 4)
     owners: list[int | None] = [None] * len(detections)
     scored: list[tuple[float, float]] = []
     free = np.ones(len(there), bool)
-    for place in sorted(range(len(detections)), key=lambda each: -detections[each].score):
+    for place in sorted(range(len(detections)), key=lambda number: -detections[number].score):
         overlaps = _overlaps(np.array(detections[place].box), boxes)
         fitting = free & (overlaps >= IOU)
         of_clear = np.where(fitting & clear, overlaps, 0.0)
@@ -217,17 +217,17 @@ def summary(scores: Iterable[PlotScore], least_score: float = 0.5) -> dict[str, 
         was of each. Not a number where there was nothing.
     """
     scores = list(scores)
-    true = np.array([each.true for each in scores], float)
-    counted = np.array([each.counted for each in scores], float)
-    widths = np.concatenate([each.widths for each in scores]) if scores else np.zeros((0, 2))
-    finds = np.concatenate([each.finds for each in scores]) if scores else np.zeros((0, 2))
-    stalks = sum(each.stalks for each in scores)
+    true = np.array([score.true for score in scores], float)
+    counted = np.array([score.counted for score in scores], float)
+    widths = np.concatenate([score.widths for score in scores]) if scores else np.zeros((0, 2))
+    finds = np.concatenate([score.finds for score in scores]) if scores else np.zeros((0, 2))
+    stalks = sum(score.stalks for score in scores)
     error = widths[:, 0] - widths[:, 1]
-    upper = np.concatenate([each.upper for each in scores]) if scores else np.zeros((0, 2))
+    upper = np.concatenate([score.upper for score in scores]) if scores else np.zeros((0, 2))
     upper_error = upper[:, 0] - upper[:, 1]
     people = np.random.default_rng(0).normal(0.0, PERSON_SD, (len(error), 2)).mean(axis=1)
-    kept = finds[finds[:, 0] >= least_score]
-    hits = float(kept[:, 1].sum())
+    selected = finds[finds[:, 0] >= least_score]
+    hits = float(selected[:, 1].sum())
     best, best_score = _best_f1(finds, stalks)
     return {
         "plots": len(scores),
@@ -242,15 +242,15 @@ def summary(scores: Iterable[PlotScore], least_score: float = 0.5) -> dict[str, 
         "widths_24in": len(upper),
         "width_24in_mae_mm": _mean(np.abs(upper_error)),
         "width_24in_bias_mm": _mean(upper_error),
-        "finds": len(kept),
+        "finds": len(selected),
         "stalks_in_view": stalks,
         "ap50": average_precision(finds, stalks),
-        "precision": hits / len(kept) if len(kept) else float("nan"),
+        "precision": hits / len(selected) if len(selected) else float("nan"),
         "recall": hits / stalks if stalks else float("nan"),
-        "f1": 2.0 * hits / (len(kept) + stalks) if len(kept) + stalks else float("nan"),
+        "f1": 2.0 * hits / (len(selected) + stalks) if len(selected) + stalks else float("nan"),
         "f1_best": best,
         "f1_best_least_score": best_score,
-        "seconds_per_pair": _mean(np.array([each.seconds for each in scores if math.isfinite(each.seconds)])),
+        "seconds_per_pair": _mean(np.array([score.seconds for score in scores if math.isfinite(score.seconds)])),
         **_thesis_summary(scores),
     }
 
@@ -268,7 +268,7 @@ def _best_f1(finds: np.ndarray, stalks: int) -> tuple[float, float]:
 
 def _thesis_summary(scores: list[PlotScore]) -> dict[str, float]:
     """The same figures of the thesis's ways, where all plots have them."""
-    both = [(each, each.thesis) for each in scores if each.thesis is not None]
+    both = [(score, score.thesis) for score in scores if score.thesis is not None]
     if not both:
         return {}
     true, counted = np.array([(score.true, thesis.counted) for score, thesis in both]).T

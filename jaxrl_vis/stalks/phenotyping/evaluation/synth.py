@@ -107,7 +107,7 @@ def write_plot(folder: Path, plot: Plot, image_format: ImageFormat, truth: Truth
     write_calibration(folder / "calibration.yaml", sequence.drive.stated)
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []
-    seen: list[dict[str, Any]] = []
+    visible: list[dict[str, Any]] = []
     for pair in sequence:
         names = [f"{side}_{pair.frame:03d}{SUFFIX[image_format]}" for side in ("left", "right")]
         for name, image in zip(names, (pair.left, pair.right)):
@@ -119,14 +119,14 @@ def write_plot(folder: Path, plot: Plot, image_format: ImageFormat, truth: Truth
             height, width = instance.shape
             images.append({"id": pair.frame + 1, "file_name": names[0], "width": width, "height": height})
             stalks = stalks_in_view(plot, pair.pose, sequence.drive.true, instance, depth)
-            annotations += [_annotation(pair.frame, each, instance, truth == "all") for each in stalks if each.pixels]
-            seen += [{"pair": pair.frame, **dataclasses.asdict(each)} for each in stalks]
+            annotations += [_annotation(pair.frame, stalk, instance, truth == "all") for stalk in stalks if stalk.pixels]
+            visible += [{"pair": pair.frame, **dataclasses.asdict(stalk)} for stalk in stalks]
         done(plot.seed, pair.frame + 1)
     write_atomically(folder / "odometry.csv", _odometry(sequence, SUFFIX[image_format]))
     if truth != "none":
         text = f"synthetic stalks, family {plot.family.name}, seed {plot.seed}"
         write_atomically(folder / "annotations.json", json.dumps(coco(images, annotations, {"description": text})) + "\n")
-    write_atomically(folder / "plot.json", json.dumps(_summary(sequence, seen)) + "\n")
+    write_atomically(folder / "plot.json", json.dumps(_summary(sequence, visible)) + "\n")
 
 
 def _write_maps(folder: Path, pair: Pair, instance: np.ndarray) -> None:
@@ -138,7 +138,7 @@ def _write_maps(folder: Path, pair: Pair, instance: np.ndarray) -> None:
 def _annotation(frame: int, stalk: StalkInView, instance: np.ndarray, with_mask: bool) -> dict[str, Any]:
     assert stalk.visible_box is not None
     left, top, right, bottom = stalk.visible_box
-    found: dict[str, Any] = {
+    annotation: dict[str, Any] = {
         "image_id": frame + 1,
         "bbox": [left + 0.5, top + 0.5, right - left, bottom - top],
         "area": stalk.pixels,
@@ -148,8 +148,8 @@ def _annotation(frame: int, stalk: StalkInView, instance: np.ndarray, with_mask:
     if with_mask:
         lines, columns = slice(int(top + 0.5), int(bottom + 0.5)), slice(int(left + 0.5), int(right + 0.5))
         mask = instance[lines, columns] == stalk.stalk
-        found["segmentation"] = encode_mask(mask, (lines.start, columns.start), instance.shape)
-    return found
+        annotation["segmentation"] = encode_mask(mask, (lines.start, columns.start), instance.shape)
+    return annotation
 
 
 def _odometry(sequence: Sequence, suffix: str) -> str:
@@ -160,7 +160,7 @@ def _odometry(sequence: Sequence, suffix: str) -> str:
     return to_csv(rows)
 
 
-def _summary(sequence: Sequence, seen: list[dict[str, Any]]) -> dict[str, Any]:
+def _summary(sequence: Sequence, visible: list[dict[str, Any]]) -> dict[str, Any]:
     """What plot.json holds: lengths in metres but for diameters, which are in millimetres."""
     plot, drive = sequence.plot, sequence.drive
     stalks = []
@@ -192,7 +192,7 @@ def _summary(sequence: Sequence, seen: list[dict[str, Any]]) -> dict[str, Any]:
         "poses": [{"position": pose.position.tolist(), "rotation": pose.rotation.tolist()} for pose in drive.poses],
         "disparity_scale": DISPARITY_SCALE,
         "band": BAND,
-        "seen": seen,
+        "seen": visible,
     }
 
 

@@ -21,8 +21,8 @@ def look_as_thesis(
     """Measures what was found in a pair [H, W, 3] uint8, by ellipses and semi-global matching."""
     disparity = np.full(left.shape[:2], np.nan, np.float32)
     far, near = (float(calibration.disparity(np.array(depth))) for depth in reversed(_DEPTHS))
-    for each in detections:
-        (top, first), (tall, wide) = each.corner, each.mask.shape
+    for detection in detections:
+        (top, first), (tall, wide) = detection.corner, detection.mask.shape
         box = (first, top, first + wide, top + tall)
         disparity[top : top + tall, first : first + wide] = match_sgbm(left, right, box, (far, near))
     return look(detections, left, right, calibration, "ellipse", disparity=disparity)
@@ -38,10 +38,10 @@ def count_by_length(frames: list[list[Sighting]], calibration: Calibration, leng
     """
     shares = []
     for sightings in frames:
-        depths = [each.depth_m for each in sightings if each.depth_m is not None]
+        depths = [sighting.depth_m for sighting in sightings if sighting.depth_m is not None]
         if depths:
-            seen = calibration.width / calibration.focal * float(np.median(depths))
-            shares.append(len(sightings) / seen)
+            extent = calibration.width / calibration.focal * float(np.median(depths))
+            shares.append(len(sightings) / extent)
         else:
             shares.append(0.0)
     return length * float(np.mean(shares)) if shares else 0.0
@@ -49,9 +49,9 @@ def count_by_length(frames: list[list[Sighting]], calibration: Calibration, leng
 
 def mean_widths(frames: list[list[Sighting]], owners: list[list[int | None]]) -> dict[int, float]:
     """Mean diameter in mm of each stalk, by its index, over the pairs in which it was identified and measured."""
-    found: dict[int, list[float]] = {}
+    widths: dict[int, list[float]] = {}
     for sightings, names in zip(frames, owners):
-        for each, name in zip(sightings, names):
-            if name is not None and each.diameter_mm is not None:
-                found.setdefault(name, []).append(each.diameter_mm)
-    return {name: float(np.mean(widths)) for name, widths in found.items()}
+        for sighting, name in zip(sightings, names):
+            if name is not None and sighting.diameter_mm is not None:
+                widths.setdefault(name, []).append(sighting.diameter_mm)
+    return {name: float(np.mean(values)) for name, values in widths.items()}

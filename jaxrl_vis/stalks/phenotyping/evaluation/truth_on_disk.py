@@ -22,11 +22,11 @@ def find_truth(image: np.ndarray, plot: PlotFolder, pair: PairFiles) -> list[Det
         RequestError: The plot is not synthetic, or was written without masks.
     """
     try:
-        seen = _seen(plot.folder).get(int(pair.name), [])
+        stalks = _seen(plot.folder).get(int(pair.name), [])
         truth = plot.folder / "truth" / f"instance_{pair.name}.png"
         if image_size(truth) != image.shape[:2]:
             raise ValueError("masks of another image")
-        return perfect_detections(seen, read_image(truth).astype(np.int64) - 1)
+        return perfect_detections(stalks, read_image(truth).astype(np.int64) - 1)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError) as error:
         raise RequestError(
             f"{plot.folder} holds no true masks: write it with `jaxrl-vis phenotype synth --truth all`, or use --masks network"
@@ -37,11 +37,11 @@ def find_truth(image: np.ndarray, plot: PlotFolder, pair: PairFiles) -> list[Det
 def _seen(folder: Path) -> dict[int, list[dict]]:
     """What plot.json says of each pair."""
     of_pair: dict[int, list[dict]] = {}
-    for each in read_json(folder / "plot.json")["seen"]:
-        box = each["band_box"]
+    for stalk in read_json(folder / "plot.json")["seen"]:
+        box = stalk["band_box"]
         if box is not None and (len(box) != 4 or not all(abs(float(edge)) < _FARTHEST for edge in box)):
             raise ValueError("a box is none")
-        of_pair.setdefault(each["pair"], []).append(
-            {**each, "band_box": None if box is None else [float(edge) for edge in box]}
+        of_pair.setdefault(stalk["pair"], []).append(
+            {**stalk, "band_box": None if box is None else [float(edge) for edge in box]}
         )
     return of_pair

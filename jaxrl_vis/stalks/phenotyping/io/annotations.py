@@ -34,7 +34,9 @@ def coco(images: list[dict[str, Any]], annotations: list[dict[str, Any]], about:
             are added.
         about: What the data set is.
     """
-    numbered = [{"id": place + 1, "category_id": STALK, "iscrowd": 0, **each} for place, each in enumerate(annotations)]
+    numbered = [
+        {"id": place + 1, "category_id": STALK, "iscrowd": 0, **annotation} for place, annotation in enumerate(annotations)
+    ]
     categories = [{"id": STALK, "name": "stalk", "supercategory": "plant"}]
     return {"info": about, "images": images, "annotations": numbered, "categories": categories}
 
@@ -69,12 +71,12 @@ def read_annotations(folder: Path) -> dict[str, Any]:
 def _coco_of(path: Path) -> dict[str, Any]:
     try:
         data = read_json(path)
-        names = {each["id"]: str(each["name"]) for each in data.get("categories", [])}
+        names = {category["id"]: str(category["name"]) for category in data.get("categories", [])}
         annotations = []
-        for place, each in enumerate(data["annotations"]):
-            source = f"{path}: annotation {str(each.get('id', place + 1))[:60]}"
-            annotations.append({**each, "name": names.get(each.get("category_id"), ""), "source": source})
-        return {"images": [{**each, "source": str(path)} for each in data["images"]], "annotations": annotations}
+        for place, annotation in enumerate(data["annotations"]):
+            source = f"{path}: annotation {str(annotation.get('id', place + 1))[:60]}"
+            annotations.append({**annotation, "name": names.get(annotation.get("category_id"), ""), "source": source})
+        return {"images": [{**image, "source": str(path)} for image in data["images"]], "annotations": annotations}
     except OSError as error:
         raise RequestError(f"cannot read {path}: {error.strerror or error}") from error
     except _WRONG as error:
@@ -90,7 +92,7 @@ def _together(files: list[Path], read: _Read) -> dict[str, Any]:
     images, annotations = [], []
     for number, file in enumerate(files):
         try:
-            name, width, height, found = read(file)
+            name, width, height, shapes = read(file)
         except OSError as error:
             raise RequestError(f"cannot read {file}: {error.strerror or error}") from error
         except _WRONG as error:
@@ -98,7 +100,7 @@ def _together(files: list[Path], read: _Read) -> dict[str, Any]:
             raise RequestError(f"{file} is no annotation of {kind}{_reason(error)}") from error
         images.append({"id": number, "file_name": name, "width": width, "height": height, "source": str(file)})
         annotations += [
-            {"image_id": number, "source": f"{file}: annotation {place + 1}", **each} for place, each in enumerate(found)
+            {"image_id": number, "source": f"{file}: annotation {place + 1}", **shape} for place, shape in enumerate(shapes)
         ]
     return {"images": images, "annotations": annotations}
 
@@ -118,18 +120,18 @@ def _voc(path: Path) -> tuple[str, int, int, list[dict[str, Any]]]:
             raise ValueError(name)
         return value
 
-    found = []
-    for each in root.iter("object"):
+    annotations = []
+    for element in root.iter("object"):
         # Pixels count from 1, and the last ones belong to the box.
-        left, top, right, bottom = (float(text(each, f"bndbox/{name}")) for name in ("xmin", "ymin", "xmax", "ymax"))
+        left, top, right, bottom = (float(text(element, f"bndbox/{name}")) for name in ("xmin", "ymin", "xmax", "ymax"))
         box = [left - 1.0, top - 1.0, right - left + 1.0, bottom - top + 1.0]
-        found.append({"name": text(each, "name"), "bbox": box})
-    return text(root, "filename"), int(text(root, "size/width")), int(text(root, "size/height")), found
+        annotations.append({"name": text(element, "name"), "bbox": box})
+    return text(root, "filename"), int(text(root, "size/width")), int(text(root, "size/height")), annotations
 
 
 def _labelme(path: Path) -> tuple[str, int, int, list[dict[str, Any]]]:
     data = read_json(path, _MOST_BYTES)
-    found = []
+    annotations = []
     for shape in data["shapes"]:
         points = np.asarray(shape["points"], float).reshape(-1, 2)
         kind = shape.get("shape_type", "polygon")
@@ -139,33 +141,33 @@ def _labelme(path: Path) -> tuple[str, int, int, list[dict[str, Any]]]:
         outline = points if kind == "polygon" else np.array([low, (high[0], low[1]), high, (low[0], high[1])])
         with np.errstate(over="ignore", invalid="ignore"):
             box = [*map(float, low), *map(float, high - low)]
-        found.append({"name": str(shape["label"]), "bbox": box, "segmentation": [outline.ravel().tolist()]})
+        annotations.append({"name": str(shape["label"]), "bbox": box, "segmentation": [outline.ravel().tolist()]})
     # The path is as its writer's machine spelled it.
     return (
         str(data["imagePath"]).replace("\\", "/").rpartition("/")[2],
         int(data["imageWidth"]),
         int(data["imageHeight"]),
-        found,
+        annotations,
     )
 
 
 def _kept(data: dict[str, Any], path: Path) -> dict[str, Any]:
     """What is called a stalk, if anything is, and else all; checked."""
-    named = [each for each in data["annotations"] if "stalk" in each.get("name", "").lower()]
+    named = [annotation for annotation in data["annotations"] if "stalk" in annotation.get("name", "").lower()]
     data = {**data, "annotations": named or data["annotations"]}
     if not data["images"] or not data["annotations"]:
         raise RequestError(f"{path} annotates nothing: name a folder with annotated images")
-    images = [_checked_image(each, place) for place, each in enumerate(data["images"])]
-    twice = len(images) - len({each["id"] for each in images})
+    images = [_checked_image(image, place) for place, image in enumerate(data["images"])]
+    twice = len(images) - len({image["id"] for image in images})
     if twice:
         raise RequestError(f"{path}: {twice} images have the id of another one, so nobody can tell whose annotations are whose")
-    sizes = {each["id"]: (each["height"], each["width"]) for each in images}
+    sizes = {image["id"]: (image["height"], image["width"]) for image in images}
     annotations = []
-    for each in data["annotations"]:
+    for annotation in data["annotations"]:
         try:
-            annotations.append(_checked_annotation(each, sizes))
+            annotations.append(_checked_annotation(annotation, sizes))
         except ValueError as error:
-            raise RequestError(f"{each['source']} {error}: mend it, or delete it") from error
+            raise RequestError(f"{annotation['source']} {error}: mend it, or delete it") from error
     return {"images": images, "annotations": annotations}
 
 
@@ -256,8 +258,8 @@ def _checked_segmentation(segmentation: Any, size: tuple[int, int]) -> dict[str,
         if not runs[1::2].any():
             raise ValueError("has a mask without a pixel")
         return {"size": list(size), "counts": runs.tolist()}
-    outlines = [_numbers(each) for each in segmentation] if isinstance(segmentation, list) else [None]
-    corners = [each for each in outlines if each is not None and len(each) >= 6 and len(each) % 2 == 0]
+    outlines = [_numbers(outline) for outline in segmentation] if isinstance(segmentation, list) else [None]
+    corners = [outline for outline in outlines if outline is not None and len(outline) >= 6 and len(outline) % 2 == 0]
     if len(corners) < len(outlines):
         raise ValueError("has a polygon that is not column, line, column, line, ... of 3 corners or more")
     if any(abs(corner) > _FARTHEST for outline in corners for corner in outline):
@@ -278,6 +280,6 @@ def _box_around(segmentation: dict[str, Any] | list[list[float]]) -> list[float]
     """The box (left, top, width, height) around what was checked."""
     if isinstance(segmentation, dict):
         return box_around_runs(np.array(segmentation["counts"], np.int64), segmentation["size"][0])
-    corners = np.concatenate([np.reshape(each, (-1, 2)) for each in segmentation])
+    corners = np.concatenate([np.reshape(outline, (-1, 2)) for outline in segmentation])
     low, high = corners.min(axis=0), corners.max(axis=0)
     return [*map(float, low), *map(float, high - low)]

@@ -59,8 +59,8 @@ def read_calibration(path: Path, unit: Unit | None = None) -> Calibration:
         raise RequestError(f"{path}: the left image has {_times(sizes[0])} pixels and the right one {_times(sizes[1])}")
     said = stores[0].get("unit")
     if said is not None and (not isinstance(said, str) or said not in _METRES):
-        told = reprlib.repr(said) if isinstance(said, str) else "something that is no text"
-        raise RequestError(f"{path}: unit must be m or mm, not {told}")
+        unit_read = reprlib.repr(said) if isinstance(said, str) else "something that is no text"
+        raise RequestError(f"{path}: unit must be m or mm, not {unit_read}")
     return _checked(path, matrices[0], matrices[1], sizes[0], unit or said or "m")
 
 
@@ -98,17 +98,17 @@ def _beside(path: Path, side: str) -> Path:
     """The file of one side: ``path``, with the other side's name in it replaced."""
     other = _SIDES[1 - _SIDES.index(side)]
     if side in path.stem:
-        found = path
+        file = path
     elif other in path.stem:
-        found = path.with_stem(path.stem.replace(other, side))
+        file = path.with_stem(path.stem.replace(other, side))
     else:
         raise RequestError(
             f"{path} holds neither P1 and P2 of OpenCV nor one side of a ROS camera_info (left.yaml and right.yaml): "
             "calibrate the pair, and rectify its images"
         )
-    if not found.is_file():
-        raise RequestError(f"there is no calibration {found}: name a file of OpenCV, or a folder with left.yaml and right.yaml")
-    return found
+    if not file.is_file():
+        raise RequestError(f"there is no calibration {file}: name a file of OpenCV, or a folder with left.yaml and right.yaml")
+    return file
 
 
 def _storage(path: Path) -> dict[str, Any]:
@@ -138,8 +138,8 @@ def _matrix(store: dict[str, Any], names: tuple[str, ...], path: Path, side: str
         )
     data = value.get("data") if isinstance(value, dict) else value
     rows = data if isinstance(data, list) else []
-    numbers = [each for row in rows for each in row] if rows and all(isinstance(row, list) for row in rows) else rows
-    if len(numbers) != 12 or not all(isinstance(each, float) and math.isfinite(each) for each in numbers):
+    numbers = [number for row in rows for number in row] if rows and all(isinstance(row, list) for row in rows) else rows
+    if len(numbers) != 12 or not all(isinstance(number, float) and math.isfinite(number) for number in numbers):
         raise RequestError(f"{path}: {names[0]} of the {side} camera must be 3 x 4 numbers")
     return np.array(numbers).reshape(3, 4)
 

@@ -71,7 +71,7 @@ def find_plots(folder: Path) -> list[PlotFolder]:
     own = _pairs(folder)
     folders = {folder.resolve(): own} if own else {}
     if not own:
-        folders = {each: _pairs(each) for each in sorted(path for path in folder.iterdir() if path.is_dir())}
+        folders = {path: _pairs(path) for path in sorted(path for path in folder.iterdir() if path.is_dir())}
     plots: dict[str, PlotFolder] = {}
     for path, pairs in folders.items():
         if pairs:
@@ -93,8 +93,8 @@ _Sides = dict[str, dict[str, Path]]
 
 def _pairs(folder: Path) -> tuple[PairFiles, ...]:
     sides = _by_folder(folder) or {}
-    for name, each in _by_name(folder).items():
-        for side, path in each.items():
+    for name, files in _by_name(folder).items():
+        for side, path in files.items():
             _put(sides, name, side, path)
     stored = _folder_of(folder, ("disparity",))
     inside = [] if stored is None else _images(stored, _DISPARITIES)
@@ -104,8 +104,10 @@ def _pairs(folder: Path) -> tuple[PairFiles, ...]:
         name = re.sub("disparity", "", stem, flags=re.IGNORECASE).strip("_-. ") if beside else stem
         if name in sides and (not beside or "disparity" in stem.lower()):
             _put(sides, name, "disparity", path)
-    found = [PairFiles(name, each.get("left"), each.get("right"), each.get("disparity")) for name, each in sides.items()]
-    return tuple(sorted(found, key=lambda pair: _natural(pair.name)))
+    files = [
+        PairFiles(name, by_side.get("left"), by_side.get("right"), by_side.get("disparity")) for name, by_side in sides.items()
+    ]
+    return tuple(sorted(files, key=lambda pair: _natural(pair.name)))
 
 
 def _put(sides: _Sides, name: str, side: str, path: Path) -> None:
@@ -117,7 +119,7 @@ def _put(sides: _Sides, name: str, side: str, path: Path) -> None:
     check_length(path)
     other = sides.setdefault(name, {}).setdefault(side, path)
     if other != path:
-        both = " and ".join(readable(str(each)) for each in (other, path))
+        both = " and ".join(readable(str(file)) for file in (other, path))
         what = "disparity" if side == "disparity" else f"{side} image"
         raise RequestError(f"{both} are both the {what} of pair {name}: rename one of them, or move it elsewhere")
 
@@ -130,7 +132,7 @@ def _by_folder(folder: Path) -> _Sides:
         for side, path in nested.items():
             assert path is not None
             # A folder L that holds whole pairs is a plot of that name, and no side.
-            if any(len(each) == 2 for each in _by_name(path).values()):
+            if any(len(by_side) == 2 for by_side in _by_name(path).values()):
                 return {}
             for image in _images(path):
                 _put(sides, readable(image.stem), side, image)
@@ -163,15 +165,15 @@ def _side_in(stem: str, stems: set[str]) -> re.Match[str] | None:
     """
     words = list(_WORD.finditer(stem)) or list(_LETTER.finditer(stem))
     paired = [
-        each for each in words if (stem[: each.start()] + _OTHER[each.group().lower()] + stem[each.end() :]).lower() in stems
+        word for word in words if (stem[: word.start()] + _OTHER[word.group().lower()] + stem[word.end() :]).lower() in stems
     ]
     return (paired or words or [None])[-1]
 
 
 def _folder_of(folder: Path, names: tuple[str, ...]) -> Path | None:
     """The folder in a folder that has one of some names, whatever their case; the first name goes before the others."""
-    found = [path for path in sorted(folder.iterdir()) if path.name.lower() in names and path.is_dir()]
-    return min(found, key=lambda path: names.index(path.name.lower()), default=None)
+    folders = [path for path in sorted(folder.iterdir()) if path.name.lower() in names and path.is_dir()]
+    return min(folders, key=lambda path: names.index(path.name.lower()), default=None)
 
 
 def _images(folder: Path, suffixes: set[str] = _IMAGES) -> list[Path]:

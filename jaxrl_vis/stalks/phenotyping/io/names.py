@@ -24,7 +24,7 @@ def readable(name: str) -> str:
         text = raw.decode()
     except UnicodeDecodeError:
         text = raw.decode("latin-1")
-    return "".join("_" if unicodedata.category(each) in _UNPRINTABLE else each for each in text)
+    return "".join("_" if unicodedata.category(letter) in _UNPRINTABLE else letter for letter in text)
 
 
 def file_name(text: str) -> str:

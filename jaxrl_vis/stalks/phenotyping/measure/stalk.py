@@ -92,10 +92,10 @@ def measure(
     matched = _disparity(strip, corner, left, right, calibration, depths, disparity)
     if ground is not None and height is not None:
         place = _place_at(height, strip, corner, matched, calibration, ground)
-    found = matched.at(place + corner[0])
-    if found is None:
+    disparity_here = matched.at(place + corner[0])
+    if disparity_here is None:
         return Measurement(line=place + corner[0], lean=strip.lean, reason="the right image does not show it clearly")
-    beside, error = found
+    beside, error = disparity_here
     depth = float(calibration.depth(np.array(beside)))
     if not depths[0] <= depth <= depths[1]:
         return Measurement(line=place + corner[0], depth=depth, lean=strip.lean, reason=f"it stands {depth:.2f} m away")
@@ -135,8 +135,8 @@ def _place_at(
 ) -> float:
     """Line of the mask at which a stalk is so high above the ground, m, or the nearest one in which its edges are seen."""
     ends = np.array([strip.first, strip.last], float)
-    found = [matched.at(place + corner[0]) for place in ends]
-    known = [each[0] for each in found if each is not None]
+    disparities = [matched.at(place + corner[0]) for place in ends]
+    known = [disparity_here[0] for disparity_here in disparities if disparity_here is not None]
     if len(known) < 2 or ends[0] == ends[1]:
         return strip.reference
     depths = calibration.depth(np.array(known))
@@ -146,7 +146,7 @@ def _place_at(
     ]
     if not heights[0] > heights[1]:
         return strip.reference
-    return float(np.interp(-height, [-each for each in heights], ends))
+    return float(np.interp(-height, [-height_here for height_here in heights], ends))
 
 
 def _disparity(
@@ -161,7 +161,7 @@ def _disparity(
     """Disparities of windows spread over the lines in which both edges are seen."""
     half = max(round(8 * calibration.focal / 2168), 3)
     lines = np.unique(np.linspace(strip.first + half, max(strip.last - half, strip.first + half), _WINDOWS).round()).astype(int)
-    edges = np.array([strip.edges(each) for each in lines]) + corner[1]
+    edges = np.array([strip.edges(line) for line in lines]) + corner[1]
     far, near = (float(calibration.disparity(np.array(depth))) for depth in (depths[1], depths[0]))
     if disparity is not None:
         return sample_rows(disparity, lines + corner[0], (edges[:, 0], edges[:, 1]), (far, near))

@@ -109,21 +109,21 @@ def match_rows(
         )
         for line, begin, end in zip(np.asarray(lines, int), *edges)
     ]
-    wanted = [each for each in wanted if each.inside(left.shape, half_height, spread)]
+    wanted = [strip for strip in wanted if strip.inside(left.shape, half_height, spread)]
     # A few windows are looked for wherever they may be. Where they agree, the others are looked for near to where that says.
     first = sorted(set(np.linspace(0, len(wanted) - 1, min(_FIRST, len(wanted))).round().astype(int)))
     whole = int(np.floor(bounds[0])), int(np.ceil(bounds[1]))
-    found = {place: _match(left, right, wanted[place], whole, half_height, spread) for place in first}
-    expected = _agreed([(wanted[place].line, each[0]) for place, each in found.items() if each is not None])
+    matches = {place: _match(left, right, wanted[place], whole, half_height, spread) for place in first}
+    expected = _agreed([(wanted[place].line, result[0]) for place, result in matches.items() if result is not None])
     for place, window in enumerate(wanted):
-        if place in found:
+        if place in matches:
             continue
         within = whole
         if expected is not None:
             middle = expected[0] + expected[1] * window.line
             within = max(math.floor(middle) - _BESIDE, whole[0]), min(math.ceil(middle) + _BESIDE, whole[1])
-        found[place] = _match(left, right, window, within, half_height, spread) if within[0] < within[1] else None
-    values = [(float(wanted[place].line), *each) for place, each in sorted(found.items()) if each is not None]
+        matches[place] = _match(left, right, window, within, half_height, spread) if within[0] < within[1] else None
+    values = [(float(wanted[place].line), *result) for place, result in sorted(matches.items()) if result is not None]
     matched = np.array(values, float).reshape(-1, 3)
     return StalkDisparity(matched[:, 0], matched[:, 1], matched[:, 2], len(lines))
 
@@ -157,11 +157,11 @@ def _match(
     return None if best is None else (window.first - (begin + best[0]), best[1])
 
 
-def _agreed(found: list[tuple[int, float]]) -> tuple[float, float] | None:
+def _agreed(matches: list[tuple[int, float]]) -> tuple[float, float] | None:
     """Offset and slope of the line through most of some (line, disparity); None unless at least three agree."""
-    if len(found) < 3:
+    if len(matches) < 3:
         return None
-    line, value = np.array(found, float).T
+    line, value = np.array(matches, float).T
     first, second = pairs_of(len(line))
     slope = median((value[second] - value[first]) / (line[second] - line[first]))
     rest = value - slope * line
@@ -185,7 +185,7 @@ def sample_rows(
         bounds: Least and greatest disparity, pixels.
         core: Share of the stalk's width that is looked at, in its middle.
     """
-    found = []
+    samples = []
     for line, begin, end in zip(np.asarray(lines, int), *edges):
         margin = 0.5 * (1.0 - core) * (end - begin)
         first, last = max(int(np.ceil(begin + margin)), 0), int(np.floor(end - margin)) + 1
@@ -194,8 +194,8 @@ def sample_rows(
         values = disparity[line, first:last]
         values = values[(values >= bounds[0]) & (values <= bounds[1])]  # not a number is neither
         if 2 * values.size >= last - first:
-            found.append((float(line), float(np.median(values))))
-    columns = np.array(found, float).reshape(-1, 2)
+            samples.append((float(line), float(np.median(values))))
+    columns = np.array(samples, float).reshape(-1, 2)
     return StalkDisparity(columns[:, 0], columns[:, 1], np.ones(len(columns)), len(lines))
 
 
@@ -247,5 +247,5 @@ def match_sgbm(left: np.ndarray, right: np.ndarray, box: tuple[int, int, int, in
         uniquenessRatio=10,
         mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )
-    found = matcher.compute(*strips)[:, -(last - first) :].astype(np.float32) / 16.0
-    return np.where(found >= low, found, np.nan)
+    disparity = matcher.compute(*strips)[:, -(last - first) :].astype(np.float32) / 16.0
+    return np.where(disparity >= low, disparity, np.nan)

@@ -99,7 +99,7 @@ def line_edges(mask: np.ndarray, threshold: float = 0.5) -> tuple[np.ndarray, np
     # The longest run of each line, and of equally long ones the first.
     order = np.lexsort((start, start - end, line))
     first = np.concatenate([[True], np.diff(line[order]) > 0])
-    line, start, end = (each[order][first] for each in (line, start, end))
+    line, start, end = (array[order][first] for array in (line, start, end))
     whole = (start > 0) & (end < soft.shape[1])
     line, start, end = line[whole], start[whole], end[whole]
 
@@ -145,18 +145,18 @@ def strip_near(strip: Strip, line: float, reach: float, lines: int) -> Strip | N
     if last - first < _LEAST_LINES:
         return None
     begin, end = np.searchsorted(strip.points[0], (first, last))
-    place, left, right = (each[begin:end] for each in strip.points)
+    place, left, right = (array[begin:end] for array in strip.points)
     offset = place - strip.reference
     beside = [edge - fit[0] - fit[1] * offset for edge, fit in zip((left, right), (strip.left, strip.right))]
     tolerance = max(3.0, _SWELLING * strip.width(line))
-    good = np.logical_and(*(np.abs(each) < tolerance for each in beside))
-    for each in beside:
-        good &= np.abs(each - _mode(each[good])) < _STEP if good.any() else False
+    good = np.logical_and(*(np.abs(offsets) < tolerance for offsets in beside))
+    for offsets in beside:
+        good &= np.abs(offsets - _mode(offsets[good])) < _STEP if good.any() else False
     count = int(good.sum())
     if count < max(_LEAST_LINES, 0.5 * (last - first)) or not place[good].min() <= line <= place[good].max():
         return None
-    moved = [float(each[good].mean()) for each in beside]
-    rms = float(np.sqrt(np.mean([np.var(each[good]) for each in beside])))
+    moved = [float(offsets[good].mean()) for offsets in beside]
+    rms = float(np.sqrt(np.mean([np.var(offsets[good]) for offsets in beside])))
     edges = [(edge + shift, fit[1]) for edge, shift, fit in zip(strip.edges(line), moved, (strip.left, strip.right))]
     return Strip(
         reference=line,
@@ -194,9 +194,9 @@ def fit_edges(line: np.ndarray, left: np.ndarray, right: np.ndarray) -> Strip | 
     # projection of the first and last line.
     wide = median(right - left)
     cut = math.ceil(wide * abs(slope) / (1.0 + slope**2)) if abs(slope) > 0.01 else 0
-    kept = (line >= line[0] + cut) & (line <= line[-1] - cut)
-    if kept.sum() >= _LEAST_LINES:
-        line, left, right = line[kept], left[kept], right[kept]
+    inner = (line >= line[0] + cut) & (line <= line[-1] - cut)
+    if inner.sum() >= _LEAST_LINES:
+        line, left, right = line[inner], left[inner], right[inner]
         total = line.size
     reference = float(line.mean())
     offset = line - reference

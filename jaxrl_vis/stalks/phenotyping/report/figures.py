@@ -32,7 +32,7 @@ def read_evaluation(path: Path) -> dict[str, Any]:
     try:
         data = read_json(path)
         if data["synthetic"] is not True or not all(
-            {"true", "counted", "widths_mm", "pairs"} <= each.keys() for each in data["each"]
+            {"true", "counted", "widths_mm", "pairs"} <= plot.keys() for plot in data["each"]
         ):
             raise ValueError
     except OSError as error:
@@ -46,14 +46,14 @@ def draw_counts(data: dict[str, Any], out: Path) -> None:
     """Figure 3.4: stalks that were counted against stalks that are there, plot by plot."""
     import matplotlib.pyplot as plt
 
-    true = np.array([each["true"] for each in data["each"]], float)
-    counted = np.array([each["counted"] for each in data["each"]], float)
+    true = np.array([plot["true"] for plot in data["each"]], float)
+    counted = np.array([plot["counted"] for plot in data["each"]], float)
     low, high = min(true.min(), counted.min()) - 2, max(true.max(), counted.max()) + 2
     figure, axis = plt.subplots(figsize=(5.2, 5.0), layout="constrained")
     axis.axline((0, 0), slope=1, color=_GREY, linewidth=1, label="as many as there are")
     axis.plot(true, counted, "o", color=_GREEN, alpha=0.7, label=f"{len(true)} plots")
-    if all(each.get("thesis") for each in data["each"]):
-        thesis = np.array([each["thesis"]["counted"] for each in data["each"]], float)
+    if all(plot.get("thesis") for plot in data["each"]):
+        thesis = np.array([plot["thesis"]["counted"] for plot in data["each"]], float)
         low, high = min(low, thesis.min() - 2), max(high, thesis.max() + 2)
         axis.plot(
             true, thesis, "s", color=_ORANGE, alpha=0.5, markerfacecolor="none", label="the same, counted as in the thesis"
@@ -67,7 +67,7 @@ def draw_counts(data: dict[str, Any], out: Path) -> None:
     out.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(out, dpi=150)
     plt.close(figure)
-    rows = [{"seed": each["seed"], "true": each["true"], "counted": each["counted"]} for each in data["each"]]
+    rows = [{"seed": plot["seed"], "true": plot["true"], "counted": plot["counted"]} for plot in data["each"]]
     _write_tables(out, "Counts of synthetic plots; the thesis reports an R^2 of 0.88 in the field.", rows)
 
 
@@ -79,7 +79,7 @@ def draw_widths(data: dict[str, Any], out: Path) -> None:
     """
     import matplotlib.pyplot as plt
 
-    pairs = np.array([pair for each in data["each"] for pair in each["widths_mm"]], float).reshape(-1, 2)
+    pairs = np.array([pair for plot in data["each"] for pair in plot["widths_mm"]], float).reshape(-1, 2)
     if not len(pairs):
         raise RequestError("no stalk was measured and identified: evaluate more plots, or larger images")
     measured, true = pairs.T
@@ -121,10 +121,10 @@ def write_times(data: dict[str, Any], out: Path) -> None:
     Raises:
         RequestError: The evaluation holds no times.
     """
-    known = [each for each in data["each"] if each.get("seconds_per_pair")]
+    known = [plot for plot in data["each"] if plot.get("seconds_per_pair")]
     if not known:
         raise RequestError("the evaluation holds no times: plots need at least two pairs")
-    seconds = float(np.mean([each["seconds_per_pair"] * each["pairs"] for each in known]))
+    seconds = float(np.mean([plot["seconds_per_pair"] * plot["pairs"] for plot in known]))
     (count_1, count_2), (width_1, width_2) = HUMAN_MINUTES["count"], HUMAN_MINUTES["width"]
 
     def row(task: str, first: float, second: float, own: str, thesis: str) -> dict[str, str]:
@@ -136,9 +136,9 @@ def write_times(data: dict[str, Any], out: Path) -> None:
         row("stalk width", width_1, width_2, "", ""),
         row("total", count_1 + width_1, count_2 + width_2, f"{seconds:.1f} s", f"{THESIS_SECONDS} s"),
     ]
-    pairs = float(np.mean([each["pairs"] for each in known]))
+    pairs = float(np.mean([plot["pairs"] for plot in known]))
     device = known[0].get("device", "a device that is not known")
-    side_by_side = max(each.get("workers", 1) for each in known)
+    side_by_side = max(plot.get("workers", 1) for plot in known)
     shared = f", {side_by_side} plots at a time, which makes each slower" if side_by_side > 1 else ""
     people = 30.0 * (count_1 + width_1 + count_2 + width_2)
     note = (
@@ -153,6 +153,6 @@ def _write_tables(out: Path, note: str, rows: list[dict[str, Any]]) -> None:
     """Rows as Markdown and as CSV beside a figure."""
     columns = list(rows[0])
     lines = [note, "", "| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]
-    lines += ["| " + " | ".join(str(each[column]) for column in columns) + " |" for each in rows]
+    lines += ["| " + " | ".join(str(row[column]) for column in columns) + " |" for row in rows]
     write_atomically(out.with_suffix(".md"), "\n".join(lines) + "\n")
     write_atomically(out.with_suffix(".csv"), to_csv(rows))

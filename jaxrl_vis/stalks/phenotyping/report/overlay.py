@@ -33,37 +33,39 @@ def draw_overlay(image: np.ndarray, sightings: list[Sighting], labels: list[str 
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     canvas = np.round(255.0 * (small / 255.0) ** 0.7).astype(np.uint8)
     thick = max(round(size[0] / 800), 1)
-    for each, label in zip(sightings, labels):
-        _outline(canvas, each, COUNTED if label is not None else REJECTED, scale, thick)
+    for sighting, label in zip(sightings, labels):
+        _outline(canvas, sighting, COUNTED if label is not None else REJECTED, scale, thick)
     writer = _Writer(canvas, max(size[0] / 2200, 0.3), thick)
     writer.legend(readable(title))  # OpenCV does not survive a lone surrogate
-    for each, label in sorted(zip(sightings, labels), key=lambda pair: pair[0].column):
-        width = "" if each.diameter_mm is None else f"{each.diameter_mm:.1f} mm"
+    for sighting, label in sorted(zip(sightings, labels), key=lambda pair: pair[0].column):
+        width = "" if sighting.diameter_mm is None else f"{sighting.diameter_mm:.1f} mm"
         text = " ".join(filter(None, (f"#{label}" if label else "", width))) or "no width"
-        place = round((each.axis[0] + 0.5) * scale - 0.5), round((each.box[1] + 0.5) * scale - 0.5)
+        place = round((sighting.axis[0] + 0.5) * scale - 0.5), round((sighting.box[1] + 0.5) * scale - 0.5)
         writer.above(place, text, COUNTED if label is not None else REJECTED)
     return canvas
 
 
-def _outline(canvas: np.ndarray, each: Sighting, colour: tuple[int, int, int], scale: float, thick: int) -> None:
+def _outline(canvas: np.ndarray, sighting: Sighting, colour: tuple[int, int, int], scale: float, thick: int) -> None:
     """The two edges of a stalk in the band, and bars where its widths were taken."""
 
     def at(column: float, line: float) -> tuple[int, int]:
         return round((column + 0.5) * scale - 0.5), round((line + 0.5) * scale - 0.5)
 
-    left, top, right, bottom = each.box
-    lean = math.radians(each.lean_deg or 0.0)
+    left, top, right, bottom = sighting.box
+    lean = math.radians(sighting.lean_deg or 0.0)
     # The width is taken across the axis, the edges stand further apart along a line.
     half = 0.5 * (
-        each.width_px / math.cos(lean) if each.width_px else max(right - left - abs(each.axis[1] - each.axis[0]), 2.0)
+        sighting.width_px / math.cos(lean)
+        if sighting.width_px
+        else max(right - left - abs(sighting.axis[1] - sighting.axis[0]), 2.0)
     )
-    slope = (each.axis[1] - each.axis[0]) / max(bottom - top, 1.0)
+    slope = (sighting.axis[1] - sighting.axis[0]) / max(bottom - top, 1.0)
     # The outline goes through the middle that was measured.
-    middle = [each.column + slope * (line - each.line) for line in (top, bottom)]
+    middle = [sighting.column + slope * (line - sighting.line) for line in (top, bottom)]
     for side in (-half, half):
         cv2.line(canvas, at(middle[0] + side, top), at(middle[1] + side, bottom), colour, thick, cv2.LINE_AA)
-    bars = [(each.column, each.line, each.width_px)] if each.diameter_mm is not None else []
-    for column, line, width in [*bars, *([each.upper_place] if each.upper_place else [])]:
+    bars = [(sighting.column, sighting.line, sighting.width_px)] if sighting.diameter_mm is not None else []
+    for column, line, width in [*bars, *([sighting.upper_place] if sighting.upper_place else [])]:
         reach = 0.5 * (width or 0.0)
         over, down = reach * math.cos(lean), reach * math.sin(lean)
         cv2.line(canvas, at(column - over, line - down), at(column + over, line + down), MEASURED, 2 * thick, cv2.LINE_AA)
@@ -81,7 +83,7 @@ class _Writer:
         wide, tall = self._size(text)
         left = min(max(place[0] - wide // 2, 0), max(self._canvas.shape[1] - wide, 0))
         bottom = place[1] - tall // 2
-        while bottom > 2 * tall and any(_overlap((left, bottom - tall, left + wide, bottom), each) for each in self._taken):
+        while bottom > 2 * tall and any(_overlap((left, bottom - tall, left + wide, bottom), box) for box in self._taken):
             bottom -= tall // 3
         cv2.line(self._canvas, (place[0], bottom), place, colour, 1, cv2.LINE_AA)
         self._write((left, bottom), text, colour)

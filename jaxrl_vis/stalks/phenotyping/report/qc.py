@@ -142,7 +142,7 @@ class Page:
             }
             for track in rejected
         ]
-        reasons = Counter(each.reason for frame in plot.frames for each in frame if each.reason)
+        reasons = Counter(sighting.reason for frame in plot.frames for sighting in frame if sighting.reason)
         finds = [{"why": why, "finds": count} for why, count in _grouped(reasons).most_common()]
         write = self._file.write
         write(f'<details id="{_safe(name)}"><summary>{_safe(name)}: {_safe(_headline(plot.row))}</summary>')
@@ -203,10 +203,10 @@ def _headline(row: dict[str, Any]) -> str:
 
 def _grouped(reasons: Counter[str]) -> Counter[str]:
     """Reasons, with those together that differ in a distance only."""
-    found: Counter[str] = Counter()
+    groups: Counter[str] = Counter()
     for reason, count in reasons.items():
-        found["it stands too near or too far away" if reason.startswith("it stands ") else reason] += count
-    return found
+        groups["it stands too near or too far away" if reason.startswith("it stands ") else reason] += count
+    return groups
 
 
 def table(columns: dict[str, str], rows: Iterable[dict[str, Any]]) -> str:
@@ -240,7 +240,7 @@ class _Pictures:
         # The clearest sighting of each track, from pair to pair, so that each overlay is read once.
         wanted: dict[int, list[tuple[int, int]]] = {}
         for place, track in enumerate(plot.tracks):
-            frame, sighting = max(track.sightings, key=lambda each: self._clear(*each))
+            frame, sighting = max(track.sightings, key=lambda indices: self._clear(*indices))
             wanted.setdefault(frame, []).append((place, sighting))
         self._found: dict[int, _Html] = {}
         for frame, tracks in wanted.items():
@@ -250,12 +250,12 @@ class _Pictures:
                 self._found[place] = picture(self._crop(overlay, plot.frames[frame][sighting]), name, "stalk")
 
     def _clear(self, frame: int, sighting: int) -> tuple[bool, float]:
-        each = self._plot.frames[frame][sighting]
-        return each.diameter_mm is not None, each.confidence
+        chosen = self._plot.frames[frame][sighting]
+        return chosen.diameter_mm is not None, chosen.confidence
 
-    def _crop(self, overlay: np.ndarray, each: Sighting) -> np.ndarray:
+    def _crop(self, overlay: np.ndarray, sighting: Sighting) -> np.ndarray:
         scale = scale_of(self._plot.image_width)
-        left, top, right, bottom = (round(edge * scale) for edge in each.box)
+        left, top, right, bottom = (round(edge * scale) for edge in sighting.box)
         beside = max((bottom - top) // 2, 12)
         top, bottom = max(top - beside // 2, 0), min(bottom + beside // 4, overlay.shape[0])
         left, right = max(left - beside, 0), min(right + beside, overlay.shape[1])
@@ -269,7 +269,7 @@ class _Pictures:
 
     def of(self, track: Track) -> _Html:
         """The picture of a track."""
-        return self._found[next(place for place, each in enumerate(self._plot.tracks) if each is track)]
+        return self._found[next(place for place, other in enumerate(self._plot.tracks) if other is track)]
 
     def whole(self, most: int) -> Iterable[str]:
         """Pictures of whole pairs, spread over the plot."""
@@ -300,9 +300,9 @@ def _chart(plot: PlotResult, rejected: list[Track]) -> str:
     ]
     if not points:
         return ""
-    places = [each[0] for each in points] + [track.position_m - plot.start for track in rejected]
+    places = [point[0] for point in points] + [track.position_m - plot.start for track in rejected]
     low, high = min(places) - 0.05, max(places) + 0.05
-    most = 1.1 * max(each[1] + each[2] for each in points)
+    most = 1.1 * max(point[1] + point[2] for point in points)
     wide, tall, margin = 900, 240, 44
 
     def x(place: float) -> float:

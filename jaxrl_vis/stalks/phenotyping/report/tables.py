@@ -75,8 +75,8 @@ def rows_of(
     counted = [track for track in tracks if track.counted]
     for track, widths in zip(counted, widths_of(frames, counted)):
         sightings = [frames[frame][place] for frame, place in track.sightings]
-        leans = [each.lean_deg for each in sightings if each.lean_deg is not None]
-        confidence = float(np.median([each.confidence for each in sightings]))
+        leans = [sighting.lean_deg for sighting in sightings if sighting.lean_deg is not None]
+        confidence = float(np.median([sighting.confidence for sighting in sightings]))
         lower, upper = widths.lower, widths.upper
         stalks.append(
             {
@@ -143,7 +143,7 @@ def _plot_row(stalks: list[Row], pairs: int, length: float, skipped: int, origin
 
 def rows_without_path(frames: list[list[Sighting]], skipped: int, origin: Origin, why: str) -> tuple[list[Row], Row]:
     """The plot's row where pairs cannot be put together: widths of finds, but no count. There are no rows of stalks."""
-    measured = [each.diameter_mm for sightings in frames for each in sightings if each.diameter_mm is not None]
+    measured = [sighting.diameter_mm for sightings in frames for sighting in sightings if sighting.diameter_mm is not None]
     row = {
         "plot": origin.plot,
         "pairs": len(frames),
@@ -164,7 +164,7 @@ def _higher(stalks: list[Row]) -> Row:
     """Means over the stalks that were measured at 24 inches, too."""
     means = {"width_24in_mean_mm": "width_24in_mm", "taper_mean_mm_per_in": "taper_mm_per_in"}
     values = {name: [float(row[column]) for row in stalks if row[column] != ""] for name, column in means.items()}
-    return {name: _text(float(np.mean(each)), 3) if each else "" for name, each in values.items()}
+    return {name: _text(float(np.mean(numbers)), 3) if numbers else "" for name, numbers in values.items()}
 
 
 def _widths(widths: np.ndarray) -> Row:

@@ -48,13 +48,13 @@ def follow_either_way(frames: list[list[Sighting]], distances: np.ndarray, calib
     """
     tracks, path = follow(frames, distances, calibration)
     fits = not _contradicted(frames, path.places)
-    back, way = follow(frames, -np.asarray(distances, float), calibration)
+    back, backwards = follow(frames, -np.asarray(distances, float), calibration)
     # Where pairs are too unlike each other to contradict anything, the way on which they go together is the right one.
     better = _links(back) > (_CLEARLY if fits else 1.0) * _links(tracks)
     well = _links(back) > _WELL * sum(map(len, frames))
-    if better and well and not _contradicted(frames, way.places):
-        tracks = [dataclasses.replace(each, position_m=-each.position_m) for each in back]
-        return Followed(tracks, dataclasses.replace(way, places=-way.places), True)
+    if better and well and not _contradicted(frames, backwards.places):
+        tracks = [dataclasses.replace(track, position_m=-track.position_m) for track in back]
+        return Followed(tracks, dataclasses.replace(backwards, places=-backwards.places), True)
     return Followed(tracks, path, fits)
 
 
@@ -82,7 +82,11 @@ def _contradicted(frames: list[list[Sighting]], places: np.ndarray) -> bool:
 
 def _places(sightings: list[Sighting]) -> np.ndarray:
     """Where the stalks of a pair stand that say so, [N, 2] float64: along the row and away from the cameras, m."""
-    known = [(each.along_m, each.depth_m) for each in sightings if each.along_m is not None and each.depth_m is not None]
+    known = [
+        (sighting.along_m, sighting.depth_m)
+        for sighting in sightings
+        if sighting.along_m is not None and sighting.depth_m is not None
+    ]
     return np.array(known, float).reshape(-1, 2)
 
 

@@ -83,7 +83,7 @@ class Path:
 class _Open:
     """A track in the making."""
 
-    seen: list[tuple[int, int]] = dataclasses.field(default_factory=list)
+    sightings: list[tuple[int, int]] = dataclasses.field(default_factory=list)
     along: list[float] = dataclasses.field(default_factory=list)
     depth: list[float] = dataclasses.field(default_factory=list)
     rays: list[tuple[float, float]] = dataclasses.field(default_factory=list)
@@ -98,7 +98,7 @@ class _Open:
         return float(np.median([offset + ray * depth for offset, ray in self.rays]))
 
     def place(self) -> tuple[float, float]:
-        depths = [each for each in self.depth[-9:] if math.isfinite(each)]
+        depths = [depth for depth in self.depth[-9:] if math.isfinite(depth)]
         return float(np.median(self.along[-9:])), float(np.median(depths)) if depths else math.nan
 
 
@@ -117,36 +117,36 @@ def follow(
     places = np.zeros(len(frames))
     correction = 0.0
     driven = np.asarray(distances, float) - (distances[0] if len(distances) else 0.0)
-    row = [each.depth_m for sightings in frames for each in sightings if each.depth_m is not None]
+    row = [sighting.depth_m for sightings in frames for sighting in sightings if sighting.depth_m is not None]
     usual = float(np.median(row)) if row else _USUAL_DEPTH
     for frame, sightings in enumerate(frames):
-        seen = _Seen.of(sightings, calibration, usual)
+        view = _Seen.of(sightings, calibration, usual)
         places[frame] = driven[frame] + correction
-        pairs = _assign(tracks, seen, places[frame], gates)
-        moves = [tracks[track].place()[0] - seen.along[new] - places[frame] for track, new in pairs if seen.known[new]]
+        pairs = _assign(tracks, view, places[frame], gates)
+        moves = [tracks[track].place()[0] - view.along[new] - places[frame] for track, new in pairs if view.known[new]]
         if len(moves) >= 3:
             correction += float(np.median(moves))
             places[frame] = driven[frame] + correction
-            pairs = _assign(tracks, seen, places[frame], gates)
+            pairs = _assign(tracks, view, places[frame], gates)
         taken = {new: track for track, new in pairs}
-        for new in map(int, np.flatnonzero(seen.there)):
-            depth = float(seen.depth[new]) if seen.known[new] else math.nan
+        for new in map(int, np.flatnonzero(view.there)):
+            depth = float(view.depth[new]) if view.known[new] else math.nan
             if new in taken:
                 track = tracks[taken[new]]
-                along = seen.along[new] if seen.known[new] else seen.beside(track.place()[1])[new]
+                along = view.along[new] if view.known[new] else view.beside(track.place()[1])[new]
             else:
-                track, along = _Open(), seen.along[new]
+                track, along = _Open(), view.along[new]
                 tracks.append(track)
-            track.seen.append((frame, new))
+            track.sightings.append((frame, new))
             track.along.append(float(along + places[frame]))
             track.depth.append(depth)
-            track.rays.append((float(places[frame]) - seen.half, float(seen.rays[new])))
-            track.feet.append(float(along + places[frame] - seen.over[new]))
+            track.rays.append((float(places[frame]) - view.half, float(view.rays[new])))
+            track.feet.append(float(along + places[frame] - view.over[new]))
     step = float(np.median(np.diff(places))) if len(places) > 1 else 0.0
     path = Path(places, abs(float(places[-1] - places[0]) + step) if len(places) else 0.0)
     half_field = 0.5 * calibration.width / calibration.focal
-    closed = [_closed(each, path, step, half_field, usual, gates) for each in _merged(tracks, gates)]
-    return sorted(closed, key=lambda each: each.position_m * (-1.0 if step < 0 else 1.0)), path
+    closed = [_closed(track, path, step, half_field, usual, gates) for track in _merged(tracks, gates)]
+    return sorted(closed, key=lambda track: track.position_m * (-1.0 if step < 0 else 1.0)), path
 
 
 @dataclasses.dataclass(frozen=True)
@@ -175,13 +175,13 @@ class _Seen:
 
     @classmethod
     def of(cls, sightings: list[Sighting], calibration: Calibration, usual: float) -> "_Seen":
-        rays = np.array([(each.column - calibration.centre[0]) / calibration.focal for each in sightings])
-        along = np.array([math.nan if each.along_m is None else each.along_m for each in sightings])
-        depth = np.array([math.nan if each.depth_m is None else each.depth_m for each in sightings])
+        rays = np.array([(sighting.column - calibration.centre[0]) / calibration.focal for sighting in sightings])
+        along = np.array([math.nan if sighting.along_m is None else sighting.along_m for sighting in sightings])
+        depth = np.array([math.nan if sighting.depth_m is None else sighting.depth_m for sighting in sightings])
         known = np.isfinite(along) & np.isfinite(depth)
         # What stands elsewhere is no stalk of the row.
-        elsewhere = np.array([each.depth_m is not None and each.along_m is None for each in sightings], bool)
-        over = np.array([_over(each) for each in sightings])
+        elsewhere = np.array([sighting.depth_m is not None and sighting.along_m is None for sighting in sightings], bool)
+        over = np.array([_over(sighting) for sighting in sightings])
         half = 0.5 * calibration.baseline
         along = np.where(known, along, rays * usual - half)
         return cls(rays, along, depth, known, ~elsewhere & _apart_in_space(sightings), over, half, usual)
@@ -206,29 +206,29 @@ def _apart_in_space(sightings: list[Sighting]) -> np.ndarray:
     """
     own = np.ones(len(sightings), bool)
     order = sorted(range(len(sightings)), key=lambda place: -sightings[place].score * (0.1 + sightings[place].confidence))
-    kept: list[tuple[float, float, float]] = []
+    distinct: list[tuple[float, float, float]] = []
     for place in order:
-        each = sightings[place]
-        if each.along_m is None or each.depth_m is None or each.diameter_mm is None:
+        sighting = sightings[place]
+        if sighting.along_m is None or sighting.depth_m is None or sighting.diameter_mm is None:
             continue
-        here = (each.along_m, each.depth_m, 1e-3 * each.diameter_mm)
-        if any(math.hypot(here[0] - x, here[1] - z) < _SOLID * 0.5 * (here[2] + wide) for x, z, wide in kept):
+        here = (sighting.along_m, sighting.depth_m, 1e-3 * sighting.diameter_mm)
+        if any(math.hypot(here[0] - x, here[1] - z) < _SOLID * 0.5 * (here[2] + wide) for x, z, wide in distinct):
             own[place] = False
         else:
-            kept.append(here)
+            distinct.append(here)
     return own
 
 
-def _assign(tracks: list[_Open], seen: _Seen, place: float, gates: Gates) -> list[tuple[int, int]]:
+def _assign(tracks: list[_Open], view: _Seen, place: float, gates: Gates) -> list[tuple[int, int]]:
     """Which track each sighting goes on: pairs of indices, each at most once."""
-    if not tracks or not seen.rays.size:
+    if not tracks or not view.rays.size:
         return []
     there = np.array([track.place() for track in tracks])
     # A sighting that does not say how far away it is, is looked for where the camera would see the track's stalk.
-    along = np.where(seen.known, seen.along, [seen.beside(depth) for _, depth in there]) + place
+    along = np.where(view.known, view.along, [view.beside(depth) for _, depth in there]) + place
     aside = np.abs(there[:, :1] - along) / gates.along
-    away = np.nan_to_num(np.abs(there[:, 1:] - seen.depth[None]) / gates.depth, nan=0.4)
-    cost = np.where((aside < 1.0) & (away < 1.0) & seen.there, aside + 0.5 * away, _NEVER)
+    away = np.nan_to_num(np.abs(there[:, 1:] - view.depth[None]) / gates.depth, nan=0.4)
+    cost = np.where((aside < 1.0) & (away < 1.0) & view.there, aside + 0.5 * away, _NEVER)
     rows, columns = linear_sum_assignment(cost)
     return [(int(row), int(column)) for row, column in zip(rows, columns) if cost[row, column] < _NEVER]
 
@@ -239,29 +239,29 @@ def _merged(tracks: list[_Open], gates: Gates) -> list[_Open]:
     Or they are seen in one place, always, and one depth is wrong: of two solid stalks that stand behind each other, the cameras
     would see both as soon as they have moved on.
     """
-    kept: list[_Open] = []
-    for track in sorted(tracks, key=lambda each: -len(each.seen)):
-        for other in kept:
+    merged: list[_Open] = []
+    for track in sorted(tracks, key=lambda track: -len(track.sightings)):
+        for other in merged:
             aside, away = _apart(track, other)
-            shared = {frame for frame, _ in track.seen} & {frame for frame, _ in other.seen}
+            shared = {frame for frame, _ in track.sightings} & {frame for frame, _ in other.sightings}
             # A sighting that went astray may make one pair show both.
             near = aside < gates.merge and away < gates.depth
-            if (near or _one_behind(track, other) < gates.behind) and len(shared) <= gates.astray * len(track.seen):
-                other.seen += track.seen
+            if (near or _one_behind(track, other) < gates.behind) and len(shared) <= gates.astray * len(track.sightings):
+                other.sightings += track.sightings
                 other.along += track.along
                 other.depth += track.depth
                 other.rays += track.rays
                 other.feet += track.feet
                 break
         else:
-            kept.append(track)
-    return kept
+            merged.append(track)
+    return merged
 
 
 def _one_behind(track: _Open, other: _Open) -> float:
     """How far beside another track's stalk a track would be seen, m along the row, if it were as far away."""
     depths = other.depths()
-    if len(track.seen) < 2 or not len(depths):
+    if len(track.sightings) < 2 or not len(depths):
         return math.inf
     depth = float(np.median(depths))
     beside = np.array([offset + ray * depth for offset, ray in track.rays]) - float(np.median(other.along))
@@ -290,12 +290,12 @@ def _closed(track: _Open, path: Path, step: float, half_field: float, usual: flo
     # What no pair says the distance of must be seen the more often.
     wanted = max(min(gates.least, expected), math.ceil((1.0 if known else 2.0) * gates.share * expected), 1)
     begin, end = sorted((path.places[0] - 0.5 * step, path.places[-1] + 0.5 * step))
-    if len(track.seen) < wanted:
-        reason = f"seen in {len(track.seen)} of {expected} pairs"
+    if len(track.sightings) < wanted:
+        reason = f"seen in {len(track.sightings)} of {expected} pairs"
     elif known and abs(depth - usual) > gates.row:
         reason = f"it stands {abs(depth - usual):.2f} m {'behind' if depth > usual else 'before'} the row"
     elif not begin - gates.ends <= float(np.median(track.feet)) <= end + gates.ends:
         reason = "it stands beyond the ends of the path"
     else:
         reason = ""
-    return Track(tuple(sorted(track.seen)), position, depth, not reason, reason)
+    return Track(tuple(sorted(track.sightings)), position, depth, not reason, reason)

@@ -67,7 +67,7 @@ def widths_of(frames: list[list[Sighting]], tracks: list[Track]) -> list[StalkWi
     """Widths of the stalks of a plot, in the order of their tracks."""
     of_stalks = [[frames[frame][place] for frame, place in track.sightings] for track in tracks]
     first = [_of_stalk(sightings, USUAL_TAPER) for sightings in of_stalks]
-    tapers = [each.taper for each in first if each.taper is not None]
+    tapers = [width.taper for width in first if width.taper is not None]
     taper = float(np.median(tapers)) if len(tapers) >= _ENOUGH else USUAL_TAPER
     return [_of_stalk(sightings, taper) for sightings in of_stalks]
 
@@ -108,39 +108,39 @@ def _facing(sighting: Sighting) -> float:
 
 def _at(height: float, values: list[_Value], taper: float) -> Width | None:
     """Width at a height in m."""
-    found, far = [], 0
-    for each in values:
-        beside = (each.height - height) / INCH
-        if abs(each.height - height) > _FURTHEST:
+    near, far = [], 0
+    for value in values:
+        beside = (value.height - height) / INCH
+        if abs(value.height - height) > _FURTHEST:
             continue
-        error = math.hypot(each.deviation or 0.0, _TAPER_SPREAD * taper * beside)
-        found.append(dataclasses.replace(each, mm=each.mm + taper * beside, deviation=error))
-        far += abs(each.height - height) > _NEAR
-    width = _robust(found)
-    return None if width is None else dataclasses.replace(width, corrected=2 * far > len(found))
+        error = math.hypot(value.deviation or 0.0, _TAPER_SPREAD * taper * beside)
+        near.append(dataclasses.replace(value, mm=value.mm + taper * beside, deviation=error))
+        far += abs(value.height - height) > _NEAR
+    width = _robust(near)
+    return None if width is None else dataclasses.replace(width, corrected=2 * far > len(near))
 
 
 def robust_width(sightings: list[Sighting]) -> Width | None:
     """Diameter of a stalk wherever it was measured; None if it never was."""
-    measured = [each for each in sightings if each.diameter_mm is not None]
+    measured = [sighting for sighting in sightings if sighting.diameter_mm is not None]
     return _robust([_Value(e.diameter_mm, e.deviation_mm, 0.0, e.confidence * _facing(e), e.hidden) for e in measured])  # pyright: ignore[reportArgumentType]
 
 
-def _robust(found: list[_Value]) -> Width | None:
+def _robust(values: list[_Value]) -> Width | None:
     """The median of what shows both edges; None where there is nothing.
 
     Where too little does, a stalk is at least as thick as it looks, and most of what is said of it is too thin.
     """
-    clear = [each for each in found if not each.hidden]
-    some, share = (clear, 0.5) if len(clear) >= _CLEAR or len(clear) == len(found) else (found, _LOWER_BOUNDS)
+    clear = [value for value in values if not value.hidden]
+    some, share = (clear, 0.5) if len(clear) >= _CLEAR or len(clear) == len(values) else (values, _LOWER_BOUNDS)
     if not some:
         return None
-    values, stated, weights = np.array([(each.mm, each.deviation or 0.0, each.confidence) for each in some]).T
+    widths, stated, weights = np.array([(value.mm, value.deviation or 0.0, value.confidence) for value in some]).T
     weights = np.maximum(weights, 0.02)
-    order = np.argsort(values)
+    order = np.argsort(widths)
     passed = np.cumsum(weights[order]) - 0.5 * weights[order]
-    middle = float(np.interp(share * weights.sum(), passed, values[order]))
+    middle = float(np.interp(share * weights.sum(), passed, widths[order]))
     enough = float(weights.sum() ** 2 / (weights**2).sum())
-    scatter = 1.4826 * float(np.median(np.abs(values - middle))) * 1.2533 if len(values) > 2 else 0.0
+    scatter = 1.4826 * float(np.median(np.abs(widths - middle))) * 1.2533 if len(widths) > 2 else 0.0
     least = math.sqrt(float((weights * stated**2).sum() / weights.sum()))
-    return Width(middle, max(scatter, least) / math.sqrt(enough), len(values))
+    return Width(middle, max(scatter, least) / math.sqrt(enough), len(widths))

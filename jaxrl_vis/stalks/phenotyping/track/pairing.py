@@ -25,7 +25,7 @@ def wrong_with(
         left, right: [H, W, 3] uint8.
         calibration: Of the cameras.
     """
-    measured = sum(each.diameter_mm is not None for each in sightings)
+    measured = sum(sighting.diameter_mm is not None for sighting in sightings)
     if len(detections) < _ENOUGH or measured > _FEW * len(detections):
         return None
     grey_left, grey_right = grey_of(left), grey_of(right)
@@ -33,16 +33,16 @@ def wrong_with(
     mirror = dataclasses.replace(calibration, centre=(calibration.width - 1 - calibration.centre[0], calibration.centre[1]))
     turned = [
         dataclasses.replace(
-            each,
-            mask=each.mask[:, ::-1],
-            corner=(each.corner[0], left.shape[1] - each.corner[1] - each.mask.shape[1]),
+            detection,
+            mask=detection.mask[:, ::-1],
+            corner=(detection.corner[0], left.shape[1] - detection.corner[1] - detection.mask.shape[1]),
             strip=None,
         )
-        for each in detections
+        for detection in detections
     ]
     if _share(turned, grey_left[:, ::-1], grey_right[:, ::-1], mirror) >= _MANY:
         return "left and right are swapped: exchange their names"
-    for lines in sorted({max(round(each * calibration.width / 3376), 3) for each in _LINES}):
+    for lines in sorted({max(round(line * calibration.width / 3376), 3) for line in _LINES}):
         for shift in (lines, -lines):
             if _share(detections, grey_left, np.roll(grey_right, shift, axis=0), calibration) >= _MANY:
                 return f"the right image lies about {lines} lines too {'high' if shift > 0 else 'low'}: rectify the pair"
@@ -53,5 +53,7 @@ def _share(detections: list[Detection], left: np.ndarray, right: np.ndarray, cal
     """Share of finds, ten at most, that the right image shows."""
     some = detections[:: -(-len(detections) // 10)]
     left, right = np.ascontiguousarray(left), np.ascontiguousarray(right)
-    found = [measure(each.mask, each.corner, left, right, calibration).diameter_mm is not None for each in some]
-    return sum(found) / len(found)
+    measured = [
+        measure(detection.mask, detection.corner, left, right, calibration).diameter_mm is not None for detection in some
+    ]
+    return sum(measured) / len(measured)

@@ -89,7 +89,7 @@ class Sighting:
             if value is None and optional:
                 continue
             several = value if isinstance(value, tuple) else (value,)
-            if len(several) != length or not all(isinstance(each, kind) for each in several):
+            if len(several) != length or not all(isinstance(value, kind) for value in several):
                 raise ValueError(f"{name} is not of its kind")
         if len(parts) != len(values) or not {"box", "axis", "score", "line", "column"} <= parts.keys():
             raise ValueError("something is missing or too many")
@@ -153,43 +153,48 @@ def look(
         disparity: [H, W] float32, disparities that are known, pixels.
     """
     if calibration is None:
-        return [_in_pixels(each) for each in detections]
+        return [_in_pixels(detection) for detection in detections]
     grey_left, grey_right = grey_of(left), grey_of(right)
     measured: list[tuple[Measurement, Measurement | None]] = []
-    for each in detections:
-        line = 0.5 * (each.box[1] + each.box[3])
+    for detection in detections:
+        line = 0.5 * (detection.box[1] + detection.box[3])
         images = (grey_left, grey_right, calibration)
         how = {"method": method, "ground": ground, "disparity": disparity}
-        got = measure(each.mask, each.corner, *images, line=line, height=HEIGHTS[0], strip=each.strip, **how)
+        got = measure(detection.mask, detection.corner, *images, line=line, height=HEIGHTS[0], strip=detection.strip, **how)
         upper = None
-        if ground is not None and each.upper is not None:
-            upper = measure(*each.upper, *images, height=HEIGHTS[1], **how)
+        if ground is not None and detection.upper is not None:
+            upper = measure(*detection.upper, *images, height=HEIGHTS[1], **how)
         measured.append((got, upper))
     hidden = _hidden_edges([got for got, _ in measured])
     above = _hidden_edges([upper or Measurement() for _, upper in measured])
     hidden = [behind or not got.here for behind, (got, _) in zip(hidden, measured)]
     sightings = []
-    for each, (got, upper), *behind in zip(detections, measured, hidden, above):
+    for detection, (got, upper), *behind in zip(detections, measured, hidden, above):
         less = dataclasses.replace(got, confidence=got.confidence * _HIDDEN) if behind[0] else got
-        sighting = _sighting(each, less, upper, calibration)
+        sighting = _sighting(detection, less, upper, calibration)
         sightings.append(dataclasses.replace(sighting, hidden=behind[0], upper_hidden=behind[1]))
     return sightings
 
 
-def _hidden_edges(found: list[Measurement]) -> list[bool]:
+def _hidden_edges(measurements: list[Measurement]) -> list[bool]:
     """Which stalks have an edge where another one stands that is not behind them: it may be the other one's, and they look too
     thin.
     """
     hidden = []
-    for each in found:
-        half = 0.5 * each.width / math.cos(each.lean) if each.diameter_mm is not None else math.nan
+    for measurement in measurements:
+        half = 0.5 * measurement.width / math.cos(measurement.lean) if measurement.diameter_mm is not None else math.nan
         hidden.append(False)
-        for other in found:
-            if each.diameter_mm is None or other.diameter_mm is None or other is each or other.depth > each.depth + _BEHIND:
+        for other in measurements:
+            if (
+                measurement.diameter_mm is None
+                or other.diameter_mm is None
+                or other is measurement
+                or other.depth > measurement.depth + _BEHIND
+            ):
                 continue
-            middle = other.column + math.tan(other.lean) * (other.line - each.line)
+            middle = other.column + math.tan(other.lean) * (other.line - measurement.line)
             reach = 0.5 * other.width / math.cos(other.lean) + _TOUCHING * half
-            hidden[-1] |= any(abs(each.column + side * half - middle) < reach for side in (-1.0, 1.0))
+            hidden[-1] |= any(abs(measurement.column + side * half - middle) < reach for side in (-1.0, 1.0))
     return hidden
 
 
@@ -230,8 +235,8 @@ def _sighting(detection: Detection, got: Measurement, upper: Measurement | None,
         depth = got.depth + 0.5e-3 * got.diameter_mm
         along = (column - calibration.centre[0]) / calibration.focal * depth - 0.5 * calibration.baseline
     return Sighting(
-        box=tuple(round(each, 2) for each in detection.box),  # pyright: ignore[reportArgumentType]
-        axis=tuple(round(each, 2) for each in detection.axis),  # pyright: ignore[reportArgumentType]
+        box=tuple(round(edge, 2) for edge in detection.box),  # pyright: ignore[reportArgumentType]
+        axis=tuple(round(column, 2) for column in detection.axis),  # pyright: ignore[reportArgumentType]
         score=round(detection.score, 4),
         line=round(line, 2),
         column=round(column, 2),

@@ -62,14 +62,14 @@ def move(
         key: For the random numbers.
     """
     keys = jax.random.split(key, images.shape[0])
-    return jax.vmap(lambda image, stalk, kind, each: _moved(image, stalk, kind, shape, each))(images, stalks, kinds, keys)
+    return jax.vmap(lambda image, stalk, kind, key: _moved(image, stalk, kind, shape, key))(images, stalks, kinds, keys)
 
 
 def _moved(image: jax.Array, stalks: jax.Array, kinds: jax.Array, shape: tuple[int, int], key: jax.Array):
     drawn = jax.random.uniform(key, (7,), minval=-1.0, maxval=1.0)
     height, width = shape
     still = drawn[0] > 0.5
-    wide, tall = (jnp.where(still, 1.0, jnp.exp(0.12 * each)) for each in drawn[1:3])
+    wide, tall = (jnp.where(still, 1.0, jnp.exp(0.12 * factor)) for factor in drawn[1:3])
     # Stalks of other fields lean by up to 20 degrees.
     shear = jnp.where(still, 0.0, 0.3 * drawn[3])
     over, down = jnp.where(still, 0.0, 0.04 * width * drawn[4]), jnp.where(still, 0.0, 0.04 * height * drawn[5])
@@ -89,9 +89,9 @@ def _moved(image: jax.Array, stalks: jax.Array, kinds: jax.Array, shape: tuple[i
     above, below = across(above, top), across(below, bottom)
     begin = jnp.minimum(above, below) + wide * (left - first)
     end = jnp.maximum(above, below) + wide * (right - last)
-    top, bottom = (tall * (each - height / 2) + height / 2 + down for each in (top, bottom))
+    top, bottom = (tall * (edge - height / 2) + height / 2 + down for edge in (top, bottom))
     begin, end = jnp.where(mirror, width - end, begin), jnp.where(mirror, width - begin, end)
-    above, below = (jnp.where(mirror, width - each, each) for each in (above, below))
+    above, below = (jnp.where(mirror, width - column, column) for column in (above, below))
     # The axis goes on beyond what the image's edges leave of the box.
     begin, end = jnp.clip(begin, 0.0, width), jnp.clip(end, 0.0, width)
     low, high = jnp.clip(top, 0.0, height), jnp.clip(bottom, 0.0, height)

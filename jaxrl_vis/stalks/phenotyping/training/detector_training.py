@@ -69,7 +69,7 @@ class _Pool(Pool[Example]):
         images = np.zeros((len(chosen), *shape, 3), np.uint8)
         for image, example in zip(images, chosen):
             image[: example.image.shape[0], : example.image.shape[1]] = example.image
-        return images, np.stack([each.stalks for each in chosen]), np.stack([each.kinds for each in chosen])
+        return images, np.stack([example.stalks for example in chosen]), np.stack([example.kinds for example in chosen])
 
     def strips(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray] | None:
         """A batch of snips with their masks; None where there are no snips yet."""
@@ -78,7 +78,7 @@ class _Pool(Pool[Example]):
         chosen = [self.snips[place] for place in rng.integers(len(self.snips), size=self._plan.snips)]
         # All of one size: in a folder of images of several, those that are as large as the first one.
         shape = self.examples[chosen[0][0]].snips.shape[1:3]
-        chosen = [each if self.examples[each[0]].snips.shape[1:3] == shape else chosen[0] for each in chosen]
+        chosen = [place if self.examples[place[0]].snips.shape[1:3] == shape else chosen[0] for place in chosen]
         return (
             np.stack([self.examples[image].snips[place] for image, place in chosen]),
             np.stack([self.examples[image].masks[place] for image, place in chosen]),
@@ -169,7 +169,7 @@ def train(
     try:
         pool.fill(plan.first)
         shape = pool.examples[0].image.shape[:2]
-        whole = padded_shape(tuple(np.max([each.image.shape[:2] for each in pool.examples], axis=0)))
+        whole = padded_shape(tuple(np.max([example.image.shape[:2] for example in pool.examples], axis=0)))
         step = repeat(update, pool, plan, started, report, every)
     finally:
         pool.close()

@@ -104,16 +104,16 @@ def truth_of(
     centre = (camera.centre[0] / _THIN, camera.centre[1] / _THIN)
     small = Calibration(instance.shape[1], instance.shape[0], camera.focal / _THIN, centre, camera.baseline)
     stalks, kinds, indices = [], [], []
-    for seen in stalks_in_view(plot, pose, small, instance, depth):
-        if seen.band_box is None or seen.band_visible < _BARELY:
+    for visible in stalks_in_view(plot, pose, small, instance, depth):
+        if visible.band_box is None or visible.band_visible < _BARELY:
             continue
-        edges = outline(plot.stalks[seen.stalk], pose, camera, np.linspace(BAND[1], BAND[0], 21)) + 0.5  # from the top
+        edges = outline(plot.stalks[visible.stalk], pose, camera, np.linspace(BAND[1], BAND[0], 21)) + 0.5  # from the top
         middle = edges.mean(axis=1)
         (left, top), (right, bottom) = edges.min(axis=(0, 1)), edges.max(axis=(0, 1))
         axis = np.interp([top, bottom], middle[:, 1], middle[:, 0])
         stalks.append([left, top, right, bottom, *axis])
-        kinds.append(STALK if seen.band_visible >= LEAST_VISIBLE else UNCLEAR)
-        indices.append(seen.stalk)
+        kinds.append(STALK if visible.band_visible >= LEAST_VISIBLE else UNCLEAR)
+        indices.append(visible.stalk)
     return np.array(stalks, np.float32).reshape(-1, 6), np.array(kinds, np.int32), np.array(indices, np.int32)
 
 
@@ -137,9 +137,9 @@ def _example(
     moved[:, 4:] += wide * rng.normal(size=(len(clear), 2))
     moved[:, 1::2][:, :2] += 2.0 * wide * rng.normal(size=(len(clear), 1))
     drawn = rng.random(len(clear)) < higher
-    above = np.array([higher_up(each) for each in moved[drawn]], np.float32).reshape(-1, 6)
-    seen = above[:, 1] > 0
-    clear, moved = np.concatenate([clear, clear[drawn][seen]]), np.concatenate([moved, above[seen]])
+    above = np.array([higher_up(stalk) for stalk in moved[drawn]], np.float32).reshape(-1, 6)
+    shown = above[:, 1] > 0
+    clear, moved = np.concatenate([clear, clear[drawn][shown]]), np.concatenate([moved, above[shown]])
     on_device, places = jnp.asarray(image), moved
     snips, masks = np.zeros((0, *shape, 3), np.uint8), np.zeros((0, *shape), bool)
     if len(clear):
@@ -177,11 +177,11 @@ def annotated_examples(folder: Path, settings: Settings) -> Iterator[Example]:
                 f"{path} has {there[1]} x {there[0]} pixels, but {about['source']} is for "
                 f"{size[1]} x {size[0]}: save the image at the size at which it was annotated"
             )
-        found = of_image.get(about["id"], [])
-        stalks = np.array([_stalk_of(each, size) for each in found], np.float32).reshape(-1, 6)
-        kinds = np.full(len(found), STALK, np.int32)
+        annotations = of_image.get(about["id"], [])
+        stalks = np.array([_stalk_of(annotation, size) for annotation in annotations], np.float32).reshape(-1, 6)
+        kinds = np.full(len(annotations), STALK, np.int32)
         rng = np.random.default_rng([number, 18])
-        yield _example(image, stalks, kinds, functools.partial(_own_masks, found, size), settings, rng)
+        yield _example(image, stalks, kinds, functools.partial(_own_masks, annotations, size), settings, rng)
 
 
 def _own_masks(
@@ -202,20 +202,20 @@ def _own_masks(
 def settings_for(folder: Path, settings: Settings) -> Settings:
     """Settings whose anchors are as large as the boxes of a folder's annotations."""
     data = read_annotations(folder)
-    widths = {each["id"]: each["width"] for each in data["images"]}
+    widths = {image["id"]: image["width"] for image in data["images"]}
     sizes = np.array(
         [
-            np.array(each["bbox"][2:], float) * min(settings.width / widths[each["image_id"]], 1.0)
-            for each in data["annotations"]
+            np.array(annotation["bbox"][2:], float) * min(settings.width / widths[annotation["image_id"]], 1.0)
+            for annotation in data["annotations"]
         ]
     )
-    across = tuple(round(float(each), 1) for each in np.quantile(sizes[:, 0], (0.2, 0.6, 0.95)))
+    across = tuple(round(float(width), 1) for width in np.quantile(sizes[:, 0], (0.2, 0.6, 0.95)))
     return dataclasses.replace(settings, band_lines=round(float(np.median(sizes[:, 1])), 1), anchor_widths=across)
 
 
 def any_outlined(folder: Path) -> bool:
     """Whether any annotation of a folder has more than a box."""
-    return any(each["segmentation"] for each in read_annotations(folder)["annotations"])
+    return any(annotation["segmentation"] for annotation in read_annotations(folder)["annotations"])
 
 
 def _mask_of(annotation: dict[str, Any], size: tuple[int, int]) -> np.ndarray:
@@ -236,5 +236,5 @@ def _stalk_of(annotation: dict[str, Any], size: tuple[int, int]) -> list[float]:
     axis = [left + wide / 2] * 2
     if line.size > 50 and np.ptp(line) > 8:
         slope, offset = np.polyfit(line + 0.5, column + 0.5, 1)
-        axis = [float(np.clip(offset + slope * each, left, right)) for each in (top, bottom)]
+        axis = [float(np.clip(offset + slope * edge, left, right)) for edge in (top, bottom)]
     return [left, top, right, bottom, *axis]

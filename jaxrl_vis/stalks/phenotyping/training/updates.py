@@ -50,7 +50,7 @@ def repeat(update: Update, pool: Pool, plan: Schedule, started: float, report: R
         NonFiniteError: A loss is not finite any more.
         RequestError: The time was over before the first update.
     """
-    told, step, before = started, 0, None
+    last_report, step, before = started, 0, None
     while step < plan.steps:
         pool.fill(0)
         elapsed = (time.monotonic() - started) / 60.0
@@ -65,8 +65,8 @@ def repeat(update: Update, pool: Pool, plan: Schedule, started: float, report: R
             pool.fill(len(pool.examples) + 1)
             continue
         (parts, weights), step = made, step + 1
-        if step % 8 == 0 and time.monotonic() - told > every:
-            told = time.monotonic()
+        if step % 8 == 0 and time.monotonic() - last_report > every:
+            last_report = time.monotonic()
             losses = {name: float(part) for name, part in parts.items()}
             if not np.isfinite(list(losses.values())).all():
                 raise NonFiniteError(f"a loss is not finite at step {step}: try a lower --rate")
