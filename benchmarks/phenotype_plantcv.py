@@ -32,7 +32,7 @@ def masks_of(options: argparse.Namespace, seed: int) -> tuple[int, Masks]:
     from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights
     from jaxrl_vis.stalks.phenotyping.evaluation.perfect import perfect_detections
     from jaxrl_vis.stalks.phenotyping.evaluation.scoring import match, true_diameter
-    from jaxrl_vis.stalks.phenotyping.track.sightings import find_with_ground, look
+    from jaxrl_vis.stalks.phenotyping.track.sightings import find_with_ground, measure_pair
     from jaxrl_vis_envs.plants import FAMILIES, draw
     from jaxrl_vis_envs.plants.pairs import Sequence
     from jaxrl_vis_envs.plants.truth import HEIGHTS, stalks_in_view
@@ -50,7 +50,7 @@ def masks_of(options: argparse.Namespace, seed: int) -> tuple[int, Masks]:
         seen = stalks_in_view(sequence.plot, pair.pose, true, instance, np.asarray(pair.depth))
         ideal = perfect_detections(map(dataclasses.asdict, seen), instance)
         finds, ground = find_with_ground((lambda image, ideal=ideal: ideal) if options.truth else finder, left, right, stated)
-        sightings = look(finds, left, right, stated, ground=ground)
+        sightings = measure_pair(finds, left, right, stated, ground=ground)
         owners, _ = match(finds, seen)
         for find, sighting, owner in zip(finds, sightings, owners):
             at = sighting.height_m

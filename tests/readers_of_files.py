@@ -52,7 +52,7 @@ def _storage(path: Path) -> None:
 
 def read_annotations(folder: Path) -> None:
     from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
-    from jaxrl_vis.stalks.phenotyping.training.examples import _mask_of, _stalk_of
+    from jaxrl_vis.stalks.phenotyping.training.examples import _annotated_mask, _annotated_stalk
 
     data = read_annotations(folder)
     sizes = {each["id"]: (each["height"], each["width"]) for each in data["images"]}
@@ -63,9 +63,9 @@ def read_annotations(folder: Path) -> None:
         left, top, wide, tall = each["bbox"]
         assert wide > 0 and tall > 0 and left < width and top < height and left + wide > 0 and top + tall > 0
         if (height, width) == ANNOTATED:  # others are compared with their image, and refused
-            mask = _mask_of(each, (height, width))
+            mask = _annotated_mask(each, (height, width))
             assert mask.shape == ANNOTATED and mask.dtype == bool
-            assert np.isfinite(_stalk_of(each, (height, width))).all()
+            assert np.isfinite(_annotated_stalk(each, (height, width))).all()
 
 
 def read_odometry(folder: Path) -> None:
@@ -173,10 +173,10 @@ def read_evaluation(folder: Path) -> None:
 
 
 def read_truth(folder: Path) -> None:
-    from jaxrl_vis.stalks.phenotyping.evaluation.truth_on_disk import _seen, find_truth
+    from jaxrl_vis.stalks.phenotyping.evaluation.truth_on_disk import _stalks_by_pair, find_truth
     from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder
 
-    _seen.cache_clear()
+    _stalks_by_pair.cache_clear()
     image = np.zeros((*ANNOTATED, 3), np.uint8)
     for each in find_truth(image, PlotFolder("plot", folder, ()), PairFiles("0", None, None)):
         assert each.mask.dtype == bool and np.isfinite(each.box).all()

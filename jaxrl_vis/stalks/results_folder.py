@@ -80,7 +80,7 @@ def claim(
         out: The folder; made if it is missing.
         noun: Word for the folders of pairs, in the plural.
         folders: Folders of pairs.
-        calibrations: Of each folder by its name; None where there is none.
+        calibrations: Calibration of each folder by its name; None where there is none.
         about: Anything else that results depend on, as JSON.
         begun: The folder holds results.
 

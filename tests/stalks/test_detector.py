@@ -11,10 +11,10 @@ from tiny_detector import TINY
 
 from jaxrl_vis.errors import NonFiniteError, RequestError
 from jaxrl_vis.parameters import write_parameters
-from jaxrl_vis.stalks.phenotyping.detector.anchors import anchors_of, decode, encode
+from jaxrl_vis.stalks.phenotyping.detector.anchors import decode, encode, make_anchors
 from jaxrl_vis.stalks.phenotyping.detector.boxes import band_overlap, overlap, roi_align, suppress
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, best_proposals
-from jaxrl_vis.stalks.phenotyping.detector.doubles import found_once
+from jaxrl_vis.stalks.phenotyping.detector.doubles import without_duplicates
 from jaxrl_vis.stalks.phenotyping.detector.finder import Finder
 from jaxrl_vis.stalks.phenotyping.detector.losses import NOTHING, STALK, UNCLEAR, assign
 from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import cut, put_back, snip_shape
@@ -112,14 +112,14 @@ def test_a_stalk_that_two_finds_outline_is_one():
     half = np.where(np.arange(120)[:, None] < 55, crossing, upright)  # the first of one and the rest of the other
     pieces = [piece(0, 0, upright), piece(0, 0, crossing), piece(20, 30, part), piece(0, 0, half), piece(0, 0, image[:0, :0])]
     scores = np.array([0.8, 0.9, 0.7, 0.5, 0.4])
-    assert found_once(pieces, scores).tolist() == [True, True, False, True, True]
-    assert found_once(pieces, scores[[0, 2, 1, 3, 4]]).tolist() == [True, False, True, True, True]
-    assert found_once(pieces, scores, most_shared=0.4).tolist() == [True, True, False, False, True]
+    assert without_duplicates(pieces, scores).tolist() == [True, True, False, True, True]
+    assert without_duplicates(pieces, scores[[0, 2, 1, 3, 4]]).tolist() == [True, False, True, True, True]
+    assert without_duplicates(pieces, scores, most_shared=0.4).tolist() == [True, True, False, False, True]
     # Of three in a row that each share most of their neighbour's mask, the first and the last are two.
     chain = [piece(0, left, np.ones((50, 20), bool)) for left in (0, 7, 14)]
-    assert found_once(chain, np.array([0.9, 0.8, 0.7])).tolist() == [True, False, True]
-    assert found_once(chain, np.array([0.8, 0.9, 0.7])).tolist() == [False, True, False]
-    assert found_once([], np.zeros(0)).tolist() == []
+    assert without_duplicates(chain, np.array([0.9, 0.8, 0.7])).tolist() == [True, False, True]
+    assert without_duplicates(chain, np.array([0.8, 0.9, 0.7])).tolist() == [False, True, False]
+    assert without_duplicates([], np.zeros(0)).tolist() == []
 
 
 def test_codes_are_inverted():
@@ -133,7 +133,7 @@ def test_codes_are_inverted():
 
 def test_proposals_are_the_best_anchors_and_no_copies():
     shape = (64, 64)
-    anchors = jnp.asarray(anchors_of(shape, 30.0, (6.0, 12.0)))
+    anchors = jnp.asarray(make_anchors(shape, 30.0, (6.0, 12.0)))
     logits = jnp.full(len(anchors), -5.0).at[jnp.array([40, 42, 90])].set(jnp.array([3.0, 2.0, 4.0]))
     stalks, scores, valid = best_proposals(logits, jnp.zeros((len(anchors), 6)), anchors, TINY, shape)
     assert stalks.shape == (12, 6) and valid.shape == (12,)

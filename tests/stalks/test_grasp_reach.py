@@ -17,7 +17,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.grasping.arm import approach, control
 from jaxrl_vis.stalks.grasping.arm.choice import LEAST_ROOM, choose, choose_nearest
 from jaxrl_vis.stalks.grasping.arm.policy_loop import STALKS, check_policy, reach_by_policy
-from jaxrl_vis.stalks.grasping.arm.reach import LOOK, ReachResult, Sight, arms_among, reach
+from jaxrl_vis.stalks.grasping.arm.reach import LOOK, ArmView, ReachResult, arms_among, reach
 from jaxrl_vis.stalks.grasping.evaluation.attempts import follow, wind_keys
 from jaxrl_vis.stalks.grasping.perception.lines import GraspPoint
 from jaxrl_vis.stalks.grasping.report import path_figure, video
@@ -277,7 +277,7 @@ def test_wind_moves_stalks_away_from_blind_jaws_and_looking_helps():
     blind = reach(scenes, targets, key, wind)
     times = []
 
-    def look(sight: Sight) -> np.ndarray:
+    def look(sight: ArmView) -> np.ndarray:
         times.append(sight.time)
         return sight.stalks[:, slot]
 
@@ -311,7 +311,7 @@ def test_what_is_found_again_is_late_wrong_by_as_much_and_expected_to_go_on():
         stalks = np.zeros((3, 4, 3))
         stalks[0, slots[0]] = [0.01 * time, 0.0, HEIGHT + 0.001 * time]
         stalks[2] = 1.0
-        found.append(look(Sight(0.1 * time, np.zeros((3, 3)), stalks)))
+        found.append(look(ArmView(0.1 * time, np.zeros((3, 3)), stalks)))
     assert np.isnan(found[0]).all() and np.isnan(found[1]).all()
     # In the third look the second is known: 10 mm, going on by 10 mm a look for a look and a half.
     np.testing.assert_allclose(found[2][0], [0.010 + 0.015 + 0.002, 0.0, HEIGHT + 0.001], atol=1e-9)

@@ -11,9 +11,9 @@ from jaxrl_vis.stalks.grasping.perception.cloud import Cloud, Mount, match, orga
 from jaxrl_vis.stalks.grasping.perception.lines import grasp_points
 from jaxrl_vis.stalks.grasping.perception.perceive import View, perceive
 from jaxrl_vis.stalks.grasping.perception.slices import slice_at, slice_points
-from jaxrl_vis.stalks.grasping.perception.stalk_segments import chords_of, joined
+from jaxrl_vis.stalks.grasping.perception.stalk_segments import joined, stalk_segments
 from jaxrl_vis.stalks.grasping.perception.stitch import DEFAULT, THESIS, Motion, Thinned, rigid, stitch
-from jaxrl_vis.stalks.grasping.perception.visibility import Sight
+from jaxrl_vis.stalks.grasping.perception.visibility import Visibility
 from jaxrl_vis_envs.plants import Calibration, Pose, draw, drive
 from jaxrl_vis_envs.plants.grasping import GRASPING, GRASPING_FAMILIES, GRASPING_SHIFTED, LEAST_RANGE
 
@@ -185,9 +185,9 @@ STALKS = [(-0.25, 0.55, 0.05), (-0.13, 0.6, -0.08), (-0.05, 0.52, 0.0), (0.1, 0.
 
 
 def found_in(clouds: list[Cloud], motions: list[Motion]):
-    parts = [chords_of(cloud, CAMERA, MOUNT, frame) for frame, cloud in enumerate(clouds)]
+    parts = [stalk_segments(cloud, CAMERA, MOUNT, frame) for frame, cloud in enumerate(clouds)]
     parts = [dataclasses.replace(part, middle=motion(part.middle)) for motion, part in zip(motions, parts)]
-    return grasp_points(joined(parts), Sight(tuple(clouds), tuple(motions), CAMERA, MOUNT))
+    return grasp_points(joined(parts), Visibility(tuple(clouds), tuple(motions), CAMERA, MOUNT))
 
 
 def test_a_line_per_stalk_in_spite_of_what_hides_it():

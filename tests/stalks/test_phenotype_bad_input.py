@@ -16,8 +16,8 @@ from phenotype_plots import run, table
 from jaxrl_vis import cli
 from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
 from jaxrl_vis.stalks.phenotyping.io.images import read_image, write_image
-from jaxrl_vis.stalks.phenotyping.track.pairing import wrong_with
-from jaxrl_vis.stalks.phenotyping.track.sightings import look
+from jaxrl_vis.stalks.phenotyping.track.pairing import pair_fault
+from jaxrl_vis.stalks.phenotyping.track.sightings import measure_pair
 from jaxrl_vis_envs.plants import Calibration
 
 BLANK = np.full((12, 16, 3), 80, np.uint8)
@@ -60,7 +60,7 @@ def test_swapped_and_unrectified_pairs_are_told():
             Detection((each, 100.0, each + 13.0, 300.0), (each + 6.5, each + 6.5), 1.0, mask, (100, each - 5))
             for each in (column - offset for column in columns)
         ]
-        return wrong_with(finds, look(finds, left, right, camera), left, right, camera)
+        return pair_fault(finds, measure_pair(finds, left, right, camera), left, right, camera)
 
     assert told(left, right) is None
     assert told(right, left, disparity) == "left and right are swapped: exchange their names"

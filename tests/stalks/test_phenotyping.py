@@ -10,8 +10,8 @@ import pytest
 
 from jaxrl_vis.stalks.phenotyping.io.images import read_disparity, read_image, write_image
 from jaxrl_vis.stalks.phenotyping.io.masks import decode_mask, encode_mask
-from jaxrl_vis.stalks.phenotyping.measure.diameter import diameter_mm, tilt_of
-from jaxrl_vis.stalks.phenotyping.measure.edges import settle
+from jaxrl_vis.stalks.phenotyping.measure.diameter import diameter_mm, edge_tilt
+from jaxrl_vis.stalks.phenotyping.measure.edges import refine_edges
 from jaxrl_vis.stalks.phenotyping.measure.ground import _plane, find_ground
 from jaxrl_vis.stalks.phenotyping.measure.stalk import measure
 from jaxrl_vis.stalks.phenotyping.measure.stereo import match_rows, match_sgbm
@@ -105,7 +105,7 @@ def test_edges_settle_where_the_image_changes(wrong):
     strip = strip_width(mask | ((np.arange(80) > 20.5) & (np.arange(80) < 59.5)))
     assert strip is not None
     off = dataclasses.replace(strip, left=(strip.left[0] - wrong, 0.0), right=(strip.right[0] + wrong, 0.0))
-    settled = settle(off, image, (20, 20), 80.0, 60.0)
+    settled = refine_edges(off, image, (20, 20), 80.0, 60.0)
     assert abs(settled.edges(80.0)[0] + 20 - 40.0) < 0.6 and abs(settled.width() - 39.0) < 0.3
     assert abs(off.width() - 39.0) == pytest.approx(2 * abs(wrong), abs=0.01)
 
@@ -117,9 +117,9 @@ def test_edges_stay_where_the_image_shows_none():
     assert strip is not None
     noise = np.random.default_rng(1).normal(100.0, 10.0, (200, 120)).astype(np.float32)
     for image in (np.full((200, 120), 60.0, np.float32), blurred_stalk(28.5, 91.5)):
-        assert settle(strip, image, (20, 20), 80.0, 60.0) == strip
-    assert abs(settle(strip, noise, (20, 20), 80.0, 60.0).width() - strip.width()) < 5.1
-    assert settle(strip, noise[:24], (20, 20), 2.0, 3.0) == strip
+        assert refine_edges(strip, image, (20, 20), 80.0, 60.0) == strip
+    assert abs(refine_edges(strip, noise, (20, 20), 80.0, 60.0).width() - strip.width()) < 5.1
+    assert refine_edges(strip, noise[:24], (20, 20), 2.0, 3.0) == strip
 
 
 def test_a_width_that_was_not_seen_where_it_is_asked_for_is_a_lower_bound():
@@ -187,7 +187,7 @@ def test_tilt_is_read_from_the_slope_of_disparity():
     lines = 0.0, higher[1] / higher[2] * CAMERAS.focal
     disparities = CAMERAS.disparity(np.array([depth, higher[2]]))
     slope = (disparities[1] - disparities[0]) / (lines[1] - lines[0])
-    assert tilt_of(slope, disparities.mean(), CAMERAS) == pytest.approx(np.radians(10.0), rel=0.03)
+    assert edge_tilt(slope, disparities.mean(), CAMERAS) == pytest.approx(np.radians(10.0), rel=0.03)
 
 
 # --- the ground ---

@@ -14,7 +14,7 @@ from jaxrl_vis.stalks.phenotyping.io.folders import find_plots, read_odometries,
 from jaxrl_vis.stalks.phenotyping.measure.stalk import Measurement
 from jaxrl_vis.stalks.phenotyping.track.direction import follow_either_way
 from jaxrl_vis.stalks.phenotyping.track.follow import Track, follow
-from jaxrl_vis.stalks.phenotyping.track.heights import USUAL_TAPER, robust_width, widths_of
+from jaxrl_vis.stalks.phenotyping.track.heights import USUAL_TAPER, robust_width, stalk_widths
 from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting, _hidden_edges
 from jaxrl_vis_envs.plants import Calibration
 from jaxrl_vis_envs.plants.truth import StalkInView
@@ -277,7 +277,7 @@ def test_widths_are_those_at_12_and_24_inches():
         [seen(0.0, diameter_mm=None, **hidden)] * 3,
     ]
     tracks = [Track(tuple((stalk, place) for place in range(3)), 0.0, 0.8, True, "") for stalk in range(len(stalks))]
-    found = widths_of(stalks, tracks)
+    found = stalk_widths(stalks, tracks)
     first, below, unknown, nothing = found[0], *found[6:]
     assert first.lower.mm == pytest.approx(14.0, abs=0.01) and first.upper.mm == pytest.approx(10.4, abs=0.01)  # pyright: ignore
     assert first.taper == pytest.approx(taper, abs=1e-3) and first.height_known and first.lower.corrected  # pyright: ignore
@@ -314,7 +314,7 @@ def test_a_stalk_that_is_partly_hidden_is_at_least_as_thick_as_it_looks():
     assert robust_width(hidden).mm == pytest.approx(13.7, abs=0.31)  # pyright: ignore[reportOptionalMemberAccess]
     above = [dataclasses.replace(each, upper_mm=each.diameter_mm, upper_hidden=each.hidden, hidden=False) for each in hidden]
     heights = [dataclasses.replace(each, height_m=12 * 0.0254, upper_height_m=24 * 0.0254) for each in above]
-    (found,) = widths_of([heights], [Track(tuple((0, place) for place in range(6)), 0.0, 0.8, True, "")])
+    (found,) = stalk_widths([heights], [Track(tuple((0, place) for place in range(6)), 0.0, 0.8, True, "")])
     assert found.lower.mm < 13.0 < found.upper.mm  # pyright: ignore[reportOptionalMemberAccess]
 
 

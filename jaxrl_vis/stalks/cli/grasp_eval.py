@@ -109,7 +109,7 @@ def evaluate(options: Eval) -> int:
     table = records.evaluate_runs(conditions, numbers, options.json, started, _print_run)
     print(f"simulated runs of family {family.name}, masks: {name}, {variant}:")
     perceived = [{**table.records[number], "reaches": {}} for number in numbers]
-    for figure, value in records.summary_of(perceived).items():
+    for figure, value in records.summarise(perceived).items():
         print(f"  {figure:20} {f'{value:.4f}' if isinstance(value, float) else value}")
     if options.reach:
         _reach(options, table, numbers)
@@ -157,7 +157,7 @@ def _print_run(number: int, record: Record) -> None:
     from jaxrl_vis.stalks.grasping.evaluation import records
     from jaxrl_vis.stalks.grasping.evaluation.scoring import summary
 
-    score = records.score_of(record)
+    score = records.read_score(record)
     one = summary([score])
     print(
         f"run {number}: {len(score.errors)} of {score.true} stalks, {score.detected - len(score.errors)} false, "

@@ -1,4 +1,4 @@
-"""How far a command has come: a bar in a terminal, a line for each part elsewhere."""
+"""Progress of a command: a bar in a terminal, a line for each part elsewhere."""
 
 import contextlib
 import sys
@@ -19,7 +19,7 @@ def progress(unit: str) -> Iterator[Done]:
     """Shows how far a command has come.
 
     Args:
-        unit: What is counted, in the plural.
+        unit: Unit of progress, in the plural.
     """
     stream = safe(sys.stdout)
     if not stream.isatty():

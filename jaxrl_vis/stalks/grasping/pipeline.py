@@ -69,16 +69,16 @@ SKIPPED_COLUMNS = ("run", "pair", "why")
 
 @dataclasses.dataclass(frozen=True)
 class Request:
-    """What is asked for.
+    """Request for the results of runs.
 
     Attributes:
         out: Folder of the results.
-        ways: Which steps go as in the thesis.
-        finder: What finds the pixels of stalks, in words; results of another one are not mixed with it.
-        calibrations: Of each run by its name.
-        mount: How the pair is mounted.
-        speed: Of the robot, m/s, where only times are known.
-        reachable: Which points the arm can go to; None where nothing is known of an arm.
+        variant: Steps that follow the thesis.
+        finder: Name of the network of masks; results of another one are not mixed with it.
+        calibrations: Calibration of each run by its name.
+        mount: Mount of the pair.
+        speed: Speed of the robot, m/s, where only times are known.
+        reachable: Function that returns True for points that the arm can go to; None if nothing is known of an arm.
     """
 
     out: Path
@@ -99,9 +99,9 @@ def run(runs: list[PlotFolder], find: Find, request: Request, done: Callable[[Ro
     """Writes the results of runs.
 
     Args:
-        runs: What to look at.
-        find: What finds the pixels of stalks.
-        request: What is asked for.
+        runs: Folders of pairs.
+        find: Function that returns the mask of a pair.
+        request: The request.
         done: Called after each run with its row.
 
     Returns:
@@ -159,7 +159,7 @@ def _is_whole(record: dict[str, Any]) -> bool:
 
 
 def _record(folder: PlotFolder, driven: dict[str, float] | None, find: Find, request: Request) -> dict[str, Any]:
-    """What is kept of one run: its row, those of its points, and those of pairs that were skipped."""
+    """Return the record of one run: its row, those of its points, and those of pairs that were skipped."""
     calibration = request.calibrations[folder.name]
     views: list[View] = []
     skipped: list[Row] = []

@@ -37,14 +37,14 @@ from jaxrl_vis.stalks.phenotyping.report.tables import (
     STALK_COLUMNS,
     Origin,
     Row,
-    rows_of,
+    plot_rows,
     rows_without_path,
     write_rows,
 )
 from jaxrl_vis.stalks.phenotyping.track.direction import follow_either_way
 from jaxrl_vis.stalks.phenotyping.track.follow import Track
-from jaxrl_vis.stalks.phenotyping.track.pairing import wrong_with
-from jaxrl_vis.stalks.phenotyping.track.sightings import NO_CALIBRATION, Sighting, find_with_ground, look
+from jaxrl_vis.stalks.phenotyping.track.pairing import pair_fault
+from jaxrl_vis.stalks.phenotyping.track.sightings import NO_CALIBRATION, Sighting, find_with_ground, measure_pair
 from jaxrl_vis.stalks.results_folder import claim, is_current, pair_state, write_record
 from jaxrl_vis_envs.documents import read_json
 from jaxrl_vis_envs.plants import Calibration
@@ -58,15 +58,15 @@ SKIPPED_COLUMNS = ("plot", "pair", "why")
 
 @dataclasses.dataclass(frozen=True)
 class Request:
-    """What is asked for.
+    """Request for the results of plots.
 
     Attributes:
         out: Folder of the results.
-        method: How widths are taken.
-        finder: What finds stalks, in words; results of another one are not mixed with it.
-        calibrations: Of each plot by its name; None where there is none.
-        speed: Of the robot, m/s, where only times are known.
-        disparity_scale: What disparities in 16-bit images are divided by.
+        method: Method of widths.
+        finder: Name of the detector; results of another one are not mixed with it.
+        calibrations: Calibration of each plot by its name; None where there is none.
+        speed: Speed of the robot, m/s, where only times are known.
+        disparity_scale: Divisor of disparities in 16-bit images.
     """
 
     out: Path
@@ -88,11 +88,11 @@ def run(
     """Writes the results of plots.
 
     Args:
-        plots: What to look at.
-        find: What finds stalks; with more than one worker it is pickled.
-        request: What is asked for.
+        plots: Folders of pairs.
+        find: Detector of stalks; with more than one worker it is pickled.
+        request: The request.
         done: Called after each pair with the plot's name, how many of its pairs are done, and how many it has.
-        workers: How many processes look at pairs and draw overlays; 1 for this one.
+        workers: Number of processes that look at pairs and draw overlays; 1 for this one.
         say: Called for each plot without a count with its name and why it has none.
 
     Returns:
@@ -198,9 +198,9 @@ def _sightings_record(plot: PlotFolder, find: Find, request: Request, pair: Pair
         detections, ground = find_with_ground(lambda image: find(image, plot, pair), left, right, calibration, disparity)
     except Unusable as problem:
         return {"skipped": str(problem)}
-    sightings = look(detections, left, right, calibration, request.method, ground, disparity)
+    sightings = measure_pair(detections, left, right, calibration, request.method, ground, disparity)
     wrong = (
-        None if calibration is None or disparity is not None else wrong_with(detections, sightings, left, right, calibration)
+        None if calibration is None or disparity is not None else pair_fault(detections, sightings, left, right, calibration)
     )
     if wrong is not None:
         return {"skipped": wrong}
@@ -231,9 +231,9 @@ def _finish(
         stalks, row = rows_without_path(frames, skipped, origin, why)
     else:
         tracks, path = drive.tracks, drive.path
-        labels = labels_of(frames, tracks)
+        labels = sighting_labels(frames, tracks)
         start = float(path.places[0])
-        stalks, row = rows_of(frames, tracks, path, skipped, origin)
+        stalks, row = plot_rows(frames, tracks, path, skipped, origin)
     _draw_overlays(plot.name, request.out / "overlays" / file_name(plot.name), usable, labels, run_all)
     width = usable[0][1]["size"][1] if usable else 0
     return PlotResult(row, stalks, [pair.name for pair, _ in usable], frames, tracks, start, width)
@@ -282,7 +282,7 @@ def _what_is_missing(pairs: int, calibration: Calibration | None) -> str:
     return "a single pair" if pairs == 1 else NO_ODOMETRY
 
 
-def labels_of(frames: list[list[Sighting]], tracks: list[Track]) -> list[list[str | None]]:
+def sighting_labels(frames: list[list[Sighting]], tracks: list[Track]) -> list[list[str | None]]:
     """The number of the stalk that each sighting shows, as in the table; None for those of stalks that do not count."""
     labels: list[list[str | None]] = [[None] * len(frame) for frame in frames]
     for number, track in enumerate((track for track in tracks if track.counted), start=1):

@@ -15,7 +15,7 @@ _FOLDED_ROOM = 0.02  # m, of the tips of the folded jaws from the middle of the 
 
 
 def reachable(rail_pose: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Whether the arm's lengths and joint limits let its grip be at a target: [...] bool. Nothing else counts.
+    """Return True where the arm's lengths and joint limits let its grip be at a target: [...] bool. Nothing else counts.
 
     Args:
         rail_pose: [..., 3], `Stands.origin`: the place on the row's line that the arm faces, m in the plot's frame.
@@ -33,7 +33,7 @@ def reachable(rail_pose: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def room(target: np.ndarray, others: np.ndarray, radii: np.ndarray, whole_way: bool = True) -> np.ndarray:
-    """How much room other stalks leave the open gripper on its way, with the elbow to either side.
+    """Return the room that other stalks leave the open gripper on its path, with the elbow to either side.
 
     Args:
         target: [B, 3], m in the frame of the stand.
@@ -78,8 +78,8 @@ class Approach(NamedTuple):
 
     Attributes:
         stop: Index of the place of the mast; -1 where none will do.
-        side: Which solution: 1 or -1.
-        room: What other stalks leave the open gripper on the way, m; -inf where there is no way.
+        side: Solution of the kinematics: 1 or -1.
+        room: Room that other stalks leave the open gripper on its path, m; -inf if there is no path.
     """
 
     stop: int

@@ -1,4 +1,4 @@
-"""Which way the arm goes to a stalk: from which stop, with which solution of its kinematics, at which height; or none at all.
+"""Choice of an approach to a stalk: the stop, the solution of the arm's kinematics and the height, or none at all.
 
 Stalks lean, so that what is in the way at one height is not at another one. Of all stops, both solutions and the heights around
 the grasp point, the way is chosen on which the other stalks leave most room, as far as is known of them. Where that is too
@@ -23,12 +23,12 @@ _USUAL = 0.007  # m: radius of a stalk whose thickness is not known
 
 
 class Choice(NamedTuple):
-    """How a stalk is gone to.
+    """An approach to a stalk.
 
     Attributes:
         stop: Index of the stop; -1 where the arm's geometry does not let it be reached from any.
-        side: Which solution: 1 or -1.
-        room: What other stalks leave the open gripper on the way, m; -inf where there is no way.
+        side: Solution of the kinematics: 1 or -1.
+        room: Room that other stalks leave the open gripper on its path, m; -inf if there is no path.
         point: [3] float64, where the jaws are to close, m.
     """
 
@@ -39,7 +39,7 @@ class Choice(NamedTuple):
 
     @property
     def is_blocked(self) -> bool:
-        """Whether it could be reached, but other stalks are in the way."""
+        """True if it could be reached, but other stalks are in the way."""
         return self.stop >= 0 and self.room < LEAST_ROOM
 
 
@@ -47,7 +47,7 @@ def choose(points: Sequence[GraspPoint], stops: np.ndarray, heights: tuple[float
     """Chooses a way to each of the stalks that were found.
 
     Args:
-        points: Where they are, in one robot frame.
+        points: Grasp points, in one robot frame.
         stops: [S, 3], `Stands.origin` of each place where the robot may stop, in the same frame, m.
         heights: Lowest and highest grasp, m above the ground.
     """
@@ -56,7 +56,7 @@ def choose(points: Sequence[GraspPoint], stops: np.ndarray, heights: tuple[float
         best, worth = Choice(-1, 1, -np.inf, point.point), -np.inf
         for step in _STEPS:
             height = float(np.clip(point.point[2] + step, *heights))
-            path = _way(point, points, stops, height)
+            path = _approach_at(point, points, stops, height)
             if path.stop < 0:
                 continue
             value = min(path.room, _ENOUGH) - _UNSURE * abs(height - point.point[2])
@@ -77,19 +77,19 @@ def choose_nearest(points: Sequence[GraspPoint], stops: np.ndarray, heights: tup
         height = float(np.clip(point.point[2], *heights))
         target = point.at_height(height)
         stop = int(np.argmin(np.abs(stops[:, 0] - target[0])))
-        path = _way(point, points, stops[stop : stop + 1], height)
+        path = _approach_at(point, points, stops[stop : stop + 1], height)
         chosen.append(Choice(stop if path.stop >= 0 else -1, path.side, path.room, target))
     return chosen
 
 
-def _way(point: GraspPoint, points: Sequence[GraspPoint], stops: np.ndarray, height: float) -> approach.Approach:
+def _approach_at(point: GraspPoint, points: Sequence[GraspPoint], stops: np.ndarray, height: float) -> approach.Approach:
     """The best way to one of the points at a height, among all others as they are there."""
     others = [other for other in points if other is not point]
     beside = np.array([other.at_height(height) for other in others]).reshape(-1, 3)
-    return approach.best_approach(stops, point.at_height(height), beside[:, :2], radii_of(others, height), _ENOUGH)
+    return approach.best_approach(stops, point.at_height(height), beside[:, :2], stalk_radii(others, height), _ENOUGH)
 
 
-def radii_of(points: Sequence[GraspPoint], height: float | None = None) -> np.ndarray:
+def stalk_radii(points: Sequence[GraspPoint], height: float | None = None) -> np.ndarray:
     """Radii [B] of stalks at a height, or at their grasp points, m: a usual one where a thickness is not known."""
     thickness = [point.thickness if height is None else point.thickness_at(height) for point in points]
     radii = 0.5 * np.array(thickness, float)

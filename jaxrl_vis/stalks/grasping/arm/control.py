@@ -25,13 +25,13 @@ HOME = (0.0, stalk_arm.SHOULDER[1] + FOLDED, 0.85)
 
 @dataclasses.dataclass(frozen=True)
 class Timing:
-    """How long the parts of a reach take, s."""
+    """Durations of the parts of a reach, s."""
 
     turn: float = 0.8
     """The slide moves and the folded arm turns."""
     extend: float = 1.0
     """The grip moves outwards along the line."""
-    settle: float = 0.2
+    refine_edges: float = 0.2
     """The grip waits for what the controllers still lack."""
     close: float = 0.4
     """The jaws close."""
@@ -39,11 +39,11 @@ class Timing:
     @property
     def reach(self) -> float:
         """Until the jaws close."""
-        return self.turn + self.extend + self.settle
+        return self.turn + self.extend + self.refine_edges
 
 
 class Gains(NamedTuple):
-    """What drives the joints; [2] for shoulder and elbow. SI units."""
+    """Gains and limits of the controllers; [2] for shoulder and elbow. SI units."""
 
     proportional: Any = (260.0, 130.0)  # N m/rad
     integral: Any = (600.0, 300.0)  # N m/(rad s)
@@ -59,7 +59,7 @@ class Gains(NamedTuple):
 
 
 class Drive(NamedTuple):
-    """What the controllers remember.
+    """State of the controllers.
 
     Attributes:
         integral: [3] float32, the integrated errors of slide, shoulder and elbow, m s and rad s.
@@ -84,13 +84,13 @@ def better_side(target: Any, numeric: Any = jnp) -> Any:
 
 
 def planned(target: jax.Array, start: jax.Array, time: Any, timing: Timing) -> jax.Array:
-    """Where the grip should be at a time, on its way from `HOME` to ``target``: [3] m.
+    """Return the planned position of the grip at a time, on its path from `HOME` to ``target``: [3] m.
 
     Args:
         target: [3], m in the frame of a stand.
         start: [3], where the grip was at time 0, m.
         time: [] since the start, s.
-        timing: Of the reach.
+        timing: Timing of the reach.
     """
     shoulder = jnp.asarray(stalk_arm.SHOULDER, jnp.float32)
     turned = smooth(time / timing.turn)
@@ -113,11 +113,11 @@ def drive(state: Drive, joints: jax.Array, velocity: jax.Array, wanted: jax.Arra
     """One period of the controllers.
 
     Args:
-        state: What they remember.
+        state: State of the controllers.
         joints: [3], slide, shoulder and elbow, m and rad.
         velocity: [3], of these, m/s and rad/s.
         wanted: [3], where they should be.
-        gains: Of the controllers.
+        gains: Gains of the controllers.
 
     Returns:
         What they remember now; and what acts on the joints [3], N and N m.

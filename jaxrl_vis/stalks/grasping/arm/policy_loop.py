@@ -18,7 +18,7 @@ from jaxrl_vis.run.policy import Policy
 from jaxrl_vis.stalks.grasping.arm import control
 from jaxrl_vis.stalks.grasping.arm.approach import reachable
 from jaxrl_vis.stalks.grasping.arm.control import Gains, Timing
-from jaxrl_vis.stalks.grasping.arm.reach import Reaching, ReachResult, Scene, arms_among, begin, held_by, period
+from jaxrl_vis.stalks.grasping.arm.reach import Reaching, ReachResult, Scene, arms_among, begin, held_stalks, period
 from jaxrl_vis_envs.compilation import env_jit
 from jaxrl_vis_envs.physics import mjx_model
 from jaxrl_vis_envs.pixels import ImageObserver
@@ -58,9 +58,9 @@ def reach_by_policy(
         stands: The true stalks around each of B arms.
         detected: The stalks that were found there, in the same order of arms.
         targets: [B, 3] float32, where the jaws should close, m in the plot's frame; only the goal pictures know them.
-        policy: Of a run of VisualStalkReach.
+        policy: Policy of a run of VisualStalkReach.
         key: [B], typed: the winds.
-        wind_mm: How far stalks sway, mm.
+        wind_mm: Amplitude of the stalks' sway, mm.
 
     Returns:
         What came of it; its ``path`` is the place to which the grip was driven.
@@ -133,6 +133,6 @@ def _programs(policy: Policy) -> tuple[Any, Any]:
             start = _Moving(begin(arms, scene, HOME), jnp.asarray(HOME, jnp.float32))
             steps = round((timing.reach + timing.close) / env.control_period)
             (reaching, _), history = jax.lax.scan(step, start, length=steps)
-        return {**history, "held": held_by(arms, reaching.data), "touched": reaching.touched, "brushed": reaching.brushed}
+        return {**history, "held": held_stalks(arms, reaching.data), "touched": reaching.touched, "brushed": reaching.brushed}
 
     return env_jit(jax.vmap(draw)), env_jit(jax.vmap(episode))

@@ -41,7 +41,7 @@ _TOUCH = 0.0015  # m, a jaw this near to a stalk presses on it: soft contacts gi
 
 @dataclasses.dataclass(frozen=True)
 class ReachResult:
-    """What came of B reaches among N stalks each. NumPy arrays; paths have T points, `interval` s apart.
+    """Results of B reaches among N stalks each. NumPy arrays; paths have T points, `interval` s apart.
 
     Attributes:
         held: [B, N] bool, stalks between the closed jaws.
@@ -66,8 +66,8 @@ class ReachResult:
     interval: float = INTERVAL
 
 
-class Sight(NamedTuple):
-    """What there is to see from B arms on their way; the truth, of which a detector may make what it can.
+class ArmView(NamedTuple):
+    """The true view from B arms on their path, from which a detector may compute what it can.
 
     Attributes:
         time: Since the start, s.
@@ -85,7 +85,7 @@ class Reaching(NamedTuple):
 
     Attributes:
         data: The physics.
-        drive: What the controllers remember.
+        drive: State of the controllers.
         start: [3] float32, where the grip was at time 0, m in the frame of the stand.
         touched, brushed: [N] bool, so far.
     """
@@ -98,7 +98,7 @@ class Reaching(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """What does not change on the way of one arm: its stalks, the wind, and the side of its elbow (1 or -1)."""
+    """Constants of one arm's reach: its stalks, the wind, and the side of its elbow (1 or -1)."""
 
     shape: Shape
     gusts: Gusts
@@ -138,7 +138,7 @@ def reach(
     timing: Timing | None = None,
     gains: Gains | None = None,
     sides: np.ndarray | None = None,
-    look: Callable[[Sight], np.ndarray] | None = None,
+    look: Callable[[ArmView], np.ndarray] | None = None,
 ) -> ReachResult:
     """Sends each arm to its target and closes its jaws there.
 
@@ -146,9 +146,9 @@ def reach(
         stands: The stalks around each of B arms.
         targets: [B, 3] float32, where the jaws should close, m in the plot's frame.
         key: [] or [B], typed: the wind; one for all arms, or one each, so that an arm's wind is the same in any company.
-        wind_mm: How far stalks sway (`bending.Gusts.strength`), mm; [] or [B], 0 to 20 in the field.
-        timing: How long the parts of a reach take.
-        gains: Of the controllers.
+        wind_mm: Amplitude of the stalks' sway (`bending.Gusts.strength`), mm; [] or [B], 0 to 20 in the field.
+        timing: Durations of the parts of a reach.
+        gains: Gains of the controllers.
         sides: [B], 1 or -1: which of the two solutions each arm takes (see `approach.room`). None for `control.better_side`.
         look: Called every `LOOK` s on the way and while the jaws close; returns targets [B, 3] in place of those before, nan
             where they stay. None: the arm moves without looking again.
@@ -209,11 +209,11 @@ def reach(
 
 
 def _looked(
-    look: Callable[[Sight], np.ndarray], stands: Stands, targets: np.ndarray, can: np.ndarray, time: float, report: dict
+    look: Callable[[ArmView], np.ndarray], stands: Stands, targets: np.ndarray, can: np.ndarray, time: float, report: dict
 ) -> np.ndarray:
     """Targets [B, 3] after another look; those of before where there is no new one, or the arm cannot go there."""
     places = np.where(stands.present[..., None], report["stalks"], np.nan) + stands.origin[:, None]
-    updated = np.asarray(look(Sight(time, report["taken"][:, -1] + stands.origin, places)), np.float32)
+    updated = np.asarray(look(ArmView(time, report["taken"][:, -1] + stands.origin, places)), np.float32)
     if updated.shape != targets.shape:
         raise ValueError(f"a look must return targets {list(targets.shape)}, got {list(updated.shape)}")
     there = np.all(np.isfinite(updated), axis=-1)
@@ -235,7 +235,7 @@ def _empty(stands: Stands, timing: Timing) -> ReachResult:
 
 @functools.cache
 def _programs(stalks: int, timing: Timing, gains: Gains) -> tuple[Any, Any]:
-    """How B arms start, and how they go on for `LOOK` s."""
+    """Return the compiled programs that start B arms and advance them by `LOOK` s."""
     arms = arms_among(stalks)
 
     def start(shape: Shape, key: jax.Array, wind: jax.Array, side: jax.Array) -> tuple[Scene, Reaching]:
@@ -280,7 +280,7 @@ def _advance(
         reaching, report = jax.lax.scan(point, reaching, length=_POINTS_A_CALL)
     data = mjx_model.kinematics(model, reaching.data)
     report |= {
-        "held": held_by(arms, data),
+        "held": held_stalks(arms, data),
         "touched": reaching.touched,
         "brushed": reaching.brushed,
         "stalks": bending.at_height(data, arms.layout, target[2]),
@@ -296,11 +296,11 @@ def period(
     Args:
         arms: The model at rest.
         model: The same with the stalks of the scene (`bending.fit`).
-        scene: What does not change.
+        scene: Constants of the reach.
         reaching: The arm.
         wanted: [3], where the grip should be, m in the frame of the stand.
         is_closing: [] bool, whether the jaws close.
-        gains: Of the controllers.
+        gains: Gains of the controllers.
     """
     data = reaching.data
     memory, forces = control.drive(reaching.drive, data.qpos[:3], data.qvel[:3], stalk_arm.joints_at(wanted, scene.side), gains)
@@ -314,8 +314,8 @@ def period(
     return Reaching(data, memory, reaching.start, touched, reaching.brushed | (by_gripper & ~is_closing))
 
 
-def held_by(arms: Arms, data: Any) -> jax.Array:
-    """Which stalks the closed jaws hold: [N] bool. They are between the jaws, and at least one of these presses on them."""
+def held_stalks(arms: Arms, data: Any) -> jax.Array:
+    """Return True for the stalks that the closed jaws hold, [N] bool: between the jaws, and at least one jaw presses on it."""
     across, along = stalk_arm.grip_frame(data.qpos[:3])
     grip = stalk_arm.grip_at(data.qpos[:3])
     places = (bending.at_height(data, arms.layout, grip[2]) - grip)[:, :2]

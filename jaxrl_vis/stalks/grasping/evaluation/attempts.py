@@ -17,16 +17,16 @@ import numpy as np
 
 from jaxrl_vis.run.policy import Policy
 from jaxrl_vis.stalks.grasping.arm import approach
-from jaxrl_vis.stalks.grasping.arm.choice import Choice, choose, choose_nearest, radii_of
+from jaxrl_vis.stalks.grasping.arm.choice import Choice, choose, choose_nearest, stalk_radii
 from jaxrl_vis.stalks.grasping.arm.policy_loop import HEIGHTS as POLICY_HEIGHTS
 from jaxrl_vis.stalks.grasping.arm.policy_loop import STALKS as POLICY_STALKS
 from jaxrl_vis.stalks.grasping.arm.policy_loop import reach_by_policy
-from jaxrl_vis.stalks.grasping.arm.reach import ReachResult, Sight, reach
+from jaxrl_vis.stalks.grasping.arm.reach import ArmView, ReachResult, reach
 from jaxrl_vis.stalks.grasping.evaluation.grasp_score import Attempt, Standing, match
-from jaxrl_vis.stalks.grasping.evaluation.scoring import RADIUS, Scene, stretch_of
+from jaxrl_vis.stalks.grasping.evaluation.scoring import RADIUS, Scene, driven_stretch
 from jaxrl_vis.stalks.grasping.perception.lines import PREFERRED, GraspPoint
 from jaxrl_vis.stalks.grasping.perception.perceive import Perception
-from jaxrl_vis.stalks.grasping.perception.stalk_segments import Chords, chords_of
+from jaxrl_vis.stalks.grasping.perception.stalk_segments import StalkSegments, stalk_segments
 from jaxrl_vis.stalks.grasping.perception.stitch import Motion
 from jaxrl_vis_envs.plants import Plot
 from jaxrl_vis_envs.plants.stand import MAST_DISTANCE, STALKS, Stands, concatenated, origin_of, stand_of_lines, stands_at
@@ -71,18 +71,18 @@ class Plan:
 
 
 def plan(scene: Scene, perception: Perception, number: int, for_policy: bool = False) -> Plan:
-    """What the arm is to try in a run.
+    """Plan the attempts of a run.
 
     Args:
         scene: The run.
-        perception: What was made of it.
-        number: Of the run, in the metric.
+        perception: Its perception.
+        number: Number of the run.
         for_policy: As the task that a policy has learned: from the stop that is nearest to the stalk, at one of its heights,
             among as many stalks; and nothing is refused.
     """
     plot, poses = scene.plot, scene.drive.poses
-    low, high = stretch_of(plot)
-    masts, points = masts_of(perception), perception.points
+    low, high = driven_stretch(plot)
+    masts, points = mast_positions(perception), perception.points
     chosen = choose_nearest(points, masts, POLICY_HEIGHTS) if for_policy else choose(points, masts)
     targets = np.array([_from_stop(choice, scene, perception) for choice in chosen]).reshape(-1, 3)
     places = np.array([[stalk.at_height(target[2])[0][:2] for stalk in plot.measured] for target in targets])
@@ -97,10 +97,14 @@ def plan(scene: Scene, perception: Perception, number: int, for_policy: bool = F
         if (stalk in known if stalk >= 0 else low <= target[0] <= high)
     ]
     off = np.array([_off(targets[place], places[place], stalks[place]) for place in scored]).reshape(-1, 2)
-    chords = {stop: chords_of(perception.clouds[stop], scene.drive.stated, scene.mount, stop) for stop in range(len(poses))}
-    again = [off[index] + _found_again(chosen[place], points[place], perception, chords) for index, place in enumerate(scored)]
+    chords = {
+        stop: stalk_segments(perception.clouds[stop], scene.drive.stated, scene.mount, stop) for stop in range(len(poses))
+    }
+    again = [
+        off[index] + _offset_at_stop(chosen[place], points[place], perception, chords) for index, place in enumerate(scored)
+    ]
     at = origins[[chosen[place].stop for place in scored], 0]
-    detected = [_seen(chosen[place], x, targets[place], scene, perception) for x, place in zip(at, scored)]
+    detected = [_detected_around(chosen[place], x, targets[place], scene, perception) for x, place in zip(at, scored)]
     return Plan(
         run=number,
         targets=targets[scored],
@@ -115,23 +119,23 @@ def plan(scene: Scene, perception: Perception, number: int, for_policy: bool = F
     )
 
 
-def masts_of(perception: Perception) -> np.ndarray:
+def mast_positions(perception: Perception) -> np.ndarray:
     """[S, 3], `Stands.origin` of the places where the pairs were taken, as the stitches say, in the last one's frame, m."""
     return np.array([motion(np.array([0.0, MAST_DISTANCE, 0.0])) for motion in perception.to_last]) * [1.0, 1.0, 0.0]
 
 
 def _from_stop(choice: Choice, scene: Scene, perception: Perception, points: np.ndarray | None = None) -> np.ndarray:
-    """Where the arm goes [3], m in the plot's frame: at the stop, the robot knows the point, or others, from there."""
+    """Return the chosen point, or others [..., 3], as the robot at the stop knows them: [..., 3], m in the plot's frame."""
     from_there = perception.to_last[choice.stop].inverse()(choice.point if points is None else points)
     return scene.drive.poses[choice.stop].to_world(scene.mount.pose.to_camera(from_there))
 
 
-def _seen(choice: Choice, x: float, target: np.ndarray, scene: Scene, perception: Perception) -> Stands:
+def _detected_around(choice: Choice, x: float, target: np.ndarray, scene: Scene, perception: Perception) -> Stands:
     """The stalks that were found around an arm with its mast ``x`` m along the row, for a target [3] in the plot's frame."""
     height = float(choice.point[2])
     ends = np.array([point.at_height(np.array([height, height + _AROUND])) for point in perception.points])
     ends = _from_stop(choice, scene, perception, ends)
-    return stand_of_lines(ends[:, 0], ends[:, 1] - ends[:, 0], radii_of(perception.points, height), x, target, POLICY_STALKS)
+    return stand_of_lines(ends[:, 0], ends[:, 1] - ends[:, 0], stalk_radii(perception.points, height), x, target, POLICY_STALKS)
 
 
 def _off(target: np.ndarray, places: np.ndarray, stalk: int) -> np.ndarray:
@@ -139,7 +143,7 @@ def _off(target: np.ndarray, places: np.ndarray, stalk: int) -> np.ndarray:
     return target[:2] - places[stalk] if stalk >= 0 else np.full(2, np.nan)
 
 
-def _found_again(choice: Choice, point: GraspPoint, perception: Perception, chords: dict[int, Chords]) -> np.ndarray:
+def _offset_at_stop(choice: Choice, point: GraspPoint, perception: Perception, chords: dict[int, StalkSegments]) -> np.ndarray:
     """By how much [2] m the pair at the stop alone shows the stalk beside where all pairs do; nan where it does not show it.
 
     Axes are those of the robot at the last pair, from which those at other stops and of the plot differ by little.
@@ -154,7 +158,7 @@ def _found_again(choice: Choice, point: GraspPoint, perception: Perception, chor
 
 
 def from_any_stop(points: np.ndarray, stops: np.ndarray) -> np.ndarray:
-    """Which points the arm can go to from any of the places where the left camera was, as far as its geometry goes.
+    """Return True for the points that the arm's geometry lets it reach from any of the places where the left camera was.
 
     Args:
         points: [B, 3], m in the robot frame of one pair.
@@ -169,7 +173,7 @@ def from_any_stop(points: np.ndarray, stops: np.ndarray) -> np.ndarray:
 
 def _standing(plot: Plot, origins: np.ndarray, number: int) -> tuple[Standing, ...]:
     """The true stalks of the stretch, and whether and how freely they could be reached at the preferred height."""
-    low, high = stretch_of(plot)
+    low, high = driven_stretch(plot)
     middles = np.array([stalk.at_height(PREFERRED)[0] for stalk in plot.measured]).reshape(-1, 3)
     radii = np.array([0.5 * stalk.diameter(PREFERRED) for stalk in plot.measured])
     standing = []
@@ -190,10 +194,10 @@ def carry_out(
 
     Args:
         plans: One for each run.
-        wind_mm: How far stalks sway, mm. What wind an arm meets depends neither on other runs nor on the loop.
-        loop: Whether the arm looks again.
+        wind_mm: Amplitude of the stalks' sway, mm. The wind around an arm depends neither on other runs nor on the loop.
+        loop: Loop of the arm: with or without a second look, or a policy.
         policy: For that loop, and plans that were made for it.
-        seed: Of the wind.
+        seed: Seed of the wind.
     """
     attempts: list[Attempt] = []
     for block in _blocks(list(plans)):
@@ -212,7 +216,7 @@ def carry_out(
         else:
             look = follow(stands, stalks, again) if loop == "again" else None
             result = reach(stands, targets, keys, wind_mm, sides=sides, look=look)
-        attempts += attempts_of(stands, result, numbers, stalks, errors, refused)
+        attempts += to_attempts(stands, result, numbers, stalks, errors, refused)
     return attempts
 
 
@@ -222,14 +226,14 @@ def wind_keys(runs: np.ndarray, places: np.ndarray, seed: int = 0) -> jax.Array:
     return jax.vmap(jax.random.fold_in)(of_runs, places)
 
 
-def attempts_of(
+def to_attempts(
     stands: Stands, result: ReachResult, runs: np.ndarray, stalks: np.ndarray, errors: np.ndarray, refused: np.ndarray
 ) -> list[Attempt]:
-    """What came of B reaches, for the metric.
+    """Convert the results of B reaches to attempts, for the score.
 
     Args:
         stands: The stalks around each arm.
-        result: What came of it.
+        result: Their results.
         runs, stalks, errors, refused: [B], see `Plan`.
     """
     attempts = []
@@ -251,8 +255,8 @@ def attempts_of(
     return attempts
 
 
-def follow(stands: Stands, stalks: np.ndarray, again: np.ndarray) -> Callable[[Sight], np.ndarray]:
-    """What the arm makes of looking again: targets [B, 3] from what there is to see, for `reach`.
+def follow(stands: Stands, stalks: np.ndarray, again: np.ndarray) -> Callable[[ArmView], np.ndarray]:
+    """Return a function that finds the targets [B, 3] again from the view on the way, for `reach`.
 
     The pair at the stop stands still. What it finds is where the stalk is, plus the error that it alone made with this stalk
     at rest; what it did not show at rest it does not find again. A result is there one look later, and the stalk is expected
@@ -268,7 +272,7 @@ def follow(stands: Stands, stalks: np.ndarray, again: np.ndarray) -> Callable[[S
     error = np.where(known.any(axis=1)[:, None], again, np.nan)
     places: list[np.ndarray] = []
 
-    def look(sight: Sight) -> np.ndarray:
+    def look(sight: ArmView) -> np.ndarray:
         place = sight.stalks[np.arange(len(slot)), slot]
         place[:, :2] += error
         places.append(place)

@@ -1,4 +1,4 @@
-"""How well stalks are grasped: one target, one stalk between the jaws. NumPy and SciPy only.
+"""Score of grasps: one target, one stalk between the jaws. NumPy and SciPy only.
 
 The thesis counts stalks: 1 - |grasped - attempted| / attempted, averaged over runs. Misses and double grasps cancel there.
 Here an attempt succeeds where exactly the stalk that it was for is between the jaws at closure, all that goes wrong is told
@@ -29,9 +29,9 @@ class Attempt:
         run: In which run.
         stalk: Index of the stalk that the grasp point is matched to (`match`); None where no stalk is there.
         held: Indices of the stalks between the closed jaws.
-        reachable: Whether the arm could go there; if not, nothing is held.
-        refused: Whether it could, and was not sent: other stalks were in its way, as far as was known. Then nothing is held.
-        collided: Whether links other than the jaws touched a stalk that the attempt was not for.
+        reachable: The arm could go there; if not, nothing is held.
+        refused: It could, and was not sent: other stalks were in its path, as far as was known. Then nothing is held.
+        collided: Links other than the jaws touched a stalk that the attempt was not for.
         brushed: The same for the open jaws.
         aim_error: Horizontal distance of the grasp point from the middle of the stalk, m; nan without one.
     """
@@ -47,7 +47,7 @@ class Attempt:
 
     @property
     def sent(self) -> bool:
-        """Whether the arm moved."""
+        """True if the arm moved."""
         return self.reachable and not self.refused
 
     @property
@@ -71,7 +71,7 @@ class Standing:
     Attributes:
         run: In which run.
         stalk: Its index.
-        reachable: Whether the arm's geometry lets it be grasped from somewhere in the run.
+        reachable: The arm's geometry lets it be grasped from somewhere in the run.
         room: Least distance from other stalks that it leaves the open gripper, m; see `approach.room`.
         neighbour: Distance to the nearest other stalk at the height of the grasp, middle to middle, m.
     """
@@ -84,7 +84,7 @@ class Standing:
 
     @property
     def crowded(self) -> bool:
-        """Whether the jaws cannot take it alone."""
+        """True if the jaws cannot take it alone."""
         return self.room < ROOM
 
 
@@ -93,9 +93,9 @@ class Share:
     """So many of so many, with Wilson's interval of 95 %; all nan where there are none.
 
     Attributes:
-        name: What is counted.
-        count: How many.
-        of: Of how many.
+        name: Name of the share.
+        count: Number of hits.
+        of: Total.
     """
 
     name: str
@@ -104,7 +104,7 @@ class Share:
 
     @property
     def share(self) -> float:
-        """Of 1."""
+        """Share, 0 to 1."""
         return self.count / self.of if self.of else math.nan
 
     @property
@@ -121,7 +121,7 @@ class Share:
 
 @dataclasses.dataclass(frozen=True)
 class Score:
-    """What came of all runs.
+    """Score of all runs.
 
     Attributes:
         of_sent: Successes, of the attempts for which the arm moved.
@@ -186,7 +186,7 @@ def wilson(count: int, of: int, z: float = 1.959964) -> tuple[float, float]:
 
 
 def match(points: np.ndarray, stalks: np.ndarray, gate: float) -> np.ndarray:
-    """Which stalk each grasp point is for: at most one each, as many pairs as possible, least total distance.
+    """Match grasp points with stalks one to one: as many pairs as possible, at the least total distance.
 
     Args:
         points: [P, 2], where the arm is to go, m.
@@ -215,7 +215,7 @@ def score(attempts: Iterable[Attempt], stalks: Iterable[Standing], tolerance: fl
     """Puts the attempts beside the truth.
 
     Args:
-        attempts: Of all runs, at most one for each stalk.
+        attempts: Attempts of all runs, at most one for each stalk.
         stalks: All stalks of the stretches that the runs pass.
         tolerance: An attempt is aimed beside its stalk where it fails and its aim is further off than this, m.
 
@@ -285,7 +285,7 @@ def thesis_ratio(attempts: Iterable[Attempt]) -> tuple[float, int]:
 
 
 def _stage(attempt: Attempt | None, tolerance: float) -> str:
-    """Which of `STAGES` a stalk came to."""
+    """Return the one of `STAGES` that a stalk came to."""
     if attempt is None:
         return "not detected"
     if attempt.outcome == "success":

@@ -1,4 +1,4 @@
-"""What `grasp eval` keeps of each run as JSON: how well it was perceived, the plan of its attempts, and what came of these.
+"""Records of `grasp eval` as JSON: for each run its perception's score, the plan of its attempts, and their results.
 
 Everything that follows is computed from what was kept, so that it is the same whether a run was evaluated now or before.
 """
@@ -41,7 +41,7 @@ class Conditions:
         family: Family that rows are drawn from.
         weights: File of the weights of the network of masks; None for true masks.
         masks: Name of that network, or ``truth``.
-        ways: Which steps go as in the thesis.
+        variant: Steps that follow the thesis.
         workers: Number of processes that share the machine; records state it, as it bears on the time that a pair takes.
     """
 
@@ -86,7 +86,7 @@ def evaluate_runs(
         "masks": conditions.masks,
         "method": str(conditions.variant),
     }
-    table = Kept(path, about, summary_of)
+    table = Kept(path, about, summarise)
     missing = [number for number in numbers if number not in table]
     started(len(numbers) - len(missing))
 
@@ -99,7 +99,7 @@ def evaluate_runs(
 
 
 def evaluate_run(conditions: Conditions, number: int) -> Record:
-    """What is kept of one run, before an arm moves.
+    """Evaluate one run, before an arm moves, and return its record.
 
     Args:
         conditions: For all runs.
@@ -120,18 +120,18 @@ def evaluate_run(conditions: Conditions, number: int) -> Record:
     }
 
 
-def summary_of(records: Sequence[Record]) -> dict[str, Any]:
-    """What the records of runs say together: the figures of `evaluate.summary`, and of all reaches that all of them have."""
-    figures: dict[str, Any] = summary([score_of(record) for record in records])
+def summarise(records: Sequence[Record]) -> dict[str, Any]:
+    """Summarise the records of runs: the figures of `scoring.summary`, and of all reaches that all of them have."""
+    figures: dict[str, Any] = summary([read_score(record) for record in records])
     figures["devices"] = sorted({record["device"] for record in records})
     figures["workers"] = sorted({record["workers"] for record in records})
     known = [set(record.get("reaches", {})) for record in records]
     if known and (everywhere := set.intersection(*known)):
-        figures["reaches"] = {name: figures_of(grasp_score(records, name)) for name in sorted(everywhere)}
+        figures["reaches"] = {name: score_figures(grasp_score(records, name)) for name in sorted(everywhere)}
     return figures
 
 
-def figures_of(score: Score) -> dict[str, Any]:
+def score_figures(score: Score) -> dict[str, Any]:
     """A score as JSON."""
     shares = {share.name: {"count": share.count, "of": share.of, "interval": share.interval} for share in score.shares}
     return {"thesis_ratio": score.thesis_ratio, "shares": shares}
@@ -139,14 +139,14 @@ def figures_of(score: Score) -> dict[str, Any]:
 
 @dataclasses.dataclass(frozen=True)
 class Reaches:
-    """How all targets are gone to.
+    """A kind of reaches, for all targets.
 
     Attributes:
-        loop: Whether the arm looks again.
-        wind_mm: How far stalks sway, mm.
-        for_policy: Whether all loops have the scenes of the policy's task; see `attempts.plan`.
+        loop: Loop of the arm: with or without a second look, or a policy.
+        wind_mm: Amplitude of the stalks' sway, mm.
+        for_policy: All loops have the scenes of the policy's task; see `attempts.plan`.
         policy: For that loop.
-        policy_name: Of it.
+        policy_name: Its name.
     """
 
     loop: Loop
@@ -170,12 +170,12 @@ def reach_all(table: Kept, numbers: Iterable[int], reaches: Reaches) -> None:
 
     Args:
         table: The records of all runs.
-        numbers: Which runs.
-        reaches: How.
+        numbers: Numbers of the runs.
+        reaches: Kind of reaches.
     """
     name = str(reaches)
     missing = [number for number in numbers if name not in table.records[number].get("reaches", {})]
-    plans = [plan_of(number, table.records[number], reaches.plan) for number in missing]
+    plans = [read_plan(number, table.records[number], reaches.plan) for number in missing]
     attempts = carry_out(plans, reaches.wind_mm, reaches.loop, reaches.policy)
     changed = {}
     for number in missing:
@@ -191,7 +191,7 @@ def grasp_score(records: Iterable[Record], name: str) -> Score:
     for record in records:
         number, reaches = int(record["number"]), record["reaches"][name]
         attempts += attempts_in(record, name)
-        standing += plan_of(number, record, reaches["plan"]).standing
+        standing += read_plan(number, record, reaches["plan"]).standing
     return score(attempts, standing)
 
 
@@ -201,8 +201,8 @@ def _score_record(score: RunScore) -> Record:
     return {name: value.round(4).tolist() if isinstance(value, np.ndarray) else value for name, value in values.items()}
 
 
-def score_of(record: Record) -> RunScore:
-    """How well a run was perceived."""
+def read_score(record: Record) -> RunScore:
+    """Return the score of a run's perception from its record."""
     values, mask = record["score"], record["score"]["mask"]
     return RunScore(
         seed=values["seed"],
@@ -239,13 +239,13 @@ def _plan_record(made: Plan) -> Record:
     }
 
 
-def plan_of(number: int, record: Record, name: str = "plan") -> Plan:
+def read_plan(number: int, record: Record, name: str = "plan") -> Plan:
     """A plan of a run.
 
     Args:
-        number: Of the run.
-        record: What was kept of it.
-        name: Which plan.
+        number: Number of the run.
+        record: Its record.
+        name: Name of the plan in the record.
     """
     values = record[name]
     return Plan(
@@ -256,16 +256,16 @@ def plan_of(number: int, record: Record, name: str = "plan") -> Plan:
         sides=np.array(values["sides"], float),
         refused=np.array(values["refused"], bool),
         again=np.array(values["again"], float).reshape(-1, 2),
-        stands=_stands_of(values["stands"]),
+        stands=_read_stands(values["stands"]),
         standing=tuple(
             Standing(number, stalk, reachable, *(np.inf if length is None else length for length in (room, neighbour)))
             for stalk, reachable, room, neighbour in values["standing"]
         ),
-        detected=None if values["seen"] is None else _stands_of(values["seen"]),
+        detected=None if values["seen"] is None else _read_stands(values["seen"]),
     )
 
 
-def _stands_of(values: Record) -> Stands:
+def _read_stands(values: Record) -> Stands:
     shapes = {"foot": (3,), "knee": (3,), "top": (3,), "radius": (2,), "bending_radius": (2,)}
     stalk = np.array(values["stalk"], np.int32)
     stalk = stalk.reshape(len(stalk), -1 if len(stalk) else 0)
@@ -280,11 +280,11 @@ def _attempt_record(attempt: Attempt) -> Record:
 
 
 def attempts_in(record: Record, name: str) -> list[Attempt]:
-    """What came of the reaches of one kind in a run."""
-    return [_attempt_of(int(record["number"]), values) for values in record["reaches"][name]["attempts"]]
+    """Return the attempts of one kind of reaches in a run."""
+    return [_read_attempt(int(record["number"]), values) for values in record["reaches"][name]["attempts"]]
 
 
-def _attempt_of(number: int, values: Record) -> Attempt:
+def _read_attempt(number: int, values: Record) -> Attempt:
     return Attempt(**{**values, "held": frozenset(values["held"]), "aim_error": _number(values["aim_error"])}, run=number)
 
 

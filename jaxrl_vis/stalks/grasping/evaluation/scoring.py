@@ -1,4 +1,4 @@
-"""How good masks, stitches and grasp points are, against the exact truth of synthetic rows that are drawn for it.
+"""Scores of masks, stitches and grasp points against the exact truth of synthetic rows, which are drawn for it.
 
 row -> five pairs -> perception -> grasp points         as `run` does, without files
     -> true stalks, poses and masks                     from the row itself
@@ -30,7 +30,7 @@ RADIUS = 0.03
 
 @dataclasses.dataclass(frozen=True)
 class MaskScore:
-    """How well masks fit, over the pairs of a run.
+    """Agreement of masks with the truth, over the pairs of a run.
 
     Attributes:
         hits, painted, true: Pixels that are rightly painted, painted, and of stalks.
@@ -48,15 +48,15 @@ class RunScore:
     """One run.
 
     Attributes:
-        seed: Of the row.
+        seed: Seed of the row.
         true: Stalks in the stretch.
         found: Grasp points in the stretch, and those that are matched with a stalk in it.
         errors: [K] float64, horizontal distance of each matched grasp point from its stalk, mm.
         stitches: [S] float64, horizontal error of each stitch, mm.
         refused: Stitches that were refused.
         seconds: Time per pair, by stage, s.
-        mask: How well masks fit; None for true masks.
-        notes: What was not as it should be.
+        mask: Agreement of masks with the truth; None for true masks.
+        notes: Irregularities, in words.
     """
 
     seed: int
@@ -75,9 +75,9 @@ class Scene:
     """One run, drawn.
 
     Attributes:
-        plot: What stands there.
-        drive: How the cameras passed it.
-        mount: How they are mounted, nominally.
+        plot: The plants.
+        drive: Path and properties of the cameras.
+        mount: Their nominal mount.
         views: The pairs.
         masks: [F, H, W] bool, true masks.
     """
@@ -104,9 +104,9 @@ def score_scene(scene: Scene, mask: Mask | None = None, variant: Variant = DEFAU
     """Runs everything on a scene and compares.
 
     Args:
-        scene: What is seen.
-        mask: What finds the pixels of stalks; None for true masks.
-        variant: Which steps go as in the thesis.
+        scene: The pairs and the truth.
+        mask: Function that returns the mask of an image; None for true masks.
+        variant: Steps that follow the thesis.
     """
     painted: dict[int, np.ndarray] = {}
 
@@ -143,8 +143,8 @@ def in_world(perception: Perception, scene: Scene) -> np.ndarray:
     return scene.drive.poses[-1].to_world(scene.mount.pose.to_camera(points))
 
 
-def stretch_of(plot: Plot) -> tuple[float, float]:
-    """Where along the row the robot drives, m."""
+def driven_stretch(plot: Plot) -> tuple[float, float]:
+    """Return the two ends of the stretch of the row that the robot drives along, m."""
     length = plot.family.layout.plot_length
     stretch = plot.family.rig.stretch or length
     return 0.5 * (length - stretch), 0.5 * (length + stretch)
@@ -155,13 +155,13 @@ def match_stalks(targets: np.ndarray, plot: Plot) -> tuple[int, int, np.ndarray]
 
     Args:
         targets: [B, 3] in the plot's frame, m.
-        plot: What stands there.
+        plot: The plants.
 
     Returns:
         How many stalks there are in the stretch, how many grasp points, without those of stalks beyond it, and the distances
         [K] of those that hit, m.
     """
-    low, high = stretch_of(plot)
+    low, high = driven_stretch(plot)
     inside = np.array([low <= stalk.at_height(PREFERRED)[0][0] <= high for stalk in plot.measured], bool)
     distance = np.array(
         [[math.dist(target[:2], stalk.at_height(target[2])[0][:2]) for stalk in plot.measured] for target in targets]
@@ -175,7 +175,7 @@ def match_stalks(targets: np.ndarray, plot: Plot) -> tuple[int, int, np.ndarray]
 
 
 def true_motion(before: Pose, after: Pose, mount: Mount) -> Motion:
-    """How the robot frame of one pair lies in that of another one, by the true poses of their cameras."""
+    """Return the motion from the robot frame of one pair to that of another one, by the true poses of their cameras."""
     nominal = mount.pose
     rotation = nominal.rotation.T @ after.rotation @ before.rotation.T @ nominal.rotation
     origin = nominal.to_world(after.to_camera(before.to_world(nominal.to_camera(np.zeros(3)))))
@@ -211,7 +211,7 @@ def _between_outlines(painted: np.ndarray, true: np.ndarray) -> float:
 
 
 def summary(scores: Iterable[RunScore]) -> dict[str, Any]:
-    """What the scores of runs say together.
+    """Summarise the scores of runs.
 
     Returns:
         ``f1``, ``precision`` and ``recall`` of stalks, ``point_median_mm`` and ``point_p95_mm``, ``stitch_median_mm`` and

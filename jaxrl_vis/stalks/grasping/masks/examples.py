@@ -1,4 +1,4 @@
-"""What the generator learns from: left images of synthetic rows, and which of their pixels show a stalk of the near row."""
+"""Training examples of the generator: left images of synthetic rows, with masks of the stalks of the near row."""
 
 import dataclasses
 
@@ -37,9 +37,9 @@ def synthetic_examples(family: Family, seed: int, frames: int = 2) -> list[Examp
     """Examples of one row of a family.
 
     Args:
-        family: What the row is drawn from.
-        seed: Of the row.
-        frames: How many images of it; pairs that follow each other show nearly the same.
+        family: Family that the row is drawn from.
+        seed: Seed of the row.
+        frames: Number of images of it; consecutive pairs show nearly the same.
     """
     sequence = Sequence.of(draw(family, seed))
     length = len(sequence)

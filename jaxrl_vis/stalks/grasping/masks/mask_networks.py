@@ -15,7 +15,7 @@ class Generator(nn.Module):
     """A U-Net: images [N, H, W, 3] to [N, H, W, outputs]. H and W: multiples of 2 to the number of its levels.
 
     Attributes:
-        channels: Of each level; all but the first are multiples of 8.
+        channels: Channels of each level; all but the first are multiples of 8.
         outputs: 3 to paint (then between -1 and 1), 1 for logits.
         dtype: In which convolutions are computed.
     """
@@ -46,7 +46,7 @@ class Discriminator(nn.Module):
     """PatchGAN: for each patch of 70 x 70 pixels, whether a painting belongs to its image. Logits [N, h, w].
 
     Attributes:
-        channels: Of each layer; the last two keep the resolution.
+        channels: Channels of each layer; the last two keep the resolution.
         dtype: In which convolutions are computed.
     """
 

@@ -33,18 +33,18 @@ _RED = (1.0, -1.0, -1.0)
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """How long and how fast the generator learns.
+    """Schedule of the generator's training.
 
     Attributes:
         steps: Most updates.
         minutes: Most minutes, the drawing of the first images and compilation included; None for no limit.
-        images: How many images are kept to learn from.
+        images: Number of images to learn from.
         first: With how many the updates begin.
         batch: Crops per update.
         crop: Height and width of a crop, pixels.
         rate: Highest learning rate of the generator.
-        average: Of the generator's weights over updates: the share of the old ones.
-        seed: Of everything random.
+        average: Average of the generator's weights over updates: the share of the old ones.
+        seed: Seed of everything random.
     """
 
     steps: int = 20_000
@@ -64,7 +64,7 @@ def crops(examples: list[Example], rng: np.random.Generator, count: int, size: i
     Args:
         examples: To choose from.
         rng: Random numbers.
-        count: How many crops.
+        count: Number of crops.
         size: Their height and width, pixels; where an image is smaller, the rest is black.
 
     Returns:
@@ -147,11 +147,11 @@ def train(
     """Trains a generator.
 
     Args:
-        sources: Where examples come from; each is read by a thread of its own.
-        settings: What it is, and by what loss it learns.
-        plan: How long and how fast.
+        sources: Iterators over examples; each is read by a thread of its own.
+        settings: Settings of the generator, loss included.
+        plan: Schedule.
         report: See `Report`.
-        every: How often, s.
+        every: Interval of reports, s.
 
     Returns:
         The generator's parameters, averaged, and the number of updates.

@@ -25,11 +25,11 @@ _COMMAND = "jaxrl-vis grasp train"
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """What a generator is.
+    """Settings of a generator.
 
     Attributes:
-        loss: What it learned by: it paints, or gives logits.
-        channels: Of its levels.
+        loss: Loss that it learned by: it paints, or gives logits.
+        channels: Channels of its levels.
     """
 
     loss: Loss = "segmentation"
@@ -37,7 +37,7 @@ class Settings:
 
     @property
     def multiple(self) -> int:
-        """What height and width of an image must be multiples of."""
+        """Divisor of the height and width of an image."""
         return 2 ** len(self.channels)
 
     def generator(self, dtype: Any) -> Generator:
@@ -63,7 +63,7 @@ class Painter:
     """Finds the pixels of stalks.
 
     Attributes:
-        settings: Of its generator.
+        settings: Settings of its generator.
     """
 
     def __init__(self, params: Any, settings: Settings) -> None:
@@ -81,7 +81,7 @@ class Painter:
         self._paint = jax.jit(paint)
 
     def paint(self, image: np.ndarray) -> np.ndarray:
-        """What the generator makes of an image [H, W, 3] uint8: [H, W, 3] uint8, the image with its stalks in red."""
+        """Paint an image [H, W, 3] uint8: [H, W, 3] uint8, the image with its stalks in red."""
         result = self._run(image)
         if self.settings.loss == "gan":
             return result
@@ -90,7 +90,7 @@ class Painter:
         return painted
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
-        """Which pixels of an image [H, W, 3] uint8 show a stalk of the near row: [H, W] bool."""
+        """Return True for the pixels of an image [H, W, 3] uint8 that show a stalk of the near row: [H, W] bool."""
         result = self._run(image)
         return redness(result) > RED if self.settings.loss == "gan" else result
 

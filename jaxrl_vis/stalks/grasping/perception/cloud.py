@@ -20,10 +20,10 @@ RED = 0.5
 
 @dataclasses.dataclass(frozen=True)
 class Mount:
-    """How the pair is mounted, and the range of depths in which it is believed.
+    """Mount of the pair of cameras, and the range of depths in which it is trusted.
 
     Attributes:
-        height: Of the left camera above the ground, m.
+        height: Height of the left camera above the ground, m.
         pitch: By how much it looks down, degrees.
         nearest, farthest: Planar depths, m. What lies farther away belongs to the next row.
     """
@@ -68,7 +68,7 @@ class Cloud:
 
 
 def redness(painted: np.ndarray) -> np.ndarray:
-    """How red pixels [..., 3] uint8 are: [...] float32, 1 for pure red, at most 0 for grey."""
+    """Return the redness of pixels [..., 3] uint8: [...] float32, 1 for pure red, at most 0 for grey."""
     values = painted.astype(np.float32) / 255.0
     return values[..., 0] - np.maximum(values[..., 1], values[..., 2])
 
@@ -78,8 +78,8 @@ def match(left: np.ndarray, right: np.ndarray, calibration: Calibration, mount: 
 
     Args:
         left, right: [H, W, 3] or [H, W] uint8, rectified.
-        calibration: Of the pair.
-        mount: Which depths are looked for.
+        calibration: Calibration of the pair.
+        mount: Mount of the pair, with the range of depths to search.
 
     Returns:
         [H, W] float32, pixels; not a number where nothing matches.
@@ -116,8 +116,8 @@ def organised(disparity: np.ndarray, red: np.ndarray, calibration: Calibration, 
     Args:
         disparity: [H, W] float32, pixels; not a number where there is none.
         red: [H, W] bool, which pixels show stalks.
-        calibration: Of the pair.
-        mount: Of the pair.
+        calibration: Calibration of the pair.
+        mount: Mount of the pair.
     """
     with np.errstate(invalid="ignore"):
         depth = calibration.depth(disparity).astype(np.float32)
@@ -136,7 +136,7 @@ def thinned(points: np.ndarray, size: float) -> np.ndarray:
 
     Args:
         points: [N, 3], m.
-        size: Of a cube, m.
+        size: Size of a cube, m.
     """
     if not len(points):
         return points

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxrl_vis.stalks.grasping.perception.stalk_segments import Chords
-from jaxrl_vis.stalks.grasping.perception.visibility import Sight
+from jaxrl_vis.stalks.grasping.perception.stalk_segments import StalkSegments
+from jaxrl_vis.stalks.grasping.perception.visibility import Visibility
 
 HEIGHTS = (0.45, 1.05)
 """Heights at which stalks are grasped, m above the ground."""
@@ -27,9 +27,9 @@ class GraspPoint:
         point: [3] float64, middle of the stalk where it is to be grasped, in the robot frame of the last pair, m.
         direction: [3] float64, unit vector along the stalk there, upwards.
         thickness: Diameter there, m; not a number where it was not measured.
-        frames: How many pairs show it.
+        frames: Number of pairs that show it.
         spread: Standard deviation of what was seen around the line, horizontally, m; not a number where unknown.
-        bend: How much it turns, x and y, per m.
+        bend: Curvature, x and y, per m.
         taper: By how much its diameter grows for each m upwards, m.
     """
 
@@ -42,7 +42,7 @@ class GraspPoint:
     taper: float = 0.0
 
     def at_height(self, height: float | np.ndarray) -> np.ndarray:
-        """Where the stalk's line is at heights [...] in m: [..., 3], m."""
+        """Return the positions of the stalk's line at heights [...] in m: [..., 3], m."""
         up = np.asarray(height - self.point[2])[..., None]
         return self.point + self.direction * (up / self.direction[2]) + np.array([*self.bend, 0.0]) * up**2
 
@@ -71,7 +71,7 @@ _LEAST_BESIDE, _SHARE_BESIDE = 20, 0.2  # chords that lie beside each other, of 
 _APART_BESIDE = 0.008  # m
 
 
-class _Found(NamedTuple):
+class _Line(NamedTuple):
     """A line, the chords that it is made of, and how often pairs show it."""
 
     point: GraspPoint
@@ -79,16 +79,16 @@ class _Found(NamedTuple):
     shown: int
 
 
-def grasp_points(chords: Chords, sight: Sight, heights: tuple[float, float] = HEIGHTS) -> list[GraspPoint]:
+def grasp_points(chords: StalkSegments, visibility: Visibility, heights: tuple[float, float] = HEIGHTS) -> list[GraspPoint]:
     """Stalks and where to grasp them, from left to right.
 
     Args:
-        chords: Of all pairs, in one robot frame.
-        sight: What all pairs say of a place.
+        chords: Segments of all pairs, in one robot frame.
+        visibility: Visibility of places in all pairs.
         heights: Lowest and highest grasp, m above the ground.
     """
     free = np.ones(len(chords), bool)
-    lines: list[_Found] = []
+    lines: list[_Line] = []
     for seed in _seeds(chords):
         members = seed[free[seed]]
         if np.ptp(chords.middle[members, 2]) < _LEAST_PIECE if len(members) else True:
@@ -97,18 +97,18 @@ def grasp_points(chords: Chords, sight: Sight, heights: tuple[float, float] = HE
         if not len(members):
             continue
         free[members] = False
-        point = _grasp(chords, members, min(2, len(sight.clouds)), heights)
+        point = _grasp(chords, members, min(2, len(visibility.clouds)), heights)
         if point is None:
             continue
-        count = _agreed(point, sight)
+        count = _agreed(point, visibility)
         if count:
-            lines.append(_Found(point, members, count))
+            lines.append(_Line(point, members, count))
     lines.sort(key=lambda line: -line.shown)
     return sorted((line.point for line in _distinct(lines, chords)), key=lambda point: float(point.point[0]))
 
 
-def _seeds(chords: Chords) -> list[np.ndarray]:
-    """Chords of each piece, tall pieces first."""
+def _seeds(chords: StalkSegments) -> list[np.ndarray]:
+    """StalkSegments of each piece, tall pieces first."""
     order = np.argsort(chords.piece, kind="stable")
     parts = np.split(order, np.flatnonzero(np.diff(chords.piece[order])) + 1) if len(order) else []
     parts = [part for part in parts if len(part) >= 5]
@@ -143,7 +143,7 @@ def _robust(points: np.ndarray, bent: bool) -> tuple[np.ndarray, float]:
     return coefficients, middle
 
 
-def _grow(chords: Chords, members: np.ndarray, free: np.ndarray) -> np.ndarray:
+def _grow(chords: StalkSegments, members: np.ndarray, free: np.ndarray) -> np.ndarray:
     """All free chords along the line through some of them; none where that is no stalk."""
     candidates = np.flatnonzero(free)
     points = chords.middle[candidates]
@@ -164,7 +164,7 @@ def _grow(chords: Chords, members: np.ndarray, free: np.ndarray) -> np.ndarray:
     return members
 
 
-def _support(chords: Chords, members: np.ndarray) -> tuple[float, int]:
+def _support(chords: StalkSegments, members: np.ndarray) -> tuple[float, int]:
     """Length that is seen, summed over pairs, in m, and the number of pairs that see at least two heights of it."""
     bins = np.floor(chords.middle[members, 2] / _BIN).astype(int)
     occupied = np.unique(np.stack([chords.frame[members], bins], axis=1), axis=0)
@@ -172,8 +172,8 @@ def _support(chords: Chords, members: np.ndarray) -> tuple[float, int]:
     return _BIN * len(occupied), int((counts >= 2).sum())
 
 
-def _grasp(chords: Chords, members: np.ndarray, least_frames: int, heights: tuple[float, float]) -> GraspPoint | None:
-    """Where to grasp a stalk; None where too little of it is seen."""
+def _grasp(chords: StalkSegments, members: np.ndarray, least_frames: int, heights: tuple[float, float]) -> GraspPoint | None:
+    """Return the grasp point of a stalk; None if the pairs show too little of it."""
     length, frames = _support(chords, members)
     if length < _LEAST_SUPPORT or frames < least_frames:
         return None
@@ -213,19 +213,19 @@ def _taper(heights: np.ndarray, thickness: np.ndarray) -> float:
     return float((parts[0][1] - parts[1][1]) / (parts[0][0] - parts[1][0]))
 
 
-def _agreed(point: GraspPoint, sight: Sight) -> int:
-    """How often pairs show the stalk along its line; 0 where fewer than two do, or too many see through it."""
+def _agreed(point: GraspPoint, visibility: Visibility) -> int:
+    """Count the places along a stalk's line at which pairs show it; 0 if fewer than two pairs do, or too many see through."""
     places = point.point[2] + np.arange(-_AROUND, _AROUND, 0.5 * _BIN)
-    shown, through = sight.look(point.at_height(places))
+    shown, through = visibility.query(point.at_height(places))
     count = int(shown.sum())
     frames = int((shown.sum(axis=1) >= _LEAST_SHOWN).sum())
-    agreed = frames >= min(2, len(sight.clouds)) and count >= _LEAST_SHARE * (count + through.sum())
+    agreed = frames >= min(2, len(visibility.clouds)) and count >= _LEAST_SHARE * (count + through.sum())
     return count if agreed else 0
 
 
-def _distinct(lines: list[_Found], chords: Chords) -> list[_Found]:
+def _distinct(lines: list[_Line], chords: StalkSegments) -> list[_Line]:
     """Without lines that are the same stalk as one before them."""
-    distinct: list[_Found] = []
+    distinct: list[_Line] = []
     for line in lines:
         if not any(_same(line.point, other.point) and not _beside(chords, line, other) for other in distinct):
             distinct.append(line)
@@ -233,15 +233,15 @@ def _distinct(lines: list[_Found], chords: Chords) -> list[_Found]:
 
 
 def _same(point: GraspPoint, other: GraspPoint) -> bool:
-    """Whether a line is likely the same stalk as another one that is seen better."""
+    """Return True if a line is probably the same stalk as another one that pairs show better."""
     up = point.point[2] - other.point[2]
     distance = float(np.linalg.norm((point.point - other.at_height(point.point[2]))[:2]))
     # What is left of a stalk beside its line is near it, and scatters.
     return distance < _APART + _BEND * abs(up) or (distance < _REST_WITHIN and point.spread > _REST_SPREAD)
 
 
-def _beside(chords: Chords, one: _Found, other: _Found) -> bool:
-    """Whether pairs show two lines beside each other at the same heights: then they are two stalks, however near."""
+def _beside(chords: StalkSegments, one: _Line, other: _Line) -> bool:
+    """Return True if pairs show two lines beside each other at the same heights: then they are two stalks, however near."""
     apart = [np.zeros(0)]
     for frame in np.intersect1d(chords.frame[one.members], chords.frame[other.members]):
         mine, theirs = (chords.middle[line.members[chords.frame[line.members] == frame]] for line in (one, other))

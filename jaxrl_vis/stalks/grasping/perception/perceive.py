@@ -19,9 +19,9 @@ import numpy as np
 from jaxrl_vis.stalks.grasping.perception.cloud import Cloud, Mount, match, organised
 from jaxrl_vis.stalks.grasping.perception.lines import GraspPoint, grasp_points
 from jaxrl_vis.stalks.grasping.perception.slices import slice_points
-from jaxrl_vis.stalks.grasping.perception.stalk_segments import chords_of, joined
+from jaxrl_vis.stalks.grasping.perception.stalk_segments import joined, stalk_segments
 from jaxrl_vis.stalks.grasping.perception.stitch import DEFAULT, THESIS, Motion, Stitch, Thinned, stitch
-from jaxrl_vis.stalks.grasping.perception.visibility import Sight
+from jaxrl_vis.stalks.grasping.perception.visibility import Visibility
 from jaxrl_vis_envs.plants import Calibration
 
 Mask = Callable[[np.ndarray, int], np.ndarray]
@@ -33,9 +33,9 @@ class View:
     """One pair that can be used.
 
     Attributes:
-        number: Which of the run's pairs it is.
+        number: Index of the pair in the run.
         left, right: [H, W, 3] uint8, rectified.
-        driven: How far the robot had driven, m; None where nothing says so.
+        driven: Distance that the robot had driven, m; None if unknown.
     """
 
     number: int
@@ -46,15 +46,15 @@ class View:
 
 @dataclasses.dataclass(frozen=True)
 class Perception:
-    """What is known of a run.
+    """Perception of a run.
 
     Attributes:
         clouds: One for each pair that was used, in its own robot frame.
         stitches: One for each but the last: to the pair that follows.
         to_last: One for each cloud: to the robot frame of the last one.
-        points: Where stalks can be grasped, in the robot frame of the last pair, from left to right.
+        points: Grasp points, in the robot frame of the last pair, from left to right.
         seconds: Time spent, by stage.
-        notes: What was not as it should be, one line each.
+        notes: Irregularities, a line each.
     """
 
     clouds: tuple[Cloud, ...]
@@ -71,7 +71,7 @@ class Perception:
 
 @dataclasses.dataclass(frozen=True)
 class Variant:
-    """Which steps go as the thesis describes them, in place of the default.
+    """Choice of the steps that follow the thesis in place of the default.
 
     Attributes:
         stitch: The stitching of clouds.
@@ -97,10 +97,10 @@ def perceive(
 
     Args:
         views: The pairs in the order in which they were taken; at least one.
-        mask: What finds the pixels of stalks.
-        calibration: Of the pair, as far as it is known.
-        mount: Of the pair.
-        variant: Which steps go as in the thesis.
+        mask: Function that returns the mask of an image.
+        calibration: Calibration of the pair, as far as it is known.
+        mount: Mount of the pair.
+        variant: Steps that follow the thesis.
 
     Raises:
         ValueError: There is no pair.
@@ -140,17 +140,17 @@ def perceive(
                 points = slice_points(np.concatenate([motion(cloud.red_points()) for motion, cloud in zip(to_last, clouds)]))
             else:
                 segments = side_by_side(
-                    lambda cloud, frame: chords_of(cloud, calibration, mount, frame), clouds, range(len(clouds))
+                    lambda cloud, frame: stalk_segments(cloud, calibration, mount, frame), clouds, range(len(clouds))
                 )
                 parts = [dataclasses.replace(part, middle=motion(part.middle)) for motion, part in zip(to_last, segments)]
-                points = grasp_points(joined(parts), Sight(tuple(clouds), tuple(to_last), calibration, mount))
+                points = grasp_points(joined(parts), Visibility(tuple(clouds), tuple(to_last), calibration, mount))
     if not points:
         notes.append("no stalk was found")
     return Perception(tuple(clouds), tuple(stitches), tuple(to_last), points, seconds, tuple(notes))
 
 
 def _driven(here: View, there: View) -> float:
-    """How far the robot drove between two pairs, m; 0 where nothing says so."""
+    """Return the distance that the robot drove between two pairs, m; 0 if it is not known."""
     return 0.0 if here.driven is None or there.driven is None else there.driven - here.driven
 
 

@@ -1,4 +1,4 @@
-"""Where lines of an image cross stalks: the middle of each stalk in space, line by line.
+"""Segments of image lines on stalks: the middle of each stalk in space, line by line.
 
 Line by line, painted pixels that are next to each other and about equally far away are one chord of a stalk. Its middle column
 says in which direction the stalk is, its depth how far its front is, and its length how thick it is, so that the middle of the
@@ -25,8 +25,8 @@ _SIDEWAYS = 3.0  # pixels: by how much a stalk moves from one line to the next
 
 
 @dataclasses.dataclass(frozen=True)
-class Chords:
-    """Chords of one image or of several.
+class StalkSegments:
+    """StalkSegments of one image or of several.
 
     Attributes:
         middle: [N, 3] float64, middle of the stalk, m.
@@ -44,7 +44,7 @@ class Chords:
         return len(self.thickness)
 
 
-def chords_of(cloud: Cloud, calibration: Calibration, mount: Mount, frame: int) -> Chords:
+def stalk_segments(cloud: Cloud, calibration: Calibration, mount: Mount, frame: int) -> StalkSegments:
     """The chords of one pair, in its own robot frame."""
     red, depth = cloud.red[::STEP], cloud.depth[::STEP]
     with np.errstate(invalid="ignore"):
@@ -74,15 +74,15 @@ def chords_of(cloud: Cloud, calibration: Calibration, mount: Mount, frame: int) 
         axis=1,
     )
     points = rays * (far + _BEHIND_FRONT * 0.5 * thickness)[:, None]
-    return Chords(mount.pose.to_world(points), thickness, np.full(len(line), frame), piece)
+    return StalkSegments(mount.pose.to_world(points), thickness, np.full(len(line), frame), piece)
 
 
-def joined(parts: list[Chords]) -> Chords:
-    """Chords of several pairs, in one frame; pieces stay apart."""
+def joined(parts: list[StalkSegments]) -> StalkSegments:
+    """StalkSegments of several pairs, in one frame; pieces stay apart."""
     if not parts:
         return _nothing()
     counts = np.cumsum([0, *(int(part.piece.max(initial=-1)) + 1 for part in parts)])
-    return Chords(
+    return StalkSegments(
         np.concatenate([part.middle for part in parts]),
         np.concatenate([part.thickness for part in parts]),
         np.concatenate([part.frame for part in parts]),
@@ -90,8 +90,8 @@ def joined(parts: list[Chords]) -> Chords:
     )
 
 
-def _nothing() -> Chords:
-    return Chords(np.zeros((0, 3)), np.zeros(0), np.zeros(0, int), np.zeros(0, int))
+def _nothing() -> StalkSegments:
+    return StalkSegments(np.zeros((0, 3)), np.zeros(0), np.zeros(0, int), np.zeros(0, int))
 
 
 def _middle_depth(depth: np.ndarray, first: np.ndarray, last: np.ndarray) -> np.ndarray:

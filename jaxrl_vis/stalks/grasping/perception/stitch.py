@@ -41,7 +41,7 @@ class Motion:
         return Motion(self.rotation @ first.rotation, self.rotation @ first.shift + self.shift)
 
     def inverse(self) -> "Motion":
-        """What undoes it."""
+        """Return the inverse motion."""
         return Motion(self.rotation.T, -self.rotation.T @ self.shift)
 
     @property
@@ -52,7 +52,7 @@ class Motion:
 
 @dataclasses.dataclass(frozen=True)
 class Method:
-    """How clouds are stitched.
+    """Method of stitching clouds.
 
     Attributes:
         voxel: Edge of the cubes of the grid, m.
@@ -95,7 +95,7 @@ _STILL = 0.01  # of the gate, m, and the same in rad: what moves less has arrive
 
 @dataclasses.dataclass(frozen=True)
 class Stitch:
-    """How one cloud was laid on the next.
+    """Result of stitching one cloud to the next.
 
     Attributes:
         motion: From the robot frame of one pair to that of the next one.
@@ -138,8 +138,8 @@ def stitch(source: Thinned, target: Thinned, driven: float, method: Method = DEF
 
     Args:
         source, target: Points in the robot frame of their own pair.
-        driven: How far the robot moved along the row in between, m, as its odometry says.
-        method: How.
+        driven: Distance that the robot moved along the row in between, m, by its odometry.
+        method: Method of stitching.
     """
     prior = Motion.along(-driven)
     start = prior if method.from_odometry else Motion.along(0.0)
@@ -174,8 +174,8 @@ def closest_points(source: np.ndarray, target: Thinned, start: Motion, method: M
 
     Args:
         source: [N, 3], m.
-        target: What they are laid on.
-        start: Where to begin.
+        target: Cloud that they are laid on.
+        start: Motion to begin with.
         method: Gates and steps.
 
     Returns:

@@ -1,4 +1,4 @@
-"""What all pairs say of a place: whether they show a stalk there, or see through it to something farther away."""
+"""Visibility of a place in all pairs: they show a stalk there, or see through it to something farther away."""
 
 import dataclasses
 
@@ -13,14 +13,14 @@ _THROUGH = 0.035  # m: a depth that is greater by more lies behind it
 
 
 @dataclasses.dataclass(frozen=True)
-class Sight:
+class Visibility:
     """The clouds of a run, stitched.
 
     Attributes:
         clouds: One for each pair, in its own robot frame.
         to_last: One for each cloud: to the robot frame of the last one.
-        calibration: Of the pair.
-        mount: Of the pair.
+        calibration: Calibration of the pair.
+        mount: Mount of the pair.
     """
 
     clouds: tuple[Cloud, ...]
@@ -28,8 +28,8 @@ class Sight:
     calibration: Calibration
     mount: Mount
 
-    def look(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Whether each pair shows a stalk at each point, and whether it sees through it.
+    def query(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return True where a pair shows a stalk at a point, and True where it sees through the point.
 
         Neither is so where a point is outside the image, hidden by something nearer, or without a depth.
 

@@ -22,10 +22,10 @@ def draw_path(path: Path, stands: Stands, targets: np.ndarray, result: ReachResu
 
     Args:
         path: A .png, or any other format that matplotlib can write.
-        stands: Of the reaches.
+        stands: Stands of the reaches.
         targets: [B, 3], m in the plot's frame.
-        result: What came of them.
-        index: Which reach.
+        result: Their results.
+        index: Index of the reach.
     """
     figure = Figure(figsize=(9.0, 5.4), dpi=150, facecolor="white")
     grid = figure.add_gridspec(2, 2, width_ratios=(1.2, 1), hspace=0.35, wspace=0.25)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxrl_vis.stalks.grasping.evaluation.scoring import Scene, draw_scene, stretch_of
+from jaxrl_vis.stalks.grasping.evaluation.scoring import Scene, draw_scene, driven_stretch
 from jaxrl_vis.stalks.grasping.perception.lines import PREFERRED
 from jaxrl_vis.stalks.grasping.perception.perceive import Mask, Perception, perceive
 from jaxrl_vis.stalks.grasping.perception.slices import CELL, THICKNESS, slice_at
@@ -22,10 +22,10 @@ def draw_figure(out: Path, family: Family, seed: int, mask: Mask | None, name: s
 
     Args:
         out: The file, .png, .pdf or .svg.
-        family: What the row is drawn from.
-        seed: Of the row.
-        mask: What finds the pixels of stalks; None for true masks.
-        name: Of that, for the title.
+        family: Family that the row is drawn from.
+        seed: Seed of the row.
+        mask: Function that returns the mask of an image; None for true masks.
+        name: Name of the masks, for the title.
 
     Raises:
         OSError: The file cannot be written.
@@ -93,7 +93,7 @@ def _slice(above: Any, below: Any, red: np.ndarray, scene: Scene, perception: Pe
     shown = np.where(slice_.regions > 0, (slice_.regions * 7) % 20 + 1, 0).astype(float)
     shown[slice_.regions == 0] = np.nan
     below.imshow(shown.T, origin="lower", extent=extent, cmap="tab20", interpolation="nearest")
-    true, inside = [], stretch_of(scene.plot)
+    true, inside = [], driven_stretch(scene.plot)
     for stalk in scene.plot.measured:
         middle = stalk.at_height(PREFERRED)[0]
         if inside[0] <= middle[0] <= inside[1]:

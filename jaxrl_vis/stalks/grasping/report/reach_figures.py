@@ -35,10 +35,10 @@ def draw_reach(
 
     Args:
         out: The file of the figure.
-        family: What the row is drawn from.
-        seed: Of the row.
-        mask: What finds the pixels of stalks; None for true masks.
-        wind_mm: How far stalks sway, mm.
+        family: Family that the row is drawn from.
+        seed: Seed of the row.
+        mask: Function that returns the mask of an image; None for true masks.
+        wind_mm: Amplitude of the stalks' sway, mm.
         video: A .gif, .mp4 or .html file.
         size: Height and width of its images, px.
 
@@ -96,10 +96,10 @@ def draw_grasps(out: Path, records: Sequence[Record], name: str, score: Score, t
 
     Args:
         out: The file.
-        records: Of the runs.
-        name: Of the reaches that are shown, in their records.
-        score: Of these.
-        title: What was simulated.
+        records: Records of the runs.
+        name: Kind of reaches, as their records name it.
+        score: Their score.
+        title: Description of the simulation.
     """
     figure = Figure(figsize=(11.0, 5.6), dpi=150, facecolor="white")
     axes = figure.add_axes((0.07, 0.13, 0.58, 0.7))

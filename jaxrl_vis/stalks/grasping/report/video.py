@@ -30,10 +30,10 @@ def write_reaches(
 
     Args:
         path: A .gif, .mp4 or .html file.
-        stands: Of all reaches.
-        result: What came of them.
+        stands: Stands of all reaches.
+        result: Their results.
         targets: [B], index of the stalk that each was for.
-        chosen: Which to show.
+        chosen: Indices of the reaches to show.
         size: Height and width of the image, px.
 
     Raises:
@@ -54,7 +54,7 @@ def write_reaches(
 
 
 def reach_frames(stands: Stands, result: ReachResult, index: int, size: int) -> np.ndarray:
-    """What the camera sees of one reach: [F, size, size, 3] uint8, ``2 * result.interval`` s apart."""
+    """Render the camera's view of one reach: [F, size, size, 3] uint8, ``2 * result.interval`` s apart."""
     shape = jax.tree.map(lambda part: part[index], bending.shapes(stands))
     draw = _program(stands.stalk.shape[1], size)
     return np.stack([np.asarray(draw(shape, pose)) for pose in result.poses[index, ::_EVERY]])
@@ -78,7 +78,7 @@ def _program(stalks: int, size: int) -> Any:
 
 
 def _deed(time: float, held: set[int], is_alone: bool) -> str:
-    """What the arm is about."""
+    """Return a caption of the arm's action at a time, s."""
     timing = Timing()
     if time < timing.turn:
         return "turns"

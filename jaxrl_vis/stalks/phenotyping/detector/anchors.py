@@ -1,4 +1,4 @@
-"""Where stalks are looked for, and boxes in codes relative to that.
+"""Anchors at which stalks are looked for, and codes of boxes relative to them.
 
 A stalk in the band is a box and an axis: six numbers, left, top, right, bottom, and the columns of its middle at the box's top
 and bottom. Coded relative to a box: offset of the middle (of its size), logarithm of both sizes, offsets of the axis (of its
@@ -15,13 +15,13 @@ _MOST = 2.0  # of a logarithm of a size, so that nothing overflows
 _UNIT = np.array([0.2, 0.1, 0.3, 0.1, 0.3, 0.3], np.float32)  # about the spread of each code, so that all count alike
 
 
-def anchors_of(shape: tuple[int, int], heights: float, widths: tuple[float, ...]) -> np.ndarray:
+def make_anchors(shape: tuple[int, int], heights: float, widths: tuple[float, ...]) -> np.ndarray:
     """Anchors [K, 6] float32 of an image of ``shape`` (lines, columns), in the order of `Detector.propose`.
 
     Args:
         shape: Multiples of the networks' padding.
-        heights: Of all anchors, pixels: the band's.
-        widths: Of the anchors of a place, pixels.
+        heights: Height of all anchors, pixels: the band's.
+        widths: Widths of the anchors of a place, pixels.
     """
     lines, columns = (-(-length // stride) for length, stride in zip(shape, ANCHOR_STRIDE))
     y = (np.arange(lines) + 0.5) * ANCHOR_STRIDE[0]
@@ -50,5 +50,5 @@ def decode(codes: jax.Array, others: jax.Array) -> jax.Array:
 
 
 def _middle_and_size(stalks: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Of the boxes of stalks [..., 6]: both [..., 2], across and down."""
+    """Return the middles and sizes of the boxes of stalks [..., 6]: both [..., 2], across and down."""
     return 0.5 * (stalks[..., :2] + stalks[..., 2:4]), jnp.maximum(stalks[..., 2:4] - stalks[..., :2], 1e-3)

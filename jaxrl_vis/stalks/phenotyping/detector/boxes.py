@@ -54,7 +54,7 @@ def suppress(overlaps: jax.Array, scores: jax.Array, threshold: float, valid: ja
 
 
 def band_overlap(first: jax.Array, second: jax.Array, lines: int = 8) -> jax.Array:
-    """How much of each other stalks cover, [N, M]: intersection over union of the strips that they are, not of their boxes.
+    """Return the overlap of stalks, [N, M]: intersection over union of the strips that they are, not of their boxes.
 
     Boxes of two parallel stalks that lean overlap by half, though the stalks stand apart; strips do not. Both are compared at
     the same heights of the band.
@@ -103,7 +103,7 @@ def roi_align(
         size: Lines and columns of the grid.
         scale: From the boxes' coordinates to those of the features; (vertical, horizontal) where they differ.
         samples: Points in each direction of a cell of the grid, of which the mean is taken.
-        aligned: Whether the middle of the first feature lies at 0.5, as of the first pixel. If not, a box is at least one
+        aligned: The middle of the first feature lies at 0.5, as of the first pixel. If not, a box is at least one
             feature wide and tall.
         lean: [N], by how much more a box's bottom is moved to the right than its top, about its middle: a box that leans, of
             which each line of the grid stays level. None for upright boxes.
@@ -117,7 +117,7 @@ def roi_align(
     scaled = boxes * jnp.array([horizontal, vertical, horizontal, vertical], boxes.dtype) - shift
 
     def weights(low: jax.Array, high: jax.Array, cells: int, length: int) -> jax.Array:
-        """How much each of ``length`` features counts in each cell: [..., cells, length] for low and high [...]."""
+        """Return the weights of ``length`` features in each cell: [..., cells, length] for low and high [...]."""
         extent = high - low if aligned else jnp.maximum(high - low, 1.0)
         share = (jnp.arange(cells * samples) + 0.5) / (cells * samples)
         place = low[..., None] + extent[..., None] * share

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis.stalks.phenotyping.detector.anchors import anchors_of, decode
+from jaxrl_vis.stalks.phenotyping.detector.anchors import decode, make_anchors
 from jaxrl_vis.stalks.phenotyping.detector.boxes import band_overlap, roi_align, strip_half_width, suppress
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import PADDING, STRIDE, Detector
 
@@ -18,7 +18,7 @@ GRID = (14, 7)
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """What is fixed with the weights, and kept beside them.
+    """Settings that are fixed with the weights, and stored beside them.
 
     Attributes:
         width: Pixels to which the width of an image is reduced before stalks are looked for; narrower ones stay as they are.
@@ -26,16 +26,16 @@ class Settings:
             smaller in proportion.
         snip_lines, snip_columns: Size of a snip.
         band_lines: Height of the band in an image that was reduced, pixels.
-        anchor_widths: Of the boxes that are proposed, pixels there.
-        channels, hidden: Of the detector; see `networks.Detector`.
+        anchor_widths: Widths of the boxes that are proposed, pixels there.
+        channels, hidden: Sizes of the detector; see `networks.Detector`.
         segmenter: Channels of the segmentation.
-        candidates: How many of the boxes that score best are looked through for proposals. Most are copies of stalks that are
-            easy: among 480, two thirds of the stalks that were missed on crowded images had none.
-        proposals: How many proposals are judged.
-        most: How many stalks an image may show.
+        candidates: Number of the boxes with the best scores that are looked through for proposals. Most are copies of easy
+            stalks: among 480, two thirds of the stalks that were missed on crowded images had none.
+        proposals: Number of proposals that are judged.
+        most: Greatest number of stalks in an image.
         proposal_threshold: Overlap of strips above which only one is proposed.
         threshold: Overlap of strips above which two finds are one stalk.
-        least_score: What is no find.
+        least_score: Lowest score of a detection.
     """
 
     width: int = 844
@@ -88,7 +88,7 @@ def normalise(images: jax.Array) -> jax.Array:
     return 2.0 * jnp.sqrt(images.astype(jnp.float32) / 255.0) - 1.0
 
 
-def regions_of(features: jax.Array, stalks: jax.Array) -> jax.Array:
+def region_features(features: jax.Array, stalks: jax.Array) -> jax.Array:
     """Features [R, *GRID, C] along stalks [R, 6] of an image whose features are [H, W, C].
 
     A region follows the axis, so that a stalk that leans stands upright in it: in a clump, two that lean differently have about
@@ -113,7 +113,7 @@ def best_proposals(
         logits: [K] of the anchors.
         codes: [K, 6].
         anchors: [K, 6].
-        settings: How many, and what is a copy.
+        settings: Number of proposals, and the overlap of copies.
         shape: Lines and columns of the image; what reaches beyond it is cut off.
 
     Returns:
@@ -151,8 +151,8 @@ def heads(
 def judge(
     network: Detector, params: Any, features: jax.Array, proposals: jax.Array, valid: jax.Array, settings: Settings
 ) -> Found:
-    """What the head says of proposals [P, 6] of one image with features [H, W, C]: stalks, less what is found twice."""
-    logits, codes = heads(network, params, regions_of(features, proposals), "judge_all")
+    """Judge proposals [P, 6] of one image with features [H, W, C]: stalks, without duplicates."""
+    logits, codes = heads(network, params, region_features(features, proposals), "judge_all")
     stalks, scores = decode(codes, proposals), jax.nn.sigmoid(logits)
     valid = valid & (scores >= settings.least_score)
     selected = suppress(band_overlap(stalks, stalks), jnp.where(valid, scores, -1.0), settings.threshold, valid)
@@ -165,14 +165,14 @@ def detect(params: Any, image: jax.Array, settings: Settings, dtype: Any = jnp.f
     """Stalks in one image.
 
     Args:
-        params: Of the detector.
+        params: Parameters of the detector.
         image: [H, W, 3] uint8, reduced, padded to multiples of the networks' padding.
         settings: Beside the weights.
         dtype: In which convolutions are computed.
     """
     network = settings.detector(dtype)
     shape = (image.shape[0], image.shape[1])
-    anchors = jnp.asarray(anchors_of(shape, settings.band_lines, settings.anchor_widths))
+    anchors = jnp.asarray(make_anchors(shape, settings.band_lines, settings.anchor_widths))
     features = network.apply(params, normalise(image)[None], method="features")
     assert isinstance(features, jax.Array)
     logits, codes = heads(network, params, features, "propose")

@@ -13,7 +13,7 @@ STRIDE = (8, 4)
 ANCHOR_STRIDE = (16, 4)
 """The same per place at which boxes are proposed."""
 PADDING = 32
-"""What height and width of an image must be multiples of."""
+"""Divisor of the height and width of an image."""
 
 
 class Block(nn.Module):
@@ -40,7 +40,7 @@ class Detector(nn.Module):
     """Backbone and proposals, and the head that judges them.
 
     Attributes:
-        channels: Of the finest to the coarsest level; multiples of 8.
+        channels: Channels of the finest to the coarsest level; multiples of 8.
         hidden: Units of the box head.
         anchors: Boxes that are proposed in each place.
         dtype: In which convolutions are computed.

@@ -16,8 +16,8 @@ Piece = tuple[np.ndarray, tuple[int, int]]
 """A mask [h, w] in a part of the image, and line and column of its first pixel there."""
 
 
-def found_once(pieces: Sequence[Piece], scores: np.ndarray, most_shared: float = MOST_SHARED) -> np.ndarray:
-    """Which finds to keep: the best goes first, and takes away those whose masks it shares.
+def without_duplicates(pieces: Sequence[Piece], scores: np.ndarray, most_shared: float = MOST_SHARED) -> np.ndarray:
+    """Return the detections to keep: the best goes first, and removes those whose masks it shares.
 
     Args:
         pieces: N masks, float32 from 0 to 1 or bool, and where they are.

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, detect, pad
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
-from jaxrl_vis.stalks.phenotyping.detector.doubles import found_once
+from jaxrl_vis.stalks.phenotyping.detector.doubles import without_duplicates
 from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import cut, put_back, smoothed, snip_shape
 from jaxrl_vis.stalks.phenotyping.measure.width import Strip, strip_width
 from jaxrl_vis_envs.plants.truth import BAND, HEIGHTS
@@ -73,7 +73,7 @@ def in_image(stalks: np.ndarray, scale: tuple[float, float]) -> np.ndarray:
 
 
 @functools.partial(jax.jit, static_argnums=(2, 3, 4))
-def _masks_of(params: Any, snips: jax.Array, settings: Settings, dtype: Any, full: tuple[int, int]) -> jax.Array:
+def _segment(params: Any, snips: jax.Array, settings: Settings, dtype: Any, full: tuple[int, int]) -> jax.Array:
     """Chances [N, h, w] float32 that pixels of snips [N, h, w, 3] uint8 show the stalk in the middle.
 
     Snips of smaller images are enlarged to the ``full`` size: the network knows stalks that are as many pixels wide as there.
@@ -91,7 +91,7 @@ class Finder:
     Args:
         params: With ``detector`` and ``segmenter``.
         settings: Beside the weights.
-        least_score: What is no find; 0.5 balances what is missed against what is made up.
+        least_score: Lowest score of a detection; 0.5 balances misses against false detections.
 
     Attributes:
         dtype: In which convolutions are computed.
@@ -112,7 +112,7 @@ class Finder:
         stalks, scores = in_image(stalks_found.stalks[selected], scale), stalks_found.scores[selected]
         on_device = jnp.asarray(image)
         pieces = self._pieces(on_device, stalks, self._settings.snip_lines)
-        once = np.flatnonzero(found_once(pieces, scores))
+        once = np.flatnonzero(without_duplicates(pieces, scores))
         stalks, scores, pieces = stalks[once], scores[once], [pieces[place] for place in once]
         strips = [strip_width(mask) if mask.size else None for mask, _ in pieces]
         higher = [_follow(stalk, strip, corner) for stalk, strip, (_, corner) in zip(stalks, strips, pieces)]
@@ -145,12 +145,12 @@ class Finder:
             part = stalks[start : start + self._batch]
             filled = np.pad(part, ((0, self._batch - len(part)), (0, 0)), mode="edge")
             snips = cut(on_device, filled, shape)
-            masks.append(_masks_of(self._params["segmenter"], snips, settings, self.dtype, full))
+            masks.append(_segment(self._params["segmenter"], snips, settings, self.dtype, full))
         return np.concatenate(jax.device_get(masks))[: len(stalks)]
 
 
 def _follow(stalk: np.ndarray, strip: Strip | None, corner: tuple[int, int]) -> np.ndarray | None:
-    """Where a stalk's upper piece [6] is, by the edges of its mask in the band; None if that is not in the image."""
+    """Return a stalk's upper piece [6], by the edges of its mask in the band; None if it is not in the image."""
     if strip is None:
         return None
     # Half a pixel: stalks are in continuous coordinates.

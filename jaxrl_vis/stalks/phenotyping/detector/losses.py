@@ -1,4 +1,4 @@
-"""What the networks learn from: which boxes are stalks, where those are, and which pixels are theirs."""
+"""Losses of the networks: the boxes that are stalks, their positions, and their pixels."""
 
 from typing import Any
 
@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from jaxrl_vis.stalks.phenotyping.detector.anchors import anchors_of, encode
+from jaxrl_vis.stalks.phenotyping.detector.anchors import encode, make_anchors
 from jaxrl_vis.stalks.phenotyping.detector.boxes import band_overlap, overlap
-from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, best_proposals, heads, normalise, regions_of
+from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, best_proposals, heads, normalise, region_features
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import smoothed
 
@@ -17,7 +17,7 @@ NOTHING, UNCLEAR, STALK = 0, 1, 2
 
 
 def assign(overlaps: jax.Array, kinds: jax.Array, positive: float, negative: float) -> tuple[jax.Array, ...]:
-    """Which stalk each box belongs to.
+    """Assign boxes to stalks.
 
     Args:
         overlaps: [K, T] of boxes and true stalks.
@@ -46,17 +46,17 @@ def detector_loss(
     """Loss of proposals and of the head, mean over images.
 
     Args:
-        params: Of the detector.
+        params: Parameters of the detector.
         images: [N, H, W, 3] uint8, reduced and padded.
         truth: [N, T, 6] stalks.
         kinds: [N, T] int32.
-        settings: Of the networks.
+        settings: Settings of the networks.
         dtype: In which convolutions are computed.
-        key: Of the boxes around true ones that the head sees beside the proposals.
+        key: Key of the boxes around true ones that the head sees beside the proposals.
     """
     network = settings.detector(dtype)
     shape = (images.shape[1], images.shape[2])
-    anchors = jnp.asarray(anchors_of(shape, settings.band_lines, settings.anchor_widths))
+    anchors = jnp.asarray(make_anchors(shape, settings.band_lines, settings.anchor_widths))
     features = network.apply(params, normalise(images), method="features")
     assert isinstance(features, jax.Array)
     logits, codes = heads(network, params, features, "propose")
@@ -75,7 +75,7 @@ def detector_loss(
         alike = 0.5 * (overlap(proposals[:, :4], truth[:, :4]) + band_overlap(proposals, truth))
         which, shows, none = assign(alike, kinds, 0.5, 0.45)
         shows, none = shows & valid, none & valid
-        judged, refined = heads(network, params, regions_of(features, proposals), "judge_all")
+        judged, refined = heads(network, params, region_features(features, proposals), "judge_all")
         weight = (shows | none).astype(jnp.float32)
         right = optax.sigmoid_binary_cross_entropy(judged, shows.astype(jnp.float32))
         judgement = (right * weight).sum() / jnp.maximum(weight.sum(), 1.0)
@@ -104,10 +104,10 @@ def segmenter_loss(params: Any, snips: jax.Array, masks: jax.Array, settings: Se
     """Cross entropy and Dice loss of the masks of snips.
 
     Args:
-        params: Of the segmentation.
+        params: Parameters of the segmentation.
         snips: [N, h, w, 3] uint8.
         masks: [N, h, w] bool.
-        settings: Of the networks.
+        settings: Settings of the networks.
         dtype: In which convolutions are computed.
     """
     logits = Segmenter(settings.segmenter, dtype).apply(params, smoothed(snips))

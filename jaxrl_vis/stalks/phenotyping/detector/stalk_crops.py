@@ -19,16 +19,16 @@ def snip_shape(width: int, full: tuple[int, int], full_width: int) -> tuple[int,
     """Lines and columns of snips of an image ``width`` pixels wide: multiples of 8.
 
     Args:
-        width: Of the image.
-        full: Of the snips of an image that is ``full_width`` wide.
+        width: Width of the image.
+        full: Shape of the snips of an image that is ``full_width`` wide.
         full_width: Pixels.
     """
     lines, columns = (max(round(length * width / full_width / 8), 2) * 8 for length in full)
     return lines, columns
 
 
-def places_of(stalks: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Which pixels of the image snips hold. Computed on the host, once for cutting out and for putting back.
+def crop_places(stalks: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pixels of the image that crops hold. Computed on the host, once for cutting out and for putting back.
 
     Args:
         stalks: [N, 6], box and columns of the axis at its top and bottom, continuous coordinates of the image.
@@ -51,11 +51,11 @@ def cut(image: jax.Array, stalks: np.ndarray, shape: tuple[int, int]) -> jax.Arr
     """Snips [N, lines, columns, ...] of an image [H, W, ...]; 0 beyond the image.
 
     Args:
-        image: Of any type.
-        stalks: [N, 6]; see `places_of`.
+        image: Image of any type.
+        stalks: [N, 6]; see `crop_places`.
         shape: Lines and columns of a snip.
     """
-    return _cut(image, *places_of(stalks, shape), shape[1])
+    return _cut(image, *crop_places(stalks, shape), shape[1])
 
 
 @functools.partial(jax.jit, static_argnums=3)
@@ -90,7 +90,7 @@ def put_back(snip: np.ndarray, stalk: np.ndarray, size: tuple[int, int]) -> tupl
     Returns:
         [h, w] float32, 0 where the snip holds nothing, and line and column of its first pixel in the image.
     """
-    top, left = (edge[0] for edge in places_of(stalk[None], (snip.shape[0], snip.shape[1])))
+    top, left = (edge[0] for edge in crop_places(stalk[None], (snip.shape[0], snip.shape[1])))
     columns = snip.shape[1]
     used = np.flatnonzero((top + np.arange(snip.shape[0]) >= 0) & (top + np.arange(snip.shape[0]) < size[0]))
     begin, end = max(int(left.min()), 0), min(int(left.max()) + columns, size[1])

@@ -41,8 +41,8 @@ def write_weights(
     Args:
         path: The file, .safetensors.
         params: Nested dictionaries of arrays.
-        settings: What they go with.
-        about: Where they come from; anything that JSON holds.
+        settings: Settings of the networks.
+        about: Their origin; anything that JSON holds.
         bits: Bits of a number, see `write_parameters`.
 
     Raises:

@@ -1,6 +1,6 @@
 """An evaluation of many plots, as `evaluation_pool` goes through them: what is done with one, and what is kept of it.
 
-    Task, seed -> evaluate_plot -> record -> `Kept`: the file, written after each plot -> scores_of -> summary
+    Task, seed -> evaluate_plot -> record -> `Kept`: the file, written after each plot -> read_scores -> summary
 
 A score is rounded when it is made, so that what the file keeps is what was scored. Which process scores a plot does not matter.
 """
@@ -53,11 +53,11 @@ class Task:
 
 
 def evaluate_plot(task: Task, seed: int) -> Record:
-    """What is kept of one plot; networks are read once in each process.
+    """Evaluate one plot, and return its record; networks are read once in each process.
 
     Args:
         task: For all plots.
-        seed: Of the plot.
+        seed: Seed of the plot.
     """
     find = None
     if task.weights is not None:
@@ -116,8 +116,8 @@ def evaluate_tasks(
     """
     names = list(tasks)
     first = tasks[names[0]]
-    summarise = functools.partial(summary_of, first.least_score)
-    tables = {name: Kept(paths[name], conditions(task), summarise) for name, task in tasks.items()}
+    summarise_plots = functools.partial(summarise, first.least_score)
+    tables = {name: Kept(paths[name], conditions(task), summarise_plots) for name, task in tasks.items()}
     started(sum(seed in table for table in tables.values() for seed in seeds))
     jobs = [(name, seed) for name in names for seed in seeds if seed not in tables[name]]
 
@@ -127,7 +127,7 @@ def evaluate_tasks(
         done(name, seed, tables[name].records[seed])
 
     evaluate_each(functools.partial(_evaluate_job, dict(tasks), jobs), range(len(jobs)), first.workers, keep)
-    return {name: summarise([table.records[seed] for seed in seeds]) for name, table in tables.items()}
+    return {name: summarise_plots([table.records[seed] for seed in seeds]) for name, table in tables.items()}
 
 
 def _evaluate_job(tasks: Mapping[str, Task], jobs: Sequence[tuple[str, int]], number: int) -> Record:
@@ -135,18 +135,18 @@ def _evaluate_job(tasks: Mapping[str, Task], jobs: Sequence[tuple[str, int]], nu
     return evaluate_plot(tasks[name], seed)
 
 
-def scores_of(records: Iterable[Record]) -> list[PlotScore]:
+def read_scores(records: Iterable[Record]) -> list[PlotScore]:
     """The scores that records hold."""
     return [_read(record) for record in records]
 
 
-def summary_of(least_score: float, records: Iterable[Record]) -> dict[str, Any]:
-    """What the records of plots say together, see `summary`."""
-    return summary(scores_of(records), least_score)
+def summarise(least_score: float, records: Iterable[Record]) -> dict[str, Any]:
+    """Summarise the records of plots, see `summary`."""
+    return summary(read_scores(records), least_score)
 
 
 def _record(score: PlotScore, pairs: int) -> Record:
-    """What JSON keeps of a plot."""
+    """Return the record of a plot, as JSON holds it."""
     thesis = score.thesis
     return {
         "seed": score.seed,

@@ -1,4 +1,4 @@
-"""How good finds, counts and widths are, against the exact truth of synthetic plots that are drawn for it.
+"""Scores of detections, counts and widths against the exact truth of synthetic plots, which are drawn for it.
 
 plot -> pairs -> finds -> sightings -> stalks       as `pipeline.run` does, without files
      -> true boxes, count and diameters             from the plot itself
@@ -15,11 +15,11 @@ import numpy as np
 
 from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
 from jaxrl_vis.stalks.phenotyping.evaluation.perfect import perfect_detections
-from jaxrl_vis.stalks.phenotyping.evaluation.thesis import count_by_length, look_as_thesis, mean_widths
+from jaxrl_vis.stalks.phenotyping.evaluation.thesis import count_by_length, mean_widths, measure_pair_as_thesis
 from jaxrl_vis.stalks.phenotyping.measure.stalk import Method
 from jaxrl_vis.stalks.phenotyping.track.follow import follow
-from jaxrl_vis.stalks.phenotyping.track.heights import widths_of
-from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting, find_with_ground, look
+from jaxrl_vis.stalks.phenotyping.track.heights import stalk_widths
+from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting, find_with_ground, measure_pair
 from jaxrl_vis_envs.plants import Family, Stalk, draw
 from jaxrl_vis_envs.plants.pairs import Sequence
 from jaxrl_vis_envs.plants.truth import HEIGHTS, StalkInView, stalks_in_view
@@ -34,14 +34,14 @@ class PlotScore:
     """One plot.
 
     Attributes:
-        seed: Of the plot.
+        seed: Seed of the plot.
         true, counted: Stalks.
         widths: [N, 2] float64, measured and true diameter at 12 inches of each stalk that was counted and identified, mm.
         upper: [M, 2] float64, the same at 24 inches.
-        seconds: Of finding and measuring, for each pair, from arrays in memory; the first pair, which compiles, is left out.
-        thesis: What the thesis's ways make of the same finds.
+        seconds: Time of finding and measuring per pair, from arrays in memory; the first pair, which compiles, is left out.
+        thesis: Score of the thesis's methods on the same detections.
         finds: [K, 2] float64, score of each find, and 1 where it is a stalk, 0 where not; those of unclear stalks are left out.
-        stalks: How many stalks finds could have shown, over all pairs.
+        stalks: Number of stalks that detections could have shown, over all pairs.
     """
 
     seed: int
@@ -82,11 +82,11 @@ def score_plot(
     """Draws a plot, runs everything on it and compares.
 
     Args:
-        family: What the plot is drawn from.
-        seed: Of the plot.
-        find: What finds stalks in a left image [H, W, 3] uint8, those of low scores too; None for true boxes and masks.
-        method: How widths are taken.
-        least_score: What counts as a find.
+        family: Family that the plot is drawn from.
+        seed: Seed of the plot.
+        find: Detector of the stalks in a left image [H, W, 3] uint8, those of low scores too; None for true boxes and masks.
+        method: Method of widths.
+        least_score: Lowest score of a detection that counts.
         with_thesis: Score the thesis's ways on the same finds, too.
     """
     sequence = Sequence.of(draw(family, seed))
@@ -104,10 +104,10 @@ def score_plot(
         detections, ground = find_with_ground(finder, left, right, drive.stated)
         selected = [place for place, detection in enumerate(detections) if detection.score >= least_score]
         finds_kept = [detections[place] for place in selected]
-        frames.append(look(finds_kept, left, right, drive.stated, method, ground))
+        frames.append(measure_pair(finds_kept, left, right, drive.stated, method, ground))
         seconds.append(time.monotonic() - started)
         if with_thesis:
-            as_thesis.append(look_as_thesis(finds_kept, left, right, drive.stated))
+            as_thesis.append(measure_pair_as_thesis(finds_kept, left, right, drive.stated))
         matched, scored = match(detections, stalks)
         total += sum(stalk.band_box is not None and stalk.band_visible >= LEAST_VISIBLE for stalk in stalks)
         finds += scored
@@ -115,7 +115,7 @@ def score_plot(
     tracks, _ = follow(frames, drive.odometry, drive.stated)
     widths, upper = [], []
     counted = [track for track in tracks if track.counted]
-    for track, measured in zip(counted, widths_of(frames, counted)):
+    for track, measured in zip(counted, stalk_widths(frames, counted)):
         names = [owners[frame][place] for frame, place in track.sightings]
         known = [name for name in names if name is not None]
         if not known:
@@ -157,7 +157,7 @@ def true_diameter(stalk: Stalk, height: float = HEIGHTS[0]) -> float:
 
 
 def match(detections: list[Detection], stalks: list[StalkInView]) -> tuple[list[int | None], list[tuple[float, float]]]:
-    """Which stalk each find shows, by COCO's rules: the best find first, each stalk once, at an overlap of boxes of 0.5.
+    """Match detections with stalks by COCO's rules: the best detection first, a stalk once, at an overlap of boxes of 0.5.
 
     Returns:
         The stalk of each find, or None; and score and success of each find, less those of stalks that are too hidden to count.
@@ -195,7 +195,7 @@ def average_precision(finds: np.ndarray, stalks: int) -> float:
 
     Args:
         finds: [K, 2], score and success.
-        stalks: How many there are to find.
+        stalks: Number of stalks to detect.
     """
     if not stalks or not len(finds):
         return 0.0
@@ -208,7 +208,7 @@ def average_precision(finds: np.ndarray, stalks: int) -> float:
 
 
 def summary(scores: Iterable[PlotScore], least_score: float = 0.5) -> dict[str, Any]:
-    """What the scores of plots say together.
+    """Summarise the scores of plots.
 
     Returns:
         ``count_r2`` (1 - SSE / SST against y = x), ``count_mae``, ``count_bias`` (of the true number), ``width_mae_mm``,

@@ -52,10 +52,10 @@ def write_plots(
     """Writes plots of a family.
 
     Args:
-        folder: Where; made if it is missing.
-        family: What to draw from.
+        folder: Folder to write to; made if it is missing.
+        family: Family to draw from.
         seeds: One plot each.
-        image_format: Of the images of the cameras.
+        image_format: Format of the images of the cameras.
         truth: ``all``; ``boxes``, without images of disparity and instance and without masks; or ``none``, but plot.json.
         done: Called after each pair with the plot's seed and the number of pairs that it has so far.
 
@@ -89,7 +89,7 @@ def write_plots(
 
 
 def _holds(folder: Path, truth: Truth, frames: int) -> bool:
-    """Whether a plot that is whole holds as much of the truth as is asked for, or more."""
+    """Return True if a complete plot holds as much of the truth as is asked for, or more."""
     maps = [folder / "truth" / f"{kind}_{frame:03d}.png" for kind in ("instance", "disparity") for frame in range(frames)]
     wanted = {"none": [], "boxes": [folder / "annotations.json"], "all": [folder / "annotations.json", *maps]}[truth]
     return all(path.exists() for path in wanted)
@@ -161,7 +161,7 @@ def _odometry(sequence: Sequence, suffix: str) -> str:
 
 
 def _summary(sequence: Sequence, visible: list[dict[str, Any]]) -> dict[str, Any]:
-    """What plot.json holds: lengths in metres but for diameters, which are in millimetres."""
+    """Return the contents of plot.json: lengths in metres, but diameters in millimetres."""
     plot, drive = sequence.plot, sequence.drive
     stalks = []
     for index, stalk in enumerate(plot.measured):

@@ -1,4 +1,4 @@
-"""What the thesis does with finds, to show on the same images what each of our ways is worth.
+"""The thesis's methods on the same detections, to show what each of ours is worth.
 
 width     the largest minor axis of the ellipses fitted to a mask, and the disparity of the pixels in it by semi-global
           matching; where the mask is, as the ground is not looked for; the mean over the pairs that show a stalk
@@ -9,13 +9,13 @@ import numpy as np
 
 from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
 from jaxrl_vis.stalks.phenotyping.measure.stereo import match_sgbm
-from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting, look
+from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting, measure_pair
 from jaxrl_vis_envs.plants import Calibration
 
 _DEPTHS = (0.5, 1.3)  # m
 
 
-def look_as_thesis(
+def measure_pair_as_thesis(
     detections: list[Detection], left: np.ndarray, right: np.ndarray, calibration: Calibration
 ) -> list[Sighting]:
     """Measures what was found in a pair [H, W, 3] uint8, by ellipses and semi-global matching."""
@@ -25,7 +25,7 @@ def look_as_thesis(
         (top, first), (tall, wide) = detection.corner, detection.mask.shape
         box = (first, top, first + wide, top + tall)
         disparity[top : top + tall, first : first + wide] = match_sgbm(left, right, box, (far, near))
-    return look(detections, left, right, calibration, "ellipse", disparity=disparity)
+    return measure_pair(detections, left, right, calibration, "ellipse", disparity=disparity)
 
 
 def count_by_length(frames: list[list[Sighting]], calibration: Calibration, length: float) -> float:
@@ -33,8 +33,8 @@ def count_by_length(frames: list[list[Sighting]], calibration: Calibration, leng
 
     Args:
         frames: Sightings of each pair.
-        calibration: Of the cameras.
-        length: Of the plot, m.
+        calibration: Calibration of the cameras.
+        length: Length of the plot, m.
     """
     shares = []
     for sightings in frames:

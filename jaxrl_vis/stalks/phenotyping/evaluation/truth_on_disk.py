@@ -22,7 +22,7 @@ def find_truth(image: np.ndarray, plot: PlotFolder, pair: PairFiles) -> list[Det
         RequestError: The plot is not synthetic, or was written without masks.
     """
     try:
-        stalks = _seen(plot.folder).get(int(pair.name), [])
+        stalks = _stalks_by_pair(plot.folder).get(int(pair.name), [])
         truth = plot.folder / "truth" / f"instance_{pair.name}.png"
         if image_size(truth) != image.shape[:2]:
             raise ValueError("masks of another image")
@@ -34,8 +34,8 @@ def find_truth(image: np.ndarray, plot: PlotFolder, pair: PairFiles) -> list[Det
 
 
 @functools.lru_cache(maxsize=4)
-def _seen(folder: Path) -> dict[int, list[dict]]:
-    """What plot.json says of each pair."""
+def _stalks_by_pair(folder: Path) -> dict[int, list[dict]]:
+    """Return the stalks of each pair from plot.json."""
     of_pair: dict[int, list[dict]] = {}
     for stalk in read_json(folder / "plot.json")["seen"]:
         box = stalk["band_box"]

@@ -32,7 +32,7 @@ def coco(images: list[dict[str, Any]], annotations: list[dict[str, Any]], about:
         images: With id, file_name, width and height.
         annotations: With image_id, bbox (left, top, width, height in pixels), area and, where there is one, segmentation; ids
             are added.
-        about: What the data set is.
+        about: Description of the data set.
     """
     numbered = [
         {"id": place + 1, "category_id": STALK, "iscrowd": 0, **annotation} for place, annotation in enumerate(annotations)
@@ -57,18 +57,18 @@ def read_annotations(folder: Path) -> dict[str, Any]:
     """
     path = folder / "annotations.json"
     if path.exists():
-        return _kept(_coco_of(path), path)
+        return _checked_annotations(_read_coco(path), path)
     for pattern, read in (("*.xml", _voc), ("*.json", _labelme)):
         files = sorted(folder.glob(pattern)) if folder.is_dir() else []
         if files:
-            return _kept(_together(files, read), folder)
+            return _checked_annotations(_together(files, read), folder)
     raise RequestError(
         f"there are no annotations in {folder}: put annotations.json of COCO there, or .xml of Pascal VOC or .json of LabelMe "
         "beside each image"
     )
 
 
-def _coco_of(path: Path) -> dict[str, Any]:
+def _read_coco(path: Path) -> dict[str, Any]:
     try:
         data = read_json(path)
         names = {category["id"]: str(category["name"]) for category in data.get("categories", [])}
@@ -151,8 +151,8 @@ def _labelme(path: Path) -> tuple[str, int, int, list[dict[str, Any]]]:
     )
 
 
-def _kept(data: dict[str, Any], path: Path) -> dict[str, Any]:
-    """What is called a stalk, if anything is, and else all; checked."""
+def _checked_annotations(data: dict[str, Any], path: Path) -> dict[str, Any]:
+    """Return the annotations that are called a stalk, or all if none is; checked."""
     named = [annotation for annotation in data["annotations"] if "stalk" in annotation.get("name", "").lower()]
     data = {**data, "annotations": named or data["annotations"]}
     if not data["images"] or not data["annotations"]:
@@ -172,7 +172,7 @@ def _kept(data: dict[str, Any], path: Path) -> dict[str, Any]:
 
 
 def _checked_image(image: dict[str, Any], place: int) -> dict[str, Any]:
-    """What is known of an image, with its width and height as whole numbers.
+    """Return the entry of an image, with its width and height as whole numbers.
 
     Raises:
         RequestError: Something is missing.

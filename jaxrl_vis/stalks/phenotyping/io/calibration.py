@@ -1,4 +1,4 @@
-"""What is known of a pair of rectified cameras, read from the files of OpenCV and ROS, and written for OpenCV.
+"""Calibrations of a pair of rectified cameras, read from the files of OpenCV and ROS, and written for OpenCV.
 
     OpenCV YAML or XML      P1 and P2 as cv2.stereoRectify returns them; image_width and image_height
     ROS camera_info YAML    a folder with left.yaml and right.yaml, or either of them beside the other
@@ -36,7 +36,7 @@ def read_calibration(path: Path, unit: Unit | None = None) -> Calibration:
 
     Args:
         path: A file of OpenCV or of ROS, or a folder that holds left.yaml and right.yaml.
-        unit: Of the baseline; None for what the file says (its key ``unit``), and else metres.
+        unit: Unit of the baseline; None for what the file says (its key ``unit``), and else metres.
 
     Raises:
         RequestError: There is no such file, it does not describe a pair of rectified cameras, or its baseline cannot be in that

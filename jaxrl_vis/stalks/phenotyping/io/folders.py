@@ -50,8 +50,8 @@ class PlotFolder:
     """One plot.
 
     Attributes:
-        name: Of its folder.
-        folder: Where.
+        name: Name of its folder.
+        folder: Its path.
         pairs: In the order of their names.
     """
 
@@ -96,7 +96,7 @@ def _pairs(folder: Path) -> tuple[PairFiles, ...]:
     for name, files in _by_name(folder).items():
         for side, path in files.items():
             _put(sides, name, side, path)
-    stored = _folder_of(folder, ("disparity",))
+    stored = _find_folder(folder, ("disparity",))
     inside = [] if stored is None else _images(stored, _DISPARITIES)
     for path in [*inside, *_images(folder, _DISPARITIES)]:
         beside = path.parent == folder
@@ -126,7 +126,7 @@ def _put(sides: _Sides, name: str, side: str, path: Path) -> None:
 
 def _by_folder(folder: Path) -> _Sides:
     """Images in two folders, one for each side, by the name of their pair and their side."""
-    nested = {side: _folder_of(folder, (side, side[0])) for side in ("left", "right")}
+    nested = {side: _find_folder(folder, (side, side[0])) for side in ("left", "right")}
     sides: _Sides = {}
     if all(nested.values()):
         for side, path in nested.items():
@@ -160,7 +160,7 @@ def _side_in(stem: str, stems: set[str]) -> re.Match[str] | None:
     what makes another image's name, if exchanged, before what does not; of several the last, as plots are mostly named first.
 
     Args:
-        stem: Of its name.
+        stem: Stem of its name.
         stems: Those of all images of its folder, in small letters.
     """
     words = list(_WORD.finditer(stem)) or list(_LETTER.finditer(stem))
@@ -170,7 +170,7 @@ def _side_in(stem: str, stems: set[str]) -> re.Match[str] | None:
     return (paired or words or [None])[-1]
 
 
-def _folder_of(folder: Path, names: tuple[str, ...]) -> Path | None:
+def _find_folder(folder: Path, names: tuple[str, ...]) -> Path | None:
     """The folder in a folder that has one of some names, whatever their case; the first name goes before the others."""
     folders = [path for path in sorted(folder.iterdir()) if path.name.lower() in names and path.is_dir()]
     return min(folders, key=lambda path: names.index(path.name.lower()), default=None)
@@ -187,7 +187,7 @@ def _natural(name: str) -> list[tuple[int, int, str]]:
 
 
 def read_odometries(plots: Sequence[PlotFolder], speed: float | None) -> dict[str, dict[str, float] | None]:
-    """What `read_odometry` says of each plot, by the plot's name.
+    """Read the odometry of each plot with `read_odometry`: a dictionary by the plot's name.
 
     Raises:
         RequestError: A file cannot be used, or none of them needs the speed.
@@ -199,11 +199,11 @@ def read_odometries(plots: Sequence[PlotFolder], speed: float | None) -> dict[st
 
 
 def read_odometry(plot: PlotFolder, speed: float | None = None) -> dict[str, float] | None:
-    """How far the robot had driven for each pair, by the pair's name, m; None if nothing says so, see `why_no_odometry`.
+    """Read the distance that the robot had driven at each pair, by the pair's name, m; None if unknown, see `why_no_odometry`.
 
     Args:
         plot: With ``odometry.csv``.
-        speed: Of the robot, m/s: for files that hold times only.
+        speed: Speed of the robot, m/s: for files that hold times only.
 
     Raises:
         RequestError: The file cannot be read, does not say how far or when, or nobody can tell which of its rows is which pair.
@@ -247,11 +247,11 @@ def read_odometry(plot: PlotFolder, speed: float | None = None) -> dict[str, flo
 
 
 def why_no_odometry(plot: PlotFolder, driven: Mapping[str, float] | None, pairs: Sequence[PairFiles]) -> str | None:
-    """What is missing to know how far the robot had driven, in words; None if nothing is.
+    """Say in words what is missing to know the distance that the robot had driven; None if nothing is.
 
     Args:
         plot: The plot.
-        driven: What `read_odometry` says of it.
+        driven: Its odometry, from `read_odometry`.
         pairs: Those of its pairs for which it must be known.
     """
     path = plot.folder / "odometry.csv"

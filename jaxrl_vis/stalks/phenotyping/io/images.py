@@ -91,7 +91,7 @@ def read_disparity(path: Path, scale: float = 256.0) -> np.ndarray:
 
     Args:
         path: The file. In a PFM, infinity says that there is none; in the others, 0 does.
-        scale: What 16-bit numbers are divided by: 256 in KITTI's files, 64 in those of ``phenotype synth``.
+        scale: Divisor of 16-bit numbers: 256 in KITTI's files, 64 in those of ``phenotype synth``.
 
     Returns:
         [H, W] float32, pixels; not a number where there is none.

@@ -66,7 +66,7 @@ def outlined_mask(outlines: list[list[float]], size: tuple[int, int]) -> np.ndar
     does, would make it a pixel wider.
 
     Args:
-        outlines: Of each polygon column, line, column, line, ... of its corners, which may lie beyond the image.
+        outlines: Polygons: column, line, column, line, ... of their corners, which may lie beyond the image.
         size: Height and width of the image.
     """
     height, width = size
@@ -122,7 +122,7 @@ def box_around_runs(counts: np.ndarray, height: int) -> list[float]:
 
     Args:
         counts: As `covering` gives them; at least one of what is inside is longer than 0.
-        height: Of the image.
+        height: Height of the image.
     """
     ends = np.cumsum(counts)[1::2]
     starts = ends - counts[1::2]

@@ -77,7 +77,7 @@ def known_disparity(pair: PairFiles, left: np.ndarray, scale: float) -> np.ndarr
     Args:
         pair: Its files.
         left: Its left image.
-        scale: What numbers of 16 bits are divided by.
+        scale: Divisor of numbers of 16 bits.
 
     Raises:
         Unusable: They cannot be read, or are those of another image.

@@ -26,7 +26,7 @@ def diameter_mm(
     """Diameter of a stalk across its axis.
 
     Args:
-        calibration: Of the cameras.
+        calibration: Calibration of the cameras.
         left, right: Column and line of a point of each edge in the left image, pixels; they need not be opposite each other.
         front_depth: Planar depth of the stalk's front between them, m.
         lean: Angle between the stalk and the image's vertical, rad; positive to the right.
@@ -51,13 +51,13 @@ def diameter_mm(
     return 2e3 * float(np.linalg.norm(front)) * sine / (1.0 - sine)
 
 
-def tilt_of(slope: float, disparity: float, calibration: Calibration) -> float:
+def edge_tilt(slope: float, disparity: float, calibration: Calibration) -> float:
     """Angle in rad by which a stalk leans away from the camera.
 
     Args:
         slope: Change of its disparity per line of the left image, pixels.
         disparity: In the same place, pixels.
-        calibration: Of the cameras.
+        calibration: Calibration of the cameras.
     """
     beyond = disparity - calibration.offset
     # Depth is f B / d and height Z / f per line, so that dZ / dheight = f slope / d, and lines count downwards.

@@ -1,4 +1,4 @@
-"""Where an image changes most beside the edge of a mask: there the stalk ends, to a fraction of a pixel.
+"""Edges of stalks to a fraction of a pixel: the places near a mask's edge at which the image changes most.
 
 A network's masks end half a pixel too far in or out on textures that it has not learned from. Averaged along an edge of some
 hundred lines, the image itself says better where it is; the mask says which of its edges is meant.
@@ -19,15 +19,15 @@ _LINES_APART = 4
 _LEAST_LINES = 8
 
 
-def settle(strip: Strip, image: np.ndarray, corner: tuple[int, int], line: float, reach: float) -> Strip:
+def refine_edges(strip: Strip, image: np.ndarray, corner: tuple[int, int], line: float, reach: float) -> Strip:
     """A strip whose edges lie where the image changes most; those that nothing near stands out from stay.
 
     Args:
         strip: The edges of a mask.
         image: [H, W] grey.
         corner: Line and column of the mask's first pixel in the image.
-        line: Of the mask, around which the image is looked at.
-        reach: How far above and below that, pixels.
+        line: Line of the mask, around which the image is looked at.
+        reach: Distance above and below that, pixels.
     """
     low, high = max(line - reach + corner[0], 0.0), min(line + reach + corner[0], image.shape[0] - 1.0)
     lines = np.arange(np.ceil(low), np.floor(high) + 1.0, _LINES_APART).astype(int)

@@ -38,7 +38,7 @@ class Ground:
 
     @property
     def camera_height(self) -> float:
-        """Of the left camera above it, m."""
+        """Height of the left camera above it, m."""
         return 1.0 / math.hypot(*self.normal)
 
     def height(self, column: float, line: float, depth: float, calibration: Calibration) -> float:
@@ -60,7 +60,7 @@ def find_ground(
 
     Args:
         left, right: [H, W] grey, uint8 or float32, rectified.
-        calibration: Of the cameras, for images of this size.
+        calibration: Calibration of the cameras, for images of this size.
         disparity: [H, W] float32, disparities that are known, in place of those that are matched; pixels, not a number where
             there is none.
         depths: Least and greatest depth at which it is looked for, m.
@@ -153,7 +153,7 @@ def _plane(rays: np.ndarray, inverse: np.ndarray, tolerance: float) -> np.ndarra
 
 
 def _could_be_ground(planes: np.ndarray) -> np.ndarray:
-    """Which planes [N, 3] lie below the camera, about level: [N] bool."""
+    """Return True for the planes [N, 3] that lie below the camera, about level: [N] bool."""
     length = np.linalg.norm(planes, axis=1)
     height = 1.0 / np.maximum(length, 1e-9)
     roll = np.abs(np.arcsin(np.clip(planes[:, 0] / np.maximum(length, 1e-9), -1.0, 1.0)))

@@ -6,11 +6,11 @@ from typing import Literal
 
 import numpy as np
 
-from jaxrl_vis.stalks.phenotyping.measure.diameter import diameter_mm, tilt_of
-from jaxrl_vis.stalks.phenotyping.measure.edges import settle
+from jaxrl_vis.stalks.phenotyping.measure.diameter import diameter_mm, edge_tilt
+from jaxrl_vis.stalks.phenotyping.measure.edges import refine_edges
 from jaxrl_vis.stalks.phenotyping.measure.ground import Ground
 from jaxrl_vis.stalks.phenotyping.measure.stereo import StalkDisparity, match_rows, sample_rows
-from jaxrl_vis.stalks.phenotyping.measure.width import Strip, ellipse_width, median, pairs_of, strip_near, strip_width
+from jaxrl_vis.stalks.phenotyping.measure.width import Strip, ellipse_width, index_pairs, median, strip_near, strip_width
 from jaxrl_vis_envs.plants import Calibration
 
 Method = Literal["strip", "ellipse"]
@@ -20,7 +20,7 @@ _REACH = 0.025  # m along a stalk: sheaths and nodes further away do not matter
 
 @dataclasses.dataclass(frozen=True)
 class Measurement:
-    """What one pair says of one stalk.
+    """Measurement of one stalk in one pair.
 
     Attributes:
         diameter_mm: Across its axis; None where it could not be measured, and `reason` says why.
@@ -30,10 +30,10 @@ class Measurement:
         width: Across its axis, pixels.
         disparity: There, pixels.
         depth: Planar depth of its front, m.
-        height: Of the place above the ground, m; not a number where no ground is known.
+        height: Height of the place above the ground, m; not a number where no ground is known.
         lean, tilt: Against the image's vertical and away from the camera, rad.
         confidence: 0 to 1.
-        here: Whether both edges are seen around that line; where they are not, they are those of the rest of the stalk, which
+        here: Both edges are visible around that line; if not, they are those of the rest of the stalk, which
             is mostly partly hidden then.
         reason: Empty where the stalk was measured.
     """
@@ -73,13 +73,13 @@ def measure(
         mask: [h, w] bool, or float32 from 0 to 1: of the stalk, in a part of the left image.
         corner: Line and column of the mask's first pixel in the image.
         left, right: [H, W] grey, uint8 or float32, rectified.
-        calibration: Of the cameras, for images of this size.
-        line: Where to measure, a line of the image; the middle of what is seen if not given.
+        calibration: Calibration of the cameras, for images of this size.
+        line: Line of the image at which to measure; the middle of the visible part if not given.
         depths: Least and greatest depth at which a stalk may stand, m.
         method: ``strip``, or ``ellipse`` as in the thesis, which measures the mask as a whole and not at a line.
-        ground: What heights are counted from.
-        height: Where to measure, m above the ground, if it is known: there, or as near to it as both edges are seen; ``line``
-            does not matter then.
+        ground: Origin of heights.
+        height: Height at which to measure, m above the ground, if it is known: there, or as near to it as both edges are
+            visible; ``line`` does not matter then.
         disparity: [H, W] float32, disparities that are known, in place of those that are matched; pixels, not a number where
             there is none.
         strip: The mask's edges, if they are known.
@@ -101,7 +101,7 @@ def measure(
         return Measurement(line=place + corner[0], depth=depth, lean=strip.lean, reason=f"it stands {depth:.2f} m away")
     reach = _REACH * calibration.focal / depth
     near = strip_near(strip, place, reach, mask.shape[0])
-    strip = settle(near or strip, left, corner, place, reach)
+    strip = refine_edges(near or strip, left, corner, place, reach)
     middle = 0.5 * sum(strip.edges(place))
     pixels = strip.width(place) if method == "strip" else ellipse_width(mask)
     if pixels is None:
@@ -169,10 +169,10 @@ def _disparity(
 
 
 def _tilt(matched: StalkDisparity, disparity: float, calibration: Calibration) -> float:
-    """How much the stalk leans away from the camera; 0 where too short a piece of it was matched to tell."""
+    """Return the lean of the stalk away from the camera; 0 if too short a piece of it was matched to tell."""
     if matched.lines.size < 6 or np.ptp(matched.lines) < 0.03 * calibration.focal:
         return 0.0
-    first, second = pairs_of(matched.lines.size, 3)
+    first, second = index_pairs(matched.lines.size, 3)
     slopes = (matched.values[second] - matched.values[first]) / (matched.lines[second] - matched.lines[first])
-    tilt = tilt_of(median(slopes), disparity, calibration)
+    tilt = edge_tilt(median(slopes), disparity, calibration)
     return tilt if abs(tilt) < math.radians(30.0) else 0.0

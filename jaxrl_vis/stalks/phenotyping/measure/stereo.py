@@ -18,7 +18,7 @@ import math
 import cv2
 import numpy as np
 
-from jaxrl_vis.stalks.phenotyping.measure.width import median, pairs_of
+from jaxrl_vis.stalks.phenotyping.measure.width import index_pairs, median
 
 _LEAST_SCORE = 0.5
 _AGREEING = 0.4
@@ -36,7 +36,7 @@ class StalkDisparity:
         lines: [N] float64, middle line of each window that was matched.
         values: [N] float64, disparity there, pixels.
         scores: [N] float64, how alike both sides are, up to 1.
-        tried: How many windows there were.
+        tried: Number of windows.
     """
 
     lines: np.ndarray
@@ -54,7 +54,7 @@ class StalkDisparity:
         if self.lines.size < least:
             return None
         offset = self.lines - line
-        first, second = pairs_of(self.lines.size)
+        first, second = index_pairs(self.lines.size)
         slope = median((self.values[second] - self.values[first]) / (self.lines[second] - self.lines[first]))
         rest = self.values - slope * offset
         middle = median(rest)
@@ -99,7 +99,7 @@ def match_rows(
         bounds: Least and greatest disparity, pixels.
         half_height: A window has twice as many lines and one.
         core: Share of the stalk's width that a window spans, in its middle: towards its edges a stalk is further away.
-        spread: How many lines the right image may lie too low or too high.
+        spread: Number of lines that the right image may lie too low or too high.
     """
     wanted = [
         _Window(
@@ -137,7 +137,7 @@ class _Window:
     last: int
 
     def inside(self, shape: tuple[int, ...], half_height: int, spread: int) -> bool:
-        """Whether it is wide enough, and the image holds it and the lines above and below that the right image may need."""
+        """Return True if it is wide enough, and the image holds it and the lines around it that the right image may need."""
         reach = half_height + spread
         tall = reach <= self.line and self.line + reach + 1 <= shape[0]
         return tall and self.last - self.first >= 6 and self.first >= 0 and self.last <= shape[1]
@@ -162,7 +162,7 @@ def _agreed(matches: list[tuple[int, float]]) -> tuple[float, float] | None:
     if len(matches) < 3:
         return None
     line, value = np.array(matches, float).T
-    first, second = pairs_of(len(line))
+    first, second = index_pairs(len(line))
     slope = median((value[second] - value[first]) / (line[second] - line[first]))
     rest = value - slope * line
     offset = median(rest)

@@ -81,7 +81,7 @@ def line_edges(mask: np.ndarray, threshold: float = 0.5) -> tuple[np.ndarray, np
 
     Args:
         mask: [H, W] bool, or float32 from 0 to 1, whose edges are found to a fraction of a pixel.
-        threshold: What belongs to the stalk.
+        threshold: Lowest value that belongs to the stalk.
 
     Returns:
         Lines [N] int64, and the columns of their left and right edges [N] float64. Lines in which a run touches the image's
@@ -104,7 +104,7 @@ def line_edges(mask: np.ndarray, threshold: float = 0.5) -> tuple[np.ndarray, np
     line, start, end = line[whole], start[whole], end[whole]
 
     def crossing(outer: np.ndarray, inner: np.ndarray) -> np.ndarray:
-        """How far from the inner pixel towards the outer one the mask passes the threshold, 0 to 1."""
+        """Return the position between the inner and the outer pixel at which the mask passes the threshold, 0 to 1."""
         out, within = soft[line, outer], soft[line, inner]
         return np.where(within > out, (within - threshold) / np.maximum(within - out, 1e-6), 0.5)
 
@@ -119,7 +119,7 @@ def strip_width(mask: np.ndarray, threshold: float = 0.5) -> Strip | None:
 
     Args:
         mask: [H, W] bool, or float32 from 0 to 1: of one stalk, or a piece of it, standing more upright than lying.
-        threshold: What belongs to the stalk.
+        threshold: Lowest value that belongs to the stalk.
 
     Returns:
         The strip; None where fewer than eight lines agree.
@@ -133,10 +133,10 @@ def strip_near(strip: Strip, line: float, reach: float, lines: int) -> Strip | N
     Slopes are those of the whole strip, which many more lines tell.
 
     Args:
-        strip: Of a whole mask.
-        line: Of the mask.
-        reach: How far above and below the line edges are looked at, pixels.
-        lines: How many the mask has.
+        strip: Strip of a whole mask.
+        line: Line of the mask.
+        reach: Distance above and below the line within which edges are looked at, pixels.
+        lines: Number of lines of the mask.
 
     Returns:
         The strip; None where less than half of the lines there agree, or they do not go with the rest of the stalk.
@@ -243,7 +243,7 @@ def _common_slope(line: np.ndarray, left: np.ndarray, right: np.ndarray) -> floa
     """Slope that most pairs of edge points agree on, left or right: columns a line."""
     step = max(line.size // 60, 1)
     places = np.arange(0, line.size, step)
-    first, second = pairs_of(places.size, max(places.size // 4, 1))
+    first, second = index_pairs(places.size, max(places.size // 4, 1))
     first, second = places[first], places[second]
     gap = (line[second] - line[first]).astype(float)
     slopes = np.concatenate([(edge[second] - edge[first]) / gap for edge in (left, right)])
@@ -251,13 +251,13 @@ def _common_slope(line: np.ndarray, left: np.ndarray, right: np.ndarray) -> floa
 
 
 @functools.lru_cache(maxsize=512)
-def pairs_of(count: int, apart: int = 1) -> tuple[np.ndarray, np.ndarray]:
+def index_pairs(count: int, apart: int = 1) -> tuple[np.ndarray, np.ndarray]:
     """All pairs of indices below ``count`` that are so far ``apart`` or further, the lower one first."""
     return np.triu_indices(count, k=apart)
 
 
 def median(values: np.ndarray) -> float:
-    """Of a few values [N], at least one: many times quicker than NumPy's, which looks after much else."""
+    """Return the median of a few values [N], at least one: many times quicker than NumPy's, which looks after much else."""
     ordered = np.sort(values)
     half = len(ordered) // 2
     return float(ordered[half]) if len(ordered) % 2 else 0.5 * float(ordered[half - 1] + ordered[half])
@@ -285,7 +285,7 @@ def ellipse_width(mask: np.ndarray, fit: EllipseFit = "pixels") -> float | None:
 
     Args:
         mask: [H, W] bool, or float32 from 0 to 1.
-        fit: How an ellipse is fitted; see `ELLIPSE_FITS`.
+        fit: Method of fitting an ellipse; see `ELLIPSE_FITS`.
 
     Returns:
         Pixels; None where no blob has an ellipse that makes sense. Fits that come out wider than a blob of that area and length

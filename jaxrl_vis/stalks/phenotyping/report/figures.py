@@ -115,7 +115,7 @@ def write_times(data: dict[str, Any], out: Path) -> None:
     """Table 3.1: minutes of two people, quoted, beside ours.
 
     Args:
-        data: Of `read_evaluation`.
+        data: Result of `read_evaluation`.
         out: The table, .md; the same as .csv goes beside it.
 
     Raises:

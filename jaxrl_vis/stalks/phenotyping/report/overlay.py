@@ -14,8 +14,8 @@ _WIDEST = 1688
 _LEGEND = (("counted", COUNTED), ("not counted", REJECTED), ("width was taken here", MEASURED))
 
 
-def scale_of(width: int) -> float:
-    """How much smaller than its image, ``width`` pixels wide, an overlay is."""
+def overlay_scale(width: int) -> float:
+    """Return the scale of the overlay of an image ``width`` pixels wide."""
     return min(_WIDEST / width, 1.0)
 
 
@@ -25,10 +25,10 @@ def draw_overlay(image: np.ndarray, sightings: list[Sighting], labels: list[str 
     Args:
         image: The left one.
         sightings: In it.
-        labels: Of each: the number of its stalk; None for what does not count.
+        labels: Number of each sighting's stalk; None for what does not count.
         title: Written into a corner.
     """
-    scale = scale_of(image.shape[1])
+    scale = overlay_scale(image.shape[1])
     size = (round(image.shape[1] * scale), round(image.shape[0] * scale))
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     canvas = np.round(255.0 * (small / 255.0) ** 0.7).astype(np.uint8)

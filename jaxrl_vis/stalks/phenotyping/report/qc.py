@@ -22,7 +22,7 @@ import numpy as np
 from jaxrl_vis.files import replacing
 from jaxrl_vis.stalks.phenotyping.io.images import read_image
 from jaxrl_vis.stalks.phenotyping.io.names import file_name
-from jaxrl_vis.stalks.phenotyping.report.overlay import scale_of
+from jaxrl_vis.stalks.phenotyping.report.overlay import overlay_scale
 from jaxrl_vis.stalks.phenotyping.report.qc_style import SCRIPT, STYLE
 from jaxrl_vis.stalks.phenotyping.report.tables import NO_GROUND
 from jaxrl_vis.stalks.phenotyping.track.follow import Track
@@ -75,16 +75,16 @@ _ERRORS = (
 
 @dataclasses.dataclass(frozen=True)
 class PlotResult:
-    """What became of one plot.
+    """Results of one plot.
 
     Attributes:
-        row: Of plots.csv.
-        stalks: Of stalks.csv.
+        row: Row of plots.csv.
+        stalks: Rows of stalks.csv.
         pairs: Names of the pairs that were used.
         frames: Sightings of each.
         tracks: Stalks, and what does not count; empty where pairs could not be put together.
         start: Place of the first pair, which positions count from, m.
-        image_width: Of its images, pixels.
+        image_width: Width of its images, pixels.
     """
 
     row: dict[str, Any]
@@ -100,9 +100,9 @@ class Page:
     """The page in the making. A context manager.
 
     Args:
-        about: What goes under the title: lines of text.
+        about: Lines of text under the title.
         overlays: Folder with a folder of overlays for each plot.
-        plots: How many there will be.
+        plots: Number of plots that will be added.
     """
 
     def __init__(self, about: list[str], overlays: Path, plots: int) -> None:
@@ -213,7 +213,7 @@ def table(columns: dict[str, str], rows: Iterable[dict[str, Any]]) -> str:
     """A sortable table as HTML.
 
     Args:
-        columns: What stands above each column, by its name in the rows.
+        columns: Title of each column, by its name in the rows.
         rows: Their values; a flag that is not ``ok`` is marked.
     """
     head = "".join(
@@ -254,7 +254,7 @@ class _Pictures:
         return chosen.diameter_mm is not None, chosen.confidence
 
     def _crop(self, overlay: np.ndarray, sighting: Sighting) -> np.ndarray:
-        scale = scale_of(self._plot.image_width)
+        scale = overlay_scale(self._plot.image_width)
         left, top, right, bottom = (round(edge * scale) for edge in sighting.box)
         beside = max((bottom - top) // 2, 12)
         top, bottom = max(top - beside // 2, 0), min(bottom + beside // 4, overlay.shape[0])

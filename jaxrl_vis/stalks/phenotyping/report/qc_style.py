@@ -1,4 +1,4 @@
-"""How the page of `qc` looks, and how its tables are sorted."""
+"""Style of the page of `qc`, and the script that sorts its tables."""
 
 STYLE = """
 :root { color-scheme: light dark; --line: #8884; --good: #1a7f37; --doubt: #c2570c; --no: #cf222e; }

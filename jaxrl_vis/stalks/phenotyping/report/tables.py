@@ -1,4 +1,4 @@
-"""What is told of plots: one row per stalk, one row per plot, tidy, with units in the header."""
+"""Tables of plots: one row per stalk, one row per plot, tidy, with units in the header."""
 
 import dataclasses
 import math
@@ -11,7 +11,7 @@ from jaxrl_vis.files import write_atomically
 from jaxrl_vis.spreadsheets import to_csv
 from jaxrl_vis.stalks.phenotyping.track.follow import Path as Driven
 from jaxrl_vis.stalks.phenotyping.track.follow import Track
-from jaxrl_vis.stalks.phenotyping.track.heights import StalkWidths, widths_of
+from jaxrl_vis.stalks.phenotyping.track.heights import StalkWidths, stalk_widths
 from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting
 
 STALK_COLUMNS = (
@@ -60,20 +60,20 @@ NO_WIDTHS = "no widths"
 
 @dataclasses.dataclass(frozen=True)
 class Origin:
-    """What goes into every row: plot, method of the widths and version of the software."""
+    """Values of every row: plot, method of the widths and version of the software."""
 
     plot: str
     method: str
     version: str
 
 
-def rows_of(
+def plot_rows(
     frames: list[list[Sighting]], tracks: list[Track], path: Driven, skipped: int, origin: Origin
 ) -> tuple[list[Row], Row]:
     """Rows of the stalks of one plot, from its beginning to its end, and the plot's own row."""
     stalks: list[Row] = []
     counted = [track for track in tracks if track.counted]
-    for track, widths in zip(counted, widths_of(frames, counted)):
+    for track, widths in zip(counted, stalk_widths(frames, counted)):
         sightings = [frames[frame][place] for frame, place in track.sightings]
         leans = [sighting.lean_deg for sighting in sightings if sighting.lean_deg is not None]
         confidence = float(np.median([sighting.confidence for sighting in sightings]))
@@ -103,7 +103,7 @@ def rows_of(
 
 
 def _flag(widths: StalkWidths, confidence: float) -> str:
-    """What a reader should know of a stalk's width before trusting it; ``ok`` if nothing."""
+    """Return the flag of a stalk: what a reader should know before trusting its width; ``ok`` if nothing."""
     if widths.lower is None:
         return "no width"
     if not widths.height_known:

@@ -1,4 +1,4 @@
-"""Which way the robot drove, and whether its odometry and its images can both be right.
+"""Direction in which the robot drove, and a check that its odometry and its images can both be right.
 
 Odometry counts metres, but does not say whether the cameras moved to their own right or to their left: that depends on the
 side of the robot that they look from. Two pairs that show the same stalks say by how much and which way they moved.
@@ -23,12 +23,12 @@ _CLEARLY = 1.2  # by what more stalks go together the other way, where nothing i
 
 @dataclasses.dataclass(frozen=True)
 class Followed:
-    """What became of the sightings of a plot.
+    """Tracks of a plot, and the robot's path.
 
     Attributes:
         tracks: Stalks, and what does not count.
-        path: How the robot drove; places grow as the odometry does, also where the cameras moved to their own left.
-        fits: Whether the images agree with the odometry. If not, nothing can be counted.
+        path: The robot's path; places grow as the odometry does, also where the cameras moved to their own left.
+        fits: The images agree with the odometry. If not, nothing can be counted.
     """
 
     tracks: list[Track]
@@ -42,9 +42,9 @@ def follow_either_way(frames: list[list[Sighting]], distances: np.ndarray, calib
     What goes together with distances that grow to the cameras' right stays as `track.follow` makes it.
 
     Args:
-        frames: Of each pair, in the order in which the robot passed.
+        frames: Sightings of each pair, in the order in which the robot passed.
         distances: [F] float64, how far it had driven by its odometry, m.
-        calibration: Of the cameras.
+        calibration: Calibration of the cameras.
     """
     tracks, path = follow(frames, distances, calibration)
     fits = not _contradicted(frames, path.places)
@@ -59,15 +59,15 @@ def follow_either_way(frames: list[list[Sighting]], distances: np.ndarray, calib
 
 
 def _links(tracks: list[Track]) -> int:
-    """How often a pair shows a stalk that an earlier one showed."""
+    """Count the sightings of stalks that an earlier pair showed."""
     return sum(len(track.sightings) - 1 for track in tracks)
 
 
 def _contradicted(frames: list[list[Sighting]], places: np.ndarray) -> bool:
-    """Whether most pairs that share stalks with the one before say that the cameras moved by something else.
+    """Return True if most pairs that share stalks with the one before contradict the path.
 
     Args:
-        frames: Of each pair.
+        frames: Sightings of each pair.
         places: [F] float64, of each pair along the row, m.
     """
     compared = judged = against = 0
@@ -81,7 +81,7 @@ def _contradicted(frames: list[list[Sighting]], places: np.ndarray) -> bool:
 
 
 def _places(sightings: list[Sighting]) -> np.ndarray:
-    """Where the stalks of a pair stand that say so, [N, 2] float64: along the row and away from the cameras, m."""
+    """Return the positions of a pair's stalks that are known, [N, 2] float64: along the row and away from the cameras, m."""
     known = [
         (sighting.along_m, sighting.depth_m)
         for sighting in sightings
@@ -91,11 +91,11 @@ def _places(sightings: list[Sighting]) -> np.ndarray:
 
 
 def _shared(first: np.ndarray, second: np.ndarray, step: float) -> tuple[int, int, int]:
-    """How many stalks two pairs share: after the step that shares most, after a given one, and at the very most.
+    """Count the stalks that two pairs share: after the step that shares most, after a given one, and at the very most.
 
     Args:
         first, second: [N, 2] and [M, 2] float64, see `_places`.
-        step: How far the cameras moved between them, m.
+        step: Distance that the cameras moved between them, m.
     """
     most = min(len(first), len(second))
     if most < _ENOUGH:

@@ -1,4 +1,4 @@
-"""Which sightings of several pairs are one stalk, where it stands along the row, and how thick it is.
+"""Tracks: sightings in several pairs that are one stalk, and its position along the row.
 
 The robot says how far it has driven, to a few per cent; stereo says where a stalk stands beside it, to millimetres. A stalk's
 place along the row is their sum and stays the same from pair to pair, so a sighting belongs to the stalk that stands where it
@@ -22,7 +22,7 @@ _NEVER = 1e3  # cost of what does not belong together
 
 @dataclasses.dataclass(frozen=True)
 class Gates:
-    """What belongs together, lengths in m.
+    """Limits of what belongs together, lengths in m.
 
     Attributes:
         along: Greatest distance along the row between a stalk and a sighting of it.
@@ -31,9 +31,9 @@ class Gates:
         behind: The same, of pieces of which one has another depth, if it had not.
         astray: Share of the pairs of the shorter piece that may show both.
         row: Away from the cameras, between a stalk of the row and most others.
-        share: Of the pairs that should show a stalk, how many must.
-        least: How many pairs must show it, if so many can.
-        ends: How far beyond the ends of the path a stalk's foot may stand and still count.
+        share: Share of the pairs that should show a stalk which must show it.
+        least: Least number of pairs that must show it, if so many can.
+        ends: Distance beyond the ends of the path within which a stalk's foot still counts.
     """
 
     along: float = 0.018
@@ -55,7 +55,7 @@ class Track:
         sightings: Pair and place in its list of each sighting.
         position_m: Along the row, from where the robot was at the first pair.
         depth_m: From the cameras; not a number where no pair says.
-        counted: Whether it counts: enough pairs show it, and it stands beside the path.
+        counted: It counts: enough pairs show it, and it stands beside the path.
         reason: Why it does not count; empty where it does.
     """
 
@@ -68,11 +68,11 @@ class Track:
 
 @dataclasses.dataclass(frozen=True)
 class Path:
-    """How the robot drove.
+    """The robot's path.
 
     Attributes:
         places: [F] float64, of each pair along the row, m: odometry, corrected by what stereo saw.
-        length: Of the row that it passed, m: half a step more at each end.
+        length: Length of the row that it passed, m: half a step more at each end.
     """
 
     places: np.ndarray
@@ -90,11 +90,11 @@ class _Open:
     feet: list[float] = dataclasses.field(default_factory=list)
 
     def depths(self) -> np.ndarray:
-        """What pairs say of how far away it is."""
+        """Return its depth as the last pairs measured it, m."""
         return np.array(self.depth)[np.isfinite(self.depth)]
 
     def at(self, depth: float) -> float:
-        """Where it would stand along the row if it were so far away, m."""
+        """Return its position along the row if it were at a depth in m, m."""
         return float(np.median([offset + ray * depth for offset, ray in self.rays]))
 
     def place(self) -> tuple[float, float]:
@@ -108,10 +108,10 @@ def follow(
     """Puts the sightings of a plot together.
 
     Args:
-        frames: Of each pair, in the order in which the robot passed.
+        frames: Sightings of each pair, in the order in which the robot passed.
         distances: [F] float64, how far it had driven by its odometry, m.
-        calibration: Of the cameras.
-        gates: What belongs together.
+        calibration: Calibration of the cameras.
+        gates: Limits of what belongs together.
     """
     tracks: list[_Open] = []
     places = np.zeros(len(frames))
@@ -120,7 +120,7 @@ def follow(
     row = [sighting.depth_m for sightings in frames for sighting in sightings if sighting.depth_m is not None]
     usual = float(np.median(row)) if row else _USUAL_DEPTH
     for frame, sightings in enumerate(frames):
-        view = _Seen.of(sightings, calibration, usual)
+        view = _PairView.of(sightings, calibration, usual)
         places[frame] = driven[frame] + correction
         pairs = _assign(tracks, view, places[frame], gates)
         moves = [tracks[track].place()[0] - view.along[new] - places[frame] for track, new in pairs if view.known[new]]
@@ -150,18 +150,18 @@ def follow(
 
 
 @dataclasses.dataclass(frozen=True)
-class _Seen:
-    """Where the sightings of one pair are, [N] each.
+class _PairView:
+    """Positions of the sightings of one pair, arrays [N].
 
     Attributes:
         rays: Tangent of the angle at which the left camera sees a stalk.
         along: Beside the middle between the cameras, m; taken to be as far away as most where the pair does not say.
-        depth: Of the fronts, m.
-        known: Whether the pair says how far away it is.
-        there: Whether it may be a stalk of the row.
-        over: How far along the row it leans over its foot where it was measured, m; 0 where its height is not known.
+        depth: Depth of the fronts, m.
+        known: The pair measured its depth.
+        there: It may be a stalk of the row.
+        over: Distance along the row between its foot and the place of its measurement, m; 0 if its height is not known.
         half: Half the baseline, m.
-        usual: How far away most are, m.
+        usual: Usual depth, m.
     """
 
     rays: np.ndarray
@@ -174,7 +174,7 @@ class _Seen:
     usual: float
 
     @classmethod
-    def of(cls, sightings: list[Sighting], calibration: Calibration, usual: float) -> "_Seen":
+    def of(cls, sightings: list[Sighting], calibration: Calibration, usual: float) -> "_PairView":
         rays = np.array([(sighting.column - calibration.centre[0]) / calibration.focal for sighting in sightings])
         along = np.array([math.nan if sighting.along_m is None else sighting.along_m for sighting in sightings])
         depth = np.array([math.nan if sighting.depth_m is None else sighting.depth_m for sighting in sightings])
@@ -187,19 +187,19 @@ class _Seen:
         return cls(rays, along, depth, known, ~elsewhere & _apart_in_space(sightings), over, half, usual)
 
     def beside(self, depth: float) -> np.ndarray:
-        """Where they would stand along the row, [N], if they were so far away, m."""
+        """Return their positions along the row, [N], if they were at a depth in m, m."""
         return self.rays * (depth if math.isfinite(depth) else self.usual) - self.half
 
 
 def _over(sighting: Sighting) -> float:
-    """How far along the row a stalk leans over its foot where it was measured, m."""
+    """Return the distance along the row between a stalk's foot and the place where it was measured, m."""
     if sighting.height_m is None or sighting.lean_deg is None or abs(sighting.lean_deg) > _MOST_LEAN:
         return 0.0
     return sighting.height_m * math.tan(math.radians(sighting.lean_deg))
 
 
 def _apart_in_space(sightings: list[Sighting]) -> np.ndarray:
-    """Which sightings of a pair may be stalks of their own, [N] bool: two solid stalks cannot stand in one place.
+    """Return True for the sightings of a pair that may be stalks of their own, [N] bool: two cannot stand in one place.
 
     Of two that do, one was found twice, and the less certain one goes. Their measured diameters are taken to be too large by up
     to 40 % together with the error of their places.
@@ -219,8 +219,8 @@ def _apart_in_space(sightings: list[Sighting]) -> np.ndarray:
     return own
 
 
-def _assign(tracks: list[_Open], view: _Seen, place: float, gates: Gates) -> list[tuple[int, int]]:
-    """Which track each sighting goes on: pairs of indices, each at most once."""
+def _assign(tracks: list[_Open], view: _PairView, place: float, gates: Gates) -> list[tuple[int, int]]:
+    """Assign sightings to tracks: pairs of indices, every index at most once."""
     if not tracks or not view.rays.size:
         return []
     there = np.array([track.place() for track in tracks])
@@ -259,7 +259,7 @@ def _merged(tracks: list[_Open], gates: Gates) -> list[_Open]:
 
 
 def _one_behind(track: _Open, other: _Open) -> float:
-    """How far beside another track's stalk a track would be seen, m along the row, if it were as far away."""
+    """Return the distance along the row, m, between two tracks if both were as far away as the other one."""
     depths = other.depths()
     if len(track.sightings) < 2 or not len(depths):
         return math.inf
@@ -269,7 +269,7 @@ def _one_behind(track: _Open, other: _Open) -> float:
 
 
 def _apart(track: _Open, other: _Open) -> tuple[float, float]:
-    """How far apart two tracks are along the row and away from the cameras, m."""
+    """Return the distances of two tracks along the row and away from the cameras, m."""
     depths = track.depths(), other.depths()
     if all(map(len, depths)) or not any(map(len, depths)):
         aside = abs(float(np.median(track.along) - np.median(other.along)))

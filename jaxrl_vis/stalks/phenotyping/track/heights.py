@@ -36,8 +36,8 @@ class Width:
         mm: Weighted median.
         error: Its standard error, mm: that of the scatter between pairs, and at least what edges and disparity tell. What hides
             a stalk from all sides is not in it.
-        count: How many sightings say so.
-        corrected: Whether most of them were measured elsewhere, so that taper had to make up for it.
+        count: Number of sightings.
+        corrected: Most of them were measured elsewhere, so that taper had to make up for it.
     """
 
     mm: float
@@ -54,7 +54,7 @@ class StalkWidths:
         lower: At 12 inches, or where it was seen if ``height_known`` is false.
         upper: At 24 inches.
         taper: Between them, mm per inch; None unless both were measured.
-        height_known: Whether a pair that shows the stalk shows the ground.
+        height_known: A pair that shows the stalk shows the ground.
     """
 
     lower: Width | None
@@ -63,7 +63,7 @@ class StalkWidths:
     height_known: bool
 
 
-def widths_of(frames: list[list[Sighting]], tracks: list[Track]) -> list[StalkWidths]:
+def stalk_widths(frames: list[list[Sighting]], tracks: list[Track]) -> list[StalkWidths]:
     """Widths of the stalks of a plot, in the order of their tracks."""
     of_stalks = [[frames[frame][place] for frame, place in track.sightings] for track in tracks]
     first = [_of_stalk(sightings, USUAL_TAPER) for sightings in of_stalks]
@@ -74,7 +74,7 @@ def widths_of(frames: list[list[Sighting]], tracks: list[Track]) -> list[StalkWi
 
 @dataclasses.dataclass(frozen=True)
 class _Value:
-    """What one pair says: diameter and its standard error, mm, the height where, m, and whether an edge may be hidden."""
+    """Width in one pair: diameter and its standard error, mm, the height, m, the weight, and True if an edge may be hidden."""
 
     mm: float
     deviation: float | None
@@ -102,7 +102,7 @@ def _of_stalk(sightings: list[Sighting], taper: float) -> StalkWidths:
 
 
 def _facing(sighting: Sighting) -> float:
-    """How much a sighting says of the side of a stalk that faces the row, 0 to 1."""
+    """Return the weight of a sighting for the side of a stalk that faces the row, 0 to 1."""
     return 1.0 if sighting.ray_deg is None else math.exp(-((sighting.ray_deg / _ASIDE) ** 2))
 
 

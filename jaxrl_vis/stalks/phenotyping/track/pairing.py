@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
 from jaxrl_vis.stalks.phenotyping.measure.stalk import measure
-from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting, grey_of
+from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting, grey_at
 from jaxrl_vis_envs.plants import Calibration
 
 _ENOUGH = 4
@@ -14,21 +14,21 @@ _FEW, _MANY = 0.25, 0.6
 _LINES = (6, 12, 24, 48)  # how far two images lie apart that are not rectified, pixels of an image 3376 wide
 
 
-def wrong_with(
+def pair_fault(
     detections: list[Detection], sightings: list[Sighting], left: np.ndarray, right: np.ndarray, calibration: Calibration
 ) -> str | None:
-    """What is wrong with a pair, in words; None if nothing is, or too little was found to tell.
+    """Say in words what is wrong with a pair; None if nothing is, or too few stalks were detected to tell.
 
     Args:
         detections: In the left image.
-        sightings: What came of them.
+        sightings: Their sightings.
         left, right: [H, W, 3] uint8.
-        calibration: Of the cameras.
+        calibration: Calibration of the cameras.
     """
     measured = sum(sighting.diameter_mm is not None for sighting in sightings)
     if len(detections) < _ENOUGH or measured > _FEW * len(detections):
         return None
-    grey_left, grey_right = grey_of(left), grey_of(right)
+    grey_left, grey_right = grey_at(left), grey_at(right)
     # Seen in a mirror, a pair that is swapped is one that is not.
     mirror = dataclasses.replace(calibration, centre=(calibration.width - 1 - calibration.centre[0], calibration.centre[1]))
     turned = [

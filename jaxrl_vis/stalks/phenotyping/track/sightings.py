@@ -1,4 +1,4 @@
-"""What one pair says of the stalks in it: a sighting for each find, measured where the pair allows it."""
+"""Sightings: the stalks that one pair shows, measured where the pair allows it."""
 
 import dataclasses
 import math
@@ -31,20 +31,20 @@ class Sighting:
     Attributes:
         box: Left, top, right, bottom of its part in the band, pixels of the left image; (0, 0) is the middle of the first one.
         axis: Columns of its middle at the box's top and bottom.
-        score: Of the detector, 0 to 1.
-        line, column: Where it was measured: line, and column of its middle, pixels.
+        score: Score of the detector, 0 to 1.
+        line, column: Place of the measurement: line, and column of its middle, pixels.
         width_px: Across its axis there, pixels.
         lean_deg: Against the image's vertical, degrees, positive to the right.
         diameter_mm: Across its axis.
         deviation_mm: Its standard error.
         depth_m: Planar depth of its front.
-        along_m: Where it stands along the row, from the middle between the cameras.
-        height_m: Where above the ground; None where the pair shows no ground.
+        along_m: Position along the row, from the middle between the cameras.
+        height_m: Height of the measurement above the ground; None if the pair shows no ground.
         upper_mm, upper_deviation_mm, upper_height_m, upper_confidence: Diameter, its standard error, height and confidence
             around 24 inches above the ground.
         upper_place: Column, line and width in pixels of that.
         confidence: 0 to 1.
-        hidden, upper_hidden: Whether one of its edges may be hidden, so that it is at least so thick: another stalk stands
+        hidden, upper_hidden: One of its edges may be hidden, so that it is at least so thick: another stalk stands
             there, or, of the lower one, the edges were not seen around the height itself. All of the upper piece is near its
             height.
         ray_deg: Angle between the left camera's axis and the ray to it, degrees, positive to the right.
@@ -96,17 +96,17 @@ class Sighting:
         return cls(**parts)
 
 
-def _kind_of(hint: Any) -> tuple[type | tuple[type, ...], bool, int]:
+def _field_kind(hint: Any) -> tuple[type | tuple[type, ...], bool, int]:
     """Type of a field's values, whether it may be None, and the number of values."""
     one, optional, several = fields.unwrap(hint)
     length = next((len(get_args(part)) for part in (hint, *get_args(hint)) if get_origin(part) is tuple), 1)
     return (int, float) if one is float else one, optional, length if several else 1
 
 
-_KINDS = {name: _kind_of(hint) for name, hint in fields.hints(Sighting).items()}
+_KINDS = {name: _field_kind(hint) for name, hint in fields.hints(Sighting).items()}
 
 
-def grey_of(image: np.ndarray) -> np.ndarray:
+def grey_at(image: np.ndarray) -> np.ndarray:
     """An image [H, W, 3] uint8 as [H, W] uint8."""
     return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
 
@@ -121,19 +121,19 @@ def find_with_ground(
     """The stalks and the ground of a pair, looked for at the same time: an accelerator finds the one and the host the other.
 
     Args:
-        find: What finds stalks in a left image.
+        find: Detector of the stalks in a left image.
         left, right: [H, W, 3] uint8, rectified.
-        calibration: Of the cameras; without it, no ground is looked for.
+        calibration: Calibration of the cameras; without it, no ground is looked for.
         disparity: See `find_ground`.
     """
     if calibration is None:
         return find(left), None
     with ThreadPoolExecutor(1) as aside:
-        ground = aside.submit(lambda: find_ground(grey_of(left), grey_of(right), calibration, disparity))
+        ground = aside.submit(lambda: find_ground(grey_at(left), grey_at(right), calibration, disparity))
         return find(left), ground.result()
 
 
-def look(
+def measure_pair(
     detections: list[Detection],
     left: np.ndarray,
     right: np.ndarray,
@@ -147,14 +147,14 @@ def look(
     Args:
         detections: In the left image.
         left, right: [H, W, 3] uint8, rectified.
-        calibration: Of the cameras; without it there are no millimetres and no metres.
-        method: How widths are taken.
-        ground: What heights are counted from; without it a stalk is measured in the middle of its box, and only there.
+        calibration: Calibration of the cameras; without it there are no millimetres and no metres.
+        method: Method of widths.
+        ground: Origin of heights; without it a stalk is measured in the middle of its box, and only there.
         disparity: [H, W] float32, disparities that are known, pixels.
     """
     if calibration is None:
         return [_in_pixels(detection) for detection in detections]
-    grey_left, grey_right = grey_of(left), grey_of(right)
+    grey_left, grey_right = grey_at(left), grey_at(right)
     measured: list[tuple[Measurement, Measurement | None]] = []
     for detection in detections:
         line = 0.5 * (detection.box[1] + detection.box[3])
@@ -177,7 +177,7 @@ def look(
 
 
 def _hidden_edges(measurements: list[Measurement]) -> list[bool]:
-    """Which stalks have an edge where another one stands that is not behind them: it may be the other one's, and they look too
+    """Return True for the stalks with an edge at another one that is not behind them: it may be the other's, and they look too
     thin.
     """
     hidden = []

@@ -25,18 +25,18 @@ from jaxrl_vis.stalks.phenotyping.training.updates import Report, repeat
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """How long and how fast the networks learn.
+    """Schedule of the networks' training.
 
     Attributes:
         steps: Most updates.
         minutes: Most minutes of updates, compilation included; None for no limit.
-        images: How many images are kept to learn from.
+        images: Number of images to learn from.
         first: With how many the updates begin.
         batch: Images per update.
         snips: Snips per update.
         rate: Highest learning rate.
-        average: Of the weights over updates: the share of the old ones.
-        seed: Of everything random.
+        average: Average of the weights over updates: the share of the old ones.
+        seed: Seed of everything random.
     """
 
     steps: int = 20_000
@@ -127,11 +127,11 @@ def train(
     """Trains the networks.
 
     Args:
-        sources: Where examples come from; each is read by a thread of its own.
-        settings: Of the networks.
-        plan: How long and how fast.
+        sources: Iterators over examples; each is read by a thread of its own.
+        settings: Settings of the networks.
+        plan: Schedule.
         report: See `Report`.
-        every: How often, s.
+        every: Interval of reports, s.
         start: Parameters to go on from, as they are returned; None: random ones.
 
     Returns:

@@ -1,4 +1,4 @@
-"""What the networks learn from: reduced images with the stalks in them, and snips at full resolution with their masks."""
+"""Training examples: reduced images with the stalks in them, and crops at full resolution with their masks."""
 
 import dataclasses
 import functools
@@ -58,10 +58,10 @@ def synthetic_examples(family: Family, settings: Settings, seed: int, frames: in
     """Examples of one plot of a family.
 
     Args:
-        family: What the plot is drawn from.
-        settings: Of the networks.
-        seed: Of the plot.
-        frames: How many images of it, spread over it.
+        family: Family that the plot is drawn from.
+        settings: Settings of the networks.
+        seed: Seed of the plot.
+        frames: Number of images of it, spread over it.
     """
     sequence = Sequence.of(draw(family, seed))
     rng = np.random.default_rng([seed, 17])
@@ -73,7 +73,7 @@ def synthetic_examples(family: Family, settings: Settings, seed: int, frames: in
         # What shows, and how much of it, is as well counted in every fourth pixel.
         true = sequence.drive.true
         thinned = np.asarray(instance[::_THIN, ::_THIN]), np.asarray(depth[::_THIN, ::_THIN])
-        stalks, kinds, indices = truth_of(sequence.plot, sequence.drive.poses[frame], true, *thinned)
+        stalks, kinds, indices = true_boxes(sequence.plot, sequence.drive.poses[frame], true, *thinned)
         masks_of = functools.partial(_instance_masks, instance, indices)
         examples.append(_example(image, stalks, kinds, masks_of, settings, rng, _HIGHER))
     return examples
@@ -87,14 +87,14 @@ def _instance_masks(
     return cut_out == indices[parts][:, None, None] + 1
 
 
-def truth_of(
+def true_boxes(
     plot: Plot, pose: Pose, camera: Calibration, instance: np.ndarray, depth: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The stalks of the near row whose part in the band one image shows, in continuous coordinates of the image.
 
     Args:
-        plot: What stands there.
-        pose: Of the left camera.
+        plot: The plants.
+        pose: Pose of the left camera.
         camera: As it is.
         instance, depth: [h, w], of each first of `_THIN` pixels in both directions.
 
@@ -178,7 +178,7 @@ def annotated_examples(folder: Path, settings: Settings) -> Iterator[Example]:
                 f"{size[1]} x {size[0]}: save the image at the size at which it was annotated"
             )
         annotations = of_image.get(about["id"], [])
-        stalks = np.array([_stalk_of(annotation, size) for annotation in annotations], np.float32).reshape(-1, 6)
+        stalks = np.array([_annotated_stalk(annotation, size) for annotation in annotations], np.float32).reshape(-1, 6)
         kinds = np.full(len(annotations), STALK, np.int32)
         rng = np.random.default_rng([number, 18])
         yield _example(image, stalks, kinds, functools.partial(_own_masks, annotations, size), settings, rng)
@@ -193,7 +193,7 @@ def _own_masks(
 ) -> np.ndarray:
     """Masks of the snips of some stalks, cut out of the mask of each: they may overlap, and together fill the memory."""
     snips = [
-        np.asarray(cut(jnp.asarray(_mask_of(annotations[part], size)), places[place : place + 1], shape))
+        np.asarray(cut(jnp.asarray(_annotated_mask(annotations[part], size)), places[place : place + 1], shape))
         for place, part in enumerate(parts)
     ]
     return np.concatenate(snips)
@@ -214,11 +214,11 @@ def settings_for(folder: Path, settings: Settings) -> Settings:
 
 
 def any_outlined(folder: Path) -> bool:
-    """Whether any annotation of a folder has more than a box."""
+    """Return True if any annotation of a folder has more than a box."""
     return any(annotation["segmentation"] for annotation in read_annotations(folder)["annotations"])
 
 
-def _mask_of(annotation: dict[str, Any], size: tuple[int, int]) -> np.ndarray:
+def _annotated_mask(annotation: dict[str, Any], size: tuple[int, int]) -> np.ndarray:
     """The mask [H, W] bool of one annotation; all of the box where there is none."""
     segmentation = annotation["segmentation"]
     if isinstance(segmentation, dict):
@@ -228,11 +228,11 @@ def _mask_of(annotation: dict[str, Any], size: tuple[int, int]) -> np.ndarray:
     return outlined_mask(segmentation or [[left, top, right, top, right, bottom, left, bottom]], size)
 
 
-def _stalk_of(annotation: dict[str, Any], size: tuple[int, int]) -> list[float]:
+def _annotated_stalk(annotation: dict[str, Any], size: tuple[int, int]) -> list[float]:
     """Box and axis [6] of one annotation."""
     left, top, wide, tall = annotation["bbox"]
     right, bottom = left + wide, top + tall
-    line, column = np.nonzero(_mask_of(annotation, size))
+    line, column = np.nonzero(_annotated_mask(annotation, size))
     axis = [left + wide / 2] * 2
     if line.size > 50 and np.ptp(line) > 8:
         slope, offset = np.polyfit(line + 0.5, column + 0.5, 1)

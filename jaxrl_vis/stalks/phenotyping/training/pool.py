@@ -20,7 +20,7 @@ class Pool(Generic[T]):
 
         Args:
             sources: Each is read by a thread of its own.
-            most: How many are kept; no more are made.
+            most: Greatest number of examples.
         """
         self._queue: queue.Queue[T | Exception | None] = queue.Queue(maxsize=16)
         self._stop = threading.Event()

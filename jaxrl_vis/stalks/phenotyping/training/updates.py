@@ -20,7 +20,7 @@ there is nothing to learn from yet."""
 
 
 class Schedule(Protocol):
-    """How long and how fast: most updates and minutes, how many examples to begin with, highest rate, share of the average."""
+    """A schedule of training: most updates and minutes, number of examples to begin with, highest rate, share of the mean."""
 
     @property
     def steps(self) -> int: ...  # noqa: D102
@@ -37,11 +37,11 @@ def repeat(update: Update, pool: Pool, plan: Schedule, started: float, report: R
 
     Args:
         update: Makes one.
-        pool: Where examples come from; filled with as many as are wanted to begin with.
-        plan: How long and how fast.
-        started: When the minutes began, by `time.monotonic`.
+        pool: Source of examples; filled with as many as are wanted to begin with.
+        plan: Schedule.
+        started: Start of the minutes, by `time.monotonic`.
         report: See `Report`.
-        every: How often, s.
+        every: Interval of reports, s.
 
     Returns:
         How many updates were made.
