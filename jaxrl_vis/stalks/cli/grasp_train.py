@@ -15,7 +15,7 @@ from jaxrl_vis.report.outputs import check_writable
 from jaxrl_vis.stalks.cli.options import TrainingOptions, check_extra
 
 _FIRST_SEED = 100_000
-"""Of the rows that networks learn from: evaluations use the seeds below."""
+"""First seed of the rows that networks learn from: evaluations use the seeds below."""
 
 
 _RATES = {"segmentation": 1e-3, "gan": 4e-4}

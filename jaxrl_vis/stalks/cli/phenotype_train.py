@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
 
 _FIRST_SEED = 100_000
-"""Of the plots that networks learn from: evaluations use the seeds below."""
+"""First seed of the plots that networks learn from: evaluations use the seeds below."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

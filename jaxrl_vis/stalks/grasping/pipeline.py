@@ -1,4 +1,4 @@
-"""Folders of pairs to grasp points: `run` reads, perceives and writes, and goes on where it was stopped.
+"""Folders of pairs to grasp points: `run` reads, perceives and writes, and continues where it was stopped.
 
     OUT/run.json                 what was asked for: a folder holds the results of one request
         runs/RUN.json            what came of one run, and of which files; not computed again while these are the same, unless
@@ -31,9 +31,9 @@ from jaxrl_vis_envs.documents import read_json
 from jaxrl_vis_envs.plants import Calibration
 
 Find = Callable[[np.ndarray, PlotFolder, PairFiles], np.ndarray]
-"""Which pixels of a left image [H, W, 3] uint8 show a stalk of the near row: [H, W] bool."""
+"""From a left image [H, W, 3] uint8 and its files to the mask of the stalks of the near row, [H, W] bool."""
 Reachable = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""Which points [B, 3] the arm can go to from any of the stops [S, 3], all in the robot frame of the last one, m: [B] bool."""
+"""From points [B, 3] and stops [S, 3] in the robot frame of the last stop, m, to True for points in the arm's reach, [B]."""
 
 RUN_COLUMNS = (
     "run",

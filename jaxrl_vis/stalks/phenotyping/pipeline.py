@@ -1,4 +1,4 @@
-"""Folders of pairs to tables: `run` reads, finds, measures, follows and writes, and goes on where it was stopped.
+"""Folders of pairs to tables: `run` reads, finds, measures, follows and writes, and continues where it was stopped.
 
     OUT/run.json                 what was asked for: a folder holds the results of one request
         pairs/PLOT/PAIR.json     sightings, or why the pair was skipped, and of which files; not computed again while these are

@@ -20,7 +20,7 @@ RATE = 250.0
 FOLDED = 0.34
 """Distance of the grip from the first joint before it moves outwards, m."""
 HOME = (0.0, stalk_arm.SHOULDER[1] + FOLDED, 0.85)
-"""Where the grip waits, m in the frame of a stand."""
+"""Position in which the grip waits, m in the frame of a stand."""
 
 
 @dataclasses.dataclass(frozen=True)

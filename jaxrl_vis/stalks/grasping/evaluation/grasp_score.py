@@ -1,8 +1,8 @@
 """Score of grasps: one target, one stalk between the jaws. NumPy and SciPy only.
 
 The thesis counts stalks: 1 - |grasped - attempted| / attempted, averaged over runs. Misses and double grasps cancel there.
-Here an attempt succeeds where exactly the stalk that it was for is between the jaws at closure, all that goes wrong is told
-apart, and the thesis's ratio stands beside it.
+Here an attempt succeeds if exactly the stalk that it was for is between the jaws at closure. Failures are counted by kind,
+beside the thesis's ratio.
 """
 
 import dataclasses

@@ -27,7 +27,7 @@ from jaxrl_vis_envs.plants import Family
 from jaxrl_vis_envs.plants.stand import Stands
 
 SCHEMA = 2
-"""Of the records: those of another one cannot be gone on with."""
+"""Schema of the records: those with another one cannot be resumed."""
 _DIGITS = 6  # of lengths in m
 # Files and folders that train networks or draw figures and videos.
 _CHANGES_NO_RECORD = ("examples.py", "mask_training.py", "variation.py", "report")

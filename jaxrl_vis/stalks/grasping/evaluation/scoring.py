@@ -25,7 +25,7 @@ from jaxrl_vis_envs.plants import Drive, Family, Plot, Pose, draw
 from jaxrl_vis_envs.plants.pairs import Sequence
 
 RADIUS = 0.03
-"""How far a grasp point may be from the stalk that it is matched with, m: half the mean spacing."""
+"""Greatest distance of a grasp point from the stalk that it is matched with, m: half the mean spacing."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -35,7 +35,7 @@ class Mount:
 
     @classmethod
     def of(cls, rig: Rig) -> "Mount":
-        """As the cameras of a family are mounted, but for what varies."""
+        """Return the nominal mount of a family's cameras."""
         return cls(rig.camera_height, rig.pitch, max(rig.distance - 0.33, 0.15), rig.distance + 0.4)
 
     @property

@@ -25,7 +25,7 @@ from jaxrl_vis.stalks.grasping.perception.visibility import Visibility
 from jaxrl_vis_envs.plants import Calibration
 
 Mask = Callable[[np.ndarray, int], np.ndarray]
-"""Which pixels of a left image [H, W, 3] uint8 show a stalk of the near row: [H, W] bool. Also told which pair it is."""
+"""From a left image [H, W, 3] uint8 and the number of its pair to the mask of the stalks of the near row, [H, W] bool."""
 
 
 @dataclasses.dataclass(frozen=True)

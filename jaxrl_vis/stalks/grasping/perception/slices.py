@@ -14,9 +14,9 @@ from jaxrl_vis.stalks.grasping.perception.cloud import thinned
 from jaxrl_vis.stalks.grasping.perception.lines import PREFERRED, GraspPoint
 
 THICKNESS = 0.2
-"""Of a slice, m."""
+"""Thickness of a slice, m."""
 CELL = 0.01
-"""Of the heat map, m."""
+"""Edge of a cell of the heat map, m."""
 _VOXEL = 0.005  # m: near stalks have more pixels, not more points
 _SHARE = 0.25
 _LEAST_CELLS = 2

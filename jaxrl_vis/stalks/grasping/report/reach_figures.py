@@ -24,7 +24,7 @@ from jaxrl_vis_envs.plants import Family
 
 THESIS_RATIO, CORNBOT_SHARE = 0.7413, 43 / 48
 RUNS = 16
-"""Of figure 4.6, as many as the thesis has."""
+"""Number of runs of figure 4.6, as many as the thesis has."""
 _HELD, _OTHER, _LOST = "#2f855a", "#dd6b20", "#cbd5e0"
 
 

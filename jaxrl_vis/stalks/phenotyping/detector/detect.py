@@ -34,7 +34,7 @@ class Settings:
         proposals: Number of proposals that are judged.
         most: Greatest number of stalks in an image.
         proposal_threshold: Overlap of strips above which only one is proposed.
-        threshold: Overlap of strips above which two finds are one stalk.
+        threshold: Overlap of strips above which two detections are one stalk.
         least_score: Lowest score of a detection.
     """
 

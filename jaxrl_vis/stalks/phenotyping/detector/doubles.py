@@ -1,8 +1,8 @@
-"""Stalks that were found twice, told by their masks.
+"""Duplicate detections of a stalk, recognised by their masks.
 
-In a clump the boxes of two finds of one stalk can be as different as those of two stalks that cross, so the detector keeps
-both. Their masks are not: both are of the one stalk that is there. Masks of two stalks share little, as a mask is of what can
-be seen.
+In a clump the boxes of two detections of one stalk can be as different as those of two stalks that cross, so the detector keeps
+both. The masks of duplicates agree, as both show the one stalk that is there; those of two stalks share little, as a mask holds
+only the visible part.
 """
 
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 MOST_SHARED = 0.6
-"""Of the smaller mask's pixels: what lies between doubled finds, which share more, and touching stalks, which share less."""
+"""Greatest share of the smaller mask's pixels in two stalks: duplicates share more, and stalks that touch share less."""
 
 Piece = tuple[np.ndarray, tuple[int, int]]
 """A mask [h, w] in a part of the image, and line and column of its first pixel there."""
@@ -21,7 +21,7 @@ def without_duplicates(pieces: Sequence[Piece], scores: np.ndarray, most_shared:
 
     Args:
         pieces: N masks, float32 from 0 to 1 or bool, and where they are.
-        scores: [N] of the finds; of equal ones, the first goes first.
+        scores: [N] of the detections; of equal ones, the first goes first.
         most_shared: Share of the smaller of two masks above which they show the same stalk.
 
     Returns:

@@ -43,7 +43,7 @@ class Detection:
 
 
 UPPER = (HEIGHTS[1] - HEIGHTS[0]) / (BAND[1] - BAND[0])
-"""How far the upper height lies above the middle of the band, in heights of the band."""
+"""Distance of the upper height above the middle of the band, in heights of the band."""
 
 
 def higher_up(stalk: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Finds as perfect networks would give them: true boxes and masks of synthetic pairs, to see what the rest makes of them."""
+"""Detections as perfect networks would make them, from true boxes and masks of synthetic pairs, to test everything after."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -12,7 +12,7 @@ def perfect_detections(stalks: Iterable[Mapping[str, Any]], instance: np.ndarray
     """The stalks that an image shows, from left to right.
 
     Args:
-        stalks: With ``stalk``, ``band_box`` and ``band_visible``, as of `truth.StalkInView` or plot.json.
+        stalks: With ``stalk``, ``band_box`` and ``band_visible``, as in `truth.StalkInView` or plot.json.
         instance: [H, W] whole numbers: which stalk each pixel shows.
         least: Share of a stalk's part in the band that must be seen.
     """

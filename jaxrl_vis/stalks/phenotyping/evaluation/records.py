@@ -26,7 +26,7 @@ from jaxrl_vis_envs.plants import Family
 
 SCHEMA = 2
 KEPT_SCORE = 0.05
-"""Finds of lower scores are not kept: they matter for nothing but the far end of the precision curve."""
+"""Lowest score of recorded detections: others matter for nothing but the far end of the precision curve."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Scores of detections, counts and widths against the exact truth of synthetic plots, which are drawn for it.
 
-plot -> pairs -> finds -> sightings -> stalks       as `pipeline.run` does, without files
+plot -> pairs -> detections -> sightings -> stalks       as `pipeline.run` does, without files
      -> true boxes, count and diameters             from the plot itself
 """
 
@@ -40,7 +40,7 @@ class PlotScore:
         upper: [M, 2] float64, the same at 24 inches.
         seconds: Time of finding and measuring per pair, from arrays in memory; the first pair, which compiles, is left out.
         thesis: Score of the thesis's methods on the same detections.
-        finds: [K, 2] float64, score of each find, and 1 where it is a stalk, 0 where not; those of unclear stalks are left out.
+        finds: [K, 2] float64, score of a detection, and 1 if it is a stalk, 0 if not; those of unclear stalks are left out.
         stalks: Number of stalks that detections could have shown, over all pairs.
     """
 
@@ -57,7 +57,7 @@ class PlotScore:
 
 @dataclasses.dataclass(frozen=True)
 class ThesisScore:
-    """The same finds, as the thesis makes counts and widths of them.
+    """Counts and widths of the same detections by the thesis's methods.
 
     Attributes:
         counted: Stalks, by the stalks on each metre of image.
@@ -87,7 +87,7 @@ def score_plot(
         find: Detector of the stalks in a left image [H, W, 3] uint8, those of low scores too; None for true boxes and masks.
         method: Method of widths.
         least_score: Lowest score of a detection that counts.
-        with_thesis: Score the thesis's ways on the same finds, too.
+        with_thesis: Score the thesis's methods on the same detections, too.
     """
     sequence = Sequence.of(draw(family, seed))
     drive, plot = sequence.drive, sequence.plot
@@ -256,7 +256,7 @@ def summary(scores: Iterable[PlotScore], least_score: float = 0.5) -> dict[str, 
 
 
 def _best_f1(finds: np.ndarray, stalks: int) -> tuple[float, float]:
-    """The best F1 that any least score gives, and that score; finds [K, 2] as of `PlotScore`."""
+    """Return the best F1 over all lowest scores, and that score; finds [K, 2] as in `PlotScore`."""
     if not len(finds) or not stalks:
         return float("nan"), float("nan")
     order = np.argsort(-finds[:, 0], kind="stable")

@@ -10,7 +10,7 @@
         plot.json            count, each stalk's diameters, the cameras as they are; written last, so it says that the plot is
         whole
 
-A plot that is whole is not drawn again, so a command that was stopped goes on where it was; one that holds less of the truth
+A complete plot is not drawn again, so a command that was stopped continues where it was; one that holds less of the truth
 than is asked for is.
 """
 

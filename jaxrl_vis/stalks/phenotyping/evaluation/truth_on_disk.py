@@ -1,4 +1,4 @@
-"""Finds from the truth that `phenotype synth` wrote beside its images: what perfect networks would give."""
+"""Detections from the truth that `phenotype synth` wrote beside its images, as perfect networks would make them."""
 
 import functools
 from pathlib import Path

@@ -22,7 +22,7 @@ STALK = 1
 _MOST_BYTES = 10_000_000  # of a file of one image
 _FARTHEST = 1e7  # pixels
 _WRONG = (ValueError, KeyError, TypeError, AttributeError, OverflowError)
-"""What a file raises that is of another form."""
+"""Errors that reading a file of another form raises."""
 
 
 def coco(images: list[dict[str, Any]], annotations: list[dict[str, Any]], about: dict[str, Any]) -> dict[str, Any]:
@@ -209,7 +209,7 @@ def _checked_annotation(annotation: dict[str, Any], sizes: dict[int | str, tuple
         sizes: Height and width of each image, by its id.
 
     Raises:
-        ValueError: They do not. The message goes on where the annotation's name ends.
+        ValueError: They do not. The message continues after the annotation's name.
     """
     number = annotation.get("image_id")
     if not isinstance(number, (int, str)) or number not in sizes:

@@ -64,7 +64,7 @@ def find_plots(folder: Path) -> list[PlotFolder]:
     """The plots in a folder: the folder itself if it holds pairs, else its subfolders that do.
 
     Raises:
-        RequestError: There is no such folder, there are no pairs in it, or nobody can tell which of two files is meant.
+        RequestError: There is no such folder, there are no pairs in it, or two files could be meant.
     """
     if not folder.is_dir():
         raise RequestError(f"there is no folder {folder}: name one with stereo pairs")
@@ -206,7 +206,7 @@ def read_odometry(plot: PlotFolder, speed: float | None = None) -> dict[str, flo
         speed: Speed of the robot, m/s: for files that hold times only.
 
     Raises:
-        RequestError: The file cannot be read, does not say how far or when, or nobody can tell which of its rows is which pair.
+        RequestError: The file cannot be read, states neither distances nor times, or its rows cannot be matched with the pairs.
     """
     path = plot.folder / "odometry.csv"
     if not path.exists():

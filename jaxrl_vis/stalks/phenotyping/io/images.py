@@ -17,12 +17,12 @@ _OPTIONS: dict[str, list[int]] = {
     ".jpg": [cv2.IMWRITE_JPEG_QUALITY, 95],
 }
 MOST_PIXELS = 100_000_000
-"""Of an image that is read."""
+"""Greatest number of pixels of an image that is read."""
 _MOST_BYTES, _MOST_BESIDES = 16, 1 << 26  # of a file, for each pixel and for what else cameras write down
 
 
 def write_image(path: Path, image: np.ndarray) -> None:
-    """Writes an image: [H, W, 3] or [H, W], uint8 or uint16; the suffix says how. Nobody sees half of it.
+    """Writes an image: [H, W, 3] or [H, W], uint8 or uint16; the suffix says how. The file is complete whenever it can be read.
 
     Raises:
         OSError: It cannot be written.

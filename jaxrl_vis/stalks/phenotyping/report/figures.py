@@ -18,9 +18,9 @@ from jaxrl_vis_envs.documents import read_json
 _INK, _GREY, _GREEN, _ORANGE = "#222222", "#9a9a9a", "#1a7f37", "#d1720c"
 _MOST_SHOWN = 60  # stalks of figure 3.5, as many as can be told apart
 HUMAN_MINUTES = {"count": (3.33, 3.66), "width": (29.0, 30.0)}
-"""Of a plot of 33 stalks, by two people; quoted from Table 3.1 of the thesis."""
+"""Minutes of two people for a plot of 33 stalks; quoted from Table 3.1 of the thesis."""
 THESIS_SECONDS = 6.5
-"""Of the thesis's own pipeline for the same plot, quoted."""
+"""Seconds of the thesis's own pipeline for the same plot, quoted."""
 
 
 def read_evaluation(path: Path) -> dict[str, Any]:

@@ -66,7 +66,7 @@ _DIGITS = {
     **dict.fromkeys(("width_mm", "width_24in_mm", "width_mean_mm", "width_sd_mm", "width_24in_mean_mm", "stalks_per_m"), 1),
     "confidence": 2,
 }
-"""Of numbers in the page; the files have more."""
+"""Digits of numbers in the page; the files have more."""
 _ERRORS = (
     "± is the scatter between pairs. The error of the calibration, and what hides a stalk from all sides, are not in it. "
     "Point at a picture to enlarge it."
@@ -159,7 +159,7 @@ class Page:
         write("<h3>Pairs</h3>" + "".join(pictures.whole(self._whole)) + "</details>\n")
 
     def write(self, path: Path, skipped: list[dict[str, Any]]) -> None:
-        """Writes the page. Nobody sees half of it.
+        """Writes the page. The file is complete whenever it can be read.
 
         Args:
             path: The file, .html.

@@ -142,7 +142,7 @@ def _plot_row(stalks: list[Row], pairs: int, length: float, skipped: int, origin
 
 
 def rows_without_path(frames: list[list[Sighting]], skipped: int, origin: Origin, why: str) -> tuple[list[Row], Row]:
-    """The plot's row where pairs cannot be put together: widths of finds, but no count. There are no rows of stalks."""
+    """The plot's row where pairs cannot be put together: widths of detections, but no count. There are no rows of stalks."""
     measured = [sighting.diameter_mm for sightings in frames for sighting in sightings if sighting.diameter_mm is not None]
     row = {
         "plot": origin.plot,
@@ -182,7 +182,7 @@ def _text(value: float, digits: int) -> str:
 
 
 def write_rows(path: Path, columns: tuple[str, ...], rows: list[Row]) -> None:
-    """Writes a table as CSV. Nobody sees half of it.
+    """Writes a table as CSV. The file is complete whenever it can be read.
 
     Raises:
         OSError: It cannot be written.

@@ -234,7 +234,7 @@ def _assign(tracks: list[_Open], view: _PairView, place: float, gates: Gates) ->
 
 
 def _merged(tracks: list[_Open], gates: Gates) -> list[_Open]:
-    """Tracks less those that go on where another one was lost: they stand in one place and no pair shows both.
+    """Return the tracks without those that continue where another one was lost: they stand in one place and no pair shows both.
 
     Or they are seen in one place, always, and one depth is wrong: of two solid stalks that stand behind each other, the cameras
     would see both as soon as they have moved on.

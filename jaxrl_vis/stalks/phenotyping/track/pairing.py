@@ -50,7 +50,7 @@ def pair_fault(
 
 
 def _share(detections: list[Detection], left: np.ndarray, right: np.ndarray, calibration: Calibration) -> float:
-    """Share of finds, ten at most, that the right image shows."""
+    """Return the share of detections, ten at most, that the right image shows."""
     some = detections[:: -(-len(detections) // 10)]
     left, right = np.ascontiguousarray(left), np.ascontiguousarray(right)
     measured = [
