@@ -25,7 +25,7 @@ from jaxrl_vis.stalks.phenotyping.io.masks import decode_counts
 from jaxrl_vis.stalks.phenotyping.training.augment import move, vary_snips
 from jaxrl_vis.stalks.phenotyping.training.detector_training import Plan, train
 from jaxrl_vis.stalks.phenotyping.training.examples import (
-    MOST,
+    MAX_STALKS,
     Example,
     _instance_masks,
     annotated_examples,
@@ -212,7 +212,7 @@ def drawing(seed: int) -> Example:
         image[line, begin:end] = 200
         mask[line, begin:end] = True
     stalk = np.array([min(top, bottom) - 3, 15, max(top, bottom) + 3, 45, top, bottom], np.float32)
-    stalks, kinds = np.zeros((MOST, 6), np.float32), np.zeros(MOST, np.int32)
+    stalks, kinds = np.zeros((MAX_STALKS, 6), np.float32), np.zeros(MAX_STALKS, np.int32)
     stalks[0], kinds[0] = stalk, STALK
     snips = np.asarray(cut(jnp.asarray(image), stalk[None], (32, 16)))
     masks = np.asarray(cut(jnp.asarray(mask), stalk[None], (32, 16)))

@@ -15,7 +15,7 @@ from PIL import Image
 import jaxrl_vis_envs
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.grasping.arm import approach, control
-from jaxrl_vis.stalks.grasping.arm.choice import LEAST_ROOM, choose, choose_nearest
+from jaxrl_vis.stalks.grasping.arm.choice import MIN_ROOM, choose, choose_nearest
 from jaxrl_vis.stalks.grasping.arm.policy_loop import STALKS, check_policy, reach_by_policy
 from jaxrl_vis.stalks.grasping.arm.reach import LOOK, ArmView, ReachResult, arms_among, reach
 from jaxrl_vis.stalks.grasping.evaluation.attempts import follow, wind_keys
@@ -330,7 +330,7 @@ def test_the_height_with_most_room_is_taken_and_what_is_blocked_is_refused():
     assert not alone.is_blocked and alone.point[2] == HEIGHT and alone.room == np.inf
     # A neighbour that leans over the target at its height, and away from it below.
     leaning, other = choose([line(0.0, 0.0), line(0.02, -0.03, -0.3)], stops)
-    assert leaning.point[2] < HEIGHT and leaning.room > LEAST_ROOM
+    assert leaning.point[2] < HEIGHT and leaning.room > MIN_ROOM
     # Its neighbour is as thick as it is at the height of the grasp, and where it bends to.
     bent = dataclasses.replace(line(0.1, 0.0), bend=(-0.5, 0.0), taper=-0.02)
     rooms = [choose([line(0.0, 0.0), each], stops, (0.45, 0.45))[0].room for each in (line(0.1, 0.0), bent)]

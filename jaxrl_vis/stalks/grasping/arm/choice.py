@@ -13,13 +13,13 @@ import numpy as np
 from jaxrl_vis.stalks.grasping.arm import approach
 from jaxrl_vis.stalks.grasping.perception.lines import HEIGHTS, GraspPoint
 
-LEAST_ROOM = 0.0045
+MIN_ROOM = 0.0045
 """Room in m beside the open gripper, on its whole way, with less of which the arm is not sent."""
-_ENOUGH = 0.02  # m: more room is no better
+_ENOUGH_ROOM = 0.02  # m: more room is no better
 _STEPS = tuple(sign * step for step in np.arange(0.0, 0.31, 0.05) for sign in (-1.0, 1.0))
 # m, from the height of the grasp point: further away the line is not believed
 _UNSURE = 0.005  # m per m: how much less is known of a stalk away from the height of its grasp point
-_USUAL = 0.007  # m: radius of a stalk whose thickness is not known
+_USUAL_RADIUS = 0.007  # m: radius of a stalk whose thickness is not known
 
 
 class Choice(NamedTuple):
@@ -40,7 +40,7 @@ class Choice(NamedTuple):
     @property
     def is_blocked(self) -> bool:
         """True if it could be reached, but other stalks are in the way."""
-        return self.stop >= 0 and self.room < LEAST_ROOM
+        return self.stop >= 0 and self.room < MIN_ROOM
 
 
 def choose(points: Sequence[GraspPoint], stops: np.ndarray, heights: tuple[float, float] = HEIGHTS) -> list[Choice]:
@@ -59,7 +59,7 @@ def choose(points: Sequence[GraspPoint], stops: np.ndarray, heights: tuple[float
             path = _approach_at(point, points, stops, height)
             if path.stop < 0:
                 continue
-            value = min(path.room, _ENOUGH) - _UNSURE * abs(height - point.point[2])
+            value = min(path.room, _ENOUGH_ROOM) - _UNSURE * abs(height - point.point[2])
             if value > worth:
                 best, worth = Choice(path.stop, path.side, path.room, point.at_height(height)), value
         chosen.append(best)
@@ -86,11 +86,11 @@ def _approach_at(point: GraspPoint, points: Sequence[GraspPoint], stops: np.ndar
     """The best way to one of the points at a height, among all others as they are there."""
     others = [other for other in points if other is not point]
     beside = np.array([other.at_height(height) for other in others]).reshape(-1, 3)
-    return approach.best_approach(stops, point.at_height(height), beside[:, :2], stalk_radii(others, height), _ENOUGH)
+    return approach.best_approach(stops, point.at_height(height), beside[:, :2], stalk_radii(others, height), _ENOUGH_ROOM)
 
 
 def stalk_radii(points: Sequence[GraspPoint], height: float | None = None) -> np.ndarray:
     """Radii [B] of stalks at a height, or at their grasp points, m: a usual one where a thickness is not known."""
     thickness = [point.thickness if height is None else point.thickness_at(height) for point in points]
     radii = 0.5 * np.array(thickness, float)
-    return np.where(np.isfinite(radii), radii, _USUAL)
+    return np.where(np.isfinite(radii), radii, _USUAL_RADIUS)

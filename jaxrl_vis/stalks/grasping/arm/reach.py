@@ -35,7 +35,7 @@ INTERVAL = _STEPS_A_POINT / control.RATE
 """Time between two points of a path, s."""
 LOOK = _POINTS_A_CALL * INTERVAL
 """Time between two looks on the way, s."""
-_FEWEST = 8  # arms in a program
+_MIN_ARMS = 8  # arms in a program
 _TOUCH = 0.0015  # m, a jaw this near to a stalk presses on it: soft contacts give way by some tenths of a millimetre
 
 
@@ -178,7 +178,7 @@ def reach(
     if not count:
         return _empty(stands, timing)
     # The rest of the program's arms do what the first one does.
-    fill = np.concatenate([np.arange(count), np.zeros(max(_FEWEST, 1 << (count - 1).bit_length()) - count, int)])
+    fill = np.concatenate([np.arange(count), np.zeros(max(_MIN_ARMS, 1 << (count - 1).bit_length()) - count, int)])
     start, advance = _programs(stands.stalk.shape[1], timing, gains)
     shape = jax.tree.map(lambda part: part[fill], bending.shapes(stands))
     winds = np.broadcast_to(wind / 1000, (count,))[fill]

@@ -33,10 +33,10 @@ from jaxrl_vis_envs.plants.stand import MAST_DISTANCE, STALKS, Stands, concatena
 
 Loop = Literal["open", "again", "policy"]
 
-_MOST = 1024  # arms in a program
+_MAX_ARMS = 1024  # arms in a program
 _AROUND = 0.1  # m: above and below the grasp a pair is asked for the stalk again; so far a line is as good as straight
 _BESIDE = 0.015  # m: what it shows further away from the line is another stalk
-_LEAST = 5  # chords
+_MIN_SEGMENTS = 5  # chords
 _AHEAD = 1.5  # looks: a stalk is expected to go on as it did for so long after it was seen
 
 
@@ -154,7 +154,7 @@ def _offset_at_stop(choice: Choice, point: GraspPoint, perception: Perception, c
     middles_here = motion(chords[choice.stop].middle)
     beside = (middles_here - point.at_height(middles_here[:, 2]))[:, :2]
     near = (np.abs(middles_here[:, 2] - choice.point[2]) < _AROUND) & (np.linalg.norm(beside, axis=1) < _BESIDE)
-    return np.median(beside[near], axis=0) if near.sum() >= _LEAST else np.full(2, np.nan)
+    return np.median(beside[near], axis=0) if near.sum() >= _MIN_SEGMENTS else np.full(2, np.nan)
 
 
 def from_any_stop(points: np.ndarray, stops: np.ndarray) -> np.ndarray:
@@ -287,12 +287,12 @@ def follow(stands: Stands, stalks: np.ndarray, again: np.ndarray) -> Callable[[A
 
 
 def _blocks(plans: list[Plan]) -> Iterator[list[Plan]]:
-    """Plans that are carried out together: as many as have at most `_MOST` targets, but at least one."""
+    """Plans that are carried out together: as many as have at most `_MAX_ARMS` targets, but at least one."""
     block: list[Plan] = []
     for plan in plans:
         if not len(plan.targets):
             continue
-        if block and sum(len(other.targets) for other in block) + len(plan.targets) > _MOST:
+        if block and sum(len(other.targets) for other in block) + len(plan.targets) > _MAX_ARMS:
             yield block
             block = []
         block.append(plan)

@@ -46,7 +46,7 @@ class Settings:
 
 
 _HINTS = fields.hints(Settings)
-_MOST_LEVELS = 10  # each of them halves the image
+_MAX_LEVELS = 10  # each of them halves the image
 
 
 def normalise(images: jax.Array) -> jax.Array:
@@ -126,8 +126,8 @@ def read_weights(path: Path) -> tuple[dict[str, Any], Settings, dict[str, Any]]:
             raise RequestError(f"{path} holds weights of another version: train them again with `{_COMMAND}`")
         settings = Settings(**{name: fields.check(f"{path}: {name}", _HINTS[name], value) for name, value in values.items()})
         check_range(path, "channels", settings.channels, 8, 1024, 8)
-        if len(settings.channels) > _MOST_LEVELS:
-            raise RequestError(f"{path}: its network must have {_MOST_LEVELS} levels at most, not {len(settings.channels)}")
+        if len(settings.channels) > _MAX_LEVELS:
+            raise RequestError(f"{path}: its network must have {_MAX_LEVELS} levels at most, not {len(settings.channels)}")
         return settings, declared(settings)
 
     return read_parameters(path, _COMMAND, declare)

@@ -51,23 +51,23 @@ class GraspPoint:
         return max(self.thickness + self.taper * (height - self.point[2]), 0.5 * self.thickness)
 
 
-_NEAR = 0.009  # m: chords so near a line belong to it
-_LONG = 0.3  # m: of a stalk that shows how it bends
+_LINE_RADIUS = 0.009  # m: chords so near a line belong to it
+_BENT_LENGTH = 0.3  # m: of a stalk that shows how it bends
 _USUAL_TAPER = -0.01  # m per m
 _OPENING = 0.03  # by how much more for each m beyond what is known of the line
-_LEAST_PIECE = 0.03  # m
+_MIN_PIECE = 0.03  # m
 _STEEPEST = 0.6  # m per m
 _BIN = 0.02  # m: heights that are counted as one
-_LEAST_SUPPORT = 0.12  # m, over all pairs
+_MIN_SUPPORT = 0.12  # m, over all pairs
 _WINDOW = 0.10  # m: above and below the grasp point
 _AROUND = 0.2  # m: above and below the grasp point pairs are asked what they show
-_LEAST_SHOWN = 4  # places, of a pair that shows it
-_LEAST_SHARE = 0.4  # of the pairs and places that show it or see through it
+_MIN_SHOWN = 4  # places, of a pair that shows it
+_MIN_SHARE = 0.4  # of the pairs and places that show it or see through it
 _APART = 0.012  # m: lines that come nearer are one stalk
 _BEND = 0.04  # by how much more for each m between the heights at which they were seen
 _REST_WITHIN, _REST_SPREAD = 0.025, 0.003  # m
 _LEVEL = 0.002  # m: chords of one pair that differ less in height are of one line of its image
-_LEAST_BESIDE, _SHARE_BESIDE = 20, 0.2  # chords that lie beside each other, of two stalks that do
+_MIN_BESIDE, _SHARE_BESIDE = 20, 0.2  # chords that lie beside each other, of two stalks that do
 _APART_BESIDE = 0.008  # m
 
 
@@ -91,7 +91,7 @@ def grasp_points(chords: StalkSegments, visibility: Visibility, heights: tuple[f
     lines: list[_Line] = []
     for seed in _seeds(chords):
         members = seed[free[seed]]
-        if np.ptp(chords.middle[members, 2]) < _LEAST_PIECE if len(members) else True:
+        if np.ptp(chords.middle[members, 2]) < _MIN_PIECE if len(members) else True:
             continue
         members = _grow(chords, members, free)
         if not len(members):
@@ -150,12 +150,12 @@ def _grow(chords: StalkSegments, members: np.ndarray, free: np.ndarray) -> np.nd
     for _ in range(6):
         known = chords.middle[members]
         low, high = known[:, 2].min(), known[:, 2].max()
-        coefficients, middle = _robust(known, bent=high - low > _LONG)
+        coefficients, middle = _robust(known, bent=high - low > _BENT_LENGTH)
         if np.abs(coefficients[1]).max() > _STEEPEST:
             return members[:0]
         beyond = np.maximum(np.maximum(low - points[:, 2], points[:, 2] - high), 0.0)
         # Further away than a stalk is long at the known bend, nothing is believed.
-        near = _offsets(points, coefficients, middle) < _NEAR + _OPENING * beyond
+        near = _offsets(points, coefficients, middle) < _LINE_RADIUS + _OPENING * beyond
         near &= beyond < max(0.15, 1.0 * (high - low))
         grown = candidates[near]
         if len(grown) < 5 or (len(grown) == len(members) and (grown == members).all()):
@@ -175,7 +175,7 @@ def _support(chords: StalkSegments, members: np.ndarray) -> tuple[float, int]:
 def _grasp(chords: StalkSegments, members: np.ndarray, least_frames: int, heights: tuple[float, float]) -> GraspPoint | None:
     """Return the grasp point of a stalk; None if the pairs show too little of it."""
     length, frames = _support(chords, members)
-    if length < _LEAST_SUPPORT or frames < least_frames:
+    if length < _MIN_SUPPORT or frames < least_frames:
         return None
     points = chords.middle[members]
     places = np.arange(heights[0], heights[1] + 1e-9, _BIN)
@@ -187,10 +187,10 @@ def _grasp(chords: StalkSegments, members: np.ndarray, least_frames: int, height
     near = np.flatnonzero(within[best])
     local, middle = _robust(points[near], bent=False)
     x, y = local[0] + local[1] * (places[best] - middle)
-    spread = float(np.sqrt(np.mean(np.minimum(_offsets(points[near], local, middle), _NEAR) ** 2)))
+    spread = float(np.sqrt(np.mean(np.minimum(_offsets(points[near], local, middle), _LINE_RADIUS) ** 2)))
     thickness = float(np.median(chords.thickness[members[near]]))
     # Where it goes from there, all of it says.
-    whole, middle = _robust(points, bent=np.ptp(points[:, 2]) > _LONG)
+    whole, middle = _robust(points, bent=np.ptp(points[:, 2]) > _BENT_LENGTH)
     bend = whole[2] if len(whole) > 2 else np.zeros(2)
     direction = np.array([*(whole[1] + 2.0 * bend * (places[best] - middle)), 1.0])
     return GraspPoint(
@@ -206,7 +206,7 @@ def _grasp(chords: StalkSegments, members: np.ndarray, least_frames: int, height
 
 def _taper(heights: np.ndarray, thickness: np.ndarray) -> float:
     """By how much a diameter grows for each m upwards, m: from the lower half of what is seen to the upper one."""
-    if np.ptp(heights) < _LONG:
+    if np.ptp(heights) < _BENT_LENGTH:
         return _USUAL_TAPER
     upper = heights > 0.5 * (heights.min() + heights.max())
     parts = [(np.median(heights[half]), np.median(thickness[half])) for half in (upper, ~upper)]
@@ -218,8 +218,8 @@ def _agreed(point: GraspPoint, visibility: Visibility) -> int:
     places = point.point[2] + np.arange(-_AROUND, _AROUND, 0.5 * _BIN)
     shown, through = visibility.query(point.at_height(places))
     count = int(shown.sum())
-    frames = int((shown.sum(axis=1) >= _LEAST_SHOWN).sum())
-    agreed = frames >= min(2, len(visibility.clouds)) and count >= _LEAST_SHARE * (count + through.sum())
+    frames = int((shown.sum(axis=1) >= _MIN_SHOWN).sum())
+    agreed = frames >= min(2, len(visibility.clouds)) and count >= _MIN_SHARE * (count + through.sum())
     return count if agreed else 0
 
 
@@ -250,5 +250,5 @@ def _beside(chords: StalkSegments, one: _Line, other: _Line) -> bool:
         level = np.abs(theirs[place, 2] - mine[:, 2]) < _LEVEL
         apart.append(np.linalg.norm((theirs[place] - mine)[level, :2], axis=1))
     distances = np.concatenate(apart)
-    enough = max(_LEAST_BESIDE, _SHARE_BESIDE * min(len(one.members), len(other.members)))
+    enough = max(_MIN_BESIDE, _SHARE_BESIDE * min(len(one.members), len(other.members)))
     return len(distances) >= enough and float(np.median(distances)) > _APART_BESIDE

@@ -19,7 +19,7 @@ CELL = 0.01
 """Edge of a cell of the heat map, m."""
 _VOXEL = 0.005  # m: near stalks have more pixels, not more points
 _SHARE = 0.25
-_LEAST_CELLS = 2
+_MIN_CELLS = 2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,7 +59,7 @@ def slice_at(points: np.ndarray, low: float) -> Slice:
     middles = []
     for region in range(1, count + 1):
         own = inside[of_point == region]
-        if (regions == region).sum() >= _LEAST_CELLS and len(own):
+        if (regions == region).sum() >= _MIN_CELLS and len(own):
             middles.append([*own[:, :2].mean(axis=0), low + 0.5 * THICKNESS])
     return Slice(low, corner, heat, regions, np.array(middles).reshape(-1, 3))
 

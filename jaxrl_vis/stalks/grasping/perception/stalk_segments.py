@@ -18,7 +18,7 @@ STEP = 3
 """Each so-many-th line of the image is looked at."""
 
 _JUMP = 0.02  # m: pixels that differ more in depth are not one stalk
-_LEAST = 3  # pixels
+_MIN_PIXELS = 3  # pixels
 _BEHIND_FRONT = 0.9  # of a radius: how far the middle lies behind what matching sees of the front
 _THICK = 0.035  # m: no stalk is
 _SIDEWAYS = 3.0  # pixels: by how much a stalk moves from one line to the next
@@ -59,7 +59,7 @@ def stalk_segments(cloud: Cloud, calibration: Calibration, mount: Mount, frame: 
     length = column[last] - column[first] + 1.0
     far = _middle_depth(depth[line, column], first, last)
     thickness = length * far / calibration.focal
-    good = (length >= _LEAST) & np.isfinite(far) & (thickness < _THICK)
+    good = (length >= _MIN_PIXELS) & np.isfinite(far) & (thickness < _THICK)
     line, far, thickness = line[first][good], far[good], thickness[good]
     across = (0.5 * (column[first] + column[last]))[good]
     if not len(line):

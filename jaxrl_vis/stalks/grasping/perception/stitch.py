@@ -89,7 +89,7 @@ DEFAULT = Method(
 _ODOMETRY_SHARE = 0.05
 _WOBBLE = 0.03  # m
 _TURN = math.radians(3.0)
-_LEAST_OVERLAP = 0.2
+_MIN_OVERLAP = 0.2
 _STILL = 0.01  # of the gate, m, and the same in rad: what moves less has arrived
 
 
@@ -160,7 +160,7 @@ def _why_refused(motion: Motion, prior: Motion, driven: float, overlap: float) -
     place = np.array([0.0, 0.6, 0.8])
     moved = float(np.linalg.norm(motion(place) - prior(place)))
     allowed = _ODOMETRY_SHARE * abs(driven) + _WOBBLE
-    if overlap < _LEAST_OVERLAP:
+    if overlap < _MIN_OVERLAP:
         return f"only {100 * overlap:.0f} % of the points overlap"
     if moved > allowed:
         return f"it moved {1e3 * moved:.0f} mm from the odometry, which allows {1e3 * allowed:.0f} mm"

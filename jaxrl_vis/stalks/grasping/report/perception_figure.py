@@ -12,7 +12,7 @@ from jaxrl_vis.stalks.grasping.perception.perceive import Mask, Perception, perc
 from jaxrl_vis.stalks.grasping.perception.slices import CELL, THICKNESS, slice_at
 from jaxrl_vis_envs.plants import Family
 
-_MOST = 20_000  # points that are drawn
+_MAX_POINTS = 20_000  # points that are drawn
 _LOW, _HIGH = (-0.95, 0.3, 0.2), (0.55, 0.95, 1.4)  # m: corners of what is drawn
 _INK = "#333333"
 
@@ -60,10 +60,10 @@ def _image(axes: Any, scene: Scene, perception: Perception) -> None:
 def _cloud(axes: Any, whole: np.ndarray | None, red: np.ndarray, title: str, perception: Perception | None = None) -> None:
     rng = np.random.default_rng(0)
     if whole is not None:
-        x, y, z = _shown(whole)[rng.integers(len(_shown(whole)), size=_MOST)].T
+        x, y, z = _shown(whole)[rng.integers(len(_shown(whole)), size=_MAX_POINTS)].T
         axes.scatter(x, y, z, s=0.8, c="#6f8f5a", alpha=0.5, linewidths=0)
     if len(red):
-        x, y, z = _shown(red)[rng.integers(len(_shown(red)), size=_MOST)].T
+        x, y, z = _shown(red)[rng.integers(len(_shown(red)), size=_MAX_POINTS)].T
         pale = perception is not None
         axes.scatter(x, y, z, s=0.6, c="#e8b0b0" if pale else "#d62728", linewidths=0)
     if perception is not None and perception.points:

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import ANCHOR_STRIDE
 
-_MOST = 2.0  # of a logarithm of a size, so that nothing overflows
+_MAX_LOG_SIZE = 2.0  # of a logarithm of a size, so that nothing overflows
 _UNIT = np.array([0.2, 0.1, 0.3, 0.1, 0.3, 0.3], np.float32)  # about the spread of each code, so that all count alike
 
 
@@ -43,7 +43,7 @@ def decode(codes: jax.Array, others: jax.Array) -> jax.Array:
     """The inverse of `encode`."""
     codes = codes * _UNIT
     middle, size = _middle_and_size(others)
-    half = 0.5 * size * jnp.exp(jnp.clip(codes[..., 2:4], -_MOST, _MOST))
+    half = 0.5 * size * jnp.exp(jnp.clip(codes[..., 2:4], -_MAX_LOG_SIZE, _MAX_LOG_SIZE))
     centre = middle + codes[..., :2] * size
     axis = others[..., 4:] + codes[..., 4:] * size[..., :1]
     return jnp.concatenate([centre - half, centre + half, axis], axis=-1)

@@ -9,14 +9,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-MOST_SHARED = 0.6
+MAX_SHARED = 0.6
 """Greatest share of the smaller mask's pixels in two stalks: duplicates share more, and stalks that touch share less."""
 
 Piece = tuple[np.ndarray, tuple[int, int]]
 """A mask [h, w] in a part of the image, and line and column of its first pixel there."""
 
 
-def without_duplicates(pieces: Sequence[Piece], scores: np.ndarray, most_shared: float = MOST_SHARED) -> np.ndarray:
+def without_duplicates(pieces: Sequence[Piece], scores: np.ndarray, most_shared: float = MAX_SHARED) -> np.ndarray:
     """Return the detections to keep: the best goes first, and removes those whose masks it shares.
 
     Args:

@@ -24,7 +24,7 @@ from jaxrl_vis_envs.plants import Family, Stalk, draw
 from jaxrl_vis_envs.plants.pairs import Sequence
 from jaxrl_vis_envs.plants.truth import HEIGHTS, StalkInView, stalks_in_view
 
-LEAST_VISIBLE = 0.3
+MIN_VISIBLE = 0.3
 IOU = 0.5
 PERSON_SD = 1.45  # mm: of one person with calipers, from the thesis's 1.639 mm between two
 
@@ -109,7 +109,7 @@ def score_plot(
         if with_thesis:
             as_thesis.append(measure_pair_as_thesis(finds_kept, left, right, drive.stated))
         matched, scored = match(detections, stalks)
-        total += sum(stalk.band_box is not None and stalk.band_visible >= LEAST_VISIBLE for stalk in stalks)
+        total += sum(stalk.band_box is not None and stalk.band_visible >= MIN_VISIBLE for stalk in stalks)
         finds += scored
         owners.append([matched[place] for place in selected])
     tracks, _ = follow(frames, drive.odometry, drive.stated)
@@ -140,7 +140,7 @@ def score_plot(
 
 def _perfectly(stalks: list[StalkInView], instance: np.ndarray, image: np.ndarray) -> list[Detection]:
     """True boxes and masks, as a finder that needs no image."""
-    return perfect_detections(map(dataclasses.asdict, stalks), instance, LEAST_VISIBLE)
+    return perfect_detections(map(dataclasses.asdict, stalks), instance, MIN_VISIBLE)
 
 
 def _thesis_score(frames: list[list[Sighting]], owners: list[list[int | None]], sequence: Sequence) -> ThesisScore:
@@ -163,7 +163,7 @@ def match(detections: list[Detection], stalks: list[StalkInView]) -> tuple[list[
         The stalk of each find, or None; and score and success of each find, less those of stalks that are too hidden to count.
     """
     there = [stalk for stalk in stalks if stalk.band_box is not None]
-    clear = np.array([stalk.band_visible >= LEAST_VISIBLE for stalk in there], bool)
+    clear = np.array([stalk.band_visible >= MIN_VISIBLE for stalk in there], bool)
     boxes = np.array([stalk.band_box for stalk in there], float).reshape(-1, 4)
     owners: list[int | None] = [None] * len(detections)
     scored: list[tuple[float, float]] = []

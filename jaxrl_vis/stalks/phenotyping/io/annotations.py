@@ -12,14 +12,14 @@ from xml.etree import ElementTree
 import numpy as np
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.stalks.phenotyping.io.images import MOST_PIXELS
+from jaxrl_vis.stalks.phenotyping.io.images import MAX_PIXELS
 from jaxrl_vis.stalks.phenotyping.io.masks import box_around_runs, covering, decode_counts
 from jaxrl_vis.stalks.phenotyping.io.names import readable
 from jaxrl_vis_envs.documents import parse_xml, read_bytes, read_json
 
 STALK = 1
 """Category of stalks."""
-_MOST_BYTES = 10_000_000  # of a file of one image
+_MAX_BYTES = 10_000_000  # of a file of one image
 _FARTHEST = 1e7  # pixels
 _WRONG = (ValueError, KeyError, TypeError, AttributeError, OverflowError)
 """Errors that reading a file of another form raises."""
@@ -112,7 +112,7 @@ def _reason(error: Exception) -> str:
 
 
 def _voc(path: Path) -> tuple[str, int, int, list[dict[str, Any]]]:
-    root = parse_xml(read_bytes(path, _MOST_BYTES))
+    root = parse_xml(read_bytes(path, _MAX_BYTES))
 
     def text(node: ElementTree.Element, name: str) -> str:
         value = node.findtext(name)
@@ -130,7 +130,7 @@ def _voc(path: Path) -> tuple[str, int, int, list[dict[str, Any]]]:
 
 
 def _labelme(path: Path) -> tuple[str, int, int, list[dict[str, Any]]]:
-    data = read_json(path, _MOST_BYTES)
+    data = read_json(path, _MAX_BYTES)
     annotations = []
     for shape in data["shapes"]:
         points = np.asarray(shape["points"], float).reshape(-1, 2)
@@ -188,8 +188,8 @@ def _checked_image(image: dict[str, Any], place: int) -> dict[str, Any]:
     if sides is None or min(sides) < 1 or any(side % 1 for side in sides):
         said = f"{reprlib.repr(image.get('width'))} and {reprlib.repr(image.get('height'))}"
         raise RequestError(f"{image['source']}: image {name} needs a width and a height in pixels, not {said}")
-    if sides[0] * sides[1] > MOST_PIXELS:
-        most = f"more than {MOST_PIXELS // 10**6} million pixels"
+    if sides[0] * sides[1] > MAX_PIXELS:
+        most = f"more than {MAX_PIXELS // 10**6} million pixels"
         raise RequestError(f"{image['source']}: image {name} is said to have {sides[0]:g} x {sides[1]:g}, {most}")
     return {**image, "width": int(sides[0]), "height": int(sides[1])}
 

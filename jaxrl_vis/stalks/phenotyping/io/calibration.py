@@ -27,8 +27,8 @@ _METRES: dict[str, float] = {"m": 1.0, "mm": 1e-3}
 _BASELINES = (0.008, 2.0)  # m: of stereo pairs that look at plants from a robot
 _SIDES = ("left", "right")
 _NO_STORAGE = "it is neither YAML nor XML as OpenCV and ROS write it"
-_MOST_BYTES = 2_000_000  # of a file
-_MOST_PIXELS = 100_000  # along a side of an image
+_MAX_BYTES = 2_000_000  # of a file
+_MAX_PIXELS = 100_000  # along a side of an image
 
 
 def read_calibration(path: Path, unit: Unit | None = None) -> Calibration:
@@ -114,7 +114,7 @@ def _beside(path: Path, side: str) -> Path:
 def _storage(path: Path) -> dict[str, Any]:
     """Contents of the file, by name."""
     try:
-        store = parse_storage(read_text(path, _MOST_BYTES))
+        store = parse_storage(read_text(path, _MAX_BYTES))
     except OSError as error:
         raise RequestError(f"there is no calibration {path}: {error.strerror or error}") from error
     except ValueError as error:
@@ -157,7 +157,7 @@ def _size(store: dict[str, Any], path: Path) -> tuple[int, int]:
 
 
 def _whole(values: list[Any], path: Path, names: str) -> tuple[int, int]:
-    if not all(isinstance(value, float) and 1 <= value <= _MOST_PIXELS and value.is_integer() for value in values):
+    if not all(isinstance(value, float) and 1 <= value <= _MAX_PIXELS and value.is_integer() for value in values):
         raise RequestError(f"{path}: {names} must be numbers of pixels, without quotation marks")
     return int(values[0]), int(values[1])
 

@@ -22,7 +22,7 @@ from jaxrl_vis_envs.documents import read_text
 _IMAGES = {".png", ".jpg", ".jpeg", ".tif", ".tiff"}
 SAMPLE = Path(__file__).parents[1] / "sample_row"
 """A short synthetic row that comes with the package."""
-_MOST_ODOMETRY = 8_000_000  # bytes
+_MAX_ODOMETRY = 8_000_000  # bytes
 _DISPARITIES = {".pfm", ".png", ".tif", ".tiff"}
 _WORD = re.compile(r"(?<![a-z])(left|right)(?![a-z])", re.IGNORECASE)
 _LETTER = re.compile(r"(?<![a-z])[lr](?![a-z])", re.IGNORECASE)
@@ -278,7 +278,7 @@ def _read_table(path: Path) -> tuple[list[str], Iterator[list[str]]]:
     """
     try:
         # Spreadsheets write a mark of the byte order before the first column's name.
-        reader = csv.reader(io.StringIO(read_text(path, _MOST_ODOMETRY), newline=""), skipinitialspace=True)
+        reader = csv.reader(io.StringIO(read_text(path, _MAX_ODOMETRY), newline=""), skipinitialspace=True)
         return [text_of(name.strip()) for name in next(reader, [])], (row for row in reader if row)
     except OSError as error:
         raise RequestError(f"cannot read {path}: {error.strerror or error}") from error

@@ -16,9 +16,9 @@ _OPTIONS: dict[str, list[int]] = {
     ".tiff": [],
     ".jpg": [cv2.IMWRITE_JPEG_QUALITY, 95],
 }
-MOST_PIXELS = 100_000_000
+MAX_PIXELS = 100_000_000
 """Greatest number of pixels of an image that is read."""
-_MOST_BYTES, _MOST_BESIDES = 16, 1 << 26  # of a file, for each pixel and for what else cameras write down
+_MAX_BYTES, _MAX_BESIDES = 16, 1 << 26  # of a file, for each pixel and for what else cameras write down
 
 
 def write_image(path: Path, image: np.ndarray) -> None:
@@ -50,9 +50,9 @@ def image_size(path: Path) -> tuple[int, int]:
     if size is None:
         raise _unreadable(path, "is not an image, or only a part of one")
     pixels = size[0] * size[1]
-    if pixels > MOST_PIXELS:
-        raise _unreadable(path, f"has {size[1]} x {size[0]} pixels, more than {MOST_PIXELS // 10**6} million")
-    if path.stat().st_size > _MOST_BESIDES + _MOST_BYTES * pixels:
+    if pixels > MAX_PIXELS:
+        raise _unreadable(path, f"has {size[1]} x {size[0]} pixels, more than {MAX_PIXELS // 10**6} million")
+    if path.stat().st_size > _MAX_BESIDES + _MAX_BYTES * pixels:
         raise _unreadable(path, f"is larger than {size[1]} x {size[0]} pixels can be")
     return size
 

@@ -10,13 +10,13 @@ import numpy as np
 
 from jaxrl_vis.stalks.phenotyping.measure.width import Strip, median
 
-_STEP = 0.25  # pixels between two samples across an edge
+_SAMPLE_STEP = 0.25  # pixels between two samples across an edge
 _BESIDE = 40  # samples on either side
 _SMOOTHING = 2.0  # samples: standard deviation
 _FURTHEST = 2.5  # pixels that an edge may be moved by
-_CLEAR = 3.0  # by how much an edge stands out of the usual change of brightness
+_MIN_CONTRAST = 3.0  # by how much an edge stands out of the usual change of brightness
 _LINES_APART = 4
-_LEAST_LINES = 8
+_MIN_LINES = 8
 
 
 def refine_edges(strip: Strip, image: np.ndarray, corner: tuple[int, int], line: float, reach: float) -> Strip:
@@ -31,7 +31,7 @@ def refine_edges(strip: Strip, image: np.ndarray, corner: tuple[int, int], line:
     """
     low, high = max(line - reach + corner[0], 0.0), min(line + reach + corner[0], image.shape[0] - 1.0)
     lines = np.arange(np.ceil(low), np.floor(high) + 1.0, _LINES_APART).astype(int)
-    if lines.size < _LEAST_LINES:
+    if lines.size < _MIN_LINES:
         return strip
     edges = []
     for offset, slope in (strip.left, strip.right):
@@ -42,7 +42,7 @@ def refine_edges(strip: Strip, image: np.ndarray, corner: tuple[int, int], line:
 
 def _shift(image: np.ndarray, lines: np.ndarray, columns: np.ndarray) -> float:
     """By how many pixels an edge in [N] lines and columns is moved to the right."""
-    beside = _STEP * np.arange(-_BESIDE, _BESIDE + 1)
+    beside = _SAMPLE_STEP * np.arange(-_BESIDE, _BESIDE + 1)
     places = columns[:, None] + beside
     if places.min() < 0.0 or places.max() >= image.shape[1] - 1:
         return 0.0
@@ -56,7 +56,7 @@ def _shift(image: np.ndarray, lines: np.ndarray, columns: np.ndarray) -> float:
     near = np.flatnonzero(np.abs(beside) <= _FURTHEST)
     best = int(near[np.argmax(change[near])])
     before, most, after = change[best - 1 : best + 2]
-    if most < _CLEAR * max(median(change), 1e-6) or before > most or after > most:
+    if most < _MIN_CONTRAST * max(median(change), 1e-6) or before > most or after > most:
         return 0.0
     bend = before - 2.0 * most + after
-    return float(beside[best] + (0.5 * _STEP * (before - after) / bend if bend < 0.0 else 0.0))
+    return float(beside[best] + (0.5 * _SAMPLE_STEP * (before - after) / bend if bend < 0.0 else 0.0))

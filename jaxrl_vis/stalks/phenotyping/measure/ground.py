@@ -16,14 +16,14 @@ from jaxrl_vis_envs.plants import Calibration
 _WIDTH = 1688  # pixels to which images are reduced: grains of the ground are still seen
 _WINDOW = (5, 41)  # lines and columns there: flat, as the ground comes nearer from line to line
 _COLUMNS, _LINES = 32, 32  # windows side by side and above each other
-_LEAST_SCORE = 0.7
+_MIN_SCORE = 0.7
 _TOLERANCE = 0.7  # pixels there
 _TRIES = 600
 _CAMERA_HEIGHTS = (0.1, 2.0)  # m
-_MOST_PITCH, _MOST_ROLL = math.radians(30.0), math.radians(12.0)
-_LEAST_WINDOWS = 30
-_LEAST_SPAN = 0.3  # of the image's width
-_MOST_BELOW = 0.1  # share of windows that may lie under the ground: they are matched wrongly
+_MAX_PITCH, _MAX_ROLL = math.radians(30.0), math.radians(12.0)
+_MIN_WINDOWS = 30
+_MIN_SPAN = 0.3  # of the image's width
+_MAX_BELOW = 0.1  # share of windows that may lie under the ground: they are matched wrongly
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,7 +74,7 @@ def find_ground(
         places, values = _windows(left, right, (bounds[0], bounds[1]))
     else:
         places, values = _samples(disparity, scale)
-    if len(values) < _LEAST_WINDOWS:
+    if len(values) < _MIN_WINDOWS:
         return None
     focal = calibration.focal * scale
     centre = (np.array(calibration.centre) + 0.5) * scale - 0.5
@@ -90,7 +90,7 @@ def find_ground(
     facing = rays @ fitted > 0
     below = facing & (residual < -4.0 * _TOLERANCE * unit)
     span = float(np.ptp(places[agree, 0])) if agree.any() else 0.0
-    if agree.sum() < _LEAST_WINDOWS or span < _LEAST_SPAN * left.shape[1] or below.sum() > _MOST_BELOW * facing.sum():
+    if agree.sum() < _MIN_WINDOWS or span < _MIN_SPAN * left.shape[1] or below.sum() > _MAX_BELOW * facing.sum():
         return None
     return Ground((float(fitted[0]), float(fitted[1]), float(fitted[2])))
 
@@ -111,7 +111,7 @@ def _windows(left: np.ndarray, right: np.ndarray, bounds: tuple[float, float]) -
                 continue
             score = cv2.matchTemplate(right[top - 1 : top + tall + 1, begin:end], window, cv2.TM_CCOEFF_NORMED).max(axis=0)
             column = int(np.argmax(score))
-            if not score[column] >= _LEAST_SCORE or column in (0, score.size - 1):
+            if not score[column] >= _MIN_SCORE or column in (0, score.size - 1):
                 continue
             before, at, after = score[column - 1 : column + 2]
             bend = before - 2.0 * at + after
@@ -162,6 +162,6 @@ def _could_be_ground(planes: np.ndarray) -> np.ndarray:
         (height > _CAMERA_HEIGHTS[0])
         & (height < _CAMERA_HEIGHTS[1])
         & (planes[:, 1] > 0)
-        & (pitch < _MOST_PITCH)
-        & (roll < _MOST_ROLL)
+        & (pitch < _MAX_PITCH)
+        & (roll < _MAX_ROLL)
     )

@@ -20,7 +20,7 @@ import numpy as np
 
 from jaxrl_vis.stalks.phenotyping.measure.width import index_pairs, median
 
-_LEAST_SCORE = 0.5
+_MIN_SCORE = 0.5
 _AGREEING = 0.4
 _SCATTER = 1.0  # pixels: windows that scatter by more do not see one stalk
 _FIRST = 6  # windows of a stalk that are looked for at every disparity
@@ -203,7 +203,7 @@ def _peak(score: np.ndarray) -> tuple[float, float] | None:
     """Column to a fraction of a pixel, and height of the one clear peak of a correlation; None where there is none."""
     row, column = divmod(int(score.argmax()), score.shape[1])
     height = float(score[row, column])
-    if not height >= _LEAST_SCORE or column in (0, score.shape[1] - 1):
+    if not height >= _MIN_SCORE or column in (0, score.shape[1] - 1):
         return None
     best = score.max(axis=0)
     elsewhere = max(best[: max(column - 4, 0)].max(initial=-1.0), best[column + 5 :].max(initial=-1.0))

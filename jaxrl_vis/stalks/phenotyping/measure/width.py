@@ -20,10 +20,10 @@ EllipseFit = Literal["pixels", "pixels_direct", "contour", "contour_direct", "co
 ELLIPSE_FITS: tuple[EllipseFit, ...] = ("pixels", "pixels_direct", "contour", "contour_direct", "contour_ams", "moments")
 """Ways to fit an ellipse to a blob. ``pixels``, least squares over all its pixels, is what the thesis describes."""
 
-_LEAST_LINES = 8
+_MIN_LINES = 8
 _SETTLED = 1e-3  # weights that change by less are those that they would become
 _SWELLING = 0.12  # of the width: by how much an edge may lie beside that of the rest of a stalk
-_STEP = 1.5  # pixels: an edge that lies further beside the others of its neighbourhood belongs to something else
+_OUTLIER_DISTANCE = 1.5  # pixels: an edge that lies further beside the others of its neighbourhood belongs to something else
 _NOISE = (
     0.35  # pixels: how far an edge of a perfect mask lies from the line through it (0.29, the error of rounding, and some more)
 )
@@ -142,7 +142,7 @@ def strip_near(strip: Strip, line: float, reach: float, lines: int) -> Strip | N
         The strip; None where less than half of the lines there agree, or they do not go with the rest of the stalk.
     """
     first, last = max(math.floor(line - reach), 0), min(math.ceil(line + reach) + 1, lines)
-    if last - first < _LEAST_LINES:
+    if last - first < _MIN_LINES:
         return None
     begin, end = np.searchsorted(strip.points[0], (first, last))
     place, left, right = (array[begin:end] for array in strip.points)
@@ -151,9 +151,9 @@ def strip_near(strip: Strip, line: float, reach: float, lines: int) -> Strip | N
     tolerance = max(3.0, _SWELLING * strip.width(line))
     good = np.logical_and(*(np.abs(offsets) < tolerance for offsets in beside))
     for offsets in beside:
-        good &= np.abs(offsets - _mode(offsets[good])) < _STEP if good.any() else False
+        good &= np.abs(offsets - _mode(offsets[good])) < _OUTLIER_DISTANCE if good.any() else False
     count = int(good.sum())
-    if count < max(_LEAST_LINES, 0.5 * (last - first)) or not place[good].min() <= line <= place[good].max():
+    if count < max(_MIN_LINES, 0.5 * (last - first)) or not place[good].min() <= line <= place[good].max():
         return None
     moved = [float(offsets[good].mean()) for offsets in beside]
     rms = float(np.sqrt(np.mean([np.var(offsets[good]) for offsets in beside])))
@@ -186,7 +186,7 @@ def fit_edges(line: np.ndarray, left: np.ndarray, right: np.ndarray) -> Strip | 
     Returns:
         The strip; None where fewer than eight lines agree.
     """
-    if line.size < _LEAST_LINES:
+    if line.size < _MIN_LINES:
         return None
     points, total = (line, left, right), line.size
     slope = _common_slope(line, left, right)
@@ -195,7 +195,7 @@ def fit_edges(line: np.ndarray, left: np.ndarray, right: np.ndarray) -> Strip | 
     wide = median(right - left)
     cut = math.ceil(wide * abs(slope) / (1.0 + slope**2)) if abs(slope) > 0.01 else 0
     inner = (line >= line[0] + cut) & (line <= line[-1] - cut)
-    if inner.sum() >= _LEAST_LINES:
+    if inner.sum() >= _MIN_LINES:
         line, left, right = line[inner], left[inner], right[inner]
         total = line.size
     reference = float(line.mean())
@@ -208,7 +208,7 @@ def fit_edges(line: np.ndarray, left: np.ndarray, right: np.ndarray) -> Strip | 
         weight = (np.abs(edge - slope * offset - start) < max(3.0, 0.08 * wide)).astype(float)
         for _ in range(12):
             heavy = weight > 0
-            if np.count_nonzero(heavy) < _LEAST_LINES:
+            if np.count_nonzero(heavy) < _MIN_LINES:
                 return None
             fitted = _line(offset, edge, weight)
             residual = edge - fitted[0] - fitted[1] * offset
@@ -220,7 +220,7 @@ def fit_edges(line: np.ndarray, left: np.ndarray, right: np.ndarray) -> Strip | 
         good &= weight > 0
         lines.append(fitted)
         scale = max(scale, spread)
-    if good.sum() < _LEAST_LINES:
+    if good.sum() < _MIN_LINES:
         return None
     # Both edges of the same lines, so that what hides one of them tilts neither.
     fits = [_line(offset, edge, good.astype(float)) for edge in (left, right)]

@@ -16,7 +16,7 @@ from jaxrl_vis.stalks.phenotyping.evaluation.scoring import PERSON_SD
 from jaxrl_vis_envs.documents import read_json
 
 _INK, _GREY, _GREEN, _ORANGE = "#222222", "#9a9a9a", "#1a7f37", "#d1720c"
-_MOST_SHOWN = 60  # stalks of figure 3.5, as many as can be told apart
+_MAX_SHOWN = 60  # stalks of figure 3.5, as many as can be told apart
 HUMAN_MINUTES = {"count": (3.33, 3.66), "width": (29.0, 30.0)}
 """Minutes of two people for a plot of 33 stalks; quoted from Table 3.1 of the thesis."""
 THESIS_SECONDS = 6.5
@@ -85,7 +85,7 @@ def draw_widths(data: dict[str, Any], out: Path) -> None:
     measured, true = pairs.T
     people = true[:, None] + np.random.default_rng(0).normal(0.0, PERSON_SD, (len(true), 2))
     error, between = np.abs(measured - people.mean(axis=1)).mean(), np.abs(people[:, 0] - people[:, 1]).mean()
-    shown = np.linspace(0, len(true) - 1, min(len(true), _MOST_SHOWN)).round().astype(int)
+    shown = np.linspace(0, len(true) - 1, min(len(true), _MAX_SHOWN)).round().astype(int)
     shown = shown[np.argsort(true[shown])]
     figure, axis = plt.subplots(figsize=(9.0, 4.4), layout="constrained")
     place = np.arange(len(shown))

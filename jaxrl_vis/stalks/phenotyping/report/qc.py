@@ -29,7 +29,7 @@ from jaxrl_vis.stalks.phenotyping.track.follow import Track
 from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting
 
 _WHOLE = 200  # pictures of whole pairs in a page
-_MOST_WHOLE, _LEAST_WHOLE = 8, 1  # of a plot
+_MAX_WHOLE, _MIN_WHOLE = 8, 1  # of a plot
 _THUMB = 844  # pixels: width of those
 _STALK_COLUMNS = {
     "stalk": "stalk",
@@ -107,7 +107,7 @@ class Page:
 
     def __init__(self, about: list[str], overlays: Path, plots: int) -> None:
         self._about, self._overlays = about, overlays
-        self._whole = min(max(_WHOLE // max(plots, 1), _LEAST_WHOLE), _MOST_WHOLE)
+        self._whole = min(max(_WHOLE // max(plots, 1), _MIN_WHOLE), _MAX_WHOLE)
         self._file = tempfile.TemporaryFile("w+", encoding="utf-8")
         self._rows: list[dict[str, Any]] = []
 

@@ -51,7 +51,7 @@ PLOT_COLUMNS = (
     "version",
 )
 Row = dict[str, Any]
-_MOST_ERROR = 0.08  # of a width: what its pairs disagree about by more is no measurement
+_MAX_ERROR = 0.08  # of a width: what its pairs disagree about by more is no measurement
 NO_GROUND = "no visible ground"
 """Flag of widths at a height that is not known."""
 NO_WIDTHS = "no widths"
@@ -110,7 +110,7 @@ def _flag(widths: StalkWidths, confidence: float) -> str:
         return NO_GROUND
     if widths.lower.count < 3:
         return "few frames"
-    if confidence < 0.3 or widths.lower.error > _MOST_ERROR * widths.lower.mm:
+    if confidence < 0.3 or widths.lower.error > _MAX_ERROR * widths.lower.mm:
         return "uncertain"
     return "corrected for taper" if widths.lower.corrected else "ok"
 

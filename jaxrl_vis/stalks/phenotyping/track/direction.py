@@ -13,12 +13,12 @@ from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting
 from jaxrl_vis_envs.plants import Calibration
 
 _ALONG, _DEPTH = 0.006, 0.02  # m: by what two sightings of one stalk differ at most once the drive is taken off
-_ENOUGH = 4  # stalks that two pairs must share before they say anything
-_SHARED = 0.75  # of the stalks of the pair that has fewer: by chance, so many do not stand as they do in another pair
-_FEW = 0.5  # of those: the odometry's own step explains less
-_SOME = 0.25  # of the pairs with so many stalks must say something against the odometry
-_WELL = 0.3  # of all sightings must go on a track the other way: fewer may do so by chance
-_CLEARLY = 1.2  # by what more stalks go together the other way, where nothing is wrong with the way as it is given
+_MIN_SHARED = 4  # stalks that two pairs must share before they say anything
+_SHARED_SHARE = 0.75  # of the stalks of the pair that has fewer: by chance, so many do not stand as they do in another pair
+_MAX_STEP_SHARE = 0.5  # of those: the odometry's own step explains less
+_MIN_CONTRADICTIONS = 0.25  # of the pairs with so many stalks must say something against the odometry
+_MIN_LINKED = 0.3  # of all sightings must go on a track the other way: fewer may do so by chance
+_LINK_RATIO = 1.2  # by what more stalks go together the other way, where nothing is wrong with the way as it is given
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,8 +50,8 @@ def follow_either_way(frames: list[list[Sighting]], distances: np.ndarray, calib
     fits = not _contradicted(frames, path.places)
     back, backwards = follow(frames, -np.asarray(distances, float), calibration)
     # Where pairs are too unlike each other to contradict anything, the way on which they go together is the right one.
-    better = _links(back) > (_CLEARLY if fits else 1.0) * _links(tracks)
-    well = _links(back) > _WELL * sum(map(len, frames))
+    better = _links(back) > (_LINK_RATIO if fits else 1.0) * _links(tracks)
+    well = _links(back) > _MIN_LINKED * sum(map(len, frames))
     if better and well and not _contradicted(frames, backwards.places):
         tracks = [dataclasses.replace(track, position_m=-track.position_m) for track in back]
         return Followed(tracks, dataclasses.replace(backwards, places=-backwards.places), True)
@@ -73,11 +73,11 @@ def _contradicted(frames: list[list[Sighting]], places: np.ndarray) -> bool:
     compared = judged = against = 0
     for first, second, step in zip(frames, frames[1:], np.diff(places)):
         best, own, most = _shared(_places(first), _places(second), float(step))
-        compared += most >= _ENOUGH
-        if best >= max(_ENOUGH, _SHARED * most):
+        compared += most >= _MIN_SHARED
+        if best >= max(_MIN_SHARED, _SHARED_SHARE * most):
             judged += 1
-            against += own < _FEW * best
-    return against > max(judged / 2, _SOME * compared)
+            against += own < _MAX_STEP_SHARE * best
+    return against > max(judged / 2, _MIN_CONTRADICTIONS * compared)
 
 
 def _places(sightings: list[Sighting]) -> np.ndarray:
@@ -98,7 +98,7 @@ def _shared(first: np.ndarray, second: np.ndarray, step: float) -> tuple[int, in
         step: Distance that the cameras moved between them, m.
     """
     most = min(len(first), len(second))
-    if most < _ENOUGH:
+    if most < _MIN_SHARED:
         return 0, 0, most
     moved = first[:, None, 0] - second[None, :, 0]  # [N, M], m: by what the cameras moved if the two were one stalk
     near = np.abs(first[:, None, 1] - second[None, :, 1]) < _DEPTH

@@ -16,8 +16,8 @@ from jaxrl_vis_envs.plants import Calibration
 
 _USUAL_DEPTH = 0.8  # m, where no pair says
 _SOLID = 0.6  # of the distance at which two stalks touch
-_MOST_LEAN = 25.0  # degrees: what leans further was measured wrongly
-_NEVER = 1e3  # cost of what does not belong together
+_MAX_LEAN = 25.0  # degrees: what leans further was measured wrongly
+_FORBIDDEN_COST = 1e3  # cost of what does not belong together
 
 
 @dataclasses.dataclass(frozen=True)
@@ -193,7 +193,7 @@ class _PairView:
 
 def _over(sighting: Sighting) -> float:
     """Return the distance along the row between a stalk's foot and the place where it was measured, m."""
-    if sighting.height_m is None or sighting.lean_deg is None or abs(sighting.lean_deg) > _MOST_LEAN:
+    if sighting.height_m is None or sighting.lean_deg is None or abs(sighting.lean_deg) > _MAX_LEAN:
         return 0.0
     return sighting.height_m * math.tan(math.radians(sighting.lean_deg))
 
@@ -228,9 +228,9 @@ def _assign(tracks: list[_Open], view: _PairView, place: float, gates: Gates) ->
     along = np.where(view.known, view.along, [view.beside(depth) for _, depth in there]) + place
     aside = np.abs(there[:, :1] - along) / gates.along
     away = np.nan_to_num(np.abs(there[:, 1:] - view.depth[None]) / gates.depth, nan=0.4)
-    cost = np.where((aside < 1.0) & (away < 1.0) & view.there, aside + 0.5 * away, _NEVER)
+    cost = np.where((aside < 1.0) & (away < 1.0) & view.there, aside + 0.5 * away, _FORBIDDEN_COST)
     rows, columns = linear_sum_assignment(cost)
-    return [(int(row), int(column)) for row, column in zip(rows, columns) if cost[row, column] < _NEVER]
+    return [(int(row), int(column)) for row, column in zip(rows, columns) if cost[row, column] < _FORBIDDEN_COST]
 
 
 def _merged(tracks: list[_Open], gates: Gates) -> list[_Open]:

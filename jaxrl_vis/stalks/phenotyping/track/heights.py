@@ -18,11 +18,11 @@ LOWER, UPPER = HEIGHTS
 USUAL_TAPER = 0.405
 """mm per inch: of the thesis, for plots with too few stalks that were measured at both heights."""
 _TAPER_SPREAD = 0.3  # of a stalk's own taper about the plot's, of 1
-_ENOUGH = 5
-_CLEAR = 3  # sightings without a hidden edge that make others unnecessary
+_MIN_SIGHTINGS = 5
+_MIN_CLEAR = 3  # sightings without a hidden edge that make others unnecessary
 _LOWER_BOUNDS = 0.85
 _FURTHEST = 4.0 * INCH  # m: what was measured further away says nothing of a height
-_NEAR = 0.5 * INCH  # m: taper within that does not matter
+_NEAR_HEIGHT = 0.5 * INCH  # m: taper within that does not matter
 _ASIDE = (
     20.0  # degrees beside the cameras' axis: from there another side of an oval stalk is seen than the one that faces the row
 )
@@ -68,7 +68,7 @@ def stalk_widths(frames: list[list[Sighting]], tracks: list[Track]) -> list[Stal
     of_stalks = [[frames[frame][place] for frame, place in track.sightings] for track in tracks]
     first = [_of_stalk(sightings, USUAL_TAPER) for sightings in of_stalks]
     tapers = [width.taper for width in first if width.taper is not None]
-    taper = float(np.median(tapers)) if len(tapers) >= _ENOUGH else USUAL_TAPER
+    taper = float(np.median(tapers)) if len(tapers) >= _MIN_SIGHTINGS else USUAL_TAPER
     return [_of_stalk(sightings, taper) for sightings in of_stalks]
 
 
@@ -115,7 +115,7 @@ def _at(height: float, values: list[_Value], taper: float) -> Width | None:
             continue
         error = math.hypot(value.deviation or 0.0, _TAPER_SPREAD * taper * beside)
         near.append(dataclasses.replace(value, mm=value.mm + taper * beside, deviation=error))
-        far += abs(value.height - height) > _NEAR
+        far += abs(value.height - height) > _NEAR_HEIGHT
     width = _robust(near)
     return None if width is None else dataclasses.replace(width, corrected=2 * far > len(near))
 
@@ -132,7 +132,7 @@ def _robust(values: list[_Value]) -> Width | None:
     Where too little does, a stalk is at least as thick as it looks, and most of what is said of it is too thin.
     """
     clear = [value for value in values if not value.hidden]
-    some, share = (clear, 0.5) if len(clear) >= _CLEAR or len(clear) == len(values) else (values, _LOWER_BOUNDS)
+    some, share = (clear, 0.5) if len(clear) >= _MIN_CLEAR or len(clear) == len(values) else (values, _LOWER_BOUNDS)
     if not some:
         return None
     widths, stated, weights = np.array([(value.mm, value.deviation or 0.0, value.confidence) for value in some]).T

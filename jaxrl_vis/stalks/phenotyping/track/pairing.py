@@ -9,8 +9,8 @@ from jaxrl_vis.stalks.phenotyping.measure.stalk import measure
 from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting, grey_at
 from jaxrl_vis_envs.plants import Calibration
 
-_ENOUGH = 4
-_FEW, _MANY = 0.25, 0.6
+_MIN_STALKS = 4
+_SMALL_SHARE, _LARGE_SHARE = 0.25, 0.6
 _LINES = (6, 12, 24, 48)  # how far two images lie apart that are not rectified, pixels of an image 3376 wide
 
 
@@ -26,7 +26,7 @@ def pair_fault(
         calibration: Calibration of the cameras.
     """
     measured = sum(sighting.diameter_mm is not None for sighting in sightings)
-    if len(detections) < _ENOUGH or measured > _FEW * len(detections):
+    if len(detections) < _MIN_STALKS or measured > _SMALL_SHARE * len(detections):
         return None
     grey_left, grey_right = grey_at(left), grey_at(right)
     # Seen in a mirror, a pair that is swapped is one that is not.
@@ -40,11 +40,11 @@ def pair_fault(
         )
         for detection in detections
     ]
-    if _share(turned, grey_left[:, ::-1], grey_right[:, ::-1], mirror) >= _MANY:
+    if _share(turned, grey_left[:, ::-1], grey_right[:, ::-1], mirror) >= _LARGE_SHARE:
         return "left and right are swapped: exchange their names"
     for lines in sorted({max(round(line * calibration.width / 3376), 3) for line in _LINES}):
         for shift in (lines, -lines):
-            if _share(detections, grey_left, np.roll(grey_right, shift, axis=0), calibration) >= _MANY:
+            if _share(detections, grey_left, np.roll(grey_right, shift, axis=0), calibration) >= _LARGE_SHARE:
                 return f"the right image lies about {lines} lines too {'high' if shift > 0 else 'low'}: rectify the pair"
     return None
 

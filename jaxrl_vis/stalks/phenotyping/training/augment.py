@@ -5,7 +5,7 @@ import jax.numpy as jnp
 
 from jaxrl_vis.stalks.phenotyping.detector.losses import NOTHING
 
-_WELL = 94.9  # square root of the electrons of a white pixel of the synthetic cameras
+_WELL_ROOT = 94.9  # square root of the electrons of a white pixel of the synthetic cameras
 _DARK = 0.016  # light that makes as much noise as the sensor does by itself, of white
 _TAPS = 3  # pixels: reach of the blur
 
@@ -31,7 +31,7 @@ def relight(images: jax.Array, key: jax.Array) -> jax.Array:
     gain = gain * jnp.exp(each("strength", 0.0, 0.3) * jax.image.resize(coarse, (*images.shape[:3], 1), "linear"))
     values = _blurred(values * gain, jnp.where(each("sharp", 0.0, 1.0) > 0.5, each("blur", 0.3, 1.3), 0.05))
     # Up to three times the shot and read noise that is there already, less where the image is reduced.
-    level = 3.0 * each("level", 0.0, 1.0) ** 2 / _WELL
+    level = 3.0 * each("level", 0.0, 1.0) ** 2 / _WELL_ROOT
     values = values + level * jnp.sqrt(values + _DARK) * jax.random.normal(keys["noise"], values.shape)
     curve = jnp.exp(0.15 * jax.random.normal(keys["gamma"], (count, 1, 1, 1))) / 2.2
     return jnp.round(255.0 * jnp.clip(values, 0.0, 1.0) ** curve).astype(jnp.uint8)

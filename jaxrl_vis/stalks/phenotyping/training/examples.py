@@ -24,11 +24,11 @@ from jaxrl_vis_envs.plants.field import Plot
 from jaxrl_vis_envs.plants.pairs import Sequence
 from jaxrl_vis_envs.plants.truth import BAND, outline, stalks_in_view
 
-LEAST_VISIBLE = 0.3
+MIN_VISIBLE = 0.3
 """Share of a stalk in the band that must be seen for it to count."""
 _MasksOf = Callable[[np.ndarray, np.ndarray, tuple[int, int]], np.ndarray]
 """Masks [N, h, w] bool of the snips of stalks with indices [N], from their places [N or more, 6] and the snips' shape."""
-MOST = 56
+MAX_STALKS = 56
 """Stalks of an image that networks learn from."""
 _BARELY = 0.02  # what is seen less is not there
 _THIN = 4
@@ -112,7 +112,7 @@ def true_boxes(
         (left, top), (right, bottom) = edges.min(axis=(0, 1)), edges.max(axis=(0, 1))
         axis = np.interp([top, bottom], middle[:, 1], middle[:, 0])
         stalks.append([left, top, right, bottom, *axis])
-        kinds.append(STALK if visible.band_visible >= LEAST_VISIBLE else UNCLEAR)
+        kinds.append(STALK if visible.band_visible >= MIN_VISIBLE else UNCLEAR)
         indices.append(visible.stalk)
     return np.array(stalks, np.float32).reshape(-1, 6), np.array(kinds, np.int32), np.array(indices, np.int32)
 
@@ -148,8 +148,8 @@ def _example(
         snips = np.asarray(cut(on_device, places, shape))[: len(clear)]
         masks = masks_of(clear, places, shape)
     divisor = np.array([scale[1], scale[0], scale[1], scale[0], scale[1], scale[1]], np.float32)
-    count = min(len(stalks), MOST)
-    padded, padded_kinds = np.zeros((MOST, 6), np.float32), np.full(MOST, NOTHING, np.int32)
+    count = min(len(stalks), MAX_STALKS)
+    padded, padded_kinds = np.zeros((MAX_STALKS, 6), np.float32), np.full(MAX_STALKS, NOTHING, np.int32)
     padded[:count], padded_kinds[:count] = (stalks / divisor)[:count], kinds[:count]
     return Example(np.asarray(reduced), padded, padded_kinds, snips, masks)
 
