@@ -1,11 +1,12 @@
 """Network parameters in safetensors files, described by the file's metadata."""
 
 import json
+import math
 import reprlib
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import jax
 import numpy as np
@@ -19,25 +20,52 @@ from jaxrl_vis_envs.documents import parse_json
 SUFFIX = ".safetensors"
 _ABOUT = "about"
 _KINDS = {"F16": np.float16, "F32": np.float32}
-_LONGEST_HEADER = 1 << 20  # bytes; those of our networks are about 15,000
+# An array of 10 bits is three in the file: the upper 8 bits under its own name, and with these suffixes the lower 2 bits, four
+# numbers in a byte, and the factors of its last axis. A wheel's compression would make little of 10 bits in words of 16.
+_LOW, _SCALE = ".low", ".scale"
+_PLACES = np.array([0, 2, 4, 6], np.uint8)
+_LEVELS = 511
+_FEWEST_QUANTISED = 4096  # smaller arrays keep 16 bits: they cost nothing
+_LONGEST_HEADER = 1 << 20  # bytes; those of our networks have some 15,000
 
 Settings = TypeVar("Settings")
 
 
-def write_parameters(path: Path, params: Mapping[str, Any], about: Mapping[str, Any], half: bool = True) -> None:
-    """Writes parameters atomically.
+def write_parameters(path: Path, params: Mapping[str, Any], about: Mapping[str, Any], bits: Literal[10, 16, 32] = 16) -> None:
+    """Write parameters to a file, which is complete whenever it can be read.
 
     Args:
         path: The file, .safetensors.
         params: Nested dictionaries of arrays.
-        about: Description and provenance of the parameters; any JSON value.
-        half: Store 16 bits per number.
+        about: What they are and where they come from; anything that JSON holds.
+        bits: Bits of a number. With 10, arrays of two axes or more and 4,096 numbers or more become integers from -511 to 511
+            and a factor for each index of the last axis, and the others keep 16.
 
     Raises:
         OSError: The file cannot be written.
     """
-    kind = np.float16 if half else np.float32
-    _write(path, {name: np.asarray(leaf).astype(kind) for name, leaf in _named(params).items()}, about)
+    arrays: dict[str, np.ndarray] = {}
+    for name, leaf in _named(params).items():
+        array = np.asarray(leaf, np.float32)
+        if bits == 10 and array.ndim > 1 and array.size >= _FEWEST_QUANTISED:
+            arrays |= _quantised(name, array)
+        else:
+            arrays[name] = array.astype(np.float32 if bits == 32 else np.float16)
+    _write(path, arrays, about)
+
+
+def _quantised(name: str, array: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the three arrays, by name, that stand for an array float32 [..., C] with 10 bits a number."""
+    scale = np.abs(array).max(axis=tuple(range(array.ndim - 1))) / np.float32(_LEVELS)
+    levels = np.round(array / np.where(scale > 0, scale, 1)).astype(np.int16)
+    low = np.pad((levels & 3).ravel(), (0, -levels.size % 4)).reshape(-1, 4) << _PLACES
+    return {name: (levels >> 2).astype(np.int8), f"{name}{_LOW}": low.sum(axis=1).astype(np.uint8), f"{name}{_SCALE}": scale}
+
+
+def _restored(high: np.ndarray, low: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """Return the array float32 that the three stand for."""
+    lower = ((low[:, None] >> _PLACES) & 3).ravel()[: high.size].reshape(high.shape)
+    return (4 * high.astype(np.float32) + lower.astype(np.float32)) * scale
 
 
 def _write(path: Path, arrays: Mapping[str, np.ndarray], about: Mapping[str, Any]) -> None:
@@ -83,12 +111,17 @@ def read_parameters(
             settings, shapes = declare(about)
             names = set(file.keys())
             wanted = {name: tuple(leaf.shape) for name, leaf in _named(shapes).items()}
+            quantised = {name for name in wanted.keys() & names if file.get_slice(name).get_dtype() == "I8"}
+            kinds = dict.fromkeys(wanted, ("F16", "F32"))
+            for name in quantised:
+                wanted |= {f"{name}{_LOW}": (-(-math.prod(wanted[name]) // 4),), f"{name}{_SCALE}": wanted[name][-1:]}
+                kinds |= {name: ("I8",), f"{name}{_LOW}": ("U8",), f"{name}{_SCALE}": ("F32",)}
             if names != wanted.keys():
                 raise RequestError(_other_network(path, f"{min(names ^ wanted.keys())} is missing or too many", command))
             for name, shape in wanted.items():
                 part = file.get_slice(name)
-                if tuple(part.get_shape()) != shape or part.get_dtype() not in _KINDS:
-                    raise RequestError(_other_network(path, f"{name} is not {shape} numbers of 16 or 32 bits", command))
+                if tuple(part.get_shape()) != shape or part.get_dtype() not in kinds[name]:
+                    raise RequestError(_other_network(path, f"{name} is not {shape} numbers of 10, 16 or 32 bits", command))
             arrays = {name: file.get_tensor(name) for name in wanted}
     except OSError as error:
         raise RequestError(f"cannot read the weights {path}: {error.strerror or error}") from error
@@ -96,6 +129,9 @@ def read_parameters(
         if isinstance(error, RequestError):
             raise
         raise RequestError(f"{path} holds no weights: name a file that `{command}` wrote") from error
+    # By NumPy: JAX would compile a program for each shape.
+    for name in quantised:
+        arrays[name] = _restored(arrays[name], arrays.pop(f"{name}{_LOW}"), arrays.pop(f"{name}{_SCALE}"))
     unsound = next((name for name, array in arrays.items() if not np.isfinite(array).all()), None)
     if unsound is not None:
         raise RequestError(f"{path} holds numbers that are not finite ({unsound}): train the weights again with `{command}`")
@@ -105,7 +141,7 @@ def read_parameters(
         *folders, last = name.split("/")
         for folder in folders:
             place = place.setdefault(folder, {})
-        place[last] = array.astype(np.float32)  # in NumPy: JAX would compile a program per shape
+        place[last] = array.astype(np.float32)
     return jax.device_put(params), settings, about
 
 

@@ -170,21 +170,3 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
     config.option.loadscopereorder = False  # or else it would start with the group of most tests
     return OneProcessPerGroup(config, log)
-
-
-@pytest.fixture(scope="session")
-def plots(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Small synthetic plots with true masks."""
-    from phenotype_plots import write_plots
-
-    return write_plots(tmp_path_factory.mktemp("phenotype"))
-
-
-@pytest.fixture(scope="session")
-def results(plots: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What `phenotype run` makes of them."""
-    from phenotype_plots import run
-
-    out = tmp_path_factory.mktemp("results") / "out"
-    assert run(plots, out) == 0
-    return out

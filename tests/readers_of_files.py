@@ -35,7 +35,7 @@ def _parses(parse):
 
 
 def read_calibration(folder: Path) -> None:
-    from jaxrl_vis.phenotyping.calibration import read_calibration
+    from jaxrl_vis.stalks.phenotyping.io.calibration import read_calibration
 
     files = list(folder.iterdir())
     found = read_calibration(files[0] if len(files) == 1 else folder)
@@ -45,14 +45,14 @@ def read_calibration(folder: Path) -> None:
 
 
 def _storage(path: Path) -> None:
-    from jaxrl_vis.phenotyping.storage import parse_storage
+    from jaxrl_vis.stalks.phenotyping.io.file_storage import parse_storage
 
     parse_storage(documents.read_text(path, 2_000_000))
 
 
 def read_annotations(folder: Path) -> None:
-    from jaxrl_vis.phenotyping.annotations import read_annotations
-    from jaxrl_vis.phenotyping.training.examples import _mask_of, _stalk_of
+    from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
+    from jaxrl_vis.stalks.phenotyping.training.examples import _annotated_mask, _annotated_stalk
 
     data = read_annotations(folder)
     sizes = {each["id"]: (each["height"], each["width"]) for each in data["images"]}
@@ -63,13 +63,13 @@ def read_annotations(folder: Path) -> None:
         left, top, wide, tall = each["bbox"]
         assert wide > 0 and tall > 0 and left < width and top < height and left + wide > 0 and top + tall > 0
         if (height, width) == ANNOTATED:  # others are compared with their image, and refused
-            mask = _mask_of(each, (height, width))
+            mask = _annotated_mask(each, (height, width))
             assert mask.shape == ANNOTATED and mask.dtype == bool
-            assert np.isfinite(_stalk_of(each, (height, width))).all()
+            assert np.isfinite(_annotated_stalk(each, (height, width))).all()
 
 
 def read_odometry(folder: Path) -> None:
-    from jaxrl_vis.phenotyping.folders import PairFiles, PlotFolder, read_odometries
+    from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder, read_odometries
 
     pairs = tuple(PairFiles(name, folder / f"left_{name}.png", folder / f"right_{name}.png") for name in PAIRS)
     plot = PlotFolder("plot", folder, pairs)
@@ -88,9 +88,9 @@ def _table(path: Path) -> None:
 
 
 def read_image(folder: Path) -> None:
-    from jaxrl_vis.phenotyping.folders import PairFiles
-    from jaxrl_vis.phenotyping.images import rgb8
-    from jaxrl_vis.phenotyping.reading import Unusable, read_pair, read_side
+    from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles
+    from jaxrl_vis.stalks.phenotyping.io.images import rgb8
+    from jaxrl_vis.stalks.phenotyping.io.pair_reading import Unusable, read_pair, read_side
     from jaxrl_vis_envs.plants import Calibration
 
     sides = sorted(folder.iterdir())
@@ -106,7 +106,7 @@ def read_image(folder: Path) -> None:
 
 def read_names(folder: Path) -> None:
     """Plots of a folder of empty files: each image is at most one side of one pair, and what is not found is no pair's."""
-    from jaxrl_vis.phenotyping.folders import find_plots, read_odometries
+    from jaxrl_vis.stalks.phenotyping.io.folders import find_plots, read_odometries
 
     plots = find_plots(folder)
     pairs = [(plot, pair) for plot in plots for pair in plot.pairs]
@@ -119,8 +119,8 @@ def read_names(folder: Path) -> None:
 
 
 def read_disparity(folder: Path) -> None:
-    from jaxrl_vis.phenotyping.folders import PairFiles
-    from jaxrl_vis.phenotyping.reading import known_disparity
+    from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles
+    from jaxrl_vis.stalks.phenotyping.io.pair_reading import known_disparity
 
     found = known_disparity(PairFiles("a", None, None, _only(folder)), np.zeros((*IMAGE, 3), np.uint8), 64.0)
     assert found is not None and found.shape == IMAGE and found.dtype == np.float32
@@ -128,20 +128,20 @@ def read_disparity(folder: Path) -> None:
 
 
 def _has_size(path: Path) -> None:
-    from jaxrl_vis.phenotyping.images import image_size
+    from jaxrl_vis.stalks.phenotyping.io.images import image_size
 
     image_size(path)
 
 
 def read_detector(folder: Path) -> None:
-    from jaxrl_vis.phenotyping.detector.weights import read_weights
+    from jaxrl_vis.stalks.phenotyping.detector.weights import read_weights
 
     params, settings, _ = read_weights(_only(folder))
     assert params.keys() == {"detector", "segmenter"} and len(settings.channels) == 4
 
 
 def read_painter(folder: Path) -> None:
-    from jaxrl_vis.grasping.masks.painter import read_weights
+    from jaxrl_vis.stalks.grasping.masks.painter import read_weights
 
     params, settings, _ = read_weights(_only(folder))
     assert params.keys() == {"params"} and settings.loss in ("gan", "segmentation")
@@ -167,16 +167,16 @@ def _document(path: Path) -> None:
 
 
 def read_evaluation(folder: Path) -> None:
-    from jaxrl_vis.phenotyping.figures import read_evaluation
+    from jaxrl_vis.stalks.phenotyping.report.figures import read_evaluation
 
     read_evaluation(_only(folder))
 
 
 def read_truth(folder: Path) -> None:
-    from jaxrl_vis.phenotyping.folders import PairFiles, PlotFolder
-    from jaxrl_vis.phenotyping.truth_on_disk import _seen, find_truth
+    from jaxrl_vis.stalks.phenotyping.evaluation.truth_on_disk import _stalks_by_pair, find_truth
+    from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder
 
-    _seen.cache_clear()
+    _stalks_by_pair.cache_clear()
     image = np.zeros((*ANNOTATED, 3), np.uint8)
     for each in find_truth(image, PlotFolder("plot", folder, ()), PairFiles("0", None, None)):
         assert each.mask.dtype == bool and np.isfinite(each.box).all()
@@ -184,12 +184,13 @@ def read_truth(folder: Path) -> None:
 
 def read_records(folder: Path) -> None:
     """What `phenotype run` kept of a pair: as good as new, or computed again."""
-    from jaxrl_vis.phenotyping.folders import PairFiles
-    from jaxrl_vis.phenotyping.pipeline import _is_done
-    from jaxrl_vis.phenotyping.sightings import Sighting
+    from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles
+    from jaxrl_vis.stalks.phenotyping.pipeline import _is_whole, _sources
+    from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting
+    from jaxrl_vis.stalks.results_folder import is_current
 
     path = _only(folder)
-    if _is_done(path, PairFiles("0", None, None), None):
+    if is_current(path, _sources(PairFiles("0", None, None), None), _is_whole):
         record = json.loads(path.read_bytes())
         assert all(len(Sighting.read(each).box) == 4 for each in record["sightings"])
 
@@ -223,7 +224,7 @@ def _loads(path: Path) -> None:
 
 
 def _pair_errors() -> tuple[type[Exception], ...]:
-    from jaxrl_vis.phenotyping.reading import Unusable
+    from jaxrl_vis.stalks.phenotyping.io.pair_reading import Unusable
 
     return (Unusable,)
 

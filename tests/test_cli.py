@@ -38,7 +38,7 @@ def one_line(capsys: pytest.CaptureFixture[str], status: int) -> str:
 
 
 ROOT = Path(__file__).resolve().parents[1]
-HELP = [[], ["phenotype"], *(name.split() for name in cli.COMMANDS)]
+HELP = [[], ["phenotype"], *(name.split() for name in cli.all_commands())]
 
 
 @pytest.fixture(scope="module")
@@ -247,7 +247,7 @@ def test_a_given_option_counts_even_where_it_repeats_a_default(tmp_path: Path) -
 def test_help_explains_every_option(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "500")
     texts: dict[str, dict[str, str]] = {}
-    for name in cli.COMMANDS:
+    for name in cli.all_commands():
         with pytest.raises(SystemExit) as stop:
             cli.main([*name.split(), "--help"])
         assert stop.value.code == 0

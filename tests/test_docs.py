@@ -188,7 +188,7 @@ def test_shell_blocks_could_be_typed(page: Path, reader: Path) -> None:
                 with pytest.raises(SystemExit, match="0"):
                     cli.main([*name.split(), *rest])
             else:
-                options = parse(cli.COMMANDS[name][0], rest)
+                options = parse(cli.all_commands()[name][0], rest)
                 if name == "train":
                     asked = validate(training_config(options))
                     checked_environment(asked.env, asked.env_options, asked.randomize)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from jaxrl_vis.cli import COMMANDS
+from jaxrl_vis.cli import all_commands
 from jaxrl_vis.cli.parsing import parse
 
 SCRIPT = runpy.run_path(str(Path(__file__).resolve().parents[1] / "benchmarks" / "install_smoke_test.py"))
@@ -61,7 +61,7 @@ def test_it_starts_without_the_settings_of_the_caller(monkeypatch, tmp_path):
 @pytest.mark.parametrize("line", SCRIPT["readme_commands"]())
 def test_commands_of_the_readme_can_be_typed_and_made_tiny(line):
     for words in (shlex.split(line), shlex.split(SCRIPT["tiny"](line))):
-        command, _ = COMMANDS[words[1]]
+        command, _ = all_commands()[words[1]]
         options = parse(command, words[2:])
     if words[1] == "train" and "--resume" not in words:
         assert options.preset == "debug"

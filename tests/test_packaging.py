@@ -15,7 +15,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 
-# Folders and single files of jaxrl_vis. A folder imports from earlier rows only; files of one row do not import each other.
+# Folders and single files of jaxrl_vis. A folder imports from earlier rows only; files of one row do not import each other. A
+# file of a folder may have a row of its own.
 LAYERS: tuple[tuple[str, ...], ...] = (
     ("errors", "methods", "streams"),
     ("fields",),
@@ -25,8 +26,10 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("report",),
     ("run",),
     ("evaluation_pool", "studies"),
-    ("bench", "doctor", "phenotyping"),
-    ("grasping",),
+    ("bench", "doctor"),
+    ("cli.parsing",),  # the part of the command line that commands of `stalks` are written with
+    ("cli.checks",),
+    ("stalks",),
     ("cli",),
     ("__main__",),
 )
@@ -95,12 +98,40 @@ def imports_within(package: str, when_running: bool) -> dict[str, set[str]]:
 def test_arrows_run_one_way(package: str) -> None:
     _, layers = PACKAGES[package]
     depth_of = {name: depth for depth, names in enumerate(layers) for name in names}
+
+    def unit_of(module: str) -> str:
+        folder, file = module.split(".")[1], ".".join(module.split(".")[1:3])
+        return file if file in depth_of else folder
+
     for name, targets in imports_within(package, when_running=False).items():
-        unit = name.split(".")[1]
+        unit = unit_of(name)
         assert unit in depth_of, f"{unit} has no layer: give it one"
         for target in targets:
-            other = target.split(".")[1]
+            other = unit_of(target)
             assert other == unit or depth_of[other] < depth_of[unit], f"{name} must not import {target}"
+
+
+def test_the_farm_has_one_door_that_opens_on_request(clean_environment: dict[str, str]) -> None:
+    outside = [
+        *(path for path in (ROOT / "jaxrl_vis").rglob("*.py") if "stalks" not in path.relative_to(ROOT).parts),
+        *(ROOT / "envs" / "jaxrl_vis_envs").rglob("*.py"),
+    ]
+    arrows = {
+        (path.relative_to(ROOT).as_posix(), name)
+        for path in outside
+        for name in imported(path, when_running=False)
+        if f"{name}.".startswith("jaxrl_vis.stalks.")
+    }
+    assert arrows == {("jaxrl_vis/cli/__init__.py", "jaxrl_vis.stalks.cli.COMMANDS")}
+    code = """
+import sys
+from jaxrl_vis import cli
+cli.main(["--version"])
+assert "jaxrl_vis.stalks" not in sys.modules
+cli.main(["--help"])
+assert "jaxrl_vis.stalks" in sys.modules and not {"jax", "numpy", "cv2"} & set(sys.modules)
+"""
+    subprocess.run([sys.executable, "-c", code], env=clean_environment, check=True, stdout=subprocess.DEVNULL)
 
 
 @pytest.mark.parametrize("package", PACKAGES)
@@ -244,6 +275,11 @@ def test_wheel_holds_both_packages_and_nothing_else(wheel: Path) -> None:
     assert [name.rpartition("/")[2] for name in names if "/licenses/" in name] == ["LICENSE", "NOTICE"]
     # Without these, type checkers take no notice of the annotations of an installed package.
     assert {"jaxrl_vis/py.typed", "jaxrl_vis_envs/py.typed"} <= set(names)
+
+
+def test_wheel_is_small(wheel: Path) -> None:
+    assert wheel.stat().st_size <= 6_000_000
+    assert max(file.file_size for file in zipfile.ZipFile(wheel).infolist()) <= 5_000_000
 
 
 def test_wheel_works_outside_the_checkout(wheel: Path, tmp_path: Path) -> None:

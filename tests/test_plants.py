@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from jaxrl_vis import cli
-from jaxrl_vis.phenotyping.measure import measure
-from jaxrl_vis.phenotyping.stereo import grey
+from jaxrl_vis.stalks.phenotyping.measure.stalk import measure
+from jaxrl_vis.stalks.phenotyping.measure.stereo import grey
 from jaxrl_vis_envs import plants
 from jaxrl_vis_envs.plants import SHIFTED, SHIFTS, TRAINING, drawing, tables
 from jaxrl_vis_envs.plants.family import INCH, Family, Layout, Rig, Stalks
@@ -327,9 +327,9 @@ def test_synth_writes_plots_and_resumes(tmp_path, capsys):
     assert cli.main(["phenotype", "synth", str(out), "--family", "shifted"]) == 2
     assert "another family" in capsys.readouterr().err
 
-    from jaxrl_vis.phenotyping.calibration import read_calibration
-    from jaxrl_vis.phenotyping.images import read_image
-    from jaxrl_vis.phenotyping.masks import decode_mask
+    from jaxrl_vis.stalks.phenotyping.io.calibration import read_calibration
+    from jaxrl_vis.stalks.phenotyping.io.images import read_image
+    from jaxrl_vis.stalks.phenotyping.io.masks import decode_mask
 
     plot = out / "plot_0005"
     truth, coco = (json.loads((plot / name).read_text()) for name in ("plot.json", "annotations.json"))

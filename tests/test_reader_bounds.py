@@ -19,16 +19,16 @@ from safetensors.numpy import save
 
 from jaxrl_vis import cli, parameters
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.grasping.masks import painter
-from jaxrl_vis.phenotyping import masks
-from jaxrl_vis.phenotyping.annotations import read_annotations
-from jaxrl_vis.phenotyping.detector.weights import SCHEMA, SHIPPED, read_weights
-from jaxrl_vis.phenotyping.folders import find_plots, read_odometry
-from jaxrl_vis.phenotyping.images import image_size, read_image, write_image
-from jaxrl_vis.phenotyping.names import file_name, readable
-from jaxrl_vis.phenotyping.overlay import draw_overlay
-from jaxrl_vis.phenotyping.results import write_rows
 from jaxrl_vis.spreadsheets import escape_cell, to_csv, unescape_cell
+from jaxrl_vis.stalks.grasping.masks import painter
+from jaxrl_vis.stalks.phenotyping.detector.weights import SCHEMA, SHIPPED, read_weights, write_weights
+from jaxrl_vis.stalks.phenotyping.io import masks
+from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
+from jaxrl_vis.stalks.phenotyping.io.folders import find_plots, read_odometry
+from jaxrl_vis.stalks.phenotyping.io.images import image_size, read_image, write_image
+from jaxrl_vis.stalks.phenotyping.io.names import file_name, readable
+from jaxrl_vis.stalks.phenotyping.report.overlay import draw_overlay
+from jaxrl_vis.stalks.phenotyping.report.tables import write_rows
 from jaxrl_vis_envs.plants import read
 
 LATIN = os.fsdecode(b"t\xe9t\xe9")
@@ -327,11 +327,11 @@ def test_weights_are_checked_before_a_network_is_built(worker, data, part):
     [("shape", "is not"), ("type", "is not"), ("name", "is missing or too many"), ("value", "not finite")],
 )
 def test_arrays_that_are_not_those_of_the_network_are_told(tmp_path, kind, part):
-    with parameters.safetensors.safe_open(painter.SHIPPED["gan"], "numpy") as file:
+    with parameters.safetensors.safe_open(painter.SHIPPED, "numpy") as file:
         about, arrays = file.metadata(), {name: file.get_tensor(name) for name in file.keys()}
-    name = min(arrays)
+    name = min(name for name in arrays if name.endswith("bias"))
     arrays |= {
-        "shape": {name: arrays[name].ravel()},
+        "shape": {name: arrays[name][1:]},
         "type": {name: arrays[name].astype(np.int32)},
         "name": {f"{name}/more": arrays[name]},
         "value": {name: arrays[name] * np.float16("nan")},
@@ -342,7 +342,8 @@ def test_arrays_that_are_not_those_of_the_network_are_told(tmp_path, kind, part)
 
 
 def test_weights_of_an_earlier_version_are_converted_bit_for_bit(tmp_path):
-    with parameters.safetensors.safe_open(SHIPPED, "numpy") as file:
+    write_weights(tmp_path / "new.safetensors", *read_weights(SHIPPED))
+    with parameters.safetensors.safe_open(tmp_path / "new.safetensors", "numpy") as file:
         about, arrays = json.loads(file.metadata()["about"]), {name: file.get_tensor(name) for name in file.keys()}
     assert about["schema"] == SCHEMA and {array.dtype for array in arrays.values()} == {np.dtype(np.float16)}
     text = np.frombuffer(json.dumps(about).encode(), np.uint8)
@@ -350,11 +351,31 @@ def test_weights_of_an_earlier_version_are_converted_bit_for_bit(tmp_path):
     with pytest.raises(RequestError, match="convert it with `python -m jaxrl_vis.parameters .*old.npz .*old.safetensors`"):
         read_weights(tmp_path / "old.npz")
     parameters.convert(tmp_path / "old.npz", tmp_path / "old.safetensors")
-    assert (tmp_path / "old.safetensors").read_bytes() == SHIPPED.read_bytes()
+    assert (tmp_path / "old.safetensors").read_bytes() == (tmp_path / "new.safetensors").read_bytes()
     (tmp_path / "no.npz").write_bytes(b"no weights")
     words = [sys.executable, "-m", "jaxrl_vis.parameters", str(tmp_path / "no.npz"), str(tmp_path / "new.safetensors")]
     done = subprocess.run(words, capture_output=True, text=True)
     assert done.returncode == 1 and done.stderr.startswith("cannot convert") and len(done.stderr.splitlines()) == 1
+
+
+def test_weights_of_ten_bits_are_off_by_half_a_step_at_most(tmp_path):
+    rng = np.random.default_rng(0)
+    kernel = rng.normal(size=(9, 64, 32)).astype(np.float32) * np.linspace(0.0, 2.0, 32, dtype=np.float32)
+    params = {"layer": {"kernel": kernel, "bias": kernel[0, 0], "small": kernel[0]}}
+    parameters.write_parameters(tmp_path / "w.safetensors", params, {}, bits=10)
+    found, _, _ = parameters.read_parameters(tmp_path / "w.safetensors", "train", lambda about: (None, params))
+    step = np.abs(kernel).max(axis=(0, 1)) / 511
+    assert (np.abs(np.asarray(found["layer"]["kernel"]) - kernel) <= 0.501 * step).all()
+    for name in ("bias", "small"):  # too few to be worth it
+        np.testing.assert_array_equal(found["layer"][name], params["layer"][name].astype(np.float16))
+    assert (tmp_path / "w.safetensors").stat().st_size < 2.5 * kernel.size
+    with parameters.safetensors.safe_open(tmp_path / "w.safetensors", "numpy") as file:
+        about, arrays = file.metadata(), {name: file.get_tensor(name) for name in file.keys()}
+    assert arrays.pop("layer/kernel.scale").shape == (32,) and arrays["layer/kernel.low"].shape == (9 * 64 * 32 // 4,)
+    for more, part in (({}, "is missing or too many"), ({"layer/kernel.scale": np.ones(31, np.float32)}, "is not")):
+        (tmp_path / "w.safetensors").write_bytes(save({**arrays, **more}, about))
+        with pytest.raises(RequestError, match=part):
+            parameters.read_parameters(tmp_path / "w.safetensors", "train", lambda about: (None, params))
 
 
 # --- families ---

@@ -10,9 +10,9 @@ import pytest
 
 from jaxrl_vis import parameters
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.phenotyping.annotations import read_annotations
-from jaxrl_vis.phenotyping.folders import PairFiles, PlotFolder, find_plots, read_odometry
-from jaxrl_vis.phenotyping.images import read_disparity, read_image
+from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
+from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder, find_plots, read_odometry
+from jaxrl_vis.stalks.phenotyping.io.images import read_disparity, read_image
 
 SIZE = {"width": 20, "height": 12}
 OUTLINE = [2, 3, 8, 3, 8, 9]

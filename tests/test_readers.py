@@ -299,14 +299,14 @@ def test_weights_of_the_detector(worker):
 
     from tiny_detector import TINY
 
-    from jaxrl_vis.phenotyping.detector.weights import SCHEMA, declared
+    from jaxrl_vis.stalks.phenotyping.detector.weights import SCHEMA, declared
 
     about = {"schema": SCHEMA, "settings": json.loads(json.dumps(dataclasses.asdict(TINY))), "origin": "nothing"}
     hold(worker, "detector", named("w.safetensors", safetensors(_shapes(declared(TINY)), about)))
 
 
 def test_weights_of_the_painter(worker):
-    from jaxrl_vis.grasping.masks.painter import SCHEMA, Settings, declared
+    from jaxrl_vis.stalks.grasping.masks.painter import SCHEMA, Settings, declared
 
     settings = Settings("segmentation", (8, 8))
     about = {"schema": SCHEMA, "generator": {"loss": "segmentation", "channels": [8, 8]}, "origin": "nothing"}

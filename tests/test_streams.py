@@ -16,11 +16,11 @@ import pytest
 from fake_program import interrupted_at, make_fake_trainer, rows_without_time, small_config
 
 from jaxrl_vis import cli
-from jaxrl_vis.cli.progress import progress
 from jaxrl_vis.errors import StorageError
 from jaxrl_vis.run import metrics
 from jaxrl_vis.run.bar import clock
 from jaxrl_vis.run.console import RunConsole
+from jaxrl_vis.stalks.cli.progress import progress
 from jaxrl_vis.streams import SafeStream, safe, safe_streams
 from jaxrl_vis_envs.compiling import mjx_imports
 

@@ -1,6 +1,6 @@
 """Settings of networks that compile quickly, and images as large as they are made for."""
 
-from jaxrl_vis.phenotyping.detector.detect import Settings
+from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
 
 IMAGE = (60, 64)
 TINY = Settings(

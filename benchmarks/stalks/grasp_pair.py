@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.stalks.worker_rate import Once, options, print_rate
-from jaxrl_vis.grasping.evaluate import Scene, draw_scene
-from jaxrl_vis.grasping.masks.painter import SHIPPED, Painter, read_weights
-from jaxrl_vis.grasping.perceive import Perception, perceive
 from jaxrl_vis.provenance import device_name
+from jaxrl_vis.stalks.grasping.evaluation.scoring import Scene, draw_scene
+from jaxrl_vis.stalks.grasping.masks.painter import SHIPPED, Painter, read_weights
+from jaxrl_vis.stalks.grasping.perception.perceive import Perception, perceive
 from jaxrl_vis_envs.plants.grasping import GRASPING_FAMILIES
 
 
@@ -31,7 +31,7 @@ def look(scene: Scene, painter: Painter) -> Perception:
 def make(path: Path) -> tuple[Once, int]:
     """Make the work of a process on the runs in a file."""
     scenes = pickle.loads(path.read_bytes())
-    params, settings, _ = read_weights(SHIPPED["segmentation"])
+    params, settings, _ = read_weights(SHIPPED)
     painter = Painter(params, settings)
 
     def once(number: int) -> list[float]:
@@ -45,7 +45,7 @@ if __name__ == "__main__":
     family = GRASPING_FAMILIES["shifted"]
     family = family if asked.width is None else family.at_width(asked.width)
     scenes = [draw_scene(family, seed) for seed in range(3)]
-    params, settings, _ = read_weights(SHIPPED["segmentation"])
+    params, settings, _ = read_weights(SHIPPED)
     painter = Painter(params, settings)
     started = time.perf_counter()
     look(scenes[0], painter)

@@ -8,8 +8,8 @@ import json
 
 import cv2
 
-from jaxrl_vis.phenotyping.folders import SAMPLE
-from jaxrl_vis.phenotyping.synth import write_plot
+from jaxrl_vis.stalks.phenotyping.evaluation.synth import write_plot
+from jaxrl_vis.stalks.phenotyping.io.folders import SAMPLE
 from jaxrl_vis_envs.plants import TRAINING, draw
 
 SEED = 41

@@ -8,8 +8,8 @@ import argparse
 
 import numpy as np
 
-from jaxrl_vis.phenotyping.measure import measure
-from jaxrl_vis.phenotyping.stereo import grey
+from jaxrl_vis.stalks.phenotyping.measure.stalk import measure
+from jaxrl_vis.stalks.phenotyping.measure.stereo import grey
 from jaxrl_vis_envs.plants import FAMILIES, Family, draw
 from jaxrl_vis_envs.plants.pairs import Sequence
 from jaxrl_vis_envs.plants.truth import outline, stalks_in_view

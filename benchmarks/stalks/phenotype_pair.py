@@ -17,12 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.stalks.worker_rate import Once, options, print_rate, timed
-from jaxrl_vis.phenotyping.detector.detect import detect, pad
-from jaxrl_vis.phenotyping.detector.finder import Finder, reduce
-from jaxrl_vis.phenotyping.detector.weights import SHIPPED, read_weights
-from jaxrl_vis.phenotyping.ground import find_ground
-from jaxrl_vis.phenotyping.sightings import find_with_ground, grey_of, look
 from jaxrl_vis.provenance import device_name
+from jaxrl_vis.stalks.phenotyping.detector.detect import detect, pad
+from jaxrl_vis.stalks.phenotyping.detector.finder import Finder, reduce
+from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights
+from jaxrl_vis.stalks.phenotyping.measure.ground import find_ground
+from jaxrl_vis.stalks.phenotyping.track.sightings import find_with_ground, grey_at, measure_pair
 from jaxrl_vis_envs.plants import SHIFTED, Calibration, draw
 from jaxrl_vis_envs.plants.pairs import Sequence
 from jaxrl_vis_envs.plants.truth import stalks_in_view
@@ -38,7 +38,7 @@ def make(path: Path, stated: Calibration) -> tuple[Once, int]:
     def once(number: int) -> list[float]:
         left, right = pairs[number]
         detections, ground = find_with_ground(finder, left, right, stated)
-        return [sighting.diameter_mm or 0.0 for sighting in look(detections, left, right, stated, ground=ground)]
+        return [sighting.diameter_mm or 0.0 for sighting in measure_pair(detections, left, right, stated, ground=ground)]
 
     return once, len(pairs)
 
@@ -55,7 +55,7 @@ if __name__ == "__main__":
     def once() -> tuple[Any, Any, list[Any]]:
         """Process one pair: finds, ground and sightings."""
         detections, ground = find_with_ground(finder, left, right, stated)
-        return detections, ground, look(detections, left, right, stated, ground=ground)
+        return detections, ground, measure_pair(detections, left, right, stated, ground=ground)
 
     started = time.perf_counter()
     detections, ground, sightings = once()
@@ -71,8 +71,8 @@ if __name__ == "__main__":
         "reduced image": lambda: reduce(left, settings.width),
         "detector": lambda: jax.block_until_ready(detect(params["detector"], small, settings, dtype)),
         "all of finding, with masks and edges": lambda: finder(left),
-        "ground, beside that": lambda: find_ground(grey_of(left), grey_of(right), stated),
-        "disparities and widths": lambda: look(detections, left, right, stated, ground=ground),
+        "ground, beside that": lambda: find_ground(grey_at(left), grey_at(right), stated),
+        "disparities and widths": lambda: measure_pair(detections, left, right, stated, ground=ground),
     }
     for name, part in parts.items():
         print(f"  {np.median(timed(part, asked.repeats)):.4f} s  {name}")

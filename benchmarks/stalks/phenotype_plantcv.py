@@ -28,11 +28,11 @@ def plot_masks(options: argparse.Namespace, seed: int) -> tuple[int, Masks]:
     """Draws a plot: its seed, and the masks of what is measured at 12 inches with our width and the truth."""
     import dataclasses
 
-    from jaxrl_vis.phenotyping.detector.finder import Finder
-    from jaxrl_vis.phenotyping.detector.weights import SHIPPED, read_weights
-    from jaxrl_vis.phenotyping.evaluate import match, true_diameter
-    from jaxrl_vis.phenotyping.perfect import perfect_detections
-    from jaxrl_vis.phenotyping.sightings import find_with_ground, look
+    from jaxrl_vis.stalks.phenotyping.detector.finder import Finder
+    from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights
+    from jaxrl_vis.stalks.phenotyping.evaluation.perfect import perfect_detections
+    from jaxrl_vis.stalks.phenotyping.evaluation.scoring import match, true_diameter
+    from jaxrl_vis.stalks.phenotyping.track.sightings import find_with_ground, measure_pair
     from jaxrl_vis_envs.plants import FAMILIES, draw
     from jaxrl_vis_envs.plants.pairs import Sequence
     from jaxrl_vis_envs.plants.truth import HEIGHTS, stalks_in_view
@@ -50,7 +50,7 @@ def plot_masks(options: argparse.Namespace, seed: int) -> tuple[int, Masks]:
         views = stalks_in_view(sequence.plot, pair.pose, true, instance, np.asarray(pair.depth))
         ideal = perfect_detections(map(dataclasses.asdict, views), instance)
         finds, ground = find_with_ground((lambda image, ideal=ideal: ideal) if options.truth else finder, left, right, stated)
-        sightings = look(finds, left, right, stated, ground=ground)
+        sightings = measure_pair(finds, left, right, stated, ground=ground)
         owners, _ = match(finds, views)
         for find, sighting, owner in zip(finds, sightings, owners):
             at = sighting.height_m

@@ -20,7 +20,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "envs")]
 import jax  # noqa: E402
 import numpy as np  # noqa: E402
 
-from jaxrl_vis.grasping.reach import reach  # noqa: E402
+from jaxrl_vis.stalks.grasping.arm.reach import reach  # noqa: E402
 from jaxrl_vis_envs.plants import TRAINING, draw  # noqa: E402
 from jaxrl_vis_envs.plants.stand import stands_at  # noqa: E402
 

@@ -8,7 +8,7 @@ import argparse
 
 import numpy as np
 
-from jaxrl_vis.phenotyping.width import ELLIPSE_FITS, ellipse_width, strip_width
+from jaxrl_vis.stalks.phenotyping.measure.width import ELLIPSE_FITS, ellipse_width, strip_width
 
 RATIOS = (1.5, 3.0, 6.0, 12.0)
 LEANS = (0.0, 2.0, 8.0, 14.0, 20.0)

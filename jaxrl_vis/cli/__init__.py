@@ -12,37 +12,19 @@ import inspect
 import os
 import sys
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import jaxrl_vis
 from jaxrl_vis import processes
-from jaxrl_vis.cli import (
-    bench,
-    doctor,
-    envs,
-    eval,
-    figure,
-    grasp,
-    grasp_eval,
-    grasp_run,
-    grasp_train,
-    phenotype,
-    phenotype_eval,
-    phenotype_run,
-    phenotype_train,
-    play,
-    sweep,
-    train,
-    verify,
-)
+from jaxrl_vis.cli import bench, doctor, envs, eval, figure, play, sweep, train, verify
 from jaxrl_vis.cli.parsing import PROGRAM, parse
 from jaxrl_vis.errors import NonFiniteError, RequestError, StorageError, Terminated, WorkerError, nearest
 from jaxrl_vis.run.signals import Ending, signal_name
 from jaxrl_vis.streams import SafeStream, detach_broken_streams, reserve_standard_files, safe_streams
 
 DESCRIPTION = "Trains robots to reach goals given only as images."
-COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
+COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {  # without those of `jaxrl_vis.stalks`, see `all_commands`
     "train": (train.Train, train.run),
     "eval": (eval.Eval, eval.run),
     "play": (play.Play, play.run),
@@ -52,14 +34,6 @@ COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
     "bench": (bench.Bench, bench.run),
     "figure": (figure.Figure, figure.run),
     "sweep": (sweep.Sweep, sweep.run),
-    "phenotype synth": (phenotype.Synth, phenotype.synth),
-    "phenotype train": (phenotype_train.Train, phenotype_train.train),
-    "phenotype run": (phenotype_run.Run, phenotype_run.run),
-    "phenotype eval": (phenotype_eval.Eval, phenotype_eval.evaluate),
-    "grasp synth": (grasp.Synth, grasp.synth),
-    "grasp train": (grasp_train.Train, grasp_train.train),
-    "grasp run": (grasp_run.Run, grasp_run.run),
-    "grasp eval": (grasp_eval.Eval, grasp_eval.evaluate),
 }
 
 # Exit statuses of errors reported in one line.
@@ -69,10 +43,17 @@ _PRINT_RESULTS = ("eval", "envs", "doctor", "phenotype eval", "grasp eval")
 _READER_LEFT = 141
 
 
+def all_commands() -> dict[str, tuple[type, Callable[[Any], int]]]:
+    """Return every command by name: `COMMANDS` and those of `jaxrl_vis.stalks`, which is imported for this alone."""
+    from jaxrl_vis.stalks.cli import COMMANDS as STALK_COMMANDS
+
+    return {**COMMANDS, **STALK_COMMANDS}
+
+
 def overview(group: str = "") -> str:
-    """Formats the help of the whole program, or of the two-word commands that begin with ``group``."""
+    """Return the help of the whole program, or of the commands whose names begin with ``group``."""
     lines = [f"usage: {PROGRAM} [-h] [--version] COMMAND ...", "", DESCRIPTION, "", "commands:"]
-    named = {name: command for name, (command, _) in COMMANDS.items() if name.startswith(group)}
+    named = {name: command for name, (command, _) in all_commands().items() if name.startswith(group)}
     width = max(map(len, named))
     for name, command in named.items():
         lines.append(f"  {name:{width}} {(inspect.getdoc(command) or '').splitlines()[0]}")
@@ -168,7 +149,7 @@ def entry() -> None:
 
 
 def split_command(words: Sequence[str]) -> tuple[str, Sequence[str]]:
-    """Splits a command line into the command, of one or two words, and its arguments.
+    """Splits a command line into the command, of one word or more, and its arguments.
 
     Args:
         words: At least one word.
@@ -176,30 +157,40 @@ def split_command(words: Sequence[str]) -> tuple[str, Sequence[str]]:
     Raises:
         RequestError: There is no such command.
     """
-    name, *rest = words
-    if name in COMMANDS:
-        return name, rest
-    seconds = [command.partition(" ")[2] for command in COMMANDS if command.startswith(f"{name} ")]
-    if not seconds:
-        kind = "option" if name.startswith("-") else "command"
-        raise RequestError(f"unknown {kind} {name!r}{nearest(name, dict.fromkeys(command.split()[0] for command in COMMANDS))}")
-    if not rest:
-        raise RequestError(f"{name} what? Choose one of {', '.join(seconds)} (or see {PROGRAM} {name} --help)")
-    if rest[0] not in seconds:
-        raise RequestError(f"unknown command '{name} {rest[0]}'{nearest(rest[0], seconds)}")
-    return f"{name} {rest[0]}", rest[1:]
+    table = COMMANDS if words[0] in COMMANDS else all_commands()
+    for count in range(len(words), 0, -1):
+        name = " ".join(words[:count])
+        if name in table:
+            return name, words[count:]
+    group = ""
+    for word in words:
+        choices = _next_words(group, table)
+        if word not in choices:
+            kind = "option" if word.startswith("-") and not group else "command"
+            raise RequestError(f"unknown {kind} {group + word!r}{nearest(word, choices)}")
+        group += f"{word} "
+    name = group.strip()
+    raise RequestError(f"{name} what? Choose one of {', '.join(_next_words(group, table))} (or see {PROGRAM} {name} --help)")
+
+
+def _next_words(group: str, table: Iterable[str]) -> list[str]:
+    """List the words that may follow ``group``, which ends in a space unless it is empty, in names of commands."""
+    return list(dict.fromkeys(name.removeprefix(group).split()[0] for name in table if name.startswith(group)))
 
 
 def _run(words: Sequence[str]) -> int:
     if not words:
-        first = dict.fromkeys(command.split()[0] for command in COMMANDS)
-        raise RequestError(f"no command given; choose one of {', '.join(first)} (or see {PROGRAM} --help)")
+        first = ", ".join(_next_words("", all_commands()))
+        raise RequestError(f"no command given; choose one of {first} (or see {PROGRAM} --help)")
     if words[0] in ("-h", "--help", "--version"):
         print(jaxrl_vis.__version__ if words[0] == "--version" else overview())
         return 0
-    if len(words) > 1 and words[1] in ("-h", "--help") and any(command.startswith(f"{words[0]} ") for command in COMMANDS):
-        print(overview(f"{words[0]} "))
-        return 0
+    if words[-1] in ("-h", "--help") and words[0] not in COMMANDS:
+        group = " ".join(words[:-1])
+        names = all_commands()
+        if group not in names and any(name.startswith(f"{group} ") for name in names):
+            print(overview(f"{group} "))
+            return 0
     name, rest = split_command(words)
-    command, run = COMMANDS[name]
+    command, run = (COMMANDS if name in COMMANDS else all_commands())[name]
     return run(parse(command, rest, name))

@@ -1,6 +1,5 @@
 """Checks shared by several commands before they start to work."""
 
-import importlib.util
 import sys
 from pathlib import Path
 
@@ -8,29 +7,9 @@ from jaxrl_vis.cli.parsing import PROGRAM
 from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.files import check_path
-from jaxrl_vis.provenance import install_command
 from jaxrl_vis.run import trust as trusting
 from jaxrl_vis.run.folder import read_config
 from jaxrl_vis.run.signals import shielded_children
-
-# Packages of an extra: module -> package.
-_GRASPING = {"cv2": "opencv-python-headless", "scipy": "scipy", "yaml": "pyyaml"}
-_EXTRAS = {"phenotyping": {**_GRASPING, "tifffile": "tifffile", "pandas": "pandas"}, "grasping": _GRASPING}
-
-
-def check_extra(command: str, extra: str) -> None:
-    """Checks that the packages of an extra are installed.
-
-    Args:
-        command: First word of the command.
-        extra: Name of the extra.
-
-    Raises:
-        RequestError: A package is missing.
-    """
-    missing = [package for module, package in _EXTRAS[extra].items() if importlib.util.find_spec(module) is None]
-    if missing:
-        raise RequestError(f"{command} needs {', '.join(missing)}: {install_command(extra)}")
 
 
 def check_env(name: str, folder: str | None = None) -> None:

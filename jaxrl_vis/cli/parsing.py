@@ -292,10 +292,11 @@ def _collect_options(command: type) -> list[_Option]:
 def _describe_fields(record: type) -> list[tuple[dataclasses.Field, Any, tuple[Any, ...], str]]:
     """Lists the fields of a dataclass with their annotations, the metadata of `typing.Annotated`, and their docstrings."""
     texts: dict[str, str] = {}
-    (definition,) = ast.parse(textwrap.dedent(inspect.getsource(record))).body
-    for line, following in itertools.pairwise(definition.body):
-        if isinstance(line, ast.AnnAssign) and isinstance(line.target, ast.Name) and isinstance(following, ast.Expr):
-            texts[line.target.id] = " ".join(str(ast.literal_eval(following.value)).split())
+    for kind in reversed([kind for kind in record.__mro__ if dataclasses.is_dataclass(kind)]):
+        (definition,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
+        for line, following in itertools.pairwise(definition.body):
+            if isinstance(line, ast.AnnAssign) and isinstance(line.target, ast.Name) and isinstance(following, ast.Expr):
+                texts[line.target.id] = " ".join(str(ast.literal_eval(following.value)).split())
     hints = typing.get_type_hints(record, include_extras=True)
     plain = fields.hints(record)
     return [

@@ -6,6 +6,8 @@ from pathlib import Path
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.files import check_path
 
+FIGURE_SUFFIXES = (".png", ".pdf", ".svg")
+
 
 def check_writable(path: Path, option: str = "", folder: bool = False) -> None:
     """Checks that a file, or files in a folder, can be written. Leaves nothing behind.
@@ -37,3 +39,15 @@ def check_writable(path: Path, option: str = "", folder: bool = False) -> None:
             pass
     except OSError as error:
         raise RequestError(f"cannot write {wanted}: {error.strerror or error}") from error
+
+
+def check_figure(out: Path) -> None:
+    """Check that ``--out`` names a figure that can be written.
+
+    Raises:
+        RequestError: Its suffix is not one of `FIGURE_SUFFIXES`, or it cannot be written.
+    """
+    if out.suffix.lower() not in FIGURE_SUFFIXES:
+        *others, last = FIGURE_SUFFIXES
+        raise RequestError(f"--out {out}: a figure is a file that ends in {', '.join(others)} or {last}")
+    check_writable(out, "--out")

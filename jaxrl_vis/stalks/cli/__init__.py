@@ -1,0 +1,36 @@
+"""The commands of the farm, ``phenotype`` and ``grasp``: the one door through which the rest of `jaxrl_vis` reaches `stalks`.
+
+Importing it loads no JAX. One file a command: its options as a frozen dataclass, and the function that carries it out.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+from jaxrl_vis.stalks.cli import (
+    grasp_eval,
+    grasp_figure,
+    grasp_run,
+    grasp_synth,
+    grasp_train,
+    phenotype_eval,
+    phenotype_figure,
+    phenotype_run,
+    phenotype_synth,
+    phenotype_train,
+)
+
+COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
+    "phenotype synth": (phenotype_synth.Synth, phenotype_synth.synth),
+    "phenotype train": (phenotype_train.Train, phenotype_train.train),
+    "phenotype run": (phenotype_run.Run, phenotype_run.run),
+    "phenotype eval": (phenotype_eval.Eval, phenotype_eval.evaluate),
+    "phenotype figure": (phenotype_figure.Figure, phenotype_figure.draw),
+    "grasp synth": (grasp_synth.Synth, grasp_synth.synth),
+    "grasp train": (grasp_train.Train, grasp_train.train),
+    "grasp run": (grasp_run.Run, grasp_run.run),
+    "grasp eval": (grasp_eval.Eval, grasp_eval.evaluate),
+    "grasp figure 4.4": (grasp_figure.PerceptionFigure, grasp_figure.draw_perception),
+    "grasp figure 4.5": (grasp_figure.PathFigure, grasp_figure.draw_path),
+    "grasp figure 4.6": (grasp_figure.GraspsFigure, grasp_figure.draw_grasps),
+}
+"""Name -> options, and the function that carries the command out and returns the exit status."""

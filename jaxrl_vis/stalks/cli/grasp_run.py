@@ -1,0 +1,89 @@
+"""``jaxrl-vis grasp run``."""
+
+import dataclasses
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+from jaxrl_vis.cli.parsing import AlsoPositional
+from jaxrl_vis.devices import check_devices, enable_compilation_cache
+from jaxrl_vis.errors import RequestError, StorageError
+from jaxrl_vis.report.outputs import check_writable
+from jaxrl_vis.stalks.cli.options import CameraOptions, check_extra, check_masks, check_speed
+from jaxrl_vis.stalks.cli.phenotype_run import SKIPPED
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Run(CameraOptions):
+    """Find grasp points in folders of stereo pairs: a table of points and of runs, and an overlay per run."""
+
+    folder: Annotated[Path, AlsoPositional()]
+    """A run's folder of pairs (left_000.png, right_000.png, ...), or a folder of such folders."""
+    out: Path = Path("grasp_results")
+    """Folder for the results; a command that was stopped continues where it was."""
+    height: float = 1.0
+    """Height of the left camera above the ground, m."""
+    pitch: float = 15.0
+    """Downward pitch of the cameras, degrees."""
+    weights: Path | None = None
+    """Weights from `grasp train`; the shipped ones if not given."""
+    masks: Literal["gan", "segmentation", "truth"] = "segmentation"
+    """Source of masks: the segmentation that ships, a GAN that you have trained (--weights), or the truth of synthetic runs."""
+    thesis: bool = False
+    """Stitch and find grasp points as the thesis describes it."""
+
+
+def run(options: Run) -> int:
+    """Writes tables and overlays."""
+    check_speed(options.speed)
+    if not 0.05 <= options.height <= 3.0:
+        raise RequestError(f"--height must be from 0.05 to 3 m, not {options.height:g}")
+    if not -60.0 <= options.pitch <= 60.0:
+        raise RequestError(f"--pitch must be from -60 to 60 degrees, not {options.pitch:g}")
+    check_masks(options.masks, options.weights)
+    check_extra("grasping")
+    check_writable(options.out, "--out", folder=True)
+    from jaxrl_vis.stalks.phenotyping.io.folders import find_plots
+
+    runs = find_plots(options.folder)
+    calibrations = {folder.name: options.read_calibration(folder.folder) for folder in runs}
+    for name, calibration in calibrations.items():
+        if calibration is None:
+            raise RequestError(f"{name} has no calibration, without which there are no metres: name one with --calibration")
+    check_devices()
+    enable_compilation_cache()
+    from jaxrl_vis.stalks.grasping.evaluation.attempts import from_any_stop
+    from jaxrl_vis.stalks.grasping.perception.cloud import Mount
+    from jaxrl_vis.stalks.grasping.perception.perceive import DEFAULT_VARIANT, THESIS_VARIANT
+    from jaxrl_vis.stalks.grasping.pipeline import Request, run
+
+    if options.masks == "truth":
+        from jaxrl_vis.stalks.grasping.evaluation.truth_on_disk import find_truth as find
+
+        name = "truth"
+    else:
+        from jaxrl_vis.stalks.grasping.masks.loading import load_painter, resolve_weights
+
+        weights, name = resolve_weights(options.weights, options.masks)
+        painter = load_painter(weights)
+
+        def find(image, folder, pair):
+            return painter(image)
+
+    known = {name: calibration for name, calibration in calibrations.items() if calibration is not None}
+    variant, mount = THESIS_VARIANT if options.thesis else DEFAULT_VARIANT, Mount(options.height, options.pitch)
+    request = Request(options.out, variant, name, known, mount, options.speed, from_any_stop)
+
+    def say(row) -> None:
+        print(f"{row['run']}: {row['grasp_points']} grasp points in {row['pairs']} pairs: {row['flag']}", flush=True)
+
+    try:
+        skipped = run(runs, find, request, say)
+    except OSError as error:
+        raise StorageError(
+            f"cannot write to {options.out}: {error.strerror or error}; run the command again to go on"
+        ) from error
+    for row in skipped:
+        print(f"skipped {row['run']}/{row['pair']}: {row['why']}", file=sys.stderr)
+    print(f"{options.out}: points.csv, runs.csv and overlays (runs: {len(runs)}, pairs skipped: {len(skipped)})")
+    return SKIPPED if skipped else 0

@@ -1,0 +1,29 @@
+"""``jaxrl-vis grasp synth``."""
+
+import dataclasses
+
+from jaxrl_vis.cli.checks import check_counts
+from jaxrl_vis.devices import check_devices
+from jaxrl_vis.report.outputs import check_writable
+from jaxrl_vis.stalks.cli.options import SynthOptions, check_extra
+from jaxrl_vis.stalks.cli.phenotype_synth import write_synthetic
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Synth(SynthOptions):
+    """Write synthetic runs for grasping: folders of five stereo pairs over half a metre, with odometry and exact truth."""
+
+    runs: int = 1
+    """Number of runs."""
+
+
+def synth(options: Synth) -> int:
+    """Writes the runs."""
+    check_counts(runs=options.runs)
+    options.check()
+    check_extra("grasping")
+    check_writable(options.out, "--out", folder=True)
+    family = options.read_family("grasping")
+    check_devices()
+    write_synthetic(options, family, options.runs, "all", "runs")
+    return 0

@@ -1,0 +1,85 @@
+"""``jaxrl-vis grasp train``."""
+
+import dataclasses
+import functools
+import itertools
+import time
+from collections.abc import Iterator
+from typing import Literal
+
+from jaxrl_vis.cli.checks import check_counts
+from jaxrl_vis.devices import check_devices, enable_compilation_cache
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.evaluation_pool import map_unordered, share_accelerator
+from jaxrl_vis.report.outputs import check_writable
+from jaxrl_vis.stalks.cli.options import TrainingOptions, check_extra
+
+_FIRST_SEED = 100_000
+"""First seed of the rows that networks learn from: evaluations use the seeds below."""
+
+
+_RATES = {"segmentation": 1e-3, "gan": 4e-4}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Train(TrainingOptions):
+    """Train the network that paints stalks red, on synthetic rows: against a discriminator, or as a plain segmentation."""
+
+    loss: Literal["gan", "segmentation"] = "segmentation"
+    """Loss: that of a discriminator as in pix2pix, or cross entropy and Dice of the mask."""
+    crop: int = 384
+    """Height and width of a crop, pixels: a multiple of 64."""
+
+
+def train(options: Train) -> int:
+    """Trains the network and writes its weights."""
+    check_counts(crop=options.crop)
+    options.check()
+    if options.crop % 64:
+        raise RequestError(f"--crop must be a multiple of 64, not {options.crop}")
+    check_extra("grasping")
+    check_writable(options.out, "OUT")
+    family = options.read_family("grasping")
+    if options.workers > 1:
+        share_accelerator()
+    check_devices()
+    enable_compilation_cache()
+    return _train(options, family)
+
+
+def _train(options: Train, family) -> int:
+    from jaxrl_vis import __version__
+    from jaxrl_vis.stalks.grasping.masks.examples import Example, synthetic_examples
+    from jaxrl_vis.stalks.grasping.masks.mask_training import Plan, train
+    from jaxrl_vis.stalks.grasping.masks.painter import Settings, write_weights
+
+    first = _FIRST_SEED * (1 + options.seed)
+    draw = functools.partial(synthetic_examples, family)
+    sources: list[Iterator[Example]] = [
+        itertools.chain.from_iterable(map_unordered(draw, itertools.count(first), options.workers))
+    ]
+    settings = Settings(options.loss)
+    plan = Plan(
+        steps=options.steps,
+        minutes=options.minutes,
+        images=options.images,
+        first=min(16, options.images),
+        batch=options.batch,
+        crop=options.crop,
+        rate=options.rate or _RATES[options.loss],
+        seed=options.seed,
+    )
+    about = {"version": __version__, "origin": f"synthetic rows of family {family.name}", "seed": options.seed}
+    started = time.monotonic()
+
+    def report(step, progress, images, losses, params) -> None:
+        write_weights(options.out, params, settings, {**about, "steps": step})
+        parts = "  ".join(f"{name} {value:.3f}" for name, value in losses.items())
+        print(
+            f"{(time.monotonic() - started) / 60:5.1f} min  {progress:4.0%}  step {step}  {images} images  {parts}", flush=True
+        )
+
+    params, steps = train(sources, settings, plan, report)
+    write_weights(options.out, params, settings, {**about, "steps": steps})
+    print(f"{options.out}: {options.loss}, {steps} updates on {about['origin']}, {options.out.stat().st_size / 1e6:.1f} MB")
+    return 0

@@ -1,0 +1,127 @@
+"""``jaxrl-vis phenotype eval``."""
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from jaxrl_vis.cli.checks import check_counts
+from jaxrl_vis.devices import check_devices, enable_compilation_cache
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.evaluation_pool import Record, finite, share_accelerator
+from jaxrl_vis.report.outputs import check_writable
+from jaxrl_vis.stalks.cli.options import EvaluationOptions, check_extra, check_masks
+
+if TYPE_CHECKING:
+    from jaxrl_vis_envs.plants import Family
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Eval(EvaluationOptions):
+    """Compare detections, counts and widths with the exact truth of synthetic plots, which are drawn for it."""
+
+    masks: Literal["network", "truth"] = "network"
+    """Source of masks: the networks, or the truth, to see how good everything after the masks is."""
+    plots: int = 10
+    """Number of plots."""
+    method: Literal["strip", "ellipse"] = "strip"
+    """Method of widths."""
+    least_score: float = 0.5
+    """Lowest score of a detection that counts as a stalk, 0 to 1."""
+    thesis: bool = False
+    """Score the thesis's methods too (ellipses, semi-global matching, stalks per metre of image), on the same detections."""
+    each_factor: bool = False
+    """A table: the training family, each factor of the world shifted alone, and all of them; --plots of each. --json names the
+    file of the table; the files of the factors go beside it."""
+
+
+def evaluate(options: Eval) -> int:
+    """Prints the figures."""
+    check_counts(plots=options.plots)
+    options.check()
+    if not 0.0 <= options.least_score <= 1.0:
+        raise RequestError(f"--least-score must be from 0 to 1, not {options.least_score:g}")
+    check_masks(options.masks, options.weights)
+    check_extra("phenotyping")
+    if options.json is not None:
+        check_writable(options.json, "--json")
+    if options.each_factor and (options.family or options.shift or options.spec):
+        raise RequestError("--each-factor goes through the families by itself: leave out --family, --shift and --spec")
+    family = options.read_family("phenotyping", "shifted")
+    if options.workers > 1:
+        share_accelerator()
+    check_devices()
+    enable_compilation_cache()
+    weights, name = None, "truth"
+    if options.masks == "network":
+        from jaxrl_vis.stalks.phenotyping.detector.loading import detector_name, load_finder, resolve_weights
+
+        weights = resolve_weights(options.weights)
+        load_finder(weights, options.least_score)  # reports what is wrong with the weights
+        name = detector_name(weights)
+    figures = _evaluate(options, _factors(options) if options.each_factor else {"": family}, weights, name)
+    if options.each_factor:
+        _write_table(options, name, figures)
+        return 0
+    print(f"synthetic plots of family {family.name}, {name}, {options.method}:")
+    for figure, value in figures[""].items():
+        print(f"  {figure:24} {value if isinstance(value, int) else f'{value:.4f}'}")
+    return 0
+
+
+def _factors(options: Eval) -> "dict[str, Family]":
+    """Return the training family, each factor shifted alone, and all of them, by name."""
+    from jaxrl_vis_envs.plants import SHIFTS
+
+    alone = {factor: dataclasses.replace(options, family="training", shift=(factor,)) for factor in SHIFTS}
+    none, all_of_them = (dataclasses.replace(options, family=name) for name in ("training", "shifted"))
+    shifted = {"none": none, **alone, "all": all_of_them}
+    return {factor: changed.read_family("phenotyping") for factor, changed in shifted.items()}
+
+
+def _evaluate(options: Eval, families: "Mapping[str, Family]", weights: Path | None, name: str) -> dict[str, dict[str, Any]]:
+    """Evaluate all plots of each family, print a line per plot, and return the figures of each family."""
+    from jaxrl_vis.stalks.phenotyping.evaluation import records
+
+    tasks = {
+        factor: records.Task(family, weights, name, options.method, options.least_score, options.thesis, options.workers)
+        for factor, family in families.items()
+    }
+
+    def started(count: int) -> None:
+        if count:
+            print(f"evaluated before: {count} of {len(tasks) * options.plots} plots, in {options.json}", flush=True)
+
+    def done(factor: str, seed: int, record: Record) -> None:
+        one = records.summarise(options.least_score, [record])
+        print(
+            f"{factor} plot {seed}: {record['counted']} of {record['true']} stalks, ".lstrip()
+            + f"width error {one['width_mae_mm']:.2f} mm, F1 {one['f1']:.3f}",
+            flush=True,
+        )
+
+    seeds = range(options.seed, options.seed + options.plots)
+    return records.evaluate_tasks(tasks, seeds, {factor: _path(options.json, factor) for factor in tasks}, started, done)
+
+
+def _path(path: Path | None, factor: str) -> Path | None:
+    """Return the file of one factor, which lies beside that of the table."""
+    return path.with_name(f"{path.stem}-{factor}.json") if path and factor else path
+
+
+_COLUMNS = ("count_r2", "count_mae", "count_bias", "width_mae_mm", "width_bias_mm", "ap50", "f1")
+
+
+def _write_table(options: Eval, name: str, figures: Mapping[str, dict[str, Any]]) -> None:
+    """Print a line of Markdown for each factor that is shifted alone, and write the file."""
+    from jaxrl_vis.files import write_atomically
+
+    if options.json is not None:
+        about = {"synthetic": True, "finder": name, "method": options.method, "factors": finite(figures)}
+        write_atomically(options.json, json.dumps(about, indent=2) + "\n")
+    print(f"\nsynthetic plots, {options.plots} each, {name}, {options.method}\n")
+    print("| shifted | " + " | ".join(_COLUMNS) + " |")
+    print("|---|" + "---|" * len(_COLUMNS))
+    for factor, values in figures.items():
+        print(f"| {factor} | " + " | ".join(f"{values[column]:.3f}" for column in _COLUMNS) + " |")

@@ -1,0 +1,110 @@
+"""``jaxrl-vis phenotype run``."""
+
+import dataclasses
+import functools
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+from jaxrl_vis.cli.checks import check_counts
+from jaxrl_vis.cli.parsing import AlsoPositional
+from jaxrl_vis.devices import check_devices, enable_compilation_cache
+from jaxrl_vis.errors import RequestError, StorageError
+from jaxrl_vis.evaluation_pool import share_accelerator
+from jaxrl_vis.report.outputs import check_writable
+from jaxrl_vis.stalks.cli.options import CameraOptions, check_extra, check_masks, check_speed
+from jaxrl_vis.stalks.cli.progress import progress
+
+SKIPPED = 3
+"""Exit status where files were skipped."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Run(CameraOptions):
+    """Count and measure the stalks in folders of stereo pairs: tables per stalk and per plot, and an overlay per image."""
+
+    folder: Annotated[Path | None, AlsoPositional()] = None
+    """A plot's folder of pairs (left_000.png, right_000.png, ...), or a folder of such folders; the short synthetic row that
+    comes with the package if not given."""
+    out: Path = Path("phenotype_results")
+    """Folder for the results; a command that was stopped continues where it was."""
+    weights: Path | None = None
+    """Weights from `phenotype train`; the shipped ones if not given."""
+    masks: Literal["network", "truth"] = "network"
+    """Source of masks: the networks, or the truth of synthetic plots, to see how good everything after the masks is."""
+    method: Literal["strip", "ellipse"] = "strip"
+    """Method of widths: between two edges, or by ellipses as in the thesis."""
+    least_score: float = 0.5
+    """Lowest score of a detection that counts as a stalk, 0 to 1."""
+    disparity_scale: float = 256.0
+    """Divisor that makes pixels of disparities in files of 16 bits (disparity_000.png beside the images): 256 as KITTI writes
+    them, 64 as `phenotype synth` does."""
+    workers: int = 1
+    """Number of processes that look at pairs side by side; they share the GPUs and cores, and take 1 to 2 GB each."""
+
+
+def run(options: Run) -> int:
+    """Writes tables and overlays."""
+    if not 0.0 <= options.least_score <= 1.0:
+        raise RequestError(f"--least-score must be from 0 to 1, not {options.least_score:g}")
+    check_speed(options.speed)
+    if not options.disparity_scale > 0:
+        raise RequestError(f"--disparity-scale must be more than 0, not {options.disparity_scale:g}")
+    check_masks(options.masks, options.weights)
+    check_counts(workers=options.workers)
+    check_extra("phenotyping")
+    check_writable(options.out, "--out", folder=True)
+    from jaxrl_vis.stalks.phenotyping.io.folders import SAMPLE, find_plots
+
+    plots = find_plots(options.folder or SAMPLE)
+    if options.folder is None:
+        print("no folder given: this is the short synthetic row that comes with jaxrl-vis")
+    calibrations = {plot.name: options.read_calibration(plot.folder) for plot in plots}
+    if options.workers > 1:
+        share_accelerator()
+    check_devices()
+    enable_compilation_cache()
+    from jaxrl_vis.stalks.phenotyping.pipeline import Request, run
+    from jaxrl_vis.stalks.phenotyping.report.tables import NO_GROUND, NO_WIDTHS
+
+    if options.masks == "truth":
+        from jaxrl_vis.stalks.phenotyping.evaluation.truth_on_disk import find_truth
+
+        find, name = find_truth, "truth"
+    else:
+        from jaxrl_vis.stalks.phenotyping.detector.loading import detector_name, find_stalks, load_finder, resolve_weights
+
+        weights = resolve_weights(options.weights)
+        load_finder(weights, options.least_score)  # reports what is wrong with the weights
+        name = f"{detector_name(weights)}, least score {options.least_score:g}"
+        find = functools.partial(find_stalks, weights, options.least_score)
+
+    request = Request(options.out, options.method, name, calibrations, options.speed, options.disparity_scale)
+    for plot in plots:
+        if calibrations[plot.name] is None:
+            print(f"{plot.name}: no calibration, so no millimetres and no count: name one with --calibration", file=sys.stderr)
+
+    uncounted: dict[str, str] = {}
+    try:
+        with progress("pairs") as done:
+            rows, skipped = run(plots, find, request, done, options.workers, uncounted.__setitem__)
+    except OSError as error:
+        raise StorageError(
+            f"cannot write to {options.out}: {error.strerror or error}; run the command again to go on"
+        ) from error
+    for name, why in uncounted.items():
+        if calibrations[name] is not None:
+            print(f"{name}: {why}, so no count", file=sys.stderr)
+    for row in rows:
+        if row["flag"] == NO_WIDTHS:
+            print(
+                f"{row['plot']}: no width: none of its {row['stalks']} stalks could be measured, see qc.html", file=sys.stderr
+            )
+        if row["flag"] == NO_GROUND:
+            print(
+                f"{row['plot']}: the ground is not seen, so nobody knows at what height the widths were taken", file=sys.stderr
+            )
+    for row in skipped:
+        print(f"skipped {row['plot']}/{row['pair']}: {row['why']}", file=sys.stderr)
+    print(f"{options.out}: stalks.csv, plots.csv, qc.html and overlays (plots: {len(plots)}, pairs skipped: {len(skipped)})")
+    return SKIPPED if skipped else 0

@@ -1,0 +1,132 @@
+"""``jaxrl-vis phenotype train``."""
+
+import dataclasses
+import functools
+import itertools
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from jaxrl_vis.cli.checks import check_counts
+from jaxrl_vis.devices import check_devices, enable_compilation_cache
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.evaluation_pool import map_unordered, share_accelerator
+from jaxrl_vis.report.outputs import check_writable
+from jaxrl_vis.stalks.cli.options import TrainingOptions, check_extra
+
+if TYPE_CHECKING:
+    from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
+
+_FIRST_SEED = 100_000
+"""First seed of the plots that networks learn from: evaluations use the seeds below."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Train(TrainingOptions):
+    """Train the networks that find and outline stalks, on synthetic plots or on your own annotated images."""
+
+    data: Path | None = None
+    """A folder of annotated images (annotations.json of COCO, or .xml of Pascal VOC or .json of LabelMe beside each image), in
+    place of synthetic plots."""
+    start: str | None = None
+    """Weights to start from: a file of an earlier training, `shipped` for those of the package, or `random`; if not given,
+    `shipped` where the boxes of --data are about as tall as those that these weights find, as a few images are too few to learn
+    everything from, and `random` otherwise."""
+    batch: int = 8
+    """Images per update."""
+    snips: int = 32
+    """Strips at full resolution per update, for the masks."""
+
+
+def train(options: Train) -> int:
+    """Trains the networks and writes their weights."""
+    check_counts(snips=options.snips)
+    options.check()
+    drawn = (options.family, options.shift, options.spec, options.frames, options.width)
+    if options.data is not None and any(drawn):
+        raise RequestError(
+            "--data takes images of your own: leave out --spec and --width, --family, --shift and --frames, which describe "
+            "synthetic ones"
+        )
+    check_extra("phenotyping")
+    check_writable(options.out, "OUT")
+    if options.workers > 1:
+        share_accelerator()
+    check_devices()
+    enable_compilation_cache()
+    return _train(options)
+
+
+def _train(options: Train) -> int:
+    from jaxrl_vis import __version__
+    from jaxrl_vis.stalks.phenotyping.detector.weights import write_weights
+    from jaxrl_vis.stalks.phenotyping.training.detector_training import Plan, train
+    from jaxrl_vis.stalks.phenotyping.training.examples import Example, annotated_examples, any_outlined, synthetic_examples
+
+    before, settings, origin_before = _start(options)
+    left_alone = {}
+    if options.data is not None and before is not None and not any_outlined(options.data):
+        # A box is no outline: what the weights know of masks is better.
+        left_alone = {"segmenter": before["segmenter"]}
+        print("masks stay as they are: no annotation has an outline, only boxes")
+    sources: list[Iterator[Example]]
+    if options.data is not None:
+        sources = [annotated_examples(options.data, settings)]
+        origin = "annotated images"
+    else:
+        family = options.read_family("phenotyping")
+        first = _FIRST_SEED * (1 + options.seed)
+        draw = functools.partial(synthetic_examples, family, settings)
+        sources = [itertools.chain.from_iterable(map_unordered(draw, itertools.count(first), options.workers))]
+        origin = f"synthetic plots of family {family.name}"
+    plan = Plan(
+        steps=options.steps,
+        minutes=options.minutes,
+        images=options.images,
+        first=min(24, options.images),
+        batch=options.batch,
+        snips=options.snips,
+        rate=options.rate or (1e-3 if before is None else 3e-4),
+        seed=options.seed,
+    )
+    about = {"version": __version__, "origin": origin + origin_before, "steps": 0, "seed": options.seed}
+    started = time.monotonic()
+
+    def report(step, progress, images, losses, params) -> None:
+        write_weights(options.out, {**params, **left_alone}, settings, {**about, "steps": step})
+        parts = "  ".join(f"{name} {value:.3f}" for name, value in losses.items())
+        print(
+            f"{(time.monotonic() - started) / 60:5.1f} min  {progress:4.0%}  step {step}  {images} images  {parts}", flush=True
+        )
+
+    params, steps = train(sources, settings, plan, report, start=before)
+    write_weights(options.out, {**params, **left_alone}, settings, {**about, "steps": steps})
+    print(f"{options.out}: {steps} updates on {origin}{origin_before}, {options.out.stat().st_size / 1e6:.1f} MB")
+    return 0
+
+
+def _start(options: Train) -> tuple[Any, "Settings", str]:
+    """Parameters to go on from (None: random ones), settings of the networks, and what to say of it."""
+    from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
+    from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights
+    from jaxrl_vis.stalks.phenotyping.training.examples import settings_for
+
+    fitting = None if options.data is None else settings_for(options.data, Settings())
+    start = options.start or ("random" if fitting is None else "shipped")
+    if start == "random":
+        return None, fitting or Settings(), ""
+    params, settings, _ = read_weights(SHIPPED if start == "shipped" else Path(start))
+    if fitting is not None and not 0.5 <= fitting.band_lines / settings.band_lines <= 2.0:
+        why = (
+            f"boxes of {options.data} are {fitting.band_lines:.0f} pixels tall in images of {settings.width}, and those that "
+            f"the weights `{start}` find {settings.band_lines:.0f}"
+        )
+        if options.start is not None:
+            raise RequestError(f"{why}: annotate stalks from 8 to 16 inches above the ground, or give --start random")
+        print(f"starting from random weights: {why}")
+        return None, fitting, ""
+    # What was learned goes with its anchors, so those of the annotations are not taken. How many candidates there are is no
+    # part of it: what the head has not seen yet it learns now.
+    settings = dataclasses.replace(settings, candidates=Settings().candidates)
+    return params, settings, f", from {'the weights that ship' if start == 'shipped' else start}"

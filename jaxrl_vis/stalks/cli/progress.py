@@ -1,0 +1,52 @@
+"""Progress of a command: a bar in a terminal, a line for each part elsewhere."""
+
+import contextlib
+import sys
+from collections.abc import Callable, Iterator, Sequence
+
+from rich.progress import Task
+
+from jaxrl_vis.run.bar import FittingProgress
+from jaxrl_vis.streams import safe
+
+Done = Callable[[str, int, int], None]
+"""Called with the name of a part, the number of units done, and their total."""
+_SHORT_NAME = 20
+
+
+@contextlib.contextmanager
+def progress(unit: str) -> Iterator[Done]:
+    """Shows the progress of a command.
+
+    Args:
+        unit: Unit of progress, in the plural.
+    """
+    stream = safe(sys.stdout)
+    if not stream.isatty():
+
+        def say(name: str, done: int, total: int) -> None:
+            if done == total:
+                print(f"{name}: {total} {unit}", flush=True, file=stream)
+
+        yield say
+        return
+
+    def wordings(task: Task, elapsed: str, left: str) -> Sequence[Sequence[str]]:
+        count, name = f"{task.completed:.0f}/{task.total:.0f}", task.description
+        times = (f"{elapsed} elapsed", f"{left} left")
+        return [
+            (name, f"{count} {unit}", *times),
+            (name[:_SHORT_NAME], count, *times),
+            (count, *times),
+            (count, f"{elapsed}, {left} left"),
+        ]
+
+    tasks = {}
+    with FittingProgress(stream, wordings) as bars:
+
+        def draw(name: str, done: int, total: int) -> None:
+            if name not in tasks:
+                tasks[name] = bars.add_task(name, total=total)
+            bars.update(tasks[name], completed=done)
+
+        yield draw

@@ -1,0 +1,137 @@
+"""The arm's way to a stalk and its controllers: a straight line out of the first joint, PID and PI, springs in the joints.
+
+A reach takes two seconds. While the slide goes to the height of the target, the folded arm turns towards it. Then the grip
+moves along the straight line that the first joint and the target define, until the stalk is between the jaws. Both solutions
+of the inverse kinematics move the grip along the same line; they differ in where the forearm comes from.
+
+Source: section 4.2.2 of the thesis. It tuned its gains by hand and does not state them; ours are tuned by hand, too.
+"""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxrl_vis_envs.tasks import stalk_arm
+
+RATE = 250.0
+"""Frequency of the controllers, Hz."""
+FOLDED = 0.34
+"""Distance of the grip from the first joint before it moves outwards, m."""
+HOME = (0.0, stalk_arm.SHOULDER[1] + FOLDED, 0.85)
+"""Position in which the grip waits, m in the frame of a stand."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Timing:
+    """Durations of the parts of a reach, s."""
+
+    turn: float = 0.8
+    """The slide moves and the folded arm turns."""
+    extend: float = 1.0
+    """The grip moves outwards along the line."""
+    refine_edges: float = 0.2
+    """The grip waits for what the controllers still lack."""
+    close: float = 0.4
+    """The jaws close."""
+
+    @property
+    def reach(self) -> float:
+        """Until the jaws close."""
+        return self.turn + self.extend + self.refine_edges
+
+
+class Gains(NamedTuple):
+    """Gains and limits of the controllers; [2] for shoulder and elbow. SI units."""
+
+    proportional: Any = (260.0, 130.0)  # N m/rad
+    integral: Any = (600.0, 300.0)  # N m/(rad s)
+    derivative: Any = (18.0, 7.0)  # N m s/rad
+    spring: Any = (180.0, 90.0)  # N m/rad, the elastic part of a joint
+    torque: Any = (30.0, 15.0)  # N m, the most
+    motor: float = 120.0  # 1/s, how fast a motor follows what it is told
+    slide_proportional: float = 25.0  # 1/s
+    slide_integral: float = 4.0  # 1/s^2
+    slide_speed: float = 1.0  # m/s, the most
+    slide_drive: float = 400.0  # N s/m
+    jaw_force: float = 10.0  # N
+
+
+class Drive(NamedTuple):
+    """State of the controllers.
+
+    Attributes:
+        integral: [3] float32, the integrated errors of slide, shoulder and elbow, m s and rad s.
+        motor: [2] float32, where the motors before the springs of shoulder and elbow are, rad.
+        error: [2] float32, the last errors of shoulder and elbow, rad.
+    """
+
+    integral: jax.Array
+    motor: jax.Array
+    error: jax.Array
+
+
+def smooth(share: Any) -> Any:
+    """Minimum jerk: how far, of 1, a movement has come after a ``share`` of its time; at rest at both ends."""
+    share = jnp.clip(share, 0.0, 1.0)
+    return share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+
+
+def better_side(target: Any, numeric: Any = jnp) -> Any:
+    """The solution, 1 or -1, whose forearm points more squarely at the row, for ``target`` [..., 3] (m, frame of a stand)."""
+    return numeric.where(target[..., 0] > stalk_arm.SHOULDER[0], 1.0, -1.0)
+
+
+def planned(target: jax.Array, start: jax.Array, time: Any, timing: Timing) -> jax.Array:
+    """Return the planned position of the grip at a time, on its path from `HOME` to ``target``: [3] m.
+
+    Args:
+        target: [3], m in the frame of a stand.
+        start: [3], where the grip was at time 0, m.
+        time: [] since the start, s.
+        timing: Timing of the reach.
+    """
+    shoulder = jnp.asarray(stalk_arm.SHOULDER, jnp.float32)
+    turned = smooth(time / timing.turn)
+    extended = smooth((time - timing.turn) / timing.extend)
+    bearings = [jnp.arctan2(-(place - shoulder)[0], (place - shoulder)[1]) for place in (start[:2], target[:2])]
+    radii = [jnp.linalg.norm(place - shoulder) for place in (start[:2], target[:2])]
+    bearing = bearings[0] + turned * (bearings[1] - bearings[0])
+    folded = radii[0] + turned * (FOLDED - radii[0])
+    radius = folded + extended * (radii[1] - FOLDED)
+    height = start[2] + turned * (target[2] - start[2])
+    return jnp.stack([shoulder[0] - radius * jnp.sin(bearing), shoulder[1] + radius * jnp.cos(bearing), height])
+
+
+def start_drive(joints: jax.Array) -> Drive:
+    """Controllers of an arm at rest at ``joints`` [3]."""
+    return Drive(jnp.zeros(3, jnp.float32), joints[1:3], jnp.zeros(2, jnp.float32))
+
+
+def drive(state: Drive, joints: jax.Array, velocity: jax.Array, wanted: jax.Array, gains: Gains) -> tuple[Drive, jax.Array]:
+    """One period of the controllers.
+
+    Args:
+        state: State of the controllers.
+        joints: [3], slide, shoulder and elbow, m and rad.
+        velocity: [3], of these, m/s and rad/s.
+        wanted: [3], where they should be.
+        gains: Gains of the controllers.
+
+    Returns:
+        What they remember now; and what acts on the joints [3], N and N m.
+    """
+    period = 1.0 / RATE
+    error = wanted - joints
+    integral = jnp.clip(state.integral + period * error, -0.05, 0.05)
+    parts = [jnp.asarray(part, jnp.float32) for part in gains[:5]]
+    proportional, integrating, derivative, spring, most = parts
+    slope = (error[1:] - state.error) / period
+    wish = jnp.clip(proportional * error[1:] + integrating * integral[1:] + derivative * slope, -most, most)
+    # A motor gives a torque by how far it winds up the spring between itself and its joint.
+    motor = state.motor + period * gains.motor * (joints[1:] + wish / spring - state.motor)
+    torque = jnp.clip(spring * (motor - joints[1:]), -most, most)
+    speed = gains.slide_proportional * error[0] + gains.slide_integral * integral[0]
+    force = gains.slide_drive * (jnp.clip(speed, -gains.slide_speed, gains.slide_speed) - velocity[0])
+    return Drive(integral, motor, error[1:]), jnp.concatenate([force[None], torque])

@@ -1,0 +1,138 @@
+"""Reaches by a policy that learned VisualStalkReach, in the physics of `reach`: the third of the loops.
+
+The goal picture shows the stalks that the pipeline has found, in still air, with the gripper at the one that it is to take: it
+is drawn from detections, without truth. From then on the policy sees through the camera over the arm's shoulder, 25 times a
+second, and says by how much the place moves to which the grip is driven. After two seconds the jaws close; it goes on to act.
+"""
+
+import copy
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxrl_vis_envs
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.run.policy import Policy
+from jaxrl_vis.stalks.grasping.arm import control
+from jaxrl_vis.stalks.grasping.arm.approach import reachable
+from jaxrl_vis.stalks.grasping.arm.control import Gains, Timing
+from jaxrl_vis.stalks.grasping.arm.reach import Reaching, ReachResult, Scene, arms_among, begin, held_stalks, period
+from jaxrl_vis_envs.physics import mjx_model
+from jaxrl_vis_envs.pixels import ImageObserver
+from jaxrl_vis_envs.plants import bending
+from jaxrl_vis_envs.plants.bending import Shape
+from jaxrl_vis_envs.plants.stand import Stands
+from jaxrl_vis_envs.tasks import stalk_arm
+from jaxrl_vis_envs.tasks.stalk_reach import HOME, StalkReach, within_reach
+
+STALKS = 4
+"""Stalks of a stand: as many as the task has unless told otherwise."""
+HEIGHTS = (0.6, 0.9)
+"""Heights of the goals that the task draws unless told otherwise, m."""
+
+
+def check_policy(policy: Policy) -> None:
+    """Raises a `RequestError` unless the policy can drive the arm."""
+    if not isinstance(policy.env, StalkReach) or policy.env.observation_spec.dtype != jnp.uint8:
+        raise RequestError(f"--policy must be a run of VisualStalkReach, not of {policy.env_name}")
+    if policy.env.frame_stack != 1:
+        raise RequestError(f"--policy must see single images: its run has frame_stack {policy.env.frame_stack}")
+
+
+class _Moving(NamedTuple):
+    """An arm on its way, and the place [3] (m, frame of the stand) to which its grip is driven."""
+
+    reaching: Reaching
+    place: jax.Array
+
+
+def reach_by_policy(
+    stands: Stands, detected: Stands, targets: np.ndarray, policy: Policy, key: jax.Array, wind_mm: float
+) -> ReachResult:
+    """Lets the policy bring each arm to its target, and closes the jaws there.
+
+    Args:
+        stands: The true stalks around each of B arms.
+        detected: The stalks that were found there, in the same order of arms.
+        targets: [B, 3] float32, where the jaws should close, m in the plot's frame; only the goal pictures know them.
+        policy: Policy of a run of VisualStalkReach.
+        key: [B], typed: the winds.
+        wind_mm: Amplitude of the stalks' sway, mm.
+
+    Returns:
+        What came of it; its ``path`` is the place to which the grip was driven.
+    """
+    check_policy(policy)
+    can = reachable(stands.origin, targets)
+    count = len(stands)
+    fill = np.concatenate([np.arange(count), np.zeros(max(8, 1 << (count - 1).bit_length()) - count, int)])
+    local = np.where(can[:, None], targets - stands.origin, np.array(HOME))[fill].astype(np.float32)
+    shapes = [jax.tree.map(lambda part: jnp.asarray(part[fill]), bending.shapes(stalks)) for stalks in (stands, detected)]
+    winds = jnp.full(len(fill), wind_mm / 1000, jnp.float32)
+    draw, episode = _programs(policy)
+    goals = draw(shapes[1], local)
+    result = jax.tree.map(lambda part: np.asarray(part)[:count], episode(*shapes[:1], goals, key[fill], winds))
+    steps = round(Timing().reach / policy.env.control_period)
+    error = np.linalg.norm(result["taken"][:, steps - 1] - (targets - stands.origin), axis=-1)
+    mine = can[:, None] & stands.present
+    return ReachResult(
+        held=result["held"] & mine,
+        path=result["path"] + stands.origin[:, None],
+        taken=result["taken"] + stands.origin[:, None],
+        touched=result["touched"] & mine,
+        brushed=result["brushed"] & mine,
+        reachable=can,
+        error=np.where(can, error, np.nan).astype(np.float32),
+        poses=result["poses"],
+        interval=policy.env.control_period,
+    )
+
+
+@functools.lru_cache(maxsize=4)
+def _programs(policy: Policy) -> tuple[Any, Any]:
+    """Goal pictures [B, C, H, W] from the stalks that were found and the targets; and episodes, reaches of B arms."""
+    env: Any = policy.env
+    arms, gains, timing = arms_among(STALKS), Gains(), Timing()
+    observer = ImageObserver(arms.mj_model, env.camera, env.config)
+    geoms = np.concatenate([arms.layout.lower_geom, arms.layout.upper_geom])
+    substeps = round(env.control_period * control.RATE)
+
+    def image(model: Any, data: Any) -> jax.Array:
+        fitted = copy.copy(observer)
+        fitted.scene = observer.scene.replace(size=observer.scene.size.at[geoms].set(model.geom_size[geoms]))
+        return fitted(data)
+
+    def draw(shape: Shape, target: jax.Array) -> jax.Array:
+        model = bending.fit(arms.model, arms.layout, shape)
+        data = bending.placed(arms.rest, arms.layout, shape)
+        joints = stalk_arm.joints_at(target, 1.0)
+        return image(model, mjx_model.kinematics(model, data.replace(qpos=data.qpos.at[: stalk_arm.ARM_JOINTS].set(joints))))
+
+    def episode(shape: Shape, goal: jax.Array, key: jax.Array, wind: jax.Array) -> dict[str, jax.Array]:
+        scene = Scene(shape, bending.gusts(key, wind), jnp.float32(1.0))
+        model = bending.fit(arms.model, arms.layout, shape)
+
+        def step(moving: _Moving, _: None) -> tuple[_Moving, dict[str, jax.Array]]:
+            reaching, place = moving
+            action = jnp.clip(policy(image(model, reaching.data), goal), -1.0, 1.0)
+            wanted = within_reach(place + env.config.action_scale * action)
+            is_closing = reaching.data.time > timing.reach - 0.5 / control.RATE
+
+            def one(reaching: Reaching, share: jax.Array) -> tuple[Reaching, None]:
+                return period(arms, model, scene, reaching, place + share * (wanted - place), is_closing, gains), None
+
+            reaching, _ = jax.lax.scan(one, reaching, jnp.arange(1, substeps + 1) / substeps)
+            reaching = reaching._replace(data=mjx_model.kinematics(model, reaching.data))
+            now = {"path": wanted, "taken": stalk_arm.grip_at(reaching.data.qpos[:3]), "poses": reaching.data.qpos}
+            return _Moving(reaching, wanted), now
+
+        with jax.default_matmul_precision("highest"):
+            start = _Moving(begin(arms, scene, HOME), jnp.asarray(HOME, jnp.float32))
+            steps = round((timing.reach + timing.close) / env.control_period)
+            (reaching, _), history = jax.lax.scan(step, start, length=steps)
+        return {**history, "held": held_stalks(arms, reaching.data), "touched": reaching.touched, "brushed": reaching.brushed}
+
+    return jaxrl_vis_envs.jit(jax.vmap(draw)), jaxrl_vis_envs.jit(jax.vmap(episode))

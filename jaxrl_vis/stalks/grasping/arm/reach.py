@@ -1,0 +1,328 @@
+"""Many arms that reach for stalks at once: physics, contacts and wind in one compiled program.
+
+    stands = stands_at(plot, x, targets)                     # jaxrl_vis_envs.plants.stand: the stalks around each arm
+    result = reach(stands, targets, jax.random.key(0), wind_mm=10.0)
+    result.held                                              # [B, N] bool: which stalks the jaws hold, by contact
+
+What a grasp holds comes of the contacts of the jaws with the stalks, which bend and are pushed; no rule decides it. Programs
+are compiled for 8, 16, 32, ... arms, and reused for fewer.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+import jaxrl_vis_envs
+from jaxrl_vis.stalks.grasping.arm import control
+from jaxrl_vis.stalks.grasping.arm.approach import reachable
+from jaxrl_vis.stalks.grasping.arm.control import Drive, Gains, Timing
+from jaxrl_vis_envs.physics import mjx_model
+from jaxrl_vis_envs.physics.mjx_model import mjx
+from jaxrl_vis_envs.plants import bending
+from jaxrl_vis_envs.plants.bending import Gusts, Layout, Shape
+from jaxrl_vis_envs.plants.stand import Stands
+from jaxrl_vis_envs.tasks import stalk_arm
+
+_STEPS_A_POINT = 5  # physics steps between two points of a path
+_POINTS_A_CALL = 5
+INTERVAL = _STEPS_A_POINT / control.RATE
+"""Time between two points of a path, s."""
+LOOK = _POINTS_A_CALL * INTERVAL
+"""Time between two looks on the way, s."""
+_MIN_ARMS = 8  # arms in a program
+_TOUCH = 0.0015  # m, a jaw this near to a stalk presses on it: soft contacts give way by some tenths of a millimetre
+
+
+@dataclasses.dataclass(frozen=True)
+class ReachResult:
+    """Results of B reaches among N stalks each. NumPy arrays; paths have T points, `interval` s apart.
+
+    Attributes:
+        held: [B, N] bool, stalks between the closed jaws.
+        path: [B, T, 3] float32, where the grip should have been, m in the plot's frame.
+        taken: [B, T, 3] float32, where it was.
+        touched: [B, N] bool, stalks that the arm's links touched: upper arm and forearm at any time.
+        brushed: [B, N] bool, stalks that the open jaws or the palm touched before the jaws began to close.
+        reachable: [B] bool, whether the arm's geometry lets the grip be at the target.
+        error: [B] float32, distance of the grip from the target when the jaws began to close, m; nan where it was not sent.
+        poses: [B, T, J] float32, positions of all joints on the way, for drawing (`video`).
+        interval: Time between two points of a path, s.
+    """
+
+    held: np.ndarray
+    path: np.ndarray
+    taken: np.ndarray
+    touched: np.ndarray
+    brushed: np.ndarray
+    reachable: np.ndarray
+    error: np.ndarray
+    poses: np.ndarray
+    interval: float = INTERVAL
+
+
+class ArmView(NamedTuple):
+    """The true view from B arms on their path, from which a detector may compute what it can.
+
+    Attributes:
+        time: Since the start, s.
+        grip: [B, 3] float32, where the grips are, m in the plot's frame.
+        stalks: [B, N, 3] float32, where the middles of the stalks are at the height of the target; nan for absent ones.
+    """
+
+    time: float
+    grip: np.ndarray
+    stalks: np.ndarray
+
+
+class Reaching(NamedTuple):
+    """One arm on its way.
+
+    Attributes:
+        data: The physics.
+        drive: State of the controllers.
+        start: [3] float32, where the grip was at time 0, m in the frame of the stand.
+        touched, brushed: [N] bool, so far.
+    """
+
+    data: Any
+    drive: Drive
+    start: jax.Array
+    touched: jax.Array
+    brushed: jax.Array
+
+
+class Scene(NamedTuple):
+    """Constants of one arm's reach: its stalks, the wind, and the side of its elbow (1 or -1)."""
+
+    shape: Shape
+    gusts: Gusts
+    side: jax.Array
+
+
+class Arms(NamedTuple):
+    """The model of an arm among N stalks, and where things are in it."""
+
+    mj_model: mujoco.MjModel
+    model: Any
+    layout: Layout
+    rest: Any
+    contacts: dict[str, np.ndarray]  # geom of the arm -> its contacts with the stalks, in their order
+
+
+@functools.cache
+def arms_among(stalks: int) -> Arms:
+    """The model of an arm among so many stalks."""
+    mj_model = stalk_arm.build(stalks)
+    layout = bending.read_layout(mj_model)
+    rest = mjx_model.still_data(mj_model)
+    model = mjx_model.put_model(mj_model)
+    geoms = np.asarray(jax.jit(mjx.collision)(model, rest)._impl.contact.geom)
+    places = {}
+    for name in stalk_arm.JAWS + stalk_arm.LINKS:
+        pairs = [{mj_model.geom(name).id, int(geom)} for geom in layout.upper_geom]
+        places[name] = np.array([next(i for i, geom in enumerate(geoms) if set(geom) == pair) for pair in pairs])
+    return Arms(mj_model, model, layout, rest, places)
+
+
+def reach(
+    stands: Stands,
+    targets: np.ndarray,
+    key: jax.Array,
+    wind_mm: Any = 0.0,
+    timing: Timing | None = None,
+    gains: Gains | None = None,
+    sides: np.ndarray | None = None,
+    look: Callable[[ArmView], np.ndarray] | None = None,
+) -> ReachResult:
+    """Sends each arm to its target and closes its jaws there.
+
+    Args:
+        stands: The stalks around each of B arms.
+        targets: [B, 3] float32, where the jaws should close, m in the plot's frame.
+        key: [] or [B], typed: the wind; one for all arms, or one each, so that an arm's wind is the same in any company.
+        wind_mm: Amplitude of the stalks' sway (`bending.Gusts.strength`), mm; [] or [B], 0 to 20 in the field.
+        timing: Durations of the parts of a reach.
+        gains: Gains of the controllers.
+        sides: [B], 1 or -1: which of the two solutions each arm takes (see `approach.room`). None for `control.better_side`.
+        look: Called every `LOOK` s on the way and while the jaws close; returns targets [B, 3] in place of those before, nan
+            where they stay. None: the arm moves without looking again.
+
+    Returns:
+        What came of it. Arms whose target cannot be reached are not sent: they hold and touch nothing.
+
+    Raises:
+        ValueError: Shapes differ, a target is not finite, or the wind is negative.
+    """
+    timing, gains = timing or Timing(), gains or Gains()
+    count, targets = len(stands), np.array(targets, np.float32)
+    if targets.shape != (count, 3):
+        raise ValueError(f"targets must be [B, 3] for {count} stands, got {list(targets.shape)}")
+    if not np.isfinite(targets).all():
+        raise ValueError("targets must be finite")
+    wind = np.asarray(wind_mm, np.float32)
+    if wind.shape not in ((), (count,)) or not (wind >= 0).all():
+        raise ValueError(f"wind_mm must be at least 0, one number or one for each of {count} arms, got {wind_mm}")
+    can = reachable(stands.origin, targets)
+    targets = np.where(can[:, None], targets, stands.origin + np.array(control.HOME, np.float32))
+    side = np.asarray(control.better_side(targets - stands.origin, np) if sides is None else sides, np.float32)
+    if side.shape != (count,) or not (np.abs(side) == 1).all():
+        raise ValueError(f"sides must be 1 or -1 for each of {count} arms")
+    if key.shape not in ((), (count,)):
+        raise ValueError(f"there must be one key, or one for each of {count} arms, got {list(key.shape)}")
+    if not count:
+        return _empty(stands, timing)
+    # The rest of the program's arms do what the first one does.
+    fill = np.concatenate([np.arange(count), np.zeros(max(_MIN_ARMS, 1 << (count - 1).bit_length()) - count, int)])
+    start, advance = _programs(stands.stalk.shape[1], timing, gains)
+    shape = jax.tree.map(lambda part: part[fill], bending.shapes(stands))
+    winds = np.broadcast_to(wind / 1000, (count,))[fill]
+    keys = key[fill] if key.shape else jax.random.split(key, len(fill))
+    scene, reaching = start(shape, keys, winds, side[fill])
+    parts, aimed_at = [], targets
+    for call in range(_calls(timing.reach) + _calls(timing.close)):
+        if look is not None and call:
+            targets = _looked(look, stands, targets, can, call * LOOK, parts[-1])
+        if call < _calls(timing.reach):
+            aimed_at = targets
+        reaching, report = advance(scene, reaching, (targets - stands.origin)[fill])
+        parts.append(jax.tree.map(lambda part: np.asarray(part)[:count], report))
+    paths = {name: np.concatenate([part[name] for part in parts], axis=1) for name in ("path", "taken", "poses")}
+    closing = parts[_calls(timing.reach) - 1]
+    error = np.linalg.norm(closing["taken"][:, -1] - (aimed_at - stands.origin), axis=-1)
+    mine = can[:, None] & stands.present
+    return ReachResult(
+        held=parts[-1]["held"] & mine,
+        path=paths["path"] + stands.origin[:, None],
+        taken=paths["taken"] + stands.origin[:, None],
+        touched=parts[-1]["touched"] & mine,
+        brushed=parts[-1]["brushed"] & mine,
+        reachable=can,
+        error=np.where(can, error, np.nan).astype(np.float32),
+        poses=paths["poses"],
+    )
+
+
+def _looked(
+    look: Callable[[ArmView], np.ndarray], stands: Stands, targets: np.ndarray, can: np.ndarray, time: float, report: dict
+) -> np.ndarray:
+    """Targets [B, 3] after another look; those of before where there is no new one, or the arm cannot go there."""
+    places = np.where(stands.present[..., None], report["stalks"], np.nan) + stands.origin[:, None]
+    updated = np.asarray(look(ArmView(time, report["taken"][:, -1] + stands.origin, places)), np.float32)
+    if updated.shape != targets.shape:
+        raise ValueError(f"a look must return targets {list(targets.shape)}, got {list(updated.shape)}")
+    there = np.all(np.isfinite(updated), axis=-1)
+    there &= can & reachable(stands.origin, np.where(there[:, None], updated, 0.0))
+    return np.where(there[:, None], updated, targets)
+
+
+def _calls(seconds: float) -> int:
+    return max(round(seconds / LOOK), 1)
+
+
+def _empty(stands: Stands, timing: Timing) -> ReachResult:
+    """The result of no reach."""
+    points, stalks = _POINTS_A_CALL * (_calls(timing.reach) + _calls(timing.close)), stands.stalk.shape[1]
+    none, path = np.zeros((0, stalks), bool), np.zeros((0, points, 3), np.float32)
+    poses = np.zeros((0, points, arms_among(stalks).mj_model.nq), np.float32)
+    return ReachResult(none, path, path, none, none, np.zeros(0, bool), np.zeros(0, np.float32), poses)
+
+
+@functools.cache
+def _programs(stalks: int, timing: Timing, gains: Gains) -> tuple[Any, Any]:
+    """Return the compiled programs that start B arms and advance them by `LOOK` s."""
+    arms = arms_among(stalks)
+
+    def start(shape: Shape, key: jax.Array, wind: jax.Array, side: jax.Array) -> tuple[Scene, Reaching]:
+        scene = Scene(jax.tree.map(jnp.asarray, shape), bending.gusts(key, wind), side)
+        return scene, begin(arms, scene)
+
+    def advance(scene: Scene, reaching: Reaching, target: jax.Array) -> tuple[Reaching, dict[str, jax.Array]]:
+        return _advance(arms, scene, reaching, target, timing, gains)
+
+    return jaxrl_vis_envs.jit(jax.vmap(start), runs_once=True), jaxrl_vis_envs.jit(jax.vmap(advance))
+
+
+def begin(arms: Arms, scene: Scene, home: tuple[float, float, float] = control.HOME) -> Reaching:
+    """An arm with its grip at ``home`` (m, frame of the stand) among swaying stalks."""
+    model = bending.fit(arms.model, arms.layout, scene.shape)
+    data = bending.placed(arms.rest, arms.layout, scene.shape)
+    swayed = bending.hinge_angles(arms.layout, model.nv, bending.displacement(scene.gusts, scene.shape.foot, 0.0))
+    joints = stalk_arm.joints_at(jnp.asarray(home, jnp.float32), scene.side)
+    data = mjx_model.kinematics(model, data.replace(qpos=(data.qpos + swayed).at[: stalk_arm.ARM_JOINTS].set(joints)))
+    nothing = jnp.zeros(len(arms.layout.mocap), bool)
+    return Reaching(data, control.start_drive(joints), stalk_arm.grip_at(joints), nothing, nothing)
+
+
+def _advance(
+    arms: Arms, scene: Scene, reaching: Reaching, target: jax.Array, timing: Timing, gains: Gains
+) -> tuple[Reaching, dict[str, jax.Array]]:
+    """`LOOK` s of a reach to ``target`` [3] (m, frame of the stand): the arm then, and what there is to report."""
+    model = bending.fit(arms.model, arms.layout, scene.shape)
+
+    def step(reaching: Reaching, _: None) -> tuple[Reaching, None]:
+        time = reaching.data.time
+        wanted = control.planned(target, reaching.start, time + 1.0 / control.RATE, timing)
+        return period(arms, model, scene, reaching, wanted, time > timing.reach - 0.5 / control.RATE, gains), None
+
+    def point(reaching: Reaching, _: None) -> tuple[Reaching, dict[str, jax.Array]]:
+        reaching = jax.lax.scan(step, reaching, length=_STEPS_A_POINT)[0]
+        data = reaching.data
+        path = control.planned(target, reaching.start, data.time, timing)
+        return reaching, {"path": path, "taken": stalk_arm.grip_at(data.qpos[:3]), "poses": data.qpos}
+
+    with jax.default_matmul_precision("highest"):
+        reaching, report = jax.lax.scan(point, reaching, length=_POINTS_A_CALL)
+    data = mjx_model.kinematics(model, reaching.data)
+    report |= {
+        "held": held_stalks(arms, data),
+        "touched": reaching.touched,
+        "brushed": reaching.brushed,
+        "stalks": bending.at_height(data, arms.layout, target[2]),
+    }
+    return reaching._replace(data=data), report
+
+
+def period(
+    arms: Arms, model: Any, scene: Scene, reaching: Reaching, wanted: jax.Array, is_closing: jax.Array, gains: Gains
+) -> Reaching:
+    """One period of the controllers, and of the physics.
+
+    Args:
+        arms: The model at rest.
+        model: The same with the stalks of the scene (`bending.fit`).
+        scene: Constants of the reach.
+        reaching: The arm.
+        wanted: [3], where the grip should be, m in the frame of the stand.
+        is_closing: [] bool, whether the jaws close.
+        gains: Gains of the controllers.
+    """
+    data = reaching.data
+    memory, forces = control.drive(reaching.drive, data.qpos[:3], data.qvel[:3], stalk_arm.joints_at(wanted, scene.side), gains)
+    jaws = jnp.where(is_closing, gains.jaw_force, -gains.jaw_force) * jnp.ones(2, jnp.float32)
+    wind = bending.wind_torque(model, arms.layout, scene.gusts, scene.shape.foot, data.time)
+    none = jnp.zeros(model.nv - stalk_arm.JOINTS, jnp.float32)
+    data = mjx_model.step(model, data.replace(qfrc_applied=wind + jnp.concatenate([forces, jaws, none])), False)
+    touches = {name: data._impl.contact.dist[places] < 0 for name, places in arms.contacts.items()}
+    touched = reaching.touched | touches["forearm"] | touches["upper_arm"]
+    by_gripper = touches["left_jaw"] | touches["right_jaw"] | touches["palm"]
+    return Reaching(data, memory, reaching.start, touched, reaching.brushed | (by_gripper & ~is_closing))
+
+
+def held_stalks(arms: Arms, data: Any) -> jax.Array:
+    """Return True for the stalks that the closed jaws hold, [N] bool: between the jaws, and at least one jaw presses on it."""
+    across, along = stalk_arm.grip_frame(data.qpos[:3])
+    grip = stalk_arm.grip_at(data.qpos[:3])
+    places = (bending.at_height(data, arms.layout, grip[2]) - grip)[:, :2]
+    aside, ahead = places @ across, places @ along
+    open_at = stalk_arm.OPENING / 2 + stalk_arm.JAW_RADIUS
+    is_between = (aside > data.qpos[3] - open_at) & (aside < open_at - data.qpos[4])
+    is_between &= (ahead > stalk_arm.PALM) & (ahead < stalk_arm.TIPS)
+    distance = data._impl.contact.dist
+    pressed = jnp.stack([distance[arms.contacts[name]] < _TOUCH for name in stalk_arm.JAWS]).any(axis=0)
+    return is_between & pressed

@@ -1,0 +1,305 @@
+"""Score of grasps: one target, one stalk between the jaws. NumPy and SciPy only.
+
+The thesis counts stalks: 1 - |grasped - attempted| / attempted, averaged over runs. Misses and double grasps cancel there.
+Here an attempt succeeds if exactly the stalk that it was for is between the jaws at closure. Failures are counted by kind,
+beside the thesis's ratio.
+"""
+
+import dataclasses
+import math
+from collections import Counter
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+ROOM = 0.005
+"""Room in m beside the open jaws with less of which a stalk is crowded: the jaws cannot take it alone."""
+NEIGHBOUR_EDGES = (0.0, 0.03, 0.04, 0.05, 0.065, 0.1, math.inf)
+"""Bounds of the classes of distances to the nearest neighbour, m, middle to middle."""
+OUTCOMES = ("success", "miss", "wrong stalk", "several", "unreachable", "refused")
+STAGES = ("grasped", "not detected", "aimed beside", "out of reach", "refused", "not held", "several held")
+
+
+@dataclasses.dataclass(frozen=True)
+class Attempt:
+    """One grasp point that the arm was to go to.
+
+    Attributes:
+        run: In which run.
+        stalk: Index of the stalk that the grasp point is matched to (`match`); None where no stalk is there.
+        held: Indices of the stalks between the closed jaws.
+        reachable: The arm could go there; if not, nothing is held.
+        refused: It could, and was not sent: other stalks were in its path, as far as was known. Then nothing is held.
+        collided: Links other than the jaws touched a stalk that the attempt was not for.
+        brushed: The same for the open jaws.
+        aim_error: Horizontal distance of the grasp point from the middle of the stalk, m; nan without one.
+    """
+
+    run: int
+    stalk: int | None
+    held: frozenset[int]
+    reachable: bool = True
+    refused: bool = False
+    collided: bool = False
+    brushed: bool = False
+    aim_error: float = math.nan
+
+    @property
+    def sent(self) -> bool:
+        """True if the arm moved."""
+        return self.reachable and not self.refused
+
+    @property
+    def outcome(self) -> str:
+        """One of `OUTCOMES`."""
+        if not self.reachable:
+            return "unreachable"
+        if self.refused:
+            return "refused"
+        if len(self.held) > 1:
+            return "several"
+        if not self.held:
+            return "miss"
+        return "success" if self.held == {self.stalk} else "wrong stalk"
+
+
+@dataclasses.dataclass(frozen=True)
+class Standing:
+    """One stalk of the stretch that a run passes: the truth.
+
+    Attributes:
+        run: In which run.
+        stalk: Its index.
+        reachable: The arm's geometry lets it be grasped from somewhere in the run.
+        room: Least distance from other stalks that it leaves the open gripper, m; see `approach.room`.
+        neighbour: Distance to the nearest other stalk at the height of the grasp, middle to middle, m.
+    """
+
+    run: int
+    stalk: int
+    reachable: bool
+    room: float
+    neighbour: float
+
+    @property
+    def crowded(self) -> bool:
+        """True if the jaws cannot take it alone."""
+        return self.room < ROOM
+
+
+@dataclasses.dataclass(frozen=True)
+class Share:
+    """So many of so many, with Wilson's interval of 95 %; all nan where there are none.
+
+    Attributes:
+        name: Name of the share.
+        count: Number of hits.
+        of: Total.
+    """
+
+    name: str
+    count: int
+    of: int
+
+    @property
+    def share(self) -> float:
+        """Share, 0 to 1."""
+        return self.count / self.of if self.of else math.nan
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Lowest and highest share that fit."""
+        return wilson(self.count, self.of)
+
+    def __str__(self) -> str:
+        if not self.of:
+            return f"{self.name}: none"
+        low, high = self.interval
+        return f"{self.name}: {self.share:.1%} ({self.count} of {self.of}; {low:.1%} to {high:.1%})"
+
+
+@dataclasses.dataclass(frozen=True)
+class Score:
+    """Score of all runs.
+
+    Attributes:
+        of_sent: Successes, of the attempts for which the arm moved.
+        with_room: Stalks grasped alone, of those that can be reached and leave the open jaws room.
+        crowded: The same of those that can be reached and do not.
+        of_reachable: The same of all that can be reached: with room and crowded.
+        of_all: The same of all stalks of the stretch: the whole process.
+        outcomes: Attempts by what came of them; one row for each of `OUTCOMES`, of all attempts.
+        stages: Stalks that can be reached, by the stage that failed; one row for each of `STAGES`.
+        false_targets: Attempts at places without a stalk, of all attempts.
+        collisions: Attempts sent whose links touched another stalk, of those sent.
+        brushes: Attempts sent whose open jaws touched another stalk, of those sent.
+        touches: Attempts sent of which either did, of those sent.
+        by_neighbour: Stalks grasped alone, of those that can be reached, by distance to the nearest neighbour.
+        thesis_ratio: The thesis's metric, mean over runs with attempts; nan without any.
+        runs: Runs with attempts.
+        aim_errors: [A] float64, `Attempt.aim_error` of the attempts at a stalk, m.
+    """
+
+    of_sent: Share
+    with_room: Share
+    crowded: Share
+    of_reachable: Share
+    of_all: Share
+    outcomes: tuple[Share, ...]
+    stages: tuple[Share, ...]
+    false_targets: Share
+    collisions: Share
+    brushes: Share
+    touches: Share
+    by_neighbour: tuple[Share, ...]
+    thesis_ratio: float
+    runs: int
+    aim_errors: np.ndarray
+
+    @property
+    def shares(self) -> tuple[Share, ...]:
+        """All rows, in the order of a table."""
+        first = (self.of_sent, self.with_room, self.crowded, self.of_reachable, self.of_all)
+        return (
+            *first,
+            *self.outcomes,
+            self.false_targets,
+            self.collisions,
+            self.brushes,
+            self.touches,
+            *self.stages,
+            *self.by_neighbour,
+        )
+
+
+def wilson(count: int, of: int, z: float = 1.959964) -> tuple[float, float]:
+    """Wilson's interval of a share ``count / of``; (nan, nan) for none. ``z`` is the normal quantile: 95 %."""
+    if not 0 <= count <= of:
+        raise ValueError(f"a count must be from 0 to what it is of, got {count} of {of}")
+    if not of:
+        return math.nan, math.nan
+    share, square = count / of, z * z / of
+    middle = (share + square / 2) / (1 + square)
+    half = z / (1 + square) * math.sqrt(share * (1 - share) / of + square / (4 * of))
+    return max(middle - half, 0.0), min(middle + half, 1.0)
+
+
+def match(points: np.ndarray, stalks: np.ndarray, gate: float) -> np.ndarray:
+    """Match grasp points with stalks one to one: as many pairs as possible, at the least total distance.
+
+    Args:
+        points: [P, 2], where the arm is to go, m.
+        stalks: [S, 2], where the middles of the stalks are at the heights of the grasps, m; or [P, S, 2] where these differ.
+        gate: Greatest distance of a pair, m.
+
+    Returns:
+        [P] int: index of the stalk, -1 for none.
+    """
+    points, stalks = np.asarray(points, float).reshape(-1, 2), np.asarray(stalks, float)
+    if stalks.ndim == 2:
+        stalks = np.broadcast_to(stalks, (len(points), *stalks.shape))
+    matched = np.full(len(points), -1)
+    if not points.size or not stalks.size:
+        return matched
+    distance = np.linalg.norm(points[:, None] - stalks, axis=-1)
+    # A pair beyond the gate costs more than any number of pairs within it.
+    cost = np.where(distance <= gate, distance, gate * (min(distance.shape) + 1.0))
+    for point, stalk in zip(*linear_sum_assignment(cost)):
+        if distance[point, stalk] <= gate:
+            matched[point] = stalk
+    return matched
+
+
+def score(attempts: Iterable[Attempt], stalks: Iterable[Standing], tolerance: float = 0.015) -> Score:
+    """Puts the attempts beside the truth.
+
+    Args:
+        attempts: Attempts of all runs, at most one for each stalk.
+        stalks: All stalks of the stretches that the runs pass.
+        tolerance: An attempt is aimed beside its stalk where it fails and its aim is further off than this, m.
+
+    Raises:
+        ValueError: Two attempts of a run are for one stalk, a stalk is listed twice, or an attempt is for an unknown stalk.
+    """
+    attempts, stalks = list(attempts), list(stalks)
+    known = Counter((stalk.run, stalk.stalk) for stalk in stalks)
+    tried = Counter((attempt.run, attempt.stalk) for attempt in attempts if attempt.stalk is not None)
+    for what, counted in (("stalk is listed", known), ("stalk has an attempt", tried)):
+        twice = [place for place, count in counted.items() if count > 1]
+        if twice:
+            raise ValueError(f"a {what} more than once: stalk {twice[0][1]} of run {twice[0][0]}")
+    strange = sorted(set(tried) - set(known))
+    if strange:
+        raise ValueError(f"an attempt is for stalk {strange[0][1]} of run {strange[0][0]}, which is not among the stalks")
+    by_place = {(attempt.run, attempt.stalk): attempt for attempt in attempts if attempt.stalk is not None}
+    stage_of = [_stage(by_place.get((stalk.run, stalk.stalk)), tolerance) for stalk in stalks]
+    reachable = [(stalk, stage) for stalk, stage in zip(stalks, stage_of) if stalk.reachable]
+    sent = [attempt for attempt in attempts if attempt.sent]
+
+    def grasped(name: str, chosen: Sequence[str]) -> Share:
+        return Share(name, sum(stage == "grasped" for stage in chosen), len(chosen))
+
+    outcomes = Counter(attempt.outcome for attempt in attempts)
+    stages = Counter(stage for _, stage in reachable)
+    ratio, runs = thesis_ratio(attempts)
+    return Score(
+        of_sent=Share("attempts: exactly the target held", outcomes["success"], len(sent)),
+        with_room=grasped("reachable stalks with room", [stage for stalk, stage in reachable if not stalk.crowded]),
+        crowded=grasped("reachable stalks, crowded", [stage for stalk, stage in reachable if stalk.crowded]),
+        of_reachable=grasped("all reachable stalks", [stage for _, stage in reachable]),
+        of_all=grasped("all stalks", stage_of),
+        outcomes=tuple(Share(f"attempts: {name}", outcomes[name], len(attempts)) for name in OUTCOMES),
+        stages=tuple(Share(f"reachable stalks: {name}", stages[name], len(reachable)) for name in STAGES),
+        false_targets=Share("attempts: no stalk there", sum(attempt.stalk is None for attempt in attempts), len(attempts)),
+        collisions=Share("attempts: links touched another stalk", sum(attempt.collided for attempt in sent), len(sent)),
+        brushes=Share("attempts: jaws touched another stalk", sum(attempt.brushed for attempt in sent), len(sent)),
+        touches=Share("attempts: links or jaws did", sum(attempt.collided or attempt.brushed for attempt in sent), len(sent)),
+        by_neighbour=tuple(
+            grasped(
+                _class_name(low, high),
+                [
+                    stage
+                    for stalk, stage in reachable
+                    if low <= stalk.neighbour and (stalk.neighbour < high or math.isinf(high))
+                ],
+            )
+            for low, high in zip(NEIGHBOUR_EDGES, NEIGHBOUR_EDGES[1:])
+        ),
+        thesis_ratio=ratio,
+        runs=runs,
+        aim_errors=np.array([attempt.aim_error for attempt in attempts if attempt.stalk is not None], float),
+    )
+
+
+def thesis_ratio(attempts: Iterable[Attempt]) -> tuple[float, int]:
+    """The thesis's metric, mean over the runs in which the arm was sent, and the number of these; nan for none."""
+    sent: Counter[int] = Counter()
+    held: Counter[int] = Counter()
+    for attempt in attempts:
+        if attempt.sent:
+            sent[attempt.run] += 1
+            held[attempt.run] += len(attempt.held)
+    ratios = [1 - abs(held[run] - count) / count for run, count in sent.items()]
+    return (float(np.mean(ratios)) if ratios else math.nan), len(ratios)
+
+
+def _stage(attempt: Attempt | None, tolerance: float) -> str:
+    """Return the one of `STAGES` that a stalk came to."""
+    if attempt is None:
+        return "not detected"
+    if attempt.outcome == "success":
+        return "grasped"
+    if not attempt.reachable:
+        return "out of reach"
+    if attempt.refused:
+        return "refused"
+    if attempt.aim_error > tolerance:
+        return "aimed beside"
+    return "several held" if attempt.outcome == "several" else "not held"
+
+
+def _class_name(low: float, high: float) -> str:
+    if math.isinf(high):
+        return f"neighbour from {1000 * low:g} mm"
+    return f"neighbour {1000 * low:g} to {1000 * high:g} mm"

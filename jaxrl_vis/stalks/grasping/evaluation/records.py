@@ -1,0 +1,292 @@
+"""Records of `grasp eval` as JSON: for each run its perception's score, the plan of its attempts, and their results.
+
+Everything that follows is computed from what was kept, so that it is the same whether a run was evaluated now or before.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import jaxrl_vis
+import jaxrl_vis.stalks.grasping
+import jaxrl_vis_envs.plants
+from jaxrl_vis.evaluation_pool import Record, RecordFile, code_digest, evaluate_all
+from jaxrl_vis.provenance import device_name
+from jaxrl_vis.run.policy import Policy
+from jaxrl_vis.stalks.digests import value_digest
+from jaxrl_vis.stalks.grasping.evaluation.attempts import Loop, Plan, carry_out, plan
+from jaxrl_vis.stalks.grasping.evaluation.grasp_score import Attempt, Score, Standing, score
+from jaxrl_vis.stalks.grasping.evaluation.scoring import MaskScore, RunScore, draw_scene, score_scene, summary
+from jaxrl_vis.stalks.grasping.masks.loading import load_painter
+from jaxrl_vis.stalks.grasping.perception.perceive import Variant
+from jaxrl_vis_envs.plants import Family
+from jaxrl_vis_envs.plants.stand import Stands
+
+SCHEMA = 2
+"""Schema of the records: those with another one cannot be resumed."""
+_DIGITS = 6  # of lengths in m
+# Files and folders that train networks or draw figures and videos.
+_CHANGES_NO_RECORD = ("examples.py", "mask_training.py", "variation.py", "report")
+
+
+@dataclasses.dataclass(frozen=True)
+class Conditions:
+    """Conditions under which runs are evaluated.
+
+    Attributes:
+        family: Family that rows are drawn from.
+        weights: File of the weights of the network of masks; None for true masks.
+        masks: Name of that network, or ``truth``.
+        variant: Steps that follow the thesis.
+        workers: Number of processes that share the machine; records state it, as it bears on the time that a pair takes.
+    """
+
+    family: Family
+    weights: Path | None = None
+    masks: str = "truth"
+    variant: Variant = dataclasses.field(default_factory=Variant)
+    workers: int = 1
+
+
+def evaluate_runs(
+    conditions: Conditions,
+    numbers: Sequence[int],
+    path: Path | None,
+    started: Callable[[int], None],
+    done: Callable[[int, Record], None],
+) -> RecordFile:
+    """Evaluate runs, side by side in several processes, before an arm moves.
+
+    Args:
+        conditions: For all runs.
+        numbers: Seeds of the rows.
+        path: JSON file of the records, which is written after each run; None for no file. Runs that it holds already are not
+            evaluated again.
+        started: Called once with the number of runs that the file holds already.
+        done: Called after each run with its number and its record.
+
+    Returns:
+        The records of all runs.
+
+    Raises:
+        RequestError: The file holds records of another evaluation, or cannot be read.
+        WorkerError: A process was ended from outside.
+    """
+    about = {
+        "synthetic": True,
+        "version": jaxrl_vis.__version__,
+        "schema": SCHEMA,
+        "code": code_digest(jaxrl_vis_envs.plants, jaxrl_vis.stalks.grasping, leave_out=_CHANGES_NO_RECORD),
+        "family": conditions.family.name,
+        "family_digest": value_digest(dataclasses.asdict(conditions.family)),
+        "masks": conditions.masks,
+        "method": str(conditions.variant),
+    }
+    table = RecordFile(path, about, summarise)
+    missing = [number for number in numbers if number not in table]
+    started(len(numbers) - len(missing))
+
+    def keep(number: int, record: Record) -> None:
+        table.add(number, record)
+        done(number, table.records[number])
+
+    evaluate_all(functools.partial(evaluate_run, conditions), missing, conditions.workers, keep)
+    return table
+
+
+def evaluate_run(conditions: Conditions, number: int) -> Record:
+    """Evaluate one run, before an arm moves, and return its record.
+
+    Args:
+        conditions: For all runs.
+        number: Seed of the row.
+    """
+    scene = draw_scene(conditions.family, number)
+    painter = None if conditions.weights is None else load_painter(conditions.weights)
+    score, perception = score_scene(scene, None if painter is None else lambda image, _: painter(image), conditions.variant)
+    return {
+        "stalks": score.true,
+        "grasp_points": score.detected,
+        "hits": len(score.errors),
+        "device": device_name(),
+        "workers": conditions.workers,
+        "score": _score_record(score),
+        "plan": _plan_record(plan(scene, perception, number)),
+        "plan_for_policy": _plan_record(plan(scene, perception, number, for_policy=True)),
+    }
+
+
+def summarise(records: Sequence[Record]) -> dict[str, Any]:
+    """Summarise the records of runs: the figures of `scoring.summary`, and of all reaches that all of them have."""
+    figures: dict[str, Any] = summary([read_score(record) for record in records])
+    figures["devices"] = sorted({record["device"] for record in records})
+    figures["workers"] = sorted({record["workers"] for record in records})
+    known = [set(record.get("reaches", {})) for record in records]
+    if known and (everywhere := set.intersection(*known)):
+        figures["reaches"] = {name: score_figures(grasp_score(records, name)) for name in sorted(everywhere)}
+    return figures
+
+
+def score_figures(score: Score) -> dict[str, Any]:
+    """A score as JSON."""
+    shares = {share.name: {"count": share.count, "of": share.of, "interval": share.interval} for share in score.shares}
+    return {"thesis_ratio": score.thesis_ratio, "shares": shares}
+
+
+@dataclasses.dataclass(frozen=True)
+class Reaches:
+    """A kind of reaches, for all targets.
+
+    Attributes:
+        loop: Loop of the arm: with or without a second look, or a policy.
+        wind_mm: Amplitude of the stalks' sway, mm.
+        for_policy: All loops have the scenes of the policy's task; see `attempts.plan`.
+        policy: For that loop.
+        policy_name: Its name.
+    """
+
+    loop: Loop
+    wind_mm: float
+    for_policy: bool = False
+    policy: Policy | None = None
+    policy_name: str = ""
+
+    def __str__(self) -> str:
+        scenes = ", nearest stop" if self.for_policy else ""
+        return f"{self.loop}{' ' + self.policy_name if self.loop == 'policy' else ''}, wind {self.wind_mm:g} mm{scenes}"
+
+    @property
+    def plan(self) -> str:
+        """Under what name its plan is kept."""
+        return "plan_for_policy" if self.for_policy else "plan"
+
+
+def reach_all(table: RecordFile, numbers: Iterable[int], reaches: Reaches) -> None:
+    """Sends the arm to all targets of the runs that were not carried out in this way yet, and keeps what came of it.
+
+    Args:
+        table: The records of all runs.
+        numbers: Numbers of the runs.
+        reaches: Kind of reaches.
+    """
+    name = str(reaches)
+    missing = [number for number in numbers if name not in table.records[number].get("reaches", {})]
+    plans = [read_plan(number, table.records[number], reaches.plan) for number in missing]
+    attempts = carry_out(plans, reaches.wind_mm, reaches.loop, reaches.policy)
+    changed = {}
+    for number in missing:
+        record = table.records[number]
+        mine = {"plan": reaches.plan, "attempts": [_attempt_record(attempt) for attempt in attempts if attempt.run == number]}
+        changed[number] = {**record, "reaches": {**record.get("reaches", {}), name: mine}}
+    table.add_all(changed)
+
+
+def grasp_score(records: Iterable[Record], name: str) -> Score:
+    """The score of what came of all reaches of one kind, named as `Reaches` are."""
+    attempts, standing = [], []
+    for record in records:
+        number, reaches = int(record["number"]), record["reaches"][name]
+        attempts += attempts_in(record, name)
+        standing += read_plan(number, record, reaches["plan"]).standing
+    return score(attempts, standing)
+
+
+def _score_record(score: RunScore) -> Record:
+    values = dataclasses.asdict(score)
+    values["found"] = values.pop("detected")
+    return {name: value.round(4).tolist() if isinstance(value, np.ndarray) else value for name, value in values.items()}
+
+
+def read_score(record: Record) -> RunScore:
+    """Return the score of a run's perception from its record."""
+    values, mask = record["score"], record["score"]["mask"]
+    return RunScore(
+        seed=values["seed"],
+        true=values["true"],
+        detected=values["found"],
+        errors=np.array(values["errors"], float),
+        stitches=np.array(values["stitches"], float),
+        refused=values["refused"],
+        seconds=values["seconds"],
+        mask=None if mask is None else MaskScore(**{**mask, "boundary": _number(mask["boundary"])}),
+        notes=tuple(values["notes"]),
+    )
+
+
+def _stands_record(stands: Stands) -> Record:
+    arrays = {field.name: getattr(stands, field.name) for field in dataclasses.fields(Stands)}
+    return {name: array.astype(float).round(_DIGITS).tolist() for name, array in arrays.items()}
+
+
+def _plan_record(made: Plan) -> Record:
+    return {
+        "targets": made.targets.round(_DIGITS).tolist(),
+        "stalks": made.stalks.tolist(),
+        "errors": made.errors.round(_DIGITS).tolist(),
+        "sides": made.sides.tolist(),
+        "refused": made.refused.tolist(),
+        "again": made.again.round(_DIGITS).tolist(),
+        "stands": _stands_record(made.stands),
+        "seen": None if made.detected is None else _stands_record(made.detected),
+        "standing": [
+            [stalk.stalk, stalk.reachable, round(stalk.room, _DIGITS), round(stalk.neighbour, _DIGITS)]
+            for stalk in made.standing
+        ],
+    }
+
+
+def read_plan(number: int, record: Record, name: str = "plan") -> Plan:
+    """A plan of a run.
+
+    Args:
+        number: Number of the run.
+        record: Its record.
+        name: Name of the plan in the record.
+    """
+    values = record[name]
+    return Plan(
+        run=number,
+        targets=np.array(values["targets"], float).reshape(-1, 3),
+        stalks=np.array(values["stalks"], int),
+        errors=np.array(values["errors"], float),  # not a number where there is None
+        sides=np.array(values["sides"], float),
+        refused=np.array(values["refused"], bool),
+        again=np.array(values["again"], float).reshape(-1, 2),
+        stands=_read_stands(values["stands"]),
+        standing=tuple(
+            Standing(number, stalk, reachable, *(np.inf if length is None else length for length in (room, neighbour)))
+            for stalk, reachable, room, neighbour in values["standing"]
+        ),
+        detected=None if values["seen"] is None else _read_stands(values["seen"]),
+    )
+
+
+def _read_stands(values: Record) -> Stands:
+    shapes = {"foot": (3,), "knee": (3,), "top": (3,), "radius": (2,), "bending_radius": (2,)}
+    stalk = np.array(values["stalk"], np.int32)
+    stalk = stalk.reshape(len(stalk), -1 if len(stalk) else 0)
+    arrays = {name: np.array(values[name], np.float32).reshape(*stalk.shape, *shape) for name, shape in shapes.items()}
+    return Stands(stalk=stalk, **arrays, origin=np.array(values["origin"], np.float32).reshape(-1, 3))
+
+
+def _attempt_record(attempt: Attempt) -> Record:
+    values = dataclasses.asdict(attempt)
+    del values["run"]
+    return {**values, "held": sorted(attempt.held)}
+
+
+def attempts_in(record: Record, name: str) -> list[Attempt]:
+    """Return the attempts of one kind of reaches in a run."""
+    return [_read_attempt(int(record["number"]), values) for values in record["reaches"][name]["attempts"]]
+
+
+def _read_attempt(number: int, values: Record) -> Attempt:
+    return Attempt(**{**values, "held": frozenset(values["held"]), "aim_error": _number(values["aim_error"])}, run=number)
+
+
+def _number(value: float | None) -> float:
+    return np.nan if value is None else value

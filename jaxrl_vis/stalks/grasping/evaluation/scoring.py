@@ -1,0 +1,255 @@
+"""Scores of masks, stitches and grasp points against the exact truth of synthetic rows, which are drawn for it.
+
+row -> five pairs -> perception -> grasp points         as `run` does, without files
+    -> true stalks, poses and masks                     from the row itself
+
+Only the half metre that the robot drives along counts: the stalks that stand there at the preferred height. A grasp point hits
+the stalk that it is matched with, one to one, if it lies within 30 mm of that stalk's middle at its own height.
+"""
+
+import dataclasses
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import cv2
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from jaxrl_vis.stalks.grasping.masks.examples import true_mask
+from jaxrl_vis.stalks.grasping.perception.cloud import Mount
+from jaxrl_vis.stalks.grasping.perception.lines import PREFERRED
+from jaxrl_vis.stalks.grasping.perception.perceive import DEFAULT_VARIANT, Mask, Perception, Variant, View, perceive
+from jaxrl_vis.stalks.grasping.perception.stitch import Motion
+from jaxrl_vis_envs.plants import Drive, Family, Plot, Pose, draw
+from jaxrl_vis_envs.plants.pairs import Sequence
+
+RADIUS = 0.03
+"""Greatest distance of a grasp point from the stalk that it is matched with, m: half the mean spacing."""
+
+
+@dataclasses.dataclass(frozen=True)
+class MaskScore:
+    """Agreement of masks with the truth, over the pairs of a run.
+
+    Attributes:
+        hits, painted, true: Pixels that are rightly painted, painted, and of stalks.
+        boundary: Mean distance between the outlines of both masks, in both directions, pixels; not a number without outlines.
+    """
+
+    hits: int
+    painted: int
+    true: int
+    boundary: float
+
+
+@dataclasses.dataclass(frozen=True)
+class RunScore:
+    """One run.
+
+    Attributes:
+        seed: Seed of the row.
+        true: Stalks in the stretch.
+        found: Grasp points in the stretch, and those that are matched with a stalk in it.
+        errors: [K] float64, horizontal distance of each matched grasp point from its stalk, mm.
+        stitches: [S] float64, horizontal error of each stitch, mm.
+        refused: Stitches that were refused.
+        seconds: Time per pair, by stage, s.
+        mask: Agreement of masks with the truth; None for true masks.
+        notes: Irregularities, in words.
+    """
+
+    seed: int
+    true: int
+    detected: int
+    errors: np.ndarray
+    stitches: np.ndarray
+    refused: int
+    seconds: dict[str, float]
+    mask: MaskScore | None
+    notes: tuple[str, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """One run, drawn.
+
+    Attributes:
+        plot: The plants.
+        drive: Path and properties of the cameras.
+        mount: Their nominal mount.
+        views: The pairs.
+        masks: [F, H, W] bool, true masks.
+    """
+
+    plot: Plot
+    drive: Drive
+    mount: Mount
+    views: tuple[View, ...]
+    masks: np.ndarray
+
+
+def draw_scene(family: Family, seed: int) -> Scene:
+    """Draws the pairs of a row."""
+    sequence = Sequence.of(draw(family, seed))
+    views, masks = [], []
+    for pair in sequence:
+        driven = float(sequence.drive.odometry[pair.frame])
+        views.append(View(pair.frame, np.asarray(pair.left), np.asarray(pair.right), driven))
+        masks.append(true_mask(pair.instance, len(sequence.plot.measured)))
+    return Scene(sequence.plot, sequence.drive, Mount.of(family.rig), tuple(views), np.stack(masks))
+
+
+def score_scene(scene: Scene, mask: Mask | None = None, variant: Variant = DEFAULT_VARIANT) -> tuple[RunScore, Perception]:
+    """Runs everything on a scene and compares.
+
+    Args:
+        scene: The pairs and the truth.
+        mask: Function that returns the mask of an image; None for true masks.
+        variant: Steps that follow the thesis.
+    """
+    painted: dict[int, np.ndarray] = {}
+
+    def remembered(image: np.ndarray, number: int) -> np.ndarray:
+        painted[number] = scene.masks[number] if mask is None else mask(image, number)
+        return painted[number]
+
+    perception = perceive(scene.views, remembered, scene.drive.stated, scene.mount, variant)
+    targets = in_world(perception, scene)
+    true, detected, errors = match_stalks(targets, scene.plot)
+    poses = scene.drive.poses
+    errors_of_stitches = [
+        stitch_error(stitch.motion, poses[place], poses[place + 1], scene.mount)
+        for place, stitch in enumerate(perception.stitches)
+    ]
+    count = len(scene.views)
+    score = RunScore(
+        seed=scene.plot.seed,
+        true=true,
+        detected=detected,
+        errors=1e3 * errors,
+        stitches=1e3 * np.array(errors_of_stitches),
+        refused=sum(bool(stitch.refused) for stitch in perception.stitches),
+        seconds={name: value / count for name, value in perception.seconds.items()},
+        mask=None if mask is None else _mask_score([(painted[number], scene.masks[number]) for number in painted]),
+        notes=perception.notes,
+    )
+    return score, perception
+
+
+def in_world(perception: Perception, scene: Scene) -> np.ndarray:
+    """Grasp points [B, 3] in the plot's frame, m: the robot stands where the last pair was taken, and is mounted as stated."""
+    points = np.array([point.point for point in perception.points]).reshape(-1, 3)
+    return scene.drive.poses[-1].to_world(scene.mount.pose.to_camera(points))
+
+
+def driven_stretch(plot: Plot) -> tuple[float, float]:
+    """Return the two ends of the stretch of the row that the robot drives along, m."""
+    length = plot.family.layout.plot_length
+    stretch = plot.family.rig.stretch or length
+    return 0.5 * (length - stretch), 0.5 * (length + stretch)
+
+
+def match_stalks(targets: np.ndarray, plot: Plot) -> tuple[int, int, np.ndarray]:
+    """Matches grasp points with stalks of the near row, one to one.
+
+    Args:
+        targets: [B, 3] in the plot's frame, m.
+        plot: The plants.
+
+    Returns:
+        How many stalks there are in the stretch, how many grasp points, without those of stalks beyond it, and the distances
+        [K] of those that hit, m.
+    """
+    low, high = driven_stretch(plot)
+    inside = np.array([low <= stalk.at_height(PREFERRED)[0][0] <= high for stalk in plot.measured], bool)
+    distance = np.array(
+        [[math.dist(target[:2], stalk.at_height(target[2])[0][:2]) for stalk in plot.measured] for target in targets]
+    ).reshape(len(targets), len(plot.measured))
+    rows, columns = linear_sum_assignment(np.minimum(distance, RADIUS))
+    near = distance[rows, columns] < RADIUS
+    of_target = dict(zip(rows[near].tolist(), columns[near].tolist()))
+    errors = [distance[row, column] for row, column in of_target.items() if inside[column]]
+    false = sum(row not in of_target and low <= target[0] <= high for row, target in enumerate(targets))
+    return int(inside.sum()), len(errors) + int(false), np.array(errors)
+
+
+def true_motion(before: Pose, after: Pose, mount: Mount) -> Motion:
+    """Return the motion from the robot frame of one pair to that of another one, by the true poses of their cameras."""
+    nominal = mount.pose
+    rotation = nominal.rotation.T @ after.rotation @ before.rotation.T @ nominal.rotation
+    origin = nominal.to_world(after.to_camera(before.to_world(nominal.to_camera(np.zeros(3)))))
+    return Motion(rotation, origin)
+
+
+def stitch_error(motion: Motion, before: Pose, after: Pose, mount: Mount) -> float:
+    """Mean horizontal distance in m between where a stitch puts places of the row, and where they are."""
+    away = float(0.5 * (before.position[1] + after.position[1]))
+    places = np.array([[x, -away, z] for x in (-0.2, 0.0, 0.2) for z in (0.5, 0.75, 1.0)])
+    difference = motion(places) - true_motion(before, after, mount)(places)
+    return float(np.linalg.norm(difference[:, :2], axis=1).mean())
+
+
+def _mask_score(masks: list[tuple[np.ndarray, np.ndarray]]) -> MaskScore:
+    """Compares painted masks with true ones."""
+    far = [_between_outlines(*both) for both in masks]
+    return MaskScore(
+        hits=int(sum((painted & true).sum() for painted, true in masks)),
+        painted=int(sum(painted.sum() for painted, _ in masks)),
+        true=int(sum(true.sum() for _, true in masks)),
+        boundary=float(np.nanmean(far)) if np.isfinite(far).any() else math.nan,
+    )
+
+
+def _between_outlines(painted: np.ndarray, true: np.ndarray) -> float:
+    """Mean distance of the outlines of two masks, in both directions, pixels; not a number where one has none."""
+    outlines = [mask.astype(np.uint8) - cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) for mask in (painted, true)]
+    if not all(outline.any() for outline in outlines):
+        return math.nan
+    far = [cv2.distanceTransform(1 - outline, cv2.DIST_L2, 5) for outline in outlines]
+    return 0.5 * float(far[0][outlines[1] > 0].mean() + far[1][outlines[0] > 0].mean())
+
+
+def summary(scores: Iterable[RunScore]) -> dict[str, Any]:
+    """Summarise the scores of runs.
+
+    Returns:
+        ``f1``, ``precision`` and ``recall`` of stalks, ``point_median_mm`` and ``point_p95_mm``, ``stitch_median_mm`` and
+        ``stitch_p95_mm``, ``stitches_refused``, ``seconds_per_pair`` and its parts, for networks ``mask_f1`` and
+        ``mask_boundary_px``, and how much there was of each. Not a number where there was nothing.
+    """
+    scores = list(scores)
+    true, detected = sum(score.true for score in scores), sum(score.detected for score in scores)
+    errors = np.concatenate([score.errors for score in scores] or [np.zeros(0)])
+    stitches = np.concatenate([score.stitches for score in scores] or [np.zeros(0)])
+    hits = len(errors)
+    seconds = {
+        name: float(np.median([score.seconds[name] for score in scores])) for name in (scores[0].seconds if scores else ())
+    }
+    figures = {
+        "runs": len(scores),
+        "stalks": true,
+        "grasp_points": detected,
+        "hits": hits,
+        "precision": hits / detected if detected else math.nan,
+        "recall": hits / true if true else math.nan,
+        "f1": 2.0 * hits / (true + detected) if true + detected else math.nan,
+        "point_median_mm": _quantile(errors, 0.5),
+        "point_p95_mm": _quantile(errors, 0.95),
+        "stitches": len(stitches),
+        "stitches_refused": sum(score.refused for score in scores),
+        "stitch_median_mm": _quantile(stitches, 0.5),
+        "stitch_p95_mm": _quantile(stitches, 0.95),
+        "seconds_per_pair": float(np.median([sum(score.seconds.values()) for score in scores])) if scores else math.nan,
+        **{f"seconds_{name}": value for name, value in seconds.items()},
+    }
+    masks = [score.mask for score in scores if score.mask is not None]
+    if masks:
+        painted, wanted = sum(mask.painted for mask in masks), sum(mask.true for mask in masks)
+        figures["mask_f1"] = 2.0 * sum(mask.hits for mask in masks) / (painted + wanted) if painted + wanted else math.nan
+        figures["mask_boundary_px"] = float(np.nanmean([mask.boundary for mask in masks]))
+    return figures
+
+
+def _quantile(values: np.ndarray, share: float) -> float:
+    return float(np.quantile(values, share)) if values.size else math.nan

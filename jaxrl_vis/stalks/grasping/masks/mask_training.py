@@ -1,0 +1,182 @@
+"""Training the generator: against a discriminator, as pix2pix, or as a plain segmentation. Same network, same data.
+
+gan             the discriminator tells true paintings from those of the generator; the generator deceives it, and stays near
+                the true painting (100 times the mean absolute difference)
+segmentation    cross entropy and Dice loss of the mask
+
+Examples are drawn by threads while the network already learns from those that are there.
+"""
+
+import dataclasses
+import functools
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from jaxrl_vis.stalks.grasping.masks.examples import Example
+from jaxrl_vis.stalks.grasping.masks.mask_networks import Discriminator
+from jaxrl_vis.stalks.grasping.masks.painter import Settings, compute_dtype, normalise
+from jaxrl_vis.stalks.grasping.masks.variation import vary
+from jaxrl_vis.stalks.phenotyping.detector.losses import mask_loss
+from jaxrl_vis.stalks.phenotyping.training.pool import Pool
+from jaxrl_vis.stalks.phenotyping.training.updates import Report, repeat
+
+_NEAR_TRUTH = 100.0
+"""Weight of the mean absolute difference, pix2pix's own."""
+_RED = (1.0, -1.0, -1.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """Schedule of the generator's training.
+
+    Attributes:
+        steps: Most updates.
+        minutes: Most minutes, the drawing of the first images and compilation included; None for no limit.
+        images: Number of images to learn from.
+        first: With how many the updates begin.
+        batch: Crops per update.
+        crop: Height and width of a crop, pixels.
+        rate: Highest learning rate of the generator.
+        average: Average of the generator's weights over updates: the share of the old ones.
+        seed: Seed of everything random.
+    """
+
+    steps: int = 20_000
+    minutes: float | None = None
+    images: int = 800
+    first: int = 16
+    batch: int = 16
+    crop: int = 384
+    rate: float = 1e-3
+    average: float = 0.998
+    seed: int = 0
+
+
+def crops(examples: list[Example], rng: np.random.Generator, count: int, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """A batch of crops at random places.
+
+    Args:
+        examples: To choose from.
+        rng: Random numbers.
+        count: Number of crops.
+        size: Their height and width, pixels; where an image is smaller, the rest is black.
+
+    Returns:
+        [N, size, size, 3] uint8 and [N, size, size] bool.
+    """
+    images = np.zeros((count, size, size, 3), np.uint8)
+    masks = np.zeros((count, size, size), bool)
+    for place, number in enumerate(rng.integers(len(examples), size=count)):
+        example = examples[number]
+        top, left = (int(rng.integers(max(length - size, 0) + 1)) for length in example.mask.shape)
+        part = example.image[top : top + size, left : left + size]
+        images[place, : part.shape[0], : part.shape[1]] = part
+        masks[place, : part.shape[0], : part.shape[1]] = example.mask[top : top + size, left : left + size]
+    return images, masks
+
+
+@functools.partial(jax.jit, static_argnames=("settings", "dtype"), donate_argnums=0)
+def _update(state: Any, batch: Any, key: jax.Array, rates: tuple[jax.Array, jax.Array], settings: Settings, dtype: Any):
+    """One update: generator, its average, discriminator (None for segmentation), and the optimiser's states of both."""
+    generator, average, discriminator, moments = state
+    rate, share = rates
+    images, masks = vary(batch[0], batch[1], key)
+    network, judge, values = settings.generator(dtype), Discriminator(dtype=dtype), normalise(images)
+    true = jnp.where(masks[..., None], jnp.array(_RED), values)
+
+    def of_generator(params: Any):
+        painted = network.apply(params, values)
+        assert isinstance(painted, jax.Array)
+        if settings.loss == "segmentation":
+            loss = mask_loss(painted[..., 0], masks)
+            return loss, ({"mask": loss}, painted)
+        verdict = judge.apply(discriminator, values, painted)
+        assert isinstance(verdict, jax.Array)
+        deceived = optax.sigmoid_binary_cross_entropy(verdict, jnp.ones_like(verdict)).mean()
+        difference = jnp.abs(painted - true).mean()
+        return deceived + _NEAR_TRUTH * difference, ({"deceived": deceived, "difference": difference}, painted)
+
+    gradients, (parts, painted) = jax.grad(of_generator, has_aux=True)(generator)
+    updates, first = _optimiser().update(gradients, moments[0], generator)
+    generator = jax.tree.map(lambda old, change: old + rate * change, generator, updates)
+    average = jax.tree.map(lambda old, new: share * old + (1.0 - share) * new, average, generator)
+    if settings.loss == "segmentation":
+        return (generator, average, None, (first, None)), parts
+
+    def of_discriminator(params: Any) -> jax.Array:
+        verdicts = [judge.apply(params, values, painting) for painting in (true, jax.lax.stop_gradient(painted))]
+        losses = [
+            optax.sigmoid_binary_cross_entropy(verdict, jnp.full_like(verdict, wanted)).mean()  # pyright: ignore
+            for verdict, wanted in zip(verdicts, (1.0, 0.0))
+        ]
+        return 0.5 * (losses[0] + losses[1])
+
+    judged, gradients = jax.value_and_grad(of_discriminator)(discriminator)
+    updates, second = _optimiser().update(gradients, moments[1], discriminator)
+    # As in pix2pix, the discriminator learns at half the speed.
+    discriminator = jax.tree.map(lambda old, change: old + 0.5 * rate * change, discriminator, updates)
+    return (generator, average, discriminator, (first, second)), {**parts, "told": judged}
+
+
+def _optimiser() -> optax.GradientTransformation:
+    # The rate is applied outside, as it follows the clock.
+    return optax.chain(optax.clip_by_global_norm(5.0), optax.adam(1.0, b1=0.5))
+
+
+def _initial(settings: Settings, crop: int, key: jax.Array) -> Any:
+    """Generator, its average, discriminator and the states of their optimisers."""
+    painter, judge = jax.random.split(key)
+    blank = jnp.zeros((1, crop, crop, 3))
+    generator = settings.generator(jnp.float32).init(painter, blank)
+    average = jax.tree.map(jnp.array, generator)
+    if settings.loss == "segmentation":
+        return generator, average, None, (_optimiser().init(generator), None)
+    discriminator = Discriminator().init(judge, blank, blank)
+    return generator, average, discriminator, (_optimiser().init(generator), _optimiser().init(discriminator))
+
+
+def train(
+    sources: list[Iterator[Example]], settings: Settings, plan: Plan, report: Report, every: float = 30.0
+) -> tuple[Any, int]:
+    """Trains a generator.
+
+    Args:
+        sources: Iterators over examples; each is read by a thread of its own.
+        settings: Settings of the generator, loss included.
+        plan: Schedule.
+        report: See `Report`.
+        every: Interval of reports, s.
+
+    Returns:
+        The generator's parameters, averaged, and the number of updates.
+
+    Raises:
+        NonFiniteError: A loss is not finite any more.
+        RequestError: The time was over before the first update.
+    """
+    started = time.monotonic()
+    rng = np.random.default_rng(plan.seed)
+    start_key, steps_key = jax.random.split(jax.random.key(plan.seed))
+    dtype = compute_dtype()
+    pool = Pool(sources, plan.images)
+    state: Any = None
+
+    def update(step: int, rates: tuple[jax.Array, jax.Array]) -> tuple[dict[str, jax.Array], Any]:
+        nonlocal state
+        batch = crops(pool.examples, rng, plan.batch, plan.crop)
+        state, parts = _update(state, batch, jax.random.fold_in(steps_key, step), rates, settings, dtype)
+        return parts, state[1]
+
+    try:
+        state = _initial(settings, plan.crop, start_key)
+        pool.fill(plan.first)
+        step = repeat(update, pool, plan, started, report, every)
+    finally:
+        pool.close()
+    return state[1], step

@@ -1,0 +1,128 @@
+"""The same crop under another light, of other colours and textures, leaning and larger: what a mask must not depend on.
+
+A network that has only seen one family of plants takes its colours and its brightness for what makes a stalk; in a family with
+other ones it then misses half of the pixels. What is drawn here is general: no value is taken from a shifted family.
+"""
+
+import math
+
+import jax
+import jax.numpy as jnp
+
+_AS_IT_IS = 0.2  # of all crops
+_TAPS = 4  # pixels, of the blur
+
+
+def vary(images: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Crops with other exposure, contrast, colours, textures, blur, noise, scale and lean, half of them mirrored.
+
+    How much is changed is drawn for each crop; a fifth is only mirrored.
+
+    Args:
+        images: [N, H, W, 3] uint8.
+        masks: [N, H, W] bool.
+        key: For the random numbers.
+
+    Returns:
+        The same, varied: [N, H, W, 3] uint8 and [N, H, W] bool.
+    """
+    keys = dict(zip(("strength", "kept", "place", "texture", "colour", "light", "blur", "noise"), jax.random.split(key, 8)))
+    count = len(images)
+    strength = jax.random.uniform(keys["strength"], (count,), minval=0.3)
+    strength = jnp.where(jax.random.bernoulli(keys["kept"], _AS_IT_IS, (count,)), 0.0, strength)
+    values, masks = _moved(images.astype(jnp.float32) / 255.0, masks, strength, keys["place"])
+    share = strength[:, None, None, None]
+    values = values * _textures(values.shape, share, keys["texture"])
+    values = _coloured(values, share, keys["colour"])
+    values = _lit(values, share, keys["light"])
+    values = _blurred(values, strength, keys["blur"])
+    level, shot = jax.random.split(keys["noise"])
+    amount = 0.06 * share * jax.random.uniform(level, share.shape)
+    values = values + amount * jnp.sqrt(jnp.maximum(values, 0.05)) * jax.random.normal(shot, values.shape)
+    return jnp.round(255.0 * jnp.clip(values, 0.0, 1.0)).astype(jnp.uint8), masks
+
+
+def _moved(values: jax.Array, masks: jax.Array, strength: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Crops scaled, stretched, sheared and mirrored about their middles; what lies beyond their edges repeats these."""
+    count, height, width = masks.shape
+    drawn = jax.random.uniform(key, (4, count), minval=-1.0, maxval=1.0)
+    size, wide, shear = jnp.exp(0.3 * strength * drawn[0]), jnp.exp(0.25 * strength * drawn[1]), 0.2 * strength * drawn[2]
+    mirror = jnp.where(drawn[3] > 0.0, 1.0, -1.0)
+    line, column = jnp.meshgrid(jnp.arange(height) - 0.5 * (height - 1), jnp.arange(width) - 0.5 * (width - 1), indexing="ij")
+
+    def one(image: jax.Array, mask: jax.Array, size: jax.Array, wide: jax.Array, shear: jax.Array, mirror: jax.Array):
+        y = jnp.clip(line / size + 0.5 * (height - 1), 0.0, height - 1.0)
+        x = jnp.clip(mirror * (column / wide + shear * line) / size + 0.5 * (width - 1), 0.0, width - 1.0)
+        top, left = jnp.floor(y).astype(jnp.int32), jnp.floor(x).astype(jnp.int32)
+        below, right = jnp.minimum(top + 1, height - 1), jnp.minimum(left + 1, width - 1)
+        down, over = (y - top)[..., None], (x - left)[..., None]
+        both = jnp.concatenate([image, mask[..., None].astype(image.dtype)], axis=-1)
+        upper = both[top, left] * (1 - over) + both[top, right] * over
+        lower = both[below, left] * (1 - over) + both[below, right] * over
+        mixed = upper * (1 - down) + lower * down
+        return mixed[..., :3], mixed[..., 3] >= 0.5
+
+    return jax.vmap(one)(values, masks, size, wide, shear, mirror)
+
+
+def _field(key: jax.Array, shape: tuple[int, ...], lines: int, columns: int, channels: int = 1) -> jax.Array:
+    """Smooth normal noise [N, H, W, channels] with so many lines and columns of independent values."""
+    coarse = jax.random.normal(key, (shape[0], max(lines, 2), max(columns, 2), channels))
+    return jax.image.resize(coarse, (*shape[:3], channels), "linear")
+
+
+def _textures(shape: tuple[int, ...], strength: jax.Array, key: jax.Array) -> jax.Array:
+    """Brightness [N, H, W, 1] of blotches, fibres along stalks, bands across them, and dark speckles."""
+    height, width = shape[1:3]
+    names = ("blotches", "patches", "fibres", "bands", "speckles", "amounts")
+    keys = dict(zip(names, jax.random.split(key, 6)))
+    amount = strength * jax.random.uniform(keys["amounts"], (5, shape[0], 1, 1, 1))
+    grain = 0.5 * amount[0] * _field(keys["blotches"], shape, height // 24, width // 24)
+    grain += 0.5 * amount[1] * _field(keys["patches"], shape, height // 6, width // 6)
+    grain += 0.6 * amount[2] * _field(keys["fibres"], shape, height // 96, width // 2)
+    grain += 0.6 * amount[3] * _field(keys["bands"], shape, height // 6, width // 48)
+    spots = _field(keys["speckles"], shape, height // 4, width // 3) > 2.2 - 1.4 * amount[4]
+    return jnp.exp(grain) * jnp.where(spots, 1.0 - 0.8 * amount[4], 1.0)
+
+
+def _coloured(values: jax.Array, strength: jax.Array, key: jax.Array) -> jax.Array:
+    """Other hues, saturation and casts, of the whole crop and of its parts."""
+    count = len(values)
+    keys = dict(zip(("hue", "grey", "cast", "parts"), jax.random.split(key, 4)))
+    angle = 0.4 * strength * jax.random.normal(keys["hue"], (count, 1, 1, 1))
+    grey = values.mean(axis=-1, keepdims=True)
+    colour = values - grey
+    # A turn about the axis of greys: what is across it is the cross product with (1, 1, 1) / sqrt(3).
+    across = (jnp.roll(colour, 1, axis=-1) - jnp.roll(colour, -1, axis=-1)) / math.sqrt(3.0)
+    colour = jnp.cos(angle) * colour + jnp.sin(angle) * across
+    saturation = jnp.exp(strength * jax.random.uniform(keys["grey"], (count, 1, 1, 1), minval=-1.5, maxval=0.5))
+    cast = 0.2 * strength * jax.random.normal(keys["cast"], (count, 1, 1, 3))
+    return (grey + saturation * colour) * jnp.exp(cast + 0.15 * strength * _field(keys["parts"], values.shape, 6, 6, 3))
+
+
+def _lit(values: jax.Array, strength: jax.Array, key: jax.Array) -> jax.Array:
+    """Other gain, gamma, contrast and black level, and light that falls off towards some side or corner."""
+    count = len(values)
+    gain, gamma, contrast, black, amount, ramp = jax.random.split(key, 6)
+
+    def drawn(key: jax.Array, low: float, high: float) -> jax.Array:
+        return strength * jax.random.uniform(key, (count, 1, 1, 1), minval=low, maxval=high)
+
+    values = jnp.maximum(values, 1e-4) ** jnp.exp(drawn(gamma, -0.5, 0.5))
+    middle = values.mean(axis=(1, 2, 3), keepdims=True)
+    values = middle + (values - middle) * jnp.exp(drawn(contrast, -0.5, 0.4))
+    ramp = drawn(amount, 0.0, 0.6) * _field(ramp, values.shape, 2, 2)
+    return values * jnp.exp(drawn(gain, -1.1, 0.8) + ramp) + drawn(black, 0.0, 0.08)
+
+
+def _blurred(values: jax.Array, strength: jax.Array, key: jax.Array) -> jax.Array:
+    """Blur by up to 1.3 pixels."""
+    deviation = jnp.maximum(1.3 * strength * jax.random.uniform(key, strength.shape), 0.05)
+    taps = jnp.exp(-0.5 * (jnp.arange(-_TAPS, _TAPS + 1) / deviation[:, None]) ** 2)
+    taps = taps / taps.sum(axis=1, keepdims=True)
+    for axis in (1, 2):
+        padded = jnp.pad(values, [(_TAPS, _TAPS) if other == axis else (0, 0) for other in range(4)], mode="edge")
+        size = values.shape[axis]
+        parts = [jax.lax.slice_in_dim(padded, k, k + size, axis=axis) for k in range(2 * _TAPS + 1)]
+        values = sum((taps[:, k, None, None, None] * part for k, part in enumerate(parts)), jnp.zeros_like(values))
+    return values

@@ -1,0 +1,254 @@
+"""Grasp points from a line per stalk: what several pairs agree on.
+
+Pieces of stalks give lines; chords of all pairs that lie along a line belong to it, above and below what hides the rest; a
+stalk is a line that enough chords of enough pairs support. Its grasp point lies where most of it is seen, at a height at which
+the gripper works. Lines bend: half a metre below the grasp point a straight one is 12 mm beside the stalk, a bent one 2 mm.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxrl_vis.stalks.grasping.perception.stalk_segments import StalkSegments
+from jaxrl_vis.stalks.grasping.perception.visibility import Visibility
+
+HEIGHTS = (0.45, 1.05)
+"""Heights at which stalks are grasped, m above the ground."""
+PREFERRED = 0.75
+"""The one that is taken if all are as good, m."""
+
+
+@dataclasses.dataclass(frozen=True)
+class GraspPoint:
+    """One stalk that can be grasped.
+
+    Attributes:
+        point: [3] float64, middle of the stalk where it is to be grasped, in the robot frame of the last pair, m.
+        direction: [3] float64, unit vector along the stalk there, upwards.
+        thickness: Diameter there, m; not a number where it was not measured.
+        frames: Number of pairs that show it.
+        spread: Standard deviation of what was seen around the line, horizontally, m; not a number where unknown.
+        bend: Curvature, x and y, per m.
+        taper: By how much its diameter grows for each m upwards, m.
+    """
+
+    point: np.ndarray
+    direction: np.ndarray
+    thickness: float
+    frames: int
+    spread: float
+    bend: tuple[float, float] = (0.0, 0.0)
+    taper: float = 0.0
+
+    def at_height(self, height: float | np.ndarray) -> np.ndarray:
+        """Return the positions of the stalk's line at heights [...] in m: [..., 3], m."""
+        up = np.asarray(height - self.point[2])[..., None]
+        return self.point + self.direction * (up / self.direction[2]) + np.array([*self.bend, 0.0]) * up**2
+
+    def thickness_at(self, height: float) -> float:
+        """Diameter at a height in m, m; no less than half of what it is at the grasp point."""
+        return max(self.thickness + self.taper * (height - self.point[2]), 0.5 * self.thickness)
+
+
+_LINE_RADIUS = 0.009  # m: chords so near a line belong to it
+_BENT_LENGTH = 0.3  # m: of a stalk that shows how it bends
+_USUAL_TAPER = -0.01  # m per m
+_OPENING = 0.03  # by how much more for each m beyond what is known of the line
+_MIN_PIECE = 0.03  # m
+_STEEPEST = 0.6  # m per m
+_BIN = 0.02  # m: heights that are counted as one
+_MIN_SUPPORT = 0.12  # m, over all pairs
+_WINDOW = 0.10  # m: above and below the grasp point
+_AROUND = 0.2  # m: above and below the grasp point pairs are asked what they show
+_MIN_SHOWN = 4  # places, of a pair that shows it
+_MIN_SHARE = 0.4  # of the pairs and places that show it or see through it
+_APART = 0.012  # m: lines that come nearer are one stalk
+_BEND = 0.04  # by how much more for each m between the heights at which they were seen
+_REST_WITHIN, _REST_SPREAD = 0.025, 0.003  # m
+_LEVEL = 0.002  # m: chords of one pair that differ less in height are of one line of its image
+_MIN_BESIDE, _SHARE_BESIDE = 20, 0.2  # chords that lie beside each other, of two stalks that do
+_APART_BESIDE = 0.008  # m
+
+
+class _Line(NamedTuple):
+    """A line, the chords that it is made of, and how often pairs show it."""
+
+    point: GraspPoint
+    members: np.ndarray
+    shown: int
+
+
+def grasp_points(chords: StalkSegments, visibility: Visibility, heights: tuple[float, float] = HEIGHTS) -> list[GraspPoint]:
+    """Stalks and where to grasp them, from left to right.
+
+    Args:
+        chords: Segments of all pairs, in one robot frame.
+        visibility: Visibility of places in all pairs.
+        heights: Lowest and highest grasp, m above the ground.
+    """
+    free = np.ones(len(chords), bool)
+    lines: list[_Line] = []
+    for seed in _seeds(chords):
+        members = seed[free[seed]]
+        if np.ptp(chords.middle[members, 2]) < _MIN_PIECE if len(members) else True:
+            continue
+        members = _grow(chords, members, free)
+        if not len(members):
+            continue
+        free[members] = False
+        point = _grasp(chords, members, min(2, len(visibility.clouds)), heights)
+        if point is None:
+            continue
+        count = _agreed(point, visibility)
+        if count:
+            lines.append(_Line(point, members, count))
+    lines.sort(key=lambda line: -line.shown)
+    return sorted((line.point for line in _distinct(lines, chords)), key=lambda point: float(point.point[0]))
+
+
+def _seeds(chords: StalkSegments) -> list[np.ndarray]:
+    """StalkSegments of each piece, tall pieces first."""
+    order = np.argsort(chords.piece, kind="stable")
+    parts = np.split(order, np.flatnonzero(np.diff(chords.piece[order])) + 1) if len(order) else []
+    parts = [part for part in parts if len(part) >= 5]
+    return sorted(parts, key=lambda part: -float(np.ptp(chords.middle[part, 2])))
+
+
+def _fit(points: np.ndarray, weights: np.ndarray, bent: bool) -> tuple[np.ndarray, float]:
+    """Coefficients [K, 2] of x and y as polynomials of the height from the middle one, and that height."""
+    middle = float(weights @ points[:, 2] / weights.sum())
+    height = points[:, 2] - middle
+    powers = np.stack([np.ones_like(height), height, height**2][: 3 if bent else 2], axis=1)
+    # Stalks are nearly straight: little is believed of a bend that a short piece shows.
+    stiff = np.diag([0.0, 1e-4, 0.02][: powers.shape[1]]) * weights.sum() * 1e-2
+    normal = powers.T @ (powers * weights[:, None]) + stiff
+    return np.linalg.solve(normal, powers.T @ (points[:, :2] * weights[:, None])), middle
+
+
+def _offsets(points: np.ndarray, coefficients: np.ndarray, middle: float) -> np.ndarray:
+    """Horizontal distance [N] of points from a line."""
+    height = points[:, 2] - middle
+    powers = np.stack([np.ones_like(height), height, height**2][: len(coefficients)], axis=1)
+    return np.linalg.norm(points[:, :2] - powers @ coefficients, axis=1)
+
+
+def _robust(points: np.ndarray, bent: bool) -> tuple[np.ndarray, float]:
+    weights = np.ones(len(points))
+    coefficients, middle = _fit(points, weights, bent)
+    for _ in range(4):
+        offset = _offsets(points, coefficients, middle)
+        weights = 1.0 / (1.0 + (offset / 0.004) ** 2)
+        coefficients, middle = _fit(points, weights, bent)
+    return coefficients, middle
+
+
+def _grow(chords: StalkSegments, members: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """All free chords along the line through some of them; none where that is no stalk."""
+    candidates = np.flatnonzero(free)
+    points = chords.middle[candidates]
+    for _ in range(6):
+        known = chords.middle[members]
+        low, high = known[:, 2].min(), known[:, 2].max()
+        coefficients, middle = _robust(known, bent=high - low > _BENT_LENGTH)
+        if np.abs(coefficients[1]).max() > _STEEPEST:
+            return members[:0]
+        beyond = np.maximum(np.maximum(low - points[:, 2], points[:, 2] - high), 0.0)
+        # Further away than a stalk is long at the known bend, nothing is believed.
+        near = _offsets(points, coefficients, middle) < _LINE_RADIUS + _OPENING * beyond
+        near &= beyond < max(0.15, 1.0 * (high - low))
+        grown = candidates[near]
+        if len(grown) < 5 or (len(grown) == len(members) and (grown == members).all()):
+            break
+        members = grown
+    return members
+
+
+def _support(chords: StalkSegments, members: np.ndarray) -> tuple[float, int]:
+    """Length that is seen, summed over pairs, in m, and the number of pairs that see at least two heights of it."""
+    bins = np.floor(chords.middle[members, 2] / _BIN).astype(int)
+    occupied = np.unique(np.stack([chords.frame[members], bins], axis=1), axis=0)
+    frames, counts = np.unique(occupied[:, 0], return_counts=True)
+    return _BIN * len(occupied), int((counts >= 2).sum())
+
+
+def _grasp(chords: StalkSegments, members: np.ndarray, least_frames: int, heights: tuple[float, float]) -> GraspPoint | None:
+    """Return the grasp point of a stalk; None if the pairs show too little of it."""
+    length, frames = _support(chords, members)
+    if length < _MIN_SUPPORT or frames < least_frames:
+        return None
+    points = chords.middle[members]
+    places = np.arange(heights[0], heights[1] + 1e-9, _BIN)
+    within = np.abs(points[None, :, 2] - places[:, None]) < _WINDOW
+    count = within.sum(axis=1) * np.exp(-0.5 * ((places - PREFERRED) / 0.3) ** 2)
+    best = int(np.argmax(count))
+    if within[best].sum() < 8:
+        return None
+    near = np.flatnonzero(within[best])
+    local, middle = _robust(points[near], bent=False)
+    x, y = local[0] + local[1] * (places[best] - middle)
+    spread = float(np.sqrt(np.mean(np.minimum(_offsets(points[near], local, middle), _LINE_RADIUS) ** 2)))
+    thickness = float(np.median(chords.thickness[members[near]]))
+    # Where it goes from there, all of it says.
+    whole, middle = _robust(points, bent=np.ptp(points[:, 2]) > _BENT_LENGTH)
+    bend = whole[2] if len(whole) > 2 else np.zeros(2)
+    direction = np.array([*(whole[1] + 2.0 * bend * (places[best] - middle)), 1.0])
+    return GraspPoint(
+        np.array([x, y, places[best]]),
+        direction / np.linalg.norm(direction),
+        thickness,
+        frames,
+        spread,
+        (float(bend[0]), float(bend[1])),
+        _taper(points[:, 2], chords.thickness[members]),
+    )
+
+
+def _taper(heights: np.ndarray, thickness: np.ndarray) -> float:
+    """By how much a diameter grows for each m upwards, m: from the lower half of what is seen to the upper one."""
+    if np.ptp(heights) < _BENT_LENGTH:
+        return _USUAL_TAPER
+    upper = heights > 0.5 * (heights.min() + heights.max())
+    parts = [(np.median(heights[half]), np.median(thickness[half])) for half in (upper, ~upper)]
+    return float((parts[0][1] - parts[1][1]) / (parts[0][0] - parts[1][0]))
+
+
+def _agreed(point: GraspPoint, visibility: Visibility) -> int:
+    """Count the places along a stalk's line at which pairs show it; 0 if fewer than two pairs do, or too many see through."""
+    places = point.point[2] + np.arange(-_AROUND, _AROUND, 0.5 * _BIN)
+    shown, through = visibility.query(point.at_height(places))
+    count = int(shown.sum())
+    frames = int((shown.sum(axis=1) >= _MIN_SHOWN).sum())
+    agreed = frames >= min(2, len(visibility.clouds)) and count >= _MIN_SHARE * (count + through.sum())
+    return count if agreed else 0
+
+
+def _distinct(lines: list[_Line], chords: StalkSegments) -> list[_Line]:
+    """Without lines that are the same stalk as one before them."""
+    distinct: list[_Line] = []
+    for line in lines:
+        if not any(_same(line.point, other.point) and not _beside(chords, line, other) for other in distinct):
+            distinct.append(line)
+    return distinct
+
+
+def _same(point: GraspPoint, other: GraspPoint) -> bool:
+    """Return True if a line is probably the same stalk as another one that pairs show better."""
+    up = point.point[2] - other.point[2]
+    distance = float(np.linalg.norm((point.point - other.at_height(point.point[2]))[:2]))
+    # What is left of a stalk beside its line is near it, and scatters.
+    return distance < _APART + _BEND * abs(up) or (distance < _REST_WITHIN and point.spread > _REST_SPREAD)
+
+
+def _beside(chords: StalkSegments, one: _Line, other: _Line) -> bool:
+    """Return True if pairs show two lines beside each other at the same heights: then they are two stalks, however near."""
+    apart = [np.zeros(0)]
+    for frame in np.intersect1d(chords.frame[one.members], chords.frame[other.members]):
+        mine, theirs = (chords.middle[line.members[chords.frame[line.members] == frame]] for line in (one, other))
+        theirs = theirs[np.argsort(theirs[:, 2])]
+        place = np.searchsorted(0.5 * (theirs[1:, 2] + theirs[:-1, 2]), mine[:, 2])
+        level = np.abs(theirs[place, 2] - mine[:, 2]) < _LEVEL
+        apart.append(np.linalg.norm((theirs[place] - mine)[level, :2], axis=1))
+    distances = np.concatenate(apart)
+    enough = max(_MIN_BESIDE, _SHARE_BESIDE * min(len(one.members), len(other.members)))
+    return len(distances) >= enough and float(np.median(distances)) > _APART_BESIDE

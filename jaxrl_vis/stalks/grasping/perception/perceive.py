@@ -1,0 +1,189 @@
+"""Five pairs to grasp points: match, paint, stitch, find.
+
+pair -> disparity -> organised cloud, red where the mask says so
+     -> stitched to the last pair's frame, where the robot stands when it begins to grasp
+     -> grasp points: a line per stalk, or the thesis's slices
+"""
+
+import contextlib
+import dataclasses
+import itertools
+import time
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import cv2
+import numpy as np
+
+from jaxrl_vis.stalks.grasping.perception.cloud import Cloud, Mount, match, organised
+from jaxrl_vis.stalks.grasping.perception.lines import GraspPoint, grasp_points
+from jaxrl_vis.stalks.grasping.perception.slices import slice_points
+from jaxrl_vis.stalks.grasping.perception.stalk_segments import joined, stalk_segments
+from jaxrl_vis.stalks.grasping.perception.stitch import DEFAULT, THESIS, Motion, Stitch, Thinned, stitch
+from jaxrl_vis.stalks.grasping.perception.visibility import Visibility
+from jaxrl_vis_envs.plants import Calibration
+
+Mask = Callable[[np.ndarray, int], np.ndarray]
+"""From a left image [H, W, 3] uint8 and the number of its pair to the mask of the stalks of the near row, [H, W] bool."""
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """One pair that can be used.
+
+    Attributes:
+        number: Index of the pair in the run.
+        left, right: [H, W, 3] uint8, rectified.
+        driven: Distance that the robot had driven, m; None if unknown.
+    """
+
+    number: int
+    left: np.ndarray
+    right: np.ndarray
+    driven: float | None
+
+
+@dataclasses.dataclass(frozen=True)
+class Perception:
+    """Perception of a run.
+
+    Attributes:
+        clouds: One for each pair that was used, in its own robot frame.
+        stitches: One for each but the last: to the pair that follows.
+        to_last: One for each cloud: to the robot frame of the last one.
+        points: Grasp points, in the robot frame of the last pair, from left to right.
+        seconds: Time spent, by stage.
+        notes: Irregularities, a line each.
+    """
+
+    clouds: tuple[Cloud, ...]
+    stitches: tuple[Stitch, ...]
+    to_last: tuple[Motion, ...]
+    points: list[GraspPoint]
+    seconds: dict[str, float]
+    notes: tuple[str, ...]
+
+    def red_points(self) -> np.ndarray:
+        """[N, 3] red points of all pairs, in the robot frame of the last one, m."""
+        return np.concatenate([motion(cloud.red_points()) for motion, cloud in zip(self.to_last, self.clouds)])
+
+
+@dataclasses.dataclass(frozen=True)
+class Variant:
+    """Choice of the steps that follow the thesis in place of the default.
+
+    Attributes:
+        stitch: The stitching of clouds.
+        points: The finding of grasp points.
+    """
+
+    stitch: bool = False
+    points: bool = False
+
+    def __str__(self) -> str:
+        if self.stitch == self.points:
+            return "thesis" if self.stitch else "default"
+        return f"{'stitches' if self.stitch else 'grasp points'} of the thesis"
+
+
+DEFAULT_VARIANT, THESIS_VARIANT = Variant(), Variant(True, True)
+
+
+def perceive(
+    views: Iterable[View], mask: Mask, calibration: Calibration, mount: Mount, variant: Variant = DEFAULT_VARIANT
+) -> Perception:
+    """Grasp points of a run.
+
+    Args:
+        views: The pairs in the order in which they were taken; at least one.
+        mask: Function that returns the mask of an image.
+        calibration: Calibration of the pair, as far as it is known.
+        mount: Mount of the pair.
+        variant: Steps that follow the thesis.
+
+    Raises:
+        ValueError: There is no pair.
+    """
+    seconds: dict[str, float] = {name: 0.0 for name in ("match", "mask", "stitch", "points")}
+    clock = _Clock(seconds)
+    views = list(views)
+    if not views:
+        raise ValueError("there is no pair to perceive anything in")
+    notes = []
+    if not variant.stitch and len(views) > 1 and any(view.driven is None for view in views):
+        views, notes = views[-1:], ["no odometry: only the last pair was used"]
+    with _threads(len(views)) as side_by_side:
+        with clock("match"):
+            matched = side_by_side(lambda view: match(view.left, view.right, calibration, mount), views)
+            # A network on an accelerator paints meanwhile.
+            with clock("mask"):
+                painted = [mask(view.left, view.number) for view in views]
+            clouds = list(side_by_side(lambda disparity, red: organised(disparity, red, calibration, mount), matched, painted))
+        with clock("stitch"):
+            method = THESIS if variant.stitch else DEFAULT
+            whole = list(side_by_side(lambda cloud: Thinned.of(cloud, method), clouds))
+            driven = [_driven(*neighbours) for neighbours in itertools.pairwise(views)]
+            stitches = list(
+                side_by_side(lambda here, there, far: stitch(here, there, far, method), whole[:-1], whole[1:], driven)
+            )
+        notes += [
+            f"pair {views[place].number} does not stitch to the next, odometry was used: {step.refused}"
+            for place, step in enumerate(stitches)
+            if step.refused
+        ]
+        to_last = [Motion.along(0.0)]
+        for step in reversed(stitches):
+            to_last.insert(0, to_last[0].after(step.motion))
+        with clock("points"):
+            if variant.points:
+                points = slice_points(np.concatenate([motion(cloud.red_points()) for motion, cloud in zip(to_last, clouds)]))
+            else:
+                segments = side_by_side(
+                    lambda cloud, frame: stalk_segments(cloud, calibration, mount, frame), clouds, range(len(clouds))
+                )
+                parts = [dataclasses.replace(part, middle=motion(part.middle)) for motion, part in zip(to_last, segments)]
+                points = grasp_points(joined(parts), Visibility(tuple(clouds), tuple(to_last), calibration, mount))
+    if not points:
+        notes.append("no stalk was found")
+    return Perception(tuple(clouds), tuple(stitches), tuple(to_last), points, seconds, tuple(notes))
+
+
+def _driven(here: View, there: View) -> float:
+    """Return the distance that the robot drove between two pairs, m; 0 if it is not known."""
+    return 0.0 if here.driven is None or there.driven is None else there.driven - here.driven
+
+
+@contextlib.contextmanager
+def _threads(pairs: int) -> Iterator[Callable[..., Iterator[Any]]]:
+    """`map` for so many pairs, in threads that begin at once: as many as OpenCV may use, or none where that is one."""
+    threads = min(cv2.getNumThreads(), pairs)
+    if threads < 2:
+        yield map
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        yield pool.map
+
+
+class _Clock:
+    """Adds up the time that is spent under its names; what is spent under an inner one does not count for the outer one."""
+
+    def __init__(self, seconds: dict[str, float]) -> None:
+        self._seconds, self._last = seconds, 0.0
+        self._names: list[str] = []
+
+    @contextlib.contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        self._turn()
+        self._names.append(name)
+        try:
+            yield
+        finally:
+            self._turn()
+            self._names.pop()
+
+    def _turn(self) -> None:
+        now = time.perf_counter()
+        if self._names:
+            self._seconds[self._names[-1]] += now - self._last
+        self._last = now

@@ -1,0 +1,55 @@
+"""Visibility of a place in all pairs: they show a stalk there, or see through it to something farther away."""
+
+import dataclasses
+
+import numpy as np
+
+from jaxrl_vis.stalks.grasping.perception.cloud import Cloud, Mount
+from jaxrl_vis.stalks.grasping.perception.stitch import Motion
+from jaxrl_vis_envs.plants import Calibration
+
+_SAME = 0.02  # m: a depth that differs less is that of the place
+_THROUGH = 0.035  # m: a depth that is greater by more lies behind it
+
+
+@dataclasses.dataclass(frozen=True)
+class Visibility:
+    """The clouds of a run, stitched.
+
+    Attributes:
+        clouds: One for each pair, in its own robot frame.
+        to_last: One for each cloud: to the robot frame of the last one.
+        calibration: Calibration of the pair.
+        mount: Mount of the pair.
+    """
+
+    clouds: tuple[Cloud, ...]
+    to_last: tuple[Motion, ...]
+    calibration: Calibration
+    mount: Mount
+
+    def query(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return True where a pair shows a stalk at a point, and True where it sees through the point.
+
+        Neither is so where a point is outside the image, hidden by something nearer, or without a depth.
+
+        Args:
+            points: [K, 3] in the robot frame of the last pair, m.
+
+        Returns:
+            Two [F, K] bool.
+        """
+        shown, through = np.zeros((2, len(self.clouds), len(points)), bool)
+        for frame, (cloud, motion) in enumerate(zip(self.clouds, self.to_last)):
+            x, y, z = self.mount.pose.to_camera(motion.inverse()(points)).T
+            height, width = cloud.depth.shape
+            with np.errstate(divide="ignore", invalid="ignore"):
+                column = np.round(self.calibration.focal * x / z + self.calibration.centre[0])
+                line = np.round(self.calibration.focal * y / z + self.calibration.centre[1])
+                inside = (z > 0) & (column >= 0) & (column < width) & (line >= 0) & (line < height)
+            place = line[inside].astype(int), column[inside].astype(int)
+            with np.errstate(invalid="ignore"):
+                behind = cloud.depth[place] - z[inside]
+                shown[frame, inside] = cloud.red[place] & (np.abs(behind) < _SAME)
+                through[frame, inside] = behind > _THROUGH
+        return shown, through

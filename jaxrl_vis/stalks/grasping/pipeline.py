@@ -1,0 +1,258 @@
+"""Folders of pairs to grasp points: `run` reads, perceives and writes, and continues where it was stopped.
+
+    OUT/run.json                 what was asked for: a folder holds the results of one request
+        runs/RUN.json            what came of one run, and of which files; not computed again while these are the same, unless
+                                 pairs were skipped
+        overlays/RUN.png         the last left image, its stalks in red, and the grasp points in it
+        points.csv  runs.csv  skipped.csv
+
+Tables are always made from the files under runs/. One run is in memory at a time.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+import jaxrl_vis
+from jaxrl_vis.stalks.grasping.perception.cloud import Mount
+from jaxrl_vis.stalks.grasping.perception.perceive import Perception, Variant, View, perceive
+from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder, read_odometries
+from jaxrl_vis.stalks.phenotyping.io.images import write_image
+from jaxrl_vis.stalks.phenotyping.io.names import file_name
+from jaxrl_vis.stalks.phenotyping.io.pair_reading import Unusable, read_pair
+from jaxrl_vis.stalks.phenotyping.report.tables import Row, write_rows
+from jaxrl_vis.stalks.results_folder import claim, file_state, is_current, pair_state, write_record
+from jaxrl_vis_envs.documents import read_json
+from jaxrl_vis_envs.plants import Calibration
+
+Find = Callable[[np.ndarray, PlotFolder, PairFiles], np.ndarray]
+"""From a left image [H, W, 3] uint8 and its files to the mask of the stalks of the near row, [H, W] bool."""
+Reachable = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""From points [B, 3] and stops [S, 3] in the robot frame of the last stop, m, to True for points in the arm's reach, [B]."""
+
+RUN_COLUMNS = (
+    "run",
+    "pairs",
+    "pairs_skipped",
+    "driven_m",
+    "stitches",
+    "stitches_refused",
+    "stitch_residual_mm",
+    "grasp_points",
+    "reachable",
+    "seconds_per_pair",
+    "flag",
+    "method",
+    "version",
+)
+POINT_COLUMNS = (
+    "run",
+    "point",
+    "x_m",
+    "y_m",
+    "z_m",
+    "lean_deg",
+    "diameter_mm",
+    "pairs",
+    "spread_mm",
+    "reachable",
+    "method",
+    "version",
+)
+SKIPPED_COLUMNS = ("run", "pair", "why")
+
+
+@dataclasses.dataclass(frozen=True)
+class Request:
+    """Request for the results of runs.
+
+    Attributes:
+        out: Folder of the results.
+        variant: Steps that follow the thesis.
+        finder: Name of the network of masks; results of another one are not mixed with it.
+        calibrations: Calibration of each run by its name.
+        mount: Mount of the pair.
+        speed: Speed of the robot, m/s, where only times are known.
+        reachable: Function that returns True for points that the arm can go to; None if nothing is known of an arm.
+    """
+
+    out: Path
+    variant: Variant
+    finder: str
+    calibrations: dict[str, Calibration]
+    mount: Mount
+    speed: float | None = None
+    reachable: Reachable | None = None
+
+    @property
+    def method(self) -> str:
+        """In the tables."""
+        return str(self.variant)
+
+
+def run(runs: list[PlotFolder], find: Find, request: Request, done: Callable[[Row], None] = lambda row: None) -> list[Row]:
+    """Writes the results of runs.
+
+    Args:
+        runs: Folders of pairs.
+        find: Function that returns the mask of a pair.
+        request: The request.
+        done: Called after each run with its row.
+
+    Returns:
+        A row for each pair that was skipped: run, pair and why.
+
+    Raises:
+        RequestError: The folder holds other results, or a run's odometry cannot be read.
+        OSError: A file cannot be written.
+    """
+    driven = read_odometries(runs, request.speed)
+    claim(
+        request.out,
+        "runs",
+        runs,
+        request.calibrations,
+        {
+            "method": request.method,
+            "finder": request.finder,
+            "speed": request.speed,
+            "mount": dataclasses.asdict(request.mount),
+            "reachable": request.reachable is not None,
+        },
+        any(request.out.glob("runs/*.json")),
+    )
+    rows: list[Row] = []
+    points: list[Row] = []
+    skipped: list[Row] = []
+    (request.out / "runs").mkdir(exist_ok=True)
+    for folder in runs:
+        path = request.out / "runs" / file_name(f"{folder.name}.json")
+        sources = _sources(folder)  # before the files are read: they may be replaced meanwhile
+        if not is_current(path, sources, _is_whole):
+            write_record(path, _record(folder, driven[folder.name], find, request), sources)
+        record = read_json(path)
+        rows, points, skipped = [*rows, record["row"]], points + record["points"], skipped + record["skipped"]
+        write_rows(request.out / "runs.csv", RUN_COLUMNS, rows)
+        write_rows(request.out / "points.csv", POINT_COLUMNS, points)
+        write_rows(request.out / "skipped.csv", SKIPPED_COLUMNS, skipped)
+        done(record["row"])
+    return skipped
+
+
+def _sources(folder: PlotFolder) -> dict[str, Any]:
+    """Return the state of everything that the record of a run depends on, beside the request."""
+    return {
+        "odometry": file_state(folder.folder / "odometry.csv"),
+        "pairs": {pair.name: pair_state(pair) for pair in folder.pairs},
+    }
+
+
+def _is_whole(record: dict[str, Any]) -> bool:
+    """Return True for a record with all columns and without skipped pairs, which are tried again."""
+    known = record["row"].keys() == set(RUN_COLUMNS) and all(row.keys() == set(POINT_COLUMNS) for row in record["points"])
+    return known and record["skipped"] == []
+
+
+def _record(folder: PlotFolder, driven: dict[str, float] | None, find: Find, request: Request) -> dict[str, Any]:
+    """Return the record of one run: its row, those of its points, and those of pairs that were skipped."""
+    calibration = request.calibrations[folder.name]
+    views: list[View] = []
+    skipped: list[Row] = []
+    for number, pair in enumerate(folder.pairs):
+        try:
+            left, right = read_pair(pair, calibration)
+        except Unusable as problem:
+            skipped.append({"run": folder.name, "pair": pair.name, "why": str(problem)})
+            continue
+        views.append(View(number, left, right, None if driven is None else driven.get(pair.name)))
+    if not views:
+        return {"row": _row(folder, request, len(skipped), None, views), "points": [], "skipped": skipped}
+    perception = perceive(
+        views, lambda image, number: find(image, folder, folder.pairs[number]), calibration, request.mount, request.variant
+    )
+    (request.out / "overlays").mkdir(exist_ok=True)
+    overlay = draw_points(views[-1].left, perception, calibration, request.mount)
+    write_image(request.out / "overlays" / file_name(f"{folder.name}.png"), overlay)
+    points = _points(folder, request, perception)
+    return {"row": _row(folder, request, len(skipped), perception, views), "points": points, "skipped": skipped}
+
+
+def _can_reach(request: Request, perception: Perception) -> np.ndarray | None:
+    """[B] bool, which grasp points the arm can go to; None where nothing is known of an arm."""
+    if request.reachable is None:
+        return None
+    points = np.array([point.point for point in perception.points]).reshape(-1, 3)
+    stops = np.array([motion.shift for motion in perception.to_last])
+    return np.asarray(request.reachable(points, stops), bool)
+
+
+def _row(folder: PlotFolder, request: Request, skipped: int, perception: Perception | None, views: list[View]) -> Row:
+    """The row of a run; without a perception, none of its pairs could be used."""
+    row: Row = dict.fromkeys(RUN_COLUMNS, "")
+    row |= {"run": folder.name, "pairs": len(views), "pairs_skipped": skipped, "grasp_points": 0}
+    row |= {"method": request.method, "version": jaxrl_vis.__version__}
+    if perception is None:
+        return row | {"flag": "no usable pairs"}
+    known = [view.driven for view in views if view.driven is not None]
+    residuals = [step.residual for step in perception.stitches if math.isfinite(step.residual)]
+    can = _can_reach(request, perception)
+    notes = ([f"pairs skipped: {skipped}"] if skipped else []) + list(perception.notes)
+    if can is not None and len(can) and not can.any():
+        notes.append("no stalk is within reach")
+    return row | {
+        "driven_m": f"{max(known) - min(known):.4f}" if len(known) == len(views) else "",
+        "stitches": len(perception.stitches),
+        "stitches_refused": sum(bool(step.refused) for step in perception.stitches),
+        "stitch_residual_mm": f"{1e3 * np.median(residuals):.2f}" if residuals else "",
+        "grasp_points": len(perception.points),
+        "reachable": "" if can is None else int(can.sum()),
+        "seconds_per_pair": f"{sum(perception.seconds.values()) / len(views):.3f}",
+        "flag": "; ".join(notes) or "ok",
+    }
+
+
+def _points(folder: PlotFolder, request: Request, perception: Perception) -> list[Row]:
+    """The rows of the grasp points of a run, in the robot frame of its last pair."""
+    can = _can_reach(request, perception)
+    rows = []
+    for place, point in enumerate(perception.points):
+        x, y, z = point.point
+        rows.append(
+            {
+                "run": folder.name,
+                "point": place + 1,
+                "x_m": f"{x:.4f}",
+                "y_m": f"{y:.4f}",
+                "z_m": f"{z:.4f}",
+                "lean_deg": f"{math.degrees(math.acos(min(float(point.direction[2]), 1.0))):.1f}",
+                "diameter_mm": f"{1e3 * point.thickness:.1f}" if math.isfinite(point.thickness) else "",
+                "pairs": point.frames or "",
+                "spread_mm": f"{1e3 * point.spread:.2f}" if math.isfinite(point.spread) else "",
+                "reachable": "" if can is None else "yes" if can[place] else "no",
+                "method": request.method,
+                "version": jaxrl_vis.__version__,
+            }
+        )
+    return rows
+
+
+def draw_points(left: np.ndarray, perception: Perception, calibration: Calibration, mount: Mount) -> np.ndarray:
+    """The last left image with its stalks in red and the grasp points in it, numbered as in the table: [H, W, 3] uint8."""
+    image = left.copy()
+    red = perception.clouds[-1].red
+    image[red] = (0.4 * image[red] + 0.6 * np.array([255, 0, 0])).astype(np.uint8)
+    size = max(image.shape[1] // 170, 3)
+    for place, point in enumerate(perception.points):
+        x, y, z = mount.pose.to_camera(point.point)
+        column, line = calibration.focal * x / z + calibration.centre[0], calibration.focal * y / z + calibration.centre[1]
+        middle = (round(column), round(line))
+        cv2.circle(image, middle, size, (255, 255, 0), -1, cv2.LINE_AA)
+        cv2.circle(image, middle, size, (0, 0, 0), 1, cv2.LINE_AA)
+        beside = (middle[0] + size + 2, middle[1] + size)
+        cv2.putText(image, str(place + 1), beside, cv2.FONT_HERSHEY_SIMPLEX, size / 10, (255, 255, 0), 1, cv2.LINE_AA)
+    return image

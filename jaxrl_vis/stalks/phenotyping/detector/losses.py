@@ -1,0 +1,124 @@
+"""Losses of the networks: the boxes that are stalks, their positions, and their pixels."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from jaxrl_vis.stalks.phenotyping.detector.anchors import encode, make_anchors
+from jaxrl_vis.stalks.phenotyping.detector.boxes import band_overlap, overlap
+from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, best_proposals, heads, normalise, region_features
+from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
+from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import smoothed
+
+# Truth of an image is padded: what there is not has the weight NOTHING, what is too hidden to count either way UNCLEAR.
+NOTHING, UNCLEAR, STALK = 0, 1, 2
+
+
+def assign(overlaps: jax.Array, kinds: jax.Array, positive: float, negative: float) -> tuple[jax.Array, ...]:
+    """Assign boxes to stalks.
+
+    Args:
+        overlaps: [K, T] of boxes and true stalks.
+        kinds: [T] int32: NOTHING, UNCLEAR or STALK.
+        positive: Overlap from which on a box shows a stalk.
+        negative: Overlap below which it shows none.
+
+    Returns:
+        Index of the stalk [K] int32; whether the box shows it [K] bool; whether it shows none [K] bool. Boxes between the two,
+        and those on unclear stalks, are neither.
+    """
+    unclear = jnp.where((kinds == UNCLEAR)[None, :], overlaps, 0.0).max(axis=1) >= negative
+    overlaps = jnp.where((kinds == STALK)[None, :], overlaps, 0.0)
+    best = overlaps.max(axis=1)
+    # The best box of each stalk shows it even where none overlaps it enough.
+    best_of_stalk = overlaps.max(axis=0)
+    forced = (overlaps >= best_of_stalk[None, :] - 1e-6) & (best_of_stalk > 0.2)[None, :]
+    which = jnp.where(forced.any(axis=1), jnp.argmax(jnp.where(forced, overlaps, -1.0), axis=1), jnp.argmax(overlaps, axis=1))
+    shows = (best >= positive) | forced.any(axis=1)
+    return which, shows, (best < negative) & ~unclear & ~shows
+
+
+def detector_loss(
+    params: Any, images: jax.Array, truth: jax.Array, kinds: jax.Array, settings: Settings, dtype: Any, key: jax.Array
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """Loss of proposals and of the head, mean over images.
+
+    Args:
+        params: Parameters of the detector.
+        images: [N, H, W, 3] uint8, reduced and padded.
+        truth: [N, T, 6] stalks.
+        kinds: [N, T] int32.
+        settings: Settings of the networks.
+        dtype: In which convolutions are computed.
+        key: Key of the boxes around true ones that the head sees beside the proposals.
+    """
+    network = settings.detector(dtype)
+    shape = (images.shape[1], images.shape[2])
+    anchors = jnp.asarray(make_anchors(shape, settings.band_lines, settings.anchor_widths))
+    features = network.apply(params, normalise(images), method="features")
+    assert isinstance(features, jax.Array)
+    logits, codes = heads(network, params, features, "propose")
+
+    def of_image(features, logits, codes, truth, kinds, key):
+        which, shows, none = assign(overlap(anchors[:, :4], truth[:, :4]), kinds, 0.5, 0.3)
+        loss = _focal(logits, shows, none) / jnp.maximum(shows.sum(), 1)
+        placed = _distance(codes, encode(truth[which], anchors), shows)
+
+        proposals, _, valid = best_proposals(*jax.lax.stop_gradient((logits, codes)), anchors, settings, shape)
+        size = jnp.concatenate([truth[:, 2:4] - truth[:, :2]] * 2 + [truth[:, 2:3] - truth[:, :1]] * 2, axis=-1)
+        near = truth + 0.15 * jax.random.normal(key, truth.shape) * size
+        proposals = jnp.concatenate([proposals, near])
+        valid = jnp.concatenate([valid, kinds == STALK])
+        # In a clump, the box of what stands between two stalks overlaps both by half, and its strip neither.
+        alike = 0.5 * (overlap(proposals[:, :4], truth[:, :4]) + band_overlap(proposals, truth))
+        which, shows, none = assign(alike, kinds, 0.5, 0.45)
+        shows, none = shows & valid, none & valid
+        judged, refined = heads(network, params, region_features(features, proposals), "judge_all")
+        weight = (shows | none).astype(jnp.float32)
+        right = optax.sigmoid_binary_cross_entropy(judged, shows.astype(jnp.float32))
+        judgement = (right * weight).sum() / jnp.maximum(weight.sum(), 1.0)
+        refinement = _distance(refined, encode(truth[which], proposals), shows)
+        return loss, placed, 2.0 * judgement, 2.0 * refinement
+
+    keys = jax.random.split(key, images.shape[0])
+    parts = jax.vmap(of_image)(features, logits, codes, truth, kinds, keys)
+    named = {name: part.mean() for name, part in zip(("objectness", "offsets", "head", "boxes"), parts)}
+    return sum(named.values(), jnp.zeros(())), named
+
+
+def _focal(logits: jax.Array, shows: jax.Array, none: jax.Array) -> jax.Array:
+    """Cross entropy of the anchors that say something, less for those that are easy; their sum."""
+    loss = optax.sigmoid_focal_loss(logits, shows.astype(jnp.float32), alpha=0.5, gamma=2.0)
+    return (loss * (shows | none)).sum()
+
+
+def _distance(codes: jax.Array, wanted: jax.Array, shows: jax.Array) -> jax.Array:
+    """Mean Huber loss of codes [K, 6] of the boxes that show a stalk."""
+    loss = optax.huber_loss(codes, jnp.clip(wanted, -20.0, 20.0), delta=1.0).sum(axis=-1)
+    return (loss * shows).sum() / jnp.maximum(shows.sum(), 1)
+
+
+def segmenter_loss(params: Any, snips: jax.Array, masks: jax.Array, settings: Settings, dtype: Any) -> jax.Array:
+    """Cross entropy and Dice loss of the masks of snips.
+
+    Args:
+        params: Parameters of the segmentation.
+        snips: [N, h, w, 3] uint8.
+        masks: [N, h, w] bool.
+        settings: Settings of the networks.
+        dtype: In which convolutions are computed.
+    """
+    logits = Segmenter(settings.segmenter, dtype).apply(params, smoothed(snips))
+    assert isinstance(logits, jax.Array)
+    return mask_loss(logits, masks)
+
+
+def mask_loss(logits: jax.Array, masks: jax.Array) -> jax.Array:
+    """Cross entropy of logits [N, h, w], and 0.3 times their Dice loss, against masks [N, h, w] bool: []."""
+    wanted = masks.astype(jnp.float32)
+    entropy = optax.sigmoid_binary_cross_entropy(logits, wanted).mean()
+    chances = jax.nn.sigmoid(logits)
+    common, total = (chances * wanted).sum((1, 2)), (chances + wanted).sum((1, 2))
+    return entropy + 0.3 * (1.0 - (2.0 * common + 1.0) / (total + 1.0)).mean()

@@ -1,0 +1,96 @@
+"""Weights of the networks that find stalks, with their settings and their origin."""
+
+import dataclasses
+import functools
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+
+from jaxrl_vis import fields
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.parameters import check_range, read_parameters, write_parameters
+from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, initial
+from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
+
+SHIPPED = Path(__file__).with_name("stalks.safetensors")
+"""Weights that come with the package, trained on synthetic stalks."""
+SCHEMA = 2
+"""Raised where the same numbers mean something else: since 2, boxes and axes are in codes relative to the proposal's axis."""
+_COMMAND = "jaxrl-vis phenotype train"
+_HINTS = fields.hints(Settings)
+# Least, most, and what it is a multiple of: a file must not ask for a network that no memory holds.
+_SANE: dict[str, tuple[float, float, int]] = {
+    **dict.fromkeys(("width", "full_width"), (32, 16384, 1)),
+    **dict.fromkeys(("snip_lines", "snip_columns"), (16, 2048, 8)),
+    **dict.fromkeys(("band_lines", "anchor_widths"), (0.1, 4096, 1)),
+    **dict.fromkeys(("channels", "segmenter"), (8, 512, 8)),
+    "hidden": (1, 4096, 1),
+    **dict.fromkeys(("candidates", "proposals", "most"), (1, 10_000, 1)),
+    **dict.fromkeys(("proposal_threshold", "threshold", "least_score"), (0, 1, 1)),
+}
+
+
+def write_weights(
+    path: Path, params: Mapping[str, Any], settings: Settings, about: Mapping[str, Any], bits: Literal[10, 16, 32] = 16
+) -> None:
+    """Write parameters to a file, which is complete whenever it can be read.
+
+    Args:
+        path: The file, .safetensors.
+        params: Nested dictionaries of arrays.
+        settings: Settings of the networks.
+        about: Their origin; anything that JSON holds.
+        bits: Bits of a number, see `write_parameters`.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    write_parameters(path, params, {"schema": SCHEMA, "settings": dataclasses.asdict(settings), **about}, bits)
+
+
+def read_weights(path: Path) -> tuple[dict[str, Any], Settings, dict[str, Any]]:
+    """Reads what `write_weights` wrote: parameters, settings, and where they come from.
+
+    Raises:
+        RequestError: There is no such file, or it holds no weights, or not those of its settings.
+    """
+
+    def declare(about: dict[str, Any]) -> tuple[Settings, Any]:
+        values = about.pop("settings")
+        if not isinstance(values, dict):
+            raise ValueError("settings are no table")
+        if about.pop("schema") != SCHEMA or not values.keys() <= _HINTS.keys():
+            raise RequestError(f"{path} holds weights of another version: train them again with `{_COMMAND}`")
+        settings = _checked(path, values)
+        return settings, declared(settings)
+
+    return read_parameters(path, _COMMAND, declare)
+
+
+def _checked(path: Path, values: dict[str, Any]) -> Settings:
+    """Settings of the kinds and sizes that networks can have.
+
+    Raises:
+        RequestError: They are not.
+    """
+    settings = Settings(**{name: fields.check(f"{path}: {name}", _HINTS[name], value) for name, value in values.items()})
+    for name, (low, high, step) in _SANE.items():
+        value = getattr(settings, name)
+        check_range(path, name, value if isinstance(value, tuple) else (value,), low, high, step)
+    if len(settings.channels) != len(Settings.channels):
+        raise RequestError(f"{path}: its network must have {len(Settings.channels)} channels, not {len(settings.channels)}")
+    return settings
+
+
+@functools.lru_cache(maxsize=4)
+def declared(settings: Settings) -> dict[str, Any]:
+    """Shapes of the parameters that the networks of these settings have: nested dictionaries, nothing of which is computed."""
+    snips = jax.ShapeDtypeStruct((1, settings.snip_lines, settings.snip_columns, 3), jnp.float32)
+
+    def draw(key: jax.Array) -> dict[str, Any]:
+        return {"detector": initial(settings, key), "segmenter": Segmenter(settings.segmenter).lazy_init(key, snips)}
+
+    return jax.eval_shape(draw, jax.random.key(0))

@@ -1,0 +1,1 @@
+"""Synthetic plots with exact truth, and scores of detections, counts and widths against it."""

@@ -1,0 +1,46 @@
+"""Detections as perfect networks would make them, from true boxes and masks of synthetic pairs, to test everything after."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from jaxrl_vis.stalks.phenotyping.detector.finder import Detection, higher_up
+
+
+def perfect_detections(stalks: Iterable[Mapping[str, Any]], instance: np.ndarray, least: float = 0.3) -> list[Detection]:
+    """The stalks that an image shows, from left to right.
+
+    Args:
+        stalks: With ``stalk``, ``band_box`` and ``band_visible``, as in `truth.StalkInView` or plot.json.
+        instance: [H, W] whole numbers: which stalk each pixel shows.
+        least: Share of a stalk's part in the band that must be seen.
+    """
+    detections = []
+    height, width = instance.shape
+    for stalk in stalks:
+        if stalk["band_box"] is None or stalk["band_visible"] < least:
+            continue
+        left, top, right, bottom = stalk["band_box"]
+        first, last = max(round(left) - 3, 0), min(round(right) + 4, width)
+        upper, lower = max(round(top), 0), min(round(bottom) + 1, height)
+        mask = instance[upper:lower, first:last] == stalk["stalk"]
+        line, column = np.nonzero(mask)
+        if line.size < 50 or np.ptp(line) < 4:
+            continue
+        slope, offset = np.polyfit(line + upper, column + first, 1)
+        axis = (float(offset + slope * top), float(offset + slope * bottom))
+        above = _upper(np.array([left, top, right, bottom, *axis]) + 0.5, instance, stalk["stalk"])
+        detections.append(Detection((left, top, right, bottom), axis, 1.0, mask, (upper, first), above))
+    return sorted(detections, key=lambda detection: sum(detection.axis))
+
+
+def _upper(stalk: np.ndarray, instance: np.ndarray, index: int) -> tuple[np.ndarray, tuple[int, int]] | None:
+    """True mask of a stalk's piece around the upper height, and its corner; None where the image does not show it."""
+    left, top, right, bottom = higher_up(stalk)[:4]
+    beside = right - left  # it may bend
+    first, last = max(round(left - beside), 0), min(round(right + beside), instance.shape[1])
+    if top <= 0 or last <= first:
+        return None
+    lines = slice(round(top), round(bottom))
+    return instance[lines, first:last] == index, (lines.start, first)

@@ -1,0 +1,184 @@
+"""An evaluation of many plots, as `evaluation_pool` goes through them: what is done with one, and what is kept of it.
+
+    Task, seed -> evaluate_plot -> record -> `RecordFile`: the file, written after each plot -> read_scores -> summary
+
+A score is rounded when it is made, so that what the file keeps is what was scored. Which process scores a plot does not matter.
+"""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import jaxrl_vis
+import jaxrl_vis.stalks.phenotyping
+import jaxrl_vis_envs.plants
+from jaxrl_vis.evaluation_pool import Record, RecordFile, code_digest, evaluate_all
+from jaxrl_vis.provenance import device_name, revision
+from jaxrl_vis.stalks.digests import file_digest, value_digest
+from jaxrl_vis.stalks.phenotyping.evaluation.scoring import PlotScore, ThesisScore, score_plot, summary
+from jaxrl_vis.stalks.phenotyping.measure.stalk import Method
+from jaxrl_vis_envs.plants import Family
+
+SCHEMA = 2
+KEPT_SCORE = 0.05
+"""Lowest score of recorded detections: others matter for nothing but the far end of the precision curve."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """Plots to score and methods to score, the same for all plots of an evaluation.
+
+    Attributes:
+        family: Family that plots are drawn from.
+        weights: File of the networks' weights; None for true boxes and masks.
+        finder: Name of the networks, or ``truth``.
+        method: Method of widths.
+        least_score: Lowest score of a detection that counts.
+        thesis: Score the thesis's methods on the same detections, too.
+        workers: Number of processes that share the machine; records state it, as it bears on the time that a pair takes.
+    """
+
+    family: Family
+    weights: Path | None
+    finder: str = "truth"
+    method: Method = "strip"
+    least_score: float = 0.5
+    thesis: bool = False
+    workers: int = 1
+
+
+def evaluate_plot(task: Task, seed: int) -> Record:
+    """Evaluate one plot, and return its record; networks are read once in each process.
+
+    Args:
+        task: For all plots.
+        seed: Seed of the plot.
+    """
+    find = None
+    if task.weights is not None:
+        from jaxrl_vis.stalks.phenotyping.detector.loading import load_finder
+
+        find = load_finder(task.weights, KEPT_SCORE)
+    score = score_plot(task.family, seed, find, task.method, task.least_score, task.thesis)
+    where = {"device": device_name(), "workers": task.workers, "revision": revision()}
+    return {**where, **_record(score, task.family.rig.frames)}
+
+
+def conditions(task: Task) -> dict[str, Any]:
+    """All that the scores of a plot depend on beside its seed: those of equal conditions belong together."""
+    import jax
+
+    return {
+        "synthetic": True,
+        "family": task.family.name,
+        "schema": SCHEMA,
+        "version": jaxrl_vis.__version__,
+        # What trains networks and draws figures changes no score.
+        "code": code_digest(jaxrl_vis_envs.plants, jaxrl_vis.stalks.phenotyping, leave_out=("training", "figures.py")),
+        "platform": jax.default_backend(),
+        "family_digest": value_digest(dataclasses.asdict(task.family)),
+        "finder": task.finder,
+        "weights": None if task.weights is None else file_digest(task.weights),
+        "method": task.method,
+        "least_score": task.least_score,
+        "thesis": task.thesis,
+    }
+
+
+def evaluate_tasks(
+    tasks: Mapping[str, Task],
+    seeds: Sequence[int],
+    paths: Mapping[str, Path | None],
+    started: Callable[[int], None],
+    done: Callable[[str, int, Record], None],
+) -> dict[str, dict[str, Any]]:
+    """Evaluate the same plots for several tasks, side by side in the tasks' number of processes.
+
+    Args:
+        tasks: Name -> task; they agree on `Task.workers` and `Task.least_score`.
+        seeds: Seeds of the plots.
+        paths: Name -> JSON file of the task's records, which is written after each plot; None for no file. Plots that it holds
+            already are not evaluated again.
+        started: Called once with the number of plots that the files hold already.
+        done: Called after each plot with the task's name, the seed and the record.
+
+    Returns:
+        Name -> figures of all plots together, see `scoring.summary`.
+
+    Raises:
+        RequestError: A file holds records of another evaluation, or cannot be read.
+        WorkerError: A process was ended from outside.
+    """
+    names = list(tasks)
+    first = tasks[names[0]]
+    summarise_plots = functools.partial(summarise, first.least_score)
+    tables = {name: RecordFile(paths[name], conditions(task), summarise_plots) for name, task in tasks.items()}
+    started(sum(seed in table for table in tables.values() for seed in seeds))
+    jobs = [(name, seed) for name in names for seed in seeds if seed not in tables[name]]
+
+    def keep(number: int, record: Record) -> None:
+        name, seed = jobs[number]
+        tables[name].add(seed, record)
+        done(name, seed, tables[name].records[seed])
+
+    evaluate_all(functools.partial(_evaluate_job, dict(tasks), jobs), range(len(jobs)), first.workers, keep)
+    return {name: summarise_plots([table.records[seed] for seed in seeds]) for name, table in tables.items()}
+
+
+def _evaluate_job(tasks: Mapping[str, Task], jobs: Sequence[tuple[str, int]], number: int) -> Record:
+    name, seed = jobs[number]
+    return evaluate_plot(tasks[name], seed)
+
+
+def read_scores(records: Iterable[Record]) -> list[PlotScore]:
+    """The scores that records hold."""
+    return [_read(record) for record in records]
+
+
+def summarise(least_score: float, records: Iterable[Record]) -> dict[str, Any]:
+    """Summarise the records of plots, see `summary`."""
+    return summary(read_scores(records), least_score)
+
+
+def _record(score: PlotScore, pairs: int) -> Record:
+    """Return the record of a plot, as JSON holds it."""
+    thesis = score.thesis
+    return {
+        "seed": score.seed,
+        "true": score.true,
+        "counted": score.counted,
+        "widths_mm": score.widths.round(4).tolist(),
+        "widths_24in_mm": score.upper.round(4).tolist(),
+        "seconds_per_pair": None if math.isnan(score.seconds) else round(score.seconds, 4),
+        "pairs": pairs,
+        "stalks_in_view": score.stalks,
+        "scores": score.finds[:, 0].round(4).tolist(),
+        "right": "".join("1" if right else "0" for right in score.finds[:, 1]),
+        "thesis": thesis and {"counted": round(thesis.counted, 4), "widths_mm": thesis.widths.round(4).tolist()},
+    }
+
+
+def _read(record: Record) -> PlotScore:
+    """The inverse of `_record`."""
+
+    def pairs(values: list[list[float]]) -> np.ndarray:
+        return np.array(values, float).reshape(-1, 2)
+
+    thesis = record["thesis"]
+    right = np.array([digit == "1" for digit in record["right"]], float)
+    return PlotScore(
+        seed=record["seed"],
+        true=record["true"],
+        counted=record["counted"],
+        widths=pairs(record["widths_mm"]),
+        finds=np.stack([np.array(record["scores"], float), right], axis=1),
+        stalks=record["stalks_in_view"],
+        upper=pairs(record["widths_24in_mm"]),
+        seconds=math.nan if record["seconds_per_pair"] is None else record["seconds_per_pair"],
+        thesis=thesis and ThesisScore(thesis["counted"], pairs(thesis["widths_mm"])),
+    )

@@ -1,0 +1,292 @@
+"""Scores of detections, counts and widths against the exact truth of synthetic plots, which are drawn for it.
+
+plot -> pairs -> detections -> sightings -> stalks       as `pipeline.run` does, without files
+     -> true boxes, count and diameters             from the plot itself
+"""
+
+import dataclasses
+import functools
+import math
+import time
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+
+from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
+from jaxrl_vis.stalks.phenotyping.evaluation.perfect import perfect_detections
+from jaxrl_vis.stalks.phenotyping.evaluation.thesis import count_by_length, mean_widths, measure_pair_as_thesis
+from jaxrl_vis.stalks.phenotyping.measure.stalk import Method
+from jaxrl_vis.stalks.phenotyping.track.follow import follow
+from jaxrl_vis.stalks.phenotyping.track.heights import stalk_widths
+from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting, find_with_ground, measure_pair
+from jaxrl_vis_envs.plants import Family, Stalk, draw
+from jaxrl_vis_envs.plants.pairs import Sequence
+from jaxrl_vis_envs.plants.truth import HEIGHTS, StalkInView, stalks_in_view
+
+MIN_VISIBLE = 0.3
+IOU = 0.5
+PERSON_SD = 1.45  # mm: of one person with calipers, from the thesis's 1.639 mm between two
+
+
+@dataclasses.dataclass(frozen=True)
+class PlotScore:
+    """One plot.
+
+    Attributes:
+        seed: Seed of the plot.
+        true, counted: Stalks.
+        widths: [N, 2] float64, measured and true diameter at 12 inches of each stalk that was counted and identified, mm.
+        upper: [M, 2] float64, the same at 24 inches.
+        seconds: Time of finding and measuring per pair, from arrays in memory; the first pair, which compiles, is left out.
+        thesis: Score of the thesis's methods on the same detections.
+        finds: [K, 2] float64, score of a detection, and 1 if it is a stalk, 0 if not; those of unclear stalks are left out.
+        stalks: Number of stalks that detections could have shown, over all pairs.
+    """
+
+    seed: int
+    true: int
+    counted: int
+    widths: np.ndarray
+    finds: np.ndarray
+    stalks: int
+    upper: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 2)))
+    seconds: float = math.nan
+    thesis: "ThesisScore | None" = None
+
+
+@dataclasses.dataclass(frozen=True)
+class ThesisScore:
+    """Counts and widths of the same detections by the thesis's methods.
+
+    Attributes:
+        counted: Stalks, by the stalks on each metre of image.
+        widths: [N, 2] float64, measured and true diameter at 12 inches, mm.
+    """
+
+    counted: float
+    widths: np.ndarray
+
+
+Finder = Callable[[np.ndarray], list[Detection]]
+
+
+def score_plot(
+    family: Family,
+    seed: int,
+    find: Finder | None,
+    method: Method = "strip",
+    least_score: float = 0.5,
+    with_thesis: bool = False,
+) -> PlotScore:
+    """Draws a plot, runs everything on it and compares.
+
+    Args:
+        family: Family that the plot is drawn from.
+        seed: Seed of the plot.
+        find: Detector of the stalks in a left image [H, W, 3] uint8, those of low scores too; None for true boxes and masks.
+        method: Method of widths.
+        least_score: Lowest score of a detection that counts.
+        with_thesis: Score the thesis's methods on the same detections, too.
+    """
+    sequence = Sequence.of(draw(family, seed))
+    drive, plot = sequence.drive, sequence.plot
+    frames: list[list[Sighting]] = []
+    owners: list[list[int | None]] = []
+    finds: list[tuple[float, float]] = []
+    as_thesis: list[list[Sighting]] = []
+    total, seconds = 0, []
+    for pair in sequence:
+        left, right, instance = np.asarray(pair.left), np.asarray(pair.right), np.asarray(pair.instance)
+        stalks = stalks_in_view(plot, pair.pose, drive.true, instance, np.asarray(pair.depth))
+        started = time.monotonic()
+        finder = find or functools.partial(_perfectly, stalks, instance)
+        detections, ground = find_with_ground(finder, left, right, drive.stated)
+        selected = [place for place, detection in enumerate(detections) if detection.score >= least_score]
+        finds_kept = [detections[place] for place in selected]
+        frames.append(measure_pair(finds_kept, left, right, drive.stated, method, ground))
+        seconds.append(time.monotonic() - started)
+        if with_thesis:
+            as_thesis.append(measure_pair_as_thesis(finds_kept, left, right, drive.stated))
+        matched, scored = match(detections, stalks)
+        total += sum(stalk.band_box is not None and stalk.band_visible >= MIN_VISIBLE for stalk in stalks)
+        finds += scored
+        owners.append([matched[place] for place in selected])
+    tracks, _ = follow(frames, drive.odometry, drive.stated)
+    widths, upper = [], []
+    counted = [track for track in tracks if track.counted]
+    for track, measured in zip(counted, stalk_widths(frames, counted)):
+        names = [owners[frame][place] for frame, place in track.sightings]
+        known = [name for name in names if name is not None]
+        if not known:
+            continue
+        stalk = plot.stalks[max(sorted(set(known)), key=known.count)]
+        if measured.lower is not None:
+            widths.append((measured.lower.mm, true_diameter(stalk)))
+        if measured.upper is not None:
+            upper.append((measured.upper.mm, true_diameter(stalk, HEIGHTS[1])))
+    return PlotScore(
+        seed,
+        len(plot.measured),
+        len(counted),
+        np.array(widths).reshape(-1, 2),
+        np.array(finds).reshape(-1, 2),
+        total,
+        np.array(upper).reshape(-1, 2),
+        float(np.mean(seconds[1:])) if len(seconds) > 1 else math.nan,
+        _thesis_score(as_thesis, owners, sequence) if with_thesis else None,
+    )
+
+
+def _perfectly(stalks: list[StalkInView], instance: np.ndarray, image: np.ndarray) -> list[Detection]:
+    """True boxes and masks, as a finder that needs no image."""
+    return perfect_detections(map(dataclasses.asdict, stalks), instance, MIN_VISIBLE)
+
+
+def _thesis_score(frames: list[list[Sighting]], owners: list[list[int | None]], sequence: Sequence) -> ThesisScore:
+    plot, stated = sequence.plot, sequence.drive.stated
+    widths = [(width, true_diameter(plot.stalks[name])) for name, width in mean_widths(frames, owners).items()]
+    counted = count_by_length(frames, stated, plot.family.layout.plot_length)
+    return ThesisScore(counted, np.array(widths).reshape(-1, 2))
+
+
+def true_diameter(stalk: Stalk, height: float = HEIGHTS[0]) -> float:
+    """Diameter of a stalk at a height in m as the cameras face it, mm; beside a node, the stalk above and below it is meant."""
+    beside = (0.02, -0.02) if stalk.node_distance(height) < 0.01 else (0.0,)
+    return 1e3 * float(np.mean([stalk.diameter(height + offset) for offset in beside]))
+
+
+def match(detections: list[Detection], stalks: list[StalkInView]) -> tuple[list[int | None], list[tuple[float, float]]]:
+    """Match detections with stalks by COCO's rules: the best detection first, a stalk once, at an overlap of boxes of 0.5.
+
+    Returns:
+        The stalk of each find, or None; and score and success of each find, less those of stalks that are too hidden to count.
+    """
+    there = [stalk for stalk in stalks if stalk.band_box is not None]
+    clear = np.array([stalk.band_visible >= MIN_VISIBLE for stalk in there], bool)
+    boxes = np.array([stalk.band_box for stalk in there], float).reshape(-1, 4)
+    owners: list[int | None] = [None] * len(detections)
+    scored: list[tuple[float, float]] = []
+    free = np.ones(len(there), bool)
+    for place in sorted(range(len(detections)), key=lambda number: -detections[number].score):
+        overlaps = _overlaps(np.array(detections[place].box), boxes)
+        fitting = free & (overlaps >= IOU)
+        of_clear = np.where(fitting & clear, overlaps, 0.0)
+        best = int(np.argmax(of_clear)) if of_clear.any() else None
+        if best is None and (fitting & ~clear).any():
+            best = int(np.argmax(np.where(fitting & ~clear, overlaps, 0.0)))
+        if best is not None:
+            owners[place], free[best] = there[best].stalk, False
+        if best is None or clear[best]:
+            scored.append((detections[place].score, float(best is not None)))
+    return owners, scored
+
+
+def _overlaps(box: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    """Intersection over union [N] of a box [4] with boxes [N, 4]."""
+    low, high = np.maximum(box[:2], boxes[:, :2]), np.minimum(box[2:], boxes[:, 2:])
+    common = np.prod(np.clip(high - low, 0.0, None), axis=1)
+    areas = np.prod(boxes[:, 2:] - boxes[:, :2], axis=1)
+    return common / np.maximum(np.prod(box[2:] - box[:2]) + areas - common, 1e-9)
+
+
+def average_precision(finds: np.ndarray, stalks: int) -> float:
+    """Average precision as COCO takes it: the mean over 101 recalls of the best precision at that recall or beyond.
+
+    Args:
+        finds: [K, 2], score and success.
+        stalks: Number of stalks to detect.
+    """
+    if not stalks or not len(finds):
+        return 0.0
+    success = finds[np.argsort(-finds[:, 0], kind="stable"), 1]
+    hits = np.cumsum(success)
+    precision = np.maximum.accumulate((hits / np.arange(1, len(hits) + 1))[::-1])[::-1]
+    recall = hits / stalks
+    place = np.searchsorted(recall, np.linspace(0.0, 1.0, 101))
+    return float(np.where(place < len(precision), precision[np.minimum(place, len(precision) - 1)], 0.0).mean())
+
+
+def summary(scores: Iterable[PlotScore], least_score: float = 0.5) -> dict[str, Any]:
+    """Summarise the scores of plots.
+
+    Returns:
+        ``count_r2`` (1 - SSE / SST against y = x), ``count_mae``, ``count_bias`` (of the true number), ``width_mae_mm``,
+        ``width_bias_mm``, ``width_mae_two_people_mm`` (against the simulated mean of two people with calipers), the same at 24
+        inches, ``ap50``, ``f1``, ``precision``, ``recall``, the best F1 and the least score that gives it, and how much there
+        was of each. Not a number where there was nothing.
+    """
+    scores = list(scores)
+    true = np.array([score.true for score in scores], float)
+    counted = np.array([score.counted for score in scores], float)
+    widths = np.concatenate([score.widths for score in scores]) if scores else np.zeros((0, 2))
+    finds = np.concatenate([score.finds for score in scores]) if scores else np.zeros((0, 2))
+    stalks = sum(score.stalks for score in scores)
+    error = widths[:, 0] - widths[:, 1]
+    upper = np.concatenate([score.upper for score in scores]) if scores else np.zeros((0, 2))
+    upper_error = upper[:, 0] - upper[:, 1]
+    people = np.random.default_rng(0).normal(0.0, PERSON_SD, (len(error), 2)).mean(axis=1)
+    selected = finds[finds[:, 0] >= least_score]
+    hits = float(selected[:, 1].sum())
+    best, best_score = _best_f1(finds, stalks)
+    return {
+        "plots": len(scores),
+        "count_true": int(true.sum()),
+        "count_r2": _agreement(counted, true),
+        "count_mae": _mean(np.abs(counted - true)),
+        "count_bias": float(counted.sum() / true.sum() - 1.0) if true.sum() else float("nan"),
+        "widths": len(error),
+        "width_mae_mm": _mean(np.abs(error)),
+        "width_bias_mm": _mean(error),
+        "width_mae_two_people_mm": _mean(np.abs(error - people)),
+        "widths_24in": len(upper),
+        "width_24in_mae_mm": _mean(np.abs(upper_error)),
+        "width_24in_bias_mm": _mean(upper_error),
+        "finds": len(selected),
+        "stalks_in_view": stalks,
+        "ap50": average_precision(finds, stalks),
+        "precision": hits / len(selected) if len(selected) else float("nan"),
+        "recall": hits / stalks if stalks else float("nan"),
+        "f1": 2.0 * hits / (len(selected) + stalks) if len(selected) + stalks else float("nan"),
+        "f1_best": best,
+        "f1_best_least_score": best_score,
+        "seconds_per_pair": _mean(np.array([score.seconds for score in scores if math.isfinite(score.seconds)])),
+        **_thesis_summary(scores),
+    }
+
+
+def _best_f1(finds: np.ndarray, stalks: int) -> tuple[float, float]:
+    """Return the best F1 over all lowest scores, and that score; finds [K, 2] as in `PlotScore`."""
+    if not len(finds) or not stalks:
+        return float("nan"), float("nan")
+    order = np.argsort(-finds[:, 0], kind="stable")
+    hits = np.cumsum(finds[order, 1])
+    f1 = 2.0 * hits / (np.arange(1, len(hits) + 1) + stalks)
+    best = int(np.argmax(f1))
+    return float(f1[best]), float(finds[order[best], 0])
+
+
+def _thesis_summary(scores: list[PlotScore]) -> dict[str, float]:
+    """The same figures of the thesis's ways, where all plots have them."""
+    both = [(score, score.thesis) for score in scores if score.thesis is not None]
+    if not both:
+        return {}
+    true, counted = np.array([(score.true, thesis.counted) for score, thesis in both]).T
+    widths = np.concatenate([thesis.widths for _, thesis in both])
+    return {
+        "thesis_count_r2": _agreement(counted, true),
+        "thesis_count_mae": _mean(np.abs(counted - true)),
+        "thesis_count_bias": float(counted.sum() / true.sum() - 1.0) if true.sum() else float("nan"),
+        "thesis_width_mae_mm": _mean(np.abs(widths[:, 0] - widths[:, 1])),
+        "thesis_width_bias_mm": _mean(widths[:, 0] - widths[:, 1]),
+    }
+
+
+def _agreement(counted: np.ndarray, true: np.ndarray) -> float:
+    """1 - SSE / SST against y = x; not a number where all true values are equal."""
+    spread = float(((true - true.mean()) ** 2).sum()) if len(true) else 0.0
+    return 1.0 - float(((counted - true) ** 2).sum()) / spread if spread > 0 else float("nan")
+
+
+def _mean(values: np.ndarray) -> float:
+    return float(values.mean()) if values.size else float("nan")

@@ -1,0 +1,203 @@
+"""Writes synthetic plots: folders of stereo pairs with calibration, odometry and truth.
+
+    family.json          what was drawn from
+    plot_0000/
+        left_000.png  right_000.png  ...
+        calibration.yaml     as it is stated, OpenCV
+        odometry.csv         pair, file names, time_s, distance_m
+        annotations.json     COCO: a box and a mask for each stalk of the near row in each left image
+        truth/               instance_000.png  disparity_000.png
+        plot.json            count, each stalk's diameters, the cameras as they are; written last, so it says that the plot is
+        whole
+
+A complete plot is not drawn again, so a command that was stopped continues where it was; one that holds less of the truth
+than is asked for is.
+"""
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+import jaxrl_vis
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.files import write_atomically
+from jaxrl_vis.spreadsheets import to_csv
+from jaxrl_vis.stalks.phenotyping.io.annotations import coco
+from jaxrl_vis.stalks.phenotyping.io.calibration import write_calibration
+from jaxrl_vis.stalks.phenotyping.io.images import SUFFIX, ImageFormat, write_image
+from jaxrl_vis.stalks.phenotyping.io.masks import encode_mask
+from jaxrl_vis_envs.documents import parse_json
+from jaxrl_vis_envs.plants import Family, Plot, draw
+from jaxrl_vis_envs.plants.pairs import Pair, Sequence
+from jaxrl_vis_envs.plants.truth import BAND, HEIGHTS, StalkInView, stalks_in_view
+
+Truth = Literal["all", "boxes", "none"]
+DISPARITY_SCALE = 64.0
+"""Disparity images are uint16: disparity in pixels times this, 0 where there is none."""
+SCHEMA = 1
+
+
+def write_plots(
+    folder: Path,
+    family: Family,
+    seeds: range,
+    image_format: ImageFormat = "png",
+    truth: Truth = "all",
+    done: Callable[[int, int], None] = lambda plot, pair: None,
+) -> int:
+    """Writes plots of a family.
+
+    Args:
+        folder: Folder to write to; made if it is missing.
+        family: Family to draw from.
+        seeds: One plot each.
+        image_format: Format of the images of the cameras.
+        truth: ``all``; ``boxes``, without images of disparity and instance and without masks; or ``none``, but plot.json.
+        done: Called after each pair with the plot's seed and the number of pairs that it has so far.
+
+    Returns:
+        How many plots were there already.
+
+    Raises:
+        RequestError: The folder holds another family's plots.
+        OSError: A file cannot be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    about = {"schema": SCHEMA, "synthetic": True, "version": jaxrl_vis.__version__, **dataclasses.asdict(family)}
+    text = json.dumps(about, indent=2) + "\n"
+    index = folder / "family.json"
+    if index.exists() and _without_version(index.read_text(encoding="utf-8", errors="replace")) != _without_version(text):
+        raise RequestError(f"{folder} holds plots of another family: choose another folder")
+    write_atomically(index, text)
+    present = 0
+    for seed in seeds:
+        whole = folder / plot_name(seed) / "plot.json"
+        if whole.exists():
+            if _holds(whole.parent, truth, family.rig.frames):
+                present += 1
+                done(seed, family.rig.frames)
+                continue
+            whole.unlink()  # until all is there again
+            for image in [*whole.parent.glob("left_*.*"), *whole.parent.glob("right_*.*")]:
+                image.unlink()  # they may be of another format
+        write_plot(folder / plot_name(seed), draw(family, seed), image_format, truth, done)
+    return present
+
+
+def _holds(folder: Path, truth: Truth, frames: int) -> bool:
+    """Return True if a complete plot holds as much of the truth as is asked for, or more."""
+    maps = [folder / "truth" / f"{kind}_{frame:03d}.png" for kind in ("instance", "disparity") for frame in range(frames)]
+    wanted = {"none": [], "boxes": [folder / "annotations.json"], "all": [folder / "annotations.json", *maps]}[truth]
+    return all(path.exists() for path in wanted)
+
+
+def plot_name(seed: int) -> str:
+    """Folder of the plot of a seed."""
+    return f"plot_{seed:04d}"
+
+
+def write_plot(folder: Path, plot: Plot, image_format: ImageFormat, truth: Truth, done: Callable[[int, int], None]) -> None:
+    """Writes one plot; see `write_plots`."""
+    (folder / "truth").mkdir(parents=True, exist_ok=True)
+    sequence = Sequence.of(plot)
+    write_calibration(folder / "calibration.yaml", sequence.drive.stated)
+    images: list[dict[str, Any]] = []
+    annotations: list[dict[str, Any]] = []
+    visible: list[dict[str, Any]] = []
+    for pair in sequence:
+        names = [f"{side}_{pair.frame:03d}{SUFFIX[image_format]}" for side in ("left", "right")]
+        for name, image in zip(names, (pair.left, pair.right)):
+            write_image(folder / name, np.asarray(image))
+        instance, depth = np.asarray(pair.instance), np.asarray(pair.depth)
+        if truth == "all":
+            _write_maps(folder / "truth", pair, instance)
+        if truth != "none":
+            height, width = instance.shape
+            images.append({"id": pair.frame + 1, "file_name": names[0], "width": width, "height": height})
+            stalks = stalks_in_view(plot, pair.pose, sequence.drive.true, instance, depth)
+            annotations += [_annotation(pair.frame, stalk, instance, truth == "all") for stalk in stalks if stalk.pixels]
+            visible += [{"pair": pair.frame, **dataclasses.asdict(stalk)} for stalk in stalks]
+        done(plot.seed, pair.frame + 1)
+    write_atomically(folder / "odometry.csv", _odometry(sequence, SUFFIX[image_format]))
+    if truth != "none":
+        text = f"synthetic stalks, family {plot.family.name}, seed {plot.seed}"
+        write_atomically(folder / "annotations.json", json.dumps(coco(images, annotations, {"description": text})) + "\n")
+    write_atomically(folder / "plot.json", json.dumps(_summary(sequence, visible)) + "\n")
+
+
+def _write_maps(folder: Path, pair: Pair, instance: np.ndarray) -> None:
+    scaled = np.round(np.asarray(pair.disparity) * DISPARITY_SCALE)
+    write_image(folder / f"disparity_{pair.frame:03d}.png", np.clip(scaled, 0, 65535).astype(np.uint16))
+    write_image(folder / f"instance_{pair.frame:03d}.png", np.clip(instance + 1, 0, 65535).astype(np.uint16))
+
+
+def _annotation(frame: int, stalk: StalkInView, instance: np.ndarray, with_mask: bool) -> dict[str, Any]:
+    assert stalk.visible_box is not None
+    left, top, right, bottom = stalk.visible_box
+    annotation: dict[str, Any] = {
+        "image_id": frame + 1,
+        "bbox": [left + 0.5, top + 0.5, right - left, bottom - top],
+        "area": stalk.pixels,
+        "stalk": stalk.stalk,
+        "visible": round(stalk.visible, 4),
+    }
+    if with_mask:
+        lines, columns = slice(int(top + 0.5), int(bottom + 0.5)), slice(int(left + 0.5), int(right + 0.5))
+        mask = instance[lines, columns] == stalk.stalk
+        annotation["segmentation"] = encode_mask(mask, (lines.start, columns.start), instance.shape)
+    return annotation
+
+
+def _odometry(sequence: Sequence, suffix: str) -> str:
+    rows = []
+    for frame, (time, distance) in enumerate(zip(sequence.drive.times, sequence.drive.odometry)):
+        images = {side: f"{side}_{frame:03d}{suffix}" for side in ("left", "right")}
+        rows.append({"pair": frame, **images, "time_s": f"{time:.4f}", "distance_m": f"{distance:.5f}"})
+    return to_csv(rows)
+
+
+def _summary(sequence: Sequence, visible: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return the contents of plot.json: lengths in metres, but diameters in millimetres."""
+    plot, drive = sequence.plot, sequence.drive
+    stalks = []
+    for index, stalk in enumerate(plot.measured):
+        by_height = {}
+        for height in HEIGHTS:
+            by_height[f"{round(height / 0.0254)}in"] = {
+                "diameter_mm": round(1e3 * stalk.diameter(height), 4),
+                "bare_diameter_mm": round(1e3 * stalk.diameter(height, bare=True), 4),
+                "node_distance_mm": round(1e3 * stalk.node_distance(height), 2),
+            }
+        foot = {"stalk": index, "x": float(stalk.points[0, 0]), "y": float(stalk.points[0, 1])}
+        # Height after height, 5 cm apart: x and y of its middle, and its diameter.
+        line = [
+            [*np.round(stalk.at_height(height)[0], 5).tolist(), round(1e3 * stalk.diameter(height), 3)]
+            for height in np.arange(0.0, stalk.points[:, 2].max(), 0.05)
+        ]
+        stalks.append({**foot, "middle_line_x_y_z_diameter_mm": line, **by_height})
+    return {
+        "schema": SCHEMA,
+        "synthetic": True,
+        "family": plot.family.name,
+        "seed": plot.seed,
+        "count": len(plot.measured),
+        "plot_length": plot.family.layout.plot_length,
+        "stalks": stalks,
+        "cameras": dataclasses.asdict(drive.true),
+        "stated_cameras": dataclasses.asdict(drive.stated),
+        "poses": [{"position": pose.position.tolist(), "rotation": pose.rotation.tolist()} for pose in drive.poses],
+        "disparity_scale": DISPARITY_SCALE,
+        "band": BAND,
+        "seen": visible,
+    }
+
+
+def _without_version(text: str) -> dict[str, Any]:
+    try:
+        return {name: value for name, value in parse_json(text).items() if name != "version"}
+    except (ValueError, AttributeError):
+        return {}

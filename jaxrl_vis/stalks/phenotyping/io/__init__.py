@@ -1,0 +1,1 @@
+"""Files of the phenotyping application: images, pairs, calibrations, annotations, odometry."""

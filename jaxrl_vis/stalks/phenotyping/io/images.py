@@ -1,0 +1,130 @@
+"""Reading and writing images of any bit depth that cameras deliver, and disparities."""
+
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from jaxrl_vis.files import replacing
+from jaxrl_vis.stalks.phenotyping.io.image_headers import PNG, plain_png, size_in
+
+ImageFormat = Literal["png", "tiff", "jpeg"]
+SUFFIX: dict[str, str] = {"png": ".png", "tiff": ".tiff", "jpeg": ".jpg"}
+_OPTIONS: dict[str, list[int]] = {
+    ".png": [cv2.IMWRITE_PNG_COMPRESSION, 1],
+    ".tiff": [],
+    ".jpg": [cv2.IMWRITE_JPEG_QUALITY, 95],
+}
+MAX_PIXELS = 100_000_000
+"""Greatest number of pixels of an image that is read."""
+_MAX_BYTES, _MAX_BESIDES = 16, 1 << 26  # of a file, for each pixel and for what else cameras write down
+
+
+def write_image(path: Path, image: np.ndarray) -> None:
+    """Writes an image: [H, W, 3] or [H, W], uint8 or uint16; the suffix says how. The file is complete whenever it can be read.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    suffix = path.suffix.lower()
+    ordered = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    encoded, data = cv2.imencode(suffix, ordered, _OPTIONS[suffix])
+    if not encoded:
+        raise OSError(f"{path}: the image could not be encoded")
+    with replacing(path, durable=False) as file:
+        file.write(data.tobytes())
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Height and width of an image, from its header: nothing is decoded.
+
+    Raises:
+        OSError: It cannot be read, is no image, or one that no camera takes. One line that names it.
+    """
+    if not path.is_file():
+        path.stat()
+        raise _unreadable(path, "is no ordinary file")
+    with path.open("rb") as file:
+        size = size_in(file)
+    if size is None:
+        raise _unreadable(path, "is not an image, or only a part of one")
+    pixels = size[0] * size[1]
+    if pixels > MAX_PIXELS:
+        raise _unreadable(path, f"has {size[1]} x {size[0]} pixels, more than {MAX_PIXELS // 10**6} million")
+    if path.stat().st_size > _MAX_BESIDES + _MAX_BYTES * pixels:
+        raise _unreadable(path, f"is larger than {size[1]} x {size[0]} pixels can be")
+    return size
+
+
+def read_image(path: Path) -> np.ndarray:
+    """An image as [H, W, 3] or [H, W], uint8 or uint16.
+
+    Raises:
+        OSError: It cannot be read, or is no whole image. One line that names it.
+    """
+    image = _decoded(path)
+    if image is None:
+        raise _unreadable(path, "is not an image, or only a part of one")
+    if image.dtype not in (np.uint8, np.uint16):
+        # Which of such numbers is black and which is white, nobody has said.
+        raise _unreadable(path, f"holds {image.dtype} pixels: save it with 8 or 16 bits")
+    if image.ndim == 2:
+        return image
+    return cv2.cvtColor(image[..., :3], cv2.COLOR_BGR2RGB)  # OpenCV's decoders give 1, 3 or 4 channels
+
+
+def rgb8(image: np.ndarray) -> np.ndarray:
+    """An image of any kind that `read_image` gives as [H, W, 3] uint8.
+
+    Cameras of 10, 12 or 14 bits write them into files of 16, with what is above them empty: the depth is taken to be the least
+    of these in which all values fit.
+    """
+    if image.dtype == np.uint16:
+        bits = next(bits for bits in (10, 12, 14, 16) if int(image.max()) < 1 << bits)
+        image = (image >> (bits - 8)).astype(np.uint8)
+    return np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image
+
+
+def read_disparity(path: Path, scale: float = 256.0) -> np.ndarray:
+    """Disparities from a file: PFM, floating-point TIFF, or 16-bit PNG or TIFF.
+
+    Args:
+        path: The file. In a PFM, infinity says that there is none; in the others, 0 does.
+        scale: Divisor of 16-bit numbers: 256 in KITTI's files, 64 in those of ``phenotype synth``.
+
+    Returns:
+        [H, W] float32, pixels; not a number where there is none.
+
+    Raises:
+        OSError: It cannot be read, or holds no disparities. One line that names it.
+    """
+    image = _decoded(path)
+    if image is None or image.ndim != 2 or image.dtype.itemsize == 1:
+        raise OSError(f"{path} holds no disparities: name a PFM, or a TIFF or PNG of 16 bits or more and one channel")
+    values = image.astype(np.float32) / (1.0 if image.dtype.kind == "f" else scale)
+    return np.where(np.isfinite(values) & (values > 0), values, np.nan)
+
+
+def _decoded(path: Path) -> np.ndarray | None:
+    """Pixels of a file, [H, W] or [H, W, channels] of any type, blue first; None where OpenCV cannot decode it.
+
+    Raises:
+        OSError: The file cannot be read, is no image, or one that no camera takes.
+    """
+    size = image_size(path)
+    data: bytes | None = path.read_bytes()
+    if data.startswith(PNG):
+        data = plain_png(data)
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    except cv2.error:
+        return None
+    return image if image is not None and image.shape[:2] == size else None
+
+
+def _unreadable(path: Path, why: str) -> OSError:
+    """An error whose text names the file, and whose ``strerror`` does not, as those of the operating system."""
+    error = OSError(f"{path} {why}")
+    error.strerror = f"it {why}"
+    return error

@@ -1,0 +1,167 @@
+"""The ground in a pair of images, found by stereo: what heights of stalks are counted from.
+
+Windows all over the image are matched in the right one. The disparities of a plane change linearly over the image, so the plane
+on which most windows agree, of those that could be ground, is the ground. Where too few agree there is none to be seen, and
+nothing says how high something is.
+"""
+
+import dataclasses
+import math
+
+import cv2
+import numpy as np
+
+from jaxrl_vis_envs.plants import Calibration
+
+_WIDTH = 1688  # pixels to which images are reduced: grains of the ground are still seen
+_WINDOW = (5, 41)  # lines and columns there: flat, as the ground comes nearer from line to line
+_COLUMNS, _LINES = 32, 32  # windows side by side and above each other
+_MIN_SCORE = 0.7
+_TOLERANCE = 0.7  # pixels there
+_TRIES = 600
+_CAMERA_HEIGHTS = (0.1, 2.0)  # m
+_MAX_PITCH, _MAX_ROLL = math.radians(30.0), math.radians(12.0)
+_MIN_WINDOWS = 30
+_MIN_SPAN = 0.3  # of the image's width
+_MAX_BELOW = 0.1  # share of windows that may lie under the ground: they are matched wrongly
+
+
+@dataclasses.dataclass(frozen=True)
+class Ground:
+    """The ground as a plane in the left camera's frame: x to the right, y down, z forwards.
+
+    Attributes:
+        normal: [3], 1/m; the points of the plane are those whose product with it is 1.
+    """
+
+    normal: tuple[float, float, float]
+
+    @property
+    def camera_height(self) -> float:
+        """Height of the left camera above it, m."""
+        return 1.0 / math.hypot(*self.normal)
+
+    def height(self, column: float, line: float, depth: float, calibration: Calibration) -> float:
+        """Height above the ground of what a pixel of the left image shows at a planar depth in m; m."""
+        x = (column - calibration.centre[0]) / calibration.focal
+        y = (line - calibration.centre[1]) / calibration.focal
+        across, down, forwards = self.normal
+        return (1.0 - depth * (across * x + down * y + forwards)) * self.camera_height
+
+
+def find_ground(
+    left: np.ndarray,
+    right: np.ndarray,
+    calibration: Calibration,
+    disparity: np.ndarray | None = None,
+    depths: tuple[float, float] = (0.45, 3.0),
+) -> Ground | None:
+    """The ground that a pair shows; None where it shows none, or too little.
+
+    Args:
+        left, right: [H, W] grey, uint8 or float32, rectified.
+        calibration: Calibration of the cameras, for images of this size.
+        disparity: [H, W] float32, disparities that are known, in place of those that are matched; pixels, not a number where
+            there is none.
+        depths: Least and greatest depth at which it is looked for, m.
+    """
+    scale = min(_WIDTH / left.shape[1], 1.0)
+    if scale < 1.0:
+        size = (round(left.shape[1] * scale), round(left.shape[0] * scale))
+        left, right = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (left, right))
+    bounds = tuple(float(calibration.disparity(np.array(depth))) * scale for depth in reversed(depths))
+    if disparity is None:
+        places, values = _windows(left, right, (bounds[0], bounds[1]))
+    else:
+        places, values = _samples(disparity, scale)
+    if len(values) < _MIN_WINDOWS:
+        return None
+    focal = calibration.focal * scale
+    centre = (np.array(calibration.centre) + 0.5) * scale - 0.5
+    # Inverse depth, which is linear in the rays of a plane's points; one pixel of disparity is `unit` of it.
+    unit = 1.0 / (focal * calibration.baseline)
+    rays = np.concatenate([(places - centre) / focal, np.ones((len(places), 1))], axis=1)
+    inverse = (values - calibration.offset * scale) * unit
+    fitted = _plane(rays, inverse, _TOLERANCE * unit)
+    if fitted is None:
+        return None
+    residual = inverse - rays @ fitted
+    agree = np.abs(residual) < _TOLERANCE * unit
+    facing = rays @ fitted > 0
+    below = facing & (residual < -4.0 * _TOLERANCE * unit)
+    span = float(np.ptp(places[agree, 0])) if agree.any() else 0.0
+    if agree.sum() < _MIN_WINDOWS or span < _MIN_SPAN * left.shape[1] or below.sum() > _MAX_BELOW * facing.sum():
+        return None
+    return Ground((float(fitted[0]), float(fitted[1]), float(fitted[2])))
+
+
+def _windows(left: np.ndarray, right: np.ndarray, bounds: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Middles (column, line) [N, 2] and disparities [N] of windows that are found in the right image, and clearly."""
+    tall, wide = _WINDOW
+    height, width = left.shape
+    low, high = math.floor(bounds[0]), math.ceil(bounds[1])
+    columns = np.linspace(low + 1, width - wide - 1, _COLUMNS).astype(int)
+    lines = np.linspace(1, height - tall - 1, _LINES).astype(int)
+    places, values = [], []
+    for top in lines:
+        for first in columns:
+            window = left[top : top + tall, first : first + wide]
+            begin, end = max(first - high - 1, 0), first - low + 1 + wide
+            if float(window.max()) - float(window.min()) < 4.0 or end - begin <= wide + 2:
+                continue
+            score = cv2.matchTemplate(right[top - 1 : top + tall + 1, begin:end], window, cv2.TM_CCOEFF_NORMED).max(axis=0)
+            column = int(np.argmax(score))
+            if not score[column] >= _MIN_SCORE or column in (0, score.size - 1):
+                continue
+            before, at, after = score[column - 1 : column + 2]
+            bend = before - 2.0 * at + after
+            fraction = 0.0 if bend >= 0.0 else 0.5 * float(before - after) / float(bend)
+            places.append((first + 0.5 * (wide - 1), top + 0.5 * (tall - 1)))
+            values.append(first - (begin + column + fraction))
+    return np.array(places, float).reshape(-1, 2), np.array(values, float)
+
+
+def _samples(disparity: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """Places and values as of `_windows`, out of an image of disparities."""
+    lines, columns = (np.linspace(0, size - 1, 64).astype(int) for size in disparity.shape)
+    values = disparity[np.ix_(lines, columns)]
+    line, column = np.nonzero(np.isfinite(values))
+    places = (np.stack([columns[column], lines[line]], axis=1) + 0.5) * scale - 0.5
+    return places, values[line, column] * scale
+
+
+def _plane(rays: np.ndarray, inverse: np.ndarray, tolerance: float) -> np.ndarray | None:
+    """The plane [3] that could be ground and that most points agree with; None if there is none."""
+    rng = np.random.default_rng(0)
+    # Most of what an image shows is no ground; most of what its lower third shows is.
+    low = np.flatnonzero(rays[:, 1] >= np.quantile(rays[:, 1], 2 / 3))
+    triples = np.concatenate([rng.integers(len(rays), size=(_TRIES // 2, 3)), rng.choice(low, (_TRIES // 2, 3))])
+    corners = rays[triples]
+    good = np.abs(np.linalg.det(corners)) > 1e-4
+    planes = np.linalg.solve(corners[good], inverse[triples[good]][..., None])[..., 0]
+    planes = planes[_could_be_ground(planes)]
+    if not len(planes):
+        return None
+    votes = (np.abs(rays @ planes.T - inverse[:, None]) < tolerance).sum(axis=0)
+    best = planes[int(np.argmax(votes))]
+    for _ in range(5):
+        agree = np.abs(rays @ best - inverse) < tolerance
+        if agree.sum() < 3:
+            return None
+        best = np.linalg.lstsq(rays[agree], inverse[agree], rcond=None)[0]
+    return best if bool(_could_be_ground(best[None])[0]) else None
+
+
+def _could_be_ground(planes: np.ndarray) -> np.ndarray:
+    """Return True for the planes [N, 3] that lie below the camera, about level: [N] bool."""
+    length = np.linalg.norm(planes, axis=1)
+    height = 1.0 / np.maximum(length, 1e-9)
+    roll = np.abs(np.arcsin(np.clip(planes[:, 0] / np.maximum(length, 1e-9), -1.0, 1.0)))
+    pitch = np.abs(np.arctan2(planes[:, 2], planes[:, 1]))
+    return (
+        (height > _CAMERA_HEIGHTS[0])
+        & (height < _CAMERA_HEIGHTS[1])
+        & (planes[:, 1] > 0)
+        & (pitch < _MAX_PITCH)
+        & (roll < _MAX_ROLL)
+    )

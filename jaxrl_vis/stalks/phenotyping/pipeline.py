@@ -1,0 +1,295 @@
+"""Folders of pairs to tables: `run` reads, finds, measures, follows and writes, and continues where it was stopped.
+
+    OUT/run.json                 what was asked for: a folder holds the results of one request
+        pairs/PLOT/PAIR.json     sightings, or why the pair was skipped, and of which files; not computed again while these are
+                                 the same, unless the pair was skipped
+        overlays/PLOT/PAIR.png   drawn again where they show something else; drawn.json says what they show
+        stalks.csv  plots.csv  skipped.csv
+        qc.html                  the same with pictures, and what was rejected
+
+Tables are always made from the files under pairs/, so they do not depend on when the command was stopped, nor on how many
+processes look at pairs. Each of them has one pair in memory at a time.
+"""
+
+import dataclasses
+import functools
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import jaxrl_vis
+from jaxrl_vis.evaluation_pool import UnorderedMap, worker_pool
+from jaxrl_vis.files import write_atomically
+from jaxrl_vis.stalks.digests import value_digest
+from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
+from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder, read_odometries, why_no_odometry
+from jaxrl_vis.stalks.phenotyping.io.images import write_image
+from jaxrl_vis.stalks.phenotyping.io.names import file_name
+from jaxrl_vis.stalks.phenotyping.io.pair_reading import Unusable, known_disparity, read_pair, read_side
+from jaxrl_vis.stalks.phenotyping.measure.stalk import Method
+from jaxrl_vis.stalks.phenotyping.report.overlay import draw_overlay
+from jaxrl_vis.stalks.phenotyping.report.qc import Page, PlotResult
+from jaxrl_vis.stalks.phenotyping.report.tables import (
+    PLOT_COLUMNS,
+    STALK_COLUMNS,
+    Origin,
+    Row,
+    plot_rows,
+    rows_without_path,
+    write_rows,
+)
+from jaxrl_vis.stalks.phenotyping.track.direction import follow_either_way
+from jaxrl_vis.stalks.phenotyping.track.follow import Track
+from jaxrl_vis.stalks.phenotyping.track.pairing import pair_fault
+from jaxrl_vis.stalks.phenotyping.track.sightings import NO_CALIBRATION, Sighting, find_with_ground, measure_pair
+from jaxrl_vis.stalks.results_folder import claim, is_current, pair_state, write_record
+from jaxrl_vis_envs.documents import read_json
+from jaxrl_vis_envs.plants import Calibration
+
+Find = Callable[[np.ndarray, PlotFolder, PairFiles], list[Detection]]
+"""Finds the stalks of a left image [H, W, 3] uint8."""
+NO_ODOMETRY = "no odometry"
+NO_FIT = "odometry does not fit the images"
+SKIPPED_COLUMNS = ("plot", "pair", "why")
+
+
+@dataclasses.dataclass(frozen=True)
+class Request:
+    """Request for the results of plots.
+
+    Attributes:
+        out: Folder of the results.
+        method: Method of widths.
+        finder: Name of the detector; results of another one are not mixed with it.
+        calibrations: Calibration of each plot by its name; None where there is none.
+        speed: Speed of the robot, m/s, where only times are known.
+        disparity_scale: Divisor of disparities in 16-bit images.
+    """
+
+    out: Path
+    method: Method
+    finder: str
+    calibrations: dict[str, Calibration | None]
+    speed: float | None = None
+    disparity_scale: float = 256.0
+
+
+def run(
+    plots: list[PlotFolder],
+    find: Find,
+    request: Request,
+    done: Callable[[str, int, int], None] = lambda plot, pair, of: None,
+    workers: int = 1,
+    say: Callable[[str, str], None] = lambda plot, why: None,
+) -> tuple[list[Row], list[Row]]:
+    """Writes the results of plots.
+
+    Args:
+        plots: Folders of pairs.
+        find: Detector of stalks; with more than one worker it is pickled.
+        request: The request.
+        done: Called after each pair with the plot's name, how many of its pairs are done, and how many it has.
+        workers: Number of processes that look at pairs and draw overlays; 1 for this one.
+        say: Called for each plot without a count with its name and why it has none.
+
+    Returns:
+        The rows of plots.csv and of skipped.csv.
+
+    Raises:
+        RequestError: The folder holds other results, or a plot's odometry cannot be read.
+        OSError: A file cannot be written.
+    """
+    driven = read_odometries(plots, request.speed)
+    claim(
+        request.out,
+        "plots",
+        plots,
+        request.calibrations,
+        {
+            "method": request.method,
+            "finder": request.finder,
+            "speed": request.speed,
+            "disparity_scale": request.disparity_scale,
+        },
+        any(request.out.glob("pairs/*/*.json")),
+    )
+    about = [
+        f"jaxrl-vis {jaxrl_vis.__version__}; finds by {request.finder}; widths by the method {request.method}.",
+        "Tables: stalks.csv, plots.csv and skipped.csv; all pairs: overlays/.",
+    ]
+    with worker_pool(workers) as run_all, Page(about, request.out / "overlays", len(plots)) as page:
+        return _run(plots, find, request, driven, page, done, say, run_all)
+
+
+def _run(
+    plots: list[PlotFolder],
+    find: Find,
+    request: Request,
+    driven: dict[str, dict[str, float] | None],
+    page: Page,
+    done: Callable[[str, int, int], None],
+    say: Callable[[str, str], None],
+    run_all: UnorderedMap,
+) -> tuple[list[Row], list[Row]]:
+    """Plot by plot; see `run`."""
+    stalks: list[Row] = []
+    rows: list[Row] = []
+    skipped: list[Row] = []
+    for plot in plots:
+        folder = request.out / "pairs" / file_name(plot.name)
+        folder.mkdir(parents=True, exist_ok=True)
+        paths = {pair.name: folder / file_name(f"{pair.name}.json") for pair in plot.pairs}
+        calibration = request.calibrations[plot.name]
+        missing = [pair for pair in plot.pairs if not is_current(paths[pair.name], _sources(pair, calibration), _is_whole)]
+        for number in range(1, len(plot.pairs) - len(missing) + 1):
+            done(plot.name, number, len(plot.pairs))
+        made = run_all(functools.partial(_record, plot, find, request), missing)
+        for number, (name, record, sources) in enumerate(made, start=1):
+            write_record(paths[name], record, sources)
+            done(plot.name, len(plot.pairs) - len(missing) + number, len(plot.pairs))
+        records = [read_json(paths[pair.name]) for pair in plot.pairs]
+        bad = [
+            {"plot": plot.name, "pair": pair.name, "why": record["skipped"]}
+            for pair, record in zip(plot.pairs, records)
+            if "skipped" in record
+        ]
+        result = _finish(plot, records, driven[plot.name], request, run_all)
+        if result.row["stalks"] == "":
+            why = why_no_odometry(plot, driven[plot.name], plot.pairs) if result.row["flag"] == NO_ODOMETRY else None
+            say(plot.name, result.row["flag"] + ("" if why is None else f" ({why})"))
+        page.add(result)
+        stalks, rows, skipped = stalks + result.stalks, [*rows, result.row], skipped + bad
+        write_rows(request.out / "stalks.csv", STALK_COLUMNS, stalks)
+        write_rows(request.out / "plots.csv", PLOT_COLUMNS, rows)
+        write_rows(request.out / "skipped.csv", SKIPPED_COLUMNS, skipped)
+    page.write(request.out / "qc.html", skipped)
+    return rows, skipped
+
+
+def _is_whole(record: dict[str, Any]) -> bool:
+    """Return True for a record of sightings; a pair that was skipped is tried again."""
+    lines, columns = record["size"]
+    for values in record["sightings"]:
+        Sighting.read(values)
+    return isinstance(lines, int) and isinstance(columns, int)
+
+
+def _sources(pair: PairFiles, calibration: Calibration | None) -> dict[str, Any]:
+    """Return the state of everything that the record of a pair depends on, beside the request."""
+    return {**pair_state(pair), "calibration": None if calibration is None else value_digest(dataclasses.asdict(calibration))}
+
+
+def _record(plot: PlotFolder, find: Find, request: Request, pair: PairFiles) -> tuple[str, dict[str, Any], dict[str, Any]]:
+    """Return the name of a pair, its record, and the state of the record's sources."""
+    calibration = request.calibrations[plot.name]
+    sources = _sources(pair, calibration)  # before the files are read: they may be replaced meanwhile
+    return pair.name, _sightings_record(plot, find, request, pair), sources
+
+
+def _sightings_record(plot: PlotFolder, find: Find, request: Request, pair: PairFiles) -> dict[str, Any]:
+    """Return the record of a pair: its sightings, or why it was skipped."""
+    calibration = request.calibrations[plot.name]
+    try:
+        left, right = read_pair(pair, calibration, pair.disparity is None)
+        disparity = known_disparity(pair, left, request.disparity_scale)
+        detections, ground = find_with_ground(lambda image: find(image, plot, pair), left, right, calibration, disparity)
+    except Unusable as problem:
+        return {"skipped": str(problem)}
+    sightings = measure_pair(detections, left, right, calibration, request.method, ground, disparity)
+    wrong = (
+        None if calibration is None or disparity is not None else pair_fault(detections, sightings, left, right, calibration)
+    )
+    if wrong is not None:
+        return {"skipped": wrong}
+    return {
+        "size": list(left.shape[:2]),
+        "camera_height_m": None if ground is None else round(ground.camera_height, 4),
+        "sightings": [dataclasses.asdict(sighting) for sighting in sightings],
+    }
+
+
+def _finish(
+    plot: PlotFolder, records: list[dict[str, Any]], driven: dict[str, float] | None, request: Request, run_all: UnorderedMap
+) -> PlotResult:
+    """Follows the stalks of a plot, and draws its overlays."""
+    usable = [(pair, record) for pair, record in zip(plot.pairs, records) if "sightings" in record]
+    skipped = len(records) - len(usable)
+    frames = [[Sighting.read(values) for values in record["sightings"]] for _, record in usable]
+    origin = Origin(plot.name, request.method, jaxrl_vis.__version__)
+    calibration = request.calibrations[plot.name]
+    known = driven is not None and all(pair.name in driven for pair, _ in usable)
+    why, tracks, start = _what_is_missing(len(usable), calibration), [], 0.0
+    labels: list[list[str | None]] = [[None] * len(frame) for frame in frames]
+    drive = None
+    if calibration is not None and driven is not None and known and len(usable) >= 2:
+        drive = follow_either_way(frames, np.array([driven[pair.name] for pair, _ in usable]), calibration)
+        why = NO_FIT
+    if drive is None or not drive.fits:
+        stalks, row = rows_without_path(frames, skipped, origin, why)
+    else:
+        tracks, path = drive.tracks, drive.path
+        labels = sighting_labels(frames, tracks)
+        start = float(path.places[0])
+        stalks, row = plot_rows(frames, tracks, path, skipped, origin)
+    _draw_overlays(plot.name, request.out / "overlays" / file_name(plot.name), usable, labels, run_all)
+    width = usable[0][1]["size"][1] if usable else 0
+    return PlotResult(row, stalks, [pair.name for pair, _ in usable], frames, tracks, start, width)
+
+
+def _draw_overlays(
+    plot: str,
+    folder: Path,
+    usable: list[tuple[PairFiles, dict[str, Any]]],
+    labels: list[list[str | None]],
+    run_all: UnorderedMap,
+) -> None:
+    """Writes the overlays of a plot that are missing or show something else."""
+    folder.mkdir(parents=True, exist_ok=True)
+    index = folder / "drawn.json"
+    shown = {pair.name: value_digest([record, names]) for (pair, record), names in zip(usable, labels)}
+    try:
+        drawn = dict(read_json(index))
+    except (FileNotFoundError, ValueError, TypeError):
+        drawn = {}
+    for name in drawn.keys() - shown.keys():
+        (folder / file_name(f"{name}.png")).unlink(missing_ok=True)  # of a pair that cannot be used any more
+    missing = [
+        (folder / file_name(f"{pair.name}.png"), pair, [Sighting.read(values) for values in record["sightings"]], names)
+        for (pair, record), names in zip(usable, labels)
+        if drawn.get(pair.name) != shown[pair.name] or not (folder / file_name(f"{pair.name}.png")).exists()
+    ]
+    if drawn != shown:
+        # Before anything is drawn: what is drawn anew must not be taken for the old one, if this is stopped.
+        current = {name: digest for name, digest in drawn.items() if digest == shown.get(name)}
+        write_atomically(index, json.dumps(current) + "\n")
+    for _ in run_all(functools.partial(_draw_overlay, plot), missing):
+        pass
+    if drawn != shown:
+        write_atomically(index, json.dumps(shown) + "\n")
+
+
+def _draw_overlay(plot: str, asked: tuple[Path, PairFiles, list[Sighting], list[str | None]]) -> None:
+    """Writes the overlay of one pair."""
+    target, pair, frame, names = asked
+    write_image(target, draw_overlay(read_side(pair, "left"), frame, names, f"{plot} {pair.name}"))
+
+
+def _what_is_missing(pairs: int, calibration: Calibration | None) -> str:
+    """Why the pairs of a plot cannot be put together."""
+    if pairs == 0:
+        return "no usable pairs"
+    if calibration is None:
+        return NO_CALIBRATION
+    return "a single pair" if pairs == 1 else NO_ODOMETRY
+
+
+def sighting_labels(frames: list[list[Sighting]], tracks: list[Track]) -> list[list[str | None]]:
+    """The number of the stalk that each sighting shows, as in the table; None for those of stalks that do not count."""
+    labels: list[list[str | None]] = [[None] * len(frame) for frame in frames]
+    for number, track in enumerate((track for track in tracks if track.counted), start=1):
+        for frame, place in track.sightings:
+            labels[frame][place] = str(number)
+    return labels

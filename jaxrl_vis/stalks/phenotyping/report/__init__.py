@@ -1,0 +1,1 @@
+"""Results of a plot for people: tables, overlays, the page qc.html and figures."""

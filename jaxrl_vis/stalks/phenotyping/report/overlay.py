@@ -1,0 +1,115 @@
+"""An image with what was found in it: the picture behind every number."""
+
+import math
+
+import cv2
+import numpy as np
+
+from jaxrl_vis.stalks.phenotyping.io.names import readable
+from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting
+
+COUNTED, REJECTED, MEASURED = (70, 235, 100), (255, 105, 75), (255, 225, 60)
+"""Colours: outlines of stalks that count, of what does not count, and where widths were taken."""
+_WIDEST = 1688
+_LEGEND = (("counted", COUNTED), ("not counted", REJECTED), ("width was taken here", MEASURED))
+
+
+def overlay_scale(width: int) -> float:
+    """Return the scale of the overlay of an image ``width`` pixels wide."""
+    return min(_WIDEST / width, 1.0)
+
+
+def draw_overlay(image: np.ndarray, sightings: list[Sighting], labels: list[str | None], title: str = "") -> np.ndarray:
+    """The image [H, W, 3] uint8, at most 1688 pixels wide, brightened, with outlines and widths.
+
+    Args:
+        image: The left one.
+        sightings: In it.
+        labels: Number of each sighting's stalk; None for what does not count.
+        title: Written into a corner.
+    """
+    scale = overlay_scale(image.shape[1])
+    size = (round(image.shape[1] * scale), round(image.shape[0] * scale))
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    canvas = np.round(255.0 * (small / 255.0) ** 0.7).astype(np.uint8)
+    thick = max(round(size[0] / 800), 1)
+    for sighting, label in zip(sightings, labels):
+        _outline(canvas, sighting, COUNTED if label is not None else REJECTED, scale, thick)
+    writer = _Writer(canvas, max(size[0] / 2200, 0.3), thick)
+    writer.legend(readable(title))  # OpenCV does not survive a lone surrogate
+    for sighting, label in sorted(zip(sightings, labels), key=lambda pair: pair[0].column):
+        width = "" if sighting.diameter_mm is None else f"{sighting.diameter_mm:.1f} mm"
+        text = " ".join(filter(None, (f"#{label}" if label else "", width))) or "no width"
+        place = round((sighting.axis[0] + 0.5) * scale - 0.5), round((sighting.box[1] + 0.5) * scale - 0.5)
+        writer.above(place, text, COUNTED if label is not None else REJECTED)
+    return canvas
+
+
+def _outline(canvas: np.ndarray, sighting: Sighting, colour: tuple[int, int, int], scale: float, thick: int) -> None:
+    """The two edges of a stalk in the band, and bars where its widths were taken."""
+
+    def at(column: float, line: float) -> tuple[int, int]:
+        return round((column + 0.5) * scale - 0.5), round((line + 0.5) * scale - 0.5)
+
+    left, top, right, bottom = sighting.box
+    lean = math.radians(sighting.lean_deg or 0.0)
+    # The width is taken across the axis, the edges stand further apart along a line.
+    half = 0.5 * (
+        sighting.width_px / math.cos(lean)
+        if sighting.width_px
+        else max(right - left - abs(sighting.axis[1] - sighting.axis[0]), 2.0)
+    )
+    slope = (sighting.axis[1] - sighting.axis[0]) / max(bottom - top, 1.0)
+    # The outline goes through the middle that was measured.
+    middle = [sighting.column + slope * (line - sighting.line) for line in (top, bottom)]
+    for side in (-half, half):
+        cv2.line(canvas, at(middle[0] + side, top), at(middle[1] + side, bottom), colour, thick, cv2.LINE_AA)
+    bars = [(sighting.column, sighting.line, sighting.width_px)] if sighting.diameter_mm is not None else []
+    for column, line, width in [*bars, *([sighting.upper_place] if sighting.upper_place else [])]:
+        reach = 0.5 * (width or 0.0)
+        over, down = reach * math.cos(lean), reach * math.sin(lean)
+        cv2.line(canvas, at(column - over, line - down), at(column + over, line + down), MEASURED, 2 * thick, cv2.LINE_AA)
+
+
+class _Writer:
+    """Writes on an image so that no word covers another."""
+
+    def __init__(self, canvas: np.ndarray, letters: float, thick: int) -> None:
+        self._canvas, self._letters, self._thick = canvas, letters, thick
+        self._taken: list[tuple[int, int, int, int]] = []
+
+    def above(self, place: tuple[int, int], text: str, colour: tuple[int, int, int]) -> None:
+        """Writes above a place, as near to it as there is room, with a thread down to it."""
+        wide, tall = self._size(text)
+        left = min(max(place[0] - wide // 2, 0), max(self._canvas.shape[1] - wide, 0))
+        bottom = place[1] - tall // 2
+        while bottom > 2 * tall and any(_overlap((left, bottom - tall, left + wide, bottom), box) for box in self._taken):
+            bottom -= tall // 3
+        cv2.line(self._canvas, (place[0], bottom), place, colour, 1, cv2.LINE_AA)
+        self._write((left, bottom), text, colour)
+
+    def legend(self, title: str) -> None:
+        """Title and meaning of the colours, in the lower left corner."""
+        left, bottom = self._size("0")[1] // 2, self._canvas.shape[0] - self._size("0")[1] // 2
+        for text, colour in [*([(title, (255, 255, 255))] if title else []), *_LEGEND]:
+            self._write((left, bottom), text, colour)
+            left += self._size(text)[0] + self._size("0")[1] // 2
+
+    def _size(self, text: str) -> tuple[int, int]:
+        (wide, tall), base = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, self._letters, self._thick)
+        return wide + base, tall + 2 * base
+
+    def _write(self, corner: tuple[int, int], text: str, colour: tuple[int, int, int]) -> None:
+        """On a darkened box whose lower left corner is given."""
+        left, bottom = corner
+        wide, tall = self._size(text)
+        part = self._canvas[max(bottom - tall, 0) : bottom, left : left + wide]
+        part[...] = part // 4
+        self._taken.append((left, bottom - tall, left + wide, bottom))
+        base = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, self._letters, self._thick)[1]
+        place = (left + base // 2, bottom - base)
+        cv2.putText(self._canvas, text, place, cv2.FONT_HERSHEY_SIMPLEX, self._letters, colour, self._thick, cv2.LINE_AA)
+
+
+def _overlap(first: tuple[int, int, int, int], second: tuple[int, int, int, int]) -> bool:
+    return first[0] < second[2] and second[0] < first[2] and first[1] < second[3] and second[1] < first[3]

@@ -1,0 +1,337 @@
+"""A page to check the results by: sortable tables, a picture for every stalk, and what was rejected and why. It is one file.
+
+Pictures are cut out of the overlays that `pipeline.run` wrote. Plots are added one by one and wait in a file, so that memory
+does not grow with their number; pictures of whole pairs are limited to about 200 in all.
+"""
+
+import base64
+import codecs
+import dataclasses
+import html
+import math
+import shutil
+import tempfile
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from jaxrl_vis.files import replacing
+from jaxrl_vis.stalks.phenotyping.io.images import read_image
+from jaxrl_vis.stalks.phenotyping.io.names import file_name
+from jaxrl_vis.stalks.phenotyping.report.overlay import overlay_scale
+from jaxrl_vis.stalks.phenotyping.report.qc_style import SCRIPT, STYLE
+from jaxrl_vis.stalks.phenotyping.report.tables import NO_GROUND
+from jaxrl_vis.stalks.phenotyping.track.follow import Track
+from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting
+
+_WHOLE = 200  # pictures of whole pairs in a page
+_MAX_WHOLE, _MIN_WHOLE = 8, 1  # of a plot
+_THUMB = 844  # pixels: width of those
+_STALK_COLUMNS = {
+    "stalk": "stalk",
+    "position_m": "position, m",
+    "depth_m": "depth, m",
+    "width_mm": "width at 12 in, mm",
+    "width_se_mm": "± mm",
+    "width_24in_mm": "at 24 in, mm",
+    "taper_mm_per_in": "taper, mm/in",
+    "lean_deg": "lean, °",
+    "frames": "pairs",
+    "frames_measured": "measured in",
+    "confidence": "confidence",
+    "flag": "flag",
+}
+_PLOT_COLUMNS = {
+    "plot": "plot",
+    "pairs": "pairs",
+    "pairs_skipped": "skipped",
+    "length_m": "length, m",
+    "stalks": "stalks",
+    "stalks_per_m": "stalks per m",
+    "width_mean_mm": "mean width at 12 in, mm",
+    "width_sd_mm": "sd, mm",
+    "width_24in_mean_mm": "mean at 24 in, mm",
+    "taper_mean_mm_per_in": "mean taper, mm/in",
+    "rejected": "rejected",
+    "flag": "flag",
+}
+
+
+_DIGITS = {
+    **dict.fromkeys(("position_m", "depth_m", "length_m", "width_se_mm", "taper_mm_per_in", "taper_mean_mm_per_in"), 2),
+    **dict.fromkeys(("width_mm", "width_24in_mm", "width_mean_mm", "width_sd_mm", "width_24in_mean_mm", "stalks_per_m"), 1),
+    "confidence": 2,
+}
+"""Digits of numbers in the page; the files have more."""
+_ERRORS = (
+    "± is the scatter between pairs. The error of the calibration, and what hides a stalk from all sides, are not in it. "
+    "Point at a picture to enlarge it."
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class PlotResult:
+    """Results of one plot.
+
+    Attributes:
+        row: Row of plots.csv.
+        stalks: Rows of stalks.csv.
+        pairs: Names of the pairs that were used.
+        frames: Sightings of each.
+        tracks: Stalks, and what does not count; empty where pairs could not be put together.
+        start: Place of the first pair, which positions count from, m.
+        image_width: Width of its images, pixels.
+    """
+
+    row: dict[str, Any]
+    stalks: list[dict[str, Any]]
+    pairs: list[str]
+    frames: list[list[Sighting]]
+    tracks: list[Track]
+    start: float
+    image_width: int
+
+
+class Page:
+    """The page in the making. A context manager.
+
+    Args:
+        about: Lines of text under the title.
+        overlays: Folder with a folder of overlays for each plot.
+        plots: Number of plots that will be added.
+    """
+
+    def __init__(self, about: list[str], overlays: Path, plots: int) -> None:
+        self._about, self._overlays = about, overlays
+        self._whole = min(max(_WHOLE // max(plots, 1), _MIN_WHOLE), _MAX_WHOLE)
+        self._file = tempfile.TemporaryFile("w+", encoding="utf-8")
+        self._rows: list[dict[str, Any]] = []
+
+    def __enter__(self) -> "Page":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._file.close()
+
+    def add(self, plot: PlotResult) -> None:
+        """Adds a plot.
+
+        Raises:
+            OSError: An overlay cannot be read.
+        """
+        name = plot.row["plot"]
+        rejected = [track for track in plot.tracks if not track.counted]
+        self._rows.append({**plot.row, "rejected": len(rejected) if plot.tracks else ""})
+        pictures = _Pictures(self._overlays / file_name(name), plot)
+        counted = [track for track in plot.tracks if track.counted]
+        tables = [
+            {"picture": pictures.of(track), **{column: row[column] for column in _STALK_COLUMNS}}
+            for track, row in zip(counted, plot.stalks)
+        ]
+        others = [
+            {
+                "picture": pictures.of(track),
+                "position, m": f"{track.position_m - plot.start:.3f}",
+                "depth, m": "" if math.isnan(track.depth_m) else f"{track.depth_m:.3f}",
+                "pairs": len(track.sightings),
+                "why": track.reason,
+            }
+            for track in rejected
+        ]
+        reasons = Counter(sighting.reason for frame in plot.frames for sighting in frame if sighting.reason)
+        finds = [{"why": why, "finds": count} for why, count in _grouped(reasons).most_common()]
+        write = self._file.write
+        write(f'<details id="{_safe(name)}"><summary>{_safe(name)}: {_safe(_headline(plot.row))}</summary>')
+        if plot.stalks:
+            write(_chart(plot, rejected))
+            write(f"<h3>Stalks</h3><p>{_ERRORS}</p>" + table({"picture": "", **_STALK_COLUMNS}, tables))
+        if others:
+            write("<h3>Rejected: not counted</h3>" + table({column: column for column in others[0]}, others))
+        if finds:
+            total = sum(map(len, plot.frames))
+            write(
+                f"<h3>Finds without a width, of {total} in single pairs</h3>" + table({"why": "why", "finds": "finds"}, finds)
+            )
+        write("<h3>Pairs</h3>" + "".join(pictures.whole(self._whole)) + "</details>\n")
+
+    def write(self, path: Path, skipped: list[dict[str, Any]]) -> None:
+        """Writes the page. The file is complete whenever it can be read.
+
+        Args:
+            path: The file, .html.
+            skipped: The rows of skipped.csv.
+
+        Raises:
+            OSError: It cannot be written.
+        """
+        rows = [{**row, "plot": _Html(f'<a href="#{_safe(row["plot"])}">{_safe(row["plot"])}</a>')} for row in self._rows]
+        with replacing(path) as encoded:
+            file = codecs.getwriter("utf-8")(encoded)
+            file.write('<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>Stalks</title>')
+            file.write(f'<meta name="viewport" content="width=device-width"><style>{STYLE}</style></head><body>')
+            file.write("<h1>Stalks: what was counted and measured</h1>")
+            file.write("".join(f"<p>{_safe(line)}</p>" for line in self._about))
+            file.write("<h2>Plots</h2><p>Click on a column to sort by it, and on a plot to see its stalks.</p>")
+            file.write(table(_PLOT_COLUMNS, rows))
+            if skipped:
+                columns = {"plot": "plot", "pair": "pair", "why": "why"}
+                file.write(f"<h2>Pairs that were skipped: {len(skipped)}</h2>" + table(columns, skipped))
+            file.write("<h2>Plot by plot</h2>")
+            self._file.seek(0)
+            shutil.copyfileobj(self._file, file)
+            file.write(f"<script>{SCRIPT}</script></body></html>\n")
+
+
+class _Html(str):
+    """Text that is HTML already."""
+
+
+def _safe(value: Any) -> str:
+    return html.escape(str(value))
+
+
+def _headline(row: dict[str, Any]) -> str:
+    parts = [f"{row['stalks']} stalks"] if row["stalks"] != "" else []
+    where = "" if row["flag"] == NO_GROUND else " at 12 inches"
+    parts += [f"{float(row['width_mean_mm']):.1f} mm thick{where}"] if row["width_mean_mm"] != "" else []
+    return ", ".join([*parts, *([] if row["flag"] == "ok" else [str(row["flag"])])])
+
+
+def _grouped(reasons: Counter[str]) -> Counter[str]:
+    """Reasons, with those together that differ in a distance only."""
+    groups: Counter[str] = Counter()
+    for reason, count in reasons.items():
+        groups["it stands too near or too far away" if reason.startswith("it stands ") else reason] += count
+    return groups
+
+
+def table(columns: dict[str, str], rows: Iterable[dict[str, Any]]) -> str:
+    """A sortable table as HTML.
+
+    Args:
+        columns: Title of each column, by its name in the rows.
+        rows: Their values; a flag that is not ``ok`` is marked.
+    """
+    head = "".join(
+        f'<th aria-sort="none"><button>{_safe(title)}</button></th>' if title else "<th></th>" for title in columns.values()
+    )
+    lines = []
+    for row in rows:
+        cells = []
+        for column in columns:
+            value = row.get(column, "")
+            if column in _DIGITS and value != "":
+                value = f"{float(value):.{_DIGITS[column]}f}"
+            kind = ' class="doubt"' if column == "flag" and value != "ok" else ""
+            cells.append(f"<td{kind}>{value if isinstance(value, _Html) else _safe(value)}</td>")
+        lines.append(f"<tr>{''.join(cells)}</tr>")
+    return f"<div class=wide><table><thead><tr>{head}</tr></thead><tbody>{''.join(lines)}</tbody></table></div>"
+
+
+class _Pictures:
+    """Pictures of a plot, cut out of its overlays; one overlay is in memory at a time."""
+
+    def __init__(self, folder: Path, plot: PlotResult) -> None:
+        self._folder, self._plot = folder, plot
+        # The clearest sighting of each track, from pair to pair, so that each overlay is read once.
+        wanted: dict[int, list[tuple[int, int]]] = {}
+        for place, track in enumerate(plot.tracks):
+            frame, sighting = max(track.sightings, key=lambda indices: self._clear(*indices))
+            wanted.setdefault(frame, []).append((place, sighting))
+        self._found: dict[int, _Html] = {}
+        for frame, tracks in wanted.items():
+            overlay = read_image(folder / file_name(f"{plot.pairs[frame]}.png"))
+            for place, sighting in tracks:
+                name = f"pair {plot.pairs[frame]}"
+                self._found[place] = picture(self._crop(overlay, plot.frames[frame][sighting]), name, "stalk")
+
+    def _clear(self, frame: int, sighting: int) -> tuple[bool, float]:
+        chosen = self._plot.frames[frame][sighting]
+        return chosen.diameter_mm is not None, chosen.confidence
+
+    def _crop(self, overlay: np.ndarray, sighting: Sighting) -> np.ndarray:
+        scale = overlay_scale(self._plot.image_width)
+        left, top, right, bottom = (round(edge * scale) for edge in sighting.box)
+        beside = max((bottom - top) // 2, 12)
+        top, bottom = max(top - beside // 2, 0), min(bottom + beside // 4, overlay.shape[0])
+        left, right = max(left - beside, 0), min(right + beside, overlay.shape[1])
+        cut = overlay[top:bottom, left:right]
+        shrink = min(240 / max(cut.shape[0], 1), 1.0)
+        return (
+            cv2.resize(cut, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+            if cut.size
+            else np.zeros((8, 8, 3), np.uint8)
+        )
+
+    def of(self, track: Track) -> _Html:
+        """The picture of a track."""
+        return self._found[next(place for place, other in enumerate(self._plot.tracks) if other is track)]
+
+    def whole(self, most: int) -> Iterable[str]:
+        """Pictures of whole pairs, spread over the plot."""
+        pairs = self._plot.pairs
+        for place in np.unique(np.linspace(0, len(pairs) - 1, min(most, len(pairs))).round()).astype(int):
+            overlay = read_image(self._folder / file_name(f"{pairs[place]}.png"))
+            shrink = min(_THUMB / overlay.shape[1], 1.0)
+            small = cv2.resize(overlay, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+            name = f"pair {pairs[place]}"
+            yield f"<figure>{picture(small, name, 'pair')}<figcaption>{_safe(name)}</figcaption></figure>"
+
+
+def picture(image: np.ndarray, name: str, kind: str) -> _Html:
+    """An image [H, W, 3] uint8 as HTML, with the image itself in it."""
+    _, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 75])
+    source = base64.b64encode(data.tobytes()).decode()
+    return _Html(
+        f'<img class="{kind}" loading="lazy" alt="{_safe(name)}" title="{_safe(name)}" src="data:image/jpeg;base64,{source}">'
+    )
+
+
+def _chart(plot: PlotResult, rejected: list[Track]) -> str:
+    """Widths along the row, with their standard errors, and where something was rejected, as SVG."""
+    points = [
+        (float(row["position_m"]), float(row["width_mm"]), float(row["width_se_mm"] or 0), row)
+        for row in plot.stalks
+        if row["width_mm"] != ""
+    ]
+    if not points:
+        return ""
+    places = [point[0] for point in points] + [track.position_m - plot.start for track in rejected]
+    low, high = min(places) - 0.05, max(places) + 0.05
+    most = 1.1 * max(point[1] + point[2] for point in points)
+    wide, tall, margin = 900, 240, 44
+
+    def x(place: float) -> float:
+        return margin + (place - low) / (high - low) * (wide - margin - 8)
+
+    def y(width: float) -> float:
+        return tall - 30 - width / most * (tall - 40)
+
+    marks = []
+    step = 5 if most < 40 else 10
+    for value in range(0, int(most) + 1, step):
+        marks.append(f'<line class="grid" x1="{margin}" x2="{wide - 8}" y1="{y(value):.1f}" y2="{y(value):.1f}"/>')
+        marks.append(f'<text x="{margin - 6}" y="{y(value) + 4:.1f}" text-anchor="end">{value}</text>')
+    apart = 0.25 if high - low > 1.0 else 0.1
+    for number in range(math.ceil(low / apart), math.floor(high / apart) + 1):
+        tick = number * apart
+        marks.append(f'<text x="{x(tick):.1f}" y="{tall - 12}" text-anchor="middle">{tick:.2f}</text>')
+    for track in rejected:
+        place = f'x="{x(track.position_m - plot.start):.1f}" y="{tall - 32}"'
+        marks.append(f'<text class="no" {place} text-anchor="middle">×<title>{_safe(track.reason)}</title></text>')
+    for place, width, error, row in points:
+        kind = "good" if row["flag"] == "ok" else "doubt"
+        ends = f'y1="{y(width - error):.1f}" y2="{y(width + error):.1f}"'
+        title = f"stalk {row['stalk']}: {row['width_mm']} ± {row['width_se_mm']} mm, {row['flag']}"
+        marks.append(f'<line class="{kind}" x1="{x(place):.1f}" x2="{x(place):.1f}" {ends}/>')
+        marks.append(
+            f'<circle class="{kind}" cx="{x(place):.1f}" cy="{y(width):.1f}" r="4"><title>{_safe(title)}</title></circle>'
+        )
+    caption = "Width in mm along the row in m. Orange: look at its flag. ×: rejected."
+    return (
+        f'<figure><svg viewBox="0 0 {wide} {tall}" role="img">{"".join(marks)}</svg><figcaption>{caption}</figcaption></figure>'
+    )

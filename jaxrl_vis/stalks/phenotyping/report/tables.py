@@ -1,0 +1,190 @@
+"""Tables of plots: one row per stalk, one row per plot, tidy, with units in the header."""
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxrl_vis.files import write_atomically
+from jaxrl_vis.spreadsheets import to_csv
+from jaxrl_vis.stalks.phenotyping.track.follow import Path as Driven
+from jaxrl_vis.stalks.phenotyping.track.follow import Track
+from jaxrl_vis.stalks.phenotyping.track.heights import StalkWidths, stalk_widths
+from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting
+
+STALK_COLUMNS = (
+    "plot",
+    "stalk",
+    "position_m",
+    "depth_m",
+    "width_mm",
+    "width_se_mm",
+    "height_in",
+    "width_24in_mm",
+    "width_24in_se_mm",
+    "taper_mm_per_in",
+    "lean_deg",
+    "frames",
+    "frames_measured",
+    "confidence",
+    "flag",
+    "method",
+    "version",
+)
+PLOT_COLUMNS = (
+    "plot",
+    "pairs",
+    "pairs_skipped",
+    "length_m",
+    "stalks",
+    "stalks_per_m",
+    "width_mean_mm",
+    "width_sd_mm",
+    "width_se_mm",
+    "width_24in_mean_mm",
+    "taper_mean_mm_per_in",
+    "stalks_measured",
+    "flag",
+    "method",
+    "version",
+)
+Row = dict[str, Any]
+_MAX_ERROR = 0.08  # of a width: what its pairs disagree about by more is no measurement
+NO_GROUND = "no visible ground"
+"""Flag of widths at a height that is not known."""
+NO_WIDTHS = "no widths"
+"""Flag of a plot whose stalks were counted, but none of them measured."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Origin:
+    """Values of every row: plot, method of the widths and version of the software."""
+
+    plot: str
+    method: str
+    version: str
+
+
+def plot_rows(
+    frames: list[list[Sighting]], tracks: list[Track], path: Driven, skipped: int, origin: Origin
+) -> tuple[list[Row], Row]:
+    """Rows of the stalks of one plot, from its beginning to its end, and the plot's own row."""
+    stalks: list[Row] = []
+    counted = [track for track in tracks if track.counted]
+    for track, widths in zip(counted, stalk_widths(frames, counted)):
+        sightings = [frames[frame][place] for frame, place in track.sightings]
+        leans = [sighting.lean_deg for sighting in sightings if sighting.lean_deg is not None]
+        confidence = float(np.median([sighting.confidence for sighting in sightings]))
+        lower, upper = widths.lower, widths.upper
+        stalks.append(
+            {
+                "plot": origin.plot,
+                "stalk": len(stalks) + 1,
+                "position_m": _text(track.position_m - path.places[0], 4),
+                "depth_m": _text(track.depth_m, 4),
+                "width_mm": "" if lower is None else _text(lower.mm, 3),
+                "width_se_mm": "" if lower is None else _text(lower.error, 3),
+                "height_in": 12 if widths.height_known else "",
+                "width_24in_mm": "" if upper is None else _text(upper.mm, 3),
+                "width_24in_se_mm": "" if upper is None else _text(upper.error, 3),
+                "taper_mm_per_in": "" if widths.taper is None else _text(widths.taper, 3),
+                "lean_deg": _text(float(np.median(leans)), 1) if leans else "",
+                "frames": len(sightings),
+                "frames_measured": 0 if lower is None else lower.count,
+                "confidence": _text(confidence, 3),
+                "flag": _flag(widths, confidence),
+                "method": origin.method,
+                "version": origin.version,
+            }
+        )
+    return stalks, _plot_row(stalks, len(frames), path.length, skipped, origin)
+
+
+def _flag(widths: StalkWidths, confidence: float) -> str:
+    """Return the flag of a stalk: what a reader should know before trusting its width; ``ok`` if nothing."""
+    if widths.lower is None:
+        return "no width"
+    if not widths.height_known:
+        return NO_GROUND
+    if widths.lower.count < 3:
+        return "few frames"
+    if confidence < 0.3 or widths.lower.error > _MAX_ERROR * widths.lower.mm:
+        return "uncertain"
+    return "corrected for taper" if widths.lower.corrected else "ok"
+
+
+def _plot_row(stalks: list[Row], pairs: int, length: float, skipped: int, origin: Origin) -> Row:
+    widths = np.array([float(row["width_mm"]) for row in stalks if row["width_mm"] != ""])
+    unknown = [row for row in stalks if row["flag"] == NO_GROUND]
+    if not stalks:
+        flag = "no stalks"
+    elif not widths.size:
+        flag = NO_WIDTHS
+    elif skipped:
+        flag = "pairs skipped"
+    else:
+        flag = NO_GROUND if len(unknown) > len(stalks) / 2 else "ok"
+    return {
+        "plot": origin.plot,
+        "pairs": pairs,
+        "pairs_skipped": skipped,
+        "length_m": _text(length, 4),
+        "stalks": len(stalks),
+        "stalks_per_m": _text(len(stalks) / length, 3) if length > 0 else "",
+        **_widths(widths),
+        **_higher(stalks),
+        "flag": flag,
+        "method": origin.method,
+        "version": origin.version,
+    }
+
+
+def rows_without_path(frames: list[list[Sighting]], skipped: int, origin: Origin, why: str) -> tuple[list[Row], Row]:
+    """The plot's row where pairs cannot be put together: widths of detections, but no count. There are no rows of stalks."""
+    measured = [sighting.diameter_mm for sightings in frames for sighting in sightings if sighting.diameter_mm is not None]
+    row = {
+        "plot": origin.plot,
+        "pairs": len(frames),
+        "pairs_skipped": skipped,
+        "length_m": "",
+        "stalks": "",
+        "stalks_per_m": "",
+        **_widths(np.array(measured)),
+        "flag": why,
+        "method": origin.method,
+        "version": origin.version,
+    }
+    # The same stalk is seen many times: a standard error would claim too much.
+    return [], {**row, "width_se_mm": "", "width_24in_mean_mm": "", "taper_mean_mm_per_in": "", "stalks_measured": ""}
+
+
+def _higher(stalks: list[Row]) -> Row:
+    """Means over the stalks that were measured at 24 inches, too."""
+    means = {"width_24in_mean_mm": "width_24in_mm", "taper_mean_mm_per_in": "taper_mm_per_in"}
+    values = {name: [float(row[column]) for row in stalks if row[column] != ""] for name, column in means.items()}
+    return {name: _text(float(np.mean(numbers)), 3) if numbers else "" for name, numbers in values.items()}
+
+
+def _widths(widths: np.ndarray) -> Row:
+    spread = float(widths.std(ddof=1)) if widths.size > 1 else math.nan
+    return {
+        "width_mean_mm": _text(float(widths.mean()), 3) if widths.size else "",
+        "width_sd_mm": _text(spread, 3),
+        "width_se_mm": _text(spread / math.sqrt(widths.size), 3) if widths.size else "",
+        "stalks_measured": widths.size,
+    }
+
+
+def _text(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}" if math.isfinite(value) else ""
+
+
+def write_rows(path: Path, columns: tuple[str, ...], rows: list[Row]) -> None:
+    """Writes a table as CSV. The file is complete whenever it can be read.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    write_atomically(path, to_csv(rows, columns))

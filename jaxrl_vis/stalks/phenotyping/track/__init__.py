@@ -1,0 +1,1 @@
+"""Sightings of stalks, followed from pair to pair along a plot."""

@@ -1,0 +1,206 @@
+"""The same image, differently lit, leaning, mirrored: what the networks must not depend on."""
+
+import jax
+import jax.numpy as jnp
+
+from jaxrl_vis.stalks.phenotyping.detector.losses import NOTHING
+
+_WELL_ROOT = 94.9  # square root of the electrons of a white pixel of the synthetic cameras
+_DARK = 0.016  # light that makes as much noise as the sensor does by itself, of white
+_TAPS = 3  # pixels: reach of the blur
+
+
+def relight(images: jax.Array, key: jax.Array) -> jax.Array:
+    """Images [N, H, W, 3] uint8 as taken with other light, lens, sensor and tone curve, uint8.
+
+    Light, blur and noise act where they do in a camera: on linear values, before what is negative or beyond white is cut off.
+    """
+    names = ("gain", "gamma", "colour", "grey", "noise", "level", "blotch", "strength", "blur", "sharp")
+    keys: dict[str, jax.Array] = dict(zip(names, jax.random.split(key, len(names))))
+    count = images.shape[0]
+
+    def each(name: str, low: float, high: float) -> jax.Array:
+        return jax.random.uniform(keys[name], (count, 1, 1, 1), minval=low, maxval=high)
+
+    values = (images.astype(jnp.float32) / 255.0) ** 2.2
+    grey = values.mean(axis=-1, keepdims=True)
+    values = jnp.maximum(grey + (values - grey) * each("grey", 0.2, 1.5), 0.0)
+    gain = jnp.exp(each("gain", -1.2, 1.0)) * jnp.exp(0.2 * jax.random.normal(keys["colour"], (count, 1, 1, 3)))
+    # Blotches of brightness, as of other textures, a few pixels to a tenth of the image large.
+    coarse = jax.random.normal(keys["blotch"], (count, 24, 24, 1))
+    gain = gain * jnp.exp(each("strength", 0.0, 0.3) * jax.image.resize(coarse, (*images.shape[:3], 1), "linear"))
+    values = _blurred(values * gain, jnp.where(each("sharp", 0.0, 1.0) > 0.5, each("blur", 0.3, 1.3), 0.05))
+    # Up to three times the shot and read noise that is there already, less where the image is reduced.
+    level = 3.0 * each("level", 0.0, 1.0) ** 2 / _WELL_ROOT
+    values = values + level * jnp.sqrt(values + _DARK) * jax.random.normal(keys["noise"], values.shape)
+    curve = jnp.exp(0.15 * jax.random.normal(keys["gamma"], (count, 1, 1, 1))) / 2.2
+    return jnp.round(255.0 * jnp.clip(values, 0.0, 1.0) ** curve).astype(jnp.uint8)
+
+
+def _blurred(values: jax.Array, deviation: jax.Array) -> jax.Array:
+    """Values [N, H, W, C] seen through a lens whose point spread is a normal one, ``deviation`` [N, 1, 1, 1] pixels wide."""
+    taps = jnp.exp(-0.5 * (jnp.arange(-_TAPS, _TAPS + 1) / deviation) ** 2)  # [N, 1, 1, taps]
+    taps = taps / taps.sum(axis=-1, keepdims=True)
+    for axis in (1, 2):
+        padding = [(_TAPS, _TAPS) if place == axis else (0, 0) for place in range(4)]
+        padded, size = jnp.pad(values, padding, mode="edge"), values.shape[axis]
+        parts = [jax.lax.slice_in_dim(padded, k, k + size, axis=axis) * taps[..., k : k + 1] for k in range(2 * _TAPS + 1)]
+        values = sum(parts[1:], parts[0])
+    return values
+
+
+def move(
+    images: jax.Array, stalks: jax.Array, kinds: jax.Array, shape: tuple[int, int], key: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Images mirrored, sheared, stretched and shifted, with their stalks; a quarter of them is only mirrored.
+
+    Args:
+        images: [N, H, W, 3] uint8, padded below and on the right.
+        stalks: [N, T, 6].
+        kinds: [N, T] int32.
+        shape: Lines and columns of the images without what was added.
+        key: For the random numbers.
+    """
+    keys = jax.random.split(key, images.shape[0])
+    return jax.vmap(lambda image, stalk, kind, key: _moved(image, stalk, kind, shape, key))(images, stalks, kinds, keys)
+
+
+def _moved(image: jax.Array, stalks: jax.Array, kinds: jax.Array, shape: tuple[int, int], key: jax.Array):
+    drawn = jax.random.uniform(key, (7,), minval=-1.0, maxval=1.0)
+    height, width = shape
+    still = drawn[0] > 0.5
+    wide, tall = (jnp.where(still, 1.0, jnp.exp(0.12 * factor)) for factor in drawn[1:3])
+    # Stalks of other fields lean by up to 20 degrees.
+    shear = jnp.where(still, 0.0, 0.3 * drawn[3])
+    over, down = jnp.where(still, 0.0, 0.04 * width * drawn[4]), jnp.where(still, 0.0, 0.04 * height * drawn[5])
+    mirror = drawn[6] > 0.0
+    # x' = wide (x - w/2) + shear (y - h/2) + w/2 + over, and then mirrored; y' = tall (y - h/2) + h/2 + down.
+    line, column = jnp.meshgrid(jnp.arange(image.shape[0]) + 0.5, jnp.arange(image.shape[1]) + 0.5, indexing="ij")
+    column = jnp.where(mirror, width - column, column)
+    y = (line - down - height / 2) / tall + height / 2
+    x = (column - over - width / 2 - shear * (y - height / 2)) / wide + width / 2
+    moved = _sample(image, y - 0.5, x - 0.5, shape)
+
+    def across(x: jax.Array, y: jax.Array) -> jax.Array:
+        return wide * (x - width / 2) + shear * (y - height / 2) + width / 2 + over
+
+    left, top, right, bottom, above, below = stalks.T
+    first, last = jnp.minimum(above, below), jnp.maximum(above, below)
+    above, below = across(above, top), across(below, bottom)
+    begin = jnp.minimum(above, below) + wide * (left - first)
+    end = jnp.maximum(above, below) + wide * (right - last)
+    top, bottom = (tall * (edge - height / 2) + height / 2 + down for edge in (top, bottom))
+    begin, end = jnp.where(mirror, width - end, begin), jnp.where(mirror, width - begin, end)
+    above, below = (jnp.where(mirror, width - column, column) for column in (above, below))
+    # The axis goes on beyond what the image's edges leave of the box.
+    begin, end = jnp.clip(begin, 0.0, width), jnp.clip(end, 0.0, width)
+    low, high = jnp.clip(top, 0.0, height), jnp.clip(bottom, 0.0, height)
+    slope = (below - above) / jnp.maximum(bottom - top, 1.0)
+    above, below = above + slope * (low - top), below + slope * (high - bottom)
+    kinds = jnp.where((end - begin < 3.0) | (high - low < 16.0), NOTHING, kinds)
+    return moved, jnp.stack([begin, low, end, high, above, below], axis=-1), kinds
+
+
+def _sample(image: jax.Array, line: jax.Array, column: jax.Array, shape: tuple[int, int]) -> jax.Array:
+    """An image at other places, by bilinear interpolation; black beyond ``shape``."""
+    inside = (line >= -0.5) & (line <= shape[0] - 0.5) & (column >= -0.5) & (column <= shape[1] - 0.5)
+    line, column = jnp.clip(line, 0.0, shape[0] - 1.0), jnp.clip(column, 0.0, shape[1] - 1.0)
+    top, left = jnp.floor(line).astype(jnp.int32), jnp.floor(column).astype(jnp.int32)
+    down, over = (line - top)[..., None], (column - left)[..., None]
+    below, beside = jnp.minimum(top + 1, shape[0] - 1), jnp.minimum(left + 1, shape[1] - 1)
+    values = image.astype(jnp.float32)
+    upper = values[top, left] * (1 - over) + values[top, beside] * over
+    lower = values[below, left] * (1 - over) + values[below, beside] * over
+    return jnp.round((upper * (1 - down) + lower * down) * inside[..., None]).astype(jnp.uint8)
+
+
+def vary_snips(snips: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Snips [N, H, W, 3] uint8 and masks [N, H, W] bool: relit, with other textures and widths, and half of them mirrored."""
+    light, side, marks, size, contrast, along = jax.random.split(key, 6)
+    snips, masks = _stretched(snips, masks, size)
+    snips = _striped(_set_off(_textured(snips, marks), masks, contrast), masks, along)
+    mirror = jax.random.bernoulli(side, 0.5, (snips.shape[0],))
+    snips = jnp.where(mirror[:, None, None, None], snips[:, :, ::-1], snips)
+    masks = jnp.where(mirror[:, None, None], masks[:, :, ::-1], masks)
+    return relight(snips, light), masks
+
+
+def _stretched(snips: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Snips and masks wider or narrower by up to a third, about their middle."""
+    count, _, width = snips.shape[:3]
+    wider = jnp.exp(jax.random.uniform(key, (count,), minval=-0.3, maxval=0.3))
+    place = (jnp.arange(width) + 0.5 - width / 2) / wider[:, None] + width / 2 - 0.5  # [N, W], where a column comes from
+    place = jnp.clip(place, 0.0, width - 1.0)
+    left = jnp.minimum(jnp.floor(place).astype(jnp.int32), width - 2)
+    share = (place - left)[:, None, :]
+
+    def columns(values: jax.Array, at: jax.Array) -> jax.Array:
+        return jnp.take_along_axis(values, at.reshape(count, 1, width, *(1,) * (values.ndim - 3)), axis=2)
+
+    values = snips.astype(jnp.float32)
+    mixed = columns(values, left) * (1 - share[..., None]) + columns(values, left + 1) * share[..., None]
+    inside = masks.astype(jnp.float32)
+    return jnp.round(mixed).astype(jnp.uint8), columns(inside, left) * (1 - share) + columns(inside, left + 1) * share >= 0.5
+
+
+def _textured(snips: jax.Array, key: jax.Array) -> jax.Array:
+    """Snips with speckles, fibres along the stalk and dark sides: the textures of a family are not all that there are."""
+    count, height, width = snips.shape[:3]
+    spots, fibres, shades, amounts = jax.random.split(key, 4)
+    amount = jax.random.uniform(amounts, (4, count, 1, 1))
+
+    def noise(key: jax.Array, lines: int, columns: int) -> jax.Array:
+        shape = (count, max(height // lines, 1), max(width // columns, 1))
+        return jax.image.resize(jax.random.normal(key, shape), (count, height, width), "linear")
+
+    dark = jnp.where(noise(spots, 6, 3) > 2.2 - 1.4 * amount[0], 1.0 - 0.6 * amount[1], 1.0)
+    grain = jnp.exp(0.25 * amount[2] * noise(fibres, 160, 2) + 0.35 * amount[3] * noise(shades, 80, 10))
+    return jnp.round(jnp.clip(snips * (dark * grain)[..., None], 0.0, 255.0)).astype(jnp.uint8)
+
+
+def _striped(snips: jax.Array, masks: jax.Array, key: jax.Array) -> jax.Array:
+    """Snips of which most have stalks with lighter and darker stripes along them, as of ribs and folded sheaths, which change
+    from node to node.
+
+    A dark stripe looks like a gap between two stalks, and what lies beyond it like another one; but it ends with the stalk.
+    """
+    count, height, width = snips.shape[:3]
+    keys = jax.random.split(key, 5)
+    # Internodes: which of four each line belongs to.
+    nodes = jnp.sort(jax.random.uniform(keys[0], (3, count)), axis=0) * height
+    internode = (jnp.arange(height) > nodes[..., None]).sum(axis=0)  # [N, lines]
+    stripes = jnp.zeros(masks.shape)
+    weights = jax.nn.softmax(2.0 * jax.random.normal(keys[1], (2, count)), axis=0)
+    for place, (columns, weight) in enumerate(zip((5, 12), weights)):
+        drawn = jax.random.normal(keys[2 + place], (count, 4, max(width // columns, 2)))
+        across = jax.image.resize(drawn, (count, 4, width), "linear")
+        stripes += weight[:, None, None] * jnp.take_along_axis(across, internode[..., None], axis=1)
+    amount, chance = jax.random.uniform(keys[4], (2, count, 1, 1))
+    factor = jnp.where(masks & (chance < 0.7), jnp.exp(amount * jnp.tanh(4.0 * stripes)), 1.0)
+    return jnp.round(jnp.clip(snips * factor[..., None], 0.0, 255.0)).astype(jnp.uint8)
+
+
+def _set_off(snips: jax.Array, masks: jax.Array, key: jax.Array) -> jax.Array:
+    """Snips whose stalks differ more or less from what is behind them, and are darker towards their edges.
+
+    How quickly a round stalk darkens towards its edges depends on its surface and on the light. A network that learns it by
+    heart puts the edges of other stalks too far in or out. What is black stays black: no edge is drawn where none is seen.
+    """
+    count, _, width = snips.shape[:3]
+    keys = jax.random.split(key, 6)
+    inside = masks.astype(jnp.float32)
+    own = jnp.exp(0.3 * jax.random.normal(keys[0], (count, 1, 1, 1)) + 0.15 * jax.random.normal(keys[1], (count, 1, 1, 3)))
+    # Share of the stalk in what lies beside each pixel of it: 1 in its middle, about a half at its edges.
+    share = jnp.zeros_like(inside)
+    weights = jax.nn.softmax(2.0 * jax.random.normal(keys[2], (3, count)), axis=0)
+    for reach, weight in zip((4, 8, 16), weights):
+        reach = min(reach, (width - 1) // 2)
+        sums = jax.lax.reduce_window(inside, 0.0, jax.lax.add, (1, 1, 2 * reach + 1), (1, 1, 1), "SAME")
+        share += weight[:, None, None] * sums / (2 * reach + 1)
+    amount = jax.random.uniform(keys[3], (count, 1, 1), minval=-0.3, maxval=0.8)
+    power = jnp.exp(0.4 * jax.random.normal(keys[4], (count, 1, 1)))
+    shade = 1.0 - amount * jnp.clip(2.0 * (1.0 - share), 0.0, 1.0) ** power
+    # Half of them stay as they are: their own contrast is all that a network has to go by elsewhere.
+    changed = jax.random.bernoulli(keys[5], 0.5, (count, 1, 1, 1)) & masks[..., None]
+    factor = jnp.where(changed, own * shade[..., None], 1.0)
+    return jnp.round(jnp.clip(snips * factor, 0.0, 255.0)).astype(jnp.uint8)

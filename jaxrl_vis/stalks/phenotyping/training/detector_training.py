@@ -1,0 +1,176 @@
+"""The optimisation of both networks, for a number of steps or of minutes, whichever ends first.
+
+Examples are made by threads while the networks already learn from those that are there, so that an accelerator does not wait.
+"""
+
+import dataclasses
+import functools
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, initial, padded_shape
+from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
+from jaxrl_vis.stalks.phenotyping.detector.losses import detector_loss, segmenter_loss
+from jaxrl_vis.stalks.phenotyping.training.augment import move, relight, vary_snips
+from jaxrl_vis.stalks.phenotyping.training.examples import Example
+from jaxrl_vis.stalks.phenotyping.training.pool import Pool
+from jaxrl_vis.stalks.phenotyping.training.updates import Report, repeat
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """Schedule of the networks' training.
+
+    Attributes:
+        steps: Most updates.
+        minutes: Most minutes of updates, compilation included; None for no limit.
+        images: Number of images to learn from.
+        first: With how many the updates begin.
+        batch: Images per update.
+        snips: Snips per update.
+        rate: Highest learning rate.
+        average: Average of the weights over updates: the share of the old ones.
+        seed: Seed of everything random.
+    """
+
+    steps: int = 20_000
+    minutes: float | None = None
+    images: int = 800
+    first: int = 24
+    batch: int = 8
+    snips: int = 32
+    rate: float = 1e-3
+    average: float = 0.998
+    seed: int = 0
+
+
+class _Pool(Pool[Example]):
+    """Examples of images and of snips, drawn from at random."""
+
+    def __init__(self, sources: list[Iterator[Example]], plan: Plan) -> None:
+        self._plan = plan
+        self.snips: list[tuple[int, int]] = []
+        super().__init__(sources, plan.images)
+
+    def add(self, example: Example) -> None:
+        """Keeps an example and its snips."""
+        self.snips += [(len(self.examples), place) for place in range(len(example.snips))]
+        super().add(example)
+
+    def images(self, rng: np.random.Generator, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """A batch of images, padded to ``shape``, with their stalks and kinds."""
+        chosen = [self.examples[place] for place in rng.integers(len(self.examples), size=self._plan.batch)]
+        images = np.zeros((len(chosen), *shape, 3), np.uint8)
+        for image, example in zip(images, chosen):
+            image[: example.image.shape[0], : example.image.shape[1]] = example.image
+        return images, np.stack([example.stalks for example in chosen]), np.stack([example.kinds for example in chosen])
+
+    def strips(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray] | None:
+        """A batch of snips with their masks; None where there are no snips yet."""
+        if not self.snips:
+            return None
+        chosen = [self.snips[place] for place in rng.integers(len(self.snips), size=self._plan.snips)]
+        # All of one size: in a folder of images of several, those that are as large as the first one.
+        shape = self.examples[chosen[0][0]].snips.shape[1:3]
+        chosen = [place if self.examples[place[0]].snips.shape[1:3] == shape else chosen[0] for place in chosen]
+        return (
+            np.stack([self.examples[image].snips[place] for image, place in chosen]),
+            np.stack([self.examples[image].masks[place] for image, place in chosen]),
+        )
+
+
+@functools.partial(jax.jit, static_argnames=("settings", "shape", "dtype"), donate_argnums=0)
+def _update(
+    state: Any, batch: Any, key: jax.Array, rates: tuple[jax.Array, jax.Array], settings: Settings, shape: Any, dtype: Any
+):
+    """One update of both networks: parameters, their average, and the optimiser's state."""
+    params, average, moments = state
+    rate, share = rates
+    (images, stalks, kinds), (snips, masks) = batch
+    places, light, near, strips = jax.random.split(key, 4)
+    images, stalks, kinds = move(images, stalks, kinds, shape, places)
+    images = relight(images, light)
+    snips, masks = vary_snips(snips, masks, strips)
+
+    def loss(params):
+        total, parts = detector_loss(params["detector"], images, stalks, kinds, settings, dtype, near)
+        of_masks = segmenter_loss(params["segmenter"], snips, masks, settings, dtype)
+        return total + of_masks, {**parts, "masks": of_masks}
+
+    gradients, parts = jax.grad(loss, has_aux=True)(params)
+    updates, moments = _optimiser().update(gradients, moments, params)
+    params = jax.tree.map(lambda old, change: old + rate * change, params, updates)
+    average = jax.tree.map(lambda old, new: share * old + (1.0 - share) * new, average, params)
+    return (params, average, moments), parts
+
+
+@jax.jit
+def _beginning(params: Any) -> tuple[Any, Any]:
+    """The average of parameters before the first update, and the optimiser's state."""
+    return jax.tree.map(jnp.copy, params), _optimiser().init(params)  # a donated buffer must not appear twice
+
+
+def _optimiser() -> optax.GradientTransformation:
+    # The rate is applied outside, as it follows the clock.
+    return optax.chain(optax.clip_by_global_norm(5.0), optax.adamw(1.0, weight_decay=1e-4))
+
+
+def train(
+    sources: list[Iterator[Example]], settings: Settings, plan: Plan, report: Report, every: float = 30.0, start: Any = None
+) -> tuple[Any, int]:
+    """Trains the networks.
+
+    Args:
+        sources: Iterators over examples; each is read by a thread of its own.
+        settings: Settings of the networks.
+        plan: Schedule.
+        report: See `Report`.
+        every: Interval of reports, s.
+        start: Parameters to go on from, as they are returned; None: random ones.
+
+    Returns:
+        Parameters with ``detector`` and ``segmenter``, and the number of updates.
+
+    Raises:
+        NonFiniteError: A loss is not finite any more.
+        RequestError: The time was over before the first update.
+    """
+    started = time.monotonic()
+    rng = np.random.default_rng(plan.seed)
+    root = jax.random.key(plan.seed)
+    dtype = jnp.bfloat16 if jax.default_backend() in ("gpu", "tpu") else jnp.float32
+    pool = _Pool(sources, plan)
+    detector_key, segmenter_key, steps_key = jax.random.split(root, 3)
+    if start is None:
+        blank = jax.ShapeDtypeStruct((1, 32, 32, 3), jnp.float32)
+        params = {
+            "detector": initial(settings, detector_key),
+            "segmenter": Segmenter(settings.segmenter).lazy_init(segmenter_key, blank),
+        }
+    else:
+        params = jax.tree.map(lambda leaf: jnp.array(leaf, jnp.float32), start)
+    state = params, *_beginning(params)
+
+    def update(step: int, rates: tuple[jax.Array, jax.Array]) -> tuple[dict[str, jax.Array], Any] | None:
+        nonlocal state
+        strips = pool.strips(rng)
+        if strips is None:
+            return None
+        batch, key = (pool.images(rng, whole), strips), jax.random.fold_in(steps_key, step)
+        state, parts = _update(state, batch, key, rates, settings, shape, dtype)
+        return parts, state[1]
+
+    try:
+        pool.fill(plan.first)
+        shape = pool.examples[0].image.shape[:2]
+        whole = padded_shape(tuple(np.max([example.image.shape[:2] for example in pool.examples], axis=0)))
+        step = repeat(update, pool, plan, started, report, every)
+    finally:
+        pool.close()
+    return state[1], step

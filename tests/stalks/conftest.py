@@ -1,0 +1,23 @@
+"""Fixtures of the farm's tests."""
+
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def plots(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Small synthetic plots with true masks."""
+    from phenotype_plots import write_plots
+
+    return write_plots(tmp_path_factory.mktemp("phenotype"))
+
+
+@pytest.fixture(scope="session")
+def results(plots: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What `phenotype run` makes of them."""
+    from phenotype_plots import run
+
+    out = tmp_path_factory.mktemp("results") / "out"
+    assert run(plots, out) == 0
+    return out

@@ -1,0 +1,188 @@
+"""The command that counts and measures, on good and on bad input: its tables, its comparison with the truth, its figures."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from phenotype_plots import run, table
+
+from jaxrl_vis import cli
+from jaxrl_vis.stalks.phenotyping.io.images import read_image
+
+
+def test_run_counts_and_measures(plots, results):
+    rows = table(results / "plots.csv")
+    assert [row["plot"] for row in rows] == ["plot_0000", "plot_0001"]
+    stalks = table(results / "stalks.csv")
+    for row in rows:
+        truth = json.loads((plots / row["plot"] / "plot.json").read_text())
+        assert int(row["stalks"]) == truth["count"] and row["flag"] == "ok" and row["pairs"] == "4"
+        assert float(row["stalks_per_m"]) == pytest.approx(truth["count"] / 0.5, rel=0.05)
+        own = [each for each in stalks if each["plot"] == row["plot"]]
+        assert [int(each["stalk"]) for each in own] == list(range(1, truth["count"] + 1))
+        true = [each["diameters"] if "diameters" in each else each["12in"]["diameter_mm"] for each in truth["stalks"]]
+        assert np.mean([float(each["width_mm"]) for each in own]) == pytest.approx(np.mean(true), rel=0.1)
+        assert all(float(each["width_se_mm"]) > 0 and each["method"] == "strip" for each in own)
+    overlay = read_image(results / "overlays" / "plot_0000" / "000.png")
+    assert overlay.shape == (338, 422, 3)
+    assert (results / "skipped.csv").read_text() == "plot,pair,why\n"
+
+
+def test_several_processes_write_the_same(plots, results, tmp_path):
+    """However many look at pairs, and whichever pairs had been looked at before."""
+    out = tmp_path / "out"
+    assert run(plots, out, "--workers", "2") == 0
+    written = sorted(path.relative_to(results) for path in results.rglob("*") if path.is_file())
+    assert written == sorted(path.relative_to(out) for path in out.rglob("*") if path.is_file())
+    same = [path for path in written if path.suffix in (".csv", ".json", ".png")]
+    assert all((out / path).read_bytes() == (results / path).read_bytes() for path in same) and len(same) > 16
+    for lost in ("pairs/plot_0000/001.json", "overlays/plot_0001/002.png", "stalks.csv"):
+        (out / lost).unlink()
+    assert run(plots, out, "--workers", "2") == 0
+    assert all((out / path).read_bytes() == (results / path).read_bytes() for path in same)
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        (["--workers", "0"], "--workers must be at least 1"),
+        (["--least-score", "2"], "--least-score must be from 0 to 1"),
+        (["--speed", "0"], "--speed must be more than 0"),
+        (["--calibration", "missing.yaml"], "there is no calibration"),
+        (["--masks", "network", "--weights", "missing.safetensors"], "cannot read the weights"),
+        (["--weights", "missing.safetensors"], "--masks truth uses no weights: leave out --weights"),
+        (["--speed", "0.05"], "--speed goes with an odometry.csv that holds times"),
+    ],
+)
+def test_wrong_requests_of_run(plots, tmp_path, capsys, words, part):
+    assert run(plots, tmp_path / "out", *words) == 2
+    assert part in capsys.readouterr().err
+
+
+def test_eval_compares_with_the_truth(plots, tmp_path, capsys):
+    spec, out = plots.parent / "few.json", tmp_path / "eval.json"
+    words = ["--spec", str(spec), "--width", "422", "--frames", "4", "--plots", "1", "--masks", "truth", "--json", str(out)]
+    words += ["--thesis"]
+    assert cli.main(["phenotype", "eval", *words]) == 0
+    figures = json.loads(out.read_text())
+    truth = json.loads((plots / "plot_0000" / "plot.json").read_text())
+    assert figures["count_true"] == truth["count"] and figures["count_mae"] == 0.0 and figures["count_r2"] is None
+    assert figures["f1"] > 0.9 and figures["width_mae_mm"] < 2.5 and figures["synthetic"] is True
+    # The thesis's ways on the same finds: ellipses are biased, and its count depends on how many stalks an image shows.
+    assert figures["thesis_width_mae_mm"] < 5 and figures["thesis_count_mae"] >= 0 and figures["width_24in_mae_mm"] is not None
+    assert figures["each"][0]["widths_mm"] and figures["each"][0]["seconds_per_pair"] > 0
+    said = capsys.readouterr().out
+    assert "synthetic plots of family" in said and "count_mae" in said
+
+
+def test_eval_in_two_processes_and_after_a_stop_is_the_same(plots, tmp_path, capsys):
+    small = ["--spec", str(plots.parent / "few.json"), "--width", "211", "--frames", "2", "--masks", "truth"]
+
+    def evaluate(name: str, *words: str) -> dict:
+        assert cli.main(["phenotype", "eval", *small, "--json", str(tmp_path / name), *words]) == 0
+        data = json.loads((tmp_path / name).read_text())
+        for each in (data, *data["each"]):  # times are no figures
+            each.pop("seconds_per_pair")
+            each.pop("workers", None)
+        return data
+
+    both = evaluate("both.json", "--plots", "3", "--workers", "2")
+    assert [each["seed"] for each in both["each"]] == [0, 1, 2] and both["finds"] > 0
+    first = evaluate("one.json", "--plots", "1")
+    assert first["plots"] == 1
+    capsys.readouterr()
+    assert evaluate("one.json", "--plots", "3") == both
+    said = capsys.readouterr().out
+    assert "evaluated before: 1 of 3 plots" in said and "plot 0:" not in said and "plot 2:" in said
+    # What was evaluated under other conditions is neither mixed with nor lost.
+    for words in (["--method", "ellipse"], ["--frames", "3"]):
+        assert cli.main(["phenotype", "eval", *small, "--json", str(tmp_path / "one.json"), *words]) == 2
+        assert "holds records of another evaluation" in capsys.readouterr().err
+    (tmp_path / "other.json").write_text("[]")
+    assert cli.main(["phenotype", "eval", *small, "--json", str(tmp_path / "other.json")]) == 2
+    assert "holds no records to resume" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        (["train", "weights.bin"], "ends in .safetensors"),
+        (["train", "weights.safetensors", "--minutes", "0"], "--minutes must be more than 0"),
+        (["train", "weights.safetensors", "--data", "images", "--width", "422"], "leave out --spec and --width"),
+        (["train", "weights.safetensors", "--data", "images"], "there are no annotations"),
+        (["train", "weights.safetensors", "--batch", "0"], "--batch"),
+        (["eval", "--seed", "-1"], "--seed must be at least 0"),
+        (["eval", "--workers", "0"], "--workers"),
+        (["eval", "--least-score", "2"], "--least-score must be from 0 to 1"),
+        (["eval", "--weights", "missing.safetensors"], "cannot read the weights"),
+        (["eval", "--masks", "truth", "--weights", "w.safetensors"], "leave out --weights"),
+        (["eval", "--spec", "missing.toml"], "missing.toml"),
+    ],
+)
+def test_wrong_requests_of_train_and_eval(tmp_path, monkeypatch, capsys, words, part):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["phenotype", *words]) == 2
+    assert part in capsys.readouterr().err
+
+
+# --- the thesis's ways, and figures ---
+
+
+@pytest.fixture(scope="module")
+def evaluation(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("figures") / "eval.json"
+    plots = [
+        {
+            "seed": seed,
+            "true": 30 + seed,
+            "counted": 31,
+            "pairs": 34,
+            "device": "a laptop",
+            "seconds_per_pair": 0.5,
+            "widths_mm": [[14.2, 14.0 + seed]],
+        }
+        for seed in range(3)
+    ]
+    path.write_text(json.dumps({"synthetic": True, "family": "shifted", "count_r2": 0.5, "each": plots}))
+    return path
+
+
+@pytest.mark.parametrize("figure", ["3.4", "3.5", "table3.1"])
+def test_figures_of_chapter_3(evaluation, tmp_path, figure):
+    out = tmp_path / "new" / ("table.md" if figure == "table3.1" else "figure.png")
+    assert cli.main(["phenotype", "figure", figure, "--out", str(out), "--evaluation", str(evaluation)]) == 0
+    text, rows = out.with_suffix(".md").read_text(), table(out.with_suffix(".csv"))
+    assert "ynthetic" in text and len(rows) == 3
+    if figure == "table3.1":
+        # 34 pairs of half a second; both people's minutes are the thesis's, and say so.
+        assert rows[2]["here, measured"] == "17.0 s" and rows[2]["person 1, quoted"] == "32.33 min"
+        assert "116 times faster" in text and "quoted from Table 3.1" in text
+        assert "synthetic plots of 34 pairs on a laptop" in text
+    else:
+        assert out.read_bytes()[1:4] == b"PNG"
+        assert "thesis" in text
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        (["3.4", "--out", "a.txt"], "3.4 is a file that ends in .png or .pdf or .svg"),
+        (["3.4", "--preset", "cpu"], "unknown option --preset"),
+        (["3.4", "--evaluation", "missing.json"], "cannot read missing.json"),
+        (["3.5", "--evaluation", "missing.json", "--plots", "2"], "leave out --plots and --quick"),
+        (["5.4"], "unknown figure '5.4'"),
+    ],
+)
+def test_wrong_requests_of_figures(tmp_path, monkeypatch, capsys, words, part):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["phenotype", "figure", *words]) == 2
+    assert part in capsys.readouterr().err
+
+
+def test_what_is_no_evaluation(tmp_path, capsys):
+    path = tmp_path / "eval.json"
+    for text in ("", "{}", '{"synthetic": true, "each": [{}]}'):
+        path.write_text(text)
+        assert cli.main(["phenotype", "figure", "3.4", "--out", str(tmp_path / "a.png"), "--evaluation", str(path)]) == 2
+        assert "holds no evaluation" in capsys.readouterr().err

@@ -1,0 +1,256 @@
+"""Training on annotated images: what it starts from, and what boxes alone do not change."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import cv2
+import jax
+import numpy as np
+import pytest
+from tiny_detector import IMAGE, TINY
+
+from jaxrl_vis import cli
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.stalks.phenotyping.detector.detect import initial
+from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
+from jaxrl_vis.stalks.phenotyping.detector.weights import read_weights, write_weights
+from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
+from jaxrl_vis.stalks.phenotyping.io.masks import encode_mask, outlined_mask
+from jaxrl_vis.stalks.phenotyping.training.examples import annotated_examples, settings_for
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three images with a bright stalk in each, and a box around its middle, 30 pixels tall."""
+    folder = tmp_path_factory.mktemp("annotated")
+    images, annotations = [], []
+    for number in range(3):
+        image = np.full((*IMAGE, 3), 40, np.uint8)
+        left = 10 + 14 * number
+        image[:, left : left + 8] = 200
+        cv2.imwrite(str(folder / f"{number}.png"), image)
+        images.append({"id": number, "file_name": f"{number}.png", "width": IMAGE[1], "height": IMAGE[0]})
+        annotations.append({"id": number, "image_id": number, "category_id": 1, "bbox": [left, 15, 8, 30]})
+    data = {"images": images, "annotations": annotations, "categories": [{"id": 1, "name": "stalk"}]}
+    (folder / "annotations.json").write_text(json.dumps(data))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
+    detector, segmenter = jax.random.split(jax.random.key(3))
+    params = {
+        "detector": initial(TINY, detector),
+        "segmenter": Segmenter(TINY.segmenter).init(segmenter, np.zeros((1, 32, 32, 3), np.float32)),
+    }
+    write_weights(path, params, dataclasses.replace(TINY, candidates=7), {"origin": "nothing"})
+    return path
+
+
+def differences(one: Path, other: Path) -> dict[str, float]:
+    """The greatest change of any number of each network."""
+    first, second = read_weights(one)[0], read_weights(other)[0]
+    changes = {name: jax.tree.map(lambda a, b: float(np.abs(a - b).max()), first[name], second[name]) for name in first}
+    return {name: max(jax.tree.leaves(changes[name])) for name in changes}
+
+
+def train(out: Path, folder: Path, *words: str) -> int:
+    return cli.main(["phenotype", "train", str(out), "--data", str(folder), "--batch", "4", "--snips", "4", *words])
+
+
+def test_training_goes_on_from_weights_and_boxes_leave_masks_alone(folder, weights, tmp_path, capsys):
+    assert train(tmp_path / "none.safetensors", folder, "--start", str(weights), "--steps", "1", "--rate", "1e-9") == 0
+    assert max(differences(tmp_path / "none.safetensors", weights).values()) < 1e-3  # they are kept in 16 bits
+    assert train(tmp_path / "more.safetensors", folder, "--start", str(weights), "--steps", "3", "--rate", "1") == 0
+    said = capsys.readouterr().out
+    assert f"from {weights}" in said and "masks stay as they are" in said
+    _, settings, about = read_weights(tmp_path / "more.safetensors")
+    assert settings == TINY  # all the candidates of a new training
+    assert about["origin"] == f"annotated images, from {weights}"
+    changes = differences(tmp_path / "more.safetensors", weights)
+    assert changes["detector"] > 1e-3 and changes["segmenter"] == 0.0
+
+
+def test_outlines_teach_masks(folder, weights, tmp_path):
+    data = json.loads((folder / "annotations.json").read_text())
+    for each in data["annotations"]:
+        left, top, wide, tall = each["bbox"]
+        each["segmentation"] = [[left, top, left + wide, top, left + wide, top + tall, left, top + tall]]
+    outlined = tmp_path / "outlined"
+    outlined.mkdir()
+    for image in folder.glob("*.png"):
+        (outlined / image.name).write_bytes(image.read_bytes())
+    (outlined / "annotations.json").write_text(json.dumps(data))
+    assert train(tmp_path / "out.safetensors", outlined, "--start", str(weights), "--steps", "3", "--rate", "1") == 0
+    assert differences(tmp_path / "out.safetensors", weights)["segmenter"] > 1e-3
+
+
+def test_boxes_of_another_size_start_from_random_weights_or_are_refused(folder, tmp_path, capsys):
+    # So small an image is not reduced: 30 lines, where the weights that ship know 135.
+    assert train(tmp_path / "out.safetensors", folder, "--start", "shipped", "--steps", "1") == 2
+    refusal = capsys.readouterr().err
+    assert "30 pixels tall" in refusal and "135" in refusal and "--start random" in refusal
+    assert not (tmp_path / "out.safetensors").exists()
+    assert cli.main(["phenotype", "train", str(tmp_path / "out.safetensors"), "--start", "missing.safetensors"]) == 2
+    assert "cannot read the weights" in capsys.readouterr().err
+    assert cli.main(["phenotype", "train", str(tmp_path / "out.safetensors"), "--rate", "0"]) == 2
+    assert "--rate must be more than 0" in capsys.readouterr().err
+
+
+# --- what annotations say ---
+
+
+def coco_folder(folder: Path, annotation: dict, image: dict | None = None) -> Path:
+    """A folder with one image of 64 x 60 pixels and one annotation."""
+    about = {"id": 1, "file_name": "row.png", "width": IMAGE[1], "height": IMAGE[0], **(image or {})}
+    cv2.imwrite(str(folder / "row.png"), np.full((*IMAGE, 3), 90, np.uint8))
+    data = {"images": [about], "annotations": [{"id": 7, "image_id": 1, **annotation}]}
+    (folder / "annotations.json").write_text(json.dumps(data))
+    return folder
+
+
+BOX = [10, 4, 10, 40]
+RUNS = encode_mask(np.ones((40, 10), bool), (4, 10), IMAGE)
+
+
+@pytest.mark.parametrize(
+    ("annotation", "part"),
+    [
+        ({"bbox": BOX, "image_id": 5}, "has the image_id 5, which no image has"),
+        ({"bbox": BOX, "image_id": [1]}, "has the image_id [1], which no image has"),
+        ({}, "has neither a bbox nor a segmentation"),
+        ({"bbox": [10, 4, 10]}, "has a bbox that is not 4 numbers"),
+        ({"bbox": [10, 4, None, 40]}, "has a bbox that is not 4 numbers"),
+        ({"bbox": [10, 4, 0, 40]}, "has a box of 0 x 40 pixels"),
+        ({"bbox": [10, 4, 10, -1]}, "has a box of 10 x -1 pixels"),
+        ({"bbox": [100, 40, 100, 400]}, "outside its image of 64 x 60 pixels"),
+        ({"bbox": BOX, "segmentation": [[10, 4, 20, 4, 20]]}, "has a polygon that is not column, line"),
+        ({"bbox": BOX, "segmentation": [10, 4, 20, 4, 20, 44]}, "has a polygon that is not column, line"),
+        ({"bbox": BOX, "segmentation": [[10, 4, 20, 44]]}, "3 corners or more"),
+        ({"bbox": BOX, "segmentation": {"counts": [1]}}, "has a mask without size"),
+        ({"bbox": BOX, "segmentation": {**RUNS, "size": [600, 640]}}, "a mask of 640 x 600 pixels, but its image has 64 x 60"),
+        ({"bbox": BOX, "segmentation": {**RUNS, "counts": [5, 5]}}, "runs of 10 pixels do not cover an image of 64 x 60"),
+        ({"bbox": BOX, "segmentation": {**RUNS, "counts": [-1, 3841]}}, "has a mask that cannot be read"),
+        (
+            {"bbox": BOX, "segmentation": {**RUNS, "counts": [[1], 2]}},
+            "has a mask that cannot be read (counts are not numbers)",
+        ),
+        ({"bbox": BOX, "segmentation": {**RUNS, "counts": "`"}}, "runs of a mask end in the middle of a number"),
+        ({"bbox": BOX, "segmentation": {**RUNS, "counts": [3840]}}, "has a mask without a pixel"),
+    ],
+)
+def test_what_is_wrong_with_an_annotation_is_told_with_its_number(tmp_path, annotation, part):
+    with pytest.raises(RequestError) as error:
+        read_annotations(coco_folder(tmp_path, annotation))
+    message = str(error.value)
+    assert part in message and "annotations.json: annotation 7 has" in message and message.endswith("mend it, or delete it")
+    assert len(message.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("image", "part"),
+    [
+        ({"width": None}, "image row.png needs a width and a height in pixels, not None and 60"),
+        ({"height": 0}, "image row.png needs a width and a height in pixels, not 64 and 0"),
+        ({"file_name": None}, "image number 1 needs an id and a file_name"),
+    ],
+)
+def test_what_is_missing_of_an_image_is_told(tmp_path, image, part):
+    with pytest.raises(RequestError) as error:
+        read_annotations(coco_folder(tmp_path, {"bbox": BOX}, image))
+    assert part in str(error.value) and "annotations.json" in str(error.value)
+
+
+def test_wrong_annotations_of_voc_and_labelme_name_their_file(tmp_path):
+    box = "<bndbox><xmin>11</xmin><ymin>5</ymin><xmax>{}</xmax><ymax>44</ymax></bndbox>"
+    text = "<annotation><filename>row.png</filename><size><width>{}</width><height>60</height></size>{}</annotation>"
+    thing = f"<object><name>stalk</name>{box}</object>"
+    for width, right, part in (
+        (0, 20, "row.xml: image row.png needs a width"),
+        (64, 10, "annotation 1 has a box of 0 x"),
+    ):
+        (tmp_path / "row.xml").write_text(text.format(width, thing.format(right)))
+        with pytest.raises(RequestError, match=part):
+            read_annotations(tmp_path)
+    (tmp_path / "row.xml").unlink()
+    shapes = [{"label": "stalk", "points": [[10, 4], [10, 44]], "shape_type": "rectangle"}]
+    about = {"shapes": shapes, "imagePath": "row.png", "imageWidth": 64, "imageHeight": 60}
+    (tmp_path / "row.json").write_text(json.dumps(about))
+    with pytest.raises(RequestError, match="row.json: annotation 1 has a box of 0 x 40 pixels"):
+        read_annotations(tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["coco", "voc", "labelme"])
+def test_images_of_another_size_than_was_annotated_are_refused(tmp_path, kind):
+    """An image that was made ten times smaller after it was annotated."""
+    coco_folder(tmp_path, {"bbox": [100, 40, 100, 400]}, {"width": 640, "height": 600})
+    if kind != "coco":
+        (tmp_path / "annotations.json").unlink()
+    if kind == "voc":
+        box = "<bndbox><xmin>101</xmin><ymin>41</ymin><xmax>200</xmax><ymax>440</ymax></bndbox>"
+        thing = f"<filename>row.png</filename><object><name>stalk</name>{box}</object>"
+        size = "<size><width>640</width><height>600</height></size>"
+        (tmp_path / "row.xml").write_text(f"<annotation>{thing}{size}</annotation>")
+    if kind == "labelme":
+        shapes = [{"label": "stalk", "points": [[100, 40], [200, 440]], "shape_type": "rectangle"}]
+        about = {"shapes": shapes, "imagePath": "row.png", "imageWidth": 640, "imageHeight": 600}
+        (tmp_path / "row.json").write_text(json.dumps(about))
+    with pytest.raises(RequestError, match=r"row.png has 64 x 60 pixels, but .* is for 640 x 600: save the image at"):
+        list(annotated_examples(tmp_path, TINY))
+
+
+@pytest.mark.parametrize("segmentation", [[[10, 4, 20, 4, 20, 44, 10, 44]], RUNS])
+def test_a_box_that_is_not_there_is_the_one_around_the_mask(tmp_path, segmentation):
+    for annotation in ({}, {"bbox": None}):
+        (found,) = read_annotations(coco_folder(tmp_path, {"segmentation": segmentation, **annotation}))["annotations"]
+        assert found["bbox"] == BOX
+    assert settings_for(tmp_path, TINY).band_lines == 40.0
+
+
+# --- masks from outlines ---
+
+
+def test_masks_of_strips_are_as_wide_as_the_strips():
+    """Random leaning strips: no pixel more on the mean, whose spread is what 100 lines leave of half a pixel at either edge."""
+    rng = np.random.default_rng(0)
+    errors = []
+    for _ in range(300):
+        left, wide, lean = rng.uniform(60, 80), rng.uniform(8, 30), rng.uniform(-0.3, 0.3)
+        top, tall = rng.uniform(5, 15), 120.0
+        right = left + wide
+        outline = [left, top, right, top, right + lean * tall, top + tall, left + lean * tall, top + tall]
+        runs = outlined_mask([outline], (160, 200)).sum(axis=1)[20:120]
+        errors.append(runs.mean() - wide)
+    assert abs(np.mean(errors)) < 0.02 and np.std(errors) < 0.1
+
+
+def test_masks_of_outlines_agree_with_boxes_and_runs(tmp_path):
+    """A rectangle of 14 x 170 is 14 x 170 pixels, the same ones as a box of that size has, and as the runs of the truth."""
+    size = (200, 100)
+    cv2.imwrite(str(tmp_path / "row.png"), np.full((*size, 3), 90, np.uint8))
+    shapes = [{"label": "stalk", "points": [[30, 20], [44, 190]], "shape_type": "rectangle"}]
+    about = {"shapes": shapes, "imagePath": "row.png", "imageWidth": 100, "imageHeight": 200}
+    (tmp_path / "row.json").write_text(json.dumps(about))
+    settings = dataclasses.replace(TINY, width=100, full_width=100, snip_lines=192, snip_columns=32)
+    (of_rectangle,) = annotated_examples(tmp_path, settings)
+    mask = of_rectangle.masks[0]
+    assert mask.any(axis=1).sum() == 170 and set(mask.sum(axis=1)) == {0, 14}  # lines of a snip may be shifted
+    data = {"images": [{"id": 1, "file_name": "row.png", "width": 100, "height": 200}]}
+    for segmentation in (None, encode_mask(np.ones((170, 14), bool), (20, 30), size)):
+        data["annotations"] = [{"image_id": 1, "bbox": [30, 20, 14, 170], "segmentation": segmentation}]
+        (tmp_path / "annotations.json").write_text(json.dumps(data))
+        (other,) = annotated_examples(tmp_path, settings)
+        np.testing.assert_array_equal(other.masks, of_rectangle.masks)
+        np.testing.assert_array_equal(other.stalks, of_rectangle.stalks)
+
+
+def test_outlines_beyond_the_image_and_of_several_parts():
+    inside = np.zeros((10, 12), bool)
+    inside[:4, :5] = True
+    np.testing.assert_array_equal(outlined_mask([[-7, -3, 5, -3, 5, 4, -7, 4]], (10, 12)), inside)
+    inside[6:, 9:] = True
+    parts = [[-7, -3, 5, -3, 5, 4, -7, 4], [0, 0, 3, 0, 3, 3, 0, 3], [9, 6, 30, 6, 30, 30, 9, 30]]
+    np.testing.assert_array_equal(outlined_mask(parts, (10, 12)), inside)  # parts that overlap are no holes
+    assert not outlined_mask([[20, 20, 30, 20, 30, 30]], (10, 12)).any()
