@@ -285,7 +285,8 @@ def _decays() -> Iterator[Sentence]:
     yield Sentence(
         DECAY,
         f"On the finger 0.3 takes {finger[0]}, {finger[1]} and {finger[2]} times fewer steps at 0.98, 0.95 and 0.9, but 0.5 "
-        f"only {times(FINGER, 0.5, 0.9)} times fewer at 0.9. On the hand 0.2 takes {hand[0]} and {hand[1]} times fewer at 0.98 and 0.95.",
+        f"only {times(FINGER, 0.5, 0.9)} times fewer at 0.9. On the hand 0.2 takes {hand[0]} and {hand[1]} "
+        "times fewer at 0.98 and 0.95.",
         run(FINGER, "ol_aux_5", 0.9).name,
     )
     faster, slower = run(FETCH, "none", 0.95).means(240_000).mean(), run(FETCH, "ol_aux_5", 0.98).means(240_000).mean()
