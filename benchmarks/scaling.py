@@ -330,7 +330,7 @@ def main() -> None:
     os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
     enable_compilation_cache()
     if options.coordinator:
-        processes.start(processes.Place(options.coordinator, 2, options.process_id))
+        processes.start(processes.Rank(options.coordinator, 2, options.process_id))
     began, there = time.perf_counter(), len(jax.devices())
     numbers = [count for count in options.devices or (2, 4, 8) if 1 < count <= there]
     if not numbers:

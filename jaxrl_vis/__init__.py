@@ -1,11 +1,11 @@
-"""Trains robots to reach goals that are given as images.
+"""Trains robots to reach goals given only as images.
 
     config = jaxrl_vis.preset("fast", env="VisualFetchReach")
     trainer = jaxrl_vis.make_trainer(config)
     for report in trainer.run(): ...
     policy = jaxrl_vis.load_policy(run_dir)     # observation, goal -> action
 
-Importing the package imports no JAX; asking for the trainer does.
+Importing the package does not import JAX; accessing the trainer does.
 """
 
 import importlib

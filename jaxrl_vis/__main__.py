@@ -1,4 +1,4 @@
-"""``python -m jaxrl_vis`` is the command line."""
+"""Entry point of ``python -m jaxrl_vis``: the command line."""
 
 from jaxrl_vis.cli import entry
 

@@ -1,7 +1,7 @@
-"""Mends XLA's cache on disk, which JAX writes in place: an entry that a kill has cut in half would be told of at every start.
+"""Repairs XLA's on-disk cache, which JAX does not write atomically: a truncated entry would cause a warning at every start.
 
-JAX warns of an entry that it cannot read, compiles the program, and does not replace the entry, as there is one. So entries of
-that program which are not whole are deleted when JAX warns, and it keeps what it has compiled.
+When JAX cannot read an entry it warns and recompiles the program, but does not replace the entry. So damaged entries of a
+program are deleted when JAX warns about it, and JAX then stores the compiled program.
 """
 
 import contextlib
@@ -20,15 +20,15 @@ _hooked: Any = None
 
 
 def mend_damaged_entries() -> None:
-    """From here on, damaged entries are deleted when JAX comes across them, and nothing is said; may be called again."""
+    """Installs a hook that deletes damaged entries when JAX warns of them, and suppresses the warning; idempotent."""
     global _hooked
     if warnings.showwarning is _hooked:
         return
     before = warnings.showwarning
 
     def show(message: Any, *arguments: Any, **options: Any) -> None:
-        found = re.match(f"{_WARNING}([^']+)'", str(message))
-        if found is None or not _delete_damaged(found[1]):
+        matched = re.match(f"{_WARNING}([^']+)'", str(message))
+        if matched is None or not _delete_damaged(matched[1]):
             before(message, *arguments, **options)
 
     _hooked = warnings.showwarning = show
@@ -36,7 +36,7 @@ def mend_damaged_entries() -> None:
 
 
 def _delete_damaged(program: str) -> bool:
-    """Deletes entries of a program that are not whole, or else all of that name, as one of them must be; True if it could."""
+    """Deletes the damaged entries of a program, or all of them if none can be identified; returns True if any was deleted."""
     folder = Path(str(jax.config.jax_compilation_cache_dir))
     entries = list(folder.glob(f"{program}-*{_SUFFIX}"))
     deleted = False
@@ -48,7 +48,7 @@ def _delete_damaged(program: str) -> bool:
 
 
 def _is_whole(entry: Path) -> bool:
-    """Returns whether an entry can be unpacked, by the library that JAX takes, which is there if an entry is of it."""
+    """Returns True if an entry can be decompressed, with the library that JAX used to write it."""
     try:
         contents = entry.read_bytes()
         if not contents.startswith(_ZSTANDARD):
@@ -58,6 +58,6 @@ def _is_whole(entry: Path) -> bool:
         import zstandard  # pyright: ignore[reportMissingImports]
 
         zstandard.ZstdDecompressor().decompress(contents)
-    except Exception:  # whatever these libraries raise
+    except Exception:  # the libraries raise various types
         return False
     return True

@@ -1,4 +1,4 @@
-"""The configuration of a training run: one frozen dataclass and four presets. What follows for an environment: `resolved`.
+"""Configuration of a training run: one frozen dataclass and four presets. `resolved` derives what depends on the environment.
 
 Imports no JAX, so that the command line can print its help at once.
 """
@@ -11,7 +11,7 @@ from jaxrl_vis import fields
 from jaxrl_vis.errors import RequestError, nearest
 from jaxrl_vis.methods import METHODS, AuxTaskName, MethodName, WeightingName
 
-# Values that a field allows, for everything that asks: checks, the command line and its help.
+# Values that a field allows, for checks, the command line and its help.
 Pixels = Literal["rgbd", "rgb", "depth"]
 Randomized = Literal["camera", "lights", "colours", "dynamics"]
 ComputeDtype = Literal["auto", "float32", "bfloat16"]
@@ -19,31 +19,32 @@ ComputeDtype = Literal["auto", "float32", "bfloat16"]
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """One training run. Counts are per seed; lengths of time are in control steps unless a unit is given.
+    """One training run. Counts are per seed; durations are in control steps unless a unit is given.
 
-    The defaults are the preset ``fast``'s; `preset` also has what that has otherwise for some tasks.
+    The defaults are those of the preset ``fast``; `preset` also applies its task-specific values.
     """
 
     env: str = "VisualFetchReach"
-    """The environment; `jaxrl-vis envs` lists them, and module:Name is one of your own."""
+    """Environment: a name that `jaxrl-vis envs` lists, or module:Name for your own."""
     env_folder: str | None = None
-    """Folder from which module:Name is imported; a run keeps it. None: the current one, or wherever Python finds the module."""
+    """Folder from which module:Name is imported; stored with the run. None: the current folder, or Python's module search
+    path."""
     preset: str = "fast"
-    """The preset that this configuration started from; kept for the record."""
+    """Preset that this configuration was derived from; for the record only."""
     method: MethodName = "oracle"
-    """Where rewards come from: the true state (oracle), similarity in the latent space of an autoencoder that is trained along,
-    or equality of observations (indicator), without or with balancing and filtering."""
+    """Source of the rewards: the true state (oracle), similarity in the latent space of an autoencoder trained alongside, or
+    equality of observations (indicator), without or with balancing and filtering."""
     seed: int = 0
     """First seed."""
     seeds: int = 1
-    """How many seeds to train side by side in one program: seed, seed + 1, ..."""
+    """Number of seeds trained in parallel in one program: seed, seed + 1, ..."""
 
-    # -- Where it runs (docs/scaling.md)
+    # -- Devices (docs/scaling.md)
     devices: int = 1
-    """How many devices to use. Several seeds are divided among them; of one seed, each batch and the environments are."""
+    """Number of devices. Multiple seeds are spread over them; with a single seed, its batches and environments are."""
     data_devices: int | None = None
-    """How many devices share each learner: its environments, replay and batches. None: one, or all of them if there is one
-    seed."""
+    """Number of devices that share one learner: its environments, replay and batches. None: 1 with several seeds, all devices
+    with a single seed."""
 
     # -- The environment
     pixels: Pixels = "rgbd"
@@ -51,19 +52,20 @@ class Config:
     image_size: int = 64
     """Height and width of the image, in pixels."""
     frame_stack: int | None = None
-    """Images of the latest control steps that an observation stacks. None: the environment's own number."""
+    """Number of latest images stacked in an observation. None: the environment's own number."""
     env_options: tuple[str, ...] = ()
-    """Further options of the environment, as name=value; docs/tasks.md has those that undo a departure from a release."""
+    """Further options of the environment, as name=value; docs/tasks.md lists those that restore a release's behaviour."""
     randomize: tuple[Randomized, ...] = ()
-    """What varies between episodes, in training and in evaluation."""
+    """Properties randomised between episodes, in training and in evaluation."""
     randomize_strength: float = 1.0
-    """How far it varies, in multiples of the typical ranges (`jaxrl_vis_envs.randomization.KINDS`)."""
+    """Strength of the randomisation, in multiples of the typical ranges (`jaxrl_vis_envs.randomization.KINDS`)."""
     observation_noise: float = 0.0
-    """Standard deviation of the camera's noise, in the observation's unit (grey levels for images); new in every frame."""
+    """Standard deviation of the camera noise, in the observation's unit (grey levels for images); drawn anew for every
+    frame."""
     num_envs: int = 100
     """Environments in a rollout; each plays one episode per iteration."""
 
-    # -- How long, and how often to learn
+    # -- Training length and update schedule
     env_steps: int = 200_000
     """Environment steps to train for; rounded up to whole iterations of num_envs * horizon."""
     updates_per_iteration: int = 200
@@ -71,32 +73,34 @@ class Config:
     batch_size: int = 512
     """Transitions in a gradient step."""
     replay_transitions: int = 200_000
-    """Replay capacity; rounded up to whole rollouts."""
+    """Replay capacity in transitions; rounded up to whole rollouts."""
     replay_mean_age: int | None = None
-    """Mean age of samples, in transitions: the older, the rarer, as if new episodes replaced random ones. None: all alike."""
+    """Mean age of sampled transitions, in transitions: older ones become rarer, as if new episodes replaced random ones. None:
+    uniform sampling."""
 
     # -- Goal relabelling and reward (thesis, section 5.1.4)
     relabel_probability: float = 0.9
-    """p1: share of samples whose goal is replaced by an observation of the same episode."""
+    """p1: fraction of samples whose goal is replaced by an observation from the same episode."""
     balance_probability: float | None = None
-    """p2: share of those whose goal is the very next observation, a sure positive. None: 0.5 for balancing methods, else 0."""
+    """p2: fraction of those whose goal is the next observation, a certain positive. None: 0.5 for balancing methods, else 0."""
     filter_threshold: float | None = None
-    """q0: negatives with Q above it are dropped as false. None: the middle of its band, for filtering methods."""
+    """q0: negatives with Q above it are dropped as false. None: the middle of its valid range, for filtering methods."""
     trivial_goals: float = 1.0
-    """Share kept of relabelled goals that are reached already before the action; the others give way to what another episode
-    observed."""
+    """Fraction kept of relabelled goals that are already reached before the action; the rest are replaced by observations from
+    other episodes."""
     reward_positive: float | None = None
     """R+. None: 0 for the oracle, 1 for other methods."""
     reward_negative: float | None = None
     """R-. None: 0 for the autoencoder, -1 for other methods."""
     reward_noise: float = 0.0
-    """Standard deviation of the noise on the state that the oracle's reward is computed from, in the unit of the state."""
+    """Standard deviation of the noise on the state from which the oracle's reward is computed, in the unit of the state."""
     reward_false_positives: float = 0.0
-    """Share of the oracle's negatives that are rewarded as positives."""
+    """Fraction of the oracle's negatives that are rewarded as positives."""
     reward_false_negatives: float = 0.0
-    """Share of the oracle's positives that are rewarded as negatives."""
+    """Fraction of the oracle's positives that are rewarded as negatives."""
     reward_clutter: float = 1.0
-    """Share of the workspace, from the low end of the state's first coordinate, where all those false rewards occur."""
+    """Fraction of the workspace, from the low end of the state's first coordinate, to which these false rewards are
+    confined."""
 
     # -- DDPG
     discount: float | None = None
@@ -106,48 +110,50 @@ class Config:
     critic_learning_rate: float = 1e-3
     """Adam step size of the critic."""
     target_decay: float = 0.99
-    """Share of a target network that stays at each update of it."""
+    """Decay of a target network: the fraction of its parameters kept at each of its updates."""
     target_update_interval: int = 1
     """Gradient steps between target updates."""
     actor_interval: int = 1
-    """Gradient steps of the critic for each one of the actor; divides updates_per_iteration."""
+    """Critic gradient steps per actor gradient step; divides updates_per_iteration."""
     n_step: int = 1
-    """Rewards that a target sums before it trusts the critic. More than 1 needs true states, and a method without a filter."""
+    """Number of rewards summed in a target before it bootstraps. More than 1 needs true states and a method without a
+    filter."""
     action_penalty: float = 1.0
     """Weight of the mean squared action in the actor's loss."""
     actor_log: Literal["value", "loss"] = "value"
-    """Of what an actor learns the logarithm, with weightings that take logarithms. value: of its value's distance from the best
-    there can be, as in the authors' release, with the action penalty added afterwards, which weighs as many times more as that
-    distance is large. loss: of the distance and the penalty together, which keeps their proportion."""
+    """Quantity whose logarithm the actor minimises, with log weightings. value: log(Q_max - Q) plus the action penalty, as in
+    the authors' release, so the penalty's relative weight grows with Q_max - Q. loss: log(Q_max - Q + penalty), which keeps
+    their ratio."""
     clip_targets_above: bool = True
     """Clip critic targets at R+/(1-gamma) too (they are always clipped at R-/(1-gamma) below)."""
     random_action_probability: float = 0.3
-    """Exploration: share of actions drawn uniformly."""
+    """Exploration: fraction of actions drawn uniformly."""
     action_noise: float = 0.2
-    """Exploration: standard deviation of the Gaussian noise on the other actions."""
+    """Exploration: standard deviation of the Gaussian noise added to the other actions."""
 
     # -- Auxiliary losses (thesis, section 5.2; docs/auxiliary_losses.md)
     aux_tasks: tuple[AuxTaskName, ...] = ()
-    """What the encoders also learn to predict."""
+    """Auxiliary tasks that the encoders are also trained on."""
     weighting: WeightingName = "none"
-    """How much each auxiliary loss counts."""
+    """Weighting of the auxiliary losses."""
     weighting_interval: int = 5
-    """N of OL-AUX: gradient steps from one change of the weights to the next; divides updates_per_iteration."""
+    """N of OL-AUX: gradient steps between updates of the weights; divides updates_per_iteration."""
     weighting_beta: float | None = None
     """beta of OL-AUX: step size of the weights, in multiples of critic_learning_rate. None: 5 N."""
     weighting_main_grad: Literal["main", "total"] = "main"
-    """Whose gradient OL-AUX compares others with: the main loss's, or, as in the authors' release, that of all losses."""
+    """Gradient with which OL-AUX compares those of the auxiliary losses: that of the main loss, or, as in the authors' release,
+    that of the total loss."""
     weighting_window: int = 1
     """Gradient steps over which OL-AUX averages gradients before it compares them; 4 in the authors' release."""
     weighting_fixed: float = 1.0
     """Weight of every auxiliary loss, for weighting fixed."""
     weighting_log: bool = False
-    """Whether weighting cosine learns logarithms of the losses."""
+    """Minimise the logarithms of the losses, with weighting cosine."""
     aux_form: Literal["thesis", "release"] = "thesis"
-    """Whose targets the auxiliary tasks have, where the thesis and the authors' release differ (`auxtasks.Options`)."""
+    """Form of the auxiliary tasks' targets, where the thesis and the authors' release differ (`auxtasks.Options`)."""
     aux_gradients: Literal["auto", "per_loss", "one_hot", "jvp", "latents"] = "auto"
-    """How gradients of losses are found and compared, for weightings that compare them; all ways agree
-    (`learner.weighting.gradients`). auto: latents, the fastest, or one_hot for weightings that keep whole gradients."""
+    """Method of computing and comparing the gradients of losses, for weightings that compare them; all methods agree
+    (`learner.weighting.gradients`). auto: latents, the fastest, or one_hot for weightings that store whole gradients."""
 
     # -- Networks
     encoder_filters: tuple[int, ...] = (16, 32, 64, 64)
@@ -157,35 +163,38 @@ class Config:
     hidden_sizes: tuple[int, ...] = (256, 256, 256)
     """Hidden layers of the actor's and the critic's heads."""
     encoders: Literal["separate", "shared"] = "separate"
-    """Whether the actor has an encoder of its own, or acts on the latents of the critic's, which it cannot change."""
+    """Give the actor a separate encoder, or let it act on the latents of the critic's encoder, which it cannot change."""
     target_encoder: bool = True
-    """Whether target networks have encoders of their own, which follow slowly; if not, the targets' heads read the online
-    encoders' latents."""
+    """Give target networks slowly updated encoders of their own; if false, the target heads read the latents of the online
+    encoders."""
     random_shift: int = 0
-    """Images of a batch move by up to so many pixels each way, the three of a transition alike (Kostrikov et al., 2020)."""
+    """Random shift augmentation: largest shift in pixels per axis, the same for the three images of a transition (Kostrikov et
+    al., 2020)."""
     compute_dtype: ComputeDtype = "auto"
-    """Arithmetic of the networks; parameters and losses are float32. auto: bfloat16 on accelerators."""
+    """Precision of the networks' arithmetic; parameters and losses are float32. auto: bfloat16 on accelerators."""
     normalizer_floor: float = 0.01
     """Smallest standard deviation that an observation is divided by, in the observation's unit (grey levels for images)."""
     normalizers: Literal["shared", "separate"] = "shared"
-    """Whether goals are normalised with the statistics of all observations, or, as in the authors' release, with their own."""
+    """Statistics that normalise goals: those of all observations (shared), or, as in the authors' release, their own
+    (separate)."""
     normalizer_source: Literal["rollouts", "relabelled"] = "rollouts"
-    """What statistics are of: every observation of a rollout, or, as in the authors' release, its relabelled transitions."""
+    """Source of the normalisation statistics: all observations of a rollout, or, as in the authors' release, relabelled
+    transitions."""
     normalizer_clip: float = 5.0
-    """Normalised observations are clipped to plus and minus this."""
+    """Bound to which normalised observations are clipped: plus and minus this."""
 
     # -- Evaluating and saving
     eval_interval: int = 2
-    """Iterations between evaluations; one more comes at the end."""
+    """Iterations between evaluations; a last one runs at the end of training."""
     eval_episodes: int = 1000
-    """Episodes of an evaluation, always the same ones."""
+    """Number of episodes of an evaluation, always the same ones."""
     checkpoint_interval: int = 5
     """Iterations between light checkpoints (networks and optimisers; enough for eval and play)."""
     full_checkpoint_interval: int = 0
-    """Iterations between full checkpoints (with the replay; resume is exact). 0: only at the end of an interrupted run."""
+    """Iterations between full checkpoints (with the replay, for an exact resume). 0: only when a run is interrupted."""
 
     def replace(self, **changes: Any) -> Self:
-        """A copy with some fields changed.
+        """Returns a copy with some fields changed.
 
         Raises:
             RequestError: A name is not a field.
@@ -245,10 +254,10 @@ _DEBUG = _CPU.replace(
 )
 
 PRESETS: dict[str, Config] = {config.preset: config for config in (_PAPER, _FAST, _CPU, _DEBUG)}
-"""``paper``: the authors' release. ``fast``: ours. ``cpu``: what two cores do in minutes. ``debug``: seconds, no learning."""
+"""``paper``: the authors' release. ``fast``: ours. ``cpu``: minutes on two cores. ``debug``: seconds, too short to learn."""
 
-# A rollout of the hand waits for the GPU's latency: with 500 environments it takes hardly longer than with 100. FetchReach is
-# learned in so few steps that it pays to look more often at what they taught; a checkpoint takes two of its iterations.
+# A rollout of the hand is bound by GPU latency: with 500 environments it takes hardly longer than with 100. FetchReach is
+# learned in so few steps that more frequent evaluations are worthwhile; a checkpoint takes as long as two of its iterations.
 OF_TASK: dict[tuple[str, str], dict[str, Any]] = {
     ("fast", "HandReach"): {
         "num_envs": 500,
@@ -285,18 +294,18 @@ OF_TASK: dict[tuple[str, str], dict[str, Any]] = {
     ("fast", "FingerTurn"): {"trivial_goals": 0.2, "actor_log": "loss"},
     ("cpu", "FingerTurn"): {"trivial_goals": 0.2, "actor_log": "loss"},
 }
-"""(preset, task) -> fields that this preset has otherwise for this task, from images or states; see docs/learner.md."""
-# Of those, what goes with the oracle's rewards: other methods read no true states, and have a balance of their own.
+"""(preset, task) -> fields with task-specific values in this preset, for images or states; see docs/learner.md."""
+# Fields that apply only with the oracle's rewards: other methods read no true states and have their own balance.
 OF_ORACLE = ("trivial_goals", "balance_probability")
-# And what goes with images: left out from states, and where images are compared to give rewards.
+# Fields that apply only to images; also left out where rewards come from comparing images.
 OF_IMAGES = ("random_shift", "relabel_probability", "balance_probability")
 
 
 def preset(name: str, **overrides: Any) -> Config:
-    """A named configuration with some fields changed.
+    """Returns a preset with some fields changed.
 
     Args:
-        name: ``paper``, ``fast``, ``cpu`` or ``debug`` (`PRESETS`). Some have settings of their own for some tasks.
+        name: ``paper``, ``fast``, ``cpu`` or ``debug`` (`PRESETS`). Some have task-specific values.
         **overrides: Fields of `Config` and their values.
 
     Raises:
@@ -318,7 +327,7 @@ def preset(name: str, **overrides: Any) -> Config:
 
 
 def data_devices_of(config: Config) -> int:
-    """How many devices share each learner, where ``data_devices`` leaves that open, too."""
+    """Returns the number of devices that share one learner, with the default of ``data_devices`` filled in."""
     if config.data_devices is not None:
         return config.data_devices
     return config.devices if config.seeds == 1 else 1
@@ -328,9 +337,9 @@ _OLD_NAMES = {"frames": "frame_stack"}
 
 
 def config_from_dict(values: Mapping[str, Any]) -> Config:
-    """The configuration that a run saved: what JSON makes of `dataclasses.asdict`, which has lists in the place of tuples.
+    """Reads a saved configuration: `dataclasses.asdict` after a round trip through JSON, which turns tuples into lists.
 
-    Fields that had another name when it was saved are known by that, too; fields that are missing have their defaults.
+    Fields saved under an earlier name are recognised; missing fields take their defaults.
 
     Raises:
         RequestError: ``values`` is no dictionary, or a field is unknown or of the wrong type. The message names the field.

@@ -1,4 +1,4 @@
-"""What there is to compute on: asked of JAX, or, where an answer must not wait for JAX, guessed."""
+"""Devices to compute on: queried from JAX, or guessed where the answer must not wait for JAX."""
 
 import contextlib
 import dataclasses
@@ -18,30 +18,30 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.files import make_private, user_cache
 from jaxrl_vis.provenance import child_environment
 
-_MOST_MEMORY = 0.9
-"""Share of a GPU's memory; what drivers, CUDA graphs and libraries take comes on top."""
-_LEAST_KEPT_S = 1.0  # JAX's own: what takes longer to compile should be kept
-_BLOCK = 4096  # bytes; a full disk still makes files, but empty ones
+_MAX_MEMORY = 0.9
+"""Fraction of a GPU's memory; drivers, CUDA graphs and libraries need the rest."""
+_DEFAULT_MIN_COMPILE_S = 1.0  # JAX's default: programs that take longer to compile should be cached
+_BLOCK = 4096  # bytes; a full disk can still create empty files
 
-# The packages by which JAX reaches an accelerator, and files that show that the machine has one.
+# Packages through which JAX uses an accelerator, and files that indicate its presence.
 _NVIDIA = (("jax_cuda12_plugin", "jax_cuda13_plugin"), ("/dev/nvidiactl", "/dev/nvidia0", "/dev/dxg"))
 _TPU = (("libtpu",), ("/dev/accel0", "/dev/vfio/0"))
 
 
 def claim_memory() -> None:
-    """Lets JAX take nine tenths of a GPU's memory, which is more than its own three quarters; call it before JAX is imported.
+    """Lets JAX preallocate nine tenths of a GPU's memory instead of its default three quarters; call it before importing JAX.
 
-    For what has a GPU to itself, as training has. What the user or a study has set (`shared`) stays as it is.
+    For processes with exclusive use of a GPU, as in training. Values set by the user or a study (`shared`) are not changed.
     """
     names = ("XLA_CLIENT_MEM_FRACTION", "XLA_PYTHON_CLIENT_MEM_FRACTION")
     if not any(os.environ.get(name) for name in names):
-        os.environ[names[1]] = str(_MOST_MEMORY)
+        os.environ[names[1]] = str(_MAX_MEMORY)
 
 
 def start_devices() -> None:
-    """Lets JAX start its devices in a thread of its own, which for a GPU takes a second or two: time to import the rest.
+    """Initialises JAX's devices in a background thread, which takes a second or two for a GPU, while imports continue.
 
-    Whoever uses devices, or calls `check_devices`, waits for it. If it fails, they fail, too, and say why.
+    Any use of the devices, or `check_devices`, waits for the thread. If initialisation fails, that use raises the error.
     """
     import jax
 
@@ -53,37 +53,39 @@ def start_devices() -> None:
 
 
 def check_devices() -> None:
-    """Starts JAX, which fails where it is told to use what is not there.
+    """Initialises JAX's devices and reports errors of its configuration.
 
     Raises:
-        RequestError: JAX_PLATFORMS asks for a platform that JAX cannot use here, or JAX is told not to compile.
+        RequestError: JAX_PLATFORMS names a platform that is not available, or compilation is disabled.
     """
     import jax
 
     if jax.config.jax_disable_jit:
         raise RequestError(
-            "JAX is told not to compile, and without that nothing here would end: unset JAX_DISABLE_JIT, or call"
+            "compilation is disabled in JAX, without which nothing here would finish: unset JAX_DISABLE_JIT, or call"
             " jax.config.update('jax_disable_jit', False) first"
         )
-    asked = jax.config.jax_platforms
+    requested = jax.config.jax_platforms
     try:
         jax.default_backend()
         jax.devices()
     except (RuntimeError, AssertionError) as error:
-        if not asked:
+        if not requested:
             raise RequestError(f"JAX finds no device to compute on: {' '.join(str(error).split())}") from error
-        there = _platforms_without(asked)
-        raise RequestError(f"JAX_PLATFORMS={asked}, but JAX finds no such device here, only {there}{_mend(asked)}") from error
+        available = _default_platform(requested)
+        raise RequestError(
+            f"JAX_PLATFORMS={requested}, but JAX finds no such device here, only {available}{_mend(requested)}"
+        ) from error
 
 
 def enable_compilation_cache() -> str:
-    """Keeps compiled programs in a folder, so that the second start takes seconds.
+    """Enables JAX's persistent compilation cache, so that later starts take seconds.
 
-    A folder that was chosen already (JAX_COMPILATION_CACHE_DIR, or jax.config) is left as it is; otherwise it is
-    ``jaxrl-vis/xla`` in the user's cache folder, if that can be made. `cache_fault` says what is wrong with it.
+    A folder that is already configured (JAX_COMPILATION_CACHE_DIR, or jax.config) is kept; otherwise it is ``jaxrl-vis/xla`` in
+    the user's cache folder, if that can be created. `cache_fault` reports problems with it.
 
     Returns:
-        The folder; empty where there is none.
+        The folder; empty if there is none.
     """
     import jax
     from jax.experimental.compilation_cache import compilation_cache
@@ -91,11 +93,11 @@ def enable_compilation_cache() -> str:
     from jaxrl_vis.cache_entries import mend_damaged_entries
 
     default = default_cache()
-    if not jax.config.jax_compilation_cache_dir and _why_not_writable(default) is None:
+    if not jax.config.jax_compilation_cache_dir and _write_fault(default) is None:
         with contextlib.suppress(OSError):
-            make_private(default)  # it holds machine code, which runs
+            make_private(default)  # it holds machine code that will be executed
         jax.config.update("jax_compilation_cache_dir", str(default))
-        # JAX decides at its first compilation whether it has a cache, and a notebook has compiled something by now.
+        # JAX decides at its first compilation whether to use a cache; a notebook may already have compiled something.
         compilation_cache.reset_cache()
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
@@ -105,7 +107,7 @@ def enable_compilation_cache() -> str:
 
 
 def hush_cache() -> None:
-    """Lets JAX be silent about a cache with a fault, which the run says once; JAX would warn of each program."""
+    """Suppresses JAX's warnings about a faulty cache, one per program; the run reports the fault once."""
     import jax
 
     if jax.config.jax_compilation_cache_dir and cache_fault() is not None:
@@ -113,29 +115,31 @@ def hush_cache() -> None:
 
 
 def default_cache() -> Path:
-    """The folder of compiled programs where nobody has chosen another."""
+    """Default folder of the compilation cache."""
     return user_cache() / "xla"
 
 
 def cache_fault() -> str | None:
-    """Why the next start will not find what is compiled now, after `enable_compilation_cache`; None where it will."""
+    """Returns why programs compiled now will not be reused, after `enable_compilation_cache`; None if they will."""
     import jax
 
     if not jax.config.jax_enable_compilation_cache or jax.config.jax_compilation_cache_max_size == 0:
-        return "JAX is told to keep no compiled programs"
+        return "the compilation cache is disabled in JAX"
     folder = jax.config.jax_compilation_cache_dir
     if not folder:
-        why = _why_not_writable(default_cache())
-        return f"{why}; set JAX_COMPILATION_CACHE_DIR to a folder that can" if why else "no cache is set up"
-    if jax.config.jax_persistent_cache_min_compile_time_secs > _LEAST_KEPT_S:
-        return f"only what takes {jax.config.jax_persistent_cache_min_compile_time_secs:g} s to compile is kept"
-    if "://" in folder:  # of a cloud, which JAX looks at
+        reason = _write_fault(default_cache())
+        return f"{reason}; set JAX_COMPILATION_CACHE_DIR to a writable folder" if reason else "no cache is set up"
+    if jax.config.jax_persistent_cache_min_compile_time_secs > _DEFAULT_MIN_COMPILE_S:
+        return (
+            f"only programs that take {jax.config.jax_persistent_cache_min_compile_time_secs:g} s or more to compile are cached"
+        )
+    if "://" in folder:  # cloud storage, which JAX checks itself
         return None
-    return _why_not_writable(Path(folder))
+    return _write_fault(Path(folder))
 
 
-def _why_not_writable(folder: Path) -> str | None:
-    """Why a folder, which is made if need be, takes no file; None where it does."""
+def _write_fault(folder: Path) -> str | None:
+    """Returns why a folder, created if missing, cannot hold new files; None if it can."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder) as file:
@@ -145,14 +149,14 @@ def _why_not_writable(folder: Path) -> str | None:
     return None
 
 
-def count_devices(asked: str) -> int:
-    """How many devices an option means: a number, or ``all`` that JAX finds, in all processes.
+def count_devices(requested: str) -> int:
+    """Converts an option to a number of devices: a number, or ``all``, the devices of all processes.
 
     Raises:
-        RequestError: It is neither.
+        RequestError: The value is neither.
     """
-    if asked.lower() != "all":
-        return fields.read("--devices", int, [asked])
+    if requested.lower() != "all":
+        return fields.read("--devices", int, [requested])
     check_devices()
     import jax
 
@@ -161,18 +165,18 @@ def count_devices(asked: str) -> int:
 
 @dataclasses.dataclass(frozen=True)
 class Device:
-    """Where a process may run.
+    """A device that a process may use.
 
     Attributes:
-        name: For people.
-        environment: Variables that keep a process to this device.
+        name: Name for messages.
+        environment: Variables that restrict a process to this device.
     """
 
     name: str
     environment: Mapping[str, str]
 
 
-# Asked in a process of its own: one that has looked at a GPU holds some of its memory until it ends.
+# Run in a separate process: once initialised, JAX holds some of a GPU's memory until the process ends.
 _ASK = """
 import json, sys
 from jaxrl_vis.devices import check_devices
@@ -187,7 +191,7 @@ print(json.dumps([[device.platform, device.device_kind] for device in jax.local_
 
 
 def list_devices() -> list[Device]:
-    """Each GPU that this process may use; or one entry that leaves everything as it is, where there is one device or no GPU.
+    """Lists the GPUs that this process may use; a single entry without variables if there is only one device or no GPU.
 
     Raises:
         RequestError: JAX finds no device.
@@ -197,8 +201,8 @@ def list_devices() -> list[Device]:
     lines = (done.stdout if done.returncode == 0 else done.stderr).strip().splitlines()
     if done.returncode or not lines:
         raise RequestError(lines[-1] if lines else "JAX finds no device to compute on")
-    found = json.loads(lines[-1])
-    (platform, kind), count = found[0], len(found)
+    devices = json.loads(lines[-1])
+    (platform, kind), count = devices[0], len(devices)
     if platform not in ("gpu", "cuda") or count == 1:
         return [Device("the CPU" if platform == "cpu" else kind, {})]
     visible = [word.strip() for word in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if word.strip()]
@@ -207,31 +211,31 @@ def list_devices() -> list[Device]:
 
 
 def shared(devices: Sequence[Device], processes: int) -> list[Device]:
-    """Each device so many times, for that many processes side by side on it; GPU memory is divided among them."""
+    """Repeats every device for a number of parallel processes, and divides GPU memory among them."""
     if processes == 1:
         return list(devices)
-    share = {"XLA_PYTHON_CLIENT_MEM_FRACTION": f"{_MOST_MEMORY / processes:.3f}"}
+    share = {"XLA_PYTHON_CLIENT_MEM_FRACTION": f"{_MAX_MEMORY / processes:.3f}"}
     return [Device(device.name, {**device.environment, **share}) for _ in range(processes) for device in devices]
 
 
 def guess_accelerator() -> bool:
-    """Whether JAX will run on an accelerator: asked without importing JAX, so a guess, for help that comes at once."""
-    asked = [word.strip() for word in os.environ.get("JAX_PLATFORMS", "").split(",") if word.strip()]
-    if asked:
-        return asked[0] != "cpu"
-    return any(_is_installed(packages) and _is_there(files) for packages, files in (_NVIDIA, _TPU))
+    """Returns True if JAX will probably use an accelerator: a guess without importing JAX, for help that must be fast."""
+    requested = [word.strip() for word in os.environ.get("JAX_PLATFORMS", "").split(",") if word.strip()]
+    if requested:
+        return requested[0] != "cpu"
+    return any(_is_installed(packages) and _exists(files) for packages, files in (_NVIDIA, _TPU))
 
 
 def _is_installed(packages: tuple[str, ...]) -> bool:
     return any(importlib.util.find_spec(package) for package in packages)
 
 
-def _is_there(files: tuple[str, ...]) -> bool:
+def _exists(files: tuple[str, ...]) -> bool:
     return any(Path(file).exists() for file in files)
 
 
-def _platforms_without(asked: str) -> str:
-    """What JAX finds if it is not told what to use: such as ``cpu``. What it is told stays as it is."""
+def _default_platform(requested: str) -> str:
+    """Returns the platform that JAX chooses without JAX_PLATFORMS, such as ``cpu``. The setting is restored."""
     import jax
     from jax.extend.backend import clear_backends
 
@@ -241,14 +245,14 @@ def _platforms_without(asked: str) -> str:
     except (RuntimeError, AssertionError):
         return "nothing"
     finally:
-        jax.config.update("jax_platforms", asked)
-        clear_backends()  # or else the next question would be answered with what was found here
+        jax.config.update("jax_platforms", requested)
+        clear_backends()  # otherwise the next call would return the backend initialised here
 
 
-def _mend(asked: str) -> str:
-    wanted = {word.strip().lower() for word in asked.split(",")}
+def _mend(requested: str) -> str:
+    wanted = {word.strip().lower() for word in requested.split(",")}
     if "cpu" in wanted:
         return "; write JAX_PLATFORMS=cpu"
     packages, files = _NVIDIA
-    install = wanted & {"cuda", "gpu"} and _is_there(files) and not _is_installed(packages)
+    install = wanted & {"cuda", "gpu"} and _exists(files) and not _is_installed(packages)
     return "; install this project with the extra cuda12 or cuda13" if install else "; unset JAX_PLATFORMS to run on that"

@@ -1,4 +1,4 @@
-"""Says whether this installation works, in one line for each check."""
+"""Self-test of an installation, with one line of output per check."""
 
 import os
 import time
@@ -11,23 +11,23 @@ from jaxrl_vis.errors import RequestError
 
 
 def versions() -> str:
-    """Versions of Python and of the packages that matter."""
-    found = provenance.versions()
-    # The checkout itself need not be installed.
-    missing = [name for name, version in found.items() if version == provenance.NOT_INSTALLED and name != "jaxrl-vis"]
+    """Returns the versions of Python and of the packages that matter."""
+    installed = provenance.versions()
+    # The checkout itself does not have to be installed.
+    missing = [name for name, version in installed.items() if version == provenance.NOT_INSTALLED and name != "jaxrl-vis"]
     if missing:
         raise ModuleNotFoundError(f"{', '.join(missing)} missing; install this project with `pip install .`")
-    return ", ".join(f"{name} {version}" for name, version in found.items())
+    return ", ".join(f"{name} {version}" for name, version in installed.items())
 
 
 def devices() -> str:
-    """What JAX runs on."""
+    """Returns the platform and the device that JAX uses."""
     check_devices()
     return f"{provenance.device_record()['platform']}: {provenance.device_name()}"
 
 
 def memory() -> str:
-    """Memory of the host and of the first device."""
+    """Returns the memory of the host and of the first device."""
     import jax
 
     host = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 0
@@ -37,7 +37,7 @@ def memory() -> str:
 
 
 def compilation_cache() -> str:
-    """The folder where compiled programs are kept, and whether it can be written."""
+    """Returns the folder of the compilation cache, or why there is none."""
     import jax
 
     folder = enable_compilation_cache()
@@ -50,7 +50,9 @@ def compilation_cache() -> str:
 
 
 def physics_and_camera() -> str:
-    """Compiles and takes one control step, renders the result, and checks that the image shows something."""
+    """Compiles and runs one control step, renders it, and checks that the image is neither empty nor equal to the goal
+    image.
+    """
     import jax
     import jax.numpy as jnp
 
@@ -66,7 +68,7 @@ def physics_and_camera() -> str:
 
     position, obs = env_jit(step_once, runs_once=True)(jax.random.key(0))
     if not bool(jnp.isfinite(position).all()):
-        raise FloatingPointError("a number after one physics step is not finite")
+        raise FloatingPointError("the state after one physics step is not finite")
     frame, goal = obs["observation"], obs["desired_goal"]
     if int(frame.max()) == int(frame.min()):
         raise ValueError("the image is empty")
@@ -86,10 +88,10 @@ CHECKS: tuple[tuple[str, Callable[[], str]], ...] = (
 
 
 def main() -> int:
-    """Runs every check, whatever came of the earlier ones, and says what it finds.
+    """Runs all checks, even after failures, and prints the results.
 
     Returns:
-        0 where all is well; 1 where a check fails; 2 where JAX is asked for a device that is not there, which ends the checks.
+        0 if all checks pass; 1 if one fails; 2 if JAX is configured for a device that is not available, which stops the checks.
     """
     failures = 0
     for name, check in CHECKS:
@@ -98,7 +100,7 @@ def main() -> int:
         except RequestError as error:
             print(f"FAIL  {name:14} {error}", flush=True)
             return 2
-        except Exception as error:  # noqa: BLE001 - a doctor reports whatever is wrong
+        except Exception as error:  # noqa: BLE001 - every failure is reported
             failures += 1
             verdict, text = "FAIL", f"{type(error).__name__}: {' '.join(str(error).split())}"
         print(f"{verdict}  {name:14} {text}", flush=True)

@@ -1,4 +1,4 @@
-"""What can go wrong with a request or a run: each says in one line what it is, and how to mend it. Imports nothing heavy."""
+"""Exceptions for requests and runs. Each message is one line: the problem and its remedy. Imports nothing heavy."""
 
 import signal
 
@@ -8,22 +8,25 @@ __all__ = ["NonFiniteError", "RequestError", "StorageError", "Terminated", "Work
 
 
 class RequestError(ValueError):
-    """The request was wrong. The message is one line: what is wrong, and how to mend it. The command line exits with 2."""
+    """Error in the request. The message is one line: what is wrong, and how to fix it. The command line exits with 2."""
 
 
 class NonFiniteError(FloatingPointError):
-    """A loss, a state or a parameter is not finite any more. One line: what, where the state was dumped, what is still good."""
+    """Non-finite loss, state or parameter. One line: which one, where the state was dumped, and what is still usable."""
 
 
 class StorageError(RuntimeError):
-    """A run could not write its files, for instance because the disk is full. One line: what, what is kept, and the mend."""
+    """Failure to write a run's files, for example because the disk is full. One line: the cause, what was saved, and the
+    remedy.
+    """
 
 
 class Terminated(SystemExit):
-    """A signal other than Ctrl-C stopped the work, after saving. Left alone, it ends the program with 128 + its number.
+    """Exit after a signal other than Ctrl-C, raised once the work is saved. Uncaught, it ends the program with 128 + the
+    signal.
 
     Attributes:
-        signal: Its number.
+        signal: Number of the signal.
     """
 
     def __init__(self, number: int = signal.SIGTERM) -> None:
@@ -32,4 +35,4 @@ class Terminated(SystemExit):
 
 
 class WorkerError(RuntimeError):
-    """A process that works for this one was ended from outside. One line: what, and the mend. The command line exits with 1."""
+    """Worker process killed from outside. One line: the cause and the remedy. The command line exits with 1."""

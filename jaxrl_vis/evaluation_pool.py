@@ -1,10 +1,10 @@
-"""Many numbered things, such as synthetic plots, evaluated in processes side by side; what is evaluated already is left out.
+"""Evaluation of many numbered items, such as synthetic plots, in parallel processes; those already evaluated are skipped.
 
-    kept = Kept(path, about, summary)                     # the file goes on where it was, if it is about the same
-    missing = [number for number in numbers if number not in kept]
-    evaluate_each(function, missing, workers, kept.add)   # function(number) -> record; kept.add writes the file
+    records = RecordFile(path, about, summary)               # resumes the file if it has the same conditions
+    missing = [number for number in numbers if number not in records]
+    evaluate_all(function, missing, workers, records.add)    # function(number) -> record; records.add writes the file
 
-Records are what JSON can hold. What one says must depend on its number alone: then it is the same with any number of workers.
+Records are JSON values. A record must depend on its number only, so that it is the same with any number of workers.
 """
 
 import contextlib
@@ -31,32 +31,32 @@ from jaxrl_vis.run.signals import heed_parent_only, shielded_children
 from jaxrl_vis_envs.cores import num_cores
 
 Record = dict[str, Any]
-"""What is kept of one number."""
+"""Result of the evaluation of one number."""
 A = TypeVar("A")
 T = TypeVar("T")
 
-# What limits the threads of NumPy, SciPy, OpenCV and XLA in a process.
+# Variables that limit the threads of NumPy, SciPy, OpenCV and XLA in a process.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPROC")
 
 
-def evaluate_each(
+def evaluate_all(
     evaluate: Callable[[int], Record], numbers: Iterable[int], workers: int, done: Callable[[int, Record], None]
 ) -> None:
-    """Evaluates numbers, in this process or in several.
+    """Evaluates numbers in this process or in several.
 
     Args:
-        evaluate: From a number to its record. With more than one worker it is pickled: a function of a module, or a
+        evaluate: Maps a number to its record. With more than one worker it is pickled: a function at module level, or a
             `functools.partial` of one.
-        numbers: What to evaluate.
-        workers: How many processes; 1 for this one. They share the GPUs and the cores of the machine.
-        done: Called in this process with each number and its record, in the order in which they are finished.
+        numbers: Numbers to evaluate.
+        workers: Number of processes; 1 for this one. They share the machine's GPUs and cores.
+        done: Called in this process with a number and its record, in order of completion.
 
     Raises:
-        WorkerError: A process was ended from outside, most likely as the memory was used up.
+        WorkerError: A process was killed from outside, most likely because memory ran out.
     """
     numbers = list(numbers)
-    with processes(min(workers, len(numbers))) as each:
-        for number, record in each(functools.partial(_numbered, evaluate), numbers):
+    with worker_pool(min(workers, len(numbers))) as unordered_map:
+        for number, record in unordered_map(functools.partial(_numbered, evaluate), numbers):
             done(number, record)
 
 
@@ -64,53 +64,54 @@ def _numbered(evaluate: Callable[[int], Record], number: int) -> tuple[int, Reco
     return number, evaluate(number)
 
 
-def results_of(function: Callable[[A], T], arguments: Iterable[A], workers: int) -> Generator[T]:
-    """Results of arguments, of which there may be no end, in the order in which they are finished.
+def map_unordered(function: Callable[[A], T], arguments: Iterable[A], workers: int) -> Generator[T]:
+    """Maps a function over arguments, possibly endless, and yields the results in order of completion.
 
     Args:
-        function: From an argument to its result. With more than one worker both are pickled.
-        arguments: What to call it with.
-        workers: How many processes; 1 for this one. They are ended with the iterator.
+        function: Maps an argument to its result. With more than one worker, both are pickled.
+        arguments: Arguments of the calls.
+        workers: Number of processes; 1 for this one. They are stopped with the iterator.
 
     Raises:
-        WorkerError: A process was ended from outside, most likely as the memory was used up.
+        WorkerError: A process was killed from outside, most likely because memory ran out.
     """
-    with processes(workers) as each:
-        yield from each(function, arguments)
+    with worker_pool(workers) as unordered_map:
+        yield from unordered_map(function, arguments)
 
 
-class Each(Protocol):
-    """Calls a function with arguments, in several processes or in this one; results come as they are finished."""
+class UnorderedMap(Protocol):
+    """Map of a function over arguments in this process or in several, with results in order of completion."""
 
     def __call__(self, function: Callable[[A], T], arguments: Iterable[A]) -> Iterator[T]: ...  # noqa: D102
 
 
 @contextlib.contextmanager
-def processes(workers: int) -> Iterator[Each]:
-    """Processes that share the GPUs and cores; after an error they are ended at once, and with this process however it ends.
+def worker_pool(workers: int) -> Iterator[UnorderedMap]:
+    """Context of worker processes that share the GPUs and cores; they are killed after an error, and whenever this process
+    ends.
 
     Args:
-        workers: How many; 1 or less for this one.
+        workers: Number of processes; 1 or less for this one.
 
     Raises:
-        WorkerError: One was ended from outside, most likely as the memory was used up.
+        WorkerError: One was killed from outside, most likely because memory ran out.
     """
     if workers < 2:
         yield lambda function, arguments: map(function, arguments)
         return
     spawning = multiprocessing.get_context("spawn")
     others = set(multiprocessing.active_children())
-    with shielded_children():  # starts multiprocessing's own helper
+    with shielded_children():  # starts multiprocessing's helper process
         counter = spawning.Value("i", 0)
     pool = ProcessPoolExecutor(workers, mp_context=spawning, initializer=_prepare, initargs=(counter, _environments(workers)))
 
     def submit(function: Callable[[A], T], argument: A) -> Future[T]:
-        with shielded_children():  # a process may be started, and this one alone ends it: see `_prepare`
+        with shielded_children():  # may start a process, which only this one may end: see `_prepare`
             return pool.submit(function, argument)
 
-    def each(function: Callable[[A], T], arguments: Iterable[A]) -> Iterator[T]:
+    def unordered_map(function: Callable[[A], T], arguments: Iterable[A]) -> Iterator[T]:
         arguments = iter(arguments)
-        # Two each, so that none waits for this process.
+        # Two submitted calls per worker, so that none waits for this process.
         waiting = {submit(function, argument) for argument in itertools.islice(arguments, 2 * workers)}
         while waiting:
             ready, waiting = wait(waiting, return_when=FIRST_COMPLETED)
@@ -119,10 +120,10 @@ def processes(workers: int) -> Iterator[Each]:
                 yield result.result()
 
     try:
-        yield each
+        yield unordered_map
     except BrokenProcessPool as error:
         raise WorkerError(
-            f"one of {workers} processes was ended from outside, most likely for want of memory: use fewer --workers"
+            f"one of {workers} processes was killed from outside, most likely because memory ran out: use fewer --workers"
         ) from error
     except BaseException:
         pool.shutdown(wait=False, cancel_futures=True)
@@ -135,10 +136,10 @@ def processes(workers: int) -> Iterator[Each]:
 
 
 def _wait_for(children: Collection[BaseProcess], seconds: float) -> None:
-    """Waits until children have ended, but no longer than so many seconds.
+    """Waits for children to end, up to a number of seconds.
 
-    `BaseProcess.join` would return too soon at times: the pool's own thread waits for its processes, too, and of two threads
-    only one is told by the system how a process ended; the other takes it for one that runs until the first has noted it.
+    `BaseProcess.join` may return too soon: the pool's own thread waits for its processes too, and the system reports the exit
+    of a process to only one of the two threads; the other treats it as running until the first has recorded it.
     """
     deadline = time.monotonic() + seconds
     while any(child.is_alive() for child in children) and time.monotonic() < deadline:
@@ -146,12 +147,12 @@ def _wait_for(children: Collection[BaseProcess], seconds: float) -> None:
 
 
 def share_accelerator() -> None:
-    """Lets this process take memory of a GPU as it needs it, so that others find some; to be called before JAX is used."""
+    """Lets this process allocate GPU memory on demand, so that other processes can use the GPU; call it before using JAX."""
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
 
 def _environments(workers: int) -> list[dict[str, str]]:
-    """Variables of each worker: its GPU, if there are several, and how many threads it may have."""
+    """Returns the environment variables of the workers: their GPU, if there are several, and their number of threads."""
     import jax
 
     from jaxrl_vis.devices import list_devices
@@ -160,13 +161,13 @@ def _environments(workers: int) -> list[dict[str, str]]:
     threads = dict.fromkeys(_THREADS, str(max(num_cores() // workers, 1)))
     # Workers open no window; importing MuJoCo would start another process that looks for GLFW, and outlives its worker.
     share = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false", "MUJOCO_GL": os.environ.get("MUJOCO_GL", "disable")}
-    if cache := jax.config.jax_compilation_cache_dir:  # one compiles for all
+    if cache := jax.config.jax_compilation_cache_dir:  # a program is compiled once for all
         share["JAX_COMPILATION_CACHE_DIR"] = cache
     return [{**threads, **share, **devices[index % len(devices)].environment} for index in range(workers)]
 
 
 def _end_with_parent() -> None:
-    """Waits until the process that started this one is gone, killed for instance: nobody wants what is computed here then."""
+    """Waits for the parent process to end, for example when killed, then exits: its results are no longer needed."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
@@ -174,8 +175,8 @@ def _end_with_parent() -> None:
 
 
 def _prepare(counter: Any, environments: list[dict[str, str]]) -> None:
-    """Makes a new process one of several."""
-    heed_parent_only()  # both would otherwise be interrupted at once, by a signal to all of them
+    """Initialises a worker process."""
+    heed_parent_only()  # a signal to the process group would otherwise interrupt parent and worker at once
     threading.Thread(target=_end_with_parent, daemon=True).start()
     with counter.get_lock():
         index = counter.value
@@ -189,12 +190,12 @@ def _prepare(counter: Any, environments: list[dict[str, str]]) -> None:
     cv2.setNumThreads(int(variables[_THREADS[0]]))
 
 
-def code_of(*packages: ModuleType, leave_out: tuple[str, ...] = ()) -> str:
-    """What tells apart versions of the code that records come from: 12 hexadecimal digits.
+def code_digest(*packages: ModuleType, leave_out: tuple[str, ...] = ()) -> str:
+    """Computes a digest of the code that records come from: 12 hexadecimal digits.
 
     Args:
-        packages: Whose files count.
-        leave_out: Names of files, and of folders, that change no record.
+        packages: Packages whose files are included.
+        leave_out: Names of files and folders that affect no record.
     """
     digest = hashlib.sha256()
     for package in packages:
@@ -206,23 +207,23 @@ def code_of(*packages: ModuleType, leave_out: tuple[str, ...] = ()) -> str:
     return digest.hexdigest()[:12]
 
 
-class Kept:
-    """A JSON file of records: what they are about, what they say together, and a line for each number.
+class RecordFile:
+    """JSON file of records: their conditions, their summary, and one line per number.
 
     Attributes:
-        records: Of each number.
+        records: Records by number.
     """
 
     def __init__(self, path: Path | None, about: Mapping[str, Any], summary: Callable[[list[Record]], Mapping[str, Any]]):
-        """Reads the file, if there is one that is about the same.
+        """Reads the file, if it exists and was written under the same conditions.
 
         Args:
-            path: The file; None to keep records in memory alone.
-            about: Under what conditions numbers are evaluated.
-            summary: What records, in the order of their numbers, say together.
+            path: The file; None to keep the records in memory only.
+            about: Conditions under which numbers are evaluated.
+            summary: Computes the summary of records in the order of their numbers.
 
         Raises:
-            RequestError: The file is about something else, or cannot be read.
+            RequestError: The file has other conditions, or cannot be read.
         """
         self.records: dict[int, Record] = {}
         self._path, self._about, self._summary = path, json.loads(json.dumps(finite(about))), summary
@@ -236,11 +237,11 @@ class Kept:
         return number in self.records
 
     def add(self, number: int, record: Record) -> None:
-        """Keeps what came of a number, and writes the file."""
+        """Adds the record of a number, and writes the file."""
         self.add_all({number: record})
 
     def add_all(self, records: Mapping[int, Record]) -> None:
-        """Keeps what came of several numbers, and writes the file once."""
+        """Adds the records of several numbers, and writes the file once."""
         for number, record in records.items():
             self._keep(number, {"number": number, **record})
         self.write()
@@ -256,49 +257,51 @@ class Kept:
         write_atomically(self._path, f'{head[:-2]},\n  "each": [\n{lines}\n  ]\n}}\n')
 
     def _check(self, path: Path) -> None:
-        """Raises a RequestError where records that were read are not such as they were written."""
+        """Raises a RequestError if the records that were read have been altered."""
         try:
             self._summary([self.records[number] for number in sorted(self.records)])
-        except Exception as error:  # whatever comes of computing with what somebody has changed
+        except Exception as error:  # computing with altered records may raise anything
             raise RequestError(
                 f"{path} holds a damaged record ({type(error).__name__}: {error}): delete it, or name another file with --json"
             ) from error
 
     def _keep(self, number: int, record: Record) -> None:
         record = finite(record)
-        # What is computed from a record must not depend on whether it was read from the file.
+        # Results must not depend on whether a record was read from the file.
         line = json.dumps(record, allow_nan=False)
         self.records[number], self._lines[number] = json.loads(line), line
 
 
 def finite(value: Any) -> Any:
-    """What JSON can hold: None in place of what is not a number, however deep."""
+    """Replaces non-finite numbers by None, at any depth, for JSON."""
     if isinstance(value, Mapping):
-        return {name: finite(each) for name, each in value.items()}
+        return {name: finite(item) for name, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [finite(each) for each in value]
+        return [finite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _read(path: Path, about: Mapping[str, Any]) -> list[Record]:
-    """The records of a file.
+    """Reads the records of a file.
 
     Raises:
-        RequestError: It is about something else, or cannot be read.
+        RequestError: The file has other conditions, or cannot be read.
     """
     mend = "delete it, or name another file with --json"
-    found = read_json(path, mend=f"it holds no records to go on with; {mend}")
-    records = found.get("each")
-    if not isinstance(records, list) or not all(isinstance(each, dict) and _is_count(each.get("number")) for each in records):
-        raise RequestError(f"{path} holds no records to go on with: {mend}")
-    other = [name for name, value in about.items() if found.get(name) != value]
+    contents = read_json(path, mend=f"it holds no records to resume; {mend}")
+    records = contents.get("each")
+    if not isinstance(records, list) or not all(
+        isinstance(record, dict) and _is_count(record.get("number")) for record in records
+    ):
+        raise RequestError(f"{path} holds no records to resume: {mend}")
+    other = [name for name, value in about.items() if contents.get(name) != value]
     if other:
         name = other[0]
         raise RequestError(
-            f"{path} holds records of another evaluation ({name}: {_short(found.get(name))}, not {_short(about[name])}): "
+            f"{path} holds records of another evaluation ({name}: {_short(contents.get(name))}, not {_short(about[name])}): "
             "name another file with --json"
         )
-    numbers = [each["number"] for each in records]
+    numbers = [record["number"] for record in records]
     if twice := sorted({number for number in numbers if numbers.count(number) > 1}):
         raise RequestError(f"{path} holds number {twice[0]} twice: {mend}")
     return records

@@ -1,4 +1,4 @@
-"""Values of a dataclass's fields, checked against their annotations: as JSON saved them, or as words of a command line.
+"""Validation of dataclass fields against their annotations, for values read from JSON or from a command line.
 
 Annotations may be bool, int, float, str, Path, a Literal of words, an optional one of these, or a tuple of any length.
 """
@@ -13,21 +13,21 @@ from typing import Any, Literal, NoReturn
 
 from jaxrl_vis.errors import RequestError, nearest
 
-_LONGEST = 200  # letters of a value that a message repeats
+_LONGEST = 200  # characters of a value that a message quotes
 _TRUTH = {"true": True, "false": False}
 _KINDS = {bool: "true or false", int: "a whole number", float: "a finite number", str: "a word", Path: "a path"}
 
 
 def hints(record: type) -> dict[str, Any]:
-    """Field name -> annotation, without what `typing.Annotated` adds."""
+    """Maps field names to annotations, without `typing.Annotated`."""
     return typing.get_type_hints(record)
 
 
 def unwrap(hint: Any) -> tuple[Any, bool, bool]:
-    """What one value of a field is.
+    """Unwraps optional and tuple annotations.
 
     Returns:
-        The annotation of one value, whether None is allowed, and whether there are several.
+        The annotation of a single value, True if None is allowed, and True if the field holds several values.
     """
     optional = several = False
     if typing.get_origin(hint) in (typing.Union, types.UnionType):
@@ -39,7 +39,7 @@ def unwrap(hint: Any) -> tuple[Any, bool, bool]:
 
 
 def is_known(hint: Any) -> bool:
-    """Whether values of a field with this annotation can be checked and read."""
+    """Returns True if values with this annotation can be checked and parsed."""
     try:
         one, _, _ = unwrap(hint)
     except (ValueError, IndexError):  # a union of several kinds, an empty tuple
@@ -48,32 +48,32 @@ def is_known(hint: Any) -> bool:
 
 
 def choices(hint: Any) -> tuple[str, ...]:
-    """The words that a field allows, where it is a Literal, optional or not, or a tuple of them; else none."""
+    """Returns the choices of a Literal field, optional or not, or a tuple of them; empty for other fields."""
     hint, _, _ = unwrap(hint)
     return typing.get_args(hint) if typing.get_origin(hint) is Literal else ()
 
 
 def check(label: str, hint: Any, value: Any) -> Any:
-    """The value as its field holds it: a tuple for a list, a float for a whole number where one is wanted.
+    """Checks a value and converts it to its field's type: lists to tuples, whole numbers to floats.
 
     Args:
-        label: What the field is called in complaints.
+        label: Name of the field in error messages.
         hint: Its annotation.
-        value: Anything.
+        value: Any value.
 
     Raises:
-        RequestError: The value does not suit the annotation.
+        RequestError: The value does not match the annotation.
     """
     one, optional, several = unwrap(hint)
     if value is None and optional:
         return None
     if several:
         if not isinstance(value, list | tuple):
-            raise RequestError(f"{label} must be a list, not {_said(value)}")
-        return tuple(check(label, one, each) for each in value)
+            raise RequestError(f"{label} must be a list, not {_quote(value)}")
+        return tuple(check(label, one, item) for item in value)
     if typing.get_origin(one) is Literal:
         if value not in typing.get_args(one):
-            raise RequestError(f"{label} cannot be {_said(value)}{nearest(str(value)[:_LONGEST], typing.get_args(one))}")
+            raise RequestError(f"{label} cannot be {_quote(value)}{nearest(str(value)[:_LONGEST], typing.get_args(one))}")
         return value
     if isinstance(value, bool):  # which is an int as well
         if one is bool:
@@ -88,15 +88,15 @@ def check(label: str, hint: Any, value: Any) -> Any:
 
 
 def read(label: str, hint: Any, words: Sequence[str]) -> Any:
-    """The value that a command line spells.
+    """Parses the words of a command line.
 
     Args:
-        label: What the option is called in complaints.
+        label: Name of the option in error messages.
         hint: The annotation of its field.
-        words: What follows the option: one word, or any number where the field is a tuple.
+        words: Words after the option: one, or any number if the field is a tuple.
 
     Raises:
-        RequestError: The words do not spell such a value.
+        RequestError: The words cannot be parsed.
     """
     one, optional, several = unwrap(hint)
     if several:
@@ -110,7 +110,7 @@ def read(label: str, hint: Any, words: Sequence[str]) -> Any:
             value.exists()
     except ValueError:
         _refuse(label, one, word)
-    except OSError as error:  # a name of more letters than there can be, a folder that is closed to us
+    except OSError as error:  # a name that is too long, a folder without permission
         raise RequestError(f"{label} {word[:60]}{'...' if len(word) > 60 else ''}: {error.strerror or error}") from error
     return check(label, one, value)
 
@@ -118,22 +118,22 @@ def read(label: str, hint: Any, words: Sequence[str]) -> Any:
 def _is_finite(value: Any) -> bool:
     try:
         return math.isfinite(value)
-    except OverflowError:  # a whole number of more digits than a float holds
+    except OverflowError:  # an integer beyond the range of floats
         return False
 
 
 def _refuse(label: str, one: Any, value: Any) -> NoReturn:
-    raise RequestError(f"{label} must be {_KINDS[one]}, not {_said(value)}{_mend(one, value)}")
+    raise RequestError(f"{label} must be {_KINDS[one]}, not {_quote(value)}{_suggestion(one, value)}")
 
 
-def _said(value: Any) -> str:
-    """A value in a message of one line."""
+def _quote(value: Any) -> str:
+    """Formats a value for a one-line message."""
     text = repr(value)
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
 
 
-def _mend(one: Any, value: Any) -> str:
-    """How to write a whole number that is written as another kind: 1e6."""
+def _suggestion(one: Any, value: Any) -> str:
+    """Suggests the integer spelling of a whole number written otherwise, such as 1e6."""
     try:
         number = float(value) if one is int and not isinstance(value, bool) else math.nan
     except (TypeError, ValueError, OverflowError):

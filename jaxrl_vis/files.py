@@ -1,4 +1,4 @@
-"""Files: written so that nobody ever reads half of one, read so that whatever is wrong is one line, and kept to their owner."""
+"""File helpers: atomic writing, reading with one-line errors, and files private to their owner."""
 
 import contextlib
 import os
@@ -13,24 +13,24 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis_envs.documents import parse_json, read_text
 
 _TEMPORARY = re.compile(r"\.\d+-[0-9a-f]{16}\.tmp")
-_MOST_BYTES = 200_000_000  # of JSON: records of the largest study have a hundredth of that
+_MOST_BYTES = 200_000_000  # of JSON: the records of the largest study have a hundredth of that
 _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 
 def user_cache() -> Path:
-    """The folder for what this project keeps for a user: ``jaxrl-vis`` in the user's cache folder."""
+    """Returns the cache folder of this project: ``jaxrl-vis`` in the user's cache folder."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxrl-vis"
 
 
 def write_atomically(path: Path, contents: str | bytes) -> None:
-    """Replaces a file's contents in one step: a reader, or a power cut, sees the old contents or the new ones.
+    """Replaces a file's contents atomically: after a power cut, or for a concurrent reader, the file is either old or new.
 
     Args:
-        path: The file; folders that are missing on the way are made. What a link points to is replaced, not the link.
+        path: The file; missing parent folders are created. A link is followed: its target is replaced.
         contents: The new contents; text is written as UTF-8.
 
     Raises:
-        OSError: A folder cannot be made, or the file cannot be written.
+        OSError: A folder cannot be created, or the file cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as file:
@@ -39,17 +39,17 @@ def write_atomically(path: Path, contents: str | bytes) -> None:
 
 @contextlib.contextmanager
 def replacing(path: Path, durable: bool = True, mode: int = 0o666) -> Iterator[IO[bytes]]:
-    """A file to write into, which takes the place of ``path`` at the end; where something is raised, ``path`` stays as it was.
+    """Opens a temporary file that replaces ``path`` on success; on an exception, ``path`` is unchanged.
 
-    Several processes may do so at the same time: each writes a file of its own, and the last one stays.
+    Safe for concurrent processes: each writes a file of its own, and the last one to finish wins.
 
     Args:
-        path: The file to replace, in a folder that is there.
-        durable: See to it that contents and name are on the disk.
-        mode: Permissions of the file, less those that the process's umask takes away.
+        path: The file to replace, in an existing folder.
+        durable: Sync contents and name to the disk.
+        mode: Permissions of the file, before the process's umask.
 
     Raises:
-        OSError: It cannot be written.
+        OSError: The file cannot be written.
     """
     path = Path(os.path.realpath(path))
     temporary = path.with_name(f".{os.getpid()}-{secrets.token_hex(8)}.tmp")  # short: a name has 255 bytes at most
@@ -70,13 +70,13 @@ def replacing(path: Path, durable: bool = True, mode: int = 0o666) -> Iterator[I
 
 
 def is_temporary(name: str) -> bool:
-    """Returns whether a file's name is that of a file which `replacing` had not finished."""
+    """Returns True if a name is that of an unfinished file of `replacing`."""
     return _TEMPORARY.fullmatch(name) is not None
 
 
 def sync_folder(folder: Path) -> None:
-    """Sees to it that the names of a folder's files are on the disk, where the system lets us."""
-    with contextlib.suppress(OSError):  # Windows opens no folder, and some file systems have no such call
+    """Syncs the entries of a folder to the disk, where the system supports it."""
+    with contextlib.suppress(OSError):  # Windows cannot open folders, and some file systems do not support fsync
         descriptor = os.open(folder, os.O_RDONLY)
         try:
             os.fsync(descriptor)
@@ -85,15 +85,15 @@ def sync_folder(folder: Path) -> None:
 
 
 def read_json(path: Path, kind: type = dict, mend: str = "") -> Any:
-    """The value of a JSON file.
+    """Reads a JSON file.
 
     Args:
         path: The file.
-        kind: What it must be: dict, list, or object for anything.
-        mend: What to do about a file that cannot be used; goes to the end of the message.
+        kind: Expected type of the value: dict, list, or object for any.
+        mend: Remedy for an unusable file, appended to the message.
 
     Raises:
-        RequestError: It is not there, cannot be read, is not UTF-8, not JSON, nested too deep, or another kind of value.
+        RequestError: The file is missing, unreadable, not UTF-8, not JSON, nested too deeply, or holds a value of another type.
     """
     mend = f": {mend}" if mend else ""
     check_path(path)
@@ -114,10 +114,10 @@ def read_json(path: Path, kind: type = dict, mend: str = "") -> Any:
 
 
 def check_path(path: Path) -> None:
-    """Checks that the system can say whether ``path`` is there, and what it is.
+    """Checks that ``path`` can be looked up, whether it exists or not.
 
     Raises:
-        RequestError: It cannot: a name is too long or holds a NUL, or a folder on the way may not be looked into.
+        RequestError: The lookup fails: a name is too long or contains a NUL, or a parent folder is not accessible.
     """
     try:
         path.stat()
@@ -135,10 +135,10 @@ def _short(path: Path) -> str:
 
 
 def make_private(folder: Path) -> None:
-    """Makes a folder into which nobody but its owner looks or writes; of one that is there and ours, it takes others' rights.
+    """Creates a folder accessible only to its owner; an existing folder of this user is restricted likewise.
 
     Raises:
-        OSError: It cannot be made.
+        OSError: The folder cannot be created.
     """
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     if os.name == "posix" and folder.stat().st_uid == os.geteuid():
@@ -146,10 +146,10 @@ def make_private(folder: Path) -> None:
 
 
 def stranger_to(status: os.stat_result) -> str | None:
-    """Name who, beside this user and root, could have written a file or a folder; None for nobody, and on Windows.
+    """Describes who, other than this user and root, can have written a file or folder; None for nobody, and on Windows.
 
     Args:
-        status: From `os.stat`, or of the opened file from `os.fstat`.
+        status: Result of `os.stat`, or of `os.fstat` for an open file.
     """
     if os.name != "posix":
         return None
@@ -161,9 +161,9 @@ def stranger_to(status: os.stat_result) -> str | None:
 
 
 def read_private(path: Path) -> bytes | None:
-    """The contents of a file that only this user, or root, can have written; None where it is not there, or is not such a file.
+    """Reads a file that only this user or root can have written; returns None if it is missing or not such a file.
 
-    Links are not followed.
+    Symbolic links are not followed.
     """
     flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
     try:

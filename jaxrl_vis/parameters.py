@@ -1,4 +1,4 @@
-"""Parameters of networks in a file of plain arrays: safetensors, with what they are in its metadata."""
+"""Network parameters in safetensors files, described by the file's metadata."""
 
 import json
 import reprlib
@@ -19,19 +19,19 @@ from jaxrl_vis_envs.documents import parse_json
 SUFFIX = ".safetensors"
 _ABOUT = "about"
 _KINDS = {"F16": np.float16, "F32": np.float32}
-_LONGEST_HEADER = 1 << 20  # bytes; those of our networks have some 15,000
+_LONGEST_HEADER = 1 << 20  # bytes; those of our networks are about 15,000
 
 Settings = TypeVar("Settings")
 
 
 def write_parameters(path: Path, params: Mapping[str, Any], about: Mapping[str, Any], half: bool = True) -> None:
-    """Writes parameters. Nobody sees half of them.
+    """Writes parameters atomically.
 
     Args:
         path: The file, .safetensors.
         params: Nested dictionaries of arrays.
-        about: What they are and where they come from; anything that JSON holds.
-        half: Keep 16 bits of each number.
+        about: Description and provenance of the parameters; any JSON value.
+        half: Store 16 bits per number.
 
     Raises:
         OSError: The file cannot be written.
@@ -41,39 +41,39 @@ def write_parameters(path: Path, params: Mapping[str, Any], about: Mapping[str, 
 
 
 def _write(path: Path, arrays: Mapping[str, np.ndarray], about: Mapping[str, Any]) -> None:
-    """Writes arrays under their names, as they are."""
+    """Writes named arrays without conversion."""
     whole = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     write_atomically(path, save(whole, {_ABOUT: json.dumps(dict(about))}))
 
 
 def _named(params: Any) -> dict[str, Any]:
-    """Leaves of nested dictionaries, by their path: ``detector/params/stem/kernel``."""
+    """Returns the leaves of nested dictionaries by path: ``detector/params/stem/kernel``."""
     return {"/".join(str(part.key) for part in names): leaf for names, leaf in jax.tree_util.tree_flatten_with_path(params)[0]}
 
 
 def read_parameters(
     path: Path, command: str, declare: Callable[[dict[str, Any]], tuple[Settings, Any]]
 ) -> tuple[dict[str, Any], Settings, dict[str, Any]]:
-    """Reads what `write_parameters` wrote. No array is read before names, shapes and types are those of the network.
+    """Reads a file of `write_parameters`. Names, shapes and types are compared with the network's before any array is read.
 
     Args:
         path: The file.
-        command: What makes such files, for messages.
-        declare: From what the file says about its parameters to settings and the parameters' shapes (nested dictionaries of
-            anything with a ``shape``); it may take entries away. It raises a RequestError that names the file, or a KeyError or
-            ValueError where it is not spoken of networks at all.
+        command: Command that creates such files, for messages.
+        declare: Maps the file's description to settings and the parameters' shapes (nested dictionaries of objects with a
+            ``shape``); it may remove entries. It raises a RequestError that names the file, or a KeyError or ValueError if the
+            description is not that of a network.
 
     Returns:
-        Parameters, float32; settings; and what else is said about them.
+        Parameters, float32; settings; and the rest of the description.
 
     Raises:
-        RequestError: There is no such file, or it holds no parameters, or those of another network.
+        RequestError: The file is missing, or holds no parameters or those of another network.
     """
     try:
         if path.suffix.lower() == ".npz" and path.is_file():
             raise RequestError(
-                f"{path} is of an earlier version: convert it with `python -m jaxrl_vis.parameters {path} "
-                f"{path.with_suffix(SUFFIX)}`, and name that"
+                f"{path} was written by an earlier version: convert it with `python -m jaxrl_vis.parameters {path} "
+                f"{path.with_suffix(SUFFIX)}`, and pass the result"
             )
         _check_header(path)
         with safetensors.safe_open(path, framework="numpy") as file:
@@ -105,38 +105,38 @@ def read_parameters(
         *folders, last = name.split("/")
         for folder in folders:
             place = place.setdefault(folder, {})
-        place[last] = array.astype(np.float32)  # by NumPy: JAX would compile a program for each shape
+        place[last] = array.astype(np.float32)  # in NumPy: JAX would compile a program per shape
     return jax.device_put(params), settings, about
 
 
 def _check_header(path: Path) -> None:
-    """Raises a ValueError where what comes before the arrays is not of the size that it says, or too long to be ours."""
+    """Raises a ValueError if the header's size is inconsistent with the file or larger than that of any of our networks."""
     size = path.stat().st_size
     if not path.is_file():
-        raise ValueError("no ordinary file")  # a pipe would never open
+        raise ValueError("not a regular file")  # opening a pipe would block
     with path.open("rb") as file:
         if not 2 <= int.from_bytes(file.read(8), "little") <= min(_LONGEST_HEADER, size - 8):
             raise ValueError("no header")
 
 
 def check_range(path: Path, name: str, values: tuple[float, ...], low: float, high: float, step: int = 1) -> None:
-    """Checks a setting of a network before anything is built by it.
+    """Checks a setting of a network before it is used.
 
     Args:
-        path: The file that it is from.
-        name: What it is called.
+        path: File that the setting was read from.
+        name: Name of the setting.
         values: One number, or several.
-        low, high: What each must lie between.
-        step: What each must be a multiple of, if it is a whole number.
+        low, high: Bounds of each number, inclusive.
+        step: Divisor of each number, for whole numbers.
 
     Raises:
-        RequestError: It is not so.
+        RequestError: The setting is out of range.
     """
-    unfit = next((each for each in values if not low <= each <= high or (step > 1 and each % step)), None)
+    unfit = next((value for value in values if not low <= value <= high or (step > 1 and value % step)), None)
     if unfit is not None or not 1 <= len(values) <= 16:
         kind = f"multiples of {step} " if step > 1 else ""
-        said = f"{len(values)} numbers" if unfit is None else reprlib.repr(unfit)  # which may have hundreds of digits
-        raise RequestError(f"{path}: {name} of its network must be {kind}from {low:g} to {high:g}, 16 at most, not {said}")
+        shown = f"{len(values)} numbers" if unfit is None else reprlib.repr(unfit)  # a number may have hundreds of digits
+        raise RequestError(f"{path}: {name} of its network must be {kind}from {low:g} to {high:g}, 16 at most, not {shown}")
 
 
 def _other_network(path: Path, why: str, command: str) -> str:
@@ -144,11 +144,11 @@ def _other_network(path: Path, why: str, command: str) -> str:
 
 
 def convert(old: Path, new: Path) -> None:
-    """Writes the weights of an earlier version, .npz, as this version reads them; no bit of theirs changes.
+    """Converts a .npz file of an earlier version to the current format, bit for bit.
 
     Raises:
         OSError: A file cannot be read or written.
-        ValueError: It holds no weights.
+        ValueError: The file holds no weights.
     """
     with np.load(old, allow_pickle=False) as file:
         arrays = {name: file[name] for name in file.files}
@@ -161,5 +161,5 @@ def convert(old: Path, new: Path) -> None:
 if __name__ == "__main__":
     try:
         convert(*map(Path, sys.argv[1:]))
-    except Exception as error:  # an old file of one's own, which may be anything
+    except Exception as error:  # the old file may contain anything
         sys.exit(f"cannot convert {' '.join(sys.argv[1:])}: {' '.join(str(error).split())}")

@@ -1,7 +1,7 @@
-"""Several processes that train as one, each with devices of its own, on one machine or on many (`jax.distributed`).
+"""Multi-process training, on one machine or several (`jax.distributed`); every process has devices of its own.
 
-Every process runs the same program on the same arguments. The first one (of index 0) is where the others find each other; it
-alone writes metrics, images and lines for people. What processes must do at the same moment, such as saving, they agree upon.
+Every process runs the same program with the same arguments. The first process (index 0) is the coordinator; it alone writes
+metrics, images and console output. Steps that all processes must take together, such as saving, are agreed upon.
 """
 
 import dataclasses
@@ -15,20 +15,20 @@ from collections.abc import Mapping
 from jaxrl_vis.errors import RequestError
 
 START_S = 120
-"""How long a process waits for the others at its start, s."""
-_HEARTBEAT_S = 20  # without a sign of life for so long, a process counts as dead, and ends the others
+"""Time that a process waits for the others at startup, s."""
+_HEARTBEAT_S = 20  # a process without heartbeat for this long is considered dead, and the others are ended
 _SHUTDOWN_S = 30
 _LEAVE_S = 10
 
 
 @dataclasses.dataclass(frozen=True)
-class Place:
-    """Of a process among the others.
+class Rank:
+    """Rank of a process among the others.
 
     Attributes:
-        coordinator: HOST:PORT of the first; None where the cluster's own variables say it (Slurm, Open MPI).
-        count: Processes.
-        index: Of this one, from 0.
+        coordinator: HOST:PORT of the first process; None if the cluster's own variables define it (Slurm, Open MPI).
+        count: Number of processes.
+        index: Index of this process, from 0.
     """
 
     coordinator: str | None
@@ -36,27 +36,27 @@ class Place:
     index: int
 
 
-def find_place(
+def find_rank(
     coordinator: str | None = None,
     count: int | None = None,
     index: int | None = None,
     variables: Mapping[str, str] = os.environ,
-) -> Place | None:
-    """The place of this process, by options or by what a launcher has set; None where it is alone. Imports no JAX.
+) -> Rank | None:
+    """Determines the rank of this process from options or a launcher's variables; None for a single process. Imports no JAX.
 
     Args:
-        coordinator, count, index: The options, of which none or all are given.
-        variables: Environment variables: those of ``srun`` and of Open MPI's ``mpirun`` are known.
+        coordinator, count, index: The options; all or none must be set.
+        variables: Environment variables; those of ``srun`` and of Open MPI's ``mpirun`` are recognised.
 
     Raises:
-        RequestError: The options make no sense.
+        RequestError: The options are incomplete or invalid.
     """
-    given = {"--coordinator": coordinator, "--num-processes": count, "--process-id": index}
-    missing = [name for name, value in given.items() if value is None]
-    if len(missing) == len(given):
+    options = {"--coordinator": coordinator, "--num-processes": count, "--process-id": index}
+    missing = [name for name, value in options.items() if value is None]
+    if len(missing) == len(options):
         return _by_launcher(variables)
     if missing:
-        raise RequestError(f"{', '.join(given)} belong together: {' and '.join(missing)} is missing")
+        raise RequestError(f"{', '.join(options)} belong together: {' and '.join(missing)} is missing")
     assert coordinator is not None and count is not None and index is not None
     host, _, port = coordinator.rpartition(":")
     if not host or not port.isdigit() or not 0 < int(port) < 2**16:
@@ -65,39 +65,39 @@ def find_place(
         raise RequestError(f"--num-processes must be at least 1, not {count}")
     if not 0 <= index < count:
         raise RequestError(f"--process-id must be one of 0 to {count - 1}, not {index}")
-    return Place(coordinator, count, index) if count > 1 else None
+    return Rank(coordinator, count, index) if count > 1 else None
 
 
-def _by_launcher(variables: Mapping[str, str]) -> Place | None:
+def _by_launcher(variables: Mapping[str, str]) -> Rank | None:
     launchers = (
         ("SLURM_STEP_NUM_TASKS", "SLURM_PROCID", "SLURM_STEP_NODELIST"),
         ("OMPI_COMM_WORLD_SIZE", "OMPI_COMM_WORLD_RANK", "OMPI_MCA_orte_hnp_uri"),
     )
     for count, index, needed in launchers:
         if {count, index, needed} <= set(variables) and variables[count].isdigit() and int(variables[count]) > 1:
-            return Place(variables.get("JAX_COORDINATOR_ADDRESS"), int(variables[count]), int(variables[index]))
+            return Rank(variables.get("JAX_COORDINATOR_ADDRESS"), int(variables[count]), int(variables[index]))
     return None
 
 
-def start(place: Place, seconds: int = START_S) -> None:
-    """Finds the other processes. To be called before JAX has looked for devices.
+def start(rank: Rank, seconds: int = START_S) -> None:
+    """Connects to the other processes; call it before JAX initialises its devices.
 
     Args:
-        place: From `find_place`.
-        seconds: How long to wait for them.
+        rank: From `find_rank`.
+        seconds: Timeout.
 
     Raises:
-        RequestError: They were not found.
+        RequestError: They were not found in time.
     """
     import jax
 
-    if place.coordinator is not None and place.index > 0:
-        _wait_for(place.coordinator, seconds)
+    if rank.coordinator is not None and rank.index > 0:
+        _wait_for(rank.coordinator, seconds)
     try:
         jax.distributed.initialize(
-            coordinator_address=place.coordinator,
-            num_processes=place.count,
-            process_id=place.index,
+            coordinator_address=rank.coordinator,
+            num_processes=rank.count,
+            process_id=rank.index,
             initialization_timeout=seconds,
             heartbeat_timeout_seconds=_HEARTBEAT_S,
             shutdown_timeout_seconds=_SHUTDOWN_S,
@@ -105,16 +105,16 @@ def start(place: Place, seconds: int = START_S) -> None:
     except (RuntimeError, ValueError, OSError) as error:
         reason = " ".join(str(error).split())[:200]
         raise RequestError(
-            f"process {place.index} of {place.count} has not found the others within {seconds} s: start all of them with the "
+            f"process {rank.index} of {rank.count} has not found the others within {seconds} s: start all of them with the "
             f"same --coordinator and --num-processes, and check that its port is open ({reason})"
         ) from error
 
 
 def _wait_for(coordinator: str, seconds: float) -> None:
-    """Returns when the first process answers: JAX itself would end this one without a word that helps.
+    """Waits for the coordinator to accept connections: JAX itself would end this process without a helpful message.
 
     Raises:
-        RequestError: It does not.
+        RequestError: It does not answer in time.
     """
     host, _, port = coordinator.rpartition(":")
     deadline, reason = time.monotonic() + seconds, "no answer"
@@ -128,17 +128,17 @@ def _wait_for(coordinator: str, seconds: float) -> None:
             return
     raise RequestError(
         f"the first process does not answer at {coordinator} within {seconds:g} s ({reason}): start it with --process-id 0, or "
-        "mend --coordinator"
+        "correct --coordinator"
     )
 
 
 def are_several() -> bool:
-    """Whether this process has company."""
+    """Returns True if there are several processes."""
     return _count_and_index()[0] > 1
 
 
 def is_first() -> bool:
-    """Whether this process is the one that writes for people."""
+    """Returns True in the process that writes files and console output."""
     return _count_and_index()[1] == 0
 
 
@@ -147,15 +147,15 @@ def _count_and_index() -> tuple[int, int]:
         return 1, 0
     import jax
 
-    # Without `start` there is no company, and JAX is not made to look for devices, which may not be there.
+    # Before `start` there is one process, and JAX must not initialise devices, which may be unavailable.
     return (jax.process_count(), jax.process_index()) if jax.distributed.is_initialized() else (1, 0)
 
 
 def meet(name: str) -> None:
-    """Returns when all processes have come here.
+    """Waits until all processes have reached this point.
 
     Args:
-        name: Of the place.
+        name: Name of the synchronisation point.
     """
     if are_several():
         from jax.experimental import multihost_utils
@@ -164,27 +164,27 @@ def meet(name: str) -> None:
 
 
 def leave_together() -> None:
-    """Waits a while for the others to end, too, so that each has said why; else JAX would end them in the middle of it.
+    """Shuts down together with the other processes, within a timeout, so that each can print its error before JAX ends it.
 
-    To be called where what was asked for is refused, as all processes will find.
+    Call it after an error in the request, which all processes will raise.
     """
     if not are_several():
         return
     import jax
 
-    # In a thread, because JAX ends a process whose wait has failed.
+    # In a thread, because JAX ends a process when its shutdown barrier fails.
     leaving = threading.Thread(target=jax.distributed.shutdown, daemon=True)
     leaving.start()
     leaving.join(_LEAVE_S)
 
 
-def any_of(answer: bool) -> bool:
-    """Whether any process says yes: all ask at the same point of the program, and get the same answer."""
-    return bool(greatest(int(answer)))
+def any_process(answer: bool) -> bool:
+    """Returns True in all processes if ``answer`` is true in any; a collective call."""
+    return bool(max_over_processes(int(answer)))
 
 
-def greatest(number: int) -> int:
-    """The greatest number that any process gives: all ask at the same point of the program, and get the same answer."""
+def max_over_processes(number: int) -> int:
+    """Returns the maximum of ``number`` over all processes; a collective call."""
     if not are_several():
         return number
     import numpy as np

@@ -1,6 +1,6 @@
-"""Where a run or a figure comes from: the revision of the code, the versions of the libraries, and the device.
+"""Provenance of a run or a figure: revision of the code, versions of the libraries, and device.
 
-Importing this loads no JAX; asking for the device does.
+Importing this module does not import JAX; querying the device does.
 """
 
 import functools
@@ -20,17 +20,17 @@ PACKAGES = ("jaxrl-vis", "jax", "jaxlib", "numpy", "mujoco", "mujoco-mjx", "flax
 """The libraries that a result depends on."""
 
 NOT_INSTALLED = "not installed"
-"""What `versions` says of a package that is missing."""
+"""Version that `versions` reports for a missing package."""
 
 CHECKOUT = Path(__file__).resolve().parents[1]
-"""The folder that holds both packages: the checkout, or site-packages for an installed copy."""
+"""Folder that holds both packages: the checkout, or site-packages for an installed copy."""
 
-# What a result can depend on. Kept records and run folders may change without making a checkout dirty.
+# Files that results can depend on. Changed records and run folders do not make a checkout dirty.
 _CODE = ("jaxrl_vis", "envs", "benchmarks", "pyproject.toml", ":!benchmarks/results")
 
 
 def git(*arguments: str, folder: Path = CHECKOUT) -> str | None:
-    """Standard output of a git command in ``folder``; None where git is missing or the command fails."""
+    """Runs a git command in ``folder`` and returns its standard output; None if git is missing or the command fails."""
     try:
         done = subprocess.run(("git", "-C", str(folder), *arguments), capture_output=True, text=True, timeout=60)
     except (OSError, subprocess.TimeoutExpired):
@@ -39,23 +39,23 @@ def git(*arguments: str, folder: Path = CHECKOUT) -> str | None:
 
 
 def is_checkout(folder: Path = CHECKOUT) -> bool:
-    """Whether ``folder`` is the top of a git checkout: an installed copy may lie inside somebody else's."""
+    """Returns True if ``folder`` is the top of a git checkout: an installed copy may lie inside another project's."""
     top = git("rev-parse", "--show-toplevel", folder=folder)
     return top is not None and Path(top).resolve() == folder.resolve()
 
 
 def revision(digits: int = 40, folder: Path = CHECKOUT) -> str | None:
-    """The revision of the checkout in ``folder``, with ``-dirty`` where its code differs from that; None outside a checkout.
+    """Returns the revision of the checkout, with ``-dirty`` if its code was modified; None outside a checkout.
 
-    The environment variable JAXRL_VIS_REVISION goes first: it names the revision of a copy that has no history.
+    The environment variable JAXRL_VIS_REVISION takes precedence: it names the revision of a copy without history.
 
     Args:
-        digits: Hexadecimal digits of the revision.
+        digits: Number of hexadecimal digits.
         folder: The top of the checkout.
     """
     named = os.environ.get("JAXRL_VIS_REVISION")
     if named:
-        return re.sub(r"^([0-9a-f]{7,40})", lambda found: found[1][:digits], named)
+        return re.sub(r"^([0-9a-f]{7,40})", lambda matched: matched[1][:digits], named)
     head = git("rev-parse", "HEAD", folder=folder) if is_checkout(folder) else None
     if not head:
         return None
@@ -63,16 +63,16 @@ def revision(digits: int = 40, folder: Path = CHECKOUT) -> str | None:
 
 
 def child_environment() -> dict[str, str]:
-    """Environment variables for a process that runs this very copy of the project, wherever Python would find another one."""
+    """Returns environment variables for a child process that imports this copy of the project."""
     import jaxrl_vis_envs
 
     sources = {str(CHECKOUT), str(Path(jaxrl_vis_envs.__file__).resolve().parents[1])}
-    there = [part for part in os.environ.get("PYTHONPATH", "").split(os.pathsep) if part and part not in sources]
-    return {**os.environ, "PYTHONPATH": os.pathsep.join([*sorted(sources), *there])}
+    others = [part for part in os.environ.get("PYTHONPATH", "").split(os.pathsep) if part and part not in sources]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join([*sorted(sources), *others])}
 
 
 def install_command(extra: str) -> str:
-    """The command that installs one of this project's extras here: in a clone or an installed copy, with or without pip."""
+    """Returns the command that installs one of this project's extras: in a clone or an installed copy, with or without pip."""
     in_clone = (CHECKOUT / "pyproject.toml").exists()
     local_uv = CHECKOUT / ".uv" / "bin" / "uv"
     if importlib.util.find_spec("pip"):
@@ -83,18 +83,18 @@ def install_command(extra: str) -> str:
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of `PACKAGES`; `NOT_INSTALLED` for those that are missing."""
-    found = {"python": platform.python_version()}
+    """Returns the versions of Python and of `PACKAGES`; `NOT_INSTALLED` for missing ones."""
+    installed = {"python": platform.python_version()}
     for package in PACKAGES:
         try:
-            found[package] = importlib.metadata.version(package)
+            installed[package] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:
-            found[package] = NOT_INSTALLED
-    return found
+            installed[package] = NOT_INSTALLED
+    return installed
 
 
 def device_record() -> dict[str, Any]:
-    """The devices that JAX runs on: ``platform``, ``kind`` of the first, ``count``, and ``cpu_count`` of the host."""
+    """Describes JAX's devices: ``platform``, ``kind`` of the first, ``count``, and ``cpu_count`` of the host."""
     import jax
 
     device = jax.devices()[0]
@@ -103,7 +103,7 @@ def device_record() -> dict[str, Any]:
 
 @functools.cache
 def device_name() -> str:
-    """The machine that computes: the accelerator's name and count, or the processor's name and the cores that may be used."""
+    """Returns the hardware's name: the accelerator's name and count, or the processor's name and the number of usable cores."""
     import jax
 
     if jax.default_backend() != "cpu":

@@ -1,7 +1,7 @@
-"""Tables as CSV that no spreadsheet takes for a program.
+"""CSV tables without formula injection.
 
-What begins with one of a few signs, a spreadsheet computes: a folder's name may then read files or start programs. An
-apostrophe before it says that it is text. Numbers stay as they are.
+A spreadsheet evaluates a cell that begins with one of a few characters: a folder's name could read files or start programs. A
+leading apostrophe marks such a cell as text. Numbers are not changed.
 """
 
 import csv
@@ -13,29 +13,29 @@ _SIGNS = ("=", "+", "-", "@", "\t", "\r", "\n", "＝", "＋", "－", "＠")
 
 
 def to_csv(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None) -> str:
-    """Rows under the columns' names, those of the first row if none are given; None is an empty field.
+    """Formats rows as CSV with a header; the columns default to those of the first row. None becomes an empty field.
 
     Raises:
-        ValueError: A row has a column that is not named.
+        ValueError: A row has a column that is not in ``columns``.
     """
     text = io.StringIO()
     columns = list(rows[0] if rows else ()) if columns is None else columns
     if not columns:
         return ""
     writer = csv.DictWriter(text, list(columns), lineterminator="\n")
-    writer.writerow({name: cell(name) for name in columns})
-    writer.writerows({name: cell(value) for name, value in row.items()} for row in rows)
+    writer.writerow({name: escape_cell(name) for name in columns})
+    writer.writerows({name: escape_cell(value) for name, value in row.items()} for row in rows)
     return text.getvalue()
 
 
-def cell(value: Any) -> Any:
-    """Text of a cell: one that a spreadsheet would compute gets an apostrophe; see `text_of`."""
-    # One that is there already must not be taken for ours.
+def escape_cell(value: Any) -> Any:
+    """Returns the text of a cell, with an apostrophe if a spreadsheet would evaluate it; the inverse is `unescape_cell`."""
+    # Text that already has one gets another, so that `unescape_cell` is exact.
     return f"'{value}" if isinstance(value, str) and _needs_mark(value) else value
 
 
-def text_of(written: str) -> str:
-    """The text for which `cell` wrote this."""
+def unescape_cell(written: str) -> str:
+    """Returns the text from which `escape_cell` made ``written``."""
     return written[1:] if written.startswith("'") and _needs_mark(written[1:]) else written
 
 

@@ -1,7 +1,7 @@
-"""Standard streams that nothing printed can break.
+"""Standard streams that never raise on output.
 
-A terminal may not know a character, a reader may leave (`| head`, ssh gone), a disk may be full, and a service may have no
-streams at all. What cannot be shown is left out, or becomes a question mark, and whoever prints goes on.
+A terminal may not support a character, a reader may exit (`| head`, a lost ssh connection), a disk may be full, and a service
+may have no streams at all. Output that cannot be shown is dropped or replaced by question marks, and the program continues.
 """
 
 import contextlib
@@ -12,13 +12,13 @@ from typing import Any
 
 
 class SafeStream:
-    """A stream whose `write` and `flush` raise nothing. Anything else that is asked of it is asked of what lies below.
+    """Stream whose `write` and `flush` never raise; other attributes are those of the wrapped stream.
 
     Args:
-        below: A text stream; None drops everything.
+        below: The wrapped text stream; None discards everything.
 
     Attributes:
-        failure: The first error of what lies below; None while there was none.
+        failure: The first error of the wrapped stream; None if there was none.
     """
 
     def __init__(self, below: Any):
@@ -26,11 +26,11 @@ class SafeStream:
         self.failure: Exception | None = None
 
     def write(self, text: str) -> int:
-        """Writes what can be written; the length of ``text``."""
+        """Writes as much as possible; returns the length of ``text``."""
         if self._below is not None:
             try:
                 self._write(text)
-            except Exception as error:  # noqa: BLE001 - streams of notebooks and services have kinds of their own
+            except Exception as error:  # noqa: BLE001 - streams of notebooks and services raise errors of their own
                 self.failure = self.failure or error
         return len(text)
 
@@ -41,12 +41,12 @@ class SafeStream:
             self._below.write(text.encode(error.encoding, "replace").decode(error.encoding))
 
     def writelines(self, lines: Iterable[str]) -> None:
-        """Writes each of them."""
+        """Writes a sequence of lines."""
         for line in lines:
             self.write(line)
 
     def flush(self) -> None:
-        """Passes on what was written, as far as that is possible."""
+        """Flushes the wrapped stream, if possible."""
         if self._below is not None:
             try:
                 self._below.flush()
@@ -54,21 +54,21 @@ class SafeStream:
                 self.failure = self.failure or error
 
     def isatty(self) -> bool:
-        """Returns whether this is a terminal."""
+        """Returns True if the stream is a terminal."""
         with contextlib.suppress(Exception):
             return bool(self._below.isatty())
         return False
 
     @property
     def encoding(self) -> str:
-        """Encoding of the stream below."""
+        """Encoding of the wrapped stream."""
         return getattr(self._below, "encoding", None) or "utf-8"
 
     def fileno(self) -> int:
-        """Number of the file below.
+        """Returns the file descriptor of the wrapped stream.
 
         Raises:
-            OSError: It has none.
+            OSError: There is none.
         """
         if self._below is None:
             raise OSError("there is no stream")
@@ -79,21 +79,21 @@ class SafeStream:
 
 
 def safe(stream: Any) -> SafeStream:
-    """A stream, such as ``sys.stdout``, which may be None or closed, as one that can be printed to."""
+    """Wraps a stream, such as ``sys.stdout``, which may be None or closed."""
     return stream if isinstance(stream, SafeStream) else SafeStream(stream)
 
 
 def say(line: str) -> None:
-    """Prints a line to stdout, for whoever can see it."""
+    """Prints a line to stdout; never raises."""
     print(line, flush=True, file=safe(sys.stdout))
 
 
 @contextlib.contextmanager
 def safe_streams() -> Iterator[SafeStream]:
-    """Lets everything in this process print to safe streams, third-party libraries included; gives stdout."""
+    """Replaces stdout and stderr by safe streams, for third-party libraries as well; yields stdout."""
     before = sys.stdout, sys.stderr
     stdout, stderr = safe(before[0]), safe(before[1])
-    sys.stdout, sys.stderr = stdout, stderr  # type: ignore[assignment] - a stream, though not of Python's classes
+    sys.stdout, sys.stderr = stdout, stderr  # type: ignore[assignment] - a stream, but not a subclass of Python's
     try:
         yield stdout
     finally:
@@ -104,9 +104,9 @@ def safe_streams() -> Iterator[SafeStream]:
 
 
 def reserve_standard_files() -> None:
-    """Opens nothing in the place of standard files (0, 1, 2) that are closed.
+    """Opens the null device for closed standard files (0, 1, 2).
 
-    Otherwise the next file that is opened would take their place, such as a run's metrics, and what libraries in C print would
+    Otherwise the next file to be opened, such as a run's metrics, would take their descriptor, and output of C libraries would
     be written into it.
     """
     for number in range(3):
@@ -121,14 +121,14 @@ def reserve_standard_files() -> None:
                 os.set_inheritable(number, True)
 
 
-def let_go_of_broken_streams() -> None:
-    """Flushes standard streams, for the last time, and leaves nothing in them that Python would complain about at its end."""
+def detach_broken_streams() -> None:
+    """Flushes the standard streams and detaches broken ones, so that Python does not report errors at exit."""
     for stream in (sys.stdout, sys.stderr):
         if stream is None:
             continue
         try:
             stream.flush()
-        except Exception:  # noqa: BLE001 - as of `SafeStream`
+        except Exception:  # noqa: BLE001 - as in `SafeStream`
             with contextlib.suppress(Exception):
                 nothing = os.open(os.devnull, os.O_WRONLY)
                 os.dup2(nothing, stream.fileno())

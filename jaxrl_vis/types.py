@@ -1,8 +1,8 @@
-"""Arrays and records that the learner's modules pass to each other, and the letters that name their axes.
+"""Arrays and records passed between the learner's modules, and the letters that name their axes.
 
     E  environments in a rollout          B  transitions in a batch       C, H, W  channels, height, width of an image
     N  episodes that the replay holds     A  action components            G        components of the true goal state
-    T  control steps of an episode        S  seeds trained side by side
+    T  control steps of an episode        S  seeds trained in parallel
 
 An observation is a planar image [C, H, W] uint8 or a state vector [S] float32; "..." stands for its own axes.
 """
@@ -17,27 +17,27 @@ Metrics = dict[str, jax.Array]
 
 
 class Replaceable:
-    """Gives a frozen dataclass a ``replace`` method."""
+    """Mixin that gives a frozen dataclass a ``replace`` method."""
 
     def replace(self, **changes: Any) -> Self:
-        """A copy with some fields changed."""
+        """Returns a copy with some fields changed."""
         return dataclasses.replace(self, **changes)  # type: ignore[type-var]
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Episodes(Replaceable):
-    """E whole episodes, episode-major, each observation once. Slot T+1 of observations and states holds the goal.
+    """E complete episodes, episode-major, each observation stored once. Slot T+1 of observations and states holds the goal.
 
-    One array for an episode's observations *and* its goal makes relabelling the choice of a slot: t+1 to T is an observation of
-    the same episode, T+1 the goal that the episode was started with.
+    With the observations *and* the goal of an episode in one array, relabelling is the choice of a slot: t+1 to T is an
+    observation of the same episode, T+1 the original goal.
 
     Attributes:
         observations: [E, T+2, ...] after 0, 1, ... T steps, then the goal's.
-        states: [E, T+2, G] float32, the true goal-space states of the same instants.
+        states: [E, T+2, G] float32, the true goal-space states at the same times.
         actions: [E, T, A] float32, as executed (with exploration noise).
-        flow: [E, T, H, W] uint8, strength of the optical flow of each step (`auxtasks.optical_flow.to_bytes`); None where no
-            auxiliary task asks for it.
+        flow: [E, T, H, W] uint8, magnitude of the optical flow of each step (`auxtasks.optical_flow.to_bytes`); None if no
+            auxiliary task uses it.
     """
 
     observations: jax.Array
@@ -49,11 +49,12 @@ class Episodes(Replaceable):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class ReplayState(Replaceable):
-    """A ring of N episodes. Same arrays as `Episodes` with E = N, but for images: packed, and one for each instant (`replay`).
+    """Ring buffer of N episodes. The arrays are those of `Episodes` with E = N, except that images are packed and stored once
+    (`replay`).
 
     Attributes:
-        episodes: [N, ...] storage; the part that was never written is zero.
-        size: [] int32, episodes stored.
+        episodes: [N, ...] storage; unwritten entries are zero.
+        size: [] int32, number of episodes stored.
     """
 
     episodes: Episodes
@@ -63,23 +64,23 @@ class ReplayState(Replaceable):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Batch(Replaceable):
-    """B transitions with a goal each, as sampled and relabelled.
+    """Batch of B sampled and relabelled transitions, each with a goal.
 
     Attributes:
-        observations: [3, B, ...] before the action, of the goal (relabelled or original), and after the action: side by
-            side, as they are read and as the networks take them, so that nothing is copied in between.
+        observations: [3, B, ...] before the action, of the goal (relabelled or original), and after the action: contiguous, in
+            the order in which the networks take them, to avoid a copy.
         action: [B, A] float32.
         state_tp1: [B, G] float32, the true state after the action.
-        goal_state: [B, G] float32, the true state that the goal shows.
-        reward: [B] float32 of reaching that goal, over the steps from the first observation to the last; None as long as goals
-            may still change, and where the learner itself makes the reward (method autoencoder).
-        discount: [B] float32 of what comes after these steps; None: that of one step.
-        shift: [B, 2] int32, pixels by which the images are to be moved down and to the right; None: not at all.
-        targets: `auxtasks.Targets` of auxiliary tasks; None where there are no tasks.
-        reached: [B, ...] what the observation after the action is as a goal, where that is something else (stacked images);
-            else None.
-        success: [B] float32, 1 where the true state after the action lies at the goal's, else 0: for diagnostics alone. None
-            where rewards are of several steps.
+        goal_state: [B, G] float32, the true state depicted by the goal.
+        reward: [B] float32 for reaching that goal, summed over the steps between the first and the last observation; None while
+            goals may still change, and where the learner itself computes the reward (method autoencoder).
+        discount: [B] float32, discount of the value after these steps; None: that of one step.
+        shift: [B, 2] int32, pixels by which to shift the images down and to the right; None: no shift.
+        targets: `auxtasks.Targets` of auxiliary tasks; None without such tasks.
+        reached: [B, ...] the observation after the action in the form of a goal, if the forms differ (stacked images); else
+            None.
+        success: [B] float32, 1 where the true state after the action reaches the goal, else 0; for diagnostics only. None if
+            rewards span several steps.
     """
 
     observations: jax.Array
@@ -95,17 +96,17 @@ class Batch(Replaceable):
 
     @property
     def observation_t(self) -> jax.Array:
-        """[B, ...] before the action."""
+        """[B, ...] observation before the action."""
         return self.observations[0]
 
     @property
     def goal(self) -> jax.Array:
-        """[B, ...] the goal's observation."""
+        """[B, ...] observation of the goal."""
         return self.observations[1]
 
     @property
     def observation_tp1(self) -> jax.Array:
-        """[B, ...] after the action."""
+        """[B, ...] observation after the action."""
         return self.observations[2]
 
 
@@ -115,7 +116,7 @@ class NormalizerState(Replaceable):
     """Running mean and variance of observations, per pixel and channel.
 
     Attributes:
-        count: [] float32, observations seen.
+        count: [] float32, number of observations.
         mean: [...] float32, in the observation's own unit (0 to 255 for images).
         sum_of_squares: [...] float32, of deviations from the mean.
     """
@@ -131,13 +132,13 @@ class TrainState(Replaceable):
     """The learner: networks, their targets, optimisers, observation statistics.
 
     Attributes:
-        actor, critic: Online parameters. The actor is a head alone where it shares the critic's encoder.
-        target_actor, target_critic: Slowly following copies; heads alone where there is no target encoder.
+        actor, critic: Online parameters. The actor is only a head if it shares the critic's encoder.
+        target_actor, target_critic: Slowly updated copies; only heads if there is no target encoder.
         actor_optimizer, critic_optimizer: optax states.
         normalizer: Observation statistics.
-        goal_normalizer: Those of goals, where they have their own; else None.
-        weighting: `weighting.WeightingState` of the auxiliary losses; None where there is nothing to remember.
-        autoencoder: `latent_reward.AutoencoderState`; None where rewards come from elsewhere.
+        goal_normalizer: Separate statistics of goals; None if they share ``normalizer``.
+        weighting: `weighting.WeightingState` of the auxiliary losses; None for a stateless weighting.
+        autoencoder: `latent_reward.AutoencoderState`; None unless the rewards come from it.
         updates: [] int32, gradient steps taken (fewer than 2^31 in any run that ends).
     """
 
@@ -155,20 +156,20 @@ class TrainState(Replaceable):
 
     @property
     def goal_statistics(self) -> NormalizerState:
-        """What goals are normalised with."""
+        """Statistics that normalise goals."""
         return self.normalizer if self.goal_normalizer is None else self.goal_normalizer
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class LoopState(Replaceable):
-    """All that one training iteration carries to the next, with a leading seed axis S on every leaf but ``iteration``.
+    """State carried from one training iteration to the next, with a leading seed axis S on every leaf except ``iteration``.
 
     Attributes:
         train: The learner, [S, ...].
         replay: The episodes, [S, N, ...].
-        key: [S] typed keys, never changed: iteration k draws from ``fold_in(key, k)``, so a resumed run repeats itself exactly.
-        iteration: [] int32, iterations done; shared by all seeds, so that the replay is written with one contiguous slice.
+        key: [S] typed keys, constant: iteration k draws from ``fold_in(key, k)``, so that a resumed run is reproduced exactly.
+        iteration: [] int32, iterations completed; shared by all seeds, so that the replay is written with one contiguous slice.
     """
 
     train: TrainState

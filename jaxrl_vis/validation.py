@@ -1,6 +1,6 @@
-"""Whether a configuration makes sense in itself: checks that say in one line what is wrong, and how to mend it.
+"""Validation of configurations, with one-line messages that name the problem and the remedy.
 
-Imports no JAX, so that the command line can refuse a request at once.
+Imports no JAX, so that the command line can reject a request at once.
 """
 
 import dataclasses
@@ -11,8 +11,8 @@ from jaxrl_vis.config import Config, data_devices_of
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.methods import METHODS
 
-_LARGEST_SEED = 2**32 - 1  # a random key is made of 32 bits of it: larger seeds would repeat smaller ones
-_LARGEST_COUNT = 2**31 - 1  # arrays are indexed by int32; environment steps are counted on the host, without a bound
+_LARGEST_SEED = 2**32 - 1  # a random key uses 32 bits of it: larger seeds would repeat smaller ones
+_LARGEST_COUNT = 2**31 - 1  # arrays are indexed by int32; environment steps are counted on the host, without bound
 
 _OL_AUX = ("ol_aux", "ol_aux_ablation")
 _OF_WEIGHTINGS = {
@@ -32,7 +32,7 @@ _AT_LEAST_0 = (
 
 
 def validate(config: Config) -> Config:
-    """Returns ``config`` if it makes sense in itself; what depends on the environment is checked where that is known.
+    """Returns ``config`` if it is valid by itself; constraints that depend on the environment are checked elsewhere.
 
     Raises:
         RequestError: A field is of the wrong type or out of range. The message names the field and its value.
@@ -69,11 +69,11 @@ def validate(config: Config) -> Config:
         )
     method = METHODS[config.method]
     if config.n_step > 1 and method.filter:
-        raise RequestError(f"n_step {config.n_step} with method {config.method}: the filter's band is that of one step")
+        raise RequestError(f"n_step {config.n_step} with method {config.method}: the filter's valid range assumes one step")
     _validate_reward(config)
     _validate_auxiliary(config)
     if not config.randomize and _is_set(config, "randomize_strength"):
-        raise RequestError(f"randomize_strength {config.randomize_strength} varies nothing: say what, with --randomize")
+        raise RequestError(f"randomize_strength {config.randomize_strength} has no effect: choose what varies with --randomize")
     _validate_devices(config)
     if config.seed + config.seeds - 1 > _LARGEST_SEED:
         raise RequestError(f"seed {config.seed} is too large: the last of {config.seeds} must be at most {_LARGEST_SEED}")
@@ -81,16 +81,16 @@ def validate(config: Config) -> Config:
 
 
 def _is_set(config: Config, name: str) -> bool:
-    """Whether a field is not as it is where nobody asks for anything."""
+    """Returns True if a field differs from its default."""
     return getattr(config, name) != next(field.default for field in dataclasses.fields(Config) if field.name == name)
 
 
 def _validate_auxiliary(config: Config) -> None:
-    """Raises a RequestError where an option is another weighting's, or there are no tasks that it could be one of."""
+    """Raises a RequestError for an option of another weighting, or one of auxiliary tasks without any tasks."""
     for name, weightings in _OF_WEIGHTINGS.items():
         if _is_set(config, name) and config.weighting not in weightings:
             raise RequestError(
-                f"{name} is an option of weighting {' and '.join(weightings)}, which {config.weighting} does not read: "
+                f"{name} is an option of weighting {' and '.join(weightings)}, which {config.weighting} does not use: "
                 f"leave it out, or choose --weighting {weightings[0]}"
             )
     if _is_set(config, "aux_form") and not config.aux_tasks:
@@ -98,7 +98,7 @@ def _validate_auxiliary(config: Config) -> None:
 
 
 def _validate_devices(config: Config) -> None:
-    """Raises a RequestError where the devices do not divide what is to be spread over them."""
+    """Raises a RequestError if the devices cannot be divided among seeds, environments or batches."""
     devices, along_data = config.devices, data_devices_of(config)
     if along_data < 1:
         raise RequestError(f"data_devices must be at least 1, not {along_data}")
@@ -120,15 +120,15 @@ def _validate_devices(config: Config) -> None:
 
 
 def _validate_reward(config: Config) -> None:
-    """Raises a RequestError where options of a reward are given to a method with another one, or contradict each other."""
+    """Raises a RequestError for reward options that do not fit the method or contradict each other."""
     kind = METHODS[config.method].reward
     errors = {name: getattr(config, name) > 0.0 for name in ("reward_noise", *_FALSE_REWARDS)}
     reads_states = {"n_step": config.n_step > 1, "trivial_goals": config.trivial_goals < 1.0, **errors}
     for name, is_set in reads_states.items():
         if is_set and kind != "oracle":
-            raise RequestError(f"{name} reads true states, which method {config.method} does without; use --method oracle")
+            raise RequestError(f"{name} needs true states, which method {config.method} does not use: choose --method oracle")
         if is_set and name in errors and config.n_step > 1:
-            raise RequestError(f"n_step {config.n_step} and {name} exclude each other: errors are those of single rewards")
+            raise RequestError(f"n_step {config.n_step} and {name} exclude each other: errors apply to single rewards")
     if config.reward_clutter < 1.0 and not any(getattr(config, name) for name in _FALSE_REWARDS):
         raise RequestError(
             f"reward_clutter is where false rewards occur, and there are none: set {' or '.join(_FALSE_REWARDS)}"
@@ -141,4 +141,4 @@ def _validate_reward(config: Config) -> None:
             )
     for name, is_set in (("random_shift", config.random_shift > 0), ("normalizers separate", config.normalizers == "separate")):
         if is_set and kind == "autoencoder":
-            raise RequestError(f"{name} and method {config.method} exclude each other: it compares images as they were seen")
+            raise RequestError(f"{name} and method {config.method} exclude each other: it compares unmodified images")

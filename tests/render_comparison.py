@@ -1,10 +1,10 @@
-"""How far our images are from MuJoCo's own, in the measures that the project has set itself bounds for.
+"""Comparison of our images with MuJoCo's own, in the measures that the project has set bounds for.
 
-A pixel within one pixel of an edge of the segmentation, in either image, is left out of colour, depth and the shares of the
-segmentation: there OpenGL and a ray caster may choose differently. All other pixels count, whether or not the two agree on what
-they show. So that nothing thin is lost with the edges, each object is also matched by itself, with all its pixels: those in one
-image must lie within one pixel of the same object's in the other, in both directions. Where two surfaces coincide, so that
-depth and colour are the same whichever is drawn, either object will do.
+A pixel within one pixel of a segmentation edge, in either image, is excluded from colour, depth and segmentation measures:
+there, OpenGL and a ray caster may legitimately differ. All other pixels count, whether or not the two agree on the object. So
+that thin objects are not lost with the edges, each object is also matched with all its pixels: those in one image must be
+within one pixel of the same object's in the other, in both directions. Where two surfaces coincide, with the same depth and
+colour, either object is accepted.
 """
 
 import dataclasses
@@ -25,13 +25,13 @@ PLANE, SKY, BARE, TEXTURED = "plane", "sky", "bare", "textured"
 
 @dataclasses.dataclass(frozen=True)
 class Bound:
-    """What a measure must keep to: ``at_least`` or ``at_most``."""
+    """Bound of a measure: ``at_least`` or ``at_most``."""
 
     limit: float
     at_least: bool
 
     def holds(self, value: float) -> bool:
-        """Whether the value keeps to it. A measure of nothing (NaN: no such pixels) does."""
+        """Return True if the value is within the bound, or NaN (nothing to measure)."""
         return bool(np.isnan(value) or (value >= self.limit if self.at_least else value <= self.limit))
 
 
@@ -48,7 +48,7 @@ BOUNDS = {
 
 
 def surface_kinds(mj_model: mujoco.MjModel) -> np.ndarray:
-    """[ngeom + nsite] of PLANE, BARE or TEXTURED, indexed as the segmentation is."""
+    """Return [ngeom + nsite] of PLANE, BARE or TEXTURED, indexed like the segmentation."""
     kinds = []
     for types, materials in ((mj_model.geom_type, mj_model.geom_matid), (mj_model.site_type, mj_model.site_matid)):
         for kind, material in zip(types, materials, strict=True):
@@ -59,7 +59,7 @@ def surface_kinds(mj_model: mujoco.MjModel) -> np.ndarray:
 
 
 def near_edges(labels: np.ndarray) -> np.ndarray:
-    """Where one of the eight neighbours of a pixel shows something else. [..., H, W] -> bool."""
+    """Return a mask of pixels with a neighbour (of eight) that shows something else. [..., H, W] -> bool."""
     *batch, height, width = labels.shape
     padded = np.pad(labels, [(0, 0)] * len(batch) + [(1, 1), (1, 1)], mode="edge")
     shifted = (padded[..., row : row + height, column : column + width] for row in range(3) for column in range(3))
@@ -67,21 +67,22 @@ def near_edges(labels: np.ndarray) -> np.ndarray:
 
 
 def dilated(mask: np.ndarray) -> np.ndarray:
-    """Where a pixel or one of its eight neighbours is set. [H, W] -> bool."""
+    """Dilate a mask by one pixel in all eight directions. [H, W] -> bool."""
     height, width = mask.shape
     padded = np.pad(mask, 1)
     return np.any([padded[row : row + height, column : column + width] for row in range(3) for column in range(3)], axis=0)
 
 
 def coincident(ours: Any, theirs: Any) -> np.ndarray:
-    """Where two images show surfaces of the same depth and colour, whichever object each of them names. [H, W] bool."""
+    """Return a mask [H, W] of pixels where two images have the same depth and colour, whatever their objects."""
     same_depth = np.abs(ours.depth - theirs.depth) <= COINCIDENT_METRES
     same_colour = np.max(np.abs(ours.rgb.astype(np.int16) - theirs.rgb), axis=-1) <= COINCIDENT_GREY_LEVELS
     return same_depth & same_colour
 
 
 def matched_shares(ours: Any, theirs: Any) -> dict[int, float]:
-    """Of each object with enough pixels, the share of them that lies within a pixel of its own in the other image; the lesser.
+    """Return, for each object with enough pixels, the fraction within a pixel of its own in the other image; the smaller of
+    both directions.
 
     Pixels where the two surfaces are `coincident` count as the object's own.
 
@@ -102,18 +103,18 @@ def matched_shares(ours: Any, theirs: Any) -> dict[int, float]:
 
 @dataclasses.dataclass
 class Tally:
-    """Sums over the images of one model. Feed it with `add`; read `measures`.
+    """Sums over the images of one model. Add images with `add`; read `measures`.
 
     Attributes:
-        kinds: What `surface_kinds` gives for the model.
-        images: How many were added.
+        kinds: `surface_kinds` of the model.
+        images: Number of images added.
         kept: Pixels away from edges.
-        agreeing: Of these, where the segmentations agree.
+        agreeing: Those of them where the segmentations agree.
         solid: Kept pixels that show an object in either image.
-        close: Of these, where the depths agree.
-        worst: The least IoU, with the object and the image that it was found in.
-        worst_match: The same of `matched_shares`.
-        colours: For each kind of surface, counts [256] of absolute differences of colour values, in 1/255.
+        close: Those of them where the depths agree.
+        worst: Minimum IoU, with its object and image.
+        worst_match: Minimum of `matched_shares`, likewise.
+        colours: Counts [256] of absolute differences of colour values, in 1/255, by kind of surface.
     """
 
     kinds: np.ndarray
@@ -129,7 +130,7 @@ class Tally:
     )
 
     def add(self, ours: Any, theirs: Any) -> None:
-        """Adds one image: two `Frame` of NumPy arrays; ``theirs`` is the truth."""
+        """Add one image: two `Frame` of NumPy arrays; ``theirs`` is the reference."""
         kept = ~(near_edges(ours.segmentation) | near_edges(theirs.segmentation))
         solid = kept & ((ours.segmentation >= 0) | (theirs.segmentation >= 0))
         self.kept += int(kept.sum())
@@ -156,9 +157,9 @@ class Tally:
         self.images += 1
 
     def measures(self) -> dict[str, float]:
-        """The figures by name: those of `BOUNDS`, and ``plane_mean``, ``plane_p99``, ``sky_mean``, ``kept`` (a share).
+        """Measures by name: those of `BOUNDS`, and ``plane_mean``, ``plane_p99``, ``sky_mean``, ``kept`` (a fraction).
 
-        NaN where there was nothing to measure.
+        NaN if there was nothing to measure.
         """
         found = {
             "segmentation": _share(self.agreeing, self.kept),
@@ -172,7 +173,7 @@ class Tally:
         return found
 
     def failures(self, limits: Mapping[str, float] = MappingProxyType({})) -> list[str]:
-        """Names of the bounds that do not hold; ``limits`` are a model's own, that its measures must not exceed."""
+        """Return the names of violated bounds; ``limits`` are additional upper bounds of a model."""
         measures = self.measures()
         bounds = {**BOUNDS, **{name: Bound(limit, False) for name, limit in limits.items()}}
         return [name for name, bound in bounds.items() if not bound.holds(measures[name])]
@@ -183,5 +184,5 @@ def _share(part: float, whole: int) -> float:
 
 
 def _percentile(counts: np.ndarray, share: float) -> float:
-    """The least difference that ``share`` of the counted values do not pass."""
+    """Return the minimum difference that a fraction ``share`` of the counted values does not exceed."""
     return float(np.searchsorted(np.cumsum(counts), share * counts.sum())) if counts.sum() else float("nan")

@@ -1,4 +1,4 @@
-"""The environments behind other libraries' interfaces: each library's own checker, and what wrong adapters get wrong."""
+"""Adapters to other libraries' interfaces: each library's own checker, and common mistakes of adapters."""
 
 import dataclasses
 import functools
@@ -55,7 +55,7 @@ def actions_of(env: Any, steps: int, seed: int = 0) -> np.ndarray:
 
 
 class ReacherWithoutPhysics(reacher.Reacher):
-    """The arm turns by its action: everything but the physics, which takes longest to compile, is real."""
+    """Reacher whose arm is rotated directly by the action: only the physics, which takes longest to compile, is replaced."""
 
     def act(self, data, action):
         return self.configuration(data.qpos + action)
@@ -67,7 +67,7 @@ def build_turned(config: Any) -> ReacherWithoutPhysics:
 
 @pytest.fixture
 def registered(monkeypatch):
-    """What `registry.register` and Gymnasium learn in a test, they forget after it."""
+    """Undo registrations with `registry.register` and Gymnasium after a test."""
     monkeypatch.setattr(registry, "_ENTRIES", dict(registry._ENTRIES))
     monkeypatch.setattr(gymnasium.envs.registration, "registry", dict(gymnasium.registry))
     monkeypatch.setattr(gymnasium, "registry", gymnasium.envs.registration.registry)
@@ -103,7 +103,7 @@ def test_gymnasium_checks_state_and_image_probes():
             check_env(GymnasiumEnv(env))
 
 
-def test_a_reward_is_what_compute_reward_says_of_the_observation():
+def test_reward_equals_compute_reward_of_the_observation():
     for reward in ("oracle", "dense"):
         env = GymnasiumEnv(told(), reward=reward)
         rewards, achieved, desired = [], [], []
@@ -138,7 +138,7 @@ def test_episodes_end_in_truncation_at_the_horizon():
         env.reset()
 
 
-def test_a_seed_settles_this_episode_and_the_next():
+def test_a_seed_determines_this_and_later_episodes():
     def goals_of(env: GymnasiumEnv, seed: int) -> list[float]:
         return [env.reset(seed=seed)[0]["desired_goal"][0], env.reset()[0]["desired_goal"][0]]
 
@@ -148,7 +148,7 @@ def test_a_seed_settles_this_episode_and_the_next():
     assert len({*first, *goals_of(env, 6)}) == 4
 
 
-def test_environments_are_pickled_in_the_middle_of_an_episode(registered):
+def test_environments_can_be_pickled_during_an_episode(registered):
     registry.register("TurnedReacher", build_turned, registry.config_class("VisualReacher"))
     register_all()
     settings = {"image_size": 16, "pixels": "depth", "render_size": 24, "render_mode": "rgb_array"}
@@ -165,7 +165,7 @@ def test_environments_are_pickled_in_the_middle_of_an_episode(registered):
 
 
 @pytest.mark.parametrize("reward", ["oracle", "dense"])
-def test_brax_environments_are_pickled(reward):
+def test_brax_environments_can_be_pickled(reward):
     env = BraxEnv(told(), reward=reward)
     copy = pickle.loads(pickle.dumps(env))
     states = [each.step(each.reset(jax.random.key(2)), jnp.ones(1)) for each in (env, copy)]
@@ -173,7 +173,7 @@ def test_brax_environments_are_pickled(reward):
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-def test_the_vector_environment_does_what_separate_environments_do(mode):
+def test_vector_environment_equals_separate_environments(mode):
     ours = GymnasiumVectorEnv(told(), 3, autoreset_mode=mode)
     theirs = gymnasium.vector.SyncVectorEnv([lambda: GymnasiumEnv(told())] * 3, autoreset_mode=mode)
     assert ours.metadata["autoreset_mode"] == theirs.metadata["autoreset_mode"]
@@ -244,7 +244,7 @@ def test_environments_with_the_same_settings_are_compiled_once(registered):
     [
         (lambda: GymnasiumEnv("Reachr"), "did you mean Reacher"),
         (lambda: GymnasiumEnv("Reacher", horizn=3), "did you mean horizon"),
-        (lambda: GymnasiumEnv(told(), horizon=3), "horizon: options go with the name"),
+        (lambda: GymnasiumEnv(told(), horizon=3), "horizon: options can be changed for a named environment"),
         (lambda: GymnasiumEnv(told(), reward="sparse"), "reward must be one of oracle, dense, got 'sparse'"),
         (lambda: GymnasiumEnv(told(), render_mode="human"), "rgb_array"),
         (lambda: GymnasiumEnv(told(), render_mode="rgb_array"), "no MuJoCo model"),
@@ -252,15 +252,15 @@ def test_environments_with_the_same_settings_are_compiled_once(registered):
         (lambda: GymnasiumVectorEnv(told(), "3"), "num_envs must be a whole number of at least 1, got '3'"),
         (lambda: GymnasiumVectorEnv(told(), 2.0), "num_envs must be a whole number of at least 1, got 2.0"),
         (lambda: GymnasiumVectorEnv(told(), 2).reset(seed=1.5), "one for each of 2 environments, got 1.5"),
-        (lambda: GymnasiumEnv(None), "the name of an environment, or a GoalEnv that is made already, got a NoneType"),
+        (lambda: GymnasiumEnv(None), "the name of an environment, or an existing GoalEnv, got a NoneType"),
         (lambda: GymnasiumEnv(probes.GoWhereTold), "got the class GoWhereTold"),
         (lambda: GymnasiumEnv("Reacher", horizon={}), "horizon must be a whole number of at least 1, got {}"),
         (lambda: GymnasiumEnv("VisualReacher", depth_range=np.ones(2)), "depth_range must be 2 finite numbers, got array"),
-        (lambda: BraxEnv(None), "the name of an environment, or a GoalEnv that is made already, got a NoneType"),
+        (lambda: BraxEnv(None), "the name of an environment, or an existing GoalEnv, got a NoneType"),
         (lambda: GymnasiumVectorEnv(told(), 2, autoreset_mode="Disabled"), "NextStep or SameStep"),
         (lambda: GymnasiumVectorEnv(told(), 2).reset(seed=[1]), "each of 2"),
         (lambda: BraxEnv(told(), reward="sparse"), "oracle, dense"),
-        (lambda: BraxEnv(told(), horizon=3), "horizon: options go with the name"),
+        (lambda: BraxEnv(told(), horizon=3), "horizon: options can be changed for a named environment"),
     ],
 )
 def test_bad_settings_are_refused_in_one_line(make, message):
@@ -269,7 +269,7 @@ def test_bad_settings_are_refused_in_one_line(make, message):
     assert "\n" not in str(caught.value)
 
 
-def test_rewards_are_of_states_of_the_right_size_and_in_32_bits():
+def test_rewards_check_state_sizes_and_are_float32():
     env = GymnasiumEnv(told(), reward="dense")
     rewards = env.compute_reward(np.zeros((3, 1)), np.array([[0], [1], [2]], np.uint8))
     assert rewards.dtype == np.float32
@@ -281,7 +281,7 @@ def test_rewards_are_of_states_of_the_right_size_and_in_32_bits():
         assert "\n" not in str(refused.value)
 
 
-def test_a_rendered_image_has_the_looks_of_its_episode():
+def test_rendered_images_have_the_appearance_of_their_episode():
     varied = point_mass.PointMass(point_mass.PointMassConfig(randomization=Randomization(colour=0.5)))
     env = GymnasiumVectorEnv(varied, 2, render_mode="rgb_array", render_size=8)
     observations, _ = env.reset(seed=0)
@@ -306,7 +306,7 @@ def test_misuse_is_refused_in_one_line():
         ("gymnasium", "gymnasium", "pip install 'jaxrl-vis[gymnasium]'"),
     ],
 )
-def test_a_missing_library_is_named_with_its_mend(monkeypatch, adapter, library, mend):
+def test_missing_library_error_says_how_to_install_it(monkeypatch, adapter, library, mend):
     for name in [name for name in sys.modules if name.split(".")[0] == library]:
         monkeypatch.setitem(sys.modules, name, None)
     monkeypatch.setitem(sys.modules, library, None)
@@ -315,7 +315,7 @@ def test_a_missing_library_is_named_with_its_mend(monkeypatch, adapter, library,
         importlib.import_module(f"jaxrl_vis_envs.adapters.{adapter}")
 
 
-def test_brax_wrappers_truncate_at_the_horizon_and_start_again():
+def test_brax_wrappers_truncate_at_the_horizon_and_reset():
     env = BraxEnv(told(), reward="dense")
     wrapped = training.EvalWrapper(training.wrap(env, episode_length=env.episode_length))
     state = jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(0), 3))
@@ -338,7 +338,7 @@ def test_brax_wrappers_truncate_at_the_horizon_and_start_again():
     np.testing.assert_allclose(summed["goal_distance"], 0.25 * HORIZON, atol=1e-5)
 
 
-def test_brax_shows_images_as_its_vision_agents_take_them():
+def test_brax_images_suit_its_vision_agents():
     env = BraxEnv(wide())
     state = env.step(env.reset(jax.random.PRNGKey(0)), jnp.zeros(1))
     assert env.observation_size == {"pixels/observation": (2, 4, 3), "pixels/goal": (2, 4, 3)}
@@ -348,7 +348,7 @@ def test_brax_shows_images_as_its_vision_agents_take_them():
     assert float(state.reward) == -1.0
 
 
-def test_brax_keys_of_either_kind_start_the_same_episode():
+def test_typed_and_untyped_brax_keys_start_the_same_episode():
     env = BraxEnv(told())
     np.testing.assert_array_equal(env.reset(jax.random.PRNGKey(7)).obs, env.reset(jax.random.key(7)).obs)
 
@@ -356,7 +356,7 @@ def test_brax_keys_of_either_kind_start_the_same_episode():
 BRAX_LEARNING = {"batch_size": 64, "discounting": 0.5}
 
 
-def test_brax_ppo_learns_where_to_go():
+def test_brax_ppo_learns():
     env = BraxEnv(told(), reward="dense")
     sizes = {"policy_hidden_layer_sizes": (16,), "value_hidden_layer_sizes": (16,)}
     with lend_jax():

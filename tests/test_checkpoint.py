@@ -17,7 +17,7 @@ import pytest
 from fake_program import FakeProgram, as_plain, make_fake_trainer, small_config
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.run.checkpoint import FULL, LIGHT, Checkpoints
+from jaxrl_vis.run.checkpoint import FULL, LIGHT, RECENT, Checkpoints
 
 FAKE = Path(__file__).with_name("fake_program.py")
 
@@ -26,11 +26,11 @@ FAKE = Path(__file__).with_name("fake_program.py")
 def states():
     """Loop states after 1, 2 and 3 iterations of the fake program, and its shapes."""
     trainer = make_fake_trainer(small_config(), None)
-    loop, found = trainer.init(jax.random.key(7)), []
+    loop, snapshots = trainer.init(jax.random.key(7)), []
     for _ in range(3):
         loop, _ = trainer.train_iteration(loop)
-        found.append(jax.tree.map(jnp.copy, loop))
-    return found, trainer.shapes
+        snapshots.append(jax.tree.map(jnp.copy, loop))
+    return snapshots, trainer.shapes
 
 
 @pytest.fixture(scope="module")
@@ -227,6 +227,7 @@ def test_kill_while_saving_keeps_the_checkpoint_before(tmp_path, clean_environme
         process.wait()
     assert caught and process.returncode == -signal.SIGKILL
     newest = max(int(name) for name in done)
+    shutil.rmtree(run_dir / "checkpoints" / RECENT, ignore_errors=True)  # which may be newer, and would be restored
     config = small_config(env_steps=10**7, replay_transitions=50_000, num_envs=1000, full_checkpoint_interval=1)
     lines = []
     trainer = make_fake_trainer(config, None)

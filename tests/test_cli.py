@@ -23,11 +23,11 @@ from jaxrl_vis.config import PRESETS, Config, preset
 from jaxrl_vis.errors import NonFiniteError, StorageError, Terminated
 from jaxrl_vis.methods import METHODS, MethodName
 from jaxrl_vis.report.outputs import check_writable
-from jaxrl_vis.run.command import options_of
+from jaxrl_vis.run.command import training_options
 
 
 def one_line(capsys: pytest.CaptureFixture[str], status: int) -> str:
-    """What a wrong request was told: exactly one line, on stderr, with exit status 2."""
+    """Checks the report of a wrong request: exactly one line, on stderr, with exit status 2."""
     output = capsys.readouterr()
     assert status == 2
     assert output.out == ""
@@ -155,7 +155,7 @@ def test_the_command_of_a_configuration_gives_that_configuration(method: MethodN
     choices: list[dict[str, Any]] = [{}, {"trivial_goals": 1.0}, {"hidden_sizes": (8, 8), "clip_targets_above": False}]
     for changes in choices:
         config = preset("fast", env="VisualFingerTurn", method=method, **changes)
-        assert training_config(parse(Train, options_of(config))) == config
+        assert training_config(parse(Train, training_options(config))) == config
 
 
 def test_a_task_is_named_by_its_place_or_by_its_name(capsys: pytest.CaptureFixture[str]) -> None:
@@ -170,10 +170,10 @@ def test_a_task_is_named_by_its_place_or_by_its_name(capsys: pytest.CaptureFixtu
         for words in (["runs/mine"], ["--run-dir", "runs/mine"]):
             assert parse(command, words).run_dir == Path("runs/mine")
     for words in (["train", "Reacher", "--env", "FetchReach"], ["bench", "env", "Reacher", "--env", "FetchReach"]):
-        assert "env is given twice, FetchReach by --env and Reacher by its place; give it once" in one_line(
+        assert "env is given twice, FetchReach by --env and Reacher by position; give it once" in one_line(
             capsys, cli.main(words)
         )
-    assert "run_dir is given twice, a by --run-dir and b by its place" in one_line(
+    assert "run_dir is given twice, a by --run-dir and b by position" in one_line(
         capsys, cli.main(["eval", "b", "--run-dir", "a"])
     )
     assert "env is given twice" in one_line(capsys, cli.main(["envs", "Reacher", "--env", "FetchReach", "Reacher"]))

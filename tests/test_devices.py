@@ -1,4 +1,4 @@
-"""What JAX computes on: told in one line where it is not there, and guessed where help must not wait for JAX."""
+"""Devices that JAX computes on: reported in one line if missing, and guessed for help that must not wait for JAX."""
 
 import json
 import logging
@@ -88,13 +88,13 @@ def test_the_guess_follows_what_is_asked_for_installed_and_there(
 ) -> None:
     monkeypatch.setenv("JAX_PLATFORMS", asked)
     monkeypatch.setattr(devices, "_is_installed", lambda _: packages)
-    monkeypatch.setattr(devices, "_is_there", lambda _: there)
+    monkeypatch.setattr(devices, "_exists", lambda _: there)
     assert devices.guess_accelerator() is expected
 
 
 def test_a_gpu_without_its_packages_is_mended_by_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(devices, "_is_installed", lambda _: False)
-    monkeypatch.setattr(devices, "_is_there", lambda _: True)
+    monkeypatch.setattr(devices, "_exists", lambda _: True)
     assert devices._mend("cuda") == "; install this project with the extra cuda12 or cuda13"
 
 
@@ -103,17 +103,17 @@ def test_sizes_are_all_in_one_unit() -> None:
     assert sizes == ["under 0.001 GiB", "under 0.001 GiB", "0.005 GiB", "0.1 GiB", "3.0 GiB", "32768.0 GiB"]
 
 
-@pytest.mark.parametrize("given", [{}, {"XLA_CLIENT_MEM_FRACTION": "0.5"}, {"XLA_PYTHON_CLIENT_MEM_FRACTION": "0.4"}])
-def test_training_claims_most_of_a_gpu_unless_told_how_much(given: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("variables", [{}, {"XLA_CLIENT_MEM_FRACTION": "0.5"}, {"XLA_PYTHON_CLIENT_MEM_FRACTION": "0.4"}])
+def test_training_claims_most_of_a_gpu_unless_told_how_much(variables: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
     names = ("XLA_CLIENT_MEM_FRACTION", "XLA_PYTHON_CLIENT_MEM_FRACTION")
     for name in names:
         monkeypatch.setenv(name, "")  # so that what is set here ends with the test
         monkeypatch.delenv(name)
-    for name, value in given.items():
+    for name, value in variables.items():
         monkeypatch.setenv(name, value)
     devices.claim_memory()
     # JAX refuses to start with both.
-    assert {name: os.environ[name] for name in names if name in os.environ} == (given or {names[1]: "0.9"})
+    assert {name: os.environ[name] for name in names if name in os.environ} == (variables or {names[1]: "0.9"})
 
 
 @pytest.fixture
@@ -147,29 +147,29 @@ def test_what_a_run_says_of_the_cache_is_true(
     assert said() == f"once; the next start finds it in {elsewhere}" and elsewhere.is_dir()
     jax_config("persistent_cache_min_compile_time_secs", 30.0)
     monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "30")
-    assert said() == "as will every start: only what takes 30 s to compile is kept"
+    assert said() == "as will every start: only programs that take 30 s or more to compile are cached"
     jax_config("enable_compilation_cache", False)
-    assert said() == "as will every start: JAX is told to keep no compiled programs"
+    assert said() == "as will every start: the compilation cache is disabled in JAX"
     jax_config("enable_compilation_cache", True)
     monkeypatch.setenv("XDG_CACHE_HOME", str(file))
     jax_config("compilation_cache_dir", None)
-    assert said().endswith("cannot be written (Not a directory); set JAX_COMPILATION_CACHE_DIR to a folder that can")
+    assert said().endswith("cannot be written (Not a directory); set JAX_COMPILATION_CACHE_DIR to a writable folder")
     assert devices.enable_compilation_cache() == ""
     # And nobody else complains of it.
     jax_config("compilation_cache_dir", str(file / "cache"))
     jax_config("persistent_cache_min_compile_time_secs", 0.0)
     compilation_cache.reset_cache()
     assert len(list(make_fake_trainer(small_config(), tmp_path / "run").run())) == 8
-    found = capsys.readouterr()
-    assert f"compiling (as will every start: {file / 'cache'} cannot be written (Not a directory)) ..." in found.out
-    assert found.err == "" and not recwarn.list
+    printed = capsys.readouterr()
+    assert f"compiling (as will every start: {file / 'cache'} cannot be written (Not a directory)) ..." in printed.out
+    assert printed.err == "" and not recwarn.list
 
 
 def test_a_jax_that_does_not_compile_is_refused(tmp_path: Path, jax_config, capsys) -> None:
     jax_config("disable_jit", True)
     assert cli.main(["train", "--preset", "debug", "--run-dir", str(tmp_path / "run")]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("jaxrl-vis: JAX is told not to compile") and "unset JAX_DISABLE_JIT" in line
+    assert line.startswith("jaxrl-vis: compilation is disabled in JAX") and "unset JAX_DISABLE_JIT" in line
     assert not (tmp_path / "run").exists()
 
 

@@ -48,7 +48,7 @@ SMALLER = {"FetchReach": "Reacher", "4096": "4", "num_envs=64": "num_envs=4"}
 SMALLER |= {"image_size=64, render_mode": 'image_size=16, pixels="depth", render_mode'}
 
 
-def name_of(page: Path) -> str:
+def page_name(page: Path) -> str:
     return page.relative_to(ROOT).as_posix()
 
 
@@ -97,7 +97,7 @@ def reader(desk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Itera
 
 
 def missing(what: str) -> bool:
-    """Whether a thing that a mark says is needed is not there: a module, a name in one, or an option of `train`."""
+    """Returns True if a requirement in a mark is missing: a module, a name in one, or an option of `train`."""
     if what.startswith("--"):
         return what[2:] not in {field.name for field in (*dataclasses.fields(Config), *dataclasses.fields(Train))}
     module, _, name = what.rpartition(".")
@@ -109,7 +109,7 @@ def missing(what: str) -> bool:
     return not module or not hasattr(importlib.import_module(module), name)
 
 
-@pytest.mark.parametrize("page", doc_blocks.PAGES, ids=name_of)
+@pytest.mark.parametrize("page", doc_blocks.PAGES, ids=page_name)
 def test_blocks_have_a_language_and_marks_are_true(page: Path) -> None:
     for block in blocks(page):
         assert block.language in {*doc_blocks.LANGUAGES, ""}, f"{page}:{block.line}"
@@ -144,7 +144,7 @@ def run_block(page: Path, block: Block, names: dict[str, Any], capsys: pytest.Ca
             assert said in printed, f"{page}:{block.line}: {said} is not what it prints: {printed}"
 
 
-@pytest.mark.parametrize("page", pages_with("python"), ids=name_of)
+@pytest.mark.parametrize("page", pages_with("python"), ids=page_name)
 def test_python_blocks_run(
     page: Path, reader: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -158,7 +158,7 @@ def test_python_blocks_run(
             run_block(page, block, names, capsys)
 
 
-@pytest.mark.parametrize("page", [ROOT / "README.md", DOCS / "index.md"], ids=name_of)
+@pytest.mark.parametrize("page", [ROOT / "README.md", DOCS / "index.md"], ids=page_name)
 def test_what_is_typed_first_suits_a_laptop(page: Path) -> None:
     text = next(block.text for block in blocks(page) if "jaxrl_vis.preset(" in block.text)
     call = re.search(r"jaxrl_vis\.preset\(.*?\)", text)
@@ -172,7 +172,7 @@ def checked_environment(env: str, env_options: tuple[str, ...], randomize: tuple
     make_env(Config(env=env, env_options=env_options, randomize=randomize))  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("page", pages_with("sh"), ids=name_of)
+@pytest.mark.parametrize("page", pages_with("sh"), ids=page_name)
 def test_shell_blocks_could_be_typed(page: Path, reader: Path) -> None:
     for block in blocks(page):
         save_file(block)
@@ -180,7 +180,7 @@ def test_shell_blocks_could_be_typed(page: Path, reader: Path) -> None:
             if words[0] != "jaxrl-vis":
                 doc_blocks.check_other(words)
                 continue
-            name, rest = (words[1], words[2:]) if words[1].startswith("-") else cli.command_of(words[1:])
+            name, rest = (words[1], words[2:]) if words[1].startswith("-") else cli.split_command(words[1:])
             there = name != "eval" or Path(rest[0]).exists()  # a page may evaluate what it has trained
             if name in EXECUTED and there and "--gallery" not in rest:
                 assert cli.main([*name.split(), *rest]) == 0, f"{page}:{block.line}"
@@ -263,7 +263,7 @@ for figure in ("5.1", "5.4"):  # of no runs: status 3
 # -- Tables
 
 
-def keys_of(page: Path, name: str) -> list[str]:
+def read_keys(page: Path, name: str) -> list[str]:
     """The first column of the table between the marks of that name."""
     table = page.read_text().partition(f"<!-- {name}: begin -->")[2].partition(f"<!-- {name}: end -->")[0]
     return re.findall(r"^\| `([^`]+)`", table, re.MULTILINE)
@@ -275,7 +275,7 @@ def test_the_table_of_metrics_has_the_keys_that_runs_write(desk: Path, tmp_path:
     list(make_fake_trainer(small_config(full_checkpoint_interval=0, env_steps=40), tmp_path / "run").run())
     list(make_fake_trainer(small_config(full_checkpoint_interval=0), tmp_path / "run", resume=True).run())
     later = set(metrics.read_rows(tmp_path / "run" / "metrics.jsonl")[-1])
-    said = keys_of(DOCS / "learner.md", "metrics")
+    said = read_keys(DOCS / "learner.md", "metrics")
     assert len(said) == len(set(said))
     assert set(said) == written | {key for key in later if key.startswith("resume/")}
 
@@ -291,7 +291,7 @@ def load_tool(name: str) -> Any:
 def test_the_configuration_page_is_that_of_the_source() -> None:
     tool = load_tool("configuration")
     assert tool.PAGE.read_text() == tool.page(tool.PAGE.read_text()), "run python docs/tools/configuration.py"
-    assert set(keys_of(tool.PAGE, "fields")) == {field.name for field in dataclasses.fields(Config)}
+    assert set(read_keys(tool.PAGE, "fields")) == {field.name for field in dataclasses.fields(Config)}
 
 
 def test_runs_page_lists_what_may_change_and_every_exit_status() -> None:
@@ -338,7 +338,7 @@ def test_the_table_of_models_is_that_of_the_record(checkout: Path) -> None:
 # -- Links and the site
 
 
-@pytest.mark.parametrize("page", [*doc_blocks.PAGES, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"], ids=name_of)
+@pytest.mark.parametrize("page", [*doc_blocks.PAGES, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"], ids=page_name)
 def test_scripts_that_are_named_exist(page: Path) -> None:
     text = page.read_text()
     for script in re.findall(r"benchmarks/[\w/]+\.py", text):
@@ -347,7 +347,7 @@ def test_scripts_that_are_named_exist(page: Path) -> None:
         assert module == "benchmarks.peers.NAME" or importlib.util.find_spec(module) is not None, module
 
 
-@pytest.mark.parametrize("page", doc_blocks.PAGES, ids=name_of)
+@pytest.mark.parametrize("page", doc_blocks.PAGES, ids=page_name)
 def test_links_and_images_lead_somewhere(page: Path) -> None:
     text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
     for target in re.findall(r"\]\(([^)]+)\)", text):
@@ -368,14 +368,14 @@ def test_every_page_is_in_the_menu_and_reached_from_the_readme() -> None:
         assert (
             page.stem == "index"
             or f"(docs/{page.name})" in readme
-            or f"({page.name})" in "".join(each.read_text() for each in DOCS.glob("*.md"))
+            or f"({page.name})" in "".join(other.read_text() for other in DOCS.glob("*.md"))
         )
     for guide in ("tasks", "learner", "configuration", "runs", "extending", "adapters", "renderer", "glossary"):
         assert f"(docs/{guide}.md)" in readme
 
 
 class Reader(html.parser.HTMLParser):
-    """What a page loads by itself (scripts, styles, images, frames), where its links lead, and the anchors that it has."""
+    """Parser of a page's resources (scripts, styles, images, frames), link targets and anchors."""
 
     def __init__(self) -> None:
         super().__init__()

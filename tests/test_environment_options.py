@@ -25,7 +25,7 @@ def test_options_reach_the_environment_with_their_types():
         ("threshold=-1", "threshold"),
     ],
 )
-def test_bad_options_are_one_line(option, complaint):
+def test_bad_options_raise_one_line(option, complaint):
     with pytest.raises(RequestError, match=complaint) as refused:
         make_env(preset("debug", env_options=(option,)))
     assert "\n" not in str(refused.value)

@@ -1,4 +1,4 @@
-"""The contract that every registered environment keeps, and what is particular to each task."""
+"""Contract of every registered environment, and properties of each task."""
 
 import functools
 import os
@@ -59,7 +59,7 @@ def play(name: str, state: State, actions: Any) -> list[State]:
 
 @functools.cache
 def images(task: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """[BATCH, C, H, W]: of the goals, of the starts, and after the last step."""
+    """Images [BATCH, C, H, W] of the goals, of the starts, and after the last step."""
     env, played = make_visual(task), episode(task)
     nowhere = jnp.zeros(played.states[0].goal_state.shape[1])
     observe = env_jit(jax.vmap(lambda data: env.observe(env.state_at(data, nowhere))))
@@ -149,7 +149,7 @@ def test_images_show_goals_and_movement(name: str) -> None:
 
 @functools.cache
 def seen_episodes(frame_stack: int = 1) -> tuple[GoalEnv, State, State]:
-    """Four episodes of a visual task, played as one program: the task, their starts, their states [STEPS, 4] after actions."""
+    """Four episodes of a visual task, run as one program: the task, their starts, their states [STEPS, 4] after actions."""
     env = PointMass(PointMassConfig(image_size=16, frame_stack=frame_stack))
     actions = jax.random.uniform(jax.random.key(1), (STEPS, 4, 2), minval=-1.0)
     actions = actions.at[:3, 0].set(jnp.array([[1.0], [-0.5], [0.8]]))  # so that no two of the first images are alike
@@ -166,7 +166,7 @@ def seen_episodes(frame_stack: int = 1) -> tuple[GoalEnv, State, State]:
 
 
 def test_a_visual_task_resets_and_steps_as_its_parts_say() -> None:
-    """`reset` and `step` put together what the other tests see one by one."""
+    """`reset` and `step` equal the combination of their parts."""
     env, start, steps = seen_episodes()
     keys = jax.random.split(jax.random.key(0), 4)
     assert start.obs is not None and steps.obs is not None
@@ -193,13 +193,13 @@ def test_an_action_of_another_shape_is_refused(name: str, wrong: tuple[int, ...]
 
 
 @EACH_TASK
-def test_tasks_refuse_64_bits(name: str) -> None:
+def test_tasks_refuse_64_bit_jax(name: str) -> None:
     with jax.enable_x64(True), pytest.raises(ValueError, match=f"{name} simulates in 32 bits.*unset JAX_ENABLE_X64"):
         jaxrl_vis_envs.make(name)
 
 
 @pytest.mark.parametrize("shape", [(), (3,), (5, 2)])
-def test_what_is_not_one_untyped_key_is_refused(shape: tuple[int, ...]) -> None:
+def test_batched_or_non_typed_keys_are_refused(shape: tuple[int, ...]) -> None:
     env = jaxrl_vis_envs.make("Reacher")
     with pytest.raises(ValueError, match="reset takes one JAX key, not an array of shape") as refused:
         env.reset(np.zeros(shape, np.uint32))
@@ -219,7 +219,7 @@ def test_sanitize_action():
 
 
 def test_images_stack_newest_first():
-    """Against an environment that shows one image, from the same key, under the same actions."""
+    """Compared with an environment that observes one image, from the same key, under the same actions."""
     (env, *states), (_, *states_1) = seen_episodes(3), seen_episodes()
     (start, steps), (start_1, steps_1) = ([state.obs for state in each] for each in (states, states_1))
     assert start is not None and steps is not None and start_1 is not None and steps_1 is not None
@@ -351,11 +351,11 @@ def test_register(monkeypatch):
     with pytest.raises(ValueError, match="TaskConfig.horizon of 'Other' needs a default"):
         registry.register("Other", lambda config: environments.make("Reacher"), TaskConfig)
     registry.register("Nothing", lambda config: None, config_class)
-    with pytest.raises(ValueError, match="Nothing is no environment but None: its factory"):
+    with pytest.raises(ValueError, match="Nothing is not an environment but None: its factory"):
         jaxrl_vis_envs.make("Nothing")
 
 
-def test_what_an_environment_sees_is_known_before_it_is_built(monkeypatch):
+def test_observation_kind_is_known_before_building(monkeypatch):
     for task in TASKS:
         assert registry.has_images(f"Visual{task}") and not registry.has_images(task)
         assert registry.state_variant(f"Visual{task}") == registry.state_variant(task) == task

@@ -16,7 +16,7 @@ from types import ModuleType
 import pytest
 
 from jaxrl_vis.errors import RequestError, Terminated, WorkerError
-from jaxrl_vis.evaluation_pool import Kept, Record, code_of, evaluate_each, results_of
+from jaxrl_vis.evaluation_pool import Record, RecordFile, code_digest, evaluate_all, map_unordered
 from jaxrl_vis.run import signals
 
 
@@ -41,8 +41,8 @@ def killed(number: int) -> Record:
 
 def signalled(number: int) -> Record:
     """Signals itself, as somebody would who signals the whole group of processes."""
-    for each in signals.SIGNALS:
-        subprocess.run(["kill", f"-{each}", str(os.getpid())], check=True)
+    for item in signals.SIGNALS:
+        subprocess.run(["kill", f"-{item}", str(os.getpid())], check=True)
     return {"ignored": sorted(signal.pthread_sigmask(signal.SIG_BLOCK, ()))}
 
 
@@ -51,10 +51,10 @@ def total(records: list[Record]) -> Record:
 
 
 def test_results_are_the_same_in_one_process_and_in_several():
-    found: list[dict[int, Record]] = [{}, {}]
-    for workers, into in zip((1, 2), found):
-        evaluate_each(functools.partial(squared, 7), range(6), workers, into.__setitem__)
-    one, two = found
+    results: list[dict[int, Record]] = [{}, {}]
+    for workers, into in zip((1, 2), results):
+        evaluate_all(functools.partial(squared, 7), range(6), workers, into.__setitem__)
+    one, two = results
     assert {number: record["square"] for number, record in one.items()} == {number: number**2 + 7 for number in range(6)}
     assert {number: record["square"] for number, record in two.items()} == {number: number**2 + 7 for number in range(6)}
     assert {record["process"] for record in one.values()} == {os.getpid()}
@@ -63,25 +63,25 @@ def test_results_are_the_same_in_one_process_and_in_several():
 
 
 def test_what_goes_wrong_in_a_process_is_told():
-    found: dict[int, Record] = {}
+    results: dict[int, Record] = {}
     with pytest.raises(ValueError, match="number 2 is broken"):
-        evaluate_each(broken, range(3), 2, found.__setitem__)
-    with pytest.raises(WorkerError, match="was ended from outside"):
-        evaluate_each(killed, range(3), 2, found.__setitem__)
+        evaluate_all(broken, range(3), 2, results.__setitem__)
+    with pytest.raises(WorkerError, match="was killed from outside"):
+        evaluate_all(killed, range(3), 2, results.__setitem__)
 
 
 def test_signals_to_the_whole_group_do_not_reach_processes():
-    """What the one that started them ends, and so also keeps, must not be ended beside it."""
-    found: dict[int, Record] = {}
-    evaluate_each(signalled, range(2), 2, found.__setitem__)
-    assert all(set(record["ignored"]) >= set(signals.SIGNALS) for record in found.values()) and len(found) == 2
+    """Workers ignore signals to the process group: only their parent ends them."""
+    results: dict[int, Record] = {}
+    evaluate_all(signalled, range(2), 2, results.__setitem__)
+    assert all(set(record["ignored"]) >= set(signals.SIGNALS) for record in results.values()) and len(results) == 2
 
 
 def test_a_signal_to_the_one_that_started_them_ends_processes():
     before = set(multiprocessing.active_children())
     started = time.monotonic()
     with signals.Ending() as ending, pytest.raises(Terminated):
-        for _ in results_of(slow, itertools.count(), 2):
+        for _ in map_unordered(slow, itertools.count(), 2):
             signal.raise_signal(signal.SIGTERM)
     assert ending.signal == signal.SIGTERM and not set(multiprocessing.active_children()) - before
     assert time.monotonic() - started < 60
@@ -90,7 +90,7 @@ def test_a_signal_to_the_one_that_started_them_ends_processes():
 @pytest.mark.parametrize("workers", [1, 2])
 def test_endless_numbers_are_taken_as_they_are_needed(workers: int):
     before = set(multiprocessing.active_children())
-    results = results_of(functools.partial(squared, 1), itertools.count(), workers)
+    results = map_unordered(functools.partial(squared, 1), itertools.count(), workers)
     some = [record["square"] for record in itertools.islice(results, 5)]
     results.close()
     assert set(some) <= {number**2 + 1 for number in range(12)} and len(set(some)) == 5
@@ -100,9 +100,9 @@ def test_endless_numbers_are_taken_as_they_are_needed(workers: int):
 
 def test_what_goes_wrong_with_endless_numbers_is_told():
     with pytest.raises(ValueError, match="number 2 is broken"):
-        list(results_of(broken, itertools.count(), 2))
-    with pytest.raises(WorkerError, match="was ended from outside"):
-        list(results_of(killed, itertools.count(), 2))
+        list(map_unordered(broken, itertools.count(), 2))
+    with pytest.raises(WorkerError, match="was killed from outside"):
+        list(map_unordered(killed, itertools.count(), 2))
 
 
 def test_processes_end_with_the_one_that_started_them_however_that_ends(tmp_path: Path, clean_environment: dict[str, str]):
@@ -110,13 +110,13 @@ def test_processes_end_with_the_one_that_started_them_however_that_ends(tmp_path
     script.write_text(
         "import os, time\n"
         "from pathlib import Path\n"
-        "from jaxrl_vis.evaluation_pool import results_of\n"
+        "from jaxrl_vis.evaluation_pool import map_unordered\n"
         "def work(number):\n"
         "    Path(__file__).with_name(f'{number}.part').write_text(str(os.getpid()))\n"
         "    Path(__file__).with_name(f'{number}.part').rename(Path(__file__).with_name(f'{number}.pid'))\n"
         "    time.sleep(120)\n"
         "if __name__ == '__main__':\n"
-        "    list(results_of(work, range(2), 2))\n"
+        "    list(map_unordered(work, range(2), 2))\n"
     )
     started = subprocess.Popen([sys.executable, script], env=clean_environment)
     try:
@@ -136,7 +136,7 @@ def wait_until(holds: Callable[[], bool], seconds: float) -> None:
 
 
 def runs(process: int) -> bool:
-    """Whether a process does anything; one that has ended may still be listed."""
+    """Returns True if a process runs; an ended one may still be listed."""
     try:
         os.kill(process, 0)
         status = Path(f"/proc/{process}/stat")
@@ -147,25 +147,25 @@ def runs(process: int) -> bool:
 
 def test_a_file_goes_on_where_it_was_and_holds_one_evaluation(tmp_path: Path):
     path, about = tmp_path / "kept.json", {"family": "training", "method": "default"}
-    kept = Kept(path, about, total)
-    kept.add(3, {"square": 9, "room": float("inf")})
-    kept.add(1, {"square": 1, "room": 0.5})
-    again = Kept(path, about, total)
+    records = RecordFile(path, about, total)
+    records.add(3, {"square": 9, "room": float("inf")})
+    records.add(1, {"square": 1, "room": 0.5})
+    again = RecordFile(path, about, total)
     assert (
         again.records
-        == kept.records
+        == records.records
         == {1: {"number": 1, "square": 1, "room": 0.5}, 3: {"number": 3, "square": 9, "room": None}}
     )
     again.add_all({2: {"square": 4}})
-    found = json.loads(path.read_text())
-    assert found["total"] == 14 and found["nothing"] is None and found["family"] == "training"
-    assert [each["number"] for each in found["each"]] == [1, 2, 3]
+    results = json.loads(path.read_text())
+    assert results["total"] == 14 and results["nothing"] is None and results["family"] == "training"
+    assert [item["number"] for item in results["each"]] == [1, 2, 3]
     with pytest.raises(RequestError, match='another evaluation \\(method: "default", not "thesis"\\)'):
-        Kept(path, {**about, "method": "thesis"}, total)
+        RecordFile(path, {**about, "method": "thesis"}, total)
     path.write_text("{}")
-    with pytest.raises(RequestError, match="holds no records to go on with"):
-        Kept(path, about, total)
-    in_memory = Kept(None, about, total)
+    with pytest.raises(RequestError, match="holds no records to resume"):
+        RecordFile(path, about, total)
+    in_memory = RecordFile(None, about, total)
     in_memory.add(1, {"square": 1})
     assert 1 in in_memory and 2 not in in_memory
 
@@ -176,15 +176,15 @@ def test_other_code_is_told_apart(tmp_path: Path):
     (tmp_path / "training").mkdir()
     for name in ("__init__.py", "look.py", "training/fit.py"):
         (tmp_path / name).write_text("1")
-    before = code_of(package, leave_out=("training",))
+    before = code_digest(package, leave_out=("training",))
     (tmp_path / "training/fit.py").write_text("2")
-    assert code_of(package, leave_out=("training",)) == before != code_of(package)
+    assert code_digest(package, leave_out=("training",)) == before != code_digest(package)
     (tmp_path / "look.py").write_text("2")
-    assert code_of(package, leave_out=("training",)) != before
+    assert code_digest(package, leave_out=("training",)) != before
 
 
 @pytest.mark.parametrize(
-    "each",
+    "item",
     [
         '{"number": 3}, {"number": 3}',
         '{"number": "3"}',
@@ -198,12 +198,12 @@ def test_other_code_is_told_apart(tmp_path: Path):
         '{"number": 3, "square": ' + "[" * 10**5,
     ],
 )
-def test_records_that_somebody_has_changed_are_one_line(tmp_path: Path, each: str):
+def test_records_that_somebody_has_changed_are_one_line(tmp_path: Path, item: str):
     path = tmp_path / "kept.json"
-    kept = Kept(path, {}, total)
-    kept.add(3, {"square": 9})
+    records = RecordFile(path, {}, total)
+    records.add(3, {"square": 9})
     before = json.dumps(json.loads(path.read_text())["each"])[1:-1]
-    path.write_text(path.read_text().replace("\n    " + before, "\n    " + each))
+    path.write_text(path.read_text().replace("\n    " + before, "\n    " + item))
     with pytest.raises(RequestError, match="delete it, or name another file with --json") as refused:
-        Kept(path, {}, total)
+        RecordFile(path, {}, total)
     assert "\n" not in str(refused.value) and str(path) in str(refused.value)

@@ -18,7 +18,7 @@ DEEP = 10**5
     ("contents", "part"),
     [
         (b"{", "is not JSON"),
-        (b'{"a": "\xff"}', "no text in UTF-8"),
+        (b'{"a": "\xff"}', "is not UTF-8 text"),
         (b"[" * DEEP, "levels deep"),
         (b'{"a":' * 500 + b"1" + b"}" * 500, "levels deep"),
         (b'{"a": ' + b"9" * 5000 + b"}", "is not JSON"),
@@ -51,7 +51,7 @@ def test_writers_side_by_side_do_not_disturb_each_other(tmp_path):
         first.write(b'{"by": "first"}')
         write_atomically(path, '{"by": "second"}')
     assert json.loads(path.read_text()) == {"by": "first"}
-    assert [each.name for each in tmp_path.iterdir()] == ["file.json"]
+    assert [entry.name for entry in tmp_path.iterdir()] == ["file.json"]
     texts = [json.dumps([number] * 1000) for number in range(8)]
     threads = [threading.Thread(target=write_atomically, args=(path, text)) for text in texts]
     for thread in threads:
@@ -66,7 +66,7 @@ def test_what_fails_leaves_the_old_contents_and_nothing_else(tmp_path):
     write_atomically(path, "old")
     with pytest.raises(OSError, match="full"), replacing(path) as file:
         file.write(b"new")
-        assert [is_temporary(each.name) for each in tmp_path.iterdir() if each != path] == [True]
+        assert [is_temporary(entry.name) for entry in tmp_path.iterdir() if entry != path] == [True]
         raise OSError("full")
     assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
 

@@ -1,4 +1,4 @@
-"""FingerTurn against the measured facts of its original, and MJX against C MuJoCo on its model."""
+"""FingerTurn against measured properties of its original, and MJX against C MuJoCo on its model."""
 
 import functools
 
@@ -27,7 +27,7 @@ def starts():
     return starts_and_goals()[0]
 
 
-def test_nothing_touches_at_the_start():
+def test_starts_are_contact_free():
     env = make()
     data = mujoco.MjData(env.mj_model)
     for qpos in np.asarray(starts().data.qpos):
@@ -70,7 +70,7 @@ def test_control_period(substeps, period):
     assert jaxrl_vis_envs.make("FingerTurn", substeps=substeps).control_period == pytest.approx(period)
 
 
-def test_a_step_is_that_of_mujoco():
+def test_a_step_matches_mujoco():
     """With the task's own iterations."""
     env = make()
     states = one_step.finger_states(env)

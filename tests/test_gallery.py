@@ -56,7 +56,7 @@ def test_the_gallery_shows_start_and_goals(own_environment: str, tmp_path: Path)
     assert cli.main(["envs", "--env", own_environment, *options]) == 0
     sheet = np.asarray(Image.open(path))
     assert sheet.shape[0] > size and sheet.shape[1] > (4 + goals) * size
-    frames = gallery.frames_of(jaxrl_vis_envs.make(own_environment), jax.random.key(1), goals, size)
+    frames = gallery.render_poses(jaxrl_vis_envs.make(own_environment), jax.random.key(1), goals, size)
     assert frames.rgb.shape == (1 + goals, size, size, 3)
     for labels in frames.segmentation:
         assert set(np.unique(labels)) == {0, 1}  # ground and ball

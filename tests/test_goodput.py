@@ -1,4 +1,4 @@
-"""What was computed and what was kept: the arithmetic, its file, and the counters of runs that were left and resumed."""
+"""Goodput: the arithmetic, its file, and the counters of interrupted and resumed runs."""
 
 import pytest
 from fake_program import make_fake_trainer, rows_without_time, small_config

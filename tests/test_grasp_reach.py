@@ -22,7 +22,7 @@ from jaxrl_vis.grasping.policy_loop import STALKS, check_policy, reach_by_policy
 from jaxrl_vis.grasping.reach import LOOK, ReachResult, Sight, arms_among, reach
 from jaxrl_vis_envs.plants import TRAINING, bending, draw
 from jaxrl_vis_envs.plants.field import Plot, Stalk
-from jaxrl_vis_envs.plants.stand import KNEE, MAST_DISTANCE, Stands, origin_of, stand_of_lines, stands_at
+from jaxrl_vis_envs.plants.stand import KNEE, MAST_DISTANCE, Stands, stand_of_lines, stand_origin, stands_at
 from jaxrl_vis_envs.tasks import stalk_arm
 from jaxrl_vis_envs.tasks.stalk_reach import StalkReach
 
@@ -111,7 +111,7 @@ def test_the_model_has_the_dimensions_that_the_formulas_have():
     ],
 )
 def test_what_can_be_reached_is_what_the_geometry_allows(place: tuple[float, float, float], can: bool):
-    rail = origin_of(1.7)
+    rail = stand_origin(1.7)
     assert bool(arm.reachable(rail, rail + np.array(place))) is can
 
 
@@ -151,7 +151,7 @@ def test_the_folded_arm_needs_room_as_it_turns():
 
 
 def test_the_way_with_most_room_is_taken():
-    origins = np.array([origin_of(x) for x in (-0.35, 0.0, 0.35)])
+    origins = np.array([stand_origin(x) for x in (-0.35, 0.0, 0.35)])
     target = np.array([0.0, 0.0, HEIGHT])
 
     def best(*others: tuple[float, float]) -> arm.Way:
@@ -255,7 +255,7 @@ def test_an_arm_is_not_sent_where_it_cannot_go():
     found = still_air()
     np.testing.assert_array_equal(found.reachable, [True, True, True, True, True, False, True, True])
     assert np.isnan(found.error[5]) and not found.held[5].any()
-    np.testing.assert_allclose(found.taken[5], np.tile(origin_of(1.0) + arm.HOME, (found.taken.shape[1], 1)), atol=2e-3)
+    np.testing.assert_allclose(found.taken[5], np.tile(stand_origin(1.0) + arm.HOME, (found.taken.shape[1], 1)), atol=2e-3)
 
 
 def test_the_way_taken_is_the_one_planned():
@@ -324,7 +324,7 @@ def line(x: float, y: float, slope: float = 0.0) -> GraspPoint:
 
 
 def test_the_height_with_most_room_is_taken_and_what_is_blocked_is_refused():
-    stops = np.array([origin_of(x) for x in (-0.1, 0.0, 0.1)])
+    stops = np.array([stand_origin(x) for x in (-0.1, 0.0, 0.1)])
     (alone,) = choose([line(0.0, 0.0)], stops)
     assert not alone.is_blocked and alone.point[2] == HEIGHT and alone.room == np.inf
     # A neighbour that leans over the target at its height, and away from it below.

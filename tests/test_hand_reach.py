@@ -1,4 +1,4 @@
-"""HandReach against the measured facts of its original, and MJX against C MuJoCo on its model."""
+"""HandReach against measured properties of its original, and MJX against C MuJoCo on its model."""
 
 import functools
 
@@ -33,7 +33,7 @@ def tips(data):
     return np.asarray(data.site_xpos)[..., make()._tips, :]
 
 
-def test_the_hand_is_the_original_one():
+def test_hand_matches_the_original():
     env = make()
     start = env.sample_start(jax.random.key(0))
     assert (env.mj_model.njnt, env.mj_model.nu, env.threshold, env.action_size) == (24, 20, 0.03, 20)
@@ -42,7 +42,7 @@ def test_the_hand_is_the_original_one():
     assert not env.mj_model.geom_contype.any() and 18 <= env.mj_model.npair <= 22
 
 
-def test_goals_are_where_random_actions_lead():
+def test_goals_result_from_random_actions():
     start = np.array(START_TIPS).reshape(-1)
     goal = tips(goals()).reshape(COUNT, -1)
     distance = np.linalg.norm(goal - start, axis=-1)
@@ -52,7 +52,7 @@ def test_goals_are_where_random_actions_lead():
     assert not np.asarray(goals().qvel).any()  # a goal stands still
 
 
-def test_tied_joints_move_together():
+def test_coupled_joints_move_together():
     qpos = np.asarray(goals().qpos)
     names = [make().mj_model.joint(index).name for index in range(24)]
     for finger in ("FF", "MF", "RF", "LF"):
@@ -83,7 +83,7 @@ def test_gym_rule():
     assert np.median(error.max(axis=-1)) < 0.003
 
 
-def test_a_step_is_that_of_mujoco():
+def test_a_step_matches_mujoco():
     """With the task's own single iteration."""
     env = make()
     states = one_step.hand_states(env)

@@ -126,8 +126,8 @@ def test_other_methods_carry_no_autoencoder():
     [
         ({"method": "autoencoder", "random_shift": 2}, "random_shift and method autoencoder exclude each other"),
         ({"method": "autoencoder", "normalizers": "separate"}, "normalizers separate and method autoencoder"),
-        ({"method": "autoencoder", "n_step": 2}, "n_step reads true states, which method autoencoder does without"),
-        ({"method": "indicator", "reward_noise": 0.1}, "reward_noise reads true states, which method indicator does without"),
+        ({"method": "autoencoder", "n_step": 2}, "n_step needs true states, which method autoencoder does not use"),
+        ({"method": "indicator", "reward_noise": 0.1}, "reward_noise needs true states, which method indicator does not use"),
         ({"reward_noise": 0.1, "n_step": 2}, "n_step 2 and reward_noise exclude each other"),
         ({"reward_false_positives": 1.5}, "reward_false_positives is a share"),
         ({"reward_noise": -1.0}, "reward_noise must be at least 0"),

@@ -33,7 +33,7 @@ def no_locks(monkeypatch):
 
 
 def marker(host: str, process: int) -> str:
-    """What a holder writes where there are no locks."""
+    """Returns the lock file of a holder on a file system without locks."""
     return f"filelock/2\npid={process}\nhost={host}\nmode=lease\ntoken={'0' * 32}\nduration=1.0\n"
 
 
@@ -108,7 +108,7 @@ def test_a_process_of_another_host_that_touches_its_file_is_refused(tmp_path, no
     finally:
         ended.set()
         thread.join()
-    assert "of process 7 on elsewhere: waiting up to 1 s for a sign of life" in said[-1] and path.exists()
+    assert "belongs to process 7 on elsewhere: waiting up to 1 s for a sign of life" in said[-1] and path.exists()
 
 
 def test_a_process_of_another_host_that_does_not_is_taken_over(tmp_path, no_locks):
@@ -173,7 +173,7 @@ def test_whoever_was_taken_for_dead_saves_nothing_any_more(tmp_path, no_locks):
         other = tmp_path / "other"
         other.write_text(marker("elsewhere", 7))
         other.replace(tmp_path / FILE_NAME)
-        with pytest.raises(FolderGoneError, match="another process has taken this one for dead"):
+        with pytest.raises(FolderGoneError, match="another process took over"):
             held.check()
     assert "elsewhere" in (tmp_path / FILE_NAME).read_text()  # and does not take the other's away
 

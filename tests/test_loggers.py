@@ -29,23 +29,23 @@ def offline(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 def events(folder: Path) -> list[Any]:
     """Everything in TensorBoard's files in ``folder``, which are records with lengths and checksums."""
-    found = []
+    results = []
     for file in sorted(folder.glob("events.out.tfevents.*")):
         data, place = file.read_bytes(), 0
         while place < len(data):
             (length,) = struct.unpack_from("<Q", data, place)
-            found.append(event_pb2.Event.FromString(data[place + 12 : place + 12 + length]))
+            results.append(event_pb2.Event.FromString(data[place + 12 : place + 12 + length]))
             place += 12 + length + 4
-    return found
+    return results
 
 
-def curve_of(folder: Path, tag: str) -> list[tuple[int, float]]:
-    return [(each.step, value.simple_value) for each in events(folder) for value in each.summary.value if value.tag == tag]
+def read_curve(folder: Path, tag: str) -> list[tuple[int, float]]:
+    return [(event.step, value.simple_value) for event in events(folder) for value in event.summary.value if value.tag == tag]
 
 
 def records(file: Path) -> list[Any]:
     """Everything in a .wandb file."""
-    data, place, part, found = file.read_bytes(), 7, b"", []
+    data, place, part, results = file.read_bytes(), 7, b"", []
     while place + 7 <= len(data):
         left = BLOCK - place % BLOCK
         if left < 7:
@@ -55,24 +55,24 @@ def records(file: Path) -> list[Any]:
         part += data[place + 7 : place + 7 + length]
         place += 7 + length
         if kind in (1, 4):  # whole, or the last part
-            found.append(wandb_internal_pb2.Record.FromString(part))
+            results.append(wandb_internal_pb2.Record.FromString(part))
             part = b""
-    return found
+    return results
 
 
 def wandb_runs(path: Path) -> dict[int, list[dict[str, Any]]]:
     """Seed -> the history of its runs, in the order of the parts they were written in."""
-    found: dict[int, list[dict[str, Any]]] = {}
+    results: dict[int, list[dict[str, Any]]] = {}
     ids = json.loads((path / "wandb.json").read_text())
     for seed, known in ids.items():
-        rows = found.setdefault(int(seed), [])
+        rows = results.setdefault(int(seed), [])
         for file in sorted(path.glob(f"wandb/*run-*/run-{known['id']}.wandb"), key=lambda file: file.stat().st_mtime_ns):
             for record in records(file):
                 if record.WhichOneof("record_type") == "history":
                     rows.append(
                         {item.key or "/".join(item.nested_key): json.loads(item.value_json) for item in record.history.item}
                     )
-    return found
+    return results
 
 
 def expected(path: Path, seed: int, name: str) -> list[tuple[int, float]]:
@@ -81,7 +81,7 @@ def expected(path: Path, seed: int, name: str) -> list[tuple[int, float]]:
 
 def assert_shown(path: Path, seed: int, name: str) -> None:
     """TensorBoard shows a figure as metrics.jsonl has it, each evaluation once."""
-    curve, there = curve_of(path / "tensorboard" / f"seed{seed}", name), expected(path, seed, name)
+    curve, there = read_curve(path / "tensorboard" / f"seed{seed}", name), expected(path, seed, name)
     assert [step for step, _ in curve] == [step for step, _ in there] and there
     assert [value for _, value in curve] == pytest.approx([value for _, value in there])
 
@@ -104,10 +104,10 @@ def test_both_show_what_the_run_has_written(tmp_path: Path, capsys: pytest.Captu
     check_all(path)
     assert "failed" not in capsys.readouterr().out
     first = events(path / "tensorboard" / "seed0")
-    images = {value.tag: value.image for each in first for value in each.summary.value if value.HasField("image")}
+    images = {value.tag: value.image for event in first for value in event.summary.value if value.HasField("image")}
     assert images["curve"].encoded_image_string == (path / "curve.png").read_bytes()
     assert images["video"].encoded_image_string == (path / "video.gif").read_bytes() and images["video"].width > 100
-    (text,) = [value for each in first for value in each.summary.value if value.tag == "config/text_summary"]
+    (text,) = [value for event in first for value in event.summary.value if value.tag == "config/text_summary"]
     assert '"num_envs": 2' in text.tensor.string_val[0].decode()
     last = wandb_runs(path)[0][-1]
     assert (last["env_steps"], last["video/_type"], last["curve/_type"]) == (80, "video-file", "image-file")

@@ -11,7 +11,7 @@ from jaxrl_vis.report.learning import curve
 from jaxrl_vis.run import metrics
 from jaxrl_vis.run.folder import RunFolder, read_run_id
 from jaxrl_vis.run.loggers import Loggers
-from jaxrl_vis.studies.cells import Cell, folder_of, latest_rows, standing
+from jaxrl_vis.studies.cells import Cell, describe_progress, find_folder, latest_rows
 
 
 def row(iteration: int, seed: int = 0, **changes) -> dict:
@@ -73,7 +73,7 @@ def test_what_a_kill_has_left_of_the_last_line_is_not_told(tmp_path, torn):
 
 def test_rows_out_of_order_and_of_an_editor_of_windows(tmp_path):
     path = tmp_path / "metrics.jsonl"
-    lines = [json.dumps(each) for each in (row(3), row(1), row(2, seed=1), row(2))]
+    lines = [json.dumps(entry) for entry in (row(3), row(1), row(2, seed=1), row(2))]
     path.write_bytes(b"\xef\xbb\xbf" + "\r\n".join([*lines, "", ""]).encode())
     assert metrics.read_rows(path) == [row(1), row(2, seed=1), row(2), row(3)]
     assert metrics.read_contents(path).damaged == []
@@ -97,7 +97,7 @@ def test_a_run_goes_on_without_damaged_rows(tmp_path, capsys):
     list(make_fake_trainer(small_config(), path, resume=True).run())
     assert "metrics.jsonl held 2 damaged lines (line 1, 4): kept in" in capsys.readouterr().out
     after = rows_without_time(path)
-    assert after[:4] == good and [each["iteration"] for each in after[4:]] == [8, 8]
+    assert after[:4] == good and [entry["iteration"] for entry in after[4:]] == [8, 8]
     assert (path / "checkpoints" / "damaged" / "metrics.jsonl").read_bytes().splitlines() == bad
 
 
@@ -127,7 +127,7 @@ def test_a_torn_last_row_that_was_whole_is_kept_aside_and_told(tmp_path, capsys,
     said = capsys.readouterr().out
     assert said.count(f"metrics.jsonl held 1 damaged line (line {number}): kept in") == 1
     assert (path / "checkpoints" / "damaged" / "metrics.jsonl").read_bytes() == torn + b"\n"
-    assert [each["iteration"] for each in rows_without_time(path)][-2:] == [env_steps // 10] * 2
+    assert [entry["iteration"] for entry in rows_without_time(path)][-2:] == [env_steps // 10] * 2
 
 
 def test_everything_else_that_reads_rows_leaves_damaged_ones_out(tmp_path):
@@ -135,15 +135,15 @@ def test_everything_else_that_reads_rows_leaves_damaged_ones_out(tmp_path):
     config = small_config()
     folder.open(config)
     whose = {"run_id": read_run_id(folder.path)}
-    good = [row(each, seed, **whose) for each in (2, 4) for seed in (0, 1)]
-    lines = [json.dumps(each).encode() for each in good]
+    good = [row(entry, seed, **whose) for entry in (2, 4) for seed in (0, 1)]
+    lines = [json.dumps(entry).encode() for entry in good]
     folder.metrics.write_bytes(
         b"\n".join([*lines, *DAMAGED.values(), json.dumps(row(8, **whose, **{"eval/success": None})).encode(), b""])
     )
     assert folder.rows()[:-1] == good
     cell = Cell("family", config)
-    assert folder_of(cell, tmp_path) == folder.path and standing(cell, tmp_path) == "80 of 80 steps"
-    assert [each["seed"] for each in latest_rows(folder.path)] == [0]
+    assert find_folder(cell, tmp_path) == folder.path and describe_progress(cell, tmp_path) == "80 of 80 steps"
+    assert [entry["seed"] for entry in latest_rows(folder.path)] == [0]
     assert curve(folder.rows(), "eval/success") == [(20, 0.5), (40, 0.5)]
     said: list[str] = []
     loggers = Loggers(["tensorboard"], folder.path, said.append)

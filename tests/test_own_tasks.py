@@ -1,4 +1,4 @@
-"""Tasks of a user's own, by module:Name, and those of installed packages, by an entry point."""
+"""User tasks, by module:Name, and tasks of installed packages, by an entry point."""
 
 import dataclasses
 import json
@@ -71,7 +71,7 @@ def my_task(here: Path) -> str:
 
 @pytest.fixture
 def package(tmp_path: Path, here: Path) -> Callable[..., None]:
-    """Installs packages with entry points: a folder on Python's path, as `pip install` leaves it."""
+    """Install packages with entry points: a folder on Python's path, as `pip install` leaves it."""
     site = tmp_path / "site-packages"
     site.mkdir()
     sys.path.append(str(site))
@@ -136,8 +136,8 @@ def test_a_built_in_name_cannot_be_taken(here: Path) -> None:
 
 WRONG = (
     ("my_task:MyRech", "my_task has no MyRech; did you mean MyReach?"),
-    ("my_task:helper", "my_task:helper is no environment but of type int"),
-    ("my_task:MyConfig", "my_task:MyConfig is no environment but a class: it must be a subclass of jaxrl_vis_envs.GoalEnv"),
+    ("my_task:helper", "my_task:helper is not an environment but of type int"),
+    ("my_task:MyConfig", "my_task:MyConfig is not an environment but a class: it must be a subclass of jaxrl_vis_envs.GoalEnv"),
     ("my_task:Unfinished", "my_task:Unfinished is not complete: it must define advance, observe"),
     ("my_task:Untyped", "the settings of my_task:Untyped are unknown: annotate 'config'"),
     ("my_taks:MyReach", "there is no module my_taks, in "),
@@ -146,8 +146,8 @@ WRONG = (
     ("../my_task:MyReach", "names a file, not a module: write my_task:MyReach"),
     ("sub/my_task.py:MyReach", "write sub.my_task:MyReach"),
     ("my_task.MyReach", "unknown environment 'my_task.MyReach'; a task of your own is written module:Name"),
-    ("my_task:", "is no task: a task of your own is written module:Name"),
-    ("a:b:c", "is no task"),
+    ("my_task:", "is not a task: a task of your own is written module:Name"),
+    ("a:b:c", "is not a task"),
     ("types:MyReach", "types has no MyReach"),
     ("needs:X", "No module named 'nothing_like_it' (needs.py, line 2); install nothing_like_it"),
     ("divides:X", "divides cannot be imported: ZeroDivisionError: division by zero (divides.py, line 1)"),
@@ -184,11 +184,11 @@ def test_wrong_names_get_one_line(
     ("name", "complaint"),
     [
         ("my_task:Fails", "my_task:Fails cannot be built: AttributeError: 'Fails' object has no attribute 'nothing'"),
-        ("my_task:Silent", "my_task:Silent has no threshold: every environment says what its horizon, action_size"),
+        ("my_task:Silent", "my_task:Silent has no threshold: every environment must define horizon, action_size"),
         ("my_task:OldReset", "my_task:OldReset: reset must take (key), not ()"),
     ],
 )
-def test_what_cannot_be_built_is_told_in_one_line(
+def test_environments_that_cannot_be_built_raise_one_line(
     name: str, complaint: str, my_task: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for words in (["train", name, "--preset", "debug"], ["envs", name], ["bench", "env", name]):
@@ -197,7 +197,7 @@ def test_what_cannot_be_built_is_told_in_one_line(
         assert complaint in line
 
 
-def test_options_reach_a_task_of_ones_own(my_task: str) -> None:
+def test_options_reach_a_custom_task(my_task: str) -> None:
     config = preset("debug", env=my_task, env_options=("strength=2.5",))
     assert make_env(config).config.strength == 2.5
     for option, complaint in (("strenght=2", "did you mean strength"), ("mode=x", "mode cannot be set")):
@@ -208,7 +208,7 @@ def test_options_reach_a_task_of_ones_own(my_task: str) -> None:
 def test_a_run_is_found_again_from_another_folder(
     my_task: str, here: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Trained by name in one folder, evaluated and played in another, and refused in one line once the file has gone."""
+    """Trained by name in one folder, evaluated and played in another, and refused in one line once the file is gone."""
     tiny = ["--preset", "debug", "--image-size", "8", "--encoder-filters", "4", "--env-steps", "40", "--eval-episodes", "2"]
     assert cli.main(["train", "--env", my_task, *tiny]) == 0
     run = (here / "runs" / "my_task-MyReach-oracle-debug-seed0").resolve()
@@ -235,17 +235,18 @@ def test_a_run_is_found_again_from_another_folder(
     forget()
     assert cli.main(["eval", str(run)]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert f"my_task was imported from {here}, which holds it no longer" in line and "run this in the folder that does" in line
+    assert f"my_task was imported from {here}, which no longer contains it" in line
+    assert "run this in the folder that does" in line
     monkeypatch.chdir(tmp_path)
     resumed = jaxrl_vis.make_trainer(preset("debug", env=my_task, env_folder=str(here)))
     assert resumed.config.env_folder == str(tmp_path)  # where it lies now
 
 
-def test_another_module_of_that_name_is_not_taken_for_it(my_task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_loaded_module_of_that_name_is_an_error(my_task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     jaxrl_vis_envs.make(my_task)
     (tmp_path / "my_task.py").write_text(TASK)
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(jaxrl_vis_envs.TaskModuleError, match="has loaded another my_task already.*start another process"):
+    with pytest.raises(jaxrl_vis_envs.TaskModuleError, match="has loaded another my_task already.*start a new process"):
         jaxrl_vis_envs.make(my_task)
 
 
@@ -278,7 +279,7 @@ def test_broken_packages_do_not_break_the_list(package: Callable[..., None], cap
     for name, complaint in (
         ("BadReach", "badworks cannot be imported: RuntimeError: out of order"),
         ("WorseReach", "there is no module nowhere"),
-        ("Twice", "several installed packages have a Twice: ask for goodworks:MyReach or samename:MyReach"),
+        ("Twice", "several installed packages have a Twice: request goodworks:MyReach or samename:MyReach"),
     ):
         assert any(line.startswith(f"{name} cannot be used: ") and complaint in line for line in lines), name
         assert cli.main(["train", name, "--preset", "debug"]) == 2
@@ -286,12 +287,12 @@ def test_broken_packages_do_not_break_the_list(package: Callable[..., None], cap
         assert complaint in line
 
 
-def test_a_task_of_ones_own_in_the_gallery(my_task: str, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_custom_task_in_the_gallery(my_task: str, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["envs", my_task, "--gallery", "tasks.png", "--image-size", "16", "--goals", "1"]) == 0
     assert (here / "tasks.png").exists() and my_task in capsys.readouterr().out
 
 
-def test_records_of_tasks_of_ones_own_are_of_no_file_of_ours() -> None:
+def test_records_of_custom_tasks_depend_on_no_package_file() -> None:
     from benchmarks.ledger import staleness
     from jaxrl_vis.provenance import CHECKOUT
 

@@ -101,7 +101,7 @@ def test_eval_in_two_processes_and_after_a_stop_is_the_same(plots, tmp_path, cap
         assert "holds records of another evaluation" in capsys.readouterr().err
     (tmp_path / "other.json").write_text("[]")
     assert cli.main(["phenotype", "eval", *small, "--json", str(tmp_path / "other.json")]) == 2
-    assert "holds no records to go on with" in capsys.readouterr().err
+    assert "holds no records to resume" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

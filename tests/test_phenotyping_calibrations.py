@@ -180,7 +180,7 @@ def test_a_calibration_may_be_a_stream_of_documents(tmp_path):
     assert read_calibration(path) == CAMERAS
 
 
-def test_what_is_no_ordinary_file_is_not_waited_for(tmp_path):
+def test_reading_a_pipe_does_not_block(tmp_path):
     os.mkfifo(tmp_path / "rig.yaml")
-    with pytest.raises(RequestError, match="it is no ordinary file"):
+    with pytest.raises(RequestError, match="it is not a regular file"):
         read_calibration(tmp_path / "rig.yaml")

@@ -1,4 +1,4 @@
-"""Fields of sorghum: what is drawn is what was asked for, and the truth of an image is that of the image."""
+"""Fields of sorghum: parameters are respected, and the ground truth matches the images."""
 
 import dataclasses
 import json
@@ -33,7 +33,7 @@ def plots() -> list[plants.Plot]:
     return [plants.draw(BARE, seed) for seed in range(40)]
 
 
-def test_numbers_are_those_of_the_thesis(plots):
+def test_training_family_matches_the_thesis(plots):
     counts = np.array([len(plot.measured) for plot in plots])
     assert abs(counts.mean() - 33.0) < 3.0 * 6.0 / np.sqrt(40)
     assert 3.5 < counts.std() < 8.5
@@ -47,7 +47,7 @@ def test_numbers_are_those_of_the_thesis(plots):
     assert abs(lean.std() - 4.0) < 0.5
 
 
-def test_plants_stand_in_the_plot_and_apart(plots):
+def test_plants_are_in_the_plot_and_keep_their_distance(plots):
     for plot in plots:
         foot = np.array([stalk.points[0] for stalk in plot.measured])
         assert (foot[:, 0] >= 0).all() and (foot[:, 0] <= 2.134).all()
@@ -67,7 +67,7 @@ def test_nodes_are_swollen_and_sheaths_are_thick(plots):
     assert (thicker >= 0).all() and (thicker < 0.7e-3).all() and (thicker > 0.15e-3).any()
 
 
-def test_the_same_seed_is_the_same_plot_and_no_other_is():
+def test_equal_seeds_give_equal_plots():
     again = plants.draw(BARE, 3)
     first = plants.draw(BARE, 3)
     assert all((a.points == b.points).all() and (a.radius == b.radius).all() for a, b in zip(first.stalks, again.stalks))
@@ -97,7 +97,7 @@ def test_families_differ_as_stated():
         plants.shift(TRAINING, "leafs")
 
 
-def test_calibrations_state_the_cameras_but_for_their_error():
+def test_stated_calibration_differs_by_its_error_only():
     drives = [plants.drive(SHIFTED, seed) for seed in range(60)]
     focal, baseline = (np.array([getattr(drive.true, name) for drive in drives]) for name in ("focal", "baseline"))
     assert np.abs(focal / 2168.0 - 1.0).max() <= 0.05 and np.abs(baseline / 0.1 - 1.0).max() <= 0.05
@@ -131,7 +131,7 @@ def test_calibrations_state_the_cameras_but_for_their_error():
         ("missing.json", None, ["missing.json cannot be read"]),
     ],
 )
-def test_bad_specs_are_told_in_one_line(tmp_path, capsys, name, text, parts):
+def test_bad_specs_raise_one_line(tmp_path, capsys, name, text, parts):
     path = tmp_path / name
     if text is not None:
         path.write_text(text)
@@ -160,13 +160,13 @@ def test_bad_specs_are_told_in_one_line(tmp_path, capsys, name, text, parts):
         (lambda: plants.read("missing.json"), "missing.json cannot be read"),
     ],
 )
-def test_bad_families_and_seeds_are_told_in_one_line(make, said):
+def test_bad_families_and_seeds_raise_one_line(make, said):
     with pytest.raises(ValueError, match=said) as told:
         make()
     assert "\n" not in str(told.value)
 
 
-def test_specs_change_what_they_name(tmp_path):
+def test_specs_change_only_the_named_fields(tmp_path):
     path = tmp_path / "wild.toml"
     path.write_text('base = "shifted"\n[stalks]\nlean_sd = [1, 2]\n[rig]\nframes = 40\n')
     family = plants.read(path)
@@ -207,13 +207,13 @@ def test_disparity_times_depth_is_focal_length_times_baseline(sequence, pair):
 
 
 def crossings(points: np.ndarray, line: float) -> float:
-    """Column at which an edge [K, 2] crosses a line."""
+    """Return the column at which an edge [K, 2] crosses a line."""
     order = np.argsort(points[:, 1])
     return float(np.interp(line, points[order, 1], points[order, 0]))
 
 
-def test_edges_of_masks_are_where_the_stated_diameter_puts_them(sequence, pair):
-    """A mask is what a stalk covers of the middles of pixels, so its edges lie within half a pixel of the true ones."""
+def test_mask_edges_match_the_true_diameter(sequence, pair):
+    """A mask contains the pixels whose centres a stalk covers, so its edges are within half a pixel of the true ones."""
     instance, checked = np.asarray(pair.instance), []
     for index, stalk in enumerate(sequence.plot.measured):
         edges = outline(stalk, pair.pose, sequence.drive.true, np.linspace(0.0, 1.3, 500))
@@ -230,7 +230,7 @@ def test_edges_of_masks_are_where_the_stated_diameter_puts_them(sequence, pair):
     assert np.quantile(abs(errors), 0.95) < 0.55
 
 
-def test_outlines_are_as_wide_as_the_diameter_says(sequence, pair):
+def test_outline_width_matches_the_diameter(sequence, pair):
     """Tangents to a circle of radius r at distance D are 2 f r / sqrt(D^2 - r^2) apart in the image's middle."""
     true, stalk = sequence.drive.true, sequence.plot.measured[7]
     upright = np.zeros_like(stalk.points)
@@ -243,7 +243,7 @@ def test_outlines_are_as_wide_as_the_diameter_says(sequence, pair):
     assert stalk.diameter(0.3) == pytest.approx(0.02)
 
 
-def test_boxes_are_tight_and_shares_are_shares(sequence, pair):
+def test_boxes_are_tight_and_visibility_is_a_fraction(sequence, pair):
     instance, depth = np.asarray(pair.instance), np.asarray(pair.depth)
     found = stalks_in_view(sequence.plot, pair.pose, sequence.drive.true, instance, depth)
     assert len(found) >= 4
@@ -265,7 +265,7 @@ def test_boxes_are_tight_and_shares_are_shares(sequence, pair):
 
 
 def test_a_stalk_keeps_its_identity_over_frames(sequence, pair):
-    """What is seen of a stalk in one image is, moved by the camera's step, on the same stalk in the next."""
+    """The visible part of a stalk in one image, shifted by the camera's step, is on the same stalk in the next."""
     following = sequence[17]
     true = sequence.drive.true
     instance, depth = np.asarray(pair.instance), np.asarray(pair.depth)
@@ -285,7 +285,7 @@ def test_a_stalk_keeps_its_identity_over_frames(sequence, pair):
     assert agree / total > 0.85  # the rest is hidden by something else in the next image, or at an edge
 
 
-def test_the_ground_is_flat_and_seen(sequence, pair):
+def test_the_ground_is_flat_and_visible(sequence, pair):
     line, column = np.nonzero(np.asarray(pair.instance) == -2)
     true = sequence.drive.true
     x, y = (column - true.centre[0]) / true.focal, (line - true.centre[1]) / true.focal
@@ -294,7 +294,7 @@ def test_the_ground_is_flat_and_seen(sequence, pair):
     assert np.abs(pair.pose.to_world(points)[:, 2]).max() < 1e-4
 
 
-def test_synth_writes_plots_and_goes_on_where_it_was(tmp_path, capsys):
+def test_synth_writes_plots_and_resumes(tmp_path, capsys):
     out, spec = tmp_path / "plots", tmp_path / "thin.json"
     spec.write_text('{"layout": {"rows_behind": 0, "stalks_mean": 12}, "leaves": {"density": 0.5}}')
     words = [
@@ -356,7 +356,7 @@ def test_synth_writes_plots_and_goes_on_where_it_was(tmp_path, capsys):
         (["--format", "bmp"], "--format cannot be 'bmp'"),
     ],
 )
-def test_wrong_requests_of_synth(tmp_path, capsys, words, part):
+def test_bad_arguments_of_synth(tmp_path, capsys, words, part):
     assert cli.main(["phenotype", "synth", str(tmp_path / "out"), *words]) == 2
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1 and part in lines[0], lines
@@ -368,10 +368,10 @@ def test_a_stalk_height_of_twelve_inches(plots):
     assert middle[2] == pytest.approx(12 * INCH)
 
 
-def test_tiles_drawn_side_by_side_are_those_drawn_one_by_one(sequence):
-    """What an accelerator runs draws the same image as what a CPU runs."""
+def test_batched_and_sequential_tiles_agree(sequence):
+    """Batches, as used on an accelerator, render the same image as sequential tiles, as used on a CPU."""
     true, pose = sequence.drive.true, sequence.drive.poses[16]
-    view = tables.see(sequence.surfaces, pose, true)
+    view = tables.build_view(sequence.surfaces, pose, true)
     numbers = (true.focal, true.centre, (0.0, 0.0), pose.rotation, pose.position, (0.05, -0.1, 0.0), (1.0, 0.01, 0.8))
     shot = drawing.Shot(*(jnp.asarray(number, jnp.float32) for number in numbers))
     one, many = (drawing.draw(view, shot, true.width, true.height, 1, at_once) for at_once in (1, 20))
@@ -381,13 +381,13 @@ def test_tiles_drawn_side_by_side_are_those_drawn_one_by_one(sequence):
 
 @pytest.fixture(scope="module")
 def close_up() -> Sequence:
-    """The cameras of half the real size, but only the 0.31 m around 12 inches that they see."""
+    """Cameras at half the real resolution that see only the 0.31 m around 12 inches."""
     family = changed(TRAINING, layout=dict(rows_behind=1, stalks_mean=20.0, tillers=0.0), leaves=dict(density=0.3, litter=0.0))
     return Sequence.of(plants.draw(changed(family, rig=dict(width=422, height=338, focal=1084.0)), 2))
 
 
 def test_a_pair_gives_diameters_in_millimetres(close_up):
-    """True masks, our own disparity, our own widths: what is left of the error is below the pixel, which is 0.74 mm."""
+    """With true masks and our own disparity and widths, the remaining error is below the pixel size of 0.74 mm."""
     drive, errors = close_up.drive, []
     for frame in (8, 13, 18, 23):
         pair = close_up[frame]
@@ -410,6 +410,6 @@ def test_a_pair_gives_diameters_in_millimetres(close_up):
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
-def test_plots_of_few_stalks_have_them_all(count):
+def test_small_plots_have_the_requested_number_of_stalks(count):
     few = changed(BARE, layout=dict(stalks_mean=float(count), stalks_sd=0.0, tillers=0.9))
     assert {len(plants.draw(few, seed).measured) for seed in range(10)} == {count}

@@ -60,15 +60,15 @@ def test_a_run_shows_what_it_predicts(
     assert cli.main(["play", str(run), "--aux", "--episodes", "3"]) == 0
     out = run / "play_aux.gif"
     assert capsys.readouterr().out.strip() == str(out)
-    (found,) = drawn
+    (predictions,) = drawn
     horizon = Dots().horizon
-    assert found.reconstruction.shape == (3, horizon, 1, 16, 16) and found.reconstruction.dtype == np.uint8
-    assert found.flow.shape == (3, horizon, 18, 16) and found.flow_predicted.shape == (3, horizon, 16, 16)
-    assert found.rotated.shape == (3, horizon, 1, 18, 16) and found.rotated.dtype == np.uint8
-    assert found.angle.shape == found.angle_predicted.shape == (3, horizon)
-    assert 5 < np.abs(found.angle).max() <= 30 and (found.flow >= 0).all()
+    assert predictions.reconstruction.shape == (3, horizon, 1, 16, 16) and predictions.reconstruction.dtype == np.uint8
+    assert predictions.flow.shape == (3, horizon, 18, 16) and predictions.flow_predicted.shape == (3, horizon, 16, 16)
+    assert predictions.rotated.shape == (3, horizon, 1, 18, 16) and predictions.rotated.dtype == np.uint8
+    assert predictions.angle.shape == predictions.angle_predicted.shape == (3, horizon)
+    assert 5 < np.abs(predictions.angle).max() <= 30 and (predictions.flow >= 0).all()
     # Every episode, and every step, has rotations of its own.
-    assert len(np.unique(found.angle)) == found.angle.size
+    assert len(np.unique(predictions.angle)) == predictions.angle.size
     image: Any = Image.open(out)
     assert image.n_frames == 3 * horizon and image.width > 6 * 192
 

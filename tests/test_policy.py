@@ -37,7 +37,7 @@ class Seen(probes.GoWhereTold):
 
 @dataclasses.dataclass(frozen=True)
 class NoOptions:
-    """Of an environment without any."""
+    """Options of an environment without any."""
 
 
 def register(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -88,11 +88,11 @@ def test_it_acts_as_the_learner_does(name: str, seeds: tuple[int, ...], runs: di
     for index, seed in enumerate(seeds):
         policy = jaxrl_vis.load_policy(runs[name], seed=seed)
         assert (policy.env_name, policy.seed, policy.iteration) == (name, seed, 3)
-        goals, seen = episodes.observations[index, :, -1], episodes.observations[index, :, 1]
-        actions.append(jax.vmap(policy)(seen, goals))
+        goals, current = episodes.observations[index, :, -1], episodes.observations[index, :, 1]
+        actions.append(jax.vmap(policy)(current, goals))
         assert actions[-1].shape == (5, 1) and actions[-1].dtype == jnp.float32
         np.testing.assert_allclose(actions[-1], episodes.actions[index, :, 1], atol=1e-5)
-        np.testing.assert_allclose(policy(np.asarray(seen[2]), np.asarray(goals[2])), actions[-1][2], atol=1e-5)
+        np.testing.assert_allclose(policy(np.asarray(current[2]), np.asarray(goals[2])), actions[-1][2], atol=1e-5)
         assert np.ptp(actions[-1]) > 1e-4
     if len(seeds) > 1:
         assert not np.allclose(*actions)
@@ -121,15 +121,15 @@ def test_it_works_inside_a_scan(policies: dict[str, jaxrl_vis.Policy]) -> None:
 def test_a_checkpoint_can_be_chosen(runs: dict[str, Path], tmp_path: Path) -> None:
     newest, before = (jaxrl_vis.load_policy(runs["Told"], checkpoint=iteration) for iteration in (3, 2))
     assert (newest.iteration, before.iteration) == (3, 2)
-    goal, seen = np.float32([0.5]), np.float32([0.1])
-    assert newest(seen, goal) != before(seen, goal)
+    goal, current = np.float32([0.5]), np.float32([0.1])
+    assert newest(current, goal) != before(current, goal)
     run = tmp_path / "run"
     shutil.copytree(runs["Told"], run)
     for file in (run / "checkpoints" / LIGHT / "2").rglob("d/*"):
         file.unlink()
     with pytest.raises(RequestError, match="checkpoint 2 of the run in .* is damaged"):
         jaxrl_vis.load_policy(run, checkpoint=2)
-    with pytest.raises(RequestError, match="keeps no checkpoint of iteration 9; it keeps 2, 3"):
+    with pytest.raises(RequestError, match="has no checkpoint of iteration 9, only of 2, 3"):
         jaxrl_vis.load_policy(run, checkpoint=9)
 
 
@@ -199,7 +199,7 @@ def test_it_plays_in_gymnasium(name: str, policies: dict[str, jaxrl_vis.Policy])
 @pytest.mark.parametrize("page", ["README.md", "docs/adapters.md"])
 def test_examples_of_the_pages_run(page: str, runs: dict[str, Path], checkout: Path) -> None:
     blocks = re.findall(r"```python\n(.*?)```", (checkout / page).read_text(), re.DOTALL)
-    (block,) = [each for each in blocks if "load_policy" in each]
+    (block,) = [text for text in blocks if "load_policy" in text]
     names: dict[str, Any] = {"jax": jax, "jaxrl_vis": jaxrl_vis}
     exec(compile(block.replace("runs/mine", str(runs["VisualTold"])), page, "exec"), names)
     assert names["action"].shape == (1,)

@@ -17,7 +17,7 @@ from fake_program import as_plain, rows_without_time
 from jaxrl_vis import cli
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.train_step import make_train_step
-from jaxrl_vis.processes import Place, find_place
+from jaxrl_vis.processes import Rank, find_rank
 from jaxrl_vis.run.checkpoint import Checkpoints
 from jaxrl_vis.run.folder import read_config
 from jaxrl_vis.run.programs import Programs
@@ -27,14 +27,14 @@ MPIRUN = {"OMPI_COMM_WORLD_SIZE": "2", "OMPI_COMM_WORLD_RANK": "1", "OMPI_MCA_or
 
 
 def test_place_by_options_and_by_launchers() -> None:
-    assert find_place(variables={}) is None
-    assert find_place("node1:1234", 2, 1, variables=SRUN) == Place("node1:1234", 2, 1)
-    assert find_place("node1:1234", 1, 0, variables={}) is None
-    assert find_place(variables=SRUN) == Place(None, 4, 3)
-    assert find_place(variables=MPIRUN) == Place(None, 2, 1)
-    assert find_place(variables=SRUN | {"SLURM_STEP_NUM_TASKS": "1"}) is None
+    assert find_rank(variables={}) is None
+    assert find_rank("node1:1234", 2, 1, variables=SRUN) == Rank("node1:1234", 2, 1)
+    assert find_rank("node1:1234", 1, 0, variables={}) is None
+    assert find_rank(variables=SRUN) == Rank(None, 4, 3)
+    assert find_rank(variables=MPIRUN) == Rank(None, 2, 1)
+    assert find_rank(variables=SRUN | {"SLURM_STEP_NUM_TASKS": "1"}) is None
     # In a batch script, without srun, there is no step.
-    assert find_place(variables={"SLURM_NTASKS": "4", "SLURM_PROCID": "0"}) is None
+    assert find_rank(variables={"SLURM_NTASKS": "4", "SLURM_PROCID": "0"}) is None
 
 
 @pytest.mark.parametrize(
@@ -50,7 +50,7 @@ def test_place_by_options_and_by_launchers() -> None:
 )
 def test_options_that_make_no_sense(options: tuple, message: str) -> None:
     with pytest.raises(RequestError, match=message):
-        find_place(*options, variables={})
+        find_rank(*options, variables={})
 
 
 def test_a_process_that_cannot_reach_the_first(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -83,13 +83,13 @@ def start(run_dir: Path, count: int, devices: int, *options: str) -> list[subpro
 
 
 def ended(processes: Sequence[subprocess.Popen], seconds: float = 120.0) -> list[tuple[int, str, str]]:
-    """Exit status and output of each."""
+    """Exit status and output of process."""
     try:
-        told = [each.communicate(timeout=seconds) for each in processes]
+        outputs = [process.communicate(timeout=seconds) for process in processes]
     finally:
-        for each in processes:
-            each.kill()
-    return [(each.returncode, *words) for each, words in zip(processes, told, strict=True)]
+        for process in processes:
+            process.kill()
+    return [(process.returncode, *words) for process, words in zip(processes, outputs, strict=True)]
 
 
 @pytest.fixture(scope="module")
@@ -127,13 +127,13 @@ def test_two_processes_learn_and_save_what_one_does(pair: tuple[Path, list, list
     shapes = Programs(config, make_train_step(probes.GoWhereTold(), config)).shapes
     folders = [path / "checkpoints" for path in (run_dir, tmp_path / "one")]
     saved = [Checkpoints(folder, read_only=True).restore_for_resume(shapes) for folder in folders]
-    assert [each.iteration for each in saved if each is not None and each.loop is not None] == [4, 4]
-    for ours, theirs in zip(*(as_plain(each.loop) for each in saved if each is not None), strict=True):
+    assert [restored.iteration for restored in saved if restored is not None and restored.loop is not None] == [4, 4]
+    for ours, theirs in zip(*(as_plain(restored.loop) for restored in saved if restored is not None), strict=True):
         np.testing.assert_allclose(ours, theirs, atol=1e-4)
 
 
 def two_trainings(*words: str) -> list[tuple[int, str, str]]:
-    """How `jaxrl-vis train Reacher` ends in two processes of a device each: exit status and output."""
+    """Runs `jaxrl-vis train Reacher` in two processes with one device each; returns exit statuses and outputs."""
     train = [sys.executable, "-m", "jaxrl_vis", "train", "Reacher", "--preset", "debug", "--env-steps", "800", *words]
     place = ["--coordinator", f"127.0.0.1:{free_port()}", "--num-processes", "2", "--process-id"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}

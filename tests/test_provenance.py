@@ -1,4 +1,4 @@
-"""Where runs and records say they come from, and how their files are written."""
+"""Provenance in runs and records, and the writing of their files."""
 
 import subprocess
 import sys

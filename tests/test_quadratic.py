@@ -86,16 +86,16 @@ def test_algorithm_1_is_its_transcription(interval: int) -> None:
 
         def step(carry: Any, _: None) -> Any:
             point, state = carry
-            found = gradient(point, state)
-            after = (point - alpha * found.gradient, found.state)
+            result = gradient(point, state)
+            after = (point - alpha * result.gradient, result.state)
             return after, jnp.stack([*after[0], after[1].weights["shifted"], after[1].weights["opposed"]])
 
         first = (jnp.asarray(start), weighting.init((MAIN, "shifted", "opposed")))
         _, rows = jax.jit(lambda: jax.lax.scan(step, first, length=steps))()
-        found = np.asarray(rows)
+        result = np.asarray(rows)
     expected = algorithm_1(start, steps, interval, alpha, beta, eps)[1:]
-    assert found.dtype == np.float64
-    np.testing.assert_allclose(found, expected, atol=1e-6)
+    assert result.dtype == np.float64
+    np.testing.assert_allclose(result, expected, atol=1e-6)
     assert expected[-1, 3] == 0.0 and expected[:, 2].max() > 1.05  # the opposed task is dropped, the shifted one helps
     assert np.linalg.norm(expected[-1, :2]) < 0.5 * np.linalg.norm(start)
 

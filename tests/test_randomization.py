@@ -1,4 +1,4 @@
-"""Domain randomisation: what is on changes what it should and nothing else, and off is as if there were none."""
+"""Domain randomisation: active ranges change only what they should, and with all off nothing changes."""
 
 import functools
 from typing import Any, get_args
@@ -78,14 +78,14 @@ def test_off_adds_nothing() -> None:
     assert str(jax.make_jaxpr(plain.reset)(jax.random.key(0))) == str(jax.make_jaxpr(env.reset)(jax.random.key(0)))
 
 
-def test_starts_and_goals_are_those_without_randomisation() -> None:
+def test_starts_and_goals_are_not_randomised() -> None:
     plain, varied = episodes()[0], episodes(ALL)[0]
     np.testing.assert_array_equal(varied.achieved_state, plain.achieved_state)
     np.testing.assert_array_equal(varied.goal_state, plain.goal_state)
     np.testing.assert_array_equal(varied.data.qpos, plain.data.qpos)
 
 
-def test_a_look_changes_images_and_not_the_physics() -> None:
+def test_appearance_changes_images_but_not_physics() -> None:
     (plain_start, plain_end), (start, end) = episodes(), episodes(LOOKS)
     for before, after in ((plain_start, start), (plain_end, end)):
         for name in ("observation", "desired_goal"):
@@ -94,7 +94,7 @@ def test_a_look_changes_images_and_not_the_physics() -> None:
             np.testing.assert_array_equal(one, other)
 
 
-def test_dynamics_change_the_motion_and_not_the_look() -> None:
+def test_dynamics_change_motion_but_not_appearance() -> None:
     (plain_start, plain_end), (start, end) = episodes(), episodes(typical("dynamics"))
     for one, other in zip(without_domain(plain_start), without_domain(start), strict=True):
         np.testing.assert_array_equal(one, other)
@@ -118,7 +118,7 @@ def test_environments_of_a_batch_differ_and_keys_repeat() -> None:
 
 @functools.cache
 def draw_shape() -> Any:
-    """The task's scene, and draw(domain) -> (planes [4, H, W], geoms [H, W]) of its first start."""
+    """Task scene, and draw(domain) -> (planes [4, H, W], geoms [H, W]) of its first start."""
     env = make(OFF)
     data = jax.tree.map(lambda leaf: leaf[0], episodes()[0].data)
     scene = Scene.from_mjmodel(env.mj_model, env.camera, SIZE, SIZE)
@@ -144,7 +144,7 @@ def draw_shape() -> Any:
         ("colour", "first", False, True),
     ],
 )
-def test_each_look(name: str, value: Any, geometry: bool, colours: bool) -> None:
+def test_each_appearance_range(name: str, value: Any, geometry: bool, colours: bool) -> None:
     scene, draw = draw_shape()
     if value == "first":
         value = np.zeros((len(scene.rgba), 3))
@@ -162,7 +162,7 @@ def test_each_look(name: str, value: Any, geometry: bool, colours: bool) -> None
         assert (after[0] >= before[0]).all()
 
 
-def test_a_camera_is_shifted_in_its_own_frame() -> None:
+def test_camera_translation_is_in_its_own_frame() -> None:
     scene, draw = draw_shape()
     near = randomization.varied_scene(scene, {"camera_position": jnp.array([0.0, 0.0, 0.1])})
     # 10 cm back: everything in the middle of the image is 10 cm further.
@@ -197,7 +197,7 @@ def test_each_range_of_the_dynamics_scales_its_leaves(task: str) -> None:
 
 
 def test_mjx_steps_a_varied_model_as_mujoco_does() -> None:
-    """The leaves that are changed are those that MuJoCo's own model has: C MuJoCo with the same numbers moves the same."""
+    """The changed leaves exist in MuJoCo's own model: C MuJoCo with the same values moves the same."""
     end = jax.tree.map(lambda leaf: np.asarray(leaf[0], np.float64), episodes(ALL)[1])
     start = episodes(ALL)[0]
     model = mujoco.MjModel.from_xml_string(point_mass.XML)
@@ -216,7 +216,7 @@ def test_mjx_steps_a_varied_model_as_mujoco_does() -> None:
 
 
 def test_the_gpu_kernel_draws_varied_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By Pallas's interpreter: the scene's leaves differ between the environments of a batch, and both ways draw the same."""
+    """In Pallas's interpreter: the scene's leaves differ between environments of a batch, and both paths render the same."""
     scene, _ = draw_shape()
     start = episodes(ALL)[0]
     assert kernel.supports(scene)
@@ -226,7 +226,7 @@ def test_the_gpu_kernel_draws_varied_scenes(monkeypatch: pytest.MonkeyPatch) -> 
         return jnp.concatenate([planes.rgb, planes.depth[None]])
 
     plain = np.asarray(env_jit(jax.vmap(draw))(start.data, start.domain))
-    monkeypatch.setattr(kernel, "takes", lambda scene, outputs: kernel.supports(scene))
+    monkeypatch.setattr(kernel, "can_render", lambda scene, outputs: kernel.supports(scene))
     monkeypatch.setattr(kernel, "draw", functools.partial(kernel.draw, interpret=True))
     by_kernel = np.asarray(jax.vmap(draw)(start.data, start.domain))
     assert (np.abs(plain - by_kernel).max(axis=1) < 1e-3).mean() > 0.98  # but for pixels on an edge
@@ -269,7 +269,7 @@ def test_every_image_task_takes_every_kind() -> None:
         assert isinstance(env._draw, pixels.ImageObserver)
 
 
-def test_the_learner_asks_for_it() -> None:
+def test_training_command_randomizes() -> None:
     """`jaxrl-vis train --randomize camera dynamics --randomize-strength 2`."""
     settings = {"randomize": ("camera", "dynamics"), "randomize_strength": 2.0}
     env = make_env(preset("debug", env="VisualReacher", **settings))
@@ -288,7 +288,7 @@ def test_the_learner_asks_for_it() -> None:
 
 
 def test_a_learner_trains_in_environments_that_vary() -> None:
-    """Every episode starts at the same place and looks different; learning goes on, and repeats itself bit for bit."""
+    """Every episode starts at the same place with a different appearance; learning continues, reproducibly bit for bit."""
     settings = {"num_envs": 4, "replay_transitions": 40, "updates_per_iteration": 2, "batch_size": 16, "eval_episodes": 2}
     # Other tests see that colours vary; depth takes half as long to compile, and varies with the camera.
     program = make_train_step(make(ALL, pixels="depth"), preset("debug", **settings))

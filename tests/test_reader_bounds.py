@@ -28,7 +28,7 @@ from jaxrl_vis.phenotyping.images import image_size, read_image, write_image
 from jaxrl_vis.phenotyping.names import file_name, readable
 from jaxrl_vis.phenotyping.overlay import draw_overlay
 from jaxrl_vis.phenotyping.results import write_rows
-from jaxrl_vis.spreadsheets import cell, text_of, to_csv
+from jaxrl_vis.spreadsheets import escape_cell, to_csv, unescape_cell
 from jaxrl_vis_envs.plants import read
 
 LATIN = os.fsdecode(b"t\xe9t\xe9")
@@ -110,8 +110,8 @@ def test_what_macos_leaves_beside_images_is_no_pair(tmp_path):
 # --- tables ---
 @given(st.text() | st.sampled_from(("=1+1", "+1", "-1.5", "@x", "\t=1", "'=1", "''=1", "-", " =1", "＝1", "+x")))
 def test_no_text_is_computed_and_all_of_it_comes_back(text):
-    written = cell(text)
-    assert text_of(written) == text
+    written = escape_cell(text)
+    assert unescape_cell(written) == text
     assert not written.startswith(("=", "@", "\t", "\r", "\n")) and (
         written[:1] not in ("+", "-") or float(written) is not None
     )
@@ -231,7 +231,7 @@ RUNS = {"size": [10**6, 10**6], "counts": [10, 10**12 - 10]}
         ({"annotations.json": b'{"a":' * 100_000}, "nested more than 100 levels deep"),
         ({"annotations.json": b"[" * 100_000}, "nested more than 100 levels deep"),
         ({"annotations.json": b'{"images": [], "annotations": [], "a": ' + b"1" * 5000 + b"}"}, "is not COCO"),
-        ({"annotations.json": "{}".encode("utf-16")}, "no text in UTF-8"),
+        ({"annotations.json": "{}".encode("utf-16")}, "is not UTF-8 text"),
     ],
 )
 def test_annotations_of_coco_that_ask_for_too_much(worker, files, part):
@@ -364,7 +364,7 @@ def test_weights_of_an_earlier_version_are_converted_bit_for_bit(tmp_path):
         ("a.json", "[" * 100_000, "nested more than 100 levels deep"),
         ("a.json", '{"a":' * 90_000, "is not JSON"),
         ("a.toml", "a = " + "[" * 90_000, "nested more than 100 levels deep"),
-        ("a.toml", "a." * 40_000 + "b = 1", "more than 200 points in a line"),
+        ("a.toml", "a." * 40_000 + "b = 1", "more than 200 dots in a line"),
         ("a.toml", "layout.plot_length = 0x" + "f" * 9_000, "plot_length"),
         ("a.json", '{"layout": {"plot_length": 1e400}}', "plot_length"),
         ("a.json", '{"name": "\\ud800"}', "a.json"),

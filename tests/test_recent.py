@@ -22,15 +22,15 @@ NO_OTHERS = {"full_checkpoint_interval": 0, "checkpoint_interval": 100}
 def states():
     """Loop states after 1 to 7 iterations of the fake program, by iteration, and its shapes."""
     trainer = make_fake_trainer(small_config(), None)
-    loop, found = trainer.init(jax.random.key(7)), {}
+    loop, states_at = trainer.init(jax.random.key(7)), {}
     for iteration in range(1, 8):
         loop, _ = trainer.train_iteration(loop)
-        found[iteration] = jax.tree.map(jnp.copy, loop)
-    return found, trainer.shapes
+        states_at[iteration] = jax.tree.map(jnp.copy, loop)
+    return states_at, trainer.shapes
 
 
 @pytest.fixture
-def kept(states, tmp_path):
+def store(states, tmp_path):
     """A folder in which states 1 to 7 were saved, one after the other."""
     keeper = Recent(tmp_path / RECENT, print)
     for iteration, loop in states[0].items():
@@ -38,9 +38,9 @@ def kept(states, tmp_path):
     return tmp_path / RECENT
 
 
-def test_the_newest_two_come_back_bit_for_bit(states, kept):
+def test_the_newest_two_come_back_bit_for_bit(states, store):
     loops, shapes = states
-    again = Recent(kept, print)
+    again = Recent(store, print)
     assert again.iterations() == [6, 7]
     for iteration in (6, 7):
         loop, progress = again.restore(iteration, shapes)
@@ -87,11 +87,11 @@ def flip(file, place: int) -> None:
 
 @pytest.mark.parametrize("name", ["7.state", "7.rollout", "5.rollout"])
 @pytest.mark.parametrize("how", ["flip", "cut", "delete", "empty"])
-def test_damage_anywhere_is_noticed(states, kept, name, how):
-    size = (kept / name).stat().st_size
+def test_damage_anywhere_is_noticed(states, store, name, how):
+    size = (store / name).stat().st_size
     for place in np.linspace(0, size - 1, 23).astype(int) if how == "flip" else [0]:
-        shutil.copytree(kept, kept.with_name("copy"))
-        file = kept.with_name("copy") / name
+        shutil.copytree(store, store.with_name("copy"))
+        file = store.with_name("copy") / name
         if how == "flip":
             flip(file, place)
         elif how == "cut":
@@ -101,14 +101,14 @@ def test_damage_anywhere_is_noticed(states, kept, name, how):
         else:
             file.unlink()
         with pytest.raises(Unusable) as refused:
-            Recent(kept.with_name("copy"), print).restore(7, states[1])
+            Recent(store.with_name("copy"), print).restore(7, states[1])
         assert "\n" not in str(refused.value)
-        shutil.rmtree(kept.with_name("copy"))
+        shutil.rmtree(store.with_name("copy"))
 
 
-def test_another_structure_is_refused(kept):
+def test_another_structure_is_refused(store):
     with pytest.raises(RequestError, match="has another structure"):
-        Recent(kept, print).restore(7, make_fake_trainer(small_config(image_size=8), None).shapes)
+        Recent(store, print).restore(7, make_fake_trainer(small_config(image_size=8), None).shapes)
 
 
 def test_another_runs_states_are_not_there(states, tmp_path):
@@ -119,8 +119,8 @@ def test_another_runs_states_are_not_there(states, tmp_path):
     assert not theirs.set_foreign_aside(tmp_path / "foreign" / RECENT) and ours.set_foreign_aside(tmp_path / "foreign" / RECENT)
     ours.save(1, states[0][1], E, {})
     assert ours.iterations() == [1] and theirs.iterations() == []
-    kept = Recent(tmp_path / "foreign" / RECENT, print)
-    assert all(map(np.array_equal, as_plain(kept.restore(5, states[1])[0]), as_plain(states[0][5])))
+    store = Recent(tmp_path / "foreign" / RECENT, print)
+    assert all(map(np.array_equal, as_plain(store.restore(5, states[1])[0]), as_plain(states[0][5])))
 
 
 def test_no_room_is_said_once_and_ends_nothing(states, tmp_path, monkeypatch):

@@ -1,4 +1,4 @@
-"""Options that undo a departure from the authors' release: each changes what it says, and nothing else."""
+"""Options that revert a deviation from the authors' release: each changes only its own property."""
 
 import functools
 from typing import Any
@@ -31,14 +31,14 @@ def poses(name: str, **options: Any) -> tuple[Any, Any, np.ndarray]:
 
     def sample(key: jax.Array) -> tuple[Any, Any, jax.Array]:
         goal = env.sample_goal(key)
-        return env.sample_start(key), goal, env.goal_state_of(key, goal)
+        return env.sample_start(key), goal, env.goal_state(key, goal)
 
     return jax.device_get(env_jit(jax.vmap(sample))(KEYS))
 
 
 @functools.cache
 def images(**options: Any) -> np.ndarray:
-    """Of the starts, then the goals: [2 COUNT, 4, SIZE, SIZE] uint8."""
+    """Images of the starts, then of the goals: [2 COUNT, 4, SIZE, SIZE] uint8."""
     env = make("VisualFetchReach", image_size=SIZE, **options)
     cross_hair = {name: value for name, value in options.items() if name == "cross_hair"}
     start, goal, _ = poses("VisualFetchReach", image_size=SIZE, **cross_hair)
@@ -47,7 +47,7 @@ def images(**options: Any) -> np.ndarray:
 
 
 def assert_same_configuration(one: Any, other: Any) -> None:
-    """Up to the rounding of two programs."""
+    """Compare up to the rounding of two programs."""
     for name in ("qpos", "qvel", "qacc_warmstart", "mocap_quat", "site_xpos"):
         np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=2e-6)
 
@@ -70,7 +70,7 @@ def test_the_release_shows_the_grip_two_centimetres_off_its_goal():
     assert_same_configuration(start, their_start)
 
 
-def test_a_goal_image_shows_the_goal_configuration_under_the_bias():
+def test_goal_image_shows_the_biased_goal_configuration():
     env = make("FetchReach", goal_at="link")
     state = env_jit(jax.vmap(env.reset))(KEYS)
     _, goals, goal_state = poses("FetchReach", goal_at="link")
@@ -97,7 +97,7 @@ def test_the_cross_hair_stands_at_the_goal_in_the_first_image():
     assert (green > np.maximum(red, blue))[changed].mean() > 0.9
 
 
-def test_the_cross_hair_is_nothing_to_physics():
+def test_cross_hair_does_not_affect_physics():
     plain, crossed = (make("VisualFetchReach", image_size=SIZE, **option).mj_model for option in ({}, {"cross_hair": True}))
     assert crossed.ngeom == plain.ngeom + 4 and (crossed.nv, crossed.npair, crossed.neq) == (plain.nv, plain.npair, plain.neq)
     for prefix in (
@@ -118,7 +118,7 @@ def test_the_cross_hair_is_nothing_to_physics():
 
 
 def test_grey_fingers():
-    """Other colours where the fingers are seen, and nowhere else; the same depth."""
+    """Only the colours of visible finger pixels differ; depth is the same."""
     model = make("VisualFetchReach", image_size=SIZE).mj_model
     fingers = [model.geom(name).id for name in ("left_finger", "right_finger")]
     scene = Scene.from_mjmodel(model, camera="front", height=SIZE, width=SIZE)
@@ -130,7 +130,7 @@ def test_grey_fingers():
     np.testing.assert_array_equal(grey[3], orange[3])
 
 
-def test_the_hand_from_before_its_fingertips():
+def test_release_view_of_the_hand():
     env = make("VisualHandReach", image_size=SIZE, view="fingertips")
     data = mujoco.MjData(env.mj_model)
     mujoco.mj_forward(env.mj_model, data)
@@ -148,7 +148,7 @@ def test_the_hand_from_before_its_fingertips():
 
 
 def test_faint_marks_of_fingertips():
-    """Other colours where tips and their links are seen, and nowhere else; nothing else of the model is different."""
+    """Only the colours of visible tips and their links differ, and nothing else in the model."""
     faint, bright = (make("VisualHandReach", image_size=SIZE, tip_marks=marks).mj_model for marks in ("faint", "bright"))
     marks = [faint.geom(f"{finger}tip").id for finger in ("ff", "mf", "rf", "lf", "th")]
     links = [faint.geom(f"{finger}distal").id for finger in ("ff", "mf", "rf", "lf", "th")]
@@ -168,7 +168,7 @@ def test_faint_marks_of_fingertips():
     assert changed.sum() > 20 and np.isin(labels[changed], marks + links).all()
 
 
-def test_depth_as_opengl_holds_it():
+def test_zbuffer_depth_matches_opengl():
     near, far = 0.026, 130.0
     depth = jnp.array([0.0, near, 0.05, 0.4, 1.8, far, 1000.0, jnp.inf])
     # z of a depth by the projection matrix: (1 + its third row over its fourth) / 2.
@@ -180,7 +180,7 @@ def test_depth_as_opengl_holds_it():
     assert encoded[0] == 0 and encoded[-2] == encoded[-1] == 255
 
 
-def test_only_depth_is_encoded_in_another_way():
+def test_zbuffer_changes_only_the_depth_encoding():
     ranges = {"clip_range": (0.5, 1.5)}
     metric, zbuffer = (
         PointMass(PointMassConfig(image_size=16, depth_encoding=encoding, **ranges)) for encoding in ("metric", "zbuffer")
@@ -193,6 +193,6 @@ def test_only_depth_is_encoded_in_another_way():
     assert np.abs(np.asarray(other[3], int) - expected).max() <= 2 and (one[3] != other[3]).any()
 
 
-def test_the_finger_has_one_image_by_choice():
+def test_finger_turn_can_observe_a_single_image():
     env = jaxrl_vis_envs.make("VisualFingerTurn", image_size=8, frame_stack=1)
     assert env.observation_spec.shape == (4, 8, 8)

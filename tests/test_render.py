@@ -1,4 +1,4 @@
-"""The renderer against MuJoCo's own (stored images, so no GL is needed), against geometry, and against itself under vmap."""
+"""Renderer against MuJoCo's own (stored images, so no GL is needed), against geometry, and against itself under vmap."""
 
 import pathlib
 from types import SimpleNamespace
@@ -32,7 +32,9 @@ BALL_XML = """
 
 
 def poses_of(data, batch: int | None = None) -> dict:
-    """What the renderer reads of MjData, as a dictionary that vmap understands; repeated ``batch`` times if given."""
+    """Return the poses in MjData that the renderer reads, as a dictionary that vmap accepts; with ``batch``, repeated that many
+    times.
+    """
     poses = {name: np.array(getattr(data, name), np.float32) for name in POSES}
     return poses if batch is None else {name: np.repeat(value[None], batch, 0) for name, value in poses.items()}
 
@@ -43,7 +45,7 @@ def draw(scene: Scene, poses: dict):
 
 @pytest.fixture(scope="module")
 def ball():
-    """(model, data, scene of 33 x 33 pixels: its middle pixel looks along the camera's axis)."""
+    """Model, data, and a scene of 33 x 33 pixels whose central pixel looks along the camera's axis."""
     mj_model = mujoco.MjModel.from_xml_string(BALL_XML)
     mj_data = mujoco.MjData(mj_model)
     mujoco.mj_forward(mj_model, mj_data)
@@ -52,7 +54,7 @@ def ball():
 
 @pytest.fixture(scope="module")
 def references():
-    """(arrays of the file, scene, our frames of the same poses, drawn as one batch)."""
+    """Stored arrays, their scene, and our images of the same poses, rendered as one batch."""
     with np.load(REFERENCES) as stored:
         arrays = dict(stored)
     mj_model = mujoco.MjModel.from_xml_string(str(arrays["xml"]))
@@ -63,7 +65,7 @@ def references():
 
 
 def away_from_silhouettes(labels: np.ndarray) -> np.ndarray:
-    """Where all eight neighbours of a pixel show the same object."""
+    """Return a mask of pixels whose eight neighbours show the same object."""
     padded = np.pad(labels, ((0, 0), (1, 1), (1, 1)), mode="edge")
     height, width = labels.shape[1:]
     same = np.ones(labels.shape, bool)
@@ -182,7 +184,7 @@ def test_a_nan_camera_sees_only_sky(ball):
     np.testing.assert_array_equal(frame.depth, float(scene.zfar))
 
 
-def test_the_view_from_inside_a_geom_goes_through_it(ball):
+def test_geoms_are_see_through_from_inside(ball):
     _, mj_data, scene = ball
     poses = poses_of(mj_data)
     assert int(draw(scene.replace(camera_position=poses["geom_xpos"][0]), poses).segmentation[16, 16]) == 2
@@ -208,7 +210,7 @@ def test_gradient_of_depth_with_respect_to_a_pose(ball):
     assert np.all(np.isfinite(env_jit(jax.grad(brightness))(jnp.zeros(3))))
 
 
-def test_looks_can_differ_within_a_batch(ball):
+def test_appearance_can_differ_within_a_batch(ball):
     _, mj_data, scene = ball
     poses = poses_of(mj_data)
     rgba = jnp.stack([scene.rgba, scene.rgba.at[0, :3].set(jnp.array([1.0, 0.0, 0.0]))])
@@ -238,19 +240,19 @@ def test_a_signed_distance_field_is_drawn_through_its_mesh():
     jax.tree.map(np.testing.assert_array_equal, *shown)
 
 
-def test_an_unknown_camera_is_refused_with_the_names_there_are(ball):
+def test_unknown_camera_error_lists_the_cameras(ball):
     with pytest.raises(ValueError, match="'side'.*'front'"):
         Scene.from_mjmodel(ball[0], "side")
 
 
 @pytest.mark.parametrize(("height", "width", "named"), [(0, 4, "height=0"), (4, 4.5, "width=4.5"), ("4", 4, "height='4'")])
-def test_an_image_without_a_whole_number_of_pixels_is_refused(ball, height, width, named):
+def test_image_sizes_must_be_positive_integers(ball, height, width, named):
     with pytest.raises(ValueError, match=named):
         Scene.from_mjmodel(ball[0], "front", height, width)
     assert Scene.from_mjmodel(ball[0], "front", np.int64(3), 4).height == 3
 
 
-def test_what_is_left_out_must_be_there(ball):
+def test_leave_out_names_must_exist(ball):
     with pytest.raises(ValueError, match="'nosuch'.*'ball', 'ghost', 'wall'") as refusal:
         Scene.from_mjmodel(ball[0], "front", leave_out=("ball", "nosuch"))
     assert "\n" not in str(refusal.value) and "'ball'" not in str(refusal.value).partition(":")[0]
@@ -265,18 +267,18 @@ def test_what_is_left_out_must_be_there(ball):
         (lambda model: (mjx.put_model(model),), "not from a Model; mjx.put_model was given one"),
         (lambda model: (model, ("front", "side")), "a scene has one camera: .* got a tuple"),
         (lambda model: (model, 0.5), "a scene has one camera: .* got a float"),
-        (lambda model: (model, None, 4, 4, "all"), "groups must be numbers of groups.*'all'"),
-        (lambda model: (model, None, 4, 4, (0,), None), "site_groups must be numbers of groups.*None"),
+        (lambda model: (model, None, 4, 4, "all"), "groups must be group numbers.*'all'"),
+        (lambda model: (model, None, 4, 4, (0,), None), "site_groups must be group numbers.*None"),
         (lambda model: (model, None, 4, 4, (0,), (), True, False, False, None, "ball"), "leave_out must be .*'ball'"),
     ],
 )
-def test_what_no_scene_can_be_read_from_is_refused_in_one_line(ball, given, said):
+def test_invalid_scene_arguments_raise_one_line(ball, given, said):
     with pytest.raises(ValueError, match=said) as refusal:
         Scene.from_mjmodel(*given(ball[0]))
     assert "\n" not in str(refusal.value)
 
 
-def test_groups_come_in_any_collection(ball):
+def test_groups_may_be_any_collection(ball):
     for groups in ({4}, [4], np.array([4]), range(4, 5), 4):
         assert Scene.from_mjmodel(ball[0], "front", groups=groups).object_ids == (1,)
 
@@ -284,7 +286,7 @@ def test_groups_come_in_any_collection(ball):
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        (lambda scene, data: (data, scene), "a scene comes first, .* got MjData"),
+        (lambda scene, data: (data, scene), "the scene, .* comes first, .* got MjData"),
         (lambda scene, _: (scene, None), "mjx.Data or mujoco.MjData; NoneType has no geom_xpos"),
         (lambda scene, data: (scene, SimpleNamespace(data=data)), "such as state.data; SimpleNamespace has no geom_xpos"),
         (lambda scene, data: (scene, SimpleNamespace(**poses_of(data, 2))), r"\(3, 3\), got \(2, 3, 3\); jax.vmap"),
@@ -298,7 +300,7 @@ def test_groups_come_in_any_collection(ball):
         ),
     ],
 )
-def test_poses_that_are_not_of_the_scene_are_refused_in_one_line(ball, given, said):
+def test_poses_of_another_scene_raise_one_line(ball, given, said):
     with pytest.raises(ValueError, match=said) as refusal:
         render_planes(*given(ball[2], ball[1]))
     assert "\n" not in str(refusal.value)
@@ -312,15 +314,15 @@ def test_leaves_may_be_plain_numbers(ball):
     np.testing.assert_array_equal(given.depth, stated.depth)
 
 
-def test_nothing_that_is_not_asked_for_is_returned(ball):
+def test_only_requested_planes_are_returned(ball):
     assert render_planes(ball[2], ball[1], rgb=False, depth=False) == (None, None, None, None, None)
 
 
 @pytest.mark.parametrize(
     ("height", "width", "said"), [(-1, 4, "height=-1"), (4, 5.5, "width=5.5"), (4, 9999, "offwidth of the")]
 )
-def test_sizes_that_mujoco_cannot_draw_are_refused_in_one_line(ball, height, width, said):
-    """Before GL is looked for."""
+def test_sizes_mujoco_cannot_render_raise_one_line(ball, height, width, said):
+    """Checked before GL is initialised."""
     with pytest.raises(ValueError, match=said) as refusal:
         ReferenceRenderer(ball[0], height, width)
     assert "\n" not in str(refusal.value)

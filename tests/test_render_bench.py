@@ -61,7 +61,7 @@ def test_textures_can_be_left_out() -> None:
     ("content", "complaint"),
     [(None, "no scene .*finger, fetch_reach, primitives"), ("<mujoco/>", "no camera"), ("<robot", "no MuJoCo model")],
 )
-def test_what_is_no_scene_is_refused_in_one_line(content: str | None, complaint: str, tmp_path: Path) -> None:
+def test_invalid_scenes_raise_one_line(content: str | None, complaint: str, tmp_path: Path) -> None:
     path = tmp_path / "scene.xml"
     if content is not None:
         path.write_text(content)
@@ -70,7 +70,7 @@ def test_what_is_no_scene_is_refused_in_one_line(content: str | None, complaint:
     assert "\n" not in str(caught.value)
 
 
-def test_a_missing_suite_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_suite_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(models.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(RequestError, match="pip install --no-deps dm_control"):
         models.load("finger")
@@ -132,7 +132,7 @@ def test_operations_are_those_of_the_tests_and_of_one_shading(ball: str) -> None
     assert operations._count(lambda x, y: jnp.sqrt(x * y + 1.0), *[jax.ShapeDtypeStruct((7919,), jnp.float32)] * 2) == 3
 
 
-def test_images_that_do_not_change_are_refused() -> None:
+def test_unchanging_images_are_refused() -> None:
     rows = np.arange(8, dtype=np.float32)[:, None]
     with pytest.raises(AssertionError, match="8 of 8 images stay the same"):
         variation.assert_new_images(lambda batch: (jnp.asarray(batch), None), [rows, rows])
@@ -248,7 +248,7 @@ def test_warp_gets_the_options_that_a_scene_needs(scene: str) -> None:
     assert warp_options(scene) == WARP_NEEDS[scene]
 
 
-def test_warp_is_spared_textures_and_highlights_where_there_are_none() -> None:
+def test_warp_options_omit_absent_textures_and_highlights() -> None:
     assert warp_options("primitives", textures=False, highlights=False) == {"use_ambient_lighting"}
 
 
@@ -264,7 +264,7 @@ LIGHT = '<worldbody><light ambient=".1 .1 .1" pos="0 0 3"/>'
         ("<worldbody>", GLOW, None),  # a material that nothing has
     ],
 )
-def test_warp_gets_what_a_scene_adds(old: str, new: str, option: str | None, tmp_path: Path) -> None:
+def test_warp_gets_scene_specific_options(old: str, new: str, option: str | None, tmp_path: Path) -> None:
     path = tmp_path / "scene.xml"
     path.write_text(BALL.replace(old, new, 1))
     assert warp_options(str(path)) == {"use_ambient_lighting", "enable_specular"} | ({option} if option else set())
@@ -283,7 +283,7 @@ def test_warp_s_buffers_become_images() -> None:
     assert depth.shape == (1, 2, 2) and np.isinf(depth[0, 0, 0]) and depth[0, 1, 1] == 4.0
 
 
-def test_a_missing_warp_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_warp_raises_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "path", [])
     monkeypatch.setitem(sys.modules, "mujoco_warp", None)
     with pytest.raises(RequestError, match="pip install mujoco-warp==4.0.0") as caught:
@@ -291,7 +291,7 @@ def test_a_missing_warp_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch) -> 
     assert "\n" not in str(caught.value)
 
 
-def test_another_warp_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_warp_versions_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(warp.importlib.metadata, "version", lambda name: "5.0.0")
     for name in ("mujoco_warp", "warp"):
         monkeypatch.setitem(sys.modules, name, type(sys)(name))

@@ -1,4 +1,4 @@
-"""The passes of a CPU draw what the plain renderer draws, and have its gradients."""
+"""CPU passes render the image of the plain renderer, with its gradients."""
 
 from types import SimpleNamespace
 
@@ -18,8 +18,8 @@ from jaxrl_vis_envs.render.pixel.prepare import prepare
 
 @pytest.fixture
 def plainly(monkeypatch):
-    """Makes `render_planes` draw without the passes from here on."""
-    return lambda: monkeypatch.setattr(passes, "takes", lambda scene, outputs: False)
+    """Return a function that makes `render_planes` ignore the passes from then on."""
+    return lambda: monkeypatch.setattr(passes, "can_render", lambda scene, outputs: False)
 
 
 @pytest.mark.parametrize(
@@ -32,10 +32,10 @@ def plainly(monkeypatch):
     ],
     ids=["many", "shadows", "orthographic"],
 )
-def test_the_passes_draw_the_same_image(lens, more, shape, options, plainly):
+def test_passes_render_the_same_image(lens, more, shape, options, plainly):
     height, width = shape
     scene, poses = small_scene(lens, more, height, width, **options)
-    assert passes.takes(scene, Outputs(rgb=True, depth=True, segmentation=True, quantized=True))
+    assert passes.can_render(scene, Outputs(rgb=True, depth=True, segmentation=True, quantized=True))
 
     def draw_all(places):
         def draw(geom_xpos):
@@ -63,8 +63,8 @@ def test_the_passes_draw_the_same_image(lens, more, shape, options, plainly):
     assert alone.sum() >= 8 and not np.any(np.asarray(drawn.segmentation[:2])[:, alone] == 5)
 
 
-def test_what_is_computed_once_is_computed_for_all_or_none():
-    """A loop of no or one round, in a batch too; and the answer to whether is one for the batch."""
+def test_once_runs_for_the_whole_batch_or_not_at_all():
+    """The loop has zero or one iterations, also in a batch, whose condition is one for all."""
 
     def double(flags, x):
         seen = tiles._anywhere(flags)
@@ -77,11 +77,11 @@ def test_what_is_computed_once_is_computed_for_all_or_none():
     np.testing.assert_array_equal(nested, [[[3, 6, 6], [5, 10, 10]]])
 
 
-def test_tiles_see_what_is_in_them():
+def test_visible_objects_are_in_their_tiles_masks():
     scene, poses = small_scene(height=64, width=64)
     layout = tiles.layout(scene)
     rays = camera.pixel_rays(scene, layout.rows, layout.columns)
-    seen = np.asarray(tiles.seen_in_tiles(scene, prepare(scene, poses).unit, rays))
+    seen = np.asarray(tiles.visible_in_tiles(scene, prepare(scene, poses).unit, rays))
     labels = np.asarray(render_planes(scene, poses, rgb=False, segmentation=True).segmentation)
     for tile, (rows, columns) in enumerate(zip(layout.rows, layout.columns, strict=True)):
         shown = set(labels[rows, columns].tolist()) - {-1}
@@ -104,7 +104,7 @@ def test_the_passes_have_the_gradients_of_the_plain_renderer(plainly):
     np.testing.assert_allclose(gradient, expected, rtol=1e-4, atol=1e-4)
 
 
-def test_packed_normals_come_back():
+def test_packed_normals_round_trip():
     directions = jax.random.normal(jax.random.key(0), (3, 1000)) * jnp.array([[1e-3], [1.0], [30.0]])
     found = jnp.stack(passes._unpack_normal(passes._pack_normal(tuple(directions))))
     np.testing.assert_allclose(found, directions / jnp.linalg.norm(directions, axis=0), atol=1e-4)
@@ -115,7 +115,7 @@ _slopes = jax.jit(jax.vmap(jax.grad(arithmetic.power), in_axes=(0, None)))
 
 
 @pytest.mark.parametrize("exponent", [0.0, 0.5, 1.0, 10.0, 64.0, 128.0])
-def test_powers_are_right_to_a_fifth_of_a_grey_level(exponent):
+def test_powers_are_accurate_to_a_fifth_of_a_grey_level(exponent):
     base = np.concatenate([np.linspace(0.0, 1.0, 20_001), 1.0 - np.geomspace(1e-7, 1e-2, 1000)]).astype(np.float32)
     found = _powers(base, jnp.float32(exponent))
     np.testing.assert_allclose(found, np.maximum(base, np.float64(1e-6)) ** exponent, atol=1.0 / 5 / 255)

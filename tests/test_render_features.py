@@ -1,4 +1,4 @@
-"""What the renderer can draw, against geometry and against itself; what MuJoCo makes of it is in test_render_parity.py."""
+"""Features of the renderer, against geometry and against itself; test_render_parity.py compares with MuJoCo."""
 
 from types import SimpleNamespace
 
@@ -19,7 +19,7 @@ ABOVE = '<camera name="above" pos="0 0 2" fovy="45"/>'
 
 
 def load(body: str, header: str = FLAT_LIGHT, assets: str = ""):
-    """(model, data after forward kinematics)."""
+    """Return model and data after forward kinematics."""
     xml = f"<mujoco>{header}<asset>{assets}</asset><worldbody>{body}</worldbody></mujoco>"
     mj_model = mujoco.MjModel.from_xml_string(xml)
     mj_data = mujoco.MjData(mj_model)
@@ -28,7 +28,7 @@ def load(body: str, header: str = FLAT_LIGHT, assets: str = ""):
 
 
 def drawn(body: str, camera: str = "above", size: int = 17, header: str = FLAT_LIGHT, assets: str = "", **options):
-    """A frame of NumPy arrays, with normals and distance."""
+    """Render an image as NumPy arrays, with normals and distance."""
     mj_model, mj_data = load(body, header, assets)
     scene = Scene.from_mjmodel(mj_model, camera, size, size, **options)
     return shown(scene, mj_data)
@@ -36,12 +36,12 @@ def drawn(body: str, camera: str = "above", size: int = 17, header: str = FLAT_L
 
 @env_jit
 def draw(scene: Scene, poses: dict):
-    """Compiled once for all scenes that are alike in all but numbers."""
+    """Render; compiled once for all scenes that differ only in numerical values."""
     return render(scene, SimpleNamespace(**poses), normals=True, distance=True)
 
 
 def shown(scene: Scene, mj_data):
-    """A frame of NumPy arrays, with normals and distance."""
+    """Render an image as NumPy arrays, with normals and distance."""
     poses = {name: np.array(getattr(mj_data, name), np.float32) for name in POSES}
     return jax.tree.map(np.asarray, draw(scene, poses))
 
@@ -58,7 +58,7 @@ def test_normals_and_distance_of_a_ball():
     assert not frame.normals[0, 0].any() and frame.distance[0, 0] == frame.depth[0, 0] == 50.0
 
 
-def test_only_what_is_asked_for_comes_back():
+def test_only_requested_outputs_are_computed():
     mj_model, mj_data = load('<geom type="box" size=".3 .3 .3"/>' + ABOVE)
     scene = Scene.from_mjmodel(mj_model, "above", 8, 12)
     everything = dict(rgb=True, depth=True, segmentation=True, normals=True, distance=True)
@@ -84,8 +84,8 @@ def test_an_orthographic_camera():
     np.testing.assert_array_equal(frame.depth, frame.distance)
 
 
-def test_an_orthographic_camera_sees_a_plane_whose_sides_its_place_and_its_direction_agree_on():
-    """As MuJoCo's renderer does; benchmarks/render_parity.py found it (camera_ortho, pose 12 of seed 0)."""
+def test_orthographic_camera_culls_planes_like_mujoco():
+    """Found by benchmarks/render_parity.py (camera_ortho, pose 12 of seed 0): position and direction must agree on the side."""
     planes = "".join(
         f'<geom type="plane" size=".5 .5 .1" pos="{x} 0 0" zaxis="{normal}"/>'
         for x, normal in ((-2, ".9 0 -.3"), (0, ".9 0 .3"), (2, ".9 0 .3"))
@@ -146,7 +146,7 @@ def test_a_height_field_has_the_heights_of_its_grid():
     np.testing.assert_allclose(frame.depth[10, 0], 2.0 - 0.4 * along_edge, atol=1e-4)
 
 
-def test_what_is_transparent_lets_what_is_behind_through():
+def test_transparent_objects_show_the_background():
     body = '<geom type="box" size=".5 .5 .1" rgba="0 0 1 1"/><geom type="box" size=".2 .2 .1" pos="0 0 .5" rgba="1 0 0 .25"/>'
     frame = drawn(body + ABOVE, header=FLAT_LIGHT)
     covered = 1 - 0.75**2  # MuJoCo draws it twice
@@ -158,8 +158,8 @@ def test_what_is_transparent_lets_what_is_behind_through():
 
 
 @pytest.mark.parametrize("turn", ["0 0 0", "180 0 0", "90 0 0", "-90 0 0", "0 90 0", "0 -90 0"])
-def test_common_edges_and_corners_of_clear_triangles_are_covered_once(turn):
-    """An octahedron, from each side: middles of pixels lie on its nearest corner, and on all edges that end there."""
+def test_shared_edges_and_corners_of_transparent_triangles_are_blended_once(turn):
+    """An octahedron seen along each axis: pixel centres lie on its nearest corner and on all edges that end there."""
     corners = ".3 0 0 -.3 0 0 0 .35 0 0 -.35 0 0 0 .4 0 0 -.4"
     body = '<geom type="plane" size="2 2 .1" pos="0 0 -.6" rgba="0 0 1 1"/>'
     body += f'<geom type="mesh" mesh="m" rgba="1 0 0 .25" euler="{turn}"/>'
@@ -170,7 +170,7 @@ def test_common_edges_and_corners_of_clear_triangles_are_covered_once(turn):
     assert np.ptp(frame.rgb[seen].astype(int), axis=0).max() <= 1
 
 
-def test_planes_are_half_transparent_from_behind():
+def test_planes_are_transparent_from_behind():
     body = '<geom type="plane" size="1 1 .1" rgba="1 0 0 1"/><geom type="sphere" size=".2" pos="0 0 .5" rgba="0 0 1 1"/>'
     body += '<camera name="below" pos="0 0 -2" xyaxes="1 0 0 0 -1 0"/><camera name="above" pos="0 0 2"/>'
     below, above = (drawn(body, camera, plane_backs=True) for camera in ("below", "above"))
@@ -182,8 +182,8 @@ def test_planes_are_half_transparent_from_behind():
     assert not drawn(body, "below", plane_backs=False).rgb[8, 8, 2]
 
 
-def test_what_has_no_thickness_is_a_sheet_and_what_has_no_area_is_not_there():
-    """MuJoCo's images of such things are in test_render_parity.py; here, that both implementations of a CPU draw the same."""
+def test_shapes_without_thickness_are_sheets_and_without_area_are_hidden():
+    """test_render_parity.py compares with MuJoCo; here, both CPU implementations must agree."""
     things = {"box": (0.2, 0.15, 0.0), "cylinder": (0.2, 0.0, 0.0), "capsule": (0.2, 0.0, 0.0), "sphere": (0.0, 0.0, 0.0)}
     body = "".join(f'<geom type="{kind}" size=".2 .2 .2" pos="{x} 0 0"/>' for x, kind in zip((-0.6, -0.2, 0.2, 0.6), things))
     mj_model, mj_data = load(body + ABOVE)
@@ -247,14 +247,14 @@ def test_a_texture_repeats_per_object_or_per_metre():
     np.testing.assert_allclose(mean.rgb, 128, atol=1)
 
 
-def test_the_sky_can_be_a_image():
+def test_the_sky_can_be_an_image():
     sky = '<texture type="skybox" builtin="checker" rgb1="0 0 0" rgb2="1 1 1" width="64" height="64"/>'
     frame = drawn('<geom type="sphere" size=".1"/>' + ABOVE, size=32, assets=sky)
     values = frame.rgb[frame.segmentation < 0][:, 0]
     assert (values < 5).sum() > 100 and (values > 250).sum() > 100
 
 
-def test_many_objects_are_drawn_as_few_are(monkeypatch):
+def test_looped_and_unrolled_intersections_agree(monkeypatch):
     rng = np.random.default_rng(0)
     kinds = ("sphere", "capsule", "ellipsoid", "cylinder", "box")
     body = '<geom type="plane" size="0 0 .1"/>'
@@ -267,18 +267,18 @@ def test_many_objects_are_drawn_as_few_are(monkeypatch):
         mj_model, mj_data = load(body + ABOVE)
         scene = Scene.from_mjmodel(mj_model, "above", height, width)
         unrolled = shown(scene, mj_data)
-        monkeypatch.setattr(raycast, "UNROLLED", 0)
-        assert blocks.tiled(scene)
-        images._drawn.clear_cache()
+        monkeypatch.setattr(raycast, "MAX_UNROLLED", 0)
+        assert blocks.is_tiled(scene)
+        images._draw_along.clear_cache()
         looped = shown(scene, mj_data)
         monkeypatch.undo()
-        images._drawn.clear_cache()
+        images._draw_along.clear_cache()
         np.testing.assert_array_equal(unrolled.segmentation, looped.segmentation)
         np.testing.assert_allclose(unrolled.depth, looped.depth, rtol=1e-5)
         assert np.mean(unrolled.rgb == looped.rgb) > 0.999
 
 
-def test_every_look_can_differ_within_a_batch_without_another_trace():
+def test_all_appearance_leaves_can_be_batched_without_retracing():
     light = '<light pos="0 0 3" dir="0 0 -1" specular=".1 .1 .1"/><geom type="plane" size="1 1 .1"/>'
     mj_model, mj_data = load(light + '<geom type="box" size=".2 .2 .2"/>' + ABOVE)
     scene = Scene.from_mjmodel(mj_model, "above", 8, 8)
@@ -330,7 +330,7 @@ REFUSALS = {
 
 
 @pytest.mark.parametrize("case", REFUSALS)
-def test_refusals_name_the_culprit_and_the_mend(case):
+def test_errors_name_the_object_and_the_remedy(case):
     body, assets, message, options, culprits = REFUSALS[case]
     deformable = ""
     if "<mesh" not in assets:
@@ -351,8 +351,8 @@ def free_view(**changes: float) -> mujoco.MjvCamera:
     return view
 
 
-def test_a_free_camera_stands_where_mujoco_puts_it() -> None:
-    """Looking along +y from 2 m before the middle: the box, which is half a metre to the right, is seen to the right."""
+def test_free_camera_pose_matches_mujoco() -> None:
+    """Looking along +y from 2 m in front of the centre: the box, half a metre to the right, appears on the right."""
     box = "<geom type='box' pos='.5 0 .5' size='.1 .1 .1'/>"
     mj_model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{box}</worldbody></mujoco>")
     mj_data = mujoco.MjData(mj_model)
@@ -367,7 +367,7 @@ def test_a_free_camera_stands_where_mujoco_puts_it() -> None:
     assert shown(default, mj_data).segmentation[16, 16] == 0  # the middle of the model is in the middle
 
 
-def test_a_camera_that_there_is_not_is_told() -> None:
+def test_missing_camera_error_says_so() -> None:
     mj_model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
     with pytest.raises(ValueError, match="its cameras are: none; or None for a free one"):
         Scene.from_mjmodel(mj_model, "front")

@@ -1,4 +1,4 @@
-"""The verdict on models of other people: what `benchmarks/render_parity.py FOLDER` calls a pass. No GL is needed."""
+"""Verdicts of `benchmarks/render_parity.py FOLDER` on third-party models. No GL is needed."""
 
 import mujoco
 import numpy as np
@@ -8,7 +8,7 @@ from jaxrl_vis_envs.render import Frame
 
 
 def frame(labels: np.ndarray, colour: int = 100, depth: float = 2.0) -> Frame:
-    """An image of what ``labels`` [H, W] say, of one colour and depth."""
+    """Return an image with segmentation ``labels`` [H, W], of one colour and depth."""
     rgb = np.full((*labels.shape, 3), colour, np.uint8)
     return Frame(rgb, np.full(labels.shape, depth, np.float32), labels)  # pyright: ignore[reportArgumentType]
 
@@ -17,7 +17,7 @@ def verdict(ours: Frame, theirs: Frame, hidden: np.ndarray | None = None) -> lis
     return model_folder.measure(ours, theirs, np.zeros((32, 32), bool) if hidden is None else hidden).failures()
 
 
-def test_images_pass_where_they_are_the_same_and_fail_by_what_is_not() -> None:
+def test_equal_images_pass_and_failures_name_the_measure() -> None:
     labels = np.full((32, 32), -1, np.int32)
     labels[4:28, 4:28] = 0
     small = labels.copy()
@@ -42,7 +42,7 @@ def test_rows_of_a_model_are_its_cameras_its_sites_and_its_haze() -> None:
         assert [view.title(mj_model) for view in model_folder.views(mj_model)] == titles
 
 
-def test_what_is_no_model_has_a_verdict_of_its_own(tmp_path, capsys) -> None:
+def test_invalid_models_have_their_own_verdict(tmp_path, capsys) -> None:
     (tmp_path / "deep").mkdir()
     (tmp_path / "deep" / "broken.xml").write_text("<mujoco><worldbody>")
     (tmp_path / "notes.txt").write_text("not looked at")

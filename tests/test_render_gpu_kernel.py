@@ -1,4 +1,4 @@
-"""The GPU kernel draws what the plain renderer draws; run by Pallas's interpreter, so no GPU is needed."""
+"""GPU kernel renders the image of the plain renderer; run by Pallas's interpreter, so no GPU is needed."""
 
 import functools
 from types import SimpleNamespace
@@ -16,17 +16,17 @@ from jaxrl_vis_envs.render.gpu import kernel
 
 @pytest.fixture
 def with_kernel(monkeypatch):
-    """Makes `render_planes` take the kernel from here on."""
+    """Return a function that makes `render_planes` use the kernel from then on."""
 
     def switch() -> None:
-        monkeypatch.setattr(kernel, "takes", lambda scene, outputs: kernel.supports(scene))
+        monkeypatch.setattr(kernel, "can_render", lambda scene, outputs: kernel.supports(scene))
         monkeypatch.setattr(kernel, "draw", functools.partial(kernel.draw, interpret=True))
 
     return switch
 
 
 @pytest.mark.parametrize(("lens", "textured", "more"), [("", True, MORE_SPHERES), (ORTHOGRAPHIC, False, "")])
-def test_the_kernel_draws_the_same_image(lens, textured, more, with_kernel):
+def test_kernel_renders_the_same_image(lens, textured, more, with_kernel):
     scene, poses = small_scene(lens, more, textured=textured)
     assert kernel.supports(scene)
 
@@ -47,7 +47,7 @@ def test_the_kernel_draws_the_same_image(lens, textured, more, with_kernel):
     assert 2 in np.asarray(drawn.segmentation[0]) and 2 not in np.asarray(drawn.segmentation[1])
 
 
-def test_quantized_colours_are_the_quantized_colours(with_kernel):
+def test_quantized_output_equals_quantizing_the_output(with_kernel):
     scene, poses = small_scene()
     expected = env_jit(lambda: render_planes(scene, poses, quantized=True).rgb)()
     with_kernel()
@@ -72,7 +72,7 @@ def test_the_kernel_has_the_gradients_of_the_plain_renderer(with_kernel):
 
 
 @pytest.mark.parametrize("size", [8, 32, 64, 84, 100, 128, 250])
-def test_tiles_cover_the_image_and_little_else(size):
+def test_tiles_cover_the_image_with_little_overhang(size):
     high, wide = kernel.tile_shape(size, size)
     drawn = -(-size // high) * -(-size // wide) * 128
     assert high * wide <= 128

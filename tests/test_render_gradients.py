@@ -1,4 +1,4 @@
-"""Gradients of images against finite differences, away from silhouettes, and what must not spoil them."""
+"""Gradients of images against finite differences away from silhouettes, and their robustness."""
 
 import functools
 from collections.abc import Callable
@@ -60,7 +60,7 @@ def no_change() -> dict:
 
 
 def moved(scene: Scene, poses: dict, thing: jax.Array, change: dict) -> tuple[Scene, dict]:
-    """The scene and the poses with small changes: of a thing's position and orientation, the camera, sizes, colours."""
+    """Return scene and poses with small changes of position and orientation of an object, camera, sizes and colours."""
     x, y, z = change["turn"]
     cross = jnp.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     turned = poses["geom_xmat"].reshape(-1, 3, 3)
@@ -79,10 +79,10 @@ def moved(scene: Scene, poses: dict, thing: jax.Array, change: dict) -> tuple[Sc
 
 
 class Setting(NamedTuple):
-    """A scene, its poses, and one compiled program.
+    """Scene, poses, and one compiled program.
 
-    ``measure(poses, thing, change, mask, weights)`` gives the planes, the means over ``mask`` of depth, of all colours and of
-    red, and the slopes of the weighted sum of these three with respect to ``change``.
+    ``measure(poses, thing, change, mask, weights)`` returns the planes, the means over ``mask`` of depth, of all colours and of
+    red, and the derivatives of the weighted sum of these three with respect to ``change``.
     """
 
     scene: Scene
@@ -120,13 +120,13 @@ def setting(name: str) -> Setting:
 
 
 def slopes_of_each(measure: Callable, *arguments: Any) -> dict[str, np.ndarray]:
-    """Of each of the three means, [3, ...]: one after the other, which is less to compile than all of them at once."""
+    """Return the derivatives of the three means, [3, ...], computed sequentially, which takes less time to compile."""
     rows = [measure(*arguments, row)[2] for row in np.eye(3, dtype=np.float32)]
     return {quantity: np.stack([row[quantity] for row in rows]) for quantity in rows[0]}
 
 
 def well_inside(planes: Any, thing: int) -> jax.Array:
-    """[SIZE, SIZE] bool: away from silhouettes, and from the edges between the faces of one thing."""
+    """Return the mask [SIZE, SIZE] of pixels away from silhouettes, and from edges between faces of one object."""
     labels, normals = np.asarray(planes.segmentation), np.asarray(planes.normals)
     inside = np.zeros((SIZE, SIZE), bool)
     for row in range(2, SIZE - 2):
@@ -144,7 +144,7 @@ NOTHING = np.zeros(3, np.float32)
 
 
 @pytest.mark.parametrize("name", THINGS)
-def test_gradients_are_those_of_finite_differences(name):
+def test_gradients_match_finite_differences(name):
     scene = SCENE_OF[name]
     _, poses, measure = setting(scene)
     thing = 1 + SCENES[scene].index(name)  # after the floor
@@ -168,8 +168,8 @@ def test_gradients_are_those_of_finite_differences(name):
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_a_nan_pose_leaves_no_nan_in_other_gradients(name):
-    """The last thing has no pose; gradients of the whole image with respect to the floor, the camera and the lights."""
+def test_nan_pose_does_not_spoil_other_gradients(name):
+    """The last object has a NaN pose; gradients of the whole image with respect to floor, camera and lights stay finite."""
     _, poses, measure = setting(name)
     poses = poses | {"geom_xpos": poses["geom_xpos"].at[-1].set(jnp.nan)}
     arguments = poses, 0, no_change(), ~NOWHERE
@@ -181,8 +181,8 @@ def test_a_nan_pose_leaves_no_nan_in_other_gradients(name):
     assert np.any(np.asarray(slopes["colour"][1]) > 0)
 
 
-def test_a_pose_is_found_by_descent():
-    """Of a ball, from a depth image alone."""
+def test_gradient_descent_finds_a_pose():
+    """The pose of a ball, from a depth image alone."""
     scene, poses, _ = setting("primitives")
     thing = 1 + SCENES["primitives"].index("sphere")
 

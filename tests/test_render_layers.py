@@ -1,4 +1,4 @@
-"""The rooms of the renderer: each imports only from those before it."""
+"""Import layers of the renderer: each module imports only from earlier ones."""
 
 from test_packaging import imports_within
 
@@ -7,7 +7,7 @@ ROOMS = (("mounts",), ("model", "outputs"), ("scene", "reference"), ("camera",),
 RENDER = "jaxrl_vis_envs.render."
 
 
-def test_imports_of_the_renderer_run_one_way() -> None:
+def test_renderer_imports_have_no_cycles() -> None:
     depth_of = {name: depth for depth, names in enumerate(ROOMS) for name in names}
     graph = imports_within("jaxrl_vis_envs", when_running=False)
     inside = {name.removeprefix(RENDER): targets for name, targets in graph.items() if name.startswith(RENDER)}

@@ -1,4 +1,4 @@
-"""Cameras and lights stand where the bodies are, whatever the data says of them: in all modes, from `mjx.kinematics` alone."""
+"""Poses of cameras and lights follow the bodies in all modes, from `mjx.kinematics` alone, whatever the data contains."""
 
 import itertools
 import json
@@ -54,7 +54,7 @@ MODEL = f"""
 
 @pytest.fixture(scope="module")
 def moved():
-    """(model, MjData of two poses, mjx.Data of both: [2, ...] with `mjx.kinematics` and nothing else)."""
+    """Model, MjData of two poses, and mjx.Data of both, [2, ...], with `mjx.kinematics` only."""
     mj_model = mujoco.MjModel.from_xml_string(MODEL)
     rng = np.random.default_rng(0)
     data, positions = [], []
@@ -68,7 +68,7 @@ def moved():
     return mj_model, data, env_jit(move)(jnp.asarray(np.stack(positions), jnp.float32))
 
 
-def test_cameras_of_all_modes_stand_where_mujoco_has_them(moved):
+def test_camera_poses_match_mujoco_in_all_modes(moved):
     mj_model, data, batch = moved
     assert mj_model.ncam == 3 * len(MODES) and not np.any(batch.cam_xpos)
     scenes = [Scene.from_mjmodel(mj_model, index, 4, 4) for index in range(mj_model.ncam)]
@@ -80,9 +80,9 @@ def test_cameras_of_all_modes_stand_where_mujoco_has_them(moved):
             np.testing.assert_allclose(rotation[row].reshape(9), truth.cam_xmat[index], atol=5e-6, err_msg=name)
 
 
-def test_lights_of_all_modes_shine_from_where_mujoco_has_them(moved, monkeypatch):
+def test_light_poses_match_mujoco_in_all_modes(moved, monkeypatch):
     mj_model, data, batch = moved
-    monkeypatch.setattr("jaxrl_vis_envs.render.model.reading.MOST_LIGHTS", mj_model.nlight + 1)
+    monkeypatch.setattr("jaxrl_vis_envs.render.model.reading.MAX_LIGHTS", mj_model.nlight + 1)
     scene = Scene.from_mjmodel(mj_model, 0, 4, 4)
     positions, directions = env_jit(jax.vmap(lambda one: lights.light_poses(scene, one)))(batch)
     for row, truth in enumerate(data):
@@ -90,7 +90,7 @@ def test_lights_of_all_modes_shine_from_where_mujoco_has_them(moved, monkeypatch
         np.testing.assert_allclose(directions[row], truth.light_xdir, atol=5e-6)
 
 
-def test_the_centre_of_a_body_without_mass_is_its_own():
+def test_centre_of_mass_of_a_massless_subtree_is_the_body():
     bodies = mounts.Bodies(jnp.array([0.0, 2.0, 1.0, 0.0]), (0, 0, 1, 2))
     data = SimpleNamespace(xipos=np.array([[0, 0, 0], [1, 0, 0], [4, 0, 3], [0, 7, 0]], np.float32))
     np.testing.assert_allclose(mounts.centre_of_mass(bodies, data, 1), [2.0, 0.0, 1.0], atol=1e-6)
@@ -98,13 +98,13 @@ def test_the_centre_of_a_body_without_mass_is_its_own():
 
 
 @pytest.mark.parametrize(("place", "up"), [((0.1, 0.2, 3.0), 1.0), ((0.1, 0.2, -3.0), -1.0)])
-def test_a_camera_that_looks_straight_down_or_up_has_its_right_along_x(place, up):
-    rotation = mounts.looking(jnp.array(place), jnp.array([0.1, 0.2, 0.0]))
+def test_vertical_camera_has_right_along_x(place, up):
+    rotation = mounts.look_at(jnp.array(place), jnp.array([0.1, 0.2, 0.0]))
     np.testing.assert_allclose(rotation, [[1, 0, 0], [0, up, 0], [0, 0, up]], atol=1e-6)
 
 
 @pytest.mark.parametrize("kind", ["mjx", "mujoco"])
-def test_poses_that_nothing_has_filled_in_are_refused_in_one_line(moved, kind):
+def test_uncomputed_poses_raise_one_line(moved, kind):
     mj_model = moved[0]
     data = mjx.make_data(mj_model) if kind == "mjx" else mujoco.MjData(mj_model)
     with pytest.raises(ValueError, match="all poses are zero: run mjx.kinematics") as refusal:
@@ -113,7 +113,7 @@ def test_poses_that_nothing_has_filled_in_are_refused_in_one_line(moved, kind):
 
 
 def documented_task(page: str) -> type:
-    """The task that a page makes, with its camera in the hand: it rides on the puck and looks ahead over the table."""
+    """Task from a documentation page, with a camera that is fixed to the puck and looks ahead over the table."""
     path = doc_blocks.ROOT / page
     cells = json.loads(path.read_text())["cells"] if path.suffix == ".ipynb" else []
     sources = [block.text for block in doc_blocks.blocks(path)] if not cells else ["".join(cell["source"]) for cell in cells]
@@ -133,7 +133,7 @@ def documented_task(page: str) -> type:
 
 
 @pytest.mark.parametrize("page", ["docs/extending.md", "notebooks/02_new_environment.ipynb"])
-def test_goals_of_a_documented_task_are_seen_from_an_eye_in_the_hand(page):
+def test_documented_task_renders_goals_from_the_hand_camera(page):
     task = documented_task(page)
     env = task(typing.get_type_hints(task.__init__)["config"](image_size=24, pixels="depth", depth_range=(0.1, 2.0)))
     goals = env_jit(jax.vmap(env.sample_goal))(jax.random.split(jax.random.key(0), 3))

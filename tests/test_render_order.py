@@ -1,4 +1,4 @@
-"""What is on top of what, as MuJoCo has it: see-through faces, ties, what coincides, layers as thin as paper."""
+"""Visibility as in MuJoCo: transparent faces, ties, coincident surfaces, and paper-thin layers."""
 
 import functools
 import io
@@ -41,7 +41,9 @@ RED, BLUE = np.array([0.9, 0.1, 0.2]), np.array([0.1, 0.2, 0.9])
 
 
 def load(body: str, floor: str = FLOOR) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """(model, data after forward kinematics) of a scene over a grey floor. The left half of the texture is clear."""
+    """Return model and data after forward kinematics of a scene over a grey floor, with a texture whose left half is
+    transparent.
+    """
     pixels = np.full((8, 8, 4), [200, 100, 50, 255], np.uint8)
     pixels[:, :4, 3] = 0
     file = io.BytesIO()
@@ -59,7 +61,7 @@ def geom(kind: str, size: str, pos: str, colour: np.ndarray, alpha: float = 0.5,
 
 
 def laid(*colours: np.ndarray, alpha: float = 0.5) -> np.ndarray:
-    """Sheets over the floor, the nearest first: front to back, and then back to front."""
+    """Blend sheets over the floor, nearest first: front to back, and then back to front."""
     shown = BACK
     for colour in (*colours, *reversed(colours)):
         shown = shown + alpha * (colour - shown)
@@ -67,7 +69,7 @@ def laid(*colours: np.ndarray, alpha: float = 0.5) -> np.ndarray:
 
 
 def colours_at(body: str, places: list[tuple[float, float]], size: int = 31) -> np.ndarray:
-    """What is seen at places on the floor (m), [places, 3] in [0, 1]."""
+    """Return the colours visible at points on the floor (m), [points, 3] in [0, 1]."""
     mj_model, mj_data = load(body)
     planes = render_planes(Scene.from_mjmodel(mj_model, "above", size, size), mj_data, depth=False)
     scale = size / (2.0 * 3.5 * np.tan(np.deg2rad(22.5)))
@@ -77,7 +79,7 @@ def colours_at(body: str, places: list[tuple[float, float]], size: int = 31) -> 
 
 
 @pytest.mark.parametrize("turned", [False, True])
-def test_of_what_is_equally_far_the_first_to_be_declared_is_the_nearer(turned):
+def test_first_declared_of_equidistant_objects_is_nearer(turned):
     balls = [geom("sphere", ".4", "-.1 0 0", RED), geom("sphere", ".4", ".1 0 0", BLUE)]
     # Planes all count as equally far, whatever is above.
     planes = [geom("plane", ".2 .2 .1", f"0 .9 {height}", colour) for height, colour in ((0.1, RED), (0.3, BLUE))]
@@ -86,14 +88,14 @@ def test_of_what_is_equally_far_the_first_to_be_declared_is_the_nearer(turned):
     np.testing.assert_allclose(colours_at(body, [(0.0, 0.0), (0.0, 0.9)]), [laid(*order)] * 2, atol=2e-3)
 
 
-def test_every_face_of_a_see_through_mesh_that_looks_to_the_camera_covers_something():
+def test_all_front_faces_of_a_transparent_mesh_are_blended():
     body = f'<geom type="mesh" mesh="two floors" material="own" rgba=".9 .1 .2 .5"/>{geom("box", ".1 .1 .1", "1 0 0", RED)}'
     twice, once = colours_at(body, [(0.0, 0.0), (1.1, 0.0)])
     np.testing.assert_allclose(twice, laid(RED, RED), atol=2e-3)
     np.testing.assert_allclose(once, laid(RED), atol=2e-3)
 
 
-def test_the_faces_of_a_see_through_mesh_have_gradients():
+def test_faces_of_a_transparent_mesh_have_gradients():
     mj_model, mj_data = load('<geom type="mesh" mesh="two floors" material="own" rgba=".9 .1 .2 .5"/>')
     scene = Scene.from_mjmodel(mj_model, "above", 5, 5)
 
@@ -107,7 +109,7 @@ def test_the_faces_of_a_see_through_mesh_have_gradients():
     np.testing.assert_allclose(slope, 4 * 0.4 * 0.7**3, atol=1e-2)
 
 
-def test_alpha_of_a_texture_counts_on_what_is_transparent_and_nowhere_else():
+def test_texture_alpha_applies_to_transparent_objects_only():
     body = '<geom type="plane" size=".4 .4 .1" pos="-.8 0 0" material="leaf"/>'
     body += '<geom type="box" size=".3 .3 .1" pos=".8 0 0" material="leaf"/>'
     body += '<geom type="plane" size=".4 .4 .1" pos="0 .9 0" material="solid leaf"/>'
@@ -118,15 +120,15 @@ def test_alpha_of_a_texture_counts_on_what_is_transparent_and_nowhere_else():
     np.testing.assert_allclose(seen, expected, atol=5e-3)
 
 
-def test_what_is_drawn_twice_is_seen_twice():
-    """A clear box in the very place of an opaque one, before it and after it in the model."""
+def test_coincident_transparent_and_opaque_boxes_are_both_visible():
+    """A transparent box coincides with an opaque one, declared before it and after it."""
     for order in (1, -1):
         body = "".join([geom("box", ".3 .3 .2", "0 0 0", RED, 1.0), geom("box", ".3 .3 .2", "0 0 0", BLUE)][::order])
         (seen,) = colours_at(body, [(0.0, 0.0)])
         np.testing.assert_allclose(seen, RED + 0.75 * (BLUE - RED), atol=2e-3)
 
 
-def test_what_reflects_is_drawn_first_and_labelled_in_its_turn():
+def test_reflecting_objects_are_drawn_first_but_labelled_in_order():
     mirror = 'material="mirror"'
     body = geom("box", ".3 .3 .2", "0 0 0", RED, 1.0) + geom("box", ".3 .3 .2", "0 0 0", BLUE, 1.0, mirror)
     body += geom("box", ".3 .3 .2", ".8 0 0", BLUE, 1.0, mirror) + geom("box", ".3 .3 .2", ".8 0 0", RED, 1.0)
@@ -136,7 +138,7 @@ def test_what_reflects_is_drawn_first_and_labelled_in_its_turn():
     # Only the first one reflects in MuJoCo.
     assert frame.segmentation[15, 15] == 2 and frame.segmentation[15, 23] == 4
     np.testing.assert_allclose(frame.rgb[15, [15, 23]] / 255, [RED, RED], atol=3e-3)
-    assert scene.reordered and not passes.takes(scene, Outputs(True, True, True, quantized=True))
+    assert scene.reordered and not passes.can_render(scene, Outputs(True, True, True, quantized=True))
 
 
 THIN = 3e-5  # m
@@ -144,7 +146,7 @@ THIN = 3e-5  # m
 
 @pytest.fixture(scope="module")
 def papers():
-    """(scene, data): sheets on a desk among so many geoms that rows are kept beside keys, seen from 3 m."""
+    """Scene and data of sheets on a desk among so many geoms that rows are separate from keys, seen from 3 m."""
     desk = geom("box", ".9 .9 .5", "0 0 -.5", BACK, 1.0)
     papers = "".join(
         geom("box", f".1 .4 {THIN / 2}", f"{x} 0 {THIN / 2}", RED, 1.0)
@@ -162,7 +164,7 @@ def test_paper_among_many_geoms_stays_on_the_desk(papers, way, monkeypatch):
     assert len(scene.object_ids) > 63
     if way == "kernel":
         assert kernel.supports(scene)
-        monkeypatch.setattr(kernel, "takes", lambda scene, outputs: True)
+        monkeypatch.setattr(kernel, "can_render", lambda scene, outputs: True)
         monkeypatch.setattr(kernel, "draw", functools.partial(kernel.draw, interpret=True))
     draw = env_jit(lambda: render_planes(scene, mj_data, segmentation=True, quantized=way == "passes"))
     labels = np.asarray(draw().segmentation)
@@ -174,8 +176,8 @@ def test_paper_among_many_geoms_stays_on_the_desk(papers, way, monkeypatch):
     np.testing.assert_array_equal(labels[row, columns], sheets)
 
 
-def test_slopes_of_3_to_4_are_as_smooth_as_32_bits_have_them():
-    """The cosine of their angle is the bound from which on MuJoCo shades a corner smoothly: rounding of bits decides."""
+def test_smoothing_threshold_matches_float32_rounding():
+    """The cosine of their angle is exactly MuJoCo's threshold for smooth shading: float32 rounding decides."""
     ridge = "-.2 0 0 .2 0 0 -.2 .8 .6 .2 .8 .6 -.2 1.6 0 .2 1.6 0 -.2 .8 -.05 .2 .8 -.05"
     faces = "0 1 3 0 3 2 2 3 5 2 5 4 0 6 7 0 7 1 4 5 7 4 7 6 0 2 6 2 4 6 1 7 3 3 7 5"
     xml = f"""<mujoco><asset><mesh name="ridge" vertex="{ridge}" face="{faces}"/></asset>
@@ -187,7 +189,7 @@ def test_slopes_of_3_to_4_are_as_smooth_as_32_bits_have_them():
     assert len(rows) == 12 and np.sum(np.max(np.abs(corners - flat), axis=2) > 1e-5) == 11
 
 
-def test_lights_that_mujoco_does_not_know():
+def test_point_lights_unknown_to_mujoco():
     lights = '<light type="image" texture="half"/><light type="point" pos="0 0 2"/><light type="spot" pos="0 0 2" cutoff="30"/>'
     mj_model, _ = load(lights)
     types = mujoco.mjtLightType

@@ -1,7 +1,7 @@
-"""The renderer against MuJoCo's own, model by model, with stored images: no GL is needed.
+"""Renderer against MuJoCo's own, model by model, with stored images: no GL is needed.
 
-The bounds are those of the live comparison (benchmarks/render_parity.py), on fewer and smaller images. A model without
-stored images fails, and so does one whose package has changed since they were made.
+The bounds are those of the live comparison (benchmarks/render_parity.py), on fewer and smaller images. A model without stored
+images fails, and so does one whose package has changed since they were made.
 """
 
 import mujoco
@@ -44,7 +44,7 @@ def test_images_agree_with_mujoco(name: str) -> None:
 
 
 def frame(label: int = 0, depth: float = 2.0, colour: int = 100) -> Frame:
-    """A uniform image of 16 x 16 pixels, with sky in the right half."""
+    """Return a uniform image of 16 x 16 pixels, with sky in the right half."""
     labels = np.full((16, 16), label, np.int32)
     labels[:, 8:] = -1
     rgb = np.full((16, 16, 3), colour, np.uint8)
@@ -57,7 +57,7 @@ def tally_of(ours: Frame, theirs: Frame, kind: str = BARE) -> Tally:
     return tally
 
 
-def test_a_image_agrees_with_itself_away_from_edges() -> None:
+def test_an_image_agrees_with_itself_away_from_edges() -> None:
     tally = tally_of(frame(), frame())
     assert tally.failures() == []
     assert (tally.kept, tally.solid) == (16 * 14, 16 * 7)  # one pixel each side of the edge is left out
@@ -69,7 +69,7 @@ def test_another_object_fails() -> None:
 
 
 def thin(width: int, column: int = 3, label: int = 1) -> Frame:
-    """`frame` with a geom of some columns and twelve rows in it, all of whose pixels lie near its edges."""
+    """Return `frame` with a geom of a few columns and twelve rows, all of whose pixels are near its edges."""
     changed = frame()
     changed.segmentation[2:14, column : column + width] = label
     changed.rgb[2:14, column : column + width] = 255
@@ -90,7 +90,7 @@ def test_a_thin_object_may_be_a_pixel_away_and_no_further() -> None:
     assert "matched" in tally_of(thin(1), thin(4)).failures()
 
 
-def test_of_two_surfaces_that_coincide_either_may_be_drawn() -> None:
+def test_either_of_two_coincident_surfaces_may_be_rendered() -> None:
     other, nearer = thin(1), thin(1)
     other.segmentation[other.segmentation == 1] = 0  # the same image, by the name of the object behind
     assert tally_of(thin(1), other).failures() == []
@@ -108,7 +108,7 @@ def test_a_wrong_object_inside_counts_though_edges_are_left_out() -> None:
 
 
 @pytest.mark.parametrize("depth", [2.0021, 1.997, np.nan])
-def test_depth_counts_from_a_millimetre_or_a_thousandth(depth: float) -> None:
+def test_depth_tolerance_is_a_millimetre_or_a_thousandth(depth: float) -> None:
     assert tally_of(frame(depth=2.0019), frame()).failures() == []
     assert tally_of(frame(depth=depth), frame()).failures() == ["depth"]
     assert tally_of(frame(depth=0.0509), frame(depth=0.05)).failures() == []
@@ -125,7 +125,7 @@ def test_depth_counts_from_a_millimetre_or_a_thousandth(depth: float) -> None:
         (PLANE, 50, []),
     ],
 )
-def test_colours_are_judged_by_what_they_lie_on(kind: str, difference: int, failures: list[str]) -> None:
+def test_colour_bounds_depend_on_the_kind_of_surface(kind: str, difference: int, failures: list[str]) -> None:
     ours = frame()
     ours.rgb[:, :8] -= np.uint8(difference)
     tally = tally_of(ours, frame(), kind)
@@ -138,7 +138,7 @@ def test_every_bound_is_measured() -> None:
     assert set(BOUNDS) <= set(tally_of(frame(), frame()).measures())
 
 
-def test_packing_loses_nothing_that_counts(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_packing_is_accurate_enough(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(render_references, "FOLDER", tmp_path)
     rng = np.random.default_rng(0)
     labels = rng.integers(-1, 300, (2, 5, 7)).astype(np.int32)

@@ -1,4 +1,4 @@
-"""The renderer inside what JAX makes of functions: vmap of scan, scan of vmap, donation, several devices; and its memory."""
+"""Renderer under JAX transformations: vmap of scan, scan of vmap, donation, several devices; and its memory use."""
 
 import subprocess
 import sys
@@ -40,7 +40,7 @@ def setting(kind: str, alpha: float = 1.0, size: int = SIZE) -> tuple[Scene, dic
 
 
 def image(scene: Scene, poses: dict, height, quantized: bool = False):
-    """RGB-D of the scene with everything ``height`` higher, [4, H, W]; quantised, the colours are bytes first."""
+    """Render RGB-D, [4, H, W], with everything raised by ``height``; if quantised, colours are converted to bytes first."""
     lifted = poses | {"geom_xpos": poses["geom_xpos"].at[1:, 2].add(height)}
     planes = render_planes(scene, SimpleNamespace(**lifted), quantized=quantized)
     rgb = planes.rgb / 255.0 if quantized else planes.rgb
@@ -48,7 +48,7 @@ def image(scene: Scene, poses: dict, height, quantized: bool = False):
 
 
 @pytest.mark.parametrize(("kind", "rgb"), [("mesh", False), ("capsule", True)])
-def test_images_are_the_same_where_jax_computes_in_64_bits(kind, rgb):
+def test_images_are_the_same_with_64_bit_jax(kind, rgb):
     def draw():
         scene, poses = setting(kind)
         poses = {name: jnp.asarray(value, float) for name, value in poses.items()}
@@ -96,7 +96,7 @@ def test_vmap_of_scan_is_scan_of_vmap(kind, alpha, quantized, size):
     assert len(np.unique(images, axis=0)) == 6
 
 
-def test_a_donated_state_is_drawn_into():
+def test_donated_buffers_are_reused():
     scene, poses = setting("mesh")
 
     def step(state):

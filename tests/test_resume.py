@@ -96,7 +96,7 @@ def test_resume_of_nothing_starts(tmp_path, capsys):
 
 
 def test_an_existing_folder_is_refused(straight, tmp_path):
-    with pytest.raises(RequestError, match="--resume goes on with it, --overwrite starts again"):
+    with pytest.raises(RequestError, match="--resume continues it, --overwrite starts again"):
         make_fake_trainer(small_config(), straight[0])
     with pytest.raises(RequestError, match="contradict each other"):
         make_fake_trainer(small_config(), straight[0], resume=True, overwrite=True)
@@ -225,9 +225,9 @@ def test_a_damaged_final_checkpoint_is_not_a_finished_run(straight, tmp_path, ca
     assert [report.iteration for report in reports] == [7, 8] and "not finished" in out
     assert out.count("light/8 is damaged") == 1 and "finished already" not in out
     assert rows_without_time(path) == rows_without_time(straight[0])
-    kept = path / "checkpoints" / "damaged"
-    assert sorted(entry.name for entry in kept.iterdir()) == ["full-8", "light-8", "metrics.jsonl"]
-    assert [row["iteration"] for row in metrics.read_rows(kept / "metrics.jsonl")] == [8, 8]
+    damaged = path / "checkpoints" / "damaged"
+    assert sorted(entry.name for entry in damaged.iterdir()) == ["full-8", "light-8", "metrics.jsonl"]
+    assert [row["iteration"] for row in metrics.read_rows(damaged / "metrics.jsonl")] == [8, 8]
 
 
 def test_nothing_usable_keeps_what_was_there(straight, tmp_path, capsys):

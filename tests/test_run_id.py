@@ -1,4 +1,4 @@
-"""Whose a checkpoint and a row are: nothing of another run is resumed, counted or deleted."""
+"""Run ids of checkpoints and rows: nothing of another run is resumed, counted or deleted."""
 
 import json
 import os
@@ -22,7 +22,7 @@ from jaxrl_vis.run.sums import write_sums
 
 
 def checkpoints_in(path: Path) -> list[str]:
-    return sorted(f"{each.parent.name}/{each.name}" for each in path.glob("checkpoints/*/*") if each.name.isdigit())
+    return sorted(f"{entry.parent.name}/{entry.name}" for entry in path.glob("checkpoints/*/*") if entry.name.isdigit())
 
 
 def test_everything_that_a_run_writes_carries_its_id(tmp_path):
@@ -51,10 +51,10 @@ def test_a_new_run_does_not_go_on_with_an_old_ones_checkpoints(straight, tmp_pat
     assert reports[0].iteration < 6 and "exactly" in said and "not of this run, and left out" in said
     assert "metrics.jsonl held 8 rows of another run: kept in" in said
     assert rows_without_time(path) == rows_without_time(straight[0])
-    kept = path / "checkpoints" / "foreign"
+    aside = path / "checkpoints" / "foreign"
     foreign = ["full-6", "full-8", "light-6", "light-8", "metrics.jsonl"]
-    assert sorted(each.name for each in kept.iterdir()) == foreign
-    assert metrics.read_rows(kept / "metrics.jsonl") == metrics.read_rows(straight[0] / "metrics.jsonl")
+    assert sorted(entry.name for entry in aside.iterdir()) == foreign
+    assert metrics.read_rows(aside / "metrics.jsonl") == metrics.read_rows(straight[0] / "metrics.jsonl")
 
 
 def test_starting_again_deletes_nothing_of_another_run(straight, tmp_path, capsys):
@@ -67,10 +67,12 @@ def test_starting_again_deletes_nothing_of_another_run(straight, tmp_path, capsy
     capsys.readouterr()
     list(make_fake_trainer(small_config(env_steps=20), path, overwrite=True).run())
     assert capsys.readouterr().out.count("not of this run, and left out") == 4
-    kept = path / "checkpoints" / "foreign"
+    aside = path / "checkpoints" / "foreign"
     names = ["full-6", "full-8", "light-6", "light-8"]
-    assert sorted(each.name for each in kept.iterdir()) == sorted([*names, *(f"{name}-2" for name in names), "metrics.jsonl"])
-    assert (kept / "metrics.jsonl").read_text() == (straight[0] / "metrics.jsonl").read_text() * 2
+    assert sorted(entry.name for entry in aside.iterdir()) == sorted(
+        [*names, *(f"{name}-2" for name in names), "metrics.jsonl"]
+    )
+    assert (aside / "metrics.jsonl").read_text() == (straight[0] / "metrics.jsonl").read_text() * 2
     assert checkpoints_in(path) == ["full/2", "light/2"]
 
 
@@ -83,7 +85,7 @@ def test_what_uses_a_run_does_not_count_another_ones(straight, tmp_path, monkeyp
     monkeypatch.setattr(trained, "make_trainer", lambda config, **_: trainer.Trainer(config, FakeProgram(config)))
     opened = trained.open_run(path)
     assert trained.load(opened, path).iteration == 2
-    with pytest.raises(RequestError, match="no checkpoint of iteration 8; it keeps 2"):
+    with pytest.raises(RequestError, match="no checkpoint of iteration 8, only of 2"):
         trained.load(opened, path, 8)
 
 
@@ -145,7 +147,7 @@ def test_what_cannot_be_deleted_is_told_before_a_new_run_starts(straight, tmp_pa
 
 
 def moved_at(trainer, iteration: int, act) -> StorageError:
-    """What a run ends with whose folder something happens to after ``iteration``."""
+    """Returns the error of a run that ends because its folder changes after ``iteration``."""
     with pytest.raises(StorageError) as stopped:
         for report in trainer.run():
             if report.iteration == iteration:
@@ -241,7 +243,7 @@ def test_a_new_folder_of_the_same_name_is_left_alone(tmp_path):
         (path / "notes.txt").write_text("mine")
 
     assert "was moved to" in str(moved_at(make_fake_trainer(small_config(), path), 3, replace)) or os.name != "posix"
-    assert [each.name for each in path.iterdir()] == ["notes.txt"]
+    assert [entry.name for entry in path.iterdir()] == ["notes.txt"]
 
 
 @pytest.mark.parametrize("name", ["a" * 300, "a/" + "b" * 300])
@@ -307,11 +309,34 @@ def test_a_config_file_that_cannot_be_used_is_one_line(tmp_path, capsys, words, 
     assert error.count("\n") == 1 and len(error) < 600
 
 
-@pytest.mark.parametrize("names, goes", [(["_CHECKPOINT_METADATA", "SHA256SUMS"], True), (["manifest"], False)])
-def test_what_a_thread_made_of_a_folder_that_was_moved_goes(tmp_path, names, goes):
-    checkpoint = tmp_path / "run" / "checkpoints" / LIGHT / "4"
-    checkpoint.mkdir(parents=True)
-    for name in names:
-        (checkpoint / name).touch()
-    RunFolder(tmp_path / "run").remove_remains()
+@pytest.mark.parametrize(
+    "contents, goes",
+    [
+        ({"_CHECKPOINT_METADATA": "", "SHA256SUMS": ""}, True),
+        ({"manifest/metadata": '{"run_id": "ours"}'}, True),
+        ({"manifest/metadata": '{"run_id": "theirs"}'}, False),
+        ({"manifest/metadata": "{"}, False),
+    ],
+)
+def test_what_a_thread_made_of_a_folder_that_was_moved_goes(tmp_path, contents, goes):
+    for name, text in contents.items():
+        file = tmp_path / "run" / "checkpoints" / LIGHT / "4" / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text)
+    RunFolder(tmp_path / "run").remove_remains("ours")
     assert (tmp_path / "run").exists() != goes
+
+
+def test_a_row_whose_id_has_a_wrong_bit_is_put_aside(straight, tmp_path, capsys):
+    path = tmp_path / "run"
+    interrupted_at(make_fake_trainer(small_config(), path), 4)
+    file = path / "metrics.jsonl"
+    *lines, last = file.read_text().splitlines(keepends=True)
+    run_id = read_run_id(path)
+    assert run_id is not None and run_id in last
+    spoilt = last.replace(run_id, ("1" if run_id[0] == "0" else "0") + run_id[1:])
+    file.write_text("".join([*lines, spoilt]))
+    list(make_fake_trainer(small_config(), path, resume=True).run())
+    assert "metrics.jsonl held 1 row of another run: kept in" in capsys.readouterr().out
+    assert (path / "checkpoints" / "foreign" / "metrics.jsonl").read_text() == spoilt
+    assert rows_without_time(path)[-2:] == rows_without_time(straight[0])[-2:]

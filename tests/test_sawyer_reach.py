@@ -1,4 +1,4 @@
-"""SawyerReach against what the thesis says of it, and MJX against C MuJoCo on its model."""
+"""SawyerReach against the thesis, and MJX against C MuJoCo on its model."""
 
 import functools
 
@@ -21,7 +21,7 @@ def starts():
     return environments.reset(make(), jax.random.split(jax.random.key(3), COUNT))[0]
 
 
-def test_the_numbers_of_the_thesis():
+def test_task_matches_the_thesis():
     env = make()
     assert (env.horizon, env.threshold, env.action_size) == (25, 0.1, 3)
     assert abs(np.linalg.norm(env.config.goal_size) - 1.30) < 0.005
@@ -59,7 +59,7 @@ def test_the_gripper_stays_over_the_table():
     assert np.asarray(state.achieved_state)[:, 2].min() > 0.69
 
 
-def test_a_step_is_that_of_mujoco_less_a_term_of_welds():
+def test_a_step_matches_mujoco_without_a_weld_term():
     env = make()
     states = one_step.sawyer_states(env)
     less = one_step.mujoco_step(env.mj_model, states, weld_term=False)

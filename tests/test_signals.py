@@ -32,21 +32,21 @@ def start(run_dir: Path, environment: dict[str, str]) -> subprocess.Popen:
 def test_a_signal_saves_and_loses_at_most_one_iteration(tmp_path, clean_environment, number, status):
     run_dir = tmp_path / "run"
     process = start(run_dir, clean_environment)
-    seen = 0
+    latest = 0
     for line in process.stdout:
         if line.startswith("report"):
-            seen = int(line.split()[1])
-        if seen == 7:
+            latest = int(line.split()[1])
+        if latest == 7:
             process.send_signal(number)
             break
     rest, errors = process.communicate(timeout=60)
     assert process.returncode == status, errors
     assert "--resume" in rest
-    seen = max([seen, *(int(line.split()[1]) for line in rest.splitlines() if line.startswith("report"))])
+    latest = max([latest, *(int(line.split()[1]) for line in rest.splitlines() if line.startswith("report"))])
     shapes = make_fake_trainer(small_config(), None).shapes
     checkpoints = Checkpoints(run_dir / "checkpoints")
     restored = checkpoints.restore_for_resume(shapes)
-    assert restored.tier == FULL and restored.iteration >= seen - 1
+    assert restored.tier == FULL and restored.iteration >= latest - 1
     assert checkpoints.iterations(LIGHT) == [restored.iteration]
     config = read_config(run_dir).replace(env_steps=10 * (restored.iteration + 2), eval_interval=1)
     reports = list(make_fake_trainer(config, run_dir, resume=True).run())
@@ -87,12 +87,12 @@ def test_a_second_signal_does_not_wait(tmp_path):
 @pytest.fixture
 def compilations():
     """Names of what XLA compiles from the moment on that ``watch`` is called with a trainer: at the end of its compilation."""
-    found: list[str] = []
+    results: list[str] = []
     watching = []
 
     def listen(event, duration, **_):
         if watching and "backend_compile" in event:
-            found.append(event)
+            results.append(event)
 
     jax.monitoring.register_event_duration_secs_listener(listen)
 
@@ -105,7 +105,7 @@ def compilations():
             return compiled
 
         trainer.programs.compile = compile_and_watch
-        return found
+        return results
 
     yield watch
     watching.clear()
@@ -116,15 +116,15 @@ def test_nothing_is_compiled_once_training_has_begun(tmp_path, compilations, end
     """Neither by evaluations, saves, curve and video, nor by what a signal or a broken number sets going."""
     jax.clear_caches()
     trainer = make_fake_trainer(small_config(seeds=3), tmp_path / "run", nan_at=5 if end == "nan" else None)
-    found = compilations(trainer)
+    results = compilations(trainer)
     try:
         for report in trainer.run():
             if end == "signal" and report.iteration == 5:
                 signal.raise_signal(signal.SIGTERM)
     except (Terminated, NonFiniteError):
         assert end != "itself"
-    assert found == []
-    assert jax.numpy.ones(3).sum() == 3 and found  # and the listener hears
+    assert results == []
+    assert jax.numpy.ones(3).sum() == 3 and results  # and the listener hears
 
 
 def test_children_that_compile_do_not_get_the_groups_signals(clean_environment):
@@ -247,7 +247,7 @@ def test_no_signal_that_ends_a_process_is_left_out(not_ignored):
     with signals.Interruption() as interruption:
         signal.raise_signal(signal.SIGRTMIN + 3)
         assert interruption.signal == signal.SIGRTMIN + 3 and interruption.name == "SIGRTMIN+3"
-    assert [signals.name_of(number) for number in (signal.SIGRTMIN, signal.SIGRTMAX)] == ["SIGRTMIN", "SIGRTMAX"]
+    assert [signals.signal_name(number) for number in (signal.SIGRTMIN, signal.SIGRTMAX)] == ["SIGRTMIN", "SIGRTMAX"]
 
 
 def test_what_is_ignored_or_handled_by_the_caller_stays_so(tmp_path, not_ignored):
@@ -334,11 +334,11 @@ def test_a_signal_ends_any_other_command_in_one_line(number, monkeypatch, capsys
             cleaned.append(True)
 
     monkeypatch.setitem(cli.COMMANDS, "doctor", (cli.doctor.Doctor, work))
-    before = [signal.getsignal(each) for each in ENDS]
+    before = [signal.getsignal(ending) for ending in ENDS]
     assert cli.main(["doctor"]) == 128 + number and cleaned
     name = "Ctrl-C" if number == signal.SIGINT else number.name
     assert capsys.readouterr().err.splitlines() == [f"jaxrl-vis: {name}: ended before it was done"]
-    assert [signal.getsignal(each) for each in ENDS] == before
+    assert [signal.getsignal(ending) for ending in ENDS] == before
 
 
 def test_a_command_that_does_not_look_up_is_ended(monkeypatch, not_ignored):

@@ -1,4 +1,4 @@
-"""A learner that sees stacked images: its goals stand still, whether they were given or made by relabelling."""
+"""Learner with stacked images: goals are static, whether given or relabelled."""
 
 import functools
 
@@ -23,8 +23,8 @@ from jaxrl_vis_envs.base import push_history, start_history
 ENVS, SETTINGS = 2, {"batch_size": 64, "updates_per_iteration": 1, "replay_transitions": 10, "image_size": 8, "num_envs": 2}
 
 
-def test_relabelled_goals_are_what_was_reached_standing_still():
-    """VisualReacher's own rule, on episodes whose images hold their number and their slot, newest first."""
+def test_relabelled_goals_repeat_the_achieved_image():
+    """VisualReacher's own rule, on episodes whose images encode their number and their slot, newest first."""
     env = jaxrl_vis_envs.make("VisualReacher", frame_stack=2, image_size=4, pixels="depth")
     horizon = 5
     slots = np.arange(horizon + 2)
@@ -55,8 +55,8 @@ def test_relabelled_goals_are_what_was_reached_standing_still():
         assert not np.array_equal(still.goal[row], still.observation_tp1[row])
 
 
-def test_what_the_replay_puts_together_is_what_the_camera_saw():
-    """Episodes draw the images before anew, from joint positions; the replay takes those that it has. They are the same."""
+def test_stacked_images_from_replay_equal_rendered_ones():
+    """Episodes render the preceding images again, from joint positions; the replay uses its stored ones. They are equal."""
     config = preset("debug", env="VisualReacher", frame_stack=3, pixels="rgbd", **SETTINGS | {"image_size": 16})
     made = train_step.make_train_step(make_env(config), config)
     episodes, _ = made.rollout(made.init(jax.random.key(0)[None]).train, jax.random.key(1)[None])
@@ -68,7 +68,7 @@ def test_what_the_replay_puts_together_is_what_the_camera_saw():
 
 
 class Walker(Probe):
-    """A point that walks; an image is as bright as the point is far, on six grey levels, so that goals can be met."""
+    """A walking point; an image's brightness is the point's distance, on six grey levels, so that goals can be reached."""
 
     def __init__(self, frame_stack: int):
         self.frame_stack = frame_stack
@@ -93,7 +93,7 @@ class Walker(Probe):
 
 @functools.cache
 def program(frame_stack: int = 2):
-    """A training program whose gradient step only looks at its batch."""
+    """A training program whose gradient step only inspects its batch."""
     config = preset("debug", method="indicator_balance_filter", relabel_probability=1.0, **SETTINGS)
     env = Walker(frame_stack)
 

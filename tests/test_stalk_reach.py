@@ -32,7 +32,7 @@ def target_stalks() -> np.ndarray:
 
 def test_the_goal_is_a_stalk_between_the_jaws():
     env, (state, goal) = make(), starts()
-    layout = bending.layout_of(env.mj_model)
+    layout = bending.read_layout(env.mj_model)
     heights = np.asarray(goal.qpos)[:, 0]
     places = np.asarray(jax.vmap(lambda data: bending.at_height(data, layout, data.qpos[0]))(goal))
     np.testing.assert_allclose(places[np.arange(COUNT), target_stalks()], state.goal_state, atol=1e-4)
@@ -46,11 +46,11 @@ def test_the_goal_is_a_stalk_between_the_jaws():
     assert (swayed > 1e-4).mean() > 0.9
 
 
-def test_the_distance_is_that_from_where_the_stalk_is_now():
+def test_distance_is_to_the_current_position_of_the_stalk():
     env, (state, _) = make(), starts()
     for _ in range(3):
         state = environments.advance(env, state, np.zeros((COUNT, 3)))
-    layout = bending.layout_of(env.mj_model)
+    layout = bending.read_layout(env.mj_model)
     now = np.asarray(jax.vmap(lambda data: bending.at_height(data, layout, data.qpos[0]))(state.data))
     now = now[np.arange(COUNT), target_stalks()]
     grip = np.asarray(stalk_arm.grip_at(state.data.qpos[:, :3]))
@@ -81,7 +81,7 @@ def test_the_arm_pushes_stalks():
     assert (pushed > 2 * still).mean() > 0.5
 
 
-def test_stalks_come_back():
+def test_stalks_spring_back():
     env, (state, _) = make(), starts()
     bent = np.array(state.data.qpos)
     bent[:, 3:] += 0.1
@@ -95,8 +95,8 @@ def test_stalks_come_back():
     ("override", "value", "message"),
     [
         ("stalks", 5, "stalks must be from 1 to 4"),
-        ("spacing", (0.1, 0.05), "spacing must run"),
-        ("goal_heights", (0.2, 0.9), "goal_heights must run"),
+        ("spacing", (0.1, 0.05), "spacing must be within"),
+        ("goal_heights", (0.2, 0.9), "goal_heights must be within"),
         ("lean", 30.0, "lean must be from 0 to 20"),
         ("wind", -0.01, "wind"),
         ("substeps", 4, "substeps"),

@@ -1,4 +1,4 @@
-"""What is printed where nobody can read it: no stream, of whatever kind, ends what prints to it."""
+"""Printing to unreadable streams: no kind of stream ends the program that prints to it."""
 
 import contextlib
 import errno
@@ -113,7 +113,7 @@ def test_a_run_goes_on_when_its_terminal_is_gone(tmp_path, monkeypatch):
 
 
 def shown_on_a_terminal(width, monkeypatch, show) -> list[str]:
-    """What stands in the last lines of a terminal of that width."""
+    """Returns the last lines of a terminal of a given width."""
     keeper, terminal = pty.openpty()
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", str(width))
@@ -151,7 +151,13 @@ def test_a_bar_shows_what_matters_at_any_width(width, monkeypatch):
 
 
 def test_a_clock_is_not_ambiguous():
-    assert [clock(each) for each in (None, 0, 65, 3725.9, 100_000)] == ["-:--:--", "0:00:00", "0:01:05", "1:02:05", "27:46:40"]
+    assert [clock(seconds) for seconds in (None, 0, 65, 3725.9, 100_000)] == [
+        "-:--:--",
+        "0:00:00",
+        "0:01:05",
+        "1:02:05",
+        "27:46:40",
+    ]
 
 
 @pytest.mark.parametrize("kind", ["no reader", *(["full"] if FULL.exists() else []), "none"])
@@ -206,7 +212,7 @@ def test_what_is_no_fault_of_the_disk_is_not_told_as_one(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     ("number", "mend", "is_moved"),
-    [(errno.ENOSPC, "make room", False), (errno.EACCES, "mend that", False), (errno.ENOENT, "", True)],
+    [(errno.ENOSPC, "make room", False), (errno.EACCES, "fix that", False), (errno.ENOENT, "", True)],
 )
 def test_advice_after_a_fault_of_the_disk_can_be_followed(tmp_path, monkeypatch, number, mend, is_moved):
     if is_moved and not Path("/proc/self/fd").exists():

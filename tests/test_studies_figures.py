@@ -20,7 +20,7 @@ from jaxrl_vis.studies.figures import make_figure
 from jaxrl_vis.studies.ol_aux import AUX_TASKS, FETCH, FINGER, HAND, LEVELS, STUDIES, VARIANTS
 from jaxrl_vis.studies.results import Line, Reached, mean_weight, reached
 from jaxrl_vis.studies.show import Request
-from jaxrl_vis.studies.study import Scope, cells_of
+from jaxrl_vis.studies.study import Scope, make_cells
 from jaxrl_vis.studies.tables import Named, steps_table, weights_table
 from jaxrl_vis.validation import validate
 from jaxrl_vis_envs import registry
@@ -55,7 +55,7 @@ def slope(speed: float) -> Callable[[int], float]:
 
 def all_cells(figure: str, tasks=(), variants=(), **scope) -> dict[tuple[str, str], list[Cell]]:
     study = STUDIES[figure]
-    return cells_of(study, tasks or tuple(study.steps), variants or (*study.extra, *study.variants), Scope(**scope))
+    return make_cells(study, tasks or tuple(study.steps), variants or (*study.extra, *study.variants), Scope(**scope))
 
 
 def test_the_cells_are_those_of_the_issue() -> None:
@@ -93,19 +93,19 @@ def test_every_variant_can_be_made_with_every_preset(preset: str) -> None:
 
 def test_families_keep_configurations_apart() -> None:
     """Two cells of one name are one cell."""
-    seen: dict[str, Cell] = {}
+    cells_by_name: dict[str, Cell] = {}
     for preset in ("paper", "fast"):
         for options in ((), ("view=fingertips",), ("view=fingertips", "tip_marks=faint")):
             for figure in STUDIES:
                 changes = {"env_options": options}
                 for parts in all_cells(figure, variants=tuple(VARIANTS), preset=preset, changes=changes).values():
                     assert parts[0].config.env_options == options
-                    assert seen.setdefault(parts[0].name, parts[0]) == parts[0]
+                    assert cells_by_name.setdefault(parts[0].name, parts[0]) == parts[0]
 
 
 def test_settings_of_an_environment_are_shown_and_name_one_folder(tmp_path: Path) -> None:
     scope = Scope(seeds=2, env_steps=100_000, changes={"env_options": ("depth_encoding=zbuffer", "clip_range=0.1/9")})
-    ((cell,),) = cells_of(STUDIES["5.4"], (FETCH,), ("none",), scope).values()
+    ((cell,),) = make_cells(STUDIES["5.4"], (FETCH,), ("none",), scope).values()
     made_up(cell, tmp_path, slope(1.0))
     assert [folder.name for folder in tmp_path.iterdir()] == [cell.name]
     request = Request("5.4", STUDIES["5.4"], tmp_path / "f.png", tmp_path, (FETCH,), ("none",), scope, draw_only=True)
@@ -140,8 +140,8 @@ def line(values: list[list[float]], task: str = FETCH, variant: str = "ol_aux_5"
 
 
 def test_levels_are_reached_by_the_rule_of_three() -> None:
-    found = reached(line([[0.1, 0.6, 0.4, 0.6, 0.7, 0.8]] * 3), 0.5)
-    assert found == Reached(0.5, 80_000, 80_000.0, 80_000.0, 120_000) and str(found) == "80 k (80 k to 80 k)"
+    result = reached(line([[0.1, 0.6, 0.4, 0.6, 0.7, 0.8]] * 3), 0.5)
+    assert result == Reached(0.5, 80_000, 80_000.0, 80_000.0, 120_000) and str(result) == "80 k (80 k to 80 k)"
     # The last two evaluations have nothing after them.
     assert str(reached(line([[0.1, 0.1, 0.1, 0.1, 0.9, 0.9]]), 0.5)) == "> 120 k"
     one_never = reached(line([[0.9] * 6, [0.1, 0.9, 0.9, 0.9, 0.9, 0.9], [0.1] * 6]), 0.5)
@@ -248,7 +248,7 @@ def test_the_title_of_weights_names_their_method(tmp_path: Path) -> None:
 def test_rewards_with_and_without_ground_truth_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     runs, out = tmp_path / "runs", tmp_path / "f.png"
     study = indicator.STUDIES["5.1"]
-    cells = cells_of(study, tuple(study.steps), study.variants, Scope("fast"))
+    cells = make_cells(study, tuple(study.steps), study.variants, Scope("fast"))
     assert {(cell.config.method, cell.config.image_size) for (cell,) in cells.values()} == {
         (method, size) for method in study.variants for size in (64, 100)
     }
@@ -284,7 +284,7 @@ def test_panels_say_no_more_about_an_inactive_filter_than_tables(tmp_path: Path)
     """A single negative that was dropped and false once was a dot at 100 %, beside a table that gave no precision."""
     study = indicator.STUDIES["5.2"]
     variant = "indicator_balance_filter"
-    ((cell,),) = cells_of(study, ("VisualSawyerReach",), (variant,), Scope("fast")).values()
+    ((cell,),) = make_cells(study, ("VisualSawyerReach",), (variant,), Scope("fast")).values()
     made_up(cell, tmp_path, slope(1.0))
     for share, titles in ((0.009, 3), (0.011, 4)):
         file = tmp_path / cell.name / "metrics.jsonl"
@@ -313,7 +313,7 @@ def test_what_is_asked_for_twice_is_shown_once(tmp_path: Path) -> None:
 
 def test_a_comparison_with_an_oracle_that_fails_does_not_count(tmp_path: Path) -> None:
     study = indicator.STUDIES["5.2"]
-    ((cell,),) = cells_of(study, ("VisualSawyerReach",), ("oracle",), Scope("fast")).values()
+    ((cell,),) = make_cells(study, ("VisualSawyerReach",), ("oracle",), Scope("fast")).values()
     made_up(cell, tmp_path, slope(1.0))
     file = tmp_path / cell.name / "metrics.jsonl"
     rows = [json.loads(row) | {"eval/goal_distance": 0.2} for row in file.read_text().splitlines()]
@@ -342,7 +342,7 @@ def test_runs_of_other_settings_are_drawn_only_where_nothing_is_trained_and_name
 def test_every_figure_of_rewards_can_be_made_with_every_preset(preset: str) -> None:
     family = indicator.FAMILY
     for study in indicator.STUDIES.values():
-        for parts in cells_of(study, family.tasks, study.variants, Scope(preset)).values():
+        for parts in make_cells(study, family.tasks, study.variants, Scope(preset)).values():
             for cell in parts:
                 validate(cell.config)
 
@@ -359,7 +359,7 @@ def test_a_run_that_lost_its_replay_is_owned_up_to(tmp_path: Path) -> None:
 
 def test_seeds_of_several_runs_are_one_line(tmp_path: Path) -> None:
     scope = Scope(seeds_per_run=2)
-    parts = cells_of(STUDIES["5.4"], (FETCH,), ("none",), scope)[FETCH, "none"]
+    parts = make_cells(STUDIES["5.4"], (FETCH,), ("none",), scope)[FETCH, "none"]
     assert len(parts) == 3
     request = Request("5.4", STUDIES["5.4"], tmp_path / "f.png", tmp_path, (FETCH,), ("none",), scope, draw_only=True)
     for cell in parts[:2]:
@@ -381,7 +381,7 @@ def test_seeds_of_several_runs_are_one_line(tmp_path: Path) -> None:
         (["5.4", "--minutes", "3", "--draw-only"], ["leave out --minutes"]),
         (["5.6", "--methods", "ol_aux_5", "ol_aux_1"], ["weights of one method", "ol_aux_1"]),
         (["5.6", "--methods", "sum"], ["weights of one method that learns them", "ol_aux_5"]),
-        (["5.4", "--runs", "nowhere", "--draw-only"], ["--runs nowhere is no folder", "--draw-only draws what was trained"]),
+        (["5.4", "--runs", "nowhere", "--draw-only"], ["--runs nowhere is no folder", "--draw-only draws trained runs"]),
         (["5.4", "--runs", "/proc/x"], ["cannot write --runs /proc/x"]),
         (["5.4", "--out", "x.gif"], ["--out x.gif", ".png"]),
         (["quadratic", "--tasks", FETCH], ["--tasks", "not with quadratic"]),
@@ -398,7 +398,7 @@ def test_bad_requests_get_one_line(words: list[str], parts: list[str], here: Pat
 
 def test_runs_that_end_before_the_authors_first_evaluation_are_drawn(tmp_path: Path) -> None:
     scope = Scope("cpu", seeds=1, env_steps=6_400)
-    ((cell,),) = cells_of(STUDIES["5.4"], (FETCH,), ("none",), scope).values()
+    ((cell,),) = make_cells(STUDIES["5.4"], (FETCH,), ("none",), scope).values()
     made_up(cell, tmp_path, slope(1.0), every=3_200)
     request = Request("5.4", STUDIES["5.4"], tmp_path / "f.png", tmp_path, (FETCH,), ("none",), scope)
     said: list[str] = []

@@ -18,7 +18,7 @@ from jaxrl_vis.config import preset
 from jaxrl_vis.devices import Device, list_devices
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.run.folder import SCHEMA
-from jaxrl_vis.studies.cells import Cell, folder_of, is_finished, rows_of, show_budget, split_seeds, standing
+from jaxrl_vis.studies.cells import Cell, describe_progress, find_folder, finished_rows, is_finished, show_budget, split_seeds
 from jaxrl_vis.studies.grid import run_cells, train_command
 
 CPU = [Device("the CPU", {})]
@@ -85,11 +85,11 @@ def test_what_is_missing_is_trained_what_is_begun_goes_on_and_what_is_there_stay
     failures, said = run(cells, runs, Script(b="ends early"))
     assert len(failures) == 1 and "b-300: ended before it was finished" in failures[0] and failures[0] in said
     assert [is_finished(cell, runs) for cell in cells] == [True, False, True]
-    assert standing(cells[1], runs) == "100 of 300 steps"
+    assert describe_progress(cells[1], runs) == "100 of 300 steps"
     again = Script()
     assert run(cells, runs, again)[0] == []
     assert again.calls == [("b", True)] and seen(runs, cells[1])[1][1] == ["--resume"]
-    assert {row["env_steps"] for row in rows_of(cells[1], runs)} == {100, 200, 300}
+    assert {row["env_steps"] for row in finished_rows(cells[1], runs)} == {100, 200, 300}
     none = Script()
     assert run_cells(cells, runs, lambda: pytest.fail("asked for devices"), command=none) == [] and not none.calls
 
@@ -128,19 +128,19 @@ def test_every_device_has_one_process_at_a_time(tmp_path: Path) -> None:
     cells = [make_cell(name) for name in "abcde"]
     devices = [Device(f"GPU {number}", {"CUDA_VISIBLE_DEVICES": str(number)}) for number in (3, 5)]
     assert run(cells, tmp_path, Script(), devices)[0] == []
-    found = sorted((tuple(seen(tmp_path, cell)[0][:1]), seen(tmp_path, cell)[0][2]) for cell in cells)
-    assert {device for (device,), _ in found} == {"3", "5"}
+    order = sorted((tuple(seen(tmp_path, cell)[0][:1]), seen(tmp_path, cell)[0][2]) for cell in cells)
+    assert {device for (device,), _ in order} == {"3", "5"}
     for one in ("3", "5"):
-        starts = [at for (device,), at in found if device == one]
+        starts = [at for (device,), at in order if device == one]
         assert len(starts) >= 2 and all(later - before > 0.29 for before, later in zip(starts, starts[1:]))
-    first = sorted(at for _, at in found)[:2]
+    first = sorted(at for _, at in order)[:2]
     assert first[1] - first[0] < 0.29  # side by side
 
 
 def test_time_that_is_up_stops_cells_and_they_are_no_failures(tmp_path: Path) -> None:
     cells = [make_cell("a"), make_cell("b")]
     failures, said = run(cells, tmp_path, Script(a="waits"), seconds=1.0)
-    assert failures == [] and any("a-300: stopped" in line and "starting again goes on" in line for line in said)
+    assert failures == [] and any("a-300: stopped" in line and "start again to resume" in line for line in said)
     assert not (tmp_path / cells[1].name).exists()
     assert run(cells, tmp_path, Script())[0] == [] and all(is_finished(cell, tmp_path) for cell in cells)
 
@@ -178,7 +178,7 @@ except KeyboardInterrupt:
 
 def test_a_second_signal_does_not_wait(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Not even for a process that does not listen; and it leaves none behind."""
-    monkeypatch.setattr("jaxrl_vis.studies.grid._HURRY_S", 0.5)
+    monkeypatch.setattr("jaxrl_vis.studies.grid._GRACE_S", 0.5)
     cell = make_cell("a")
     pids: list[int] = []
 
@@ -217,7 +217,7 @@ def test_a_folder_with_another_run_is_refused_before_anything_starts(tmp_path: P
     command = Script()
     failures, _ = run([cell, make_cell("b")], tmp_path, command)
     assert "batch_size (saved 8, asked 16)" in failures[0] and "--runs" in failures[0]
-    assert command.calls == [("b", False)] and rows_of(cell, tmp_path) == []
+    assert command.calls == [("b", False)] and finished_rows(cell, tmp_path) == []
 
 
 @pytest.mark.parametrize("contents", ['{"schema": ', '{"schema": 99}'])
@@ -236,9 +236,9 @@ def test_a_longer_run_serves_a_shorter_cell_and_never_the_other_way_round(tmp_pa
     assert not is_finished(long, tmp_path)
     run([long], tmp_path, Script())
     other = make_cell("a", env_steps=450)
-    assert folder_of(other, tmp_path) == tmp_path / long.name
-    assert {row["env_steps"] for row in rows_of(other, tmp_path)} == {100, 200, 300, 400, 500}
-    assert folder_of(short, tmp_path) == tmp_path / short.name
+    assert find_folder(other, tmp_path) == tmp_path / long.name
+    assert {row["env_steps"] for row in finished_rows(other, tmp_path)} == {100, 200, 300, 400, 500}
+    assert find_folder(short, tmp_path) == tmp_path / short.name
     # Neither another configuration nor other evaluations.
     for changes in ({"batch_size": 8}, {"eval_interval": 1}):
         assert not is_finished(make_cell("a", env_steps=450, **changes), tmp_path)
@@ -273,8 +273,8 @@ def test_the_engine_starts_no_jax(clean_environment: dict[str, str]) -> None:
     subprocess.run([sys.executable, "-c", code], env=clean_environment, check=True)
 
 
-def answer(monkeypatch: pytest.MonkeyPatch, found: object, status: int = 0) -> None:
-    done = subprocess.CompletedProcess([], status, json.dumps(found), "jaxlib grumbles\nJAX finds no such device\n")
+def answer(monkeypatch: pytest.MonkeyPatch, order: object, status: int = 0) -> None:
+    done = subprocess.CompletedProcess([], status, json.dumps(order), "jaxlib grumbles\nJAX finds no such device\n")
     monkeypatch.setattr("jaxrl_vis.devices.subprocess.run", lambda *_, **__: done)
 
 

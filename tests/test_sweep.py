@@ -16,7 +16,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.studies.cells import Cell, is_finished
 from jaxrl_vis.studies.cluster import Cluster, Job, Training
 from jaxrl_vis.studies.grid import run_cells
-from jaxrl_vis.studies.sweep import Request, cells_of, run_sweep
+from jaxrl_vis.studies.sweep import Request, make_cells, run_sweep
 
 
 def make_request(runs: Path, **changes) -> Request:
@@ -25,7 +25,7 @@ def make_request(runs: Path, **changes) -> Request:
 
 
 def test_every_task_is_trained_with_every_method_and_seed(tmp_path: Path) -> None:
-    cells = cells_of(make_request(tmp_path, seeds_per_run=2))
+    cells = make_cells(make_request(tmp_path, seeds_per_run=2))
     assert [cell.name for cell in cells[:4]] == [
         "FetchReach-oracle-debug-seeds0to1-300",
         "FetchReach-oracle-debug-seed2-300",
@@ -40,7 +40,7 @@ def test_every_task_is_trained_with_every_method_and_seed(tmp_path: Path) -> Non
 
 def test_a_finished_sweep_trains_nothing_and_shows_what_was_reached(tmp_path: Path) -> None:
     request = make_request(tmp_path, tasks=("Reacher",))
-    assert run_cells(cells_of(request), tmp_path, lambda: CPU, command=Script(), say=lambda line: None) == []
+    assert run_cells(make_cells(request), tmp_path, lambda: CPU, command=Script(), say=lambda line: None) == []
     said: list[str] = []
     assert run_sweep(request, said.append)
     head, *lines = said

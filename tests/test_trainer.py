@@ -149,8 +149,8 @@ def test_where_a_simulation_went_wrong(name, place, said):
     broken = getattr(episodes, name).at[place].set(np.inf)
     after = episodes.states.at[place[0], place[1], 4:6].set(np.nan) if name == "actions" else episodes.states
     episodes = episodes.replace(**({"states": after} | {name: broken}))
-    found = made_by_simulation(loop.replace(replay=loop.replay.replace(episodes=episodes)), 2)
-    assert found == (said and f"{said}, and all actions before it are")
+    evidence = made_by_simulation(loop.replace(replay=loop.replay.replace(episodes=episodes)), 2)
+    assert evidence == (said and f"{said}, and all actions before it are")
 
 
 def test_bad_episodes_of_a_replay_that_devices_share_are_dumped(tmp_path):
@@ -220,9 +220,9 @@ def test_evaluate_and_play_a_run(straight, tmp_path, monkeypatch):
         return trainer.Trainer(config, FakeProgram(config), *arguments, **options)
 
     monkeypatch.setattr(trained, "make_trainer", fake_make_trainer)
-    found = trained.evaluate_run(path, episodes=7)
-    assert found["eval/success"] == pytest.approx(reports[-1].metrics["eval/success"], rel=1e-5)
-    assert [type(value) for value in found["eval/success"]] == [float, float]
+    values = trained.evaluate_run(path, episodes=7)
+    assert values["eval/success"] == pytest.approx(reports[-1].metrics["eval/success"], rel=1e-5)
+    assert [type(value) for value in values["eval/success"]] == [float, float]
     for suffix in (".gif", ".png", ".html"):
         trained.play_run(path, tmp_path / f"out{suffix}", episodes=4)
         assert (tmp_path / f"out{suffix}").stat().st_size > 1000

@@ -101,8 +101,8 @@ def test_what_was_trusted_is_remembered_for_that_run_and_that_code(stranger, cac
     (stranger / "config.json").write_text(json.dumps({**record, "run_id": "0" * 32}))
     assert not trust.is_trusted(stranger, config)
     (stranger / "config.json").write_text(json.dumps(record))
-    (kept,) = cache.iterdir()
-    kept.chmod(0o666)  # anybody could have written that
+    (file,) = cache.iterdir()
+    file.chmod(0o666)  # anybody could have written that
     assert not trust.is_trusted(stranger, config)
 
 

@@ -25,12 +25,12 @@ from jaxrl_vis.run.verification import Verification, verify
 
 
 def expected_in(path: Path) -> Expected:
-    """What must hold for the rows of the run of eight iterations."""
+    """Conditions on the rows of the run of eight iterations."""
     return Expected(seeds=[0, 1], updates=3, env_steps=10, eval_interval=2, run_id=read_run_id(path))
 
 
 @pytest.fixture(scope="module")
-def trainer_of(straight) -> Callable[..., Trainer]:
+def run_trainer(straight) -> Callable[..., Trainer]:
     """Makes trainers of the fake program, which is compiled once for all tests."""
 
     def function(config: Config, path: Path | None = None, resume: bool = False) -> Trainer:
@@ -42,13 +42,13 @@ def trainer_of(straight) -> Callable[..., Trainer]:
 
 
 @pytest.fixture(scope="module")
-def verified(trainer_of) -> Callable[..., Verification]:
+def verified(run_trainer) -> Callable[..., Verification]:
     """Verifies a folder."""
 
     def function(path: Path, iterations: int | None = None, say: Callable[[str], None] = lambda line: None) -> Verification:
         record, config, report = read_record(path), read_config(path), Verification()
         check_record(record, config, report)
-        return verify(trainer_of(config), path, record, iterations, report, say)
+        return verify(run_trainer(config), path, record, iterations, report, say)
 
     return function
 
@@ -86,7 +86,7 @@ def test_a_run_that_nobody_touched_is_equal_and_stays_as_it_is(copy, verified):
     # Two evaluations from the seed, one from full/6; and the states on the way.
     assert report.rows == 6 and report.checkpoints == ["light/8", "full/8"]
     assert contents(copy) == before
-    assert "of iterations 6 to 6: looked at, but not repeated" in " ".join(report.unverified)
+    assert "of iterations 6 to 6: checked, but not repeated" in " ".join(report.unverified)
     write_rows(copy, [row | {"time/wall_s": 5.0} for row in rows_in(copy)])  # times are left out
     whole = verified(copy, iterations=8)
     assert whole.is_equal and whole.rows == 8 and {"light/6", "full/6"} <= set(whole.checkpoints)
@@ -132,10 +132,10 @@ def test_each_flipped_bit_of_a_full_checkpoint_is_found(copy, verified):
     assert any("full/8 is damaged" in line for line in verified(copy).problems)
 
 
-def test_a_checkpoint_of_another_state_is_found(copy, verified, trainer_of, tmp_path):
+def test_a_checkpoint_of_another_state_is_found(copy, verified, run_trainer, tmp_path):
     """One that is whole, with checksums that fit, but that this run does not arrive at."""
     other = tmp_path / "other"
-    list(trainer_of(small_config(seed=5, env_steps=60), other).run())
+    list(run_trainer(small_config(seed=5, env_steps=60), other).run())
     whose = {name: value for name, value in read_record(copy).items() if name == RUN_ID}
     for tier in ("light", "full"):
         shutil.rmtree(copy / "checkpoints" / tier / "6")
@@ -144,7 +144,7 @@ def test_a_checkpoint_of_another_state_is_found(copy, verified, trainer_of, tmp_
         manifest.write_text(json.dumps(json.loads(manifest.read_text()) | whose))
         write_sums(copy / "checkpoints" / tier / "6")
     report = verified(copy, iterations=8)
-    assert any("light/6 is not what the repetition arrives at" in line for line in report.problems)
+    assert any("light/6 differs from the repetition" in line for line in report.problems)
 
 
 @pytest.mark.parametrize(
@@ -154,11 +154,11 @@ def test_a_checkpoint_of_another_state_is_found(copy, verified, trainer_of, tmp_
         (lambda rows: rows[:-2], "rows of iteration 8 are missing"),
         (lambda rows: [], "rows of iteration 2, 4, 6, 8 are missing"),
         (lambda rows: rows[:5] + rows[6:], "iteration 6 has no row of seed 1"),
-        (lambda rows: [*rows[:3], rows[2], *rows[3:]], "iteration 4, seed 0 is there more than once"),
+        (lambda rows: [*rows[:3], rows[2], *rows[3:]], "iteration 4, seed 0 occurs more than once"),
         (lambda rows: [*rows[:4], *rows[6:], *rows[4:6]], "iteration 6, seed 0 is out of order"),
         (lambda rows: [*rows[:6], rows[6] | {"seed": 9}, rows[7]], "is of seed 9"),
         (lambda rows: [*rows[:6], rows[6] | {"env_steps": 81}, rows[7]], "env_steps is 81, not 80"),
-        (lambda rows: [*rows[:6], rows[6] | {"train/success": "0.5"}, rows[7]], "train/success: no number"),
+        (lambda rows: [*rows[:6], rows[6] | {"train/success": "0.5"}, rows[7]], "train/success: not a number"),
         (lambda rows: [*rows[:6], rows[6] | {"resume/replay_lost_at": 11}, rows[7]], "does not fit iteration 8"),
     ],
 )
@@ -202,7 +202,7 @@ def test_what_is_missing_contradicts_or_is_foreign_is_said(copy, verified):
     report = verified(copy)
     assert report.is_equal and "set aside before as damaged: full-9" in report.notes
     assert (
-        "no files of a run: notes.txt" in report.notes
+        "not files of a run: notes.txt" in report.notes
         and "checkpoints/light/9.orbax-checkpoint-tmp-7 is half-written" in report.notes
     )
     record = json.loads((copy / "config.json").read_text())
@@ -219,11 +219,11 @@ def test_what_is_missing_contradicts_or_is_foreign_is_said(copy, verified):
 
 
 @pytest.fixture
-def killed(trainer_of, tmp_path, monkeypatch) -> Path:
+def killed(run_trainer, tmp_path, monkeypatch) -> Path:
     """A run that kept a recent state after each iteration, and nothing else, and was killed after the sixth."""
     monkeypatch.setattr(recent, "_SHARE", math.inf)
     path = tmp_path / "killed"
-    reports = trainer_of(small_config(checkpoint_interval=0, full_checkpoint_interval=0), path).run()
+    reports = run_trainer(small_config(checkpoint_interval=0, full_checkpoint_interval=0), path).run()
     for report in reports:
         if report.iteration == 6:
             break
@@ -238,7 +238,7 @@ def test_recent_states_of_a_killed_run_are_compared_too(killed, verified):
     before = contents(killed)
     report = verified(killed, iterations=6)
     assert report.is_equal and report.rows == 6 and report.checkpoints == ["recent/5", "recent/6"]
-    assert not any("no files of a run" in line or "missing" in line for line in report.notes + report.unverified)
+    assert not any("not files of a run" in line or "missing" in line for line in report.notes + report.unverified)
     assert contents(killed) == before
     rows = rows_in(killed)
     assert all("time/goodput" in row for row in rows)
@@ -248,7 +248,7 @@ def test_recent_states_of_a_killed_run_are_compared_too(killed, verified):
     assert "rows of iteration 6 are missing" in "; ".join(verified(killed).problems)
 
 
-def test_what_is_wrong_with_recent_states_is_found(killed, verified, trainer_of):
+def test_what_is_wrong_with_recent_states_is_found(killed, verified, run_trainer):
     folder = killed / "checkpoints" / "recent"
     state = folder / "6.state"
     data = bytearray(state.read_bytes())
@@ -260,12 +260,12 @@ def test_what_is_wrong_with_recent_states_is_found(killed, verified, trainer_of)
     report = verified(killed, iterations=6)
     # A power cut may leave that behind.
     assert report.is_equal and any("recent/6 cannot be used (wrong checksum" in line for line in report.notes)
-    assert "no files of a run: checkpoints/recent/7.old" in report.notes
-    assert any("goodput of the run is not known" in line for line in report.notes)
+    assert "not files of a run: checkpoints/recent/7.old" in report.notes
+    assert any("goodput of the run is unknown" in line for line in report.notes)
     checkpoints = Checkpoints(killed / "checkpoints", run_id=read_run_id(killed))
-    loop, progress = checkpoints.recent.restore(5, trainer_of(small_config()).programs.shapes)
+    loop, progress = checkpoints.recent.restore(5, run_trainer(small_config()).programs.shapes)
     loop = loop.replace(train=loop.train.replace(updates=loop.train.updates + 1))
-    for run_id, problem in (("other", "recent/5 is another run's (other)"), (read_run_id(killed), "recent/5 is not what")):
+    for run_id, problem in (("other", "recent/5 is another run's (other)"), (read_run_id(killed), "recent/5 differs from")):
         checkpoints.run_id = run_id
         checkpoints.recent.save(5, loop, 2, progress)
         assert problem in "; ".join(verified(killed, iterations=6).problems)
@@ -280,25 +280,25 @@ def test_a_run_that_is_still_written_is_verified_as_far_as_it_is_there(copy, ver
     assert report.is_equal and any("may be writing" in line for line in report.notes)
 
 
-def test_a_run_that_lost_its_replay_is_verified_up_to_there_and_after_full_checkpoints(verified, trainer_of, tmp_path):
+def test_a_run_that_lost_its_replay_is_verified_up_to_there_and_after_full_checkpoints(verified, run_trainer, tmp_path):
     path = tmp_path / "light"
     config = small_config(full_checkpoint_interval=0, env_steps=40)
-    list(trainer_of(config, path).run())
-    list(trainer_of(config.replace(env_steps=80), path, resume=True).run())
+    list(run_trainer(config, path).run())
+    list(run_trainer(config.replace(env_steps=80), path, resume=True).run())
     report = verified(path, iterations=8)
     assert report.is_equal and report.rows == 4
-    assert any("after iteration 4 the run went on from a light checkpoint" in line for line in report.unverified)
-    assert any("of iterations 6 to 8: looked at" in line for line in report.unverified)
-    interrupted_at(trainer_of(config.replace(env_steps=100), path, resume=True), 9)
-    list(trainer_of(config.replace(env_steps=120, full_checkpoint_interval=2), path, resume=True).run())
+    assert any("after iteration 4 the run resumed from a light checkpoint" in line for line in report.unverified)
+    assert any("of iterations 6 to 8: checked" in line for line in report.unverified)
+    interrupted_at(run_trainer(config.replace(env_steps=100), path, resume=True), 9)
+    list(run_trainer(config.replace(env_steps=120, full_checkpoint_interval=2), path, resume=True).run())
     report = verified(path, iterations=12)
     assert report.is_equal and report.rows == 8  # iterations 10 and 12, too, from full/10
 
 
-def test_an_exactly_resumed_run_is_equal_whatever_its_interval_was(verified, trainer_of, tmp_path):
+def test_an_exactly_resumed_run_is_equal_whatever_its_interval_was(verified, run_trainer, tmp_path):
     path = tmp_path / "run"
-    interrupted_at(trainer_of(small_config(eval_interval=4), path), 4)
-    list(trainer_of(small_config(eval_interval=3, env_steps=90), path, resume=True).run())
+    interrupted_at(run_trainer(small_config(eval_interval=4), path), 4)
+    list(run_trainer(small_config(eval_interval=3, env_steps=90), path, resume=True).run())
     assert [row["iteration"] for row in rows_in(path)[::2]] == [4, 6, 9]
     report = verified(path, iterations=9)
     assert report.is_equal and report.rows == 6
@@ -324,5 +324,5 @@ def test_the_command_says_what_it_found(copy, verified, monkeypatch, capsys):
     (copy / "metrics.jsonl").unlink()
     shutil.rmtree(copy / "checkpoints")
     assert cli.main(["verify", str(copy)]) == 2
-    assert "let the run come to an evaluation" in capsys.readouterr().err
+    assert "let the run reach an evaluation" in capsys.readouterr().err
     assert cli.main(["verify", str(copy / "nowhere")]) == 2

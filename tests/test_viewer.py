@@ -69,7 +69,7 @@ _ARM = """
 
 
 def system_in(page: str) -> dict[str, Any]:
-    """What a page tells brax's viewer."""
+    """Returns a page's data for brax's viewer."""
     encoded = re.search(r'var system = "([^"]+)"', page)
     assert encoded is not None
     return json.loads(zlib.decompress(base64.b64decode(encoded[1])))

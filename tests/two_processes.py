@@ -14,7 +14,7 @@ from jaxrl_vis import cli, processes
 
 def train(options) -> int:
     if options["count"] > 1:
-        processes.start(processes.Place(options["coordinator"], options["count"], options["index"]), 60)
+        processes.start(processes.Rank(options["coordinator"], options["count"], options["index"]), 60)
     import jax
     import probe_environments as probes
 

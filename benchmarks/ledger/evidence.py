@@ -15,7 +15,7 @@ from typing import Any
 from jaxrl_vis.bench.record import SCHEMA, read_json
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.files import write_atomically
-from jaxrl_vis.run.command import command_of
+from jaxrl_vis.run.command import training_command
 from jaxrl_vis.run.folder import RunFolder, read_config, read_record
 from jaxrl_vis_envs.documents import parse_json
 
@@ -67,7 +67,7 @@ def keep(run: Path, name: str, results: Path) -> tuple[Path, Path]:
         "schema": SCHEMA,
         "name": NAME,
         "config": dataclasses.asdict(config),
-        "command": command_of(config),
+        "command": training_command(config),
         "device": run_record["device"],
         "versions": run_record["versions"],
         "revision": run_record["git_revision"] or "unknown",

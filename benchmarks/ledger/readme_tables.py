@@ -16,7 +16,7 @@ from benchmarks.ledger.records import read_all
 from jaxrl_vis.config import config_from_dict
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.report.learning import curve, steps_to
-from jaxrl_vis.run.command import command_of
+from jaxrl_vis.run.command import training_command
 
 MISSING = "not measured yet"
 
@@ -101,7 +101,7 @@ def load_runs(row: Learning, results: Path) -> list[Evidence]:
             names = [field.name for field in dataclasses.fields(config)]
             differing = [field for field in names if getattr(made_with, field) != getattr(config, field)]
             raise RequestError(
-                f"evidence {name} was made by `{run.record['command']}`, and the README says `{command_of(config)}`, "
+                f"evidence {name} was made by `{run.record['command']}`, and the README says `{training_command(config)}`, "
                 f"which has other {', '.join(differing)}: train again, then python -m benchmarks.ledger keep"
             )
         runs.append(run)
@@ -148,7 +148,7 @@ def results_table(results: Path) -> str:
     lines = ["| what | machine | figure | command |", "|---|---|---|---|"]
     for row in LEARNING:
         runs = load_runs(row, results)
-        command = row.command or command_of(next(iter(row.runs.values())))
+        command = row.command or training_command(next(iter(row.runs.values())))
         machine = _machine(runs[0].record["device"]) if runs else ""
         lines.append(f"| {row.label} | {machine} | {learning_text(row, runs) if runs else MISSING} | `{command}` |")
     return "\n".join(lines)

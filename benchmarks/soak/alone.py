@@ -233,7 +233,7 @@ def _pool(words: Sequence[str], folder: Path, dice: random.Random) -> None:
     if struck:
         if part.process.returncode not in (1, 2):
             raise Broken(f"ended with {part.process.returncode}: {part.lines[-5:]}")
-        _of_one_line(part, "processes was ended from outside")
+        _of_one_line(part, "processes was killed from outside")
     _finished(_command(words, folder), 0)
     if not struck:
         raise NotStruck

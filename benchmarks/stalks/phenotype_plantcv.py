@@ -66,13 +66,13 @@ def plot_masks(options: argparse.Namespace, seed: int) -> tuple[int, Masks]:
 
 def keep_masks(options: argparse.Namespace) -> None:
     """Draws plots, and writes their masks."""
-    from jaxrl_vis.evaluation_pool import results_of, share_accelerator
+    from jaxrl_vis.evaluation_pool import map_unordered, share_accelerator
 
     if options.workers > 1:
         share_accelerator()
     plots: list[tuple[int, Masks]] = []
     seeds = range(options.seed, options.seed + options.plots)
-    for seed, masks in results_of(functools.partial(plot_masks, options), seeds, options.workers):
+    for seed, masks in map_unordered(functools.partial(plot_masks, options), seeds, options.workers):
         plots.append((seed, masks))
         print(f"plot {seed}: {len(masks[1])} masks", flush=True)
     plots.sort(key=lambda plot: plot[0])

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from jaxrl_vis.evaluation_pool import processes, share_accelerator
+from jaxrl_vis.evaluation_pool import share_accelerator, worker_pool
 
 Once = Callable[[int], list[float]]
 """Does it once, with the input of that number, and says something of what came out."""
@@ -49,7 +49,7 @@ def print_rate(make: Callable[[], tuple[Once, int]], workers: int, seconds: floa
         each_is: How many pairs are looked at each time.
     """
     with tempfile.TemporaryDirectory() as folder:
-        with processes(workers) as pool:
+        with worker_pool(workers) as pool:
             counts = list(pool(functools.partial(_work, make, Path(folder), workers, seconds), range(workers)))
     pairs = sum(counts) * each_is
     print(f"{workers} processes: {seconds / pairs:.4f} s a pair ({pairs:.0f} pairs in {seconds:.0f} s)")

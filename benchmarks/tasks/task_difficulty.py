@@ -33,7 +33,7 @@ def measure(name: str, episodes: int, seed: int = 0, **overrides: Any) -> tuple[
 
     def play(key: jax.Array) -> tuple[jax.Array, jax.Array]:
         env_key, action_key = jax.random.split(key)
-        goal_state = env.goal_state_of(env_key, env.sample_goal(env_key))
+        goal_state = env.goal_state(env_key, env.sample_goal(env_key))
         start = env.state_at(env.sample_start(env_key), goal_state)
         actions = jax.random.uniform(action_key, (env.horizon, env.action_size), minval=-1.0)
         end, _ = jax.lax.scan(lambda state, action: (env.advance(state, action), None), start, actions)

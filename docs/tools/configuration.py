@@ -9,7 +9,7 @@ import re
 from pathlib import Path
 
 from jaxrl_vis import fields
-from jaxrl_vis.cli.parsing import _described
+from jaxrl_vis.cli.parsing import _describe_fields
 from jaxrl_vis.config import OF_IMAGES, OF_ORACLE, OF_TASK, PRESETS, Config
 from jaxrl_vis.run.folder import MAY_CHANGE
 
@@ -45,7 +45,7 @@ def _groups() -> dict[str, str]:
 def table() -> str:
     """All fields, group by group."""
     groups, lines, last = _groups(), [], ""
-    for field, hint, _, text in _described(Config):
+    for field, hint, _, text in _describe_fields(Config):
         if groups[field.name] != last:
             last = groups[field.name]
             lines += ["", f"## {last}", "", "| field | default | meaning |", "|---|---|---|"]

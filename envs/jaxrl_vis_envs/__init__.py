@@ -3,8 +3,8 @@
     env = jaxrl_vis_envs.make("VisualFetchReach", image_size=64)
     state = env.reset(jax.random.key(0))
 
-Importing this package loads neither MuJoCo nor JAX: the learner's leaves import `jaxrl_vis_envs.goals` alone. The names below
-are looked up when they are first used. Once it is imported, MJX does not print that Warp is missing, and is imported faster.
+Importing this package loads neither MuJoCo nor JAX, because the learner's leaf modules import only `jaxrl_vis_envs.goals`. The
+names below are resolved on first use. A later import of MJX is faster, and does not print its notice that Warp is missing.
 """
 
 import importlib

@@ -1,14 +1,14 @@
-"""What every goal-reaching environment has in common: its state, and the four functions that move it.
+"""Base class and state of goal-reaching environments.
 
     state = env.reset(key)              one environment; vmap it for a batch
     state = env.advance(state, action)  physics, reward, success; no pixels
-    frame = env.observe(state)          what the agent sees
+    frame = env.observe(state)          the agent's observation
     state = env.step(state, action)     advance, then observe, with ``state.obs`` filled in
 
 An environment object holds only constants (model, camera, configuration); a `State` holds everything that changes, so every
-method is a pure function that can be jitted, vmapped, scanned and differentiated through: forwards and in reverse, on a GPU
-within ``compilation.kernels(False)``, for physics has no derivatives in its kernels. Episodes have a fixed length
-(`GoalEnv.horizon`), ``done`` is always 0, and nothing resets by itself: no final observation is ever lost.
+method is a pure function that can be jitted, vmapped, scanned and differentiated, in forward and reverse mode. On a GPU,
+differentiate inside ``compilation.kernels(False)``, because the physics kernels define no derivatives. Episodes have a fixed
+length (`GoalEnv.horizon`), ``done`` is always 0, and nothing resets automatically, so the final observation is never lost.
 """
 
 import abc
@@ -23,26 +23,26 @@ import numpy as np
 
 from jaxrl_vis_envs import goals
 
-_ONE_STATE = "reset and step return one State, whose parts are attributes: obs, reward, metrics"
+_ONE_STATE = "reset and step return one State, with attributes obs, reward and metrics"
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class State:
-    """Everything that changes in one environment.
+    """State of one environment: everything that changes.
 
     Attributes:
-        data: The physics state (`mujoco.mjx.Data` for the MuJoCo tasks).
-        achieved_state: [G] float32, the true quantity that the goal is about (metres or radians; each task says which).
-        goal_state: [G] float32, the value of that quantity that the goal image shows. Neither is shown to the agent.
+        data: Physics state (`mujoco.mjx.Data` for the MuJoCo tasks).
+        achieved_state: [G] float32, true value of the quantity that the goal constrains (metres or radians, see each task).
+        goal_state: [G] float32, value of that quantity in the goal image. Neither is shown to the agent.
         reward: [] float32, `goals.oracle_reward` of the two.
-        done: [] float32, always 0: episodes have one length, and ending one is a truncation.
+        done: [] float32, always 0: all episodes have the same length, and their end is a truncation.
         metrics: ``success`` ([] float32, 0 or 1) and ``goal_distance`` ([] float32, unit of the state).
-        obs: ``observation``, as `GoalEnv.observe` makes it, ``achieved_goal`` and ``desired_goal``, as `GoalEnv.as_goal` does;
-            None where the caller asked for no images (`GoalEnv.advance` passes it through untouched).
-        history: [F - 1, nq] float32, the joint positions one, two, ... control steps ago, where an observation stacks F > 1
-            images; else None. Before the first step everything stood still.
-        domain: What domain randomisation drew for this episode (see `randomization`); None where it is off.
+        obs: ``observation`` from `GoalEnv.observe`, ``achieved_goal`` and ``desired_goal`` in the form of `GoalEnv.as_goal`;
+            None if the caller asked for no images (`GoalEnv.advance` passes it through unchanged).
+        history: [F - 1, nq] float32, joint positions one, two, ... control steps ago, if an observation stacks F > 1 images;
+            else None. Before the first step, the robot counts as having been at rest.
+        domain: Domain randomisation drawn for this episode (see `randomization`); None if it is off.
     """
 
     data: Any
@@ -56,7 +56,7 @@ class State:
     domain: dict[str, jax.Array] | None = None
 
     def replace(self, **changes: Any) -> Self:
-        """A copy with some fields changed."""
+        """Return a copy with some fields changed."""
         return dataclasses.replace(self, **changes)
 
     def __iter__(self) -> Iterator[Any]:
@@ -67,21 +67,21 @@ class State:
 
 
 class GoalEnv(abc.ABC):
-    """An environment with a goal. Subclasses say how it starts, moves and appears; success and reward are the same for all."""
+    """Abstract goal-reaching environment. Subclasses define start, motion and appearance; success and reward are shared."""
 
     # Set by each task.
     name: str
     horizon: int  # control steps in an episode
     action_size: int  # A
-    threshold: float  # an episode succeeds where goal_distance <= threshold, in `distance_unit`
+    threshold: float  # an episode succeeds if goal_distance <= threshold, in `distance_unit`
     distance_unit: str = "m"
     control_period: float  # simulated seconds of one control step
-    # How hard the task is before anything is learned, as measured by benchmarks/tasks/task_difficulty.py; None: not measured.
-    chance: float | None = None  # share of episodes that uniformly random actions end in success
-    difficulty: float | None = None  # mean distance from start to goal, in thresholds
-    frame_stack: int = 1  # F, images of the latest control steps that an observation stacks
+    # Difficulty of the task before learning, measured by benchmarks/tasks/task_difficulty.py; None: not measured.
+    chance: float | None = None  # success rate of uniformly random actions
+    difficulty: float | None = None  # mean distance from start to goal, in multiples of `threshold`
+    frame_stack: int = 1  # F, number of most recent images stacked in an observation
 
-    if not TYPE_CHECKING:  # a type checker would take it for every attribute
+    if not TYPE_CHECKING:  # hidden from type checkers, which would accept any attribute
 
         def __getattr__(self, name: str) -> NoReturn:
             message = f"{type(self).__name__!r} object has no attribute {name!r}"
@@ -91,46 +91,46 @@ class GoalEnv(abc.ABC):
 
     @abc.abstractmethod
     def reset(self, key: jax.Array) -> State:
-        """Starts an episode: samples a start and a goal, and fills in `State.obs`.
+        """Start an episode: sample a start and a goal, and fill in `State.obs`.
 
         Args:
-            key: [] a typed JAX key.
+            key: Typed JAX key, [].
         """
 
     @abc.abstractmethod
     def advance(self, state: State, action: jax.Array) -> State:
-        """Moves the physics by one control step, without making an image.
+        """Advance the physics by one control step, without rendering.
 
         Args:
-            state: The state to start from.
-            action: [A] float32 in [-1, 1]; values outside are clipped, and a NaN counts as 0.
+            state: Current state.
+            action: [A] float32 in [-1, 1]; values outside are clipped, and NaN counts as 0.
 
         Raises:
-            ValueError: ``action`` has another shape (`check_action`).
+            ValueError: ``action`` has the wrong shape (`check_action`).
         """
 
     @abc.abstractmethod
     def observe(self, state: State) -> jax.Array:
-        """What the agent sees of ``state``: planar [C, H, W] uint8, or [S] float32 for the state variants.
+        """Render the agent's observation of ``state``: planar [C, H, W] uint8, or [S] float32 for the state variants.
 
-        Where images are stacked, C is F times the channels of one, and the newest comes first. The others are the newest ones
-        of the observations before, or of the first one where the episode began: a replay keeps the newest alone.
+        If images are stacked, C is F times the channels of one image, newest first. The older images are the newest ones of the
+        preceding observations, or repeat the episode's first image, so a replay needs to store only the newest image of each.
         """
 
     def as_goal(self, frame: jax.Array) -> jax.Array:
-        """The goal that says "be where ``frame`` was", in the shape of ``frame``: its newest image, F times.
+        """Convert an observation to the goal of reaching it, with the same shape: its newest image, repeated F times.
 
-        A goal stands still, so whoever relabels with an observation passes it through this function.
+        A goal does not move, so relabelling with an observation must go through this function.
         """
         if self.frame_stack == 1:
             return frame
         return jnp.tile(frame[: frame.shape[0] // self.frame_stack], (self.frame_stack, 1, 1))
 
     def step(self, state: State, action: jax.Array) -> State:
-        """`advance`, then `observe`: the one to use where every step's image is wanted.
+        """Advance and observe: the convenient choice if every step's image is needed.
 
         Raises:
-            ValueError: ``action`` has another shape than [A].
+            ValueError: ``action`` does not have the shape [A].
         """
         self.check_action(action)
         state = self.advance(state, action)
@@ -140,27 +140,27 @@ class GoalEnv(abc.ABC):
         return state.replace(obs={"observation": frame, "achieved_goal": achieved_goal, "desired_goal": desired_goal})
 
     def check_key(self, key: Any) -> None:
-        """Refuses what is not one JAX key.
+        """Check that ``key`` is a single JAX key.
 
         Raises:
-            ValueError: ``key`` is a seed, or several keys.
+            ValueError: ``key`` is a seed, or a batch of keys.
         """
         is_typed = hasattr(key, "dtype") and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
         if not is_typed and getattr(key, "dtype", None) != np.uint32:
             raise ValueError(f"reset takes a JAX key, such as jax.random.key(0), not {key!r}")
-        # An untyped one is [2], or [4] where JAX is set to another generator.
+        # An untyped key is [2], or [4] if JAX is configured for another generator.
         one = jax.eval_shape(lambda: jax.random.key(0) if is_typed else jax.random.PRNGKey(0))
         if key.shape != one.shape:
             raise ValueError(f"reset takes one JAX key, not an array of shape {key.shape}; vmap over a batch")
 
     def check_action(self, action: jax.Array) -> None:
-        """Refuses an action of the wrong size, which NumPy's rules might broadcast.
+        """Check the size of an action, which NumPy might otherwise broadcast silently.
 
         Raises:
-            ValueError: ``action`` has another shape than [A].
+            ValueError: ``action`` does not have the shape [A].
         """
         if np.shape(action) != (self.action_size,):
-            task = type(self).__name__  # an environment that was not made by its name has none
+            task = type(self).__name__  # `name` is only set by `make`
             raise ValueError(
                 f"{task} takes an action of shape ({self.action_size},), got {np.shape(action)}; vmap over a batch"
             )
@@ -171,14 +171,14 @@ class GoalEnv(abc.ABC):
 
     @property
     def observation_spec(self) -> jax.ShapeDtypeStruct:
-        """Shape and dtype of `observe`, derived by tracing `reset`, so it cannot go stale."""
+        """Shape and dtype of `observe`, derived by tracing `reset` so that it cannot go stale."""
         obs = self._reset_shape.obs
         assert obs is not None
         return jax.ShapeDtypeStruct(obs["observation"].shape, obs["observation"].dtype)
 
     @property
     def goal_state_size(self) -> int:
-        """G, the length of `State.achieved_state`."""
+        """Size G of `State.achieved_state`."""
         return self._reset_shape.goal_state.shape[0]
 
     def _measure(
@@ -190,7 +190,7 @@ class GoalEnv(abc.ABC):
         history: jax.Array | None = None,
         domain: dict[str, jax.Array] | None = None,
     ) -> State:
-        """A State with its reward and metrics filled in from the truth."""
+        """Build a State, with reward and metrics computed from the true states."""
         distance = goals.goal_distance(achieved_state, goal_state)
         return State(
             data=data,
@@ -206,16 +206,16 @@ class GoalEnv(abc.ABC):
 
 
 def start_history(qpos: jax.Array, frame_stack: int) -> jax.Array | None:
-    """`State.history` [frame_stack - 1, nq] of an episode that starts at rest at ``qpos`` [nq]; None for a stack of one."""
+    """Return `State.history` [frame_stack - 1, nq] of an episode that starts at rest at ``qpos`` [nq]; None if not stacking."""
     return None if frame_stack == 1 else jnp.tile(qpos, (frame_stack - 1, 1))
 
 
 def push_history(history: jax.Array | None, qpos: jax.Array) -> jax.Array | None:
-    """``history`` after one more control step, which began at ``qpos`` [nq]; the oldest is forgotten."""
+    """Push ``qpos`` [nq], the positions before the latest control step, onto ``history`` and drop the oldest entry."""
     return None if history is None else jnp.concatenate([qpos[None], history[:-1]])
 
 
 def sanitize_action(action: jax.Array) -> jax.Array:
-    """[A] -> [A] float32 in [-1, 1], with NaN read as 0: a broken policy must not poison the physics."""
+    """Clip an action [A] to [-1, 1] as float32 and replace NaN by 0, so that a broken policy cannot poison the physics."""
     action = jnp.asarray(action, jnp.float32)
     return jnp.clip(jnp.where(jnp.isnan(action), 0.0, action), -1.0, 1.0)

@@ -1,4 +1,4 @@
-"""Checks of configuration values, each with one line that names the field, what it may be and what it was. Loads no JAX."""
+"""Validation of configuration values. Errors are one line: the field, its allowed values and the actual one. Imports no JAX."""
 
 import dataclasses
 import math
@@ -9,26 +9,26 @@ from typing import Any
 
 @dataclasses.dataclass(frozen=True)
 class CheckedConfig:
-    """A configuration that refuses bad values when it is made. A subclass with fields extends `__post_init__`."""
+    """Configuration that validates itself on construction. A subclass with fields extends `__post_init__`."""
 
     def __post_init__(self) -> None:
-        """Checks the fields of this class, and those of its bases by `super`.
+        """Check the fields of this class; subclasses call ``super().__post_init__()`` first.
 
         Raises:
-            ValueError: A value is of the wrong type or out of range.
+            ValueError: A value has the wrong type or is out of range.
         """
 
 
-def whole(config: Any, *fields: str, least: int = 1) -> None:
-    """Refuses anything but whole numbers of at least ``least``."""
+def whole(config: Any, *fields: str, minimum: int = 1) -> None:
+    """Check that fields are integers of at least ``minimum``."""
     for field in fields:
         value = getattr(config, field)
-        if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value < least:
-            raise ValueError(f"{field} must be a whole number of at least {least}, got {value!r}")
+        if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value < minimum:
+            raise ValueError(f"{field} must be a whole number of at least {minimum}, got {value!r}")
 
 
 def positive(config: Any, *fields: str) -> None:
-    """Refuses anything but finite numbers above 0."""
+    """Check that fields are finite numbers above 0."""
     for field in fields:
         value = getattr(config, field)
         if not is_finite(value) or value <= 0:
@@ -36,30 +36,30 @@ def positive(config: Any, *fields: str) -> None:
 
 
 def not_negative(config: Any, *fields: str) -> None:
-    """Refuses anything but finite numbers of at least 0."""
+    """Check that fields are finite numbers of at least 0."""
     for field in fields:
         value = getattr(config, field)
         if not is_finite(value) or value < 0:
             raise ValueError(f"{field} must be a finite number of at least 0, got {value!r}")
 
 
-def true_or_false(config: Any, *fields: str) -> None:
-    """Refuses anything but True and False."""
+def boolean(config: Any, *fields: str) -> None:
+    """Check that fields are bools."""
     for field in fields:
         value = getattr(config, field)
         if not isinstance(value, bool):
             raise ValueError(f"{field} must be True or False, got {value!r}")
 
 
-def one_of(config: Any, field: str, choices: Iterable[str]) -> None:
-    """Refuses what is not among ``choices``."""
+def choice(config: Any, field: str, choices: Iterable[str]) -> None:
+    """Check that a field is among ``choices``."""
     value, choices = getattr(config, field), tuple(choices)
     if value not in choices:
         raise ValueError(f"{field} must be one of {', '.join(choices)}, got {value!r}")
 
 
 def vector(config: Any, field: str, size: int) -> Sequence[float]:
-    """Refuses anything but ``size`` finite numbers, which it returns."""
+    """Check that a field holds ``size`` finite numbers, and return it."""
     value = getattr(config, field)
     if not isinstance(value, Sequence) or len(value) != size or not all(map(is_finite, value)):
         raise ValueError(f"{field} must be {size} finite numbers, got {value!r}")
@@ -67,5 +67,5 @@ def vector(config: Any, field: str, size: int) -> Sequence[float]:
 
 
 def is_finite(value: Any) -> bool:
-    """Whether it is a real number, neither infinite nor NaN; True and False are none."""
+    """Return True if ``value`` is a real, finite number; bools are not."""
     return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)

@@ -1,8 +1,8 @@
-"""How many processor cores there are to use."""
+"""Number of available processor cores."""
 
 import os
 
 
 def num_cores() -> int:
-    """Cores that this process may use: of the machine, or those that it is confined to."""
+    """Return the number of cores this process may use, respecting its CPU affinity."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,4 +1,4 @@
-"""Texts that somebody else wrote, read so that none of them can exhaust the memory, the stack or anyone's patience."""
+"""Readers of untrusted text files, with limits on size, nesting and parsing time."""
 
 import json
 import os
@@ -8,82 +8,82 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-MOST_BYTES = 100_000_000
-"""Of a file of text, where nothing less is said."""
-MOST_LEVELS = 100
-"""Of lists and tables within each other: what goes deeper was made to do harm, or by mistake."""
-_MOST_DOTS = 200  # in a line of TOML, whose keys of n parts take the time of n * n
+MAX_BYTES = 100_000_000
+"""Default size limit of a text file."""
+MAX_DEPTH = 100
+"""Limit on nesting: deeper documents are malicious or broken."""
+_MAX_DOTS = 200  # in a line of TOML; parsing a dotted key of n parts takes O(n^2) time
 
 
-def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
-    """The contents of a file of at most ``most`` bytes.
+def read_bytes(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
+    """Read a file of at most ``max_bytes`` bytes.
 
     Raises:
-        OSError: It cannot be read, or is no ordinary file.
-        ValueError: It is larger. The message goes on where the file's name ends.
+        OSError: It cannot be read or is not a regular file.
+        ValueError: It is larger. The message is a predicate, to be appended to the file's name.
     """
-    # Opened without waiting, as a pipe that nobody writes to would never open.
+    # Opened without blocking: opening a pipe without a writer would never return.
     with open(os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)), "rb") as file:
         if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-            error = OSError(f"{path} is no ordinary file")
-            error.strerror = "it is no ordinary file"
+            error = OSError(f"{path} is not a regular file")
+            error.strerror = "it is not a regular file"
             raise error
-        data = file.read(most + 1)
-    if len(data) > most:
-        raise ValueError(f"is larger than {most / 1e6:g} MB")
+        data = file.read(max_bytes + 1)
+    if len(data) > max_bytes:
+        raise ValueError(f"is larger than {max_bytes / 1e6:g} MB")
     return data
 
 
-def read_text(path: Path, most: int = MOST_BYTES) -> str:
-    """A file of at most ``most`` bytes of UTF-8, without the mark of byte order that editors of Windows begin with.
+def read_text(path: Path, max_bytes: int = MAX_BYTES) -> str:
+    """Read a file of at most ``max_bytes`` bytes of UTF-8, without a byte order mark.
 
     Raises:
-        OSError: It cannot be read, or is no ordinary file.
-        ValueError: It is larger, or no text. The message goes on where the file's name ends.
+        OSError: It cannot be read or is not a regular file.
+        ValueError: It is larger or not UTF-8. The message is a predicate, to be appended to the file's name.
     """
     try:
-        return read_bytes(path, most).decode("utf-8-sig")
+        return read_bytes(path, max_bytes).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise ValueError("is no text in UTF-8") from error
+        raise ValueError("is not UTF-8 text") from error
 
 
-def read_json(path: Path, most: int = MOST_BYTES) -> Any:
-    """Read a JSON file of at most ``most`` bytes.
+def read_json(path: Path, max_bytes: int = MAX_BYTES) -> Any:
+    """Read a JSON file of at most ``max_bytes`` bytes.
 
     Raises:
-        OSError: It cannot be read, or is no ordinary file.
-        ValueError: It is larger, not JSON, or goes deeper than `MOST_LEVELS`.
+        OSError: It cannot be read or is not a regular file.
+        ValueError: It is larger, not JSON, or nested deeper than `MAX_DEPTH`.
     """
-    return parse_json(read_text(path, most))
+    return parse_json(read_text(path, max_bytes))
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Parse a text of JSON.
+    """Parse JSON.
 
     Raises:
-        ValueError: It is not JSON, or goes deeper than `MOST_LEVELS`.
+        ValueError: It is not JSON, or nested deeper than `MAX_DEPTH`.
     """
-    return _shallow(json.loads, text)
+    return _parse_with_max_depth(json.loads, text)
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """Parse a text of TOML.
+    """Parse TOML.
 
     Raises:
-        ValueError: It is not TOML, or goes deeper than `MOST_LEVELS`.
+        ValueError: It is not TOML, or nested deeper than `MAX_DEPTH`.
     """
-    if any(line.count(".") > _MOST_DOTS for line in text.splitlines()):
-        raise ValueError(f"more than {_MOST_DOTS} points in a line")
-    return _shallow(tomllib.loads, text)
+    if any(line.count(".") > _MAX_DOTS for line in text.splitlines()):
+        raise ValueError(f"more than {_MAX_DOTS} dots in a line")
+    return _parse_with_max_depth(tomllib.loads, text)
 
 
-def _shallow(parse: Any, text: Any) -> Any:
+def _parse_with_max_depth(parse: Any, text: Any) -> Any:
     try:
         value = parse(text)
     except RecursionError as error:
-        raise ValueError(f"nested more than {MOST_LEVELS} levels deep") from error
+        raise ValueError(f"nested more than {MAX_DEPTH} levels deep") from error
     level = [value]
-    for _ in range(MOST_LEVELS + 1):
+    for _ in range(MAX_DEPTH + 1):
         level = [
             part
             for whole in level
@@ -93,42 +93,42 @@ def _shallow(parse: Any, text: Any) -> Any:
         ]
         if not level:
             return value
-    raise ValueError(f"nested more than {MOST_LEVELS} levels deep")
+    raise ValueError(f"nested more than {MAX_DEPTH} levels deep")
 
 
 def parse_xml(text: str | bytes) -> ElementTree.Element:
-    """The root of a document of XML.
+    """Parse XML and return the root element.
 
     Raises:
-        ValueError: It is not XML, goes deeper than `MOST_LEVELS`, or declares a document type, as those with entities do.
+        ValueError: It is not XML, nested deeper than `MAX_DEPTH`, or declares a document type (as any with entities does).
     """
     parser = ElementTree.XMLParser(target=_Builder())
     try:
         parser.feed(text)
         return parser.close()
-    except (ElementTree.ParseError, LookupError, RecursionError) as error:  # no XML, or in an encoding that nobody knows
-        raise ValueError(f"no XML: {error}") from error
+    except (ElementTree.ParseError, LookupError, RecursionError) as error:  # not XML, or an unknown encoding
+        raise ValueError(f"not XML: {error}") from error
 
 
 class _Builder(ElementTree.TreeBuilder):
-    """Builds what `parse_xml` allows."""
+    """Tree builder that enforces the limits of `parse_xml`."""
 
     def __init__(self) -> None:
         super().__init__()
         self._levels = 0
 
     def start(self, tag: Any, attrs: dict[Any, Any], /) -> ElementTree.Element:
-        """Refuses what is too deep."""
+        """Open an element, or raise ValueError if it is nested too deep."""
         self._levels += 1
-        if self._levels > MOST_LEVELS:
-            raise ValueError(f"nested more than {MOST_LEVELS} levels deep")
+        if self._levels > MAX_DEPTH:
+            raise ValueError(f"nested more than {MAX_DEPTH} levels deep")
         return super().start(tag, attrs)
 
     def end(self, tag: str, /) -> ElementTree.Element:
-        """Comes back from a level."""
+        """Close an element."""
         self._levels -= 1
         return super().end(tag)
 
     def doctype(self, name: str, pubid: str, system: str) -> None:
-        """Refuses a document type."""
+        """Reject a document type."""
         raise ValueError(f"declares a document type ({name})")

@@ -1,4 +1,4 @@
-"""Names of the built-in tasks, and help with misspelt names. Loads neither JAX nor MuJoCo."""
+"""Names of the built-in tasks, and suggestions for misspelt names. Imports neither JAX nor MuJoCo."""
 
 import difflib
 from collections.abc import Iterable
@@ -11,24 +11,24 @@ TASKS = {
     "SawyerReach": "jaxrl_vis_envs.tasks.sawyer_reach",
     "StalkReach": "jaxrl_vis_envs.tasks.stalk_reach",
 }
-"""The module of each task. It registers two environments: one that sees the state, by this name, and one that sees images."""
+"""Module of each task. It registers two environments: the state variant by this name, and one that observes images."""
 
 
 def visual_name(task: str) -> str:
-    """The name of the environment that sees images of ``task``."""
+    """Return the name of the variant of ``task`` that observes images."""
     return f"Visual{task}"
 
 
 def nearest(word: str, choices: Iterable[str], otherwise: str | None = None) -> str:
-    """How to mend a misspelt word: '; did you mean X or Y?', with the nearest of ``choices``.
+    """Return a hint for a misspelt word: '; did you mean X or Y?', with the nearest of ``choices``.
 
     Args:
-        word: What was given.
-        choices: What is allowed.
-        otherwise: What to say where none is near; None for a list of all ``choices``.
+        word: The misspelt word.
+        choices: Valid words.
+        otherwise: Hint if none is near; None lists all ``choices``.
     """
     lowered = {choice.lower(): choice for choice in choices}
-    found = [lowered[match] for match in difflib.get_close_matches(word.lower(), list(lowered), n=3, cutoff=0.5)]
-    if found:
-        return f"; did you mean {' or '.join(found)}?"
+    matches = [lowered[match] for match in difflib.get_close_matches(word.lower(), list(lowered), n=3, cutoff=0.5)]
+    if matches:
+        return f"; did you mean {' or '.join(matches)}?"
     return f"; choose one of {', '.join(lowered.values())}" if otherwise is None else f"; {otherwise}"

@@ -1,15 +1,15 @@
-"""Domain randomisation: another camera, other lights, colours and dynamics in every episode. Off by default.
+"""Domain randomisation: varies camera, lights, colours and dynamics between episodes. Off by default.
 
     env = make("VisualFetchReach", randomization=Randomization(camera_position=0.02, colour=0.1, mass=0.2))
     env = make("VisualFetchReach", randomization=typical("camera", "lights", "colours", "dynamics"))
 
-    reset     draws what is on, from a key of its own, into `State.domain`      starts and goals stay what they are without
-    observe   draws through a scene with those leaves changed                   goal images have the appearance of their episode
+    reset     samples the active deviations, with a key of their own, into `State.domain`; starts and goals are unaffected
+    observe   renders a scene with those leaves changed; goal images have the appearance of their episode
     advance   steps a model with those leaves changed
 
-Only numbers vary, so one compiled program serves all values, and under `jax.vmap` each environment has its own. The GPU kernel
-of the renderer takes every one of these leaves as an input, so it draws varied scenes too. What is off is not drawn from the
-key, not stored and not computed: the program is the one without randomisation.
+Only numerical values vary, so one compiled program serves them all, and under `jax.vmap` each environment has its own. The GPU
+kernel of the renderer takes each of these leaves as an input, so it renders varied scenes too. Inactive deviations are neither
+sampled, stored nor computed: with all of them off, the program is the one without randomisation.
 """
 
 import dataclasses
@@ -22,9 +22,9 @@ from jaxrl_vis_envs import checks
 from jaxrl_vis_envs.render import Scene
 
 Domain = dict[str, jax.Array]
-"""What was drawn for one episode, float32: deviations by the name of their range in `Randomization`, for those that are on."""
+"""Deviations of one episode, float32, by the name of their range in `Randomization`; only the active ones."""
 
-# Folded into an episode's key. Large, because small numbers give the keys that `jax.random.split` hands out.
+# Folded into an episode's key. Large, because folding in small numbers gives the keys that `jax.random.split` returns.
 _TAG = 0x646F6D61
 
 _ABSOLUTE = ("camera_position", "camera_orientation", "light_position", "light_direction", "colour")
@@ -33,68 +33,68 @@ _DYNAMICS = ("mass", "damping", "friction", "actuator_gain", "action_scale")
 
 @dataclasses.dataclass(frozen=True)
 class Randomization:
-    """How far things vary between episodes. A deviation is uniform between plus and minus its range; 0 is off.
+    """Ranges of the deviations between episodes. Each deviation is uniform between plus and minus its range; 0 is off.
 
-    Ranges that are shares multiply by 1 plus the deviation, and must be less than 1.
+    Ranges described as fractions scale a value by 1 plus the deviation, and must be less than 1.
 
     Raises:
-        ValueError: A range is no number, negative or not finite, or a share is 1 or more.
+        ValueError: A range is not a number, negative or not finite, or a fraction is 1 or more.
     """
 
     camera_position: float = 0.0
-    """Shift of the camera along each axis of its own frame, m."""
+    """Translation of the camera along each axis of its own frame, m."""
     camera_orientation: float = 0.0
-    """Turn of the camera about each axis of its own frame, rad."""
+    """Rotation of the camera about each axis of its own frame, rad."""
     camera_fovy: float = 0.0
-    """Field of view, share."""
+    """Field of view, fraction."""
     light_position: float = 0.0
-    """Shift of each light along each axis, m; nothing for directional lights."""
+    """Translation of each light along each axis, m; no effect on directional lights."""
     light_direction: float = 0.0
-    """Change of each light's unit direction along each axis: about its tilt in rad. Nothing for the headlight."""
+    """Change of each light's unit direction along each axis: approximately its tilt in rad. No effect on the headlight."""
     light_diffuse: float = 0.0
-    """Diffuse and specular strength of each light in each colour channel, share. The headlight is one of the lights."""
+    """Diffuse and specular intensity of each light, including the headlight, in each colour channel, fraction."""
     light_ambient: float = 0.0
-    """Ambient strength of each light in each colour channel, share."""
+    """Ambient intensity of each light, including the headlight, in each colour channel, fraction."""
     colour: float = 0.0
-    """Red, green and blue of each geom, of 1; clipped to what a colour can be."""
+    """Red, green and blue of each geom, on a scale of 0 to 1; the sum is clipped to it."""
     mass: float = 0.0
-    """Mass of each body, and its inertia with it, share."""
+    """Mass and inertia of each body, scaled together, fraction."""
     damping: float = 0.0
-    """Damping of each joint, share."""
+    """Damping of each joint, fraction."""
     friction: float = 0.0
-    """Friction of all contacts and all dry friction in joints together, share."""
+    """Friction of all contacts and dry friction of all joints and tendons, scaled together, fraction."""
     actuator_gain: float = 0.0
-    """Strength of each actuator (of a position servo: its stiffness), share."""
+    """Gain of each actuator (stiffness of a position servo), fraction."""
     action_scale: float = 0.0
-    """What each component of an action is multiplied with, share; for tasks without actuators too."""
+    """Scale of each component of an action, fraction; also for tasks without actuators."""
 
     def __post_init__(self) -> None:
         for name, value in dataclasses.asdict(self).items():
             if not (checks.is_finite(value) and value >= 0.0):
                 raise ValueError(f"{name} of the randomization must be a finite range of at least 0, got {value!r}")
             if name not in _ABSOLUTE and value >= 1.0:
-                raise ValueError(f"{name} of the randomization is a share and must be less than 1, got {value}")
+                raise ValueError(f"{name} of the randomization is a fraction and must be less than 1, got {value}")
 
     @property
     def active(self) -> dict[str, float]:
-        """The ranges that are on."""
+        """Active ranges, by name."""
         return {name: value for name, value in dataclasses.asdict(self).items() if value > 0.0}
 
     @property
     def varies_appearance(self) -> bool:
-        """Whether images of the same poses differ between episodes."""
+        """True if images of the same poses differ between episodes."""
         return any(name not in _DYNAMICS for name in self.active)
 
     @property
     def varies_model(self) -> bool:
-        """Whether the model of the physics differs between episodes."""
+        """True if the physics model differs between episodes."""
         return any(name in _MODEL_LEAVES for name in self.active)
 
     def scaled(self, strength: float) -> Self:
-        """The same with every range ``strength`` times as wide.
+        """Return a copy with every range scaled by ``strength``.
 
         Raises:
-            ValueError: ``strength`` is no finite number of at least 0, or a range leaves its bounds.
+            ValueError: ``strength`` is not a finite number of at least 0, or a scaled range is out of bounds.
         """
         if not checks.is_finite(strength) or strength < 0.0:
             raise ValueError(f"the strength of a randomization must be a finite number of at least 0, got {strength!r}")
@@ -109,14 +109,15 @@ KINDS: dict[str, dict[str, float]] = {
     "colours": dict(colour=0.1),
     "dynamics": dict(mass=0.2, damping=0.2, friction=0.3, actuator_gain=0.1, action_scale=0.1),
 }
-"""Typical ranges: what a careful person fails to measure about a real cell."""
+"""Typical ranges: the uncertainty left after carefully measuring a real robot cell."""
 
 
 def typical(*kinds: str, strength: float = 1.0) -> Randomization:
-    """The typical ranges of these `KINDS`, ``strength`` times as wide.
+    """Return the typical ranges of the given `KINDS`, scaled by ``strength``.
 
     Raises:
-        ValueError: There is no such kind, ``strength`` is no finite number of at least 0, or a range leaves its bounds.
+        ValueError: There is no such kind, ``strength`` is not a finite number of at least 0, or a scaled range leaves its
+            bounds.
     """
     for kind in kinds:
         if not isinstance(kind, str) or kind not in KINDS:
@@ -128,18 +129,18 @@ def typical(*kinds: str, strength: float = 1.0) -> Randomization:
 
 
 def sample(key: jax.Array, ranges: Randomization, model: Any, action_size: int, scene: Scene | None) -> Domain | None:
-    """Draws the deviations of one episode.
+    """Sample the deviations of one episode.
 
     Args:
-        key: [] the typed key of the episode; what else is drawn from it is independent of this.
-        ranges: What varies how far.
+        key: Typed key of the episode, []; the deviations are independent of other samples drawn from it.
+        ranges: Ranges of the deviations.
         model: The `mjx.Model`.
         action_size: A.
-        scene: What images are drawn of; None for a task without images, whose ``ranges`` must not vary the appearance.
+        scene: Scene that images are rendered from; None for a task without images, whose ``ranges`` must not vary appearance.
 
     Returns:
-        The deviations of what is on, or None where all is off. Each has a key of its own, so that it does not depend on what
-        else is on.
+        The active deviations, or None if all are off. Each has its own key, so its value does not depend on which others are
+        active.
     """
     active = ranges.active
     if not active:
@@ -161,12 +162,12 @@ def sample(key: jax.Array, ranges: Randomization, model: Any, action_size: int, 
         "action_scale": (action_size,),
     }
     key = jax.random.fold_in(key, _TAG)
-    keys = {name: jax.random.fold_in(key, place) for place, name in enumerate(shapes)}
+    keys = {name: jax.random.fold_in(key, index) for index, name in enumerate(shapes)}
     return {name: jax.random.uniform(keys[name], shapes[name], jnp.float32, -limit, limit) for name, limit in active.items()}
 
 
 def varied_scene(scene: Scene, domain: Domain | None) -> Scene:
-    """``scene`` with the camera, lights and colours of an episode; itself where none of them varies."""
+    """Return ``scene`` with the camera, lights and colours of an episode, or unchanged if none of them varies."""
     if domain is None:
         return scene
     changes: dict[str, jax.Array] = {}
@@ -175,13 +176,13 @@ def varied_scene(scene: Scene, domain: Domain | None) -> Scene:
     if "camera_orientation" in domain:
         changes["camera_turn"] = scene.camera_turn + domain["camera_orientation"]
     if "camera_fovy" in domain:
-        # A lens is wider by its angle, or, for a camera with a sensor, by the sensor's size.
+        # The field of view is widened by its angle or, for a camera with a sensor, by the sensor's size.
         factor = 1.0 + domain["camera_fovy"]
         changes |= {"fovy": scene.fovy * factor, "sensor": scene.sensor * factor}
     if "light_position" in domain:
         changes["light_position"] = scene.light_position + domain["light_position"]
     if "light_direction" in domain:
-        changes["light_direction"] = scene.light_direction + domain["light_direction"]  # made unit where it is used
+        changes["light_direction"] = scene.light_direction + domain["light_direction"]  # normalised where it is used
     for name, leaves in (("light_diffuse", ("diffuse", "specular")), ("light_ambient", ("ambient",))):
         if name in domain:
             factor = 1.0 + domain[name]
@@ -193,7 +194,7 @@ def varied_scene(scene: Scene, domain: Domain | None) -> Scene:
     return scene.replace(**changes) if changes else scene
 
 
-# Leaves of mjx.Model that each range multiplies along their first axis. How soft constraints are (invweight0) stays as it is.
+# Leaves of mjx.Model that each range scales along their first axis. Constraint softness (invweight0) is unchanged.
 _MODEL_LEAVES = {
     "mass": ("body_mass", "body_inertia"),
     "damping": ("dof_damping",),
@@ -203,7 +204,7 @@ _MODEL_LEAVES = {
 
 
 def varied_model(model: Any, domain: Domain | None) -> Any:
-    """``model`` (`mjx.Model`) with the dynamics of an episode; itself where none of them varies."""
+    """Return ``model`` (`mjx.Model`) with the dynamics of an episode, or unchanged if none of them varies."""
     changes = {}
     for name, leaves in _MODEL_LEAVES.items():
         if domain is None or name not in domain:
@@ -216,5 +217,5 @@ def varied_model(model: Any, domain: Domain | None) -> Any:
 
 
 def varied_action(action: jax.Array, domain: Domain | None) -> jax.Array:
-    """What an action [A] amounts to in an episode: [A] float32, in [-2, 2]."""
+    """Scale an action [A] by the episode's action scale: [A] float32, in [-2, 2]."""
     return action if domain is None or "action_scale" not in domain else action * (1.0 + domain["action_scale"])

@@ -1,9 +1,9 @@
-"""Names of environments, and how to make them. A new built-in task is one file in `tasks` and one line in `names.TASKS`.
+"""Registry of environments and their construction. A new built-in task is one file in `tasks` and one line in `names.TASKS`.
 
-    Reacher             built in, or registered by `register`, or offered by an installed package (see `task_modules`)
-    my_task:MyReach     in a module of somebody's own: a subclass of `GoalEnv`, or what the module registers by that name
+    Reacher             built in, added with `register`, or provided by an installed package (see `task_modules`)
+    my_task:MyReach     in a module of your own: a subclass of `GoalEnv`, or an environment the module registers by that name
 
-Imports no MuJoCo: the file that holds a task is loaded when the task is first asked for, and registers its own names then.
+Imports no MuJoCo: the file of a task is loaded when the task is first requested, and then registers its own names.
 """
 
 import dataclasses
@@ -20,9 +20,9 @@ from jaxrl_vis_envs.names import TASKS, nearest, visual_name
 from jaxrl_vis_envs.task_modules import TaskModuleError
 
 _BUILT_IN = {**TASKS, **{visual_name(task): module for task, module in TASKS.items()}}
-# What an environment must say of itself, and not every base class says for it.
+# Attributes every environment must define.
 _CONSTANTS = ("horizon", "action_size", "threshold", "control_period")
-# What its methods are called with.
+# Positional parameters of its methods.
 _METHODS = {"reset": ("key",), "advance": ("state", "action"), "observe": ("state",)}
 
 
@@ -45,21 +45,21 @@ class UnknownOverrideError(ValueError):
 
 
 def register(name: str, factory: Callable[[Any], GoalEnv], config_class: type, state_variant: str | None = None) -> None:
-    """Adds an environment.
+    """Register an environment.
 
     Args:
-        name: What `make` calls it.
+        name: Name for `make`.
         factory: Builds the environment from an instance of ``config_class``.
-        config_class: A frozen dataclass, all of whose fields have defaults; its fields are the overrides that `make` takes.
-            An environment that observes images has a field ``image_size`` (see `pixels.PixelsConfig`).
-        state_variant: The environment with the same physics that observes the state, where there is one.
+        config_class: Frozen dataclass whose fields all have defaults; they are the overrides that `make` accepts. An
+            environment that observes images has a field ``image_size`` (see `pixels.PixelsConfig`).
+        state_variant: Name of the environment with the same physics that observes the state, if there is one.
 
     Raises:
-        ValueError: The name is taken by another factory or is no word, ``factory`` cannot be called, or ``config_class`` is not
-            such a dataclass.
+        ValueError: The name belongs to another factory or is not a word, ``factory`` is not callable, or ``config_class`` is
+            not such a dataclass.
     """
     if not isinstance(name, str) or not name or task_modules.is_own(name):
-        raise ValueError(f"an environment is registered by a word without a colon, such as 'MyReach', got {name!r}")
+        raise ValueError(f"the name of an environment must be a word without a colon, such as 'MyReach', got {name!r}")
     if not callable(factory):
         raise ValueError(f"factory of {name!r} must be a function from its configuration, got {factory!r}")
     if not (isinstance(config_class, type) and dataclasses.is_dataclass(config_class)):
@@ -74,41 +74,44 @@ def register(name: str, factory: Callable[[Any], GoalEnv], config_class: type, s
 
 
 def list_envs() -> list[str]:
-    """Names of all environments that are built in, registered, or offered by an installed package, sorted."""
+    """Return the sorted names of all environments that are built in, registered, or provided by installed packages."""
     return sorted({*_BUILT_IN, *_ENTRIES, *task_modules.entry_points()})
 
 
 def is_built_in(name: str) -> bool:
-    """Whether the environment comes with this package."""
+    """Return True if the environment is part of this package."""
     return name in _BUILT_IN
 
 
 def config_class(name: str) -> type:
-    """The frozen dataclass whose fields `make` takes as overrides.
+    """Return the configuration dataclass of an environment, whose fields `make` accepts as overrides.
 
     Raises:
-        UnknownEnvironmentError: No such environment; the message names the nearest ones.
-        TaskModuleError: The module that holds it cannot be imported.
+        UnknownEnvironmentError: There is no such environment; the message suggests the nearest names.
+        TaskModuleError: Its module cannot be imported.
     """
     return _entry(name).config_class
 
 
 def has_images(name: str) -> bool:
-    """Whether the environment observes images, without building it.
+    """Return True if the environment observes images, without building it.
 
     Raises:
-        UnknownEnvironmentError: No such environment.
-        TaskModuleError: The module that holds it cannot be imported.
+        UnknownEnvironmentError: There is no such environment.
+        TaskModuleError: Its module cannot be imported.
     """
     return any(field.name == "image_size" for field in dataclasses.fields(config_class(name)))
 
 
 def state_variant(name: str) -> str | None:
-    """The environment with the same physics that observes the state, without building it: ``name`` itself, or None.
+    """Return the environment with the same physics that observes the state, without building it.
+
+    Returns:
+        ``name`` itself if it observes the state; None if there is no such variant.
 
     Raises:
-        UnknownEnvironmentError: No such environment.
-        TaskModuleError: The module that holds it cannot be imported.
+        UnknownEnvironmentError: There is no such environment.
+        TaskModuleError: Its module cannot be imported.
     """
     variant = _entry(name).state_variant if has_images(name) else name
     if variant is None or not task_modules.is_own(name) or task_modules.is_own(variant):
@@ -117,11 +120,11 @@ def state_variant(name: str) -> str | None:
 
 
 def visual_variant(name: str) -> str | None:
-    """The environment with the same physics that observes images, without building it; None where there is none.
+    """Return the environment with the same physics that observes images, without building it; None if there is none.
 
     Raises:
-        UnknownEnvironmentError: No such environment.
-        TaskModuleError: The module that holds it cannot be imported.
+        UnknownEnvironmentError: There is no such environment.
+        TaskModuleError: Its module cannot be imported.
     """
     if has_images(name):
         return name
@@ -134,37 +137,38 @@ def visual_variant(name: str) -> str | None:
 
 
 def load(name: str, folder: str | None = None) -> str | None:
-    """Imports what holds an environment, and says where it was, so that it is found again from another folder.
+    """Import the module of an environment and return its folder, so that it can be found again from another one.
 
     Args:
-        name: An environment.
-        folder: Of ``module:Name``, where the module was found before. It is looked for there first, then in the current folder.
+        name: Name of an environment.
+        folder: For ``module:Name``, the folder the module was imported from before, searched before the current folder.
 
     Returns:
-        The folder that makes the module of ``module:Name`` importable; None for an installed one, and for all other names.
+        The folder that must be on Python's path for the module of ``module:Name``; None for an installed module, and for all
+        other names.
 
     Raises:
-        UnknownEnvironmentError: No such environment; the message names the nearest ones.
-        TaskModuleError: The module that holds it cannot be imported.
+        UnknownEnvironmentError: There is no such environment; the message suggests the nearest names.
+        TaskModuleError: Its module cannot be imported.
     """
     _entry(name, folder)
     if not task_modules.is_own(name):
         return None
-    return task_modules.folder_of(task_modules.load(task_modules.split(name)[0], folder))
+    return task_modules.import_folder(task_modules.load(task_modules.split(name)[0], folder))
 
 
 def make(name: str, **overrides: Any) -> GoalEnv:
-    """Builds an environment.
+    """Build an environment.
 
     Args:
-        name: One of `list_envs`, or ``module:Name`` for one in a module of your own: in the current folder or importable.
+        name: One of `list_envs`, or ``module:Name`` for one in a module of your own, in the current folder or importable.
         **overrides: Fields of its configuration to change, such as ``image_size=32``.
 
     Raises:
-        UnknownEnvironmentError: No such environment; the message names the nearest ones.
-        UnknownOverrideError: No such field; the message names the nearest ones.
-        TaskModuleError: The module that holds it cannot be imported, or its environment cannot be built.
-        ValueError: A field's value is out of range, or JAX computes in 64 bits and the environment does not.
+        UnknownEnvironmentError: There is no such environment; the message suggests the nearest names.
+        UnknownOverrideError: There is no such field; the message suggests the nearest names.
+        TaskModuleError: Its module cannot be imported, or the environment cannot be built.
+        ValueError: A field's value is out of range, or JAX runs in 64 bits and the environment does not support it.
     """
     entry = _entry(name)
     fields = [field.name for field in dataclasses.fields(entry.config_class)]
@@ -173,10 +177,10 @@ def make(name: str, **overrides: Any) -> GoalEnv:
             raise UnknownOverrideError(f"{name} has no option {override!r}{nearest(override, fields)}")
     env = _build(name, entry, entry.config_class(**overrides))
     if not isinstance(env, GoalEnv):
-        raise ValueError(f"{name} is no environment but {env!r}: its factory must return a jaxrl_vis_envs.GoalEnv")
+        raise ValueError(f"{name} is not an environment but {env!r}: its factory must return a jaxrl_vis_envs.GoalEnv")
     for constant in _CONSTANTS:
         if not hasattr(env, constant):
-            raise ValueError(f"{name} has no {constant}: every environment says what its {', '.join(_CONSTANTS)} are")
+            raise ValueError(f"{name} has no {constant}: every environment must define {', '.join(_CONSTANTS)}")
     for method, parameters in _METHODS.items():
         signature = inspect.signature(getattr(env, method))
         try:
@@ -194,7 +198,7 @@ def _build(name: str, entry: _Entry, config: Any) -> GoalEnv:
         return entry.factory(config)
     except ValueError:
         raise
-    except Exception as error:  # noqa: BLE001 - somebody else's code may raise anything
+    except Exception as error:  # noqa: BLE001 - user code may raise anything
         file = inspect.getsourcefile(entry.config_class)
         raise TaskModuleError(f"{name} cannot be built: {task_modules.blame(error, file)}") from error
 
@@ -202,58 +206,60 @@ def _build(name: str, entry: _Entry, config: Any) -> GoalEnv:
 def _entry(name: str, folder: str | None = None) -> _Entry:
     if not isinstance(name, str):
         raise UnknownEnvironmentError(
-            f"an environment is asked for by its name, and one of your own by 'module:Name', not {name!r}"
+            f"an environment is requested by its name, or as 'module:Name' for one of your own, not by {name!r}"
         )
     if task_modules.is_own(name):
         module, task = task_modules.split(name)
-        return _entry_of(name, task_modules.load(module, folder), task)
+        return _module_entry(name, task_modules.load(module, folder), task)
     if name not in _ENTRIES and name in _BUILT_IN:
         importlib.import_module(_BUILT_IN[name])
     if name in _ENTRIES:
         return _ENTRIES[name]
     points = task_modules.entry_points().get(name, [])
     if not points:
-        mend = nearest(name, list_envs())
+        hint = nearest(name, list_envs())
         if "." in name:
-            mend = "; a task of your own is written module:Name, such as my_task:MyReach"
-        raise UnknownEnvironmentError(f"unknown environment {name!r}{mend}")
+            hint = "; a task of your own is written module:Name, such as my_task:MyReach"
+        raise UnknownEnvironmentError(f"unknown environment {name!r}{hint}")
     if len(points) > 1:
         choices = " or ".join(sorted(point.value for point in points))
-        raise UnknownEnvironmentError(f"several installed packages have a {name}: ask for {choices}")
+        raise UnknownEnvironmentError(f"several installed packages have a {name}: request {choices}")
     (point,) = points
-    return _entry_of(name, task_modules.load(point.module, installed=True), point.attr)
+    return _module_entry(name, task_modules.load(point.module, installed=True), point.attr)
 
 
-def _entry_of(name: str, module: ModuleType, task: str) -> _Entry:
-    """The environment ``task`` of a module: what the module has registered by that name, or else its class.
+def _module_entry(name: str, module: ModuleType, task: str) -> _Entry:
+    """Return the environment ``task`` of a module: registered by the module under that name, or else its class.
 
     Raises:
-        UnknownEnvironmentError: There is none; the message names those that there are.
+        UnknownEnvironmentError: There is none; the message lists those that exist.
     """
     registered = {
-        each: entry
-        for each, entry in _ENTRIES.items()
-        if each not in _BUILT_IN and f"{entry.config_class.__module__}.".startswith(f"{module.__name__}.")
+        registered_name: entry
+        for registered_name, entry in _ENTRIES.items()
+        if registered_name not in _BUILT_IN and f"{entry.config_class.__module__}.".startswith(f"{module.__name__}.")
     }
     if task in registered:
         return registered[task]
     if not hasattr(module, task):
-        classes = [each for each, value in vars(module).items() if _is_task(value) and not inspect.isabstract(value)]
+        classes = [attribute for attribute, value in vars(module).items() if _is_task(value) and not inspect.isabstract(value)]
         choices = sorted({*registered, *classes})
-        mend = nearest(task, choices) if choices else ", nor any other subclass of jaxrl_vis_envs.GoalEnv"
-        raise UnknownEnvironmentError(f"{module.__name__} has no {task}{mend}")
-    found = getattr(module, task)
-    if not _is_task(found):
-        kind = "a class" if inspect.isclass(found) else f"of type {type(found).__name__}"
-        raise UnknownEnvironmentError(f"{name} is no environment but {kind}: it must be a subclass of jaxrl_vis_envs.GoalEnv")
-    if inspect.isabstract(found):
-        missing = ", ".join(sorted(found.__abstractmethods__))
+        hint = nearest(task, choices) if choices else ", nor any other subclass of jaxrl_vis_envs.GoalEnv"
+        raise UnknownEnvironmentError(f"{module.__name__} has no {task}{hint}")
+    task_class = getattr(module, task)
+    if not _is_task(task_class):
+        kind = "a class" if inspect.isclass(task_class) else f"of type {type(task_class).__name__}"
+        raise UnknownEnvironmentError(
+            f"{name} is not an environment but {kind}: it must be a subclass of jaxrl_vis_envs.GoalEnv"
+        )
+    if inspect.isabstract(task_class):
+        missing = ", ".join(sorted(task_class.__abstractmethods__))
         raise UnknownEnvironmentError(f"{name} is not complete: it must define {missing}")
-    return _entry_of_class(name, found)
+    return _class_entry(name, task_class)
 
 
-def _entry_of_class(name: str, task: type[GoalEnv]) -> _Entry:
-    """How to build a task from its class: ``task(config)``, where the annotation of ``config`` is the config class."""
+def _class_entry(name: str, task: type[GoalEnv]) -> _Entry:
+    """Build an entry from a task's class, which is constructed as ``task(config)`` with an annotated ``config``."""
     build: Any = task
     parameters = list(inspect.signature(task).parameters.values())
     if not parameters:
@@ -274,7 +280,7 @@ def _entry_of_class(name: str, task: type[GoalEnv]) -> _Entry:
 
 
 def _without_default(settings: Any) -> str | None:
-    """The first field of a dataclass that has to be given a value; None for none."""
+    """Return the name of the first dataclass field without a default; None if all have one."""
     for field in dataclasses.fields(settings):
         if field.init and field.default is field.default_factory is dataclasses.MISSING:
             return field.name
@@ -283,7 +289,7 @@ def _without_default(settings: Any) -> str | None:
 
 @dataclasses.dataclass(frozen=True)
 class _NoSettings:
-    """The configuration of an environment that has none."""
+    """Empty configuration, for an environment without settings."""
 
 
 def _is_task(value: Any) -> bool:

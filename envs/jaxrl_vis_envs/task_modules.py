@@ -1,7 +1,7 @@
-"""Tasks of other people: modules that hold them, and the entry points of installed packages. Loads neither JAX nor MuJoCo.
+"""Tasks from outside this package: user modules and entry points of installed packages. Imports neither JAX nor MuJoCo.
 
-my_task:MyReach     the environment MyReach of the module my_task, from the current folder or wherever Python finds it
-MyReach             as a package calls it that is installed, in its entry points of the group `GROUP`:
+my_task:MyReach     the environment MyReach of the module my_task, in the current folder or on Python's path
+MyReach             provided by an installed package, as an entry point of the group `GROUP`:
 
     [project.entry-points."jaxrl_vis.environments"]
     MyReach = "my_package.tasks:MyReach"
@@ -18,91 +18,92 @@ from types import ModuleType
 from jaxrl_vis_envs.names import nearest
 
 GROUP = "jaxrl_vis.environments"
-"""The group of entry points by which an installed package offers tasks."""
+"""Entry point group for the tasks of installed packages."""
 
 
 class TaskModuleError(ValueError):
-    """A module that is to hold a task is not there or cannot be imported. One line: what is wrong, and the mend."""
+    """A task's module is missing or cannot be imported. The message is one line with the problem and its remedy."""
 
 
 def is_own(name: str) -> bool:
-    """Whether the name of a task says which module holds it."""
+    """Return True if a task's name includes its module."""
     return ":" in name
 
 
 def split(name: str) -> tuple[str, str]:
-    """``module:Name`` -> module, Name.
+    """Split ``module:Name`` into module and Name.
 
     Raises:
-        TaskModuleError: It is not written so.
+        TaskModuleError: The name does not have this form.
     """
     module, _, task = name.partition(":")
     if "/" in module or "\\" in module or module.endswith(".py"):
         parts = module.removesuffix(".py").replace("\\", "/").split("/")
         dotted = ".".join(part for part in parts if part not in ("", ".", ".."))
         raise TaskModuleError(
-            f"{name!r} names a file, not a module: write {dotted}:{task or 'Name'}, in the folder it starts from"
+            f"{name!r} names a file, not a module: write {dotted}:{task or 'Name'}, in the folder that it is relative to"
         )
     if not all(part.isidentifier() for part in (*module.split("."), task)):
-        raise TaskModuleError(f"{name!r} is no task: a task of your own is written module:Name, such as my_task:MyReach")
+        raise TaskModuleError(f"{name!r} is not a task: a task of your own is written module:Name, such as my_task:MyReach")
     return module, task
 
 
 def entry_points() -> dict[str, list[importlib.metadata.EntryPoint]]:
-    """The tasks of installed packages: name -> who offers it, usually one. Nothing is imported."""
-    found: dict[str, list[importlib.metadata.EntryPoint]] = {}
+    """Return the tasks of installed packages, by name; usually one entry point each. Nothing is imported."""
+    points: dict[str, list[importlib.metadata.EntryPoint]] = {}
     for point in importlib.metadata.entry_points(group=GROUP):
-        if point not in found.setdefault(point.name, []):
-            found[point.name].append(point)
-    return found
+        if point not in points.setdefault(point.name, []):
+            points[point.name].append(point)
+    return points
 
 
 def load(module: str, folder: str | None = None, installed: bool = False) -> ModuleType:
-    """Imports a module that holds tasks: from ``folder``, or else the current folder, or else as Python finds it.
+    """Import a module of tasks from ``folder``, else from the current folder, else from Python's path.
 
-    The folder that holds it stays on Python's path, for what the module imports later.
+    The folder that contains the module stays on Python's path for its later imports.
 
     Args:
-        module: Its name, with dots where it lies in a package.
-        folder: Where it was found before; may have gone.
-        installed: Look nowhere but where Python does.
+        module: Name of the module, dotted if it is in a package.
+        folder: Folder that contained it before; it may no longer exist.
+        installed: Search only Python's path.
 
     Raises:
-        TaskModuleError: It is not there, it cannot be imported, or another one of the same name is loaded already.
+        TaskModuleError: The module is missing or cannot be imported, or another one of the same name is already loaded.
     """
-    places = [] if installed else [Path(place).resolve() for place in (folder, ".") if place is not None]
-    found = next((place for place in places if _file_in(place, module) is not None), None)
-    file = None if found is None else _file_in(found, module)
+    folders = [] if installed else [Path(candidate).resolve() for candidate in (folder, ".") if candidate is not None]
+    source = next((candidate for candidate in folders if _file_in(candidate, module) is not None), None)
+    file = None if source is None else _file_in(source, module)
     if module not in sys.modules:
-        _import(module, found, file, folder)
+        _import(module, source, file, folder)
     loaded = sys.modules[module]
     if file is not None and _origin(loaded) != file:
         raise TaskModuleError(
             f"{file} cannot be imported: Python has loaded another {module} already ({_origin(loaded) or 'built in'}); "
-            "rename yours, or start another process"
+            "rename yours, or start a new process"
         )
     return loaded
 
 
 def find(module: str, folder: str | None = None) -> Path | None:
-    """The file that `load` would import first, without importing anything; None where there is none.
+    """Return the file that `load` would import first, without importing anything; None if there is none.
 
     Args:
-        module: Its name, with dots where it lies in a package: of one that is installed, the package's file is found.
-        folder: Where it was found before; may have gone.
+        module: Name of the module, dotted if it is in a package. For an installed package, the result is the package's file.
+        folder: Folder that contained it before; it may no longer exist.
     """
-    for place in (folder, "."):
-        if place is not None and (file := _file_in(Path(place).resolve(), module)) is not None:
+    for candidate in (folder, "."):
+        if candidate is not None and (file := _file_in(Path(candidate).resolve(), module)) is not None:
             return file
     spec = importlib.machinery.PathFinder.find_spec(module.partition(".")[0])
     if spec is None:
         return None
-    places = [spec.origin] if spec.origin is not None else spec.submodule_search_locations or []  # without a file of its own
-    return next((Path(place).resolve() for place in places), None)
+    # A namespace package has folders but no file.
+    paths = [spec.origin] if spec.origin is not None else spec.submodule_search_locations or []
+    return next((Path(path).resolve() for path in paths), None)
 
 
-def folder_of(module: ModuleType) -> str | None:
-    """The folder that has to be on Python's path for a module to be found again; None where it is installed, or has no file."""
+def import_folder(module: ModuleType) -> str | None:
+    """Return the folder that must be on Python's path to import a module again; None if it is installed or has no file."""
     file = _origin(module)
     if file is None or {"site-packages", "dist-packages"} & set(file.parts):
         return None
@@ -111,7 +112,7 @@ def folder_of(module: ModuleType) -> str | None:
 
 
 def blame(error: BaseException, file: str | None) -> str:
-    """An error in a module of somebody's own, in one line: its kind, what it says, and the line of ``file`` that led to it."""
+    """Describe an error in user code in one line: its type, its message, and the line of ``file`` that caused it."""
     if isinstance(error, SyntaxError):
         return f"{type(error).__name__}: {error.msg} ({Path(error.filename or '?').name}, line {error.lineno})"
     lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
@@ -119,17 +120,17 @@ def blame(error: BaseException, file: str | None) -> str:
     return f"{type(error).__name__}: {' '.join(str(error).split()) or 'no message'}{where}"
 
 
-def _import(module: str, found: Path | None, file: Path | None, folder: str | None) -> None:
+def _import(module: str, source: Path | None, file: Path | None, folder: str | None) -> None:
     before = list(sys.path)
-    if found is not None and str(found) not in sys.path:
-        sys.path.insert(0, str(found))
+    if source is not None and str(source) not in sys.path:
+        sys.path.insert(0, str(source))
     importlib.invalidate_caches()  # a notebook may have written the file a moment ago
     try:
         importlib.import_module(module)
-    except (Exception, SystemExit) as error:  # noqa: BLE001 - somebody else's code may raise anything
+    except (Exception, SystemExit) as error:  # noqa: BLE001 - user code may raise anything
         sys.path[:] = before
         missing = error.name if isinstance(error, ModuleNotFoundError) else None
-        if found is None and missing and f"{module}.".startswith(f"{missing}."):
+        if source is None and missing and f"{module}.".startswith(f"{missing}."):
             raise TaskModuleError(_not_found(module, folder)) from error
         install = f"; install {missing.partition('.')[0]}" if missing else ""
         raise TaskModuleError(f"{module} cannot be imported: {blame(error, file and str(file))}{install}") from error
@@ -138,17 +139,17 @@ def _import(module: str, found: Path | None, file: Path | None, folder: str | No
 def _not_found(module: str, folder: str | None) -> str:
     if folder is not None and Path(folder).resolve() != Path.cwd():
         return (
-            f"{module} was imported from {folder}, which holds it no longer, and the current folder does not either: "
+            f"{module} was imported from {folder}, which no longer contains it; neither does the current folder: "
             "run this in the folder that does"
         )
     names = [path.stem for path in sorted(Path.cwd().glob("*.py"))]
-    near = nearest(module, names, "run this in the folder that holds it")
+    near = nearest(module, names, "run this in the folder that contains it")
     return f"there is no module {module}, in {Path.cwd()} or installed{near}"
 
 
-def _file_in(place: Path, module: str) -> Path | None:
-    """The file of a module in a folder that would be on Python's path."""
-    path = place.joinpath(*module.split("."))
+def _file_in(folder: Path, module: str) -> Path | None:
+    """Return the file of a module, if ``folder`` were on Python's path; None if it is not there."""
+    path = folder.joinpath(*module.split("."))
     return next((file for file in (path / "__init__.py", path.with_name(f"{path.name}.py")) if file.is_file()), None)
 
 

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, get_args
 import tyro
 
 from jaxrl_vis.cli.checks import check_counts, check_env
-from jaxrl_vis.cli.parsing import ByPlaceToo
+from jaxrl_vis.cli.parsing import AlsoPositional
 from jaxrl_vis.config import Pixels
 from jaxrl_vis.devices import check_devices, claim_memory, count_devices
 from jaxrl_vis.errors import RequestError
@@ -23,7 +23,7 @@ class Bench:
 
     benchmark: Annotated[Benchmark | None, tyro.conf.Positional] = None
     """Quantity to measure: images, physics, both with resets, gradient steps, or whole training iterations."""
-    env: Annotated[str, ByPlaceToo()] = "VisualFetchReach"
+    env: Annotated[str, AlsoPositional()] = "VisualFetchReach"
     """Environment; module:Name is one of your own."""
     preset: Literal["paper", "fast", "cpu", "debug"] | None = None
     """Preset of the networks and gradient steps (update, train); fast on accelerators and cpu on a CPU if not given."""

@@ -1,4 +1,4 @@
-"""What several commands check before they start to work."""
+"""Checks shared by several commands before they start to work."""
 
 import importlib.util
 import sys
@@ -13,20 +13,20 @@ from jaxrl_vis.run import trust as trusting
 from jaxrl_vis.run.folder import read_config
 from jaxrl_vis.run.signals import shielded_children
 
-# What an extra brings: module -> package.
+# Packages of an extra: module -> package.
 _GRASPING = {"cv2": "opencv-python-headless", "scipy": "scipy", "yaml": "pyyaml"}
 _EXTRAS = {"phenotyping": {**_GRASPING, "tifffile": "tifffile", "pandas": "pandas"}, "grasping": _GRASPING}
 
 
 def check_extra(command: str, extra: str) -> None:
-    """Checks that what a command needs beyond the base installation is there.
+    """Checks that the packages of an extra are installed.
 
     Args:
-        command: Its first word.
-        extra: What brings it.
+        command: First word of the command.
+        extra: Name of the extra.
 
     Raises:
-        RequestError: It is not.
+        RequestError: A package is missing.
     """
     missing = [package for module, package in _EXTRAS[extra].items() if importlib.util.find_spec(module) is None]
     if missing:
@@ -34,14 +34,14 @@ def check_extra(command: str, extra: str) -> None:
 
 
 def check_env(name: str, folder: str | None = None) -> None:
-    """Checks that there is an environment; one that is not built in is imported.
+    """Checks that an environment exists; one that is not built in is imported.
 
     Args:
-        name: Of the environment.
-        folder: Where the module of ``module:Name`` was found before.
+        name: Name of the environment.
+        folder: Folder where the module of ``module:Name`` was found before.
 
     Raises:
-        RequestError: There is none, or what holds it cannot be imported.
+        RequestError: It does not exist, or its module cannot be imported.
     """
     from jaxrl_vis_envs import registry
 
@@ -49,30 +49,30 @@ def check_env(name: str, folder: str | None = None) -> None:
         if registry.is_built_in(name):
             return
         with shielded_children():
-            check_devices()  # what somebody's module computes as it is imported must not be the first to ask
+            check_devices()  # before an import of the module can use devices
         registry.load(name, folder)
     except ValueError as error:
         raise RequestError(str(error)) from error
 
 
 def may_run_code(run_dir: Path, trust: bool) -> bool:
-    """Returns whether a run may run its own code: its user says so now or before, trained it, or answers on a terminal.
+    """Returns True if a run's own code may be used: permitted now or before, trained here, or confirmed on the terminal.
 
     Args:
         run_dir: The run folder.
-        trust: ``--trust`` was given.
+        trust: True for ``--trust``.
 
     Raises:
-        RequestError: It may not.
+        RequestError: There is no permission.
     """
     try:
         config = read_config(run_dir)
-    except RequestError:  # which is told by who uses the run, and then nothing runs
+    except RequestError:  # reported when the run is used, before any of its code runs
         return trust
     if not trust and trusting.is_own(config) and not trusting.is_trusted(run_dir, config) and _is_at_terminal():
         print(f"{trusting.question(run_dir, config)}. Run it? [y/N] ", end="", file=sys.stderr, flush=True)
         trust = sys.stdin.readline().strip().lower() in ("y", "yes")
-    trusting.check(run_dir, config, trust, "say --trust")
+    trusting.check(run_dir, config, trust, "pass --trust")
     return trust
 
 
@@ -81,7 +81,7 @@ def _is_at_terminal() -> bool:
 
 
 def check_run(folder: Path) -> None:
-    """Raises a `RequestError` unless ``folder`` holds a run."""
+    """Raises a `RequestError` unless ``folder`` is a run folder."""
     check_path(folder / "config.json")
     if not (folder / "config.json").exists():
         above = next((parent for parent in folder.parents if (parent / "config.json").exists()), None)
@@ -91,7 +91,7 @@ def check_run(folder: Path) -> None:
 
 
 def check_counts(**counts: int | None) -> None:
-    """Raises a `RequestError` that names the first option of those given that is below 1."""
+    """Raises a `RequestError` that names the first option below 1, if any."""
     for name, count in counts.items():
         if count is not None and count < 1:
             raise RequestError(f"--{name.replace('_', '-')} must be at least 1, not {count}")

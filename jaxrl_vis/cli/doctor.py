@@ -5,11 +5,11 @@ import dataclasses
 
 @dataclasses.dataclass(frozen=True)
 class Doctor:
-    """Say whether this installation works: versions, devices, one physics step, one image."""
+    """Check this installation: versions, devices, one physics step, one image."""
 
 
 def run(_: Doctor) -> int:
-    """Checks the installation; 1 where something fails."""
+    """Checks the installation; returns 1 if something fails."""
     from jaxrl_vis import doctor
 
     return doctor.main()

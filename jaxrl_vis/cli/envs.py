@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated
 
 from jaxrl_vis.cli.checks import check_counts, check_env
-from jaxrl_vis.cli.parsing import ByPlaceToo
+from jaxrl_vis.cli.parsing import AlsoPositional
 from jaxrl_vis.devices import check_devices
 
 
@@ -13,18 +13,18 @@ from jaxrl_vis.devices import check_devices
 class Envs:
     """List the environments.
 
-    chance is the share of episodes that random actions end in success, difficulty the mean distance from start to goal in
+    chance is the success rate of random actions, difficulty the mean distance from start to goal in
     thresholds.
     """
 
-    env: Annotated[tuple[str, ...], ByPlaceToo()] = ()
-    """Only these environments, built in, of an installed package or module:Name; all of the first two if not given."""
+    env: Annotated[tuple[str, ...], AlsoPositional()] = ()
+    """Only these environments: built in, of an installed package, or module:Name; all of the first two if not given."""
     gallery: Path | None = None
-    """Also draw the environments that show images, to this file: start and goals as colours, depth and geoms."""
+    """Also draw the environments with images into this file: start and goals as colours, depth and geoms."""
     image_size: int = 128
     """Height and width of the gallery's images, in pixels."""
     goals: int = 4
-    """Goals of each environment in the gallery."""
+    """Number of goals per environment in the gallery."""
 
 
 def run(options: Envs) -> int:

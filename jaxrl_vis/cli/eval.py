@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 from jaxrl_vis.cli.checks import check_counts, check_run, may_run_code
-from jaxrl_vis.cli.parsing import ByPlaceToo
+from jaxrl_vis.cli.parsing import AlsoPositional
 from jaxrl_vis.files import write_atomically
 from jaxrl_vis.report.outputs import check_writable
 
@@ -15,18 +15,18 @@ from jaxrl_vis.report.outputs import check_writable
 class Eval:
     """Measure a trained run: success and distance at the last step, without exploration."""
 
-    run_dir: Annotated[Path, ByPlaceToo()]
+    run_dir: Annotated[Path, AlsoPositional()]
     """The run folder."""
     episodes: int | None = None
-    """Episodes; the run's own number if not given."""
+    """Number of episodes; that of the run if not given."""
     json: Path | None = None
-    """Also write the figures here."""
+    """Also write the results to this file."""
     trust: bool = False
-    """Run the run's own code without a question, where its task is module:Name and somebody else trained it (docs/runs.md)."""
+    """Execute the run's own code without asking, if its task is module:Name and was trained by somebody else (docs/runs.md)."""
 
 
 def run(options: Eval) -> int:
-    """Evaluates a run and prints its figures."""
+    """Evaluates a run and prints the results."""
     check_run(options.run_dir)
     trust = may_run_code(options.run_dir, options.trust)
     check_counts(episodes=options.episodes)

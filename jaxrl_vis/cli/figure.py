@@ -23,7 +23,7 @@ _OfPlants = Literal["3.4", "3.5", "table3.1", "4.4", "4.5", "4.6"]
 _OfLearners = Literal["5.1", "5.2", "estimators", "cameras", "5.4", "5.5", "5.6", "5.7", "quadratic"]
 FigureName = Literal[_OfPlants, _OfLearners]
 SUFFIXES = (".png", ".pdf", ".svg")
-# Figures that train nothing -> options that they take.
+# Figures without training -> their options.
 _DRAWN_HERE = {
     **dict.fromkeys(grasp_figure.NAMES, ("figure", "out", "seed", *grasp_figure.OPTIONS)),
     "quadratic": ("figure", "out"),
@@ -34,67 +34,69 @@ UNFINISHED = 3
 
 @dataclasses.dataclass(frozen=True)
 class Figure:
-    """Draw a figure: train or compute what it shows, and write it to a file, with a table beside it.
+    """Draw a figure: train or compute its content, and write it to a file, with tables beside it.
 
-    3.4, 3.5, table3.1: counts, widths and times on synthetic plots of sorghum, beside what the thesis says of people; from
-    --evaluation, or from plots that are evaluated first. 4.4: from a stereo pair to grasp points, of a synthetic run; --seed
-    chooses it. 4.5: the path that the arm should take to a stalk of that run, and the one that it takes; --video shows all of
-    its reaches. 4.6: attempts and grasps of 16 runs of half a metre; from --evaluation, or from runs that are evaluated first.
+    3.4, 3.5, table3.1: counts, widths and times on synthetic plots of sorghum, beside the thesis's human results; from
+    --evaluation, or from plots that are evaluated first. 4.4: from a stereo pair to grasp points, in a synthetic run chosen by
+    --seed. 4.5: the planned and the executed path of the arm to a stalk of that run; --video shows all of its reaches. 4.6:
+    attempts and grasps of 16 runs of half a metre; from --evaluation, or from runs that are evaluated first.
 
-    5.1, 5.2: rewards with and without ground truth. estimators: rewards from state estimators that err. cameras: noisy and
-    varied images. 5.4: auxiliary losses, and how they are weighted. 5.5: single auxiliary tasks. 5.6: their weights over
-    training. 5.7: what OL-AUX-5 owes to looking ahead. These train what is missing, one process a GPU, and resume what was
-    begun, so they may be interrupted and started again at any time; the exit status is 3 where something is still missing.
+    5.1, 5.2: rewards with and without ground truth. estimators: rewards from inaccurate state estimators. cameras: noisy and
+    randomised images. 5.4: weightings of auxiliary losses. 5.5: single auxiliary tasks. 5.6: their weights over training. 5.7:
+    the benefit of OL-AUX-5's look-ahead. These train missing runs, one process per GPU, and resume unfinished ones, so they may
+    be interrupted and started again at any time; the exit status is 3 if something is still missing.
 
     quadratic: adaptive weights of auxiliary losses on three losses of a point in the plane.
     """
 
     figure: Annotated[FigureName, tyro.conf.Positional]
-    """Which figure."""
+    """Name of the figure."""
     out: Path | None = None
-    """A .png, .pdf or .svg file, and .md for table3.1; figure_FIGURE.png (or quadratic.png, or table_3.1.md) in the current
-    folder if not given. Tables go beside it, as .md and .csv."""
+    """A .png, .pdf or .svg file, or .md for table3.1; figure_FIGURE.png (or quadratic.png, or table_3.1.md) in the current
+    folder if not given. Tables are written beside it, as .md and .csv."""
     evaluation: Path | None = None
-    """For 3.4, 3.5 and table3.1: what `phenotype eval --json` wrote; for 4.6: what `grasp eval --reach --json` wrote. If not
+    """For 3.4, 3.5 and table3.1: output of `phenotype eval --json`; for 4.6: output of `grasp eval --reach --json`. If not
     given, plots or runs are evaluated."""
     wind: float = 10.0
-    """For 4.5 and 4.6: how far stalks sway in the wind, mm."""
+    """For 4.5 and 4.6: amplitude of the stalks' sway in the wind, mm."""
     video: Path | None = None
-    """For 4.5: a .gif, .mp4 or .html file of the arm at work."""
+    """For 4.5: a .gif, .mp4 or .html file of the arm's motion."""
     plots: int | None = None
-    """For 3.4, 3.5 and table3.1: how many plots to evaluate; 10 if not given."""
+    """For 3.4, 3.5 and table3.1: number of plots to evaluate; 10 if not given."""
     preset: str | None = None
     """Preset of all runs; paper for figures 5.4 to 5.7 and fast for the others if not given."""
     quick: bool = False
-    """For a CPU: preset cpu, seed 0, VisualFetchReach. 5.4 to 5.7 take a few steps only, to see them work rather than learn."""
+    """For a CPU: preset cpu, seed 0, VisualFetchReach. 5.4 to 5.7 take only a few steps, as a demonstration without
+    learning."""
     tasks: tuple[str, ...] = ()
     """Only these environments; all of the figure's if not given."""
     methods: tuple[str, ...] = ()
-    """These lines in the place of the figure's own, such as none sum fixed_0.1 ol_aux_5."""
+    """These lines instead of the figure's own, such as none sum fixed_0.1 ol_aux_5."""
     seed: int | None = None
     """First seed; 0 if not given."""
     seeds: int | None = None
-    """How many seeds; 5 if not given."""
+    """Number of seeds; 5 if not given."""
     seeds_per_run: int | None = None
-    """At most so many seeds in one program, where memory is short; all of them if not given."""
+    """Largest number of seeds in one program, to save memory; all of them if not given."""
     env_steps: int | None = None
     """Environment steps of every run; the figure's own budgets if not given."""
     env_options: tuple[str, ...] = ()
-    """Settings of the environment in every run, as of `train`: view=fingertips tip_marks=faint."""
+    """Settings of the environment in every run, as in `train`: view=fingertips tip_marks=faint."""
     runs: Path | None = None
-    """Folder of all run folders and logs, shared by figures of one subject; runs/ol_aux or runs/indicator if not given."""
+    """Folder of all run folders and logs, shared by figures on one subject; runs/ol_aux or runs/indicator if not given."""
     minutes: float | None = None
-    """Stop after so long: runs are saved, what is finished is drawn, and the next start goes on."""
+    """Time limit in minutes: runs are saved, finished ones are drawn, and the next start resumes."""
     per_device: int = 1
-    """Runs side by side on each device: while one is compiled, another one computes."""
+    """Parallel runs per device: while one is compiled, another one computes."""
     draw_only: bool = False
-    """Train nothing: draw what is there, also runs of other settings, such as an earlier version's; the table says which."""
+    """Train nothing: draw existing runs, including those with other settings, such as an earlier version's, which the table
+    notes."""
 
 
 def run(options: Figure) -> int:
-    """Draws one figure; `UNFINISHED` where a run that belongs to it is not finished."""
+    """Draws one figure; returns `UNFINISHED` if a run of it is not finished."""
     if options.figure in CHAPTER_3:
-        return _of_chapter_3(options)
+        return _draw_chapter_3(options)
     if options.figure != "4.6":
         _refuse_options(options, ("evaluation",), "figures 3.4, 3.5, 4.6 and table3.1")
     _refuse_options(options, ("plots",), "figures 3.4, 3.5 and table3.1")
@@ -120,13 +122,13 @@ def run(options: Figure) -> int:
         return 0
     if options.figure in grasp_figure.NAMES:
         return grasp_figure.make_figure(options.figure, out, options)
-    # Nothing below starts JAX in this process: the accelerator's memory belongs to the runs.
+    # Nothing below initialises JAX in this process: the accelerator's memory is for the runs.
     from jaxrl_vis.studies import figures
 
     return 0 if figures.make_figure(_request(options, out)) else UNFINISHED
 
 
-def _of_chapter_3(options: Figure) -> int:
+def _draw_chapter_3(options: Figure) -> int:
     is_table = options.figure == "table3.1"
     suffixes = (".md",) if is_table else SUFFIXES
     out = options.out or Path("table_3.1.md" if is_table else f"figure_{options.figure}.png")
@@ -134,7 +136,7 @@ def _of_chapter_3(options: Figure) -> int:
         raise RequestError(f"--out {out}: {options.figure} is a file that ends in {' or '.join(suffixes)}")
     _refuse_options_of_runs(options, ("figure", "out", "evaluation", "plots", "quick"))
     if options.evaluation is not None and (options.plots is not None or options.quick):
-        raise RequestError("--evaluation is of plots that are evaluated already: leave out --plots and --quick")
+        raise RequestError("--evaluation has results of evaluated plots: leave out --plots and --quick")
     check_counts(plots=options.plots)
     for file in (out, out.with_suffix(".md"), out.with_suffix(".csv")):
         check_writable(file, "--out")
@@ -154,10 +156,10 @@ def _refuse_options(options: Figure, names: Sequence[str], where: str) -> None:
 
 
 def _request(options: Figure, out: Path) -> "Request":
-    """What is asked for.
+    """Makes the request for a figure from the options.
 
     Raises:
-        RequestError: An option makes no sense.
+        RequestError: An option is invalid.
     """
     from jaxrl_vis.studies.figures import STUDIES
     from jaxrl_vis.studies.ol_aux import FETCH, WEIGHTS, check_weights
@@ -183,7 +185,7 @@ def _request(options: Figure, out: Path) -> "Request":
     if not options.draw_only:
         check_writable(runs, "--runs", folder=True)
     elif not runs.is_dir():
-        raise RequestError(f"--runs {runs} is no folder, and --draw-only draws what was trained: name where that is")
+        raise RequestError(f"--runs {runs} is no folder, and --draw-only draws trained runs: name their folder")
     quick = dict(study.family.quick) if options.quick else {}
     if options.env_steps is not None:
         quick.pop("env_steps", None)

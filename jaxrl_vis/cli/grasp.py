@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from jaxrl_vis.cli.checks import check_counts, check_extra
 from jaxrl_vis.cli.families import family_of
-from jaxrl_vis.cli.parsing import ByPlaceToo
+from jaxrl_vis.cli.parsing import AlsoPositional
 from jaxrl_vis.cli.phenotype import write_synthetic
 from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 class Synth:
     """Write synthetic runs for grasping: folders of five stereo pairs over half a metre, with odometry and exact truth."""
 
-    out: Annotated[Path, ByPlaceToo()]
+    out: Annotated[Path, AlsoPositional()]
     """The folder to write to; runs that it holds already are not drawn again."""
     family: Literal["training", "shifted"] = "training"
     """What rows are drawn from: what networks learn on, or with every factor of the world shifted."""

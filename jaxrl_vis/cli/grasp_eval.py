@@ -12,7 +12,7 @@ from jaxrl_vis.cli.families import family_of
 from jaxrl_vis.cli.grasp import weights_of
 from jaxrl_vis.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.evaluation_pool import Kept, Record, code_of, evaluate_each, share_accelerator
+from jaxrl_vis.evaluation_pool import Record, RecordFile, code_digest, evaluate_all, share_accelerator
 from jaxrl_vis.report.outputs import check_writable
 
 if TYPE_CHECKING:
@@ -117,13 +117,13 @@ def evaluate(options: Eval) -> int:
         "synthetic": True,
         "version": __version__,
         "schema": records.SCHEMA,
-        "code": code_of(jaxrl_vis_envs.plants, jaxrl_vis.grasping, leave_out=_CHANGES_NO_RECORD),
+        "code": code_digest(jaxrl_vis_envs.plants, jaxrl_vis.grasping, leave_out=_CHANGES_NO_RECORD),
         "family": family.name,
         "family_digest": hashlib.sha256(repr(family).encode()).hexdigest()[:12],
         "masks": name,
         "method": str(ways),
     }
-    kept = Kept(options.json, about, records.summary_of)
+    kept = RecordFile(options.json, about, records.summary_of)
     numbers = range(options.seed, options.seed + options.runs)
 
     def done(number: int, record: Record) -> None:
@@ -134,7 +134,7 @@ def evaluate(options: Eval) -> int:
     missing = [number for number in numbers if number not in kept]
     if len(missing) < len(numbers):
         print(f"evaluated before: {len(numbers) - len(missing)} of {len(numbers)} runs, in {options.json}")
-    evaluate_each(functools.partial(records.evaluate_run, conditions), missing, options.workers, done)
+    evaluate_all(functools.partial(records.evaluate_run, conditions), missing, options.workers, done)
     asked = [kept.records[number] for number in numbers]
     print(f"simulated runs of family {family.name}, masks: {name}, {ways}:")
     for each, value in records.summary_of([{**record, "reaches": {}} for record in asked]).items():
@@ -144,7 +144,7 @@ def evaluate(options: Eval) -> int:
     return 0
 
 
-def _reach(options: Eval, kept: Kept, numbers: range) -> None:
+def _reach(options: Eval, kept: RecordFile, numbers: range) -> None:
     """Sends the arm, and prints what came of it."""
     from jaxrl_vis.grasping import records
 

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from jaxrl_vis.cli.checks import check_extra
 from jaxrl_vis.cli.grasp import painter_of
-from jaxrl_vis.cli.parsing import ByPlaceToo
+from jaxrl_vis.cli.parsing import AlsoPositional
 from jaxrl_vis.cli.phenotype_run import SKIPPED, calibration_of
 from jaxrl_vis.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.errors import RequestError, StorageError
@@ -18,7 +18,7 @@ from jaxrl_vis.report.outputs import check_writable
 class Run:
     """Find grasp points in folders of stereo pairs: a table of points and of runs, and an overlay per run."""
 
-    folder: Annotated[Path, ByPlaceToo()]
+    folder: Annotated[Path, AlsoPositional()]
     """A run's folder of pairs (left_000.png, right_000.png, ...), or a folder of such folders."""
     out: Path = Path("grasp_results")
     """Folder for the results; a command that was stopped goes on where it was."""

@@ -10,10 +10,10 @@ from typing import Annotated, Literal
 
 from jaxrl_vis.cli.checks import check_counts, check_extra
 from jaxrl_vis.cli.families import family_of
-from jaxrl_vis.cli.parsing import ByPlaceToo
+from jaxrl_vis.cli.parsing import AlsoPositional
 from jaxrl_vis.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.evaluation_pool import results_of, share_accelerator
+from jaxrl_vis.evaluation_pool import map_unordered, share_accelerator
 from jaxrl_vis.report.outputs import check_writable
 
 _FIRST_SEED = 100_000
@@ -27,7 +27,7 @@ _RATES = {"segmentation": 1e-3, "gan": 4e-4}
 class Train:
     """Train the network that paints stalks red, on synthetic rows: against a discriminator, or as a plain segmentation."""
 
-    out: Annotated[Path, ByPlaceToo()]
+    out: Annotated[Path, AlsoPositional()]
     """The file to write, .safetensors; give it to `grasp run` and `grasp eval` as --weights."""
     loss: Literal["gan", "segmentation"] = "segmentation"
     """What it learns by: a discriminator as in pix2pix, or cross entropy and Dice of the mask."""
@@ -103,7 +103,7 @@ def _train(options: Train, family) -> int:
     first = _FIRST_SEED * (1 + options.seed)
     draw = functools.partial(synthetic_examples, family)
     sources: list[Iterator[Example]] = [
-        itertools.chain.from_iterable(results_of(draw, itertools.count(first), options.workers))
+        itertools.chain.from_iterable(map_unordered(draw, itertools.count(first), options.workers))
     ]
     settings = Settings(options.loss)
     plan = Plan(

@@ -1,9 +1,9 @@
-"""Reads the words of a command line into the frozen dataclass of one command.
+"""Parsing of a command line into the frozen dataclass of a command.
 
-    words -> tyro: which words belong to which option, or help -> `fields.read`: values -> the dataclass
+    words -> tyro: help, or the words of each option -> `fields.read`: values -> the dataclass
 
-tyro sees every option as a list of words that may be missing, so that it never judges a value: what is wrong with one is told
-in one line here, and what was not given is known to be so.
+For tyro, every option is an optional list of words, so that it never validates a value: errors are reported here in one line,
+and missing options are distinguished from given ones.
 """
 
 import ast
@@ -25,7 +25,7 @@ from jaxrl_vis.errors import RequestError, nearest
 
 PROGRAM = "jaxrl-vis"
 
-# Options of brax, Stable-Baselines3, its zoo and CleanRL that people try here -> what does the same.
+# Options of brax, Stable-Baselines3, its zoo and CleanRL that users may try -> the equivalent here.
 _ELSEWHERE = {
     **dict.fromkeys(
         ("--cuda", "--no-cuda", "--device", "--gpu", "--cpu"),
@@ -46,12 +46,12 @@ T = TypeVar("T")
 
 
 @dataclasses.dataclass(frozen=True)
-class ChangesOf:
-    """Marks the field of a command that collects those fields of another dataclass that were given, by name.
+class FieldsOf:
+    """Annotation of a command's field that collects, by name, the given fields of another dataclass.
 
     Attributes:
-        record: The dataclass; its fields are options of the command, but for those that the command declares itself.
-        default: A field's name -> what the help says about its default.
+        record: The dataclass; its fields are options of the command, except those that the command declares itself.
+        default: Maps a field's name to the help's description of its default.
     """
 
     record: type
@@ -59,16 +59,16 @@ class ChangesOf:
 
 
 @dataclasses.dataclass(frozen=True)
-class ByPlaceToo:
-    """Marks a field that may be given by its place as well as by its name: ``train TASK`` or ``train --env TASK``."""
+class AlsoPositional:
+    """Annotation of a field that may be given by position as well as by name: ``train TASK`` or ``train --env TASK``."""
 
 
 @dataclasses.dataclass(frozen=True)
-class SayDefault:
-    """Marks a field whose default the help cannot read off.
+class DefaultText:
+    """Annotation of a field whose default is described by a function.
 
     Attributes:
-        words: What the help says about it.
+        words: Returns the description for the help.
     """
 
     words: Callable[[], str]
@@ -76,17 +76,17 @@ class SayDefault:
 
 @dataclasses.dataclass(frozen=True)
 class _Option:
-    """One option or positional argument.
+    """Option or positional argument.
 
     Attributes:
-        name: Of the field.
+        name: Name of the field.
         hint: Its annotation, without extras.
-        positional: Whether it is known by its place instead of its name.
+        positional: True for a positional argument.
         help: One or more sentences.
-        default: What the help says about its default; nothing where it goes without saying.
-        required: Whether it must be given.
-        changes: The field of the command that collects it; None where it is a field of the command itself.
-        twin: Whether it is the same field as another option, which is known by its name.
+        default: Description of its default in the help; empty if obvious.
+        required: True if it must be given.
+        changes: Field of the command that collects it; None if it is a field of the command itself.
+        twin: True for the positional form of a field that is also an option.
     """
 
     name: str
@@ -100,42 +100,42 @@ class _Option:
 
     @property
     def key(self) -> str:
-        """What tyro calls it."""
+        """Key of the option for tyro."""
         return f"{self.name}_by_place" if self.twin else self.name
 
     @property
     def flag(self) -> str:
-        """As it is written on a command line."""
+        """Spelling on a command line."""
         return f"--{self.name.replace('_', '-')}"
 
     @property
     def metavar(self) -> str:
-        """What the help calls its values."""
+        """Name of its values in the help."""
         one, optional, several = fields.unwrap(self.hint)
         choices = fields.choices(self.hint)
         word = f"{{{','.join(choices)}}}" if choices else "TEXT" if one is str else one.__name__.upper()
         if self.positional:
             word = word if choices else self.name.upper()
             return f"[{word} ...]" if several else word if self.required else f"[{word}]"
-        # None says nothing, but where it can undo what a preset or a saved run says.
+        # None is shown only where it can override a preset or a saved run.
         return f"[{word} ...]" if several else f"{word}|None" if optional and self.changes else word
 
     @property
     def is_flag(self) -> bool:
-        """Whether no word follows."""
+        """True if it takes no value."""
         return fields.unwrap(self.hint)[0] is bool
 
     @property
     def takes_one_word(self) -> bool:
-        """Whether exactly one word must follow."""
+        """True if it takes exactly one value."""
         return not self.is_flag and not fields.unwrap(self.hint)[2]
 
     def annotation(self) -> Any:
-        """What tyro is told: a list of words, or a flag."""
+        """Returns the annotation for tyro: a list of words, or a flag."""
         hint = f"({self.default})" if self.default else ""
         if self.is_flag:
             extras: list[Any] = [tyro.conf.arg(help=self.help, help_behavior_hint=hint)]
-            if self.changes is None:  # else --no-x as well: either may contradict a preset
+            if self.changes is None:  # otherwise with --no-x, because either may override a preset
                 extras.append(tyro.conf.FlagCreatePairsOff)
             return Annotated[bool, *extras]
         words = tyro.constructors.PrimitiveConstructorSpec(
@@ -152,23 +152,23 @@ class _Option:
 
 
 def parse(command: type[T], words: Sequence[str], name: str = "") -> T:
-    """One command, from the words that follow its name.
+    """Parses the arguments of a command.
 
     Args:
-        command: A frozen dataclass. Its docstring and those of its fields are the help. A field that is annotated with
-            `tyro.conf.Positional` is known by its place, one annotated with `ByPlaceToo` by either, and one annotated with
-            `ChangesOf` stands for many.
-        words: Of the command line.
-        name: What it is called; the dataclass's name in lower case if not given.
+        command: A frozen dataclass. Its docstring and those of its fields are the help. A field annotated with
+            `tyro.conf.Positional` is positional, one with `AlsoPositional` may be either, and one with `FieldsOf` stands for
+            many options.
+        words: Arguments after the command's name.
+        name: Name of the command; the dataclass's name in lower case if not given.
 
     Raises:
-        RequestError: The words do not make sense.
-        SystemExit: Help was asked for, and printed.
+        RequestError: The arguments are invalid.
+        SystemExit: Help was printed.
     """
-    options = {option.key: option for option in _options_of(command)}
+    options = {option.key: option for option in _collect_options(command)}
     _check_values(words, list(options.values()))
     program = f"{PROGRAM} {name or command.__name__.lower()}"
-    given, left_over = _split(command, program, words, options)
+    arguments, left_over = _split(command, program, words, options)
     if left_over:
         word = left_over[0].partition("=")[0].replace("_", "-") if left_over[0].startswith("-") else left_over[0]
         if not word.startswith("-"):
@@ -183,12 +183,12 @@ def parse(command: type[T], words: Sequence[str], name: str = "") -> T:
     for key, option in options.items():
         if option.changes is not None:
             values.setdefault(option.changes, {})
-        if key in given:
+        if key in arguments:
             target = values if option.changes is None else values[option.changes]
-            value = _value(option, given[key])
+            value = _value(option, arguments[key])
             if target.get(option.name, value) != value:
-                here, there = (each if isinstance(each, tuple) else (each,) for each in (target[option.name], value))
-                both = f"{' '.join(map(str, here))} by {option.flag} and {' '.join(map(str, there))} by its place"
+                first, second = (item if isinstance(item, tuple) else (item,) for item in (target[option.name], value))
+                both = f"{' '.join(map(str, first))} by {option.flag} and {' '.join(map(str, second))} by position"
                 raise RequestError(f"{option.name} is given twice, {both}; give it once")
             target[option.name] = value
         elif option.required and option.name not in values:
@@ -201,20 +201,20 @@ def parse(command: type[T], words: Sequence[str], name: str = "") -> T:
 def _split(
     command: type, program: str, words: Sequence[str], options: dict[str, _Option]
 ) -> tuple[dict[str, Any], Sequence[str]]:
-    """The words of each option that was given (or True and False for flags), and the words that belong to none."""
-    # A dictionary of which every key may be missing: tyro leaves out what was not given.
+    """Splits arguments into the words of each given option (or True and False for flags), and the words of none."""
+    # A dictionary with optional keys: tyro omits options that were not given.
     annotations = {name: option.annotation() for name, option in options.items()}
     form: Any = typing.TypedDict(command.__name__, annotations, total=False)  # pyright: ignore[reportArgumentType]
     unset = {name: False for name, option in options.items() if option.is_flag and option.changes is None}
     text = inspect.getdoc(command)
-    unread = io.StringIO()
+    discarded = io.StringIO()
     try:
-        with contextlib.redirect_stderr(unread):
+        with contextlib.redirect_stderr(discarded):
             return tyro.cli(form, prog=program, description=text, args=list(words), default=unset, return_unknown_args=True)
     except SystemExit as stop:
         if not stop.code:
             raise
-    # The one thing that is left to go wrong: there is no word where one must be.
+    # The only remaining error is an option without its value.
     flags = {option.flag for option in options.values() if option.takes_one_word}
     for word, following in zip(words, [*words[1:], "--"], strict=True):
         is_number = following[1:2].isdigit() or following[1:2] == "."
@@ -224,19 +224,19 @@ def _split(
 
 
 def _check_values(words: Sequence[str], options: Sequence[_Option]) -> None:
-    """Refuses true or false after a flag, and several numbers after an option of one, which would be taken for a task.
+    """Rejects true or false after a flag, and several numbers after an option that takes one: they would be taken for a task.
 
     Raises:
-        RequestError: That is so.
+        RequestError: There are such values.
     """
     flags = {option.flag: option for option in options if not option.positional}
     takes_path = any(option.positional and option.hint is Path for option in options)
-    for place, word in enumerate(words):
+    for index, word in enumerate(words):
         option = flags.get(word.replace("_", "-"))
-        following = list(itertools.takewhile(_is_number, words[place + 1 :]))
+        following = list(itertools.takewhile(_is_number, words[index + 1 :]))
         if option is None:
             continue
-        if option.is_flag and words[place + 1 : place + 2] and words[place + 1].lower() in ("true", "false", "0", "1"):
+        if option.is_flag and words[index + 1 : index + 2] and words[index + 1].lower() in ("true", "false", "0", "1"):
             opposite = f"write {option.flag.replace('--', '--no-', 1)}" if option.changes else "leave it out"
             raise RequestError(f"{option.flag} takes no value: {opposite} for its opposite")
         if option.takes_one_word and len(following) > 1 and not takes_path:
@@ -261,36 +261,36 @@ def _value(option: _Option, words: Any) -> Any:
     return fields.read(option.name if option.positional else option.flag, option.hint, words)
 
 
-def _options_of(command: type) -> list[_Option]:
-    """The options of a command in the order of its fields, those that a `ChangesOf` stands for in its place.
+def _collect_options(command: type) -> list[_Option]:
+    """Lists the options of a command in the order of its fields, with those of a `FieldsOf` in its place.
 
-    A field that may be given either way is two options: first by its name, then by its place.
+    A field that may be given either by name or by position makes two options, in this order.
     """
     own = {field.name for field in dataclasses.fields(command)}
-    found = []
-    for field, hint, extras, text in _described(command):
-        changes = next((extra for extra in extras if isinstance(extra, ChangesOf)), None)
+    options = []
+    for field, hint, extras, text in _describe_fields(command):
+        changes = next((extra for extra in extras if isinstance(extra, FieldsOf)), None)
         if changes is None:
             required = field.default is dataclasses.MISSING
             default = "required" if required else f"default: {field.default}" if field.default else ""
             for extra in extras:
-                default = extra.words() if isinstance(extra, SayDefault) else default
-            if ByPlaceToo() in extras:
-                found.append(_Option(field.name, hint, False, text, "" if required else default, False))
-                found.append(_Option(field.name, hint, True, text, default, required, twin=True))
+                default = extra.words() if isinstance(extra, DefaultText) else default
+            if AlsoPositional() in extras:
+                options.append(_Option(field.name, hint, False, text, "" if required else default, False))
+                options.append(_Option(field.name, hint, True, text, default, required, twin=True))
                 continue
-            found.append(_Option(field.name, hint, tyro.conf.Positional in extras, text, default, required))
+            options.append(_Option(field.name, hint, tyro.conf.Positional in extras, text, default, required))
             continue
-        found += [
-            _Option(each.name, each_hint, False, each_text, changes.default(each.name), False, field.name)
-            for each, each_hint, _, each_text in _described(changes.record)
-            if each.name not in own
+        options += [
+            _Option(item.name, item_hint, False, item_text, changes.default(item.name), False, field.name)
+            for item, item_hint, _, item_text in _describe_fields(changes.record)
+            if item.name not in own
         ]
-    return found
+    return options
 
 
-def _described(record: type) -> list[tuple[dataclasses.Field, Any, tuple[Any, ...], str]]:
-    """Fields of a dataclass with their annotations, what `typing.Annotated` adds to these, and their docstrings."""
+def _describe_fields(record: type) -> list[tuple[dataclasses.Field, Any, tuple[Any, ...], str]]:
+    """Lists the fields of a dataclass with their annotations, the metadata of `typing.Annotated`, and their docstrings."""
     texts: dict[str, str] = {}
     (definition,) = ast.parse(textwrap.dedent(inspect.getsource(record))).body
     for line, following in itertools.pairwise(definition.body):

@@ -12,7 +12,7 @@ from jaxrl_vis.cli.families import family_of
 from jaxrl_vis.cli.phenotype_run import networks, weights_of
 from jaxrl_vis.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.evaluation_pool import Kept, Record, evaluate_each, finite, share_accelerator
+from jaxrl_vis.evaluation_pool import Record, RecordFile, evaluate_all, finite, share_accelerator
 from jaxrl_vis.report.outputs import check_writable
 
 if TYPE_CHECKING:
@@ -114,7 +114,7 @@ def _evaluate(options: Eval, tasks: "Mapping[str, Task]", name: str) -> dict[str
     summary_of = functools.partial(evaluation.summary_of, options.least_score)
     wanted = range(options.seed, options.seed + options.plots)
     kept = {
-        factor: Kept(_path(options.json, factor), {**evaluation.conditions(task), "finder": name}, summary_of)
+        factor: RecordFile(_path(options.json, factor), {**evaluation.conditions(task), "finder": name}, summary_of)
         for factor, task in tasks.items()
     }
     there = sum(seed in each for each in kept.values() for seed in wanted)
@@ -133,7 +133,7 @@ def _evaluate(options: Eval, tasks: "Mapping[str, Task]", name: str) -> dict[str
             flush=True,
         )
 
-    evaluate_each(
+    evaluate_all(
         functools.partial(evaluation.evaluate_job, list(tasks.values()), jobs), range(len(jobs)), options.workers, done
     )
     return {factor: summary_of([each.records[seed] for seed in wanted]) for factor, each in kept.items()}

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Literal, Protocol
 
 from jaxrl_vis.cli.checks import check_counts, check_extra
-from jaxrl_vis.cli.parsing import ByPlaceToo
+from jaxrl_vis.cli.parsing import AlsoPositional
 from jaxrl_vis.cli.progress import progress
 from jaxrl_vis.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.errors import RequestError, StorageError
@@ -23,7 +23,7 @@ SKIPPED = 3
 class Run:
     """Count and measure the stalks in folders of stereo pairs: tables per stalk and per plot, and an overlay per image."""
 
-    folder: Annotated[Path | None, ByPlaceToo()] = None
+    folder: Annotated[Path | None, AlsoPositional()] = None
     """A plot's folder of pairs (left_000.png, right_000.png, ...), or a folder of such folders; the short synthetic row that
     comes with the package if not given."""
     out: Path = Path("phenotype_results")

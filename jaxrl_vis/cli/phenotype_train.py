@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from jaxrl_vis.cli.checks import check_counts, check_extra
-from jaxrl_vis.cli.parsing import ByPlaceToo
+from jaxrl_vis.cli.parsing import AlsoPositional
 from jaxrl_vis.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.evaluation_pool import results_of, share_accelerator
+from jaxrl_vis.evaluation_pool import map_unordered, share_accelerator
 from jaxrl_vis.report.outputs import check_writable
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ _FIRST_SEED = 100_000
 class Train:
     """Train the networks that find and outline stalks, on synthetic plots or on your own annotated images."""
 
-    out: Annotated[Path, ByPlaceToo()]
+    out: Annotated[Path, AlsoPositional()]
     """The file to write, .safetensors; give it to `phenotype run` as --weights."""
     data: Path | None = None
     """A folder of annotated images (annotations.json of COCO, or .xml of Pascal VOC or .json of LabelMe beside each image), in
@@ -109,7 +109,7 @@ def _train(options: Train) -> int:
             raise RequestError(str(error)) from error
         first = _FIRST_SEED * (1 + options.seed)
         draw = functools.partial(synthetic_examples, family, settings)
-        sources = [itertools.chain.from_iterable(results_of(draw, itertools.count(first), options.workers))]
+        sources = [itertools.chain.from_iterable(map_unordered(draw, itertools.count(first), options.workers))]
         origin = f"synthetic plots of family {family.name}"
     plan = Plan(
         steps=options.steps,

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated
 
 from jaxrl_vis.cli.checks import check_counts, check_run, may_run_code
-from jaxrl_vis.cli.parsing import ByPlaceToo
+from jaxrl_vis.cli.parsing import AlsoPositional
 from jaxrl_vis.errors import RequestError
 
 
@@ -13,19 +13,19 @@ from jaxrl_vis.errors import RequestError
 class Play:
     """Make a video of a trained run: each observation beside the goal."""
 
-    run_dir: Annotated[Path, ByPlaceToo()]
+    run_dir: Annotated[Path, AlsoPositional()]
     """The run folder."""
     out: Path | None = None
     """A .gif, .mp4 or .html file, or a .png of some steps; play.gif (play.html with --html, play_aux.gif with --aux) in the run
     folder if not given."""
     html: bool = False
-    """Show the robot and its goal in three dimensions, on a page with brax's viewer (needs brax, and the page a network)."""
+    """Show the robot and its goal in three dimensions, on a page with brax's viewer (needs brax; the page needs a network)."""
     aux: bool = False
-    """Show what auxiliary tasks predict, too: reconstruction, true and predicted optical flow, rotated image."""
+    """Also show the predictions of auxiliary tasks: reconstruction, true and predicted optical flow, rotated image."""
     episodes: int = 6
-    """Episodes to show."""
+    """Number of episodes to show."""
     trust: bool = False
-    """Run the run's own code without a question, where its task is module:Name and somebody else trained it (docs/runs.md)."""
+    """Execute the run's own code without asking, if its task is module:Name and was trained by somebody else (docs/runs.md)."""
 
 
 def run(options: Play) -> int:

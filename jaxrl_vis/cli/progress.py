@@ -1,4 +1,4 @@
-"""How far a command has come: a bar in a terminal, a line for each part elsewhere."""
+"""Progress of a command: a bar on a terminal, otherwise one line per part."""
 
 import contextlib
 import sys
@@ -10,23 +10,23 @@ from jaxrl_vis.run.bar import FittingProgress
 from jaxrl_vis.streams import safe
 
 Done = Callable[[str, int, int], None]
-"""Called with the name of a part, how much of it is done, and how much there is."""
+"""Called with the name of a part, the number of units done, and their total."""
 _SHORT_NAME = 20
 
 
 @contextlib.contextmanager
 def progress(unit: str) -> Iterator[Done]:
-    """Shows how far a command has come.
+    """Shows the progress of a command.
 
     Args:
-        unit: What is counted, in the plural.
+        unit: Unit of counting, in the plural.
     """
     stream = safe(sys.stdout)
     if not stream.isatty():
 
-        def say(name: str, done: int, of: int) -> None:
-            if done == of:
-                print(f"{name}: {of} {unit}", flush=True, file=stream)
+        def say(name: str, done: int, total: int) -> None:
+            if done == total:
+                print(f"{name}: {total} {unit}", flush=True, file=stream)
 
         yield say
         return
@@ -44,9 +44,9 @@ def progress(unit: str) -> Iterator[Done]:
     tasks = {}
     with FittingProgress(stream, wordings) as bars:
 
-        def draw(name: str, done: int, of: int) -> None:
+        def draw(name: str, done: int, total: int) -> None:
             if name not in tasks:
-                tasks[name] = bars.add_task(name, total=of)
+                tasks[name] = bars.add_task(name, total=total)
             bars.update(tasks[name], completed=done)
 
         yield draw

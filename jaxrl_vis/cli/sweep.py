@@ -9,8 +9,8 @@ import tyro
 
 from jaxrl_vis.cli.checks import check_counts, check_env
 from jaxrl_vis.cli.figure import UNFINISHED
-from jaxrl_vis.cli.parsing import ChangesOf, SayDefault
-from jaxrl_vis.cli.train import default_of, default_preset
+from jaxrl_vis.cli.parsing import DefaultText, FieldsOf
+from jaxrl_vis.cli.train import default_preset, describe_default
 from jaxrl_vis.config import PRESETS, Config
 from jaxrl_vis.devices import guess_accelerator
 from jaxrl_vis.errors import RequestError, nearest
@@ -20,36 +20,35 @@ from jaxrl_vis.report.outputs import check_writable
 
 @dataclasses.dataclass(frozen=True)
 class Sweep:
-    """Train several tasks with several methods and seeds, one run a device or one a job of a cluster, and print a table.
+    """Train several tasks with several methods and seeds, one run per device or per cluster job, and print a table.
 
-    It may be interrupted and started again at any time: finished runs stay as they are, and those that were begun are resumed.
-    The exit status is 3 where something is still missing.
+    It may be interrupted and started again at any time: finished runs are kept, and unfinished ones are resumed. The exit
+    status is 3 if something is still missing.
     """
 
     env: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """The environments; VisualFetchReach if none is given."""
+    """Environments; VisualFetchReach if not given."""
     method: tuple[MethodName, ...] = ()
-    """The methods; oracle if not given."""
-    preset: Annotated[str, SayDefault(default_preset)] = "auto"
+    """Methods; oracle if not given."""
+    preset: Annotated[str, DefaultText(default_preset)] = "auto"
     """paper, fast, cpu or debug; auto is fast on an accelerator, else cpu."""
-    changes: Annotated[Mapping[str, Any], ChangesOf(Config, default_of)] = dataclasses.field(default_factory=dict)
+    changes: Annotated[Mapping[str, Any], FieldsOf(Config, describe_default)] = dataclasses.field(default_factory=dict)
     seeds_per_run: int | None = None
-    """At most so many seeds in one program, to spread them over more devices; all of them if not given."""
+    """Largest number of seeds in one program, to spread them over more devices; all of them if not given."""
     runs: Path | None = None
     """Folder of all run folders and logs; runs/sweep if not given."""
     minutes: float | None = None
-    """Stop after so long: runs are saved, and the next start goes on."""
+    """Time limit in minutes: runs are saved, and the next start resumes."""
     executor: Literal["local", "slurm"] | None = None
-    """Start each run as a job, with submitit: on Slurm, or on this machine in the same way. Processes, one a device, if not
-    given."""
+    """Start each run as a job of submitit, on Slurm or likewise on this machine. Processes, one per device, if not given."""
     jobs: int = 64
-    """At most so many jobs at a time (--executor slurm)."""
+    """Largest number of simultaneous jobs (--executor slurm)."""
     job_options: tuple[str, ...] = ()
     """Parameters of submitit's executor as name=value, such as timeout_min=600 slurm_partition=gpu cpus_per_task=8."""
 
 
 def run(options: Sweep) -> int:
-    """Runs a sweep; `UNFINISHED` where a run of it is not finished."""
+    """Runs a sweep; returns `UNFINISHED` if a run of it is not finished."""
     name = options.preset
     if name not in ("auto", *PRESETS):
         raise RequestError(f"unknown preset {name!r}{nearest(name, ['auto', *PRESETS])}")
@@ -65,7 +64,7 @@ def run(options: Sweep) -> int:
         check_env(task, options.changes.get("env_folder"))
     runs = options.runs or Path("runs") / "sweep"
     check_writable(runs, "--runs", folder=True)
-    # Nothing below starts JAX in this process: the accelerator's memory belongs to the runs.
+    # Nothing below initialises JAX in this process: the accelerator's memory is for the runs.
     from jaxrl_vis.studies.sweep import Request, run_sweep
 
     request = Request(

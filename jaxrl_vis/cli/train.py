@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 from jaxrl_vis import processes
 from jaxrl_vis.cli.checks import check_counts, check_env, may_run_code
-from jaxrl_vis.cli.parsing import ByPlaceToo, ChangesOf, SayDefault
+from jaxrl_vis.cli.parsing import AlsoPositional, DefaultText, FieldsOf
 from jaxrl_vis.config import PRESETS, Config, preset
 from jaxrl_vis.devices import check_devices, claim_memory, count_devices, guess_accelerator, start_devices
 from jaxrl_vis.errors import RequestError, nearest
@@ -19,24 +19,25 @@ from jaxrl_vis.run.loggers import LoggerName
 from jaxrl_vis.validation import validate
 
 
-def default_of(name: str) -> str:
-    """What the presets say about a field: what ``auto`` takes on this machine, and after it those that differ from that."""
-    here = _auto(guess_accelerator())
-    values = {each: getattr(config, name) for each, config in PRESETS.items()}
+def describe_default(name: str) -> str:
+    """Describes a field's default: its value in this machine's ``auto`` preset, and the presets with other values."""
+    current = _auto(guess_accelerator())
+    values = {preset_name: getattr(config, name) for preset_name, config in PRESETS.items()}
     words = {
-        each: " ".join(map(str, value)) or "none" if isinstance(value, tuple) else str(value) for each, value in values.items()
+        preset_name: " ".join(map(str, value)) or "none" if isinstance(value, tuple) else str(value)
+        for preset_name, value in values.items()
     }
-    others = ", ".join(f"{each} {word}" for each, word in words.items() if word != words[here])
-    return f"default: {words[here]}" + (f"; {others}" if others else "")
+    others = ", ".join(f"{preset_name} {word}" for preset_name, word in words.items() if word != words[current])
+    return f"default: {words[current]}" + (f"; {others}" if others else "")
 
 
 def _auto(on_accelerator: bool) -> str:
-    """The preset that suits the hardware."""
+    """Returns the preset for the hardware."""
     return "fast" if on_accelerator else "cpu"
 
 
 def default_preset() -> str:
-    """What the help says about ``--preset``."""
+    """Describes the default of ``--preset`` for the help."""
     return f"default: auto, which is {_auto(guess_accelerator())} on this machine; its values are the defaults shown below"
 
 
@@ -44,39 +45,39 @@ def default_preset() -> str:
 class Train:
     """Train on an environment. Options that are not given come from the preset, or with --resume from the run."""
 
-    env: Annotated[str | None, ByPlaceToo()] = None
-    """The environment; `jaxrl-vis envs` lists them, and module:Name is one of your own. VisualFetchReach if not given."""
-    preset: Annotated[str, SayDefault(default_preset)] = "auto"
-    """paper, fast, cpu or debug, which may have settings of their own for a task (docs/configuration.md); auto is fast on an
-    accelerator, else cpu."""
-    changes: Annotated[Mapping[str, Any], ChangesOf(Config, default_of)] = dataclasses.field(default_factory=dict)
+    env: Annotated[str | None, AlsoPositional()] = None
+    """Environment: a name that `jaxrl-vis envs` lists, or module:Name for your own. VisualFetchReach if not given."""
+    preset: Annotated[str, DefaultText(default_preset)] = "auto"
+    """paper, fast, cpu or debug, some with task-specific values (docs/configuration.md); auto is fast on an accelerator, else
+    cpu."""
+    changes: Annotated[Mapping[str, Any], FieldsOf(Config, describe_default)] = dataclasses.field(default_factory=dict)
     devices: str | None = None
-    """How many devices to use, or all (docs/scaling.md). Several seeds are divided among them; of one seed, each batch and the
+    """Number of devices, or all (docs/scaling.md). Multiple seeds are spread over them; with a single seed, its batches and
     environments are. One if not given."""
     run_dir: Path | None = None
     """Folder for metrics, images and checkpoints; a new one under runs/ if not given."""
     resume: bool = False
-    """Continue from the newest checkpoint in the run folder, which must be there."""
+    """Continue from the newest checkpoint in an existing run folder."""
     overwrite: bool = False
-    """Start afresh in a run folder that exists."""
+    """Start afresh in an existing run folder."""
     coordinator: str | None = None
-    """Where several processes that train as one find the first of them, as HOST:PORT; not needed under srun and mpirun."""
+    """Address of the first of several processes that train together, as HOST:PORT; not needed under srun and mpirun."""
     num_processes: int | None = None
-    """How many such processes there are."""
+    """Number of these processes."""
     process_id: int | None = None
-    """Which of them this is, from 0; the first writes metrics and images."""
+    """Index of this process, from 0; the first one writes metrics and images."""
     start_timeout: int = processes.START_S
-    """How long they wait for each other at the start, s."""
+    """Time that they wait for each other at the start, s."""
     trust: bool = False
-    """With --resume: run the run's own code without a question, where its task is module:Name and somebody else began it."""
+    """With --resume: execute the run's own code without asking, if its task is module:Name and was started by somebody else."""
     log: tuple[LoggerName, ...] = ()
-    """Show the run in TensorBoard or in Weights & Biases, too; those of the run if not given with --resume."""
+    """Also log to TensorBoard or Weights & Biases; with --resume, the run's own loggers if not given."""
 
 
 def training_config(options: Train) -> Config:
-    """The configuration that a command asks for: what it gives, and the rest from a saved run or a preset.
+    """Builds the requested configuration: the given options, and the rest from a saved run or a preset.
 
-    Where neither says what the rest is, the hardware does, which imports JAX.
+    If neither is named, the preset depends on the hardware, which requires importing JAX.
 
     Raises:
         RequestError: There is no such preset, or the saved run cannot be read.
@@ -97,21 +98,21 @@ def training_config(options: Train) -> Config:
 
         from jaxrl_vis.run.signals import shielded_children
 
-        with shielded_children():  # threads that JAX starts with its first use of a device never see signals
+        with shielded_children():  # so that threads started by JAX never receive signals
             start_devices()
-            importlib.import_module("jaxrl_vis.run.trainer")  # will be needed, and takes as long
+            importlib.import_module("jaxrl_vis.run.trainer")  # needed later, and takes as long
             check_devices()
             name = _auto(jax.default_backend() != "cpu")
     return preset(name, **changes)
 
 
 def run(options: Train) -> int:
-    """Trains; every report has already been shown and saved by the trainer."""
+    """Trains; reports are shown and saved by the trainer."""
     check_counts(start_timeout=options.start_timeout)
     claim_memory()
-    place = processes.find_place(options.coordinator, options.num_processes, options.process_id)
-    if place is not None:
-        processes.start(place, options.start_timeout)
+    rank = processes.find_rank(options.coordinator, options.num_processes, options.process_id)
+    if rank is not None:
+        processes.start(rank, options.start_timeout)
         options = dataclasses.replace(options, devices=options.devices or "all")
     if options.resume and options.overwrite:
         raise RequestError("--resume and --overwrite contradict each other; give one of them")
@@ -124,12 +125,12 @@ def run(options: Train) -> int:
     run_dir = options.run_dir or default_folder(config)
     check_there(run_dir, options.resume)
     if options.resume and options.env is None and "env_folder" not in options.changes and (run_dir / "config.json").exists():
-        may_run_code(run_dir, options.trust)  # its user named neither the task nor where it lies: the run does
+        may_run_code(run_dir, options.trust)  # the task and its folder are named only by the run
     check_env(config.env, config.env_folder)
     from jaxrl_vis.run import trainer
 
     check_writable(run_dir, "--run-dir", folder=True)
-    made = trainer.make_trainer(
+    run_trainer = trainer.make_trainer(
         config,
         options.run_dir,
         resume=options.resume,
@@ -137,6 +138,6 @@ def run(options: Train) -> int:
         log=options.log or None,
         keep_programs=True,
     )
-    for _ in made.run():
+    for _ in run_trainer.run():
         pass
     return 0

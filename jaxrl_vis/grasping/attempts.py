@@ -29,7 +29,7 @@ from jaxrl_vis.grasping.reach import ReachResult, Sight, reach
 from jaxrl_vis.grasping.stitch import Motion
 from jaxrl_vis.run.policy import Policy
 from jaxrl_vis_envs.plants import Plot
-from jaxrl_vis_envs.plants.stand import MAST_DISTANCE, STALKS, Stands, concatenated, origin_of, stand_of_lines, stands_at
+from jaxrl_vis_envs.plants.stand import MAST_DISTANCE, STALKS, Stands, concatenated, stand_of_lines, stand_origin, stands_at
 
 Loop = Literal["open", "again", "policy"]
 
@@ -88,7 +88,7 @@ def plan(scene: Scene, perception: Perception, number: int, for_policy: bool = F
     places = np.array([[stalk.at_height(target[2])[0][:2] for stalk in plot.measured] for target in targets])
     places = places.reshape(len(targets), len(plot.measured), 2)
     stalks = match(targets[:, :2], places, RADIUS)
-    origins = np.array([origin_of(pose.position[0]) for pose in poses])
+    origins = np.array([stand_origin(pose.position[0]) for pose in poses])
     standing = _standing(plot, origins, number)
     known = {each.stalk for each in standing}
     kept = [

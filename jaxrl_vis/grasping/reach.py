@@ -118,7 +118,7 @@ class Arms(NamedTuple):
 def arms_among(stalks: int) -> Arms:
     """The model of an arm among so many stalks."""
     mj_model = stalk_arm.build(stalks)
-    layout = bending.layout_of(mj_model)
+    layout = bending.read_layout(mj_model)
     rest = mjx_model.still_data(mj_model)
     model = mjx_model.put_model(mj_model)
     geoms = np.asarray(jax.jit(mjx.collision)(model, rest)._impl.contact.geom)

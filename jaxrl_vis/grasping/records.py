@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxrl_vis.evaluation_pool import Kept, Record
+from jaxrl_vis.evaluation_pool import Record, RecordFile
 from jaxrl_vis.grasping.attempts import Loop, Plan, carry_out, plan
 from jaxrl_vis.grasping.evaluate import MaskScore, RunScore, draw_scene, score_scene, summary
 from jaxrl_vis.grasping.masks.painter import Painter, read_weights
@@ -118,7 +118,7 @@ class Reaches:
         return "plan_for_policy" if self.for_policy else "plan"
 
 
-def reach_all(kept: Kept, numbers: Iterable[int], reaches: Reaches) -> None:
+def reach_all(kept: RecordFile, numbers: Iterable[int], reaches: Reaches) -> None:
     """Sends the arm to all targets of the runs that were not carried out in this way yet, and keeps what came of it.
 
     Args:

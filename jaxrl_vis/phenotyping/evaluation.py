@@ -1,6 +1,6 @@
 """An evaluation of many plots, as `evaluation_pool` goes through them: what is done with one, and what is kept of it.
 
-    Task, seed -> evaluate_plot -> record -> `Kept`: the file, written after each plot -> scores_of -> summary
+    Task, seed -> evaluate_plot -> record -> `RecordFile`: the file, written after each plot -> scores_of -> summary
 
 A score is rounded when it is made, so that what the file keeps is what was scored. Which process scores a plot does not matter.
 """
@@ -18,7 +18,7 @@ import numpy as np
 import jaxrl_vis
 import jaxrl_vis.phenotyping
 import jaxrl_vis_envs.plants
-from jaxrl_vis.evaluation_pool import Record, code_of
+from jaxrl_vis.evaluation_pool import Record, code_digest
 from jaxrl_vis.phenotyping.evaluate import PlotScore, ThesisScore, score_plot, summary
 from jaxrl_vis.phenotyping.measure import Method
 from jaxrl_vis.provenance import device_name, revision
@@ -96,7 +96,7 @@ def conditions(task: Task) -> dict[str, Any]:
         "schema": SCHEMA,
         "version": jaxrl_vis.__version__,
         # What trains networks and draws figures changes no score.
-        "code": code_of(jaxrl_vis_envs.plants, jaxrl_vis.phenotyping, leave_out=("training", "figures.py")),
+        "code": code_digest(jaxrl_vis_envs.plants, jaxrl_vis.phenotyping, leave_out=("training", "figures.py")),
         "platform": jax.default_backend(),
         "family_digest": hashlib.sha256(json.dumps(dataclasses.asdict(task.family), sort_keys=True).encode()).hexdigest()[:12],
         "weights": None if task.weights is None else fingerprint(task.weights),

@@ -19,7 +19,7 @@ from typing import Any
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.files import write_atomically
 from jaxrl_vis.phenotyping.names import check_length, readable
-from jaxrl_vis.spreadsheets import text_of
+from jaxrl_vis.spreadsheets import unescape_cell
 from jaxrl_vis_envs.documents import read_json, read_text
 
 _IMAGES = {".png", ".jpg", ".jpeg", ".tif", ".tiff"}
@@ -230,7 +230,7 @@ def read_odometry(plot: PlotFolder, speed: float | None = None) -> dict[str, flo
                 raise ValueError
             count += 1
             if named is not None:
-                name = re.split(r"[/\\]", text_of(row[named].strip()) if named < len(row) else "")[-1]
+                name = re.split(r"[/\\]", unescape_cell(row[named].strip()) if named < len(row) else "")[-1]
                 if name in wanted:
                     driven[wanted[name]] = value
             elif count <= len(plot.pairs):
@@ -280,7 +280,7 @@ def _read_table(path: Path) -> tuple[list[str], Iterator[list[str]]]:
     try:
         # Spreadsheets write a mark of the byte order before the first column's name.
         reader = csv.reader(io.StringIO(read_text(path, _MOST_ODOMETRY), newline=""), skipinitialspace=True)
-        return [text_of(name.strip()) for name in next(reader, [])], (row for row in reader if row)
+        return [unescape_cell(name.strip()) for name in next(reader, [])], (row for row in reader if row)
     except OSError as error:
         raise RequestError(f"cannot read {path}: {error.strerror or error}") from error
     except (csv.Error, ValueError) as error:

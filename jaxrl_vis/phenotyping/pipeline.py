@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 import jaxrl_vis
-from jaxrl_vis.evaluation_pool import Each, processes
+from jaxrl_vis.evaluation_pool import UnorderedMap, worker_pool
 from jaxrl_vis.files import write_atomically
 from jaxrl_vis.phenotyping.detector.finder import Detection
 from jaxrl_vis.phenotyping.direction import follow_either_way
@@ -107,7 +107,7 @@ def run(
         f"jaxrl-vis {jaxrl_vis.__version__}; finds by {request.finder}; widths by the method {request.method}.",
         "Tables: stalks.csv, plots.csv and skipped.csv; all pairs: overlays/.",
     ]
-    with processes(workers) as each, Page(about, request.out / "overlays", len(plots)) as page:
+    with worker_pool(workers) as each, Page(about, request.out / "overlays", len(plots)) as page:
         return _run(plots, find, request, driven, page, done, say, each)
 
 
@@ -119,7 +119,7 @@ def _run(
     page: Page,
     done: Callable[[str, int, int], None],
     say: Callable[[str, str], None],
-    each: Each,
+    each: UnorderedMap,
 ) -> tuple[list[Row], list[Row]]:
     """Plot by plot; see `run`."""
     stalks: list[Row] = []
@@ -216,7 +216,7 @@ def _record(plot: PlotFolder, find: Find, request: Request, pair: PairFiles) -> 
 
 
 def _finish(
-    plot: PlotFolder, records: list[dict[str, Any]], driven: dict[str, float] | None, request: Request, each: Each
+    plot: PlotFolder, records: list[dict[str, Any]], driven: dict[str, float] | None, request: Request, each: UnorderedMap
 ) -> PlotResult:
     """Follows the stalks of a plot, and draws its overlays."""
     usable = [(pair, record) for pair, record in zip(plot.pairs, records) if "sightings" in record]
@@ -244,7 +244,7 @@ def _finish(
 
 
 def _draw_overlays(
-    plot: str, folder: Path, usable: list[tuple[PairFiles, dict[str, Any]]], labels: list[list[str | None]], each: Each
+    plot: str, folder: Path, usable: list[tuple[PairFiles, dict[str, Any]]], labels: list[list[str | None]], each: UnorderedMap
 ) -> None:
     """Writes the overlays of a plot that are missing or show something else."""
     folder.mkdir(parents=True, exist_ok=True)

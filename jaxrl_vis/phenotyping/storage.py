@@ -11,7 +11,7 @@ from xml.etree.ElementTree import Element
 
 import yaml
 
-from jaxrl_vis_envs.documents import MOST_LEVELS, parse_json, parse_xml
+from jaxrl_vis_envs.documents import MAX_DEPTH, parse_json, parse_xml
 
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
@@ -82,8 +82,8 @@ def _yaml(text: str) -> Any:
                 put(value)
                 open_nodes.append(value)
                 keys.append(None)
-                if len(open_nodes) > MOST_LEVELS:
-                    raise ValueError(f"nested more than {MOST_LEVELS} levels deep")
+                if len(open_nodes) > MAX_DEPTH:
+                    raise ValueError(f"nested more than {MAX_DEPTH} levels deep")
             elif isinstance(event, yaml.CollectionEndEvent):
                 open_nodes.pop()
                 keys.pop()

@@ -1,4 +1,4 @@
-"""What auxiliary tasks predict while a policy plays, beside what they should have.
+"""Video of a policy's episodes with predictions of its auxiliary tasks and their targets.
 
 observation  goal  reconstruction  flow, true and predicted  the observation rotated, with its angle, true and predicted
 """
@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from jaxrl_vis.report import videos
 
-_SIZE = 192  # px, about, of a tile
+_SIZE = 192  # approximate size of a tile, px
 _CAPTION = 22
 
 Tile = tuple[str, np.ndarray]
@@ -21,15 +21,15 @@ Tile = tuple[str, np.ndarray]
 
 @dataclasses.dataclass(frozen=True)
 class Predictions:
-    """What was predicted for each step of K episodes; None what the run has no task for.
+    """Predictions and targets for each step of K episodes; None if the run does not have the task.
 
     Attributes:
         reconstruction: [K, T, C or 1, H, W] uint8, of the observation before the action.
-        flow: [K, T, H, W] float32, strength of the optical flow, in pixels a step; in [0, 1] where each mask is stretched.
-        flow_predicted: The same as predicted; borders that do not fill a block of the encoder may be missing.
-        rotated: [K, T, C, H, W] uint8, the observation rotated.
-        angle: [K, T] float32, by how many degrees, counter-clockwise.
-        angle_predicted: The same as predicted.
+        flow: [K, T, H, W] float32, magnitude of the optical flow, in pixels per step; in [0, 1] if masks are rescaled.
+        flow_predicted: The prediction of ``flow``; borders that do not fill a block of the encoder may be missing.
+        rotated: [K, T, C, H, W] uint8, the rotated observation.
+        angle: [K, T] float32, its rotation, degrees counter-clockwise.
+        angle_predicted: The prediction of ``angle``.
     """
 
     reconstruction: np.ndarray | None = None
@@ -43,15 +43,15 @@ class Predictions:
 def draw_frames(
     episodes: videos.EpisodeImages, predictions: Predictions, frame_seconds: float
 ) -> tuple[list[Image.Image], list[float]]:
-    """All frames of the video, and how long each is shown, in seconds; borders are as in `videos.draw_frames`.
+    """Draws all frames of the video; returns them with their durations in seconds. Borders are as in `videos.draw_frames`.
 
     Args:
         episodes: T+1 images of each of K episodes, and their goals; success at the last step.
-        predictions: For the first T of them.
-        frame_seconds: How long a frame is shown, s.
+        predictions: Predictions for the first T images.
+        frame_seconds: Duration of a frame, s.
     """
     depth_range = videos.range_of_depth(episodes)
-    fastest = 1.0 if predictions.flow is None else max(1e-3, float(np.percentile(predictions.flow, 99.8)))
+    max_flow = 1.0 if predictions.flow is None else max(1e-3, float(np.percentile(predictions.flow, 99.8)))
     images, seconds = [], []
     count, steps = len(episodes.frames), episodes.frames.shape[1] - 1
     for episode in range(count):
@@ -60,7 +60,7 @@ def draw_frames(
             success = bool(np.asarray(episodes.success[episode]).ravel()[-1])
             colour = videos.PLAIN if not is_last else videos.REACHED if success else videos.MISSED
             verdict = "" if not is_last else "goal reached" if success else "missed"
-            columns = _columns(episodes, predictions, episode, t, depth_range, fastest)
+            columns = _columns(episodes, predictions, episode, t, depth_range, max_flow)
             footer = (f"episode {episode + 1} of {count}   step {t} of {steps}", verdict)
             images.append(_compose(columns, footer, colour))
             seconds.append(videos.HOLD if is_last else frame_seconds)
@@ -73,40 +73,40 @@ def _columns(
     episode: int,
     t: int,
     depth_range: tuple[float, float],
-    fastest: float,
+    max_flow: float,
 ) -> list[list[Tile]]:
-    """Columns of tiles; all images of an observation, colour and depth, stand below each other."""
+    """Arranges tiles in columns; colour and depth of an observation are stacked in one column."""
 
-    def of_image(caption: str, image: np.ndarray) -> list[Tile]:
-        rows = [image for _, image in videos.rows_of(image, depth_range)]
-        return [(caption if place == 0 else "", row) for place, row in enumerate(rows)]
+    def image_tiles(caption: str, image: np.ndarray) -> list[Tile]:
+        rows = [image for _, image in videos.image_rows(image, depth_range)]
+        return [(caption if index == 0 else "", row) for index, row in enumerate(rows)]
 
-    columns = [of_image("observation", episodes.frames[episode, t]), of_image("goal", episodes.goals[episode])]
+    columns = [image_tiles("observation", episodes.frames[episode, t]), image_tiles("goal", episodes.goals[episode])]
     height = len(columns[0])
     if predictions.reconstruction is not None:
         image = predictions.reconstruction[episode, t]
         is_grey = image.shape[0] == 1 and episodes.frames.shape[2] != 1
         grey = [("reconstruction, grey", np.repeat(image[0][..., None], 3, axis=-1))]
-        columns.append(grey if is_grey else of_image("reconstruction", image))
+        columns.append(grey if is_grey else image_tiles("reconstruction", image))
     if predictions.flow is not None and predictions.flow_predicted is not None:
         tiles = [
-            (f"optical flow, up to {fastest:.1f}", _heat(predictions.flow[episode, t], fastest)),
-            ("predicted flow", _heat(predictions.flow_predicted[episode, t], fastest)),
+            (f"optical flow, up to {max_flow:.1f}", _heat(predictions.flow[episode, t], max_flow)),
+            ("predicted flow", _heat(predictions.flow_predicted[episode, t], max_flow)),
         ]
         columns += [tiles] if height > 1 else [[tile] for tile in tiles]
     if predictions.rotated is not None and predictions.angle is not None and predictions.angle_predicted is not None:
         angle, guess = predictions.angle[episode, t], predictions.angle_predicted[episode, t]
-        columns.append(of_image(f"rotated {angle:+.0f}°, guess {guess:+.0f}°", predictions.rotated[episode, t]))
+        columns.append(image_tiles(f"rotated {angle:+.0f}°, guess {guess:+.0f}°", predictions.rotated[episode, t]))
     return columns
 
 
-def _heat(values: np.ndarray, most: float) -> np.ndarray:
-    share = np.clip(values / most, 0.0, 1.0)
+def _heat(values: np.ndarray, maximum: float) -> np.ndarray:
+    share = np.clip(values / maximum, 0.0, 1.0)
     return (matplotlib.colormaps["viridis"](share)[..., :3] * 255).round().astype(np.uint8)
 
 
 def _compose(columns: Sequence[Sequence[Tile]], footer: tuple[str, str], colour: tuple[int, int, int]) -> Image.Image:
-    """One frame of the video; ``colour`` is that of the observation's border."""
+    """Composes one frame of the video; ``colour`` is that of the observation's border."""
     whole = columns[0][0][1].shape[:2]
     width, height = videos.enlarge(columns[0][0][1], _SIZE).size
     cell = (width + 2 * videos.BORDER + videos.GAP, height + 2 * videos.BORDER + _CAPTION)
@@ -121,7 +121,7 @@ def _compose(columns: Sequence[Sequence[Tile]], footer: tuple[str, str], colour:
             border = colour if column == 0 else videos.PLAIN
             right, bottom = x + width + 2 * videos.BORDER - 1, y + _CAPTION + height + 2 * videos.BORDER - 1
             draw.rectangle((x, y + _CAPTION, right, bottom), fill=border)
-            # What does not fill a block of the encoder is not predicted: those borders stay as they are.
+            # Borders that do not fill a block of the encoder are not predicted, and left empty.
             size = (width * image.shape[1] // whole[1], height * image.shape[0] // whole[0])
             shown = Image.fromarray(image).resize(size, Image.Resampling.NEAREST)
             canvas.paste(shown, (x + videos.BORDER, y + _CAPTION + videos.BORDER))

@@ -1,17 +1,17 @@
-"""Colours for what has none: depth and geom ids, in the video and in the gallery.
+"""Colour maps for depth and geom ids, in videos and in the gallery.
 
-Matplotlib is imported where it is used: a run imports this module before it knows that it will draw.
+Matplotlib is imported lazily: a run imports this module before it knows whether it will draw.
 """
 
 import numpy as np
 
 
 def depth_colours(depth: np.ndarray, near: float, far: float) -> np.ndarray:
-    """Depth in colours whose steps look equally large; near is bright.
+    """Maps depth to perceptually uniform colours; near is bright.
 
     Args:
         depth: [H, W], in any unit: metres, or the grey levels of an observation.
-        near, far: What the brightest and the darkest colour stand for, in the same unit; beyond them colours stay the same.
+        near, far: Depths of the brightest and the darkest colour, in the same unit; depths beyond are clipped.
 
     Returns:
         [H, W, 3] uint8.
@@ -23,12 +23,12 @@ def depth_colours(depth: np.ndarray, near: float, far: float) -> np.ndarray:
 
 
 def label_colours(labels: np.ndarray, geoms: int, sky: tuple[int, int, int]) -> np.ndarray:
-    """Geom ids in colours that differ between neighbours: hues are steps of the golden ratio.
+    """Maps geom ids to colours that differ between neighbours: hues are multiples of the golden ratio.
 
     Args:
         labels: [H, W] int; ids below 0 and from ``geoms`` on are sky.
-        geoms: How many there are.
-        sky: Its colour.
+        geoms: Number of geoms.
+        sky: Colour of the sky.
 
     Returns:
         [H, W, 3] uint8.

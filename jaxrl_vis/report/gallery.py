@@ -1,8 +1,8 @@
-"""What `jaxrl-vis envs` shows: a table of the environments, and a sheet of images with one row for each environment.
+"""Table of the environments, and gallery with one row of images per environment, for `jaxrl-vis envs`.
 
     start: colours, depth, geoms | a goal: colours, depth, geoms | more goals: colours
 
-The table compiles nothing. A row of the sheet compiles two programs: one samples poses, one renders them all.
+The table compiles nothing. A row of the gallery compiles two programs: one samples poses, one renders them all.
 """
 
 import io
@@ -35,9 +35,10 @@ _SKY = (255, 255, 255)
 
 
 def print_table(names: Sequence[str] | None = None) -> None:
-    """One row for each of the environments ``names`` (default: all), from their definitions; nothing is compiled.
+    """Prints one row per environment in ``names`` (default: all), from their definitions; nothing is compiled.
 
-    Of all environments, those of installed packages that cannot be made are named below the table, each with its fault.
+    If ``names`` is None, environments of installed packages that cannot be created are listed below the table with their
+    errors.
 
     Raises:
         RequestError: One of ``names`` cannot be made.
@@ -45,7 +46,7 @@ def print_table(names: Sequence[str] | None = None) -> None:
     table = Table(title="Environments", caption=_LEGEND, caption_justify="left")
     for column in _COLUMNS:
         table.add_column(column, no_wrap=True)
-    environments, faults = _make_each(names)
+    environments, faults = _make_all(names)
     for name, env in environments.items():
         spec = env.observation_spec
         table.add_row(
@@ -60,23 +61,23 @@ def print_table(names: Sequence[str] | None = None) -> None:
             "-" if env.difficulty is None else f"{env.difficulty:.1f}",
         )
     console = Console()
-    # A pipe gets whole lines, a terminal lines of its own width.
+    # A pipe gets full lines, a terminal lines of its own width.
     (console if console.is_terminal else Console(width=160)).print(table)
     for name, fault in faults.items():
         print(f"{name} cannot be used: {fault}")
 
 
-def _make_each(names: Sequence[str] | None) -> tuple[dict[str, Any], dict[str, str]]:
-    """The environments ``names``; or all, and what is wrong with those that cannot be made though nobody asked for them.
+def _make_all(names: Sequence[str] | None) -> tuple[dict[str, Any], dict[str, str]]:
+    """Creates the environments ``names``; or all, with errors of those that cannot be created.
 
     Raises:
-        RequestError: One of ``names`` cannot be made.
+        RequestError: One of ``names`` cannot be created.
     """
     environments, faults = {}, {}
     for name in jaxrl_vis_envs.list_envs() if names is None else names:
         try:
             environments[name] = jaxrl_vis_envs.make(name)
-            environments[name].observation_spec  # noqa: B018 - traces somebody's code, which may raise anything
+            environments[name].observation_spec  # noqa: B018 - traces third-party code, which may raise anything
         except Exception as error:
             if registry.is_built_in(name):
                 raise
@@ -89,7 +90,7 @@ def _make_each(names: Sequence[str] | None) -> tuple[dict[str, Any], dict[str, s
 
 
 class _Poses(NamedTuple):
-    """What the renderer reads of `mjx.Data`, [K, ...]."""
+    """Fields of `mjx.Data` that the renderer reads, [K, ...]."""
 
     geom_xpos: jax.Array
     geom_xmat: jax.Array
@@ -101,8 +102,8 @@ class _Poses(NamedTuple):
 
 
 def image_environments() -> list[str]:
-    """Names of the environments that show the agent images, and can be drawn."""
-    return [name for name, env in _make_each(None)[0].items() if _sees_images(env) and _can_be_drawn(env)]
+    """Returns the names of the environments that have image observations and can be drawn."""
+    return [name for name, env in _make_all(None)[0].items() if _sees_images(env) and _can_be_drawn(env)]
 
 
 def _sees_images(env: Any) -> bool:
@@ -114,8 +115,8 @@ def _can_be_drawn(env: Any) -> bool:
     return all(hasattr(env, name) for name in needed) and hasattr(env.config, "depth_range")
 
 
-def frames_of(env: Any, key: jax.Array, goals: int, size: int) -> Frame:
-    """The start of an episode and ``goals`` goals as the environment's camera sees them: [1 + goals, ...] NumPy arrays.
+def render_poses(env: Any, key: jax.Array, goals: int, size: int) -> Frame:
+    """Renders the start of an episode and ``goals`` goals with the environment's camera: [1 + goals, ...] NumPy arrays.
 
     Args:
         env: An environment with a camera (`MjxGoalEnv`).
@@ -130,28 +131,28 @@ def frames_of(env: Any, key: jax.Array, goals: int, size: int) -> Frame:
         return _Poses(*(jnp.concatenate([getattr(data, name) for data in both]) for name in _Poses._fields))
 
     scene = Scene.from_mjmodel(env.mj_model, env.camera, size, size)
-    # A loop over one image compiles sooner than a batch, and a few images take no time.
+    # A loop over single images compiles faster than a batch, and a few images render quickly.
     draw = env_jit(lambda poses: jax.lax.map(lambda one: render(scene, one), poses))
     return jax.tree.map(np.asarray, draw(env_jit(sample)(keys)))
 
 
 def check_gallery(path: Path, names: Sequence[str] | None = None) -> Sequence[str]:
-    """Checks that a gallery can be drawn. Call it before spending a minute on drawing.
+    """Checks that a gallery can be drawn. Call it before the drawing, which takes a minute.
 
     Returns:
-        The environments that it shows.
+        The environments to be drawn.
 
     Raises:
-        RequestError: The file cannot be written, its ending names no format, or an environment shows no images.
+        RequestError: The file cannot be written, its suffix is not an image format, or an environment has no images.
     """
-    try:  # Pillow knows endings of formats that it only reads, or that have no colours
+    try:  # Pillow registers suffixes of formats that it only reads, or that have no colours
         Image.new("RGB", (1, 1)).save(io.BytesIO(), Image.registered_extensions()[path.suffix.lower()])
     except (KeyError, OSError, ValueError) as error:
         raise RequestError(f"cannot write {path}: end its name in .png or .jpg") from error
     check_writable(path)
     if names is None:
         return image_environments()
-    for name, env in _make_each(names)[0].items():
+    for name, env in _make_all(names)[0].items():
         if not _sees_images(env):
             visual = registry.visual_variant(name)
             raise RequestError(f"{name} shows no images" + (f"; {visual} does" if visual else ""))
@@ -161,13 +162,13 @@ def check_gallery(path: Path, names: Sequence[str] | None = None) -> Sequence[st
 
 
 def draw(path: Path, names: Sequence[str] | None = None, image_size: int = 128, goals: int = 4) -> None:
-    """Writes the sheet.
+    """Writes the gallery.
 
     Args:
-        path: The file; its ending names the format.
-        names: Environments that show images; default: all.
+        path: The file; its suffix determines the format.
+        names: Environments with images; default: all.
         image_size: Height and width of an image, pixels.
-        goals: Goals of each environment.
+        goals: Number of goals per environment.
 
     Raises:
         RequestError: See `check_gallery`.
@@ -176,13 +177,13 @@ def draw(path: Path, names: Sequence[str] | None = None, image_size: int = 128, 
     rows = []
     for name in names:
         env: Any = jaxrl_vis_envs.make(name)
-        rows.append(_row(env, frames_of(env, jax.random.key(1), goals, image_size)))
+        rows.append(_row(env, render_poses(env, jax.random.key(1), goals, image_size)))
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(np.concatenate(rows)).save(path)
 
 
 def _row(env: Any, frames: Frame) -> np.ndarray:
-    """The strip of one environment: [H, W, 3] uint8."""
+    """Draws the row of one environment: [H, W, 3] uint8."""
     geoms, groups = env.mj_model.ngeom, []
     for index, title in ((0, "start"), (1, "goal")):
         depth = depth_colours(np.asarray(frames.depth[index]), *env.config.depth_range)

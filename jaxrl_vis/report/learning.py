@@ -1,17 +1,17 @@
-"""What learning curves say. "X by N steps": the evaluation at N and the next two all reach X, in the median over seeds."""
+"""Evaluation of learning curves. "X by N steps": the evaluation at N and the next two all reach X, in the median over seeds."""
 
 import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-CONFIRMATIONS = 2  # evaluations after the first that must reach a value, too
+CONFIRMATIONS = 2  # further evaluations that must reach a value
 
 
 def curve(rows: Sequence[Mapping[str, Any]], metric: str) -> list[tuple[int, float]]:
-    """The median over seeds of a metric against environment steps, at the steps where every seed was evaluated.
+    """Computes the median over seeds of a metric against environment steps, at the steps where every seed was evaluated.
 
     Args:
-        rows: Of metrics.jsonl, from one run or several. No seed may appear twice at the same step.
+        rows: Rows of metrics.jsonl, from one run or several. No seed may appear twice at the same step.
         metric: A column, such as ``eval/success``.
 
     Raises:
@@ -23,16 +23,16 @@ def curve(rows: Sequence[Mapping[str, Any]], metric: str) -> list[tuple[int, flo
         if row["seed"] in values.setdefault(row["env_steps"], {}):
             raise ValueError(f"seed {row['seed']} appears twice at {row['env_steps']} steps: are these different runs?")
         values[row["env_steps"]][row["seed"]] = row[metric]
-    return [(steps, statistics.median(found.values())) for steps, found in sorted(values.items()) if set(found) == seeds]
+    return [(steps, statistics.median(by_seed.values())) for steps, by_seed in sorted(values.items()) if set(by_seed) == seeds]
 
 
 def steps_to(points: Sequence[tuple[int, float]], target: float, least: bool = False) -> int | None:
-    """The first step from which on this evaluation and the next `CONFIRMATIONS` all reach ``target``; None for never.
+    """Returns the first step whose evaluation and the next `CONFIRMATIONS` all reach ``target``; None if there is none.
 
     Args:
         points: From `curve`.
-        target: What is to be reached.
-        least: Whether lower is better.
+        target: Value to be reached.
+        least: Lower values are better.
     """
     for index in range(len(points) - CONFIRMATIONS):
         window = [value for _, value in points[index : index + 1 + CONFIRMATIONS]]

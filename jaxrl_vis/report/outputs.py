@@ -1,4 +1,4 @@
-"""Whether files can be written where they are wanted: asked before the work that makes them."""
+"""Checks of output paths before the work that produces the output."""
 
 import tempfile
 from pathlib import Path
@@ -10,15 +10,15 @@ from jaxrl_vis.files import check_path
 def check_writable(path: Path, option: str = "", folder: bool = False) -> None:
     """Checks that a file, or files in a folder, can be written. Leaves nothing behind.
 
-    Folders that are missing on the way need not be there: writers make them.
+    Missing parent folders are allowed: writers create them.
 
     Args:
         path: The file or the folder.
-        option: The option that asked for it, for the message.
+        option: The command line option, for the message.
         folder: ``path`` is a folder.
 
     Raises:
-        RequestError: It cannot.
+        RequestError: The path cannot be written.
     """
     wanted = f"{option} {path}".strip()
     check_path(path)
@@ -30,10 +30,10 @@ def check_writable(path: Path, option: str = "", folder: bool = False) -> None:
                 return
         if path.exists() and not folder:
             return  # a device or a pipe
-        there = next(parent for parent in (path, *path.absolute().parents) if parent.exists())
-        if not there.is_dir():
-            raise RequestError(f"cannot write {wanted}: {there} is a file, not a folder")
-        with tempfile.TemporaryFile(dir=there):
+        parent = next(candidate for candidate in (path, *path.absolute().parents) if candidate.exists())
+        if not parent.is_dir():
+            raise RequestError(f"cannot write {wanted}: {parent} is a file, not a folder")
+        with tempfile.TemporaryFile(dir=parent):
             pass
     except OSError as error:
         raise RequestError(f"cannot write {wanted}: {error.strerror or error}") from error

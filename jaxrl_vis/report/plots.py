@@ -10,19 +10,19 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator, PercentFormatter
 
 INK, FAINT = "#22252a", "#8b919a"
-"""Colours of text: what is to be read, and what is beside."""
+"""Colours of primary and secondary text."""
 _SUCCESS, _DISTANCE = "#0f7b6c", "#b4531f"
 
 
 def gather(rows: Sequence[Mapping[str, Any]], name: str) -> tuple[np.ndarray, np.ndarray]:
-    """One metric as a table.
+    """Collects one metric as an array.
 
     Args:
         rows: The rows of metrics.jsonl, in any order.
         name: The metric, such as ``eval/success``.
 
     Returns:
-        env_steps [P], ascending, and values [S, P] float64; NaN where a seed has no number there.
+        env_steps [P], ascending, and values [S, P] float64; NaN for missing values.
     """
     steps = sorted({row["env_steps"] for row in rows})
     seeds = sorted({row["seed"] for row in rows})
@@ -34,21 +34,21 @@ def gather(rows: Sequence[Mapping[str, Any]], name: str) -> tuple[np.ndarray, np
 
 
 def show_steps(count: float, _: int | None = None) -> str:
-    """``250 k``, ``1.44 M``."""
+    """Formats a number of steps as ``250 k`` or ``1.44 M``."""
     if count >= 1e6:
         return f"{count / 1e6:g} M"
     return f"{count / 1e3:g} k" if count >= 1e3 else f"{count:g}"
 
 
 def draw_median(axes: Axes, steps: np.ndarray, values: np.ndarray, colour: str, label: str | None = None) -> float:
-    """The median over seeds as a thick line, the middle half of the seeds as a band.
+    """Draws the median over seeds as a thick line, and the middle half of the seeds as a band.
 
     Args:
         axes: Where to draw.
         steps: [P] env_steps.
         values: [S, P], NaN for gaps.
         colour: The colour of both.
-        label: What the legend says.
+        label: Label in the legend.
 
     Returns:
         The last median; NaN if there is no number at all.
@@ -66,7 +66,7 @@ def draw_median(axes: Axes, steps: np.ndarray, values: np.ndarray, colour: str, 
 
 
 def draw_curves(axes: Axes, steps: np.ndarray, values: np.ndarray, colour: str) -> float:
-    """`draw_median`, each seed as a thin line, and a dot at the end.
+    """Draws the median and its band, every seed as a thin line, and a dot at the end.
 
     Args:
         axes: Where to draw.
@@ -89,7 +89,7 @@ def draw_curves(axes: Axes, steps: np.ndarray, values: np.ndarray, colour: str) 
 
 
 def style_curves(axes: Axes, title: str) -> None:
-    """Axes of something against environment steps."""
+    """Styles axes of a metric against environment steps."""
     axes.set_title(title, loc="left", fontsize=11, color=INK, pad=8)
     axes.grid(axis="y", color="#e6e8eb", linewidth=0.8)
     axes.set_axisbelow(True)
@@ -103,8 +103,8 @@ def style_curves(axes: Axes, title: str) -> None:
 
 
 def _label_end(axes: Axes, steps: np.ndarray, value: float, text: str, colour: str) -> None:
-    place = {"xytext": (9, 0), "textcoords": "offset points", "va": "center"}
-    axes.annotate(text, (steps[-1], value), color=colour, fontsize=11, weight="bold", **place)
+    options = {"xytext": (9, 0), "textcoords": "offset points", "va": "center"}
+    axes.annotate(text, (steps[-1], value), color=colour, fontsize=11, weight="bold", **options)
 
 
 def plot_run(
@@ -115,11 +115,11 @@ def plot_run(
     unit: str = "m",
     threshold: float | None = None,
 ) -> bool:
-    """Writes the curve of a run.
+    """Writes the learning curve of a run.
 
     Args:
         rows: The rows of metrics.jsonl.
-        path: A .png, or any other format that matplotlib can write.
+        path: A .png, or any other format that Matplotlib can write.
         title: The first line, bold.
         subtitle: The second line.
         unit: The unit of eval/goal_distance.

@@ -1,6 +1,6 @@
-"""video.gif: the observations of a few episodes, each beside its goal.
+"""Videos of episodes: observations beside their goals.
 
-Images are planar, [C, H, W] uint8, and are shown in rows: colour, then depth, whichever there are.
+Images are planar, [C, H, W] uint8, and shown in rows: colour, then depth, as available.
 """
 
 import base64
@@ -21,16 +21,16 @@ from jaxrl_vis.report.outputs import check_writable
 
 SUFFIXES = (".gif", ".mp4", ".html", ".png")
 
-_IMAGE_SIZE = 256  # px, about; images are enlarged by a whole factor
+_IMAGE_SIZE = 256  # approximate, px; images are enlarged by an integer factor
 GAP, BORDER, HEADER, FOOTER = 14, 5, 30, 40
 BACKGROUND, TEXT, FAINT = (24, 26, 31), (232, 234, 237), (139, 145, 154)
 REACHED, MISSED, PLAIN = (62, 207, 142), (226, 109, 92), (52, 56, 64)
-HOLD = 1.0  # s, how long the last frame of an episode stays
+HOLD = 1.0  # duration of the last frame of an episode, s
 
 
 @dataclasses.dataclass(frozen=True)
 class EpisodeImages:
-    """The images of K episodes.
+    """Images of K episodes.
 
     Attributes:
         frames: [K, T+1, C, H, W] uint8, the observations.
@@ -44,25 +44,25 @@ class EpisodeImages:
 
 
 def shows_images(shape: Sequence[int]) -> bool:
-    """Whether frames of this shape, [episodes, steps, *observation], are images that can be shown."""
+    """Returns True if frames of this shape, [episodes, steps, *observation], are images that can be shown."""
     return len(shape) == 5 and shape[2] in (1, 3, 4)
 
 
 def first_seed(images: dict[str, Any]) -> EpisodeImages:
-    """The first seed's part of the images of an evaluation, [S, K, ...] arrays on any device, on the host."""
+    """Returns the first seed's images of an evaluation, [S, K, ...] arrays on any device, on the host."""
     first = {name: np.asarray(values)[0] for name, values in images.items()}
     return EpisodeImages(first["frames"], first["goals"], first["success"])
 
 
 def range_of_depth(episodes: EpisodeImages) -> tuple[float, float]:
-    """The grey levels between which the depth of all these images lies, except for a few outliers."""
+    """Returns the range of depth in all these images, in grey levels, without outliers."""
     depth = np.concatenate([episodes.frames[:, ::5, -1].ravel(), episodes.goals[:, -1].ravel()])
     near, far = np.percentile(depth, [0.5, 99.5])
     return float(near), max(float(far), float(near) + 1.0)
 
 
-def rows_of(image: np.ndarray, depth_range: tuple[float, float]) -> list[tuple[str, np.ndarray]]:
-    """[C, H, W] -> captions and images [H, W, 3] uint8."""
+def image_rows(image: np.ndarray, depth_range: tuple[float, float]) -> list[tuple[str, np.ndarray]]:
+    """Splits an image [C, H, W] into captions and images [H, W, 3] uint8."""
     rows = []
     if image.shape[0] >= 3:
         rows.append(("colour", np.moveaxis(image[:3], 0, -1)))
@@ -72,7 +72,7 @@ def rows_of(image: np.ndarray, depth_range: tuple[float, float]) -> list[tuple[s
 
 
 def enlarge(image: np.ndarray, size: int = _IMAGE_SIZE) -> Image.Image:
-    """[H, W, 3] uint8, enlarged by a whole factor to about ``size`` pixels."""
+    """Enlarges an image [H, W, 3] uint8 by an integer factor to about ``size`` pixels."""
     factor = max(1, round(size / image.shape[0]))
     enlarged = (image.shape[1] * factor, image.shape[0] * factor)
     return Image.fromarray(image).resize(enlarged, Image.Resampling.NEAREST)
@@ -86,18 +86,18 @@ def _compose(
     share: float,
     colour: tuple[int, int, int],
 ) -> Image.Image:
-    """One frame of the video.
+    """Composes one frame of the video.
 
     Args:
         observation: [C, H, W] uint8.
         goal: [C, H, W] uint8.
         depth_range: See `range_of_depth`.
         footer: The texts at the left and at the right.
-        share: The share of the episode that is over, 0 to 1.
-        colour: The border's colour.
+        share: Elapsed fraction of the episode, 0 to 1.
+        colour: Colour of the border.
     """
-    left, right = (rows_of(image, depth_range) for image in (observation, goal))
-    images = [(enlarge(seen), enlarge(wanted)) for (_, seen), (_, wanted) in zip(left, right, strict=True)]
+    left, right = (image_rows(image, depth_range) for image in (observation, goal))
+    images = [(enlarge(actual), enlarge(wanted)) for (_, actual), (_, wanted) in zip(left, right, strict=True)]
     width, height = images[0][0].size
     cell = height + 2 * BORDER + GAP
     size = (2 * (width + 2 * BORDER) + 3 * GAP, HEADER + GAP // 2 + cell * len(images) + FOOTER)
@@ -121,7 +121,7 @@ def _compose(
 
 
 def draw_frames(episodes: EpisodeImages, frame_seconds: float, max_episodes: int) -> tuple[list[Image.Image], list[float]]:
-    """All frames of a video, and how long each is shown, in seconds.
+    """Draws all frames of a video; returns them with their durations in seconds.
 
     The border turns green where the goal is reached, and red at the end of an episode that missed it.
     """
@@ -145,9 +145,9 @@ def draw_frames(episodes: EpisodeImages, frame_seconds: float, max_episodes: int
 
 
 def _gif_bytes(images: list[Image.Image], seconds: list[float]) -> bytes:
-    """An endless GIF. All frames share one palette, without dithering: nothing flickers, and equal frames compress well."""
+    """Encodes a looping GIF. All frames share one palette, without dithering: no flicker, and good compression."""
     samples = images[:: max(1, len(images) // 16)] + images[-1:]
-    # Swatches reserve places in the palette for the colours of borders and texts, however colourful the images are.
+    # Swatches reserve palette entries for the colours of borders and texts, however colourful the images are.
     swatches = (REACHED, MISSED, PLAIN, BACKGROUND, TEXT, FAINT)
     height = samples[0].height
     montage = Image.new("RGB", (samples[0].width, height * len(samples) + 48 * len(swatches)))
@@ -166,7 +166,7 @@ def _gif_bytes(images: list[Image.Image], seconds: list[float]) -> bytes:
 
 
 def _strip(episodes: EpisodeImages) -> Image.Image:
-    """Six steps of up to four episodes, one episode below the other, each with its goal at the right."""
+    """Draws six steps of up to four episodes, one episode per row, with the goal at the right."""
     num_frames = episodes.frames.shape[1]
     depth_range = range_of_depth(episodes)
     steps = sorted({round(share * (num_frames - 1)) for share in (0, 0.1, 0.2, 0.35, 0.6, 1)})
@@ -176,7 +176,9 @@ def _strip(episodes: EpisodeImages) -> Image.Image:
         border = REACHED if bool(success if success.ndim == 0 else success[-1]) else MISSED
         shown = [(episodes.frames[episode, t], border if t == num_frames - 1 else PLAIN) for t in steps]
         shown.append((episodes.goals[episode], PLAIN))
-        views = [([enlarge(view).resize((128, 128)) for _, view in rows_of(each, depth_range)], edge) for each, edge in shown]
+        views = [
+            ([enlarge(view).resize((128, 128)) for _, view in image_rows(image, depth_range)], edge) for image, edge in shown
+        ]
         rows += [[(images[row], edge) for images, edge in views] for row in range(len(views[0][0]))]
     cell = 128 + 2 * 3 + 8
     canvas = Image.new("RGB", (cell * len(rows[0]) + 24, cell * len(rows) + 34), BACKGROUND)
@@ -195,7 +197,7 @@ def _strip(episodes: EpisodeImages) -> Image.Image:
 
 
 def check_output(path: Path) -> None:
-    """Checks that a video can be written to ``path``. Call it before spending a minute on playing episodes.
+    """Checks that a video can be written to ``path``. Call it before playing the episodes, which takes a minute.
 
     Raises:
         RequestError: The suffix is not one of `SUFFIXES`, it needs a package that is not installed, or the file cannot be
@@ -212,13 +214,13 @@ def check_output(path: Path) -> None:
 
 
 def write_video(episodes: EpisodeImages, path: Path, frame_seconds: float = 0.04, max_episodes: int = 6) -> None:
-    """Writes episodes as a .gif, an .mp4, an .html page that holds the gif, or a .png with some frames side by side.
+    """Writes episodes as a .gif, an .mp4, an .html page with an embedded .gif, or a .png with some frames.
 
     Args:
         episodes: The episodes.
-        path: The suffix decides the format.
-        frame_seconds: How long a frame is shown, s.
-        max_episodes: How many of them to show; a .png shows at most four.
+        path: The file; its suffix determines the format.
+        frame_seconds: Duration of a frame, s.
+        max_episodes: Number of episodes to show; a .png shows at most four.
 
     Raises:
         RequestError: See `check_output`; or the observations are not images.
@@ -234,13 +236,13 @@ def write_video(episodes: EpisodeImages, path: Path, frame_seconds: float = 0.04
 
 
 def write_images(images: list[Image.Image], seconds: list[float], path: Path, frame_seconds: float) -> None:
-    """Writes frames of equal size as a .gif, an .mp4 or an .html page that holds the gif.
+    """Writes frames of equal size as a .gif, an .mp4 or an .html page with an embedded .gif.
 
     Args:
         images: The frames.
-        seconds: How long each is shown, s.
-        path: The suffix decides the format; its folder is made.
-        frame_seconds: How long most of them are shown, s.
+        seconds: Durations of the frames, s.
+        path: The file; its suffix determines the format; its folder is created.
+        frame_seconds: Duration of most frames, s.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     suffix = path.suffix.lower()
@@ -255,9 +257,9 @@ def write_images(images: list[Image.Image], seconds: list[float], path: Path, fr
 
         rate = max(1, round(1 / frame_seconds))
         width, height = images[0].size
-        even = (0, 0, width + width % 2, height + height % 2)  # what most players ask for
+        even = (0, 0, width + width % 2, height + height % 2)  # required by most players
         with warnings.catch_warnings(), imageio.get_writer(path, fps=rate, macro_block_size=2, quality=8) as writer:
-            # ffmpeg starts at the first frame, and JAX warns of every fork, also of one that becomes another program at once.
+            # ffmpeg starts at the first frame, and JAX warns of every fork, even if exec follows at once.
             warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
             for image, duration in zip(images, seconds, strict=True):
                 for _ in range(max(1, round(duration * rate))):

@@ -1,4 +1,4 @@
-"""The page that ``play --html`` writes: episodes in three dimensions, for brax's viewer."""
+"""HTML page of ``play --html``: episodes in three dimensions, in brax's viewer."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,7 +13,7 @@ from jaxrl_vis.report.outputs import check_writable
 from jaxrl_vis.types import TrainState
 from jaxrl_vis_envs.compilation import env_jit
 
-_HOLD = 0.6  # s, how long the last step of an episode stays
+_HOLD = 0.6  # duration of the last step of an episode, s
 
 
 def check_page(path: Path) -> None:
@@ -50,9 +50,9 @@ def play_poses(env: Any, networks: Networks, train: TrainState, key: jax.Array, 
 
     Args:
         env: A MuJoCo environment.
-        networks: The networks that the parameters belong to.
+        networks: Networks of the parameters.
         train: The learners, [S, ...].
-        key: [] a typed key; draws the episodes, as in `rollout.play`.
+        key: [] a typed key, which determines the episodes, as in `rollout.play`.
         num_envs: E.
     """
     first = jax.tree.map(lambda leaf: leaf[:1], train)
@@ -68,8 +68,8 @@ def write_page(program: Any, train: TrainState, key: jax.Array, episodes: int, o
     Args:
         program: `train_step.TrainStep`.
         train: The learner, [S, ...].
-        key: Draws the episodes.
-        episodes: How many; the page shows one after the other.
+        key: Random key of the episodes.
+        episodes: Number of episodes, shown one after the other.
         out: The file.
     """
     from jaxrl_vis_envs.adapters.brax_viewer import Poses, viewer_page
@@ -77,7 +77,7 @@ def write_page(program: Any, train: TrainState, key: jax.Array, episodes: int, o
     env = program.env
     play_all = env_jit(lambda train, key: play_poses(env, program.networks, train, key, episodes))
     played = jax.tree.map(np.asarray, play_all(train, key))
-    # The last step of each episode is repeated, so that one sees where it ended.
+    # The last step of each episode is repeated, so that its end is visible.
     hold = max(1, round(_HOLD / env.control_period))
     steps = np.append(np.arange(env.horizon + 1), np.full(hold, env.horizon))
 

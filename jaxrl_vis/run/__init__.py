@@ -1,1 +1,1 @@
-"""The host's side of a run: trainer, loop, folder, checkpoints, metrics, memory, signals."""
+"""Host side of a run: trainer, loop, folder, checkpoints, metrics, memory, signals."""

@@ -1,6 +1,6 @@
-"""Arrays on their way into checkpoints and back: their names, their checksums, where they lie, and whether they are the same.
+"""Conversion of arrays for checkpoints and back: names, checksums, placement and comparison.
 
-From several processes, each writes the parts that it has, so their checksums are put together of those of parts.
+With several processes, each writes its own parts, so checksums are combined from those of the parts.
 """
 
 import zlib
@@ -21,17 +21,17 @@ Arrays = dict[str, np.ndarray]
 
 
 def named_leaves(tree: Any) -> dict[str, Any]:
-    """The leaves of a pytree by name, such as ``actor.head.output.kernel``."""
+    """Returns the leaves of a pytree by name, such as ``actor.head.output.kernel``."""
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in jax.tree.leaves_with_path(tree)}
 
 
 def to_host(tree: Any, copy: bool) -> Arrays:
-    """The leaves of a pytree as numpy arrays by name; typed keys as their words.
+    """Converts the leaves of a pytree to NumPy arrays by name; typed keys to their words.
 
     Args:
         tree: Arrays on a device.
-        copy: False: on a CPU, look at the device's memory itself. Only until the arrays are donated, and whoever keeps such a
-            view makes the next donation a copy.
+        copy: False: on a CPU, return views of the device's memory. A view is valid only until the arrays are donated, and while
+            one exists, the next donation makes a copy.
     """
 
     def convert(leaf: jax.Array) -> np.ndarray:
@@ -41,7 +41,7 @@ def to_host(tree: Any, copy: bool) -> Arrays:
             return np.array(leaf)
         try:
             return np.from_dlpack(leaf)  # pyright: ignore[reportArgumentType]
-        except (BufferError, RuntimeError, TypeError):  # a type that numpy lacks, or several devices
+        except (BufferError, RuntimeError, TypeError):  # a dtype that NumPy lacks, or several devices
             return np.array(leaf)
 
     return {name: convert(leaf) for name, leaf in named_leaves(tree).items()}
@@ -52,14 +52,14 @@ def _checksum(array: np.ndarray) -> int:
 
 
 def describe(arrays: dict[str, Any]) -> dict[str, list]:
-    """What a manifest says of arrays that are to be saved: shape, type and checksum, by name."""
+    """Describes arrays for a manifest: shape, dtype and checksum, by name."""
     if processes.are_several():
         return _describe_parts(arrays)
     return {name: [list(array.shape), str(array.dtype), _checksum(array)] for name, array in arrays.items()}
 
 
 def to_save(tree: Any, copy: bool) -> Arrays | dict[str, jax.Array]:
-    """The leaves of a pytree by name, as they are given to orbax: from several processes each writes what it has."""
+    """Returns the leaves of a pytree by name, as saved by orbax; with several processes, each writes its own parts."""
     if not processes.are_several():
         return to_host(tree, copy)
     return {
@@ -69,14 +69,16 @@ def to_save(tree: Any, copy: bool) -> Arrays | dict[str, jax.Array]:
 
 
 def _describe_parts(arrays: dict[str, jax.Array]) -> dict[str, list]:
-    """`describe`, of arrays of which each process has a part; the last number says of how many axes `_sum_of_rows` is."""
-    axes = {name: max((n + 1 for n, on in enumerate(_spec_of(array)) if on), default=0) for name, array in arrays.items()}
+    """Describes arrays distributed over processes; the last number is the count of axes for `_row_checksum`."""
+    axes = {
+        name: max((n + 1 for n, on in enumerate(_partition_spec(array)) if on), default=0) for name, array in arrays.items()
+    }
     sums = np.zeros(len(arrays), np.uint32)
     for number, (name, array) in enumerate(arrays.items()):
         for shard in array.addressable_shards:
             if shard.replica_id == 0:
-                start = [each.start or 0 for each in shard.index[: axes[name]]]
-                sums[number] += np.uint32(_sum_of_rows(np.asarray(shard.data), axes[name], start))
+                start = [part.start or 0 for part in shard.index[: axes[name]]]
+                sums[number] += np.uint32(_row_checksum(np.asarray(shard.data), axes[name], start))
     totals = multihost_utils.process_allgather(sums).astype(np.uint64).sum(axis=0) % 2**32
     return {
         name: [list(array.shape), str(array.dtype), int(total), axes[name]]
@@ -84,17 +86,17 @@ def _describe_parts(arrays: dict[str, jax.Array]) -> dict[str, list]:
     }
 
 
-def _spec_of(array: jax.Array) -> Sequence[Any]:
+def _partition_spec(array: jax.Array) -> Sequence[Any]:
     return getattr(array.sharding, "spec", ())
 
 
-def _sum_of_rows(array: np.ndarray, axes: int, start: Sequence[int] = ()) -> int:
-    """A checksum that can be put together of parts: the sum of those of all rows, each beginning with where it lies.
+def _row_checksum(array: np.ndarray, axes: int, start: Sequence[int] = ()) -> int:
+    """Computes a checksum that is additive over parts: the sum of the rows' checksums, each seeded with the row's position.
 
     Args:
         array: A part of an array.
-        axes: How many of the first axes number rows.
-        start: Where the part begins in these; nothing for a whole array.
+        axes: Number of leading axes that index rows.
+        start: Position of the part along these axes; empty for a whole array.
     """
     total = 0
     for index in np.ndindex(array.shape[:axes]):
@@ -106,26 +108,26 @@ def _sum_of_rows(array: np.ndarray, axes: int, start: Sequence[int] = ()) -> int
 
 
 def is_intact(array: np.ndarray, described: list) -> bool:
-    """Whether an array is as its manifest describes it."""
+    """Returns True if an array matches its description in the manifest."""
     _, _, checksum, *axes = described
-    return checksum == (_sum_of_rows(array, axes[0]) if axes else _checksum(array))
+    return checksum == (_row_checksum(array, axes[0]) if axes else _checksum(array))
 
 
 def _is_folded(one: Sequence[int], other: Sequence[int]) -> bool:
-    """Whether two shapes are [S, rollouts, E, ...] and [S, rollouts * E, ...], of the same episodes (`sharding.Layout`)."""
+    """Returns True for shapes [S, rollouts, E, ...] and [S, rollouts * E, ...] of the same episodes (`sharding.Layout`)."""
     (start, *rest), (folded_start, *folded) = sorted((tuple(one), tuple(other)), key=len)
     return len(folded) >= 2 and start == folded_start and rest == [folded[0] * folded[1], *folded[2:]]
 
 
 def as_saved(shape: Sequence[int], expected: jax.ShapeDtypeStruct) -> Any:
-    """What orbax is asked for: an array on the first device, or one on the host that is divided among devices later."""
+    """Returns the restore target for orbax: an array on the first device, or one on the host to be distributed later."""
     if tuple(shape) == expected.shape and isinstance(expected.sharding, jax.sharding.SingleDeviceSharding):
         return expected
     return np.broadcast_to(np.zeros((), expected.dtype), tuple(shape))
 
 
 def host_specs(tree: Any) -> dict[str, jax.ShapeDtypeStruct]:
-    """What `to_host` makes of a tree with these shapes, placed on the first device where the shapes do not say where."""
+    """Returns the specs of the arrays that `to_host` makes, on the first device unless the leaves define a sharding."""
     first = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
 
     def convert(leaf: Any) -> jax.ShapeDtypeStruct:
@@ -138,12 +140,13 @@ def host_specs(tree: Any) -> dict[str, jax.ShapeDtypeStruct]:
 
 
 def rebuild(template: Any, arrays: dict[str, jax.Array]) -> Any:
-    """The inverse of `to_host`: a tree like ``template``, which also says where its arrays are to lie."""
+    """Inverts `to_host`: builds a tree like ``template``, which also defines where its arrays are placed."""
 
     def convert(path: Any, leaf: Any) -> jax.Array:
         array, sharding = arrays[jax.tree_util.keystr(path, simple=True, separator=".")], getattr(leaf, "sharding", None)
         if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-            # The default kind, as `Trainer.run_keys` makes them; another one has another number of words, noticed before this.
+            # The default key type, as in `Trainer.run_keys`; another type has another number of words, which is detected
+            # earlier.
             array = jax.random.wrap_key_data(jnp.asarray(array))
         elif array.shape != leaf.shape:
             array = array.reshape(leaf.shape)
@@ -155,16 +158,16 @@ def rebuild(template: Any, arrays: dict[str, jax.Array]) -> Any:
 
 
 def check_structure(where: Path, saved: dict[str, list], expected: dict[str, jax.ShapeDtypeStruct]) -> None:
-    """Raises RequestError, naming the first differences, where a checkpoint has other arrays than this program."""
+    """Raises RequestError, naming the first differences, if a checkpoint has other arrays than this program."""
     differences = []
     for name in sorted(set(saved) | set(expected)):
-        there = f"{saved[name][1]}{saved[name][0]}" if name in saved else "nothing"
-        here = f"{expected[name].dtype}{list(expected[name].shape)}" if name in expected else "nothing"
-        if there != here and name.startswith("replay.episodes.") and name in saved and name in expected:
+        stored = f"{saved[name][1]}{saved[name][0]}" if name in saved else "nothing"
+        required = f"{expected[name].dtype}{list(expected[name].shape)}" if name in expected else "nothing"
+        if stored != required and name.startswith("replay.episodes.") and name in saved and name in expected:
             if saved[name][1] == str(expected[name].dtype) and _is_folded(saved[name][0], expected[name].shape):
                 continue
-        if there != here:
-            differences.append(f"{name} is {there} there and {here} here")
+        if stored != required:
+            differences.append(f"{name} is {stored} there and {required} here")
     if differences:
         shown = "; ".join(differences[:3]) + (f"; and {len(differences) - 3} more" if len(differences) > 3 else "")
         raise RequestError(f"{where} has another structure, so another version wrote it: {shown}; use that, or --overwrite")

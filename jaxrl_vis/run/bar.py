@@ -1,4 +1,4 @@
-"""A progress bar that fits: as much is said beside it as a line of the terminal holds, the most important first."""
+"""Progress bar whose text adapts to the terminal's width, with the most important information first."""
 
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
@@ -16,11 +16,11 @@ _LEAST_BAR = 10  # columns
 _BETWEEN = "  "
 
 Wordings = Callable[[Task, str, str], Sequence[Sequence[str]]]
-"""(task, time that it has taken, time that is left) -> what may stand beside a bar, the longest wording first."""
+"""(task, elapsed time, remaining time) -> texts beside the bar, longest wording first."""
 
 
 def clock(seconds: float | None) -> str:
-    """``0:07:30``: hours, minutes and seconds, however many hours; ``-:--:--`` for None."""
+    """Formats a duration as ``0:07:30``, with unlimited hours; ``-:--:--`` for None."""
     if seconds is None:
         return "-:--:--"
     whole = max(0, int(seconds))
@@ -28,12 +28,12 @@ def clock(seconds: float | None) -> str:
 
 
 class FittingProgress(Progress):
-    """A line for each task, drawn anew for each width that the terminal has.
+    """Progress display with one line per task, fitted to the terminal's current width.
 
     Args:
         stream: The terminal.
-        wordings: The first one that fits is shown. Of the last one, what does not fit is cut off.
-        refresh_per_second: How often it is drawn.
+        wordings: Alternatives, of which the first that fits is shown; the last one is cut off if necessary.
+        refresh_per_second: Refresh rate.
     """
 
     def __init__(self, stream: SafeStream, wordings: Wordings, refresh_per_second: float = 10):
@@ -42,7 +42,7 @@ class FittingProgress(Progress):
         super().__init__(console=Console(file=file), refresh_per_second=refresh_per_second)
 
     def get_renderables(self) -> Iterable[RenderableType]:
-        """A line for each task."""
+        """Returns one line per task."""
         for task in self.tasks:
             yield self._line(task, self.console.width)
 

@@ -1,17 +1,17 @@
-"""Checkpoints in two tiers, over orbax: a light one often, a full one rarely.
+"""Two tiers of orbax checkpoints: light ones often, full ones rarely.
 
     checkpoints/light/<iteration>/   train         networks, targets, optimisers, statistics: enough for eval and play
-    checkpoints/full/<iteration>/    train, rest   and the replay, keys and iteration: a resumed run repeats itself exactly
-    checkpoints/recent/                            the same for a process that is killed, where it costs little, see `recent`
+    checkpoints/full/<iteration>/    train, rest   with the replay, keys and iteration: for an exact resume
+    checkpoints/recent/                            the same against a kill, where it is cheap, see `recent`
 
-Each also holds a manifest: names, shapes and types of all arrays, their checksums, and what the host has to remember. orbax
-makes a folder appear under its final name only when it is complete; the checksums find what went wrong later: without them, a
-flipped byte in a data file would be restored without a word. Where the background has finished, SHA256SUMS (`sums`) follows,
-for `verification`: of what nobody restores, too. The newest two of each tier are kept.
+Each checkpoint has a manifest: names, shapes, dtypes and checksums of all arrays, and the host's progress. orbax makes a folder
+appear under its final name only when it is complete; the checksums detect later damage, such as a flipped byte, which would
+otherwise be restored silently. After the background write, SHA256SUMS (`sums`) is added for `verification`, also of data that
+is never restored. The newest two of each tier are kept.
 
-A run goes on from the newest good one of all these, and of those that are equally new from the full, the recent or the light
-one, in this order. Nothing newer than that is ever deleted: a checkpoint that turns out to be damaged is moved to
-checkpoints/damaged/, and one of another run, which its manifest tells by the run's id, to checkpoints/foreign/.
+A run resumes from the newest valid checkpoint of all tiers; if several are equally new, from the full, the recent or the light
+one, in this order. Nothing newer is ever deleted: a damaged checkpoint is moved to checkpoints/damaged/, and one of another
+run, identified by the run's id in its manifest, to checkpoints/foreign/.
 """
 
 import contextlib
@@ -32,18 +32,18 @@ from jaxrl_vis.run.metrics import RUN_ID
 from jaxrl_vis.run.recent import ANY_RUN, Recent, Unusable
 from jaxrl_vis.types import LoopState, TrainState
 
-if TYPE_CHECKING:  # orbax takes a fifth of the time that this package does to import: whatever uses it imports it
+if TYPE_CHECKING:  # orbax takes a fifth of this package's import time, so it is imported where it is used
     import orbax.checkpoint as ocp
 
 LIGHT, FULL, RECENT = "light", "full", "recent"
-_PRECEDENCE = (FULL, RECENT, LIGHT)  # for a run that goes on, of those that are equally new
+_PRECEDENCE = (FULL, RECENT, LIGHT)  # for resuming, among equally new ones
 _KEPT = 2
 _TIMEOUT_S = 10**9
 DAMAGED, FOREIGN = "damaged", "foreign"
 
 
 class _Damaged(Exception):
-    """This checkpoint cannot be trusted. The message says why, in a few words."""
+    """Damaged checkpoint. The message gives the reason in a few words."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,10 +52,10 @@ class Restored:
 
     Attributes:
         tier: `LIGHT`, `FULL` or `RECENT`.
-        iteration: Iterations that the run had done.
+        iteration: Iterations completed.
         train: The learner, [S, ...].
-        loop: Everything; None from the light tier.
-        progress: What the caller gave to be remembered.
+        loop: The complete state; None from the light tier.
+        progress: Progress that was saved with it.
     """
 
     tier: str
@@ -66,27 +66,27 @@ class Restored:
 
 
 def _free(path: Path) -> Path:
-    """Returns a path that nothing has yet: ``path`` itself, or the first of path-2, path-3, ... that is free."""
+    """Returns an unused path: ``path`` itself, or the first free one of path-2, path-3, ..."""
     numbered = (path.with_name(f"{path.name}-{number}") for number in itertools.count(2))
     return next(choice for choice in itertools.chain([path], numbered) if not choice.exists())
 
 
-def rest_of(loop: LoopState) -> dict[str, Any]:
-    """A loop state without its learner: what a full checkpoint holds more than a light one."""
+def state_without_learner(loop: LoopState) -> dict[str, Any]:
+    """Returns the part of a loop state that full checkpoints have in addition to the learner."""
     return {"replay": loop.replay, "key": loop.key, "iteration": loop.iteration}
 
 
 class Checkpoints:
-    """The checkpoints of one run. While it is open, orbax's own log is silent: what goes wrong is raised, and told in one line.
+    """Checkpoints of one run. While open, orbax's own log is silenced: errors are raised, and reported in one line.
 
     Args:
-        folder: Where both tiers lie; made when something is saved.
-        say: Called with one line about each checkpoint that cannot be used.
-        read_only: Promise to save nothing: nothing is created or cleaned up.
+        folder: Folder of the tiers; created by the first save.
+        say: Called with one line about each unusable checkpoint.
+        read_only: Never save: nothing is created or cleaned up.
 
     Attributes:
-        run_id: Of the run, None for one of an earlier version: checkpoints of others are not there as far as this class goes,
-            but for `set_foreign_aside`. `ANY_RUN`: whatever there is.
+        run_id: Id of the run, None for one of an earlier version: other runs' checkpoints are ignored, except by
+            `set_foreign_aside`. `ANY_RUN`: all checkpoints.
     """
 
     def __init__(
@@ -103,12 +103,12 @@ class Checkpoints:
         self.run_id = run_id
         self._managers: dict[str, ocp.CheckpointManager] = {}
         self._reported: set[tuple[str, int]] = set()  # damaged ones
-        self._unsummed: set[tuple[str, int]] = set()  # saved, perhaps in the background still, and without `sums`
+        self._unsummed: set[tuple[str, int]] = set()  # saved, perhaps still in the background, and without `sums`
         self._unsilence: Callable[[], None] | None = None
 
     @property
     def run_id(self) -> str | None:
-        """See the class."""
+        """Id of the run, see the class."""
         return self.recent.run_id
 
     @run_id.setter
@@ -123,8 +123,8 @@ class Checkpoints:
         if tier not in self._managers:
             if self._unsilence is None:
                 self._unsilence = hush.silence_orbax()
-            # orbax measures its timeouts with the computer's clock: where that is set meanwhile, a good save would be given up.
-            # A process alone waits for its own disk, however long; of several, one that hangs must be noticed.
+            # orbax measures timeouts with the system clock: a change of the clock could abort a good save. A single process
+            # waits for its own disk indefinitely; with several, one that hangs must be detected.
             patient = AsyncOptions(timeout_secs=_TIMEOUT_S, create_directories_asynchronously=False)
             options = ocp.CheckpointManagerOptions(
                 async_options=None if processes.are_several() else patient,
@@ -137,13 +137,13 @@ class Checkpoints:
         return self._managers[tier]
 
     def iterations(self, tier: str) -> list[int]:
-        """Iterations of which ``tier`` has a checkpoint of this run, ascending; damaged ones included."""
+        """Returns the iterations of this run's checkpoints in a tier, ascending, including damaged ones."""
         if tier == RECENT:
             return self.recent.iterations()
-        return [iteration for iteration, is_ours in self._there(tier) if is_ours]
+        return [iteration for iteration, is_ours in self._list(tier) if is_ours]
 
-    def _there(self, tier: str) -> list[tuple[int, bool]]:
-        """Iteration of each checkpoint of a tier, ascending, and whether it is of this run."""
+    def _list(self, tier: str) -> list[tuple[int, bool]]:
+        """Returns the iterations of a tier's checkpoints, ascending, with True for those of this run."""
         folder = self._folder / tier
         if not folder.is_dir():
             return []
@@ -151,7 +151,7 @@ class Checkpoints:
         return sorted((int(name), self._is_ours(folder / name)) for name in names)
 
     def _is_ours(self, checkpoint: Path) -> bool:
-        """Returns whether the manifest of a checkpoint says so; one that cannot be read is damaged, and may well be ours."""
+        """Returns True if a checkpoint's manifest has this run's id, or cannot be read: a damaged one may be this run's."""
         try:
             manifest = read_json(checkpoint / FILE)
         except RequestError:
@@ -159,22 +159,22 @@ class Checkpoints:
         return self.run_id in (ANY_RUN, manifest.get(RUN_ID))
 
     def newest(self) -> int | None:
-        """The newest iteration that a run could go on from; None where there is none."""
+        """Returns the newest iteration from which the run could resume; None if there is none."""
         return max((iteration for tier in _PRECEDENCE for iteration in self.iterations(tier)), default=None)
 
     def save_light(self, iteration: int, train: TrainState, progress: dict[str, Any]) -> None:
-        """Copies the learner to the host and writes it in the background; ``train`` may be donated as soon as this returns.
+        """Copies the learner to the host and writes it in the background; ``train`` may be donated once this returns.
 
         Args:
-            iteration: Iterations done.
+            iteration: Iterations completed.
             train: The learner, [S, ...].
-            progress: Anything that JSON can hold.
+            progress: A JSON value.
         """
         self._save(LIGHT, iteration, {"train": to_save(train, copy=True)}, progress)
 
     def save_full(self, iteration: int, loop: LoopState, progress: dict[str, Any]) -> None:
-        """Writes everything, and returns when it is on the disk: a second copy of the replay would need memory for two."""
-        items = {"train": to_save(loop.train, copy=False), "rest": to_save(rest_of(loop), copy=False)}
+        """Writes the complete state and waits for the disk: an asynchronous copy of the replay would need memory for two."""
+        items = {"train": to_save(loop.train, copy=False), "rest": to_save(state_without_learner(loop), copy=False)}
         self._save(FULL, iteration, items, progress)
         self.wait()
 
@@ -182,23 +182,23 @@ class Checkpoints:
         import orbax.checkpoint as ocp
 
         described = {name: describe(arrays) for name, arrays in items.items()}
-        whose = {} if self.run_id in (None, ANY_RUN) else {RUN_ID: self.run_id}
-        manifest = {"schema": SCHEMA, **whose, "iteration": iteration, "items": described, "progress": progress}
+        run = {} if self.run_id in (None, ANY_RUN) else {RUN_ID: self.run_id}
+        manifest = {"schema": SCHEMA, **run, "iteration": iteration, "items": described, "progress": progress}
         arguments: dict[str, Any] = {name: ocp.args.StandardSave(arrays) for name, arrays in items.items()}
         arguments["manifest"] = ocp.args.JsonSave(manifest)
         if processes.are_several():
-            self.wait()  # of two tiers that are written at the same time, processes would take one for the other
+            self.wait()  # with two tiers written concurrently, processes would confuse one with the other
         with self._writing(tier):
             manager = self._manager(tier)
             self._wait(tier)
-            if processes.any_of(iteration in self.iterations(tier)):  # orbax would quietly keep the old one
+            if processes.any_process(iteration in self.iterations(tier)):  # orbax would silently keep the old one
                 manager.delete(iteration)
             if not manager.save(iteration, args=ocp.args.Composite(**arguments), force=True):
                 raise RuntimeError(f"checkpoint {tier}/{iteration} was not written")
             self._unsummed.add((tier, iteration))
 
     def _wait(self, tier: str) -> None:
-        """Returns when the tier is on the disk, with the checksums of its files."""
+        """Waits until a tier is on the disk, including the checksums of its files."""
         self._managers[tier].wait_until_finished()
         for saved in [saved for saved in self._unsummed if saved[0] == tier]:
             folder = self._folder / tier / str(saved[1])
@@ -208,12 +208,12 @@ class Checkpoints:
 
     @contextlib.contextmanager
     def _writing(self, tier: str) -> Iterator[None]:
-        """Turns whatever orbax raises when it cannot write into a `StorageError`."""
+        """Converts orbax's exceptions on writing into a `StorageError`."""
         try:
             yield
         except Exception as error:
-            # A manager whose writing failed in the background reports it again and again: start with a new one. Its threads go
-            # on failing for a while, so from here on the process stays silent about them.
+            # After a failed background write, a manager reports the error again and again: use a new one. Its threads keep
+            # failing for a while, so the process stays silent about them from here on.
             self._managers.pop(tier, None)
             self._unsilence = hush.stay_silent
             text = " ".join(str(error).split())
@@ -221,7 +221,7 @@ class Checkpoints:
             raise StorageError(f"cannot write a {tier} checkpoint into {self._folder} ({shown})") from error
 
     def wait(self) -> None:
-        """Returns when everything is on the disk.
+        """Waits until everything is on the disk.
 
         Raises:
             StorageError: Something could not be written.
@@ -231,7 +231,7 @@ class Checkpoints:
                 self._wait(tier)
 
     def close(self) -> None:
-        """`wait`, then lets go of orbax's threads."""
+        """Waits for pending writes, then releases orbax's threads."""
         for tier, manager in list(self._managers.items()):
             with self._writing(tier):
                 self._wait(tier)
@@ -242,12 +242,12 @@ class Checkpoints:
             self._unsilence = None
 
     def retire_full(self, has_ended: bool = False) -> None:
-        """Deletes full checkpoints that are older than a light one which is safely on the disk: nothing goes on from them.
+        """Deletes full checkpoints older than a light one that is safely on the disk: they are no longer needed for resuming.
 
         Recent states that are not kept up to date any more go likewise.
 
         Args:
-            has_ended: Delete those that are as new, too: the run has come to its end.
+            has_ended: Also delete equally new ones: the run is complete.
         """
         newest = max(self.iterations(LIGHT), default=-1)
         if processes.is_first():
@@ -259,22 +259,22 @@ class Checkpoints:
                     shutil.rmtree(self._folder / FULL / str(iteration), ignore_errors=True)
 
     def set_aside_after(self, iteration: int) -> list[Path]:
-        """Moves checkpoints after ``iteration``, from which no run can go on, to checkpoints/damaged/.
+        """Moves checkpoints after ``iteration``, which are unusable, to checkpoints/damaged/.
 
         Returns:
             Where they are now.
         """
         tiers = {tier: self.iterations(tier) for tier in (LIGHT, FULL, RECENT)}
-        later = {tier: [found for found in iterations if found > iteration] for tier, iterations in tiers.items()}
+        later = {tier: [number for number in iterations if number > iteration] for tier, iterations in tiers.items()}
         return self._move(later, DAMAGED)
 
     def set_foreign_aside(self) -> list[Path]:
-        """Moves checkpoints of other runs to checkpoints/foreign/: they would be counted, and ours deleted for them.
+        """Moves checkpoints of other runs to checkpoints/foreign/, where they do not count towards the number that is kept.
 
         Returns:
             Where they are now.
         """
-        foreign = {tier: [found for found, is_ours in self._there(tier) if not is_ours] for tier in (LIGHT, FULL)}
+        foreign = {tier: [number for number, is_ours in self._list(tier) if not is_ours] for tier in (LIGHT, FULL)}
         moved = self._move(foreign, FOREIGN)
         recent = _free(self._folder / FOREIGN / RECENT)
         if processes.is_first() and self.recent.set_foreign_aside(recent):
@@ -283,7 +283,7 @@ class Checkpoints:
 
     def _move(self, iterations: dict[str, list[int]], folder: str) -> list[Path]:
         moved = []
-        for tier, iteration in [(tier, iteration) for tier, found in iterations.items() for iteration in found]:
+        for tier, iteration in [(tier, iteration) for tier, numbers in iterations.items() for iteration in numbers]:
             self._forget(tier)
             moved.append(_free(self._folder / folder / f"{tier}-{iteration}"))
             if processes.is_first():
@@ -295,15 +295,15 @@ class Checkpoints:
         return moved
 
     def _forget(self, tier: str) -> None:
-        """Closes the tier's manager, which remembers what it has seen; the next use makes a new one."""
+        """Closes the tier's manager, which caches the folder's contents; the next use creates a new one."""
         if tier in self._managers:
             self._managers.pop(tier).close()
 
     def restore_for_resume(self, template: LoopState) -> Restored | None:
-        """The newest good checkpoint of any tier, full before recent before light; None where there is none.
+        """Restores the newest valid checkpoint of any tier, full before recent before light; None if there is none.
 
         Args:
-            template: Shapes and types of the loop state, as `jax.eval_shape` makes them.
+            template: Shapes and dtypes of the loop state, as from `jax.eval_shape`.
 
         Raises:
             RequestError: A checkpoint has another structure.
@@ -311,40 +311,40 @@ class Checkpoints:
         return self._newest_good(template, with_rest=True)
 
     def restore_train(self, template: LoopState, iteration: int | None = None) -> Restored | None:
-        """The learner alone, of the newest good checkpoint of either tier, or of ``iteration``. See `restore_for_resume`."""
+        """Restores the learner of the newest valid light or full checkpoint, or of ``iteration``; see `restore_for_resume`."""
         return self._newest_good(template, with_rest=False, only=iteration)
 
     def manifest(self, tier: str, iteration: int) -> dict[str, Any]:
-        """Manifest of a checkpoint: ``schema``, ``iteration``, ``items`` (`arrays.describe`), and ``progress``.
+        """Returns the manifest of a checkpoint: ``schema``, ``iteration``, ``items`` (`arrays.describe`), and ``progress``.
 
         Raises:
-            RequestError: It is damaged, or of another schema.
+            RequestError: The checkpoint is damaged, or of another schema.
         """
-        with self._told(tier, iteration):
+        with self._damage_as_request_error(tier, iteration):
             return self._manifest(tier, iteration)
 
     def restore(self, tier: str, manifest: dict[str, Any], template: LoopState) -> Restored:
-        """One checkpoint with all that it holds, compared with the checksums in its manifest.
+        """Restores one checkpoint completely, and compares it with the checksums in its manifest.
 
         Raises:
-            RequestError: It is damaged, or has another structure.
+            RequestError: The checkpoint is damaged, or has another structure.
         """
         iteration = manifest["iteration"]
-        with self._told(tier, iteration):
+        with self._damage_as_request_error(tier, iteration):
             return self._restored(tier, iteration, template, tier == FULL, manifest)
 
     @contextlib.contextmanager
-    def _told(self, tier: str, iteration: int) -> Iterator[None]:
+    def _damage_as_request_error(self, tier: str, iteration: int) -> Iterator[None]:
         try:
             yield
         except _Damaged as damage:
             raise RequestError(f"checkpoint {tier}/{iteration} is damaged ({damage})") from None
 
     def _newest_good(self, template: LoopState, with_rest: bool, only: int | None = None) -> Restored | None:
-        # The light one is smaller; and a recent one may vanish while somebody reads it to play with what it has learned.
+        # A light checkpoint is smaller, and a recent one may be deleted by the run while it is read.
         tiers = _PRECEDENCE if with_rest else (LIGHT, FULL)
-        found = [(iteration, tier) for tier in tiers for iteration in self.iterations(tier) if only in (None, iteration)]
-        for iteration, tier in sorted(found, key=lambda item: (-item[0], tiers.index(item[1]))):
+        candidates = [(iteration, tier) for tier in tiers for iteration in self.iterations(tier) if only in (None, iteration)]
+        for iteration, tier in sorted(candidates, key=lambda item: (-item[0], tiers.index(item[1]))):
             try:
                 if tier == RECENT:
                     return self._restore_recent(iteration, template)
@@ -379,7 +379,7 @@ class Checkpoints:
     def _restored(self, tier: str, iteration: int, template: LoopState, with_rest: bool, manifest: dict[str, Any]) -> Restored:
         import orbax.checkpoint as ocp
 
-        templates = {"train": template.train} | ({"rest": rest_of(template)} if with_rest else {})
+        templates = {"train": template.train} | ({"rest": state_without_learner(template)} if with_rest else {})
         specs = {name: host_specs(tree) for name, tree in templates.items()}
         where = self._folder / tier / str(iteration)
         for name, spec in specs.items():
@@ -399,11 +399,11 @@ class Checkpoints:
         import orbax.checkpoint as ocp
 
         try:
-            manager = self._manager(tier)  # first, for `hushed` puts back the hooks that it finds
+            manager = self._manager(tier)  # first, because `hushed` restores the hooks that it finds
             with hush.hushed():
                 return manager.restore(iteration, args=ocp.args.Composite(**arguments))
-        # orbax and tensorstore report damage as whatever exception they run into, plain Exception included.
+        # orbax and tensorstore report damage by arbitrary exceptions, plain Exception included.
         except Exception as error:
-            self._unsilence = hush.stay_silent  # as after a failed write: threads of this reading may complain later
+            self._unsilence = hush.stay_silent  # as after a failed write: threads of this read may report errors later
             text = " ".join(str(error).split())[:80]
             raise _Damaged(f"{type(error).__name__}: {text}") from None

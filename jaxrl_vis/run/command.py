@@ -1,4 +1,4 @@
-"""The command that trains as a configuration says."""
+"""Command line equivalent of a configuration."""
 
 import dataclasses
 import shlex
@@ -6,8 +6,8 @@ import shlex
 from jaxrl_vis.config import Config, preset
 
 
-def options_of(config: Config) -> list[str]:
-    """What follows ``jaxrl-vis train``: the task, the preset, and what differs from that."""
+def training_options(config: Config) -> list[str]:
+    """Returns the arguments of ``jaxrl-vis train``: the task, the preset, and the fields that differ from it."""
     words = [config.env, "--preset", config.preset]
     base = preset(config.preset, env=config.env, method=config.method).replace(method=preset(config.preset).method)
     for field in dataclasses.fields(Config):
@@ -22,6 +22,6 @@ def options_of(config: Config) -> list[str]:
     return words
 
 
-def command_of(config: Config) -> str:
-    """The shortest command that trains as ``config`` says, to be typed."""
-    return shlex.join(["jaxrl-vis", "train", *options_of(config)])
+def training_command(config: Config) -> str:
+    """Returns the shortest command that trains with ``config``, quoted for a shell."""
+    return shlex.join(["jaxrl-vis", "train", *training_options(config)])

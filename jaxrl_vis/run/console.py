@@ -1,4 +1,4 @@
-"""Output of a run: a progress bar on a terminal, plain lines everywhere else. Nothing that is printed can end it."""
+"""Console output of a run: a progress bar on a terminal, plain lines otherwise. Output errors never end the run."""
 
 import statistics
 import sys
@@ -13,13 +13,13 @@ from jaxrl_vis.run.bar import FittingProgress
 
 
 def show_shares(values: Sequence[float]) -> str:
-    """``0.93`` for one seed; for several their median, then each: ``0.93 (0.91 0.93 0.96)``."""
+    """Formats shares: ``0.93`` for one seed; for several, the median and all values: ``0.93 (0.91 0.93 0.96)``."""
     median = f"{statistics.median(values):.2f}"
     return median if len(values) == 1 else f"{median} ({' '.join(f'{value:.2f}' for value in values)})"
 
 
 def show_seconds(seconds: float) -> str:
-    """``42 s``, ``3 min 5 s`` or ``2 h 10 min``."""
+    """Formats a duration as ``42 s``, ``3 min 5 s`` or ``2 h 10 min``."""
     whole = round(seconds)
     if whole < 60:
         return f"{seconds:.1f} s" if seconds < 10 else f"{whole} s"
@@ -47,10 +47,10 @@ def _wordings(task: Task, elapsed: str, left: str) -> list[tuple[str, ...]]:
 
 
 class RunConsole:
-    """Shows a run's progress. A bar appears only where stdout is a terminal; lines are printed above it.
+    """Progress display of a run. A bar appears only if stdout is a terminal; lines are printed above it.
 
     Args:
-        quiet: Say nothing at all.
+        quiet: Suppress all output.
     """
 
     def __init__(self, quiet: bool = False):
@@ -68,11 +68,11 @@ class RunConsole:
             streams.say(line)
 
     def start(self, total: int, done: int) -> None:
-        """Shows the bar, on a terminal.
+        """Starts the progress bar, on a terminal.
 
         Args:
             total: Iterations of the whole run.
-            done: Iterations that an earlier part of the run has done.
+            done: Iterations completed before this process.
         """
         stream = streams.safe(sys.stdout)
         if self._quiet or not stream.isatty():
@@ -82,7 +82,7 @@ class RunConsole:
         self._task = self._bar.add_task("training", total=total, completed=done, success="-", distance="-", speed="-")
 
     def advance(self, done: int, steps_per_second: float) -> None:
-        """Moves the bar."""
+        """Advances the progress bar."""
         if self._bar is not None and self._task is not None:
             self._bar.update(self._task, completed=done, speed=f"{steps_per_second:,.0f}")
 
@@ -93,7 +93,7 @@ class RunConsole:
             self._bar.update(self._task, success=f"{statistics.median(success):.2f}", distance=shown)
 
     def stop(self) -> None:
-        """Takes the bar away."""
+        """Removes the progress bar."""
         if self._bar is not None:
             self._bar.stop()
             self._bar = None

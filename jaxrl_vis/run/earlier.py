@@ -1,4 +1,4 @@
-"""Leftovers of an earlier part of a run: was it finished, do its files belong together, and how it goes on."""
+"""Checks of an earlier part of a run: whether it is finished, its files are consistent, and how it is resumed."""
 
 import sys
 from collections.abc import Callable, Collection
@@ -18,23 +18,23 @@ from jaxrl_vis.types import LoopState
 def is_finished(
     folder: RunFolder, checkpoints: Checkpoints, programs: Programs, total: int, say: Callable[[str], None]
 ) -> bool:
-    """Returns whether a run was trained for ``total`` iterations: a good checkpoint, a row for it, and what it draws."""
+    """Returns True if a run is complete: a valid checkpoint after ``total`` iterations, its evaluation, and its images."""
     if max([0, *checkpoints.iterations(LIGHT), *checkpoints.iterations(FULL)]) < total:
         return False
     restored = checkpoints.restore_train(programs.shapes)
     if restored is None or restored.iteration < total:
-        say("the last checkpoint is not usable, so the run is not finished: going on from the last good one")
+        say("the last checkpoint is not usable, so the run is not finished: resuming from the last good one")
         return False
     files = [folder.curve, folder.video] if programs.shows_images else [folder.curve]
     return is_evaluated(folder, programs.seeds, restored) and all(file.exists() for file in files)
 
 
 def without_replay(programs: Programs, restored: Restored) -> LoopState:
-    """The state that a run goes on with from a light checkpoint, which has no replay.
+    """Builds the state for resuming from a light checkpoint, which has no replay.
 
-    Networks, optimisers, statistics and the iteration go on (and with it the random draws); the replay starts empty, and knows
-    that it is. Until it has filled up again, updates see fewer and newer episodes than they would have: a sound run, but not
-    the one that was interrupted.
+    Networks, optimisers, statistics and the iteration (and with it the random draws) are restored; the replay starts empty.
+    Until it has filled up again, updates sample from fewer and newer episodes: a valid run, but not a continuation of the
+    interrupted one.
     """
     fresh, layout = programs.init(programs.run_keys), programs.layout
     iteration = layout.put(jnp.asarray(restored.iteration, fresh.iteration.dtype), layout.everywhere)
@@ -42,29 +42,32 @@ def without_replay(programs: Programs, restored: Restored) -> LoopState:
 
 
 def is_evaluated(folder: RunFolder, seeds: Collection[int], restored: Restored) -> bool:
-    """Returns whether the evaluation that a run ends with is there, of all seeds, if what was restored is its end."""
+    """Returns True if the evaluation at the restored iteration exists for all seeds and none is due."""
     rows = [row for row in folder.rows() if row["iteration"] == restored.iteration and "eval/success" in row]
     is_due = Progress.from_dict(restored.progress).evaluation_due
     return not is_due and {row["seed"] for row in rows} >= set(seeds)
 
 
 def last_evaluation(restored: Restored) -> int:
-    """The last iteration that a checkpoint knows to have been evaluated; 0 for none."""
+    """Returns the last iteration that was evaluated according to a checkpoint; 0 for none."""
     since = restored.progress.get("since_evaluation")
     return 0 if since is None else restored.iteration - len(since)
 
 
 def refuse_missing_rows(folder: RunFolder, restored: Restored) -> None:
-    """Checks that metrics.jsonl has what was evaluated before a checkpoint was saved; damaged lines may have been that, those
-    of an earlier resumption too, which lie with the damaged checkpoints.
+    """Checks that metrics.jsonl has the evaluations before a checkpoint.
+
+    Damaged lines and rows of another run may have been these evaluations, since one wrong bit makes either. So may lines that
+    an earlier resumption moved to the damaged or foreign checkpoints.
 
     Raises:
-        RequestError: It ends earlier.
+        RequestError: The file ends earlier.
     """
     evaluated = last_evaluation(restored)
-    last = max((row["iteration"] for row in folder.rows()), default=0)
-    contents = metrics.read_contents(folder.metrics)
-    if last < evaluated and not contents.damaged and not contents.torn and not _aside(folder).exists():
+    rows, contents = folder.rows(), metrics.read_contents(folder.metrics)
+    last = max((row["iteration"] for row in rows), default=0)
+    has_others = len(contents.rows) > len(rows) or any(aside.exists() for aside in _asides(folder))
+    if last < evaluated and not (contents.damaged or contents.torn or has_others):
         raise RequestError(
             f"checkpoint {restored.tier}/{restored.iteration} of {folder.path} comes after an evaluation at iteration "
             f"{evaluated}, but {folder.metrics.name} ends at {last}: put back the whole file, or move the checkpoints after "
@@ -73,26 +76,26 @@ def refuse_missing_rows(folder: RunFolder, restored: Restored) -> None:
 
 
 def cut_back(folder: RunFolder, checkpoints: Checkpoints, last: int, keeps_later: bool, evaluated: int = 0) -> str | None:
-    """Keeps rows of the run up to an iteration in metrics.jsonl; `metrics.cut_back` has the rest."""
-    others = folder.checkpoints / FOREIGN / folder.metrics.name
-    return metrics.cut_back(folder.metrics, last, checkpoints.run_id, _aside(folder), others, keeps_later, evaluated)
+    """Truncates metrics.jsonl to the run's rows up to an iteration, see `metrics.cut_back`."""
+    return metrics.cut_back(folder.metrics, last, checkpoints.run_id, *_asides(folder), keeps_later, evaluated)
 
 
 def set_others_aside(folder: RunFolder, checkpoints: Checkpoints) -> list[str]:
-    """Keeps what other runs left in this folder before the run in it is deleted; lines that say so."""
+    """Moves other runs' files out of this folder before its run is deleted; returns lines that report it."""
     try:
         checkpoints.run_id = read_run_id(folder.path)
-    except RequestError:  # so nothing tells whose anything is
+    except RequestError:  # without an id, no file can be attributed
         return []
     moved = checkpoints.set_foreign_aside()
-    said = cut_back(folder, checkpoints, sys.maxsize, keeps_later=False)
-    return [*map(say_foreign, moved), *([said] if said else [])]
+    report = cut_back(folder, checkpoints, sys.maxsize, keeps_later=False)
+    return [*map(say_foreign, moved), *([report] if report else [])]
 
 
 def say_foreign(path: Path) -> str:
-    """Words for what another run left, and where it is now."""
+    """Returns a message about another run's file and its new location."""
     return f"not of this run, and left out: {path}"
 
 
-def _aside(folder: RunFolder) -> Path:
-    return folder.checkpoints / DAMAGED / folder.metrics.name
+def _asides(folder: RunFolder) -> tuple[Path, Path]:
+    """Files of lines that are damaged, and of rows of other runs."""
+    return folder.checkpoints / DAMAGED / folder.metrics.name, folder.checkpoints / FOREIGN / folder.metrics.name

@@ -1,14 +1,14 @@
-"""The folder of a run: where its files lie, which configuration they belong to, and who may write there.
+"""Run folder: its files, the configuration that they belong to, and the right to write there.
 
 The files:
 
     config.json     schema, id, versions, device, git revision, configuration  metrics.jsonl   see `metrics`
-    checkpoints/    see `checkpoint`      nonfinite/   what a run that went wrong held      curve.png   video.gif
+    checkpoints/    see `checkpoint`      nonfinite/   states with non-finite numbers      curve.png   video.gif
     run.lock        while a process writes here, see `lock`      tensorboard/, wandb/, wandb.json   see `loggers`
     processes.jsonl     see `goodput`
 
-A run has an id, which is drawn when it starts and stays when it is resumed. Every row of metrics and every checkpoint carries
-it, and nothing that carries another one is resumed, counted or deleted. Runs of earlier versions have none, and keep none.
+A run has a random id, which is kept when it is resumed. Every row of metrics and every checkpoint has it, and nothing with
+another id is resumed, counted or deleted. Runs of earlier versions have no id.
 """
 
 import contextlib
@@ -33,32 +33,32 @@ from jaxrl_vis.run.metrics import RUN_ID, read_rows
 SCHEMA = 1
 
 CHECKPOINT_FOLDERS = ("light", "full", "recent", "damaged")
-"""What `checkpoint` leaves in its folder."""
+"""Subfolders written by `checkpoint`."""
 
 _UNFINISHED = "orbax-checkpoint-tmp"  # in the name of a checkpoint that is being written
 
 LOGGER_FOLDERS, WANDB_STATE = ("tensorboard", "wandb"), "wandb.json"
-"""What `loggers` leave in a run folder."""
+"""Files and folders that `loggers` write into a run folder."""
 
 MAY_CHANGE = (
     *("preset", "env_folder", "env_steps"),
     *("devices", "data_devices"),
     *("eval_interval", "eval_episodes", "checkpoint_interval", "full_checkpoint_interval"),
 )
-"""Fields that a resumed run may set anew: where its task lies now, how long to train, on how many devices, how often to look
-and save. All others shape what is learned."""
+"""Fields that may change when a run is resumed: the location of its task, training length, devices, and the schedule of
+evaluations and checkpoints. All other fields affect learning."""
 
 _OF_WEIGHTINGS = (
     *(field.name for field in dataclasses.fields(Config) if field.name.startswith("weighting_")),
     *("aux_gradients", "aux_form", "actor_log"),
 )
-"""But for these, where losses are neither weighted nor logarithms: nothing reads them."""
+"""Exceptions, which are unused if losses are neither weighted nor logarithmic."""
 
 
 def default_folder(config: Config) -> Path:
-    """``runs/<env>-<method>-<preset>-seed<first>`` or ``...-seeds<first>to<last>``, below the working directory.
+    """Returns ``runs/<env>-<method>-<preset>-seed<first>`` or ``...-seeds<first>to<last>``, below the working directory.
 
-    The colon of ``module:Name`` becomes a hyphen: Windows allows none in the name of a file.
+    The colon of ``module:Name`` becomes a hyphen, because Windows does not allow it in file names.
     """
     last = config.seed + config.seeds - 1
     seeds = f"seed{config.seed}" if config.seeds == 1 else f"seeds{config.seed}to{last}"
@@ -66,14 +66,14 @@ def default_folder(config: Config) -> Path:
 
 
 def check_there(path: Path, resume: bool) -> None:
-    """Raises a `RequestError` where a run is to go on in a folder that is not there."""
+    """Raises a `RequestError` if a run is to be resumed in a missing folder."""
     _check_run_path(path)
     if resume and not path.exists():
         raise RequestError(f"nothing to resume: there is no folder {path}; leave out --resume to start a run there")
 
 
 def _check_run_path(path: Path) -> None:
-    """Checks that a run can lie in ``path``: what writes checkpoints takes only names that are UTF-8."""
+    """Checks that ``path`` can be a run folder: orbax accepts only names in UTF-8."""
     check_path(path / "config.json")
     try:
         str(path.resolve()).encode()
@@ -86,7 +86,7 @@ def _check_run_path(path: Path) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class RunFolder:
-    """Names of the files of a run; see the module's image.
+    """Paths of a run's files; see the module.
 
     Attributes:
         path: The folder itself.
@@ -96,7 +96,7 @@ class RunFolder:
 
     @property
     def config(self) -> Path:
-        """What was asked for, by which versions and on what device."""
+        """Configuration of the run, with versions and device."""
         return self.path / "config.json"
 
     @property
@@ -106,17 +106,17 @@ class RunFolder:
 
     @property
     def processes(self) -> Path:
-        """One line per process: how many iterations it has begun."""
+        """One line per process: the number of iterations that it has begun."""
         return self.path / "processes.jsonl"
 
     @property
     def checkpoints(self) -> Path:
-        """The tiers of checkpoints."""
+        """Tiers of checkpoints."""
         return self.path / "checkpoints"
 
     @property
     def nonfinite(self) -> Path:
-        """States with a NaN or an infinity in them."""
+        """Dumped states with non-finite numbers."""
         return self.path / "nonfinite"
 
     @property
@@ -126,17 +126,17 @@ class RunFolder:
 
     @property
     def video(self) -> Path:
-        """A few episodes of the trained policy."""
+        """Episodes of the trained policy."""
         return self.path / "video.gif"
 
     def lock(self, say: Callable[[str], None] = print) -> AbstractContextManager[Held]:
-        """See `run_lock`."""
+        """Returns the context that locks the folder, see `run_lock`."""
         return run_lock(self.path, say)
 
     def rows(self) -> list[dict[str, Any]]:
-        """The rows of metrics.jsonl that this run has written, in the order of their iterations, without damaged ones.
+        """Reads this run's rows of metrics.jsonl, in order of iteration, without damaged ones.
 
-        Where config.json cannot be read, these are all rows.
+        If config.json cannot be read, these are the rows of all runs.
 
         Raises:
             RequestError: metrics.jsonl cannot be read.
@@ -149,7 +149,7 @@ class RunFolder:
         return [row for row in rows if row.get(RUN_ID) == run_id]
 
     def check_place(self, held: Held) -> None:
-        """Checks that the folder still lies where it was when it was locked, before a run begins there.
+        """Checks that the folder is still in place since it was locked, before a run starts there.
 
         Args:
             held: What holds the folder.
@@ -159,13 +159,13 @@ class RunFolder:
         """
         held.check()
         if not held.is_in_place():
-            raise FolderGoneError(_where_gone(self.path, held.place(), "before the run began"))
+            raise FolderGoneError(_where_gone(self.path, held.current_path(), "before the run began"))
 
     def check_ours(self, run_id: str | None, held: Held) -> None:
-        """Checks that this is still the folder of a run, before something is written into it.
+        """Checks that the folder still belongs to a run, before something is written into it.
 
         Args:
-            run_id: The run's.
+            run_id: Id of the run.
             held: What holds the folder.
 
         Raises:
@@ -174,34 +174,34 @@ class RunFolder:
         held.check()
         try:
             is_ours = held.is_in_place() and read_run_id(self.path) == run_id
-        except RequestError:  # a file that cannot be read, for a moment or for good, is no reason to stop
+        except RequestError:  # an unreadable file, temporarily or permanently, is no reason to stop
             is_ours = self.config.exists()
         if not is_ours:
             when = "while the run wrote there, and what was trained since its last checkpoint is lost"
-            raise FolderGoneError(_where_gone(self.path, held.place(), when))
+            raise FolderGoneError(_where_gone(self.path, held.current_path(), when))
 
-    def remove_remains(self) -> None:
-        """Deletes what threads that were writing a checkpoint have made again of a folder that was moved or deleted under them.
+    def remove_remains(self, run_id: str | None) -> None:
+        """Deletes files that checkpoint threads have recreated in a folder after it was moved or deleted.
 
-        A folder with anything else in it is somebody's, and stays.
+        A folder with other contents is left alone.
+
+        Args:
+            run_id: Id of the run: a checkpoint of it may even have become complete.
         """
         with contextlib.suppress(OSError):
-            # A folder that went between two steps of a writing thread may even get its final name, but never a manifest.
-            unfinished = [
-                _UNFINISHED in path.name or (path.name.isdigit() and not (path / "manifest").exists())
-                for path in self.checkpoints.glob("*/*")
-            ]
-            if all(unfinished) and [entry.name for entry in self.path.iterdir()] == [self.checkpoints.name]:
+            remains = [_UNFINISHED in path.name or _is_remainder(path, run_id) for path in self.checkpoints.glob("*/*")]
+            if all(remains) and [entry.name for entry in self.path.iterdir()] == [self.checkpoints.name]:
                 shutil.rmtree(self.path)
 
     def check(self, config: Config, resume: bool = False, overwrite: bool = False) -> bool:
-        """Whether this folder may be used for ``config``. Changes nothing.
+        """Checks whether this folder may be used for ``config``. Changes nothing.
 
         Returns:
-            True where an earlier run goes on, False where a run starts at the beginning.
+            True if an earlier run is to be resumed, False if a new run starts.
 
         Raises:
-            RequestError: The folder holds something that the caller did not say what to do with, or a run that contradicts.
+            RequestError: The folder has contents that are neither to be resumed nor overwritten, or a run with a conflicting
+                configuration.
         """
         if resume and overwrite:
             raise RequestError("--resume and --overwrite contradict each other: give one of them")
@@ -215,7 +215,7 @@ class RunFolder:
         if all(name.startswith(LOCK_NAME) or is_temporary(name) for name in names):
             return False
         if not (resume or overwrite):
-            raise RequestError(f"run folder {self.path} exists: --resume goes on with it, --overwrite starts again")
+            raise RequestError(f"run folder {self.path} exists: --resume continues it, --overwrite starts again")
         if not self.config.exists():
             raise RequestError(f"{self.path} holds files but no config.json, so it is not a run: choose another --run-dir")
         if overwrite:
@@ -224,15 +224,15 @@ class RunFolder:
         return True
 
     def open(self, config: Config, resume: bool = False, overwrite: bool = False, log: tuple[str, ...] = ()) -> bool:
-        """`check`, then makes the folder ready: with ``overwrite``, an earlier run's files are deleted, and nothing else.
+        """Runs `check`, then prepares the folder: with ``overwrite``, an earlier run's files are deleted, and nothing else.
 
-        Call it last, when nothing can refuse the run any more.
+        Call it last, after all other checks of the request.
 
         Returns:
-            True where an earlier run goes on.
+            True if an earlier run is to be resumed.
 
         Raises:
-            RequestError: See `check`; or the folder cannot be written to, or something in it cannot be deleted.
+            RequestError: As in `check`; or the folder is not writable, or something in it cannot be deleted.
         """
         goes_on = self.check(config, resume, overwrite)
         run_id = read_run_id(self.path) if goes_on else secrets.token_hex(16)
@@ -241,7 +241,7 @@ class RunFolder:
         try:
             self.path.mkdir(parents=True, exist_ok=True)
             for file in self.path.iterdir():
-                if is_temporary(file.name):  # of a process that was killed
+                if is_temporary(file.name):  # of a killed process
                     file.unlink()
             write_atomically(self.config, json.dumps(_record(config, log, run_id), indent=2) + "\n")
         except OSError as error:
@@ -249,13 +249,13 @@ class RunFolder:
         return goes_on
 
     def _delete_run(self) -> None:
-        """Deletes what a run leaves, checkpoints first: what remains where something cannot be deleted is still a run.
+        """Deletes a run's files, checkpoints first: after a failure, the rest is still a run.
 
         Raises:
             RequestError: Something cannot be deleted.
         """
         own = [self.checkpoints / name for name in CHECKPOINT_FOLDERS]
-        if not self.checkpoints.is_dir():  # a file, or a link to nothing; a link to a folder stays: that disk was chosen
+        if not self.checkpoints.is_dir():  # a file, or a dangling link; a link to a folder is the user's choice of a disk
             own.append(self.checkpoints)
         folders = [self.nonfinite, *(self.path / name for name in LOGGER_FOLDERS)]
         for path in (*own, *folders, self.metrics, self.processes, self.curve, self.video, self.path / WANDB_STATE):
@@ -267,18 +267,28 @@ class RunFolder:
             except NotADirectoryError:  # checkpoints is a file
                 continue
             except OSError as error:
-                what = error.filename or path
+                file = error.filename or path
                 raise RequestError(
-                    f"the run in {self.path} cannot be deleted: {what} stays ({error.strerror or error}). No new run was "
+                    f"the run in {self.path} cannot be deleted: {file} stays ({error.strerror or error}). No new run was "
                     "started: delete it by hand, or choose another --run-dir"
                 ) from error
         if not self.checkpoints.is_symlink():
-            with contextlib.suppress(OSError):  # somebody else's files are in there, or it is not there
+            with contextlib.suppress(OSError):  # other files are in there, or it does not exist
                 self.checkpoints.rmdir()
 
 
+def _is_remainder(checkpoint: Path, run_id: str | None) -> bool:
+    """Returns whether a checkpoint without its run's folder is half of one, or of the run ``run_id``."""
+    manifest = checkpoint / "manifest"
+    try:
+        is_ours = not manifest.exists() or json.loads((manifest / "metadata").read_bytes()).get(RUN_ID) == run_id
+        return is_ours and checkpoint.name.isdigit()
+    except (OSError, ValueError, AttributeError):
+        return False
+
+
 def _where_gone(path: Path, place: Path | None, when: str) -> str:
-    """Words for a run folder that is not where it was."""
+    """Returns a message about a run folder that is not in place."""
     if place is None:
         return f"{path} is gone: it was deleted, or moved away, {when}"
     is_there = place == path.resolve()
@@ -302,7 +312,7 @@ def _record(config: Config, log: tuple[str, ...], run_id: str | None) -> dict[st
 
 
 def read_record(path: Path) -> dict[str, Any]:
-    """The contents of a run's config.json.
+    """Reads a run's config.json.
 
     Raises:
         RequestError: There is no run in ``path``, or its config.json cannot be read.
@@ -320,7 +330,7 @@ def read_record(path: Path) -> dict[str, Any]:
 
 
 def read_run_id(path: Path) -> str | None:
-    """The id of the run in ``path``; None of one of an earlier version, which has none.
+    """Reads the id of the run in ``path``; None for a run of an earlier version.
 
     Raises:
         RequestError: There is no run in ``path``, or its config.json cannot be read.
@@ -332,7 +342,7 @@ def read_run_id(path: Path) -> str | None:
 
 
 def read_log(path: Path) -> tuple[str, ...]:
-    """The loggers that the run in ``path`` had; none where there is no run."""
+    """Reads the loggers of the run in ``path``; none if there is no run."""
     check_path(path)
     log = read_record(path).get("log", []) if RunFolder(path).config.exists() else []
     if not isinstance(log, list) or not all(isinstance(name, str) for name in log):
@@ -341,7 +351,7 @@ def read_log(path: Path) -> tuple[str, ...]:
 
 
 def read_config(path: Path) -> Config:
-    """The configuration of the run in ``path``.
+    """Reads the configuration of the run in ``path``.
 
     Raises:
         RequestError: There is no run, or another version wrote it.
@@ -353,27 +363,27 @@ def read_config(path: Path) -> Config:
 
 
 def contradictions(saved: Config, config: Config, but_for: Collection[str] = MAY_CHANGE) -> list[str]:
-    """The fields in which ``config`` would not learn what ``saved`` learned, in words.
+    """Describes the fields in which ``config`` would learn differently from ``saved``.
 
     Args:
         saved: The configuration of a run.
-        config: What is asked for.
-        but_for: Fields that do not count.
+        config: The requested configuration.
+        but_for: Fields to ignore.
     """
-    before, asked = dataclasses.asdict(saved), dataclasses.asdict(config)
+    before, requested = dataclasses.asdict(saved), dataclasses.asdict(config)
     unread = _OF_WEIGHTINGS if saved.weighting == config.weighting == "none" else ()
     return [
-        f"{name} (saved {before[name]}, asked {asked[name]})"
+        f"{name} (saved {before[name]}, asked {requested[name]})"
         for name in sorted(before)
-        if name not in but_for and name not in unread and before[name] != asked[name]
+        if name not in but_for and name not in unread and before[name] != requested[name]
     ]
 
 
 def _check_same(path: Path, saved: Config, config: Config) -> None:
-    """Raises RequestError, naming the fields, where ``config`` would not learn what ``saved`` learned."""
-    found = contradictions(saved, config)
-    if found:
+    """Raises RequestError, naming the fields, if ``config`` would learn differently from ``saved``."""
+    differences = contradictions(saved, config)
+    if differences:
         raise RequestError(
-            f"cannot resume {path}, its configuration is another one: {'; '.join(found)}; "
-            "ask for the saved values, or take another --run-dir"
+            f"cannot resume {path}, its configuration differs: {'; '.join(differences)}; "
+            "use the saved values, or choose another --run-dir"
         )

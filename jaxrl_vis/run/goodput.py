@@ -1,13 +1,13 @@
-"""Gradient steps that were computed, and those that are in the networks: what a run has lost to whatever ended its processes.
+"""Goodput: gradient steps that are in the networks, as a fraction of those computed, over all processes of a run.
 
-processes.jsonl has a line for each process that has trained the run:
+processes.jsonl has one line per process that has trained the run:
 
     {"start": 35, "begun": 48, "replay_lost": false}
 
-This one went on from iteration 35 with the replay that was there, and has begun to learn from 48 more. The line is overwritten
-in place, at each of them. Nothing waits for the disk: what a process has written outlives it, however it ends, and a power cut
-costs the count of the last seconds. An iteration counts in full from the moment in which its gradient steps are given to the
-device, so the goodput of a run that was killed is never better than what is said here.
+This process resumed from iteration 35 with the replay, and has begun 48 more iterations. The line is overwritten in place at
+each iteration, without waiting for the disk: data written by a process survives its end, and a power cut loses only the last
+seconds. An iteration counts as begun when its gradient steps are dispatched to the device, so the goodput reported for a killed
+run is an upper bound.
 """
 
 import dataclasses
@@ -16,17 +16,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import IO
 
-_WIDTH = 80  # bytes of a line, its end included: it never grows over the next one
+_WIDTH = 80  # bytes per line, newline included, so that a line never overwrites the next one
 
 
 @dataclasses.dataclass
 class Process:
-    """A line of the file.
+    """One line of the file.
 
     Attributes:
-        start: The iteration that the process went on from; 0 where it began the run.
-        begun: Iterations that it has begun to learn from.
-        replay_lost: Whether it went on with an empty replay.
+        start: Iteration from which the process resumed; 0 if it started the run.
+        begun: Iterations begun by the process.
+        replay_lost: True if it resumed with an empty replay.
     """
 
     start: int
@@ -42,10 +42,10 @@ class Account:
     """Account of the iterations of a run.
 
     Attributes:
-        done: Iterations that are in the networks.
+        done: Iterations contained in the networks.
         begun: Iterations begun by all processes; None where a line cannot be read.
-        resumes: How often a process went on with the run.
-        replays_lost: How often it did so with an empty replay.
+        resumes: Number of resumptions.
+        replays_lost: Number of resumptions with an empty replay.
     """
 
     done: int
@@ -55,13 +55,13 @@ class Account:
 
     @property
     def goodput(self) -> float | None:
-        """The share of iterations begun that are in the networks; 1 before the first, None where it is not known."""
+        """Fraction of the iterations begun that are in the networks; 1 before the first, None if unknown."""
         if self.begun is None:
             return None
         return self.done / self.begun if self.begun else 1.0
 
     def describe(self, updates: int) -> str:
-        """The account in a line; ``updates``: gradient steps of an iteration."""
+        """Formats the account as one line; ``updates``: gradient steps per iteration."""
         if self.begun is None:
             text = "goodput unknown (processes.jsonl is damaged)"
         else:
@@ -74,11 +74,11 @@ def _times(count: int) -> str:
 
 
 def account(processes: Sequence[Process | None], done: int) -> Account:
-    """Adds up.
+    """Sums up the processes of a run.
 
     Args:
         processes: As `read_processes` returns them.
-        done: Iterations that are in the networks.
+        done: Iterations contained in the networks.
     """
     known = [process for process in processes if process is not None]
     begun = sum(process.begun for process in known) if len(known) == len(processes) else None
@@ -86,7 +86,7 @@ def account(processes: Sequence[Process | None], done: int) -> Account:
 
 
 def read_processes(path: Path) -> list[Process | None]:
-    """The processes of a run in their order, None for a line that cannot be read; nothing where there is no file."""
+    """Reads the processes of a run in order, None for a damaged line; empty if there is no file."""
     if not path.exists():
         return []
     return [_process(line) for line in path.read_bytes().splitlines() if line.strip()]
@@ -103,7 +103,7 @@ def _process(line: bytes) -> Process | None:
 
 
 class Goodput:
-    """Keeps the account of the process that trains. Nothing is written before `begin`.
+    """Account of the training process. Nothing is written before `begin`.
 
     Args:
         path: processes.jsonl.
@@ -114,46 +114,46 @@ class Goodput:
         self._earlier: list[Process | None] = []
         self._own = Process(0)
         self._file: IO[bytes] | None = None
-        self._place = 0
+        self._offset = 0
 
     def begin(self, iteration: int, replay_lost: bool) -> None:
-        """Adds a line for this process.
+        """Appends a line for this process.
 
         Args:
-            iteration: What it goes on from; 0 for a run that begins.
-            replay_lost: Whether it goes on without the replay that there was.
+            iteration: Iteration from which it resumes; 0 for a new run.
+            replay_lost: True if it resumes without the replay.
 
         Raises:
             OSError: The file cannot be written.
         """
         self._earlier = read_processes(self._path)
         before = self._path.read_bytes() if self._earlier else b""
-        if not self._earlier and iteration:  # nothing is known of earlier processes but what they have left
+        if not self._earlier and iteration:  # earlier processes are known only by their result
             self._earlier = [Process(0, iteration)]
             before = bytes(Process(0, iteration))
         if before and not before.endswith(b"\n"):
             before += b"\n"
-        self._own, self._place = Process(iteration, 0, replay_lost), len(before)
+        self._own, self._offset = Process(iteration, 0, replay_lost), len(before)
         self._path.write_bytes(before + bytes(self._own))
         self._file = self._path.open("r+b", buffering=0)
 
     def count(self) -> None:
-        """Notes that one more iteration is learned from."""
+        """Records the start of one more iteration."""
         self._own.begun += 1
         if self._file is None:
             return
         try:
-            self._file.seek(self._place)
+            self._file.seek(self._offset)
             self._file.write(bytes(self._own))
-        except OSError:  # a count is no reason to end a run
+        except OSError:  # a failed count must not end the run
             self.close()
 
     def close(self) -> None:
-        """Lets go of the file."""
+        """Closes the file."""
         if self._file is not None:
             self._file.close()
             self._file = None
 
     def account(self, done: int) -> Account:
-        """The account of this run, whose networks have learned from ``done`` iterations."""
+        """Returns the account of this run after ``done`` iterations."""
         return account([*self._earlier, self._own], done)

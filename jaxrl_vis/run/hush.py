@@ -1,4 +1,4 @@
-"""Silence of orbax and tensorstore, which print at length, from threads of their own too, what they also raise."""
+"""Silencing of orbax and tensorstore, which print long messages, also from their threads, about errors that they also raise."""
 
 import contextlib
 import gc
@@ -11,25 +11,25 @@ from typing import Any
 
 @contextlib.contextmanager
 def hushed() -> Iterator[None]:
-    """Keeps orbax from printing pages about a checkpoint that we are about to describe in one line."""
+    """Suppresses orbax's output about a checkpoint whose error will be reported in one line."""
     absl, before = logging.getLogger("absl"), sys.unraisablehook
     disabled = absl.disabled
     absl.disabled, sys.unraisablehook = True, lambda _: None
     try:
         yield
     finally:
-        gc.collect()  # abandoned coroutines complain when they are collected
+        gc.collect()  # abandoned coroutines print warnings when they are collected
         absl.disabled, sys.unraisablehook = disabled, before
 
 
 def silence_orbax() -> Callable[[], None]:
-    """Keeps orbax and tensorstore from printing, in threads of their own, what they also raise; returns what undoes that."""
+    """Silences orbax and tensorstore threads about errors that they also raise; returns the function that undoes it."""
 
     def is_not_orbax(record: logging.LogRecord) -> bool:
         return "orbax" not in record.pathname
 
     def hook(unraisable: Any) -> None:
-        # From another thread it is tensorstore, which wants to tell an event loop that has failed, and is gone.
+        # From other threads this is tensorstore, notifying an event loop that has failed and no longer exists.
         if threading.current_thread() is threading.main_thread():
             before(unraisable)
 
@@ -45,4 +45,4 @@ def silence_orbax() -> Callable[[], None]:
 
 
 def stay_silent() -> None:
-    """In the place of what undoes `silence_orbax`."""
+    """No-op replacement for the undo function of `silence_orbax`."""

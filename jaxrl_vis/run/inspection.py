@@ -1,4 +1,4 @@
-"""A run folder, looked at without computing anything: what is missing in it, damaged, or not this run's. Nothing is written."""
+"""Inspection of a run folder without computation: missing, damaged or foreign contents. Nothing is written."""
 
 import collections
 import dataclasses
@@ -17,21 +17,21 @@ from jaxrl_vis.run.metrics import RUN_ID
 from jaxrl_vis.run.recent import names_of_others
 
 LOST = "resume/replay_lost_at"
-"""Key of a row: the last iteration at which the run went on without its replay."""
+"""Key of a row: the last iteration at which the run resumed without its replay."""
 
 _PLACE = ("seed", "iteration", "updates", "env_steps")
 _PLAYED = ("play.gif", "play.mp4", "play.html", "play.png", "play_aux.gif")
 _ASIDE = {DAMAGED: "damaged", FOREIGN: "another run's"}
-_SHOWN = 5  # of a list in a line
+_SHOWN = 5  # entries of a list that a message quotes
 
 
 @dataclasses.dataclass
 class Findings:
-    """Lines about a run folder.
+    """Findings about a run folder, as lines of text.
 
     Attributes:
-        problems: What no run leaves behind that nobody has touched.
-        notes: What else there is to know.
+        problems: Contents that an untouched run never has.
+        notes: Other information.
     """
 
     problems: list[str] = dataclasses.field(default_factory=list)
@@ -43,10 +43,10 @@ class Expected:
     """Conditions that every row of a run must meet.
 
     Attributes:
-        seeds: Of the run, in order.
+        seeds: Seeds of the run, in order.
         updates, env_steps: Gradient steps and environment steps in an iteration, per seed.
         eval_interval: Iterations between evaluations.
-        run_id: Of the run; None where its config.json names none.
+        run_id: Id of the run; None if its config.json has none.
     """
 
     seeds: Sequence[int]
@@ -57,7 +57,7 @@ class Expected:
 
 
 def listed(values: Iterable[Any]) -> str:
-    """The first few of some values, and how many more there are."""
+    """Formats the first few values, and the number of the others."""
     words = [str(value) for value in values]
     return ", ".join(words[:_SHOWN]) + (f" and {len(words) - _SHOWN} more" if len(words) > _SHOWN else "")
 
@@ -71,7 +71,7 @@ def _is_figure(value: Any) -> bool:
 
 
 def _read_line(line: bytes) -> dict[str, Any] | str:
-    """A row, or what is wrong with it."""
+    """Parses a row, or describes what is wrong with it."""
     try:
         row = json.loads(line.decode("utf-8"))
     except (ValueError, RecursionError):  # UnicodeDecodeError and JSONDecodeError are ValueErrors
@@ -82,12 +82,12 @@ def _read_line(line: bytes) -> dict[str, Any] | str:
 
 
 def read_file(path: Path, expected: Expected, is_written: bool, findings: Findings) -> list[dict[str, Any]]:
-    """The rows of a metrics file that belong to a run, in the order of the file; what is wrong with others is found.
+    """Reads the rows of a run from a metrics file, in the order of the file; faults of other lines are reported.
 
     Args:
         path: metrics.jsonl.
-        expected: What must hold for each row.
-        is_written: Another process may be writing now, so that the last line may be half there.
+        expected: Conditions on every row.
+        is_written: Another process may be writing, so that the last line may be incomplete.
         findings: Is added to.
     """
     *lines, rest = path.read_bytes().split(b"\n") if path.exists() else [b""]
@@ -106,20 +106,20 @@ def read_file(path: Path, expected: Expected, is_written: bool, findings: Findin
 
 
 def _fault(row: Mapping[str, Any], expected: Expected) -> str:
-    """Contradiction between a row and the configuration; empty if there is none."""
+    """Describes a contradiction between a row and the configuration; empty if there is none."""
     iteration = row["iteration"]
     if row.get(RUN_ID) != expected.run_id:
         return f"is another run's ({row[RUN_ID]})" if RUN_ID in row else "names no run"
     if row["seed"] not in expected.seeds:
         return f"is of seed {row['seed']}, which config.json does not have"
-    for name, each in (("updates", expected.updates), ("env_steps", expected.env_steps)):
-        if row[name] != iteration * each:
-            return f"{name} is {row[name]}, not {iteration * each}, which config.json makes of {iteration} iterations"
+    for name, per_iteration in (("updates", expected.updates), ("env_steps", expected.env_steps)):
+        if row[name] != iteration * per_iteration:
+            return f"{name} is {row[name]}, not {iteration * per_iteration} as config.json implies for {iteration} iterations"
     if LOST in row and not (_is_count(row[LOST]) and row[LOST] <= iteration):
         return f"{LOST} is {row[LOST]!r}, which does not fit iteration {iteration}"
     wrong = [name for name, value in row.items() if name != RUN_ID and not _is_figure(value)]
     if wrong or "eval/success" not in row:
-        return f"{', '.join(wrong)}: no number" if wrong else "holds no evaluation"
+        return f"{', '.join(wrong)}: not a number" if wrong else "holds no evaluation"
     return ""
 
 
@@ -127,7 +127,7 @@ def _check_order(name: str, rows: Sequence[Mapping[str, Any]], expected: Expecte
     places = [(row["iteration"], row["seed"]) for row in rows]
     twice = sorted(place for place, count in collections.Counter(places).items() if count > 1)
     for iteration, seed in twice:
-        findings.problems.append(f"{name}: iteration {iteration}, seed {seed} is there more than once")
+        findings.problems.append(f"{name}: iteration {iteration}, seed {seed} occurs more than once")
     unique = list(dict.fromkeys(places))
     if unique != sorted(unique):
         first = next(after for before, after in zip(unique, unique[1:], strict=False) if after < before)
@@ -145,31 +145,31 @@ def missing_rows(
     without: Collection[int],
     is_written: bool,
 ) -> list[str]:
-    """Rows that must be there and are not, as lines.
+    """Lists required rows that are missing, as lines of text.
 
     Args:
-        rows: Those that are there.
-        expected: Which there must be.
-        reached: The last iteration whose rows were written, as checkpoints tell, or 0.
-        total: Iterations of the run; the last one ends with an evaluation.
-        without: Scheduled iterations that had none.
-        is_written: Another process may be writing rows of the last iteration now.
+        rows: The rows of the file.
+        expected: Conditions on the rows.
+        reached: Last iteration whose rows were written, according to checkpoints, or 0.
+        total: Iterations of the run; the last one is always evaluated.
+        without: Scheduled iterations without an evaluation.
+        is_written: Another process may be writing rows of the last iteration.
     """
-    there: dict[int, set[int]] = {}
+    seeds_at: dict[int, set[int]] = {}
     for row in rows:
-        there.setdefault(row["iteration"], set()).add(row["seed"])
-    last = max([reached, *there])
+        seeds_at.setdefault(row["iteration"], set()).add(row["seed"])
+    last = max([reached, *seeds_at])
     scheduled = set(range(expected.eval_interval, last + 1, expected.eval_interval)) - set(without)
     scheduled |= {total} if reached == total else set()
-    absent = sorted(scheduled - set(there))
+    absent = sorted(scheduled - set(seeds_at))
     lines = []
     if absent:
         lines.append(
             f"metrics.jsonl: rows of iteration {listed(absent)} are missing (every {expected.eval_interval}, "
             "unless a part of the run before a resumption had another eval_interval)"
         )
-    for iteration, seeds in sorted(there.items()):
-        if seeds < set(expected.seeds) and not (is_written and iteration == max(there)):
+    for iteration, seeds in sorted(seeds_at.items()):
+        if seeds < set(expected.seeds) and not (is_written and iteration == max(seeds_at)):
             lines.append(
                 f"metrics.jsonl: iteration {iteration} has no row of seed {listed(sorted(set(expected.seeds) - seeds))}"
             )
@@ -177,10 +177,10 @@ def missing_rows(
 
 
 def check_record(record: Mapping[str, Any], config: Config, findings: Findings) -> None:
-    """Finds what contradicts itself in config.json, or is not said there.
+    """Reports contradictions and omissions in config.json.
 
     Args:
-        record: Its contents.
+        record: Contents of the file.
         config: The configuration in it.
         findings: Is added to.
     """
@@ -191,26 +191,26 @@ def check_record(record: Mapping[str, Any], config: Config, findings: Findings) 
     device = record.get("device")
     count = device.get("count") if isinstance(device, Mapping) else None
     if count is None:
-        findings.problems.append("config.json: does not say on which device the run was")
+        findings.problems.append("config.json: does not name the device of the run")
     elif _is_count(count) and config.devices > count:
-        findings.problems.append(f"config.json: the run is on {config.devices} devices, of which there were {count}")
+        findings.problems.append(f"config.json: the run is on {config.devices} devices, but only {count} existed")
     if not isinstance(record.get("versions"), Mapping):
-        findings.problems.append("config.json: does not say which versions of the libraries made the run")
+        findings.problems.append("config.json: does not name the versions of the libraries")
     saved = record.get("config")
-    unsaid = sorted({field.name for field in dataclasses.fields(Config)} - set(saved if isinstance(saved, Mapping) else ()))
-    if unsaid:
+    unset = sorted({field.name for field in dataclasses.fields(Config)} - set(saved if isinstance(saved, Mapping) else ()))
+    if unset:
         findings.notes.append(
-            f"config.json does not say {listed(unsaid)}: taken to be as by default, or saved by an older name"
+            f"config.json does not have {listed(unset)}: taken to be the default, or saved under an older name"
         )
 
 
 def check_files(folder: RunFolder, is_finished: bool, shows_images: bool, findings: Findings) -> None:
-    """Finds files that a run does not write, half-written and set aside checkpoints, and what a finished run lacks.
+    """Reports foreign files, incomplete and set aside checkpoints, and files that a finished run lacks.
 
     Args:
         folder: The run folder.
-        is_finished: The run has come to its end.
-        shows_images: It has a video, then.
+        is_finished: The run is complete.
+        shows_images: A complete run has a video.
         findings: Is added to.
     """
     files = (folder.config, folder.metrics, folder.processes, folder.curve, folder.video)
@@ -227,16 +227,16 @@ def check_files(folder: RunFolder, is_finished: bool, shows_images: bool, findin
             findings.notes += [f"checkpoints/{tier}/{name} is half-written" for name in half]
             foreign += [f"checkpoints/{tier}/{name}" for name in names - set(half)]
         foreign += [f"checkpoints/{RECENT}/{name}" for name in names_of_others(folder.checkpoints / RECENT)]
-        for name, why in _ASIDE.items():
+        for name, reason in _ASIDE.items():
             if (folder.checkpoints / name).is_dir():
                 aside = sorted(entry.name for entry in (folder.checkpoints / name).iterdir())
-                findings.notes.append(f"set aside before as {why}: {listed(aside)}")
+                findings.notes.append(f"set aside before as {reason}: {listed(aside)}")
     if None in read_processes(folder.processes):
-        findings.notes.append(f"{folder.processes.name} has a damaged line: the goodput of the run is not known")
+        findings.notes.append(f"{folder.processes.name} has a damaged line: the goodput of the run is unknown")
     if folder.nonfinite.is_dir():
-        findings.notes.append(f"the run has met a number that is not finite: {folder.nonfinite.name}/ has its state")
+        findings.notes.append(f"the run has met a non-finite number: {folder.nonfinite.name}/ has its state")
     if foreign:
-        findings.notes.append(f"no files of a run: {listed(sorted(foreign))}")
+        findings.notes.append(f"not files of a run: {listed(sorted(foreign))}")
     if is_finished:
         wanted = [folder.curve, *([folder.video] if shows_images else [])]
         findings.problems += [f"{file.name} is missing, though the run is finished" for file in wanted if not file.exists()]

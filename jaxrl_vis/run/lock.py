@@ -1,9 +1,10 @@
-"""One writer for a run folder: the file ``run.lock``, which says who holds it.
+"""Exclusive lock of a run folder: the file ``run.lock``, which names its holder.
 
-Where the file system has locks, the operating system holds it, and lets go when the holder dies, however it dies. Where it has
-none (some network and FUSE file systems), the file itself is the lock: it names host and process, and its holder touches it
-every `HEARTBEAT_S` in a thread of its own. A dead holder's is taken over: on this host when no such process runs any more, of
-another host when the file was left untouched for `LEASE_S`, by this host's own clock. `filelock` does both.
+If the file system supports locks, the operating system holds the lock and releases it when the holder ends in any manner.
+Otherwise (some network and FUSE file systems), the existence of the file is the lock: it names host and process, and its holder
+touches it every `HEARTBEAT_S` from a thread. The lock of a dead holder is taken over: on the same host once its process no
+longer runs, from another host once the file was not touched for `LEASE_S`, by this host's own clock. `filelock` implements
+both.
 """
 
 import contextlib
@@ -24,87 +25,87 @@ from jaxrl_vis.run.signals import shielded_children
 FILE_NAME = "run.lock"
 HEARTBEAT_S, LEASE_S = 5.0, 60.0
 _POLL_S = 0.1
-# What file systems answer that have no locks: Lustre and FUSE, NFS without its lock daemon, 9p.
+# Errors of file systems without locks: Lustre and FUSE, NFS without its lock daemon, 9p.
 _NO_LOCKS = {errno.ENOSYS, errno.ENOLCK, errno.EINVAL, *(getattr(errno, name, None) for name in ("ENOTSUP", "EOPNOTSUPP"))}
-_MARKER = "filelock/"  # what a file that is the lock itself begins with
+_MARKER = "filelock/"  # first bytes of a file that is itself the lock
 _MEND = "wait for it, stop it, or choose another --run-dir"
 
 
 class FolderGoneError(StorageError):
-    """The run folder is not this process's any more: moved, deleted, or taken over. One line: what, and how to go on."""
+    """Loss of the run folder: moved, deleted, or taken over. One line: the cause, and how to continue."""
 
 
 class Held:
-    """A run folder that this process holds.
+    """Lock of a run folder held by this process.
 
     Args:
-        folder: The folder, which is there.
+        folder: The folder, which must exist.
 
     Attributes:
-        is_lost: Whether another process has taken the lock over, as it has taken this one for dead.
+        is_lost: True if another process has taken over the lock because this one seemed dead.
     """
 
     def __init__(self, folder: Path):
         self._folder, self.is_lost = folder, False
         self._marker: tuple[Path, os.stat_result] | None = None
-        can_open = hasattr(os, "O_DIRECTORY")  # Windows opens no folders
+        can_open = hasattr(os, "O_DIRECTORY")  # Windows cannot open folders
         self._descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY) if can_open else None
 
     def note_loss(self, _: object) -> None:
-        """Takes down that the lock is lost; called from the thread that touches it."""
+        """Records the loss of the lock; called from the heartbeat thread."""
         self.is_lost = True
 
     def watch(self, path: Path) -> None:
-        """Takes a file for the lock itself, which is lost when there is another one in its place."""
+        """Registers a file that is itself the lock, which is lost when another file takes its place."""
         self._marker = path, path.stat()
 
     def check(self) -> None:
         """Checks that the lock is still held.
 
         Raises:
-            FolderGoneError: It is lost.
+            FolderGoneError: The lock is lost.
         """
         if self._marker is not None:
             path, status = self._marker
-            with contextlib.suppress(OSError):  # not there: the folder was moved, which others find out
+            with contextlib.suppress(OSError):  # missing: the folder was moved, which other checks detect
                 self.is_lost |= not os.path.samestat(path.stat(), status)
         if self.is_lost:
             raise FolderGoneError(
-                f"{self._folder / FILE_NAME} is lost: another process has taken this one for dead, as it stood still for long. "
-                "What was saved before is good, and no more is saved; --resume goes on, unless another process does already"
+                f"{self._folder / FILE_NAME} is lost: another process took over, as this one did not respond for long. "
+                "Earlier saves are good, nothing more is saved; --resume continues, unless another process does already"
             )
 
     def is_in_place(self) -> bool:
-        """Returns whether the folder still lies under its name, and not another one, or none."""
+        """Returns True if the folder is still the one under its name."""
         if (self._folder / FILE_NAME).exists():
             return True
-        with contextlib.suppress(OSError):  # the folder may be there, and the lock's file deleted by hand
+        with contextlib.suppress(OSError):  # the folder may exist with its lock file deleted by hand
             return self._descriptor is not None and os.path.samestat(self._folder.stat(), os.fstat(self._descriptor))
         return False
 
-    def place(self) -> Path | None:
-        """Present path of the folder, if it was moved; None where it was deleted, or the system does not say."""
+    def current_path(self) -> Path | None:
+        """Returns the folder's current path; None if it was deleted, or the system cannot tell."""
         if self._descriptor is None:
             return None
         with contextlib.suppress(OSError):
-            place = Path(os.readlink(f"/proc/self/fd/{self._descriptor}"))
-            if os.path.samestat(place.stat(), os.fstat(self._descriptor)):
-                return place
+            current_path = Path(os.readlink(f"/proc/self/fd/{self._descriptor}"))
+            if os.path.samestat(current_path.stat(), os.fstat(self._descriptor)):
+                return current_path
         return None
 
     def close(self) -> None:
-        """Lets go of the folder."""
+        """Closes the folder."""
         if self._descriptor is not None:
             os.close(self._descriptor)
 
 
 @contextlib.contextmanager
 def run_lock(folder: Path, say: Callable[[str], None] = print) -> Iterator[Held]:
-    """Holds a run folder; makes it where it is missing, and removes it again if it is still empty afterwards.
+    """Locks a run folder; creates it if missing, and removes it again if it is still empty at the end.
 
     Args:
         folder: The folder.
-        say: Called with one line where the file system has no locks, and where a dead holder's lock is taken over.
+        say: Called with one line if the file system has no locks, and if a dead holder's lock is taken over.
 
     Raises:
         RequestError: Another process holds the folder, or it cannot be written to.
@@ -126,11 +127,11 @@ def run_lock(folder: Path, say: Callable[[str], None] = print) -> Iterator[Held]
     finally:
         held.close()
         with contextlib.suppress(OSError):
-            folder.rmdir()  # only an empty one goes
+            folder.rmdir()  # fails unless it is empty
 
 
 def _lock_by_system(path: Path, stack: contextlib.ExitStack) -> bool:
-    """Locks the file until the end of ``stack``; False where the file system has no locks, or the holder has found none.
+    """Locks the file until the end of ``stack``; False if the file system has no locks, or its present holder found none.
 
     Raises:
         RequestError: Another process holds it.
@@ -143,17 +144,17 @@ def _lock_by_system(path: Path, stack: contextlib.ExitStack) -> bool:
         lock.acquire(blocking=False)
     except filelock.Timeout:
         raise _in_use(path, _read(path)) from None
-    if _read(path).startswith(_MARKER):  # by a process that was faster, and finds no locks here
+    if _read(path).startswith(_MARKER):  # by a faster process, which found no locks here
         lock.release()
         return False
     stack.callback(_release, lock, path, path.stat())
-    with contextlib.suppress(OSError):  # on Windows nobody writes into a locked file
+    with contextlib.suppress(OSError):  # on Windows a locked file cannot be written
         path.write_text(json.dumps({"host": socket.gethostname(), "process": os.getpid()}), encoding="utf-8")
     return True
 
 
 def _has_locks(folder: Path) -> bool:
-    """Returns whether files there can be locked, tried on one that nobody else sees: a lock file would look held."""
+    """Returns True if files in a folder can be locked; tried on an anonymous file, because a lock file would seem held."""
     with tempfile.TemporaryFile(dir=folder) as file:
         try:
             filelock.lock_descriptor(file.fileno(), blocking=False)
@@ -165,7 +166,7 @@ def _has_locks(folder: Path) -> bool:
 
 
 def _release(lock: filelock.BaseFileLock, path: Path, status: os.stat_result) -> None:
-    """Deletes a lock file, if it is not another one by now, and lets go of it; on Windows the other way round."""
+    """Deletes the lock file, unless it was replaced, and releases the lock; on Windows in the reverse order."""
     if os.name == "nt":
         lock.release()
     with contextlib.suppress(OSError):
@@ -175,7 +176,7 @@ def _release(lock: filelock.BaseFileLock, path: Path, status: os.stat_result) ->
 
 
 def _lock_by_marker(path: Path, held: Held, say: Callable[[str], None], stack: contextlib.ExitStack) -> None:
-    """Makes the file the lock until the end of ``stack``.
+    """Uses the file itself as the lock until the end of ``stack``.
 
     Raises:
         RequestError: Another process holds it.
@@ -190,8 +191,8 @@ def _lock_by_marker(path: Path, held: Held, say: Callable[[str], None], stack: c
         on_compromise=held.note_loss,
         thread_local=False,
     )
-    seen: tuple[float, int] | None = None
-    seen_at = 0.0
+    last_touch: tuple[float, int] | None = None
+    last_touch_at = 0.0
     while True:
         before = _read(path)
         if before and not before.startswith(_MARKER) and _is_alive_or_elsewhere(before):
@@ -202,12 +203,12 @@ def _lock_by_marker(path: Path, held: Held, say: Callable[[str], None], stack: c
             break
         except filelock.Timeout:
             now, text = _touched(path), _read(path)
-            if seen is None and now is not None:
-                say(f"{path} is that of {_holder(text)}: waiting up to {LEASE_S:g} s for a sign of life of it")
-                seen, seen_at = now, time.monotonic()
-            elif now is not None and now != seen and text:  # empty until its holder, who has just made it, writes into it
+            if last_touch is None and now is not None:
+                say(f"{path} belongs to {_holder(text)}: waiting up to {LEASE_S:g} s for a sign of life")
+                last_touch, last_touch_at = now, time.monotonic()
+            elif now is not None and now != last_touch and text:  # a new file is empty until its holder writes into it
                 raise _in_use(path, text) from None
-            elif now is not None and not text and time.monotonic() - seen_at > LEASE_S:  # which `filelock` never takes over
+            elif now is not None and not text and time.monotonic() - last_touch_at > LEASE_S:  # `filelock` keeps these
                 raise _in_use(path, text, f"if there is none, delete {path}, else ") from None
             time.sleep(_POLL_S)
         except filelock.LeaseSettingsMismatch:
@@ -234,13 +235,13 @@ def _read(path: Path) -> str:
 
 
 def _owner(text: str) -> tuple[str, int] | None:
-    """Host and process of what a lock file says, in either form."""
+    """Parses host and process from a lock file of either form."""
     with contextlib.suppress(ValueError, KeyError, TypeError):
         if not text.startswith(_MARKER):
             record = json.loads(text)
             return str(record["host"]), int(record["process"])
         fields = {key: value for key, _, value in (line.partition("=") for line in text.splitlines()[1:])}
-        return fields["host"].partition("?")[0], int(fields["pid"])  # after it: which of its containers
+        return fields["host"].partition("?")[0], int(fields["pid"])  # the part after it names the container
     return None
 
 
@@ -250,7 +251,7 @@ def _holder(text: str) -> str:
 
 
 def _is_alive_or_elsewhere(text: str) -> bool:
-    """Returns whether the process that a system's lock names may still run, asked where that lock cannot be."""
+    """Returns True if the process named by a system lock may still run; used where that lock is not available."""
     owner = _owner(text)
     if owner is None:
         return False

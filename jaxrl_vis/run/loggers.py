@@ -1,9 +1,9 @@
-"""``--log tensorboard wandb``: what metrics.jsonl holds, the configuration, the curve and the video, for people who look there.
+"""Loggers (``--log tensorboard wandb``) of metrics.jsonl, the configuration, the curve and the video.
 
-metrics.jsonl stays the truth. A logger is told what that file holds already when it starts, and from then on every row that is
-added, so that a run that was resumed, or that got a logger later, shows each evaluation once.
+metrics.jsonl remains the reference. At its start, a logger receives the rows that the file already has, and then every new row,
+so that a resumed run, or a logger added later, shows each evaluation once.
 
-A logger that fails says so in one line and is not asked again: training goes on without it.
+A failing logger is reported in one line and not used again: training continues without it.
 """
 
 import importlib.util
@@ -20,11 +20,11 @@ LoggerName = Literal["tensorboard", "wandb"]
 NAMES: tuple[str, ...] = get_args(LoggerName)
 
 _MODULES = {"tensorboard": "tensorboardX", "wandb": "wandb"}
-_LEAVING_S = {True: 10.0, False: 60.0}  # seconds that a logger has to finish: after a signal, and at the end of a run
+_LEAVING_S = {True: 10.0, False: 60.0}  # seconds allowed for closing a logger: after a signal, and at the end of a run
 
 
 def check(names: Sequence[str]) -> None:
-    """Checks that there are such loggers and that their libraries are installed, without importing them.
+    """Checks that loggers exist and that their libraries are installed, without importing them.
 
     Raises:
         RequestError: There is no such logger, or its library is missing.
@@ -37,25 +37,25 @@ def check(names: Sequence[str]) -> None:
 
 
 class Logger(Protocol):
-    """What a logger does. Any method may raise anything."""
+    """Interface of a logger. Any method may raise any exception."""
 
     def rows(self, rows: Sequence[Row]) -> None:
-        """Takes in rows of metrics.jsonl."""
+        """Logs rows of metrics.jsonl."""
 
     def image(self, name: str, file: Path, env_steps: int) -> None:
-        """Takes in a .png or a .gif that was drawn after ``env_steps`` steps."""
+        """Logs a .png or .gif drawn after ``env_steps`` steps."""
 
     def close(self) -> None:
-        """Sees to it that everything has arrived."""
+        """Waits until everything is delivered."""
 
 
 class Loggers:
-    """The loggers of one run. Nothing is opened before `open`.
+    """Loggers of one run. Nothing is opened before `open`.
 
     Args:
-        names: Which; those of `NAMES`.
+        names: Names of the loggers, from `NAMES`.
         folder: The run folder.
-        say: Called with one line about what goes wrong.
+        say: Called with one line about each failure.
     """
 
     def __init__(self, names: Sequence[str], folder: Path, say: Callable[[str], None]):
@@ -63,12 +63,12 @@ class Loggers:
         self._open: dict[str, Logger] = {}
 
     def open(self, record: Mapping[str, Any], seeds: Sequence[int], rows: Sequence[Row]) -> None:
-        """Opens them all.
+        """Opens the loggers.
 
         Args:
             record: The contents of config.json.
             seeds: The seeds of the run.
-            rows: What metrics.jsonl holds already.
+            rows: Rows already in metrics.jsonl.
         """
         for name in self._names:
 
@@ -79,18 +79,18 @@ class Loggers:
             self._try(name, begin)
 
     def rows(self, rows: Sequence[Row]) -> None:
-        """Passes rows on."""
+        """Forwards rows to the loggers."""
         for name, logger in list(self._open.items()):
             self._try(name, lambda logger=logger: logger.rows(rows))
 
     def image(self, name: str, file: Path, env_steps: int) -> None:
-        """Passes an image on, if it is there."""
+        """Forwards an image to the loggers, if the file exists."""
         if file.exists():
-            for which, logger in list(self._open.items()):
-                self._try(which, lambda logger=logger: logger.image(name, file, env_steps))
+            for logger_name, logger in list(self._open.items()):
+                self._try(logger_name, lambda logger=logger: logger.image(name, file, env_steps))
 
     def close(self, in_a_hurry: bool = False) -> None:
-        """Closes them, and does not wait for long: a library that waits for a network would never end the run."""
+        """Closes the loggers, within a time limit: a library that waits for a network would otherwise never let the run end."""
         for name in list(self._open):
             logger = self._open.pop(name)
             thread = threading.Thread(target=self._try, args=(name, logger.close), daemon=True)
@@ -104,8 +104,8 @@ class Loggers:
             act()
         except Exception as error:
             self._open.pop(name, None)
-            what = " ".join(f"{type(error).__name__}: {error}".split())
-            self._say(f"--log {name} failed and is left out from here on ({what[:200]}); metrics.jsonl has everything")
+            description = " ".join(f"{type(error).__name__}: {error}".split())
+            self._say(f"--log {name} failed and is not used any more ({description[:200]}); metrics.jsonl has everything")
 
 
 def _open_tensorboard(folder: Path, record: Mapping[str, Any], seeds: Sequence[int], say: Callable[[str], None]) -> Logger:

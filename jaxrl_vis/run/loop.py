@@ -40,7 +40,7 @@ from jaxrl_vis.run.pending import Pending
 from jaxrl_vis.run.programs import Programs
 from jaxrl_vis.run.progress import Progress
 from jaxrl_vis.run.results import Results, describe
-from jaxrl_vis.run.saving import Saver, import_what_saves
+from jaxrl_vis.run.saving import Saver, import_saving_libraries
 from jaxrl_vis.run.signals import Interruption
 from jaxrl_vis.streams import reserve_standard_files, safe_streams
 from jaxrl_vis.types import LoopState
@@ -162,7 +162,7 @@ class RunLoop:
                         self._checkpoints.close()
                     self._loggers.close(in_a_hurry=bool(interruption))
                     if self.has_begun and self._held is not None and not self._held.is_in_place():
-                        self._folder.remove_remains()
+                        self._folder.remove_remains(self._checkpoints.run_id)
                 self._goodput.close()
 
     def _check_ours(self) -> None:
@@ -208,7 +208,7 @@ class RunLoop:
 
         started = time.monotonic()
         self._say(f"compiling ({programs.says_of_cache()}) ...")
-        compiled = programs.compile(meanwhile=import_what_saves)
+        compiled = programs.compile(meanwhile=import_saving_libraries)
         self._compile_s = time.monotonic() - started
         self._progress.compile_s += self._compile_s
         return compiled
@@ -218,7 +218,7 @@ class RunLoop:
         self._say(f"compiled in {show_seconds(self._compile_s)}")
         is_there, layout = self._loop is not None, self._programs.layout
         check_compiled(compiled, is_there, layout)
-        has_room = not processes.any_of(not fit_together(compiled, is_there, layout))  # and all have come here
+        has_room = not processes.any_process(not fit_together(compiled, is_there, layout))  # and all have come here
         self._evaluates_ahead = self._programs.evaluates_ahead and has_room
         if self._writes:
             self._open(goes_on, overwrite)
@@ -231,7 +231,7 @@ class RunLoop:
             foreign = self._checkpoints.set_foreign_aside()
             damaged = self._checkpoints.set_aside_after(self._done) if goes_on else []
             if self._writes:
-                self._checkpoints.recent.go_on_from(self._recent_at)
+                self._checkpoints.recent.resume_from(self._recent_at)
                 self._goodput.begin(self._done, self._replay_lost)
                 self._begin_log(goes_on, damaged, foreign)
         processes.meet("begun")
@@ -370,7 +370,7 @@ class RunLoop:
         values = outcome.read_per_seed(self._config.seeds)
         if not all(np.isfinite(row).all() for row in values.values()):
             self._stop_nonfinite(f"the evaluation after iteration {self._done}", values)
-        means = metrics.with_precision(metrics.mean_of(progress.since_evaluation))
+        means = metrics.with_precision(metrics.average_metrics(progress.since_evaluation))
         times = {
             "time/wall_s": progress.wall_s + time.monotonic() - self._started,
             "time/compile_s": progress.compile_s,

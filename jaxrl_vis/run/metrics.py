@@ -1,10 +1,10 @@
-"""metrics.jsonl, and the numbers that go into it. No JAX here: everything is plain Python by now.
+"""metrics.jsonl and its contents. Uses plain Python only, no JAX.
 
-One line per seed and evaluation: seed, iteration, updates, env_steps (counts per seed, since the beginning), eval/*, the means
-of train/* since the last evaluation and a quotient of two of them (`with_precision`), resume/replay_lost_at (where a run went
-on from a light checkpoint: the last iteration at which its replay was lost), run_id (as in config.json), and time/wall_s (the
-run so far, with evaluation, compilation and what came before a resumption), time/compile_s (of that, compilation),
-time/env_steps_per_s (all seeds together, since the last evaluation), and time/goodput (`goodput`).
+One line per seed and evaluation: seed, iteration, updates, env_steps (cumulative counts per seed), eval/*, the means of train/*
+since the last evaluation and a ratio of two of them (`with_precision`), resume/replay_lost_at (the last iteration at which the
+run resumed from a light checkpoint, without its replay), run_id (as in config.json), and time/wall_s (total, with evaluation,
+compilation and earlier processes), time/compile_s (compilation, included in the former), time/env_steps_per_s (all seeds
+together, since the last evaluation), and time/goodput (`goodput`).
 """
 
 import dataclasses
@@ -20,24 +20,24 @@ from jaxrl_vis.files import sync_folder, write_atomically
 from jaxrl_vis_envs.documents import parse_json
 
 PerSeed = dict[str, list[float]]
-"""Name -> one number per seed."""
+"""Maps names to one number per seed."""
 
 Row = Mapping[str, Any]
 """A line of the file."""
 
 RUN_ID = "run_id"
-"""Key of the run that a row, a checkpoint's manifest or a config.json is of; not there in those of earlier versions."""
+"""Key of the run's id in a row, a checkpoint's manifest or a config.json; missing in those of earlier versions."""
 
-_PLACE = ("seed", "iteration", "env_steps", RUN_ID)  # of a row: where it belongs, not what it says
-_COUNTS = ("seed", "iteration", "updates", "env_steps")  # what no row is without
-_LARGEST = 2**63  # of a number in a row: beyond, arrays of whole numbers end
-_SHOWN = 8  # numbers of lines in a message
+_PLACE = ("seed", "iteration", "env_steps", RUN_ID)  # identify a row; not figures
+_COUNTS = ("seed", "iteration", "updates", "env_steps")  # required in every row
+_LARGEST = 2**63  # of a number in a row: the range of integer arrays
+_SHOWN = 8  # line numbers in a message
 
 
-def mean_of(history: Sequence[Mapping[str, Sequence[float]]]) -> PerSeed:
-    """The mean of each metric over the iterations in ``history``, seed by seed.
+def average_metrics(history: Sequence[Mapping[str, Sequence[float]]]) -> PerSeed:
+    """Averages metrics over the iterations in ``history``, seed by seed.
 
-    The order of additions is fixed, so a resumed run writes the same digits as a straight one.
+    The order of summation is fixed, so that a resumed run writes the same digits as an uninterrupted one.
     """
     if not history:
         return {}
@@ -50,9 +50,9 @@ def mean_of(history: Sequence[Mapping[str, Sequence[float]]]) -> PerSeed:
 
 
 def with_precision(means: PerSeed) -> PerSeed:
-    """``means`` with the precision of the filter: the share of what it has dropped that truly was false; NaN for nothing.
+    """Adds the precision of the filter to ``means``: the fraction of the dropped negatives that were false; NaN if none.
 
-    The quotient is taken of means, not the mean of quotients: so it is the share among all that was dropped.
+    This is a ratio of means, not a mean of ratios: the fraction among all dropped samples.
     """
     if "train/filtered_false_share" not in means:
         return means
@@ -62,23 +62,23 @@ def with_precision(means: PerSeed) -> PerSeed:
 
 
 def _nine_digits(value: float) -> float:
-    # As many as a float32 has, so that the file stays readable.
+    # The precision of a float32, so that the file stays readable.
     return float(f"{value:.9g}")
 
 
 def make_rows(
     seeds: Iterable[int], counts: Mapping[str, int], values: Mapping[str, Sequence[float]], run_id: str | None = None
 ) -> list[dict[str, Any]]:
-    """One row per seed: its number, ``counts``, its share of ``values``, and whose it is. A NaN or an infinity becomes None."""
-    whose = {} if run_id is None else {RUN_ID: run_id}
+    """Makes one row per seed: seed, ``counts``, its entry of ``values``, and the run's id. Non-finite numbers become None."""
+    run = {} if run_id is None else {RUN_ID: run_id}
     return [
-        {"seed": seed, **counts, **{name: row[i] if math.isfinite(row[i]) else None for name, row in values.items()}, **whose}
+        {"seed": seed, **counts, **{name: row[i] if math.isfinite(row[i]) else None for name, row in values.items()}, **run}
         for i, seed in enumerate(seeds)
     ]
 
 
 def scalars(row: Row) -> dict[str, float]:
-    """The figures of a row by name; those that were not finite are left out."""
+    """Returns the figures of a row by name, without those that were not finite."""
     return {name: float(value) for name, value in row.items() if name not in _PLACE and value is not None}
 
 
@@ -88,8 +88,8 @@ class Contents:
 
     Attributes:
         rows: The rows, in the order of their iterations.
-        damaged: Number and bytes of every line that is no row, or a row that is there already.
-        torn: What is left of a last line that no line break ends. After a kill, that row was never whole.
+        damaged: Number and bytes of every line that is not a valid row, or repeats an earlier row.
+        torn: Incomplete last line without a line break. After a kill, that row was never complete.
     """
 
     rows: list[dict[str, Any]]
@@ -98,7 +98,7 @@ class Contents:
 
 
 def append_rows(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
-    """Writes rows at the end of the file and sees to it that they are on the disk."""
+    """Appends rows to the file and syncs them to the disk."""
     _append(path, "".join(json.dumps(row) + "\n" for row in rows).encode())
 
 
@@ -113,7 +113,7 @@ def _append(path: Path, contents: bytes) -> None:
 
 
 def read_contents(path: Path) -> Contents:
-    """All that a metrics file holds, whatever somebody or a disk has made of it; nothing where there is no file.
+    """Reads a metrics file, which may be damaged; empty if there is no file.
 
     Raises:
         RequestError: The file cannot be read.
@@ -127,7 +127,7 @@ def read_contents(path: Path) -> Contents:
     rows: dict[tuple[int, int, str | None], dict[str, Any]] = {}
     damaged, torn = [], b""
     for number, line in enumerate([*lines, last], 1):
-        is_last = number > len(lines)  # what no line break ends
+        is_last = number > len(lines)  # not terminated by a line break
         row = _read_row(line)
         place = None if row is None else (row["iteration"], row["seed"], row.get(RUN_ID))
         if row is not None and place is not None and place not in rows:
@@ -140,7 +140,7 @@ def read_contents(path: Path) -> Contents:
 
 
 def _read_row(line: bytes) -> dict[str, Any] | None:
-    """The row of a line; None where it is none that a run can have written."""
+    """Parses a row; None if it is not one that a run can have written."""
     try:
         row = parse_json(line.decode("utf-8"))
     except ValueError:
@@ -163,7 +163,7 @@ def _is_figure(value: Any) -> bool:
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
-    """All rows of a metrics file, in the order of their iterations, or none where there is no file. Damaged lines are left out.
+    """Reads the rows of a metrics file, in order of iteration, without damaged lines; empty if there is no file.
 
     Raises:
         RequestError: The file cannot be read.
@@ -174,20 +174,19 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
 def cut_back(
     path: Path, iteration: int, run_id: str | None, aside: Path, others: Path, keeps_later: bool, evaluated: int = 0
 ) -> str | None:
-    """Takes out every row after ``iteration``, which a resumed run writes again, and all that is not this run's.
+    """Removes the rows after ``iteration``, which a resumed run writes again, and the rows of other runs.
 
     Args:
         path: The file.
-        iteration: The last one to keep.
-        run_id: Of the run; None for one of an earlier version, which has none.
-        aside: To this file goes what is damaged; nothing is ever dropped.
-        others: To this one goes what is of another run.
-        keeps_later: Rows after ``iteration``, too.
-        evaluated: The last iteration that is known to have had a row of each seed, or 0: where one is missing, a torn line was
-            that.
+        iteration: Last iteration to keep.
+        run_id: Id of the run; None for one of an earlier version.
+        aside: File to which damaged lines are moved; nothing is discarded.
+        others: File to which other runs' rows are moved.
+        keeps_later: Also move rows after ``iteration`` to ``aside``.
+        evaluated: Last iteration known to have had a row of each seed, or 0: if one is missing, a torn line is that row.
 
     Returns:
-        A line on what is damaged or of another run; None where nothing is.
+        A line about damaged or foreign rows; None if there are none.
 
     Raises:
         OSError: A file cannot be written.
@@ -200,17 +199,17 @@ def cut_back(
     rows = [row for row in contents.rows if row.get(RUN_ID) == run_id]
     later = [row for row in rows if keeps_later and row["iteration"] > iteration]
     damaged = list(contents.damaged)
-    evaluated_there = {row["seed"] for row in rows if row["iteration"] == evaluated}
-    if contents.torn and evaluated and (not evaluated_there or evaluated_there < {row["seed"] for row in rows}):
+    evaluated_seeds = {row["seed"] for row in rows if row["iteration"] == evaluated}
+    if contents.torn and evaluated and (not evaluated_seeds or evaluated_seeds < {row["seed"] for row in rows}):
         damaged.append((path.read_bytes().count(b"\n") + 1, contents.torn))
     _keep(aside, [line for _, line in damaged] + [json.dumps(row).encode() for row in later])
     _keep(others, [json.dumps(row).encode() for row in foreign])
     text = "".join(json.dumps(row) + "\n" for row in rows if row["iteration"] <= iteration)
     if text.encode() != path.read_bytes():
         write_atomically(path, text)
-    what = [f"{_describe(damaged)}: kept in {aside}"] if damaged else []
-    what += [f"{len(foreign)} row{'s' * (len(foreign) > 1)} of another run: kept in {others}"] if foreign else []
-    return f"{path.name} held {', and '.join(what)}; left out here" if what else None
+    findings = [f"{_describe(damaged)}: kept in {aside}"] if damaged else []
+    findings += [f"{len(foreign)} row{'s' * (len(foreign) > 1)} of another run: kept in {others}"] if foreign else []
+    return f"{path.name} held {', and '.join(findings)}; left out here" if findings else None
 
 
 def _keep(path: Path, lines: Sequence[bytes]) -> None:

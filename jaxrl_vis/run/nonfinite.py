@@ -1,4 +1,4 @@
-"""A number that is not finite: how it is noticed, and what is kept for whoever looks for its cause."""
+"""Detection and dump of non-finite numbers."""
 
 from pathlib import Path
 from typing import Any
@@ -19,25 +19,25 @@ def _checked(tree: Any) -> dict[str, Any]:
 
 
 def broken_leaves(loop: LoopState) -> dict[str, jax.Array]:
-    """Which floating-point leaves hold a NaN or an infinity: name -> [] bool. Traceable; compiled before training starts."""
+    """Checks every floating-point leaf for NaN or infinity: name -> [] bool. Traceable; compiled before training starts."""
     return {name: ~jnp.isfinite(leaf).all() for name, leaf in _checked(loop).items()}
 
 
 def _episodes(loop: LoopState, *names: str) -> dict[str, np.ndarray]:
-    """Parts of all episodes of the replay, [S, N, T..., values] float32."""
+    """Returns parts of all episodes of the replay, [S, N, T..., values] float32."""
     episodes = {name: np.asarray(getattr(loop.replay.episodes, name)) for name in names}
-    # Where devices share a learner, episodes are numbered by rollout and environment (`sharding.Layout`).
+    # If devices share a learner, episodes are indexed by rollout and environment (`sharding.Layout`).
     return {name: array.reshape(len(array), -1, *array.shape[-2:]) for name, array in episodes.items()}
 
 
 def made_by_simulation(loop: LoopState, num_envs: int) -> str | None:
-    """Describe the evidence that the simulation made a non-finite number; None where there is none.
+    """Describes the evidence that the simulation produced a non-finite number; None if there is none.
 
-    It did where such a number came before the first action that is not finite: what comes after that is the learner's fault.
+    It did if such a number precedes the first non-finite action: what follows such an action is due to the learner.
 
     Args:
-        loop: As of `dump`.
-        num_envs: Environments of a seed.
+        loop: As in `dump`.
+        num_envs: Environments per seed.
     """
     names = ["states"]
     if jnp.issubdtype(loop.replay.episodes.observations.dtype, jnp.floating):
@@ -50,7 +50,7 @@ def made_by_simulation(loop: LoopState, num_envs: int) -> str | None:
         if name not in is_bad:
             continue
         step, goal = _first(is_bad[name][..., : horizon + 1]), is_bad[name][..., horizon + 1]
-        # An action leads from the state of its own number to the next one.
+        # Action t leads from state t to state t + 1.
         seeds, slots = np.nonzero(goal | (step <= np.minimum(first_action, horizon)))
         if len(seeds):
             seed, slot = seeds[0], slots[0]
@@ -60,31 +60,31 @@ def made_by_simulation(loop: LoopState, num_envs: int) -> str | None:
 
 
 def _first(is_bad: np.ndarray) -> np.ndarray:
-    """Index of the first true value along the last axis; the axis' length where there is none."""
+    """Returns the index of the first true value along the last axis; the axis' length if there is none."""
     return np.where(is_bad.any(-1), is_bad.argmax(-1), is_bad.shape[-1])
 
 
 def dump(file: Path, loop: LoopState, values: PerSeed, leaves: list[str]) -> None:
-    """Writes an .npz that shows where a non-finite number came from. Runs on the host alone: nothing is compiled here.
+    """Writes an .npz for locating the source of a non-finite number. Runs on the host only, without compilation.
 
-    ``train.*``: the learner. ``episodes.*``: states and actions of up to 64 replay episodes with a bad number in them, with
-    their seed_index and slot. ``metrics.*``: losses and the like, [S]. ``key`` (words) and ``iteration``: what the next
-    iteration would draw from. ``nonfinite_leaves``: the names in ``leaves``.
+    ``train.*``: the learner. ``episodes.*``: states and actions of up to 64 replay episodes with a non-finite number, with
+    their seed_index and slot. ``metrics.*``: losses etc., [S]. ``key`` (words) and ``iteration``: the source of the next
+    iteration's random numbers. ``nonfinite_leaves``: the names in ``leaves``.
 
     Args:
-        file: Where to; its folder is made.
-        loop: The state: of the iteration that went wrong, or of the one that was dispatched before the host knew.
-        values: Metrics of the iteration that went wrong.
-        leaves: Names of the learner's leaves that are not finite.
+        file: Output file; its folder is created.
+        loop: State of the failed iteration, or of the next one, dispatched before the host knew.
+        values: Metrics of the failed iteration.
+        leaves: Names of the learner's non-finite leaves.
     """
-    found = {f"train.{name}": array for name, array in to_host(loop.train, copy=True).items()}
+    arrays = {f"train.{name}": array for name, array in to_host(loop.train, copy=True).items()}
     episodes = _episodes(loop, "states", "actions")
     bad = ~(np.isfinite(episodes["states"]).all((-2, -1)) & np.isfinite(episodes["actions"]).all((-2, -1)))
     seeds, slots = (index[:_MAX_EPISODES] for index in np.nonzero(bad))
-    found |= {"episodes.seed_index": seeds, "episodes.slot": slots}
-    found |= {f"episodes.{name}": array[seeds, slots] for name, array in episodes.items()}
-    found |= {f"metrics.{name}": np.asarray(row) for name, row in values.items()}
-    found |= to_host({"key": loop.key, "iteration": loop.iteration}, copy=True)
-    found["nonfinite_leaves"] = np.asarray(leaves, dtype=np.str_)
+    arrays |= {"episodes.seed_index": seeds, "episodes.slot": slots}
+    arrays |= {f"episodes.{name}": array[seeds, slots] for name, array in episodes.items()}
+    arrays |= {f"metrics.{name}": np.asarray(row) for name, row in values.items()}
+    arrays |= to_host({"key": loop.key, "iteration": loop.iteration}, copy=True)
+    arrays["nonfinite_leaves"] = np.asarray(leaves, dtype=np.str_)
     file.parent.mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(file, **found)  # pyright: ignore[reportArgumentType]
+    np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType]

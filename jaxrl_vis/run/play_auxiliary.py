@@ -1,4 +1,4 @@
-"""`play --aux`: episodes of a run, with what its auxiliary tasks make of them."""
+"""`play --aux`: episodes of a run with the predictions of its auxiliary tasks."""
 
 from pathlib import Path
 from typing import Any
@@ -19,20 +19,20 @@ from jaxrl_vis.run.trained import load, open_run
 from jaxrl_vis.types import Batch, Episodes, TrainState
 
 SHOWN = ("autoencoder", "optical_flow", "egomotion")
-"""The auxiliary tasks whose predictions can be drawn."""
+"""Auxiliary tasks whose predictions can be drawn."""
 
 
 def play_auxiliary(run_dir: Path | str, out: Path | str, episodes: int = 6, trust: bool = False) -> None:
-    """Plays episodes with the first seed of the newest good checkpoint of a run, and draws what its auxiliary tasks predict.
+    """Plays episodes with the first seed of a run's newest valid checkpoint, and draws the predictions of its auxiliary tasks.
 
-    Observation, goal, reconstruction, true and predicted optical flow, and the rotated image with its angle stand side by side;
-    what the run has no task for is left out. Predictions are those of the critic's heads.
+    Observation, goal, reconstruction, true and predicted optical flow, and the rotated image with its angle are shown side by
+    side, as far as the run has the tasks. Predictions are those of the critic's heads.
 
     Args:
         run_dir: The run folder.
         out: .gif, .mp4 (needs imageio-ffmpeg, the extra ``video``) or .html.
-        episodes: How many to show.
-        trust: As of `trained.open_run`.
+        episodes: Number of episodes.
+        trust: As in `trained.open_run`.
 
     Raises:
         RequestError: There is no run, nothing usable in it, no auxiliary task to show, or no way to write ``out``.
@@ -40,7 +40,7 @@ def play_auxiliary(run_dir: Path | str, out: Path | str, episodes: int = 6, trus
     out = Path(out)
     videos.check_output(out)
     if out.suffix.lower() == ".png":
-        raise RequestError(f"--aux makes a video: name {out.stem}.gif, .mp4 or .html in the place of {out.name}")
+        raise RequestError(f"--aux makes a video: use {out.stem}.gif, .mp4 or .html instead of {out.name}")
     tasks = read_config(Path(run_dir)).aux_tasks
     if not tasks:
         raise RequestError(f"the run in {run_dir} has no auxiliary tasks to show: train with --aux-tasks, or leave out --aux")
@@ -48,7 +48,7 @@ def play_auxiliary(run_dir: Path | str, out: Path | str, episodes: int = 6, trus
         raise RequestError(
             f"the run in {run_dir} predicts nothing that can be drawn ({', '.join(tasks)}): --aux shows {', '.join(SHOWN)}"
         )
-    # A rollout is what it takes; its exploration is switched off.
+    # Uses a training rollout without exploration.
     trainer = open_run(run_dir, trust=trust, num_envs=episodes, random_action_probability=0.0, action_noise=0.0)
     env, config, networks = trainer.env, trainer.config, trainer.program.networks
     train = jax.tree.map(lambda leaf: jnp.asarray(leaf[:1]), load(trainer, run_dir).train)
@@ -63,36 +63,36 @@ def play_auxiliary(run_dir: Path | str, out: Path | str, episodes: int = 6, trus
     played = jax.jit(auxiliary.with_flow)(played)
     keys = jax.random.split(jax.random.key(config.seed), episodes)
     per_episode = jax.jit(predict)
-    found = [
-        jax.device_get(per_episode(first, jax.tree.map(lambda leaf, each=each: leaf[each], played), keys[each]))
-        for each in range(episodes)
+    predictions = [
+        jax.device_get(per_episode(first, jax.tree.map(lambda leaf, index=index: leaf[index], played), keys[index]))
+        for index in range(episodes)
     ]
-    values = {name: np.stack([each[name] for each in found]) for name in found[0]}
+    values = {name: np.stack([prediction[name] for prediction in predictions]) for name in predictions[0]}
     channels = env.observation_spec.shape[0] // env.frame_stack
-    images = np.asarray(played.observations)[:, :, :channels]  # of stacked images, the newest
-    seen = videos.EpisodeImages(images[:, :-1], images[:, -1], np.asarray(outcome["success"][0]))
+    images = np.asarray(played.observations)[:, :, :channels]  # the newest of stacked images
+    episode_images = videos.EpisodeImages(images[:, :-1], images[:, -1], np.asarray(outcome["success"][0]))
     shown = auxiliary_video.Predictions(
         **{name: value[:, :, :channels] if name in ("reconstruction", "rotated") else value for name, value in values.items()}
     )
-    drawn = auxiliary_video.draw_frames(seen, shown, trainer.programs.image_seconds)
+    drawn = auxiliary_video.draw_frames(episode_images, shown, trainer.programs.image_seconds)
     videos.write_images(*drawn, out, trainer.programs.image_seconds)
 
 
 def _predict(networks: Networks, auxiliary: Auxiliary, train: TrainState, episode: Episodes, key: jax.Array) -> dict[str, Any]:
-    """Fields of `auxiliary_video.Predictions` of one episode.
+    """Computes the fields of `auxiliary_video.Predictions` for one episode.
 
     Args:
-        networks: What the parameters mean.
-        auxiliary: The tasks.
-        train: The learner, of one seed.
-        episode: One of `Episodes`.
-        key: Of the rotations.
+        networks: Architecture of the parameters.
+        auxiliary: The auxiliary tasks.
+        train: The learner of one seed.
+        episode: One episode of `Episodes`.
+        key: Random key of the rotations.
     """
     observations, actions = episode.observations, episode.actions
     count = actions.shape[0]
     before, after = observations[:count], observations[1 : count + 1]
     goals = jnp.broadcast_to(observations[-1], before.shape)
-    nothing = jnp.zeros((count, 0))  # nobody asks for true states here
+    nothing = jnp.zeros((count, 0))  # true states are not used here
     batch = Batch(jnp.stack([before, goals, after]), actions, nothing, nothing)
     batch = batch.replace(targets=auxiliary.targets(key, batch, episode.flow))
     names = ("before", "after", *(name for name in auxiliary.others if name != "after"))
@@ -102,24 +102,24 @@ def _predict(networks: Networks, auxiliary: Auxiliary, train: TrainState, episod
     image = networks.normalize(networks.scaling(train.normalizer), before) if "image" in auxiliary.needs else None
     view = View(latent_t, actions, latent_tp1, *moved, image=image)
     predicted = auxiliary.predictions(train.critic["heads"], view, batch)
-    found: dict[str, Any] = {}
+    fields: dict[str, Any] = {}
     if "autoencoder" in predicted:
-        found["reconstruction"] = _as_image(networks, train, predicted["autoencoder"])
+        fields["reconstruction"] = _as_image(networks, train, predicted["autoencoder"])
     if "optical_flow" in predicted:
-        found |= {"flow": batch.targets.flow, "flow_predicted": predicted["optical_flow"]}
+        fields |= {"flow": batch.targets.flow, "flow_predicted": predicted["optical_flow"]}
     if "egomotion" in predicted:
         degrees = jnp.degrees(MAX_ANGLE)
-        found |= {"rotated": batch.targets.images_moved, "angle": degrees * batch.targets.motion[:, 0]}
-        found["angle_predicted"] = degrees * predicted["egomotion"][:, 0]
-    return found
+        fields |= {"rotated": batch.targets.images_moved, "angle": degrees * batch.targets.motion[:, 0]}
+        fields["angle_predicted"] = degrees * predicted["egomotion"][:, 0]
+    return fields
 
 
 def _as_image(networks: Networks, train: TrainState, values: jax.Array) -> jax.Array:
-    """Normalised images [T, C or 1, H, W] as grey levels, uint8."""
+    """Converts normalised images [T, C or 1, H, W] to grey levels, uint8."""
     mean, scale = networks.scaling(train.normalizer)
     height, width = values.shape[-2:]
     if values.shape[1] == mean.shape[0]:
         levels = values / scale[:, :height, :width] + mean[:, :height, :width]
-    else:  # one grey channel of what is normalised
+    else:  # one normalised grey channel
         levels = 127.5 * (1.0 + values / networks.config.normalizer_clip)
     return jnp.clip(jnp.round(levels), 0, 255).astype(jnp.uint8)

@@ -1,4 +1,4 @@
-"""What a run has learned, as a function.
+"""Trained policies as functions.
 
 policy = load_policy("runs/mine")
 action = policy(observation, goal)              # one environment: planar [C, H, W] uint8, or [S] float32
@@ -27,14 +27,14 @@ _Parameters = tuple[Params, NormalizerState, NormalizerState]
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Policy:
-    """A trained actor without exploration, normalisation included. Make it with `load_policy`; call it, vmap it, scan it.
+    """Trained actor without exploration, including normalisation. Create it with `load_policy`; call it, vmap it, scan it.
 
     Attributes:
-        env: The environment that it was trained on, with the image size and all other options of the run.
+        env: The environment of its training, with the image size and all other options of the run.
         config: The configuration of the run.
-        seed: Which of the run's seeds this is.
-        iteration: The iteration that its checkpoint was saved after.
-        parameters: The actor, and the statistics that observations and goals are normalised with.
+        seed: Seed of the run that trained it.
+        iteration: Iteration of its checkpoint.
+        parameters: The actor's parameters, and the statistics that normalise observations and goals.
     """
 
     env: GoalEnv
@@ -46,7 +46,7 @@ class Policy:
 
     @property
     def env_name(self) -> str:
-        """The name of the environment, as `jaxrl_vis_envs.make` takes it."""
+        """Name of the environment, as in `jaxrl_vis_envs.make`."""
         return self.config.env
 
     @property
@@ -56,21 +56,21 @@ class Policy:
 
     @property
     def action_size(self) -> int:
-        """A, the length of an action."""
+        """A, the size of an action."""
         return self.env.action_size
 
     def __call__(self, observation: Any, goal: Any) -> jax.Array:
-        """What to do now.
+        """Computes an action.
 
         Args:
-            observation: What `GoalEnv.observe` shows: planar [C, H, W] uint8, or [S] float32 for state tasks.
-            goal: What ``obs["desired_goal"]`` shows, in the same form.
+            observation: Output of `GoalEnv.observe`: planar [C, H, W] uint8, or [S] float32 for state tasks.
+            goal: ``obs["desired_goal"]``, in the same form.
 
         Returns:
             [A] float32 in [-1, 1].
 
         Raises:
-            RequestError: A shape or a dtype is another.
+            RequestError: A shape or a dtype does not match.
         """
         self._check("observation", observation)
         self._check("goal", goal)
@@ -84,15 +84,15 @@ class Policy:
             actor, *statistics = parameters
             dtype = self.observation_spec.dtype
             latents = [
-                networks.encode(actor, networks.prepare(networks.scaling(each), jnp.asarray(seen, dtype)[None]))
-                for each, seen in zip(statistics, (observation, goal), strict=True)
+                networks.encode(actor, networks.prepare(networks.scaling(state), jnp.asarray(value, dtype)[None]))
+                for state, value in zip(statistics, (observation, goal), strict=True)
             ]
             return networks.act(actor, jnp.stack(latents))[0]
 
         return jax.jit(act)
 
     def _check(self, name: str, value: Any) -> None:
-        """Raises a RequestError unless ``value`` looks like an observation."""
+        """Raises a RequestError unless ``value`` has the form of an observation."""
         spec = self.observation_spec
         shape, wanted = np.shape(value), tuple(spec.shape)
         if shape != wanted:
@@ -113,17 +113,17 @@ class Policy:
 
 
 def load_policy(run_dir: Path | str, seed: int | None = None, checkpoint: int | None = None, trust: bool = False) -> Policy:
-    """The policy that a run has trained, on whatever platform JAX runs on here.
+    """Loads the policy of a run, on any platform that JAX supports.
 
     Args:
         run_dir: The run folder.
-        seed: Which seed of a run with several; None: the first.
-        checkpoint: The iteration of a checkpoint that the run keeps; None: the newest good one.
-        trust: The run may run its own code, which a run on ``module:Name`` does; not needed for one that was trained here.
+        seed: Seed, for a run with several; None: the first.
+        checkpoint: Iteration of an existing checkpoint; None: the newest valid one.
+        trust: Allow the run's own code, which a task ``module:Name`` executes; not needed for runs that were trained here.
 
     Raises:
-        RequestError: There is no run, no such seed or checkpoint, or none that can be used; or its task cannot be made here, or
-            is code that nobody has trusted.
+        RequestError: There is no run, no such seed or checkpoint, or no usable one; or its task is not available here, or is
+            untrusted code.
     """
     trainer = open_run(run_dir, trust=trust)
     seed = trainer.config.seed if seed is None else seed

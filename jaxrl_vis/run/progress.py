@@ -1,4 +1,4 @@
-"""What the host remembers of a run from one part to the next; saved with every checkpoint."""
+"""Host-side progress of a run, saved with every checkpoint."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -9,14 +9,14 @@ from jaxrl_vis.run.metrics import PerSeed
 
 @dataclasses.dataclass
 class Progress:
-    """The host's side of a run's state.
+    """Host side of a run's state.
 
     Attributes:
-        wall_s, compile_s: Spent by earlier parts, s.
-        since_evaluation: train/* and the like of every iteration since the last scheduled evaluation.
-        evaluation_due: The iteration ends with an evaluation, which a signal prevented.
-        filtered: Evaluations in a row with too large a filtered share.
-        replay_lost_at: The last iteration at which the run went on without the replay it had; None where it never did.
+        wall_s, compile_s: Time spent by earlier processes, s.
+        since_evaluation: train/* and other metrics of every iteration since the last scheduled evaluation.
+        evaluation_due: True if the evaluation at the end of the iteration was prevented by a signal.
+        filtered: Number of consecutive evaluations with too large a filtered share.
+        replay_lost_at: Last iteration at which the run resumed without its replay; None if it never did.
     """
 
     wall_s: float = 0.0
@@ -28,24 +28,24 @@ class Progress:
 
     @classmethod
     def from_dict(cls, saved: Mapping[str, Any]) -> Self:
-        """The inverse of `dataclasses.asdict`; fields of other versions are left out.
+        """Inverts `dataclasses.asdict`; fields of other versions are ignored.
 
         Raises:
-            ValueError: A field is not what it was saved as.
+            ValueError: A field has another type than when it was saved.
         """
         names = {field.name for field in dataclasses.fields(cls)}
-        found = cls(**{name: value for name, value in saved.items() if name in names})
-        counts = (found.filtered, 0 if found.replay_lost_at is None else found.replay_lost_at)
+        progress = cls(**{name: value for name, value in saved.items() if name in names})
+        counts = (progress.filtered, 0 if progress.replay_lost_at is None else progress.replay_lost_at)
         is_good = (
-            all(_is_number(each) for each in (found.wall_s, found.compile_s))
-            and all(_is_number(each) and isinstance(each, int) for each in counts)
-            and isinstance(found.evaluation_due, bool)
-            and isinstance(found.since_evaluation, list)
-            and all(map(_are_metrics, found.since_evaluation))
+            all(_is_number(value) for value in (progress.wall_s, progress.compile_s))
+            and all(_is_number(value) and isinstance(value, int) for value in counts)
+            and isinstance(progress.evaluation_due, bool)
+            and isinstance(progress.since_evaluation, list)
+            and all(map(_are_metrics, progress.since_evaluation))
         )
         if not is_good:
-            raise ValueError("its progress holds something else than progress")
-        return found
+            raise ValueError("its progress has fields of other types")
+        return progress
 
 
 def _is_number(value: Any) -> bool:
@@ -54,6 +54,6 @@ def _is_number(value: Any) -> bool:
 
 def _are_metrics(value: Any) -> bool:
     return isinstance(value, dict) and all(
-        isinstance(row, list) and all(isinstance(each, int | float) and not isinstance(each, bool) for each in row)
+        isinstance(row, list) and all(isinstance(number, int | float) and not isinstance(number, bool) for number in row)
         for row in value.values()
     )

@@ -1,15 +1,15 @@
-"""The state of a run on a CPU, kept up to date for a process that is killed: every frame is written once.
+"""Up-to-date state of a run on a CPU, for resuming after a kill: every frame is written only once.
 
-    checkpoints/recent/<iteration>.state     learner, keys, iteration, and the checksums of the rollouts that go with it
-    checkpoints/recent/<iteration>.rollout   the episodes that were collected last when so many iterations were done
+    checkpoints/recent/<iteration>.state     learner, keys, iteration, and the checksums of its rollouts
+    checkpoints/recent/<iteration>.rollout   the episodes collected in this iteration
 
-A rollout lies in the replay until the ring comes round to it, so a state needs a few files of earlier iterations and one new
-one: some milliseconds, where a full checkpoint writes the whole replay. That is worth it on a CPU, where a copy costs nothing
-to get at, and as long as the replay is of a moderate size: `is_cheap`.
+A rollout stays in the replay until the ring buffer overwrites it, so a state needs several files of earlier iterations and one
+new file: some milliseconds, where a full checkpoint writes the whole replay. That is worthwhile on a CPU, where reading the
+arrays costs nothing, for a replay of moderate size: `is_cheap`.
 
-Nothing is forced onto the disk. Whatever kills a process leaves what it has written; a power cut may not, and then checksums
-find it, and the run goes on from a light or a full checkpoint, which do wait for the disk. A file appears under its name only
-when it is complete. The newest two states are kept.
+Nothing is synced to the disk. A killed process leaves what it has written; a power cut may not, which the checksums detect, and
+the run then resumes from a light or a full checkpoint, which are synced. A file appears under its name only when it is
+complete. The newest two states are kept.
 """
 
 import contextlib
@@ -33,58 +33,58 @@ SCHEMA = 1
 ANY_RUN = "*"
 _KEPT = 2
 _MOST_BYTES = 2**30  # of a replay
-_SHARE = 0.03  # of the time that saving may take: about each iteration of `cpu` on two cores
+_SHARE = 0.03  # largest fraction of the time spent on saving: about every iteration of `cpu` on two cores
 _EPISODES = "replay.episodes."
 
 
 def is_cheap(replay: ReplayState) -> bool:
-    """Returns whether little time and disk are needed to keep this replay (or one of these shapes) up to date in files."""
+    """Returns True if this replay (or one of these shapes) is cheap to keep up to date in files, in time and disk space."""
     return jax.default_backend() == "cpu" and num_bytes(replay) <= _MOST_BYTES
 
 
 class Unusable(Exception):
-    """A state cannot be trusted, or one of its rollouts cannot. The message says why, in a few words."""
+    """Damaged state, or one with a damaged rollout. The message gives the reason in a few words."""
 
 
 class Recent:
-    """The recent states of one run.
+    """Recent states of one run.
 
     Args:
-        folder: Where they lie; made when something is saved.
-        say: Called with one line, when there is no more room for them.
+        folder: Folder of the states; created by the first save.
+        say: Called with one line when there is no more space for them.
 
     Attributes:
-        run_id: Of the run, None for one that has none: states of others are not there as far as this class goes, but for
-            `set_foreign_aside`. `ANY_RUN`: whatever there is.
+        run_id: Id of the run, None for one without: other runs' states are ignored, except by `set_foreign_aside`. `ANY_RUN`:
+            all states.
     """
 
     def __init__(self, folder: Path, say: Callable[[str], None]):
         self._folder, self._say = folder, say
         self.run_id: str | None = ANY_RUN
-        self._rollouts: dict[int, int] = {}  # those that are known to be there, and their checksums
+        self._rollouts: dict[int, int] = {}  # rollouts known to exist, and their checksums
         self._cost, self._saved_at, self._is_off = 0.0, -np.inf, False
 
     def is_due(self, in_any_case: bool) -> bool:
-        """Returns whether so much time has passed since the last one that saving takes a small share of it.
+        """Returns True if enough time has passed since the last save for saving to take only a small fraction of it.
 
         Args:
-            in_any_case: Do not look at the time.
+            in_any_case: Ignore the time.
         """
         return not self._is_off and (in_any_case or time.monotonic() - self._saved_at >= self._cost / _SHARE)
 
     def iterations(self) -> list[int]:
-        """Iterations of which there is a state of this run, ascending; damaged ones included."""
+        """Returns the iterations of this run's states, ascending, including damaged ones."""
         return sorted(iteration for iteration in _numbers(self._folder, "state") if self._is_ours(iteration))
 
     def _is_ours(self, iteration: int) -> bool:
-        """Returns whether the first line of a state says so; one that cannot be read is damaged, and may well be ours."""
+        """Returns True if a state's header has this run's id; one that cannot be read is damaged, and may be this run's."""
         try:
             return self.run_id in (ANY_RUN, self._header(iteration).get(RUN_ID))
         except Unusable:
             return True
 
     def set_foreign_aside(self, to: Path) -> bool:
-        """Moves everything, if there is a state of another run; whether there was one."""
+        """Moves all files away if there is a state of another run; returns True if there was one."""
         is_foreign = any(not self._is_ours(iteration) for iteration in _numbers(self._folder, "state"))
         if is_foreign:
             to.parent.mkdir(exist_ok=True)
@@ -94,14 +94,14 @@ class Recent:
     def save(
         self, iteration: int, loop: LoopState, num_envs: int, progress: dict[str, Any], started: float | None = None
     ) -> None:
-        """Writes a state, and what it needs that is not there; where there is no room, it is said, and nothing more is saved.
+        """Writes a state and its missing rollouts; if there is no space, this is reported, and nothing more is saved.
 
         Args:
-            iteration: Iterations done.
+            iteration: Iterations completed.
             loop: The state, on one device.
             num_envs: E, episodes that one iteration adds to the replay.
-            progress: Anything that JSON can hold.
-            started: When the work for it began (`time.monotonic`), checks included; None: now.
+            progress: A JSON value.
+            started: Start of the work for it, checks included (`time.monotonic`); None: now.
         """
         self._saved_at = time.monotonic() if started is None else started
         try:
@@ -116,7 +116,7 @@ class Recent:
         self._cost = time.monotonic() - self._saved_at
 
     def _write(self, iteration: int, loop: LoopState, num_envs: int, progress: dict[str, Any]) -> None:
-        for folder in (self._folder.parent, self._folder):  # but not the run's own, which may have been moved
+        for folder in (self._folder.parent, self._folder):  # but not the run folder, which may have been moved
             folder.mkdir(exist_ok=True)
         replay = to_host({"replay": loop.replay}, copy=False)
         episodes = {name: array for name, array in replay.items() if name.startswith(_EPISODES)}
@@ -146,7 +146,7 @@ class Recent:
         self._tidy()
 
     def _write_rollout(self, number: int, parts: Arrays) -> int:
-        """Writes the episodes of one rollout, [S, E, ...] each, one array after the other; their checksum."""
+        """Writes the episodes of one rollout, arrays [S, E, ...] one after the other; returns their checksum."""
         checksum = 0
         with _appearing(self._path(number, "rollout")) as file:
             for part in parts.values():
@@ -156,7 +156,7 @@ class Recent:
         return checksum
 
     def _tidy(self) -> None:
-        """Deletes all states but the newest, and rollouts that none of these needs: the oldest ones."""
+        """Deletes all but the newest states, and older rollouts that these do not need."""
         for number in self.iterations()[:-_KEPT]:
             self._path(number, "state").unlink(missing_ok=True)
         first = min(self._rollouts, default=0)
@@ -168,57 +168,57 @@ class Recent:
         self._rollouts = {number: checksum for number, checksum in self._rollouts.items() if number >= int(first)}
 
     def manifest(self, iteration: int) -> dict[str, Any]:
-        """Manifest of a state: ``iteration``, ``items`` (`arrays.describe`), ``progress``, and the run's id.
+        """Returns the manifest of a state: ``iteration``, ``items`` (`arrays.describe`), ``progress``, and the run's id.
 
         Raises:
-            Unusable: It is damaged.
+            Unusable: The state is damaged.
         """
         return self._header(iteration)
 
     def restore(self, iteration: int, template: LoopState) -> tuple[LoopState, dict[str, Any]]:
-        """One state, and the progress that was saved with it.
+        """Restores a state, and the progress that was saved with it.
 
         Args:
             iteration: One of `iterations`.
-            template: Shapes and types of the loop state.
+            template: Shapes and dtypes of the loop state.
 
         Raises:
-            Unusable: It is damaged, or a rollout of it is missing or damaged.
-            RequestError: It has another structure.
+            Unusable: The state is damaged, or a rollout of it is missing or damaged.
+            RequestError: The state has another structure.
         """
         header, path = self._header(iteration), self._path(iteration, "state")
         tree = {name: getattr(template, name) for name in ("train", "replay", "key", "iteration")}
         specs = host_specs(tree)
         check_structure(path, header["items"] | header["episodes"], specs)
         contents = self._read(path)
-        place = contents.index(b"\n") + 1
-        found = {}
+        offset = contents.index(b"\n") + 1
+        arrays = {}
         for name, described in header["items"].items():  # in the order in which they were written
-            found[name], place = _array(contents, place, specs[name].shape, specs[name].dtype)
-            if not is_intact(found[name], described):
+            arrays[name], offset = _array(contents, offset, specs[name].shape, specs[name].dtype)
+            if not is_intact(arrays[name], described):
                 raise Unusable(f"wrong checksum of {name}")
         episodes = {name: np.zeros(shape, specs[name].dtype) for name, (shape, _) in header["episodes"].items()}
         self._read_rollouts(header["rollouts"], episodes)
-        # Copies: what numpy owns could not be donated.
-        loop = LoopState(**rebuild(tree, {name: jnp.array(array) for name, array in (found | episodes).items()}))
+        # Copies, because buffers owned by NumPy cannot be donated.
+        loop = LoopState(**rebuild(tree, {name: jnp.array(array) for name, array in (arrays | episodes).items()}))
         return loop, header["progress"]
 
     def _read_rollouts(self, checksums: dict[str, int], episodes: Arrays) -> None:
-        """Fills ``episodes``, [S, N, ...] each, with what rollouts hold."""
+        """Fills ``episodes``, arrays [S, N, ...], from the rollouts' files."""
         num_episodes = next(iter(episodes.values())).shape[1]
         for number, checksum in checksums.items():
             contents = self._read(self._path(int(number), "rollout"))
             if zlib.crc32(contents) != checksum:
                 raise Unusable(f"wrong checksum of rollout {number}")
-            size = sum(array.nbytes for array in episodes.values()) // num_episodes  # of an episode of every seed
+            size = sum(array.nbytes for array in episodes.values()) // num_episodes  # of one episode per seed
             num_envs = len(contents) // size
-            start, place = (int(number) - 1) % (num_episodes // num_envs) * num_envs, 0
+            start, offset = (int(number) - 1) % (num_episodes // num_envs) * num_envs, 0
             for array in episodes.values():
                 shape = (len(array), num_envs, *array.shape[2:])
-                array[:, start : start + num_envs], place = _array(contents, place, shape, array.dtype)
+                array[:, start : start + num_envs], offset = _array(contents, offset, shape, array.dtype)
 
-    def go_on_from(self, iteration: int | None) -> None:
-        """Keeps the state of an iteration, and what is older, as a past to go on from; None: there is none, begin anew."""
+    def resume_from(self, iteration: int | None) -> None:
+        """Prepares for resuming from the state of an iteration, and deletes later rollouts; None: from none, so deletes all."""
         if iteration is None:
             self.clear()
             return
@@ -241,7 +241,7 @@ class Recent:
             self.clear()
 
     def clear(self) -> None:
-        """Deletes everything: a full checkpoint takes its place, or the run has ended."""
+        """Deletes all states: a full checkpoint replaces them, or the run has ended."""
         self._rollouts = {}
         with contextlib.suppress(OSError):
             for file in self._folder.iterdir():
@@ -277,7 +277,7 @@ class Recent:
 
 
 def names_of_others(folder: Path) -> list[str]:
-    """Names of what lies in a folder of recent states and is no part of one; nothing where there is no folder."""
+    """Returns the names of foreign files in a folder of recent states; empty if there is no folder."""
     kinds = (".state", ".rollout")
     entries = folder.iterdir() if folder.is_dir() else ()
     bare = {entry.name: Path(entry.name.removesuffix(".tmp")) for entry in entries}
@@ -293,7 +293,7 @@ def _numbers(folder: Path, kind: str) -> list[int]:
 
 @contextlib.contextmanager
 def _appearing(path: Path) -> Iterator[IO[bytes]]:
-    """A file that gets its name when it is complete. It is not forced onto the disk, see the module."""
+    """Opens a file that gets its name when it is complete. It is not synced to the disk, see the module."""
     temporary = path.with_name(path.name + ".tmp")
     with temporary.open("wb") as file:
         yield file
@@ -304,10 +304,10 @@ def _bytes(array: np.ndarray) -> memoryview:
     return np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
 
 
-def _array(contents: bytes, place: int, shape: tuple[int, ...], dtype: Any) -> tuple[np.ndarray, int]:
-    """The array of that shape that begins at ``place``, and where it ends."""
+def _array(contents: bytes, offset: int, shape: tuple[int, ...], dtype: Any) -> tuple[np.ndarray, int]:
+    """Returns the array of a shape that begins at an offset, and the offset of its end."""
     count = int(np.prod(shape))
-    end = place + count * np.dtype(dtype).itemsize
+    end = offset + count * np.dtype(dtype).itemsize
     if end > len(contents):
         raise Unusable("it ends too early")
-    return np.frombuffer(contents, dtype, count, place).reshape(shape), end
+    return np.frombuffer(contents, dtype, count, offset).reshape(shape), end

@@ -1,4 +1,4 @@
-"""Iterations of a run, made again and compared with its rows and checkpoints; see `verification`."""
+"""Repetition of a run's iterations, and comparison with its rows and checkpoints; see `verification`."""
 
 import dataclasses
 import json
@@ -8,7 +8,7 @@ from typing import Any
 
 from jaxrl_vis.run import metrics
 from jaxrl_vis.run.arrays import is_intact, to_host
-from jaxrl_vis.run.checkpoint import FULL, LIGHT, RECENT, rest_of
+from jaxrl_vis.run.checkpoint import FULL, LIGHT, RECENT, state_without_learner
 from jaxrl_vis.run.inspection import Expected, Findings, listed
 from jaxrl_vis.run.loop import GUARD
 from jaxrl_vis.run.manifest import progress_in
@@ -18,7 +18,7 @@ from jaxrl_vis.run.progress import Progress
 from jaxrl_vis.types import LoopState
 
 NOT_REPEATED = (RUN_ID, "time/", "resume/")
-"""What names begin with that no repetition can be expected to write again."""
+"""Prefixes of the names of values that no repetition can reproduce."""
 
 Row = dict[str, Any]
 
@@ -27,15 +27,15 @@ _OTHER_BEGINS = 20
 
 @dataclasses.dataclass
 class Verification(Findings):
-    """Findings about a run folder, and what came of repeating its iterations.
+    """Findings about a run folder, and results of repeating its iterations.
 
     Attributes:
-        rows, numbers: How many were repeated, and are equal or not.
-        checkpoints: Names of those that were compared with the state of a repetition.
-        differences: Lines about rows and checkpoints that are not what the repetition arrives at; among the problems, too.
+        rows, numbers: Rows and numbers that were repeated, equal or not.
+        checkpoints: Names of the checkpoints that were compared with a repetition.
+        differences: Lines about rows and checkpoints that differ from the repetition; also among the problems.
         largest: The largest relative difference of a number.
-        unverified: Lines about what was not repeated, and why.
-        elsewhere: In what this machine or its software is not that of the run, so that bit equality is not promised.
+        unverified: Lines about parts that were not repeated, and why.
+        elsewhere: Differences of this machine or its software from the run's, for which bit equality is not guaranteed.
     """
 
     rows: int = 0
@@ -48,7 +48,7 @@ class Verification(Findings):
 
     @property
     def is_equal(self) -> bool:
-        """Returns whether something was repeated, all of that is equal, and nothing is missing, damaged or another run's."""
+        """True if something was repeated, all of it is equal, and nothing is missing, damaged or another run's."""
         return self.rows > 0 and not self.problems
 
 
@@ -56,16 +56,16 @@ class Repeater:
     """Repeats parts of one run.
 
     Args:
-        programs: Of the run.
-        expected: What holds for its rows.
-        rows: Of its file.
-        manifests: Of its checkpoints, by tier and iteration.
-        report: Is told what comes of it.
+        programs: Programs of the run.
+        expected: Conditions on its rows.
+        rows: Rows of its file.
+        manifests: Manifests of its checkpoints, by tier and iteration.
+        report: Receives the results.
         say: Called with a line about each step.
 
     Attributes:
         repeated: Iterations whose rows were compared.
-        without_evaluation: Iterations that had no evaluation, as the means of the next one tell.
+        without_evaluation: Iterations without an evaluation, as inferred from the means of the next one.
     """
 
     def __init__(
@@ -82,29 +82,29 @@ class Repeater:
         self.repeated: set[int] = set()
         self.without_evaluation: set[int] = set()
 
-    def repeat(self, name: str, begin: int, progress: Progress, loop: LoopState, places: Sequence[int]) -> None:
-        """Repeats iterations, and compares.
+    def repeat(self, name: str, begin: int, progress: Progress, loop: LoopState, compared_iterations: Sequence[int]) -> None:
+        """Repeats iterations and compares the results.
 
         Args:
-            name: Of the beginning, for people.
-            begin: Iterations done.
-            progress: What the host remembered then.
-            loop: The state; donated.
-            places: Iterations whose rows are compared, ascending; the last one is where it ends.
+            name: Name of the starting point, for messages.
+            begin: Iterations completed at the start.
+            progress: Progress of the host at the start.
+            loop: State at the start; donated.
+            compared_iterations: Iterations whose rows are compared, ascending; the repetition ends at the last one.
         """
-        self._say(f"repeating iterations {begin + 1} to {places[-1]} from {name} ...")
+        self._say(f"repeating iterations {begin + 1} to {compared_iterations[-1]} from {name} ...")
         history = {begin - back: values for back, values in enumerate(reversed(progress.since_evaluation))}
-        if begin in places:
+        if begin in compared_iterations:
             self._compare(name, begin, loop, history)
-        for iteration in range(begin + 1, places[-1] + 1):
+        for iteration in range(begin + 1, compared_iterations[-1] + 1):
             loop, values = self._programs.train_iteration(loop)
             read = self._programs.pending(values).read_per_seed(len(self._expected.seeds))
             broken = [key for key, counts in read.items() if key.startswith(GUARD) and any(counts)]
             if broken:
-                self._differ(f"iteration {iteration}: the repetition from {name} meets numbers that are not finite")
+                self._differ(f"iteration {iteration}: the repetition from {name} meets non-finite numbers")
                 return
-            history[iteration] = {key: each for key, each in read.items() if not key.startswith(GUARD)}
-            if iteration in places:
+            history[iteration] = {key: per_seed for key, per_seed in read.items() if not key.startswith(GUARD)}
+            if iteration in compared_iterations:
                 self._compare(name, iteration, loop, history)
             self._compare_checkpoints(iteration, progress.replay_lost_at, loop)
 
@@ -114,13 +114,13 @@ class Repeater:
         self._say(f"  {line}")
 
     def _compare(self, name: str, iteration: int, loop: LoopState, history: Mapping[int, PerSeed]) -> None:
-        """Compares the rows of an iteration with what the repetition makes of it."""
+        """Compares the rows of an iteration with the repetition."""
         there = [row for row in self._rows if row["iteration"] == iteration]
         outcome, _ = self._programs.evaluate(loop.train)
         evaluated = self._programs.pending(outcome).read_per_seed(len(self._expected.seeds))
         best: list[tuple[int, str, Any, Any]] | None = None
         for begin in self._begins(iteration, history):
-            made = self._rows_of(iteration, evaluated, [history[number] for number in range(begin + 1, iteration + 1)])
+            made = self._repeated_rows(iteration, evaluated, [history[number] for number in range(begin + 1, iteration + 1)])
             differences = [
                 (row["seed"], key, value, again) for row in there for key, value, again in _differences(row, made[row["seed"]])
             ]
@@ -130,7 +130,7 @@ class Repeater:
                 if best:
                     self.without_evaluation.update(range(begin + 1, iteration))
                     self._report.notes.append(
-                        f"iteration {iteration} has means since iteration {begin}: eval_interval was another one then"
+                        f"iteration {iteration} has means since iteration {begin}: eval_interval had another value then"
                     )
                 best = differences
                 break
@@ -140,41 +140,41 @@ class Repeater:
             self._report.rows += len(there)
             self._report.numbers += numbers
         if best:
-            self._tell(name, iteration, best)
+            self._report_differences(name, iteration, best)
         else:
             seeds = "1 seed" if len(there) == 1 else f"{len(there)} seeds"
             self._say(f"  iteration {iteration}: {numbers} numbers of {seeds}, all equal")
 
-    def _tell(self, name: str, iteration: int, differences: Sequence[tuple[int, str, Any, Any]]) -> None:
+    def _report_differences(self, name: str, iteration: int, differences: Sequence[tuple[int, str, Any, Any]]) -> None:
         self._report.largest = max([self._report.largest, *(_relative(value, again) for _, _, value, again in differences)])
         shown = listed(f"seed {seed} {key} is {value} in the file, {again} here" for seed, key, value, again in differences)
         hint = ""
         if all(key.startswith("eval/") for _, key, _, _ in differences):
-            hint = " (or eval_episodes was another one then)"
+            hint = " (or eval_episodes had another value then)"
         self._differ(f"iteration {iteration}, from {name}: {shown}{hint}")
 
     def _begins(self, iteration: int, history: Mapping[int, PerSeed]) -> list[int]:
-        """After which iterations the means in a row may begin, the one that eval_interval says first."""
+        """Lists candidates for the iteration after which the means of a row begin, the one implied by eval_interval first."""
         interval, earliest = self._expected.eval_interval, min(history, default=iteration + 1) - 1
         scheduled = max((iteration - 1) // interval * interval, earliest)
         evaluated = sorted({row["iteration"] for row in self._rows if earliest <= row["iteration"] < iteration}, reverse=True)
         return list(dict.fromkeys([scheduled, *evaluated[:_OTHER_BEGINS], earliest]))
 
-    def _rows_of(self, iteration: int, evaluated: PerSeed, history: Sequence[PerSeed]) -> dict[int, Row]:
-        """Rows that a run writes for an iteration, by seed, without columns that are not repeated."""
+    def _repeated_rows(self, iteration: int, evaluated: PerSeed, history: Sequence[PerSeed]) -> dict[int, Row]:
+        """Makes the rows that a run writes for an iteration, by seed, without the columns that are not repeated."""
         counts = {
             "iteration": iteration,
             "updates": iteration * self._expected.updates,
             "env_steps": iteration * self._expected.env_steps,
         }
-        means = metrics.with_precision(metrics.mean_of(history))
+        means = metrics.with_precision(metrics.average_metrics(history))
         return {row["seed"]: row for row in metrics.make_rows(self._expected.seeds, counts, evaluated | means)}
 
     def _compare_checkpoints(self, iteration: int, mark: int | None, loop: LoopState) -> None:
-        """Compares the state with checkpoints of the same iteration, by their checksums."""
+        """Compares the state with checkpoints of the same iteration by their checksums."""
         for tier in (LIGHT, FULL, RECENT):
             manifest = self._manifests.get((tier, iteration))
-            if manifest is None or progress_of(manifest).replay_lost_at != mark:
+            if manifest is None or saved_progress(manifest).replay_lost_at != mark:
                 continue
             differing = []
             for described, tree in _saved(tier, manifest, loop):
@@ -189,37 +189,37 @@ class Repeater:
             if (checkpoint := f"{tier}/{iteration}") not in self._report.checkpoints:
                 self._report.checkpoints.append(checkpoint)
             if differing:
-                self._differ(f"checkpoint {tier}/{iteration} is not what the repetition arrives at: {listed(differing)} differ")
+                self._differ(f"checkpoint {tier}/{iteration} differs from the repetition: {listed(differing)} differ")
             else:
                 self._say(f"  checkpoint {tier}/{iteration}: equal")
 
 
 def _saved(tier: str, manifest: Mapping[str, Any], loop: LoopState) -> Iterator[tuple[Mapping[str, Any], Any]]:
-    """Pairs of a manifest's items and the arrays of a state that they describe, part by part."""
+    """Yields pairs of a manifest's items and the arrays that they describe."""
     items = manifest["items"]
     if tier == RECENT:
-        kept = {"train": loop.train, "key": loop.key, "iteration": loop.iteration, "replay": {"size": loop.replay.size}}
-        yield items, kept
+        state = {"train": loop.train, "key": loop.key, "iteration": loop.iteration, "replay": {"size": loop.replay.size}}
+        yield items, state
         return
     yield items.get("train", {}), loop.train
     if tier == FULL:
-        yield items.get("rest", {}), rest_of(loop)
+        yield items.get("rest", {}), state_without_learner(loop)
 
 
-def progress_of(manifest: Mapping[str, Any]) -> Progress:
-    """Progress that the host saved with a checkpoint."""
+def saved_progress(manifest: Mapping[str, Any]) -> Progress:
+    """Returns the host's progress saved with a checkpoint."""
     return Progress.from_dict(progress_in(manifest))
 
 
 def has_progress(manifest: Mapping[str, Any], seeds: int) -> bool:
-    """Returns whether a manifest says what the host remembered, in the types that it had.
+    """Returns True if a manifest has the host's progress, with the right types.
 
     Args:
-        manifest: Of a checkpoint.
-        seeds: How many the run has.
+        manifest: Manifest of a checkpoint.
+        seeds: Number of seeds of the run.
     """
     try:
-        progress = progress_of(manifest)
+        progress = saved_progress(manifest)
         names = {name for values in progress.since_evaluation for name in values}
         figures = [number for values in progress.since_evaluation for name in names for number in values[name]]
         counts = [len(row) for values in progress.since_evaluation for row in values.values()]
@@ -235,7 +235,7 @@ def _compared(row: Mapping[str, Any]) -> Row:
 
 
 def _differences(row: Mapping[str, Any], made: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
-    """Names whose values are not written alike, with both."""
+    """Yields names whose values are not written identically, with both values."""
     compared = _compared(row)
     for name in dict.fromkeys([*compared, *made]):
         value, again = compared.get(name, "nothing"), made.get(name, "nothing")
@@ -244,7 +244,7 @@ def _differences(row: Mapping[str, Any], made: Mapping[str, Any]) -> Iterator[tu
 
 
 def _relative(value: Any, again: Any) -> float:
-    """The difference of two numbers, as a share of the larger; infinite where one is no number."""
+    """Returns the difference of two numbers relative to the larger one; infinite if one is not a number."""
     if not (isinstance(value, int | float) and isinstance(again, int | float)):
         return math.inf
     return abs(value - again) / max(abs(value), abs(again)) if value != again else 0.0

@@ -1,4 +1,4 @@
-"""What a run shows of itself: its curve, and at its end the video and a summary in words. Only the first process makes them."""
+"""Presentation of a run: the curve, and at the end a video and a summary. Only the first process makes them."""
 
 from collections.abc import Callable
 from typing import Any
@@ -13,18 +13,18 @@ from jaxrl_vis.run.progress import Progress
 
 
 def describe(config: Config) -> str:
-    """What was asked for, in a few words: method, preset and seeds."""
+    """Summarises a configuration in a few words: method, preset and seeds."""
     seeds = f"seed {config.seed}" if config.seeds == 1 else f"seeds {config.seed} to {config.seed + config.seeds - 1}"
     return f"{config.method}, preset {config.preset}, {seeds}"
 
 
 class Results:
-    """The files that a run leaves beside its metrics and checkpoints.
+    """Images that a run writes in addition to its metrics and checkpoints.
 
     Args:
-        programs: What was run.
-        folder: Where the files go.
-        loggers: What else is given the images.
+        programs: Programs of the run.
+        folder: Folder of the files.
+        loggers: Loggers that also receive the images.
         say: Prints a line.
     """
 
@@ -32,12 +32,12 @@ class Results:
         self._programs, self._folder, self._loggers, self._say = programs, folder, loggers, say
 
     def show(self, done: int, progress_now: Callable[[], Progress], recorded: dict[str, Any]) -> None:
-        """Draws what a finished run leaves behind, and says so.
+        """Draws the results of a finished run, and prints a summary.
 
         Args:
-            done: Iterations done.
-            progress_now: Its seconds count to the moment of the call.
-            recorded: Images of the last evaluation, see `evaluate.make_evaluate`; not read where there are none.
+            done: Iterations completed.
+            progress_now: Returns the progress, with times up to the call.
+            recorded: Images of the last evaluation, see `evaluate.make_evaluate`; unused if there are none.
         """
         self.draw_curve(done)
         if self._programs.shows_images:
@@ -52,7 +52,7 @@ class Results:
         self._say(f"see {', '.join([*written, self._folder.metrics.name])} in {self._folder.path}")
 
     def draw_curve(self, done: int) -> None:
-        """Draws the evaluations so far, after ``done`` iterations."""
+        """Draws the evaluations up to ``done`` iterations."""
         from jaxrl_vis.report import plots
 
         config, env = self._programs.config, self._programs.env

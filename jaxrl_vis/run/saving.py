@@ -1,8 +1,8 @@
-"""Contents, occasions and order of what a run saves.
+"""Contents, schedule and order of what a run saves.
 
-A checkpoint holds finite numbers only, and metrics.jsonl is on the disk before a checkpoint of the same iteration is (but for
-a recent state, whose evaluation may be due still). On a signal the light checkpoint is written first, which takes seconds, and
-the full one, with the replay, after it: whoever runs out of patience, or of disk, in between keeps the networks.
+A checkpoint has finite numbers only, and metrics.jsonl is on the disk before a checkpoint of the same iteration (except for a
+recent state, whose evaluation may still be due). On a signal, the light checkpoint is written first, which takes seconds, then
+the full one with the replay: if the process is killed or the disk fills up in between, the networks are saved.
 """
 
 import contextlib
@@ -30,8 +30,8 @@ from jaxrl_vis.run.signals import Interruption
 from jaxrl_vis.types import LoopState
 
 
-def import_what_saves() -> None:
-    """Matplotlib and orbax, which take a second or two to import: while XLA compiles, that costs nothing."""
+def import_saving_libraries() -> None:
+    """Imports Matplotlib and orbax, which takes a second or two, in parallel with XLA's compilation."""
     for name in ("jaxrl_vis.report.plots", "orbax.checkpoint"):
         importlib.import_module(name)
 
@@ -40,11 +40,11 @@ class Saver:
     """Saves the state of one run.
 
     Args:
-        programs: Of the run.
-        folder: Where its files go.
-        checkpoints: Of that folder.
-        say: Called with one line about what happens.
-        check: Raises a `StorageError` where the folder is not this run's any more; called before anything is written.
+        programs: Programs of the run.
+        folder: Folder of its files.
+        checkpoints: Checkpoints of that folder.
+        say: Called with one line about each event.
+        check: Raises a `StorageError` if the folder no longer belongs to this run; called before anything is written.
     """
 
     def __init__(
@@ -60,15 +60,15 @@ class Saver:
         self._keeps_full = programs.config.full_checkpoint_interval > 0
 
     def has(self, tier: str, iteration: int) -> bool:
-        """Whether there is a checkpoint of that tier and iteration; several processes agree on it."""
-        return processes.any_of(iteration in self._checkpoints.iterations(tier))
+        """Returns True if a tier has a checkpoint of an iteration; several processes agree on the answer."""
+        return processes.any_process(iteration in self._checkpoints.iterations(tier))
 
     def light(self, loop: LoopState, iteration: int, progress: Progress) -> None:
         """Saves the learner in the background.
 
         Raises:
             NonFiniteError: The state is not finite; it was dumped instead.
-            StorageError: It cannot be written, or the one before could not.
+            StorageError: It cannot be written, or the previous one could not.
         """
         self._check()
         self._refuse_nonfinite(loop, iteration)
@@ -77,7 +77,7 @@ class Saver:
             self._checkpoints.retire_full()
 
     def full(self, loop: LoopState, iteration: int, progress: Progress) -> None:
-        """Saves everything, and returns when it is on the disk. Raises as `light`."""
+        """Saves the complete state and waits for the disk. Raises as `light`."""
         self._check()
         self._refuse_nonfinite(loop, iteration)
         self._checkpoints.save_full(iteration, loop, dataclasses.asdict(progress))
@@ -87,15 +87,16 @@ class Saver:
         return self._programs.layout.mesh is None and is_cheap(self._programs.shapes.replay)
 
     def is_recent_due(self, light: bool) -> bool:
-        """Returns whether `recent` is to be called after this iteration: it is cheap, and was not called for long enough.
+        """Returns True if `recent` should be called after this iteration: it is cheap, and the last call was long enough ago.
 
         Args:
-            light: Whether a light checkpoint is written, which must not be the newest, for it would be gone on from.
+            light: A light checkpoint is about to be written, which must not be the newest one, because the run would resume
+                from it.
         """
         return self._keeps_recent and self._checkpoints.recent.is_due(light)
 
     def recent(self, loop: LoopState, iteration: int, progress: Progress) -> None:
-        """Keeps the state up to date for a process that is killed; see `jaxrl_vis.run.recent`.
+        """Saves the state for resuming after a kill; see `jaxrl_vis.run.recent`.
 
         Raises:
             NonFiniteError, StorageError: As `light`.
@@ -107,7 +108,7 @@ class Saver:
         self._checkpoints.recent.save(iteration, loop, num_envs, dataclasses.asdict(progress), started)
 
     def finish(self) -> None:
-        """Returns when everything is on the disk, and deletes what only a run that has not ended goes on from.
+        """Waits until everything is on the disk, and deletes states that only an unfinished run needs.
 
         Raises:
             StorageError: Something could not be written.
@@ -120,14 +121,15 @@ class Saver:
             self._checkpoints.recent.clear()
 
     def on_signal(self, loop: LoopState, iteration: int, progress: Progress, interruption: Interruption) -> None:
-        """Saves the learner, then everything. A full disk in between leaves the light checkpoint, and says so.
+        """Saves the learner, then the complete state. If the disk fills up in between, the light checkpoint stays, with a
+        message.
 
         Raises:
             NonFiniteError, StorageError: As `light`.
         """
         hint = f"{interruption.hurry} at once, without the replay"
         self._say(f"{interruption.name}: saving iteration {iteration} ({hint}) ...")
-        if self.is_recent_due(light=True):  # for whoever does not wait
+        if self.is_recent_due(light=True):  # in case the user does not wait
             self.recent(loop, iteration, progress)
         if not self.has(LIGHT, iteration) or progress.evaluation_due:
             self.light(loop, iteration, progress)
@@ -136,15 +138,15 @@ class Saver:
             try:
                 self.full(loop, iteration, progress)
             except StorageError as error:
-                what = "there is no full checkpoint" if self.has(RECENT, iteration) else "the replay is not"
-                self._say(f"the networks are saved, {what}: {error}; {self.resume}")
+                missing = "there is no full checkpoint" if self.has(RECENT, iteration) else "the replay is not"
+                self._say(f"the networks are saved, {missing}: {error}; {self.resume}")
                 return
         if processes.is_first():
             self._checkpoints.recent.clear()
         self._say(f"saved; {self.resume}")
 
     def rescue(self, loop: LoopState | None, iteration: int, progress: Progress) -> None:
-        """Tries to save the learner after something unexpected went wrong; what stands in the way is not reported."""
+        """Tries to save the learner after an unexpected error; failures are not reported."""
         if loop is None or iteration == 0 or any(leaf.is_deleted() for leaf in jax.tree.leaves(loop)):
             return
         with contextlib.suppress(Exception):
@@ -160,12 +162,12 @@ class Saver:
 
     @property
     def resume(self) -> str:
-        """Command line that goes on with the run, quoted for a shell."""
+        """Command line options that resume the run, quoted for a shell."""
         return f"go on with --run-dir {shlex.quote(str(self._folder.path))} --resume"
 
     @contextlib.contextmanager
     def writing(self) -> Iterator[None]:
-        """Turns what the system says of the run's files into a `StorageError`; what is called in here does nothing else."""
+        """Converts errors of the run's files into a `StorageError`; use it only around file operations."""
         try:
             yield
         except OSError as error:
@@ -173,16 +175,17 @@ class Saver:
             raise StorageError(f"cannot write to {self._folder.path} ({reason})") from error
 
     def storage_error(self, error: StorageError) -> StorageError:
-        """What a run that could not write ends with: what failed, what there is, and how to go on."""
-        kept = self._checkpoints.newest()
-        good = "there is no checkpoint yet" if kept is None else f"the last checkpoint is of iteration {kept}"
+        """Extends an error of writing by the last checkpoint and the command that resumes the run."""
+        newest = self._checkpoints.newest()
+        good = "there is no checkpoint yet" if newest is None else f"the last checkpoint is of iteration {newest}"
         cause = error.__cause__
         is_full = "no space left" in str(error).lower() or getattr(cause, "errno", None) in (errno.ENOSPC, errno.EDQUOT)
-        mend = "make room" if is_full else "mend that"
+        mend = "make room" if is_full else "fix that"
         return StorageError(f"{error}; {good}: {mend}, then {self.resume}")
 
     def _refuse_nonfinite(self, loop: LoopState, iteration: int) -> None:
-        # The guard looks at losses and states; a parameter that broke in the very last update shows in the next iteration's.
+        # The guard checks losses and states; a parameter that breaks in the very last update appears in those of the next
+        # iteration.
         if broken := self._programs.broken_leaves(loop):
             self.stop_nonfinite(loop, iteration, f"the state after iteration {iteration}", {}, broken)
 
@@ -192,11 +195,11 @@ class Saver:
         """Dumps the state and raises NonFiniteError."""
         with contextlib.suppress(StorageError):
             self._checkpoints.wait()
-        kept = self._checkpoints.newest()
+        newest = self._checkpoints.newest()
         leaves = self._programs.broken_leaves(loop) if broken is None else broken
         leaves = [name.removeprefix("train.") for name in leaves if name.startswith("train.")]
         file = self._folder.nonfinite / f"iteration_{iteration}.npz"
-        simulated, dumped = None, "the state lies in several processes and is not kept"
+        simulated, dumped = None, "the state is distributed over several processes and is not dumped"
         if not processes.are_several():
             try:
                 dump(file, loop, values, leaves)
@@ -208,6 +211,6 @@ class Saver:
                 simulated = "the networks are finite"
         names = [name for name, row in values.items() if not np.isfinite(row).all()] + leaves
         shown = f" ({', '.join(names[:3])}{f' and {len(names) - 3} more' if len(names) > 3 else ''})" if names else ""
-        good = "there is no checkpoint yet" if kept is None else f"the last good checkpoint is of iteration {kept}"
+        good = "there is no checkpoint yet" if newest is None else f"the last good checkpoint is of iteration {newest}"
         origin = f"they come from the simulation, not from the learner ({simulated}); " if simulated else ""
         raise NonFiniteError(f"non-finite numbers in {where}{shown}: {origin}{dumped}; {good}")

@@ -1,16 +1,17 @@
-"""Signals that end a process: noted when they come, acted upon where nothing is lost, and kept from children.
+"""Handling of signals that end a process: deferred until it is safe, and kept from child processes.
 
-    Interruption   a run, or a grid of runs: a signal sets a flag, which is looked at between two iterations
-    Ending         any other command: a signal raises an exception, on whose way out children end and files stay whole
+    Interruption   a run, or a grid of runs: a signal sets a flag, which is checked between iterations
+    Ending         any other command: a signal raises an exception, which ends children and keeps files intact
 
-Whoever was there before stays in charge: a signal that is ignored (nohup) stays ignored, and one for which the program that
-calls this has a handler of its own goes to that. Faults (SIGSEGV, SIGBUS, SIGABRT ...) are left alone.
+Existing handlers take precedence: an ignored signal (nohup) stays ignored, and a signal with a handler of the calling program
+goes to that handler. Faults (SIGSEGV, SIGBUS, SIGABRT ...) are not handled.
 """
 
 import contextlib
 import os
 import signal
 import socket
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -27,20 +28,20 @@ _NAMES = (
 )
 _REAL_TIME = range(signal.SIGRTMIN, signal.SIGRTMAX + 1) if hasattr(signal, "SIGRTMIN") else range(0)
 SIGNALS: tuple[int, ...] = (*(int(getattr(signal, name)) for name in _NAMES if hasattr(signal, name)), *_REAL_TIME)
-"""All that end a process unless it has a handler, but for faults, SIGKILL, and what Python ignores (SIGPIPE, SIGXFSZ)."""
+"""All signals that end a process by default, except faults, SIGKILL, and those that Python ignores (SIGPIPE, SIGXFSZ)."""
 
-# These are sent by somebody who wants an end, and a second time by somebody who does not want to wait. Of all others a second
-# one says nothing new: SIGXCPU comes every second, and a closed terminal sends SIGHUP by the kernel and by the shell.
+# Sent deliberately; a second one means that the sender does not want to wait. A second one of the others has no meaning:
+# SIGXCPU comes every second, and on a closed terminal both the kernel and the shell send SIGHUP.
 _DELIBERATE = tuple(
     int(getattr(signal, name)) for name in ("SIGINT", "SIGTERM", "SIGQUIT", "SIGBREAK") if hasattr(signal, name)
 )
-# Libraries install handlers in C for these two (JAX's notice of preemption, for one), which may be replaced.
+# Libraries install C handlers for these two (such as JAX's preemption notice), which may be replaced.
 _TAKEN_FROM_LIBRARIES = (signal.SIGINT, signal.SIGTERM)
-_PATIENCE_S = 10.0  # after a signal a command has so long to end by itself: XLA, which compiles, may not look up for minutes
+_PATIENCE_S = 10.0  # for a command to end after a signal: a compilation by XLA may not return to Python for minutes
 
 
-def name_of(number: int) -> str:
-    """Name of a signal for a message: ``SIGHUP``, ``SIGRTMIN+2``, or ``Ctrl-C``."""
+def signal_name(number: int) -> str:
+    """Returns a signal's name for messages: ``SIGHUP``, ``SIGRTMIN+2``, or ``Ctrl-C``."""
     if number in _REAL_TIME[1:-1]:  # Python has names for the first and the last of these
         return f"SIGRTMIN+{number - _REAL_TIME[0]}"
     return "Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name
@@ -48,11 +49,11 @@ def name_of(number: int) -> str:
 
 @contextlib.contextmanager
 def shielded_children() -> Iterator[None]:
-    """Processes and threads that this thread starts in here never see any of `SIGNALS`.
+    """Blocks `SIGNALS` in processes and threads started in this context by this thread.
 
     `timeout`, cluster schedulers and terminals signal the whole process group. XLA compiles with child processes (ptxas): a
-    signal that kills one of them fails the compilation, while the run itself means to save and end in good order. A blocked
-    signal stays blocked in children and in threads that start there; the main thread itself still receives it afterwards.
+    signal that killed one of them would fail the compilation, while the run itself is to save and end in good order. A blocked
+    signal stays blocked in child processes and threads; the main thread itself receives it afterwards.
     """
     if not hasattr(signal, "pthread_sigmask"):  # Windows, where signals do not reach children
         yield
@@ -65,13 +66,13 @@ def shielded_children() -> Iterator[None]:
 
 
 def shield_this_thread() -> None:
-    """As `shielded_children`, for the rest of this thread's life: an initializer for pools of threads that compile."""
+    """Blocks `SIGNALS` for the rest of this thread's life: an initializer for pools of compiling threads."""
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
 
 
 class _Handlers:
-    """Handlers of all `SIGNALS` that nobody else takes care of, and of SIGPIPE, which ends nothing meanwhile.
+    """Handlers of all `SIGNALS` that have no other handler; SIGPIPE is ignored meanwhile.
 
     Python delivers signals to the main thread only; in any other thread nothing is installed.
     """
@@ -86,7 +87,7 @@ class _Handlers:
         for number in SIGNALS:
             if _is_free(number, caught_in_c):
                 self._before[number] = signal.signal(number, handler)
-        # Scripts that want to end as `head` does set it so; a run does not.
+        # Scripts that should end when `head` does set it so; a run should not.
         if hasattr(signal, "SIGPIPE") and signal.getsignal(signal.SIGPIPE) == signal.SIG_DFL:
             self._before[signal.SIGPIPE] = signal.signal(signal.SIGPIPE, signal.SIG_IGN)
 
@@ -97,7 +98,7 @@ class _Handlers:
 
 
 def _is_free(number: int, caught_in_c: int) -> bool:
-    """Returns whether a signal would end this process, or is taken care of by the classes of this module."""
+    """Returns True if a signal would end this process, or has a handler of this module."""
     handler = signal.getsignal(number)
     if handler is signal.default_int_handler or isinstance(getattr(handler, "__self__", None), _Handlers):
         return True
@@ -105,9 +106,9 @@ def _is_free(number: int, caught_in_c: int) -> bool:
 
 
 def _caught_in_c() -> int:
-    """A bit for each signal that has a handler, or is ignored: Python does not know of those that C code installs.
+    """Returns a bit mask of signals that are caught or ignored: Python does not know handlers installed by C code.
 
-    `faulthandler.register` does, for one. Nothing is known where there is no /proc.
+    Such as those of `faulthandler.register`. Zero if there is no /proc.
     """
     masks = 0
     with contextlib.suppress(OSError, ValueError):
@@ -118,18 +119,18 @@ def _caught_in_c() -> int:
 
 
 class Interruption(_Handlers):
-    """A context in which `SIGNALS` only set a flag. Who asks for the end a second time does not wait: it raises at once.
+    """Context in which `SIGNALS` only set a flag. A second deliberate signal raises at once.
 
     Attributes:
-        signal: The first signal that came, or None.
-        is_urgent: Whether Ctrl-C, SIGTERM or SIGQUIT came twice.
+        signal: The first signal received, or None.
+        is_urgent: True if Ctrl-C, SIGTERM or SIGQUIT came twice.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self.signal: int | None = None
         self.is_urgent = False
-        self._was_asked = False
+        self._was_deliberate = False
 
     def __enter__(self) -> Self:
         self._install(self._note)
@@ -139,32 +140,44 @@ class Interruption(_Handlers):
         return self.signal is not None
 
     def reached_any(self) -> bool:
-        """Returns whether any of several processes, which all ask here, was told to end; they then agree on the signal."""
-        if number := processes.greatest(self.signal or 0):
+        """Returns True if any process has received a signal, on which all then agree; a collective call."""
+        if number := processes.max_over_processes(self.signal or 0):
             self.signal = number
         return bool(number)
 
     @property
     def name(self) -> str:
         """Name of the signal for a message."""
-        return name_of(self.signal or signal.SIGTERM)
+        return signal_name(self.signal or signal.SIGTERM)
 
     @property
     def hurry(self) -> str:
-        """Words for what would end the process without waiting."""
+        """Hint for messages: the input that ends the process without waiting."""
         return "once more quits" if self.signal in _DELIBERATE else "Ctrl-C or SIGTERM, twice, quits"
 
     def _note(self, number: int, _: FrameType | None) -> None:
-        if number in _DELIBERATE and self._was_asked:
+        if number in _DELIBERATE and self._was_deliberate:
             self.signal, self.is_urgent = number, True
+            _ignore_half_made_loops()
             self.end()
-        self._was_asked |= number in _DELIBERATE
+        self._was_deliberate |= number in _DELIBERATE
         if self.signal is None:
             self.signal = number
 
     def end(self) -> None:
-        """Raises what the signal stands for: `Terminated` or KeyboardInterrupt."""
+        """Raises the exception of the signal: `Terminated` or KeyboardInterrupt."""
         _raise(self.signal or signal.SIGTERM)
+
+
+def _ignore_half_made_loops() -> None:
+    """Silences asyncio (orbax saves with it) about an event loop that a raising handler has kept from being made."""
+    before = sys.unraisablehook
+
+    def hook(unraisable: "sys.UnraisableHookArgs") -> None:
+        if getattr(unraisable.object, "__qualname__", "") != "BaseEventLoop.__del__":
+            before(unraisable)
+
+    sys.unraisablehook = hook
 
 
 def _raise(number: int) -> None:
@@ -174,40 +187,40 @@ def _raise(number: int) -> None:
 
 
 class Ending(_Handlers):
-    """A context in which `SIGNALS` raise `Terminated` or KeyboardInterrupt in the main thread, as Ctrl-C does anyway.
+    """Context in which `SIGNALS` raise `Terminated` or KeyboardInterrupt in the main thread, as Ctrl-C does anyway.
 
     Args:
-        give_up: Called, in another thread, with a signal that has not ended this process after some seconds: whatever the main
-            thread does then does not return to Python. It ends the process. None: nothing of that kind happens.
+        give_up: Called in another thread with a signal that has not ended this process after some seconds, because the main
+            thread does not return to Python. It must end the process. None: no such watchdog.
 
     Attributes:
-        signal: The first signal that came in here, but for those that an `Interruption` took; None for none.
+        signal: The first signal received, except those handled by an `Interruption`; None for none.
     """
 
     def __init__(self, give_up: Callable[[int], None] | None = None) -> None:
         super().__init__()
         self.signal: int | None = None
         self._give_up = give_up
-        self._told: list[socket.socket] = []
+        self._wakeup_sockets: list[socket.socket] = []
         self._wakeup_before = -1
 
     def __enter__(self) -> Self:
         self._install(self._end)
         if self._give_up is not None and self._before:
-            # The system's handler, which Python runs at once whatever the main thread does, writes the signal's number here.
+            # Python's C-level handler, which runs at once whatever the main thread does, writes the signal's number here.
             reader, writer = socket.socketpair()
             writer.setblocking(False)
-            self._told = [reader, writer]
+            self._wakeup_sockets = [reader, writer]
             self._wakeup_before = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
             threading.Thread(target=self._watch, args=(reader, self._give_up), daemon=True).start()
         return self
 
     def __exit__(self, *error: object) -> None:
         super().__exit__(*error)
-        if self._told:
+        if self._wakeup_sockets:
             signal.set_wakeup_fd(self._wakeup_before)
-            self._told[1].close()  # the other end is read by a thread, which it ends
-            self._told.clear()
+            self._wakeup_sockets[1].close()  # ends the thread that reads the other end
+            self._wakeup_sockets.clear()
 
     def _end(self, number: int, _: FrameType | None) -> None:
         if self.signal is not None and number not in _DELIBERATE:
@@ -218,17 +231,17 @@ class Ending(_Handlers):
     def _watch(self, reader: socket.socket, give_up: Callable[[int], None]) -> None:
         shield_this_thread()
         with reader:
-            while told := reader.recv(1):
-                # An `Interruption` has handlers of its own: what it guards takes as long as it takes.
-                if told[0] in SIGNALS and signal.getsignal(told[0]) == self._end:
+            while received := reader.recv(1):
+                # An `Interruption` has handlers of its own: the code that it guards has no time limit.
+                if received[0] in SIGNALS and signal.getsignal(received[0]) == self._end:
                     time.sleep(_PATIENCE_S)
-                    give_up(told[0])
+                    give_up(received[0])
 
 
 def heed_parent_only() -> None:
-    """Lets a child process, in which `SIGNALS` are blocked (`shielded_children`), end by a SIGTERM of its parent alone.
+    """Lets a child process, in which `SIGNALS` are blocked (`shielded_children`), end only by a SIGTERM of its parent.
 
-    Where the system cannot say who has sent a signal (macOS), any SIGTERM ends it.
+    If the system does not report the sender of a signal (macOS), any SIGTERM ends it.
     """
     if hasattr(signal, "sigwaitinfo"):
         threading.Thread(target=_wait_for_parent, daemon=True).start()

@@ -1,8 +1,7 @@
-"""TensorBoard's files: a folder for each seed in ``tensorboard/`` of the run folder, so that each seed is a curve.
+"""TensorBoard logger: one folder per seed in ``tensorboard/`` of the run folder, so that each seed is a curve.
 
-What is written goes to the disk at once: tensorboardX's own writer has a thread and a queue in between, and where the disk is
-full it waits there for ever. A run that is resumed writes its files anew, from metrics.jsonl, so that no evaluation, nor one
-that the run has gone back behind, is there twice.
+Events are written synchronously: tensorboardX's own writer has a thread and a queue, which would wait for ever on a full disk.
+A resumed run rewrites its files from metrics.jsonl, so that no evaluation appears twice, nor one that the run has discarded.
 """
 
 import json
@@ -21,7 +20,7 @@ from jaxrl_vis.run.metrics import Row, scalars
 
 
 class TensorBoard:
-    """See the module.
+    """TensorBoard logger, see the module.
 
     Args:
         folder: The run folder.
@@ -34,34 +33,34 @@ class TensorBoard:
         if old.is_symlink():
             old.unlink()
         elif old.exists():
-            shutil.rmtree(old)  # or else what another run has left would be shown, too
+            shutil.rmtree(old)  # otherwise files of another run would also be shown
         self._writers: dict[int, EventsWriter] = {}
         for seed in seeds:
             where = folder / LOGGER_FOLDERS[0] / f"seed{seed}"
             where.mkdir(parents=True)
             self._writers[seed] = EventsWriter(str(where / "events"))
-            # A TensorBoard that is open forgets what it has read of files that are gone.
+            # Makes an open TensorBoard forget the contents of deleted files.
             start = event_pb2.SessionLog(status=event_pb2.SessionLog.START)
             self._write(seed, 0, session_log=start)
             self._write(seed, 0, summary=summary.text("config", f"```json\n{json.dumps(record, indent=2)}\n```"))
         self._flush()
 
-    def _write(self, seed: int, env_steps: int, **what: Any) -> None:
-        self._writers[seed].write_event(event_pb2.Event(wall_time=time.time(), step=env_steps, **what))
+    def _write(self, seed: int, env_steps: int, **fields: Any) -> None:
+        self._writers[seed].write_event(event_pb2.Event(wall_time=time.time(), step=env_steps, **fields))
 
     def _flush(self) -> None:
         for writer in self._writers.values():
             writer.flush()
 
     def rows(self, rows: Sequence[Row]) -> None:
-        """Each figure of a row, at the row's ``env_steps``."""
+        """Logs the figures of rows at their ``env_steps``."""
         for row in rows:
             values = [summary_pb2.Summary.Value(tag=name, simple_value=value) for name, value in scalars(row).items()]
             self._write(row["seed"], row["env_steps"], summary=summary_pb2.Summary(value=values))
         self._flush()
 
     def image(self, name: str, file: Path, env_steps: int) -> None:
-        """The file as it is: TensorBoard plays a .gif. It goes to the first seed, whose episodes the video shows."""
+        """Logs the unchanged file: TensorBoard plays a .gif. It goes to the first seed, whose episodes the video shows."""
         from PIL import Image
 
         with Image.open(file) as picture:

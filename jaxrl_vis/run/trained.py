@@ -1,4 +1,4 @@
-"""Using what a run has trained: evaluating it anew, and watching it play."""
+"""Use of trained runs: evaluating them again, and playing episodes."""
 
 from pathlib import Path
 
@@ -16,16 +16,16 @@ from jaxrl_vis.run.trust import check as check_trusted
 
 
 def open_run(run_dir: Path | str, keep_programs: bool = False, trust: bool = False, **changes: object) -> Trainer:
-    """The trainer of a run, on one device, with fields of its configuration changed; nothing in its folder is touched.
+    """Creates the trainer of a run on one device, with changed fields of its configuration; its folder is not modified.
 
     Args:
         run_dir: The run folder.
-        keep_programs: As of `make_trainer`; what training has traced is found then.
-        trust: The run may run its own code, where its task is not one of this project (`jaxrl_vis.run.trust`).
+        keep_programs: As in `make_trainer`; programs traced by the training are reused.
+        trust: Allow the run's own code, if its task is not one of this project (`jaxrl_vis.run.trust`).
         **changes: Fields of `Config`.
 
     Raises:
-        RequestError: There is no run, its code is not trusted, or it cannot be made any more.
+        RequestError: There is no run, its code is not trusted, or its trainer cannot be created any more.
     """
     saved = read_config(Path(run_dir))
     check_trusted(Path(run_dir), saved, trust)
@@ -34,26 +34,26 @@ def open_run(run_dir: Path | str, keep_programs: bool = False, trust: bool = Fal
 
 
 def load(trainer: Trainer, run_dir: Path | str, checkpoint: int | None = None) -> Restored:
-    """A learner that a run has saved.
+    """Loads a saved learner of a run.
 
     Args:
         trainer: From `open_run`.
         run_dir: The run folder.
-        checkpoint: Its iteration; None: the newest good one.
+        checkpoint: Iteration of the checkpoint; None: the newest valid one.
 
     Raises:
-        RequestError: There is none, or none that can be used.
+        RequestError: There is no such checkpoint, or no usable one.
     """
     checkpoints = Checkpoints(Path(run_dir) / "checkpoints", read_only=True, run_id=read_run_id(Path(run_dir)))
-    kept = sorted({*checkpoints.iterations(LIGHT), *checkpoints.iterations(FULL)})
-    if checkpoint is not None and kept and checkpoint not in kept:
-        there = ", ".join(map(str, kept))
-        raise RequestError(f"the run in {run_dir} keeps no checkpoint of iteration {checkpoint}; it keeps {there}")
+    saved = sorted({*checkpoints.iterations(LIGHT), *checkpoints.iterations(FULL)})
+    if checkpoint is not None and saved and checkpoint not in saved:
+        available = ", ".join(map(str, saved))
+        raise RequestError(f"the run in {run_dir} has no checkpoint of iteration {checkpoint}, only of {available}")
     try:
         restored = checkpoints.restore_train(trainer.shapes, checkpoint)
     finally:
         checkpoints.close()
-    if restored is None and kept and checkpoint is not None:
+    if restored is None and saved and checkpoint is not None:
         raise RequestError(f"checkpoint {checkpoint} of the run in {run_dir} is damaged: leave it out for the newest good one")
     if restored is None:
         raise RequestError(f"the run in {run_dir} has no usable checkpoint: train it first")
@@ -63,15 +63,15 @@ def load(trainer: Trainer, run_dir: Path | str, checkpoint: int | None = None) -
 def evaluate_run(
     run_dir: Path | str, episodes: int | None = None, keep_programs: bool = False, trust: bool = False
 ) -> dict[str, list[float]]:
-    """Evaluates the newest good checkpoint of a run.
+    """Evaluates the newest valid checkpoint of a run.
 
     Args:
         run_dir: The run folder.
-        episodes: How many; None: as many as during training.
+        episodes: Number of episodes; None: as during training.
         keep_programs, trust: As of `open_run`.
 
     Returns:
-        ``eval/success``, ``eval/goal_distance`` and the like: one number per seed.
+        ``eval/success``, ``eval/goal_distance`` etc.: one number per seed.
 
     Raises:
         RequestError: There is no run, nothing usable in it, or too little memory for so many episodes.
@@ -91,14 +91,14 @@ def play_run(
     keep_programs: bool = False,
     trust: bool = False,
 ) -> None:
-    """Plays episodes with the first seed of the newest good checkpoint of a run, and writes them as a video.
+    """Plays episodes with the first seed of a run's newest valid checkpoint, and writes a video.
 
     Args:
         run_dir: The run folder.
         out: .gif, .mp4 (needs imageio-ffmpeg, the extra ``video``), .html or .png.
-        episodes: How many to show.
-        three_dimensional: Write an .html page for brax's viewer (needs brax) instead of the robot's images; for state
-            variants, too.
+        episodes: Number of episodes.
+        three_dimensional: Write an .html page for brax's viewer (needs brax) instead of the robot's images; also for state
+            variants.
         keep_programs, trust: As of `open_run`.
 
     Raises:

@@ -1,10 +1,10 @@
-"""Trust in the code that a run folder names.
+"""Trust in the code named by a run folder.
 
-A run on a task of somebody's own, ``module:Name``, names that module and the folder to import it from: whoever uses the run
-runs that code. Nothing else in a run folder is code. So a run is used only by a user who has trained it here, or who has said
-that its code can be trusted; both are remembered in the user's own cache, for the folder, the run's id, the task and the file:
+A run on a custom task, ``module:Name``, names that module and the folder to import it from: using the run executes that code.
+Nothing else in a run folder is code. So a run is used only by a user who trained it here, or who declared its code trusted;
+both are stored in the user's own cache, for the folder, the run's id, the task and the file:
 
-    ~/.cache/jaxrl-vis/trusted/<digest>      what was trusted, for people; the name says it for `is_trusted`
+    ~/.cache/jaxrl-vis/trusted/<digest>      description of what was trusted; `is_trusted` uses the name only
 """
 
 import contextlib
@@ -19,31 +19,31 @@ from jaxrl_vis.files import make_private, read_private, replacing, stranger_to, 
 from jaxrl_vis.run.folder import read_run_id
 from jaxrl_vis_envs import task_modules
 
-_MOST = 2000  # runs that are remembered; the oldest are forgotten
-_trusted_here: set[str] = set()  # by this process, where the cache cannot be written
+_MOST = 2000  # runs that are stored; the oldest are deleted
+_trusted_here: set[str] = set()  # by this process, if the cache is not writable
 
 
 def is_own(config: Config) -> bool:
-    """Returns whether the task of a configuration is somebody's own code."""
+    """Returns True if the task of a configuration is custom code."""
     return task_modules.is_own(config.env)
 
 
 def is_trusted(run_dir: Path, config: Config) -> bool:
-    """Returns whether the code of a run's task was trusted before, and is the same as far as it can be told; or there is none.
+    """Returns True if a run's task code was trusted before and is, as far as can be told, unchanged; or if it has none.
 
     Raises:
-        RequestError: There is no run in ``run_dir``, or its task is not written ``module:Name``.
+        RequestError: There is no run in ``run_dir``, or its task is not of the form ``module:Name``.
     """
-    return _file(config) is None or any(name in _trusted_here or _is_kept(name) for name in _names(run_dir, config))
+    return _file(config) is None or any(name in _trusted_here or _is_stored(name) for name in _names(run_dir, config))
 
 
 def trust(run_dir: Path, config: Config, was_trained_here: bool = False) -> None:
-    """Remembers that a run's task may be imported.
+    """Stores that a run's task may be imported.
 
     Args:
         run_dir: The run folder.
         config: Its configuration.
-        was_trained_here: The file may change: a user who trains works on it, too. Not where it lies in the run folder.
+        was_trained_here: Allow later changes of the file, which a user who trains also edits; not if it lies in the run folder.
     """
     changing, as_it_is = _names(run_dir, config)
     name = changing if was_trained_here and not _is_inside(run_dir, _file(config)) else as_it_is
@@ -58,16 +58,16 @@ def trust(run_dir: Path, config: Config, was_trained_here: bool = False) -> None
 
 
 def check(run_dir: Path, config: Config, may: bool, mend: str = "pass trust=True") -> None:
-    """Checks that the code of a run's task may be imported; where ``may`` says so, that is remembered.
+    """Checks that the code of a run's task may be imported; permission by ``may`` is stored.
 
     Args:
         run_dir: The run folder.
         config: Its configuration.
-        may: Its user says that it may.
-        mend: How to say so.
+        may: Permission by the user.
+        mend: Instruction for giving the permission, for the message.
 
     Raises:
-        RequestError: Nobody has said that it may.
+        RequestError: There is no permission.
     """
     if not is_own(config) or is_trusted(run_dir, config):
         return
@@ -77,7 +77,7 @@ def check(run_dir: Path, config: Config, may: bool, mend: str = "pass trust=True
 
 
 def question(run_dir: Path, config: Config) -> str:
-    """Words for what is to be trusted."""
+    """Returns the question about trust, for messages."""
     return f"the run in {run_dir} runs code that is not of this project: its task {config.env} is imported from {_file(config)}"
 
 
@@ -85,7 +85,7 @@ def _folder() -> Path:
     return user_cache() / "trusted"
 
 
-def _is_kept(name: str) -> bool:
+def _is_stored(name: str) -> bool:
     try:
         return stranger_to(_folder().stat()) is None and read_private(_folder() / name) is not None
     except OSError:
@@ -93,16 +93,16 @@ def _is_kept(name: str) -> bool:
 
 
 def _file(config: Config) -> Path | None:
-    """Path of a task's module, found without importing anything; None where there is none."""
+    """Locates a task's module without importing anything; None if there is none."""
     try:
         module, _ = task_modules.split(config.env)
         return task_modules.find(module, config.env_folder)
-    except (ValueError, OSError) as error:  # not so written, or a folder that no system knows
+    except (ValueError, OSError) as error:  # not of this form, or an invalid folder
         raise RequestError(f"the task {config.env!r} cannot be found: {error}") from error
 
 
 def _names(run_dir: Path, config: Config) -> tuple[str, str]:
-    """Digests of a run and its task: whatever the module's file holds, and as that is now."""
+    """Computes digests of a run and its task: without, and with the current contents of the module's file."""
     file = _file(config)
     about = [str(run_dir.resolve()), read_run_id(run_dir), config.env, str(file)]
     files = _modules_in(run_dir) if _is_inside(run_dir, file) else [file] if file is not None else []
@@ -119,6 +119,6 @@ def _is_inside(run_dir: Path, file: Path | None) -> bool:
 
 
 def _modules_in(run_dir: Path) -> list[Path]:
-    """All files below a run folder that Python could import."""
+    """Lists all files below a run folder that Python could import."""
     suffixes = tuple(importlib.machinery.all_suffixes())
     return sorted(path for path in run_dir.resolve().rglob("*") if path.name.endswith(suffixes) and path.is_file())

@@ -1,11 +1,11 @@
-"""A run, made again from its seed and from its full checkpoints, and compared with its files bit for bit. Nothing is written.
+"""Verification of a run: repeats it from its seed and full checkpoints, and compares bit for bit. Nothing is written.
 
     report = verify_run("runs/mine")
     report.is_equal, report.rows, report.problems, report.unverified
 
-Rows of metrics.jsonl are written where a run is evaluated, so the repetition goes from evaluation to evaluation. On the way it
-compares its state with each checkpoint that it passes. All but times and the run's id must be equal on the same platform with
-the same versions and code; elsewhere floating-point numbers may be rounded otherwise, and the report says by how much.
+Rows of metrics.jsonl are written at evaluations, so the repetition goes from evaluation to evaluation, and compares its state
+with each checkpoint on the way. Everything except times and the run's id must be equal on the same platform with the same
+versions and code; elsewhere, rounding may differ, and the report says by how much.
 """
 
 import math
@@ -34,7 +34,7 @@ from jaxrl_vis.run.memory import check_compiled, check_memory
 from jaxrl_vis.run.metrics import RUN_ID
 from jaxrl_vis.run.progress import Progress
 from jaxrl_vis.run.recent import Unusable
-from jaxrl_vis.run.repetition import Repeater, Row, Verification, has_progress, progress_of
+from jaxrl_vis.run.repetition import Repeater, Row, Verification, has_progress, saved_progress
 from jaxrl_vis.run.results import describe
 from jaxrl_vis.run.sums import FILE_NAME as SUMS_NAME
 from jaxrl_vis.run.sums import compare_sums
@@ -44,7 +44,7 @@ from jaxrl_vis.run.trust import check as check_trusted
 __all__ = ["Verification", "verify", "verify_run"]
 
 EVALUATIONS = 2
-"""How many are repeated where nobody says: the second shows that the first has left nothing behind."""
+"""Default number of repeated evaluations: the second one shows that the first has no side effects."""
 
 
 def verify_run(
@@ -54,17 +54,17 @@ def verify_run(
     say: Callable[[str], None] = lambda line: None,
     trust: bool = False,
 ) -> Verification:
-    """Repeats the beginning of a run, and what follows each of its full checkpoints; nothing in its folder is touched.
+    """Repeats the beginning of a run and the continuation of each full checkpoint; its folder is not modified.
 
     Args:
-        run_dir: The run folder; the run may still be going on.
-        iterations: How many to repeat from each of these; None: up to the second evaluation.
-        keep_programs: As of `jaxrl_vis.run.trainer.make_trainer`.
+        run_dir: The run folder; the run may still be in progress.
+        iterations: Number of iterations to repeat from each start; None: up to the second evaluation.
+        keep_programs: As in `jaxrl_vis.run.trainer.make_trainer`.
         say: Called with a line about each step.
-        trust: Run the run's own code, where its task is module:Name and somebody else trained it.
+        trust: Allow the run's own code, if its task is module:Name and was trained by another user.
 
     Raises:
-        RequestError: There is no run, or it cannot be made any more, needs more memory than there is, or is not trusted.
+        RequestError: There is no run, or it is not trusted, cannot be created any more, or needs more memory than is available.
     """
     path = Path(run_dir)
     record = read_record(path)
@@ -91,7 +91,7 @@ def verify(
     report: Verification,
     say: Callable[[str], None],
 ) -> Verification:
-    """`verify_run`, with a trainer of the run's configuration and the contents of its config.json."""
+    """Verifies a run with an existing trainer of its configuration and the contents of its config.json."""
     return _Verifier(trainer, RunFolder(path), record, report, say).verify(iterations)
 
 
@@ -115,18 +115,19 @@ class _Verifier:
         self._rows: list[Row] = []
 
     def verify(self, iterations: int | None) -> Verification:
-        """See `verify_run`."""
+        """Runs all checks, see `verify_run`."""
         try:
             self._say_origin()
             is_written = (self._folder.path / LOCK_NAME).exists()
             if is_written:
                 self._report.notes.append("another process may be writing into the folder: verified as far as it is there")
-            # Rows are on the disk before the checkpoint that follows: read first, they might lack what that tells of.
+            # Rows are on the disk before the checkpoint that follows: if they were read first, some of the checkpoint's could
+            # be missing.
             self._read_manifests()
             self._read_recent()
             self._rows = read_file(self._folder.metrics, self._expected, is_written, self._report)
             repeater = self._repeat_all(iterations)
-            due = {number for (_, number), manifest in self._manifests.items() if progress_of(manifest).evaluation_due}
+            due = {number for (_, number), manifest in self._manifests.items() if saved_progress(manifest).evaluation_due}
             reached = max((number - (number in due) for _, number in self._manifests), default=0)
             self._report.problems += missing_rows(
                 self._rows, self._expected, reached, self._total, repeater.without_evaluation, is_written
@@ -138,31 +139,31 @@ class _Verifier:
         finally:
             self._checkpoints.close()
 
-    # -- Where it comes from
+    # -- Provenance
 
     def _say_origin(self) -> None:
         record, report = self._record, self._report
         device, versions = _mapping(record.get("device")), _mapping(record.get("versions"))
         name = provenance.device_name()
-        here = {
+        current = {
             "revision": provenance.revision(),
             **provenance.versions(),
             **_flat(provenance.device_record() | {"name": name}),
         }
-        there = {"revision": record.get("git_revision"), **versions, **_flat(device)}
+        recorded = {"revision": record.get("git_revision"), **versions, **_flat(device)}
         named = f", run {self._expected.run_id}" if self._expected.run_id else ""
         self._say(f"{self._folder.path}: {self._config.env}, {describe(self._config)}{named}")
         libraries = ", ".join(f"{name} {versions[name]}" for name in ("jax", "jaxlib", "python") if name in versions)
         where = f"{device.get('count')} {device.get('kind')}, {device.get('cpu_count')} cores"
-        self._say(f"made by revision {there['revision'] or 'unknown'}, {libraries or 'unknown versions'}, on {where}")
-        other = [name for name in there if there[name] != here.get(name)]
-        report.elsewhere += [f"{name} {there[name]} then, {here.get(name)} now" for name in other]
-        if there["revision"] is None:
+        self._say(f"made by revision {recorded['revision'] or 'unknown'}, {libraries or 'unknown versions'}, on {where}")
+        other = [name for name in recorded if recorded[name] != current.get(name)]
+        report.elsewhere += [f"{name} {recorded[name]} then, {current.get(name)} now" for name in other]
+        if recorded["revision"] is None:
             report.elsewhere.append("config.json names no revision")
-        elif str(there["revision"]).endswith("-dirty"):
-            report.elsewhere.append("the revision had changes that were not committed")
-        if here["platform"] != "cpu":
-            report.elsewhere.append("only on a CPU are the same numbers promised each time")
+        elif str(recorded["revision"]).endswith("-dirty"):
+            report.elsewhere.append("the revision had uncommitted changes")
+        if current["platform"] != "cpu":
+            report.elsewhere.append("equal numbers are guaranteed only on a CPU")
 
     # -- Checkpoints
 
@@ -173,11 +174,11 @@ class _Verifier:
         )
 
     def _is_there(self, tier: str, number: int) -> bool:
-        """Returns whether a checkpoint was not deleted meanwhile by the run itself, which keeps the newest two."""
+        """Returns True if a checkpoint still exists: the run itself deletes all but the newest two."""
         return (self._folder.checkpoints / tier / str(number)).is_dir()
 
     def _read_manifests(self) -> None:
-        """Reads and checks all checkpoints, but for the arrays of full ones, which are looked at where they are restored."""
+        """Reads and checks all checkpoints, except the arrays of full ones, which are checked when they are restored."""
         problems = self._report.problems
         for tier, number in self._names():
             name = f"checkpoint {tier}/{number}"
@@ -201,7 +202,7 @@ class _Verifier:
                 self._manifests[tier, number] = manifest
 
     def _read_recent(self) -> None:
-        """Reads and checks recent states. Nothing forces these onto the disk: a damaged one is what a power cut leaves."""
+        """Reads and checks recent states. They are not synced to the disk, so a power cut can leave a damaged one."""
         recent = self._checkpoints.recent
         for number in recent.iterations():
             name = f"{RECENT}/{number}"
@@ -209,14 +210,14 @@ class _Verifier:
                 manifest = recent.manifest(number)
                 recent.restore(number, self._programs.shapes)
             except (Unusable, RequestError) as error:
-                if number in recent.iterations():  # the run itself replaces them all the time
+                if number in recent.iterations():  # the run itself replaces them continually
                     self._report.notes.append(f"checkpoint {name} cannot be used ({error}), as after a power cut")
                 continue
             if self._check_manifest(name, number, manifest):
                 self._manifests[RECENT, number] = manifest
 
     def _check_manifest(self, name: str, number: int, manifest: Mapping[str, Any]) -> bool:
-        """Returns whether a manifest is of this run and of its checkpoint's iteration; reports what is wrong."""
+        """Returns True if a manifest belongs to this run and its checkpoint's iteration; reports errors."""
         problems = self._report.problems
         if manifest.get("iteration") != number:
             problems.append(f"checkpoint {name} says that it is of iteration {manifest.get('iteration')}")
@@ -229,10 +230,10 @@ class _Verifier:
         return False
 
     def _check_presence(self, is_written: bool) -> None:
-        """Finds that there is no checkpoint though the run has come far enough to have one."""
+        """Reports a lack of checkpoints although the run is far enough to have one."""
         last = max((row["iteration"] for row in self._rows), default=0)
         interval = self._config.checkpoint_interval
-        # An evaluation's rows are written before the checkpoint of the same iteration is.
+        # An evaluation's rows are written before the checkpoint of the same iteration.
         wanted = last >= self._total or (interval > 0 and last > interval)
         if wanted and not is_written and not self._names() and not self._checkpoints.recent.iterations():
             self._report.problems.append(f"checkpoints are missing: the run has come to iteration {last}")
@@ -240,22 +241,22 @@ class _Verifier:
     # -- Repeating
 
     def _repeat_all(self, iterations: int | None) -> Repeater:
-        """Repeats what follows the seed, and what follows each full checkpoint."""
+        """Repeats the run from the seed, and from each full checkpoint."""
         programs, seed = self._programs, Progress()
         repeater = Repeater(programs, self._expected, self._rows, self._manifests, self._report, self._say)
-        places = self._plan(0, seed, iterations)
+        compared_iterations = self._plan(0, seed, iterations)
         starts = [number for tier, number in self._manifests if tier == FULL]
-        if places or starts:
+        if compared_iterations or starts:
             self._compile()
-        if places:
-            repeater.repeat("the seed", 0, seed, programs.init(programs.run_keys), places)
+        if compared_iterations:
+            repeater.repeat("the seed", 0, seed, programs.init(programs.run_keys), compared_iterations)
         for number in starts:
             self._repeat_after(number, repeater, iterations)
         self._say_rest(repeater.repeated)
         return repeater
 
     def _repeat_after(self, number: int, repeater: Repeater, iterations: int | None) -> None:
-        """Repeats what follows a full checkpoint, unless that is damaged, which is told."""
+        """Repeats the run from a full checkpoint; a damaged one is reported."""
         manifest = self._manifests[FULL, number]
         try:
             restored = self._checkpoints.restore(FULL, manifest, self._programs.shapes)
@@ -265,10 +266,10 @@ class _Verifier:
                 del self._manifests[FULL, number]
             return
         assert restored.loop is not None
-        progress = progress_of(manifest)
-        places = self._plan(number, progress, iterations)
-        if places:
-            repeater.repeat(f"checkpoint full/{number}", number, progress, restored.loop, places)
+        progress = saved_progress(manifest)
+        compared_iterations = self._plan(number, progress, iterations)
+        if compared_iterations:
+            repeater.repeat(f"checkpoint full/{number}", number, progress, restored.loop, compared_iterations)
         else:
             self._report.unverified.append(f"checkpoint full/{number} is intact, but there is no row after it yet")
 
@@ -286,35 +287,35 @@ class _Verifier:
         check_compiled(self._programs.compile(), already_there=False, layout=layout)
 
     def _plan(self, begin: int, progress: Progress, iterations: int | None) -> list[int]:
-        """Iterations whose rows can be repeated from a state after ``begin`` iterations."""
+        """Lists iterations whose rows can be repeated from a state after ``begin`` iterations."""
         mark, first = progress.replay_lost_at, begin if progress.evaluation_due else begin + 1
-        # Up to the next loss of the replay: what follows has no start that was kept.
+        # Up to the next loss of the replay: what follows it started from a state that was not saved.
         losses = [row[LOST] for row in self._rows if LOST in row and row[LOST] != mark and row[LOST] >= begin]
         last = min(losses, default=math.inf)
-        places = sorted({row["iteration"] for row in self._rows if first <= row["iteration"] <= last})
+        compared_iterations = sorted({row["iteration"] for row in self._rows if first <= row["iteration"] <= last})
         if iterations is None:
-            return places[:EVALUATIONS]
-        near = [place for place in places if place <= begin + iterations]
-        return near or places[:1]
+            return compared_iterations[:EVALUATIONS]
+        near = [number for number in compared_iterations if number <= begin + iterations]
+        return near or compared_iterations[:1]
 
     def _say_rest(self, repeated: set[int]) -> None:
-        """Notes which rows and checkpoints no repetition has come to."""
+        """Reports rows and checkpoints that no repetition has reached."""
         unverified = self._report.unverified
         rest = [row["iteration"] for row in self._rows if row["iteration"] not in repeated]
         if rest:
             unverified.append(
-                f"rows of {len(set(rest))} evaluations, of iterations {min(rest)} to {max(rest)}: looked at, but not repeated"
+                f"rows of {len(set(rest))} evaluations, of iterations {min(rest)} to {max(rest)}: checked, but not repeated"
             )
         lost = min((row[LOST] for row in self._rows if LOST in row), default=None)
         if lost is not None:
             unverified.append(
-                f"after iteration {lost} the run went on from a light checkpoint, without its replay: rows after it follow "
+                f"after iteration {lost} the run resumed from a light checkpoint, without its replay: rows after it follow "
                 "from full checkpoints only, not from the seed"
             )
         compared = self._report.checkpoints
         others = [name for tier, number in self._manifests if (name := f"{tier}/{number}") not in compared]
         if others:
-            unverified.append(f"checkpoints {listed(others)}: intact, but no repetition has come to them")
+            unverified.append(f"checkpoints {listed(others)}: intact, but not reached by a repetition")
 
 
 def _mapping(value: Any) -> Mapping[str, Any]:

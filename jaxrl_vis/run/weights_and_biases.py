@@ -1,9 +1,9 @@
-"""Weights & Biases: a run for each seed, in a group that is named after the run folder.
+"""Weights & Biases logger: one W&B run per seed, in a group named after the run folder.
 
-``wandb.json`` in the run folder keeps the runs' ids and the last iteration that was sent of each: a run that is resumed goes on
-under the same ids, and sends nothing twice. What it says of another run than that of config.json is left out. What W&B stores
-itself is in ``wandb/``. Which account, project and server, and whether there is a network at all, is told to W&B in its own way
-(``wandb login``, ``WANDB_PROJECT``, ``WANDB_MODE=offline``).
+``wandb.json`` in the run folder stores the W&B runs' ids and the last iteration sent: a resumed run continues under the same
+ids and sends nothing twice. Its entries of another run than that of config.json are ignored. W&B's own files are in ``wandb/``.
+Account, project, server and network use are configured in W&B itself (``wandb login``, ``WANDB_PROJECT``,
+``WANDB_MODE=offline``).
 """
 
 import contextlib
@@ -28,17 +28,17 @@ _INIT_S = 30.0  # seconds to reach the server
 
 
 class WeightsAndBiases:
-    """See the module.
+    """Weights & Biases logger, see the module.
 
     Args:
         folder: The run folder.
         record: The contents of config.json.
         seeds: The seeds of the run.
-        say: Told where the runs can be seen.
+        say: Called with the addresses of the runs.
 
     Raises:
-        RequestError: Nobody is logged in.
-        Exception: Whatever W&B raises where it cannot be reached.
+        RequestError: No account is logged in.
+        Exception: Any error of W&B, for example if it cannot be reached.
     """
 
     def __init__(self, folder: Path, record: Mapping[str, Any], seeds: Sequence[int], say: Callable[[str], None]):
@@ -51,9 +51,9 @@ class WeightsAndBiases:
             raise RequestError("nobody is logged in: `wandb login`, or WANDB_MODE=offline")
         group = folder.resolve().name
         for seed in seeds:
-            whose = {} if self._run_id is None else {RUN_ID: self._run_id}
-            known = self._state.setdefault(str(seed), {"id": uuid.uuid4().hex[:8], "iteration": 0, **whose})
-            with shielded_children():  # W&B's own process must outlive a Ctrl-C, to be told the end
+            owner = {} if self._run_id is None else {RUN_ID: self._run_id}
+            known = self._state.setdefault(str(seed), {"id": uuid.uuid4().hex[:8], "iteration": 0, **owner})
+            with shielded_children():  # W&B's own process must outlive a Ctrl-C, to receive the end of the run
                 run = wandb.init(
                     project=os.environ.get("WANDB_PROJECT", PROJECT),
                     group=group,
@@ -83,7 +83,7 @@ class WeightsAndBiases:
         write_atomically(self._state_file, json.dumps(self._state, indent=2) + "\n")
 
     def rows(self, rows: Sequence[Row]) -> None:
-        """The figures of rows that were not sent before, against ``env_steps``; W&B's own step is the iteration."""
+        """Logs the figures of new rows against ``env_steps``; W&B's own step is the iteration."""
         for row in rows:
             known = self._state[str(row["seed"])]
             if row["iteration"] <= known["iteration"]:
@@ -94,7 +94,7 @@ class WeightsAndBiases:
         self._write_state()
 
     def image(self, name: str, file: Path, env_steps: int) -> None:
-        """The file as it is, beside the first seed's latest figures."""
+        """Logs the unchanged file with the first seed's latest figures."""
         seed, run = next(iter(self._runs.items()))
         media = wandb.Video(str(file), format="gif") if file.suffix == ".gif" else wandb.Image(str(file))
         run.log({"env_steps": env_steps, name: media}, step=self._state[str(seed)]["iteration"])

@@ -1,1 +1,1 @@
-"""Studies: what is computed, and drawn, for one figure."""
+"""Studies: the runs and drawings behind the figures."""

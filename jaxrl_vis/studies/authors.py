@@ -1,4 +1,4 @@
-"""Learning curves that the authors of OL-AUX released, read off their figures; the data's first lines say how."""
+"""Learning curves released by the authors of OL-AUX, digitised from their figures; the head of the data file describes how."""
 
 import csv
 import importlib.resources
@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 
 _FILE = "data/ol_aux_curves.csv"
-_ENVIRONMENTS = {"VisualFinger": "VisualFingerTurn"}  # where theirs has another name
+_ENVIRONMENTS = {"VisualFinger": "VisualFingerTurn"}  # environments with another name there
 _VARIANTS = {"NoAux": "none", "OL-AUX-5": "ol_aux_5"}
 
 
 def released_curves() -> dict[tuple[str, str], list[tuple[int, float]]]:
-    """(environment, variant) -> (environment steps, success), ascending; both named as here."""
+    """Reads the curves: (environment, variant) -> (environment steps, success), ascending; both under this project's names."""
     text = importlib.resources.files("jaxrl_vis.studies").joinpath(_FILE).read_text(encoding="utf-8")
     lines = [line for line in text.splitlines() if line and not line.startswith("#")]
     curves: dict[tuple[str, str], list[tuple[int, float]]] = {}
@@ -23,19 +23,19 @@ def released_curves() -> dict[tuple[str, str], list[tuple[int, float]]]:
 
 
 def mean_difference(ours: Sequence[tuple[int, float]], theirs: Sequence[tuple[int, float]]) -> float | None:
-    """Mean absolute difference of two curves over the points of the second that lie where both are known.
+    """Computes the mean absolute difference of two curves, at the points of the second one within the range of the first.
 
     Args:
-        ours: (environment steps, success), ascending; read linearly between its points.
-        theirs: The same.
+        ours: (environment steps, success), ascending; interpolated linearly.
+        theirs: Likewise, not interpolated.
 
     Returns:
-        None where no such point is there.
+        The difference; None if there is no such point.
     """
     if not ours:
         return None
     steps, success = zip(*ours, strict=True)
-    common = [(at, value) for at, value in theirs if steps[0] <= at <= steps[-1]]
+    common = [(position, value) for position, value in theirs if steps[0] <= position <= steps[-1]]
     if not common:
         return None
-    return float(np.mean([abs(np.interp(at, steps, success) - value) for at, value in common]))
+    return float(np.mean([abs(np.interp(position, steps, success) - value) for position, value in common]))

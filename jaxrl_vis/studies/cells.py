@@ -1,12 +1,12 @@
-"""Cells of a study: training runs with folders of their own, and what has become of them.
+"""Cells of a study: training runs with their folders, and their progress.
 
     runs/FAMILY-STEPS/      a run folder, such as VisualHandReach-ol_aux_5-paper-seeds0to4-2M
-    runs/FAMILY-STEPS.log   what the processes that trained there have printed
+    runs/FAMILY-STEPS.log   output of the processes that trained there
 
-Studies share folders: a cell that asks for 600 k steps is read off a run of the same family that goes on to 2 M. It is never
-the other way round: a run that has ended keeps no replay, and could not be made longer without changing what it learns.
+Studies share folders: a cell of 600 k steps is read from a run of the same family that has 2 M. The reverse is impossible: a
+finished run has no replay, and could not be extended without changing what it learns.
 
-Nothing here imports JAX: the process that looks after cells must not hold an accelerator's memory.
+Nothing here imports JAX: the process that manages cells must not occupy an accelerator's memory.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.run.folder import RunFolder, contradictions, read_config
 
-# A run of another length, read up to the steps of a cell, must have been evaluated like the cell.
+# Fields in which a longer run may differ from the cell; evaluations must be the same.
 _MAY_DIFFER = ("preset", "env_folder", "env_steps", "checkpoint_interval", "full_checkpoint_interval")
 
 
@@ -27,8 +27,8 @@ class Cell:
     """A training run that a study needs.
 
     Attributes:
-        family: What it is called, whatever its length; the beginning of the folder's name.
-        config: What it trains.
+        family: Name without the length; the beginning of the folder's name.
+        config: Configuration of the run.
     """
 
     family: str
@@ -36,17 +36,17 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """Of the cell, and of its folder."""
+        """Name of the cell and of its folder."""
         return f"{self.family}-{show_budget(self.config.env_steps)}"
 
     @property
     def seeds(self) -> range:
-        """What it trains side by side."""
+        """Seeds that are trained in parallel."""
         return range(self.config.seed, self.config.seed + self.config.seeds)
 
 
 def show_budget(steps: int) -> str:
-    """``250k``, ``2.5M``; all digits where these would be rounded."""
+    """Formats a number of steps as ``250k`` or ``2.5M``; with all digits if that would round."""
     for size, letter in ((10**6, "M"), (10**3, "k")):
         if steps >= size and steps % (size // 100) == 0:
             return f"{steps / size:g}{letter}"
@@ -54,12 +54,12 @@ def show_budget(steps: int) -> str:
 
 
 def split_seeds(cell: Cell, count: int) -> list[Cell]:
-    """The cell as several ones of at most ``count`` seeds each, for devices with too little memory for all of them.
+    """Splits a cell into cells of at most ``count`` seeds, for devices with too little memory for all of them.
 
-    Families end in the seeds that they train.
+    Their families end in the seeds.
     """
     config = cell.config
-    first = [config.seed + done for done in range(0, config.seeds, count)]
+    first = [config.seed + offset for offset in range(0, config.seeds, count)]
     last = [min(seed + count, config.seed + config.seeds) - 1 for seed in first]
     return [
         Cell(
@@ -70,8 +70,8 @@ def split_seeds(cell: Cell, count: int) -> list[Cell]:
     ]
 
 
-def folder_of(cell: Cell, runs: Path) -> Path:
-    """Where the cell is: in a longer run of its family that has come far enough, or else in its own folder."""
+def find_folder(cell: Cell, runs: Path) -> Path:
+    """Finds the folder of a cell: a longer run of its family that has come far enough, or else the cell's own."""
     own = runs / cell.name
     if _reached(own, cell) is not None or not runs.is_dir():
         return own
@@ -88,67 +88,67 @@ def folder_of(cell: Cell, runs: Path) -> Path:
 
 
 def _reached(folder: Path, cell: Cell) -> int | None:
-    """The first evaluation at or after the steps of the cell, in environment steps; None where there is none of all seeds."""
+    """Returns the steps of the first evaluation of all seeds at or after the cell's environment steps; None without one."""
     steps: dict[int, set[int]] = {}
     for row in RunFolder(folder).rows():
         if row["env_steps"] >= cell.config.env_steps and "eval/success" in row:
             steps.setdefault(row["env_steps"], set()).add(row["seed"])
-    return min((each for each, seeds in steps.items() if seeds >= set(cell.seeds)), default=None)
+    return min((count for count, seeds in steps.items() if seeds >= set(cell.seeds)), default=None)
 
 
 def differences(cell: Cell, runs: Path) -> list[str]:
-    """In which settings the cell's run is another one, in words; none where it is not, or where there is none yet.
+    """Describes settings in which the cell's run differs; empty if there is no difference, or no run yet.
 
     Raises:
         RequestError: Its config.json cannot be read.
     """
-    folder = folder_of(cell, runs)
+    folder = find_folder(cell, runs)
     return contradictions(read_config(folder), cell.config) if RunFolder(folder).config.exists() else []
 
 
 def contradiction(cell: Cell, runs: Path) -> str | None:
-    """Why the cell's folder cannot be used for it, in one line; None where it can, or where there is none yet."""
-    folder, mend = folder_of(cell, runs), "move it away, or take another --runs"
+    """Returns why a cell's folder cannot be used for it, in one line; None if it can, or does not exist yet."""
+    folder, mend = find_folder(cell, runs), "move it away, or choose another --runs"
     try:
-        found = differences(cell, runs)
-    except RequestError:  # which tells how `train` would mend it, with options that studies and sweeps do not have
+        changes = differences(cell, runs)
+    except RequestError:  # its remedy names options of `train` that studies and sweeps do not have
         return f"{folder} holds a config.json that is damaged, or of another version: {mend}"
-    return f"{folder} holds another run, with {'; '.join(found)}: {mend}" if found else None
+    return f"{folder} holds another run, with {'; '.join(changes)}: {mend}" if changes else None
 
 
 def is_finished(cell: Cell, runs: Path) -> bool:
-    """Whether the cell has been trained and evaluated to its end."""
-    return _reached(folder_of(cell, runs), cell) is not None and contradiction(cell, runs) is None
+    """Returns True if a cell is completely trained and evaluated."""
+    return _reached(find_folder(cell, runs), cell) is not None and contradiction(cell, runs) is None
 
 
-def rows_of(cell: Cell, runs: Path, as_it_is: bool = False) -> list[dict[str, Any]]:
-    """The evaluations of a finished cell, up to its end, from metrics.jsonl; none where it is not finished.
+def finished_rows(cell: Cell, runs: Path, as_it_is: bool = False) -> list[dict[str, Any]]:
+    """Reads the evaluations of a finished cell, up to its end, from metrics.jsonl; empty if it is not finished.
 
     Args:
         cell: The cell.
         runs: The folder of run folders.
-        as_it_is: A run of other settings will do, such as those that a preset had in an earlier version.
+        as_it_is: Accept a run with other settings, such as those of a preset in an earlier version.
     """
-    folder = folder_of(cell, runs)
+    folder = find_folder(cell, runs)
     end = _reached(folder, cell)
     if end is None or not (as_it_is or contradiction(cell, runs) is None):
         return []
     return [row for row in RunFolder(folder).rows() if row["env_steps"] <= end]
 
 
-def standing(cell: Cell, runs: Path) -> str:
-    """How far an unfinished cell has come: ``not begun``, or ``120k of 250k steps``."""
-    why = contradiction(cell, runs)
-    if why is not None:
-        return why
-    latest = latest_rows(folder_of(cell, runs))
+def describe_progress(cell: Cell, runs: Path) -> str:
+    """Describes the progress of an unfinished cell: ``not begun``, or ``120k of 250k steps``."""
+    reason = contradiction(cell, runs)
+    if reason is not None:
+        return reason
+    latest = latest_rows(find_folder(cell, runs))
     if not latest:
-        return "not begun" if not folder_of(cell, runs).exists() else "not evaluated yet"
+        return "not begun" if not find_folder(cell, runs).exists() else "not evaluated yet"
     return f"{show_budget(latest[0]['env_steps'])} of {show_budget(cell.config.env_steps)} steps"
 
 
 def latest_rows(folder: Path) -> Sequence[dict[str, Any]]:
-    """The rows of a run's last evaluation, one a seed; none before the first."""
+    """Returns the rows of a run's last evaluation, one per seed; none before the first."""
     rows = RunFolder(folder).rows()
     last = max((row["env_steps"] for row in rows), default=0)
     return [row for row in rows if row["env_steps"] == last]

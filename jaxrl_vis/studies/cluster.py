@@ -1,7 +1,7 @@
-"""Runs of a grid as jobs of a cluster, by submitit: on Slurm, or by its local executor, which is the same without a cluster.
+"""Runs of a grid as cluster jobs, by submitit: on Slurm, or by its local executor, which works the same without a cluster.
 
-A job is one training command. A job that Slurm ends, because its time is over or another one goes first, has saved by then, and
-is queued again; it resumes by itself. To `grid`, a job looks like a process.
+A job is one training command. A job that Slurm ends, because of its time limit or preemption, has saved by then, and is queued
+again; it resumes by itself. For `grid`, a job looks like a process.
 """
 
 import contextlib
@@ -23,12 +23,12 @@ _DEFAULTS: dict[str, Any] = {"name": "jaxrl-vis", "timeout_min": 24 * 60, "gpus_
 
 
 class Training:
-    """What a job does; pickled, and called on the node.
+    """Callable of a job, pickled and called on the node.
 
     Args:
         words: The command.
-        log: File for what it prints.
-        environment: Variables that it gets beside those of the node.
+        log: File for its output.
+        environment: Variables added to those of the node.
     """
 
     def __init__(self, words: Sequence[str], log: Path, environment: Mapping[str, str]):
@@ -36,7 +36,7 @@ class Training:
         self._folder, self._child = Path.cwd(), None
 
     def __call__(self) -> int:
-        """Trains; the command's exit status."""
+        """Trains, and returns the command's exit status."""
         words = list(self._words)
         run_dir = self._folder / words[words.index("--run-dir") + 1] if "--run-dir" in words else None
         if "--resume" not in words and run_dir is not None and (run_dir / "config.json").exists():
@@ -44,24 +44,24 @@ class Training:
         with self._log.open("a", encoding="utf-8") as file:
             environment = {**os.environ, **self._environment}
             self._child = subprocess.Popen(words, stdout=file, stderr=file, env=environment, cwd=self._folder)
-            if "SLURM_JOB_ID" in os.environ:  # Slurm itself tells every process of a job, and twice would be too often
+            if "SLURM_JOB_ID" in os.environ:  # Slurm itself signals every process of a job; a second one would not wait
                 return self._child.wait()
-            before = signal.signal(signal.SIGTERM, lambda *_: self._tell())
+            before = signal.signal(signal.SIGTERM, lambda *_: self._terminate_child())
             try:
                 return self._child.wait()
             finally:
                 signal.signal(signal.SIGTERM, before)
 
     def checkpoint(self) -> Any:
-        """Called by submitit before a job is ended and queued again."""
+        """Stops the run before the job is ended and queued again; called by submitit."""
         import submitit
 
-        self._tell()
+        self._terminate_child()
         if self._child is not None:
             self._child.wait()
         return submitit.helpers.DelayedSubmission(Training(self._words, self._log, self._environment))
 
-    def _tell(self) -> None:
+    def _terminate_child(self) -> None:
         if self._child is not None and self._child.poll() is None:
             self._child.send_signal(signal.SIGTERM)
 
@@ -70,11 +70,11 @@ class Training:
 
 
 class Job:
-    """A submitted job, with as much of `subprocess.Popen` as `grid` uses.
+    """Submitted job with the interface of `subprocess.Popen` that `grid` uses.
 
     Args:
-        job: Of submitit.
-        is_local: Whether it runs on this machine, under a process whose id is that of the job.
+        job: Job of submitit.
+        is_local: True if it runs on this machine, in a process whose id is that of the job.
     """
 
     def __init__(self, job: Any, is_local: bool = False):
@@ -82,32 +82,32 @@ class Job:
         self.returncode, self._is_cancelled = None, False
 
     def poll(self) -> int | None:
-        """The exit status; None while it is queued or running."""
+        """Returns the exit status; None while the job is queued or running."""
         if self.returncode is None and self._job.done():
             self.returncode = -signal.SIGTERM if self._is_cancelled else _FAILED
-            with contextlib.suppress(Exception):  # a job that was cancelled or lost has no result
+            with contextlib.suppress(Exception):  # a cancelled or lost job has no result
                 self.returncode = int(self._job.result())
         return self.returncode
 
     def send_signal(self, _: int) -> None:
-        """Cancels it: the run is told to save and to end."""
+        """Cancels the job: the run saves and ends."""
         self._is_cancelled = True
-        if self._is_local:  # which would be killed a second after it was cancelled
+        if self._is_local:  # cancelling would kill it a second later
             with contextlib.suppress(ProcessLookupError):
                 os.kill(int(self._job.job_id), signal.SIGTERM)
         else:
             self._job.cancel()
 
     def kill(self) -> None:
-        """Ends it at once; a cluster does so itself."""
+        """Cancels the job at once, as a cluster does."""
         self._is_cancelled = True
         self._job.cancel()
 
     def wait(self, timeout: float | None = None) -> int:
-        """Waits for its end.
+        """Waits for the job to end.
 
         Raises:
-            subprocess.TimeoutExpired: It goes on.
+            subprocess.TimeoutExpired: It still runs.
         """
         end = None if timeout is None else time.monotonic() + timeout
         while self.poll() is None:
@@ -118,15 +118,15 @@ class Job:
 
 
 class Cluster:
-    """Starts runs as jobs.
+    """Starter of runs as cluster jobs.
 
     Args:
-        executor: Where they run.
+        executor: Executor of the jobs.
         folder: For submitit's own files.
         options: name=value: parameters of submitit's executor, such as timeout_min=600 or slurm_partition=gpu.
 
     Raises:
-        RequestError: submitit or Slurm is missing, or an option is not known.
+        RequestError: submitit or Slurm is missing, or an option is unknown.
     """
 
     def __init__(self, executor: ExecutorName, folder: Path, options: Sequence[str] = ()):
@@ -137,7 +137,7 @@ class Cluster:
         self._is_local = executor == "local"
         parameters = {**_DEFAULTS, **dict(map(_read, options))}
         if self._is_local:
-            parameters.pop("gpus_per_node")  # each run has its device from `grid`
+            parameters.pop("gpus_per_node")  # `grid` assigns a device to each run
         try:
             self._executor = submitit.AutoExecutor(folder, cluster=executor)
             self._executor.update_parameters(**parameters)

@@ -1,4 +1,4 @@
-"""Figures of several runs: one column a task, one line a variant."""
+"""Figures of several runs: one column per task, one line per variant."""
 
 import dataclasses
 import textwrap
@@ -12,21 +12,21 @@ from matplotlib.ticker import MaxNLocator, PercentFormatter
 
 from jaxrl_vis.report.plots import FAINT, INK, draw_median, style_curves
 
-_WIDTH, _HEIGHT, _HEADER, _FOOTER = 4.9, 3.5, 0.85, 0.85  # inches, of a panel and of what is above and below all of them
-_LINE, _LETTERS = 0.17, 14  # inches from a line of the subtitle to the next, and letters of it in an inch
-_TITLE_LINE, _TITLE_LETTERS = 0.26, 8.3  # the same of the title
+_WIDTH, _HEIGHT, _HEADER, _FOOTER = 4.9, 3.5, 0.85, 0.85  # inches: a panel, and the space above and below all panels
+_LINE, _LETTERS = 0.17, 14  # subtitle: line spacing in inches, characters per inch
+_TITLE_LINE, _TITLE_LETTERS = 0.26, 8.3  # likewise for the title
 
 
 @dataclasses.dataclass(frozen=True)
 class Curve:
-    """One line.
+    """Line of a panel.
 
     Attributes:
-        label: What the legend calls it; lines of one label have one entry.
+        label: Label in the legend; lines with the same label share an entry.
         colour: Its colour.
         steps: [P] environment steps.
-        values: [S, P], one row a seed, NaN for gaps.
-        behind: Whether it belongs to somebody else: thin, dashed, and behind the others.
+        values: [S, P], one row per seed, NaN for gaps.
+        behind: True for other people's results: thin, dashed, and behind the others.
     """
 
     label: str
@@ -38,12 +38,12 @@ class Curve:
 
 @dataclasses.dataclass(frozen=True)
 class Panel:
-    """The lines of one task.
+    """Panel with the lines of one task.
 
     Attributes:
-        title: Above the panel.
-        curves: What is drawn.
-        is_share: Whether it lies in [0, 1] and is shown in percent.
+        title: Title of the panel.
+        curves: Lines of the panel.
+        is_share: True for values in [0, 1] that are shown in percent.
     """
 
     title: str
@@ -52,18 +52,18 @@ class Panel:
 
     @property
     def has_values(self) -> bool:
-        """Whether there is anything to see."""
+        """True if there is any finite value."""
         return any(np.isfinite(curve.values).any() for curve in self.curves)
 
 
 @dataclasses.dataclass(frozen=True)
 class Picture:
-    """One file.
+    """Image file of a figure.
 
     Attributes:
-        suffix: What its name has after the figure's.
-        rows: Panels, row by row; all rows are of one length.
-        subtitle: What the second line says besides what the runs were.
+        suffix: Part of its name after the figure's.
+        rows: Panels, row by row; all rows have the same length.
+        subtitle: Addition to the description of the runs in the second line.
     """
 
     suffix: str
@@ -75,7 +75,7 @@ def draw_panels(path: Path, rows: Sequence[Sequence[Panel]], title: str, subtitl
     """Writes a figure.
 
     Args:
-        path: A .png, or any other format that matplotlib can write.
+        path: A .png, or any other format that Matplotlib can write.
         rows, title, subtitle: See `compose`.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -83,17 +83,17 @@ def draw_panels(path: Path, rows: Sequence[Sequence[Panel]], title: str, subtitl
 
 
 def compose(rows: Sequence[Sequence[Panel]], title: str, subtitle: str) -> Figure:
-    """A figure of panels, with one legend for all of them.
+    """Composes a figure of panels with one legend.
 
     Args:
-        rows: Panels, row by row; all rows are of one length.
-        title: Above them, bold; broken where it is longer than the figure is wide, as the subtitle is.
-        subtitle: Below the title.
+        rows: Panels, row by row; all rows have the same length.
+        title: Title above the panels, bold; wrapped to the width of the figure, like the subtitle.
+        subtitle: Subtitle below the title.
     """
     width = max(7.5, _WIDTH * len(rows[0]))
     titles = textwrap.wrap(title, int((width - 0.7) * _TITLE_LETTERS))
-    lines = _broken(subtitle, int((width - 0.7) * _LETTERS))
-    below = _TITLE_LINE * (len(titles) - 1)  # how far the subtitle moves down
+    lines = _break_lines(subtitle, int((width - 0.7) * _LETTERS))
+    below = _TITLE_LINE * (len(titles) - 1)  # shift of the subtitle
     labels = {curve.label for row in rows for panel in row for curve in panel.curves}
     longest = max(map(len, labels), default=0)
     columns = max(1, min(len(labels), int(width / max(2.1, 0.55 + 0.068 * longest))))
@@ -110,11 +110,11 @@ def compose(rows: Sequence[Sequence[Panel]], title: str, subtitle: str) -> Figur
     for axes in grid[-1]:
         axes.set_xlabel("environment steps per seed", fontsize=9.5, color=INK)
     for number, line in enumerate(titles):
-        at = 1 - (0.22 + _TITLE_LINE * number) / height
-        figure.text(0.35 / width, at, line, fontsize=14, weight="bold", color=INK, va="center")
+        y = 1 - (0.22 + _TITLE_LINE * number) / height
+        figure.text(0.35 / width, y, line, fontsize=14, weight="bold", color=INK, va="center")
     for number, line in enumerate(lines):
-        at = 1 - (0.48 + below + _LINE * number) / height
-        figure.text(0.35 / width, at, line, fontsize=9, color=FAINT, va="center")
+        y = 1 - (0.48 + below + _LINE * number) / height
+        figure.text(0.35 / width, y, line, fontsize=9, color=FAINT, va="center")
     figure.legend(
         list(entries.values()), list(entries), loc="lower center", ncols=columns, frameon=False, fontsize=9, labelcolor=INK
     )
@@ -126,8 +126,8 @@ def compose(rows: Sequence[Sequence[Panel]], title: str, subtitle: str) -> Figur
     return figure
 
 
-def _broken(text: str, letters: int) -> list[str]:
-    """A text in lines of at most so many letters, if its clauses allow: it is broken after semicolons."""
+def _break_lines(text: str, letters: int) -> list[str]:
+    """Breaks a text after semicolons, into lines of at most a number of characters if its clauses allow."""
     lines = [""]
     for clause in text.split("; "):
         longer = f"{lines[-1]}; {clause}" if lines[-1] else clause

@@ -1,10 +1,10 @@
-"""Figures of training runs from the first process to the last file: trains what is missing, draws, and writes tables beside.
+"""Figures of training runs: trains missing runs, draws, and writes tables.
 
-FIGURE.png   the lines of finished cells; of figures 5.4 to 5.7 behind them, dashed, what the authors released
-FIGURE.md    the tables, and what the runs were
-FIGURE.csv   the same figures, to compute with
+FIGURE.png   the lines of finished cells; in figures 5.4 to 5.7 also, dashed, those released by the authors
+FIGURE.md    the tables, and a description of the runs
+FIGURE.csv   the same numbers, for further computation
 
-`ol_aux` and `indicator` say which runs a figure is made of; `ol_aux_figures` and `indicator_figures` what it shows of them.
+`ol_aux` and `indicator` define the runs of a figure; `ol_aux_figures` and `indicator_figures` their presentation.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,35 +18,35 @@ from jaxrl_vis.studies import indicator, indicator_figures, ol_aux, ol_aux_figur
 from jaxrl_vis.studies.drawing import draw_panels
 from jaxrl_vis.studies.grid import run_cells
 from jaxrl_vis.studies.results import Line, read_lines
-from jaxrl_vis.studies.show import Request, Shown
-from jaxrl_vis.studies.study import Study, cells_of
+from jaxrl_vis.studies.show import FigureContent, Request
+from jaxrl_vis.studies.study import Study, make_cells
 
 STUDIES: dict[str, Study] = {**indicator.STUDIES, **ol_aux.STUDIES}
-"""Figure -> what it shows."""
+"""Studies by figure."""
 
-_SHOW: dict[str, Callable[..., Shown]] = {
+_SHOW: dict[str, Callable[..., FigureContent]] = {
     indicator.FAMILY.name: indicator_figures.show,
     ol_aux.FAMILY.name: ol_aux_figures.show,
 }
 
 
 def make_figure(request: Request, say: Callable[[str], None] = streams.say) -> bool:
-    """Trains what is missing and draws what is finished.
+    """Trains missing cells and draws finished ones.
 
     Returns:
-        Whether all cells are finished, and so drawn.
+        True if all cells are finished, and so drawn.
 
     Raises:
-        RequestError: Something that was asked for cannot be, see `cells_of` and `run_cells`.
+        RequestError: The request cannot be fulfilled, see `make_cells` and `run_cells`.
         KeyboardInterrupt: Ctrl-C; nothing was drawn.
         Terminated: Another signal; nothing was drawn.
     """
     study = request.study
     tasks, variants = request.tasks or tuple(study.steps), request.variants or study.variants
     extra = tuple(name for name in study.extra if name not in variants)
-    cells = cells_of(study, tasks, (*extra, *variants), request.scope)
+    cells = make_cells(study, tasks, (*extra, *variants), request.scope)
     if not request.draw_only:
-        # A cell that several figures or methods ask for is one cell.
+        # A cell requested by several figures or methods is trained once.
         wanted = {cell.name: cell for parts in cells.values() for cell in parts}
         run_cells(
             list(wanted.values()), request.runs, lambda: shared(list_devices(), request.per_device), request.seconds, say=say
@@ -65,21 +65,21 @@ def make_figure(request: Request, say: Callable[[str], None] = streams.say) -> b
 def _write(
     request: Request, lines: dict[tuple[str, str], Line], variants: Sequence[str], unfinished: Sequence[str]
 ) -> list[Path]:
-    """Writes the pictures and both tables; their paths."""
+    """Writes the images and both tables; returns their paths."""
     study = request.study
     tasks = [task for task in request.tasks or study.steps if any((task, variant) in lines for variant in variants)]
-    shown = _SHOW[study.family.name](request, lines, tasks, variants)
-    about, title, pictures = _about(request, list(lines.values())), shown.title or study.title, []
-    for picture in shown.pictures:
+    content = _SHOW[study.family.name](request, lines, tasks, variants)
+    about, title, pictures = _about(request, list(lines.values())), content.title or study.title, []
+    for picture in content.pictures:
         pictures.append(request.out.with_stem(request.out.stem + picture.suffix))
         subtitle = "; ".join(part for part in (about, picture.subtitle) if part)
         draw_panels(pictures[-1], picture.rows, f"{title} ({_name(request.figure)})", subtitle)
     head = [f"# {_name(request.figure).capitalize()}: {title}", "", f"{about}.", ""]
     markdown, table = (request.out.with_suffix(suffix) for suffix in (".md", ".csv"))
-    notes = [*shown.notes, *_common_notes(study, lines, unfinished)]
+    notes = [*content.notes, *_common_notes(study, lines, unfinished)]
     spaced = [line for note in notes for line in ((note,) if note.startswith("- ") else (note, ""))]
-    write_atomically(markdown, "\n".join([*head, *shown.text, *spaced]).rstrip() + "\n")
-    write_atomically(table, to_csv(shown.rows))
+    write_atomically(markdown, "\n".join([*head, *content.text, *spaced]).rstrip() + "\n")
+    write_atomically(table, to_csv(content.rows))
     return [*pictures, markdown, table]
 
 
@@ -88,13 +88,13 @@ def _name(figure: str) -> str:
 
 
 def _about(request: Request, lines: Sequence[Line]) -> str:
-    """The preset, the seeds, the updates per step: what every figure must say."""
+    """Describes preset, seeds and updates per step, which every figure must state."""
     seeds = sorted({seed for line in lines for seed in line.seeds})
-    which = f"seed {seeds[0]}" if len(seeds) == 1 else f"seeds {seeds[0]} to {seeds[-1]}; line: median, band: 25 to 75 %"
-    often = sorted({f"{line.steps_per_update:.3g}" for line in lines}, key=float)
+    seeds_text = f"seed {seeds[0]}" if len(seeds) == 1 else f"seeds {seeds[0]} to {seeds[-1]}; line: median, band: 25 to 75 %"
+    ratios = sorted({f"{line.steps_per_update:.3g}" for line in lines}, key=float)
     options = ", ".join(request.scope.changes.get("env_options", ()))
-    learning = f"preset {request.scope.preset}, one gradient step per {' or '.join(often)} environment steps"
-    return "; ".join(part for part in (options, learning, which) if part)
+    learning = f"preset {request.scope.preset}, one gradient step per {' or '.join(ratios)} environment steps"
+    return "; ".join(part for part in (options, learning, seeds_text) if part)
 
 
 def _common_notes(study: Study, lines: dict[tuple[str, str], Line], unfinished: Sequence[str]) -> list[str]:
@@ -109,12 +109,12 @@ def _common_notes(study: Study, lines: dict[tuple[str, str], Line], unfinished: 
         if line.unlike
     ]
     records = [record for line in lines.values() for record in line.records]
-    for name, found in (
+    for name, values in (
         ("Revision", {str(record.get("git_revision")) for record in records}),
         ("Device", {str(record.get("device", {}).get("kind")) for record in records}),
     ):
-        if found:
-            notes.append(f"{name}: {', '.join(sorted(found))}.")
+        if values:
+            notes.append(f"{name}: {', '.join(sorted(values))}.")
     if unfinished:
         notes += ["Not finished, so not here:", *(f"- {text}" for text in unfinished)]
     return notes

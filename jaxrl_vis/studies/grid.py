@@ -1,10 +1,10 @@
-"""The engine of all studies: a grid of cells, each trained by a process of its own, one process a device.
+"""Engine of all studies: trains a grid of cells, each in a process, with one process per device.
 
-    cells that are not finished -> `python -m jaxrl_vis train ... [--resume]`, a free device each -> run folders (`cells`)
+    unfinished cells -> `python -m jaxrl_vis train ... [--resume]`, a free device each -> run folders (`cells`)
 
-Everything that makes a run safe is the run's own: locks, signals, checkpoints. So the engine may be interrupted, or killed, and
-started again at any time, also side by side with another one that works in the same folder. A cell that fails is told in one
-line, and the others go on.
+Locks, signals and checkpoints are handled by the runs themselves. So the engine may be interrupted or killed and started again
+at any time, even concurrently with another one in the same folder. A cell that fails is reported in one line, and the others
+continue.
 
 Nothing here imports JAX, see `cells`.
 """
@@ -24,49 +24,50 @@ from jaxrl_vis import streams
 from jaxrl_vis.devices import Device
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.provenance import child_environment
-from jaxrl_vis.run.command import options_of
+from jaxrl_vis.run.command import training_options
 from jaxrl_vis.run.console import show_seconds
 from jaxrl_vis.run.folder import RunFolder
 from jaxrl_vis.run.signals import SIGNALS, Interruption
 from jaxrl_vis.studies.cells import Cell, contradiction, is_finished, latest_rows, show_budget
 
 _POLL_S = 0.2
-_TELL_S = 60.0  # from one line on what is running to the next
-_HURRY_S = 20.0  # how long processes that were told twice to end have for it
+_STATUS_S = 60.0  # between status lines
+_GRACE_S = 20.0  # for processes to end after a second signal
 
 Command = Callable[[Cell, Path, bool], Sequence[str]]
-"""(cell, its folder, whether a run goes on there) -> the words of a command that trains it."""
+"""(cell, its folder, True to resume a run there) -> the words of a command that trains it."""
 
 
 class Process(Protocol):
-    """What `start_process` returns, as much of `subprocess.Popen` as is used here."""
+    """Interface of the processes of `start_process`: the part of `subprocess.Popen` that is used here."""
 
     returncode: Any
 
     def poll(self) -> int | None:
-        """The exit status; None as long as there is none."""
+        """Returns the exit status; None while the process runs."""
         ...
 
     def send_signal(self, sig: int, /) -> None:
-        """Tells it to end."""
+        """Sends a signal to the process."""
         ...
 
     def wait(self, timeout: float | None = None) -> int:
-        """Waits for its end."""
+        """Waits for the process to end."""
         ...
 
     def kill(self) -> None:
-        """Ends it at once."""
+        """Kills the process."""
         ...
 
 
 Start = Callable[[Sequence[str], Path, Mapping[str, str]], Process]
-"""(words of a command, file for what it prints, variables that keep it to its device) -> the process that runs it."""
+"""(words of a command, log file, variables that restrict it to its device) -> the process that runs it."""
 
 
 def start_process(words: Sequence[str], log: Path, environment: Mapping[str, str]) -> Process:
     """Runs a command on this machine. See `cluster` for others."""
-    # In a session of its own, so that a Ctrl-C of the terminal reaches it once, from here: a second one would not wait.
+    # In its own session, so that a Ctrl-C of the terminal reaches it only once, from here: a second signal would end it at
+    # once.
     with log.open("a", encoding="utf-8") as file:
         variables = child_environment() | dict(environment)
         return subprocess.Popen(
@@ -74,10 +75,10 @@ def start_process(words: Sequence[str], log: Path, environment: Mapping[str, str
         )
 
 
-def train_command(cell: Cell, folder: Path, goes_on: bool) -> list[str]:
-    """The command that trains a cell."""
-    words = [sys.executable, "-m", "jaxrl_vis", "train", *options_of(cell.config), "--run-dir", str(folder)]
-    return [*words, "--resume"] if goes_on else words
+def train_command(cell: Cell, folder: Path, resume: bool) -> list[str]:
+    """Returns the command that trains a cell."""
+    words = [sys.executable, "-m", "jaxrl_vis", "train", *training_options(cell.config), "--run-dir", str(folder)]
+    return [*words, "--resume"] if resume else words
 
 
 @dataclasses.dataclass
@@ -98,16 +99,16 @@ def run_cells(
     say: Callable[[str], None] = streams.say,
     start: Start = start_process,
 ) -> list[str]:
-    """Trains the cells that are not finished; resumes those that were begun.
+    """Trains unfinished cells; resumes those already started.
 
     Args:
-        cells: What is to be trained: the longest first, so that devices end at about the same time, and equals in this order.
-        runs: The folder of their folders.
-        find_devices: Asked only if something is left to do: where processes may run, one at a time on each.
-        seconds: Stop after so long, and save; None: when all is done.
-        command: What trains a cell.
-        say: Takes each line on what happens.
-        start: How a command is started.
+        cells: Cells to train: longest first, so that devices finish at about the same time, otherwise in this order.
+        runs: Folder of the run folders.
+        find_devices: Returns the devices, with one process at a time on each; called only if there are unfinished cells.
+        seconds: Time after which to save and stop; None: run to completion.
+        command: Makes the command that trains a cell.
+        say: Called with each line of output.
+        start: Starts a command.
 
     Returns:
         A line for each cell that failed.
@@ -120,7 +121,7 @@ def run_cells(
     missing = [cell for cell in cells if not is_finished(cell, runs)]
     if not missing:
         return []
-    failures = [why for why in (contradiction(cell, runs) for cell in missing) if why is not None]
+    failures = [reason for reason in (contradiction(cell, runs) for cell in missing) if reason is not None]
     missing = [cell for cell in missing if contradiction(cell, runs) is None]
     missing.sort(key=_work, reverse=True)
     for line in failures:
@@ -142,12 +143,12 @@ def run_cells(
 
 
 def _work(cell: Cell) -> float:
-    """How long a cell takes, compared with others: a gradient step with auxiliary losses takes some three times as long."""
+    """Estimates the relative duration of a cell: a gradient step with auxiliary losses takes about three times as long."""
     return cell.config.env_steps * cell.config.seeds * (3.0 if cell.config.aux_tasks else 1.0)
 
 
 class _Grid:
-    """One call of `run_cells`."""
+    """State of one call of `run_cells`."""
 
     def __init__(
         self,
@@ -167,7 +168,7 @@ class _Grid:
         self._is_stopping = False
 
     def run(self, seconds: float | None) -> list[str]:
-        started = told = time.monotonic()
+        started = reported = time.monotonic()
         try:
             while self._running or (self._waiting and not self._is_stopping):
                 late = seconds is not None and time.monotonic() - started >= seconds
@@ -176,10 +177,10 @@ class _Grid:
                 while self._waiting and self._free and not self._is_stopping:
                     self._start(self._waiting.pop(0), self._free.pop(0))
                 time.sleep(_POLL_S)
-                for each in [each for each in self._running if each.process.poll() is not None]:
-                    self._end(each)
-                if time.monotonic() - told >= _TELL_S and self._running:
-                    told = time.monotonic()
+                for ended in [running for running in self._running if running.process.poll() is not None]:
+                    self._end(ended)
+                if time.monotonic() - reported >= _STATUS_S and self._running:
+                    reported = time.monotonic()
                     self._say("  " + "; ".join(map(self._describe, self._running)))
         finally:
             self._end_at_once()
@@ -200,12 +201,12 @@ class _Grid:
         if status == 0 and is_finished(done.cell, self._runs):
             self._say(f"{done.cell.name}: done in {took}{_success(self._runs / done.cell.name)}")
         elif self._is_stopping and (-status in SIGNALS or status - 128 in SIGNALS):
-            self._say(f"{done.cell.name}: stopped after {took}; starting again goes on")
+            self._say(f"{done.cell.name}: stopped after {took}; start again to resume")
         else:
-            why = "ended before it was finished" if status == 0 else f"failed with exit status {status}"
-            # A run of other settings, such as those of a version that was installed meanwhile, has nothing wrong in its log.
-            what = (contradiction(done.cell, self._runs) if status == 0 else None) or _last_line(done.log)
-            line = f"{done.cell.name}: {why} after {took}: {what} (log: {done.log})"
+            outcome = "ended before it was finished" if status == 0 else f"failed with exit status {status}"
+            # The log of a run with other settings, such as those of a version installed meanwhile, shows no error.
+            cause = (contradiction(done.cell, self._runs) if status == 0 else None) or _last_line(done.log)
+            line = f"{done.cell.name}: {outcome} after {took}: {cause} (log: {done.log})"
             self._failures.append(line)
             self._say(line)
 
@@ -215,32 +216,32 @@ class _Grid:
         budget = show_budget(running.cell.config.env_steps)
         return f"{running.cell.name}: {steps} of {budget} steps{_success(self._runs / running.cell.name)}"
 
-    def _stop(self, why: str) -> None:
+    def _stop(self, reason: str) -> None:
         self._is_stopping = True
         if self._running:
-            self._say(f"{why}: waiting for {len(self._running)} to save; a second Ctrl-C does not wait")
+            self._say(f"{reason}: waiting for {len(self._running)} to save; a second Ctrl-C does not wait")
         self._signal()
 
     def _signal(self) -> None:
-        for each in self._running:
+        for running in self._running:
             with contextlib.suppress(ProcessLookupError):
-                each.process.send_signal(signal.SIGTERM)
+                running.process.send_signal(signal.SIGTERM)
 
     def _end_at_once(self) -> None:
-        """Leaves no process behind, whatever went wrong; does nothing where all have ended."""
+        """Ends all processes, after any error; does nothing if all have ended."""
         self._signal()
-        deadline = time.monotonic() + _HURRY_S
-        for each in self._running:
+        deadline = time.monotonic() + _GRACE_S
+        for running in self._running:
             try:
-                each.process.wait(max(0.0, deadline - time.monotonic()))
+                running.process.wait(max(0.0, deadline - time.monotonic()))
             except subprocess.TimeoutExpired:
-                each.process.kill()
-                each.process.wait()
+                running.process.kill()
+                running.process.wait()
 
 
 def _success(folder: Path) -> str:
-    found = [row["eval/success"] for row in latest_rows(folder) if row.get("eval/success") is not None]
-    return f", success {statistics.median(found):.2f}" if found else ""
+    values = [row["eval/success"] for row in latest_rows(folder) if row.get("eval/success") is not None]
+    return f", success {statistics.median(values):.2f}" if values else ""
 
 
 def _last_line(log: Path) -> str:

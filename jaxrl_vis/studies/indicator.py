@@ -1,11 +1,11 @@
-"""Figures 5.1 and 5.2 of the thesis, and what it claims without plotting it: which runs they are made of.
+"""Runs of figures 5.1 and 5.2 of the thesis, and of its claims without a figure.
 
     5.1          oracle, autoencoder, indicator, indicator with balancing and filtering: Reacher and FetchReach
     5.2          the same without the autoencoder: SawyerReach
-    estimators   rewards from state estimators that err, and the indicator, which needs none
-    cameras      the indicator and the oracle with noisy images, and with cameras, lights and colours that vary
+    estimators   rewards from inaccurate state estimators, and the indicator, which needs none
+    cameras      the indicator and the oracle with noisy images, and with randomised cameras, lights and colours
 
-Figure 5.1 can also be drawn for the two tasks from states, and for the hand and the finger, which the thesis never tried.
+Figure 5.1 can also be drawn for the two tasks from states, and for the hand and the finger, which are not in the thesis.
 """
 
 from typing import Any
@@ -24,10 +24,10 @@ VARIANTS: dict[str, Variant] = {
     "indicator": Variant("indicator", {"method": "indicator"}, "#3b5bdb"),
     "indicator_balance_filter": Variant("indicator, balanced and filtered", _OURS, "#0f7b6c"),
     "balance_only": Variant("indicator, balanced, no filter", {"method": "indicator", "balance_probability": 0.5}, "#6b7a1f"),
-    # The ablations of the thesis (5.1.6): relabelled goals are always the next observation; no goal is the original one.
+    # Ablations of the thesis (5.1.6): every relabelled goal is the next observation; every goal is relabelled.
     "all_next": Variant("p1 = 0.45, p2 = 1", _OURS | {"relabel_probability": 0.45, "balance_probability": 1.0}, "#a61e8c"),
     "all_relabelled": Variant("p1 = 1", _OURS | {"relabel_probability": 1.0}, "#c28f00"),
-    # An estimator that errs in a cluttered quarter of the workspace, one that errs as often anywhere, and one without bias.
+    # Estimators with errors in a cluttered quarter of the workspace, with as many anywhere, and without bias.
     "clutter": Variant(
         "10 % false positives, in a cluttered quarter",
         _ORACLE | {"reward_false_positives": 0.1, "reward_clutter": 0.25},
@@ -41,12 +41,12 @@ VARIANTS: dict[str, Variant] = {
     "oracle_randomized": Variant("oracle, varied images", _ORACLE | _RANDOM, "#c28f00"),
     "ours_randomized": Variant("indicator, balanced and filtered, varied images", _OURS | _RANDOM, "#a61e8c"),
 }
-"""Everything that a figure can show, by name."""
+"""Variants for figures, by name."""
 
 REACHER, FETCH, SAWYER = "VisualReacher", "VisualFetchReach", "VisualSawyerReach"
 HAND, FINGER = "VisualHandReach", "VisualFingerTurn"
 _OTHERS = {"Reacher": 100_000, "FetchReach": 100_000, HAND: 700_000, FINGER: 500_000}
-# All methods see images as they are (the autoencoder compares them, and cannot do with shifted ones), and relabel alike.
+# All methods use unshifted images (the autoencoder compares them, and does not work with shifted ones), and relabel alike.
 _LEARNER = ("num_envs", "updates_per_iteration", "eval_interval", "encoders", "target_encoder")
 _OWN = (*_LEARNER, "random_shift", "relabel_probability", "balance_probability")
 _AS_ELSEWHERE = {preset: {name: getattr(PRESETS[preset], name) for name in _OWN} for preset in ("fast", "cpu")}
@@ -56,8 +56,8 @@ FAMILY = Family(
     variants=VARIANTS,
     tasks=(REACHER, FETCH, SAWYER, *_OTHERS),
     preset="fast",
-    # Reacher's threshold is about a pixel of a 64x64 image.
-    # All methods relabel alike, and only the oracle knows what is trivial.
+    # Reacher's threshold is about one pixel of a 64x64 image. All methods relabel alike, and only the oracle can tell trivial
+    # goals.
     of_task={
         ("fast", REACHER): {"image_size": 100},
         ("cpu", REACHER): _AS_ELSEWHERE["cpu"],

@@ -1,4 +1,4 @@
-"""What figures 5.1 and 5.2 and their kin show: success, distance to the goal, and what rewards say about themselves."""
+"""Content of figures 5.1, 5.2 and related ones: success, distance to the goal, and statistics of rewards."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -8,7 +8,7 @@ import numpy as np
 from jaxrl_vis.studies.drawing import Curve, Panel, Picture
 from jaxrl_vis.studies.indicator import VARIANTS
 from jaxrl_vis.studies.results import DISTANCE, SUCCESS, Line, area, final
-from jaxrl_vis.studies.show import Request, Shown
+from jaxrl_vis.studies.show import FigureContent, Request
 from jaxrl_vis.studies.tables import table_row
 
 _PRECISION, _FILTERED = "train/filter_precision", "train/filtered_share"
@@ -18,10 +18,10 @@ _REWARDS = {
     _PRECISION: "dropped negatives that were false",
     "train/false_negative_share": "negatives that are false",
 }
-"""Shares that are logged about rewards, and what panels call them."""
-_ACTIVE = 0.01  # share of negatives below which the filter counts as inactive
+"""Logged statistics of rewards, and their titles in panels."""
+_ACTIVE = 0.01  # fraction of dropped negatives below which the filter counts as inactive
 
-# What makes the oracle itself worth comparing with: metric, and the value that it must reach.
+# Metric and value that the oracle must reach for a meaningful comparison.
 _ORACLE_WORKS: dict[str, tuple[str, float]] = {
     "VisualFetchReach": (SUCCESS, 0.97),
     "VisualSawyerReach": (SUCCESS, 0.90),
@@ -29,8 +29,8 @@ _ORACLE_WORKS: dict[str, tuple[str, float]] = {
 }
 
 
-def show(_: Request, lines: Mapping[tuple[str, str], Line], tasks: Sequence[str], variants: Sequence[str]) -> Shown:
-    """What the figure shows of its lines."""
+def show(_: Request, lines: Mapping[tuple[str, str], Line], tasks: Sequence[str], variants: Sequence[str]) -> FigureContent:
+    """Makes the content of a figure from its lines."""
 
     def row(metric: str, title: str, is_share: bool = True) -> list[Panel]:
         return [Panel(f"{task}: {title}", _curves(lines, task, variants, metric), is_share) for task in tasks]
@@ -46,7 +46,7 @@ def show(_: Request, lines: Mapping[tuple[str, str], Line], tasks: Sequence[str]
         "success over all evaluations. Rewards: means over training, in the median over seeds. The precision of a filter that "
         f"drops less than {_ACTIVE:.0%} of the negatives is not given: it is inactive. Distances are in metres."
     ]
-    return Shown(pictures, text, table, [*notes, *_oracle_notes(lines)])
+    return FigureContent(pictures, text, table, [*notes, *_oracle_notes(lines)])
 
 
 def _curves(lines: Mapping[tuple[str, str], Line], task: str, variants: Sequence[str], metric: str) -> list[Curve]:
@@ -58,7 +58,7 @@ def _curves(lines: Mapping[tuple[str, str], Line], task: str, variants: Sequence
 
 
 def _values(line: Line, metric: str) -> tuple[np.ndarray, np.ndarray]:
-    """env_steps [P] and the metric [S, P]; no precision, NaN, where the filter is inactive, as in the tables."""
+    """Returns env_steps [P] and the metric [S, P]; precision is NaN where the filter is inactive, as in the tables."""
     steps, values = line.values(metric)
     if metric == _PRECISION:
         values = np.where(line.values(_FILTERED)[1] >= _ACTIVE, values, np.nan)
@@ -73,9 +73,9 @@ def _tables(lines: Mapping[tuple[str, str], Line], tasks: Sequence[str]) -> tupl
         text += [f"### {task}", "", table_row(columns), table_row(["---"] * len(columns))]
         for (of_task, variant), line in lines.items():
             if of_task == task:
-                found = _figures(line)
-                text.append(table_row([VARIANTS[variant].label, *_cells(found)]))
-                names = {f"{name}{end}": value for name, values in found.items() for end, value in _csv(values)}
+                figures = _figures(line)
+                text.append(table_row([VARIANTS[variant].label, *_cells(figures)]))
+                names = {f"{name}{end}": value for name, values in figures.items() for end, value in _csv(values)}
                 rows.append({"task": task, "method": variant, "seeds": len(line.seeds), "env_steps": line.end, **names})
         text.append("")
     return text, rows
@@ -85,7 +85,7 @@ Quartiles = tuple[float, float, float]
 
 
 def _figures(line: Line) -> dict[str, Quartiles | float]:
-    """Quartiles over seeds of what evaluations say, and medians of what rewards say."""
+    """Computes quartiles over seeds of evaluation metrics, and medians of reward statistics."""
     filtered = _mean(line, _FILTERED)
     return {
         "final_success": final(line, SUCCESS),
@@ -95,28 +95,28 @@ def _figures(line: Line) -> dict[str, Quartiles | float]:
         "false_positive_share": _mean(line, "train/false_positive_share"),
         "false_negative_share": _mean(line, "train/false_negative_share"),
         "filtered_share": filtered,
-        # A quotient of means, so the share among all that was dropped.
+        # A ratio of means: the fraction among all dropped samples.
         "filter_precision": _mean(line, "train/filtered_false_share") / filtered if filtered >= _ACTIVE else float("nan"),
         "value_at_goals": _last(line, "train/value_at_goals"),
     }
 
 
 def _mean(line: Line, metric: str) -> float:
-    """The mean of a metric over training, in the median over seeds; NaN where it was never logged."""
+    """Computes the mean of a metric over training, in the median over seeds; NaN if it was never logged."""
     _, values = line.values(metric)
     per_seed = [float(np.nanmean(row)) for row in values if np.isfinite(row).any()]
     return float(np.median(per_seed)) if per_seed else float("nan")
 
 
 def _last(line: Line, metric: str) -> float:
-    """The metric at the end, in the median over seeds; NaN where it was not logged."""
+    """Returns the last value of a metric, in the median over seeds; NaN if it was not logged."""
     values = line.values(metric)[1][:, -1]
     return float(np.median(values[np.isfinite(values)])) if np.isfinite(values).any() else float("nan")
 
 
-def _cells(found: Mapping[str, Quartiles | float]) -> list[str]:
+def _cells(figures: Mapping[str, Quartiles | float]) -> list[str]:
     cells = []
-    for value in found.values():
+    for value in figures.values():
         low, median, high = value if isinstance(value, tuple) else (value, value, value)
         text = "–" if np.isnan(median) else f"{median:.3f}"
         cells.append(f"{text} ({low:.3f} to {high:.3f})" if low < high else text)
@@ -124,26 +124,26 @@ def _cells(found: Mapping[str, Quartiles | float]) -> list[str]:
 
 
 def _csv(value: Quartiles | float) -> list[tuple[str, float | None]]:
-    """Endings of a column's name, and what goes there."""
+    """Returns suffixes of a column's name, and their values."""
     low, median, high = value if isinstance(value, tuple) else (None, value, None)
     rounded = [
-        (end, None if each is None or np.isnan(each) else round(each, 5))
-        for end, each in (("", median), ("_25", low), ("_75", high))
+        (end, None if number is None or np.isnan(number) else round(number, 5))
+        for end, number in (("", median), ("_25", low), ("_75", high))
     ]
     return rounded if isinstance(value, tuple) else rounded[:1]
 
 
 def _oracle_notes(lines: Mapping[tuple[str, str], Line]) -> list[str]:
-    """Where the oracle itself does not work, methods cannot be compared."""
+    """Makes notes on tasks where the oracle itself fails, so that methods cannot be compared."""
     notes = []
     for (task, variant), line in lines.items():
         if variant == "oracle" and task in _ORACLE_WORKS:
             metric, wanted = _ORACLE_WORKS[task]
             _, median, _ = final(line, metric)
             if median < wanted if metric == SUCCESS else median > wanted:
-                what, bound = ("success", "at least") if metric == SUCCESS else ("final distance", "at most")
+                quantity, bound = ("success", "at least") if metric == SUCCESS else ("final distance", "at most")
                 notes.append(
-                    f"{task}: the oracle itself ends at a {what} of {median:.3f}, where {bound} {wanted:g} is asked for: this "
-                    "comparison of methods does not count."
+                    f"{task}: the oracle itself ends at a {quantity} of {median:.3f}, where {bound} {wanted:g} is asked for: "
+                    "this comparison of methods does not count."
                 )
     return notes

@@ -1,11 +1,11 @@
-"""Figures 5.4 to 5.7 of the thesis: which runs they are made of. See `grid` for how these are trained, `figures` for the rest.
+"""Runs of figures 5.4 to 5.7 of the thesis. `grid` trains them; `figures` draws.
 
     5.4   no auxiliary losses, gradient balancing, cosine similarity, OL-AUX-5
     5.5   each auxiliary task alone, with gradient balancing, and OL-AUX-5
     5.6   weights of OL-AUX-5 over training
     5.7   OL-AUX-5, its ablation, OL-AUX-1
 
-Every figure also has a run without auxiliary losses, which speed-ups refer to. Runs are shared between figures.
+Every figure also has a run without auxiliary losses as the reference of speed-ups. Runs are shared between figures.
 """
 
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ _AUX_COLOURS: dict[AuxTaskName, str] = {
     "optical_flow": "#1f8fb0",
 }
 AUX_TASKS: tuple[AuxTaskName, ...] = tuple(_AUX_COLOURS)
-"""The auxiliary tasks of the thesis, in its order. Others that a learner may have are in none of these figures."""
+"""Auxiliary tasks of the thesis, in its order. Others that a learner may have are not in these figures."""
 
 _ALL: dict[str, Any] = {"aux_tasks": AUX_TASKS}
 
@@ -50,24 +50,24 @@ VARIANTS: dict[str, Variant] = {
         for name in AUX_TASKS
     },
 }
-"""Everything that a figure can show, by name."""
+"""Variants for figures, by name."""
 
 FETCH, HAND, FINGER = "VisualFetchReach", "VisualHandReach", "VisualFingerTurn"
 LEVELS: dict[str, tuple[float, ...]] = {FETCH: (0.5, 0.9), FINGER: (0.3, 0.5, 0.9), HAND: (0.2, 0.3, 0.4)}
-"""Environment -> shares of success of which tables say when they are reached."""
+"""Environment -> levels of success for which tables give the steps."""
 
-# The authors stacked no images of the finger, and evaluated these two every 40 k steps.
+# The authors did not stack images of the finger, and evaluated these two every 40 k steps.
 _OF_TASK: dict[tuple[str, str], dict[str, Any]] = {
     ("paper", FINGER): {"frame_stack": 1, "eval_interval": 10},
     ("paper", HAND): {"eval_interval": 10},
 }
 QUICK: dict[str, Any] = {
-    # For all tasks alike: what FetchReach has otherwise with this preset takes more iterations.
+    # The same for all tasks: FetchReach's values of this preset would take more iterations.
     **{name: getattr(PRESETS["cpu"], name) for name in OF_TASK["cpu", "FetchReach"]},
     **{"env_steps": 19_200, "updates_per_iteration": 100, "batch_size": 64},
     **{"eval_interval": 1, "eval_episodes": 64},
 }
-"""What `figure --quick` changes in the preset ``cpu``: six evaluations, 600 gradient steps."""
+"""Changes of the preset ``cpu`` for `figure --quick`: six evaluations, 600 gradient steps."""
 
 
 FAMILY = Family(
@@ -76,7 +76,7 @@ FAMILY = Family(
     tasks=tuple(LEVELS),
     preset="paper",
     of_task=_OF_TASK,
-    # Presets that learn faster than the authors' release need no budget like its.
+    # Presets that learn faster than the authors' release need smaller budgets.
     longest={"fast": {FETCH: 100_000, HAND: 2_000_000, FINGER: 500_000}},
     quick=QUICK,
 )
@@ -112,14 +112,14 @@ STUDIES: dict[str, Study] = {
 }
 
 WEIGHTS = "5.6"
-"""The figure of weights, which shows those of one method."""
+"""Figure of weights, which shows those of one method."""
 
 
 def check_weights(variants: Sequence[str]) -> None:
-    """Checks that `WEIGHTS` can be drawn of these variants; none stands for its own.
+    """Checks that the figure `WEIGHTS` can be drawn for these variants; none selects its own.
 
     Raises:
-        RequestError: These are several, or weights of it do not learn.
+        RequestError: There are several variants, or one without learned weights.
     """
     learning = [name for name, variant in VARIANTS.items() if str(variant.changes.get("weighting")).startswith("ol_aux")]
     if len(variants) > 1 or not set(variants) <= set(learning):

@@ -1,4 +1,4 @@
-"""What figures 5.4 to 5.7 show: curves of success with the authors' behind, curves of weights, and their tables."""
+"""Content of figures 5.4 to 5.7: curves of success with the authors' behind, curves of weights, and tables."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -10,24 +10,24 @@ from jaxrl_vis.studies.authors import mean_difference, released_curves
 from jaxrl_vis.studies.drawing import Curve, Panel, Picture
 from jaxrl_vis.studies.ol_aux import AUX_TASKS, LEVELS, STUDIES, VARIANTS, WEIGHTS
 from jaxrl_vis.studies.results import SUCCESS, Line, read_lines
-from jaxrl_vis.studies.show import Request, Shown
-from jaxrl_vis.studies.study import cells_of
+from jaxrl_vis.studies.show import FigureContent, Request
+from jaxrl_vis.studies.study import make_cells
 from jaxrl_vis.studies.tables import BASELINE, Named, steps_table, weights_table
 
 _AUTHORS = "authors' release"
-_ALONE = "5.5"  # the figure whose runs have single tasks
+_ALONE = "5.5"  # the figure with runs of single tasks
 
 Lines = Mapping[tuple[str, str], Line]
 
 
-def show(request: Request, lines: Lines, tasks: Sequence[str], variants: Sequence[str]) -> Shown:
-    """What the figure shows of its lines."""
+def show(request: Request, lines: Lines, tasks: Sequence[str], variants: Sequence[str]) -> FigureContent:
+    """Makes the content of a figure from its lines."""
     is_weights = request.figure == WEIGHTS
     panels = [Panel(task, (_weights if is_weights else _success)(lines, task, variants), not is_weights) for task in tasks]
     text, rows = _weights_table(request, lines, tasks) if is_weights else _steps_table(lines, tasks)
     subtitle = "dashed: authors' release" if any(c.behind for panel in panels for c in panel.curves) else ""
     title = f"Weights of the auxiliary losses in {VARIANTS[variants[0]].label}" if is_weights else ""
-    return Shown([Picture("", [panels], subtitle)], text, rows, _notes(request, lines), title)
+    return FigureContent([Picture("", [panels], subtitle)], text, rows, _notes(request, lines), title)
 
 
 def _success(lines: Lines, task: str, shown: Sequence[str]) -> list[Curve]:
@@ -47,7 +47,7 @@ def _success(lines: Lines, task: str, shown: Sequence[str]) -> list[Curve]:
 
 
 def _weights(lines: Lines, task: str, shown: Sequence[str]) -> list[Curve]:
-    # One variant is drawn: a figure of the weights of several would not be legible.
+    # A single variant, because a figure of the weights of several would not be legible.
     line = next(lines[task, variant] for variant in shown if (task, variant) in lines)
     return [Curve(name.replace("_", " "), VARIANTS[name].colour, *line.values(f"train/weight/{name}")) for name in AUX_TASKS]
 
@@ -57,7 +57,7 @@ def _steps_table(lines: Lines, tasks: Sequence[str]):
         task: [Named(VARIANTS[variant].label, line) for (of_task, variant), line in lines.items() if of_task == task]
         for task in tasks
     }
-    ends = {task: max(each.line.end for each in found) for task, found in named.items()}
+    ends = {task: max(entry.line.end for entry in entries) for task, entries in named.items()}
     released = released_curves()
     for task, variant in sorted(released, key=lambda key: list(VARIANTS).index(key[1])):
         points = released[task, variant]
@@ -69,10 +69,10 @@ def _steps_table(lines: Lines, tasks: Sequence[str]):
 
 
 def _weights_table(request: Request, lines: Lines, tasks: Sequence[str]):
-    # Weights may be drawn over other budgets than single tasks have: then the runs of figure 5.5 itself say what each gains.
+    # Weights may have another budget than single tasks: then the runs of figure 5.5 provide the gains.
     scopes = (dataclasses.replace(request.scope, env_steps=None), request.scope)
-    cells = [cells_of(STUDIES[_ALONE], tasks, (BASELINE, *AUX_TASKS), scope) for scope in scopes]
-    others = {key: line for each in cells for key, line in read_lines(each, request.runs)[0].items()}
+    cells = [make_cells(STUDIES[_ALONE], tasks, (BASELINE, *AUX_TASKS), scope) for scope in scopes]
+    others = {key: line for part in cells for key, line in read_lines(part, request.runs)[0].items()}
     weighted = {task: next(line for (of_task, _), line in lines.items() if of_task == task) for task in tasks}
     bases = {task: line for (task, variant), line in others.items() if variant == BASELINE}
     names = {name: name.replace("_", " ") for name in AUX_TASKS}

@@ -1,12 +1,12 @@
-"""The quadratic example of OL-AUX (Lin et al., 2019): adaptive weights on three losses of a point in the plane.
+"""Quadratic example of OL-AUX (Lin et al., 2019): adaptive weights of three losses of a point in the plane.
 
     main        x^2 + y^2
-    shifted     (x - 1/2)^2 + (y - 1/2)^2, which helps from afar and misleads near the end
-    opposed     minus the main loss, which misleads everywhere
+    shifted     (x - 1/2)^2 + (y - 1/2)^2, which helps at a distance and misleads near the minimum
+    opposed     minus the main loss, which always misleads
 
-Weights begin at 1 and follow the authors' own rule for this example, on the losses as they are, after every step:
-w_i <- w_i + beta <w_i g_i, g_main>, without a bound. With weights that stay at 1, main and opposed cancel, and every path ends
-in the minimum of the shifted loss.
+Weights start at 1 and follow the authors' rule for this example after every step, on the losses themselves: w_i <- w_i + beta
+<w_i g_i, g_main>, unbounded. With weights constant at 1, main and opposed cancel, and every path ends in the minimum of the
+shifted loss.
 """
 
 from pathlib import Path
@@ -23,15 +23,15 @@ from jaxrl_vis.report.plots import FAINT, INK
 
 STARTS = ((-0.8, -1.6), (1.8, 1.0), (-1.8, 1.0), (1.0, -1.0))
 STEPS = 1000
-STEP_SIZE = 0.01  # alpha, and beta too
+STEP_SIZE = 0.01  # alpha and beta
 AUXILIARY = ("shifted", "opposed")
 
-_COLOURS = ("#0f7b6c", "#b4531f", "#3b5bdb", "#a61e8c")  # one a start
+_COLOURS = ("#0f7b6c", "#b4531f", "#3b5bdb", "#a61e8c")  # one per start
 _STYLES = {"shifted": "-", "opposed": (0, (4, 3))}
 
 
 class Paths(NamedTuple):
-    """What gradient descent did from each start.
+    """Paths of gradient descent from all starts.
 
     Attributes:
         points: [4, STEPS + 1, 2] float32, x and y.
@@ -43,26 +43,26 @@ class Paths(NamedTuple):
 
 
 def losses(point: jax.Array) -> dict[str, jax.Array]:
-    """The three losses of a point [2]."""
+    """Computes the three losses of a point [2]."""
     main = jnp.sum(jnp.square(point))
     return {MAIN: main, "shifted": jnp.sum(jnp.square(point - 0.5)), "opposed": -main}
 
 
 def authors_rule() -> Weighting:
-    """The weighting of the example."""
+    """Returns the weighting of the example."""
     return make_weighting("ol_aux", interval=1, learning_rate=1.0, beta=STEP_SIZE, log=False, minimum=None, multiplicative=True)
 
 
 def descend(weighting: Weighting) -> Paths:
-    """Gradient descent from all starts side by side."""
+    """Runs gradient descent from all starts in parallel."""
     gradient = weighted_grad(losses, weighting)
     names = (MAIN, *AUXILIARY)
 
     def path(start: jax.Array):
         def step(carry, _):
             point, state = carry
-            found = gradient(point, state)
-            return (point - STEP_SIZE * found.gradient, found.state), carry
+            result = gradient(point, state)
+            return (point - STEP_SIZE * result.gradient, result.state), carry
 
         first = (start, weighting.init(names, start))
         last, rest = jax.lax.scan(step, first, length=STEPS)
@@ -74,10 +74,10 @@ def descend(weighting: Weighting) -> Paths:
 
 
 def draw(path: Path) -> None:
-    """Draws both ways down, and the weights.
+    """Draws the paths with fixed and adaptive weights, and the weights.
 
     Args:
-        path: A .png, or any other format that matplotlib can write.
+        path: A .png, or any other format that Matplotlib can write.
     """
     fixed, adaptive = descend(make_weighting("sum")), descend(authors_rule())
     figure = Figure(figsize=(13.5, 4.9), dpi=110, facecolor="white")
@@ -119,8 +119,8 @@ def _draw_paths(axes: Axes, paths: Paths, title: str) -> None:
 def _draw_weights(axes: Axes, paths: Paths) -> None:
     _style(axes, "The weights that adapt")
     for name, values in paths.weights.items():
-        for each, colour in zip(values, _COLOURS, strict=True):
-            axes.plot(each, color=colour, linewidth=1.8, linestyle=_STYLES[name])
+        for series, colour in zip(values, _COLOURS, strict=True):
+            axes.plot(series, color=colour, linewidth=1.8, linestyle=_STYLES[name])
         axes.plot([], [], color=INK, linewidth=1.8, linestyle=_STYLES[name], label=name)
     axes.legend(frameon=False, fontsize=9.5)
     axes.grid(axis="y", color="#e6e8eb", linewidth=0.8)

@@ -14,19 +14,19 @@ RESAMPLES = 20_000
 
 
 def interquartile_mean(scores: Sequence[np.ndarray]) -> float:
-    """Mean of the middle half of all scores.
+    """Computes the mean of the middle half of all scores.
 
     Args:
-        scores: One array of scores a task, [S] each.
+        scores: One array of scores per task, [S].
     """
     return float(scipy.stats.trim_mean(np.concatenate(scores), 0.25))
 
 
 def bootstrap_interval(scores: Sequence[np.ndarray], level: float = 0.95, seed: int = 0) -> tuple[float, float]:
-    """Percentile interval of the interquartile mean; seeds are resampled within their task.
+    """Computes a percentile interval of the interquartile mean; seeds are resampled within their task.
 
     Args:
-        scores: One array of scores a task, [S] each.
+        scores: One array of scores per task, [S].
         level: Coverage of the interval.
         seed: Seed of the resampling.
     """
@@ -38,13 +38,13 @@ def bootstrap_interval(scores: Sequence[np.ndarray], level: float = 0.95, seed: 
 
 
 def permutation_p_value(first: np.ndarray, second: np.ndarray) -> float:
-    """Two-sided p-value of the difference of two means, by all permutations of seeds between the two groups.
+    """Computes the two-sided p-value of the difference of two means, by all permutations of seeds between the groups.
 
     Args:
-        first, second: Scores of either group, [S] and [T]; at most ten seeds each, of which there are 184,756 permutations.
+        first, second: Scores of the groups, [S] and [T]; at most ten seeds each, with 184,756 permutations.
 
     Raises:
-        ValueError: There are more permutations than can be listed, so that the test would not be exact.
+        ValueError: There are too many permutations for an exact test.
     """
     first, second = np.asarray(first, float), np.asarray(second, float)
     if min(len(first), len(second)) > 10 or len(first) + len(second) > 20:

@@ -1,4 +1,4 @@
-"""What is asked of a figure, and what it is made of."""
+"""Requests for figures, and the content of figures."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -11,19 +11,19 @@ from jaxrl_vis.studies.study import Scope, Study
 
 @dataclasses.dataclass(frozen=True)
 class Request:
-    """A figure that is asked for.
+    """Request for a figure.
 
     Attributes:
-        figure: Its name.
-        study: What it shows.
-        out: The picture; the tables go beside it.
-        runs: The folder of run folders.
-        tasks: Environments; none: those of the study.
-        variants: Names of its family's variants; none: those of the study.
-        scope: How it is run.
-        draw_only: Train nothing: draw what is there, also runs of other settings, and say which those are.
-        seconds: Stop training after so long.
-        per_device: Runs side by side on each device.
+        figure: Name of the figure.
+        study: Study of the figure.
+        out: Path of the image; the tables are written beside it.
+        runs: Folder of the run folders.
+        tasks: Environments; empty: those of the study.
+        variants: Names of variants of its family; empty: those of the study.
+        scope: Scope of the runs.
+        draw_only: Train nothing: draw existing runs, including those with other settings, which are noted.
+        seconds: Time after which training stops.
+        per_device: Parallel runs per device.
     """
 
     figure: str
@@ -39,15 +39,15 @@ class Request:
 
 
 @dataclasses.dataclass(frozen=True)
-class Shown:
-    """What a figure says.
+class FigureContent:
+    """Content of a figure.
 
     Attributes:
-        pictures: To draw.
-        text: Lines of Markdown: its tables.
-        rows: The same to compute with.
+        pictures: Images to draw.
+        text: Tables, as lines of Markdown.
+        rows: The same tables as rows of data.
         notes: Sentences below the tables.
-        title: In the place of the study's, where the lines that were asked for need another one.
+        title: Replacement of the study's title, if the selected lines need another one.
     """
 
     pictures: Sequence[Picture]

@@ -1,4 +1,4 @@
-"""What every study is made of: variants of a configuration, on tasks, over seeds. The studies: `indicator`, `ol_aux`."""
+"""Elements of studies: variants of a configuration, tasks and seeds. The studies: `indicator`, `ol_aux`."""
 
 import dataclasses
 import re
@@ -13,12 +13,12 @@ from jaxrl_vis.validation import validate
 
 @dataclasses.dataclass(frozen=True)
 class Variant:
-    """One line of a figure.
+    """Variant of a configuration: a line of a figure.
 
     Attributes:
-        label: What the figure calls it.
-        changes: Fields of `Config` that make it.
-        colour: Of its line.
+        label: Label in the figure.
+        changes: Fields of `Config` that define it.
+        colour: Colour of its line.
     """
 
     label: str
@@ -28,16 +28,17 @@ class Variant:
 
 @dataclasses.dataclass(frozen=True)
 class Family:
-    """What studies of one subject share, and so their run folders.
+    """Family of studies on one subject, which share their run folders.
 
     Attributes:
-        name: Of the subject, and of the folder of all run folders.
-        variants: Everything that a figure can show, by name.
-        tasks: The environments that it is about.
-        preset: The preset of every run, if nobody asks for another one.
+        name: Name of the subject, and of the folder of its run folders.
+        variants: Variants for figures, by name.
+        tasks: Environments of the subject.
+        preset: Default preset of the runs.
         of_task: (preset, environment) -> fields of `Config` that differ from the preset.
-        longest: Preset -> environment -> most environment steps, where the preset needs no budget like the thesis's.
-        quick: What `figure --quick` changes in the preset ``cpu``.
+        longest: Preset -> environment -> largest number of environment steps, for presets that need smaller budgets than the
+            thesis.
+        quick: Changes of the preset ``cpu`` for `figure --quick`.
     """
 
     name: str
@@ -51,16 +52,16 @@ class Family:
 
 @dataclasses.dataclass(frozen=True)
 class Study:
-    """What a figure shows.
+    """Definition of a figure.
 
     Attributes:
-        family: What it is about.
+        family: Family of the study.
         title: The figure's first line.
         variants: Its lines, in the order of the legend; names of `Family.variants`.
-        steps: Environment -> environment steps of each run; the tasks of the figure, if nobody asks for others.
-        shorter: (environment, variant) -> those of runs that are shorter.
-        extra: Variants that are trained for the tables, and not drawn.
-        others: Environment -> environment steps, of tasks that are shown if somebody asks for them.
+        steps: Environment -> environment steps of each run; these are the default tasks of the figure.
+        shorter: (environment, variant) -> environment steps of shorter runs.
+        extra: Variants that are trained for the tables only.
+        others: Environment -> environment steps of optional tasks.
     """
 
     family: Family
@@ -74,14 +75,14 @@ class Study:
 
 @dataclasses.dataclass(frozen=True)
 class Scope:
-    """How a study is run.
+    """Scope of a study's runs.
 
     Attributes:
-        preset: The preset of every run.
+        preset: Preset of every run.
         seed: First seed.
-        seeds: How many.
-        seeds_per_run: At most so many side by side in one program; None: all.
-        env_steps: Budget of every run, in the place of the study's own.
+        seeds: Number of seeds.
+        seeds_per_run: Largest number of seeds in one program; None: all.
+        env_steps: Budget of every run; None: the study's own.
         changes: Fields of `Config` to change in every run.
     """
 
@@ -98,14 +99,14 @@ Cells = dict[tuple[str, str], list[Cell]]
 
 # `debug` makes 4 gradient steps per iteration, which OL-AUX-5 does not divide.
 _OF_PRESET: dict[str, dict[str, Any]] = {"debug": {"updates_per_iteration": 5}}
-_LONGEST = 1_500_000  # environment steps of a task that a study has no budget for
+_LONGEST = 1_500_000  # environment steps of a task without a budget in the study
 
 
-def cells_of(study: Study, tasks: Sequence[str], variants: Sequence[str], scope: Scope) -> Cells:
-    """The cells of a study, task after task.
+def make_cells(study: Study, tasks: Sequence[str], variants: Sequence[str], scope: Scope) -> Cells:
+    """Makes the cells of a study, task after task.
 
     Raises:
-        RequestError: There is no such task or variant, or a configuration makes no sense.
+        RequestError: There is no such task or variant, or a configuration is invalid.
     """
     for task in tasks:
         if task not in study.family.tasks:
@@ -121,7 +122,7 @@ def _cells(study: Study, task: str, variant: str, scope: Scope) -> list[Cell]:
     config = config.replace(**_OF_PRESET.get(scope.preset, {}), **study.family.of_task.get((scope.preset, task), {}))
     config = config.replace(env_steps=_budget(study, task, variant, scope, config))
     changed = config.replace(**study.family.variants[variant].changes).replace(**scope.changes)
-    options = (re.sub(r"[^\w=.-]", "_", option) for option in changed.env_options)  # it names a folder
+    options = (re.sub(r"[^\w=.-]", "_", option) for option in changed.env_options)  # for a folder's name
     family = "-".join((task, variant, scope.preset, *options))
     return split_seeds(Cell(family, validate(changed)), scope.seeds_per_run or scope.seeds)
 

@@ -1,4 +1,4 @@
-"""A grid of tasks x methods x seeds: trained by `grid`, and shown as a table of what has been reached."""
+"""Sweep over tasks x methods x seeds, trained by `grid` and shown as a table of results."""
 
 import dataclasses
 import statistics
@@ -10,29 +10,29 @@ from jaxrl_vis import streams
 from jaxrl_vis.config import preset
 from jaxrl_vis.devices import Device, list_devices
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.studies.cells import Cell, rows_of, show_budget, split_seeds, standing
+from jaxrl_vis.studies.cells import Cell, describe_progress, finished_rows, show_budget, split_seeds
 from jaxrl_vis.studies.cluster import Cluster, ExecutorName
 from jaxrl_vis.studies.grid import run_cells, start_process
 from jaxrl_vis.validation import validate
 
 SUBMITTED = "submitit"
-"""Folder of submitit's own files, within that of the runs."""
+"""Folder of submitit's own files, inside the folder of runs."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Request:
-    """A sweep that is asked for.
+    """Request for a sweep.
 
     Attributes:
         tasks: Environments.
-        methods: Where rewards come from.
-        preset: Of all runs.
-        changes: Fields of `Config` that differ from it, in all runs.
-        runs: The folder of run folders.
-        seeds_per_run: At most so many seeds in one program; None: all.
-        seconds: Stop training after so long.
-        executor: None: processes of this machine, one a device; else how `cluster` starts them.
-        jobs: At most so many at a time, on a cluster.
+        methods: Methods, the sources of rewards.
+        preset: Preset of all runs.
+        changes: Fields of `Config` that differ from it in all runs.
+        runs: Folder of the run folders.
+        seeds_per_run: Largest number of seeds in one program; None: all.
+        seconds: Time after which training stops.
+        executor: None: processes on this machine, one per device; otherwise an executor of `cluster`.
+        jobs: Largest number of simultaneous jobs on a cluster.
         job_options: See `Cluster`.
     """
 
@@ -48,11 +48,11 @@ class Request:
     job_options: tuple[str, ...] = ()
 
 
-def cells_of(request: Request) -> list[Cell]:
-    """The cells of a sweep, task after task.
+def make_cells(request: Request) -> list[Cell]:
+    """Makes the cells of a sweep, task after task.
 
     Raises:
-        RequestError: A configuration makes no sense.
+        RequestError: A configuration is invalid.
     """
     cells: list[Cell] = []
     for task in request.tasks:
@@ -66,22 +66,22 @@ def cells_of(request: Request) -> list[Cell]:
 
 
 def run_sweep(request: Request, say: Callable[[str], None] = streams.say) -> bool:
-    """Trains what is missing, resumes what was begun, and prints a table.
+    """Trains missing cells, resumes unfinished ones, and prints a table.
 
     Returns:
-        Whether everything is finished.
+        True if everything is finished.
 
     Raises:
-        RequestError: See `cells_of` and `run_cells`.
+        RequestError: See `make_cells` and `run_cells`.
         KeyboardInterrupt, Terminated: After all runs have saved.
     """
-    cells = cells_of(request)
+    cells = make_cells(request)
     find_devices, start = list_devices, start_process
     if request.executor is not None:
         start = Cluster(request.executor, request.runs / SUBMITTED, request.job_options).start
     if request.executor == "slurm":
-        places = [Device("Slurm", {})] * min(request.jobs, len(cells))
-        find_devices = lambda: places  # noqa: E731
+        devices = [Device("Slurm", {})] * min(request.jobs, len(cells))
+        find_devices = lambda: devices  # noqa: E731
     run_cells(cells, request.runs, find_devices, request.seconds, say=say, start=start)
     lines, unfinished = _table(cells, request.runs)
     for line in [*lines, *unfinished]:
@@ -90,21 +90,21 @@ def run_sweep(request: Request, say: Callable[[str], None] = streams.say) -> boo
 
 
 def _table(cells: Sequence[Cell], runs: Path) -> tuple[list[str], list[str]]:
-    """Lines on finished cells, and on those that are not."""
-    found: dict[tuple[str, str], dict[int, float]] = {}
+    """Formats lines about finished and about unfinished cells."""
+    results: dict[tuple[str, str], dict[int, float]] = {}
     unfinished = []
     for cell in cells:
-        rows = rows_of(cell, runs)
+        rows = finished_rows(cell, runs)
         if not rows:
-            unfinished.append(f"not finished: {cell.name}: {standing(cell, runs)}")
+            unfinished.append(f"not finished: {cell.name}: {describe_progress(cell, runs)}")
             continue
         last = max(row["env_steps"] for row in rows)
         reached = {row["seed"]: row["eval/success"] for row in rows if row["env_steps"] == last}
-        found.setdefault((cell.config.env, cell.config.method), {}).update(reached)
+        results.setdefault((cell.config.env, cell.config.method), {}).update(reached)
     lines = [f"{'task':28}{'method':28}{'steps':>8}{'seeds':>7}{'success: median':>17}{'least':>8}{'most':>8}"]
-    for (task, method), success in found.items():
+    for (task, method), success in results.items():
         steps = show_budget(cells[0].config.env_steps)
         values = [value for value in success.values() if value is not None]
         figures = (statistics.median(values), min(values), max(values)) if values else (float("nan"),) * 3
         lines.append(f"{task:28}{method:28}{steps:>8}{len(success):7}{figures[0]:17.3f}{figures[1]:8.3f}{figures[2]:8.3f}")
-    return (lines if found else []), unfinished
+    return (lines if results else []), unfinished

@@ -1,4 +1,4 @@
-"""The table beside a figure, as Markdown and as CSV: steps to levels of success, and speed-ups over a baseline."""
+"""Tables of a figure, as Markdown and CSV: steps to levels of success, and speed-ups over a baseline."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -14,12 +14,12 @@ BASELINE = "none"
 
 @dataclasses.dataclass(frozen=True)
 class Named:
-    """A line and what tables call it.
+    """Line with its label in tables.
 
     Attributes:
-        label: Its method.
-        line: What it says.
-        source: Whose it is: ``here``, or whoever published it.
+        label: Label of its method.
+        line: The line.
+        source: Origin of the results: ``here``, or their publisher.
     """
 
     label: str
@@ -30,26 +30,26 @@ class Named:
 def steps_table(
     lines: Mapping[str, Sequence[Named]], levels: Mapping[str, Sequence[float]]
 ) -> tuple[list[str], list[dict[str, Any]]]:
-    """Steps to each level, and speed-ups over the baseline of the same source.
+    """Tabulates steps to each level, and speed-ups over the baseline of the same source.
 
     Args:
         lines: Task -> its lines.
-        levels: Task -> shares of success.
+        levels: Task -> levels of success.
 
     Returns:
-        Lines of Markdown, one table a task; and rows for `spreadsheets.to_csv`.
+        Lines of Markdown, one table per task; and rows for `spreadsheets.to_csv`.
     """
     text: list[str] = []
     rows: list[dict[str, Any]] = []
     for task, named in lines.items():
-        common = min(each.line.end for each in named)
+        common = min(entry.line.end for entry in named)
         heads = [part for level in levels[task] for part in (f"steps to {level:g}", "speed-up")]
         columns = ["method", *heads, f"mean success to {show_steps(common)}", "success at the end"]
         text += [f"### {task}", "", table_row(columns), table_row(["---"] * len(columns))]
-        for each in named:
-            base = next((b.line for b in named if b.line.variant == BASELINE and b.source == each.source), None)
-            text.append(table_row(_cells(each, base, levels[task], common)))
-            rows += _csv_rows(each, base, levels[task], common)
+        for entry in named:
+            base = next((b.line for b in named if b.line.variant == BASELINE and b.source == entry.source), None)
+            text.append(table_row(_cells(entry, base, levels[task], common)))
+            rows += _csv_rows(entry, base, levels[task], common)
         text.append("")
     return text, rows
 
@@ -61,9 +61,9 @@ def _label(named: Named) -> str:
 def _cells(named: Named, base: Line | None, levels: Sequence[float], common: int) -> list[str]:
     cells = [_label(named)]
     for level in levels:
-        found = reached(named.line, level)
+        result = reached(named.line, level)
         is_base = base is None or named.line.variant == BASELINE
-        cells += [str(found), "" if base is None or is_base else found.ratio(reached(base, level))]
+        cells += [str(result), "" if base is None or is_base else result.ratio(reached(base, level))]
     low, median, high = final(named.line)
     end = f"{median:.2f}" if len(named.line.seeds) == 1 else f"{median:.2f} ({low:.2f} to {high:.2f})"
     return [*cells, f"{mean_success(named.line, common):.3f}", end]
@@ -72,7 +72,7 @@ def _cells(named: Named, base: Line | None, levels: Sequence[float], common: int
 def _csv_rows(named: Named, base: Line | None, levels: Sequence[float], common: int) -> list[dict[str, Any]]:
     rows = []
     for level in levels:
-        found = reached(named.line, level)
+        result = reached(named.line, level)
         rows.append(
             {
                 "task": named.line.task,
@@ -80,11 +80,11 @@ def _csv_rows(named: Named, base: Line | None, levels: Sequence[float], common: 
                 "source": named.source,
                 "seeds": len(named.line.seeds),
                 "level": level,
-                "steps": found.steps,
-                "steps_25": found.low,
-                "steps_75": found.high,
-                "budget": found.budget,
-                "speed_up": "" if base is None or named.line.variant == BASELINE else found.ratio(reached(base, level)),
+                "steps": result.steps,
+                "steps_25": result.low,
+                "steps_75": result.high,
+                "budget": result.budget,
+                "speed_up": "" if base is None or named.line.variant == BASELINE else result.ratio(reached(base, level)),
                 "mean_success": round(mean_success(named.line, common), 4),
                 "mean_success_to": common,
                 "final_success": round(final(named.line)[1], 4),
@@ -96,15 +96,15 @@ def _csv_rows(named: Named, base: Line | None, levels: Sequence[float], common: 
 def weights_table(
     weighted: Mapping[str, Line], alone: Mapping[tuple[str, str], Line], bases: Mapping[str, Line], names: Mapping[str, str]
 ) -> tuple[list[str], list[dict[str, Any]]]:
-    """Mean weights of auxiliary losses beside what each gains alone, and their rank correlation (Spearman's).
+    """Tabulates mean weights of auxiliary losses with the gain of each one alone, and their rank correlation (Spearman's).
 
-    A gain is the difference of mean success to that without auxiliary losses, up to the shorter run's end.
+    The gain is the difference of mean success to the run without auxiliary losses, up to the shorter run's end.
 
     Args:
-        weighted: Task -> the run with all of them.
-        alone: (task, auxiliary loss) -> the run with that one, where there is one.
-        bases: Task -> the run without any, where there is one.
-        names: Auxiliary loss -> what to call it.
+        weighted: Task -> the run with all losses.
+        alone: (task, auxiliary loss) -> the run with only that loss, if it exists.
+        bases: Task -> the run without auxiliary losses, if it exists.
+        names: Auxiliary loss -> its label.
     """
     text: list[str] = []
     rows: list[dict[str, Any]] = []
@@ -139,5 +139,5 @@ def _correlation(weights: Sequence[float], gains: Sequence[float], wanted: int) 
 
 
 def table_row(cells: Sequence[str]) -> str:
-    """A row of a Markdown table."""
+    """Formats a row of a Markdown table."""
     return "| " + " | ".join(cells) + " |"

@@ -1,4 +1,4 @@
-"""The tasks as brax environments, for brax's own agents.
+"""Adapter to brax environments, for brax's own agents.
 
     from brax.training.agents.ppo import train as ppo
     from jaxrl_vis_envs.adapters.brax import BraxEnv, lend_jax
@@ -7,12 +7,12 @@
     with lend_jax():
         make_policy, params, metrics = ppo.train(env, episode_length=env.episode_length, num_envs=256, ...)
 
-`BraxEnv` never says ``done``: brax's EpisodeWrapper, told the ``episode_length``, ends episodes and marks that as truncation.
+`BraxEnv` never sets ``done``: brax's EpisodeWrapper, configured with ``episode_length``, ends episodes and marks them as
+truncated.
 
-Two peculiarities of brax matter here. Its AutoResetWrapper starts every episode of an environment like that environment's
-first one, with the same goal: use many environments, or ask for ``num_resets_per_eval``. And it compiles by itself, without
-the option that physics needs on a CPU (see `compilation`): there, set ``XLA_FLAGS=--xla_cpu_use_fusion_emitters=false``
-before JAX starts.
+Two properties of brax matter here. Its AutoResetWrapper restarts every episode of an environment from that environment's first
+one, with the same goal: use many environments, or set ``num_resets_per_eval``. And it compiles without the option that physics
+needs on a CPU (see `compilation`): there, set ``XLA_FLAGS=--xla_cpu_use_fusion_emitters=false`` before JAX starts.
 """
 
 import contextlib
@@ -35,16 +35,16 @@ except ImportError as error:
 
 
 class BraxEnv(Env):
-    """An environment with brax's interface.
+    """Environment with brax's interface.
 
-    What brax's agents see is, for a state task, one vector [2 S] float32: observation, then goal. For an image task it is a
-    dictionary of ``pixels/observation`` and ``pixels/goal``, [H, W, C] float32 from 0 to 1, as brax's PPO for images takes it
-    (its SAC takes vectors only).
+    For a state task, observations are one vector [2 S] float32: observation, then goal. For an image task they are a dictionary
+    of ``pixels/observation`` and ``pixels/goal``, [H, W, C] float32 from 0 to 1, as brax's PPO expects images (its SAC accepts
+    vectors only).
 
     Args:
-        env: The name of an environment, or a `GoalEnv`.
-        reward: ``oracle`` (0 at the goal, -1 elsewhere) or ``dense`` (minus the distance to the goal). Without relabelling of
-            goals, which brax's agents do not do, little is learned from ``oracle`` alone.
+        env: Name of an environment, or a `GoalEnv`.
+        reward: ``oracle`` (0 at the goal, -1 elsewhere) or ``dense`` (negative distance to the goal). Without goal relabelling,
+            which brax's agents do not do, little is learned from ``oracle`` alone.
         **overrides: Fields of the environment's configuration to change, as in `jaxrl_vis_envs.make`.
 
     Raises:
@@ -57,25 +57,25 @@ class BraxEnv(Env):
         self._sees_images = len(self.goal_env.observation_spec.shape) == 3
 
     def reset(self, rng: jax.Array) -> BraxState:
-        """Starts an episode from a key, [2] uint32 as brax's are, or typed.
+        """Start an episode from a key, [2] uint32 as in brax, or typed.
 
-        Brax's wrappers read the batch's shape from such an untyped key, so what they wrap needs untyped ones.
+        Brax's wrappers read the batch shape from an untyped key, so wrapped environments need untyped keys.
         """
         self.goal_env.check_key(rng)
         is_typed = jnp.issubdtype(rng.dtype, jax.dtypes.prng_key)
         episode = self.goal_env.reset(rng if is_typed else jax.random.wrap_key_data(rng))
-        physics: Any = episode  # brax's annotation asks for a state of its own physics, but brax never looks inside
+        physics: Any = episode  # annotated as brax's own physics state, which brax never inspects
         return BraxState(physics, self._observe(episode), self._reward(episode), jnp.zeros(()), dict(episode.metrics))
 
     def step(self, state: BraxState, action: jax.Array) -> BraxState:
-        """Moves by ``action`` [A] in [-1, 1]. ``done`` stays 0, ``info`` is passed on.
+        """Step with ``action`` [A] in [-1, 1]. ``done`` stays 0, ``info`` is passed on.
 
         ``metrics`` are ``success`` (0 or 1) and ``goal_distance`` (unit of the task). Brax's evaluation sums them over an
         episode.
         """
         episode: Any = state.pipeline_state
         episode = self.goal_env.step(episode, action)
-        return state.replace(  # type: ignore[attr-defined] - flax gives it
+        return state.replace(  # type: ignore[attr-defined] - added by flax
             pipeline_state=episode,
             obs=self._observe(episode),
             reward=self._reward(episode),
@@ -85,12 +85,12 @@ class BraxEnv(Env):
 
     @property
     def episode_length(self) -> int:
-        """Control steps in an episode, for brax's argument of that name."""
+        """Number of control steps in an episode, for brax's argument of that name."""
         return self.goal_env.horizon
 
     @property
     def observation_size(self) -> Any:
-        """2 S, or for images the shape of each key."""
+        """Size 2 S of an observation, or for images the shape of each key."""
         shape = self.goal_env.observation_spec.shape
         if not self._sees_images:
             return 2 * shape[0]
@@ -99,17 +99,17 @@ class BraxEnv(Env):
 
     @property
     def action_size(self) -> int:
-        """A."""
+        """Size A of an action."""
         return self.goal_env.action_size
 
     @property
     def dt(self) -> float:
-        """Simulated seconds of one control step."""
+        """Duration of one control step, s of simulated time."""
         return self.goal_env.control_period
 
     @property
     def backend(self) -> str:
-        """The physics: ``mjx``."""
+        """Name of the physics engine: ``mjx``."""
         return "mjx"
 
     def _observe(self, state: State) -> Any:
@@ -126,9 +126,9 @@ class BraxEnv(Env):
 
 @contextlib.contextmanager
 def lend_jax() -> Iterator[None]:
-    """Puts back ``jax.device_put_replicated``, which brax's agents call and JAX 0.10 has dropped, while the context is open.
+    """Restore ``jax.device_put_replicated``, which brax's agents call and JAX 0.10 has removed, within the context.
 
-    Where JAX still has it, nothing happens. PPO and SAC need it up to brax 0.14.2.
+    Does nothing if JAX still has it. PPO and SAC need it up to brax 0.14.2.
     """
     if hasattr(jax, "device_put_replicated"):
         yield
@@ -141,7 +141,7 @@ def lend_jax() -> Iterator[None]:
 
 
 def _device_put_replicated(tree: Any, devices: list[Any]) -> Any:
-    """``tree`` with a new first axis along which each of ``devices`` holds a copy."""
+    """Return ``tree`` with a new first axis along which each of ``devices`` holds a copy."""
     mesh = jax.sharding.Mesh(np.array(devices), ("devices",))
     sharding = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("devices"))
     return jax.tree.map(lambda leaf: jax.device_put(jnp.stack([jnp.asarray(leaf)] * len(devices)), sharding), tree)

@@ -1,7 +1,7 @@
-"""A page on which brax's viewer plays what bodies did, in three dimensions, to be turned and zoomed with the mouse.
+"""Web page that replays body trajectories in brax's interactive 3-D viewer.
 
-The page holds the bodies and their motion. The viewer itself is fetched from public servers when the page is opened, as brax
-makes its pages: without a network, the page stays empty.
+The page contains the bodies and their motion. The viewer itself is fetched from public servers when the page is opened, as in
+brax's own pages: without a network, the page stays empty.
 """
 
 import json
@@ -15,7 +15,7 @@ try:
 except ImportError as error:
     raise ImportError("the 3-D viewer needs brax, which comes with jaxrl-vis, but it is missing: pip install brax") from error
 
-# What brax's viewer calls the shapes that it can draw.
+# Names of the shapes that brax's viewer supports.
 _SHAPES = {
     mujoco.mjtGeom.mjGEOM_PLANE: "Plane",
     mujoco.mjtGeom.mjGEOM_SPHERE: "Sphere",
@@ -26,12 +26,12 @@ _SHAPES = {
     mujoco.mjtGeom.mjGEOM_MESH: "Mesh",
 }
 _GOAL_COLOUR = (0.24, 0.81, 0.56)
-_GOAL_THICKNESS = 0.8  # of the robot's: at the goal, the robot hides its goal
-_VISIBLE_GROUPS = 3  # as in MuJoCo's viewers, geoms of group 3 and more are for collisions
-_VIEW_SIZE = 5.0  # the viewer's camera stands 10 units away and cuts off what is nearer than .1
+_GOAL_THICKNESS = 0.8  # relative to the robot's, so that at the goal the robot covers its goal
+_VISIBLE_GROUPS = 3  # as in MuJoCo's viewers, geoms of groups 3 and up are for collisions
+_VIEW_SIZE = 5.0  # the viewer's camera is 10 units away, with its near plane at .1
 
 
-# Without a network brax's page stays empty: say why.
+# Without a network brax's page stays empty: explain why.
 _OFFLINE = """
     <p id="offline" hidden style="font: 16px sans-serif; position: absolute; top: 40vh; width: 100%; text-align: center">
       The viewer could not be fetched: this page needs a network. The video (.gif) that play makes without --html needs none.
@@ -43,11 +43,11 @@ _OFFLINE = """
 
 
 class Poses(NamedTuple):
-    """Where bodies are, the world's body among them.
+    """Poses of B bodies, including the world's.
 
     Attributes:
         positions: [..., B, 3] float32, m.
-        rotations: [..., B, 4] float32, unit quaternions, real part first.
+        rotations: [..., B, 4] float32, unit quaternions, scalar first.
     """
 
     positions: np.ndarray
@@ -55,15 +55,18 @@ class Poses(NamedTuple):
 
 
 def viewer_page(mj_model: mujoco.MjModel, poses: Poses, goals: Poses, seconds: float) -> str:
-    """HTML that plays T instants of a robot, and of its goal, a slimmer robot in green.
+    """Return a page that replays T instants of a robot and of its goal, shown as a thinner robot in green.
 
-    The scene is moved and scaled to fit the viewer's camera: numbers that the page shows are not metres.
+    The scene is translated and scaled to fit the viewer's camera, so the page's coordinates are not in metres.
 
     Args:
-        mj_model: The bodies; B of them.
-        poses: Of the robot, [T, B, ...].
-        goals: Of the robot at its goal at these instants, [T, B, ...].
-        seconds: From one instant to the next, s.
+        mj_model: Model with B bodies.
+        poses: Poses of the robot, [T, B, ...].
+        goals: Poses of the robot at its goal at these instants, [T, B, ...].
+        seconds: Time between instants, s.
+
+    Returns:
+        HTML.
     """
     scale = _VIEW_SIZE / float(mj_model.stat.extent)
     links: dict[str, list[dict[str, Any]]] = {}
@@ -74,7 +77,7 @@ def viewer_page(mj_model: mujoco.MjModel, poses: Poses, goals: Poses, seconds: f
             links[name] = [{**geom, "link_idx": len(tracks)} for geom in geoms]
             tracks.append((scale * (positions - mj_model.stat.center), rotations))
 
-    # The camera starts near the origin, and turns to the first link.
+    # The camera starts near the origin and looks at the first link.
     count = len(poses.positions)
     centre, upright = np.tile(mj_model.stat.center, (count, 1)), np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
     point = {"name": "Sphere", "pos": [0, 0, 0], "rot": [1, 0, 0, 0], "rgba": [0, 0, 0, 1], "size": [1e-4, 0, 0]}
@@ -97,8 +100,8 @@ def _is_moved_by_joints(mj_model: mujoco.MjModel, body: int) -> bool:
 
 
 def _geoms(mj_model: mujoco.MjModel, body: int, scale: float, is_goal: bool = False) -> list[dict[str, Any]]:
-    """The visible geoms of a body as the viewer reads them."""
-    found = []
+    """Return the visible geoms of a body in the viewer's format."""
+    entries = []
     first, count = mj_model.body_geomadr[body], mj_model.body_geomnum[body]
     for geom in range(first, first + count):
         shape = mujoco.mjtGeom(mj_model.geom_type[geom])
@@ -108,8 +111,8 @@ def _geoms(mj_model: mujoco.MjModel, body: int, scale: float, is_goal: bool = Fa
             continue
         size = scale * mj_model.geom_size[geom].astype(float)
         if shape == mujoco.mjtGeom.mjGEOM_PLANE:
-            size *= 2  # the viewer wants whole sides
-        # Capsules keep their length, so that the links of the goal still meet.
+            size *= 2  # the viewer expects full side lengths
+        # Capsules keep their length, so that the goal's links still meet.
         thick = slice(0, 1) if shape in (mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER) else slice(None)
         factor = _GOAL_THICKNESS if is_goal else 1.0
         size[thick] *= factor
@@ -123,12 +126,12 @@ def _geoms(mj_model: mujoco.MjModel, body: int, scale: float, is_goal: bool = Fa
         if entry["name"] == "Mesh":
             vertices, faces = _surface(mj_model, geom)
             entry |= {"vert": (scale * factor * vertices).round(5).tolist(), "face": faces.tolist()}
-        found.append(entry)
-    return found
+        entries.append(entry)
+    return entries
 
 
 def _surface(mj_model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [V, 3] (m, in the frame of the geom) and triangles [F, 3] of a mesh or an ellipsoid."""
+    """Return vertices [V, 3] (m, frame of the geom) and triangles [F, 3] of a mesh or an ellipsoid."""
     if mj_model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
         mesh = mj_model.geom_dataid[geom]
         vertex, face = mj_model.mesh_vertadr[mesh], mj_model.mesh_faceadr[mesh]

@@ -1,4 +1,4 @@
-"""Which environment an adapter is for: one that is made by its name, or one that there is already."""
+"""Lookup of the environment behind an adapter, by name or as an existing object."""
 
 from typing import Any
 
@@ -7,22 +7,20 @@ from jaxrl_vis_envs.registry import make
 
 
 def goal_env(env: Any, overrides: dict[str, Any]) -> GoalEnv:
-    """The environment behind an adapter.
+    """Return the environment behind an adapter.
 
     Args:
-        env: The name of an environment, or a `GoalEnv`.
-        overrides: Options that go with the name.
+        env: Name of an environment, or a `GoalEnv`.
+        overrides: Configuration overrides for a named environment.
 
     Raises:
-        ValueError: As `jaxrl_vis_envs.make`; or ``env`` is neither, or there are options for one that is made already.
+        ValueError: As in `jaxrl_vis_envs.make`; or ``env`` is neither, or there are overrides for an existing `GoalEnv`.
     """
     if isinstance(env, str):
         return make(env, **overrides)
     if not isinstance(env, GoalEnv):
         kind = f"the class {env.__name__}" if isinstance(env, type) else f"a {type(env).__name__}"
-        raise ValueError(f"env must be the name of an environment, or a GoalEnv that is made already, got {kind}")
+        raise ValueError(f"env must be the name of an environment, or an existing GoalEnv, got {kind}")
     if overrides:
-        raise ValueError(
-            f"{', '.join(overrides)}: options go with the name of an environment, not with one that is made already"
-        )
+        raise ValueError(f"{', '.join(overrides)}: options can be changed for a named environment, not for an existing one")
     return env

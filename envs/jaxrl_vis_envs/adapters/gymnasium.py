@@ -1,24 +1,23 @@
-"""The tasks as Gymnasium environments, single and vector, with the goal dictionaries of Gymnasium-Robotics.
+"""Adapter to Gymnasium environments, single and vectorised, with the goal dictionaries of Gymnasium-Robotics.
 
     import gymnasium
     import jaxrl_vis_envs.adapters.gymnasium  # registers the names
 
     env = gymnasium.make("jaxrl_vis/VisualFetchReach-v0", image_size=64)
-    envs = gymnasium.make_vec("jaxrl_vis/FetchReach-v0", num_envs=16)  # one compiled step moves all of them
+    envs = gymnasium.make_vec("jaxrl_vis/FetchReach-v0", num_envs=16)  # one compiled step for all of them
 
 Observations are dictionaries:
 
-    observation     [S] float32, what the state variant of the task sees
-    achieved_goal   [G] float32, the true state that goals are about
-    desired_goal    [G] float32, the state that is asked for
-    pixels          [H, W, C] uint8, what the robot sees (image tasks only)
-    goal_pixels     [H, W, C] uint8, the image of the goal (image tasks only)
+    observation     [S] float32, observation of the task's state variant
+    achieved_goal   [G] float32, true state that goals constrain
+    desired_goal    [G] float32, desired state
+    pixels          [H, W, C] uint8, image observation (image tasks only)
+    goal_pixels     [H, W, C] uint8, goal image (image tasks only)
 
-Goals are states, not images, so that ``compute_reward`` is vectorised and right for goals that a learner puts in later
-(hindsight relabelling). An agent that shall see images only is given those two keys, and none of the others, with
-`gymnasium.wrappers.FilterObservation`.
+Goals are states, not images, so that ``compute_reward`` is vectorised and correct for goals substituted by a learner (hindsight
+relabelling). To restrict an agent to images, select those two keys with `gymnasium.wrappers.FilterObservation`.
 
-Episodes have one length and end in truncation, never in termination.
+All episodes have the same length and end by truncation, never by termination.
 """
 
 import numbers
@@ -46,14 +45,14 @@ NAMESPACE = "jaxrl_vis"
 
 
 class GymnasiumEnv(gymnasium.Env):
-    """One environment.
+    """Gymnasium interface of one environment.
 
     Args:
-        env: The name of an environment, or a `GoalEnv`.
-        reward: ``oracle`` (0 at the goal, -1 elsewhere) or ``dense`` (minus the distance to the goal).
-        render_mode: None, or ``rgb_array`` for images from the camera of the task, which state tasks have as well; with the
-            looks of the episode where they are randomized.
-        render_size: Height and width of what `render` returns, px; it has nothing to do with ``pixels``.
+        env: Name of an environment, or a `GoalEnv`.
+        reward: ``oracle`` (0 at the goal, -1 elsewhere) or ``dense`` (negative distance to the goal).
+        render_mode: None, or ``rgb_array`` for images from the task's camera, also for state tasks; with the appearance of the
+            episode if that is randomised.
+        render_size: Height and width of images from `render`, px; independent of ``pixels``.
         **overrides: Fields of the environment's configuration to change, as in `jaxrl_vis_envs.make`.
 
     Raises:
@@ -78,67 +77,67 @@ class GymnasiumEnv(gymnasium.Env):
 
     @property
     def goal_env(self) -> GoalEnv:
-        """The environment behind it."""
+        """Underlying environment."""
         return self._environments.env
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observations, dict[str, Any]]:
-        """Starts an episode; a ``seed`` settles it and all that follow. ``options`` has no meaning here.
+        """Start an episode. A ``seed`` determines this and all following episodes; ``options`` is ignored.
 
         Raises:
-            gymnasium.error.Error: ``seed`` is negative, or no whole number of Python's.
+            gymnasium.error.Error: ``seed`` is negative or not a Python integer.
         """
         super().reset(seed=seed)
         observations = self._environments.reset(np.array([_draw_seed(self.np_random)]))
         return _first(observations), self._info(observations)
 
     def step(self, action: np.ndarray) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
-        """Moves by ``action`` [A]: clipped to [-1, 1], and a NaN counts as 0.
+        """Step with ``action`` [A], which is clipped to [-1, 1]; NaN counts as 0.
 
         Returns:
-            observation, reward, False, whether the episode has had all its steps, and ``is_success`` and ``goal_distance``.
+            Observation, reward, False (never terminated), truncated, and an info with ``is_success`` and ``goal_distance``.
 
         Raises:
-            gymnasium.error.ResetNeeded: There was no `reset`.
-            ValueError: ``action`` has another shape.
+            gymnasium.error.ResetNeeded: `reset` has not been called.
+            ValueError: ``action`` has the wrong shape.
         """
         observations, reward = self._environments.step(np.asarray(action)[None])
         return _first(observations), float(reward[0]), False, self._environments.is_over, self._info(observations)
 
     def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any = None) -> np.ndarray:
-        """Rewards of states [..., G] for goals [..., G]: [...] float32. ``info`` is not read.
+        """Compute rewards of states [..., G] for goals [..., G]: [...] float32. ``info`` is ignored.
 
         Raises:
-            ValueError: States or goals are not of G numbers, or their leading axes do not go together.
+            ValueError: States or goals do not have G elements, or their leading axes do not broadcast.
         """
-        states = [np.asarray(given, np.float32) for given in (achieved_goal, desired_goal)]
+        states = [np.asarray(state, np.float32) for state in (achieved_goal, desired_goal)]
         one = self._environments.programs.space["desired_goal"].shape
         if any(state.shape[-1:] != one for state in states):
-            given = " and ".join(str(state.shape) for state in states)
-            raise ValueError(f"one state and one goal have the shape {one}, got arrays of the shapes {given}")
+            shapes = " and ".join(str(state.shape) for state in states)
+            raise ValueError(f"one state and one goal have the shape {one}, got arrays of the shapes {shapes}")
         return self._environments.score(*states)
 
     def compute_terminated(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any = None) -> np.ndarray:
-        """Whether states [..., G] end an episode with goals [..., G]: never, [...] bool."""
+        """Return False for all states [..., G] and goals [..., G]: [...] bool. Episodes never terminate."""
         return np.zeros(np.broadcast_shapes(np.shape(achieved_goal), np.shape(desired_goal))[:-1], bool)
 
     def compute_truncated(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any = None) -> np.ndarray:
-        """Whether states cut an episode short: never, [...] bool. Only its length does, which a state does not tell."""
+        """Return False for all states and goals: [...] bool. Truncation depends on the step count alone."""
         return self.compute_terminated(achieved_goal, desired_goal, info)
 
     def learner_view(self) -> tuple[np.ndarray, np.ndarray]:
-        """Observation and goal as a policy of this package takes them: planar [C, H, W] uint8, or [S] float32 (state tasks).
+        """Return observation and goal in the form that this package's policies take: planar [C, H, W] uint8, or [S] float32.
 
         Raises:
-            gymnasium.error.ResetNeeded: There was no `reset`.
+            gymnasium.error.ResetNeeded: `reset` has not been called.
         """
         observation, goal = self._environments.learner_view()
         return observation[0], goal[0]
 
     def render(self) -> Any:
-        """An image [size, size, 3] uint8, or None where no render mode was asked for.
+        """Return an image [size, size, 3] uint8, or None without a render mode.
 
         Raises:
-            gymnasium.error.ResetNeeded: There was no `reset`.
+            gymnasium.error.ResetNeeded: `reset` has not been called.
         """
         images = self._environments.render()
         return None if images is None else images[0]
@@ -152,16 +151,16 @@ def _first(observations: Observations) -> Observations:
 
 
 class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
-    """N environments, moved by one compiled program. It does what a `gymnasium.vector.SyncVectorEnv` of `GymnasiumEnv` does.
+    """N environments stepped by one compiled program, equivalent to a `gymnasium.vector.SyncVectorEnv` of `GymnasiumEnv`.
 
-    All episodes have one length, so all end at once.
+    All episodes have the same length, so they all end together.
 
     Args:
-        env: The name of an environment, or a `GoalEnv`.
+        env: Name of an environment, or a `GoalEnv`.
         num_envs: N.
         reward: See `GymnasiumEnv`.
         autoreset_mode: ``NextStep`` (the step after the last one starts new episodes, whatever the action) or ``SameStep`` (the
-            last step does, and hands out the last observations as ``final_obs``).
+            last step does, and returns the final observations as ``final_obs``).
         render_mode: See `GymnasiumEnv`.
         render_size: See `GymnasiumEnv`.
         **overrides: See `GymnasiumEnv`.
@@ -198,17 +197,17 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
 
     @property
     def goal_env(self) -> GoalEnv:
-        """The environment behind it."""
+        """Underlying environment."""
         return self._environments.env
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Starts all episodes. Environment i is seeded with ``seed + i`` or ``seed[i]``; ``options`` has no meaning here.
+        """Start all episodes. Environment i is seeded with ``seed + i`` or ``seed[i]``; ``options`` is ignored.
 
         Raises:
-            ValueError: ``seed`` is neither a whole number nor one for each environment.
-            gymnasium.error.Error: A seed is negative, or no whole number of Python's.
+            ValueError: ``seed`` is neither an integer nor one per environment.
+            gymnasium.error.Error: A seed is negative or not a Python integer.
         """
         if seed is None or isinstance(seed, int | np.integer):
             seed = None if seed is None else int(seed)
@@ -221,51 +220,51 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         if len(seeds) != self.num_envs:
             raise ValueError(f"seed must hold one number for each of {self.num_envs} environments, got {len(seeds)}")
         if not self._generators:
-            self._generators = [seeding.np_random(given)[0] for given in seeds]
+            self._generators = [seeding.np_random(env_seed)[0] for env_seed in seeds]
         else:
             pairs = zip(self._generators, seeds)
-            self._generators = [old if given is None else seeding.np_random(given)[0] for old, given in pairs]
+            self._generators = [old if env_seed is None else seeding.np_random(env_seed)[0] for old, env_seed in pairs]
         return self._restart()
 
     def step(self, actions: np.ndarray) -> tuple[Observations, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Moves by ``actions`` [N, A]: clipped to [-1, 1], and a NaN counts as 0.
+        """Step with ``actions`` [N, A], which are clipped to [-1, 1]; NaN counts as 0.
 
         Returns:
-            observations, rewards [N] float64, terminations and truncations [N] bool, and the infos of `GymnasiumEnv` as arrays.
+            Observations, rewards [N] float64, terminations and truncations [N] bool, and the infos of `GymnasiumEnv` as arrays.
 
         Raises:
-            gymnasium.error.ResetNeeded: There was no `reset`.
-            ValueError: ``actions`` has another shape.
+            gymnasium.error.ResetNeeded: `reset` has not been called.
+            ValueError: ``actions`` has the wrong shape.
         """
-        never, all_over = np.zeros(self.num_envs, bool), np.ones(self.num_envs, bool)
+        none_over, all_over = np.zeros(self.num_envs, bool), np.ones(self.num_envs, bool)
         if self._environments.is_over and not self._resets_in_step:
             observations, infos = self._restart()
-            return observations, np.zeros(self.num_envs), never, never.copy(), infos
+            return observations, np.zeros(self.num_envs), none_over, none_over.copy(), infos
         observations, reward = self._environments.step(actions)
         infos, reward = self._infos(observations), reward.astype(np.float64)
         if not self._environments.is_over:
-            return observations, reward, never, never.copy(), infos
+            return observations, reward, none_over, none_over.copy(), infos
         if self._resets_in_step:
             final = np.empty(self.num_envs, object)
             final[:] = [{name: values[i] for name, values in observations.items()} for i in range(self.num_envs)]
             last_infos = {"final_obs": final, "final_info": infos, "_final_obs": all_over, "_final_info": all_over.copy()}
             observations, infos = self._restart()
             infos |= last_infos
-        return observations, reward, never, all_over.copy(), infos
+        return observations, reward, none_over, all_over.copy(), infos
 
     def learner_view(self) -> tuple[np.ndarray, np.ndarray]:
-        """Those of all environments, [N, ...]; see `GymnasiumEnv.learner_view`.
+        """Return observations and goals of all environments, [N, ...]; see `GymnasiumEnv.learner_view`.
 
         Raises:
-            gymnasium.error.ResetNeeded: There was no `reset`.
+            gymnasium.error.ResetNeeded: `reset` has not been called.
         """
         return self._environments.learner_view()
 
     def render(self) -> tuple[Any, ...] | None:
-        """Images [size, size, 3] uint8, one for each environment, or None where no render mode was asked for.
+        """Return images [size, size, 3] uint8, one per environment, or None without a render mode.
 
         Raises:
-            gymnasium.error.ResetNeeded: There was no `reset`.
+            gymnasium.error.ResetNeeded: `reset` has not been called.
         """
         images = self._environments.render()
         return None if images is None else tuple(images)
@@ -275,7 +274,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         return observations, self._infos(observations)
 
     def _infos(self, observations: Observations) -> dict[str, Any]:
-        """Infos as arrays, each with a mask of the environments that have it: all."""
+        """Return infos as arrays, each with a mask of the environments that have it: all of them."""
         infos = self._environments.info(observations)
         return infos | {f"_{name}": np.ones(self.num_envs, bool) for name in infos}
 
@@ -285,7 +284,7 @@ def _draw_seed(generator: np.random.Generator) -> np.uint32:
 
 
 def register_all() -> None:
-    """Registers every environment as ``jaxrl_vis/<name>-v0``. Importing this module does it; call it again for later ones."""
+    """Register every environment as ``jaxrl_vis/<name>-v0``. Called on import; call it again after adding environments."""
     for name in list_envs():
         if f"{NAMESPACE}/{name}-v0" not in gymnasium.registry:
             gymnasium.register(

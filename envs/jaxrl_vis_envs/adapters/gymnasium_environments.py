@@ -1,4 +1,4 @@
-"""N environments in step behind Gymnasium's interfaces: what the single and the vector environment are made of."""
+"""N lockstep environments, shared implementation of the single and the vectorised Gymnasium environment."""
 
 import functools
 from typing import Any, NamedTuple
@@ -21,13 +21,13 @@ Observations = dict[str, np.ndarray]
 
 
 class _Programs(NamedTuple):
-    """The compiled half of an environment, for any number N of environments; shared by all environments with the same settings.
+    """Compiled functions of an environment for any number N of environments, shared by all with the same settings.
 
     Attributes:
         env: The environment.
-        space: The observation space of one environment.
-        reset: seeds [N] uint32 -> (State, observations, goals [N, ...] as the task shows them to its learner).
-        step: (State, donated; actions [N, A] float32) -> (State, observations but for ``goal_pixels``, which stay).
+        space: Observation space of one environment.
+        reset: seeds [N] uint32 -> (State, observations, goals [N, ...] in the form of the task).
+        step: (State, donated; actions [N, A] float32) -> (State, observations without ``goal_pixels``, which do not change).
     """
 
     env: GoalEnv
@@ -41,11 +41,11 @@ def _make_cached(name: str, overrides: tuple[tuple[str, Any], ...]) -> GoalEnv:
     return make(name, **dict(overrides))
 
 
-def _made(env: str | GoalEnv, overrides: dict[str, Any]) -> GoalEnv:
-    """The environment of that name and those settings, made once where settings can be told apart: all are hashable.
+def _find_or_make(env: str | GoalEnv, overrides: dict[str, Any]) -> GoalEnv:
+    """Return the environment of that name and settings, built once if all settings are hashable.
 
     Raises:
-        ValueError: As `jaxrl_vis_envs.make` and `goal_env`.
+        ValueError: As in `jaxrl_vis_envs.make` and `goal_env`.
     """
     if not isinstance(env, str):
         return goal_env(env, overrides)
@@ -53,7 +53,7 @@ def _made(env: str | GoalEnv, overrides: dict[str, Any]) -> GoalEnv:
     settings = tuple(pairs)
     try:
         hash(settings)
-    except TypeError:  # the environment refuses them with a line of its own, or takes them
+    except TypeError:  # not hashable: the environment rejects them with its own message, or accepts them
         return goal_env(env, overrides)
     return _make_cached(env, settings)
 
@@ -68,7 +68,7 @@ def _programs(env: GoalEnv) -> _Programs:
         observation = {"achieved_goal": state.achieved_state, "desired_goal": state.goal_state}
         if not sees_images:
             return {"observation": env.observe(state), **observation}
-        # An environment of somebody else's making may have nothing but images.
+        # A user's environment may have only images.
         vector = state.achieved_state if observe_state is None else observe_state(state.data)
         return {"observation": vector, **observation, "pixels": _to_public(env.observe(state))}
 
@@ -77,7 +77,7 @@ def _programs(env: GoalEnv) -> _Programs:
         assert state.obs is not None
         goal = state.obs["desired_goal"]
         goals = {"goal_pixels": _to_public(goal)} if sees_images else {}
-        # Images are handed out, not carried.
+        # Images are returned, not carried in the state.
         state = state.replace(obs=None)
         return state, {**jax.vmap(observe)(state), **goals}, goal
 
@@ -90,12 +90,12 @@ def _programs(env: GoalEnv) -> _Programs:
 
 
 def _to_public(image: jax.Array) -> jax.Array:
-    """[..., C, H, W] -> [..., H, W, C]."""
+    """Move channels last: [..., C, H, W] -> [..., H, W, C]."""
     return jnp.moveaxis(image, -3, -1)
 
 
 def _space(shapes: dict[str, jax.ShapeDtypeStruct]) -> spaces.Dict:
-    """The space of one environment's observations, whose batches of one have ``shapes``."""
+    """Return the space of one environment's observations, given the shapes of a batch of one."""
 
     def box(shape: jax.ShapeDtypeStruct) -> spaces.Box:
         low, high = (0, 255) if shape.dtype == jnp.uint8 else (-np.inf, np.inf)
@@ -106,7 +106,7 @@ def _space(shapes: dict[str, jax.ShapeDtypeStruct]) -> spaces.Dict:
 
 @functools.cache
 def _camera(env: GoalEnv, size: int) -> Any:
-    """A compiled function from the physics of N environments, and what varies in each, to images [N, size, size, 3] uint8."""
+    """Return a compiled function from the physics and domains of N environments to images [N, size, size, 3] uint8."""
     mj_model, camera = getattr(env, "mj_model", None), getattr(env, "camera", None)
     if mj_model is None or camera is None:
         raise ValueError(f"{type(env).__name__} has no MuJoCo model with a camera to render through")
@@ -115,15 +115,15 @@ def _camera(env: GoalEnv, size: int) -> Any:
 
 
 class Environments:
-    """N environments in step, on the device. The arguments are those of `gymnasium.GymnasiumEnv`.
+    """N lockstep environments on the device. The arguments are those of `gymnasium.GymnasiumEnv`.
 
     Attributes:
         env: The environment.
-        programs: Its compiled half.
-        score: Rewards of states [..., G] for goals [..., G]: [...] float32.
-        metadata: As Gymnasium wants it.
-        action_space: Of one environment.
-        steps: Since `reset`.
+        programs: Its compiled functions.
+        score: Function from states [..., G] and goals [..., G] to rewards [...] float32.
+        metadata: Gymnasium metadata.
+        action_space: Action space of one environment.
+        steps: Number of steps since `reset`.
     """
 
     def __init__(
@@ -131,7 +131,7 @@ class Environments:
     ) -> None:
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
-        self._given, self._render_size = (env, overrides), None if render_mode is None else render_size
+        self._env_arguments, self._render_size = (env, overrides), None if render_mode is None else render_size
         self._make()
         self.score = reward_function(reward, self.env.threshold)
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": max(1, round(1 / self.env.control_period))}
@@ -142,13 +142,13 @@ class Environments:
         self._view: tuple[np.ndarray, np.ndarray] | None = None
 
     def _make(self) -> None:
-        """Makes the environment and what is compiled for it, or takes those that there are with the same settings."""
-        self.env = _made(*self._given)
+        """Build the environment and its compiled functions, or reuse those with the same settings."""
+        self.env = _find_or_make(*self._env_arguments)
         self.programs = _programs(self.env)
         self._camera = None if self._render_size is None else _camera(self.env, self._render_size)
 
     def __getstate__(self) -> dict[str, Any]:
-        # Compiled programs stay in their process: whoever gets this makes them anew. Episodes go on where they are.
+        # Compiled programs cannot be pickled: the receiver builds them again. Episodes continue from their current state.
         return {name: value for name, value in vars(self).items() if name not in ("env", "programs", "_camera")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -157,11 +157,11 @@ class Environments:
 
     @property
     def is_over(self) -> bool:
-        """Whether the episodes have had all their steps."""
+        """True if the episodes have reached their horizon."""
         return self.steps >= self.env.horizon
 
     def reset(self, seeds: np.ndarray) -> Observations:
-        """Starts the episodes of ``seeds`` [N] uint32."""
+        """Start the episodes of ``seeds`` [N] uint32."""
         self._state, observations, goal = self.programs.reset(seeds)
         self.steps = 0
         observations = _to_host(observations)
@@ -170,11 +170,11 @@ class Environments:
         return observations
 
     def step(self, actions: Any) -> tuple[Observations, np.ndarray]:
-        """Moves by ``actions`` [N, A]; returns observations and rewards [N] float32.
+        """Step with ``actions`` [N, A]; return observations and rewards [N] float32.
 
         Raises:
-            gymnasium.error.ResetNeeded: There was no `reset`.
-            ValueError: ``actions`` has another shape.
+            gymnasium.error.ResetNeeded: `reset` has not been called.
+            ValueError: ``actions`` has the wrong shape.
         """
         if self._state is None:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
@@ -187,29 +187,29 @@ class Environments:
         assert self._view is not None
         self._view = _planar(observations), self._view[1]
         observations |= {name: images.copy() for name, images in self._goal_pixels.items()}
-        # Scored here, and not by the compiled step, so that it is `compute_reward` of what was handed out to the last bit.
+        # Scored here, not in the compiled step, so that it equals `compute_reward` of the returned observations bit for bit.
         return observations, self.score(observations["achieved_goal"], observations["desired_goal"])
 
     def info(self, observations: Observations) -> dict[str, np.ndarray]:
-        """``is_success`` [N] bool and ``goal_distance`` [N] float32."""
+        """Return ``is_success`` [N] bool and ``goal_distance`` [N] float32."""
         distance = -reward_function("dense", self.env.threshold)(observations["achieved_goal"], observations["desired_goal"])
         return {"is_success": distance <= self.env.threshold, "goal_distance": distance}
 
     def learner_view(self) -> tuple[np.ndarray, np.ndarray]:
-        """Observations and goals [N, ...] as the task itself shows them to a learner, see `GymnasiumEnv.learner_view`.
+        """Return observations and goals [N, ...] in the form of the task, see `GymnasiumEnv.learner_view`.
 
         Raises:
-            gymnasium.error.ResetNeeded: There was no `reset`.
+            gymnasium.error.ResetNeeded: `reset` has not been called.
         """
         if self._view is None:
             raise gymnasium.error.ResetNeeded("call reset() before learner_view()")
         return self._view
 
     def render(self) -> np.ndarray | None:
-        """Images [N, size, size, 3] uint8, or None where no render mode was asked for.
+        """Return images [N, size, size, 3] uint8, or None without a render mode.
 
         Raises:
-            gymnasium.error.ResetNeeded: There was no `reset`.
+            gymnasium.error.ResetNeeded: `reset` has not been called.
         """
         if self._camera is None:
             return None
@@ -219,12 +219,12 @@ class Environments:
 
 
 def _planar(observations: Observations) -> np.ndarray:
-    """What a learner sees: copies of images [N, C, H, W] uint8, or of vectors [N, S] float32."""
+    """Return copies of a learner's observations: images [N, C, H, W] uint8, or vectors [N, S] float32."""
     if "pixels" in observations:
         return np.array(np.moveaxis(observations["pixels"], -1, -3), order="C")
     return observations["observation"].copy()
 
 
 def _to_host(observations: dict[str, jax.Array]) -> Observations:
-    """Copies: what JAX hands out on a CPU is a view of memory that the next step is given back."""
+    """Copy observations to the host: on a CPU, JAX returns views of memory that the next step reuses."""
     return {name: np.array(values) for name, values in observations.items()}

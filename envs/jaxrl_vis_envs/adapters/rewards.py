@@ -1,4 +1,4 @@
-"""Which reward an adapter pays. The libraries it serves choose it once, when an environment is made."""
+"""Rewards of the adapters. The other libraries choose the reward once, when an environment is made."""
 
 import functools
 from collections.abc import Callable
@@ -8,15 +8,15 @@ from jaxrl_vis_envs import goals
 
 Reward = Literal["oracle", "dense"]
 RewardFunction = Callable[[Any, Any], Any]
-"""(achieved states [..., G], goal states [..., G]) -> rewards [...] float32; NumPy in, NumPy out, and so for JAX."""
+"""(achieved states [..., G], goal states [..., G]) -> rewards [...] float32; NumPy for NumPy arrays, JAX for JAX arrays."""
 
 
 def reward_function(reward: Reward, threshold: float) -> RewardFunction:
-    """The function that scores states; it can be pickled.
+    """Return the function that scores states; it can be pickled.
 
     Args:
-        reward: ``oracle`` pays 0 within ``threshold`` of the goal and -1 elsewhere (`goals.oracle_reward`); ``dense`` pays
-            minus the distance, in the unit of the states.
+        reward: ``oracle`` is 0 within ``threshold`` of the goal and -1 elsewhere (`goals.oracle_reward`); ``dense`` is the
+            negative distance, in the unit of the states.
         threshold: Distance within which an episode succeeds, in the unit of the states.
 
     Raises:

@@ -1,14 +1,15 @@
-"""Fields of late-season sorghum with exact truth: geometry, stereo images, and what is true in them.
+"""Synthetic fields of late-season sorghum with exact ground truth: geometry, stereo images and labels.
 
-    family      what is drawn, and how far it varies: TRAINING
-    shifts      the same with factors moved: SHIFTED, `shift`     spec    a family from a file: `read`
-    field       one plot: stalks and leaves in metres      cameras    how a pair of cameras passes it
-    surfaces    the plot as cones and triangles            tables     what one camera sees of them, tile by tile
-    drawing     rays to radiance, in JAX                   imaging    radiance to the numbers in a file
-    pairs       pairs of images of a plot                  truth      boxes, visible shares and edges of its stalks
-    stand       the few stalks around a robot's arm        bending    these as bodies that give way, and the wind
+    family      parameters of the fields and their variation: TRAINING
+    shifts      families with shifted factors: SHIFTED, `shift`     spec    a family from a file: `read`
+    field       one plot: stalks and leaves in metres       cameras    trajectory of a camera pair past it
+    surfaces    the plot as cones and triangles             tables     surfaces visible to a camera, by tile
+    drawing     rays to radiance, in JAX                    imaging    radiance to pixel values
+    pairs       stereo pairs of a plot                      truth      boxes, visibility and edges of its stalks
+    stand       the few stalks around a robot's arm         bending    these as flexible bodies, and wind
 
-Everything is a function of a family and a seed. Importing this loads no JAX; `pairs`, `drawing`, `imaging` and `bending` do.
+Everything is a function of a family and a seed. Importing this package does not import JAX; `pairs`, `drawing`, `imaging` and
+`bending` do.
 """
 
 from jaxrl_vis_envs.plants.cameras import Calibration, Drive, Pose, drive

@@ -1,13 +1,13 @@
-"""Stalks that bend and can be pushed: as bodies of a MuJoCo model, and what wind does to them.
+"""Flexible stalks as bodies of a MuJoCo model, and the wind on them.
 
 Each stalk is a chain of two capsules, with two hinges with springs and dampers at the ground and two at the knee, under a mocap
-body, so that where it stands is part of the state. A stalk is a cantilever with the stiffness EI of a full round section. The
-springs are those with which the chain, pushed at heights of 0.5 and 1.0 m, gives way exactly as the beam does (3 EI / z^3; at
+body, so that its position is part of the state. A stalk is a cantilever with the stiffness EI of a full round section. The
+springs are chosen such that the chain, pushed at heights of 0.5 and 1.0 m, deflects exactly as the beam does (3 EI / z^3; at
 0.8 m within 6 %, at 1.2 m within 8 %).
 
-Sources: dry rind of maize has a modulus of 6 to 16 GPa (Al-Zube et al., Plant Methods 14, 2018); a green, pith-filled stalk
+Sources: the dry rind of maize has a modulus of 6 to 16 GPa (Al-Zube et al., Plant Methods 14, 2018); a green, pith-filled stalk
 as a whole is softer, and 2 GPa over the full section is assumed. Tall crops sway at about 1 to 2 Hz with a damping ratio near
-0.1; the mass that sways, stalk and leaves, is chosen so that a mean stalk does at 1.4 Hz.
+0.1; the moving mass, stalk and leaves, is chosen such that a mean stalk sways at 1.4 Hz.
 """
 
 from typing import Any, NamedTuple
@@ -23,28 +23,28 @@ from jaxrl_vis_envs.plants.stand import KNEE, TOP, Stands
 MODULUS = 2e9
 """Bending modulus of a full section, Pa."""
 DENSITY = 950.0
-"""Of a green stalk, kg/m^3."""
-_LEAVES = 1.5  # mass of stalk and leaves over that of the stalk
+"""Density of a green stalk, kg/m^3."""
+_LEAVES = 1.5  # ratio of the mass with leaves to that of the bare stalk
 _DAMPING_RATIO = 0.1
-# Turn of the hinges at the ground and at the knee, in 1/m, for a bending stiffness of 1 N m^2 and a moment of 1 N m.
+# Rotation of the hinges at the ground and at the knee, in 1/m, for a bending stiffness of 1 N m^2 and a moment of 1 N m.
 _COMPLIANCE = (0.0863, 0.504)
 SWAY_HEIGHT = 0.7
-"""Height at which the displacement by wind is stated, m: the middle of where the arm works."""
+"""Height at which displacement by wind is specified, m: the middle of the arm's workspace."""
 _GUST_FREQUENCIES = (0.1, 0.6)  # Hz
 _GUST_WAVES = 3
-_GUST_SPEED = 2.0  # m/s, at which gusts pass along the row
+_GUST_SPEED = 2.0  # m/s, speed of gusts along the row
 _NOMINAL_RADIUS = 0.007
 GREENS = ((0.55, 0.62, 0.25, 1), (0.62, 0.6, 0.3, 1), (0.47, 0.56, 0.22, 1))
 
 
 class Layout(NamedTuple):
-    """Where the stalks of a model are. All [N] int, or as stated.
+    """Indices of the stalks in a model, [N] int unless stated otherwise.
 
     Attributes:
-        mocap: Index of each one's mocap body among the mocap bodies.
-        lower, upper: Bodies; the same ones where stalks have no knee.
+        mocap: Index of each stalk's mocap body among the mocap bodies.
+        lower, upper: Bodies; the same if stalks have no knee.
         lower_geom, upper_geom: Geoms, likewise.
-        joints: [N, P, 2], the hinges at ground and knee (P = 2), or at the ground alone (P = 1), about x and y.
+        joints: [N, P, 2], hinges about x and y, at ground and knee (P = 2) or at the ground alone (P = 1).
     """
 
     mocap: np.ndarray
@@ -56,25 +56,25 @@ class Layout(NamedTuple):
 
 
 def add_stalks(spec: mujoco.MjSpec, stalks: int, pushed_by: tuple[str, ...], knees: bool = True) -> None:
-    """Adds upright stalks of mean thickness to a model, and the pairs of geoms that can touch.
+    """Add upright stalks of mean thickness to a model, and their contact pairs.
 
-    There is no friction: with it the two Newton steps that a physics step can afford do not find the forces of jaws that
-    press from both sides, and stalks jump out of them.
+    Contacts are frictionless: with friction, the two Newton iterations affordable per physics step do not find the forces of
+    jaws that press from both sides, and stalks jump out of them.
 
     Args:
-        spec: Changed in place.
-        stalks: How many.
-        pushed_by: Names of geoms that push the upper pieces.
-        knees: Without, stalks are one straight piece that turns about its foot; half the joints, and exact for a push at
-            `SWAY_HEIGHT` alone. Not for `fit`.
+        spec: Model, changed in place.
+        stalks: Number of stalks.
+        pushed_by: Names of geoms that push the upper segments.
+        knees: If False, stalks are one straight segment that rotates about its foot: half the joints, and exact only for a push
+            at `SWAY_HEIGHT`. Not supported by `fit`.
     """
-    pieces = ((0, KNEE), (1, TOP - KNEE)) if knees else ((None, TOP),)
+    segments = ((0, KNEE), (1, TOP - KNEE)) if knees else ((None, TOP),)
     for index in range(stalks):
         foot = spec.worldbody.add_body(name=f"foot_{index}", mocap=True, pos=[0.2 * index, 1.0, 0.0])
         parent, length = foot, 0.0
-        for piece, reach in pieces:
-            part = "lower" if piece == 0 else "upper"
-            stiffness, damping, mass, inertia = (float(value) for value in _properties(_NOMINAL_RADIUS, piece, np))
+        for segment, reach in segments:
+            part = "lower" if segment == 0 else "upper"
+            stiffness, damping, mass, inertia = (float(value) for value in _properties(_NOMINAL_RADIUS, segment, np))
             body = parent.add_body(name=f"{part}_{index}", pos=[0.0, 0.0, length])
             body.mass, body.ipos = mass, [0.0, 0.0, reach / 2]
             body.inertia, body.explicitinertial = [inertia, inertia, mass * _NOMINAL_RADIUS**2], True
@@ -101,25 +101,25 @@ def add_stalks(spec: mujoco.MjSpec, stalks: int, pushed_by: tuple[str, ...], kne
             pair.solref, pair.solimp = [0.008, 1], [0.9, 0.98, 0.001, 0.5, 2]
 
 
-def layout_of(mj_model: mujoco.MjModel) -> Layout:
-    """Where `add_stalks` has put the stalks of a model."""
+def read_layout(mj_model: mujoco.MjModel) -> Layout:
+    """Return the indices of the stalks that `add_stalks` added to a model."""
     names = [mj_model.body(body).name for body in range(mj_model.nbody)]
     count = sum(name.startswith("foot_") for name in names)
-    each, parts = range(count), ("lower", "upper") if "lower_0" in names else ("upper",)
+    stalks, parts = range(count), ("lower", "upper") if "lower_0" in names else ("upper",)
     return Layout(
-        mocap=np.array([mj_model.body_mocapid[mj_model.body(f"foot_{index}").id] for index in each], int),
-        lower=np.array([mj_model.body(f"{parts[0]}_{index}").id for index in each], int),
-        upper=np.array([mj_model.body(f"upper_{index}").id for index in each], int),
-        lower_geom=np.array([mj_model.geom(f"{parts[0]}_{index}").id for index in each], int),
-        upper_geom=np.array([mj_model.geom(f"upper_{index}").id for index in each], int),
+        mocap=np.array([mj_model.body_mocapid[mj_model.body(f"foot_{index}").id] for index in stalks], int),
+        lower=np.array([mj_model.body(f"{parts[0]}_{index}").id for index in stalks], int),
+        upper=np.array([mj_model.body(f"upper_{index}").id for index in stalks], int),
+        lower_geom=np.array([mj_model.geom(f"{parts[0]}_{index}").id for index in stalks], int),
+        upper_geom=np.array([mj_model.geom(f"upper_{index}").id for index in stalks], int),
         joints=np.array(
-            [[[mj_model.joint(f"{part}_{i}_{axis}").id for axis in "xy"] for part in parts] for i in each], int
+            [[[mj_model.joint(f"{part}_{i}_{axis}").id for axis in "xy"] for part in parts] for i in stalks], int
         ).reshape(count, len(parts), 2),
     )
 
 
 class Shape(NamedTuple):
-    """N stalks as `Stands` has them, of one stand.
+    """N stalks of one stand, as in `Stands`.
 
     Attributes:
         foot, knee, top: [N, 3] float32, m.
@@ -134,29 +134,29 @@ class Shape(NamedTuple):
 
 
 def shapes(stands: Stands) -> Shape:
-    """Shape of all stands, each array with a leading axis [B]."""
+    """Return the shapes of all stands, each array with a leading axis [B]."""
     return Shape(stands.foot, stands.knee, stands.top, stands.radius, stands.bending_radius)
 
 
 def fit(model: Any, layout: Layout, shape: Shape) -> Any:
-    """A `mjx.Model` with these stalks; where they stand is in `placed`."""
-    leg, up, shin = _pieces(shape)
-    lengths = jnp.stack([jnp.linalg.norm(leg, axis=-1), jnp.linalg.norm(shin, axis=-1)], axis=-1)
-    from_leg = jax.vmap(math.quat_inv)(_between(up, leg))
-    turn = _between(up, jax.vmap(math.rotate)(shin, from_leg))
+    """Return an `mjx.Model` with these stalks; `placed` sets their positions."""
+    lower_axis, up, upper_axis = _segments(shape)
+    lengths = jnp.stack([jnp.linalg.norm(lower_axis, axis=-1), jnp.linalg.norm(upper_axis, axis=-1)], axis=-1)
+    from_lower = jax.vmap(math.quat_inv)(_between(up, lower_axis))
+    rotation = _between(up, jax.vmap(math.rotate)(upper_axis, from_lower))
     bodies, geoms = (layout.lower, layout.upper), (layout.lower_geom, layout.upper_geom)
     changes = {
         name: getattr(model, name)
         for name in "body_pos body_quat body_ipos body_mass body_inertia geom_pos geom_size jnt_stiffness dof_damping".split()
     }
     changes["body_pos"] = changes["body_pos"].at[layout.upper].set(_upward(lengths[:, 0]))
-    changes["body_quat"] = changes["body_quat"].at[layout.upper].set(turn)
+    changes["body_quat"] = changes["body_quat"].at[layout.upper].set(rotation)
     for part in (0, 1):
         radius, length = shape.radius[:, part], lengths[:, part]
         stiffness, damping, mass, inertia = _properties(shape.bending_radius[:, part], part, jnp)
         around = jnp.stack([inertia, inertia, mass * radius**2], axis=-1)
         size = jnp.stack([radius, length / 2, jnp.zeros_like(radius)], axis=-1)
-        for name, place, value in (
+        for name, index, value in (
             ("body_ipos", bodies[part], _upward(length / 2)),
             ("body_mass", bodies[part], mass),
             ("body_inertia", bodies[part], around),
@@ -165,16 +165,16 @@ def fit(model: Any, layout: Layout, shape: Shape) -> Any:
             ("jnt_stiffness", layout.joints[:, part], jnp.stack([stiffness, stiffness], axis=-1)),
             ("dof_damping", layout.joints[:, part], jnp.stack([damping, damping], axis=-1)),
         ):
-            changes[name] = jnp.asarray(changes[name]).at[place].set(value)
+            changes[name] = jnp.asarray(changes[name]).at[index].set(value)
     return model.replace(**changes)
 
 
 def placed(data: Any, layout: Layout, shape: Shape) -> Any:
-    """A `mjx.Data` whose stalks stand at their feet, lower pieces in their direction."""
-    leg, up, _ = _pieces(shape)
+    """Return an `mjx.Data` with the stalks at their feet and the lower segments in their direction."""
+    lower_axis, up, _ = _segments(shape)
     return data.replace(
         mocap_pos=data.mocap_pos.at[layout.mocap].set(jnp.asarray(shape.foot, jnp.float32)),
-        mocap_quat=data.mocap_quat.at[layout.mocap].set(_between(up, leg)),
+        mocap_quat=data.mocap_quat.at[layout.mocap].set(_between(up, lower_axis)),
     )
 
 
@@ -183,7 +183,7 @@ class Gusts(NamedTuple):
 
     Attributes:
         heading: [2] float32, unit vector along which stalks sway.
-        strength: [] float32, how far stalks sway at `SWAY_HEIGHT`, m: the amplitude of a sine wave of the same power.
+        strength: [] float32, displacement at `SWAY_HEIGHT`, m: the amplitude of a sine wave of the same power.
         frequency: [W] float32, Hz.
         phase: [W] float32, rad.
     """
@@ -195,11 +195,11 @@ class Gusts(NamedTuple):
 
 
 def gusts(key: jax.Array, strength: Any) -> Gusts:
-    """Draws wind.
+    """Sample wind.
 
     Args:
-        key: [], typed.
-        strength: How far stalks sway at `SWAY_HEIGHT`, m: the amplitude of a sine wave of the same power.
+        key: Typed key, [].
+        strength: Displacement at `SWAY_HEIGHT`, m: the amplitude of a sine wave of the same power.
     """
     heading_key, frequency_key, phase_key = jax.random.split(key, 3)
     angle = jax.random.uniform(heading_key, (), jnp.float32, 0.0, 2 * jnp.pi)
@@ -213,55 +213,55 @@ def gusts(key: jax.Array, strength: Any) -> Gusts:
 
 
 def displacement(wind: Gusts, foot: jax.Array, time: Any) -> jax.Array:
-    """How far from rest wind alone would hold stalks at a time, at `SWAY_HEIGHT`: [N, 2] float32, m.
+    """Compute the displacement at `SWAY_HEIGHT` at which wind alone would hold stalks at a time: [N, 2] float32, m.
 
     Args:
-        wind: Over the stand.
-        foot: [N, 3], where the stalks stand, m; gusts pass along the row.
-        time: [] since the start, s.
+        wind: Wind over the stand.
+        foot: [N, 3], positions of the stalks, m; gusts travel along the row.
+        time: [] time since the start, s.
     """
     angle = 2 * jnp.pi * wind.frequency * (time - foot[:, :1] / _GUST_SPEED) + wind.phase
     return (wind.strength * jnp.sum(jnp.sin(angle), axis=-1) / _GUST_WAVES**0.5)[:, None] * wind.heading
 
 
-def hinge_angles(layout: Layout, nv: int, moved: jax.Array) -> jax.Array:
-    """Angles [nv] of the hinges of stalks that are ``moved`` [N, 2] (m) at `SWAY_HEIGHT`; 0 for all other joints."""
-    pieces = layout.joints.shape[1]
-    angle = moved / (SWAY_HEIGHT + (pieces - 1) * (SWAY_HEIGHT - KNEE))  # both hinges turn alike
+def hinge_angles(layout: Layout, nv: int, offset: jax.Array) -> jax.Array:
+    """Return the angles [nv] of the stalks' hinges for an ``offset`` [N, 2] (m) at `SWAY_HEIGHT`; 0 for all other joints."""
+    segments = layout.joints.shape[1]
+    angle = offset / (SWAY_HEIGHT + (segments - 1) * (SWAY_HEIGHT - KNEE))  # both hinges rotate by the same angle
     about = jnp.stack([-angle[:, 1], angle[:, 0]], axis=-1)  # about x and y
-    return jnp.zeros(nv, jnp.float32).at[layout.joints].set(jnp.stack([about] * pieces, axis=1))
+    return jnp.zeros(nv, jnp.float32).at[layout.joints].set(jnp.stack([about] * segments, axis=1))
 
 
 def wind_torque(model: Any, layout: Layout, wind: Gusts, foot: jax.Array, time: Any) -> jax.Array:
-    """Torques [nv] that would hold the stalks where `displacement` says."""
+    """Return the torques [nv] that would hold the stalks at their `displacement`."""
     return model.jnt_stiffness * hinge_angles(layout, model.nv, displacement(wind, foot, time))
 
 
 def at_height(data: Any, layout: Layout, height: Any) -> jax.Array:
-    """Where the middle lines of the upper pieces are at a height in m: [N, 3] float32, m."""
+    """Return the points [N, 3] float32 (m) of the upper segments' centre lines at a height in m."""
     start, axis = data.xpos[layout.upper], data.geom_xmat[layout.upper_geom][:, :, 2]
     return start + ((height - start[:, 2]) / axis[:, 2])[:, None] * axis
 
 
-def _properties(radius: Any, piece: int | None, numeric: Any) -> tuple[Any, Any, Any, Any]:
-    """Spring N m/rad and damper N m s/rad of each hinge, mass in kg and inertia in kg m^2 of a piece of a stalk.
+def _properties(radius: Any, segment: int | None, numeric: Any) -> tuple[Any, Any, Any, Any]:
+    """Return spring (N m/rad) and damper (N m s/rad) of each hinge, mass (kg) and inertia (kg m^2) of a segment of a stalk.
 
-    The piece is 0 for the lower one, 1 for the upper one, None for a stalk in one piece.
+    ``segment`` is 0 for the lower segment, 1 for the upper one, None for a stalk in one segment.
     """
-    length = TOP if piece is None else (KNEE, TOP - KNEE)[piece]
-    compliance = SWAY_HEIGHT / 3 if piece is None else _COMPLIANCE[piece]
+    length = TOP if segment is None else (KNEE, TOP - KNEE)[segment]
+    compliance = SWAY_HEIGHT / 3 if segment is None else _COMPLIANCE[segment]
     stiffness = MODULUS * 0.25 * numeric.pi * radius**4 / compliance
     mass = _LEAVES * DENSITY * numeric.pi * radius**2 * length
     inertia = mass * length**2 / 12
-    # The whole plant turns about the ground, what is above the knee about the knee.
-    swung = _LEAVES * DENSITY * numeric.pi * radius**2 * ((TOP - KNEE) ** 3 if piece == 1 else TOP**3) / 3
+    # The whole plant rotates about the ground, the part above the knee about the knee.
+    swung = _LEAVES * DENSITY * numeric.pi * radius**2 * ((TOP - KNEE) ** 3 if segment == 1 else TOP**3) / 3
     return stiffness, 2 * _DAMPING_RATIO * numeric.sqrt(stiffness * swung), mass, inertia
 
 
-def _pieces(shape: Shape) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Lower pieces, the vertical and upper pieces: [N, 3] each."""
-    leg, shin = jnp.asarray(shape.knee - shape.foot), jnp.asarray(shape.top - shape.knee)
-    return leg, jnp.zeros_like(leg).at[:, 2].set(1.0), shin
+def _segments(shape: Shape) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return lower segments, the vertical and upper segments: [N, 3] each."""
+    lower_axis, upper_axis = jnp.asarray(shape.knee - shape.foot), jnp.asarray(shape.top - shape.knee)
+    return lower_axis, jnp.zeros_like(lower_axis).at[:, 2].set(1.0), upper_axis
 
 
 def _upward(length: jax.Array) -> jax.Array:
@@ -269,8 +269,10 @@ def _upward(length: jax.Array) -> jax.Array:
 
 
 def _between(one: jax.Array, other: jax.Array) -> jax.Array:
-    """Quaternions [N, 4] of the shortest turns from directions ``one`` to ``other`` [N, 3], less than half a turn apart."""
+    """Return quaternions [N, 4] of the shortest rotations from directions ``one`` to ``other`` [N, 3], less than half a turn
+    apart.
+    """
     one = one / jnp.linalg.norm(one, axis=-1, keepdims=True)
     other = other / jnp.linalg.norm(other, axis=-1, keepdims=True)
-    whole = jnp.concatenate([1.0 + jnp.sum(one * other, axis=-1, keepdims=True), jnp.cross(one, other)], axis=-1)
-    return whole / jnp.linalg.norm(whole, axis=-1, keepdims=True)
+    quaternion = jnp.concatenate([1.0 + jnp.sum(one * other, axis=-1, keepdims=True), jnp.cross(one, other)], axis=-1)
+    return quaternion / jnp.linalg.norm(quaternion, axis=-1, keepdims=True)

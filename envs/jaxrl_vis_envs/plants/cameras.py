@@ -1,9 +1,9 @@
-"""The two cameras: where they are, what they see, and what their calibration says of them. NumPy only.
+"""Stereo camera pair: poses, projection and calibration. NumPy only.
 
 Camera frame: x to the right of the image, y down, z forwards. The cameras look along the world's y axis and move along its x
-axis; the right one stands a baseline further along. Both are rectified: a point at (X, Y, Z) in the left camera's frame is seen
-at column centre + f X / Z in the left image and a disparity f B / Z further left in the right one, in the same line but for a
-small error. Pixel (column 0, line 0) has its middle at (0.0, 0.0).
+axis; the right one is a baseline further along. Both are rectified: a point at (X, Y, Z) in the left camera's frame projects to
+column centre + f X / Z in the left image and a disparity f B / Z further left in the right one, on the same line up to a small
+error. The centre of the first pixel (column 0, line 0) is at (0.0, 0.0).
 """
 
 import dataclasses
@@ -17,14 +17,14 @@ from jaxrl_vis_envs.plants.field import generator
 
 @dataclasses.dataclass(frozen=True)
 class Calibration:
-    """What is known of a pair of rectified cameras. Both images have the same size.
+    """Calibration of a pair of rectified cameras. Both images have the same size.
 
     Attributes:
-        width, height: Pixels.
+        width, height: Image size, pixels.
         focal: Focal length, pixels.
         centre: Column and line of the left camera's principal point.
         baseline: Distance between the cameras, m.
-        offset: Disparity of what is infinitely far away, pixels: the left principal point's column less the right one's.
+        offset: Disparity at infinite depth, pixels: the column of the left principal point minus that of the right one.
     """
 
     width: int
@@ -35,19 +35,19 @@ class Calibration:
     offset: float = 0.0
 
     def depth(self, disparity: np.ndarray) -> np.ndarray:
-        """Planar depth in m of disparities in pixels, of any shape; infinite where there is no such depth."""
+        """Convert disparities in pixels, of any shape, to planar depth in m; infinite for invalid disparities."""
         beyond = np.asarray(disparity) - self.offset
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(beyond > 0, self.focal * self.baseline / beyond, np.inf)
 
     def disparity(self, depth: np.ndarray) -> np.ndarray:
-        """Disparity in pixels of planar depths in m, of any shape."""
+        """Convert planar depths in m, of any shape, to disparities in pixels."""
         return self.focal * self.baseline / np.asarray(depth) + self.offset
 
 
 @dataclasses.dataclass(frozen=True)
 class Pose:
-    """Where the left camera is for one pair.
+    """Pose of the left camera for one pair.
 
     Attributes:
         position: [3] float64, in the world, m.
@@ -58,26 +58,26 @@ class Pose:
     rotation: np.ndarray
 
     def to_camera(self, points: np.ndarray) -> np.ndarray:
-        """Points [..., 3] in the world as points in the left camera's frame, m."""
+        """Transform points [..., 3] from the world to the left camera's frame, m."""
         return (points - self.position) @ self.rotation.T
 
     def to_world(self, points: np.ndarray) -> np.ndarray:
-        """The inverse of `to_camera`."""
+        """Transform points [..., 3] from the left camera's frame to the world, m."""
         return points @ self.rotation + self.position
 
 
 @dataclasses.dataclass(frozen=True)
 class Drive:
-    """How the cameras pass one plot.
+    """Trajectory of the cameras past one plot.
 
     Attributes:
-        true: The cameras as they are.
-        stated: The cameras as their calibration says.
+        true: Actual cameras.
+        stated: Cameras according to their calibration.
         poses: One per pair.
         times: [F] float64, s.
-        odometry: [F] float64, distance along the row that the robot reports, m, from 0.
-        line_offset: By how many lines the right image lies too low.
-        line_slope: How much more per column.
+        odometry: [F] float64, distance along the row reported by the robot, m, from 0.
+        line_offset: Vertical offset of the right image downwards, lines.
+        line_slope: Change of this offset per column.
     """
 
     true: Calibration
@@ -90,10 +90,11 @@ class Drive:
 
 
 def drive(family: Family, seed: int) -> Drive:
-    """How the cameras of a family pass its plot of this seed; they see the ends of the drive from half a step inside.
+    """Sample the trajectory of a family's cameras past its plot of this seed; it begins and ends half a step inside the
+    stretch.
 
     Raises:
-        ValueError: The seed is no whole number of at least 0.
+        ValueError: The seed is not an integer of at least 0.
     """
     rig = family.rig
     rng = generator(family, seed, "drive")
@@ -109,9 +110,9 @@ def drive(family: Family, seed: int) -> Drive:
     begin = 0.5 * (family.layout.plot_length - length)
     along = begin + length / rig.frames * (np.arange(rig.frames) + 0.5)
     height = rig.camera_height + rig.camera_height_sd * rng.normal() + rig.wobble * rng.normal(size=rig.frames)
-    away = rig.distance + rig.distance_sd * rng.normal() + rig.wobble * rng.normal(size=rig.frames)
+    distance = rig.distance + rig.distance_sd * rng.normal() + rig.wobble * rng.normal(size=rig.frames)
     pitch = math.radians(rig.pitch) + math.radians(rig.pitch_sd) * (rng.normal() + 0.2 * rng.normal(size=rig.frames))
-    positions = np.stack([along - baseline / 2.0, -away, height], axis=1)
+    positions = np.stack([along - baseline / 2.0, -distance, height], axis=1)
     poses = tuple(Pose(position, looking_along_y(angle)) for position, angle in zip(positions, pitch))
 
     scale = 1.0 + rng.choice([-1.0, 1.0]) * rng.uniform(*rig.odometry_noise)
@@ -125,6 +126,6 @@ def drive(family: Family, seed: int) -> Drive:
 
 
 def looking_along_y(pitch: float) -> np.ndarray:
-    """Rotation [3, 3] of a camera that looks along the world's y axis, and down by ``pitch`` (rad)."""
+    """Return the rotation [3, 3] of a camera that looks along the world's y axis, pitched down by ``pitch`` (rad)."""
     sine, cosine = math.sin(pitch), math.cos(pitch)
     return np.array([[1.0, 0.0, 0.0], [0.0, -sine, -cosine], [0.0, cosine, -sine]])

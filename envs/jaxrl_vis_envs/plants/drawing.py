@@ -1,12 +1,12 @@
-"""Draws what a camera sees, tile by tile: which surface each ray meets first, and what colour it has there.
+"""Renderer of fields, tile by tile: the first surface along each ray, and its colour.
 
-    tables.see -> View -> draw: for each tile of up to 64 x 64 pixels
-        its cones, its triangles, the ground       -> depth and row of what is nearest      `_nearest`
-        texture and light there                    -> colour                                `_colour`
-        mean of a pixel's rays                     -> radiance, instance and depth
+    tables.build_view -> View -> draw: for each tile of up to 64 x 64 pixels
+        its cones, its triangles, the ground       -> depth and row of the nearest surface  `_nearest`
+        texture and light at the hit               -> colour                                `_colour`
+        mean over a pixel's rays                   -> radiance, instance and depth
 
-One compiled program for every view of a size. On a CPU tiles are drawn one after the other, by as many threads as there are
-cores; on an accelerator many at a time, those with equally much in them together. Memory: the images, and one batch of tiles.
+One compiled program serves all views of a size. On a CPU, tiles are rendered sequentially, by one thread per core; on an
+accelerator, many at a time, batched by similar amounts of work. Memory: the images, and one batch of tiles.
 """
 
 import concurrent.futures
@@ -21,30 +21,30 @@ import numpy as np
 from jaxrl_vis_envs.compilation import compiler_options
 from jaxrl_vis_envs.cores import num_cores
 from jaxrl_vis_envs.plants.surfaces import GROUND, NOTHING
-from jaxrl_vis_envs.plants.tables import CONE_HIT, FAR, NEAR, TRIANGLE_HIT, View, tile_of
+from jaxrl_vis_envs.plants.tables import CONE_HIT, FAR, NEAR, TRIANGLE_HIT, View, tile_size
 from jaxrl_vis_envs.plants.texture import noise, ramp
 
-_GROUND_FAR = 3.5  # m: what is behind is black
-# Each ray of a pixel has a column and a line of its own, so that edges of any direction are smooth.
+_GROUND_FAR = 3.5  # m: beyond, the ground is black
+# The rays of a pixel have distinct columns and lines, so that edges of any direction are antialiased.
 _RAYS = {1: ((0.0, 0.0),), 4: ((-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375))}
-_TILES_AT_ONCE = 256  # on an accelerator
-# Surfaces that are tried in one step of the loop over them. On an accelerator, what rays have met so far is read and written in
-# each step, which takes longer than trying a surface does.
-_SURFACES_AT_ONCE = 8
+_TILES_PER_BATCH = 256  # on an accelerator
+# Number of surfaces tested per loop iteration on an accelerator, where reading and writing the hits so far in each iteration
+# takes longer than testing a surface.
+_SURFACES_PER_STEP = 8
 
 
 class Shot(NamedTuple):
-    """What a view is drawn with, all float32.
+    """Camera and light parameters of a rendering, all float32.
 
     Attributes:
-        focal: [] pixels.
-        centre: [2] pixels.
-        lines: [2] offset and slope of the lines, see `Drive`.
+        focal: [] focal length, pixels.
+        centre: [2] principal point, pixels.
+        lines: [2] vertical offset and slope of the image lines, see `Drive`.
         rotation: [3, 3] from the world to the camera.
         position: [3] of the camera in the world, m.
-        flash: [3] where the flash is, in the camera's frame, m.
-        light: [3] strength of the flash (1: a white surface at `reference` that faces it has radiance 1), of ambient light, and
-            the distance ``reference`` in m.
+        flash: [3] position of the flash in the camera's frame, m.
+        light: [3] intensity of the flash (1: a white surface at ``reference`` facing it has radiance 1), intensity of ambient
+            light, and the distance ``reference`` in m.
     """
 
     focal: jax.Array
@@ -69,7 +69,7 @@ class _Tables(NamedTuple):
 
 
 class _Hit(NamedTuple):
-    """What rays meet: depth, row of its table, and which table (0 nothing, 1 ground, 2 cones, 3 triangles)."""
+    """Ray hits: depth, row in the table, and kind (0 nothing, 1 ground, 2 cones, 3 triangles)."""
 
     depth: jax.Array
     row: jax.Array
@@ -77,47 +77,47 @@ class _Hit(NamedTuple):
 
 
 def draw(
-    view: View, shot: Shot, width: int, height: int, samples: int, at_once: int | None = None
+    view: View, shot: Shot, width: int, height: int, samples: int, batch_size: int | None = None
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Draws a view.
+    """Render a view.
 
     Args:
-        view: What the camera sees.
-        shot: With what.
-        width, height: Of the image, pixels.
-        samples: Rays a pixel, 1 or 4; instance and depth are those of a ray through the pixel's middle.
-        at_once: Tiles that are drawn side by side; what suits the platform if not given.
+        view: Surfaces visible to the camera.
+        shot: Camera and light.
+        width, height: Image size, pixels.
+        samples: Rays per pixel, 1 or 4; instance and depth are those of a ray through the pixel's centre.
+        batch_size: Number of tiles per batch; by default chosen for the platform.
 
     Returns:
         Radiance [height, width, 3] float32, instance [height, width] int32 and planar depth [height, width] float32 in m
-        (infinite where there is nothing).
+        (infinite if nothing is hit).
     """
     tables = _Tables(*(jnp.asarray(getattr(view, name)) for name in _Tables._fields))
     work = (view.cone_ranges[:, 1] - view.cone_ranges[:, 0]) + (view.triangle_ranges[:, 1] - view.triangle_ranges[:, 0])
     order = np.argsort(-work, kind="stable")
     on_cpu = jax.default_backend() == "cpu"
-    at_once = min(at_once or (1 if on_cpu else _TILES_AT_ONCE), len(order))
+    batch_size = min(batch_size or (1 if on_cpu else _TILES_PER_BATCH), len(order))
     workers = num_cores() if on_cpu else 1
     parts = [order[start::workers] for start in range(workers)]
-    share = max(map(len, parts))  # all parts have one size, so one program: a missing tile is another one again
+    share = max(map(len, parts))  # all parts have one size, hence one program: pad with a repeated tile
     parts = [np.concatenate([part, np.repeat(order[:1], share - len(part))]) for part in parts]
-    tile = tile_of(width)
-    program = _program(samples, tile, at_once, 1 if on_cpu else _SURFACES_AT_ONCE)
+    tile = tile_size(width)
+    program = _program(samples, tile, batch_size, 1 if on_cpu else _SURFACES_PER_STEP)
     jobs = [(view.tiles[part], view.cone_ranges[part], view.triangle_ranges[part]) for part in parts]
     with concurrent.futures.ThreadPoolExecutor(workers) as pool:
         results = list(pool.map(lambda job: jax.block_until_ready(program(tables, shot, *job)), jobs))
-    place = np.empty(len(order), np.int64)
-    place[np.concatenate(parts)[::-1]] = np.arange(share * workers)[::-1]
+    position = np.empty(len(order), np.int64)
+    position[np.concatenate(parts)[::-1]] = np.arange(share * workers)[::-1]
     join = _joiner(tile, width, height)
-    return tuple(join(jnp.asarray(place), *(result[part] for result in results)) for part in range(3))  # pyright: ignore
+    return tuple(join(jnp.asarray(position), *(result[part] for result in results)) for part in range(3))  # pyright: ignore
 
 
 @functools.cache
 def _joiner(tile: int, width: int, height: int):
     columns, lines = -(-width // tile), -(-height // tile)
 
-    def join(place: jax.Array, *parts: jax.Array) -> jax.Array:
-        tiles = jnp.concatenate(parts)[place]
+    def join(position: jax.Array, *parts: jax.Array) -> jax.Array:
+        tiles = jnp.concatenate(parts)[position]
         tiles = tiles.reshape(lines, columns, *tiles.shape[1:])
         image = jnp.moveaxis(tiles, 2, 1).reshape(lines * tile, columns * tile, *tiles.shape[4:])
         return image[:height, :width]
@@ -126,14 +126,14 @@ def _joiner(tile: int, width: int, height: int):
 
 
 @functools.cache
-def _program(samples: int, size: int, at_once: int, surfaces: int):
-    """The compiled drawing of a list of tiles."""
+def _program(samples: int, size: int, batch_size: int, surfaces: int):
+    """Return the compiled rendering of a list of tiles."""
 
     def program(tables: _Tables, shot: Shot, tiles: jax.Array, cone_ranges: jax.Array, triangle_ranges: jax.Array):
         def one(tile: tuple[jax.Array, jax.Array, jax.Array]):
             return _tile(tables, shot, samples, size, surfaces, *tile)
 
-        return jax.lax.map(one, (tiles, cone_ranges, triangle_ranges), batch_size=None if at_once == 1 else at_once)
+        return jax.lax.map(one, (tiles, cone_ranges, triangle_ranges), batch_size=None if batch_size == 1 else batch_size)
 
     options = compiler_options()
     options.pop("xla_cpu_use_fusion_emitters", None)
@@ -150,7 +150,7 @@ def _tile(
     cone_range: jax.Array,
     triangle_range: jax.Array,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """One tile: radiance [size, size, 3], instance and depth [size, size]."""
+    """Render one tile: radiance [size, size, 3], instance and depth [size, size]."""
     offsets = np.array(_RAYS[samples] if samples == 1 else ((0.0, 0.0), *_RAYS[samples]), np.float32)
     column = corner[0] + jnp.arange(size, dtype=jnp.float32)[None, None, :] + offsets[:, 0, None, None]
     line = corner[1] + jnp.arange(size, dtype=jnp.float32)[None, :, None] + offsets[:, 1, None, None]
@@ -179,16 +179,16 @@ def _nearest(
     cone_range: jax.Array,
     triangle_range: jax.Array,
 ) -> _Hit:
-    """What the rays (x, y, 1) meet first; so many ``surfaces`` are tried in one step."""
+    """Find the first hits of rays (x, y, 1), testing ``surfaces`` surfaces per loop iteration."""
     up = shot.rotation[:, 2]
     falling = x * up[0] + y * up[1] + up[2]
     ground = jnp.where(falling < -1e-6, -shot.position[2] / jnp.minimum(falling, -1e-6), FAR)
-    seen = ground < _GROUND_FAR
-    start = _Hit(jnp.where(seen, ground, FAR), jnp.zeros(x.shape, jnp.int32), seen.astype(jnp.int32))
+    is_visible = ground < _GROUND_FAR
+    start = _Hit(jnp.where(is_visible, ground, FAR), jnp.zeros(x.shape, jnp.int32), is_visible.astype(jnp.int32))
     square = x * x + y * y + 1.0
 
-    def cone(place: jax.Array, there: jax.Array, hit: _Hit) -> _Hit:
-        row = tables.cone_list[place]
+    def cone(index: jax.Array, is_valid: jax.Array, hit: _Hit) -> _Hit:
+        row = tables.cone_list[index]
         c = jax.lax.dynamic_index_in_dim(tables.cones, row, keepdims=False)[:CONE_HIT]
         offset = c[0] * x + c[1] * y + c[2]
         along = c[3] * x + c[4] * y + c[5]
@@ -198,34 +198,40 @@ def _nearest(
         discriminant = b * b - a * c[13]
         depth = (-b - jnp.sqrt(jnp.maximum(discriminant, 0.0))) / a
         travelled = c[10] + depth * along
-        met = there & (discriminant > 0.0) & (travelled >= c[14]) & (travelled <= c[15]) & (depth > NEAR) & (depth < hit.depth)
-        return _Hit(jnp.where(met, depth, hit.depth), jnp.where(met, row, hit.row), jnp.where(met, 2, hit.kind))
+        is_nearer = (
+            is_valid & (discriminant > 0.0) & (travelled >= c[14]) & (travelled <= c[15]) & (depth > NEAR) & (depth < hit.depth)
+        )
+        return _Hit(
+            jnp.where(is_nearer, depth, hit.depth), jnp.where(is_nearer, row, hit.row), jnp.where(is_nearer, 2, hit.kind)
+        )
 
-    def triangle(place: jax.Array, there: jax.Array, hit: _Hit) -> _Hit:
-        row = tables.triangle_list[place]
+    def triangle(index: jax.Array, is_valid: jax.Array, hit: _Hit) -> _Hit:
+        row = tables.triangle_list[index]
         m = jax.lax.dynamic_index_in_dim(tables.triangles, row, keepdims=False)[:TRIANGLE_HIT]
         first, second, third = (m[3 * k] * x + m[3 * k + 1] * y + m[3 * k + 2] for k in range(3))
         depth = 1.0 / (first + second + third)
-        least = jnp.minimum(jnp.minimum(first, second), third)
-        met = there & (least >= 0.0) & (depth > NEAR) & (depth < hit.depth)
-        return _Hit(jnp.where(met, depth, hit.depth), jnp.where(met, row, hit.row), jnp.where(met, 3, hit.kind))
+        minimum = jnp.minimum(jnp.minimum(first, second), third)
+        is_nearer = is_valid & (minimum >= 0.0) & (depth > NEAR) & (depth < hit.depth)
+        return _Hit(
+            jnp.where(is_nearer, depth, hit.depth), jnp.where(is_nearer, row, hit.row), jnp.where(is_nearer, 3, hit.kind)
+        )
 
-    def all_of(surface: Callable[[jax.Array, jax.Array, _Hit], _Hit], places: jax.Array, hit: _Hit) -> _Hit:
-        first, last = places[0], places[1]
+    def intersect_all(surface: Callable[[jax.Array, jax.Array, _Hit], _Hit], list_range: jax.Array, hit: _Hit) -> _Hit:
+        first, last = list_range[0], list_range[1]
 
         def step(number: jax.Array, hit: _Hit) -> _Hit:
-            for each in range(surfaces):
-                place = first + number * surfaces + each
-                hit = surface(jnp.minimum(place, last - 1), place < last, hit)
+            for offset_in_step in range(surfaces):
+                index = first + number * surfaces + offset_in_step
+                hit = surface(jnp.minimum(index, last - 1), index < last, hit)
             return hit
 
         return jax.lax.fori_loop(0, (last - first + surfaces - 1) // surfaces, step, hit)
 
-    return all_of(triangle, triangle_range, all_of(cone, cone_range, start))
+    return intersect_all(triangle, triangle_range, intersect_all(cone, cone_range, start))
 
 
 class _Point(NamedTuple):
-    """Where a ray meets a surface: texture coordinates in m, unit normal, and what changes its look there (0 to 1)."""
+    """Surface properties at hits: texture coordinates in m, unit normal, and factors of appearance (0 to 1)."""
 
     u: jax.Array
     v: jax.Array
@@ -240,7 +246,7 @@ def _dot(a: tuple[jax.Array, ...], b: tuple[jax.Array, ...]) -> jax.Array:
 
 
 def _on_cone(c: jax.Array, point: tuple[jax.Array, ...]) -> _Point:
-    """A point on a cone; ``c`` [..., columns] are the rows of the table."""
+    """Compute the surface point on cones; ``c`` [..., columns] are rows of the table."""
     axis, major = (tuple(c[..., k + i] for i in range(3)) for k in (3, 6))
     start = tuple(c[..., CONE_HIT + i] for i in range(3))
     slope, arc, arc_rate, sheath, sheath_rate, node, node_rate, radius = (c[..., CONE_HIT + 3 + i] for i in range(8))
@@ -251,7 +257,7 @@ def _on_cone(c: jax.Array, point: tuple[jax.Array, ...]) -> _Point:
     normal = tuple(o + bulge * m for o, m in zip(outward, major))
     length = jnp.sqrt(jnp.maximum(_dot(normal, normal), 1e-12))
     normal = _unit(tuple(n / length - slope * a for n, a in zip(normal, axis)))
-    # An angle around the stalk that needs no arctangent: 0 in front, its seam behind.
+    # Angle around the stalk without an arctangent: 0 in front, with its seam behind.
     turn = outward[0] / (jnp.abs(outward[0]) + jnp.abs(outward[2]) + 1e-9)
     around = jnp.where(outward[2] < 0.0, turn, jnp.sign(turn) * (2.0 - jnp.abs(turn)))
     over = sheath + sheath_rate * travelled
@@ -259,28 +265,28 @@ def _on_cone(c: jax.Array, point: tuple[jax.Array, ...]) -> _Point:
 
 
 def _on_triangle(m: jax.Array, x: jax.Array, y: jax.Array, depth: jax.Array) -> _Point:
-    """A point on a leaf, which has a midrib."""
+    """Compute the surface point on leaves, which have a midrib."""
 
-    def between(first: int) -> jax.Array:
-        """What is given at the corners, in between."""
+    def interpolate(first: int) -> jax.Array:
+        """Interpolate corner values."""
         k = TRIANGLE_HIT + first
         return depth * (m[..., k] * x + m[..., k + 1] * y + m[..., k + 2])
 
-    along, across, offset = (between(3 * i) for i in range(3))
-    normal = tuple(between(9 + 3 * i) for i in range(3))
+    along, across, offset = (interpolate(3 * i) for i in range(3))
+    normal = tuple(interpolate(9 + 3 * i) for i in range(3))
     facing = jnp.where(normal[0] * x + normal[1] * y + normal[2] > 0.0, -1.0, 1.0)
-    normal = _unit(tuple(each * facing for each in normal))
+    normal = _unit(tuple(component * facing for component in normal))
     rib = ramp(0.13, 0.05, jnp.abs(across))
     return _Point(offset, along, normal, rib * 0.0, rib, ramp(0.7, 1.0, jnp.abs(across)))
 
 
 def _unit(vector: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
     scale = jax.lax.rsqrt(jnp.maximum(_dot(vector, vector), 1e-12))
-    return tuple(each * scale for each in vector)
+    return tuple(component * scale for component in vector)
 
 
 def _colour(tables: _Tables, shot: Shot, x: jax.Array, y: jax.Array, hit: _Hit) -> list[jax.Array]:
-    """Radiance towards the camera of what was hit: red, green and blue."""
+    """Compute radiance towards the camera at the hits: red, green and blue."""
     kind, depth = hit.kind, hit.depth
     is_cone, is_leaf, is_ground = kind == 2, kind == 3, kind == 1
     point = (x * depth, y * depth, depth)
@@ -298,7 +304,7 @@ def _colour(tables: _Tables, shot: Shot, x: jax.Array, y: jax.Array, hit: _Hit) 
     square = _dot(to_flash, to_flash)
     to_flash = _unit(to_flash)
     facing = jnp.maximum(_dot(at.normal, to_flash), 0.0)
-    # Rough fibres send light back even where they are seen edge on; leaves let some through.
+    # Rough fibres reflect light even at grazing angles; leaves transmit some.
     rough = jnp.where(is_ground, 0.55, jnp.where(is_leaf, 0.35, 0.18))
     to_camera = _unit((-x, -y, -jnp.ones_like(x)))
     halfway = _unit(tuple(a + b for a, b in zip(to_flash, to_camera)))
@@ -312,12 +318,12 @@ def _colour(tables: _Tables, shot: Shot, x: jax.Array, y: jax.Array, hit: _Hit) 
 def _albedo(
     m: jax.Array, at: _Point, is_cone: jax.Array, is_leaf: jax.Array, is_ground: jax.Array
 ) -> tuple[list[jax.Array], jax.Array]:
-    """Reflectance of a surface: three channels, and the strength of its highlight."""
+    """Compute the reflectance of surfaces (three channels), and the intensity of their highlights."""
     base, over = [m[..., k] for k in range(3)], [m[..., 3 + k] for k in range(3)]
-    fibre_f, fibre_c, blotch_f, blotch_c, speckles, speckle_f, bands, band_f, bloom, gloss, place, edge = (
+    fibre_f, fibre_c, blotch_f, blotch_c, speckles, speckle_f, bands, band_f, bloom, gloss, texture_shift, edge = (
         m[..., 6 + k] for k in range(12)
     )
-    u, v = at.u + place, at.v + place
+    u, v = at.u + texture_shift, at.v + texture_shift
     # Fibres run along a stalk or leaf; the ground's grains have no direction.
     stretch = jnp.where(is_ground, 1.0, 0.03)
     fibres = 0.6 * noise(u * fibre_f, v * fibre_f * stretch, 0) + 0.4 * noise(u * fibre_f * 2.7, v * fibre_f * stretch * 2.0, 1)
@@ -326,7 +332,7 @@ def _albedo(
         u * blotch_f * 2.9, v * blotch_f * longer * 2.9, 3
     )
     spots = noise(u * speckle_f, v * speckle_f * 0.8, 4)
-    # Ragged ends: a sheath or a leaf's dry edge does not end in a line.
+    # Ragged ends: sheaths and dry leaf edges do not end in a straight line.
     cover = jnp.where(is_leaf, ramp(0.75, 1.0, 0.8 * at.edge * edge + 0.75 * blotches), at.over)
     cover = jnp.where(is_ground, ramp(0.5, 0.75, blotches), cover)
     spot = ramp(1.0 - 0.55 * speckles, 1.12 - 0.55 * speckles, spots)

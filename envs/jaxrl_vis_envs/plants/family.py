@@ -1,8 +1,8 @@
-"""What a family of fields is: what is drawn for every plot, and how far it varies. Loads neither JAX nor MuJoCo.
+"""Families of fields: parameters of plots and their variation. Imports neither JAX nor MuJoCo.
 
-A range (low, high) is drawn uniformly, a mean with an sd normally. Lengths are in metres and angles in degrees unless the name
-says otherwise. Sources: the thesis, section 3.3 (33 stalks on 2.134 m, 0.8 m away, 8 mm lens, 9 megapixels, 14.354 mm at 12
-inches, 0.405 mm of taper per inch), and published traits of grain sorghum for what it does not state (leaves, tillers, spread).
+A range (low, high) is sampled uniformly, a mean with an sd normally. Lengths are in metres and angles in degrees unless stated
+otherwise. Sources: the thesis, section 3.3 (33 stalks on 2.134 m, 0.8 m away, 8 mm lens, 9 megapixels, 14.354 mm at 12 inches,
+0.405 mm of taper per inch), and published traits of grain sorghum for what the thesis does not state (leaves, tillers, spread).
 """
 
 import dataclasses
@@ -16,54 +16,54 @@ INCH = 0.0254
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """Where plants stand."""
+    """Positions of plants."""
 
     plot_length: float = 2.134
-    """Length of a plot along the row, m; plots end at alleys, in which nothing grows."""
+    """Length of a plot along the row, m; plots are separated by bare alleys."""
     stalks_mean: float = 33.0
-    """Stalks of the near row in a plot, tillers included."""
+    """Mean number of stalks in a plot's near row, including tillers."""
     stalks_sd: float = 6.0
-    """Standard deviation of their number."""
+    """Standard deviation of the number of stalks."""
     spacing_minimum: float = 0.028
-    """Least distance between plants, m."""
+    """Minimum distance between plants, m."""
     spacing_shape: float = 1.6
-    """Shape of the gamma distribution of what a distance has above the least."""
+    """Shape parameter of the gamma distribution of distances beyond the minimum."""
     offset_sd: float = 0.025
-    """Standard deviation of the distance from the row's middle line, m."""
+    """Standard deviation of the distance from the row's centre line, m."""
     tillers: float = 0.2
-    """Share of stalks that are tillers, within `clump_radius` of their mother."""
+    """Fraction of stalks that are tillers, within `clump_radius` of their mother plant."""
     clump_radius: float = 0.03
-    """Greatest distance of a tiller from its mother, m."""
+    """Maximum distance of a tiller from its mother plant, m."""
     gaps: float = 0.04
-    """Share of distances that are a missing stretch."""
+    """Fraction of distances that are a gap in the row."""
     gap_length: float = 0.25
-    """Length of a missing stretch, m."""
+    """Length of a gap, m."""
     row_spacing: float = 0.762
     """Distance between rows, m."""
     rows_behind: int = 2
-    """Rows that stand behind the near one."""
+    """Number of rows behind the near one."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Stalks:
-    """Shape of the stalks."""
+    """Shape of stalks."""
 
     height: Range = (2.1, 2.6)
     """Length of a stalk, m."""
     diameter_mean: float = 0.014354
     """Mean diameter 12 inches above the ground, m."""
     diameter_sd: float = 0.0032
-    """Its standard deviation over stalks, m."""
+    """Standard deviation of that diameter over stalks, m."""
     diameter_least: float = 0.006
-    """Least diameter there, m."""
+    """Minimum diameter at that height, m."""
     taper: float = 0.405e-3 / INCH
-    """Loss of diameter between 12 and 24 inches for a stalk of mean diameter, m per m."""
+    """Taper between 12 and 24 inches for a stalk of mean diameter, m per m."""
     taper_spread: float = 0.25
-    """Its coefficient of variation."""
+    """Coefficient of variation of the taper."""
     lean_sd: Range = (4.0, 4.0)
-    """Standard deviation of a plot's leans at the ground in both directions, degrees."""
+    """Standard deviation within a plot of the lean at the ground, in both directions, degrees."""
     lean_most: float = 20.0
-    """Greatest lean, degrees."""
+    """Maximum lean, degrees."""
     curvature_sd: float = 0.06
     """Standard deviation of the curvature, 1/m."""
     zigzag: float = 0.8
@@ -71,23 +71,23 @@ class Stalks:
     node_spacing: Range = (0.08, 0.20)
     """Distance between nodes, m."""
     node_swelling: Range = (0.05, 0.15)
-    """By how much a node is thicker than the stalk, of its diameter."""
+    """Thickening at a node, relative to the stalk's diameter."""
     ovality: Range = (1.0, 1.2)
-    """Greatest over least diameter of a cross section."""
+    """Ratio of maximum to minimum diameter of a cross section."""
     sheaths: float = 0.6
-    """Share of nodes whose leaf sheath is still there, wrapped around the stalk above it."""
+    """Fraction of nodes whose leaf sheath remains, wrapped around the stalk above it."""
     sheath_length: Range = (0.06, 0.16)
     """Length of a sheath, m."""
     sheath_thickness: Range = (0.2e-3, 0.6e-3)
-    """Thickness of a sheath, m; the diameter over it is larger by twice as much."""
+    """Thickness of a sheath, m; it adds twice as much to the diameter."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Leaves:
-    """Leaves, dry ones included."""
+    """Shape and number of leaves, including dry ones."""
 
     density: float = 1.0
-    """Multiplies the expected number of leaves."""
+    """Factor of the expected number of leaves."""
     lower: float = 0.22
     """Leaves per node below 0.3 m."""
     middle: float = 0.34
@@ -95,31 +95,31 @@ class Leaves:
     upper: float = 0.8
     """Leaves per node above 0.8 m."""
     dry: float = 0.75
-    """Share of dry leaves below 0.8 m; a third of it above."""
+    """Fraction of leaves below 0.8 m that are dry; a third of it above."""
     length_mean: float = 0.636
     """Mean length of a green leaf, m."""
     length_sd: float = 0.098
-    """Its standard deviation, m."""
+    """Standard deviation of the length, m."""
     width_mean: float = 0.07
     """Mean width of a green leaf, m."""
     width_sd: float = 0.012
-    """Its standard deviation, m."""
+    """Standard deviation of the width, m."""
     angle_mean: float = 45.0
     """Mean angle between leaf and stalk, degrees."""
     angle_sd: float = 10.7
-    """Its standard deviation, degrees."""
+    """Standard deviation of the angle, degrees."""
     droop: Range = (50.0, 130.0)
-    """By how much a green leaf bends towards the ground along its length, degrees."""
+    """Total bend of a green leaf towards the ground along its length, degrees."""
     litter: float = 60.0
-    """Pieces of dry leaf on the ground per m of row."""
+    """Number of pieces of dry leaf on the ground per m of row."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Textures:
-    """What surfaces look like; every plant draws its own values."""
+    """Appearance of surfaces; values are sampled per plant."""
 
     stalk_hue: Range = (0.085, 0.19)
-    """Hue of stalks, of the colour circle: 0.08 is straw, 0.25 is green."""
+    """Hue of stalks, as a fraction of the colour circle: 0.08 is straw, 0.25 is green."""
     leaf_hue: Range = (0.20, 0.27)
     """Hue of green leaves."""
     dry_hue: Range = (0.07, 0.11)
@@ -129,28 +129,28 @@ class Textures:
     fibre_pitch: Range = (0.7e-3, 1.4e-3)
     """Distance between fibres, m."""
     fibre_contrast: Range = (0.10, 0.25)
-    """How much darker the gaps between fibres are, of 1."""
+    """Darkening of gaps between fibres, 0 to 1."""
     blotch_size: Range = (0.006, 0.02)
     """Size of blotches, m."""
     blotch_contrast: Range = (0.15, 0.45)
-    """How much darker blotches are, of 1."""
+    """Darkening of blotches, 0 to 1."""
     speckles: Range = (0.0, 0.3)
-    """Share of the surface with small dark speckles."""
+    """Fraction of the surface with small dark speckles."""
     speckle_size: Range = (0.8e-3, 1.6e-3)
     """Size of speckles, m."""
     bands: Range = (0.0, 0.15)
-    """Contrast of bands across stalks and leaves, of 1."""
+    """Contrast of bands across stalks and leaves, 0 to 1."""
     band_pitch: Range = (0.02, 0.05)
     """Distance between bands, m."""
     bloom: Range = (0.1, 0.5)
-    """Share of a stalk with a bright waxy bloom."""
+    """Fraction of a stalk with a bright waxy bloom."""
     gloss: Range = (0.03, 0.12)
-    """Strength of the highlight."""
+    """Intensity of the highlight."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Rig:
-    """The two cameras, and how they pass the plants."""
+    """Stereo camera pair and its trajectory past the plants."""
 
     width: int = 3376
     """Width of an image, pixels."""
@@ -161,35 +161,33 @@ class Rig:
     baseline: float = 0.1
     """Nominal distance between the cameras, m."""
     stated_spread: float = 0.0
-    """Largest deviation of focal length and baseline from their nominal values, of 1; the calibration states it."""
+    """Maximum relative deviation of focal length and baseline from their nominal values; the calibration includes it."""
     calibration_error: float = 0.0
-    """Size of the error of stated focal length and stated baseline, of 1; its sign is drawn, and the calibration does not state
-    it.
-    """
+    """Relative error of focal length and baseline in the calibration; its sign is random."""
     rectification_error: float = 0.2
     """Standard deviation of the vertical offset between rectified images, pixels at full width."""
     distance: float = 0.8
     """Mean distance from the cameras to the row, m."""
     distance_sd: float = 0.015
-    """Its standard deviation over plots, m."""
+    """Standard deviation of the distance over plots, m."""
     camera_height: float = 0.42
     """Mean height of the cameras, m."""
     camera_height_sd: float = 0.015
-    """Its standard deviation over plots, m."""
+    """Standard deviation of the height over plots, m."""
     wobble: float = 0.004
     """Standard deviation of height and distance from image to image, m."""
     pitch: float = 0.0
-    """By how much the cameras look down, degrees."""
+    """Downward pitch of the cameras, degrees."""
     pitch_sd: float = 0.7
     """Standard deviation of the pitch over plots, degrees."""
     frames: int = 34
-    """Pairs of a plot."""
+    """Number of stereo pairs per plot."""
     stretch: float = 0.0
-    """Length of the drive, in the middle of the plot, m; 0 for all of the plot."""
+    """Length of the drive, centred in the plot, m; 0 for the whole plot."""
     speed: float = 0.05
     """Speed of the robot, m/s."""
     odometry_noise: Range = (0.01, 0.03)
-    """Error of the odometry's scale, of 1; its sign is drawn."""
+    """Relative error of the odometry's scale; its sign is random."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -197,35 +195,35 @@ class Imaging:
     """Flash, lens and sensor."""
 
     flash: Range = (0.92, 1.08)
-    """Strength of the flash."""
+    """Intensity of the flash."""
     exposure_spread: float = 0.04
-    """Standard deviation of the brightness from image to image, of 1."""
+    """Relative standard deviation of the brightness from image to image."""
     ambient: float = 0.004
-    """Light that does not come from the flash, of what a white surface at the row's distance has from it."""
+    """Ambient light, relative to the flash on a white surface at the row's distance."""
     vignetting: float = 0.35
-    """Loss of light in the corners, of 1."""
+    """Relative loss of light in the corners."""
     blur: Range = (0.5, 1.0)
     """Standard deviation of the point spread function, pixels at full width."""
     full_well: float = 9000.0
-    """Electrons of a white pixel."""
+    """Electrons in a white pixel."""
     read_noise: float = 12.0
-    """Standard deviation of the sensor's own noise, electrons."""
+    """Standard deviation of the sensor's read noise, electrons."""
     noise: float = 1.0
-    """Multiplies the standard deviation of all noise."""
+    """Factor of the standard deviation of all noise."""
     samples: int = 4
-    """Rays a pixel: 1 or 4."""
+    """Rays per pixel: 1 or 4."""
 
 
 def is_number(value: Any) -> bool:
-    """Whether a value is a finite number, and not true or false."""
+    """Return True if a value is a finite number; bools are not."""
     try:
         return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
-    except OverflowError:  # a whole number of more digits than a float holds
+    except OverflowError:  # an integer too large for a float
         return False
 
 
 def _check_value(label: str, example: Any, value: Any) -> None:
-    """Refuses a value that is not of the kind of the example: a range, a whole number or a number."""
+    """Check that a value is of the kind of the example: a range, an integer or a number."""
     if isinstance(example, tuple) and not (isinstance(value, tuple) and len(value) == 2):
         raise ValueError(f"{label} must be a range, (low, high), got {value!r}")
     ends: tuple[Any, Any] = value if isinstance(example, tuple) else (value, value)
@@ -238,7 +236,7 @@ def _check_value(label: str, example: Any, value: Any) -> None:
         raise ValueError(f"{label} must run from low to high, got {value}")
 
 
-# What makes sense at all, and can be drawn in the memory that there is. What is not here need only be finite and at least 0.
+# Limits of plausible values, and of memory. Fields without an entry must only be finite and at least 0.
 _BOUNDS: dict[str, tuple[float, float]] = {
     "layout.plot_length": (0.1, 50.0),
     "layout.stalks_mean": (0, 1000),
@@ -296,26 +294,26 @@ _BOUNDS: dict[str, tuple[float, float]] = {
 
 @dataclasses.dataclass(frozen=True)
 class Family:
-    """A distribution of plots. Equal families with equal seeds give equal plots.
+    """Distribution of plots. Equal families with equal seeds give equal plots.
 
     Raises:
-        ValueError: A value is of another kind or out of range; the message names the field.
+        ValueError: A value is of the wrong kind or out of range; the message names the field.
     """
 
     name: str = "training"
-    """What the family is called."""
+    """Name of the family."""
     stream: int = 1
-    """Families of different streams share no random numbers, whatever their seeds."""
+    """Families with different streams use independent random numbers for all seeds."""
     layout: Layout = Layout()
-    """Where plants stand."""
+    """Positions of plants."""
     stalks: Stalks = Stalks()
-    """Their stalks."""
+    """Shape of stalks."""
     leaves: Leaves = Leaves()
-    """Their leaves."""
+    """Shape and number of leaves."""
     textures: Textures = Textures()
-    """Their surfaces."""
+    """Appearance of surfaces."""
     rig: Rig = Rig()
-    """The cameras."""
+    """Camera pair."""
     imaging: Imaging = Imaging()
     """Light and sensor."""
 
@@ -326,19 +324,19 @@ class Family:
             if type(part) is not type(example) and dataclasses.is_dataclass(example):
                 raise ValueError(f"{field.name} must be a {type(example).__name__}, got {part!r}")
             if dataclasses.is_dataclass(part):
-                for each in dataclasses.fields(part):
-                    _check_value(f"{field.name}.{each.name}", each.default, getattr(part, each.name))
+                for part_field in dataclasses.fields(part):
+                    _check_value(f"{field.name}.{part_field.name}", part_field.default, getattr(part, part_field.name))
         for label, (low, high) in _BOUNDS.items():
             part, name = label.split(".")
             value = getattr(getattr(self, part), name)
-            least, most = value if isinstance(value, tuple) else (value, value)
-            if least < low or most > high:
+            minimum, maximum = value if isinstance(value, tuple) else (value, value)
+            if minimum < low or maximum > high:
                 raise ValueError(f"{label} must be from {low:g} to {high:g}, got {value}")
         if self.imaging.samples not in (1, 4):
             raise ValueError(f"imaging.samples must be 1 or 4, got {self.imaging.samples}")
 
     def at_width(self, width: int) -> "Family":
-        """The same cameras with fewer or more pixels: images ``width`` pixels wide that show the same."""
+        """Return a family with the same cameras at another resolution: images ``width`` pixels wide with the same view."""
         scale = width / self.rig.width
         height = max(round(self.rig.height * scale), 1)
         rig = dataclasses.replace(self.rig, width=width, height=height, focal=self.rig.focal * scale)

@@ -1,9 +1,9 @@
-"""The families for grasping: the same plants, passed by the short stereo pair of a robot that stops to take hold of them.
+"""Families for grasping: the same plants, passed by the short-baseline stereo pair of a robot that stops to grasp them.
 
-The pair is like a MultiSense S7: 1024 x 1024 pixels, 80 degrees wide, a baseline of 70 mm, 1 m above the ground (the thesis,
-section 4.1). Its vendor states a minimum range of about 0.4 m, twice what the thesis says, so the row is 0.55 m away. Where the
-pair looks is not stated; here it looks down by 15 degrees, where there are more stalks and fewer leaves. Five pairs are taken
-over 0.5 m. The row goes on at both ends of that stretch, as it does in a field.
+The pair resembles a MultiSense S7: 1024 x 1024 pixels, a field of view of 80 degrees, a baseline of 70 mm, 1 m above the ground
+(the thesis, section 4.1). Its vendor states a minimum range of about 0.4 m, twice what the thesis says, so the row is 0.55 m
+away. The thesis does not state the pitch; here it is 15 degrees downwards, where there are more stalks and fewer leaves. Five
+pairs are taken over 0.5 m. The row extends beyond both ends of that stretch, as in a field.
 """
 
 import dataclasses
@@ -11,8 +11,8 @@ import dataclasses
 from jaxrl_vis_envs.plants.family import TRAINING, Family, Layout, Rig
 from jaxrl_vis_envs.plants.shifts import SHIFTS, shift
 
-LEAST_RANGE = 0.4
-"""Least distance at which the pair measures, m."""
+MIN_RANGE = 0.4
+"""Minimum distance at which the pair measures depth, m."""
 
 _LENGTH = 1.6
 
@@ -20,7 +20,7 @@ GRASPING = dataclasses.replace(
     TRAINING,
     name="grasping",
     stream=3,
-    # As many stalks per metre as in a plot of the thesis.
+    # Same density of stalks as in a plot of the thesis.
     layout=dataclasses.replace(
         TRAINING.layout,
         plot_length=_LENGTH,

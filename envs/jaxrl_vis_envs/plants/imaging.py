@@ -1,4 +1,4 @@
-"""From radiance to the numbers in a file: lens, exposure, sensor noise, tone curve. Plain JAX."""
+"""Camera model from radiance to pixel values: lens, exposure, sensor noise, tone curve. Plain JAX."""
 
 import math
 from typing import NamedTuple
@@ -9,20 +9,20 @@ import numpy as np
 
 from jaxrl_vis_envs.plants.texture import hashed, normal
 
-_REACH = 4  # pixels: of the point spread function
+_PSF_RADIUS = 4  # pixels, of the point spread function
 
 
 class Exposure(NamedTuple):
-    """How one image is taken, all [] float32 but the seed.
+    """Exposure parameters of one image, all [] float32 except the seed.
 
     Attributes:
         gain: Brightness.
         blur: Standard deviation of the point spread function, pixels.
-        vignetting: Loss of light in the corners, of 1.
-        full_well: Electrons of a white pixel.
-        read_noise: Electrons.
-        noise: Multiplies the standard deviation of all noise.
-        seed: [] uint32, of the noise.
+        vignetting: Relative loss of light in the corners.
+        full_well: Electrons in a white pixel.
+        read_noise: Read noise, electrons.
+        noise: Factor of the standard deviation of all noise.
+        seed: [] uint32, seed of the noise.
     """
 
     gain: float | jax.Array
@@ -35,11 +35,11 @@ class Exposure(NamedTuple):
 
 
 def expose(radiance: jax.Array, exposure: Exposure) -> jax.Array:
-    """The image that a camera takes.
+    """Simulate the image that a camera takes.
 
     Args:
         radiance: [H, W, 3] float32; 1 is white at a gain of 1.
-        exposure: How it is taken.
+        exposure: Exposure parameters.
 
     Returns:
         [H, W, 3] uint8, with the tone curve of sRGB.
@@ -51,20 +51,20 @@ def expose(radiance: jax.Array, exposure: Exposure) -> jax.Array:
 @jax.jit
 def _expose(radiance: jax.Array, exposure: Exposure) -> jax.Array:
     height, width, _ = radiance.shape
-    taps = jnp.exp(-0.5 * (jnp.arange(-_REACH, _REACH + 1) / jnp.maximum(exposure.blur, 0.05)) ** 2)
+    taps = jnp.exp(-0.5 * (jnp.arange(-_PSF_RADIUS, _PSF_RADIUS + 1) / jnp.maximum(exposure.blur, 0.05)) ** 2)
     taps = taps / taps.sum()
     for axis in (0, 1):
-        padded = jnp.pad(radiance, [(_REACH, _REACH) if each == axis else (0, 0) for each in range(3)], mode="edge")
+        padded = jnp.pad(radiance, [(_PSF_RADIUS, _PSF_RADIUS) if index == axis else (0, 0) for index in range(3)], mode="edge")
         size = radiance.shape[axis]
         radiance = sum(  # pyright: ignore
-            taps[k] * jax.lax.slice_in_dim(padded, k, k + size, axis=axis) for k in range(2 * _REACH + 1)
+            taps[k] * jax.lax.slice_in_dim(padded, k, k + size, axis=axis) for k in range(2 * _PSF_RADIUS + 1)
         )
     x = (jnp.arange(width) - (width - 1) / 2) / (math.hypot(width, height) / 2)
     y = (jnp.arange(height) - (height - 1) / 2) / (math.hypot(width, height) / 2)
     falloff = 1.0 - exposure.vignetting * (x[None, :] ** 2 + y[:, None] ** 2)
     electrons = radiance * (falloff * exposure.gain * exposure.full_well)[..., None]
-    place = jnp.arange(height * width * 3, dtype=jnp.uint32).reshape(height, width, 3)
-    drawn = normal(hashed(place, jnp.broadcast_to(exposure.seed, place.shape)))
+    index = jnp.arange(height * width * 3, dtype=jnp.uint32).reshape(height, width, 3)
+    drawn = normal(hashed(index, jnp.broadcast_to(exposure.seed, index.shape)))
     deviation = exposure.noise * jnp.sqrt(jnp.maximum(electrons, 0.0) + exposure.read_noise**2)
     signal = jnp.clip((electrons + deviation * drawn) / exposure.full_well, 0.0, 1.0)
     curved = jnp.where(signal <= 0.0031308, 12.92 * signal, 1.055 * signal ** (1 / 2.4) - 0.055)

@@ -1,4 +1,4 @@
-"""Pairs of images of a plot, with what is true in them."""
+"""Stereo pairs of a plot, with ground truth."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -13,20 +13,20 @@ from jaxrl_vis_envs.plants.field import Plot, generator
 from jaxrl_vis_envs.plants.surfaces import Surfaces, build
 
 _FLASH = np.array([0.05, -0.10, -0.02])
-"""Where the flash is, in the left camera's frame, m: above the middle of the pair."""
+"""Position of the flash in the left camera's frame, m: above the middle of the pair."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Pair:
-    """One pair, and the truth of its left image.
+    """One stereo pair, and the ground truth of its left image.
 
     Attributes:
         left, right: [H, W, 3] uint8, on the device.
-        instance: [H, W] int32: index in `Plot.stalks`, or negative: see `surfaces`.
-        depth: [H, W] float32, planar, m; infinite where there is nothing.
-        disparity: [H, W] float32, pixels; 0 where there is nothing.
-        pose: Of the left camera.
-        frame: Which of the plot's pairs it is.
+        instance: [H, W] int32: index in `Plot.stalks`, or a negative label, see `surfaces`.
+        depth: [H, W] float32, planar, m; infinite where nothing is visible.
+        disparity: [H, W] float32, pixels; 0 where nothing is visible.
+        pose: Pose of the left camera.
+        frame: Index among the plot's pairs.
     """
 
     left: jax.Array
@@ -40,12 +40,12 @@ class Pair:
 
 @dataclasses.dataclass(frozen=True)
 class Sequence:
-    """All pairs of a plot, drawn when they are asked for.
+    """All stereo pairs of a plot, rendered on access.
 
     Attributes:
-        plot: What stands there.
-        surfaces: The same, as it is drawn.
-        drive: How the cameras pass it.
+        plot: The plot.
+        surfaces: Its renderable surfaces.
+        drive: Trajectory of the cameras.
     """
 
     plot: Plot
@@ -54,7 +54,7 @@ class Sequence:
 
     @classmethod
     def of(cls, plot: Plot) -> "Sequence":
-        """The pairs of a plot, as its family's cameras take them."""
+        """Return the pairs of a plot as taken by its family's cameras."""
         return cls(plot, build(plot), drive(plot.family, plot.seed))
 
     def __len__(self) -> int:
@@ -64,7 +64,7 @@ class Sequence:
         return (self[frame] for frame in range(len(self)))
 
     def __getitem__(self, frame: int) -> Pair:
-        """Draws one pair.
+        """Render one pair.
 
         Raises:
             IndexError: There is no such pair.
@@ -78,39 +78,39 @@ class Sequence:
         return Pair(left, right, instance, depth, disparity, self.drive.poses[frame], frame)
 
     def left(self, frame: int) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """The left image of one pair alone, and instance and depth in it; see `Pair`."""
+        """Render the left image of one pair, with its instance and depth images; see `Pair`."""
         return self._take(frame, 0)
 
     def _take(self, frame: int, side: int) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """One image, and instance and depth in it; side 0 is the left one."""
+        """Render one image, with its instance and depth images; side 0 is the left one."""
         family, drive = self.plot.family, self.drive
         pose, true = drive.poses[frame], drive.true
         shift = side * true.baseline
-        view = tables.see(self.surfaces, pose, true, shift)
+        view = tables.build_view(self.surfaces, pose, true, shift)
         offset = np.array([shift, 0.0, 0.0])
         rng = generator(family, self.plot.seed, "flash")
-        imaging_of = family.imaging
-        flash, blur = rng.uniform(*imaging_of.flash), rng.uniform(*imaging_of.blur, 2)
-        gains = np.exp(imaging_of.exposure_spread * rng.normal(size=(len(self), 1)) + 0.01 * rng.normal(size=(len(self), 2)))
+        settings = family.imaging
+        flash, blur = rng.uniform(*settings.flash), rng.uniform(*settings.blur, 2)
+        gains = np.exp(settings.exposure_spread * rng.normal(size=(len(self), 1)) + 0.01 * rng.normal(size=(len(self), 2)))
         lines = np.array([drive.line_offset, drive.line_slope]) * side
-        numbers = (
+        values = (
             true.focal,
             true.centre,
             lines,
             pose.rotation,
             pose.position + offset @ pose.rotation,
             _FLASH - offset,
-            (flash, imaging_of.ambient, family.rig.distance),
+            (flash, settings.ambient, family.rig.distance),
         )
-        shot = drawing.Shot(*(jnp.asarray(number, jnp.float32) for number in numbers))
-        radiance, instance, depth = drawing.draw(view, shot, true.width, true.height, imaging_of.samples)
+        shot = drawing.Shot(*(jnp.asarray(value, jnp.float32) for value in values))
+        radiance, instance, depth = drawing.draw(view, shot, true.width, true.height, settings.samples)
         exposure = imaging.Exposure(
             gain=2.0 * gains[frame, side],
             blur=blur[side] * true.width / 3376,
-            vignetting=imaging_of.vignetting,
-            full_well=imaging_of.full_well,
-            read_noise=imaging_of.read_noise,
-            noise=imaging_of.noise,
+            vignetting=settings.vignetting,
+            full_well=settings.full_well,
+            read_noise=settings.read_noise,
+            noise=settings.noise,
             seed=int(generator(family, self.plot.seed, f"noise {frame} {side}").integers(1 << 32)),
         )
         return imaging.expose(radiance, exposure), instance, depth

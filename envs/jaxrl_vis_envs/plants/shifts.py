@@ -1,4 +1,4 @@
-"""Families beside the one that networks learn on: with one factor moved, some, or all of them. Loads no JAX."""
+"""Families for evaluation under distribution shift: the training family with some or all factors changed. Imports no JAX."""
 
 import dataclasses
 from typing import Any
@@ -30,18 +30,18 @@ SHIFTS: dict[str, dict[str, dict[str, Any]]] = {
     "rig": {"rig": {"stated_spread": 0.05, "calibration_error": 0.005}},
     "noise": {"imaging": {"noise": 2.0}},
     "leaves": {"leaves": {"density": 1.3}},
-    "textures": {"textures": {each.name: getattr(_UNSEEN, each.name) for each in dataclasses.fields(_UNSEEN)}},
+    "textures": {"textures": {field.name: getattr(_UNSEEN, field.name) for field in dataclasses.fields(_UNSEEN)}},
 }
 
 
 def shift(family: Family, *factors: str, name: str = "", stream: int = 0) -> Family:
-    """The family with some factors moved.
+    """Return a family with some factors shifted.
 
     Args:
-        family: Where to start from.
+        family: Original family.
         factors: Names in `SHIFTS`.
-        name: Of the result; the factors' names if not given.
-        stream: Of the result; if not given, one that depends on the factors, and is never that of ``family``.
+        name: Name of the result; by default the factors' names.
+        stream: Stream of the result; by default, one that depends on the factors and differs from that of ``family``.
 
     Raises:
         ValueError: There is no such factor.
@@ -51,8 +51,10 @@ def shift(family: Family, *factors: str, name: str = "", stream: int = 0) -> Fam
             raise ValueError(f"there is no shift of {factor!r}{nearest(str(factor), SHIFTS)}")
         for part, changes in SHIFTS[factor].items():
             family = dataclasses.replace(family, **{part: dataclasses.replace(getattr(family, part), **changes)})
-    places = sum(1 << list(SHIFTS).index(factor) for factor in set(factors))
-    return dataclasses.replace(family, name=name or "+".join(factors), stream=stream or 100 + places + 1000 * family.stream)
+    factor_bits = sum(1 << list(SHIFTS).index(factor) for factor in set(factors))
+    return dataclasses.replace(
+        family, name=name or "+".join(factors), stream=stream or 100 + factor_bits + 1000 * family.stream
+    )
 
 
 SHIFTED = shift(TRAINING, *SHIFTS, name="shifted", stream=2)

@@ -1,4 +1,4 @@
-"""A plot as surfaces that can be drawn: cones for stalks, triangles for leaves, and how each of them looks. NumPy only."""
+"""Renderable surfaces of a plot: cones for stalks, triangles for leaves, and their materials. NumPy only."""
 
 import colorsys
 import dataclasses
@@ -9,19 +9,19 @@ from jaxrl_vis_envs.plants.family import Range, Textures
 from jaxrl_vis_envs.plants.field import Leaf, Plot, Stalk, generator
 
 GROUND = -2
-"""Instance of the ground in an image of instances, in which 0, 1, ... are the stalks of a plot."""
+"""Label of the ground in an instance image, in which 0, 1, ... are the stalks of a plot."""
 NOTHING = -1
-"""Instance where there is nothing near enough to be drawn."""
+"""Label where nothing is within the rendered depth."""
 LITTER = -3
-"""Instance of litter; that of the leaves of stalk n is `LITTER` - 1 - n."""
+"""Label of litter; that of the leaves of stalk n is `LITTER` - 1 - n."""
 
 _GUTTER = 0.3
-"""By how much of its half width a leaf's edges are raised above its midrib."""
+"""Height of a leaf's edges above its midrib, relative to its half width."""
 
 MATERIAL = ("red", "green", "blue", "red_over", "green_over", "blue_over", "fibre_frequency", "fibre_contrast",
             "blotch_frequency", "blotch_contrast", "speckles", "speckle_frequency", "bands", "band_frequency", "bloom", "gloss",
             "place", "edge")  # fmt: skip
-"""Columns of a material. ``over``: colour of sheaths, or of the edges of leaves; ``place`` shifts textures between plants."""
+"""Columns of a material. ``over``: colour of sheaths or leaf edges; ``place``: offset of the texture, one per plant."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,14 +29,15 @@ class Surfaces:
     """Cones and triangles of a plot, in the world, m. Row 0 of the materials is the ground.
 
     Attributes:
-        start, end: [C, 3] float64, middles of the ends of each cone.
+        start, end: [C, 3] float64, centres of both ends of each cone.
         radii: [C, 2] float64, mean radii at both ends.
-        arcs: [C, 2] float64, length along the stalk at both ends.
-        sheath, node: [C, 2] float64, how much of a sheath or node each end is, 0 to 1.
-        oval: [C, 2] float64, greatest over least diameter, and the direction of the greatest in rad.
+        arcs: [C, 2] float64, arc length along the stalk at both ends.
+        sheath, node: [C, 2] float64, weight of sheath or node at both ends, 0 to 1.
+        oval: [C, 2] float64, ratio of maximum to minimum diameter, and direction of the maximum in rad.
         cone_stalk, cone_material: [C] int32.
-        corners: [T, 3, 3] float64, of each triangle.
-        along, across, offset: [T, 3] float64, of each corner: m along the midrib, -1 to 1 across it, and the same in m.
+        corners: [T, 3, 3] float64, corners of each triangle.
+        along, across, offset: [T, 3] float64, coordinates of each corner: m along the midrib, -1 to 1 across it, and m across
+        it.
         normals: [T, 3, 3] float64, unit normal of the leaf at each corner.
         triangle_instance, triangle_material: [T] int32.
         materials: [M, len(MATERIAL)] float32.
@@ -62,7 +63,7 @@ class Surfaces:
 
 
 def build(plot: Plot) -> Surfaces:
-    """The surfaces of a plot, with looks drawn from its family's textures."""
+    """Build the surfaces of a plot, with materials sampled from its family's textures."""
     rng = generator(plot.family, plot.seed, "textures")
     textures = plot.family.textures
     materials = [_ground(rng, textures)]
@@ -114,7 +115,7 @@ def _cones(index: int, stalk: Stalk, material: int) -> dict[str, np.ndarray]:
 
 
 def _triangles(leaf: Leaf, material: int) -> dict[str, np.ndarray]:
-    """Two strips, one on each side of the midrib, whose edges are raised: a leaf is a shallow gutter."""
+    """Build two strips, one on each side of the midrib, with raised edges: a leaf is a shallow gutter."""
     normal = np.cross(np.gradient(leaf.middle, axis=0), leaf.across)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     half = leaf.half_width[:, None]
@@ -126,14 +127,14 @@ def _triangles(leaf: Leaf, material: int) -> dict[str, np.ndarray]:
         slanted = normal - side * _GUTTER * leaf.across
         slanted /= np.linalg.norm(slanted, axis=1, keepdims=True)
         zero = np.zeros_like(length)
-        given = {
+        values = {
             "corners": (leaf.middle, edge),
             "along": (length, length),
             "across": (zero, zero + side),
             "offset": (zero, side * leaf.half_width),
             "normals": (normal, slanted),
         }
-        for name, (inner, outer) in given.items():
+        for name, (inner, outer) in values.items():
             parts[name] += [
                 np.stack([inner[:-1], outer[:-1], inner[1:]], axis=1),
                 np.stack([outer[:-1], outer[1:], inner[1:]], axis=1),

@@ -1,9 +1,9 @@
-"""What one camera sees of a plot's surfaces, as tables for the program that draws them, and which tile sees which. NumPy only.
+"""Tables of the surfaces that one camera sees of a plot, for the rendering program, with a list per tile. NumPy only.
 
-A ray through a pixel is d = (x, y, 1) in the camera's frame, so that a distance along it is a planar depth.
+A ray through a pixel is d = (x, y, 1) in the camera's frame, so that the ray parameter is the planar depth.
 
-A cone is met where its quadratic in that depth has a root. Cross sections are ellipses; each cone has a direction u, along
-which space is compressed until they are circles. A triangle is met where d, written in its three corners, has no negative
+A cone is hit where its quadratic in that depth has a root. Cross sections are ellipses; each cone has a direction u along which
+space is compressed until they are circles. A triangle is hit where d, expressed in its three corners, has no negative
 component.
 """
 
@@ -15,28 +15,28 @@ from jaxrl_vis_envs.plants.cameras import Calibration, Pose
 from jaxrl_vis_envs.plants.surfaces import Surfaces
 
 NEAR, FAR = 0.15, 6.0
-"""Nearest and farthest depth that is drawn, m."""
+"""Minimum and maximum rendered depth, m."""
 
-# Columns of the tables. What finds out where a ray meets a cone or triangle comes first.
-CONE_HIT, CONE_LOOK = 16, 16
-TRIANGLE_HIT, TRIANGLE_LOOK = 9, 18
-# Rows of the tables: more than most plots need, so that one compiled program draws them all.
+# Numbers of table columns: first those for intersection, then those for appearance.
+CONE_HIT, CONE_SHADING = 16, 16
+TRIANGLE_HIT, TRIANGLE_SHADING = 9, 18
+# Numbers of table rows: more than most plots need, so that one compiled program renders them all.
 _CONES, _TRIANGLES, _MATERIALS, _LIST = 1 << 14, 1 << 16, 1 << 13, 1 << 18
-_OVERLAP = 0.06  # of a radius: how far cones reach into each other, so that a bend has no gap
+_OVERLAP = 0.06  # overlap of successive cones relative to their radius, so that bends have no gaps
 
 
 @dataclasses.dataclass(frozen=True)
 class View:
-    """One camera's view of a plot.
+    """Surfaces of a plot visible to one camera.
 
     Attributes:
-        cones: [C, CONE_HIT + CONE_LOOK] float32.
+        cones: [C, CONE_HIT + CONE_SHADING] float32.
         cone_instance, cone_material: [C] int32.
-        triangles: [T, TRIANGLE_HIT + TRIANGLE_LOOK] float32.
+        triangles: [T, TRIANGLE_HIT + TRIANGLE_SHADING] float32.
         triangle_instance, triangle_material: [T] int32.
-        materials: [M, ...] float32, as `Surfaces` has them.
+        materials: [M, ...] float32, as in `Surfaces`.
         tiles: [N, 2] int32, first column and line of each tile.
-        cone_ranges, triangle_ranges: [N, 2] int32, where each tile's part of the lists begins and ends.
+        cone_ranges, triangle_ranges: [N, 2] int32, begin and end of each tile's part of the lists.
         cone_list, triangle_list: [...] int32, rows of the tables, tile by tile.
     """
 
@@ -54,50 +54,50 @@ class View:
     triangle_list: np.ndarray
 
 
-def tile_of(width: int) -> int:
-    """Width and height in pixels of the tiles of an image: those of small images are small, as equally much is in sight."""
+def tile_size(width: int) -> int:
+    """Return the tile size (pixels) for an image width: smaller for small images, which show as many surfaces."""
     return 64 if width > 1500 else 32 if width > 600 else 16
 
 
-def see(surfaces: Surfaces, pose: Pose, camera: Calibration, shift: float = 0.0) -> View:
-    """What a camera sees.
+def build_view(surfaces: Surfaces, pose: Pose, camera: Calibration, shift: float = 0.0) -> View:
+    """Build the view of one camera.
 
     Args:
-        surfaces: Of the plot.
-        pose: Of the left camera.
-        camera: The cameras as they are.
-        shift: How far to the right of the left camera this one stands, m.
+        surfaces: Surfaces of the plot.
+        pose: Pose of the left camera.
+        camera: Actual calibration of the pair.
+        shift: Distance of this camera to the right of the left one, m.
     """
-    tile = tile_of(camera.width)
+    tile = tile_size(camera.width)
     columns, lines = (-(-size // tile) for size in (camera.width, camera.height))
     offset = np.array([shift, 0.0, 0.0])
 
-    near = np.flatnonzero(_roughly(surfaces.start, pose, camera))
-    start, end = pose.to_camera(surfaces.start[near]) - offset, pose.to_camera(surfaces.end[near]) - offset
-    reach = surfaces.radii[near].max(axis=1) * np.sqrt(surfaces.oval[near, 0]) * 1.15
+    candidates = np.flatnonzero(_may_be_in_sight(surfaces.start, pose, camera))
+    start, end = pose.to_camera(surfaces.start[candidates]) - offset, pose.to_camera(surfaces.end[candidates]) - offset
+    reach = surfaces.radii[candidates].max(axis=1) * np.sqrt(surfaces.oval[candidates, 0]) * 1.15
     cone_boxes = _boxes(np.stack([start, end], axis=1), reach, camera)
-    sight = _in_sight(cone_boxes, columns, lines)
-    cone_boxes, seen = cone_boxes[sight], near[sight]
-    cones = _cone_table(surfaces, seen, start[sight], end[sight], pose)
+    in_sight = _in_sight(cone_boxes, columns, lines)
+    cone_boxes, visible_cones = cone_boxes[in_sight], candidates[in_sight]
+    cones = _cone_table(surfaces, visible_cones, start[in_sight], end[in_sight], pose)
 
-    near = np.flatnonzero(_roughly(surfaces.corners[:, 0], pose, camera))
-    corners = pose.to_camera(surfaces.corners[near]) - offset
+    candidates = np.flatnonzero(_may_be_in_sight(surfaces.corners[:, 0], pose, camera))
+    corners = pose.to_camera(surfaces.corners[candidates]) - offset
     triangle_boxes = _boxes(corners, np.zeros(len(corners)), camera)
-    sight = _in_sight(triangle_boxes, columns, lines)
-    sight[sight] = np.abs(np.linalg.det(corners[sight])) > 1e-12
-    triangle_boxes, facing = triangle_boxes[sight], near[sight]
-    triangles = _triangle_table(surfaces, facing, corners[sight], pose)
+    in_sight = _in_sight(triangle_boxes, columns, lines)
+    in_sight[in_sight] = np.abs(np.linalg.det(corners[in_sight])) > 1e-12
+    triangle_boxes, visible_triangles = triangle_boxes[in_sight], candidates[in_sight]
+    triangles = _triangle_table(surfaces, visible_triangles, corners[in_sight], pose)
 
     cone_list, cone_ranges = _lists(cone_boxes, columns, lines)
     triangle_list, triangle_ranges = _lists(triangle_boxes, columns, lines)
     line, column = np.divmod(np.arange(columns * lines), columns)
     return View(
         cones=_padded(cones, _CONES),
-        cone_instance=_padded(surfaces.cone_stalk[seen], _CONES),
-        cone_material=_padded(surfaces.cone_material[seen], _CONES),
+        cone_instance=_padded(surfaces.cone_stalk[visible_cones], _CONES),
+        cone_material=_padded(surfaces.cone_material[visible_cones], _CONES),
         triangles=_padded(triangles, _TRIANGLES),
-        triangle_instance=_padded(surfaces.triangle_instance[facing], _TRIANGLES),
-        triangle_material=_padded(surfaces.triangle_material[facing], _TRIANGLES),
+        triangle_instance=_padded(surfaces.triangle_instance[visible_triangles], _TRIANGLES),
+        triangle_material=_padded(surfaces.triangle_material[visible_triangles], _TRIANGLES),
         materials=_padded(surfaces.materials, _MATERIALS),
         tiles=(tile * np.stack([column, line], axis=1)).astype(np.int32),
         cone_ranges=cone_ranges,
@@ -107,37 +107,37 @@ def see(surfaces: Surfaces, pose: Pose, camera: Calibration, shift: float = 0.0)
     )
 
 
-def _padded(table: np.ndarray, least: int) -> np.ndarray:
-    """The table with zero rows at its end, ``least`` rows in all or twice as many as often as it takes."""
-    size = least
+def _padded(table: np.ndarray, minimum: int) -> np.ndarray:
+    """Append zero rows to a table, up to ``minimum`` rows or the smallest sufficient multiple of it by a power of two."""
+    size = minimum
     while size < len(table):
         size *= 2
     return np.concatenate([table, np.zeros((size - len(table), *table.shape[1:]), table.dtype)])
 
 
-def _roughly(points: np.ndarray, pose: Pose, camera: Calibration) -> np.ndarray:
-    """Which points [N, 3] in the world may belong to something in sight: a cheap test that spares most of the rest."""
-    away = points[:, 1] - pose.position[1] + 0.3
+def _may_be_in_sight(points: np.ndarray, pose: Pose, camera: Calibration) -> np.ndarray:
+    """Return a mask of points [N, 3] in the world that may belong to something in sight: a cheap, conservative test."""
+    depth_bound = points[:, 1] - pose.position[1] + 0.3
     wide, high = (1.15 * size / camera.focal / 2 + 0.05 for size in (camera.width, camera.height))
-    aside, above = np.abs(points[:, 0] - pose.position[0]), np.abs(points[:, 2] - pose.position[2])
-    return (aside < wide * away + 0.35 + camera.baseline) & (above < high * away + 0.35)
+    sideways, above = np.abs(points[:, 0] - pose.position[0]), np.abs(points[:, 2] - pose.position[2])
+    return (sideways < wide * depth_bound + 0.35 + camera.baseline) & (above < high * depth_bound + 0.35)
 
 
 def _boxes(points: np.ndarray, reach: np.ndarray, camera: Calibration) -> np.ndarray:
-    """Tiles [N, 4] (first column and line, last column and line) that spheres of radius ``reach`` [N] about ``points`` [N, K,
-    3] lie in; what is too near is in none.
+    """Return the tile ranges [N, 4] (first column and line, last column and line) that contain the spheres of radius ``reach``
+    [N] about ``points`` [N, K, 3]; empty for spheres that are too near or too far.
     """
     with np.errstate(all="ignore"):
         depth = points[..., 2] - reach[:, None]
         low = points[..., :2] - reach[:, None, None]
         high = points[..., :2] + reach[:, None, None]
-        # A sphere's far side is seen nearer to the middle of the image, so both depths bound it.
+        # A sphere's far side projects nearer to the image's centre, so both depths bound it.
         near, far = depth[..., None], points[..., 2:] + reach[:, None, None]
-        least = np.minimum(low / near, low / far).min(axis=1)
-        most = np.maximum(high / near, high / far).max(axis=1)
-        centre, tile = np.array(camera.centre), tile_of(camera.width)
-        first = np.floor((least * camera.focal + centre - 2.0) / tile)
-        last = np.floor((most * camera.focal + centre + 2.0) / tile)
+        low_slope = np.minimum(low / near, low / far).min(axis=1)
+        high_slope = np.maximum(high / near, high / far).max(axis=1)
+        centre, tile = np.array(camera.centre), tile_size(camera.width)
+        first = np.floor((low_slope * camera.focal + centre - 2.0) / tile)
+        last = np.floor((high_slope * camera.focal + centre + 2.0) / tile)
         boxes = np.concatenate([first, last], axis=1)
     bad = (depth.min(axis=1) < NEAR) | (depth.max(axis=1) > FAR) | ~np.isfinite(boxes).all(axis=1)
     boxes[bad] = (0, 0, -1, -1)
@@ -149,14 +149,14 @@ def _in_sight(boxes: np.ndarray, columns: int, lines: int) -> np.ndarray:
 
 
 def _lists(boxes: np.ndarray, columns: int, lines: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rows that each tile sees, tile by tile, and where each tile's rows begin and end [N, 2]."""
+    """Return the rows visible in each tile, tile by tile, and the range [N, 2] of each tile's rows."""
     first = np.maximum(boxes[:, :2], 0)
     last = np.minimum(boxes[:, 2:], [columns - 1, lines - 1])
     wide, high = (last - first + 1).T if len(boxes) else np.zeros((2, 0), np.int64)
     counts = wide * high
     row = np.repeat(np.arange(len(boxes)), counts)
-    place = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-    line, column = np.divmod(place, np.maximum(wide[row], 1))
+    number_in_box = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    line, column = np.divmod(number_in_box, np.maximum(wide[row], 1))
     tile = (first[row, 1] + line) * columns + first[row, 0] + column
     order = np.argsort(tile, kind="stable")
     ends = np.cumsum(np.bincount(tile, minlength=columns * lines))
@@ -164,17 +164,17 @@ def _lists(boxes: np.ndarray, columns: int, lines: int) -> tuple[np.ndarray, np.
     return row[order].astype(np.int32), np.stack([starts, ends], axis=1).astype(np.int32)
 
 
-def _cone_table(surfaces: Surfaces, seen: np.ndarray, start: np.ndarray, end: np.ndarray, pose: Pose) -> np.ndarray:
-    """Rows for the cones that are ``seen``; their ends [C, 3] in the camera's frame."""
+def _cone_table(surfaces: Surfaces, visible: np.ndarray, start: np.ndarray, end: np.ndarray, pose: Pose) -> np.ndarray:
+    """Build the rows of the cones ``visible``, given their ends [C, 3] in the camera's frame."""
     along = end - start
     length = np.linalg.norm(along, axis=1)
     axis = along / length[:, None]
-    ratio, angle = surfaces.oval[seen].T
+    ratio, angle = surfaces.oval[visible].T
     major = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1) @ pose.rotation.T
     major -= (major * axis).sum(axis=1, keepdims=True) * axis
     major /= np.linalg.norm(major, axis=1, keepdims=True)
     squeeze = 1.0 / ratio - 1.0
-    radii = surfaces.radii[seen] / np.sqrt(ratio)[:, None]
+    radii = surfaces.radii[visible] / np.sqrt(ratio)[:, None]
     slope = (radii[:, 1] - radii[:, 0]) / length
 
     offset = -start  # from the start to the camera
@@ -184,28 +184,28 @@ def _cone_table(surfaces: Surfaces, seen: np.ndarray, start: np.ndarray, end: np
     radius = radii[:, 0] + slope * travelled
     twice = 2.0 * squeeze + squeeze**2
     constant = (round_offset**2).sum(axis=1) - travelled**2 - radius**2
-    # The product of offset and ray, both in round space, is that of the ray and an offset that is squeezed once more.
-    both = offset + (twice * inward)[:, None] * major
+    # The dot product of offset and ray in round space equals that of the ray and an offset that is squeezed twice.
+    twice_squeezed = offset + (twice * inward)[:, None] * major
     margin = _OVERLAP * radii.max(axis=1)
-    arcs, sheath, node = surfaces.arcs[seen], surfaces.sheath[seen], surfaces.node[seen]
+    arcs, sheath, node = surfaces.arcs[visible], surfaces.sheath[visible], surfaces.node[visible]
     columns = [
-        both, axis, major, twice[:, None], travelled[:, None], (1.0 + slope**2)[:, None],
+        twice_squeezed, axis, major, twice[:, None], travelled[:, None], (1.0 + slope**2)[:, None],
         (travelled + slope * radius)[:, None], constant[:, None], -margin[:, None], (length + margin)[:, None],
         start, slope[:, None], arcs[:, :1], (np.diff(arcs, axis=1)[:, 0] / length)[:, None],
         sheath[:, :1], (np.diff(sheath, axis=1)[:, 0] / length)[:, None],
         node[:, :1], (np.diff(node, axis=1)[:, 0] / length)[:, None],
-        surfaces.radii[seen][:, :1], ratio[:, None], np.zeros((len(start), 4)),
+        surfaces.radii[visible][:, :1], ratio[:, None], np.zeros((len(start), 4)),
     ]  # fmt: skip
-    return np.concatenate(columns, axis=1).astype(np.float32).reshape(-1, CONE_HIT + CONE_LOOK)
+    return np.concatenate(columns, axis=1).astype(np.float32).reshape(-1, CONE_HIT + CONE_SHADING)
 
 
-def _triangle_table(surfaces: Surfaces, seen: np.ndarray, corners: np.ndarray, pose: Pose) -> np.ndarray:
-    """Rows for the triangles that are ``seen``; their corners [T, 3, 3] in the camera's frame."""
+def _triangle_table(surfaces: Surfaces, visible: np.ndarray, corners: np.ndarray, pose: Pose) -> np.ndarray:
+    """Build the rows of the triangles ``visible``, given their corners [T, 3, 3] in the camera's frame."""
     inverse = np.linalg.inv(np.swapaxes(corners, 1, 2)) if len(corners) else np.zeros((0, 3, 3))
-    normals = surfaces.normals[seen] @ pose.rotation.T
+    normals = surfaces.normals[visible] @ pose.rotation.T
     along, across, offset = (
-        np.einsum("tk,tkc->tc", values[seen], inverse) for values in (surfaces.along, surfaces.across, surfaces.offset)
+        np.einsum("tk,tkc->tc", values[visible], inverse) for values in (surfaces.along, surfaces.across, surfaces.offset)
     )
     normal = np.einsum("tkn,tkc->tnc", normals, inverse).reshape(-1, 9)
     columns = [inverse.reshape(-1, 9), along, across, offset, normal]
-    return np.concatenate(columns, axis=1).astype(np.float32).reshape(-1, TRIANGLE_HIT + TRIANGLE_LOOK)
+    return np.concatenate(columns, axis=1).astype(np.float32).reshape(-1, TRIANGLE_HIT + TRIANGLE_SHADING)

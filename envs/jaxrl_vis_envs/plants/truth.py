@@ -1,6 +1,6 @@
-"""What is true of the stalks in one pair: boxes, how much of them is seen, and how thick they are. NumPy only.
+"""Ground truth of the stalks in one stereo pair: boxes, visibility, and edges. NumPy only.
 
-Columns and lines are those of the left image, with (0, 0) in the middle of the first pixel. A box is (left, top, right,
+Columns and lines are those of the left image, with (0, 0) at the centre of the first pixel. A box is (left, top, right,
 bottom), the outer edges of its pixels: a box around the first pixel alone is (-0.5, -0.5, 0.5, 0.5).
 """
 
@@ -15,7 +15,7 @@ from jaxrl_vis_envs.plants.field import Plot, Stalk
 HEIGHTS = (12 * INCH, 24 * INCH)
 """Heights above the ground at which the thesis measures widths, m."""
 BAND = (12 * INCH - 0.1, 12 * INCH + 0.1)
-"""Heights that bound the band in which stalks are detected, m."""
+"""Lower and upper limit of the band in which stalks are detected, m above the ground."""
 
 Box = tuple[float, float, float, float]
 
@@ -26,11 +26,12 @@ class StalkInView:
 
     Attributes:
         stalk: Index in `Plot.stalks`; the same in all pairs.
-        box: Around all of it that the image's edges leave, seen or hidden behind others.
-        visible_box: Around the pixels that show it; None where none does.
-        visible: Share of it that is seen: of its area inside the image.
-        pixels: Number of pixels that show it.
-        band_box, band_visible: The same of the part between the heights of a band; None and 0 where that is outside the image.
+        box: Box around the whole stalk within the image, including hidden parts.
+        visible_box: Box around the visible pixels; None if there are none.
+        visible: Visible fraction of its area inside the image.
+        pixels: Number of visible pixels.
+        band_box, band_visible: Box and visible fraction of the part within a band of heights; None and 0 if that is outside the
+        image.
     """
 
     stalk: int
@@ -43,15 +44,15 @@ class StalkInView:
 
 
 def outline(stalk: Stalk, pose: Pose, camera: Calibration, heights: np.ndarray | None = None) -> np.ndarray:
-    """Where the two edges of a stalk are seen in the left image, whether it is hidden or not.
+    """Project the two edges of a stalk to the left image, ignoring occlusion.
 
     Exact for a straight piece of stalk with parallel sides; taper moves an edge by less than a hundredth of a pixel.
 
     Args:
-        stalk: Whose edges.
-        pose: Of the left camera.
-        camera: The cameras as they are.
-        heights: [K] above the ground, m; the stalk's own knots if not given.
+        stalk: The stalk.
+        pose: Pose of the left camera.
+        camera: Actual calibration of the cameras.
+        heights: [K] above the ground, m; by default, the stalk's own knots.
 
     Returns:
         [K, 2, 2] float64: (left, right) x (column, line), pixels.
@@ -72,18 +73,18 @@ def outline(stalk: Stalk, pose: Pose, camera: Calibration, heights: np.ndarray |
     def scaled(vectors: np.ndarray, factor: float) -> np.ndarray:
         return vectors + (factor - 1.0) * (vectors * major).sum(axis=1, keepdims=True) * major
 
-    # Where space is squeezed until the stalk is round, its edges are where rays touch a circle.
+    # In space compressed until the stalk is round, its edges are where rays are tangent to a circle.
     radius = (np.interp(arcs, stalk.arc, stalk.radius) / np.sqrt(stalk.ovality))[:, None]
     centre = scaled(pose.to_camera(middle), 1.0 / stalk.ovality)
-    away = centre - (centre * axis).sum(axis=1, keepdims=True) * axis
-    distance = np.linalg.norm(away, axis=1, keepdims=True)
-    away /= distance
-    sideways = np.cross(axis, away)
+    from_axis = centre - (centre * axis).sum(axis=1, keepdims=True) * axis
+    distance = np.linalg.norm(from_axis, axis=1, keepdims=True)
+    from_axis /= distance
+    sideways = np.cross(axis, from_axis)
     sine = radius / distance
     sides = []
     for sign in (-1.0, 1.0):
-        touched = centre + radius * (sign * np.sqrt(1.0 - sine**2) * sideways - sine * away)
-        point = scaled(touched, stalk.ovality)
+        tangent_point = centre + radius * (sign * np.sqrt(1.0 - sine**2) * sideways - sine * from_axis)
+        point = scaled(tangent_point, stalk.ovality)
         sides.append(point[:, :2] / point[:, 2:] * camera.focal + np.array(camera.centre))
     left, right = sides
     swap = left[:, :1] > right[:, :1]
@@ -93,17 +94,17 @@ def outline(stalk: Stalk, pose: Pose, camera: Calibration, heights: np.ndarray |
 def stalks_in_view(
     plot: Plot, pose: Pose, camera: Calibration, instance: np.ndarray, depth: np.ndarray, band: tuple[float, float] = BAND
 ) -> list[StalkInView]:
-    """The stalks of the near row that one left image shows or would show if nothing hid them.
+    """Return the stalks of the near row that one left image shows, or would show without occlusion.
 
     Args:
-        plot: What stands there.
-        pose: Of the left camera.
-        camera: The cameras as they are.
+        plot: The plot.
+        pose: Pose of the left camera.
+        camera: Actual calibration of the cameras.
         instance: [H, W] int32, of a `Pair`.
         depth: [H, W] float32 planar depth, m.
-        band: Lowest and highest point of the band, m above the ground.
+        band: Lower and upper limit of the band, m above the ground.
     """
-    found = []
+    stalks = []
     for index, stalk in enumerate(plot.measured):
         tall = stalk.points[:, 2].max()
         whole = _area(outline(stalk, pose, camera, np.linspace(0.0, tall, 120)), camera)
@@ -121,23 +122,23 @@ def stalks_in_view(
             points = np.stack([x, y, np.ones_like(x)], axis=1) * depth[line, column][:, None]
             height = pose.to_world(points)[:, 2]
             within = int(((height >= band[0]) & (height <= band[1])).sum())
-        seen = _around(column, line) if line.size else None
-        found.append(
+        visible_box = _around(column, line) if line.size else None
+        stalks.append(
             StalkInView(
                 stalk=index,
                 box=box,
-                visible_box=seen,
+                visible_box=visible_box,
                 visible=min(line.size / area, 1.0),
                 pixels=int(line.size),
                 band_box=None if part is None else part[0],
                 band_visible=0.0 if part is None else min(within / part[1], 1.0),
             )
         )
-    return found
+    return stalks
 
 
 def _area(edges: np.ndarray, camera: Calibration) -> tuple[Box, float] | None:
-    """Box and area in pixels of the part of an outline [K, 2, 2] that is inside the image; None where that is nothing."""
+    """Return box and area (pixels) of the part of an outline [K, 2, 2] inside the image; None if it is empty."""
     middle_line = edges[:, :, 1].mean(axis=1)
     order = np.argsort(middle_line)
     lines = np.arange(max(int(np.ceil(middle_line.min())), 0), min(int(np.floor(middle_line.max())), camera.height - 1) + 1)
@@ -145,8 +146,8 @@ def _area(edges: np.ndarray, camera: Calibration) -> tuple[Box, float] | None:
         return None
     sides = []
     for side in (0, 1):
-        place = np.argsort(edges[:, side, 1])
-        sides.append(np.interp(lines, edges[place, side, 1], edges[place, side, 0]))
+        line_order = np.argsort(edges[:, side, 1])
+        sides.append(np.interp(lines, edges[line_order, side, 1], edges[line_order, side, 0]))
     left, right = (np.clip(side, -0.5, camera.width - 0.5) for side in sides)
     wide = right - left
     inside = wide > 0
@@ -158,7 +159,7 @@ def _area(edges: np.ndarray, camera: Calibration) -> tuple[Box, float] | None:
 
 
 def _down_to_ground(box: Box, stalk: Stalk, pose: Pose, camera: Calibration) -> Box:
-    """The box, as far down as the front of the stalk's foot, which is nearer than its edges."""
+    """Extend a box down to the front of the stalk's foot, which is nearer than its edges."""
     towards = (pose.position - stalk.points[0])[:2]
     foot = stalk.points[0].copy()
     foot[:2] += stalk.radius[0] * towards / np.linalg.norm(towards)
@@ -168,12 +169,12 @@ def _down_to_ground(box: Box, stalk: Stalk, pose: Pose, camera: Calibration) -> 
 
 
 def _around(column: np.ndarray, line: np.ndarray) -> Box:
-    """Box around pixels."""
+    """Return the box around pixels."""
     return (float(column.min()) - 0.5, float(line.min()) - 0.5, float(column.max()) + 0.5, float(line.max()) + 0.5)
 
 
 def _pixels(box: Box, camera: Calibration) -> tuple[slice, slice]:
-    """Lines and columns of an image that hold a box, and a few more."""
+    """Return the lines and columns of an image that contain a box, with a margin."""
     left, top, right, bottom = box
     return (
         slice(max(int(top) - 20, 0), min(int(bottom) + 21, camera.height)),

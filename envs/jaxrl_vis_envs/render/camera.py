@@ -1,9 +1,8 @@
-"""Where the camera stands, and the ray of every pixel.
+"""Camera pose and pixel rays.
 
-Everything is drawn in the camera's frame (OpenGL's: x right, y up, looking along -z). A ray is ``start + t * direction`` with a
-direction whose z is -1, so the ray parameter t is the planar depth in metres, and nothing has to be converted afterwards. With
-perspective the start is 0 and the direction (u, v, -1); an orthographic camera has the start (u, v, 0) and the direction
-(0, 0, -1).
+All geometry is expressed in the camera's frame (OpenGL's: x right, y up, looking along -z). A ray is ``start + t * direction``
+with a direction whose z is -1, so the ray parameter t is the planar depth in metres and needs no conversion. A perspective
+camera has the start 0 and the direction (u, v, -1); an orthographic one has the start (u, v, 0) and the direction (0, 0, -1).
 """
 
 from typing import Any, NamedTuple
@@ -19,7 +18,8 @@ _DEGREES = np.pi / 180.0
 
 
 class Rays(NamedTuple):
-    """The rays of pixels: where they meet the plane at depth 1 m (any depth, if orthographic). Float32 arrays of one shape.
+    """Pixel rays, by their intersection with the plane at depth 1 m (at any depth, if orthographic). Float32 arrays of one
+    shape.
 
     Attributes:
         u: Metres to the right of the camera's axis.
@@ -31,25 +31,25 @@ class Rays(NamedTuple):
 
 
 def camera_pose(scene: Scene, data: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Pose of the scene's camera in the world.
+    """Compute the pose of the scene's camera in the world.
 
     Args:
         scene: The scene.
-        data: `mjx.Data`, `mujoco.MjData` or anything with the poses of bodies that `mounts.place` reads. A camera that is fixed
+        data: `mjx.Data`, `mujoco.MjData` or any object with the body poses that `mounts.mount_position` reads. A camera fixed
             to the world needs none.
 
     Returns:
-        Position [3] float32 in metres, rotation [3, 3] float32 whose columns are the camera's axes, and whether both are finite
-        ([] bool). A pose that is not finite comes back as the identity.
+        Position [3] float32 in metres, rotation [3, 3] float32 whose columns are the camera's axes, and a flag ([] bool) that
+        both are finite. A non-finite pose is replaced by the identity.
     """
-    # A pose that the compiler knew would be folded into all that follows, which would round otherwise than for one that moves.
+    # Without the barrier, XLA would constant-fold a fixed pose into later operations, which rounds differently.
     fixed = barrier((scene.camera_position, scene.camera_axes))
     bodies = mounts.Bodies(scene.body_mass, scene.body_parents)
-    position, frame = mounts.place(bodies, data, scene.camera_mount, fixed[0])
+    position, frame = mounts.mount_position(bodies, data, scene.camera_mount, fixed[0])
     rotation = fixed[1]
-    # Written out rather than as matrix products, which accelerators would do at low precision.
+    # Not matrix products, which accelerators would compute at low precision.
     if scene.camera_mount.aims:
-        rotation = mounts.looking(position, mounts.target(bodies, data, scene.camera_mount))
+        rotation = mounts.look_at(position, mounts.target_position(bodies, data, scene.camera_mount))
     elif frame is not None:
         rotation = jnp.sum(frame[:, :, None] * rotation[None], axis=1)
     position = position + jnp.sum(rotation * scene.camera_shift, axis=1)
@@ -62,7 +62,7 @@ def camera_pose(scene: Scene, data: Any) -> tuple[jax.Array, jax.Array, jax.Arra
 
 @jax.custom_jvp
 def barrier(tree: Any) -> Any:
-    """Keep XLA from computing a value again for every use. JAX 0.11 cannot transpose its own barrier."""
+    """Prevent XLA from recomputing a value for every use. JAX 0.11 cannot transpose its own barrier."""
     return jax.lax.optimization_barrier(tree)
 
 
@@ -72,7 +72,7 @@ def _barrier_tangents(primals: tuple, tangents: tuple) -> tuple:
 
 
 def _rotation(vector: jax.Array) -> jax.Array:
-    """[3] radians -> [3, 3], the identity at 0 with the right gradient there."""
+    """Convert a rotation vector [3] (rad) to a matrix [3, 3], with the correct gradient at 0."""
     square = jnp.sum(vector * vector)
     small = square < 1e-8
     angle = jnp.sqrt(jnp.where(small, 1.0, square))
@@ -86,10 +86,10 @@ def _rotation(vector: jax.Array) -> jax.Array:
 
 
 def lens(scene: Scene) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Where the image lies on the plane at depth 1 m (or at any depth, if orthographic).
+    """Compute the image's extent on the plane at depth 1 m (or at any depth, if orthographic).
 
     Returns:
-        Middle across and up, half the width and half the height, each [] float32 (m).
+        Centre u, centre v, half width and half height, each [] float32 (m).
     """
     zero = jnp.zeros((), jnp.float32)
     if scene.projection == "intrinsic":
@@ -101,12 +101,12 @@ def lens(scene: Scene) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
 
 
 def pixel_rays(scene: Scene, rows: np.ndarray, columns: np.ndarray) -> Rays:
-    """The rays through the middles of pixels.
+    """Compute the rays through pixel centres.
 
     Args:
         scene: The scene.
-        rows: Rows of the pixels, from the top; any shape.
-        columns: Columns, the same shape.
+        rows: Row indices of the pixels, from the top; any shape.
+        columns: Column indices, of the same shape.
 
     Returns:
         Rays of the shape of ``rows``.
@@ -119,16 +119,17 @@ def pixel_rays(scene: Scene, rows: np.ndarray, columns: np.ndarray) -> Rays:
 
 
 def pixel_pitch(scene: Scene) -> tuple[jax.Array, jax.Array]:
-    """How much u and v change from one pixel to the next, [] float32 each."""
+    """Compute the change of u and of v from one pixel to the next, [] float32 each."""
     _, _, half_u, half_v = lens(scene)
     return half_u * (2.0 / scene.width), half_v * (2.0 / scene.height)
 
 
 def ray_parts(scene: Scene, rays: Rays) -> tuple[tuple, tuple, jax.Array | float]:
-    """Start and direction of rays in the camera's frame, and the inverse square of the direction's length.
+    """Return origins and directions of rays in the camera's frame, and the inverse squared length of the directions.
 
     Returns:
-        Three [P] arrays or numbers, three more, and [P] or a number. Numbers are what is the same for every ray.
+        Origin and direction as three components each, and the inverse squared length. Each is an array [P], or a number if it
+        is the same for all rays.
     """
     u, v = rays
     if scene.projection == "orthographic":
@@ -137,23 +138,23 @@ def ray_parts(scene: Scene, rays: Rays) -> tuple[tuple, tuple, jax.Array | float
 
 
 def ray_length(scene: Scene, rays: Rays) -> jax.Array | float:
-    """Metres along the rays for each metre of depth."""
+    """Compute the distance along the rays per metre of depth."""
     u, v = rays
     return 1.0 if scene.projection == "orthographic" else jnp.sqrt(u * u + v * v + 1.0)
 
 
 def in_view(scene: Scene, middle: jax.Array, radius: jax.Array, rays: Rays, depth: jax.Array | None) -> jax.Array:
-    """Which balls the rays through a block of pixels may meet.
+    """Check which bounding spheres may intersect the rays of a block of pixels (a conservative frustum test).
 
     Args:
         scene: The scene.
-        middle: [K, 3] float32, metres, camera's frame.
-        radius: [K] float32, metres.
+        middle: [K, 3] float32, sphere centres in the camera's frame, m.
+        radius: [K] float32, m.
         rays: [P].
-        depth: [P] float32, metres, beyond which nothing counts; None for no such depth.
+        depth: [P] float32, maximum depth per ray, m; None for the scene's ``zfar``.
 
     Returns:
-        [K] bool; false for what is not finite.
+        [K] bool; False for non-finite spheres.
     """
     ahead = -middle[:, 2]
     touching = (ahead + radius > scene.znear) & (ahead - radius < (scene.zfar if depth is None else jnp.max(depth)))
@@ -167,8 +168,8 @@ def in_view(scene: Scene, middle: jax.Array, radius: jax.Array, rays: Rays, dept
     return touching
 
 
-def mapped(matrix: Any, vector: tuple) -> tuple:
-    """``matrix @ vector`` for a [3, 3] matrix (or rows of values) and three values, without the products with plain zeros."""
+def multiply(matrix: Any, vector: tuple) -> tuple:
+    """Multiply a matrix [3, 3] (or its rows) by a vector of three values, omitting products with constants 0 and -1."""
     rows = [[matrix[row, column] for column in range(3)] for row in range(3)] if hasattr(matrix, "shape") else matrix
     result = []
     for row in rows:

@@ -1,9 +1,9 @@
-"""Images of one environment: `render` for people and files, `render_planes` for the hot path. `jax.vmap` them for a batch.
+"""Rendering of one environment: `render` for viewing and files, `render_planes` for the hot path. Use `jax.vmap` for a batch.
 
-Three steps: once per environment, everything linear (`pixel.shapes`, `pixel.lights`); per pixel, which object is nearest
-(`pixel.raycast`, `pixel.triangles`), which gives integers and is never differentiated; per pixel, once, depth, normal and
-colour of that object from the row of a table (`pixel.surface`, `pixel.shade`). For most scenes the last two are one kernel on a
-GPU (`gpu.kernel`), and passes that compute nothing twice on a CPU (`cpu.passes`).
+There are three stages: all linear work once per environment (`pixel.shapes`, `pixel.lights`); the nearest object of each pixel
+(`pixel.raycast`, `pixel.triangles`), an integer that is never differentiated; and, once per pixel, depth, normal and colour of
+that object from a row of a table (`pixel.surface`, `pixel.shade`). For most scenes the last two stages are one kernel on a GPU
+(`gpu.kernel`), and passes without redundant computation on a CPU (`cpu.passes`).
 """
 
 import dataclasses
@@ -25,12 +25,12 @@ from jaxrl_vis_envs.render.pixel import blocks, lights, lookup, raycast, shade, 
 from jaxrl_vis_envs.render.pixel.prepare import check_poses, prepare
 from jaxrl_vis_envs.render.scene import Scene
 
-# Leaves of a scene that are not float32.
+# Scene leaves that are not float32.
 _INTEGERS = {"texels": jnp.uint32, "cluster_places": jnp.int32}
 
 
 class _View(NamedTuple):
-    """What is prepared once per environment."""
+    """Quantities computed once per environment."""
 
     rotation: jax.Array
     unit: shapes.UnitShapes
@@ -39,7 +39,7 @@ class _View(NamedTuple):
 
 
 class _Path(NamedTuple):
-    """How planes are drawn: by which fast function (None: by `_draw`), and for which platform."""
+    """Rendering path: the fast function (None for `_draw`), and the platform it is traced for."""
 
     fast: Callable[..., Planes] | None
     platform: str
@@ -55,61 +55,60 @@ def render_planes(
     distance: bool = False,
     quantized: bool = False,
 ) -> Planes:
-    """Draws one environment, as planes. What is not asked for is not computed.
+    """Render one environment as planes. Planes that are not requested are not computed.
 
     Args:
-        scene: What is drawn, and from which camera.
+        scene: Scene and camera.
         data: Poses of one environment: `mjx.Data` or `mujoco.MjData` after forward kinematics (`mjx.kinematics` is enough), or
-            anything with ``geom_xpos`` [ngeom, 3], ``geom_xmat`` [ngeom, 3, 3] or [ngeom, 9], and likewise ``site_xpos``,
-            ``site_xmat`` where sites are drawn. Cameras and lights are placed from the bodies: those that ride on one, follow
-            it or aim at it need ``xpos`` and ``xmat``, those of a centre of mass ``xipos``. A geom whose pose is not finite is
-            not drawn.
-        rgb: Whether to shade.
-        depth: Whether to return the planar depth.
-        segmentation: Whether to say which object each pixel sees.
-        normals: Whether to return the normals of the surfaces.
-        distance: Whether to return the depth along the rays.
-        quantized: Whether to return the colours as `quantize` makes them, [3, H, W] uint8: less to write.
+            any object with ``geom_xpos`` [ngeom, 3], ``geom_xmat`` [ngeom, 3, 3] or [ngeom, 9], and likewise ``site_xpos`` and
+            ``site_xmat`` if sites are rendered. Cameras and lights attached to, tracking or aiming at bodies also need ``xpos``
+            and ``xmat``, those that follow a centre of mass ``xipos``. A geom with a non-finite pose is not rendered.
+        rgb: Compute colours.
+        depth: Compute the planar depth.
+        segmentation: Compute the object id of each pixel.
+        normals: Compute surface normals.
+        distance: Compute the distance along the rays.
+        quantized: Return colours as from `quantize`, [3, H, W] uint8, which is less memory traffic.
 
     Returns:
-        The planes that were asked for.
+        The requested planes.
 
     Raises:
-        ValueError: ``scene`` is no scene, or ``data`` has no poses, none that kinematics have filled in (which is seen where
-            they are numbers, not in a function that is being traced), those of several environments, or those of another model.
+        ValueError: ``scene`` is not a Scene, or ``data`` has no poses, poses that kinematics has not computed yet (detected for
+            concrete arrays, not while tracing), those of several environments, or those of another model.
     """
     outputs = Outputs(rgb, depth, segmentation, normals, distance, quantized)
     check_poses(scene, data, rgb)
-    if not any(outputs[:-1]):  # the fast ways draw something in any case
+    if not any(outputs[:-1]):  # the fast paths cannot render nothing
         return Planes(None, None, None)
     scene = _in_32_bits(scene)
     if not scene.object_ids:
         return _quantized(outputs, _draw_nothing(scene, data, outputs))
 
     def draw(scene: Scene, *prepared: Any) -> Planes:
-        return _drawn(_Path(_fast(scene, outputs), target_platform()), outputs, scene, *prepared)
+        return _draw_along(_Path(_fast(scene, outputs), target_platform()), outputs, scene, *prepared)
 
     return by_platform(draw, scene, *prepare(scene, data, rgb))
 
 
 def _in_32_bits(scene: Scene) -> Scene:
-    """The scene with leaves as `Scene` states them, whatever it was given: numbers, or the 64 bits that JAX may compute in."""
+    """Convert the leaves to the dtypes that `Scene` documents, whether they are Python numbers or 64-bit arrays."""
     leaves = [field.name for field in dataclasses.fields(scene) if not field.metadata.get("static")]
     dtypes = {name: _INTEGERS.get(name, jnp.float32) for name in leaves}
     return scene.replace(**{name: jnp.asarray(getattr(scene, name), dtype) for name, dtype in dtypes.items()})
 
 
 def _fast(scene: Scene, outputs: Outputs) -> Callable[..., Planes] | None:
-    """What draws these outputs of a scene faster than `_draw` on the platform that is being traced for, if anything does."""
+    """Return the fast rendering function for these outputs on the platform being traced for, or None."""
     for path in (kernel, passes):
-        if path.takes(scene, outputs):
+        if path.can_render(scene, outputs):
             return path.draw
     return None
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
-def _drawn(path: _Path, outputs: Outputs, *arguments: Any) -> Planes:
-    """The planes, drawn as ``path`` says. Jitted so that it is traced once, in however many programs it is."""
+def _draw_along(path: _Path, outputs: Outputs, *arguments: Any) -> Planes:
+    """Render along ``path``. Jitted so that it is traced only once, however many programs contain it."""
     with tracing_for(path.platform):
         return _draw(outputs, *arguments) if path.fast is None else _draw_fast(path, outputs, *arguments)
 
@@ -118,7 +117,7 @@ def _drawn(path: _Path, outputs: Outputs, *arguments: Any) -> Planes:
 def _draw_fast(
     path: _Path, outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.UnitShapes, light_table: jax.Array
 ) -> Planes:
-    """`_draw` as one GPU kernel, or as passes on a CPU, with the derivatives of `_draw`."""
+    """Render as `_draw`, by one GPU kernel or by passes on a CPU, with the derivatives of `_draw`."""
     assert path.fast is not None
     return path.fast(outputs, scene, rotation, unit, light_table)
 
@@ -130,21 +129,21 @@ def _differentiate(path: _Path, outputs: Outputs, primals: tuple, tangents: tupl
 
 
 def _draw(outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.UnitShapes, light_table: jax.Array) -> Planes:
-    """The wanted planes of a scene with objects, in plain JAX.
+    """Render the requested planes of a scene with objects, in plain JAX.
 
     Args:
-        outputs: Which planes, and whether colours are bytes.
+        outputs: Requested planes.
         scene: The scene.
         rotation: [3, 3] float32, see `camera.camera_pose`.
-        unit: The drawn objects.
-        light_table: From `lights.pack`.
+        unit: Rendered objects.
+        light_table: Lights, from `lights.pack`.
     """
     layout = blocks.layout(scene)
     rays = camera.pixel_rays(scene, layout.rows, layout.columns)
-    # A barrier, because XLA would otherwise redo the work per object in every pixel.
+    # Barrier: XLA would otherwise repeat the per-object work in every pixel.
     unit = camera.barrier(unit)
     beyond_depth = outputs.rgb or outputs.segmentation or outputs.normals
-    if not (beyond_depth or blocks.tiled(scene) or any(scene.transparent)):
+    if not (beyond_depth or blocks.is_tiled(scene) or any(scene.transparent)):
         far = blocks.scan(lambda rays: raycast.nearest_distance(scene, unit, rays), rays)
         depth = length = None
         if outputs.depth:
@@ -153,11 +152,11 @@ def _draw(outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.Unit
             along = jnp.where(far < scene.zfar, far * camera.ray_length(scene, rays), scene.zfar)
             length = blocks.restore(scene, layout, along)
         return Planes(None, depth, None, None, length)
-    # Barriers here too: each output would otherwise look for the nearest object again.
+    # Barriers: XLA would otherwise search for the nearest object again for each output.
     near = jax.lax.optimization_barrier(blocks.nearest(scene, unit, rays))
     rows = lookup.object_table(scene, unit)
     view = _View(rotation, unit, rows, light_table)
-    pixels = blocks.joined((rays, near))
+    pixels = blocks.merge_blocks((rays, near))
     planes = blocks.scan(lambda *block: _finish(scene, view, outputs, *block), *pixels)
     planes = jax.lax.optimization_barrier(planes)
     planes = jax.tree.map(lambda plane: blocks.restore(scene, layout, plane), planes)
@@ -166,9 +165,9 @@ def _draw(outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.Unit
 
 
 def _finish(scene: Scene, view: _View, outputs: Outputs, rays: Rays, nearest: blocks.Nearest) -> Planes:
-    """The wanted planes of a block of pixels whose nearest objects are known, [P] each; colours and normals in three."""
+    """Compute the requested planes of a block of pixels [P] whose nearest objects are known; vectors as three components."""
     near, index = raycast.decode(scene, nearest.key, nearest.row)
-    sees = index >= 0
+    hit_mask = index >= 0
     far = near
     colour: Any = None
     normal: Any = None
@@ -177,13 +176,13 @@ def _finish(scene: Scene, view: _View, outputs: Outputs, rays: Rays, nearest: bl
     if outputs.rgb or outputs.depth or outputs.normals or outputs.distance or any(scene.transparent):
         row = lookup.fetch(view.table, index)
         hit = surface.meet(scene, row, lookup.fetch_triangle(scene, nearest.triangle), rays, near)
-        far = jnp.where(sees, hit.depth, scene.zfar)
-        normal = tuple(jnp.where(sees, component, 0.0) for component in hit.normal)
-        sheets = transparent.sheets(scene, view.unit, view.table, rays, far)
+        far = jnp.where(hit_mask, hit.depth, scene.zfar)
+        normal = tuple(jnp.where(hit_mask, component, 0.0) for component in hit.normal)
+        sheets = transparent.intersect_sheets(scene, view.unit, view.table, rays, far)
         if outputs.rgb:
             front = shade.shade(scene, view.unit, lights.unpack(scene, view.lights), row, hit, rays)
             background = shade.sky(scene, view.rotation, rays)
-            colour = tuple(jnp.where(sees, one, other) for one, other in zip(front, background, strict=True))
+            colour = tuple(jnp.where(hit_mask, one, other) for one, other in zip(front, background, strict=True))
             if scene.haze[0] >= 0:
                 colour = shade.haze(scene, view.unit, rays, far, colour)
             colour = transparent.blend(scene, view.unit, view.table, view.lights, sheets, rays, far, colour)
@@ -191,25 +190,25 @@ def _finish(scene: Scene, view: _View, outputs: Outputs, rays: Rays, nearest: bl
     if outputs.distance:
         length = jnp.where(shown >= 0, far * camera.ray_length(scene, rays), scene.zfar)
     if outputs.segmentation:
-        # One entry more than there are drawn objects, so that -1 finds the sky's label at the end.
+        # The extra last entry is the sky's label, selected by index -1.
         labels = jnp.asarray(np.array([*scene.object_ids, -1], np.int32))[shown]
     return Planes(colour, far if outputs.depth else None, labels, normal if outputs.normals else None, length)
 
 
 def _declared_last(scene: Scene, view: _View, rays: Rays, nearest: blocks.Nearest, index: jax.Array) -> jax.Array:
-    """The rows ``index`` [P], but of the object that reflects where it coincides with one that comes before it in the model.
+    """Return the rows ``index`` [P], replaced by the reflecting object's where it coincides with one declared before it.
 
-    MuJoCo's colours are those of the other one there, and its labels are not.
+    There, MuJoCo renders the colour of the other object, but the segmentation label of the reflecting one.
     """
     mask = raycast.code_mask(scene)
     last = len(scene.object_ids) - 1
     key = raycast.object_key(scene, jax.lax.stop_gradient(view.unit), last, rays, jnp.full_like(nearest.key, -1), mask)
-    before = np.append(np.array(scene.object_ids[:-1]) < scene.object_ids[-1], [False, False])  # itself, and the sky
+    before = np.append(np.array(scene.object_ids[:-1]) < scene.object_ids[-1], [False, False])  # the object itself, and the sky
     return jnp.where(((key ^ nearest.key) & ~mask == 0) & jnp.asarray(before)[index], last, index)
 
 
 def _draw_nothing(scene: Scene, data: Any, outputs: Outputs) -> Planes:
-    """A scene without objects: sky."""
+    """Render a scene without objects: only sky."""
     shape = (scene.height, scene.width)
     colour = None
     if outputs.rgb:
@@ -227,33 +226,33 @@ def _draw_nothing(scene: Scene, data: Any, outputs: Outputs) -> Planes:
 
 
 def _quantized(outputs: Outputs, planes: Planes) -> Planes:
-    """With colours as bytes, if they are asked for and are not yet."""
+    """Quantize the colours, if requested and not done yet."""
     if not outputs.quantized or planes.rgb is None or planes.rgb.dtype == jnp.uint8:
         return planes
     return planes._replace(rgb=quantize(planes.rgb))
 
 
 def render(scene: Scene, data: Any, normals: bool = False, distance: bool = False) -> Frame:
-    """Draws one environment: colour, depth and segmentation. `jax.vmap` it for a batch.
+    """Render colour, depth and segmentation of one environment. Use `jax.vmap` for a batch.
 
     Args:
-        scene: What is drawn, and from which camera.
+        scene: Scene and camera.
         data: Poses of one environment, as in `render_planes`.
-        normals: Whether to return the normals of the surfaces too.
-        distance: Whether to return the depth along the rays too.
+        normals: Also compute surface normals.
+        distance: Also compute the distance along the rays.
 
     Returns:
-        The frame.
+        The image.
 
     Raises:
-        ValueError: As `render_planes`.
+        ValueError: As in `render_planes`.
     """
     planes = render_planes(scene, data, rgb=True, depth=True, segmentation=True, normals=normals, distance=distance)
     assert planes.rgb is not None and planes.depth is not None and planes.segmentation is not None
-    upright = None if planes.normals is None else jnp.moveaxis(planes.normals, 0, -1)
-    return Frame(quantize(jnp.moveaxis(planes.rgb, 0, -1)), planes.depth, planes.segmentation, upright, planes.distance)
+    channels_last = None if planes.normals is None else jnp.moveaxis(planes.normals, 0, -1)
+    return Frame(quantize(jnp.moveaxis(planes.rgb, 0, -1)), planes.depth, planes.segmentation, channels_last, planes.distance)
 
 
 def quantize(colour: jax.Array) -> jax.Array:
-    """Colours in [0, 1] as uint8, rounded to the nearest as OpenGL does; any shape."""
+    """Quantize colours in [0, 1] to uint8, rounding to the nearest as OpenGL does; any shape."""
     return jnp.floor(jnp.clip(colour, 0.0, 1.0) * 255.0 + 0.5).astype(jnp.uint8)

@@ -1,7 +1,7 @@
-"""Poses of cameras and lights, from the poses of bodies alone.
+"""Poses of cameras and lights, computed from the poses of bodies alone.
 
-`mjx.Data` has no poses of lights, and those of cameras only after `mjx.forward`: what `mjx.kinematics` leaves behind is where
-they were at some other time. So the five modes of MuJoCo's cameras and lights are computed here.
+`mjx.Data` contains no light poses, and up-to-date camera poses only after `mjx.forward`: `mjx.kinematics` leaves stale ones.
+The five modes of MuJoCo's cameras and lights are therefore computed here.
 """
 
 from typing import Any, NamedTuple
@@ -13,9 +13,9 @@ import numpy as np
 
 _MODES = mujoco.mjtCamLight
 _WORLD = 0
-# What MuJoCo takes for no mass, and for no length.
-_LEAST = 1e-15
-# The rounding of a difference of two places, as a share of how far out they are.
+# MuJoCo's threshold for zero mass and zero length.
+_MIN_VALUE = 1e-15
+# Rounding error of a difference of two positions, relative to their distance from the origin.
 _ROUNDING = 4e-7
 
 
@@ -24,8 +24,8 @@ class Mount(NamedTuple):
 
     Attributes:
         mode: A value of `mujoco.mjtCamLight`.
-        body: Index of the body that it rides on or follows.
-        target: Index of the body that it looks at, -1 for none.
+        body: Index of the body that it is fixed to or tracks.
+        target: Index of the body that it aims at, -1 for none.
     """
 
     mode: int
@@ -34,19 +34,19 @@ class Mount(NamedTuple):
 
     @property
     def aims(self) -> bool:
-        """Returns whether the target decides where it looks."""
+        """True if it aims at its target."""
         return self.target >= 0 and self.mode in (_MODES.mjCAMLIGHT_TARGETBODY, _MODES.mjCAMLIGHT_TARGETBODYCOM)
 
     @property
     def posed(self) -> int:
-        """The last body whose pose is read; 0 for none, since the world stays where it is."""
+        """Highest index of a body whose pose is used; 0 for none, since the world does not move."""
         by_mass = self.mode == _MODES.mjCAMLIGHT_TRACKCOM
         target = self.target if self.aims and self.mode == _MODES.mjCAMLIGHT_TARGETBODY else _WORLD
         return max(_WORLD if by_mass else self.body, target)
 
     @property
     def weighed(self) -> int:
-        """The body whose centre of mass is read, that of all that hangs on it too; -1 for none."""
+        """Index of the body whose subtree's centre of mass is used; -1 for none."""
         if self.mode == _MODES.mjCAMLIGHT_TRACKCOM:
             return self.body
         return self.target if self.aims and self.mode == _MODES.mjCAMLIGHT_TARGETBODYCOM else -1
@@ -57,26 +57,26 @@ class Bodies(NamedTuple):
 
     Attributes:
         mass: [nbody] float32, kg.
-        parents: nbody indices, of the body that each one hangs on.
+        parents: nbody indices of the parent bodies.
     """
 
     mass: jax.Array
     parents: tuple[int, ...]
 
 
-def place(bodies: Bodies, data: Any, mount: Mount, offset: jax.Array) -> tuple[jax.Array, jax.Array | None]:
-    """Position of a mount in the world.
+def mount_position(bodies: Bodies, data: Any, mount: Mount, offset: jax.Array) -> tuple[jax.Array, jax.Array | None]:
+    """Compute the position of a mount in the world.
 
     Args:
-        bodies: Of the scene.
-        data: Has ``xpos`` [nbody, 3], ``xmat`` [nbody, 3, 3] or [nbody, 9], and ``xipos`` [nbody, 3] where something follows
-            a centre of mass.
+        bodies: Bodies of the scene.
+        data: Physics data with ``xpos`` [nbody, 3], ``xmat`` [nbody, 3, 3] or [nbody, 9], and ``xipos`` [nbody, 3] if something
+            follows a centre of mass.
         mount: The mount.
-        offset: [3] float32, metres: in the frame of its body, or along the world's axes where it only follows.
+        offset: [3] float32, metres: in the frame of its body, or along the world's axes if it only tracks the body.
 
     Returns:
-        The position [3] float32 in metres, and the rotation [3, 3] of the frame that its orientation is given in, None for the
-        world's.
+        Position [3] float32 in metres, and the rotation [3, 3] of the frame in which its orientation is expressed, or None for
+        the world's.
     """
     if mount.mode == _MODES.mjCAMLIGHT_TRACKCOM:
         return centre_of_mass(bodies, data, mount.body) + offset, None
@@ -86,29 +86,29 @@ def place(bodies: Bodies, data: Any, mount: Mount, offset: jax.Array) -> tuple[j
     if mount.mode == _MODES.mjCAMLIGHT_TRACK:
         return position + offset, None
     rotation = jnp.asarray(data.xmat, jnp.float32).reshape(-1, 3, 3)[mount.body]
-    # Written out rather than as a matrix product, which accelerators would do at low precision.
+    # Not a matrix product, which accelerators would compute at low precision.
     return position + jnp.sum(rotation * offset, -1), rotation
 
 
-def target(bodies: Bodies, data: Any, mount: Mount) -> jax.Array:
-    """Point that a mount aims at, [3] float32 (m)."""
+def target_position(bodies: Bodies, data: Any, mount: Mount) -> jax.Array:
+    """Compute the point that a mount aims at, [3] float32 (m)."""
     if mount.mode == _MODES.mjCAMLIGHT_TARGETBODYCOM:
         return centre_of_mass(bodies, data, mount.target)
     return jnp.zeros(3, jnp.float32) if mount.target == _WORLD else jnp.asarray(data.xpos, jnp.float32)[mount.target]
 
 
 def centre_of_mass(bodies: Bodies, data: Any, body: int) -> jax.Array:
-    """Centre of mass of a body's subtree, [3] float32 (m); without any mass, the body's own."""
+    """Compute the centre of mass of a body's subtree, [3] float32 (m), or of the body itself if the subtree has no mass."""
     members = np.array(_subtree(bodies.parents, body))
     own = jnp.asarray(data.xipos, jnp.float32)
     mass = bodies.mass[members]
     total = jnp.sum(mass)
-    mean = jnp.sum(mass[:, None] * own[members], axis=0) / jnp.where(total < _LEAST, 1.0, total)
-    return jnp.where(total < _LEAST, own[body], mean)
+    mean = jnp.sum(mass[:, None] * own[members], axis=0) / jnp.where(total < _MIN_VALUE, 1.0, total)
+    return jnp.where(total < _MIN_VALUE, own[body], mean)
 
 
 def _subtree(parents: tuple[int, ...], body: int) -> list[int]:
-    """The body and all that hangs on it. Bodies come after their parents in MuJoCo."""
+    """Return the indices of a body and all its descendants. MuJoCo sorts bodies after their parents."""
     members = {body}
     for index in range(body + 1, len(parents)):
         if parents[index] in members:
@@ -116,19 +116,19 @@ def _subtree(parents: tuple[int, ...], body: int) -> list[int]:
     return sorted(members)
 
 
-def looking(position: jax.Array, aim: jax.Array) -> jax.Array:
-    """Rotation [3, 3] of a camera at ``position`` that looks at ``aim``, upright, as `mj_camlight` has it."""
+def look_at(position: jax.Array, aim: jax.Array) -> jax.Array:
+    """Compute the rotation [3, 3] of an upright camera at ``position`` that looks at ``aim``, as in `mj_camlight`."""
     back = position - aim
     rounding = _ROUNDING * (jnp.max(jnp.abs(position)) + jnp.max(jnp.abs(aim)))
     z = _unit(back, rounding)
-    # Straight up or down nothing says where the right is, and neither does a difference that is nothing but rounding.
+    # Vertical directions, and differences within rounding error, do not determine the horizontal axis.
     x = _unit(jnp.stack([-back[1], back[0], jnp.zeros_like(back[0])]), rounding)
     y = jnp.stack([z[1] * x[2] - z[2] * x[1], z[2] * x[0] - z[0] * x[2], z[0] * x[1] - z[1] * x[0]])
     return jnp.stack([x, y, z], axis=1)
 
 
 def _unit(vector: jax.Array, rounding: jax.Array) -> jax.Array:
-    """The vector [3] at length 1; where it is no longer than the rounding, along x."""
+    """Normalise a vector [3]; if it is not longer than the rounding error, return the x axis."""
     square = jnp.sum(vector * vector)
-    none = square <= jnp.square(rounding) + _LEAST * _LEAST
+    none = square <= jnp.square(rounding) + _MIN_VALUE * _MIN_VALUE
     return jnp.where(none, jnp.array([1.0, 0.0, 0.0], jnp.float32), vector / jnp.sqrt(jnp.where(none, 1.0, square)))

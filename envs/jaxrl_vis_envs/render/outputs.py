@@ -1,4 +1,4 @@
-"""What is asked of an image, and what comes back: `Outputs`, and `Frame` or `Planes`."""
+"""Requested planes, `Outputs`, and the rendered image, `Frame` or `Planes`."""
 
 from typing import NamedTuple
 
@@ -6,13 +6,14 @@ import jax
 
 
 class Frame(NamedTuple):
-    """An image as people and files want it.
+    """Image with channels last, for viewing and for files.
 
     Attributes:
         rgb: [H, W, 3] uint8.
-        depth: [H, W] float32, planar metres (distance along the camera's axis), the scene's ``zfar`` for the sky.
+        depth: [H, W] float32, planar depth in metres (along the camera's axis); the scene's ``zfar`` for the sky.
         segmentation: [H, W] int32: geom id, ngeom + site id for a site, -1 for the sky.
-        normals: [H, W, 3] float32, unit, in the camera's frame (x right, y up, z towards the viewer), 0 for the sky; or None.
+        normals: [H, W, 3] float32, unit vectors in the camera's frame (x right, y up, z towards the viewer), 0 for the sky; or
+            None.
         distance: [H, W] float32, metres along the ray, ``zfar`` for the sky; or None.
     """
 
@@ -24,10 +25,10 @@ class Frame(NamedTuple):
 
 
 class Planes(NamedTuple):
-    """An image as the hot path wants it: planes, not quantised, and only those that were asked for.
+    """Image as planes, for the hot path: not quantised by default, and only the requested planes.
 
     Attributes:
-        rgb: [3, H, W] float32 in [0, 1], or uint8 where that was asked for; or None.
+        rgb: [3, H, W] float32 in [0, 1], or uint8 if quantised; or None.
         depth: [H, W] float32 as in `Frame`, or None.
         segmentation: [H, W] int32 as in `Frame`, or None.
         normals: [3, H, W] float32 as in `Frame`, or None.
@@ -42,7 +43,9 @@ class Planes(NamedTuple):
 
 
 class Outputs(NamedTuple):
-    """Which planes are asked for, as `render_planes` takes them; ``quantized``: colours as bytes. Hashable, so static."""
+    """Requested planes, as in `render_planes`; ``quantized`` selects uint8 colours. Hashable, hence usable as a static
+    argument.
+    """
 
     rgb: bool
     depth: bool

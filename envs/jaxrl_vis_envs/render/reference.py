@@ -1,7 +1,7 @@
-"""MuJoCo's own OpenGL renderer behind the same `Frame`: the truth for tests, and the better image for videos.
+"""MuJoCo's own OpenGL renderer with the interface of `Frame`: ground truth for tests, and better-looking images for videos.
 
-It needs a GL library (``MUJOCO_GL=egl`` or ``osmesa`` without a display), one MuJoCo call per image, and NumPy only. GL is
-touched when a `ReferenceRenderer` is made, not when this module is imported.
+It needs a GL library (``MUJOCO_GL=egl`` or ``osmesa`` without a display), makes one MuJoCo call per image, and uses NumPy only.
+GL is initialised when a `ReferenceRenderer` is constructed, not on import.
 """
 
 from typing import Any, Self
@@ -15,18 +15,18 @@ from jaxrl_vis_envs.render.outputs import Frame
 
 
 class ReferenceRenderer:
-    """Draws `mujoco.MjData` with `mujoco.Renderer`. Close it, or use it in a ``with`` statement.
+    """Renders `mujoco.MjData` with `mujoco.Renderer`. Close it, or use it as a context manager.
 
     Args:
-        mj_model: The model. Its ``vis.global_.offwidth`` and ``offheight`` bound the image's size.
+        mj_model: MuJoCo model. Its ``vis.global_.offwidth`` and ``offheight`` limit the image size.
         height: H, pixels.
         width: W, pixels.
-        effects: Whether to draw what `render` does not: shadows, reflections, haze, tendons, skins, flexes and rangefinders.
-        site_groups: Site groups that are drawn.
-        haze: Whether to draw the horizon's haze all the same.
+        effects: Render what `render` does not: shadows, reflections, haze, tendons, skins, flexes and rangefinders.
+        site_groups: Visible site groups.
+        haze: Render the haze at the horizon even without ``effects``.
 
     Raises:
-        ValueError: The image is larger than the model's offscreen buffer, or a size is no positive integer.
+        ValueError: The image is larger than the model's offscreen buffer, or a size is not a positive integer.
         RuntimeError: There is no usable GL library.
     """
 
@@ -43,8 +43,8 @@ class ReferenceRenderer:
         buffer = mj_model.vis.global_
         if height > buffer.offheight or width > buffer.offwidth:
             raise ValueError(
-                f"the model's buffer has {buffer.offheight} x {buffer.offwidth} pixels, fewer than {height} x {width}: set"
-                " vis.global_.offheight and offwidth of the model first"
+                f"the model's offscreen buffer has {buffer.offheight} x {buffer.offwidth} pixels, fewer than {height} x"
+                f" {width}: set vis.global_.offheight and offwidth of the model first"
             )
         self._model = mj_model
         try:
@@ -53,21 +53,28 @@ class ReferenceRenderer:
             raise RuntimeError(f"no usable GL library (set MUJOCO_GL to egl or osmesa): {error}") from error
         self._options = mujoco.MjvOption()
         self._options.sitegroup[:] = [group in site_groups for group in range(len(self._options.sitegroup))]
-        # What is not a geom or a site has no label in a segmentation, and `render` does not draw it.
-        marks = mujoco.mjtVisFlag
-        for mark in (marks.mjVIS_TENDON, marks.mjVIS_RANGEFINDER, marks.mjVIS_SKIN, marks.mjVIS_FLEXEDGE, marks.mjVIS_FLEXSKIN):
-            self._options.flags[mark] = effects
+        # Objects other than geoms and sites have no segmentation label and are not supported by `render`.
+        vis_flags = mujoco.mjtVisFlag
+        for flag in (
+            vis_flags.mjVIS_TENDON,
+            vis_flags.mjVIS_RANGEFINDER,
+            vis_flags.mjVIS_SKIN,
+            vis_flags.mjVIS_FLEXEDGE,
+            vis_flags.mjVIS_FLEXSKIN,
+        ):
+            self._options.flags[flag] = effects
         flags = mujoco.mjtRndFlag
         for flag in (flags.mjRND_SHADOW, flags.mjRND_REFLECTION):
             self._renderer.scene.flags[flag] = effects
         self._renderer.scene.flags[flags.mjRND_HAZE] = effects or haze
 
     def __call__(self, mj_data: mujoco.MjData, camera: Camera) -> Frame:
-        """The image as NumPy arrays: a `Frame` of rgb [H, W, 3] uint8, depth [H, W] float32 and segmentation [H, W] int32.
+        """Render an image as NumPy arrays: a `Frame` of rgb [H, W, 3] uint8, depth [H, W] float32 and segmentation [H, W]
+        int32.
 
         Args:
-            mj_data: The poses.
-            camera: As `Scene.from_mjmodel` takes it.
+            mj_data: Physics data with the poses.
+            camera: Camera, as in `Scene.from_mjmodel`.
 
         Raises:
             ValueError: There is no such camera.
@@ -85,7 +92,7 @@ class ReferenceRenderer:
         return Frame(colour, depth, labels.astype(np.int32))  # pyright: ignore[reportArgumentType]
 
     def close(self) -> None:
-        """Frees the GL context."""
+        """Free the GL context."""
         self._renderer.close()
 
     def __enter__(self) -> Self:

@@ -1,11 +1,10 @@
-"""What is drawn: everything that an image needs besides the poses, read once from a MuJoCo model.
+"""Scene: everything an image needs besides the poses, read once from a MuJoCo model.
 
-A `Scene` is a pytree. Sizes, colours, materials, lights and the camera are leaves, so a batch of different appearances is
-``jax.vmap`` over ``scene.replace(rgba=...)``; what is drawn (geom types, ids, the image's size) is static and fixes the
-compiled program.
+A `Scene` is a pytree. Sizes, colours, materials, lights and camera parameters are leaves, so a batch of appearances is a
+``jax.vmap`` over ``scene.replace(rgba=...)``; geom types, ids and the image size are static and determine the compiled program.
 
-Arrays over objects are indexed as the segmentation is: object ``i`` is geom ``i`` of the model, and object ``ngeom + i`` is
-site ``i``. Objects that are never seen keep their row, so that a row can be found without a table.
+Arrays over objects are indexed like the segmentation: object ``i`` is geom ``i`` of the model, and object ``ngeom + i`` is site
+``i``. Objects that are never visible keep their row, so that indexing needs no lookup table.
 """
 
 import dataclasses
@@ -30,75 +29,76 @@ def _static() -> Any:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """One camera's view of one model, without the poses. Make it with `Scene.from_mjmodel`.
+    """One camera's view of one model, without the poses. Construct it with `Scene.from_mjmodel`.
 
-    N is ngeom + nsite, L the number of lights that are drawn with (the headlight is apart), G the number of drawn objects.
+    N is ngeom + nsite, L the number of active lights (without the headlight), G the number of rendered objects.
 
     Attributes:
-        size: [N, 3] float32, metres, as `mjModel.geom_size` means it for each type (endless planes: a very large half-size).
-        bound: [N] float32, metres, of a ball around each object, by which what is transparent is sorted.
-        rgba: [N, 4] float32 in [0, 1], the geom's own colour or its material's. Alpha counts only for the objects in
-            ``transparent``, which is settled when the scene is made.
-        emission: [N] float32, the part of the colour that needs no light.
-        specular: [N] float32 in [0, 1], strength of the highlight.
+        size: [N, 3] float32, metres, as in `mjModel.geom_size` for each type (infinite planes: a very large half-size).
+        bound: [N] float32, metres, radius of each object's bounding sphere, for sorting transparent objects.
+        rgba: [N, 4] float32 in [0, 1], colour of the geom or its material. Alpha is used only for the objects marked in
+            ``transparent``, which is fixed when the scene is constructed.
+        emission: [N] float32, emitted fraction of the colour, independent of lights.
+        specular: [N] float32 in [0, 1], specular reflectance.
         shininess: [N] float32 in [0, 1]; the Phong exponent is 128 times this.
-        texture_repeat: [N, 2] float32, how often a texture repeats over an object (over a metre where ``texture_uniform``).
-        fovy: [] float32, the vertical field of view: degrees, or metres for an orthographic camera.
-        focal: [2] float32, metres, of a camera with a sensor size.
-        principal: [2] float32, metres, of a camera with a sensor size: where the axis meets the sensor, from its middle.
-        sensor: [2] float32, metres, width and height of the sensor.
+        texture_repeat: [N, 2] float32, repetitions of the texture per object (per metre if ``atlas.uniform``).
+        fovy: [] float32, vertical field of view: degrees, or metres for an orthographic camera.
+        focal: [2] float32, focal lengths, metres, for a camera with a sensor size.
+        principal: [2] float32, principal point relative to the sensor's centre, metres, for a camera with a sensor size.
+        sensor: [2] float32, width and height of the sensor, metres.
         camera_position: [3] float32, metres, in the frame of the body that the camera is fixed to, or along the world's axes
-            from what it follows.
+            relative to the body that it tracks.
         camera_axes: [3, 3] float32 whose columns are the camera's axes (right, up, back), in the body's frame, or in the
-            world's where it follows. Not read for a camera that aims at a body.
-        camera_shift: [3] float32, metres in the camera's own frame (right, up, back), added to its pose. Of a free camera: its
-            position in the world.
-        camera_turn: [3] float32, radians, a rotation vector in the camera's own frame, applied to its pose. Of a free camera:
+            world's if it tracks a body. Unused for a camera that aims at a body.
+        camera_shift: [3] float32, translation in the camera's own frame (right, up, back), metres, applied to its pose. For a
+            free camera, its position in the world.
+        camera_turn: [3] float32, rotation vector in the camera's own frame, radians, applied to its pose. For a free camera,
             its rotation in the world.
-        body_mass: [nbody] float32, kg, where the camera or a light follows a centre of mass, else [0].
-        znear: [] float32, metres. What is nearer than this is cut away.
-        zfar: [] float32, metres. What is further is not drawn, and it is the depth of the sky.
-        light_position: [L, 3] float32, metres, in the frame of the body that it is fixed to, or along the world's axes from
-            what it follows.
-        light_direction: [L, 3] float32, unit, in the same frame. Not read for a light that aims at a body.
+        body_mass: [nbody] float32, kg, if the camera or a light follows a centre of mass, else [0].
+        znear: [] float32, depth of the near clipping plane, metres.
+        zfar: [] float32, depth of the far clipping plane and of the sky, metres.
+        light_position: [L, 3] float32, metres, in the frame of the body that the light is fixed to, or along the world's axes
+            relative to the body that it tracks.
+        light_direction: [L, 3] float32, unit vectors in the same frame. Unused for a light that aims at a body.
         light_ambient: [L, 3] float32.
         light_diffuse: [L, 3] float32.
         light_specular: [L, 3] float32.
-        light_attenuation: [L, 3] float32: constant, linear (1/m) and quadratic (1/m^2). Only for lights with a position.
-        light_cutoff: [L] float32, degrees, half-angle of the cone. Only for spot lights.
-        light_exponent: [L] float32, how fast a spot light fades from its axis.
+        light_attenuation: [L, 3] float32: constant, linear (1/m) and quadratic (1/m^2). Unused for directional lights.
+        light_cutoff: [L] float32, half-angle of a spot light's cone, degrees.
+        light_exponent: [L] float32, exponent of a spot light's falloff from its axis.
         headlight_ambient: [3] float32.
         headlight_diffuse: [3] float32.
         headlight_specular: [3] float32.
-        sky_top: [3] float32 in [0, 1], colour of a plain sky straight up (world +z).
-        sky_bottom: [3] float32 in [0, 1], colour of a plain sky straight down.
+        sky_top: [3] float32 in [0, 1], colour of a plain sky at the zenith (world +z).
+        sky_bottom: [3] float32 in [0, 1], colour of a plain sky at the nadir.
         haze_colour: [3] float32 in [0, 1].
-        texels: [T, 4] uint32, all textures at all resolutions, see `textures.Atlas`.
-        triangles: [R, 36] float32, the triangles of all meshes and height fields, see `meshes.build_triangles`.
-        clusters: [K, 4] float32, metres: balls around the clusters of triangles that are drawn.
-        cluster_places: [K, 2] int32: which of the G objects each cluster belongs to, and the first row of its triangles.
-        object_ids: G indices of the drawn objects, those that MuJoCo draws last first (of two at the same depth it shows the
-            later one, and the renderer the one that comes first here): the last of the model, but one that reflects at the end.
+        texels: [T, 4] uint32, all textures at all mipmap levels, see `textures.Atlas`.
+        triangles: [R, 36] float32, triangles of all meshes and height fields, see `meshes.build_triangles`.
+        clusters: [K, 4] float32, bounding spheres of the rendered triangle clusters, metres.
+        cluster_places: [K, 2] int32: index of the cluster's object among the G, and first row of its triangles.
+        object_ids: G indices of the rendered objects, in the reverse of MuJoCo's drawing order: of two objects at the same
+            depth, MuJoCo shows the one drawn later, this renderer the one listed first. That is descending order, with the
+            reflecting object, if any, at the end.
         object_types: G values of `mujoco.mjtGeom`.
-        transparent: Which of the G objects let light through: 0 not, 1 yes, 2 a plane that does so from behind.
-        reordered: Whether an object that reflects is drawn before others that come before it in the model. In segmentations
-            MuJoCo keeps to the model's order.
+        transparent: G flags: 0 opaque, 1 transparent, 2 a plane that is transparent from behind.
+        reordered: Whether a reflecting object is drawn before objects declared before it. MuJoCo's segmentation keeps the
+            order of declaration.
         geom_count: ngeom of the model.
-        camera_id: The camera's index in the model; `cameras.FREE_CAMERA` for a free one.
-        camera_mount: What the camera is fixed to.
-        body_parents: nbody indices of the bodies that bodies hang on, where ``body_mass`` holds their masses, else none.
+        camera_id: Index of the camera in the model; `cameras.FREE_CAMERA` for a free one.
+        camera_mount: Attachment of the camera.
+        body_parents: nbody indices of parent bodies if ``body_mass`` is used, else empty.
         projection: "perspective", "intrinsic" (a perspective camera with a sensor) or "orthographic".
         height: H, pixels.
         width: W, pixels.
         light_types: L values of `mujoco.mjtLightType`.
-        light_mounts: What each of the L lights is fixed to.
-        light_highlights: L + 1 booleans, the last for the headlight: whether the light makes highlights at all. One that has
-            no specular colour in the model never does, and costs less.
-        light_shadows: L booleans: whether the light casts shadows (none does unless shadows are asked for).
+        light_mounts: L attachments of the lights.
+        light_highlights: L + 1 booleans, the last for the headlight: whether the light can cause specular highlights. A light
+            without a specular colour in the model cannot, and costs less.
+        light_shadows: L booleans: whether the light casts shadows (none does unless shadows are requested).
         headlight: Whether the headlight is on.
         sky: "plain" (a gradient between two colours), or "texture".
-        haze: [N]-index of the endless plane whose horizon is hazy, -1 for no haze; and the width of the haze.
-        atlas: Where each texture is in ``texels``.
+        haze: Index of the infinite plane with a hazy horizon, -1 for no haze; and the width of the haze.
+        atlas: Layout of the textures in ``texels``.
     """
 
     size: jax.Array = _leaf()
@@ -173,35 +173,35 @@ class Scene:
         leave_out: tuple[str, ...] = (),
         lights: str = "all",
     ) -> Self:
-        """Reads what is drawn from ``mj_model``.
+        """Build a scene from ``mj_model``.
 
         Args:
-            mj_model: The model.
-            camera: Name or index of one of the model's cameras. None: a free camera as `mujoco.Renderer` has it, which looks
-                at the whole model from outside; or an `mujoco.MjvCamera` with a ``lookat``, ``distance``, ``azimuth`` and
-                ``elevation`` of its own. A free camera stays where it is, whatever moves.
+            mj_model: MuJoCo model.
+            camera: Name or index of one of the model's cameras. None: the free camera of `mujoco.Renderer`, which views the
+                whole model from outside. Or an `mujoco.MjvCamera` with its own ``lookat``, ``distance``, ``azimuth`` and
+                ``elevation``. A free camera does not move.
             height: Image height in pixels.
             width: Image width in pixels.
-            groups: Geom groups that are drawn (the default is that of `mujoco.Renderer`).
-            site_groups: Site groups that are drawn. None by default, unlike `mujoco.Renderer`: a site is a marker for people.
-            textured: Whether textures are drawn. Without, an object has the mean colour of its texture, and the sky is a
-                gradient between its colours straight up and straight down; that is cheaper.
-            shadows: Whether lights cast hard shadows, where the model says that they do: one more ray for each light.
-            haze: Whether the horizon of the first endless plane is hazy, as the model's visual settings have it.
-            plane_backs: Whether planes are half transparent from behind, as MuJoCo draws them, or (False) the same from both
-                sides, which is cheaper. None: those are that the camera is behind of in the model's initial pose, which is
-                right for cameras and planes that do not pass each other.
-            leave_out: Names of geoms that are not drawn, and "skin" and "flex" for all of these.
-            lights: "all" lights with all lights but images, which are left out as MuJoCo leaves them out. "mujoco" leaves out
-                point lights too, which MuJoCo's renderer does not know: for images as it draws them.
+            groups: Visible geom groups (default as in `mujoco.Renderer`).
+            site_groups: Visible site groups. None by default, unlike in `mujoco.Renderer`: sites are markers for users.
+            textured: Render textures. If False, which is cheaper, an object has its texture's mean colour, and the sky is a
+                gradient between its colours at the zenith and the nadir.
+            shadows: Render hard shadows of the lights that cast shadows in the model: one more ray per light.
+            haze: Render haze at the horizon of the first infinite plane, as in the model's visual settings.
+            plane_backs: True: planes are partly transparent from behind, as in MuJoCo. False: they look the same from both
+                sides, which is cheaper. None: planes that the camera is behind in the model's initial pose are transparent,
+                which is correct unless camera and plane pass each other.
+            leave_out: Names of geoms not to render, and "skin" or "flex" for all of those.
+            lights: "all": all lights except image lights, which MuJoCo ignores too. "mujoco": also without point lights, which
+                MuJoCo's renderer does not support, to reproduce its images.
 
         Returns:
-            The scene. Objects with alpha 0 and objects of other groups are left out; tendons are not drawn.
+            The scene. Objects with alpha 0 and objects of other groups are omitted; tendons are not rendered.
 
         Raises:
-            ValueError: ``mj_model`` is no `mujoco.MjModel`, the camera or a geom to be left out does not exist, a size is no
-                positive integer, groups are no numbers, ``lights`` is no choice, or something that would be seen cannot be
-                drawn (skins, flexes, shadows of meshes).
+            ValueError: ``mj_model`` is not a `mujoco.MjModel`, the camera or a geom in ``leave_out`` does not exist, a size is
+                not a positive integer, groups are not integers, ``lights`` is invalid, or something visible is not supported
+                (skins, flexes, shadows of meshes).
         """
         reading.check_model(mj_model)
         reading.check_size(height=height, width=width)
@@ -213,9 +213,9 @@ class Scene:
         appearance = reading.object_appearance(mj_model)
         types = reading.object_types(mj_model)
         drawn = reading.drawn_objects(mj_model, appearance["rgba"], groups, site_groups, leave_out)
-        reading.refuse_unsupported(mj_model, types, drawn, groups, leave_out, shadows)
-        seen_through = reading.planes_seen_through(mj_model, camera_id, camera, plane_backs)
-        transparency = reading.transparency(appearance["rgba"][:, 3], seen_through)
+        reading.check_supported(mj_model, types, drawn, groups, leave_out, shadows)
+        clear_planes = reading.planes_clear_from_behind(mj_model, camera_id, camera, plane_backs)
+        transparency = reading.transparency(appearance["rgba"][:, 3], clear_planes)
         ids, reordered = reading.drawing_order(mj_model, types, np.flatnonzero(drawn), transparency[drawn] == reading.SOLID)
         atlas, texels, sky = textures.build_atlas(mj_model, ids, types[ids], textured)
         if not textured:
@@ -226,12 +226,12 @@ class Scene:
         leaves["sky_top"], leaves["sky_bottom"] = reading.sky_colours(mj_model)
         leaves["haze_colour"] = mj_model.vis.rgba.haze[:3]
         camera_mount = cameras.camera_mount(mj_model, camera_id)
-        leaves["body_mass"], parents = reading.weights(mj_model, (camera_mount, *light_facts["light_mounts"]))
+        leaves["body_mass"], parents = reading.body_masses(mj_model, (camera_mount, *light_facts["light_mounts"]))
         arrays = {name: np.asarray(value, np.float32) for name, value in leaves.items()}
         clear = transparency[ids] == reading.CLEAR
         arrays |= {"texels": texels, **meshes.build_triangles(mj_model, ids, types[ids], clear)}
         return cls(
-            # All at once: `jnp.asarray` compiles a program for each shape.
+            # All in one call: `jnp.asarray` would compile a program per shape.
             **jax.device_put(arrays),
             object_ids=tuple(ids.tolist()),
             object_types=tuple(types[ids].tolist()),
@@ -252,5 +252,5 @@ class Scene:
         )
 
     def replace(self, **changes: Any) -> Self:
-        """A copy with some fields changed."""
+        """Return a copy with some fields changed."""
         return dataclasses.replace(self, **changes)

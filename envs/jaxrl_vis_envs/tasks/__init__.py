@@ -1,1 +1,1 @@
-"""One file per task."""
+"""Built-in tasks, one per file."""

@@ -1,4 +1,4 @@
-"""Settings that every built-in task has."""
+"""Settings shared by all built-in tasks."""
 
 import dataclasses
 
@@ -8,14 +8,14 @@ from jaxrl_vis_envs.randomization import OFF, Randomization
 
 @dataclasses.dataclass(frozen=True)
 class TaskConfig(checks.CheckedConfig):
-    """Settings that every built-in task has."""
+    """Settings shared by all built-in tasks."""
 
     horizon: int
     """Control steps in an episode."""
     threshold: float
-    """An episode succeeds within this distance of the goal, in the unit of the distance."""
+    """Distance to the goal within which an episode succeeds, in the task's `distance_unit`."""
     randomization: Randomization = OFF
-    """What varies between episodes, and how far."""
+    """Ranges of domain randomisation."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -1,16 +1,16 @@
-"""Fetch reach: move the gripper of a Fetch robot to a point over the table.
+"""Fetch reach: move the gripper of a Fetch robot to a point above the table.
 
-Follows the release of the authors of "Adaptive Auxiliary Task Weighting for Reinforcement Learning" (OL-AUX), itself a child of
-OpenAI Gym's FetchReach. Differences, all deliberate, each with an option that undoes it: the goal image shows the grip *site*
-at the goal (``goal_at="link"``: the gripper's link, so that the grip is 2 cm off); the mocap cross-hair, which stood at the
-goal in the first image, is not drawn (``cross_hair``); fingers are orange (``finger_colour``); depth is metric
+Follows the release of the authors of "Adaptive Auxiliary Task Weighting for Reinforcement Learning" (OL-AUX), itself derived
+from OpenAI Gym's FetchReach. The differences are deliberate, and each has an option that reverts it: the goal image shows the
+grip *site* at the goal (``goal_at="link"``: the gripper's link, which puts the grip 2 cm off); the mocap cross-hair, which
+stood at the goal in the first image, is not rendered (``cross_hair``); fingers are orange (``finger_colour``); depth is metric
 (``depth_encoding``).
 
-    VisualFetchReach   sees RGB-D from a camera that faces the robot
-    FetchReach         sees the grip's position and velocity
+    VisualFetchReach   observes RGB-D from a camera facing the robot
+    FetchReach         observes the grip's position and velocity
 
-State: grip position in the world, m. Action: displacement of the gripper along x, y, z (1 = 5 cm asked, about 3 cm done), and a
-fourth component, for the fingers, that is ignored.
+State: grip position in the world, m. Action: displacement of the gripper along x, y, z (1 commands 5 cm and achieves about
+3 cm), and a fourth component, for the fingers, that is ignored.
 """
 
 import dataclasses
@@ -29,16 +29,16 @@ from jaxrl_vis_envs.pixels import Observer, PixelsConfig
 from jaxrl_vis_envs.tasks.mjx_env import register_task
 from jaxrl_vis_envs.tasks.pulled_arm import PulledArm, PulledArmConfig, pull
 
-# The gripper points down. Added to the link's own unit quaternion, as the original does, it turns the target about 60 % of the
-# way back to this orientation in each control step.
+# Quaternion of the gripper pointing down. Adding it to the link's unit quaternion, as the original does, turns the target about
+# 60 % of the rotation back to this orientation in each control step.
 _DOWN = (1.0, 0.0, 1.0, 0.0)
-# From the grip site of the stretched arm to the start of every episode, m.
+# Offset of every episode's start from the grip site of the stretched arm, m.
 _SETUP_OFFSET = (-0.498, 0.005, -0.231)
 _SETTLING_SUBSTEPS = 200
-_DOWN_ROTATION = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])  # of the gripper while it points down
+_DOWN_ROTATION = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])  # rotation matrix of the gripper pointing down
 _TABLE_TOP = 0.4  # m
-_GREY = (0.356, 0.361, 0.376, 1.0)  # of the original's gripper
-# Half-sizes (m) and opacity of the boxes at the original's mocap body.
+_GREY = (0.356, 0.361, 0.376, 1.0)  # colour of the original's gripper
+# Half-sizes (m) and alpha of the boxes of the original's mocap body.
 _CROSS_HAIR = ((0.005, 0.005, 0.005, 0.7), (1.0, 0.005, 0.005, 0.1), (0.005, 1.0, 0.001, 0.1), (0.005, 0.005, 1.0, 0.1))
 GoalAt = Literal["grip", "link"]
 FingerColour = Literal["orange", "grey"]
@@ -50,18 +50,18 @@ class FetchReachConfig(PulledArmConfig):
 
     horizon: int = 50
     threshold: float = 0.05
-    """An episode succeeds within this distance of the goal, m."""
+    """Distance to the goal within which an episode succeeds, m."""
     goal_range: float = 0.15
     """Goals are uniform within this distance of the start along each axis, m."""
     solver_iterations: int = 4
-    """Newton iterations in a physics step. One is enough in the air, but not where the fingers rub on the table."""
+    """Newton iterations per physics step. One is enough in free space, but not while the fingers rub on the table."""
     goal_at: GoalAt = "grip"
-    """What a goal image shows at the goal: the grip site or, as in the release, the gripper's link 2 cm above it."""
+    """Point of the gripper that is at the goal in a goal image: the grip site or, as in the release, its link 2 cm above."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         checks.not_negative(self, "goal_range")
-        checks.one_of(self, "goal_at", get_args(GoalAt))
+        checks.choice(self, "goal_at", get_args(GoalAt))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,22 +69,22 @@ class VisualFetchReachConfig(PixelsConfig, FetchReachConfig):
     """Settings of the task and its images."""
 
     depth_range: tuple[float, float] = (0.4, 1.8)
-    """Depths that bytes 0 and 255 stand for, m: 5.5 mm a step, from before the nearest gripper to behind the robot."""
+    """Depths encoded as 0 and 255, m: 5.5 mm per step, from in front of the nearest gripper to behind the robot."""
     clip_range: tuple[float, float] = (0.026, 130.0)
-    """The clipping planes of the release, m."""
+    """Near and far clipping planes of the release, m."""
     cross_hair: bool = False
-    """Draws the release's cross-hair at the point that pulls the gripper. In an episode's first image it stands at the goal."""
+    """Renders the release's cross-hair at the mocap body that pulls the gripper; at the goal in an episode's first image."""
     finger_colour: FingerColour = "orange"
-    """Orange fingers, which stand out, or the original's grey ones."""
+    """Orange fingers, which stand out, or grey ones as in the original."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.true_or_false(self, "cross_hair")
-        checks.one_of(self, "finger_colour", get_args(FingerColour))
+        checks.boolean(self, "cross_hair")
+        checks.choice(self, "finger_colour", get_args(FingerColour))
 
 
 class FetchReach(PulledArm):
-    """The task; what the agent sees of it is up to ``observer``."""
+    """The task. ``observer`` determines what the agent sees."""
 
     config: FetchReachConfig
     action_size = 4
@@ -92,11 +92,11 @@ class FetchReach(PulledArm):
     chance, difficulty = 0.008, 2.8  # benchmarks/tasks/task_difficulty.py FetchReach --episodes 1000
 
     def __init__(self, config: FetchReachConfig, observer: Callable[[mujoco.MjModel], Observer] | None = None):
-        """Builds the model and finds the start.
+        """Build the model and compute the start.
 
         Args:
-            config: The settings.
-            observer: Given the model, returns the function from poses to images. Default: `observe_state`.
+            config: Settings of the task.
+            observer: Builds the function from poses to images, from the model. None: the agent observes `observe_state`.
         """
         self._has_cross_hair = isinstance(config, VisualFetchReachConfig) and config.cross_hair
         mj_model = mjx_model.load_model("fetch_reach.xml", _add_cross_hair if self._has_cross_hair else None)
@@ -107,9 +107,9 @@ class FetchReach(PulledArm):
         super().__init__(config, mj_model, "gripper", observer)
 
     def _settled(self, mj_model: mujoco.MjModel, config: PulledArmConfig) -> mujoco.MjData:
-        """The stretched arm pulled to the setup point, as Gym does once at construction.
+        """Pull the stretched arm to the setup point, as Gym does once at construction.
 
-        There it still moves a little, and so it does at the start of Gym's episodes.
+        The arm is still moving slightly afterwards, as it is at the start of Gym's episodes.
         """
         mj_data = mujoco.MjData(mj_model)
         mujoco.mj_forward(mj_model, mj_data)
@@ -121,32 +121,32 @@ class FetchReach(PulledArm):
     def sample_start(self, key: jax.Array) -> mjx.Data:
         if not self._has_cross_hair:
             return self._start
-        # The release left its mocap body at the goal that it had just drawn. Nothing is pulled there: actions start anew.
+        # The release left its mocap body at the goal it had just rendered. It does not pull: each action sets a new target.
         return self._with_cross_hair(self._start, self._link_at(self._goal_point(key)))
 
     def sample_goal(self, key: jax.Array) -> mjx.Data:
         return self.goal_configuration(self._goal_point(key))
 
-    def goal_state_of(self, key: jax.Array, goal_data: mjx.Data) -> jax.Array:
+    def goal_state(self, key: jax.Array, goal_data: mjx.Data) -> jax.Array:
         return self.achieved(goal_data) if self.config.goal_at == "grip" else self._goal_point(key)
 
     def _goal_point(self, key: jax.Array) -> jax.Array:
-        """The point [3] (m, world) that an episode asks for."""
+        """Sample the goal position [3] (m, world) of an episode."""
         offset = jax.random.uniform(key, (3,), jnp.float32, -self.config.goal_range, self.config.goal_range)
         return self._start.site_xpos[self._grip] + offset
 
     def _link_at(self, goal: jax.Array) -> jax.Array:
-        """Where the gripper's link is to be, the gripper down, for a ``goal`` [3]: [3] (m, world)."""
+        """Return the position [3] (m, world) of the gripper's link, pointing down, for a ``goal`` [3]."""
         if self.config.goal_at == "link":
             return goal
         return goal - jnp.asarray(_DOWN_ROTATION @ self.mj_model.site_pos[self._grip], jnp.float32)
 
     def _with_cross_hair(self, data: mjx.Data, position: jax.Array) -> mjx.Data:
-        """``data`` with the mocap body at ``position`` [3] (m, world)."""
+        """Return ``data`` with the mocap body at ``position`` [3] (m, world)."""
         return mjx_model.kinematics(self._model, data.replace(mocap_pos=position[None]))
 
     def act(self, data: mjx.Data, action: jax.Array) -> mjx.Data:
-        # The target starts from where the gripper is, not from the last target, so that what was not reached is forgotten.
+        # The target is relative to the gripper, not to the previous target, so tracking errors do not accumulate.
         position = data.xpos[self._hand] + self.config.action_scale * action[:3]
         quaternion = data.xquat[self._hand] + jnp.asarray(_DOWN, jnp.float32)
         data = data.replace(mocap_pos=position[None], mocap_quat=quaternion[None])
@@ -154,16 +154,16 @@ class FetchReach(PulledArm):
         return mjx_model.kinematics(self._model, self._with_closed_fingers(data))
 
     def _with_closed_fingers(self, data: mjx.Data) -> mjx.Data:
-        """After each control step the original puts the fingers back, but leaves them their velocity."""
+        """Reset the finger positions but not their velocities, as the original does after each control step."""
         return data.replace(qpos=data.qpos.at[self._fingers].set(0.0))
 
     def goal_configuration(self, goal: jax.Array) -> mjx.Data:
-        """The robot at rest with its grip as near to ``goal`` [3] (m, world) as joints and table let it, the gripper down.
+        """Return the robot at rest with its grip as near to ``goal`` [3] (m, world) as joints and table allow, pointing down.
 
-        With ``goal_at="link"`` it is the gripper's link.
+        With ``goal_at="link"`` it is the gripper's link that is at the goal.
 
-        The joint angles agree with those after driving the arm there for 200 substeps within .002 rad in the median and .02
-        rad at the 99th percentile of 300 goals, and a reset costs a hundredth.
+        The joint angles agree with those after driving the arm there for 200 substeps within .002 rad in the median and .02 rad
+        at the 99th percentile of 300 goals, and a reset costs a hundredth.
         """
         fingertip = self.mj_model.geom("right_fingertip").id
         lowest = _TABLE_TOP + float(self.mj_model.geom_pos[fingertip, 0] + self.mj_model.geom_size[fingertip, 0])
@@ -175,7 +175,7 @@ class FetchReach(PulledArm):
 
 
 def _add_cross_hair(spec: mujoco.MjSpec) -> None:
-    """Gym's mocap body: a small cube and three bars, of half a length of 1 m, that nothing touches."""
+    """Add Gym's mocap body: a small cube and three bars with a half-length of 1 m, without collisions."""
     for *size, alpha in _CROSS_HAIR:
         spec.body("mocap").add_geom(
             type=mujoco.mjtGeom.mjGEOM_BOX, size=size, rgba=(0.0, 0.5, 0.0, alpha), contype=0, conaffinity=0, mass=0.0

@@ -1,13 +1,13 @@
 """Finger turn: turn a free spinner with a two-link finger until its tip is where the goal image shows it.
 
-dm_control's finger as the authors of OL-AUX used it: any contact-free start, a goal angle of the spinner, a tolerance of .07 m
-at its tip (31 degrees), and 21 physics steps of 10 ms in an action. With dm_control's own two, random actions move the spinner
-in 16 % of the episodes; with 21 in 86 %. In the goal image the finger hangs straight down, where it touches nothing.
+dm_control's finger as used by the authors of OL-AUX: any contact-free start, a goal angle of the spinner, a tolerance of .07 m
+at its tip (31 degrees), and 21 physics steps of 10 ms per action. With dm_control's own two, random actions move the spinner in
+16 % of the episodes; with 21, in 86 %. In the goal image the finger hangs straight down, where it touches nothing.
 
-    VisualFingerTurn   sees three stacked RGB-D images from the side
-    FingerTurn         sees joint angles, the spinner's tip and joint velocities
+    VisualFingerTurn   observes three stacked RGB-D images from the side
+    FingerTurn         observes joint angles, the spinner's tip and joint velocities
 
-State: x and z of the spinner's tip relative to its hinge, m. Action: torques of the two finger joints, of 30 and 15 N m.
+State: x and z of the spinner's tip relative to its hinge, m. Action: torques of the two finger joints, up to 30 and 15 N m.
 """
 
 import dataclasses
@@ -25,7 +25,8 @@ from jaxrl_vis_envs.pixels import Observer, PixelsConfig
 from jaxrl_vis_envs.tasks.config import TaskConfig
 from jaxrl_vis_envs.tasks.mjx_env import MjxGoalEnv, register_task
 
-# Starts tried at once; the first without contact is taken. One in ten is in contact, so all are once in 10^16 episodes.
+# Start candidates sampled together; the first without contact is used. One in ten is in contact, hence all 16 are once in
+# 10^16 episodes.
 _START_CANDIDATES = 16
 
 
@@ -35,13 +36,13 @@ class FingerTurnConfig(TaskConfig):
 
     horizon: int = 50
     threshold: float = 0.07
-    """An episode succeeds where the spinner's tip is within this distance of the goal, m."""
+    """Distance between the spinner's tip and its goal within which an episode succeeds, m."""
     substeps: int = 21
-    """Physics steps of 10 ms in a control step: 21 as in the authors' release, 2 as in dm_control."""
+    """Physics steps of 10 ms per control step: 21 as in the authors' release, 2 as in dm_control."""
     solver_iterations: int = 4
-    """Newton iterations in a physics step."""
+    """Newton iterations per physics step."""
     line_search_iterations: int = 8
-    """Line search iterations in a Newton iteration of MJX's solver; ours, which the task has, takes its own number."""
+    """Line search iterations per Newton iteration of MJX's solver; ours, which this task uses, has its own number."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -53,26 +54,26 @@ class VisualFingerTurnConfig(PixelsConfig, FingerTurnConfig):
     """Settings of the task and its images."""
 
     depth_range: tuple[float, float] = (0.8, 1.3)
-    """Depths that bytes 0 and 255 stand for, m: 2 mm a step; finger and spinner lie between .85 and 1.25 m."""
+    """Depths encoded as 0 and 255, m: 2 mm per step; finger and spinner are between .85 and 1.25 m."""
     frame_stack: int = 3
-    """Images of the latest control steps that an observation stacks: three in the thesis, one in the authors' release."""
+    """Number of most recent images stacked in an observation: three in the thesis, one in the authors' release."""
 
 
 class FingerTurn(MjxGoalEnv):
-    """The task; what the agent sees of it is up to ``observer``."""
+    """The task. ``observer`` determines what the agent sees."""
 
     action_size = 2
     camera = "side"
     distance_unit = "m"
-    exact_contacts = True  # they decide what happens
+    exact_contacts = True  # contacts are what moves the spinner
     chance, difficulty = 0.16, 2.4  # benchmarks/tasks/task_difficulty.py FingerTurn --episodes 1000
 
     def __init__(self, config: FingerTurnConfig, observer: Callable[[mujoco.MjModel], Observer] | None = None):
-        """Builds the model.
+        """Build the model.
 
         Args:
-            config: The settings.
-            observer: Given the model, returns the function from poses to images. Default: `observe_state`.
+            config: Settings of the task.
+            observer: Builds the function from poses to images, from the model. None: the agent observes `observe_state`.
         """
         mj_model = mjx_model.load_model("finger_turn.xml")
         mj_model.opt.iterations = config.solver_iterations
@@ -84,13 +85,13 @@ class FingerTurn(MjxGoalEnv):
         super().__init__(config, mj_model, observer)
 
     def sample_start(self, key: jax.Array) -> mjx.Data:
-        """Uniform over the joints' ranges and all angles of the spinner, where nothing touches; at rest."""
+        """Sample a contact-free start at rest, uniform over the joints' ranges and all angles of the spinner."""
         start_key, _ = jax.random.split(key)
         low = jnp.asarray(np.where(self.mj_model.jnt_limited, self.mj_model.jnt_range[:, 0], -np.pi), jnp.float32)
         high = jnp.asarray(np.where(self.mj_model.jnt_limited, self.mj_model.jnt_range[:, 1], np.pi), jnp.float32)
         candidates = jax.random.uniform(start_key, (_START_CANDIDATES, 3), jnp.float32, low, high)
         is_free = jax.vmap(lambda qpos: self._clearance(self.configuration(qpos)) > 0)(candidates)
-        # Were none free, the finger would hang straight down, which is free whatever the spinner's angle.
+        # Fallback if none is free: the finger hangs straight down, which is free at any angle of the spinner.
         hanging = self._still.qpos.at[2].set(candidates[0, 2])
         return self.configuration(jnp.where(jnp.any(is_free), candidates[jnp.argmax(is_free)], hanging))
 
@@ -107,15 +108,15 @@ class FingerTurn(MjxGoalEnv):
         return (data.site_xpos[self._tip] - data.xpos[self._hinge])[jnp.array([0, 2])]
 
     def observe_state(self, data: mjx.Data) -> jax.Array:
-        """Angles of the finger joints (rad), x and z of the tip (m), joint velocities (rad/s): [7] float32, as dm_control."""
+        """Return finger joint angles (rad), x and z of the tip (m), joint velocities (rad/s): [7] float32, as in dm_control."""
         return jnp.concatenate([data.qpos[:2], self.achieved(data), data.qvel])
 
     def configuration(self, joint_angles: jax.Array) -> mjx.Data:
-        """Finger and spinner at rest with ``joint_angles`` [3] float32: proximal (-pi/2 hangs down), distal, spinner, rad."""
+        """Return finger and spinner at rest with ``joint_angles`` [3] (rad): proximal (-pi/2 hangs down), distal, spinner."""
         return mjx_model.kinematics(self._model, self._still.replace(qpos=joint_angles))
 
     def _clearance(self, data: mjx.Data) -> jax.Array:
-        """The least distance between finger and spinner, m; negative where they overlap."""
+        """Return the minimum distance between finger and spinner, m; negative if they overlap."""
         return jnp.min(mjx.collision(self._model, data)._impl.contact.dist)
 
 

@@ -1,16 +1,16 @@
-"""Hand reach: bring the five fingertips of a Shadow hand to where the goal image shows them.
+"""Hand reach: move the five fingertips of a Shadow hand to their positions in the goal image.
 
-HandReach of Gym's robotics environments with the goals of the OL-AUX release: where the fingertips are after 20 random actions
-from the start, most of which fully open or close each joint. ``goal_rule="meet"`` is Gym's own: the thumb meets a finger over
-the palm, or, one time in ten, everything returns to the start; its threshold in Gym is .01 m. The release's images differ from
-ours in where the camera is (``view``) and in what marks the fingertips (``tip_marks``).
+HandReach of Gym's robotics environments with the goals of the OL-AUX release: the fingertip positions after 20 random actions
+from the start, most of which fully open or close each joint. ``goal_rule="meet"`` is Gym's own: the thumb meets a finger above
+the palm or, one time in ten, everything returns to the start; its threshold in Gym is .01 m. The release's images differ from
+ours in the camera pose (``view``) and the fingertip markers (``tip_marks``).
 
-    VisualHandReach   sees RGB-D from above the palm; each fingertip has its own colour
-    HandReach         sees joint angles and velocities, and the fingertips
+    VisualHandReach   observes RGB-D from above the palm; each fingertip has its own colour
+    HandReach         observes joint angles and velocities, and fingertip positions
 
-State: positions of the tips of first, middle, ring and little finger and thumb in the world, m; the distance is that of the 15
-numbers together. Action: a target angle for each of the 20 actuators, -1 and 1 being the ends of its range. The distal
-joints of the four fingers have no actuator; a tendon ties them to the joint before.
+State: positions in the world of the tips of the first, middle, ring and little finger and the thumb, m; the distance is that of
+the 15 numbers together. Action: a target angle for each of the 20 actuators, with -1 and 1 at the ends of its range. The distal
+joints of the four fingers have no actuator; a tendon couples each to the joint before it.
 """
 
 import dataclasses
@@ -35,9 +35,10 @@ _CONTROL_PERIOD = 0.04  # s
 _FINGERTIPS = ("fftip", "mftip", "rftip", "lftip", "thtip")
 _THUMB = 4
 _RELEASE_CAMERA = "fingertips"
-_FAINT_RADIUS, _FAINT_ALPHA = 0.01, 0.2  # m; of the release's marks
-_PLAIN = (0.88, 0.88, 0.9, 1.0)  # colour of a finger's last link, where it has none of its own
-# Gym's rule, m in the world: where thumb and finger meet, from the palm's origin; its scatter; how far from it each tip stays.
+_FAINT_RADIUS, _FAINT_ALPHA = 0.01, 0.2  # m; of the release's markers
+_PLAIN = (0.88, 0.88, 0.9, 1.0)  # colour of a finger's last link, if not the fingertip's
+# Gym's rule, m in the world: meeting point of thumb and finger, from the palm's origin; its standard deviation; distance that
+# each tip keeps from it.
 _MEETING_OFFSET = (0.0, -0.09, 0.05)
 _MEETING_SCATTER = 0.005
 _MEETING_DISTANCE = 0.005
@@ -53,30 +54,30 @@ class HandReachConfig(TaskConfig):
 
     horizon: int = 50
     threshold: float = 0.03
-    """An episode succeeds where the 15 numbers lie within this distance of the goal's, m (1.3 cm rms a finger)."""
+    """Distance of the 15 numbers to the goal's within which an episode succeeds, m (1.3 cm rms per finger)."""
     goal_rule: Literal["random_actions", "meet"] = "random_actions"
-    """Where goals come from: random actions from the start (the release), or thumb and finger that meet (Gym)."""
+    """Source of goals: random actions from the start (the release), or thumb and finger meeting (Gym)."""
     goal_actions: int = 20
-    """Random actions that lead to a goal."""
+    """Number of random actions that generate a goal."""
     goal_noise: float = 5.0
-    """Standard deviation of the normal noise added to each of these uniform actions before it is clipped to [-1, 1]."""
+    """Standard deviation of the Gaussian noise added to each of these uniform actions before clipping to [-1, 1]."""
     substeps: int = 20
-    """Physics steps in a control step of 40 ms (20 is the original's 2 ms; at 10 tips are off by .1 mm more)."""
+    """Physics steps per control step of 40 ms (20 gives the original's 2 ms; 10 adds .1 mm of error at the tips)."""
     goal_substeps: int = 10
-    """The same while a goal is made, where what matters is the distribution."""
+    """Physics steps per control step while generating a goal, for which only the distribution matters."""
     contacts: bool = True
-    """Whether fingers, thumb and palm collide. False only shows how much that matters."""
+    """Whether fingers, thumb and palm collide. False is for measuring the effect of contacts."""
     solver_iterations: int = 1
-    """Newton iterations in a physics step."""
+    """Newton iterations per physics step."""
     line_search_iterations: int = 4
-    """Line search iterations in a Newton iteration of MJX's solver, which runs on a CPU (see `constraints`)."""
+    """Line search iterations per Newton iteration of MJX's solver, which runs on a CPU (see `constraints`)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         checks.whole(self, "goal_actions", "substeps", "goal_substeps", "solver_iterations", "line_search_iterations")
-        checks.one_of(self, "goal_rule", ("random_actions", "meet"))
+        checks.choice(self, "goal_rule", ("random_actions", "meet"))
         checks.not_negative(self, "goal_noise")
-        checks.true_or_false(self, "contacts")
+        checks.boolean(self, "contacts")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,38 +85,38 @@ class VisualHandReachConfig(PixelsConfig, HandReachConfig):
     """Settings of the task and its images."""
 
     depth_range: tuple[float, float] = (0.7, 0.96)
-    """Depths that bytes 0 and 255 stand for, m: 1 mm a step, from above fingers that point up to below the lowest knuckle."""
+    """Depths encoded as 0 and 255, m: 1 mm per step, from above upright fingers to below the lowest knuckle."""
     clip_range: tuple[float, float] = (0.0124, 62.0)
-    """The clipping planes of the release, m."""
+    """Near and far clipping planes of the release, m."""
     view: View = "palm"
-    """Where the camera is: above the palm, or before the fingertips, as in the release."""
+    """Camera pose: above the palm or, as in the release, in front of the fingertips."""
     tip_marks: TipMarks = "bright"
-    """What marks fingertips: opaque spheres and links in their colour, or hardly visible smaller spheres, as in the release."""
+    """Fingertip markers: opaque spheres and links in their colour or, as in the release, smaller, faint spheres."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.one_of(self, "view", get_args(View))
-        checks.one_of(self, "tip_marks", get_args(TipMarks))
+        checks.choice(self, "view", get_args(View))
+        checks.choice(self, "tip_marks", get_args(TipMarks))
 
 
 class HandReach(MjxGoalEnv):
-    """The task; what the agent sees of it is up to ``observer``."""
+    """The task. ``observer`` determines what the agent sees."""
 
     action_size = 20
     camera = "front"
     distance_unit = "m"
-    exact_contacts = True  # they decide what happens
+    exact_contacts = True  # the task depends on contacts
     chance, difficulty = 0.0, 4.3  # benchmarks/tasks/task_difficulty.py HandReach --episodes 1000
 
     def __init__(self, config: HandReachConfig, observer: Callable[[mujoco.MjModel], Observer] | None = None):
-        """Builds the model.
+        """Build the model.
 
         Args:
-            config: The settings.
-            observer: Given the model, returns the function from poses to images. Default: `observe_state`.
+            config: Settings of the task.
+            observer: Builds the function from poses to images, from the model. None: the agent observes `observe_state`.
         """
-        is_before = self.camera_of(config) == _RELEASE_CAMERA
-        mj_model = mjx_model.load_model("hand_reach.xml", _add_release_camera if is_before else None)
+        is_release_view = self.select_camera(config) == _RELEASE_CAMERA
+        mj_model = mjx_model.load_model("hand_reach.xml", _add_release_camera if is_release_view else None)
         mj_model.opt.iterations = config.solver_iterations
         mj_model.opt.ls_iterations = config.line_search_iterations
         mj_model.opt.timestep = _CONTROL_PERIOD / config.substeps
@@ -136,9 +137,9 @@ class HandReach(MjxGoalEnv):
         self._goal_model = mjx_model.put_model(goal_model)
 
     @classmethod
-    def camera_of(cls, config: HandReachConfig) -> str:
-        is_before = isinstance(config, VisualHandReachConfig) and config.view == "fingertips"
-        return _RELEASE_CAMERA if is_before else cls.camera
+    def select_camera(cls, config: HandReachConfig) -> str:
+        is_release_view = isinstance(config, VisualHandReachConfig) and config.view == "fingertips"
+        return _RELEASE_CAMERA if is_release_view else cls.camera
 
     def sample_start(self, key: jax.Array) -> mjx.Data:
         return self._start
@@ -156,15 +157,17 @@ class HandReach(MjxGoalEnv):
         return data.site_xpos[self._tips].reshape(-1)
 
     def observe_state(self, data: mjx.Data) -> jax.Array:
-        """Joint angles (rad) and velocities (rad/s), fingertips (m): [63] float32, as in Gym."""
+        """Return joint angles (rad) and velocities (rad/s), fingertip positions (m): [63] float32, as in Gym."""
         return jnp.concatenate([data.qpos, data.qvel, self.achieved(data)])
 
     def configuration(self, joint_angles: jax.Array) -> mjx.Data:
-        """The hand at rest with ``joint_angles`` [24] float32, rad."""
+        """Return the hand at rest with ``joint_angles`` [24] float32, rad."""
         return mjx_model.kinematics(self._model, self._start.replace(qpos=joint_angles))
 
     def configuration_at(self, tips: jax.Array) -> mjx.Data:
-        """The hand at rest with its tips as near to ``tips`` [5, 3] (m, world) as its joints let it (damped least squares)."""
+        """Return the hand at rest with its tips nearest to ``tips`` [5, 3] (m, world) within joint limits (damped least
+        squares).
+        """
         low, high = jnp.asarray(self.mj_model.jnt_range.T, jnp.float32)
         coupling = jnp.asarray(_joints_by_actuator(self.mj_model), jnp.float32)
 
@@ -179,12 +182,12 @@ class HandReach(MjxGoalEnv):
             return jax.lax.scan(improve, self._start, length=_IK_STEPS)[0]
 
     def _targets(self, action: jax.Array) -> jax.Array:
-        """Target angles [20] (rad) of an action [20]."""
+        """Convert an action [20] to target angles [20] (rad)."""
         low, high = jnp.asarray(self.mj_model.actuator_ctrlrange.T, jnp.float32)
         return 0.5 * (low + high) + 0.5 * (high - low) * action
 
     def _after_random_actions(self, key: jax.Array) -> mjx.Data:
-        """The hand where random actions from the start have led it, at rest."""
+        """Return the hand at rest in the configuration that random actions from the start lead to."""
         uniform_key, noise_key = jax.random.split(key)
         shape = (self.config.goal_actions, self.action_size)
         actions = jax.random.uniform(uniform_key, shape, jnp.float32, -1.0, 1.0)
@@ -198,7 +201,7 @@ class HandReach(MjxGoalEnv):
         return self.configuration(jax.lax.scan(act, self._start, actions)[0].qpos)
 
     def _meeting_tips(self, key: jax.Array) -> jax.Array:
-        """Fingertips [5, 3] (m, world) of Gym's rule."""
+        """Sample fingertip positions [5, 3] (m, world) by Gym's rule."""
         finger_key, scatter_key, return_key = jax.random.split(key, 3)
         start = self._start.site_xpos[self._tips]
         palm = self._start.xpos[self.mj_model.body("palm").id]
@@ -212,12 +215,12 @@ class HandReach(MjxGoalEnv):
 
 
 def _add_release_camera(spec: mujoco.MjSpec) -> None:
-    """The camera of the authors' release: before the fingertips, it looks along world y, and up is up."""
+    """Add the camera of the authors' release, in front of the fingertips, looking along world y, with z up."""
     spec.worldbody.add_camera(name=_RELEASE_CAMERA, pos=[1.0, 0.05, 0.15], quat=[1.0, 1.0, 0.0, 0.0], fovy=12.0)
 
 
 def _joints_by_actuator(mj_model: mujoco.MjModel) -> np.ndarray:
-    """Radians that each joint turns per radian of each actuator's joint, tied ones included: [nq, nu]."""
+    """Return the rotation of each joint, coupled ones included, per radian of each actuator's joint: [nq, nu]."""
     ratios = np.zeros((mj_model.nq, mj_model.nu))
     joints = mj_model.actuator_trnid[:, 0]
     ratios[joints, np.arange(mj_model.nu)] = 1.0

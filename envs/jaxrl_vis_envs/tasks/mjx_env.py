@@ -1,7 +1,7 @@
-"""What the MJX tasks share. A task says how it starts, what its goals are, what an action does and what is true.
+"""Base class of the MJX tasks. A task defines its start, goals, actions and true state.
 
-A task is a subclass of `MjxGoalEnv` with five methods, and a frozen config with ``horizon`` and ``threshold``. Seen through
-a `pixels.Observer` it is the visual task, without one the state task; `register_task` registers both.
+A task is a subclass of `MjxGoalEnv` with five methods, and a frozen config with ``horizon`` and ``threshold``. With a
+`pixels.Observer` it is the visual task, without one the state task; `register_task` registers both.
 """
 
 import abc
@@ -24,22 +24,21 @@ from jaxrl_vis_envs.registry import register
 
 
 class MjxGoalEnv(GoalEnv):
-    """A `GoalEnv` whose `State.data` is an `mjx.Data` with poses that belong to its ``qpos``."""
+    """`GoalEnv` whose `State.data` is an `mjx.Data` with poses consistent with its ``qpos``."""
 
-    camera: str  # the camera of the model that the visual task sees through, unless `camera_of` says otherwise
-    exact_contacts: bool = False  # whether its physics steps are those of `mjx_model.step` with ``exact``
+    camera: str  # model camera of the visual task, unless `select_camera` is overridden
+    exact_contacts: bool = False  # whether physics steps are those of `mjx_model.step` with ``exact``
 
     def __init__(self, config: Any, mj_model: mujoco.MjModel, observer: Callable[[mujoco.MjModel], Observer] | None) -> None:
-        """Keeps what is common.
+        """Store what all tasks have in common.
 
         Args:
-            config: The settings of the task.
-            mj_model: The model; changes to it after this have no effect.
-            observer: Given the model, returns the function from poses to images. None: `observe_state` is what is seen.
+            config: Settings of the task.
+            mj_model: MuJoCo model; later changes to it have no effect.
+            observer: Builds the function from poses to images, from the model. None: the agent observes `observe_state`.
 
         Raises:
-            ValueError: JAX computes in 64 bits; or the appearance is to vary (``config.randomization``), and there are no
-                images of a scene.
+            ValueError: JAX runs in 64 bits, or ``config.randomization`` varies the appearance of a task that renders no scene.
         """
         if jax.config.jax_enable_x64:
             raise ValueError(
@@ -47,7 +46,7 @@ class MjxGoalEnv(GoalEnv):
                 " jax.config.update('jax_enable_x64', False) first"
             )
         self.config = config
-        self.camera = self.camera_of(config)
+        self.camera = self.select_camera(config)
         self.horizon = config.horizon
         self.threshold = config.threshold
         self.frame_stack = getattr(config, "frame_stack", 1)
@@ -60,49 +59,49 @@ class MjxGoalEnv(GoalEnv):
             raise ValueError("camera, lights and colours can only be randomized in a task that draws images")
 
     @classmethod
-    def camera_of(cls, config: Any) -> str:
-        """The camera of the model that the visual task sees through with these settings."""
+    def select_camera(cls, config: Any) -> str:
+        """Return the name of the model camera that the visual task uses with these settings."""
         del config
         return cls.camera
 
     @abc.abstractmethod
     def sample_start(self, key: jax.Array) -> mjx.Data:
-        """The start of the episode ``reset(key)``, with poses that belong to its ``qpos``; ``key`` is [], typed."""
+        """Sample the start of the episode ``reset(key)``, with poses consistent with its ``qpos``; ``key`` is [], typed."""
 
     @abc.abstractmethod
     def sample_goal(self, key: jax.Array) -> mjx.Data:
-        """The configuration that the goal image of ``reset(key)`` shows, with its poses; ``key`` is [], typed."""
+        """Sample the configuration in the goal image of ``reset(key)``, with its poses; ``key`` is [], typed."""
 
     @abc.abstractmethod
     def act(self, data: mjx.Data, action: jax.Array) -> mjx.Data:
-        """The physics of one control step, of ``self._model``, whose numbers may vary (see `randomization`).
+        """Simulate one control step of ``self._model``, whose parameters may be randomised (see `randomization`).
 
         Args:
-            data: The physics state, poses included.
-            action: [A] float32, all finite and within [-1, 1], or in a somewhat other range where its scale varies.
+            data: Physics state, including poses.
+            action: [A] float32, finite and within [-1, 1], or somewhat beyond if the action scale is randomised.
 
         Returns:
-            The physics state `control_period` seconds later, poses included.
+            Physics state `control_period` seconds later, including poses.
         """
 
     @abc.abstractmethod
     def achieved(self, data: mjx.Data) -> jax.Array:
-        """The true quantity that goals are about, `State.achieved_state`: [G] float32."""
+        """Return the true quantity that goals constrain, `State.achieved_state`: [G] float32."""
 
-    def goal_state_of(self, key: jax.Array, goal_data: mjx.Data) -> jax.Array:
-        """The goal state [G] of ``reset(key)``, whose goal image shows ``goal_data``: what that configuration achieves."""
+    def goal_state(self, key: jax.Array, goal_data: mjx.Data) -> jax.Array:
+        """Return the goal state [G] of ``reset(key)``, whose goal image shows ``goal_data``; by default, what that achieves."""
         return self.achieved(goal_data)
 
     @abc.abstractmethod
     def observe_state(self, data: mjx.Data) -> jax.Array:
-        """What the state task sees: [S] float32."""
+        """Return the observation of the state task: [S] float32."""
 
     def reset(self, key: jax.Array) -> State:
         self.check_key(key)
         data, goal_data = self.sample_start(key), self.sample_goal(key)
         domain = randomization.sample(key, self._randomization, self._model, self.action_size, self._scene)
-        state = self.state_at(data, self.goal_state_of(key, goal_data), domain)
-        # One after the other in a loop: one copy to compile, which is traced as that of `observe` is.
+        state = self.state_at(data, self.goal_state(key, goal_data), domain)
+        # Sequentially, in a loop: the renderer is compiled once, with the same trace as in `observe`.
         both = jax.tree.map(lambda *leaves: jnp.stack(leaves), data, goal_data)
         frame, goal = jax.lax.map(lambda data: self._observe(data, None, domain), both)
         return state.replace(obs={"observation": frame, "achieved_goal": frame, "desired_goal": goal})
@@ -110,7 +109,7 @@ class MjxGoalEnv(GoalEnv):
     def advance(self, state: State, action: jax.Array) -> State:
         self.check_action(action)
         action = randomization.varied_action(sanitize_action(action), state.domain)
-        data = self._under(state.domain).act(state.data, action)
+        data = self._with_dynamics(state.domain).act(state.data, action)
         history = push_history(state.history, state.data.qpos)
         return self._measure(data, self.achieved(data), state.goal_state, state.obs, history, state.domain)
 
@@ -118,7 +117,9 @@ class MjxGoalEnv(GoalEnv):
         return self._observe(state.data, state.history, state.domain)
 
     def state_at(self, data: mjx.Data, goal_state: jax.Array, domain: randomization.Domain | None = None) -> State:
-        """An episode that starts at ``data``, with a goal state [G] and no images, where nothing but ``domain`` varies."""
+        """Return the State of an episode that starts at ``data``, with goal state [G], without images, and varied only by
+        ``domain``.
+        """
         history = start_history(data.qpos, self.frame_stack)
         return self._measure(data, self.achieved(data), goal_state, None, history, domain)
 
@@ -140,8 +141,8 @@ class MjxGoalEnv(GoalEnv):
     def _data_shape(self) -> mjx.Data:
         return jax.eval_shape(lambda: mjx.make_data(self.mj_model, device=jax.local_devices()[0]))
 
-    def _under(self, domain: randomization.Domain | None) -> Self:
-        """This task with the dynamics of an episode: a copy, so that what `act` does stays a function of its arguments."""
+    def _with_dynamics(self, domain: randomization.Domain | None) -> Self:
+        """Return a copy of this task with the dynamics of an episode, so that `act` remains a function of its arguments."""
         if not self._randomization.varies_model or domain is None:
             return self
         varied = copy.copy(self)
@@ -155,17 +156,17 @@ class MjxGoalEnv(GoalEnv):
 
 
 def register_task(task: type[MjxGoalEnv], config_class: type, visual_config_class: type) -> None:
-    """Registers the two environments of a task.
+    """Register both environments of a task.
 
     Args:
-        task: Built from a config and an observer or None. Its name is that of the environment that observes the state.
-        config_class: Of the environment that observes the state.
-        visual_config_class: Of the one that sees images: the same fields and those of `pixels.PixelsConfig`.
+        task: Task class, constructed from a config and an observer or None. Its name is that of the state variant.
+        config_class: Configuration of the state variant.
+        visual_config_class: Configuration of the visual variant: the same fields, and those of `pixels.PixelsConfig`.
     """
-    build: Any = task  # subclasses build the model themselves, and take no `mj_model`
+    build: Any = task  # subclasses build the model themselves and take no `mj_model`
 
     def build_visual(config: Any) -> MjxGoalEnv:
-        return build(config, lambda mj_model: image_observer(mj_model, task.camera_of(config), config))
+        return build(config, lambda mj_model: image_observer(mj_model, task.select_camera(config), config))
 
     name = task.__name__
     register(name, lambda config: build(config, None), config_class)

@@ -1,4 +1,4 @@
-"""What the two arms share whose hand a weld pulls to a mocap body: settings, start, state, and what the state task sees."""
+"""Base of the two tasks whose arm a weld pulls to a mocap body: settings, start, achieved state and state observation."""
 
 import abc
 import dataclasses
@@ -24,21 +24,21 @@ class PulledArmConfig(TaskConfig):
     """Settings of the task. Lengths in m."""
 
     action_scale: float = 0.05
-    """Displacement that an action of 1 asks for, m."""
+    """Displacement commanded by an action of 1, m."""
     substeps: int = 20
-    """Physics steps in a control step of 40 ms (20 as in the authors' simulations; 10 is nearly twice as fast)."""
+    """Physics steps per control step of 40 ms (20 as in the authors' simulations; 10 is nearly twice as fast)."""
     solver_iterations: int = 1
-    """Newton iterations in a physics step."""
+    """Newton iterations per physics step."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         checks.positive(self, "action_scale")
         checks.whole(self, "solver_iterations")
-        checks.whole(self, "substeps", least=4)  # the weld's time constant is 20 ms
+        checks.whole(self, "substeps", minimum=4)  # the weld's time constant is 20 ms
 
 
 class PulledArm(MjxGoalEnv):
-    """An arm without motors. Goals are about the position of its grip, m in the world."""
+    """Arm without motors, pulled by its hand. Goals are positions of its grip, m in the world."""
 
     distance_unit = "m"
     control_period = CONTROL_PERIOD
@@ -50,25 +50,25 @@ class PulledArm(MjxGoalEnv):
         hand: str,
         observer: Callable[[mujoco.MjModel], Observer] | None,
     ) -> None:
-        """Finds the start.
+        """Compute the start.
 
         Args:
-            config: The settings.
-            mj_model: With a site called "grip" and a single mocap body.
-            hand: The name of the body that is pulled.
-            observer: Given the model, returns the function from poses to images. None: `observe_state` is what is seen.
+            config: Settings of the task.
+            mj_model: Model with a site called "grip" and a single mocap body.
+            hand: Name of the body that is pulled.
+            observer: Builds the function from poses to images, from the model. None: the agent observes `observe_state`.
         """
         mj_model.opt.iterations = config.solver_iterations
         self._hand = mj_model.body(hand).id
         self._grip = mj_model.site("grip").id
-        # The start is found with the timestep of the model file, so that it does not depend on `substeps`.
+        # The start is computed with the timestep of the model file, so that it does not depend on `substeps`.
         self._start = mjx_model.start_data(mj_model, self._settled(mj_model, config))
         mj_model.opt.timestep = CONTROL_PERIOD / config.substeps
         super().__init__(config, mj_model, observer)
 
     @abc.abstractmethod
     def _settled(self, mj_model: mujoco.MjModel, config: PulledArmConfig) -> mujoco.MjData:
-        """The start of every episode."""
+        """Return the start of every episode."""
 
     def sample_start(self, key: jax.Array) -> mjx.Data:
         return self._start
@@ -77,21 +77,23 @@ class PulledArm(MjxGoalEnv):
         return data.site_xpos[self._grip]
 
     def observe_state(self, data: mjx.Data) -> jax.Array:
-        """Position of the grip (m) and its displacement in a control step at its present speed (m): [6] float32, as in Gym."""
+        """Return the grip's position (m) and its displacement per control step at its current velocity (m): [6] float32, as in
+        Gym.
+        """
         position = data.site_xpos[self._grip]
         velocity = mjx_model.point_velocity(self.mj_model, data, self._hand, position)
         return jnp.concatenate([position, self.control_period * velocity])
 
 
 def pull(mj_model: mujoco.MjModel, mj_data: mujoco.MjData, position: np.ndarray, quaternion: np.ndarray, substeps: int) -> None:
-    """Holds the mocap body at a pose for ``substeps`` physics steps, then clears the solver's warm start and the time.
+    """Hold the mocap body at a pose for ``substeps`` physics steps, then clear the solver's warm start and the time.
 
     Args:
-        mj_model: The model, with a single mocap body.
-        mj_data: The state, changed in place.
+        mj_model: Model with a single mocap body.
+        mj_data: Physics state, changed in place.
         position: [3], m in the world.
-        quaternion: [4], real part first.
-        substeps: Physics steps.
+        quaternion: [4], scalar first.
+        substeps: Number of physics steps.
     """
     mj_data.mocap_pos[0], mj_data.mocap_quat[0] = position, quaternion
     for _ in range(substeps):

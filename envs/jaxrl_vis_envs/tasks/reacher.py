@@ -1,13 +1,13 @@
-"""Reacher: bring the fingertip of a two-link arm to where the goal image shows it.
+"""Reacher: move the fingertip of a two-link arm to its position in the goal image.
 
-As the authors of "Reinforcement Learning without Ground-Truth State" used it: the joint velocities are overwritten at the
-start of a control step and then decay, and the goal is the fingertip of a random configuration. ``control="torque"`` gives the
-motors of Gym's Reacher instead.
+As used by the authors of "Reinforcement Learning without Ground-Truth State": joint velocities are overwritten at the start of
+a control step and then decay, and the goal is the fingertip position of a random configuration. ``control="torque"`` selects
+the motors of Gym's Reacher instead.
 
-    VisualReacher   sees RGB-D from above
-    Reacher         sees joint angles, fingertip and joint velocities
+    VisualReacher   observes RGB-D from above
+    Reacher         observes joint angles, fingertip position and joint velocities
 
-State: fingertip position in the plane of the table, m. Action: one component for each joint.
+State: fingertip position in the plane of the table, m. Action: one component per joint.
 """
 
 import dataclasses
@@ -34,19 +34,19 @@ class ReacherConfig(TaskConfig):
 
     horizon: int = 50
     threshold: float = 0.01
-    """An episode succeeds where the fingertip is within this distance of the goal, m."""
+    """Distance between fingertip and goal within which an episode succeeds, m."""
     start_range: float = 0.1
-    """Both joints start uniform within this angle of 0, rad."""
+    """Start angles of both joints are uniform within this distance of 0, rad."""
     control: Literal["velocity", "torque"] = "velocity"
-    """What an action sets: the velocity that the joints start the control step with, or the torque during it."""
+    """Meaning of an action: the joint velocity at the start of the control step, or the torque during it."""
     velocity_scale: float = 10.0
-    """Joint velocity of an action of 1 under velocity control, rad/s (it turns the joint by .95 rad)."""
+    """Joint velocity of an action of 1 under velocity control, rad/s (one control step then turns the joint by .95 rad)."""
     substeps: int | None = None
     """Physics steps of 10 ms in a control step. None: 10 under velocity control, 2 under torque control."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.one_of(self, "control", _DEFAULT_SUBSTEPS)
+        checks.choice(self, "control", _DEFAULT_SUBSTEPS)
         checks.not_negative(self, "start_range")
         checks.positive(self, "velocity_scale")
         if self.substeps is not None:
@@ -58,11 +58,11 @@ class VisualReacherConfig(PixelsConfig, ReacherConfig):
     """Settings of the task and its images."""
 
     depth_range: tuple[float, float] = (0.8, 1.1)
-    """Depths that bytes 0 and 255 stand for, m: 1.2 mm a step; the arm lies between .82 and 1.04 m."""
+    """Depths encoded as 0 and 255, m: 1.2 mm per step; the arm is between .82 and 1.04 m."""
 
 
 class Reacher(MjxGoalEnv):
-    """The task; what the agent sees of it is up to ``observer``."""
+    """The task. ``observer`` determines what the agent sees."""
 
     action_size = 2
     camera = "above"
@@ -70,11 +70,11 @@ class Reacher(MjxGoalEnv):
     chance, difficulty = 0.004, 23.7  # benchmarks/tasks/task_difficulty.py Reacher --episodes 20000
 
     def __init__(self, config: ReacherConfig, observer: Callable[[mujoco.MjModel], Observer] | None = None):
-        """Builds the model.
+        """Build the model.
 
         Args:
-            config: The settings.
-            observer: Given the model, returns the function from poses to images. Default: `observe_state`.
+            config: Settings of the task.
+            observer: Builds the function from poses to images, from the model. None: the agent observes `observe_state`.
         """
         mj_model = mjx_model.load_model("reacher.xml")
         self._substeps = config.substeps or _DEFAULT_SUBSTEPS[config.control]
@@ -108,7 +108,7 @@ class Reacher(MjxGoalEnv):
         return jnp.concatenate([jnp.cos(data.qpos), jnp.sin(data.qpos), self.achieved(data), data.qvel])
 
     def configuration(self, joint_angles: jax.Array) -> mjx.Data:
-        """The arm at rest with ``joint_angles`` [2] float32, rad."""
+        """Return the arm at rest with ``joint_angles`` [2] float32, rad."""
         return mjx_model.kinematics(self._model, self._still.replace(qpos=joint_angles))
 
 

@@ -1,14 +1,14 @@
-"""Sawyer reach: move the hand of a Sawyer arm, by position control, to a point in a wide box over the table.
+"""Sawyer reach: move the hand of a Sawyer arm, by position control, to a point in a large box above the table.
 
-The real-robot task of the thesis (5.1.5.2) in simulation: 25 steps of at most 5 cm along each axis, goals uniform in a box
-whose diagonal is 1.30 m, success within 10 cm at the last step. The thesis gives neither the box's sides nor where it stands;
-ours are 1.00 x 0.70 x 0.45 m, over the middle of the workspace of the authors' simulated Sawyer, and every point of it can be
-reached. An episode starts at its centre. A hand that stays there succeeds in 1.3 % of the episodes.
+The real-robot task of the thesis (5.1.5.2) in simulation: 25 steps of at most 5 cm along each axis, goals uniform in a box with
+a diagonal of 1.30 m, success within 10 cm at the last step. The thesis gives neither the sides nor the position of the box;
+ours is 1.00 x 0.70 x 0.45 m, around the middle of the workspace of the authors' simulated Sawyer, and entirely reachable. An
+episode starts at its centre. A hand that stays there succeeds in 1.3 % of the episodes.
 
-    VisualSawyerReach   sees RGB-D from above the far edge of the table
-    SawyerReach         sees the hand's position and velocity
+    VisualSawyerReach   observes RGB-D from above the far edge of the table
+    SawyerReach         observes the hand's position and velocity
 
-State: position of the grip between the fingers in the world, m. Action: displacement of where the hand is pulled to.
+State: position of the grip between the fingers in the world, m. Action: displacement of the target that pulls the hand.
 """
 
 import dataclasses
@@ -27,8 +27,8 @@ from jaxrl_vis_envs.tasks.mjx_env import register_task
 from jaxrl_vis_envs.tasks.pulled_arm import PulledArm, PulledArmConfig, pull
 
 _SETTLING_SUBSTEPS = 1000
-_DOWN_ROTATION = np.diag([1.0, -1.0, -1.0])  # of the hand
-# Joint angles at a goal: within 6 mm for 99 % of the box, 6 cm in its far corners, where the arm is nearly stretched.
+_DOWN_ROTATION = np.diag([1.0, -1.0, -1.0])  # rotation matrix of the hand pointing down
+# Inverse kinematics of goals: within 6 mm for 99 % of the box, 6 cm in its far corners, where the arm is nearly stretched.
 _IK_DAMPING = (1e-3, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3)
 _IK_STEPS = 20
 
@@ -39,13 +39,13 @@ class SawyerReachConfig(PulledArmConfig):
 
     horizon: int = 25
     threshold: float = 0.1
-    """An episode succeeds within this distance of the goal, m."""
+    """Distance to the goal within which an episode succeeds, m."""
     goal_centre: tuple[float, float, float] = (-0.055, 0.485, 0.975)
-    """Centre of the box of goals, where every episode starts, m in the world."""
+    """Centre of the goal box, where every episode starts, m in the world."""
     goal_size: tuple[float, float, float] = (1.0, 0.7, 0.45)
-    """Sides of the box of goals, m."""
+    """Sides of the goal box, m."""
     workspace_margin: float = 0.05
-    """How far the hand may be pulled out of the box on each side, m. The table is 5 cm below it."""
+    """Margin around the goal box in which the hand may also be pulled, m. The table is 5 cm below the box."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -60,11 +60,11 @@ class VisualSawyerReachConfig(PixelsConfig, SawyerReachConfig):
     """Settings of the task and its images."""
 
     depth_range: tuple[float, float] = (1.4, 2.6)
-    """Depths that bytes 0 and 255 stand for, m: 4.7 mm a step, from before the highest hand to the table behind the lowest."""
+    """Depths encoded as 0 and 255, m: 4.7 mm per step, from in front of the highest hand to the table behind the lowest."""
 
 
 class SawyerReach(PulledArm):
-    """The task; what the agent sees of it is up to ``observer``."""
+    """The task. ``observer`` determines what the agent sees."""
 
     config: SawyerReachConfig
     action_size = 3
@@ -72,16 +72,16 @@ class SawyerReach(PulledArm):
     chance, difficulty = 0.010, 3.5  # benchmarks/tasks/task_difficulty.py SawyerReach --episodes 1000
 
     def __init__(self, config: SawyerReachConfig, observer: Callable[[mujoco.MjModel], Observer] | None = None):
-        """Builds the model and finds the start.
+        """Build the model and compute the start.
 
         Args:
-            config: The settings.
-            observer: Given the model, returns the function from poses to images. Default: `observe_state`.
+            config: Settings of the task.
+            observer: Builds the function from poses to images, from the model. None: the agent observes `observe_state`.
         """
         super().__init__(config, mjx_model.load_model("sawyer_reach.xml"), "hand", observer)
 
     def _settled(self, mj_model: mujoco.MjModel, config: SawyerReachConfig) -> mujoco.MjData:
-        """The arm at rest with its grip at the centre of the goals, after it was pulled there from its ready pose."""
+        """Pull the arm from its ready pose until its grip is at the centre of the goals, and stop it there."""
         mj_data = mujoco.MjData(mj_model)
         mujoco.mj_resetDataKeyframe(mj_model, mj_data, mj_model.key("ready").id)
         down = mj_model.body_quat[mj_model.body("mocap").id]
@@ -103,7 +103,7 @@ class SawyerReach(PulledArm):
         return mjx_model.simulate(self._model, data, self.config.substeps, undisturbed=True)
 
     def goal_configuration(self, goal: jax.Array) -> mjx.Data:
-        """The arm at rest with its grip at or near ``goal`` [3] (m, world), the hand down."""
+        """Return the arm at rest with its grip at or near ``goal`` [3] (m, world), the hand pointing down."""
         hand = goal - jnp.asarray(_DOWN_ROTATION @ self.mj_model.site_pos[self._grip], jnp.float32)
         return inverse_kinematics.reach(
             self.mj_model, self._model, self._start, self._hand, hand, _DOWN_ROTATION, _IK_DAMPING, _IK_STEPS

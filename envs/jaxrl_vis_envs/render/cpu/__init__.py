@@ -1,1 +1,1 @@
-"""The fast path on a CPU: `passes` over the pixels, one tile after the other (`tiles`)."""
+"""Fast path on a CPU: `passes` over the pixels, tile by tile (`tiles`)."""

@@ -1,12 +1,13 @@
-"""The same image on a CPU, with colours of 8 bits: passes over the pixels that each give one integer of 32 bits per pixel.
+"""CPU renderer for 8-bit colours: passes over the pixels, each with one 32-bit integer per pixel as its result.
 
-XLA computes a loop on a CPU anew for each of its outputs, and with it most of what they share: three channels cost three times
-the shading. So each pass has one output, and what the next one needs of it is packed into its bits: the key of the nearest
-object (`raycast`), its normal (as a point of an octahedron, 16 bits an axis), the colour of its texture (10 bits a channel),
-and the colour that is seen (8 bits a channel). Each pass over a tile is a loop of one round (`tiles.once`), because XLA
-would fuse them otherwise; and where only planes are seen in a tile, it is a cheaper one.
+XLA on a CPU recomputes a loop for each of its outputs, including most of their shared work: three channels would cost three
+times the shading. So each pass has one output, and everything the next one needs is packed into its bits: the key of the
+nearest object (`raycast`), its normal (in octahedral encoding, 16 bits per axis), its texture colour (10 bits per channel), and
+the final colour (8 bits per channel). Each pass over a tile is a loop of one iteration (`tiles.once`), because XLA would fuse
+the passes otherwise; if only planes are visible in a tile, a cheaper version runs.
 
-What happens to a pixel is the code of the plain renderer, but for the last bits: depths beside colours are those of the keys.
+Per pixel, the code is that of the plain renderer, and results agree up to the last bits: with colours, depths are those of the
+keys.
 """
 
 from collections.abc import Callable
@@ -22,45 +23,45 @@ from jaxrl_vis_envs.render.camera import Rays
 from jaxrl_vis_envs.render.cpu import tiles
 from jaxrl_vis_envs.render.outputs import Outputs, Planes
 from jaxrl_vis_envs.render.pixel import blocks, lights, lookup, raycast, shade, shapes, surface, texturing
-from jaxrl_vis_envs.render.pixel.arithmetic import Vector, clipped, larger, normalized, reciprocal
+from jaxrl_vis_envs.render.pixel.arithmetic import Vector, clip_to_unit, maximum, normalized, reciprocal
 from jaxrl_vis_envs.render.scene import Scene
 
 _FINE = {shapes.MESH, shapes.HFIELD}
-# Up to this many objects, a pixel's row is chosen by comparing instead of being looked up.
-_CHOSEN = 24
+# Up to this many objects, a pixel's row is selected by comparisons instead of being looked up.
+_MAX_SELECTED = 24
 _NORMAL_STEPS = 32767.0
 
 
-def takes(scene: Scene, outputs: Outputs) -> bool:
-    """Returns whether these passes draw these planes on the platform that is being traced for.
+def can_render(scene: Scene, outputs: Outputs) -> bool:
+    """Return True if these passes render these planes on the platform being traced for.
 
-    They are for CPUs, and draw opaque primitives without haze, with colours of 8 bits, and neither normals nor distances, nor
-    labels where what reflects may coincide with something else.
+    They run on CPUs, and support opaque primitives without haze, with 8-bit colours, without normals and distances, and without
+    segmentation if a reflecting object may coincide with another one.
     """
-    plain = not any(scene.transparent) and scene.haze[0] < 0 and not _FINE & set(scene.object_types)
-    plain = plain and not (outputs.segmentation and scene.reordered)
-    return targets_cpu() and plain and (outputs.quantized or not outputs.rgb) and not (outputs.normals or outputs.distance)
+    is_simple = not any(scene.transparent) and scene.haze[0] < 0 and not _FINE & set(scene.object_types)
+    is_simple = is_simple and not (outputs.segmentation and scene.reordered)
+    return targets_cpu() and is_simple and (outputs.quantized or not outputs.rgb) and not (outputs.normals or outputs.distance)
 
 
 def draw(outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.UnitShapes, light_table: jax.Array) -> Planes:
-    """Draws one environment; ``jax.vmap`` it for a batch. Not differentiable.
+    """Render one environment; use ``jax.vmap`` for a batch. Not differentiable.
 
     Args:
-        outputs: Which planes.
-        scene: One that the passes take, with these planes.
+        outputs: Requested planes.
+        scene: Scene for which `can_render` holds with these planes.
         rotation: [3, 3] float32 of the camera, see `camera.camera_pose`.
-        unit: The drawn objects.
-        light_table: From `lights.pack`.
+        unit: Rendered objects.
+        light_table: Lights, from `lights.pack`.
 
     Returns:
         The planes.
     """
     layout = tiles.layout(scene)
     rays = camera.pixel_rays(scene, layout.rows, layout.columns)
-    # Where nothing but depths is wanted, no bit of the keys is needed for anything else.
+    # If only depths are requested, all bits of the keys hold the depth.
     labelled = outputs.rgb or outputs.segmentation
     colouring = _Colouring(scene, unit, rotation, light_table) if outputs.rgb else None
-    planes = _tiles(scene, unit, colouring, labelled, rays)
+    planes = _render_tiles(scene, unit, colouring, labelled, rays)
     key, packed, row = jax.tree.map(lambda plane: blocks.restore(scene, layout, plane), planes)
     colours = _unpack(packed) if outputs.rgb else None
     if not labelled:
@@ -68,7 +69,7 @@ def draw(outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.UnitS
     near, index = raycast.decode(scene, key, row)
     far = labels = None
     if outputs.depth:
-        # A key's depth has lost its lowest bits: half of them come back.
+        # A key's depth has lost its lowest bits: use the middle of their range.
         centre = jax.lax.bitcast_convert_type(near, jnp.int32) | (raycast.code_mask(scene) >> 1)
         far = jnp.where(index >= 0, jax.lax.bitcast_convert_type(centre, jnp.float32), scene.zfar)
     if outputs.segmentation:
@@ -77,9 +78,10 @@ def draw(outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.UnitS
 
 
 class _Tile(NamedTuple):
-    """Intermediate values of a tile, int32 [P] each: keys, colours, and what leads to them. The next tile's takes its memory.
+    """Intermediate int32 values [P] of a tile: keys, colours, and the results of earlier passes. The next tile reuses their
+    memory.
 
-    Rows are only there where they are no part of the keys.
+    ``row`` is None if rows are part of the keys.
     """
 
     key: jax.Array
@@ -90,41 +92,48 @@ class _Tile(NamedTuple):
     texture: jax.Array
 
 
-def _tiles(
+def _render_tiles(
     scene: Scene, unit: shapes.UnitShapes, colouring: "_Colouring | None", labelled: bool, rays: Rays
 ) -> tuple[jax.Array, ...]:
-    """Keys, packed colours and rows (or None) of all pixels, [tiles, P] int32 each, one tile after the other."""
-    seen = tiles.seen_in_tiles(scene, unit, rays)
+    """Render all tiles one after the other; return keys, packed colours and rows (or None) of all pixels, [tiles, P] int32
+    each.
+    """
+    visible = tiles.visible_in_tiles(scene, unit, rays)
 
     def draw_tile(carry: tuple, pixels: tuple) -> tuple:
         number, tile, results = carry
-        # What goes straight into the results of a loop is computed on one core: it is copied there a round later.
-        before = jnp.maximum(number - 1, 0)
-        results = jax.tree.map(lambda whole, own: whole.at[before].set(own), results, (tile.key, tile.colour, tile.row))
-        rays, seen = pixels
-        key, row, own_keys = tiles.nearest_key(scene, unit, rays, seen, tile.own_keys, labelled)
+        # Values that go directly into a loop's results are computed on one core: copy them one iteration later.
+        previous = jnp.maximum(number - 1, 0)
+        results = jax.tree.map(lambda whole, own: whole.at[previous].set(own), results, (tile.key, tile.colour, tile.row))
+        rays, visible = pixels
+        key, row, own_keys = tiles.nearest_key(scene, unit, rays, visible, tile.own_keys, labelled)
         tile = tile._replace(key=key, row=row, own_keys=own_keys)
         if colouring is not None:
-            tile = colouring.colour(tile, rays, jnp.any(seen[np.array(tiles.solids(scene), int)]))
+            tile = colouring.colour(tile, rays, jnp.any(visible[np.array(tiles.non_plane_rows(scene), int)]))
         return (number + 1, tile, results), None
 
     shape = rays.u.shape
     empty = jnp.zeros(shape[1:], jnp.int32)
-    # Zeros that XLA does not know to be the same: it would fill one array on one core, and copy it.
-    keeps_rows = labelled and raycast.keeps_rows(scene)
+    # Zeros that XLA cannot prove equal: otherwise it would fill one array on one core, and copy it.
+    has_separate_rows = labelled and raycast.has_separate_rows(scene)
     results = [
-        jnp.zeros(shape, jnp.int32) + (0.0 * unit.origin[0, axis]).astype(jnp.int32) if axis < 2 or keeps_rows else None
+        jnp.zeros(shape, jnp.int32) + (0.0 * unit.origin[0, axis]).astype(jnp.int32) if axis < 2 or has_separate_rows else None
         for axis in range(3)
     ]
-    first = _Tile(empty, empty, empty if keeps_rows else None, tiles.memory(scene, empty), empty, empty)
-    (_, last, found), _ = jax.lax.scan(draw_tile, (jnp.int32(0), first, tuple(results)), (rays, seen))
-    return jax.tree.map(lambda whole, own: whole.at[shape[0] - 1].set(own), found, (last.key, last.colour, last.row))
+    first = _Tile(empty, empty, empty if has_separate_rows else None, tiles.initial_keys(scene, empty), empty, empty)
+    (_, last, planes), _ = jax.lax.scan(draw_tile, (jnp.int32(0), first, tuple(results)), (rays, visible))
+    return jax.tree.map(lambda whole, own: whole.at[shape[0] - 1].set(own), planes, (last.key, last.colour, last.row))
 
 
-class _Seen(NamedTuple):
-    """Inputs of a pass: rows of the objects that may be seen, `lookup.object_table`, and rays and keys, [P] each.
+class _PassInputs(NamedTuple):
+    """Inputs of a pass.
 
-    And the rows that keys are of, where they are no part of them.
+    Attributes:
+        rows: Rows of the objects that may be visible.
+        table: `lookup.object_table`.
+        rays: [P].
+        key: [P] int32.
+        row: [P] int32, rows of the keys; None if they are part of the keys.
     """
 
     rows: list[int]
@@ -143,89 +152,91 @@ class _Colouring:
         self.lights = lights.unpack(scene, light_table)
 
     def colour(self, tile: _Tile, rays: Rays, busy: jax.Array) -> _Tile:
-        """The tile with its colours. In one that is not ``busy`` only planes are seen, and the sky."""
-        every = list(range(len(self.scene.object_types)))
-        planes = [row for row in every if self.scene.object_types[row] == shapes.PLANE]
+        """Return the tile with its colours. Unless it is ``busy``, only planes and sky are visible in it."""
+        all_rows = list(range(len(self.scene.object_types)))
+        planes = [row for row in all_rows if self.scene.object_types[row] == shapes.PLANE]
 
-        def seeing(rows: list[int], what: Callable, *more: jax.Array | None) -> Callable[[jax.Array], jax.Array]:
-            def see(zero: jax.Array) -> jax.Array:
-                # Everything depends on the zero, or XLA would compute and store parts of it for every tile.
-                seen, packed = jax.tree.map(
-                    lambda leaf: leaf + zero.astype(leaf.dtype), ((self.table, rays, tile.key, tile.row), more)
+        def make_pass(
+            rows: list[int], function: Callable, *packed_inputs: jax.Array | None
+        ) -> Callable[[jax.Array], jax.Array]:
+            def run(zero: jax.Array) -> jax.Array:
+                # Everything must depend on the zero, or XLA would hoist parts of it and store them for every tile.
+                inputs, packed = jax.tree.map(
+                    lambda leaf: leaf + zero.astype(leaf.dtype), ((self.table, rays, tile.key, tile.row), packed_inputs)
                 )
-                return what(_Seen(rows, *seen), *packed)
+                return function(_PassInputs(rows, *inputs), *packed)
 
-            return see
+            return run
 
-        normal = tiles.once(busy, seeing(every, self._normal), tile.normal)
+        normal = tiles.once(busy, make_pass(all_rows, self._normal), tile.normal)
         texture: jax.Array | None = None
         if self.scene.atlas.used or self.scene.atlas.sky is not None:
-            texture = tiles.once(~busy, seeing(planes, self._texture), tile.texture)
-            texture = tiles.once(busy, seeing(every, self._texture), texture)
-        colour = tiles.once(~busy, seeing(planes, self._finish, None, texture), tile.colour)
-        colour = tiles.once(busy, seeing(every, self._finish, normal, texture), colour)
+            texture = tiles.once(~busy, make_pass(planes, self._texture), tile.texture)
+            texture = tiles.once(busy, make_pass(all_rows, self._texture), texture)
+        colour = tiles.once(~busy, make_pass(planes, self._finish, None, texture), tile.colour)
+        colour = tiles.once(busy, make_pass(all_rows, self._finish, normal, texture), colour)
         return tile._replace(normal=normal, texture=tile.texture if texture is None else texture, colour=colour)
 
-    def _normal(self, seen: _Seen) -> jax.Array:
-        """Packed, for objects whose rows are among these; as all that follow."""
-        return _pack_normal(surface.outward(*self._met(seen)))
+    def _normal(self, inputs: _PassInputs) -> jax.Array:
+        """Compute packed normals. As in the following passes, only ``inputs.rows`` occur among the objects."""
+        return _pack_normal(surface.outward_normal(*self._intersect(inputs)))
 
-    def _texture(self, seen: _Seen) -> jax.Array:
-        """What the colours of objects are multiplied with, and the colour of the sky: packed, 10 bits a channel."""
-        image = texturing.texture_colour(self.scene, *self._met(seen)) or (jnp.ones_like(seen.rays.u),) * 3
-        return _pack(self._in_front(seen, image, shade.sky(self.scene, self.rotation, seen.rays)), 10)
+    def _texture(self, inputs: _PassInputs) -> jax.Array:
+        """Compute the texture factor of objects, or the colour of the sky: packed, 10 bits per channel."""
+        image = texturing.texture_colour(self.scene, *self._intersect(inputs)) or (jnp.ones_like(inputs.rays.u),) * 3
+        return _pack(self._over_sky(inputs, image, shade.sky(self.scene, self.rotation, inputs.rays)), 10)
 
-    def _finish(self, seen: _Seen, normal: jax.Array | None, texture: jax.Array | None) -> jax.Array:
-        """What is seen: packed, 8 bits a channel. Without a ``normal`` it is that of a plane, which is not much to compute."""
-        row, hit = self._met(seen)
+    def _finish(self, inputs: _PassInputs, normal: jax.Array | None, texture: jax.Array | None) -> jax.Array:
+        """Compute the final colour: packed, 8 bits per channel. Without ``normal``, it is cheaply computed for planes."""
+        row, hit = self._intersect(inputs)
         if normal is not None:
             hit = hit._replace(normal=_unpack_normal(normal))
-        colour = shade.lighted(self.scene, self.unit, self.lights, row, hit, seen.rays)
+        colour = shade.light_surface(self.scene, self.unit, self.lights, row, hit, inputs.rays)
         if texture is None:
-            sky = shade.sky(self.scene, self.rotation, seen.rays)
+            sky = shade.sky(self.scene, self.rotation, inputs.rays)
         else:
             sky = tuple(((texture >> shift) & 1023).astype(jnp.float32) / 1023.0 for shift in (0, 10, 20))
             colour = tuple(value * texel for value, texel in zip(colour, sky, strict=True))
-        return _pack(self._in_front(seen, colour, sky), 8)
+        return _pack(self._over_sky(inputs, colour, sky), 8)
 
-    def _met(self, seen: _Seen) -> tuple[lookup.Row, surface.Hit]:
-        """The object that each pixel sees, and where."""
-        depth, index = raycast.decode(self.scene, seen.key, seen.row)
-        row = _row(seen.table, seen.rows, index)
-        return row, surface.meet(self.scene, row, None, seen.rays, depth, refined=False)
+    def _intersect(self, inputs: _PassInputs) -> tuple[lookup.Row, surface.Hit]:
+        """Return the visible object and the intersection at each pixel."""
+        depth, index = raycast.decode(self.scene, inputs.key, inputs.row)
+        row = _select_row(inputs.table, inputs.rows, index)
+        return row, surface.meet(self.scene, row, None, inputs.rays, depth, refined=False)
 
-    def _in_front(self, seen: _Seen, colour: Vector, sky: Vector) -> Vector:
-        """The colours of pixels that see an object, the sky's elsewhere."""
-        sees = raycast.decode(self.scene, seen.key, seen.row)[1] >= 0
-        return tuple(jnp.where(sees, front, back) for front, back in zip(colour, sky, strict=True))
+    def _over_sky(self, inputs: _PassInputs, colour: Vector, sky: Vector) -> Vector:
+        """Return ``colour`` at pixels that show an object, ``sky`` elsewhere."""
+        is_object = raycast.decode(self.scene, inputs.key, inputs.row)[1] >= 0
+        return tuple(jnp.where(is_object, front, back) for front, back in zip(colour, sky, strict=True))
 
 
-def _row(table: jax.Array, rows: list[int], index: jax.Array) -> lookup.Row:
-    """The row of every pixel, as `lookup.fetch`; few are chosen from, because rows that are looked up would be stored."""
-    if len(rows) > _CHOSEN:
+def _select_row(table: jax.Array, rows: list[int], index: jax.Array) -> lookup.Row:
+    """Return the row of every pixel, as `lookup.fetch`. If there are few, select by comparison: XLA would store lookups."""
+    if len(rows) > _MAX_SELECTED:
         return lookup.fetch(table, index)
     first, *others = rows or [0]
     columns = [jnp.broadcast_to(value, index.shape) for value in table[first]]
     for number in others:
-        here = index == number
-        columns = [jnp.where(here, value, column) for value, column in zip(table[number], columns, strict=True)]
-    return lookup.row_of(columns)
+        is_row = index == number
+        columns = [jnp.where(is_row, value, column) for value, column in zip(table[number], columns, strict=True)]
+    return lookup.make_row(columns)
 
 
 def _pack(colour: Vector, bits: int) -> jax.Array:
-    """Three channels [P] in [0, 1], rounded to this many bits each: [P] int32."""
+    """Round three channels [P] in [0, 1] to this many bits each, and pack them: [P] int32."""
     steps = float(2**bits - 1)
-    red, green, blue = ((clipped(channel) * steps + 0.5).astype(jnp.int32) for channel in colour)
+    red, green, blue = ((clip_to_unit(channel) * steps + 0.5).astype(jnp.int32) for channel in colour)
     return red | (green << bits) | (blue << 2 * bits)
 
 
 def _unpack(packed: jax.Array) -> jax.Array:
-    """Colours of 8 bits a channel, [H, W] int32 -> [3, H, W] uint8."""
+    """Unpack 8-bit colours: [H, W] int32 -> [3, H, W] uint8."""
     return (packed >> jnp.array([0, 8, 16], jnp.int32)[:, None, None]).astype(jnp.uint8)
 
 
 def _pack_normal(normal: Vector) -> jax.Array:
-    """A direction of any length -> [P] int32: where it meets an octahedron whose lower half is folded out, 16 bits an axis."""
+    """Encode directions of any length octahedrally: [P] int32, 16 bits per axis."""
     inverse = reciprocal(jnp.abs(normal[0]) + jnp.abs(normal[1]) + jnp.abs(normal[2]) + 1e-30)
     x, y = normal[0] * inverse, normal[1] * inverse
     below = normal[2] < 0.0
@@ -238,11 +249,11 @@ def _pack_normal(normal: Vector) -> jax.Array:
 
 
 def _unpack_normal(packed: jax.Array) -> Vector:
-    """Undoes `_pack_normal`: unit vectors, right to 5e-5."""
+    """Decode `_pack_normal` to unit vectors, accurate to 5e-5."""
     x, y = (
         half.astype(jnp.float32) * (1.0 / _NORMAL_STEPS) - 1.0
         for half in (packed & 0xFFFF, jax.lax.shift_right_logical(packed, np.int32(16)))
     )
     z = 1.0 - jnp.abs(x) - jnp.abs(y)
-    fold = larger(-z, 0.0)
+    fold = maximum(-z, 0.0)
     return normalized((x - jnp.where(x >= 0.0, fold, -fold), y - jnp.where(y >= 0.0, fold, -fold), z))

@@ -1,12 +1,12 @@
-"""The nearest object of every pixel on a CPU, tile by tile, and in a tile only what may be seen there.
+"""Nearest object of every pixel on a CPU, tile by tile, testing only objects that may be visible in the tile.
 
-A program for a batch cannot leave out of one image what it does in another. But cameras mostly stand still, and robots stay
-where they are: most tiles show the same few objects in all images of a batch. So what depends on a tile is a loop of no or
-one round (`once`), which all images of the batch go through or leave out together.
+A batched program cannot skip work for one image only. But cameras mostly stand still, and robots stay in place: most tiles show
+the same few objects in all images of a batch. Work that depends on a tile is therefore a loop of zero or one iterations
+(`once`), which all images of the batch execute or skip together.
 
-XLA needs to be told so in three ways. A condition that differs between the images would become a choice after the work is
-done: it is made one for the batch (`_anywhere`). A branch of ``cond`` runs on one core, the body of a ``while`` on all. And a
-loop that reads what it overwrites is not vectorised, so every object has keys of its own, which are compared afterwards.
+XLA needs three measures for this. A condition that differs between images would become a select after the work: it is reduced
+to one for the batch (`_anywhere`). A branch of ``cond`` runs on one core, the body of a ``while`` on all. And a loop that reads
+what it overwrites is not vectorised, so every object has its own keys, which are compared afterwards.
 """
 
 from collections.abc import Callable
@@ -20,113 +20,113 @@ from jaxrl_vis_envs.render.camera import Rays
 from jaxrl_vis_envs.render.pixel import blocks, raycast, shapes
 from jaxrl_vis_envs.render.scene import Scene
 
-# So many tiles across and down. Each costs some microseconds for each object, and smaller images than this would lose by it.
+# Number of tiles along each axis. Each costs some microseconds per object, which does not pay off for smaller images.
 _TILES = 4
-_LEAST_PIXELS = 48 * 48
+_MIN_PIXELS = 48 * 48
 
 
-def _culls(scene: Scene) -> bool:
-    """Whether each object is looked for where it may be seen; otherwise `raycast.nearest_key` finds them all."""
-    return not blocks.tiled(scene) and scene.height * scene.width >= _LEAST_PIXELS
+def _culls_per_tile(scene: Scene) -> bool:
+    """Return True if objects are culled per tile; otherwise `raycast.nearest_key` tests them all."""
+    return not blocks.is_tiled(scene) and scene.height * scene.width >= _MIN_PIXELS
 
 
 def layout(scene: Scene) -> blocks.Layout:
-    """The tiles of the image."""
-    if not _culls(scene):
+    """Return the tiles of the image."""
+    if not _culls_per_tile(scene):
         return blocks.layout(scene)
     high, wide = (blocks.near_divisor(pixels, -(-pixels // _TILES)) for pixels in (scene.height, scene.width))
     return blocks.tiles(scene, high, wide)
 
 
-def seen_in_tiles(scene: Scene, unit: shapes.UnitShapes, rays: Rays) -> jax.Array:
-    """Which objects may be seen in which tiles, in any image of the batch.
+def visible_in_tiles(scene: Scene, unit: shapes.UnitShapes, rays: Rays) -> jax.Array:
+    """Determine which objects may be visible in which tiles, in any image of the batch.
 
     Args:
         scene: The scene.
-        unit: The drawn objects.
+        unit: Rendered objects.
         rays: [tiles, P].
 
     Returns:
-        [tiles, G] bool, the same for the whole batch; planes are always there.
+        [tiles, G] bool, the same for the whole batch; always True for planes.
     """
-    touching = jax.vmap(lambda rays: camera.in_view(scene, unit.ball[:, :3], unit.ball[:, 3], rays, None))(rays)
-    return _anywhere(touching) | (np.array(scene.object_types) == shapes.PLANE)
+    visible = jax.vmap(lambda rays: camera.in_view(scene, unit.ball[:, :3], unit.ball[:, 3], rays, None))(rays)
+    return _anywhere(visible) | (np.array(scene.object_types) == shapes.PLANE)
 
 
-def solids(scene: Scene) -> list[int]:
-    """Rows of the drawn objects that are no planes."""
+def non_plane_rows(scene: Scene) -> list[int]:
+    """Return the rows of the rendered objects other than planes."""
     return [row for row in raycast.primitive_rows(scene, transparent=False) if scene.object_types[row] != shapes.PLANE]
 
 
-def memory(scene: Scene, plane: jax.Array) -> tuple[jax.Array, ...]:
-    """``plane`` [P] int32 for each object whose keys `nearest_key` keeps."""
-    return (plane,) * len(solids(scene)) if _culls(scene) else ()
+def initial_keys(scene: Scene, plane: jax.Array) -> tuple[jax.Array, ...]:
+    """Return ``plane`` [P] int32 for each object whose keys `nearest_key` carries."""
+    return (plane,) * len(non_plane_rows(scene)) if _culls_per_tile(scene) else ()
 
 
 def nearest_key(
     scene: Scene,
     unit: shapes.UnitShapes,
     rays: Rays,
-    seen: jax.Array,
-    own: tuple[jax.Array, ...],
+    visible: jax.Array,
+    object_keys: tuple[jax.Array, ...],
     labelled: bool,
 ) -> tuple[jax.Array, jax.Array | None, tuple[jax.Array, ...]]:
-    """`raycast.nearest_key` of one tile.
+    """Compute `raycast.nearest_key` of one tile.
 
     Args:
         scene: The scene.
-        unit: The drawn objects.
+        unit: Rendered objects.
         rays: [P].
-        seen: [G] bool, a row of `seen_in_tiles`.
-        own: From `memory`, whatever is in it now.
-        labelled: Whether the keys say which object it is, or are nothing but the bits of its depth.
+        visible: [G] bool, a row of `visible_in_tiles`.
+        object_keys: Buffers from `initial_keys`, with any contents.
+        labelled: Include the object's row in the keys, instead of only the bits of the depth.
 
     Returns:
-        The keys [P] int32, the rows [P] int32 where the scene `raycast.keeps_rows` and they are wanted (otherwise None), and
-        the memory for the next tile.
+        The keys [P] int32, the rows [P] int32 if labelled and the scene has separate rows (otherwise None), and the buffers for
+        the next tile.
     """
-    if not _culls(scene):
-        if labelled and raycast.keeps_rows(scene):
-            return *raycast.nearest_row(scene, unit, rays), own
-        return raycast.nearest_key(scene, unit, rays, labelled), None, own
+    if not _culls_per_tile(scene):
+        if labelled and raycast.has_separate_rows(scene):
+            return *raycast.nearest_row(scene, unit, rays), object_keys
+        return raycast.nearest_key(scene, unit, rays, labelled), None, object_keys
     mask = raycast.code_mask(scene) if labelled else 0
     sky = raycast.sky_key(scene, mask)
-    rows = solids(scene)
+    rows = non_plane_rows(scene)
 
-    def keys_of(row: int) -> Callable[[jax.Array], jax.Array]:
-        def find(nothing: jax.Array) -> jax.Array:
-            moving = jax.tree.map(lambda leaf: leaf + nothing.astype(jnp.float32), unit)
-            return raycast.object_key(scene, moving, row, rays, sky, mask)
+    def make_key_function(row: int) -> Callable[[jax.Array], jax.Array]:
+        def compute(zero: jax.Array) -> jax.Array:
+            unit_from_zero = jax.tree.map(lambda leaf: leaf + zero.astype(jnp.float32), unit)
+            return raycast.object_key(scene, unit_from_zero, row, rays, sky, mask)
 
-        return find
+        return compute
 
-    own = tuple(once(seen[row], keys_of(row), old) for row, old in zip(rows, own, strict=True))
+    object_keys = tuple(once(visible[row], make_key_function(row), old) for row, old in zip(rows, object_keys, strict=True))
     best = jnp.broadcast_to(sky, rays.u.shape)
     for row in raycast.primitive_rows(scene, transparent=False):
         if row not in rows:
             best = jnp.minimum(best, raycast.object_key(scene, unit, row, rays, sky, mask))
-    for row, key in zip(rows, own, strict=True):
-        best = jnp.minimum(best, jnp.where(seen[row], key, sky))
-    return best, None, own
+    for row, key in zip(rows, object_keys, strict=True):
+        best = jnp.minimum(best, jnp.where(visible[row], key, sky))
+    return best, None, object_keys
 
 
 def once(condition: jax.Array, function: Callable[[jax.Array], jax.Array], otherwise: jax.Array) -> jax.Array:
-    """``function(0)`` where the condition, one for the whole batch, is true; computed once, whatever is done with the result.
+    """Compute ``function(0)`` if the condition, one for the whole batch, is True; only once, whatever the result is used for.
 
     Args:
         condition: [] bool.
-        function: Takes an int32 that is 0, which XLA does not know: what does not depend on it is computed in any case.
-        otherwise: The result where the condition is false; its memory is used for that of the function.
+        function: Takes an int32 zero that XLA cannot constant-fold: anything that does not depend on it is computed regardless.
+        otherwise: Result if the condition is False; its memory is reused for that of the function.
     """
-    rounds = jnp.where(condition, 0, 1)
+    iteration = jnp.where(condition, 0, 1)
     return jax.lax.while_loop(
-        lambda state: state[0] < 1, lambda state: (state[0] + 1, function(state[0])), (rounds, otherwise)
+        lambda state: state[0] < 1, lambda state: (state[0] + 1, function(state[0])), (iteration, otherwise)
     )[1]
 
 
 @jax.custom_batching.custom_vmap
 def _anywhere(flags: jax.Array) -> jax.Array:
-    """``flags``; in a batch, whether they are true anywhere in it: one answer for all."""
+    """Return ``flags``; within a batch, True where they are True for any element, as one answer for all."""
     return flags
 
 

@@ -1,1 +1,1 @@
-"""The fast path on an NVIDIA GPU: the whole image as one `kernel`."""
+"""Fast path on an NVIDIA GPU: the whole image in one `kernel`."""

@@ -1,9 +1,9 @@
-"""The same image as one GPU kernel (Pallas, by Triton), for scenes of plain primitives: most scenes that robots learn in.
+"""GPU renderer in one kernel (Pallas with Triton), for scenes of opaque primitives: most robot learning scenes.
 
-As XLA operations, every pixel meets every object. Here a program draws one tile of one image: it walks through the objects,
-type by type, skips each whose bounding rectangle in the image misses the tile, and goes on to shade what it found without
-leaving the chip. What happens to a pixel is the same code as in plain JAX (`raycast.entry`, `surface.meet`, `shade.shade`), but
-in the kernel it reads scalars and blocks of memory instead of arrays.
+As XLA operations, every pixel would be tested against every object. Here, one program renders one tile of one image: it
+iterates over the objects by type, skips those whose bounding rectangle in the image misses the tile, and shades the nearest
+hits without leaving the chip. Per pixel, the code is the same as in plain JAX (`raycast.entry`, `surface.meet`, `shade.shade`),
+but reads scalars and blocks of memory instead of arrays.
 """
 
 import functools
@@ -25,11 +25,11 @@ from jaxrl_vis_envs.render.pixel import lights, lookup, raycast, shade, shapes, 
 from jaxrl_vis_envs.render.pixel.prepare import prepare
 from jaxrl_vis_envs.render.scene import Scene
 
-# Measured on an H200: pixels of a tile (a power of two, of which a few may be idle), and how a program is run.
+# Tuned on an H200: pixels per tile (a power of two, some of which may be idle), and launch parameters.
 _PIXELS = 128
 _COMPILER = plgpu.CompilerParams(num_warps=4, num_stages=1)
-_ENDLESS = 1e9
-# Where the camera's numbers are in the vector that the kernel reads.
+_INFINITE = 1e9
+# Indices of the camera's parameters in the vector that the kernel reads.
 _LENS, _CLIP, _ROTATION, _SKY_TOP, _SKY_BOTTOM, _FOVY = range(4), range(4, 6), range(6, 15), range(15, 18), range(18, 21), 21
 _PROBE = """
 <mujoco>
@@ -48,24 +48,24 @@ _PROBE = """
 _TYPES = {shapes.PLANE, shapes.SPHERE, shapes.CAPSULE, shapes.ELLIPSOID, shapes.CYLINDER, shapes.BOX}
 
 
-def takes(scene: Scene, outputs: Outputs) -> bool:
-    """Returns whether the kernel draws these planes on the platform that is being traced for: any of a scene that it supports.
+def can_render(scene: Scene, outputs: Outputs) -> bool:
+    """Return True if the kernel renders these planes on the platform being traced for: any planes of a supported scene.
 
-    But for labels where what reflects may coincide with something else.
+    The exception is segmentation if a reflecting object may coincide with another one.
     """
     return supports(scene) and not (outputs.segmentation and scene.reordered) and runs_gpu_kernels(probe)
 
 
 def supports(scene: Scene) -> bool:
-    """Whether the kernel can draw this scene, wherever it runs: opaque primitives without shadows or haze."""
-    plain = not any(scene.transparent) and not any(scene.light_shadows) and scene.haze[0] < 0
+    """Return True if the kernel supports this scene, on any platform: opaque primitives without shadows or haze."""
+    is_simple = not any(scene.transparent) and not any(scene.light_shadows) and scene.haze[0] < 0
     textured = scene.atlas.used or scene.atlas.sky is not None
-    # How far a texture is spread over a pixel is found out in the kernel, which does not know lenses with a sensor.
-    return plain and not (textured and scene.projection == "intrinsic") and set(scene.object_types) <= _TYPES
+    # The kernel computes the texture footprint of a pixel, and does not support lenses with a sensor.
+    return is_simple and not (textured and scene.projection == "intrinsic") and set(scene.object_types) <= _TYPES
 
 
 def tile_shape(height: int, width: int) -> tuple[int, int]:
-    """Rows and columns of a tile: about twice as wide as high, with little hanging over the image's border."""
+    """Return the rows and columns of a tile: about twice as wide as high, with little overhang beyond the image's border."""
 
     def cost(shape: tuple[int, int]) -> float:
         high, wide = shape
@@ -75,7 +75,7 @@ def tile_shape(height: int, width: int) -> tuple[int, int]:
 
 
 def rectangles(scene: Scene, unit: shapes.UnitShapes) -> jax.Array:
-    """[G, 4] float32: least and largest u, least and largest v of a ball around each object; endless for planes."""
+    """Return bounds [G, 4] float32 (min u, max u, min v, max v) of each object's bounding sphere; infinite for planes."""
     x, y, depth, radius = unit.ball[:, 0], unit.ball[:, 1], -unit.ball[:, 2], unit.ball[:, 3]
     radius = radius * (1.0 + 1e-4) + 1e-6
     if scene.projection == "orthographic":
@@ -89,16 +89,16 @@ def rectangles(scene: Scene, unit: shapes.UnitShapes) -> jax.Array:
             root = radius * jnp.sqrt(jnp.maximum(along * along + square, 0.0))
             sides += [(along * depth - root) / safe, (along * depth + root) / safe]
         behind, around = depth <= -radius, depth <= radius
-    endless = np.array(scene.object_types) == shapes.PLANE
-    low, high = jnp.where(around, -_ENDLESS, 0.0), jnp.where(around, _ENDLESS, 0.0)
+    is_infinite = np.array(scene.object_types) == shapes.PLANE
+    low, high = jnp.where(around, -_INFINITE, 0.0), jnp.where(around, _INFINITE, 0.0)
     sides = [jnp.where(around, high if i % 2 else low, side) for i, side in enumerate(sides)]
-    # What is behind the camera has its sides the wrong way round, so no tile meets it.
-    sides = [jnp.where(behind, -_ENDLESS if i % 2 else _ENDLESS, side) for i, side in enumerate(sides)]
-    return jnp.stack([jnp.where(endless, _ENDLESS if i % 2 else -_ENDLESS, side) for i, side in enumerate(sides)], axis=1)
+    # Objects behind the camera get inverted bounds, so that no tile intersects them.
+    sides = [jnp.where(behind, -_INFINITE if i % 2 else _INFINITE, side) for i, side in enumerate(sides)]
+    return jnp.stack([jnp.where(is_infinite, _INFINITE if i % 2 else -_INFINITE, side) for i, side in enumerate(sides)], axis=1)
 
 
 def tile_words(scene: Scene, sides: jax.Array, tile: tuple[int, int]) -> tuple[jax.Array, np.ndarray]:
-    """Which objects may be seen in which tile.
+    """Determine which objects may be visible in which tile.
 
     Args:
         scene: The scene.
@@ -106,22 +106,22 @@ def tile_words(scene: Scene, sides: jax.Array, tile: tuple[int, int]) -> tuple[j
         tile: Rows and columns of a tile.
 
     Returns:
-        Bits [tiles, words] int32: bit b of word w is for object ``order[32 w + b]``; and the order [G], which goes by type.
+        Bits [tiles, words] int32, where bit b of word w is for object ``order[32 w + b]``; and the order [G], sorted by type.
     """
     order = np.argsort(np.array(scene.object_types), kind="stable").astype(np.int32)
     high, wide = tile
     tops, lefts = np.arange(0, scene.height, high), np.arange(0, scene.width, wide)
     middle_u, middle_v, half_u, half_v = camera.lens(scene)
 
-    def u_of(column: np.ndarray) -> jax.Array:
+    def u_at(column: np.ndarray) -> jax.Array:
         return middle_u + jnp.asarray((2.0 * column + 1.0 - scene.width) / scene.width, jnp.float32) * half_u
 
-    def v_of(row: np.ndarray) -> jax.Array:
+    def v_at(row: np.ndarray) -> jax.Array:
         return middle_v + jnp.asarray((scene.height - 1.0 - 2.0 * row) / scene.height, jnp.float32) * half_v
 
     sides = sides[order]
-    across = (sides[:, 0] <= u_of(lefts + wide)[:, None]) & (sides[:, 1] >= u_of(lefts - 1)[:, None])
-    down = (sides[:, 2] <= v_of(tops - 1)[:, None]) & (sides[:, 3] >= v_of(tops + high)[:, None])
+    across = (sides[:, 0] <= u_at(lefts + wide)[:, None]) & (sides[:, 1] >= u_at(lefts - 1)[:, None])
+    down = (sides[:, 2] <= v_at(tops - 1)[:, None]) & (sides[:, 3] >= v_at(tops + high)[:, None])
     meets = (down[:, None] & across[None, :]).reshape(len(tops) * len(lefts), -1)
     words = -(-len(order) // 32)
     meets = jnp.pad(meets, ((0, 0), (0, 32 * words - len(order)))).reshape(-1, words, 32)
@@ -130,7 +130,7 @@ def tile_words(scene: Scene, sides: jax.Array, tile: tuple[int, int]) -> tuple[j
 
 
 class _Refs(NamedTuple):
-    """What a kernel reads, all of one environment."""
+    """Memory blocks read by a kernel, all of one environment."""
 
     words: Any
     order: Any
@@ -146,8 +146,8 @@ class _Refs(NamedTuple):
     ids: Any
 
 
-def _nearest(scene: Scene, refs: _Refs, place: Any, rays: Rays, znear: Any, best: tuple) -> tuple:
-    """The least key of the objects of a tile, given ``best``: (key,), or (bits of the depth, row) where rows are kept apart."""
+def _nearest(scene: Scene, refs: _Refs, tile_index: Any, rays: Rays, znear: Any, best: tuple) -> tuple:
+    """Return the minimum key over the objects of a tile and ``best``: (key,), or (depth bits, row) if rows are separate."""
     mask = raycast.code_mask(scene)
     start, direction, inverse_square = camera.ray_parts(scene, rays)
     kinds = sorted(scene.object_types)
@@ -156,11 +156,11 @@ def _nearest(scene: Scene, refs: _Refs, place: Any, rays: Rays, znear: Any, best
     )
 
     for word in range(refs.words.shape[1]):
-        bits = refs.words[place, word]
-        some = kinds[32 * word : 32 * (word + 1)]
-        for kind in sorted(set(some)):
-            own = sum(1 << bit for bit, other in enumerate(some) if other == kind)
-            own = own - (1 << 32) if own >= 1 << 31 else own
+        bits = refs.words[tile_index, word]
+        word_kinds = kinds[32 * word : 32 * (word + 1)]
+        for kind in sorted(set(word_kinds)):
+            kind_bits = sum(1 << bit for bit, other in enumerate(word_kinds) if other == kind)
+            kind_bits = kind_bits - (1 << 32) if kind_bits >= 1 << 31 else kind_bits
 
             def one_object(carry, kind=kind, word=word):
                 left, best = carry
@@ -173,8 +173,8 @@ def _nearest(scene: Scene, refs: _Refs, place: Any, rays: Rays, znear: Any, best
                 )
                 values = ([refs.origin[index, i] for i in range(3)], axes, refs.extra[index], refs.extra_square[index])
                 t, meets = raycast.entry(kind, values, start, direction, inverse_square)
-                if raycast.culls(scene, kind):
-                    meets = meets & raycast.one_sided(refs.origin[index, 2], refs.axes[index, 2, 2])
+                if raycast.can_be_culled(scene, kind):
+                    meets = meets & raycast.is_plane_visible(refs.origin[index, 2], refs.axes[index, 2, 2])
                 bits = jax.lax.bitcast_convert_type(t, jnp.int32)
                 if len(best) == 1:
                     key = (bits & ~mask) | index
@@ -183,7 +183,7 @@ def _nearest(scene: Scene, refs: _Refs, place: Any, rays: Rays, znear: Any, best
                 nearer = meets & (t > znear) & ((bits < nearest) | ((bits == nearest) & (index < row)))
                 return left & (left - 1), (jnp.where(nearer, bits, nearest), jnp.where(nearer, index, row))
 
-            _, best = jax.lax.while_loop(lambda carry: carry[0] != 0, one_object, (bits & own, best))
+            _, best = jax.lax.while_loop(lambda carry: carry[0] != 0, one_object, (bits & kind_bits, best))
     return best
 
 
@@ -192,8 +192,8 @@ def _kernel(*refs, scene: Scene, outputs: Outputs, tile: tuple[int, int]):
     refs, out = _Refs(*refs[:count]), list(refs[count:])
     high, wide = tile
     across = np.int32(-(-scene.width // wide))
-    place = pl.program_id(0)
-    top, left = jax.lax.div(place, across) * high, jax.lax.rem(place, across) * wide
+    tile_index = pl.program_id(0)
+    top, left = jax.lax.div(tile_index, across) * high, jax.lax.rem(tile_index, across) * wide
     lane = jax.lax.broadcasted_iota(jnp.int32, (_PIXELS,), 0)
     row, column = top + jax.lax.div(lane, jnp.int32(wide)), left + jax.lax.rem(lane, jnp.int32(wide))
     inside = (lane < high * wide) & (row < scene.height) & (column < scene.width)
@@ -207,14 +207,14 @@ def _kernel(*refs, scene: Scene, outputs: Outputs, tile: tuple[int, int]):
     mask = raycast.code_mask(scene)
     sky_key = (jax.lax.bitcast_convert_type(zfar, jnp.int32) & ~mask) | mask
     sky = jnp.broadcast_to(sky_key, (_PIXELS,))
-    if raycast.keeps_rows(scene):
+    if raycast.has_separate_rows(scene):
         none = len(scene.object_ids)
-        best, index = _nearest(scene, refs, place, rays, znear, (sky, jnp.full((_PIXELS,), none, jnp.int32)))
-        sees = index != none
+        best, index = _nearest(scene, refs, tile_index, rays, znear, (sky, jnp.full((_PIXELS,), none, jnp.int32)))
+        hit_mask = index != none
     else:
-        (best,) = _nearest(scene, refs, place, rays, znear, (sky,))
+        (best,) = _nearest(scene, refs, tile_index, rays, znear, (sky,))
         index = best & mask
-        sees = index != mask
+        hit_mask = index != mask
     near = jax.lax.bitcast_convert_type(best & ~mask, jnp.float32)
     pixel = row * scene.width + column
 
@@ -230,24 +230,24 @@ def _kernel(*refs, scene: Scene, outputs: Outputs, tile: tuple[int, int]):
     if outputs.rgb or outputs.depth or outputs.normals or outputs.distance:
 
         def surfaces():
-            cell = _fetch(refs, jnp.where(sees, index, 0))
-            hit = surface.meet(inner, cell, None, rays, near)
+            object_row = _fetch(refs, jnp.where(hit_mask, index, 0))
+            hit = surface.meet(inner, object_row, None, rays, near)
             colour = (zero,) * 3
             if outputs.rgb:
-                colour = shade.shade(inner, None, lights.unpack(scene, refs.lights), cell, hit, rays)
+                colour = shade.shade(inner, None, lights.unpack(scene, refs.lights), object_row, hit, rays)
             return hit.depth, tuple(hit.normal), tuple(colour)
 
-        # A whole tile of sky is common.
-        far, normal, colour = jax.lax.cond(jnp.max(sees.astype(jnp.int32)) > 0, surfaces, lambda: (far, normal, colour))
-        far = jnp.where(sees, far, zfar)
+        # Tiles that show only sky are common.
+        far, normal, colour = jax.lax.cond(jnp.max(hit_mask.astype(jnp.int32)) > 0, surfaces, lambda: (far, normal, colour))
+        far = jnp.where(hit_mask, far, zfar)
     if outputs.rgb:
 
         def with_sky():
             rotation = _Matrix([[refs.view[_ROTATION[3 * i + j]] for j in range(3)] for i in range(3)])
             background = shade.sky(inner, rotation, rays)
-            return tuple(jnp.where(sees, front, back) for front, back in zip(colour, background, strict=True))
+            return tuple(jnp.where(hit_mask, front, back) for front, back in zip(colour, background, strict=True))
 
-        colour = jax.lax.cond(jnp.min(sees.astype(jnp.int32)) > 0, lambda: colour, with_sky)
+        colour = jax.lax.cond(jnp.min(hit_mask.astype(jnp.int32)) > 0, lambda: colour, with_sky)
         for plane, value in enumerate(colour):
             if outputs.quantized:
                 value = (jnp.clip(value, 0.0, 1.0) * 255.0 + 0.5).astype(jnp.int32)
@@ -258,31 +258,31 @@ def _kernel(*refs, scene: Scene, outputs: Outputs, tile: tuple[int, int]):
         out.pop(0)
     if outputs.normals:
         for plane, value in enumerate(normal):
-            store(jnp.where(sees, value, 0.0), plane)
+            store(jnp.where(hit_mask, value, 0.0), plane)
         out.pop(0)
     if outputs.distance:
-        store(jnp.where(sees, far * camera.ray_length(scene, rays), zfar))
+        store(jnp.where(hit_mask, far * camera.ray_length(scene, rays), zfar))
         out.pop(0)
     if outputs.segmentation:
-        store(jnp.where(sees, plgpu.load(refs.ids.at[jnp.where(sees, index, 0)]), -1))
+        store(jnp.where(hit_mask, plgpu.load(refs.ids.at[jnp.where(hit_mask, index, 0)]), -1))
 
 
 def _fetch(refs: _Refs, index: jax.Array) -> lookup.Row:
-    """Of each pixel's object, the values that `surface.meet` and `shade.shade` need."""
+    """Fetch the properties of each pixel's object that `surface.meet` and `shade.shade` need."""
     columns = [_column(refs.axes, index, i, j) for i in range(3) for j in range(3)]
     columns += [_column(refs.origin, index, i) for i in range(3)] + [_column(refs.extra, index)]
-    return lookup.row_of(columns + [_column(refs.appearance, index, number) for number in range(refs.appearance.shape[1])])
+    return lookup.make_row(columns + [_column(refs.appearance, index, number) for number in range(refs.appearance.shape[1])])
 
 
-def _column(ref: Any, index: jax.Array, *place: int) -> jax.Array:
-    """One column of the rows ``index`` [P] of a block of memory."""
-    return plgpu.load(ref.at[(index, *(jnp.full(index.shape, number, jnp.int32) for number in place))])
+def _column(ref: Any, index: jax.Array, *columns: int) -> jax.Array:
+    """Load one column of the rows ``index`` [P] of a block of memory."""
+    return plgpu.load(ref.at[(index, *(jnp.full(index.shape, number, jnp.int32) for number in columns))])
 
 
 class _BlockTexels:
-    """The atlas as blocks of memory, see `sampling.Texels`."""
+    """Texture atlas in blocks of memory, see `sampling.Texels`."""
 
-    few_textures = True  # many tiles see nothing that has one
+    few_textures = True  # many tiles show no textured object
     differentiable = False
 
     def __init__(self, texels: Any, levels: Any):
@@ -300,13 +300,13 @@ class _BlockTexels:
 
 
 class _Matrix:
-    """Scalars that are read like an array."""
+    """Scalars indexed like an array."""
 
     def __init__(self, rows: list):
         self.rows = rows
 
-    def __getitem__(self, place: tuple[int, int]) -> Any:
-        return self.rows[place[0]][place[1]]
+    def __getitem__(self, index: tuple[int, int]) -> Any:
+        return self.rows[index[0]][index[1]]
 
 
 def draw(
@@ -317,14 +317,14 @@ def draw(
     light_table: jax.Array,
     interpret: bool = False,
 ) -> Planes:
-    """Draws one environment; ``jax.vmap`` it for a batch. Not differentiable.
+    """Render one environment; use ``jax.vmap`` for a batch. Not differentiable.
 
     Args:
-        outputs: Which planes.
-        scene: One that the kernel `supports`.
+        outputs: Requested planes.
+        scene: Scene that the kernel `supports`.
         rotation: [3, 3] float32 of the camera, see `camera.camera_pose`.
-        unit: The drawn objects.
-        light_table: From `lights.pack`.
+        unit: Rendered objects.
+        light_table: Lights, from `lights.pack`.
         interpret: Run without a GPU, slowly.
 
     Returns:
@@ -357,46 +357,47 @@ def draw(
         "distance": ((pixels,), jnp.float32),
         "segmentation": ((pixels,), jnp.int32),
     }
-    drawn = {name: jax.ShapeDtypeStruct(*kind) for name, kind in kinds.items() if getattr(outputs, name)}
+    out_shapes = {name: jax.ShapeDtypeStruct(*kind) for name, kind in kinds.items() if getattr(outputs, name)}
     planes = kernel_call(
         functools.partial(_kernel, scene=_without_arrays(scene), outputs=outputs, tile=tile),
-        out_shape=list(drawn.values()),
+        out_shape=list(out_shapes.values()),
         grid=(words.shape[0],),
-        in_specs=[_whole(array.shape) for array in inputs],
-        out_specs=[_whole(like.shape) for like in drawn.values()],
+        in_specs=[_full_block(array.shape) for array in inputs],
+        out_specs=[_full_block(like.shape) for like in out_shapes.values()],
         compiler_params=_COMPILER,
         interpret=interpret,
         name="draw_tiles",
     )(*inputs)
-    upright = {
-        name: plane.reshape(*plane.shape[:-1], scene.height, scene.width) for name, plane in zip(drawn, planes, strict=True)
+    reshaped = {
+        name: plane.reshape(*plane.shape[:-1], scene.height, scene.width)
+        for name, plane in zip(out_shapes, planes, strict=True)
     }
-    return Planes(**{**dict.fromkeys(Planes._fields), **upright})
+    return Planes(**{**dict.fromkeys(Planes._fields), **reshaped})
 
 
 def probe() -> None:
-    """Compiles a small instance of the kernel."""
+    """Compile a small instance of the kernel."""
     probe_program().lower().compile()
 
 
 def probe_program() -> Any:
-    """A small instance of the kernel, traced (`jax.stages.Traced`): every type of object, two lights, a texture, a sky."""
+    """Trace a small instance of the kernel (`jax.stages.Traced`): every type of object, two lights, a texture, a sky."""
     mj_model = mujoco.MjModel.from_xml_string(_PROBE)
     mj_data = mujoco.MjData(mj_model)
     mujoco.mj_forward(mj_model, mj_data)
     scene = Scene.from_mjmodel(mj_model, 0, 8, 8)
-    prepared = jax.eval_shape(lambda scene: prepare(scene, mj_data), scene)  # nothing is compiled for it
+    prepared = jax.eval_shape(lambda scene: prepare(scene, mj_data), scene)  # avoids compilation
     outputs = Outputs(rgb=True, depth=True, segmentation=True, quantized=True)
     assert supports(scene)
     return jax.jit(functools.partial(draw, outputs)).trace(scene, *prepared)
 
 
-def _whole(shape: tuple[int, ...]) -> pl.BlockSpec:
-    """Every program sees all of it."""
-    return pl.BlockSpec(shape, lambda place: (0,) * len(shape))
+def _full_block(shape: tuple[int, ...]) -> pl.BlockSpec:
+    """Return a block that gives every program the whole array."""
+    return pl.BlockSpec(shape, lambda tile_index: (0,) * len(shape))
 
 
 def _without_arrays(scene: Scene) -> Scene:
-    """A kernel must not capture any."""
+    """Return the scene without its arrays, which a kernel must not capture."""
     leaves, structure = jax.tree.flatten(scene)
     return jax.tree.unflatten(structure, [None] * len(leaves))

@@ -1,5 +1,5 @@
-"""Reads a MuJoCo model into arrays, once for each scene. NumPy only.
+"""Conversion of a MuJoCo model to arrays, once per scene. NumPy only.
 
-`reading` (colours, lights, what cannot be drawn), `cameras` (lenses and what they are fixed to), `meshes` (triangles in small
-clusters) and `textures` (one atlas of all images at all resolutions).
+`reading` (colours, lights, unsupported objects), `cameras` (lenses and mounts), `meshes` (triangles in small clusters) and
+`textures` (one atlas of all images at all mipmap levels).
 """

@@ -1,4 +1,4 @@
-"""The camera of a scene: which one of the model's, or a free one; its lens and what it is fixed to. NumPy only."""
+"""Camera of a scene: one of the model's, or a free one; its lens and its mount. NumPy only."""
 
 import numbers
 from typing import Any
@@ -9,20 +9,24 @@ import numpy as np
 from jaxrl_vis_envs.render.mounts import Mount
 
 FREE_CAMERA = -1
-"""In the place of a camera's index, as MuJoCo has it: the free camera, which is not part of the model."""
+"""Index of the free camera, which is not part of the model, as in MuJoCo."""
 
 Camera = str | int | mujoco.MjvCamera | None
 """A camera's name or index; None, -1 or an `MjvCamera` for a free one."""
 
 
 def find_camera(mj_model: mujoco.MjModel, camera: Camera) -> int:
-    """The camera's index (`FREE_CAMERA` for a free one), or a ValueError that names the cameras there are."""
+    """Return the camera's index, `FREE_CAMERA` for a free one.
+
+    Raises:
+        ValueError: There is no such camera; the message lists those of the model.
+    """
     if isinstance(camera, mujoco.MjvCamera):
         view: Any = camera
         if view.type == mujoco.mjtCamera.mjCAMERA_FIXED:
             return find_camera(mj_model, int(view.fixedcamid))
         if view.type != mujoco.mjtCamera.mjCAMERA_FREE:
-            raise ValueError("an MjvCamera must be free or fixed: one that tracks a body belongs into the model")
+            raise ValueError("an MjvCamera must be free or fixed: define a camera that tracks a body in the model")
         return FREE_CAMERA
     if camera is None:
         return FREE_CAMERA
@@ -42,7 +46,8 @@ def find_camera(mj_model: mujoco.MjModel, camera: Camera) -> int:
 
 
 def free_camera(mj_model: mujoco.MjModel, camera: Camera) -> mujoco.MjvCamera:
-    """A free camera: ``camera`` where it is one, or else MuJoCo's default, which looks at the middle of the whole model.
+    """Return ``camera`` if it is an `MjvCamera`, else MuJoCo's default free camera, which looks at the centre of the whole
+    model.
 
     The default is that of `mjv_defaultFreeCamera`: 1.5 times ``stat.extent`` away from ``stat.center``, with the azimuth, the
     elevation and the projection of ``vis.global``.
@@ -55,7 +60,7 @@ def free_camera(mj_model: mujoco.MjModel, camera: Camera) -> mujoco.MjvCamera:
 
 
 def free_camera_pose(camera: mujoco.MjvCamera) -> tuple[np.ndarray, np.ndarray]:
-    """Position of a free camera, [3] m, and its rotation vector, [3] radians; both in the world's frame."""
+    """Return the position of a free camera, [3] m, and its rotation vector, [3] rad, both in the world's frame."""
     azimuth, elevation = np.deg2rad([camera.azimuth, camera.elevation])
     ahead = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
     right = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
@@ -66,7 +71,7 @@ def free_camera_pose(camera: mujoco.MjvCamera) -> tuple[np.ndarray, np.ndarray]:
 
 
 def projection(mj_model: mujoco.MjModel, camera_id: int, camera: Camera) -> str:
-    """Projection of a camera from space to the image, as in `Scene`."""
+    """Return the projection of a camera, as in `Scene`."""
     if camera_id == FREE_CAMERA:
         return "orthographic" if free_camera(mj_model, camera).orthographic else "perspective"
     if mj_model.cam_projection[camera_id] == mujoco.mjtProjection.mjPROJ_ORTHOGRAPHIC:
@@ -75,7 +80,7 @@ def projection(mj_model: mujoco.MjModel, camera_id: int, camera: Camera) -> str:
 
 
 def camera_parameters(mj_model: mujoco.MjModel, camera_id: int, camera: Camera) -> dict[str, Any]:
-    """Leaves of the camera. Keys as in `Scene`."""
+    """Return the leaves of the camera, with keys as in `Scene`."""
     if camera_id == FREE_CAMERA:
         position, turn = free_camera_pose(free_camera(mj_model, camera))
         lens = dict(fovy=mj_model.vis.global_.fovy, focal=np.zeros(2), principal=np.zeros(2), sensor=np.zeros(2))
@@ -84,7 +89,7 @@ def camera_parameters(mj_model: mujoco.MjModel, camera_id: int, camera: Camera) 
         intrinsic = mj_model.cam_intrinsic[camera_id]
         position, axes = mj_model.cam_pos[camera_id], np.zeros(9)
         mujoco.mju_quat2Mat(axes, mj_model.cam_quat[camera_id])
-        # A camera that follows keeps its orientation and its offset of the initial pose.
+        # A tracking camera keeps its orientation and its offset from the initial pose.
         if mj_model.cam_mode[camera_id] == mujoco.mjtCamLight.mjCAMLIGHT_TRACK:
             position, axes = mj_model.cam_pos0[camera_id], mj_model.cam_mat0[camera_id]
         elif mj_model.cam_mode[camera_id] == mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM:
@@ -107,8 +112,8 @@ def camera_parameters(mj_model: mujoco.MjModel, camera_id: int, camera: Camera) 
 
 
 def camera_mount(mj_model: mujoco.MjModel, camera_id: int) -> Mount:
-    """Mount of the camera; that of a free one is the world."""
+    """Return the mount of the camera; a free one is fixed to the world."""
     if camera_id == FREE_CAMERA:
         return Mount(int(mujoco.mjtCamLight.mjCAMLIGHT_FIXED), 0, -1)
-    facts = (mj_model.cam_mode, mj_model.cam_bodyid, mj_model.cam_targetbodyid)
-    return Mount(*(int(fact[camera_id]) for fact in facts))
+    fields = (mj_model.cam_mode, mj_model.cam_bodyid, mj_model.cam_targetbodyid)
+    return Mount(*(int(field[camera_id]) for field in fields))

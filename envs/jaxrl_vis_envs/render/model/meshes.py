@@ -1,60 +1,60 @@
-"""Meshes and height fields as small clusters of triangles, made once with the scene. NumPy only.
+"""Meshes and height fields as small clusters of triangles, built once per scene. NumPy only.
 
-A triangle is kept as the affine map that brings it to the unit triangle: rows that give its two barycentric coordinates and the
-height above its plane, so that a ray meets it where the height is 0, and both coordinates and their sum are within [0, 1]. The
-triangles are grouped, eight that are near each other at a time, with a ball around each group.
+A triangle is stored as the affine map to the unit triangle: rows for two barycentric coordinates and the height above its
+plane. A ray intersects it where the height is 0, if both coordinates and their sum are within [0, 1]. Triangles are grouped
+into clusters of eight neighbours, each with a bounding sphere.
 """
 
 import mujoco
 import numpy as np
 
 CLUSTER = 8
-"""Triangles in a cluster; the last of a mesh's are filled up with ones that no ray meets."""
+"""Triangles per cluster; incomplete clusters are padded with triangles that no ray intersects."""
 
 # Columns of `Scene.triangles`.
 MAP = slice(0, 12)  # three rows of four: first and second barycentric coordinate, height
-NORMALS = slice(12, 21)  # of the three corners
-COORDINATES = slice(21, 27)  # of the texture, at the three corners
+NORMALS = slice(12, 21)  # at the three corners
+COORDINATES = slice(21, 27)  # texture coordinates at the three corners
 CORNERS = slice(27, 36)  # metres
 COLUMNS = 36
 
 _HFIELD, _MESH = int(mujoco.mjtGeom.mjGEOM_HFIELD), int(mujoco.mjtGeom.mjGEOM_MESH)
-# MuJoCo smooths a corner only where the smooth normal is within this cosine of the triangle's own.
+# MuJoCo uses a corner's smooth normal only if its cosine with the triangle's own normal is at least this.
 _SMOOTH = 0.8
-# Of the square of a triangle's longest side: one with less area has no normal that float32 knows of.
-_LEAST_AREA = 1e-9
+# Relative to the square of a triangle's longest side; with less area, its normal is lost in float32.
+_MIN_AREA = 1e-9
 
 
 def build_triangles(mj_model: mujoco.MjModel, ids: np.ndarray, types: np.ndarray, clear: np.ndarray) -> dict[str, np.ndarray]:
-    """Triangles of all meshes and height fields among the objects ``ids``. Keys as in `Scene`.
+    """Build the triangles of all meshes and height fields among the objects ``ids``. Keys as in `Scene`.
 
     Args:
-        mj_model: The model.
-        ids: The drawn objects.
-        types: Of each of them, as it is drawn.
-        clear: Whether each of them lets light through. Its triangles are laid over each other in the order in which MuJoCo
-            draws them, so that is the order of their rows; others are grouped by where they are.
+        mj_model: MuJoCo model.
+        ids: Rendered objects.
+        types: Their types, as rendered.
+        clear: Flags of the transparent ones. Their triangles are blended in the order in which MuJoCo draws them, which is
+            therefore the order of their rows; those of other objects are grouped by position.
 
     Returns:
-        ``triangles`` [R, 36] float32, metres, in the frame of their geom, `CLUSTER` rows to a cluster; ``clusters`` [K, 4]
-        float32, middle and radius (m) of the ball around each drawn cluster, in the same frame; ``cluster_places`` [K, 2]
-        int32, the index into ``ids`` of the object, and the first row of its triangles. A mesh that several geoms show has its
-        triangles once, and its clusters once per geom.
+        ``triangles`` [R, 36] float32, metres, in the frame of their geom, `CLUSTER` rows per cluster; ``clusters`` [K, 4]
+        float32, centre and radius (m) of the bounding sphere of each rendered cluster, in the same frame; ``cluster_places``
+        [K, 2] int32, the index into ``ids`` of the object, and the first row of its triangles. A mesh shared by several geoms
+        has its triangles once, and its clusters once per geom.
     """
     rows: list[np.ndarray] = []
-    found: dict[tuple[int, int, bool], tuple[int, np.ndarray]] = {}
+    built: dict[tuple[int, int, bool], tuple[int, np.ndarray]] = {}
     clusters, places = [np.zeros((0, 4))], [np.zeros((0, 2), np.int64)]
     for row, index in enumerate(ids):
         if types[row] not in (_HFIELD, _MESH):
             continue
         key = (int(types[row]), int(mj_model.geom_dataid[index]), bool(clear[row]))
-        if key not in found:
+        if key not in built:
             triangles = _hfield(mj_model, key[1]) if key[0] == _HFIELD else _mesh(mj_model, key[1])
             first = sum(map(len, rows))
             table, balls = _clustered(*triangles, ordered=key[2])
             rows.append(table)
-            found[key] = first, balls
-        first, balls = found[key]
+            built[key] = first, balls
+        first, balls = built[key]
         clusters.append(balls)
         places.append(np.stack([np.full(len(balls), row), first + CLUSTER * np.arange(len(balls))], axis=1))
     return dict(
@@ -65,13 +65,13 @@ def build_triangles(mj_model: mujoco.MjModel, ids: np.ndarray, types: np.ndarray
 
 
 def _mesh(mj_model: mujoco.MjModel, mesh: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Corners [T, 3, 3], normals [T, 3, 3] and texture coordinates [T, 3, 2] of a mesh."""
+    """Return corners [T, 3, 3], normals [T, 3, 3] and texture coordinates [T, 3, 2] of a mesh."""
     faces = slice(mj_model.mesh_faceadr[mesh], mj_model.mesh_faceadr[mesh] + mj_model.mesh_facenum[mesh])
     corners = mj_model.mesh_vert[mj_model.mesh_vertadr[mesh] + mj_model.mesh_face[faces]]
     normals = mj_model.mesh_normal[mj_model.mesh_normaladr[mesh] + mj_model.mesh_facenormal[faces]]
     if mj_model.mesh_texcoordadr[mesh] >= 0:
-        where = mj_model.mesh_texcoordadr[mesh] + mj_model.mesh_facetexcoord[faces]
-        return corners.astype(np.float64), normals.astype(np.float64), mj_model.mesh_texcoord[where].astype(np.float64)
+        texcoords = mj_model.mesh_texcoordadr[mesh] + mj_model.mesh_facetexcoord[faces]
+        return corners.astype(np.float64), normals.astype(np.float64), mj_model.mesh_texcoord[texcoords].astype(np.float64)
     flat = _single_normals(corners)[:, None]
     cosine = (normals[..., 0] * flat[..., 0] + normals[..., 1] * flat[..., 1]) + normals[..., 2] * flat[..., 2]
     normals = np.where((cosine.astype(np.float64) < _SMOOTH)[..., None], flat, normals)
@@ -79,7 +79,7 @@ def _mesh(mj_model: mujoco.MjModel, mesh: int) -> tuple[np.ndarray, np.ndarray, 
 
 
 def _hfield(mj_model: mujoco.MjModel, hfield: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The same of a height field: its surface, its four sides and its bottom. All flat."""
+    """Return corners, normals and texture coordinates of a height field: surface, four sides and bottom, all flat-shaded."""
     rows, columns = int(mj_model.hfield_nrow[hfield]), int(mj_model.hfield_ncol[hfield])
     start = mj_model.hfield_adr[hfield]
     heights = mj_model.hfield_data[start : start + rows * columns].reshape(rows, columns).astype(np.float64)
@@ -88,7 +88,7 @@ def _hfield(mj_model: mujoco.MjModel, hfield: int) -> tuple[np.ndarray, np.ndarr
     surface = np.stack([*np.meshgrid(x, y), heights * top], axis=-1)
     floor = surface * [1.0, 1.0, 0.0] - [0.0, 0.0, base]
     quads = [_strip_quads(surface[:-1], surface[1:])]
-    # Each side from its lower edge to its upper one, seen from outside from left to right.
+    # Each side from its lower to its upper edge, from left to right as seen from outside.
     for lower, upper in (
         (floor[0], surface[0]),
         (floor[-1][::-1], surface[-1][::-1]),
@@ -99,27 +99,27 @@ def _hfield(mj_model: mujoco.MjModel, hfield: int) -> tuple[np.ndarray, np.ndarr
     ends = floor[[0, 0, -1, -1], [0, -1, 0, -1]].reshape(2, 2, 3)
     quads.append(_strip_quads(ends[1:], ends[:1]))
     quads_ = np.concatenate(quads)
-    # MuJoCo cuts every cell from its first corner to the one opposite, and draws cell by cell.
+    # MuJoCo splits every cell along the diagonal from its first corner, and draws cell by cell.
     corners = np.stack([quads_[:, [2, 0, 3]], quads_[:, [0, 1, 3]]], axis=1).reshape(-1, 3, 3)
     normals = np.broadcast_to(_flat_normals(corners)[:, None], corners.shape)
     return corners, normals, np.zeros((len(corners), 3, 2))
 
 
 def _strip_quads(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """[n, m, 3] and [n, m, 3] -> [n * (m - 1), 4, 3]: lower left, lower right, upper left, upper right."""
+    """Return quads [n * (m - 1), 4, 3] (lower left, lower right, upper left, upper right) between edges [n, m, 3]."""
     return np.stack([lower[:, :-1], lower[:, 1:], upper[:, :-1], upper[:, 1:]], axis=2).reshape(-1, 4, 3)
 
 
 def _flat_normals(corners: np.ndarray) -> np.ndarray:
-    """[T, 3] unit normals; of a triangle without area, anything."""
+    """Return unit normals [T, 3]; arbitrary for a triangle without area."""
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
 
 
 def _single_normals(corners: np.ndarray) -> np.ndarray:
-    """`_flat_normals` of [T, 3, 3] float32, operation by operation as MuJoCo computes them.
+    """Return `_flat_normals` of [T, 3, 3] float32, with the same sequence of operations as MuJoCo.
 
-    What it compares has 32 bits, and slopes of 3:4:5, whose cosine is the very bound, are common.
+    MuJoCo compares float32 values, and slopes of 3:4:5, whose cosine is exactly the threshold, are common.
     """
     x, y, z = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).T
     length = np.sqrt((x * x + y * y) + z * z)
@@ -130,11 +130,13 @@ def _single_normals(corners: np.ndarray) -> np.ndarray:
 def _clustered(
     corners: np.ndarray, normals: np.ndarray, coordinates: np.ndarray, ordered: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rows [K * CLUSTER, COLUMNS] of the triangles, cluster by cluster, and the balls [K, 4]. Without area: left out."""
+    """Return rows [K * CLUSTER, COLUMNS] of the triangles by cluster, and bounding spheres [K, 4]. Drops triangles without
+    area.
+    """
     flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     longest = np.max(np.sum(np.square(corners - np.roll(corners, 1, axis=1)), axis=2), axis=1)
-    kept = np.linalg.norm(flat, axis=1) > _LEAST_AREA * longest
-    corners, normals, coordinates = corners[kept], normals[kept], coordinates[kept]
+    valid = np.linalg.norm(flat, axis=1) > _MIN_AREA * longest
+    corners, normals, coordinates = corners[valid], normals[valid], coordinates[valid]
     unit = _flat_normals(corners)
     basis = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], unit], axis=2)
     inverse = np.linalg.inv(basis)
@@ -145,13 +147,13 @@ def _clustered(
     table = np.concatenate(parts, axis=1)
     order = np.arange(count)
     groups = np.split(order, order[CLUSTER::CLUSTER]) if ordered and count else _grouped(corners.mean(1), order)
-    # No ray meets a triangle whose height is 1 everywhere.
+    # Padding: a triangle whose height is 1 everywhere is intersected by no ray.
     rows = np.zeros((len(groups), CLUSTER, COLUMNS))
     rows[:, :, 11] = 1.0
     if not groups:
         return rows.reshape(-1, COLUMNS), np.zeros((0, 4))
     full = np.arange(CLUSTER) < np.array([len(group) for group in groups])[:, None]
-    # Groups that are not full have their first triangle again where others have further ones.
+    # Incomplete groups repeat their first triangle, for the bounding spheres.
     members = np.repeat(np.array([group[:1] for group in groups]), CLUSTER, axis=1)
     members[full] = np.concatenate(groups)
     rows[full] = table[members[full]]
@@ -162,7 +164,7 @@ def _clustered(
 
 
 def _grouped(middles: np.ndarray, members: np.ndarray) -> list[np.ndarray]:
-    """Halves the members along their longest axis until at most `CLUSTER` are left; nearly all groups are full."""
+    """Split the members recursively along their longest axis into groups of at most `CLUSTER`; nearly all groups are full."""
     if len(members) <= CLUSTER:
         return [members] if len(members) else []
     points = middles[members]

@@ -1,4 +1,4 @@
-"""Appearance of a model as MuJoCo's visualiser sees it: colours, lights, and what cannot be drawn. NumPy only."""
+"""Appearance of a model as in MuJoCo's visualiser: colours, lights, and unsupported objects. NumPy only."""
 
 import numbers
 from collections.abc import Iterable
@@ -12,21 +12,21 @@ from jaxrl_vis_envs.render.mounts import Mount
 
 _SDF, _MESH, _BOX, _PLANE = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("SDF", "MESH", "BOX", "PLANE"))
 
-# MuJoCo's half-size 0 of a plane means "without end" along that axis; this is far beyond any clip distance.
-ENDLESS = 1e10
-# MuJoCo draws what has less alpha than this as transparent.
+# A plane's half-size of 0 means infinite along that axis; this is far beyond any clipping distance.
+INFINITE_SIZE = 1e10
+# MuJoCo draws objects with less alpha as transparent.
 OPAQUE = 0.995
 # Values of `Scene.transparent`.
 SOLID, CLEAR, CLEAR_FROM_BEHIND = range(3)
-# OpenGL has eight lights; MuJoCo's renderer takes the headlight and then the model's in their order.
-MOST_LIGHTS = 8
+# OpenGL has eight lights; MuJoCo's renderer uses the headlight and then the model's in order.
+MAX_LIGHTS = 8
 
 LIGHTS = ("all", "mujoco")
-"""Which lights count: all but images, or only those that MuJoCo's renderer knows, which are no points either."""
+"""Choices of lights: all but image lights, or only those that MuJoCo's renderer supports, without point lights."""
 
 
-def weights(mj_model: mujoco.MjModel, mounts: Iterable[Mount]) -> tuple[np.ndarray, tuple[int, ...]]:
-    """Masses of the bodies and what each one hangs on, if any mount follows a centre of mass; otherwise nothing."""
+def body_masses(mj_model: mujoco.MjModel, mounts: Iterable[Mount]) -> tuple[np.ndarray, tuple[int, ...]]:
+    """Return masses and parents of the bodies if any mount follows a centre of mass, else empty ones."""
     if all(mount.weighed < 0 for mount in mounts):
         return np.zeros(0), ()
     return mj_model.body_mass, tuple(mj_model.body_parentid.tolist())
@@ -39,7 +39,7 @@ def drawn_objects(
     site_groups: tuple[int, ...],
     leave_out: tuple[str, ...],
 ) -> np.ndarray:
-    """[ngeom + nsite] bool: in a group that is drawn, not invisible, not left out."""
+    """Return the mask [ngeom + nsite] of rendered objects: in a visible group, not invisible, not left out."""
     geoms = np.isin(_clamped(mj_model.geom_group), groups)
     sites = np.isin(_clamped(mj_model.site_group), site_groups)
     left_out = [mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_GEOM, name) for name in leave_out]
@@ -48,46 +48,46 @@ def drawn_objects(
 
 
 def _clamped(group: np.ndarray) -> np.ndarray:
-    """Groups as MuJoCo's visualiser counts them: those beyond the last are the last one, and likewise below."""
+    """Clamp group numbers to the valid range, as MuJoCo's visualiser does."""
     return np.clip(group, 0, mujoco.mjNGROUP - 1)
 
 
 def check_model(mj_model: Any) -> None:
-    """Raises a ValueError where ``mj_model`` is something else that a model comes in."""
+    """Raise a ValueError, with a hint for other model types, if ``mj_model`` is not a `mujoco.MjModel`."""
     if isinstance(mj_model, mujoco.MjModel):
         return
-    mends = {
+    hints = {
         "str": "; mujoco.MjModel.from_xml_path and from_xml_string read one",
         "MjSpec": "; its compile() makes one",
         "Model": "; mjx.put_model was given one",
     }
     kind = type(mj_model).__name__
-    raise ValueError(f"a scene is read from a mujoco.MjModel, not from a {kind}{mends.get(kind, '')}")
+    raise ValueError(f"a scene is read from a mujoco.MjModel, not from a {kind}{hints.get(kind, '')}")
 
 
 def check_size(**lengths: int) -> None:
-    """Raises a ValueError that names the first length that no image can have."""
+    """Raise a ValueError naming the first length that is not a positive integer."""
     for name, pixels in lengths.items():
         if not isinstance(pixels, numbers.Integral) or pixels < 1:
-            raise ValueError(f"an image needs a whole number of pixels each way, at least one, not {name}={pixels!r}")
+            raise ValueError(f"an image needs a whole number of pixels, at least 1, along each axis, not {name}={pixels!r}")
 
 
 def group_numbers(name: str, groups: Any) -> tuple[int, ...]:
-    """The numbers of groups, or a ValueError where they are none: that would hide everything without a word."""
+    """Return group numbers as a tuple, or raise a ValueError: an invalid group would silently hide everything."""
     listed = list(groups) if isinstance(groups, Iterable) else [groups]
     if not all(isinstance(group, numbers.Integral) and not isinstance(group, bool) for group in listed):
-        raise ValueError(f"{name} must be numbers of groups, such as (0, 1, 2), got {groups!r}")
+        raise ValueError(f"{name} must be group numbers, such as (0, 1, 2), got {groups!r}")
     return tuple(map(int, listed))
 
 
 def check_lights(lights: Any) -> None:
-    """Raises a ValueError where ``lights`` is neither of the two choices there are."""
+    """Raise a ValueError if ``lights`` is not one of `LIGHTS`."""
     if lights not in LIGHTS:
         raise ValueError(f"lights must be one of {', '.join(map(repr, LIGHTS))}, got {lights!r}")
 
 
 def check_names(mj_model: mujoco.MjModel, leave_out: tuple[str, ...]) -> None:
-    """Raises a ValueError that names whatever is to be left out and is neither a geom's name nor "skin" nor "flex"."""
+    """Raise a ValueError listing the names in ``leave_out`` that are neither a geom's name nor "skin" nor "flex"."""
     if isinstance(leave_out, str) or not isinstance(leave_out, Iterable):
         raise ValueError(f"leave_out must be a tuple of names, such as ('skin',), got {leave_out!r}")
     geoms = [mj_model.geom(index).name for index in range(mj_model.ngeom)]
@@ -98,25 +98,26 @@ def check_names(mj_model: mujoco.MjModel, leave_out: tuple[str, ...]) -> None:
 
 
 def object_types(mj_model: mujoco.MjModel) -> np.ndarray:
-    """[ngeom + nsite] `mujoco.mjtGeom` as objects are drawn: a signed distance field by the mesh that MuJoCo has made of it."""
+    """Return the `mujoco.mjtGeom` [ngeom + nsite] of objects as rendered: a signed distance field as MuJoCo's mesh of it."""
     types = np.concatenate([mj_model.geom_type, mj_model.site_type])
     return np.where(types == _SDF, _MESH, types)
 
 
 def drawing_order(mj_model: mujoco.MjModel, types: np.ndarray, ids: np.ndarray, opaque: np.ndarray) -> tuple[np.ndarray, bool]:
-    """The objects ``ids`` as MuJoCo draws them, the last one first, because it is the one that is seen where several coincide.
+    """Return the objects ``ids`` in the reverse of MuJoCo's drawing order: of coincident objects, the one drawn last is
+    visible.
 
-    It draws them as they are declared, but the first that reflects before all others, also where reflections are off. In
-    segmentations it does not.
+    MuJoCo draws objects in the order of declaration, except that the first reflecting one comes before all others, even if
+    reflections are disabled. This exception does not apply to segmentation.
 
     Args:
-        mj_model: The model.
+        mj_model: MuJoCo model.
         types: `object_types`.
-        ids: Indices of the drawn objects, ascending.
-        opaque: Whether each of these is.
+        ids: Indices of the rendered objects, ascending.
+        opaque: Flags of the opaque ones.
 
     Returns:
-        The indices, and whether that is another order than that of the declarations, reversed.
+        The indices, and True if they differ from the reversed order of declaration.
     """
     material = object_materials(mj_model)[ids]
     reflectance = np.append(mj_model.mat_reflectance, 0.0)[material]
@@ -127,7 +128,7 @@ def drawing_order(mj_model: mujoco.MjModel, types: np.ndarray, ids: np.ndarray, 
 
 
 def bounds(mj_model: mujoco.MjModel) -> np.ndarray:
-    """[ngeom + nsite] metres: radii of the balls around objects that MuJoCo sorts what is transparent by."""
+    """Return the radii [ngeom + nsite] (m) of the bounding spheres by which MuJoCo sorts transparent objects."""
     x, y, z = mj_model.site_size.reshape(-1, 3).T
     kinds = mj_model.site_type
     sites = np.sqrt(x * x + y * y + z * z)
@@ -138,7 +139,7 @@ def bounds(mj_model: mujoco.MjModel) -> np.ndarray:
     return np.concatenate([mj_model.geom_rbound, sites])
 
 
-def refuse_unsupported(
+def check_supported(
     mj_model: mujoco.MjModel,
     types: np.ndarray,
     drawn: np.ndarray,
@@ -146,25 +147,25 @@ def refuse_unsupported(
     leave_out: tuple[str, ...],
     shadows: bool,
 ) -> None:
-    """Raises a ValueError of one line that names everything that would be seen and cannot be drawn, and what to do."""
+    """Raise a one-line ValueError listing everything visible that is not supported, with a remedy."""
     deformables = (
         ("skin", mj_model.skin_group, mujoco.mjtObj.mjOBJ_SKIN),
         ("flex", mj_model.flex_group, mujoco.mjtObj.mjOBJ_FLEX),
     )
     for kind, group, accessor in deformables:
-        seen = np.flatnonzero(np.isin(_clamped(group), groups)).tolist() if kind not in leave_out else []
-        if seen:
-            names = ", ".join(f"{kind} {mujoco.mj_id2name(mj_model, accessor, i) or f'number {i}'}" for i in seen)
-            raise ValueError(f"cannot draw {names}: use a group that is not drawn, or leave_out=({kind!r},)")
+        visible = np.flatnonzero(np.isin(_clamped(group), groups)).tolist() if kind not in leave_out else []
+        if visible:
+            names = ", ".join(f"{kind} {mujoco.mj_id2name(mj_model, accessor, i) or f'number {i}'}" for i in visible)
+            raise ValueError(f"cannot render {names}: move it to a hidden group, or use leave_out=({kind!r},)")
     if shadows:
         fine = np.isin(types, (mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_HFIELD))
         casting = [object_name(mj_model, int(index)) for index in np.flatnonzero(drawn & fine)]
         if casting:
-            raise ValueError(f"cannot draw shadows of {', '.join(casting)} (triangles): use shadows=False, or leave_out")
+            raise ValueError(f"cannot render shadows of {', '.join(casting)} (triangles): use shadows=False, or leave_out")
 
 
 def object_name(mj_model: mujoco.MjModel, index: int) -> str:
-    """What a message calls object ``index`` (a geom, or ngeom + a site)."""
+    """Return the name of object ``index`` (a geom, or ngeom + a site) for messages."""
     is_geom = index < mj_model.ngeom
     number = int(index if is_geom else index - mj_model.ngeom)
     name = (mj_model.geom(number) if is_geom else mj_model.site(number)).name or f"number {number}"
@@ -172,12 +173,12 @@ def object_name(mj_model: mujoco.MjModel, index: int) -> str:
 
 
 def object_materials(mj_model: mujoco.MjModel) -> np.ndarray:
-    """[N] material of every geom, then of every site; -1 for none."""
+    """Return the material [N] of every geom, then of every site; -1 for none."""
     return np.concatenate([mj_model.geom_matid, mj_model.site_matid])
 
 
 def object_textures(mj_model: mujoco.MjModel) -> np.ndarray:
-    """[N] texture that colours every geom, then every site; -1 for none."""
+    """Return the colour texture [N] of every geom, then of every site; -1 for none."""
     material = object_materials(mj_model)
     if not mj_model.nmat:
         return np.full(len(material), -1)
@@ -185,12 +186,12 @@ def object_textures(mj_model: mujoco.MjModel) -> np.ndarray:
 
 
 def object_appearance(mj_model: mujoco.MjModel) -> dict[str, np.ndarray]:
-    """Size, colour and material of every geom, then of every site. Keys as in `Scene`."""
+    """Return size, colour and material of every geom, then of every site. Keys as in `Scene`."""
     size = np.concatenate([mj_model.geom_size, mj_model.site_size]).reshape(-1, 3)
     rgba = np.concatenate([mj_model.geom_rgba, mj_model.site_rgba]).reshape(-1, 4).astype(np.float64)
     material = object_materials(mj_model)
     count = len(size)
-    # What MuJoCo's visualiser gives to an object without a material.
+    # Defaults of MuJoCo's visualiser for an object without a material.
     emission, specular, shininess = np.zeros(count), np.full(count, 0.5), np.full(count, 0.5)
     repeat = np.ones((count, 2))
     for index in np.flatnonzero(material >= 0):
@@ -199,18 +200,18 @@ def object_appearance(mj_model: mujoco.MjModel) -> dict[str, np.ndarray]:
         specular[index] = mj_model.mat_specular[number]
         shininess[index] = mj_model.mat_shininess[number]
         repeat[index] = mj_model.mat_texrepeat[number]
-        # The default grey means "not set", and then the material's colour counts.
+        # The default grey means "not set": use the material's colour.
         if np.array_equal(rgba[index], [0.5, 0.5, 0.5, 1.0]):
             rgba[index] = mj_model.mat_rgba[number]
     planes = np.concatenate([mj_model.geom_type, mj_model.site_type]) == mujoco.mjtGeom.mjGEOM_PLANE
-    size = np.where(planes[:, None] & (size <= 0), ENDLESS, size)
+    size = np.where(planes[:, None] & (size <= 0), INFINITE_SIZE, size)
     return dict(size=size, rgba=rgba, emission=emission, specular=specular, shininess=shininess, texture_repeat=repeat)
 
 
 def texture_pixels(mj_model: mujoco.MjModel, texture: int) -> np.ndarray:
-    """[rows, columns, channels] in [0, 255]: the texels that MuJoCo's renderer mixes.
+    """Return the texels [rows, columns, channels] in [0, 255] that MuJoCo's renderer interpolates.
 
-    It decodes flat textures that are flagged as sRGB (float64), and leaves all others as they are (uint8).
+    MuJoCo decodes flat textures that are flagged as sRGB (float64), and leaves all others as they are (uint8).
     """
     height, width = int(mj_model.tex_height[texture]), int(mj_model.tex_width[texture])
     channels = int(mj_model.tex_nchannel[texture])
@@ -219,14 +220,14 @@ def texture_pixels(mj_model: mujoco.MjModel, texture: int) -> np.ndarray:
     flat = mj_model.tex_type[texture] == mujoco.mjtTexture.mjTEXTURE_2D
     if flat and mj_model.tex_colorspace[texture] == mujoco.mjtColorSpace.mjCOLORSPACE_SRGB:
         pixels = pixels.astype(np.float64)
-        share = pixels[..., :3] / 255.0  # and not of alpha
+        share = pixels[..., :3] / 255.0  # alpha is linear
         pixels[..., :3] = 255.0 * np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
     return pixels
 
 
 def mean_texture_colours(mj_model: mujoco.MjModel) -> np.ndarray:
-    """[N, 4] in [0, 1], of every geom and site, alpha last; ones where there is no texture."""
-    means = np.ones((mj_model.ntex + 1, 4))  # the last row is for no texture
+    """Return mean texture colours [N, 4] in [0, 1], alpha last, of every geom and site; ones if there is no texture."""
+    means = np.ones((mj_model.ntex + 1, 4))  # the last row is for objects without a texture
     for texture in range(mj_model.ntex):
         pixels = texture_pixels(mj_model, texture)
         colour = pixels.reshape(-1, pixels.shape[-1]).mean(0) / 255.0
@@ -235,18 +236,18 @@ def mean_texture_colours(mj_model: mujoco.MjModel) -> np.ndarray:
 
 
 def skybox(mj_model: mujoco.MjModel) -> int:
-    """The texture of the sky, -1 for none."""
-    found = np.flatnonzero(mj_model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
-    return int(found[0]) if len(found) else -1
+    """Return the index of the sky's texture, -1 for none."""
+    skyboxes = np.flatnonzero(mj_model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
+    return int(skyboxes[0]) if len(skyboxes) else -1
 
 
 def sky_colours(mj_model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Colours straight up and straight down of the sky, black without one. [3] each, in [0, 1]."""
+    """Return the sky's colours at zenith and nadir, [3] each, in [0, 1]; black without a sky."""
     texture = skybox(mj_model)
     if texture < 0:
         return np.zeros(3), np.zeros(3)
     pixels = texture_pixels(mj_model, texture)
-    # Six square faces above each other, in OpenGL's order: right, left, up, down, front, back.
+    # Six square faces stacked vertically, in OpenGL's order: right, left, up, down, front, back.
     edge = pixels.shape[1]
     middle = edge // 2
     faces = pixels.reshape(-1, edge, edge, pixels.shape[-1])
@@ -254,8 +255,8 @@ def sky_colours(mj_model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
     return up[middle, middle, :3] / 255.0, down[middle, middle, :3] / 255.0
 
 
-def planes_seen_through(mj_model: mujoco.MjModel, camera_id: int, camera: Camera, plane_backs: bool | None) -> np.ndarray:
-    """[ngeom + nsite] bool: the planes that are half transparent from behind, given `Scene.from_mjmodel`'s ``plane_backs``."""
+def planes_clear_from_behind(mj_model: mujoco.MjModel, camera_id: int, camera: Camera, plane_backs: bool | None) -> np.ndarray:
+    """Return the mask [ngeom + nsite] of planes transparent from behind, for ``plane_backs`` of `Scene.from_mjmodel`."""
     planes = mj_model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
     if plane_backs is None:
         mj_data = mujoco.MjData(mj_model)
@@ -270,34 +271,34 @@ def planes_seen_through(mj_model: mujoco.MjModel, camera_id: int, camera: Camera
     return np.concatenate([planes, np.zeros(mj_model.nsite, bool)])
 
 
-def transparency(alpha: np.ndarray, seen_through: np.ndarray) -> np.ndarray:
-    """Of objects [N]: CLEAR by their alpha, CLEAR_FROM_BEHIND where they are planes that are ``seen_through``, else SOLID."""
-    return np.where(alpha < OPAQUE, CLEAR, np.where(seen_through, CLEAR_FROM_BEHIND, SOLID))
+def transparency(alpha: np.ndarray, clear_planes: np.ndarray) -> np.ndarray:
+    """Return the transparency [N] of objects: CLEAR by alpha, CLEAR_FROM_BEHIND for ``clear_planes``, else SOLID."""
+    return np.where(alpha < OPAQUE, CLEAR, np.where(clear_planes, CLEAR_FROM_BEHIND, SOLID))
 
 
 def haze_plane(mj_model: mujoco.MjModel, drawn: np.ndarray) -> tuple[int, float]:
-    """The first endless plane that is drawn (-1 for none, or where there is no sky), and the width of the haze."""
-    endless = (mj_model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) & np.all(mj_model.geom_size[:, :2] == 0, axis=1)
-    found = np.flatnonzero(endless & drawn[: mj_model.ngeom])
-    if not len(found) or skybox(mj_model) < 0:
+    """Return the index of the first rendered infinite plane (-1 for none, or without a sky), and the width of the haze."""
+    infinite = (mj_model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) & np.all(mj_model.geom_size[:, :2] == 0, axis=1)
+    planes = np.flatnonzero(infinite & drawn[: mj_model.ngeom])
+    if not len(planes) or skybox(mj_model) < 0:
         return -1, 0.0
-    return int(found[0]), float(mj_model.vis.map.haze)
+    return int(planes[0]), float(mj_model.vis.map.haze)
 
 
 def lights(
     mj_model: mujoco.MjModel, material_specular: np.ndarray, shadows: bool, points: bool
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Leaves of the lights that are drawn with, and the static facts about them. Keys as in `Scene`.
+    """Return the leaves of the active lights, and their static properties. Keys as in `Scene`.
 
-    MuJoCo's renderer knows no lights that are images, and none that are points: the latter only count if ``points``.
+    Image lights, which MuJoCo's renderer does not support, are ignored; so are point lights unless ``points``.
     """
     head = mj_model.vis.headlight
     known = mj_model.light_type != mujoco.mjtLightType.mjLIGHT_IMAGE
     if not points:
         known &= mj_model.light_type != mujoco.mjtLightType.mjLIGHT_POINT
-    active = np.flatnonzero(mj_model.light_active.astype(bool) & known)[: MOST_LIGHTS - bool(head.active)]
+    active = np.flatnonzero(mj_model.light_active.astype(bool) & known)[: MAX_LIGHTS - bool(head.active)]
     modes = mj_model.light_mode[active][:, None]
-    # A tracking light keeps its orientation and its offset of the initial pose; the others are given in their body's frame.
+    # A tracking light keeps its orientation and its offset from the initial pose; others are in their body's frame.
     track, track_com = mujoco.mjtCamLight.mjCAMLIGHT_TRACK, mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM
     position = np.where(modes == track, mj_model.light_pos0[active], mj_model.light_pos[active])
     position = np.where(modes == track_com, mj_model.light_poscom0[active], position)

@@ -1,4 +1,4 @@
-"""How MuJoCo lays a flat texture on each type of shape: coordinates on the surface, -1 to 1 across and up."""
+"""MuJoCo's mapping of flat textures onto shapes: surface coordinates from -1 to 1, horizontal and vertical."""
 
 import jax
 import jax.numpy as jnp
@@ -8,17 +8,18 @@ from jaxrl_vis_envs.render.pixel import shapes
 
 
 def chart(types: set[int], kind: jax.Array, half_length: jax.Array, local: tuple) -> tuple[jax.Array, jax.Array]:
-    """Coordinates of points on shapes.
+    """Compute surface coordinates of points on shapes.
 
     Args:
-        types: The types that may occur (of those with a flat texture); no other costs anything.
-        kind: The type of each point's shape.
-        half_length: Of a capsule, over its radius.
-        local: The points in the unit shape's frame, three [P] float32.
+        types: Types that may occur among objects with a flat texture; only these are computed.
+        kind: Type of each point's shape.
+        half_length: Half-length of a capsule over its radius.
+        local: Points in the unit shape's frame, three [P] float32.
 
     Returns:
-        Two [P] float32. Planes and all else but these: x and y. Boxes: seen from the sides, z goes up. Round shapes: the angle
-        around z goes across, the elevation (of a cylinder: z) up; the ends of a cylinder are as planes upside down.
+        Two [P] float32, horizontal and vertical. Planes and other types: x and y. Sides of boxes: z is vertical. Round shapes:
+        the azimuth is horizontal, the elevation (for a cylinder, z) vertical; the caps of a cylinder are like planes upside
+        down.
     """
     x, y, z = local
     across, up = x, y
@@ -30,7 +31,7 @@ def chart(types: set[int], kind: jax.Array, half_length: jax.Array, local: tuple
         across = jnp.where(is_box & on_x, y, across)
         up = jnp.where(is_box & on_side, z, up)
     if types & {shapes.SPHERE, shapes.ELLIPSOID, shapes.CYLINDER, shapes.CAPSULE}:
-        around = 2.0 * _turns(x, y) - 1.0
+        around = 2.0 * _azimuth(x, y) - 1.0
         round_, height = jnp.zeros_like(x, bool), z
         if types & {shapes.SPHERE, shapes.ELLIPSOID}:
             is_ball = (kind == shapes.SPHERE) | (kind == shapes.ELLIPSOID)
@@ -38,7 +39,7 @@ def chart(types: set[int], kind: jax.Array, half_length: jax.Array, local: tuple
         if shapes.CAPSULE in types:
             is_capsule = kind == shapes.CAPSULE
             beyond = z - jnp.clip(z, -half_length, half_length)
-            # Each cap has the whole height of the texture to itself.
+            # Each cap spans the whole height of the texture.
             capped = 2.0 * elevation(beyond) - jnp.sign(beyond)
             on_capsule = jnp.where(beyond == 0.0, z / jnp.maximum(half_length, 1e-9), capped)
             round_, height = round_ | is_capsule, jnp.where(is_capsule, on_capsule, height)
@@ -51,8 +52,8 @@ def chart(types: set[int], kind: jax.Array, half_length: jax.Array, local: tuple
     return across, up
 
 
-def _turns(x: jax.Array, y: jax.Array) -> jax.Array:
-    """The angle around z in turns, 0 to 1, within 1e-6."""
+def _azimuth(x: jax.Array, y: jax.Array) -> jax.Array:
+    """Compute the angle around z in turns, 0 to 1, accurate to 1e-6."""
     size_x, size_y = jnp.abs(x), jnp.abs(y)
     steep = size_y > size_x
     ratio = jnp.where(steep, size_x, size_y) / jnp.maximum(jnp.where(steep, size_y, size_x), 1e-20)
@@ -68,7 +69,7 @@ def _turns(x: jax.Array, y: jax.Array) -> jax.Array:
 
 
 def elevation(sine: jax.Array) -> jax.Array:
-    """Arcsin over a right angle, within 5e-5 (Abramowitz and Stegun, 4.4.45). XLA's own is a slow library call on a CPU."""
+    """Compute arcsin / (pi / 2) within 5e-5 (Abramowitz and Stegun, 4.4.45). XLA's own is a slow library call on a CPU."""
     size = jnp.minimum(jnp.abs(sine), 1.0 - 1e-7)
     series = 1.5707288 + size * (-0.2121144 + size * (0.0742610 - 0.0187293 * size))
     return jnp.sign(sine) * (1.0 - jnp.sqrt(1.0 - size) * series * (2.0 / np.pi))

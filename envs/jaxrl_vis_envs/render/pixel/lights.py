@@ -1,4 +1,4 @@
-"""The lights in the camera's frame, once per environment, and what each gives to a point of a surface."""
+"""Lights in the camera's frame, once per environment, and their contributions to surface points."""
 
 from typing import Any, NamedTuple
 
@@ -8,17 +8,17 @@ import mujoco
 import numpy as np
 
 from jaxrl_vis_envs.render import mounts
-from jaxrl_vis_envs.render.pixel.arithmetic import Vector, dot, larger, normalized, power
+from jaxrl_vis_envs.render.pixel.arithmetic import Vector, dot, maximum, normalized, power
 from jaxrl_vis_envs.render.scene import Scene
 
 _DIRECTIONAL = int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
 _SPOT = int(mujoco.mjtLightType.mjLIGHT_SPOT)
 COLUMNS = 20
-"""Of the table of lights: six vectors and two numbers."""
+"""Columns of the light table: six vectors and two numbers."""
 
 
 class Light(NamedTuple):
-    """One light in the camera's frame; the numbers are scalars, and [3] arrays or three scalars."""
+    """One light in the camera's frame. Vectors are [3] arrays or three scalars, all other values scalars."""
 
     directional: bool
     highlights: bool
@@ -34,11 +34,11 @@ class Light(NamedTuple):
 
 
 def light_poses(scene: Scene, data: Any) -> tuple[jax.Array, jax.Array]:
-    """World poses of the scene's lights.
+    """Compute the world poses of the scene's lights.
 
     Args:
         scene: The scene.
-        data: Has the poses of bodies that `mounts.place` reads.
+        data: Has the body poses that `mounts.mount_position` reads.
 
     Returns:
         Positions [L, 3] in metres and unit directions [L, 3], float32.
@@ -46,10 +46,10 @@ def light_poses(scene: Scene, data: Any) -> tuple[jax.Array, jax.Array]:
     bodies = mounts.Bodies(scene.body_mass, scene.body_parents)
     positions, directions = [], []
     for index, mount in enumerate(scene.light_mounts):
-        position, frame = mounts.place(bodies, data, mount, scene.light_position[index])
+        position, frame = mounts.mount_position(bodies, data, mount, scene.light_position[index])
         direction = scene.light_direction[index]
         if mount.aims:
-            direction = mounts.target(bodies, data, mount) - position
+            direction = mounts.target_position(bodies, data, mount) - position
         elif frame is not None:
             direction = jnp.sum(frame * direction, -1)
         positions.append(position)
@@ -58,7 +58,7 @@ def light_poses(scene: Scene, data: Any) -> tuple[jax.Array, jax.Array]:
 
 
 def camera_lights(scene: Scene, data: Any, camera_position: jax.Array, camera_rotation: jax.Array) -> list[Light]:
-    """The headlight, if it is on, and the model's lights, in the camera's frame."""
+    """Return the headlight, if it is on, and the model's lights, in the camera's frame."""
     lights = []
     if scene.headlight:
         ahead = jnp.array([0.0, 0.0, -1.0], jnp.float32)
@@ -76,7 +76,7 @@ def camera_lights(scene: Scene, data: Any, camera_position: jax.Array, camera_ro
             lights.append(Light(*facts, None, directions[index], *colours, None, None, None))
             continue
         cutoff = scene.light_cutoff[index]
-        # OpenGL takes cones of up to 90 degrees; a light with a wider one shines everywhere.
+        # OpenGL supports cones of up to 90 degrees; a light with a wider one shines in all directions.
         cosine = jnp.where(cutoff > 90.0, -2.0, jnp.cos(cutoff * (np.pi / 180.0))) if kind == _SPOT else None
         exponent = jnp.where(cutoff > 90.0, 0.0, scene.light_exponent[index]) if kind == _SPOT else None
         attenuation = scene.light_attenuation[index]
@@ -85,7 +85,7 @@ def camera_lights(scene: Scene, data: Any, camera_position: jax.Array, camera_ro
 
 
 class LightFacts(NamedTuple):
-    """What of a light is settled when the scene is made."""
+    """Static properties of a light."""
 
     directional: bool
     highlights: bool
@@ -94,14 +94,16 @@ class LightFacts(NamedTuple):
 
 
 def facts(scene: Scene) -> list[LightFacts]:
-    """Of the lights that `camera_lights` gives, in its order."""
-    own = zip(scene.light_types, scene.light_highlights, scene.light_shadows, strict=False)
-    found = [LightFacts(kind == _DIRECTIONAL, highlights, shadows, kind == _SPOT) for kind, highlights, shadows in own]
-    return [LightFacts(True, scene.light_highlights[-1], False, False)] * scene.headlight + found
+    """Return the static properties of the lights, in the order of `camera_lights`."""
+    properties = zip(scene.light_types, scene.light_highlights, scene.light_shadows, strict=False)
+    model_lights = [
+        LightFacts(kind == _DIRECTIONAL, highlights, shadows, kind == _SPOT) for kind, highlights, shadows in properties
+    ]
+    return [LightFacts(True, scene.light_highlights[-1], False, False)] * scene.headlight + model_lights
 
 
 def pack(lights: list[Light]) -> jax.Array:
-    """All numbers of the lights as one table: [L, COLUMNS] float32."""
+    """Store all parameters of the lights in one table: [L, COLUMNS] float32."""
     rows = []
     for light in lights:
         zeros, zero = jnp.zeros(3, jnp.float32), jnp.zeros((), jnp.float32)
@@ -117,20 +119,20 @@ def pack(lights: list[Light]) -> jax.Array:
 
 
 def unpack(scene: Scene, table: Any) -> list[Light]:
-    """Undoes `pack`; vectors come as three scalars. The table may be an array or, in a kernel, a block of memory."""
-    found = []
+    """Undo `pack`, with vectors as three scalars. The table may be an array or, in a kernel, a block of memory."""
+    lights = []
     for index, fact in enumerate(facts(scene)):
         values = [table[index, column] for column in range(COLUMNS)]
         vectors: list[Any] = [tuple(values[first : first + 3]) for first in range(0, 18, 3)]
         if fact.directional:
             vectors[0] = vectors[5] = None
         cone = values[18:] if fact.cone else (None, None)
-        found.append(Light(*fact[:3], *vectors, *cone))
-    return found
+        lights.append(Light(*fact[:3], *vectors, *cone))
+    return lights
 
 
-def towards(light: Light, point: Vector) -> tuple[Vector, jax.Array | None, jax.Array | None]:
-    """From points to the light: unit vector, distance and its inverse (m, 1/m, [P]; None for a directional light)."""
+def light_vector(light: Light, point: Vector) -> tuple[Vector, jax.Array | None, jax.Array | None]:
+    """Return unit vectors to the light, distances (m) and their inverses, [P] each; the latter None for a directional light."""
     if light.directional:
         return tuple(-light.direction[axis] for axis in range(3)), None, None
     assert light.position is not None
@@ -143,17 +145,17 @@ def towards(light: Light, point: Vector) -> tuple[Vector, jax.Array | None, jax.
 def light_factors(
     light: Light, point: Vector, normal: Vector, to_camera: Vector, exponent: jax.Array, lit: jax.Array | None
 ) -> tuple:
-    """What the ambient, diffuse and specular colour of one light are multiplied with, each [P] or a number.
+    """Compute the factors of a light's ambient, diffuse and specular colour, each [P] or a number.
 
     Args:
         light: The light.
-        point: Where, in the camera's frame.
-        normal: Unit, outward.
-        to_camera: Unit.
-        exponent: Of the highlight.
-        lit: [P], 1 where the light is seen from the point, 0 in a shadow; None for no shadows.
+        point: Surface point in the camera's frame.
+        normal: Unit outward normal.
+        to_camera: Unit vector to the camera.
+        exponent: Exponent of the highlight.
+        lit: [P], 1 where the light is visible from the point, 0 in shadow; None for no shadows.
     """
-    to_light, distance, _ = towards(light, point)
+    to_light, distance, _ = light_vector(light, point)
     fade: Any = 1.0
     if distance is not None:
         assert light.attenuation is not None
@@ -165,7 +167,7 @@ def light_factors(
             fade = jnp.where(along >= light.cosine_cutoff, fade * power(along, light.exponent), 0.0)
     if lit is not None:
         fade = fade * lit
-    facing = larger(dot(normal, to_light), 0.0)
+    facing = maximum(dot(normal, to_light), 0.0)
     shine: Any = 0.0
     if light.highlights:
         halfway = normalized(tuple(to_light[axis] + to_camera[axis] for axis in range(3)))

@@ -1,4 +1,4 @@
-"""Everything about a drawn object that a pixel which sees it needs, as a row of numbers, and how a pixel fetches it."""
+"""Table of object properties for shading, one row per object, and its lookup per pixel."""
 
 from typing import NamedTuple
 
@@ -14,17 +14,17 @@ from jaxrl_vis_envs.render.scene import Scene
 
 
 class TextureRow(NamedTuple):
-    """How the texture of an object lies on it, and where it is in the atlas: numbers, or arrays [P] float32.
+    """Texture mapping of an object, and its position in the atlas: numbers, or arrays [P] float32.
 
     Attributes:
         mapping: One of the constants of `textures`.
-        scale: What coordinates are multiplied with, see `_texture_scales`.
-        shift: What is added to a flat texture's, across and up.
-        first_level: Number of its first level.
-        levels: How many there are.
+        scale: Factors of the coordinates, see `_texture_scales`.
+        shift: Offsets of a flat texture's coordinates, horizontal and vertical.
+        first_level: Index of its first level.
+        levels: Number of levels.
         six_faces: 1 for a cube with six faces, otherwise 0.
-        width: Texels of its finest level.
-        height: Texels of its finest level.
+        width: Width of its finest level, texels.
+        height: Height of its finest level, texels.
     """
 
     mapping: jax.Array
@@ -38,7 +38,7 @@ class TextureRow(NamedTuple):
 
 
 class Row(NamedTuple):
-    """Of one object, or of the object that each pixel sees: numbers, or arrays [P] float32."""
+    """Properties of one object, or of the object at each pixel: numbers, or arrays [P] float32."""
 
     axes: Vector  # of three vectors
     origin: Vector
@@ -52,17 +52,18 @@ class Row(NamedTuple):
 
 
 class TriangleRow(NamedTuple):
-    """Of the triangle that each pixel sees: arrays [P] float32, and whether it sees one.
+    """Properties of the triangle at each pixel, and a mask of the pixels that show one. Arrays [P] float32.
 
     Attributes:
-        seen: [P] bool.
-        maps: Rows of the map to the unit triangle (three numbers and a constant each): second and third share, height.
-        normals: Of the three corners, in the frame of the geom.
-        coordinates: Of the texture at the three corners, across and up.
-        corners: Metres, in the frame of the geom.
+        hit: [P] bool.
+        maps: Rows of the map to the unit triangle (three coefficients and a constant each): second and third barycentric
+            coordinate, height.
+        normals: Normals at the three corners, in the frame of the geom.
+        coordinates: Texture coordinates at the three corners.
+        corners: Positions of the three corners, metres, in the frame of the geom.
     """
 
-    seen: jax.Array
+    hit: jax.Array
     maps: tuple
     normals: tuple
     coordinates: tuple
@@ -70,7 +71,7 @@ class TriangleRow(NamedTuple):
 
 
 def object_table(scene: Scene, unit: shapes.UnitShapes) -> jax.Array:
-    """[G, columns] float32: everything about each drawn object that a pixel which sees it needs, in the order of `Row`."""
+    """Build the table [G, columns] float32 of the rendered objects' properties, in the order of `Row`."""
     columns = [
         *(unit.axes[:, row, column] for row in range(3) for column in range(3)),
         *(unit.origin[:, axis] for axis in range(3)),
@@ -80,7 +81,7 @@ def object_table(scene: Scene, unit: shapes.UnitShapes) -> jax.Array:
 
 
 def appearance_columns(scene: Scene) -> list[jax.Array]:
-    """The columns of `object_table` that do not depend on poses, from the kind on; [G] float32 each."""
+    """Return the columns of `object_table` that do not depend on poses, from the type on; [G] float32 each."""
     ids = np.array(scene.object_ids)
     columns = [jnp.asarray(scene.object_types, jnp.float32), *(scene.rgba[ids, channel] for channel in range(3))]
     columns += [scene.emission[ids], scene.specular[ids], 128.0 * scene.shininess[ids]]
@@ -97,77 +98,79 @@ def appearance_columns(scene: Scene) -> list[jax.Array]:
 
 
 def _texture_scales(scene: Scene, ids: np.ndarray) -> list[jax.Array]:
-    """How the coordinates of a point become those of the texture: five [G].
+    """Return factors and offsets that map coordinates of a point to those of the texture: five [G].
 
-    For a flat one, coordinates across and up (see `charts`) are multiplied with the first two and the last two added; for a
-    cube, the coordinates in the unit shape's frame are multiplied with the first three; for an unwrapped one, a mesh's own
-    coordinates with the first two (where it repeats per metre, MuJoCo multiplies them with the half-sizes of the mesh).
+    A flat texture multiplies the surface coordinates (see `charts`) by the first two and adds the last two; a cube multiplies
+    the coordinates in the unit shape's frame by the first three; an unwrapped texture multiplies the mesh's own coordinates by
+    the first two (if it repeats per metre, MuJoCo multiplies them by the half-sizes of the mesh).
     """
     kinds, mappings = np.array(scene.object_types), np.array(scene.atlas.mappings)
     size = _visual_size(kinds, scene.size[ids])
     metres = np.isin(kinds, (shapes.MESH, shapes.HFIELD))
     uniform, cube, unwrapped = np.array(scene.atlas.uniform), mappings == textures.CUBE, mappings == textures.UNWRAPPED
-    endless = jnp.any((size[:, :2] >= reading.ENDLESS) & (kinds == shapes.PLANE)[:, None], axis=1)
+    infinite = jnp.any((size[:, :2] >= reading.INFINITE_SIZE) & (kinds == shapes.PLANE)[:, None], axis=1)
     scales, shifts = [], []
     for axis in range(3):
         half = size[:, axis]
         if axis == 2:
             scales.append(jnp.where(uniform, half, 1.0))
             continue
-        # An endless plane repeats per metre, whatever the material says; a mesh's own frame is in metres already.
+        # An infinite plane repeats per metre, regardless of its material; a mesh's own frame is already in metres.
         over_object = jnp.where(metres, 1.0 / jnp.where(half > 0.0, half, 1.0), 1.0)
-        per_metre = uniform | (half >= reading.ENDLESS)
-        times = scene.texture_repeat[ids][:, axis]
-        repeat = times * jnp.where(per_metre, jnp.where(metres, 1.0, half), over_object)
-        shift = jnp.where(half >= reading.ENDLESS, 0.0, 0.5 * repeat) + jnp.where(endless, 0.5, 0.0)
+        per_metre = uniform | (half >= reading.INFINITE_SIZE)
+        repetitions = scene.texture_repeat[ids][:, axis]
+        repeat = repetitions * jnp.where(per_metre, jnp.where(metres, 1.0, half), over_object)
+        shift = jnp.where(half >= reading.INFINITE_SIZE, 0.0, 0.5 * repeat) + jnp.where(infinite, 0.5, 0.0)
         shifts.append(jnp.where(metres, -0.5, shift))
         sign = 0.5 if axis == 0 else -0.5
         scale = jnp.where(cube, jnp.where(uniform, half, 1.0), sign * repeat)
-        scales.append(jnp.where(unwrapped, jnp.where(uniform, half, 1.0) * times, scale))
+        scales.append(jnp.where(unwrapped, jnp.where(uniform, half, 1.0) * repetitions, scale))
     return scales + shifts
 
 
 def _visual_size(kinds: np.ndarray, size: jax.Array) -> jax.Array:
-    """[G, 3] metres: half-sizes along x, y and z of each object (of a capsule, without the caps)."""
+    """Return the half-sizes [G, 3] (m) of objects along x, y and z (for a capsule, without the caps)."""
     x, y, z = size[:, 0], size[:, 1], size[:, 2]
     ball, tube = kinds == shapes.SPHERE, np.isin(kinds, (shapes.CAPSULE, shapes.CYLINDER))
     return jnp.stack([x, jnp.where(ball | tube, x, y), jnp.where(tube, y, jnp.where(ball, x, z))], axis=1)
 
 
 def read_row(values: jax.Array) -> Row:
-    """Sorts the columns of `object_table` (its last axis) into a `Row`."""
-    return row_of([values[..., column] for column in range(values.shape[-1])])
+    """Split the columns of `object_table` (its last axis) into a `Row`."""
+    return make_row([values[..., column] for column in range(values.shape[-1])])
 
 
-def row_of(v: list) -> Row:
-    """A `Row` of the columns of `object_table`."""
+def make_row(v: list) -> Row:
+    """Build a `Row` from the columns of `object_table`."""
     axes = tuple(tuple(v[3 * row : 3 * row + 3]) for row in range(3))
     texture = TextureRow(v[20], tuple(v[21:24]), tuple(v[24:26]), *v[26:]) if len(v) > 20 else None
     return Row(axes, tuple(v[9:12]), v[12], v[13], tuple(v[14:17]), v[17], v[18], v[19], texture)
 
 
 def fetch(table: jax.Array, row: jax.Array) -> Row:
-    """The row of every pixel: table [G, columns] and [P] int32 (below 0: the first row)."""
-    return row_of(_look_up(table, row))
+    """Fetch the row of every pixel from a table [G, columns] by [P] int32 indices (negative: the first row)."""
+    return make_row(_look_up(table, row))
 
 
 def fetch_triangle(scene: Scene, triangle: jax.Array | None) -> TriangleRow | None:
-    """The triangles of pixels, given their rows in `Scene.triangles` [P] int32, below 0 for none; None in a scene without."""
+    """Fetch the triangles of pixels by rows of `Scene.triangles` [P] int32, negative for none; None in a scene without
+    triangles.
+    """
     if triangle is None:
         return None
-    seen = triangle >= 0
+    hit = triangle >= 0
     columns = _look_up(scene.triangles, triangle)
     parts = ((meshes.MAP, 4), (meshes.NORMALS, 3), (meshes.COORDINATES, 2), (meshes.CORNERS, 3))
     grouped = (tuple(zip(*[iter(columns[part])] * length, strict=True)) for part, length in parts)
-    return TriangleRow(seen, *grouped)
+    return TriangleRow(hit, *grouped)
 
 
 def _look_up(table: jax.Array, row: jax.Array) -> list[jax.Array]:
-    """The columns [P] of the rows [P] of a table."""
+    """Return the columns [P] of table rows [P]."""
     index = jnp.maximum(row, 0)
     if targets_cpu():
-        # One row per pixel is kept and read by all that follows; a column at a time is looked up anew for every use.
+        # Whole rows are stored per pixel and reused; single columns would be looked up again for every use.
         values = table.at[index].get(mode="promise_in_bounds")
         return [values[..., column] for column in range(table.shape[1])]
-    # Elsewhere that is what keeps the rows of all pixels out of the memory.
+    # Elsewhere, separate columns avoid storing the rows of all pixels.
     return [table[:, column].at[index].get(mode="promise_in_bounds") for column in range(table.shape[1])]

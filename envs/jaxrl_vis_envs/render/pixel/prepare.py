@@ -1,4 +1,4 @@
-"""What is computed once per environment, before any pixel: where the camera is, the drawn objects and the lights before it."""
+"""Work done once per environment, before any pixel: camera pose, unit shapes and lights in the camera's frame."""
 
 import functools
 from types import SimpleNamespace
@@ -15,12 +15,12 @@ _POSES = ("geom_xpos", "geom_xmat", "site_xpos", "site_xmat", "xpos", "xmat", "x
 
 
 class Prepared(NamedTuple):
-    """What pixels are drawn from, beside the scene.
+    """Inputs of the per-pixel stages, besides the scene.
 
     Attributes:
         rotation: [3, 3] float32, see `camera.camera_pose`.
-        unit: The drawn objects.
-        lights: From `lights.pack`; of no lights where nothing is shaded.
+        unit: Rendered objects.
+        lights: Lights from `lights.pack`; empty without shading.
     """
 
     rotation: jax.Array
@@ -29,31 +29,31 @@ class Prepared(NamedTuple):
 
 
 def prepare(scene: Scene, data: Any, rgb: bool = True) -> Prepared:
-    """What the pixels of one environment are drawn from.
+    """Compute the inputs of the per-pixel stages for one environment.
 
     Args:
         scene: The scene.
         data: Poses of one environment, as in `render_planes`.
-        rgb: Whether anything is shaded.
+        rgb: Whether colours are rendered.
     """
-    return _prepared(rgb, scene, {name: getattr(data, name) for name in _POSES if hasattr(data, name)})
+    return _prepare(rgb, scene, {name: getattr(data, name) for name in _POSES if hasattr(data, name)})
 
 
 def check_poses(scene: Any, data: Any, rgb: bool) -> None:
-    """Refuses what cannot be drawn from: JAX would take the last geom's pose for every one that is missing.
+    """Check scene and poses: JAX would silently substitute the last geom's pose for missing ones.
 
     Args:
-        scene: What is drawn.
-        data: What is to hold the poses, see `render_planes`.
-        rgb: Whether anything is shaded.
+        scene: The scene.
+        data: Poses, see `render_planes`.
+        rgb: Whether colours are rendered.
 
     Raises:
-        ValueError: ``scene`` is no scene, or ``data`` has no poses, none that kinematics have filled in, those of several
-            environments, or those of another model.
+        ValueError: ``scene`` is not a Scene, or ``data`` has no poses, poses that kinematics has not computed yet, those of
+            several environments, or those of another model.
     """
     if not isinstance(scene, Scene):
         raise ValueError(
-            f"a scene comes first, from Scene.from_mjmodel(mj_model), and then the data; got {type(scene).__name__}"
+            f"the scene, from Scene.from_mjmodel(mj_model), comes first, before the data; got {type(scene).__name__}"
         )
     if scene.object_ids:
         _check_kind(data, "geom_", scene.geom_count, is_exact=True)
@@ -70,27 +70,27 @@ def check_poses(scene: Any, data: Any, rgb: bool) -> None:
 
 
 def _check_kind(data: Any, kind: str, count: int, is_exact: bool = False) -> None:
-    """Refuses ``data`` unless it holds poses of ``count`` objects of a kind, or of more where that is not exact."""
+    """Check that ``data`` has poses of ``count`` objects of a kind, or of at least that many unless ``is_exact``."""
     _check_array(data, f"{kind}xpos", ((3,),), count, is_exact)
     _check_array(data, f"{kind}xmat", ((3, 3), (9,)), count, is_exact)
 
 
-def _check_array(data: Any, name: str, shapes_of_one: tuple[tuple[int, ...], ...], count: int, is_exact: bool) -> None:
-    """Refuses ``data`` without an array ``name`` of ``count`` rows of one of the shapes, or more where that is not exact."""
+def _check_array(data: Any, name: str, row_shapes: tuple[tuple[int, ...], ...], count: int, is_exact: bool) -> None:
+    """Check that ``data`` has an array ``name`` of ``count`` rows (at least that many unless ``is_exact``) of a valid shape."""
     if not hasattr(data, name):
-        mend = ", such as state.data" if hasattr(getattr(data, "data", None), name) else ""
-        raise ValueError(f"poses are read from mjx.Data or mujoco.MjData{mend}; {type(data).__name__} has no {name}")
+        hint = ", such as state.data" if hasattr(getattr(data, "data", None), name) else ""
+        raise ValueError(f"poses are read from mjx.Data or mujoco.MjData{hint}; {type(data).__name__} has no {name}")
     shape = np.shape(getattr(data, name))
-    if shape[1:] not in shapes_of_one:
-        expected = (count if is_exact else "...", *shapes_of_one[0])
+    if shape[1:] not in row_shapes:
+        expected = (count if is_exact else "...", *row_shapes[0])
         raise ValueError(f"{name} of one environment has the shape {expected}, got {shape}; jax.vmap over a batch")
     if shape[0] < count or (is_exact and shape[0] != count):
-        least = "" if is_exact else "at least "
-        raise ValueError(f"{name} holds {shape[0]} poses and the scene's model has {least}{count}: the models differ")
+        minimum = "" if is_exact else "at least "
+        raise ValueError(f"{name} holds {shape[0]} poses and the scene's model has {minimum}{count}: the models differ")
 
 
 def _check_filled(data: Any) -> None:
-    """Refuses poses that nothing has filled in yet, where they can be looked at: a rotation is never all zeros."""
+    """Check that concrete poses have been computed: a rotation is never all zeros."""
     rotations = data.geom_xmat
     if isinstance(rotations, jax.Array) and (isinstance(rotations, jax.core.Tracer) or not rotations.is_fully_addressable):
         return
@@ -100,8 +100,8 @@ def _check_filled(data: Any) -> None:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _prepared(rgb: bool, scene: Scene, poses: dict[str, Any]) -> Prepared:
-    """Jitted so that it is traced once, in however many programs it is, and compiled as a whole where it is in none."""
+def _prepare(rgb: bool, scene: Scene, poses: dict[str, Any]) -> Prepared:
+    """Compute `Prepared`. Jitted to be traced only once, however many programs contain it, and compiled as a whole."""
     data = SimpleNamespace(**poses)
     position, rotation, finite = camera.camera_pose(scene, data)
     unit = shapes.unit_shapes(scene, data, position, rotation, finite)

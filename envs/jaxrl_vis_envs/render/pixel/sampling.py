@@ -1,6 +1,6 @@
-"""Colours of textures as MuJoCo's renderer samples them, and where a direction meets a cube of six faces.
+"""Texture sampling as in MuJoCo's renderer, and cube map lookups.
 
-Bilinear within a resolution and linear between two (OpenGL's trilinear filter). See `textures` for what is stored.
+Bilinear within a mipmap level and linear between two (OpenGL's trilinear filter). See `textures` for the storage format.
 """
 
 from typing import Any, Protocol
@@ -12,27 +12,27 @@ from jaxrl_vis_envs.render.scene import Scene
 
 
 class Texels(Protocol):
-    """Where an atlas is read: from arrays (`ArrayTexels`), or from blocks of memory in a kernel.
+    """Reader of a texture atlas: from arrays (`ArrayTexels`), or from blocks of memory in a kernel.
 
     Attributes:
-        few_textures: Whether it pays to find out first if any of the pixels has a texture at all.
-        differentiable: Whether there are derivatives with respect to places.
+        few_textures: Whether to check first if any pixel has a texture at all.
+        differentiable: Whether derivatives with respect to texture coordinates exist.
     """
 
     few_textures: bool
     differentiable: bool
 
     def level(self, number: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """First row in the texels, width and height of levels [P] int32; numbers out of range are clipped."""
+        """Return first row in the texels, width and height of levels [P] int32; out-of-range numbers are clipped."""
         ...
 
     def quad(self, row: jax.Array) -> tuple[jax.Array, ...]:
-        """The four texels of rows [P] int32, packed; rows out of range are clipped."""
+        """Return the four packed texels of rows [P] int32; out-of-range rows are clipped."""
         ...
 
 
 class ArrayTexels:
-    """The atlas as arrays: texels [T, 4] uint32 and levels as in `textures.Atlas`."""
+    """Atlas in arrays: texels [T, 4] uint32 and levels as in `textures.Atlas`."""
 
     few_textures = False
     differentiable = True
@@ -42,8 +42,8 @@ class ArrayTexels:
 
     def level(self, number: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """See `Texels`."""
-        facts = self.levels.at[jnp.clip(number, 0, len(self.levels) - 1)].get(mode="promise_in_bounds")
-        return facts[..., 0], facts[..., 1], facts[..., 2]
+        bounds = self.levels.at[jnp.clip(number, 0, len(self.levels) - 1)].get(mode="promise_in_bounds")
+        return bounds[..., 0], bounds[..., 1], bounds[..., 2]
 
     def quad(self, row: jax.Array) -> tuple[jax.Array, ...]:
         """See `Texels`."""
@@ -51,8 +51,8 @@ class ArrayTexels:
         return tuple(quad[..., corner] for corner in range(4))
 
 
-def texels_of(scene: Scene) -> Texels:
-    """Where the scene's atlas is read: a kernel puts its own reader in the place of the texels."""
+def atlas_reader(scene: Scene) -> Texels:
+    """Return the reader of the scene's atlas: a kernel substitutes its own reader for the texels."""
     own: Any = scene.texels
     return own if hasattr(own, "quad") else ArrayTexels(own, scene.atlas.levels)
 
@@ -62,44 +62,44 @@ def sample(
     first_level: jax.Array | int,
     level_count: jax.Array | int,
     face: jax.Array | int,
-    place: tuple[jax.Array, jax.Array],
+    coordinates: tuple[jax.Array, jax.Array],
     spread_square: jax.Array,
     repeats: jax.Array | bool,
     alpha: bool = False,
 ) -> tuple[jax.Array, ...]:
-    """Colours of textures at many places.
+    """Sample textures at many points.
 
     Args:
-        texels: Where they are read.
-        first_level: [P] int32 or a number: which texture.
-        level_count: [P] int32 or a number.
-        face: [P] int32 or a number: which face of a cube.
-        place: Coordinates across and down, [P] float32 each; 0 to 1 is the whole image.
-        spread_square: [P] float32, the square of how many texels (of the finest level) a pixel spans.
-        repeats: [P] bool or a bool: whether the image goes on beyond its border, or its border does.
-        alpha: Whether alpha is wanted too.
+        texels: Atlas reader.
+        first_level: [P] int32 or a number: first level of the texture.
+        level_count: [P] int32 or a number: its number of levels.
+        face: [P] int32 or a number: face of a cube.
+        coordinates: Horizontal and vertical texture coordinates, [P] float32 each; 0 to 1 is the whole image.
+        spread_square: [P] float32, squared footprint of a pixel in texels of the finest level.
+        repeats: [P] bool or a bool: repeat the image beyond its border, or clamp to the border.
+        alpha: Also return alpha.
 
     Returns:
-        Red, green and blue, and alpha if it is wanted, [P] float32 each, in [0, 1].
+        Red, green and blue, and alpha if requested, [P] float32 each, in [0, 1].
     """
     level = jnp.clip(0.5 * jnp.log2(jnp.maximum(spread_square, 1e-12)), 0.0, level_count - 1.0)
     fine = jnp.floor(level)
     weight = level - fine
     fine = fine.astype(jnp.int32)
     coarse = jnp.minimum(fine + 1, level_count - 1)
-    near = _bilinear(texels, first_level + fine, face, place, repeats, alpha)
-    far = _bilinear(texels, first_level + coarse, face, place, repeats, alpha)
+    near = _bilinear(texels, first_level + fine, face, coordinates, repeats, alpha)
+    far = _bilinear(texels, first_level + coarse, face, coordinates, repeats, alpha)
     return tuple(a + weight * (b - a) for a, b in zip(near, far, strict=True))
 
 
 def _bilinear(
-    texels: Texels, level: jax.Array, face: jax.Array | int, place: tuple, repeats: jax.Array | bool, alpha: bool
+    texels: Texels, level: jax.Array, face: jax.Array | int, coordinates: tuple, repeats: jax.Array | bool, alpha: bool
 ) -> tuple:
     first, *shape = texels.level(level)
     lows, shares = [], []
     for axis in range(2):
         count = shape[axis].astype(jnp.float32)
-        at = place[axis] * count - 0.5
+        at = coordinates[axis] * count - 0.5
         at = jnp.where(repeats, at, jnp.clip(at, 0.0, count - 1.0))
         low = jnp.floor(at)
         shares.append(at - low)
@@ -111,16 +111,16 @@ def _bilinear(
 
 
 def _mix_alpha(corners: tuple, right: jax.Array, below: jax.Array) -> jax.Array:
-    """Alpha between four texels."""
+    """Interpolate alpha between four texels."""
     one, two, three, four = ((corner >> 24).astype(jnp.int32).astype(jnp.float32) / 255.0 for corner in corners)
     upper, lower = one + right * (two - one), three + right * (four - three)
     return upper + below * (lower - upper)
 
 
 def _mix(corners: tuple, right: jax.Array, below: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Red, green and blue between four texels, with weights of 1/256 as graphics hardware has them.
+    """Interpolate red, green and blue between four texels, with weights in units of 1/256 as in graphics hardware.
 
-    So two channels fit into one product of integers.
+    Two channels then fit into one integer product.
     """
     right, below = ((256.0 * share + 0.5).astype(jnp.int32) for share in (right, below))
     both = (right * below + 128) >> 8
@@ -142,26 +142,26 @@ _mixed = jax.custom_jvp(_mix)
 
 @_mixed.defjvp
 def _mix_tangents(primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
-    """Integers have no slope; that of the mean that they stand for."""
+    """Differentiate the underlying interpolation: the integers themselves have no slope."""
     corners, right, below = primals
-    _, right_move, below_move = tangents
-    moves = []
+    _, right_tangent, below_tangent = tangents
+    colour_tangents = []
     for channel in range(3):
         one, two, three, four = (((c >> (8 * channel)) & 255).astype(jnp.int32).astype(jnp.float32) / 255.0 for c in corners)
         to_right = (two - one) * (1.0 - below) + (four - three) * below
         to_below = (three - one) * (1.0 - right) + (four - two) * right
-        moves.append(to_right * right_move + to_below * below_move)
-    return _mix(corners, right, below), tuple(moves)
+        colour_tangents.append(to_right * right_tangent + to_below * below_tangent)
+    return _mix(corners, right, below), tuple(colour_tangents)
 
 
-def cube_place(direction: tuple) -> tuple[jax.Array, tuple[jax.Array, jax.Array], tuple]:
-    """Where a direction meets a cube map, as OpenGL has it.
+def cube_coordinates(direction: tuple) -> tuple[jax.Array, tuple[jax.Array, jax.Array], tuple]:
+    """Look up a direction in a cube map, as OpenGL does.
 
     Args:
         direction: Three [P] float32, of any length.
 
     Returns:
-        The face [P] int32, the coordinates on it (across and down, [P] each), and what `cube_move` needs.
+        Face [P] int32, coordinates on it (horizontal and vertical, [P] each), and the axis choice for `cube_tangent`.
     """
     x, y, z = direction
     ax, ay, az = jnp.abs(x), jnp.abs(y), jnp.abs(z)
@@ -174,15 +174,15 @@ def cube_place(direction: tuple) -> tuple[jax.Array, tuple[jax.Array, jax.Array]
     across = jnp.where(along_x, -sign * z, jnp.where(along_y, x, sign * x))
     down = jnp.where(along_y, sign * z, -y)
     inverse = 0.5 / jnp.maximum(jnp.abs(major), 1e-20)
-    place = (across * inverse + 0.5, down * inverse + 0.5)
-    return face, place, (along_x, along_y, sign, inverse)
+    coordinates = (across * inverse + 0.5, down * inverse + 0.5)
+    return face, coordinates, (along_x, along_y, sign, inverse)
 
 
-def cube_move(choice: tuple, place: tuple, change: tuple) -> tuple[jax.Array, jax.Array]:
-    """How the place on a cube's face moves (across and down, [P] each) when the direction moves by ``change``."""
+def cube_tangent(choice: tuple, coordinates: tuple, change: tuple) -> tuple[jax.Array, jax.Array]:
+    """Compute the change of coordinates on a cube's face ([P] each) for a ``change`` of the direction."""
     along_x, along_y, sign, inverse = choice
     x, y, z = change
     major = sign * jnp.where(along_x, x, jnp.where(along_y, y, z))
     across = jnp.where(along_x, -sign * z, jnp.where(along_y, x, sign * x))
     down = jnp.where(along_y, sign * z, -y)
-    return (across - (2.0 * place[0] - 1.0) * major) * inverse, (down - (2.0 * place[1] - 1.0) * major) * inverse
+    return (across - (2.0 * coordinates[0] - 1.0) * major) * inverse, (down - (2.0 * coordinates[1] - 1.0) * major) * inverse

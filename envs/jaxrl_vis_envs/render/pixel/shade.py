@@ -1,10 +1,10 @@
-"""The colour of what each pixel sees: MuJoCo's fixed-function lighting, evaluated once per pixel after the nearest hit.
+"""Shading: MuJoCo's fixed-function lighting, evaluated once per pixel at the nearest hit.
 
-Per light, as OpenGL has it: attenuation x spot x (ambient x colour + diffuse x colour x N.L + specular x (N.H)^(128 x
-shininess)), the highlight only where N.L > 0, all lights summed with the emission, clipped to [0, 1] and then multiplied with
-the texture. The corners of a mesh's triangles are lit and their colours mixed, as by OpenGL; primitives, which OpenGL cuts into
-polygons and lights likewise, are lit at every pixel. There are no reflections. A point light shines from its position (MuJoCo's
-renderer does not know them).
+Per light, as in OpenGL: attenuation x spot x (ambient x colour + diffuse x colour x N.L + specular x (N.H)^(128 x shininess)),
+the highlight only if N.L > 0; all lights are added to the emission, clipped to [0, 1] and then multiplied by the texture.
+Meshes are lit at the corners of their triangles and the colours interpolated, as in OpenGL; primitives, which OpenGL
+tessellates and lights likewise, are lit at every pixel. There are no reflections. A point light shines from its position
+(MuJoCo's renderer does not support point lights).
 """
 
 from typing import Any
@@ -17,36 +17,36 @@ from jaxrl_vis_envs.render import camera
 from jaxrl_vis_envs.render.camera import Rays
 from jaxrl_vis_envs.render.pixel import charts, sampling, shapes, surface, texturing
 from jaxrl_vis_envs.render.pixel import lights as lighting
-from jaxrl_vis_envs.render.pixel.arithmetic import Vector, clipped, normalized
+from jaxrl_vis_envs.render.pixel.arithmetic import Vector, clip_to_unit, normalized
 from jaxrl_vis_envs.render.pixel.lookup import Row
 from jaxrl_vis_envs.render.pixel.raycast import entry
 from jaxrl_vis_envs.render.pixel.surface import Hit
 from jaxrl_vis_envs.render.scene import Scene
 
-# What MuJoCo lights a scene with that has no light at all.
+# Ambient light that MuJoCo uses in a scene without any light.
 _AMBIENT_WITHOUT_LIGHTS = 0.3
-# MuJoCo's sky stands at this share of the far plane.
+# Distance of MuJoCo's sky, relative to the far plane.
 _SKY_DISTANCE = 0.7
 
 
 def shade(scene: Scene, unit: shapes.UnitShapes | None, lights: list[lighting.Light], row: Row, hit: Hit, rays: Rays) -> Vector:
-    """Colour of surfaces: `lighted`, with their sampling."""
-    colour = lighted(scene, unit, lights, row, hit, rays)
+    """Compute the colour of surfaces, including their textures."""
+    colour = light_surface(scene, unit, lights, row, hit, rays)
     texture = texturing.texture_colour(scene, row, hit)
     return colour if texture is None else tuple(value * texel for value, texel in zip(colour, texture, strict=True))
 
 
-def lighted(
+def light_surface(
     scene: Scene, unit: shapes.UnitShapes | None, lights: list[lighting.Light], row: Row, hit: Hit, rays: Rays
 ) -> Vector:
-    """Colour of surfaces as if they had no sampling.
+    """Compute the colour of surfaces without their textures.
 
     Args:
         scene: The scene.
-        unit: The drawn objects (for shadows; None where no light casts any).
-        lights: The lights in the camera's frame.
-        row: The object of each pixel.
-        hit: Where it is met.
+        unit: Rendered objects, for shadows; None if no light casts any.
+        lights: Lights in the camera's frame.
+        row: Object at each pixel.
+        hit: Intersection at each pixel.
         rays: [P].
 
     Returns:
@@ -55,40 +55,41 @@ def lighted(
     if hit.triangle is None:
         u, v = rays
         if scene.projection == "orthographic":
-            to_camera = normalized(tuple(-p for p in hit.point))  # OpenGL's viewer is a point all the same
+            to_camera = normalized(tuple(-p for p in hit.point))  # OpenGL's viewer is a point nevertheless
         else:
             to_camera = normalized((-u, -v, jnp.ones_like(u)))
-        return _lighted(scene, unit, lights, row, hit, to_camera)
+        return _light_points(scene, unit, lights, row, hit, to_camera)
     colour: Vector = (0.0, 0.0, 0.0)
     for share, corner in surface.corners(row, hit):
         to_camera = normalized(tuple(-p for p in corner.point))
-        of_corner = _lighted(scene, unit, lights, row, corner, to_camera)
-        colour = tuple(total + share * own for total, own in zip(colour, of_corner, strict=True))
+        corner_colour = _light_points(scene, unit, lights, row, corner, to_camera)
+        colour = tuple(total + share * value for total, value in zip(colour, corner_colour, strict=True))
     return colour
 
 
-def _lighted(
+def _light_points(
     scene: Scene, unit: shapes.UnitShapes | None, lights: list[lighting.Light], row: Row, hit: Hit, to_camera: Vector
 ) -> Vector:
-    """Colour of points of surfaces without a texture, each [P] float32 in [0, 1]."""
+    """Compute the colour of surface points without textures, each [P] float32 in [0, 1]."""
     coloured: list[Any] = [row.emission if lights else row.emission + _AMBIENT_WITHOUT_LIGHTS] * 3
     highlight: list[Any] = [0.0] * 3
     for light in lights:
-        lit = _lit(scene, unit, light, hit) if light.shadows else None
+        lit = _shadow_mask(scene, unit, light, hit) if light.shadows else None
         factors = lighting.light_factors(light, hit.point, hit.normal, to_camera, row.exponent, lit)
         for channel in range(3):
             coloured[channel] += factors[0] * light.ambient[channel] + factors[1] * light.diffuse[channel]
             if light.highlights:
                 highlight[channel] += factors[2] * light.specular[channel]
     return tuple(
-        clipped(light * base + row.specular * shine) for light, base, shine in zip(coloured, row.colour, highlight, strict=True)
+        clip_to_unit(light * base + row.specular * shine)
+        for light, base, shine in zip(coloured, row.colour, highlight, strict=True)
     )
 
 
-def _lit(scene: Scene, unit: shapes.UnitShapes | None, light: lighting.Light, hit: Hit) -> jax.Array:
-    """[P] float32: 1 where no geom is between the point and the light, otherwise 0. Sites cast no shadow."""
+def _shadow_mask(scene: Scene, unit: shapes.UnitShapes | None, light: lighting.Light, hit: Hit) -> jax.Array:
+    """Return 0 where a geom is between the point and the light, else 1: [P] float32. Sites cast no shadow."""
     assert unit is not None
-    to_light, distance, _ = lighting.towards(light, hit.point)
+    to_light, distance, _ = lighting.light_vector(light, hit.point)
     start = tuple(jax.lax.stop_gradient(p) for p in hit.point)
     to_light = tuple(jax.lax.stop_gradient(component) for component in to_light)
     margin = 1e-4 * (1.0 - start[2])
@@ -105,7 +106,7 @@ def _lit(scene: Scene, unit: shapes.UnitShapes | None, light: lighting.Light, hi
 
 
 def sky(scene: Scene, camera_rotation: Any, rays: Rays) -> Vector:
-    """Colour of the sky along every ray.
+    """Compute the colour of the sky along every ray.
 
     Returns:
         Red, green and blue, each [P] float32 in [0, 1].
@@ -117,26 +118,28 @@ def sky(scene: Scene, camera_rotation: Any, rays: Rays) -> Vector:
     world = [camera_rotation[axis, 0] * u + camera_rotation[axis, 1] * v - camera_rotation[axis, 2] for axis in range(3)]
     image = scene.atlas.sky
     if image is not None:
-        # MuJoCo's skies have their up along y.
-        face, place, choice = sampling.cube_place((world[0], world[2], -world[1]))
+        # In MuJoCo's sky textures, y is up.
+        face, coordinates, choice = sampling.cube_coordinates((world[0], world[2], -world[1]))
         pitches = _pitches(scene)
         spreads = []
         for axis, pitch in enumerate(pitches):
             change = [camera_rotation[i, axis] * pitch for i in range(3)]
-            moved = sampling.cube_move(choice, place, (change[0], change[2], -change[1]))
-            spreads.append(moved[0] * moved[0] + moved[1] * moved[1])
+            tangent = sampling.cube_tangent(choice, coordinates, (change[0], change[2], -change[1]))
+            spreads.append(tangent[0] * tangent[0] + tangent[1] * tangent[1])
         spread = jnp.maximum(spreads[0], spreads[1]) * float(scene.atlas.levels[image.first_level][1]) ** 2
         face = face if image.faces == 6 else 0
-        return sampling.sample(sampling.texels_of(scene), image.first_level, image.levels, face, place, spread, repeats=False)
+        return sampling.sample(
+            sampling.atlas_reader(scene), image.first_level, image.levels, face, coordinates, spread, repeats=False
+        )
     sine = jnp.clip(world[2] * jax.lax.rsqrt(u * u + v * v + 1.0), -1.0, 1.0)
     elevation = charts.elevation(sine)
-    # The curve that MuJoCo fills a gradient texture with; 0 straight down, 1 straight up.
+    # MuJoCo's gradient curve: 0 at the nadir, 1 at the zenith.
     share = 0.5 + elevation * jax.lax.rsqrt(2.0 * (1.0 + elevation * elevation))
     return tuple(scene.sky_bottom[channel] * (1.0 - share) + scene.sky_top[channel] * share for channel in range(3))
 
 
 def _pitches(scene: Scene) -> tuple[jax.Array, jax.Array]:
-    """How much u and v of the rays to the sky change from one pixel to the next."""
+    """Return the change of u and of v of the sky's rays from one pixel to the next."""
     pitches = camera.pixel_pitch(scene)
     if scene.projection == "orthographic":
         far = 1.0 / (_SKY_DISTANCE * scene.zfar)
@@ -145,19 +148,19 @@ def _pitches(scene: Scene) -> tuple[jax.Array, jax.Array]:
 
 
 def haze(scene: Scene, unit: shapes.UnitShapes, rays: Rays, depth: jax.Array, colour: Vector) -> Vector:
-    """The colours with the horizon's haze over them, which MuJoCo draws as a wide funnel around the camera.
+    """Blend the haze at the horizon over the colours; MuJoCo draws it as a wide funnel around the camera.
 
     Args:
-        scene: A scene with a hazy plane.
-        unit: The drawn objects.
+        scene: Scene with a hazy plane.
+        unit: Rendered objects.
         rays: [P].
-        depth: [P] float32, metres, of what is seen; the funnel only counts in front of it.
+        depth: [P] float32, depth of the visible surface, metres, which occludes the funnel.
         colour: Three [P] float32.
     """
     plane, width = scene.haze
     row = scene.object_ids.index(plane)
     axes, origin = unit.axes[row], unit.origin[row]
-    height = origin[2]  # of the camera above the plane: the shape's z is in metres
+    height = origin[2]  # camera's height above the plane: the shape's z is in metres
     reach = _SKY_DISTANCE * scene.zfar
     u, v = rays
     up = axes[2, 0] * u + axes[2, 1] * v - axes[2, 2]
@@ -165,11 +168,11 @@ def haze(scene: Scene, unit: shapes.UnitShapes, rays: Rays, depth: jax.Array, co
     safe_height = jnp.maximum(height, 1e-9)
     closing = level - width * reach * up / safe_height
     at = reach / jnp.maximum(closing, 1e-9)
-    place = 1.0 + at * up / safe_height  # 0 on the plane, 1 at the camera's height
-    # Where the haze is thickest: the elevation at which the funnel meets the sky's cylinder from below.
+    level_ratio = 1.0 + at * up / safe_height  # 0 on the plane, 1 at the camera's height
+    # The haze is thickest at the elevation where the funnel meets the sky's cylinder from below.
     alpha = np.arctan2(1.0, width)
     thickest = float(np.sqrt(0.5) * width * np.sin(alpha) / np.sin(0.75 * np.pi - alpha))
-    strength = jnp.where(place < thickest, place / thickest, (1.0 - place) / (1.0 - thickest))
-    seen = (height > 0.0) & (place >= 0.0) & (place <= 1.0) & (closing > 0.0) & (at < depth)
-    strength = jnp.where(seen, jnp.clip(strength, 0.0, 1.0), 0.0)
+    strength = jnp.where(level_ratio < thickest, level_ratio / thickest, (1.0 - level_ratio) / (1.0 - thickest))
+    visible = (height > 0.0) & (level_ratio >= 0.0) & (level_ratio <= 1.0) & (closing > 0.0) & (at < depth)
+    strength = jnp.where(visible, jnp.clip(strength, 0.0, 1.0), 0.0)
     return tuple(c + strength * (scene.haze_colour[channel] - c) for channel, c in enumerate(colour))

@@ -1,8 +1,8 @@
-"""Once per environment: every drawn object as a unit shape in the camera's frame.
+"""Unit shapes: every rendered object in the camera's frame, once per environment.
 
-An object is brought to a unit shape (ball, cylinder, cube, square; a mesh keeps its metres) by an affine map of the camera's
-frame. What is left per pixel and object is a ray that is linear in the pixel's (u, v), and a handful of operations. All of it
-is in a few small tables whose rows are the drawn objects, which any other method of finding the nearest hit needs too.
+An affine map of the camera's frame turns an object into a unit shape (ball, cylinder, cube, square; a mesh keeps metric units).
+Per pixel and object, this leaves a ray that is linear in the pixel's (u, v), and a handful of operations. The maps are stored
+in a few small tables with one row per object, which any other method of finding the nearest hit could also use.
 """
 
 from collections.abc import Callable
@@ -24,24 +24,24 @@ CYLINDER = int(mujoco.mjtGeom.mjGEOM_CYLINDER)
 BOX = int(mujoco.mjtGeom.mjGEOM_BOX)
 MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
 
-# Objects that are not drawn go this far behind the camera, in metres: no ray meets them, and no NaN is left.
+# Hidden objects are moved this far behind the camera, in metres: no ray intersects them, and no NaN remains.
 _BEHIND = 1e6
-# Metres: where MuJoCo sorts planes to.
+# Distance that MuJoCo assigns to planes when sorting, metres.
 FAR_AWAY = 1e10
-# Metres: what is thinner is drawn as thin as this, so that a sheet is neither divided by 0 nor lost between two float32.
-_THINNEST = 1e-5
+# Minimum half-size, metres: thinner sheets would cause a division by 0 or vanish in float32 rounding.
+_MIN_HALF_SIZE = 1e-5
 
 
 class UnitShapes(NamedTuple):
-    """The drawn objects as unit shapes: a point p of the camera's frame is ``origin + axes @ p`` in the shape's frame.
+    """Rendered objects as unit shapes: a point p of the camera's frame is ``origin + axes @ p`` in the shape's frame.
 
     Attributes:
-        origin: [G, 3] float32, the camera in the shape's frame.
+        origin: [G, 3] float32, position of the camera in the shape's frame.
         axes: [G, 3, 3] float32, 1/metres (rotation from the camera's frame, then division by the half-sizes).
         extra: [G] float32. Sphere: radius in metres. Capsule: half-length over radius. Otherwise unused.
         extra_square: [G] float32. Sphere and capsule: squared radius in square metres. Otherwise unused.
-        ball: [G, 4] float32, metres: a ball around the object, middle in the camera's frame and radius. A mesh's is not used.
-        distance: [G] float32, metres, from the camera to the ball that MuJoCo sorts transparent objects by; [0] without any.
+        ball: [G, 4] float32, metres: bounding sphere, centre in the camera's frame and radius. Unused for a mesh.
+        distance: [G] float32, metres, distance by which MuJoCo sorts transparent objects; [0] without any.
     """
 
     origin: jax.Array
@@ -55,14 +55,14 @@ class UnitShapes(NamedTuple):
 def unit_shapes(
     scene: Scene, data: Any, camera_position: jax.Array, camera_rotation: jax.Array, camera_finite: jax.Array
 ) -> UnitShapes:
-    """Brings every drawn object to a unit shape in the camera's frame.
+    """Convert every rendered object to a unit shape in the camera's frame.
 
     Args:
         scene: The scene.
-        data: Has ``geom_xpos`` [ngeom, 3] and ``geom_xmat`` [ngeom, 3, 3] or [ngeom, 9], and the same of sites that are drawn.
+        data: Has ``geom_xpos`` [ngeom, 3] and ``geom_xmat`` [ngeom, 3, 3] or [ngeom, 9], and the same for rendered sites.
         camera_position: [3] float32, metres, world.
         camera_rotation: [3, 3] float32, columns are the camera's axes in the world.
-        camera_finite: [] bool; where false, nothing is seen.
+        camera_finite: [] bool; if False, nothing is visible.
     """
     position, rotation = _object_poses(scene, data)
     size = scene.size[np.array(scene.object_ids)]
@@ -71,54 +71,56 @@ def unit_shapes(
     finite &= ~_without_area(kinds[:, 0], size)
     position = jnp.where(finite[:, None], position, 0.0)
     rotation = jnp.where(finite[:, None, None], rotation, 0.0)
-    # Written out rather than as matrix products, which accelerators would do at low precision, and a CPU on one core.
-    away = position - camera_position
-    offset = _added(lambda k: away[:, k, None] * camera_rotation[k])  # [G, 3] in the camera's frame
-    relative = _added(lambda k: rotation[:, k, :, None] * camera_rotation[k])  # [G, shape axis, camera axis]
+    # Not matrix products, which accelerators would compute at low precision, and a CPU on one core.
+    from_camera = position - camera_position
+    offset = _sum3(lambda k: from_camera[:, k, None] * camera_rotation[k])  # [G, 3] in the camera's frame
+    relative = _sum3(lambda k: rotation[:, k, :, None] * camera_rotation[k])  # [G, shape axis, camera axis]
     offset = jnp.where(finite[:, None], offset, jnp.array([0.0, 0.0, _BEHIND], jnp.float32))
     relative = jnp.where(finite[:, None, None], relative, jnp.eye(3, dtype=jnp.float32))
 
     half = _half_sizes(kinds, size)
-    # A ball looks the same from everywhere: leaving its rotation out saves operations in every pixel, unless it has a texture.
+    # An untextured ball is rotationally symmetric: omitting its rotation saves operations in every pixel.
     bare = np.array(scene.atlas.mappings)[:, None] == 0
     relative = jnp.where(((kinds == SPHERE) & bare)[:, :, None], jnp.eye(3, dtype=jnp.float32), relative)
     axes = relative / half[:, :, None]
-    origin = -_added(lambda k: axes[:, :, k] * offset[:, k, None])
+    origin = -_sum3(lambda k: axes[:, :, k] * offset[:, k, None])
     capsules = kinds[:, 0] == CAPSULE
-    # Where: a size that means nothing for a type may be 0.
+    # Masked, because sizes that a type does not use may be 0.
     extra = jnp.where(capsules, size[:, 1] / jnp.where(capsules, size[:, 0], 1.0), size[:, 0])
     ball = jnp.concatenate([offset, _radii(kinds[:, 0], size)[:, None]], axis=1)
-    distance = _distances(scene, away) if any(scene.transparent) else jnp.zeros(0, jnp.float32)
+    distance = _distances(scene, from_camera) if any(scene.transparent) else jnp.zeros(0, jnp.float32)
     return UnitShapes(origin, axes, extra, jnp.square(size[:, 0]), ball, distance)
 
 
-def _distances(scene: Scene, away: jax.Array) -> jax.Array:
-    """[G] metres, computed as MuJoCo does it, so that what is equally far for it is so here: planes are all far away."""
-    # The bound keeps a compiler from rounding two of the squares once and the third twice.
-    x, y, z = (jnp.minimum(away[:, axis] * away[:, axis], 1e37) for axis in range(3))
+def _distances(scene: Scene, from_camera: jax.Array) -> jax.Array:
+    """Return distances [G] (m) computed exactly as in MuJoCo, so that the same objects are equally distant; planes are far
+    away.
+    """
+    # The clamp prevents fused multiply-adds, which would round the three squares differently.
+    x, y, z = (jnp.minimum(from_camera[:, axis] * from_camera[:, axis], 1e37) for axis in range(3))
     near = jnp.sqrt(x + y + z) - scene.bound[np.array(scene.object_ids)]
     return jax.lax.stop_gradient(jnp.where(np.array(scene.object_types) == PLANE, FAR_AWAY, near))
 
 
-def _added(term: Callable[[int], jax.Array]) -> jax.Array:
-    """The sum of the terms 0, 1 and 2."""
+def _sum3(term: Callable[[int], jax.Array]) -> jax.Array:
+    """Return the sum of the terms 0, 1 and 2."""
     return term(0) + term(1) + term(2)
 
 
 def _half_sizes(kinds: np.ndarray, size: jax.Array) -> jax.Array:
-    """[G, 3] metres that become 1 in the unit shape's frame."""
+    """Return the lengths [G, 3] (m) that become 1 in the unit shape's frame."""
     ones = jnp.ones_like(size[:, :1])
     radius = size[:, :1]
     half = jnp.where(kinds == PLANE, jnp.concatenate([size[:, :2], ones], 1), size)
     half = jnp.where((kinds == SPHERE) | (kinds == CAPSULE), jnp.broadcast_to(radius, size.shape), half)
     half = jnp.where(kinds == CYLINDER, jnp.concatenate([radius, radius, size[:, 1:2]], 1), half)
-    return jnp.where((kinds == MESH) | (kinds == HFIELD), 1.0, jnp.maximum(half, _THINNEST))
+    return jnp.where((kinds == MESH) | (kinds == HFIELD), 1.0, jnp.maximum(half, _MIN_HALF_SIZE))
 
 
 def _without_area(kinds: np.ndarray, size: jax.Array) -> jax.Array:
-    """[G] bool: which shapes have half-sizes of 0 that leave nothing of them to be seen, as MuJoCo draws them.
+    """Return the mask [G] of shapes with half-sizes of 0 that MuJoCo does not render.
 
-    A box, an ellipsoid or a cylinder with one of them is a sheet; a capsule without a length is not drawn at all.
+    A box, an ellipsoid or a cylinder with one half-size of 0 is a sheet; a capsule without length is not rendered at all.
     """
     zero = size <= 0.0
     none = jnp.where(np.isin(kinds, (SPHERE, CYLINDER)), zero[:, 0], False)
@@ -127,7 +129,7 @@ def _without_area(kinds: np.ndarray, size: jax.Array) -> jax.Array:
 
 
 def _radii(kinds: np.ndarray, size: jax.Array) -> jax.Array:
-    """[G] metres, of a ball around each shape (planes: around the part that is drawn)."""
+    """Return the radii [G] (m) of the bounding spheres (for planes, of the finite part)."""
     a, b, c = size[:, 0], size[:, 1], size[:, 2]
     radius = jnp.sqrt(a * a + b * b + c * c)
     radius = jnp.where(kinds == SPHERE, a, radius)
@@ -137,7 +139,7 @@ def _radii(kinds: np.ndarray, size: jax.Array) -> jax.Array:
 
 
 def _object_poses(scene: Scene, data: Any) -> tuple[jax.Array, jax.Array]:
-    """Positions [G, 3] and rotations [G, 3, 3] of the drawn objects in the world, float32."""
+    """Return positions [G, 3] and rotations [G, 3, 3] of the rendered objects in the world, float32."""
     position = jnp.asarray(data.geom_xpos, jnp.float32)
     rotation = jnp.asarray(data.geom_xmat, jnp.float32).reshape(-1, 3, 3)
     if any(index >= scene.geom_count for index in scene.object_ids):

@@ -1,8 +1,8 @@
-"""Where the ray of a pixel meets the object that it sees: exact depth, normal, and what the texture needs.
+"""Intersection of each pixel's ray with its visible object: exact depth, normal, and texture inputs.
 
-All is computed from one row of a table that is fetched for the pixel. The depth that comes in only says where to start: one
-Newton step along the ray brings it onto the surface. As a function of poses, sizes and the camera that step has the derivative
-of the depth, so nothing that searches for the nearest object has to be differentiated.
+Everything is computed from one table row fetched per pixel. The incoming depth is only an initial guess: one Newton step along
+the ray moves it onto the surface. As a function of poses, sizes and camera, that step has the derivative of the depth, so the
+search for the nearest object need not be differentiated.
 """
 
 from typing import NamedTuple
@@ -17,21 +17,21 @@ from jaxrl_vis_envs.render.pixel.arithmetic import Vector, dot, normalized
 from jaxrl_vis_envs.render.pixel.lookup import Row, TriangleRow
 from jaxrl_vis_envs.render.scene import Scene
 
-# The largest share of the depth by which a start may be wrong; keys are some hundred times better.
+# Maximum relative error of the initial depth; keys are about a hundred times better.
 _START_ERROR = 1e-3
 
 
 class Hit(NamedTuple):
-    """Where a ray meets an object. Arrays [P] float32.
+    """Intersections of rays with objects. Arrays [P] float32.
 
     Attributes:
         depth: Planar depth, metres.
-        point: In the camera's frame, metres.
-        local: In the frame of the unit shape.
-        gradient: Across the surface, in the frame of the unit shape.
-        slope: How fast the ray runs against the gradient.
-        normal: Unit, outward (of a plane: towards the camera), in the camera's frame.
-        triangle: What `meet` was given.
+        point: Point in the camera's frame, metres.
+        local: Point in the frame of the unit shape.
+        gradient: Gradient of the surface in the frame of the unit shape.
+        slope: Derivative of the surface's implicit function along the ray.
+        normal: Unit normal in the camera's frame, outward (for a plane, towards the camera).
+        triangle: Triangle rows, as passed to `meet`.
     """
 
     depth: jax.Array
@@ -44,26 +44,26 @@ class Hit(NamedTuple):
 
 
 def meet(scene: Scene, row: Row, triangle: TriangleRow | None, rays: Rays, start: jax.Array, refined: bool = True) -> Hit:
-    """Where the rays meet the objects of ``row``, given a depth nearby.
+    """Intersect rays with the objects of ``row``, given an approximate depth.
 
     Args:
         scene: The scene.
-        row: The object of each pixel.
-        triangle: The triangle of each pixel; None in a scene without meshes.
+        row: Object at each pixel.
+        triangle: Triangle at each pixel; None in a scene without meshes.
         rays: [P].
-        start: [P] float32, metres, a depth that is right to a thousandth; not differentiated.
-        refined: Whether to take the step from there onto the surface, which is the only part that has derivatives.
+        start: [P] float32, metres, depth with a relative accuracy of 1e-3; not differentiated.
+        refined: Take the Newton step onto the surface, the only part that has derivatives.
     """
     begin, direction, _ = camera.ray_parts(scene, rays)
-    ray = camera.mapped(row.axes, direction)
-    local_start = tuple(o + s for o, s in zip(row.origin, camera.mapped(row.axes, begin), strict=True))
+    ray = camera.multiply(row.axes, direction)
+    local_start = tuple(o + s for o, s in zip(row.origin, camera.multiply(row.axes, begin), strict=True))
     start = jax.lax.stop_gradient(start)
     near = tuple(b + start * r for b, r in zip(local_start, ray, strict=True))
     gradient = _gradient(scene, row, near)
     height = 0.5 * (dot(gradient, gradient) - 1.0)
     if triangle is not None:
-        gradient = _across(triangle, gradient)
-        height = jnp.where(triangle.seen, dot(gradient, near) + triangle.maps[2][3], height)
+        gradient = _override_gradient(triangle, gradient)
+        height = jnp.where(triangle.hit, dot(gradient, near) + triangle.maps[2][3], height)
     slope = dot(gradient, ray)
     slope = jnp.where(jnp.abs(slope) < 1e-12, 1e-12, slope)
     depth, local = start, near
@@ -73,67 +73,67 @@ def meet(scene: Scene, row: Row, triangle: TriangleRow | None, rays: Rays, start
         local = tuple(n - step * r for n, r in zip(near, ray, strict=True))
     facing = gradient = _gradient(scene, row, local)
     if triangle is not None:
-        gradient = _across(triangle, gradient)
-        smooth = mix(triangle.normals, shares(triangle, local))
-        facing = tuple(jnp.where(triangle.seen, own, other) for own, other in zip(smooth, facing, strict=True))
-    normal = normalized(_to_camera(row, facing))
+        gradient = _override_gradient(triangle, gradient)
+        smooth = mix(triangle.normals, barycentric(triangle, local))
+        facing = tuple(jnp.where(triangle.hit, own, other) for own, other in zip(smooth, facing, strict=True))
+    normal = normalized(_gradient_to_camera(row, facing))
     point = tuple(b + depth * d for b, d in zip(begin, direction, strict=True))
     return Hit(depth, point, local, gradient, slope, normal, triangle)
 
 
-def _to_camera(row: Row, gradient: Vector) -> Vector:
-    """A gradient in the unit shape's frame goes back to the camera's with the transpose of the map."""
+def _gradient_to_camera(row: Row, gradient: Vector) -> Vector:
+    """Transform a gradient from the unit shape's frame to the camera's, by the transpose of the map."""
     return tuple(sum(row.axes[i][j] * gradient[i] for i in range(3)) for j in range(3))
 
 
-def outward(row: Row, hit: Hit) -> Vector:
-    """The normal of a primitive at any length, in the camera's frame."""
-    return _to_camera(row, hit.gradient)
+def outward_normal(row: Row, hit: Hit) -> Vector:
+    """Compute the unnormalised outward normal of a primitive in the camera's frame."""
+    return _gradient_to_camera(row, hit.gradient)
 
 
-def _across(triangle: TriangleRow, gradient: Vector) -> Vector:
-    """The direction across the triangle where one is seen, the gradient elsewhere."""
-    return tuple(jnp.where(triangle.seen, own, other) for own, other in zip(triangle.maps[2][:3], gradient, strict=True))
+def _override_gradient(triangle: TriangleRow, gradient: Vector) -> Vector:
+    """Return the triangle's normal where a triangle is hit, the gradient elsewhere."""
+    return tuple(jnp.where(triangle.hit, own, other) for own, other in zip(triangle.maps[2][:3], gradient, strict=True))
 
 
-def shares(triangle: TriangleRow, place: Vector, moved: bool = False) -> list[jax.Array]:
-    """Barycentric coordinates of the second and third corner at a point, or (``moved``) their change along a vector."""
-    base = 0.0 if moved else 1.0
-    return [dot(map_[:3], place) + base * map_[3] for map_ in triangle.maps[:2]]
+def barycentric(triangle: TriangleRow, point: Vector, is_tangent: bool = False) -> list[jax.Array]:
+    """Compute barycentric coordinates of the 2nd and 3rd corner at a point, or (``is_tangent``) their change along a vector."""
+    base = 0.0 if is_tangent else 1.0
+    return [dot(map_[:3], point) + base * map_[3] for map_ in triangle.maps[:2]]
 
 
-def mix(corners: tuple, parts: list[jax.Array], moved: bool = False) -> list[jax.Array]:
-    """Vectors between those at the three corners, given the `shares`; or (``moved``) their change, given that of the shares."""
-    base = 0.0 if moved else 1.0
+def mix(corners: tuple, parts: list[jax.Array], is_tangent: bool = False) -> list[jax.Array]:
+    """Interpolate vectors between corners by `barycentric` coordinates, or (``is_tangent``) the change of the vectors."""
+    base = 0.0 if is_tangent else 1.0
     second, third = parts
     return [base * a + second * (b - a) + third * (c - a) for a, b, c in zip(*corners, strict=True)]
 
 
 def corners(row: Row, hit: Hit) -> list[tuple[jax.Array, Hit]]:
-    """What OpenGL lights instead of a triangle's points: its corners, each with its share of the point, [P].
+    """Return the corners of a triangle, each with its barycentric weight [P], because OpenGL lights corners instead of points.
 
-    Where no mesh is seen, each corner is the point itself. (The triangles of a height field are many and flat.)
+    Where no mesh is hit, all corners are the hit point itself. (The triangles of a height field are small and flat.)
     """
     assert hit.triangle is not None
     triangle = hit.triangle
-    seen = triangle.seen & (row.kind == shapes.MESH)
-    second, third = shares(triangle, hit.local)
-    found = []
+    is_mesh = triangle.hit & (row.kind == shapes.MESH)
+    second, third = barycentric(triangle, hit.local)
+    corner_hits = []
     for number, share in enumerate((1.0 - second - third, second, third)):
         local = tuple(corner - o for corner, o in zip(triangle.corners[number], row.origin, strict=True))
         facing = triangle.normals[number]
-        # The axes of a mesh are a rotation: its transpose leads back to the camera's frame.
-        point, normal = _to_camera(row, local), _to_camera(row, facing)
-        own = tuple(jnp.where(seen, new, old) for new, old in zip(point, hit.point, strict=True))
-        turned = tuple(jnp.where(seen, new, old) for new, old in zip(normal, hit.normal, strict=True))
-        found.append((jnp.where(seen, share, 1.0 if number == 0 else 0.0), hit._replace(point=own, normal=turned)))
-    return found
+        # The axes of a mesh are a rotation: its transpose maps back to the camera's frame.
+        point, normal = _gradient_to_camera(row, local), _gradient_to_camera(row, facing)
+        own = tuple(jnp.where(is_mesh, new, old) for new, old in zip(point, hit.point, strict=True))
+        turned = tuple(jnp.where(is_mesh, new, old) for new, old in zip(normal, hit.normal, strict=True))
+        corner_hits.append((jnp.where(is_mesh, share, 1.0 if number == 0 else 0.0), hit._replace(point=own, normal=turned)))
+    return corner_hits
 
 
 def _gradient(scene: Scene, row: Row, local: Vector) -> Vector:
-    """Outward gradient g in the unit shape's frame, so that (g.g - 1) / 2 is the height above the surface.
+    """Compute the outward gradient g in the unit shape's frame, such that (g.g - 1) / 2 is the height above the surface.
 
-    Only the types in the scene cost anything.
+    Only the types present in the scene are computed.
     """
     x, y, z = local
     types = set(scene.object_types)
@@ -142,15 +142,15 @@ def _gradient(scene: Scene, row: Row, local: Vector) -> Vector:
         gradient = (x, y, jnp.where(row.kind == shapes.CAPSULE, z - jnp.clip(z, -row.extra, row.extra), z))
     if shapes.CYLINDER in types:
         is_cylinder = row.kind == shapes.CYLINDER
-        # On the surface either |z| is 1 and the radius less, or the radius is 1 and |z| less.
+        # On the surface, either |z| is 1 and the radius at most 1, or the radius is 1 and |z| at most 1.
         on_cap = z * z >= x * x + y * y
         wall, cap = is_cylinder & ~on_cap, is_cylinder & on_cap
         gradient = (jnp.where(cap, 0.0, x), jnp.where(cap, 0.0, y), jnp.where(wall, 0.0, gradient[2]))
     if shapes.BOX in types:
         is_box = row.kind == shapes.BOX
-        most = jnp.maximum(jnp.maximum(jnp.abs(x), jnp.abs(y)), jnp.abs(z))
+        max_abs = jnp.maximum(jnp.maximum(jnp.abs(x), jnp.abs(y)), jnp.abs(z))
         gradient = tuple(
-            jnp.where(is_box & (jnp.abs(value) < most), 0.0, old) for value, old in zip(local, gradient, strict=True)
+            jnp.where(is_box & (jnp.abs(value) < max_abs), 0.0, old) for value, old in zip(local, gradient, strict=True)
         )
     if shapes.PLANE in types:
         is_plane = row.kind == shapes.PLANE

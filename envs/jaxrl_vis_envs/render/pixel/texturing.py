@@ -1,4 +1,4 @@
-"""The colour of the texture that each pixel sees: where on the image it looks, and how many texels it spans there."""
+"""Texture colour of each pixel: texture coordinates and the pixel's footprint in texels."""
 
 import jax
 import jax.numpy as jnp
@@ -13,15 +13,15 @@ from jaxrl_vis_envs.render.scene import Scene
 
 
 def texture_colour(scene: Scene, row: Row, hit: Hit, alpha: bool = False) -> Vector | None:
-    """Red, green and blue that the colour is multiplied with, [P] each in [0, 1]; None in a scene without textures.
+    """Compute the texture's red, green and blue, by which the colour is multiplied, [P] each in [0, 1]; None without textures.
 
-    With ``alpha`` there is a fourth, for textures that all have it.
+    With ``alpha``, it is the fourth component; all textures must have it.
     """
     if not scene.atlas.used:
         return None
     texture = row.texture
     assert texture is not None
-    if not sampling.texels_of(scene).few_textures:
+    if not sampling.atlas_reader(scene).few_textures:
         return _texture_colour(scene, row, texture, hit, alpha)
     plain = (jnp.ones_like(hit.depth),) * 3
     any_texture = jnp.max(texture.mapping) > 0.0
@@ -29,25 +29,27 @@ def texture_colour(scene: Scene, row: Row, hit: Hit, alpha: bool = False) -> Vec
 
 
 def _texture_colour(scene: Scene, row: Row, texture: TextureRow, hit: Hit, alpha: bool) -> Vector:
-    """`texture_colour` of a scene that has textures."""
+    """Compute `texture_colour` for a scene with textures."""
     changes = _changes(scene, row, hit)
-    flat = {kind for kind, how in zip(scene.object_types, scene.atlas.mappings, strict=True) if how == textures.FLAT}
+    flat = {kind for kind, mapping in zip(scene.object_types, scene.atlas.mappings, strict=True) if mapping == textures.FLAT}
 
     def chart(*local):
         across, up = charts.chart(flat, row.kind, row.extra, local)
         return texture.scale[0] * across + texture.shift[0], texture.scale[1] * up + texture.shift[1]
 
-    place: tuple = chart(*hit.local)
-    moves = [jax.jvp(chart, hit.local, change)[1] for change in changes]
+    coordinates: tuple = chart(*hit.local)
+    tangents = [jax.jvp(chart, hit.local, change)[1] for change in changes]
     face: jax.Array | int = 0
     repeats: jax.Array | bool = True
     if textures.UNWRAPPED in scene.atlas.mappings and hit.triangle is not None:
-        unwrapped, corners = texture.mapping == textures.UNWRAPPED, hit.triangle.coordinates
-        own = surface.mix(corners, surface.shares(hit.triangle, hit.local))
-        place = tuple(jnp.where(unwrapped, s * o, p) for s, o, p in zip(texture.scale, own, place))
+        is_unwrapped, corners = texture.mapping == textures.UNWRAPPED, hit.triangle.coordinates
+        own = surface.mix(corners, surface.barycentric(hit.triangle, hit.local))
+        coordinates = tuple(jnp.where(is_unwrapped, s * o, p) for s, o, p in zip(texture.scale, own, coordinates))
         for number, change in enumerate(changes):
-            turned = surface.mix(corners, surface.shares(hit.triangle, change, moved=True), moved=True)
-            moves[number] = tuple(jnp.where(unwrapped, s * t, m) for s, t, m in zip(texture.scale, turned, moves[number]))
+            tangent = surface.mix(corners, surface.barycentric(hit.triangle, change, is_tangent=True), is_tangent=True)
+            tangents[number] = tuple(
+                jnp.where(is_unwrapped, s * t, m) for s, t, m in zip(texture.scale, tangent, tangents[number])
+            )
     if textures.CUBE in scene.atlas.mappings:
         is_cube = texture.mapping == textures.CUBE
         x, y, z = hit.local
@@ -55,20 +57,22 @@ def _texture_colour(scene: Scene, row: Row, texture: TextureRow, hit: Hit, alpha
             middle = jnp.clip(z, -row.extra, row.extra)
             z = jnp.where(row.kind == shapes.CAPSULE, middle / jnp.maximum(row.extra, 1e-9) + (z - middle), z)
         scaled = tuple(scale * value for scale, value in zip(texture.scale, (x, y, z), strict=True))
-        cube_face, cube_place, choice = sampling.cube_place(scaled)
+        cube_face, cube_coordinates, choice = sampling.cube_coordinates(scaled)
         face = jnp.where(is_cube & (texture.six_faces > 0.0), cube_face, 0)
-        place = tuple(jnp.where(is_cube, c, p) for c, p in zip(cube_place, place, strict=True))
+        coordinates = tuple(jnp.where(is_cube, c, p) for c, p in zip(cube_coordinates, coordinates, strict=True))
         repeats = ~is_cube
         for number, change in enumerate(changes):
-            turned = sampling.cube_move(choice, cube_place, tuple(s * c for s, c in zip(texture.scale, change, strict=True)))
-            moves[number] = tuple(jnp.where(is_cube, c, move) for c, move in zip(turned, moves[number], strict=True))
-    spreads = [jnp.square(across * texture.width) + jnp.square(down * texture.height) for across, down in moves]
+            tangent = sampling.cube_tangent(
+                choice, cube_coordinates, tuple(s * c for s, c in zip(texture.scale, change, strict=True))
+            )
+            tangents[number] = tuple(jnp.where(is_cube, c, t) for c, t in zip(tangent, tangents[number], strict=True))
+    spreads = [jnp.square(across * texture.width) + jnp.square(down * texture.height) for across, down in tangents]
     colour = sampling.sample(
-        sampling.texels_of(scene),
+        sampling.atlas_reader(scene),
         jnp.asarray(texture.first_level, jnp.int32),
         jnp.asarray(texture.levels, jnp.int32),
         face,
-        place,
+        coordinates,
         jnp.maximum(spreads[0], spreads[1]),
         repeats,
         alpha,
@@ -77,10 +81,10 @@ def _texture_colour(scene: Scene, row: Row, texture: TextureRow, hit: Hit, alpha
 
 
 def _changes(scene: Scene, row: Row, hit: Hit) -> list[Vector]:
-    """How the point in the unit shape's frame moves over the surface from one pixel to the next, across and up."""
+    """Compute the change of the hit point in the unit shape's frame from one pixel to the next, horizontally and vertically."""
     perspective = scene.projection != "orthographic"
     direction = tuple(p / hit.depth for p in hit.point) if perspective else (0.0, 0.0, -1.0)
-    ray = camera.mapped(row.axes, direction)
+    ray = camera.multiply(row.axes, direction)
     changes = []
     for axis, pitch in enumerate(camera.pixel_pitch(scene)):
         across = tuple(row.axes[i][axis] * (pitch * hit.depth if perspective else pitch) for i in range(3))

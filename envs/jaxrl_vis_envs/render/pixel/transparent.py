@@ -1,9 +1,9 @@
-"""Objects that let light through, laid over the opaque image as MuJoCo does it.
+"""Transparent objects, blended over the opaque image as in MuJoCo.
 
 MuJoCo sorts them by the distance of their nearest point and draws them twice, front to back and then back to front, so that a
-single sheet of alpha a covers 1 - (1 - a)^2 of what is behind it. Of those that are equally far the one that is declared first
-counts as the nearer. Every face of an object that looks to the camera covers something: of a cup that is its outside and its
-inside behind. In depth and segmentation what is transparent counts like any other object.
+single sheet of alpha a covers 1 - (1 - a)^2 of the background. Of objects at the same distance, the one declared first counts
+as nearer. Every face of an object that faces the camera is blended: for a cup, its outside and its inner back. Depth and
+segmentation treat transparent objects like any other.
 """
 
 import functools
@@ -18,63 +18,70 @@ from jaxrl_vis_envs.render.model import reading
 from jaxrl_vis_envs.render.pixel import lights, lookup, raycast, shade, shapes, surface, texturing, triangles
 from jaxrl_vis_envs.render.scene import Scene
 
-# What MuJoCo leaves of a plane's alpha when it is seen from behind.
+# MuJoCo's factor of a plane's alpha when seen from behind.
 _PLANE_BACK = 0.3
-# What is not further behind what is opaque than this share of the depth is seen: it may be the same surface drawn twice.
-_SAME = 1e-6
-# So many faces of an object, one over the other, count in gradients; in images all do.
-_STEEP_FACES = 8
+# Relative depth tolerance for visibility behind an opaque surface, which may be the same surface drawn twice.
+_DEPTH_TOLERANCE = 1e-6
+# Number of an object's overlapping faces that contribute to gradients; in images, all do.
+_MAX_GRADIENT_FACES = 8
 
 
 class Sheet(NamedTuple):
-    """One transparent object: its row, its columns, where it is met and where that is before all that is opaque ([P] bool)."""
+    """Intersections with one transparent object.
+
+    Attributes:
+        index: Row of the object.
+        row: Its properties.
+        hit: Intersections, [P].
+        visible: [P] bool, where they are in front of all opaque objects.
+    """
 
     index: int
     row: lookup.Row
     hit: surface.Hit
-    seen: jax.Array
+    visible: jax.Array
 
 
 class Film(NamedTuple):
-    """Effect of an object on the colour c behind it: ``colour + share * c``, [P] each, the colour of three."""
+    """Effect of an object on the colour c behind it: ``colour + transmission * c``, [P] each, with three colour components."""
 
     colour: tuple
-    share: jax.Array
+    transmission: jax.Array
 
 
-def sheets(scene: Scene, unit: shapes.UnitShapes, rows: jax.Array, rays: Rays, depth: jax.Array) -> list[Sheet]:
-    """The transparent objects before ``depth`` ([P] float32, metres, of what is opaque)."""
-    depth = _reach(depth)
-    found = []
+def intersect_sheets(scene: Scene, unit: shapes.UnitShapes, rows: jax.Array, rays: Rays, depth: jax.Array) -> list[Sheet]:
+    """Intersect the transparent objects in front of ``depth`` ([P] float32, metres, of opaque objects)."""
+    depth = _max_visible_depth(depth)
+    sheets = []
     for index in (index for index, clear in enumerate(scene.transparent) if clear):
         triangle = None
         if scene.object_types[index] in (shapes.MESH, shapes.HFIELD):
             frozen = jax.lax.stop_gradient(unit)
             t, triangle, _ = triangles.nearest_triangle(scene, frozen, rays, depth, only=index)
-            seen = triangle >= 0
+            visible = triangle >= 0
         else:
             t, meets = raycast.row_entry(scene, jax.lax.stop_gradient(unit), index, rays)
-            seen = meets & (t > scene.znear) & (t < depth)
+            visible = meets & (t > scene.znear) & (t < depth)
         if scene.transparent[index] == reading.CLEAR_FROM_BEHIND:
-            seen = seen & raycast.behind(unit, index)
+            visible = visible & raycast.is_behind(unit, index)
         row = lookup.read_row(rows[index])
-        # A start that means nothing would be a source of NaN in gradients.
-        t = jnp.where(seen, t, 1.0)
-        found.append(Sheet(index, row, surface.meet(scene, row, lookup.fetch_triangle(scene, triangle), rays, t), seen))
-    return found
+        # A meaningless initial depth would cause NaN in gradients.
+        t = jnp.where(visible, t, 1.0)
+        sheets.append(Sheet(index, row, surface.meet(scene, row, lookup.fetch_triangle(scene, triangle), rays, t), visible))
+    return sheets
 
 
-def _reach(depth: jax.Array) -> jax.Array:
-    """Distances up to which transparent objects are seen, given the depth of opaque ones, [P] metres each."""
-    return jax.lax.stop_gradient(depth) * (1.0 + _SAME)
+def _max_visible_depth(depth: jax.Array) -> jax.Array:
+    """Return the distances up to which transparent objects are visible, from the depth of opaque ones, [P] metres each."""
+    return jax.lax.stop_gradient(depth) * (1.0 + _DEPTH_TOLERANCE)
 
 
-def nearest(found: list[Sheet], depth: jax.Array, index: jax.Array, normal: tuple) -> tuple[jax.Array, jax.Array, tuple]:
-    """Depth, row and normal of the nearest object of all, given those of the nearest opaque one; [P] each."""
-    for sheet in found:
-        # Of two that are equally far, the one that is drawn later; rows are in the opposite order.
-        margin = jnp.where(sheet.index < index, _SAME, -_SAME) * depth
-        nearer = sheet.seen & (sheet.hit.depth < depth + margin)
+def nearest(sheets: list[Sheet], depth: jax.Array, index: jax.Array, normal: tuple) -> tuple[jax.Array, jax.Array, tuple]:
+    """Update depth, row and normal of the nearest opaque object with the nearest transparent one; [P] each."""
+    for sheet in sheets:
+        # Of two at the same depth, the one drawn later wins; rows are in the opposite order.
+        margin = jnp.where(sheet.index < index, _DEPTH_TOLERANCE, -_DEPTH_TOLERANCE) * depth
+        nearer = sheet.visible & (sheet.hit.depth < depth + margin)
         depth = jnp.where(nearer, sheet.hit.depth, depth)
         index = jnp.where(nearer, sheet.index, index)
         normal = tuple(jnp.where(nearer, new, old) for new, old in zip(sheet.hit.normal, normal, strict=True))
@@ -86,73 +93,77 @@ def blend(
     unit: shapes.UnitShapes,
     rows: jax.Array,
     light_table: jax.Array,
-    found: list[Sheet],
+    sheets: list[Sheet],
     rays: Rays,
     depth: jax.Array,
     colour: tuple,
 ) -> tuple:
-    """The colours [P] (three) of what is opaque and ``depth`` [P] away, with the sheets laid over them."""
-    if not found:
+    """Blend the sheets over the colours [P] (three) of the opaque objects at ``depth`` [P]."""
+    if not sheets:
         return colour
-    declared = sorted(found, key=lambda sheet: scene.object_ids[sheet.index])
+    declared = sorted(sheets, key=lambda sheet: scene.object_ids[sheet.index])
     films = []
     for sheet in declared:
         if sheet.hit.triangle is None:
-            film = _cover(_bare_film(rays), *_coat(scene, unit, light_table, sheet, rays))
+            film = _add_face(_clear_film(rays), *_face_colour(scene, unit, light_table, sheet, rays))
         else:
-            film = _faces(sheet.index, scene, unit, rows, light_table, rays, _reach(depth))
-        films.append(jnp.stack([*film.colour, film.share]))
+            film = _blend_faces(sheet.index, scene, unit, rows, light_table, rays, _max_visible_depth(depth))
+        films.append(jnp.stack([*film.colour, film.transmission]))
     stack = jnp.stack(films)
-    # Stable: what is equally far stays in the order in which it was declared.
+    # Stable sort: objects at the same distance stay in order of declaration.
     order = jnp.argsort(unit.distance[np.array([sheet.index for sheet in declared])])
-    for place in [*range(len(found)), *reversed(range(len(found)))]:
-        film = stack[order[place]]
+    for index in [*range(len(sheets)), *reversed(range(len(sheets)))]:
+        film = stack[order[index]]
         colour = tuple(film[channel] + film[3] * c for channel, c in enumerate(colour))
     return colour
 
 
-def _coat(scene: Scene, unit: shapes.UnitShapes, light_table: jax.Array, sheet: Sheet, rays: Rays) -> tuple[tuple, jax.Array]:
-    """Colour and alpha of one face, [P] each; where it is not seen, alpha is 0."""
-    # Only what is opaque shows shadows.
-    bare = [light._replace(shadows=False) for light in lights.unpack(scene, light_table)]
-    own: Any = shade.lighted(scene, unit, bare, sheet.row, sheet.hit, rays)
+def _face_colour(
+    scene: Scene, unit: shapes.UnitShapes, light_table: jax.Array, sheet: Sheet, rays: Rays
+) -> tuple[tuple, jax.Array]:
+    """Compute colour and alpha of one face, [P] each; alpha is 0 where it is not visible."""
+    # Only opaque objects receive shadows.
+    unshadowed = [light._replace(shadows=False) for light in lights.unpack(scene, light_table)]
+    face: Any = shade.light_surface(scene, unit, unshadowed, sheet.row, sheet.hit, rays)
     alpha = scene.rgba[scene.object_ids[sheet.index], 3]
     if scene.object_types[sheet.index] == shapes.PLANE:
-        alpha = jnp.where(raycast.behind(unit, sheet.index), _PLANE_BACK * alpha, alpha)
+        alpha = jnp.where(raycast.is_behind(unit, sheet.index), _PLANE_BACK * alpha, alpha)
     image = None
     if scene.atlas.images[sheet.index] is not None:
         image = texturing.texture_colour(scene, sheet.row, sheet.hit, scene.atlas.alpha[sheet.index])
     if image is not None:
-        own = tuple(value * texel for value, texel in zip(own, image[:3], strict=True))
-        # A plane that is only clear from behind has a material that MuJoCo calls opaque; the alpha of its texture counts too.
+        face = tuple(value * texel for value, texel in zip(face, image[:3], strict=True))
+        # A plane that is transparent only from behind has an opaque material in MuJoCo; its texture's alpha counts too.
         alpha = alpha * image[3] if scene.atlas.alpha[sheet.index] else alpha
-    return own, jnp.where(sheet.seen, alpha, 0.0)
+    return face, jnp.where(sheet.visible, alpha, 0.0)
 
 
-def _cover(film: Film, own: tuple, alpha: jax.Array) -> Film:
-    """The film with one more face over it."""
-    return Film(tuple(old + alpha * (new - old) for old, new in zip(film.colour, own, strict=True)), film.share * (1.0 - alpha))
+def _add_face(film: Film, face: tuple, alpha: jax.Array) -> Film:
+    """Blend one more face over the film."""
+    return Film(
+        tuple(old + alpha * (new - old) for old, new in zip(film.colour, face, strict=True)), film.transmission * (1.0 - alpha)
+    )
 
 
-def _bare_film(rays: Rays) -> Film:
+def _clear_film(rays: Rays) -> Film:
     zero = jnp.zeros_like(rays.u)
     return Film((zero,) * 3, jnp.ones_like(rays.u))
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _faces(
+def _blend_faces(
     index: int, scene: Scene, unit: shapes.UnitShapes, rows: jax.Array, light_table: jax.Array, rays: Rays, depth: jax.Array
 ) -> Film:
-    """All faces of a mesh or a height field that look to the camera, in the order in which MuJoCo draws them."""
+    """Blend all faces of a mesh or a height field that face the camera, in MuJoCo's drawing order."""
 
-    def lay(state: tuple) -> tuple:
-        return _lay_face(index, scene, unit, rows, light_table, rays, depth, state)
+    def blend_next(state: tuple) -> tuple:
+        return _blend_next_face(index, scene, unit, rows, light_table, rays, depth, state)
 
     first = triangles.next_triangle(scene, unit, rays, depth, index, jnp.full(rays.u.shape, -1, jnp.int32))
-    return jax.lax.while_loop(lambda state: jnp.any(state[1][1] >= 0), lay, (_bare_film(rays), first))[0]
+    return jax.lax.while_loop(lambda state: jnp.any(state[1][1] >= 0), blend_next, (_clear_film(rays), first))[0]
 
 
-def _lay_face(
+def _blend_next_face(
     index: int,
     scene: Scene,
     unit: shapes.UnitShapes,
@@ -162,30 +173,30 @@ def _lay_face(
     depth: jax.Array,
     state: tuple,
 ) -> tuple:
-    """The film with the next face over it; and depths and rows of the triangles after it."""
+    """Blend the next face over the film; return it with the depths and rows of the following triangles."""
     film, (t, triangle) = state
-    seen = triangle >= 0
+    visible = triangle >= 0
     row = lookup.read_row(rows[index])
-    hit = surface.meet(scene, row, lookup.fetch_triangle(scene, triangle), rays, jnp.where(seen, t, 1.0))
-    film = _cover(film, *_coat(scene, unit, light_table, Sheet(index, row, hit, seen), rays))
-    # Where there was none there is none further on.
-    after = jnp.where(seen, triangle, jnp.iinfo(jnp.int32).max - 1)
+    hit = surface.meet(scene, row, lookup.fetch_triangle(scene, triangle), rays, jnp.where(visible, t, 1.0))
+    film = _add_face(film, *_face_colour(scene, unit, light_table, Sheet(index, row, hit, visible), rays))
+    # Where there was none, there is none later.
+    after = jnp.where(visible, triangle, jnp.iinfo(jnp.int32).max - 1)
     return film, triangles.next_triangle(scene, jax.lax.stop_gradient(unit), rays, depth, index, after)
 
 
-@_faces.defjvp
-def _slopes(index: int, primals: tuple, tangents: tuple) -> tuple[Film, Film]:
-    """Differentiate through the first faces: a loop that ends where the image says has no transpose."""
+@_blend_faces.defjvp
+def _blend_faces_jvp(index: int, primals: tuple, tangents: tuple) -> tuple[Film, Film]:
+    """Differentiate through the first faces: a loop with a data-dependent length cannot be transposed."""
 
-    def few(scene: Scene, unit: shapes.UnitShapes, *others: Any) -> Film:
+    def blend_first(scene: Scene, unit: shapes.UnitShapes, *others: Any) -> Film:
         rows, light_table, rays, depth = others
         frozen = jax.lax.stop_gradient(unit)
         none = jnp.full(rays.u.shape, -1, jnp.int32)
 
-        def lay(state: tuple, _: None) -> tuple:
-            return _lay_face(index, scene, unit, rows, light_table, rays, depth, state), None
+        def blend_next(state: tuple, _: None) -> tuple:
+            return _blend_next_face(index, scene, unit, rows, light_table, rays, depth, state), None
 
         first = triangles.next_triangle(scene, frozen, rays, depth, index, none)
-        return jax.lax.scan(lay, (_bare_film(rays), first), None, length=_STEEP_FACES)[0][0]
+        return jax.lax.scan(blend_next, (_clear_film(rays), first), None, length=_MAX_GRADIENT_FACES)[0][0]
 
-    return _faces(index, *primals), jax.jvp(few, primals, tangents)[1]
+    return _blend_faces(index, *primals), jax.jvp(blend_first, primals, tangents)[1]
