@@ -259,9 +259,8 @@ def _filter() -> Claim:
     return Claim(
         "The filter removes false negatives",
         PARTLY if active else FAILS,
-        f"Active (1 % of negatives or more) on {', '.join(SHORT[task] for task in active) or 'none'}; "
-        "share of negatives dropped: "
-        f"{', '.join(f'{SHORT[task]} {share:.3f}' for task, share in shares.items())}. "
+        f"Active (1 % of negatives or more) on {', '.join(SHORT[task] for task in active) or 'none'}; share of negatives "
+        f"dropped: {', '.join(f'{SHORT[task]} {share:.3f}' for task, share in shares.items())}. "
         f"On the hand {precision:.2f} of these are false at the end, {chance:.2f} of all negatives",
         "without the filter, " + "; ".join(comparison.text for comparison in comparisons),
         f"[the hand]({_INDICATOR}#the-hand)",
