@@ -57,7 +57,6 @@ def physics_and_camera() -> str:
     import jax.numpy as jnp
 
     import jaxrl_vis_envs
-    from jaxrl_vis_envs.compilation import env_jit
 
     env = jaxrl_vis_envs.make("VisualReacher", image_size=32)
     start = time.perf_counter()
@@ -66,7 +65,7 @@ def physics_and_camera() -> str:
         state = env.step(env.reset(key), jnp.full((env.action_size,), 0.5, jnp.float32))
         return state.achieved_state, state.obs
 
-    position, obs = env_jit(step_once, runs_once=True)(jax.random.key(0))
+    position, obs = jaxrl_vis_envs.jit(step_once, runs_once=True)(jax.random.key(0))
     if not bool(jnp.isfinite(position).all()):
         raise FloatingPointError("the state after one physics step is not finite")
     frame, goal = obs["observation"], obs["desired_goal"]

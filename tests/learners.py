@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import probe_environments as probes
 
+import jaxrl_vis_envs
 from jaxrl_vis.config import preset
 from jaxrl_vis.learner.train_step import make_train_step
-from jaxrl_vis_envs.compilation import env_jit
 
 # Fields that only gradient steps and evaluations read. (`normalizer_source` can make insertion relabel, too.)
 _LATER = ("updates_per_iteration", "batch_size", "n_step", "target_decay", "target_update_interval", "actor_interval") + (
@@ -63,5 +63,5 @@ def iteration_of_one(several, config):
     def iterate(chosen, loop):
         return make_train_step(OneOf(several, chosen), config).train_iteration.__wrapped__(loop)
 
-    compiled = env_jit(iterate, donate_argnums=1)
+    compiled = jaxrl_vis_envs.jit(iterate, donate_argnums=1)
     return lambda chosen, loop: compiled(jnp.int32(chosen), loop)

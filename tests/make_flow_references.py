@@ -17,7 +17,6 @@ import jax
 import numpy as np
 
 import jaxrl_vis_envs
-from jaxrl_vis_envs.compilation import env_jit
 
 TASKS = ("VisualFetchReach", "VisualHandReach", "VisualFingerTurn")
 SIZES = (64, 100)
@@ -43,9 +42,9 @@ def render(task: str) -> dict[int, np.ndarray]:
         state = env.reset(reset_key).replace(obs=None)
         return jax.lax.scan(step, state, jax.random.split(action_key, FRAMES))[1]
 
-    states = env_jit(jax.vmap(episode))(jax.random.split(jax.random.key(SEED), EPISODES))
+    states = jaxrl_vis_envs.jit(jax.vmap(episode))(jax.random.split(jax.random.key(SEED), EPISODES))
     flat = jax.tree.map(lambda leaf: leaf.reshape(EPISODES * FRAMES, *leaf.shape[2:]), states)
-    draw = {size: env_jit(lambda states, env=env: jax.lax.map(env.observe, states)) for size, env in envs.items()}
+    draw = {size: jaxrl_vis_envs.jit(lambda states, env=env: jax.lax.map(env.observe, states)) for size, env in envs.items()}
     return {size: np.asarray(draw[size](flat)).reshape(EPISODES, FRAMES, 3, size, size) for size in SIZES}
 
 

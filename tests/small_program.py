@@ -4,12 +4,12 @@ import collections
 import dataclasses
 import functools
 
+import jaxrl_vis_envs
 from jaxrl_vis.config import Config
 from jaxrl_vis.learner import train_step
 from jaxrl_vis.learner.environment import make_env
 from jaxrl_vis.run.kept_programs import HOST_FIELDS
 from jaxrl_vis_envs.base import GoalEnv
-from jaxrl_vis_envs.compilation import env_jit
 
 _TRACES: collections.Counter[Config] = collections.Counter()
 
@@ -28,7 +28,7 @@ def _program_of(config: Config) -> train_step.TrainStep:
         _TRACES[config] += 1
         return original(loop, parts)
 
-    learn = env_jit(learn_parts, donate_argnums=0)
+    learn = jaxrl_vis_envs.jit(learn_parts, donate_argnums=0)
     return dataclasses.replace(program, parts=dataclasses.replace(program.parts, learn=learn))
 
 

@@ -15,14 +15,14 @@ from jaxrl_vis.config import preset
 from jaxrl_vis.learner import encoder_kernel_passes
 from jaxrl_vis.learner.sharding import ONE_DEVICE
 from jaxrl_vis.run.programs import Programs, rarely_collecting_garbage
-from jaxrl_vis_envs import compilation, gpu_kernels
-from jaxrl_vis_envs.compilation import (
-    by_platform,
+from jaxrl_vis_envs.compiling import compilation, gpu_kernels
+from jaxrl_vis_envs.compiling.compilation import (
+    dispatch_by_platform,
     kernels,
-    runs_gpu_kernels,
     targets_cpu,
     tracing_for,
     tracing_for_default_device,
+    use_gpu_kernels,
 )
 from jaxrl_vis_envs.physics import newton_kernel, steps_kernel
 from jaxrl_vis_envs.render import render_planes
@@ -54,7 +54,7 @@ def lowered(function, platform: str, *arguments) -> str:
 def test_a_process_without_an_accelerator_traces_for_the_cpu_alone():
     assert compilation.accelerator() is None
     traced = []
-    by_platform(lambda x: traced.append(compilation.target_platform()) or x, jnp.ones(()))
+    dispatch_by_platform(lambda x: traced.append(compilation.target_platform()) or x, jnp.ones(()))
     assert traced == ["cpu"]
 
 
@@ -65,7 +65,7 @@ def test_a_process_without_an_accelerator_traces_for_the_cpu_alone():
 def test_kernels_are_left_to_gpus_that_run_them(platform, capability, expected, gpu):
     gpu(capability)
     with tracing_for(platform):
-        assert runs_gpu_kernels() is expected
+        assert use_gpu_kernels() is expected
 
 
 @pytest.mark.parametrize(
@@ -76,15 +76,15 @@ def test_kernels_can_be_switched_off_and_on(variable, inside, expected, gpu, mon
     gpu()
     monkeypatch.setenv("JAXRL_VIS_KERNELS", variable)
     with tracing_for("cuda"), kernels(inside):
-        assert runs_gpu_kernels() is expected
+        assert use_gpu_kernels() is expected
     with kernels(True), tracing_for("cpu"):
-        assert not runs_gpu_kernels()
+        assert not use_gpu_kernels()
 
 
 def test_a_wrong_value_of_the_variable_is_refused(monkeypatch):
     monkeypatch.setenv("JAXRL_VIS_KERNELS", "yes")
     with pytest.raises(ValueError, match="JAXRL_VIS_KERNELS is 'yes'.*0 .*1 .*auto"):
-        runs_gpu_kernels()
+        use_gpu_kernels()
 
 
 def test_a_kernel_that_does_not_compile_is_left_out_and_named_once(gpu, monkeypatch, capsys):
@@ -101,7 +101,7 @@ def test_a_kernel_that_does_not_compile_is_left_out_and_named_once(gpu, monkeypa
     @jax.jit
     def traced(x):
         with tracing_for("cuda"):
-            return x + runs_gpu_kernels(breaks) + 2 * runs_gpu_kernels(works) + 4 * runs_gpu_kernels(breaks)
+            return x + use_gpu_kernels(breaks) + 2 * use_gpu_kernels(works) + 4 * use_gpu_kernels(breaks)
 
     assert traced(jnp.float32(0)) == 2
     assert calls == ["cuda", "works"]
@@ -109,7 +109,7 @@ def test_a_kernel_that_does_not_compile_is_left_out_and_named_once(gpu, monkeypa
     assert len(said) == 1 and "NVIDIA Test" in said[0] and "ptxas: no" in said[0] and "JAXRL_VIS_KERNELS=0" in said[0]
     monkeypatch.setenv("JAXRL_VIS_KERNELS", "1")  # asks for the error itself
     with tracing_for("cuda"):
-        assert runs_gpu_kernels(breaks)
+        assert use_gpu_kernels(breaks)
 
 
 def run_of(function) -> Programs:
@@ -121,7 +121,7 @@ def run_of(function) -> Programs:
 
 def test_a_run_trusts_kernels_and_asks_where_its_programs_do_not_compile(gpu, monkeypatch, capsys):
     gpu()
-    monkeypatch.setattr(compilation, "_trusted", set())
+    monkeypatch.setattr(compilation, "_assumed", set())
     probed = []
 
     def breaks() -> None:
@@ -133,8 +133,8 @@ def test_a_run_trusts_kernels_and_asks_where_its_programs_do_not_compile(gpu, mo
 
     def function(keys):
         with tracing_for("cuda"):
-            assert runs_gpu_kernels(works)
-            if runs_gpu_kernels(breaks):
+            assert use_gpu_kernels(works)
+            if use_gpu_kernels(breaks):
                 raise RuntimeError("as compilers fail")
             return jnp.ones(3)
 
@@ -145,10 +145,10 @@ def test_a_run_trusts_kernels_and_asks_where_its_programs_do_not_compile(gpu, mo
 
     def mistaken(keys):
         with tracing_for("cuda"):
-            assert runs_gpu_kernels(works)
+            assert use_gpu_kernels(works)
         raise ZeroDivisionError
 
-    monkeypatch.setattr(compilation, "_trusted", set())
+    monkeypatch.setattr(compilation, "_assumed", set())
     with pytest.raises(ZeroDivisionError):
         run_of(mistaken).compiled("init")
     assert not capsys.readouterr().err
@@ -163,7 +163,7 @@ def test_a_run_whose_programs_compile_asks_nothing(gpu):
 
     def function(keys):
         with tracing_for("cuda"):
-            return jnp.ones(3) * runs_gpu_kernels(probe)
+            return jnp.ones(3) * use_gpu_kernels(probe)
 
     programs = run_of(function)
     assert programs.compiled("init")(programs.run_keys).sum() == 3
@@ -181,7 +181,7 @@ def test_the_kernels_themselves_are_probed_in_the_midst_of_a_trace(module, gpu):
     @jax.jit
     def traced(x):
         with tracing_for("cuda"):
-            return x + runs_gpu_kernels(probe)
+            return x + use_gpu_kernels(probe)
 
     assert traced(jnp.float32(0)) == 1
 
@@ -189,9 +189,9 @@ def test_the_kernels_themselves_are_probed_in_the_midst_of_a_trace(module, gpu):
 @pytest.mark.skipif(jax.__version_info__ < (0, 11), reason="JAX 0.10 does not ask what a GPU is called")
 @pytest.mark.parametrize(("capability", "name"), [("8.6", "NVIDIA A10"), ("8.7", "NVIDIA A10"), ("7.5", None)])
 def test_a_card_that_jax_does_not_know_is_called_by_the_name_of_one_like_it(gpu, monkeypatch, capability, name):
-    monkeypatch.setattr(gpu_kernels, "_called", {})
+    monkeypatch.setattr(gpu_kernels, "_substitutes", {})
     gpu(capability)
-    assert gpu_kernels._stand_in() == name
+    assert gpu_kernels._substitute_name() == name
 
     def double(source, target):
         target[...] = 2.0 * source[...]
@@ -213,7 +213,7 @@ def test_a_program_holds_the_branch_of_its_own_platform(gpu):
         return jnp.sin(x) if targets_cpu() else jnp.sin(x) + 0.0 * jnp.exp(x)
 
     def slope(x):
-        return jax.vmap(jax.grad(lambda x: by_platform(function, x)))(x)
+        return jax.vmap(jax.grad(lambda x: dispatch_by_platform(function, x)))(x)
 
     x = jnp.arange(3.0)
     assert "exponential" in lowered(slope, "cuda", x) and "exponential" not in lowered(slope, "cpu", x)
@@ -227,11 +227,11 @@ def test_a_function_is_traced_for_each_platform_and_choice(gpu):
 
     @jax.jit
     def inner(x):
-        traced.append((compilation.target_platform(), runs_gpu_kernels()))
+        traced.append((compilation.target_platform(), use_gpu_kernels()))
         return x + 1.0
 
     def outer(x):
-        return by_platform(inner, x)
+        return dispatch_by_platform(inner, x)
 
     lowered(lambda x: outer(x), "cpu", jnp.ones(()))
     with kernels(False):
@@ -248,13 +248,13 @@ def test_programs_of_the_default_device_are_traced_once(gpu, monkeypatch):
         return x
 
     with tracing_for_default_device():  # a CPU
-        by_platform(function, jnp.ones(()))
+        dispatch_by_platform(function, jnp.ones(()))
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     with tracing_for_default_device():
-        by_platform(function, jnp.ones(()))
+        dispatch_by_platform(function, jnp.ones(()))
     monkeypatch.setattr(jax, "config", SimpleNamespace(jax_default_device=SimpleNamespace(platform="cpu")))
     with tracing_for_default_device():
-        by_platform(function, jnp.ones(()))
+        dispatch_by_platform(function, jnp.ones(()))
     assert traced == ["cpu", "cuda", "cpu"]
 
 

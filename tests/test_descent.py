@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from nvidia import lowered_for_nvidia
 
+import jaxrl_vis_envs
 from benchmarks.tasks import environments
-from jaxrl_vis_envs.compilation import KERNELS_VARIABLE, env_jit
+from jaxrl_vis_envs.compiling.compilation import KERNELS_VARIABLE
 from jaxrl_vis_envs.physics import algebra, constraints, descent, line_search, newton_kernel
 from jaxrl_vis_envs.physics.descent import Motion, Problem, Structure
 from jaxrl_vis_envs.physics.mjx_model import mjx
@@ -84,7 +85,7 @@ def solved() -> tuple[Problem, Motion]:
     given.stiffness[:, CONE[0] :] = given.stiffness[:, CONE[0] : CONE[0] + 1]
     given.cone[:, :, 0] = given.cone[:, :, 1]
     arrays = jax.tree.map(lambda array: jnp.asarray(array, jnp.float32), given)
-    return given, env_jit(jax.vmap(functools.partial(solve_plainly, STRUCTURE)))(arrays)
+    return given, jaxrl_vis_envs.jit(jax.vmap(functools.partial(solve_plainly, STRUCTURE)))(arrays)
 
 
 def test_no_acceleration_near_the_solution_costs_less(solved):

@@ -16,9 +16,9 @@ from point_mass import PointMass, PointMassConfig
 
 import jaxrl_vis_envs
 from benchmarks.tasks import environments
-from jaxrl_vis_envs import compilation, goals, names, pixels, registry
+from jaxrl_vis_envs import goals, names, pixels, registry
 from jaxrl_vis_envs.base import GoalEnv, State, sanitize_action
-from jaxrl_vis_envs.compilation import env_jit
+from jaxrl_vis_envs.compiling import compilation
 from jaxrl_vis_envs.tasks.config import TaskConfig
 
 BATCH, STEPS = 32, 8
@@ -62,7 +62,7 @@ def images(task: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Images [BATCH, C, H, W] of the goals, of the starts, and after the last step."""
     env, played = make_visual(task), episode(task)
     nowhere = jnp.zeros(played.states[0].goal_state.shape[1])
-    observe = env_jit(jax.vmap(lambda data: env.observe(env.state_at(data, nowhere))))
+    observe = jaxrl_vis_envs.jit(jax.vmap(lambda data: env.observe(env.state_at(data, nowhere))))
     goal, start, end = (np.asarray(observe(data)) for data in (played.goals, played.states[0].data, played.states[-1].data))
     return goal, start, end
 
@@ -162,7 +162,7 @@ def seen_episodes(frame_stack: int = 1) -> tuple[GoalEnv, State, State]:
         start = jax.vmap(env.reset)(keys)
         return start, jax.lax.scan(step, start, actions)[1]
 
-    return env, *jax.device_get(env_jit(play)(jax.random.split(jax.random.key(0), 4), actions))
+    return env, *jax.device_get(jaxrl_vis_envs.jit(play)(jax.random.split(jax.random.key(0), 4), actions))
 
 
 def test_a_visual_task_resets_and_steps_as_its_parts_say() -> None:
@@ -171,8 +171,8 @@ def test_a_visual_task_resets_and_steps_as_its_parts_say() -> None:
     keys = jax.random.split(jax.random.key(0), 4)
     assert start.obs is not None and steps.obs is not None
     nowhere = jnp.zeros(2)
-    observe = env_jit(jax.vmap(lambda data: env.observe(env.state_at(data, nowhere))))
-    np.testing.assert_array_equal(start.obs["desired_goal"], observe(env_jit(jax.vmap(env.sample_goal))(keys)))
+    observe = jaxrl_vis_envs.jit(jax.vmap(lambda data: env.observe(env.state_at(data, nowhere))))
+    np.testing.assert_array_equal(start.obs["desired_goal"], observe(jaxrl_vis_envs.jit(jax.vmap(env.sample_goal))(keys)))
     np.testing.assert_array_equal(start.obs["observation"], observe(start.data))
     for index in range(STEPS):
         seen = observe(jax.tree.map(lambda leaf, index=index: leaf[index], steps.data))
@@ -398,10 +398,10 @@ def test_goals_need_no_mujoco():
     assert subprocess.run([sys.executable, "-c", code], check=False, env=SUBPROCESS_ENVIRONMENT).returncode == 0
 
 
-def test_env_jit_switches_off_what_slows_physics_on_a_cpu_where_jax_can(monkeypatch):
+def test_jit_switches_off_what_slows_physics_on_a_cpu_where_jax_can(monkeypatch):
     options = {}
     monkeypatch.setattr(jax, "jit", lambda function, **given: options.update(given))
-    compilation.env_jit(lambda: None, donate_argnums=0)
+    compilation.jit(lambda: None, donate_argnums=0)
     assert options["donate_argnums"] == 0
     expected = {"xla_cpu_experimental_ynn_fusion_type": ""}
     if jax.__version_info__ < (0, 11):

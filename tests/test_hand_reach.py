@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+import jaxrl_vis_envs
 from benchmarks.tasks import environments, one_step
-from jaxrl_vis_envs.compilation import env_jit
 
 COUNT = 128
 START_TIPS = [
@@ -72,7 +72,7 @@ def test_gym_rule():
     """Thumb and one finger meet near the palm's front, the others stay; one goal in ten is the start itself."""
     env = make(goal_rule="meet")
     keys = jax.random.split(jax.random.key(4), COUNT)
-    asked, got = env_jit(jax.vmap(lambda key: (env._meeting_tips(key), env.sample_goal(key))))(keys)
+    asked, got = jaxrl_vis_envs.jit(jax.vmap(lambda key: (env._meeting_tips(key), env.sample_goal(key))))(keys)
     moved = np.linalg.norm(np.asarray(asked) - np.array(START_TIPS), axis=-1) > 0.005
     returned = ~moved.any(axis=-1)
     assert 0.02 < returned.mean() < 0.2

@@ -11,6 +11,7 @@ import pytest
 import small_program
 from jax.experimental.compilation_cache import compilation_cache
 
+import jaxrl_vis_envs
 from jaxrl_vis import cli
 from jaxrl_vis.config import preset
 from jaxrl_vis.devices import enable_compilation_cache
@@ -20,8 +21,8 @@ from jaxrl_vis.run import kept_programs, programs, trainer
 from jaxrl_vis.run.folder import RunFolder
 from jaxrl_vis.run.kept_programs import VARIABLE, fingerprint
 from jaxrl_vis.run.programs import Programs
-from jaxrl_vis_envs import compilation
-from jaxrl_vis_envs.compilation import env_jit, kernels
+from jaxrl_vis_envs.compiling import compilation
+from jaxrl_vis_envs.compiling.compilation import kernels
 
 CONFIG = preset("debug")
 NAMES = ["init", "learn", "play"]
@@ -32,7 +33,7 @@ def folder(tmp_path, monkeypatch) -> Path:
     """Where programs are kept, which nothing turns off."""
     monkeypatch.setenv(VARIABLE, "1")
     monkeypatch.setattr(programs, "enable_compilation_cache", lambda: str(tmp_path))
-    monkeypatch.setattr(compilation, "_trusted", set())  # of kernels that other tests have let in
+    monkeypatch.setattr(compilation, "_assumed", set())  # of kernels that other tests have let in
     return tmp_path / "programs"
 
 
@@ -48,7 +49,7 @@ def untraceable(program, *names: str):
         raise AssertionError("traced")
 
     def without(made):
-        return dataclasses.replace(made, **{name: env_jit(refuse) for name in names if hasattr(made, name)})
+        return dataclasses.replace(made, **{name: jaxrl_vis_envs.jit(refuse) for name in names if hasattr(made, name)})
 
     return without(program) if program.parts is None else dataclasses.replace(program, parts=without(program.parts))
 
@@ -148,9 +149,9 @@ def test_a_fingerprint_is_of_all_that_is_compiled_in(folder, monkeypatch):
 
 def test_a_fingerprint_sees_whether_kernels_are_used(folder, monkeypatch):
     env = make_env(CONFIG)
-    monkeypatch.setattr(kept_programs, "runs_gpu_kernels", lambda: True)
+    monkeypatch.setattr(kept_programs, "use_gpu_kernels", lambda: True)
     with_kernels = fingerprint(CONFIG, env)
-    monkeypatch.setattr(kept_programs, "runs_gpu_kernels", lambda: False)
+    monkeypatch.setattr(kept_programs, "use_gpu_kernels", lambda: False)
     assert with_kernels != fingerprint(CONFIG, env)
     with kernels(False):
         assert fingerprint(CONFIG, env) is not None

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from jaxrl_vis_envs.compilation import env_jit
+import jaxrl_vis_envs
 from jaxrl_vis_envs.physics import mjx_model
 from jaxrl_vis_envs.physics.mjx_model import mjx
 
@@ -51,7 +51,7 @@ def assert_poses_agree(mj_model: mujoco.MjModel, names: tuple[str, ...]) -> None
     mocap_quat = rng.normal(size=(8, mj_model.nmocap, 4)).astype(np.float32)
     model, still = mjx.put_model(mj_model), mjx_model.still_data(mj_model)
 
-    @env_jit
+    @jaxrl_vis_envs.jit
     @jax.vmap
     def ours(qpos: jax.Array, mocap_pos: jax.Array, mocap_quat: jax.Array) -> mjx.Data:
         with jax.default_matmul_precision("highest"):

@@ -8,8 +8,9 @@ import mujoco
 import numpy as np
 import pytest
 
+import jaxrl_vis_envs
 from benchmarks.tasks import environments
-from jaxrl_vis_envs.compilation import env_jit, kernels, tracing_for
+from jaxrl_vis_envs.compiling.compilation import kernels, tracing_for
 from jaxrl_vis_envs.physics import constraints, mjx_model, newton
 from jaxrl_vis_envs.physics.mjx_model import mjx
 
@@ -105,8 +106,8 @@ def test_a_step_is_that_of_mjx():
         "xfrc_applied": rng.normal(0, 5, (count, model.nbody, 6)),
     }
     data = jax.vmap(lambda varied: start.replace(**varied))({name: jnp.float32(value) for name, value in numbers.items()})
-    ours = env_jit(jax.vmap(lambda data: mjx_model.step(model, data, exact=False)))(data)
-    theirs = env_jit(jax.vmap(lambda data: mjx.step(model, data)))(data)
+    ours = jaxrl_vis_envs.jit(jax.vmap(lambda data: mjx_model.step(model, data, exact=False)))(data)
+    theirs = jaxrl_vis_envs.jit(jax.vmap(lambda data: mjx.step(model, data)))(data)
     forces = np.abs(theirs._impl.efc_force)
     assert (forces[:, :6] > 0).all()  # the weld
     assert (forces[:, 6:12] > 0).any(axis=0).sum() >= 4  # limits, those of the fingers too
@@ -176,8 +177,8 @@ def test_without_warm_starts_the_last_accelerations_do_not_matter():
         "qacc_warmstart": rng.normal(0, 1000, (count, 2)),
     }
     data = jax.vmap(lambda varied: still.replace(**varied))({name: jnp.float32(value) for name, value in numbers.items()})
-    ours = env_jit(jax.vmap(lambda data: mjx_model.step(model, data, exact=False)))(data)
-    theirs = env_jit(jax.vmap(lambda data: mjx.step(model, data)))(data)
+    ours = jaxrl_vis_envs.jit(jax.vmap(lambda data: mjx_model.step(model, data, exact=False)))(data)
+    theirs = jaxrl_vis_envs.jit(jax.vmap(lambda data: mjx.step(model, data)))(data)
     assert 0.2 < (np.abs(theirs.qfrc_constraint[:, 1]) > 0).mean() < 0.8
     np.testing.assert_allclose(ours.qacc, theirs.qacc, rtol=1e-4, atol=1e-2)
     np.testing.assert_allclose(ours.qvel, theirs.qvel, rtol=1e-5, atol=1e-4)

@@ -32,7 +32,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
 )
 # The same for the environments.
 ENVIRONMENT_LAYERS: tuple[tuple[str, ...], ...] = (
-    ("checks", "compilation", "cores", "documents", "goals", "gpu_kernels", "names", "mjx_imports"),
+    ("checks", "compiling", "cores", "documents", "goals", "names"),
     ("physics", "plants", "render", "task_modules"),
     ("randomization",),
     ("base",),
@@ -143,14 +143,14 @@ def test_importing_the_package_loads_no_jax(clean_environment: dict[str, str]) -
 
 def test_mjx_does_not_print_that_warp_is_missing(clean_environment: dict[str, str]) -> None:
     """Neither in our own imports nor in those that come after them; what else is printed there is printed."""
-    for code in ("import jaxrl_vis_envs; from mujoco import mjx", "import jaxrl_vis_envs.adapters.brax_viewer"):
+    for code in ("import jaxrl_vis_envs.physics; from mujoco import mjx", "import jaxrl_vis_envs.adapters.brax_viewer"):
         done = subprocess.run([sys.executable, "-c", code], env=clean_environment, capture_output=True, text=True)
         assert (done.returncode, done.stdout) == (0, ""), done.stdout + done.stderr
 
 
 # A box of eight corners above a plane, as a mesh.
 _MESH = """
-import sys, jaxrl_vis_envs, mujoco
+import sys, jaxrl_vis_envs.physics, mujoco
 from mujoco import mjx
 assert not {"trimesh", "scipy.spatial"} & set(sys.modules)
 box = "0 0 1  1 0 1  0 1 1  0 0 2  1 1 1  1 0 2  0 1 2  1 1 2"
@@ -167,6 +167,16 @@ assert trimesh.Trimesh.__module__ == "trimesh.base" and scipy.spatial.ConvexHull
 
 def test_mjx_loads_libraries_for_meshes_only_where_there_are_meshes(clean_environment: dict[str, str]) -> None:
     subprocess.run([sys.executable, "-c", _MESH], env=clean_environment, check=True)
+
+
+def test_importing_the_environments_changes_no_imports(clean_environment: dict[str, str]) -> None:
+    """Of MJX, which their physics makes faster; and loads no JAX."""
+    code = (
+        "import sys; finders = list(sys.meta_path); import jaxrl_vis_envs.names;"
+        "assert sys.meta_path == finders and not {'jax', 'mujoco'} & set(sys.modules);"
+        "import jaxrl_vis_envs.physics; assert len(sys.meta_path) == len(finders) + 1"
+    )
+    subprocess.run([sys.executable, "-c", code], env=clean_environment, check=True)
 
 
 def test_names_load_no_jax(clean_environment: dict[str, str]) -> None:

@@ -18,7 +18,6 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.environment import make_env
 from jaxrl_vis.learner.train_step import make_train_step
 from jaxrl_vis_envs import pixels, randomization
-from jaxrl_vis_envs.compilation import env_jit
 from jaxrl_vis_envs.randomization import KINDS, OFF, Randomization, typical
 from jaxrl_vis_envs.render import Scene, render_planes
 from jaxrl_vis_envs.render.gpu import kernel
@@ -46,7 +45,7 @@ def episodes(ranges: Randomization = OFF) -> tuple[Any, Any]:
         end, _ = jax.lax.scan(lambda state, _: (jax.vmap(env.step)(state, action), None), start, length=STEPS)
         return start, end
 
-    return env_jit(play)(keys())
+    return jaxrl_vis_envs.jit(play)(keys())
 
 
 ALL = typical(*KINDS)
@@ -127,7 +126,7 @@ def draw_shape() -> Any:
         planes = render_planes(scene, data, segmentation=True)
         return jnp.concatenate([planes.rgb, planes.depth[None]]), planes.segmentation
 
-    return scene, env_jit(draw)
+    return scene, jaxrl_vis_envs.jit(draw)
 
 
 @pytest.mark.parametrize(
@@ -225,7 +224,7 @@ def test_the_gpu_kernel_draws_varied_scenes(monkeypatch: pytest.MonkeyPatch) -> 
         planes = render_planes(randomization.varied_scene(scene, domain), data)
         return jnp.concatenate([planes.rgb, planes.depth[None]])
 
-    plain = np.asarray(env_jit(jax.vmap(draw))(start.data, start.domain))
+    plain = np.asarray(jaxrl_vis_envs.jit(jax.vmap(draw))(start.data, start.domain))
     monkeypatch.setattr(kernel, "can_render", lambda scene, outputs: kernel.supports(scene))
     monkeypatch.setattr(kernel, "draw", functools.partial(kernel.draw, interpret=True))
     by_kernel = np.asarray(jax.vmap(draw)(start.data, start.domain))

@@ -12,7 +12,6 @@ from point_mass import PointMass, PointMassConfig
 
 import jaxrl_vis_envs
 from jaxrl_vis_envs import pixels
-from jaxrl_vis_envs.compilation import env_jit
 from jaxrl_vis_envs.render import Scene, render
 
 COUNT, SIZE = 8, 48
@@ -33,7 +32,7 @@ def poses(name: str, **options: Any) -> tuple[Any, Any, np.ndarray]:
         goal = env.sample_goal(key)
         return env.sample_start(key), goal, env.goal_state(key, goal)
 
-    return jax.device_get(env_jit(jax.vmap(sample))(KEYS))
+    return jax.device_get(jaxrl_vis_envs.jit(jax.vmap(sample))(KEYS))
 
 
 @functools.cache
@@ -43,7 +42,7 @@ def images(**options: Any) -> np.ndarray:
     cross_hair = {name: value for name, value in options.items() if name == "cross_hair"}
     start, goal, _ = poses("VisualFetchReach", image_size=SIZE, **cross_hair)
     data = jax.tree.map(lambda *leaves: np.concatenate(leaves), start, goal)
-    return np.asarray(env_jit(jax.vmap(lambda data: env.observe(env.state_at(data, jnp.zeros(3)))))(data))
+    return np.asarray(jaxrl_vis_envs.jit(jax.vmap(lambda data: env.observe(env.state_at(data, jnp.zeros(3)))))(data))
 
 
 def assert_same_configuration(one: Any, other: Any) -> None:
@@ -72,7 +71,7 @@ def test_the_release_shows_the_grip_two_centimetres_off_its_goal():
 
 def test_goal_image_shows_the_biased_goal_configuration():
     env = make("FetchReach", goal_at="link")
-    state = env_jit(jax.vmap(env.reset))(KEYS)
+    state = jaxrl_vis_envs.jit(jax.vmap(env.reset))(KEYS)
     _, goals, goal_state = poses("FetchReach", goal_at="link")
     np.testing.assert_allclose(state.obs["desired_goal"][:, :3], goals.site_xpos[:, env._grip], atol=2e-6)
     np.testing.assert_allclose(state.goal_state, goal_state, atol=2e-6)
@@ -123,7 +122,7 @@ def test_grey_fingers():
     fingers = [model.geom(name).id for name in ("left_finger", "right_finger")]
     scene = Scene.from_mjmodel(model, camera="front", height=SIZE, width=SIZE)
     start = jax.tree.map(lambda leaf: leaf[0], poses("VisualFetchReach", image_size=SIZE)[0])
-    labels = np.asarray(env_jit(lambda data: render(scene, data).segmentation)(start))
+    labels = np.asarray(jaxrl_vis_envs.jit(lambda data: render(scene, data).segmentation)(start))
     grey, orange = images(finger_colour="grey")[0], images()[0]
     assert np.isin(labels, fingers).sum() > 5
     np.testing.assert_array_equal((grey != orange)[:3].any(axis=0), np.isin(labels, fingers))
@@ -142,7 +141,7 @@ def test_release_view_of_the_hand():
     assert make("VisualHandReach", image_size=SIZE).camera == make("HandReach").camera == "front"
     # What is drawn is what that camera sees: fingertips in a row, from the thumb's to the little finger's.
     scene = Scene.from_mjmodel(env.mj_model, camera=env.camera, height=SIZE, width=SIZE)
-    labels = np.asarray(env_jit(lambda data: render(scene, data).segmentation)(env._start))
+    labels = np.asarray(jaxrl_vis_envs.jit(lambda data: render(scene, data).segmentation)(env._start))
     columns = [np.nonzero(labels == env.mj_model.geom(f"{name}tip").id)[1].mean() for name in ("th", "ff", "mf", "rf", "lf")]
     assert columns == sorted(columns)
 
@@ -161,9 +160,11 @@ def test_faint_marks_of_fingertips():
         np.testing.assert_array_equal(getattr(faint, name), getattr(bright, name))
     env = make("VisualHandReach", image_size=SIZE)
     scene = Scene.from_mjmodel(env.mj_model, camera="front", height=SIZE, width=SIZE)
-    labels = np.asarray(env_jit(lambda data: render(scene, data).segmentation)(env._start))
+    labels = np.asarray(jaxrl_vis_envs.jit(lambda data: render(scene, data).segmentation)(env._start))
     of = {name: make("VisualHandReach", image_size=SIZE, tip_marks=name) for name in ("faint", "bright")}
-    one, other = (np.asarray(env_jit(env.observe)(env.state_at(env._start, jnp.zeros(15)))).astype(int) for env in of.values())
+    one, other = (
+        np.asarray(jaxrl_vis_envs.jit(env.observe)(env.state_at(env._start, jnp.zeros(15)))).astype(int) for env in of.values()
+    )
     changed = (np.abs(one - other)[:3] > 1).any(axis=0)  # two programs round differently
     assert changed.sum() > 20 and np.isin(labels[changed], marks + links).all()
 
@@ -186,7 +187,7 @@ def test_zbuffer_changes_only_the_depth_encoding():
         PointMass(PointMassConfig(image_size=16, depth_encoding=encoding, **ranges)) for encoding in ("metric", "zbuffer")
     )
     key = jax.random.key(0)
-    one, other = (env_jit(env.reset)(key).obs["observation"] for env in (metric, zbuffer))
+    one, other = (jaxrl_vis_envs.jit(env.reset)(key).obs["observation"] for env in (metric, zbuffer))
     np.testing.assert_array_equal(one[:3], other[:3])
     depth = pixels.decode_depth(one[3], (0.5, 1.5))
     expected = np.asarray(pixels.encode_zbuffer(depth, (0.5, 1.5)), int)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from mujoco import mjx
 
-from jaxrl_vis_envs.compilation import env_jit
+import jaxrl_vis_envs
 from jaxrl_vis_envs.render import Scene, render, render_planes
 from jaxrl_vis_envs.render.mounts import Mount
 from jaxrl_vis_envs.render.reference import ReferenceRenderer
@@ -60,7 +60,7 @@ def references():
     mj_model = mujoco.MjModel.from_xml_string(str(arrays["xml"]))
     height, width = arrays["depth"].shape[1:]
     scene = Scene.from_mjmodel(mj_model, "eye", height, width, site_groups=(0,))
-    drawn = env_jit(jax.vmap(lambda poses: draw(scene, poses)))({name: arrays[name] for name in POSES})
+    drawn = jaxrl_vis_envs.jit(jax.vmap(lambda poses: draw(scene, poses)))({name: arrays[name] for name in POSES})
     return arrays, scene, jax.tree.map(np.asarray, drawn)
 
 
@@ -129,8 +129,8 @@ def test_accepts_mjx_data_and_vmap_equals_a_loop(ball):
     def drawn(shift):
         return render(scene, mjx.kinematics(model, data.replace(qpos=data.qpos.at[0].set(shift))))
 
-    batch = env_jit(jax.vmap(drawn))(shifts)
-    one = env_jit(drawn)
+    batch = jaxrl_vis_envs.jit(jax.vmap(drawn))(shifts)
+    one = jaxrl_vis_envs.jit(drawn)
     for index, shift in enumerate(shifts):
         single = one(shift)
         np.testing.assert_allclose(batch.depth[index], single.depth, atol=1e-5)
@@ -148,7 +148,7 @@ def test_runs_inside_scan(ball):
         moved = scene.replace(camera_position=scene.camera_position + jnp.array([0.0, 0.0, 1.0]) * height)
         return height + 0.1, render_planes(moved, SimpleNamespace(**poses), rgb=False).depth
 
-    depths = env_jit(lambda: jax.lax.scan(body, 0.0, None, length=3)[1])()
+    depths = jaxrl_vis_envs.jit(lambda: jax.lax.scan(body, 0.0, None, length=3)[1])()
     assert depths.shape == (3, 33, 33)
     assert not np.array_equal(depths[0], depths[2])
 
@@ -198,7 +198,7 @@ def test_gradient_of_depth_with_respect_to_a_pose(ball):
         moved = poses | {"geom_xpos": jnp.asarray(poses["geom_xpos"]) + shift}
         return render_planes(scene, SimpleNamespace(**moved), rgb=False).depth[row, column]
 
-    toward = env_jit(jax.grad(depth), static_argnums=(1, 2))
+    toward = jaxrl_vis_envs.jit(jax.grad(depth), static_argnums=(1, 2))
     np.testing.assert_allclose(toward(jnp.zeros(3), 16, 16), [0.0, 1.0, 0.0], atol=1e-5)
     # Also finite where other objects' rays miss, and through the colours.
     assert np.all(np.isfinite(toward(jnp.zeros(3), 3, 3)))
@@ -207,7 +207,7 @@ def test_gradient_of_depth_with_respect_to_a_pose(ball):
         moved = poses | {"geom_xpos": jnp.asarray(poses["geom_xpos"]) + shift}
         return render_planes(scene, SimpleNamespace(**moved)).rgb.sum()
 
-    assert np.all(np.isfinite(env_jit(jax.grad(brightness))(jnp.zeros(3))))
+    assert np.all(np.isfinite(jaxrl_vis_envs.jit(jax.grad(brightness))(jnp.zeros(3))))
 
 
 def test_appearance_can_differ_within_a_batch(ball):
@@ -215,7 +215,7 @@ def test_appearance_can_differ_within_a_batch(ball):
     poses = poses_of(mj_data)
     rgba = jnp.stack([scene.rgba, scene.rgba.at[0, :3].set(jnp.array([1.0, 0.0, 0.0]))])
     size = jnp.stack([scene.size, scene.size.at[0].mul(0.5)])
-    frames = env_jit(jax.vmap(lambda rgba, size: draw(scene.replace(rgba=rgba, size=size), poses)))(rgba, size)
+    frames = jaxrl_vis_envs.jit(jax.vmap(lambda rgba, size: draw(scene.replace(rgba=rgba, size=size), poses)))(rgba, size)
     assert frames.rgb[0, 16, 16, 1] > 0 and frames.rgb[1, 16, 16, 1] < frames.rgb[1, 16, 16, 0]
     np.testing.assert_allclose(frames.depth[:, 16, 16], [1.8, 1.9], atol=1e-6)
 

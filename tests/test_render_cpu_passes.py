@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from small_scene import MORE_SPHERES, ORTHOGRAPHIC, small_scene
 
-from jaxrl_vis_envs.compilation import env_jit
+import jaxrl_vis_envs
 from jaxrl_vis_envs.render import camera, render_planes
 from jaxrl_vis_envs.render.cpu import passes, tiles
 from jaxrl_vis_envs.render.outputs import Outputs
@@ -42,7 +42,7 @@ def test_passes_render_the_same_image(lens, more, shape, options, plainly):
             moved = SimpleNamespace(**{**vars(poses), "geom_xpos": geom_xpos})
             return render_planes(scene, moved, segmentation=True, quantized=True)
 
-        return env_jit(jax.vmap(draw))(places)
+        return jaxrl_vis_envs.jit(jax.vmap(draw))(places)
 
     # A batch whose second image is another one: a geom without a finite pose is not drawn. In the third, the capsule is alone
     # in its corner.
@@ -97,9 +97,9 @@ def test_the_passes_have_the_gradients_of_the_plain_renderer(plainly):
         planes = render_planes(scene, SimpleNamespace(**{**vars(poses), "geom_xpos": places}), quantized=True)
         return jnp.sum(jnp.sin(planes.depth))
 
-    gradient = env_jit(jax.grad(loss))(poses.geom_xpos)
+    gradient = jaxrl_vis_envs.jit(jax.grad(loss))(poses.geom_xpos)
     plainly()
-    expected = env_jit(jax.grad(loss))(poses.geom_xpos)
+    expected = jaxrl_vis_envs.jit(jax.grad(loss))(poses.geom_xpos)
     assert np.abs(expected).max() > 0.1
     np.testing.assert_allclose(gradient, expected, rtol=1e-4, atol=1e-4)
 

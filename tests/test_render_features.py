@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from jaxrl_vis_envs.compilation import env_jit
+import jaxrl_vis_envs
 from jaxrl_vis_envs.render import Scene, images, render, render_planes
 from jaxrl_vis_envs.render.pixel import blocks, raycast
 
@@ -34,7 +34,7 @@ def drawn(body: str, camera: str = "above", size: int = 17, header: str = FLAT_L
     return shown(scene, mj_data)
 
 
-@env_jit
+@jaxrl_vis_envs.jit
 def draw(scene: Scene, poses: dict):
     """Render; compiled once for all scenes that differ only in numerical values."""
     return render(scene, SimpleNamespace(**poses), normals=True, distance=True)
@@ -65,7 +65,7 @@ def test_only_requested_outputs_are_computed():
     poses = {name: np.array(getattr(mj_data, name), np.float32) for name in POSES}
 
     def planes(**wanted):
-        return env_jit(lambda scene, poses: render_planes(scene, SimpleNamespace(**poses), **wanted))(scene, poses)
+        return jaxrl_vis_envs.jit(lambda scene, poses: render_planes(scene, SimpleNamespace(**poses), **wanted))(scene, poses)
 
     whole = planes(**everything)
     shapes = dict(rgb=(3, 8, 12), depth=(8, 12), segmentation=(8, 12), normals=(3, 8, 12), distance=(8, 12))
@@ -195,7 +195,7 @@ def test_shapes_without_thickness_are_sheets_and_without_area_are_hidden():
         planes = render_planes(scene, SimpleNamespace(**poses), rgb=False, segmentation=True, **more)
         return planes.depth, planes.segmentation
 
-    both = env_jit(lambda *given: (depth_and_labels(*given), depth_and_labels(*given, distance=True)))
+    both = jaxrl_vis_envs.jit(lambda *given: (depth_and_labels(*given), depth_and_labels(*given, distance=True)))
     (depth, labels), (plain_depth, plain_labels) = both(scene, poses)
     np.testing.assert_array_equal(labels, plain_labels)
     np.testing.assert_allclose(depth, plain_depth, rtol=1e-5)
@@ -289,7 +289,7 @@ def test_all_appearance_leaves_can_be_batched_without_retracing():
     ]  # fmt: skip
     traces = []
 
-    @env_jit
+    @jaxrl_vis_envs.jit
     def draw(leaves):
         traces.append(1)
         poses = {name: jnp.asarray(getattr(mj_data, name), jnp.float32)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from small_scene import MORE_SPHERES, ORTHOGRAPHIC, small_scene
 
-from jaxrl_vis_envs.compilation import env_jit
+import jaxrl_vis_envs
 from jaxrl_vis_envs.render import render_planes
 from jaxrl_vis_envs.render.gpu import kernel
 
@@ -33,13 +33,13 @@ def test_kernel_renders_the_same_image(lens, textured, more, with_kernel):
     def draw(poses):
         return render_planes(scene, poses, segmentation=True, normals=True, distance=True)
 
-    expected = env_jit(lambda: draw(poses))()
+    expected = jaxrl_vis_envs.jit(lambda: draw(poses))()
     with_kernel()
     # A batch whose second image is another one: a geom without a finite pose is not drawn.
     places = jnp.stack([poses.geom_xpos, poses.geom_xpos.at[2].set(jnp.nan)])
     # Two axes, as in training: seeds and environments.
     draw_all = jax.vmap(jax.vmap(lambda geom_xpos: draw(SimpleNamespace(**{**vars(poses), "geom_xpos": geom_xpos}))))
-    drawn = jax.tree.map(lambda plane: plane[0], env_jit(draw_all)(places[None]))
+    drawn = jax.tree.map(lambda plane: plane[0], jaxrl_vis_envs.jit(draw_all)(places[None]))
     assert len(np.unique(np.asarray(expected.segmentation))) > 7
     for name, plane in expected._asdict().items():
         ours = np.asarray(getattr(drawn, name)[0], np.float64)
@@ -49,9 +49,9 @@ def test_kernel_renders_the_same_image(lens, textured, more, with_kernel):
 
 def test_quantized_output_equals_quantizing_the_output(with_kernel):
     scene, poses = small_scene()
-    expected = env_jit(lambda: render_planes(scene, poses, quantized=True).rgb)()
+    expected = jaxrl_vis_envs.jit(lambda: render_planes(scene, poses, quantized=True).rgb)()
     with_kernel()
-    drawn = env_jit(lambda: render_planes(scene, poses, depth=False, quantized=True))()
+    drawn = jaxrl_vis_envs.jit(lambda: render_planes(scene, poses, depth=False, quantized=True))()
     assert drawn.rgb.dtype == expected.dtype == jnp.uint8 and drawn.depth is None
     np.testing.assert_allclose(np.asarray(drawn.rgb, int), np.asarray(expected, int), atol=1)
 
@@ -63,9 +63,9 @@ def test_the_kernel_has_the_gradients_of_the_plain_renderer(with_kernel):
         planes = render_planes(scene.replace(rgba=colours), SimpleNamespace(**{**vars(poses), "geom_xpos": places}))
         return jnp.sum(jnp.sin(planes.depth)) + jnp.sum(planes.rgb)
 
-    expected = env_jit(jax.grad(loss, argnums=(0, 1)))(poses.geom_xpos, scene.rgba)
+    expected = jaxrl_vis_envs.jit(jax.grad(loss, argnums=(0, 1)))(poses.geom_xpos, scene.rgba)
     with_kernel()
-    gradients = env_jit(jax.grad(loss, argnums=(0, 1)))(poses.geom_xpos, scene.rgba)
+    gradients = jaxrl_vis_envs.jit(jax.grad(loss, argnums=(0, 1)))(poses.geom_xpos, scene.rgba)
     assert all(np.abs(gradient).max() > 0.1 for gradient in expected)
     for ours, theirs in zip(gradients, expected, strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-5)

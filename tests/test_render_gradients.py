@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from jaxrl_vis_envs.compilation import env_jit
+import jaxrl_vis_envs
 from jaxrl_vis_envs.render import Scene, render_planes
 
 POSES = ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat", "xpos", "xmat")
@@ -116,7 +116,7 @@ def setting(name: str) -> Setting:
         slopes, (planes, means) = jax.grad(total, has_aux=True)(change, poses, thing, mask, weights)
         return planes, means, slopes
 
-    return Setting(scene, poses, env_jit(measure))
+    return Setting(scene, poses, jaxrl_vis_envs.jit(measure))
 
 
 def slopes_of_each(measure: Callable, *arguments: Any) -> dict[str, np.ndarray]:
@@ -186,7 +186,7 @@ def test_gradient_descent_finds_a_pose():
     scene, poses, _ = setting("primitives")
     thing = 1 + SCENES["primitives"].index("sphere")
 
-    @env_jit
+    @jaxrl_vis_envs.jit
     def descend(shift, target):
         def error(shift):
             change = no_change() | {"shift": shift}

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from mujoco import mjx
 
+import jaxrl_vis_envs
 from jaxrl_vis_envs import registry
-from jaxrl_vis_envs.compilation import env_jit
 from jaxrl_vis_envs.render import Scene, camera, mounts, render
 from jaxrl_vis_envs.render.pixel import lights
 from jaxrl_vis_envs.tasks.mjx_env import MjxGoalEnv
@@ -65,14 +65,14 @@ def moved():
         mujoco.mj_forward(mj_model, data[-1])
     model, empty = mjx.put_model(mj_model), mjx.make_data(mj_model)
     move = jax.vmap(lambda qpos: mjx.kinematics(model, empty.replace(qpos=qpos)))
-    return mj_model, data, env_jit(move)(jnp.asarray(np.stack(positions), jnp.float32))
+    return mj_model, data, jaxrl_vis_envs.jit(move)(jnp.asarray(np.stack(positions), jnp.float32))
 
 
 def test_camera_poses_match_mujoco_in_all_modes(moved):
     mj_model, data, batch = moved
     assert mj_model.ncam == 3 * len(MODES) and not np.any(batch.cam_xpos)
     scenes = [Scene.from_mjmodel(mj_model, index, 4, 4) for index in range(mj_model.ncam)]
-    poses = env_jit(jax.vmap(lambda one: [camera.camera_pose(scene, one)[:2] for scene in scenes]))(batch)
+    poses = jaxrl_vis_envs.jit(jax.vmap(lambda one: [camera.camera_pose(scene, one)[:2] for scene in scenes]))(batch)
     for index, (position, rotation) in enumerate(poses):
         for row, truth in enumerate(data):
             name = mj_model.camera(index).name
@@ -84,7 +84,7 @@ def test_light_poses_match_mujoco_in_all_modes(moved, monkeypatch):
     mj_model, data, batch = moved
     monkeypatch.setattr("jaxrl_vis_envs.render.model.reading.MAX_LIGHTS", mj_model.nlight + 1)
     scene = Scene.from_mjmodel(mj_model, 0, 4, 4)
-    positions, directions = env_jit(jax.vmap(lambda one: lights.light_poses(scene, one)))(batch)
+    positions, directions = jaxrl_vis_envs.jit(jax.vmap(lambda one: lights.light_poses(scene, one)))(batch)
     for row, truth in enumerate(data):
         np.testing.assert_allclose(positions[row], truth.light_xpos, atol=2e-6)
         np.testing.assert_allclose(directions[row], truth.light_xdir, atol=5e-6)
@@ -136,8 +136,8 @@ def documented_task(page: str) -> type:
 def test_documented_task_renders_goals_from_the_hand_camera(page):
     task = documented_task(page)
     env = task(typing.get_type_hints(task.__init__)["config"](image_size=24, pixels="depth", depth_range=(0.1, 2.0)))
-    goals = env_jit(jax.vmap(env.sample_goal))(jax.random.split(jax.random.key(0), 3))
-    images = env_jit(jax.vmap(env._draw))(goals)
+    goals = jaxrl_vis_envs.jit(jax.vmap(env.sample_goal))(jax.random.split(jax.random.key(0), 3))
+    images = jaxrl_vis_envs.jit(jax.vmap(env._draw))(goals)
     data = mujoco.MjData(env.mj_model)
     for image, qpos in zip(np.asarray(images), np.asarray(goals.qpos), strict=True):
         data.qpos[:] = qpos

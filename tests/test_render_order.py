@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jaxrl_vis_envs.compilation import compiler_options, env_jit
+import jaxrl_vis_envs
+from jaxrl_vis_envs.compiling.compilation import compiler_options
 from jaxrl_vis_envs.render import Scene, render, render_planes
 from jaxrl_vis_envs.render.cpu import passes
 from jaxrl_vis_envs.render.gpu import kernel
@@ -166,7 +167,7 @@ def test_paper_among_many_geoms_stays_on_the_desk(papers, way, monkeypatch):
         assert kernel.supports(scene)
         monkeypatch.setattr(kernel, "can_render", lambda scene, outputs: True)
         monkeypatch.setattr(kernel, "draw", functools.partial(kernel.draw, interpret=True))
-    draw = env_jit(lambda: render_planes(scene, mj_data, segmentation=True, quantized=way == "passes"))
+    draw = jaxrl_vis_envs.jit(lambda: render_planes(scene, mj_data, segmentation=True, quantized=way == "passes"))
     labels = np.asarray(draw().segmentation)
     scale = 24 / (2.0 * 3.0 * np.tan(np.deg2rad(22.5)))
     columns = [round(11.5 + x * scale) for x in (-0.6, -0.2, 0.2, 0.6)]

@@ -10,8 +10,8 @@ import mujoco
 import numpy as np
 import pytest
 
+import jaxrl_vis_envs
 from jaxrl_vis.bench.scenes.program_memory import largest_temporary
-from jaxrl_vis_envs.compilation import env_jit
 from jaxrl_vis_envs.render import Scene, quantize, render_planes
 
 POSES = ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat", "xpos", "xmat")
@@ -53,7 +53,7 @@ def test_images_are_the_same_with_64_bit_jax(kind, rgb):
         scene, poses = setting(kind)
         poses = {name: jnp.asarray(value, float) for name, value in poses.items()}
 
-        @env_jit
+        @jaxrl_vis_envs.jit
         def planes(poses, rgba):
             changed = scene.replace(rgba=rgba)
             return render_planes(changed, SimpleNamespace(**poses), rgb=rgb, segmentation=True, quantized=rgb)
@@ -81,11 +81,11 @@ def test_vmap_of_scan_is_scan_of_vmap(kind, alpha, quantized, size):
     def draw(height):
         return image(scene, poses, height, quantized)
 
-    @env_jit
+    @jaxrl_vis_envs.jit
     def vmap_of_scan(heights):
         return jax.vmap(lambda row: jax.lax.scan(lambda carry, h: (carry, draw(h)), None, row)[1])(heights)
 
-    @env_jit
+    @jaxrl_vis_envs.jit
     def scan_of_vmap(heights):
         return jax.lax.scan(lambda carry, h: (carry, jax.vmap(draw)(h)), None, heights.T)[1]
 
@@ -104,7 +104,7 @@ def test_donated_buffers_are_reused():
         frame = quantize(image(scene, poses, height)[:3])
         return height + 0.1, jax.lax.dynamic_update_index_in_dim(frames, frame, jnp.int32(height * 10 + 0.5), 0)
 
-    donating = env_jit(step, donate_argnums=0)
+    donating = jaxrl_vis_envs.jit(step, donate_argnums=0)
     state = (jnp.float32(0.0), jnp.zeros((3, 3, SIZE, SIZE), jnp.uint8))
     before = state[1]
     for _ in range(3):
@@ -117,7 +117,8 @@ SHARDED = f"""
 import sys
 sys.path.insert(0, {__file__.rsplit("/", 1)[0]!r})
 import jax, numpy as np
-from test_render_transforms import image, setting, env_jit
+from test_render_transforms import image, setting
+import jaxrl_vis_envs
 from jax.sharding import PartitionSpec
 assert len(jax.devices()) == 2
 heights = np.linspace(0.0, 0.3, 4, dtype=np.float32)
@@ -126,9 +127,9 @@ spec = PartitionSpec("envs")
 for kind, size, quantized in (("mesh", 16, False), ("capsule", 48, True)):
     scene, poses = setting(kind, size=size)
     drawn = jax.vmap(lambda height: image(scene, poses, height, quantized))
-    sharded = env_jit(jax.shard_map(drawn, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False))(heights)
+    sharded = jaxrl_vis_envs.jit(jax.shard_map(drawn, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False))(heights)
     assert len(sharded.sharding.device_set) == 2
-    np.testing.assert_allclose(sharded, env_jit(drawn)(heights), atol=1e-4)
+    np.testing.assert_allclose(sharded, jaxrl_vis_envs.jit(drawn)(heights), atol=1e-4)
     print(kind, "same")
 """
 
@@ -149,7 +150,7 @@ def test_no_temporary_is_larger_than_twice_the_image(kind, quantized):
         planes = render_planes(scene, SimpleNamespace(**lifted), quantized=quantized)
         return planes.rgb, planes.depth
 
-    compiled = env_jit(jax.vmap(draw)).lower(jax.ShapeDtypeStruct((4096,), jnp.float32)).compile()
+    compiled = jaxrl_vis_envs.jit(jax.vmap(draw)).lower(jax.ShapeDtypeStruct((4096,), jnp.float32)).compile()
     output = 4096 * 64 * 64 * (7 if quantized else 16)
     largest = largest_temporary(compiled)
     assert 4096 * 64 * 64 <= largest <= 2 * output

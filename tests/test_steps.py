@@ -16,8 +16,9 @@ import numpy as np
 import pytest
 from nvidia import lowered_for_nvidia
 
+import jaxrl_vis_envs
 from benchmarks.tasks import environments
-from jaxrl_vis_envs.compilation import KERNELS_VARIABLE, env_jit, kernels, tracing_for
+from jaxrl_vis_envs.compiling.compilation import KERNELS_VARIABLE, kernels, tracing_for
 from jaxrl_vis_envs.physics import (
     algebra,
     capsules,
@@ -143,7 +144,7 @@ def taken(model: mjx.Model, data: mjx.Data, count: int, in_kernel: bool, exact: 
 @functools.cache
 def by_matrices(name: str, count: int):
     env = environments.make(name)
-    return env, env_jit(jax.vmap(lambda data: mjx_model._one_by_one(env._model, data, count, True)))
+    return env, jaxrl_vis_envs.jit(jax.vmap(lambda data: mjx_model._one_by_one(env._model, data, count, True)))
 
 
 @functools.cache
@@ -200,17 +201,19 @@ def test_on_a_cpu_the_finger_goes_number_by_number():
     env, _ = by_matrices("FingerTurn", 1)
     _, control_step = by_matrices("FingerTurn", env.config.substeps)
     after = control_step(data)
-    found = env_jit(jax.vmap(lambda data: mjx_model.take_steps(env._model, data, env.config.substeps, True, True)))(data)
+    found = jaxrl_vis_envs.jit(jax.vmap(lambda data: mjx_model.take_steps(env._model, data, env.config.substeps, True, True)))(
+        data
+    )
     assert not np.array_equal(found.qpos, after.qpos)  # or they would be matrices, too
     for name in ("qpos", "time"):
         np.testing.assert_allclose(getattr(found, name), getattr(after, name), atol=1e-3)
     assert np.median(np.abs(found.qpos - after.qpos).max(axis=1)) < 2e-6
     np.testing.assert_allclose(found.qacc_warmstart, found.qacc)
     pushed = data.replace(xfrc_applied=data.xfrc_applied.at[0, 1, 0].set(1.0))
-    found = env_jit(jax.vmap(lambda data: mjx_model.take_steps(env._model, data, 1, True, True)))(pushed)
+    found = jaxrl_vis_envs.jit(jax.vmap(lambda data: mjx_model.take_steps(env._model, data, 1, True, True)))(pushed)
     assert np.isnan(found.qpos[0]).all() and np.isfinite(found.qpos[1:]).all()
     # Whoever does not say that nothing is pushed gets what MJX does.
-    found = env_jit(jax.vmap(lambda data: mjx_model.take_steps(env._model, data, 1, True)))(pushed)
+    found = jaxrl_vis_envs.jit(jax.vmap(lambda data: mjx_model.take_steps(env._model, data, 1, True)))(pushed)
     _, one_step = by_matrices("FingerTurn", 1)
     np.testing.assert_array_equal(found.qpos, one_step(pushed).qpos)
     assert not np.array_equal(found.qvel[0], one_step(data).qvel[0])
@@ -231,7 +234,7 @@ def test_a_step_of_a_model_with_everything(warmstart):
     model = mjx.put_model(mj_model)
     assert mechanism.takes(model)
     data = odd_states(mj_model, 200)
-    after = env_jit(jax.vmap(lambda data: mjx_model.step(model, data, True)))(data)
+    after = jaxrl_vis_envs.jit(jax.vmap(lambda data: mjx_model.step(model, data, True)))(data)
     contact = np.asarray(after._impl.contact.dist) - np.asarray(after._impl.contact.includemargin)
     assert ((contact < 0).sum(axis=0) > 10).all() and ((contact < 0).sum(axis=1) > 1).sum() > 10
     state = taken(model, data, 1, in_kernel=warmstart == "disable")
@@ -353,7 +356,7 @@ def test_goals_and_steps_of_the_hand_are_one_kernel(monkeypatch):
 
 
 def test_steps_are_taken_one_by_one_where_their_kernel_does_not_compile(monkeypatch):
-    monkeypatch.setattr(mjx_model, "runs_gpu_kernels", lambda probe: probe is not steps_kernel.probe)
+    monkeypatch.setattr(mjx_model, "use_gpu_kernels", lambda probe: probe is not steps_kernel.probe)
     env = environments.make("FingerTurn")
     data = jax.eval_shape(lambda: jax.vmap(lambda _: mjx.make_data(env.mj_model))(jnp.zeros(8)))
     program = lowered_for_cuda(env._model, data)

@@ -8,8 +8,9 @@ import mujoco
 import numpy as np
 import pytest
 
+import jaxrl_vis_envs
 from benchmarks.tasks import environments
-from jaxrl_vis_envs.compilation import KERNELS_VARIABLE, env_jit
+from jaxrl_vis_envs.compiling.compilation import KERNELS_VARIABLE
 from jaxrl_vis_envs.physics import (
     dynamics,
     links,
@@ -104,7 +105,7 @@ def by_matrices(name: str):
     def steps_of(data, count):
         return jax.lax.fori_loop(0, count, lambda _, data: mjx_model.step(env._model, data, False), data)
 
-    return env, env_jit(jax.vmap(steps_of, in_axes=(0, None)))
+    return env, jaxrl_vis_envs.jit(jax.vmap(steps_of, in_axes=(0, None)))
 
 
 @functools.cache
@@ -133,7 +134,7 @@ def test_a_step_of_a_model_with_everything(in_kernel):
     assert mechanism.takes(model)
     data = odd_states(mj_model, 200)
     # Contacts of capsules are where steps by numbers have them only if exact.
-    after = env_jit(jax.vmap(lambda data: mjx_model.step(model, data, True)))(data)
+    after = jaxrl_vis_envs.jit(jax.vmap(lambda data: mjx_model.step(model, data, True)))(data)
     contact = np.asarray(after._impl.contact.dist) - np.asarray(after._impl.contact.includemargin)
     assert ((contact < 0).sum(axis=0) >= 10).all(), (contact < 0).sum(axis=0)
     state = taken(model, data, 1, in_kernel, exact=True)

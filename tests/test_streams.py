@@ -22,7 +22,7 @@ from jaxrl_vis.run import metrics
 from jaxrl_vis.run.bar import clock
 from jaxrl_vis.run.console import RunConsole
 from jaxrl_vis.streams import SafeStream, safe, safe_streams
-from jaxrl_vis_envs import mjx_imports
+from jaxrl_vis_envs.compiling import mjx_imports
 
 FULL = Path("/dev/full")
 
@@ -194,7 +194,7 @@ with open({str(tmp_path / "metrics.jsonl")!r}, "w") as file:
 def test_environments_are_made_without_a_stdout(kind, monkeypatch):
     stream = BROKEN[kind]()
     monkeypatch.setattr(sys, "stdout", stream)
-    with mjx_imports._without_remark():
+    with mjx_imports._hide_notice():
         print("of somebody else")
     let_go(stream)
 

@@ -19,7 +19,7 @@ from benchmarks.ledger.records import CHECKOUT, is_cpu_record, read_all
 from jaxrl_vis import provenance
 
 _ENVS = "envs/jaxrl_vis_envs"
-_PHYSICS = tuple(f"{_ENVS}/{name}" for name in ("base.py", "goals.py", "compilation.py", "physics", "tasks/mjx_env.py"))
+_PHYSICS = tuple(f"{_ENVS}/{name}" for name in ("base.py", "goals.py", "compiling", "physics", "tasks/mjx_env.py"))
 _RENDERER = (f"{_ENVS}/render",)
 _IMAGES = (*_RENDERER, f"{_ENVS}/pixels.py")
 _TASK = (f"{_ENVS}/tasks/{{task}}.py", f"{_ENVS}/tasks/assets/{{task}}.xml")

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-# brax compiles without the options of `compilation.env_jit`. JAX reads this variable at its first import: a script may set it,
+# brax compiles without the options of `compilation.jit`. JAX reads this variable at its first import: a script may set it,
 # a library may not.
 if "fusion_emitters" not in os.environ.get("XLA_FLAGS", ""):
     os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_use_fusion_emitters=false"

@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+import jaxrl_vis_envs
 from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.render import image_sizes
 from jaxrl_vis.bench.scenes import images, models
 from jaxrl_vis.bench.settings import Settings
-from jaxrl_vis_envs.compilation import env_jit
 from jaxrl_vis_envs.render import Scene, render_planes
 
 CPU_SCENES = ("finger", "fetch_reach")
@@ -109,7 +109,7 @@ def compare(case: images.Case, repeats: int, rate: float) -> Comparison:
         return planes.rgb, planes.depth, planes.segmentation
 
     compared = {name: jnp.asarray(rows[:COMPARED]) for name, rows in case.batches[0].items()}
-    colours, depth, segmentation = (np.asarray(plane) for plane in env_jit(jax.vmap(draw))(compared))
+    colours, depth, segmentation = (np.asarray(plane) for plane in jaxrl_vis_envs.jit(jax.vmap(draw))(compared))
     textured = np.append(textured_geoms(mj_model), scene.sky == "texture")  # the sky is -1, the last
     return Comparison(
         config=config,

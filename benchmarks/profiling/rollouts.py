@@ -16,7 +16,7 @@ import numpy as np
 
 import jaxrl_vis_envs
 from benchmarks.profiling.kernels import kernels
-from jaxrl_vis_envs.compilation import compiler_options, env_jit
+from jaxrl_vis_envs.compiling.compilation import compiler_options
 
 STEPS, COMPARED, SHOWN = 10, 64, 6
 
@@ -36,14 +36,14 @@ def rollout(env: Any, count: int, steps: int) -> Any:
 
 def reset(env: Any, count: int) -> Any:
     """Start states of so many environments."""
-    return env_jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), count))
+    return jaxrl_vis_envs.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), count))
 
 
 def report_speed(name: str, env: Any, count: int) -> None:
     """Prints the speed of ``count`` environments side by side, and the kernels that take most of the time."""
     states, key = jax.block_until_ready(reset(env, count)), jax.random.key(1)
     began = time.perf_counter()
-    program = env_jit(rollout(env, count, STEPS)).lower(states, key).compile()
+    program = jaxrl_vis_envs.jit(rollout(env, count, STEPS)).lower(states, key).compile()
     compile_s = time.perf_counter() - began
 
     def call() -> Any:
@@ -70,9 +70,9 @@ def report_speed(name: str, env: Any, count: int) -> None:
 
 def report_deviation(name: str, env: Any) -> None:
     """Prints how far a control step on the GPU is from one on a CPU."""
-    data = env_jit(rollout(env, COMPARED, 5))(reset(env, COMPARED), jax.random.key(3)).data
+    data = jaxrl_vis_envs.jit(rollout(env, COMPARED, 5))(reset(env, COMPARED), jax.random.key(3)).data
     actions = jax.random.uniform(jax.random.key(4), (COMPARED, env.action_size), minval=-1.0, maxval=1.0)
-    here = env_jit(jax.vmap(env.act))(data, actions)
+    here = jaxrl_vis_envs.jit(jax.vmap(env.act))(data, actions)
     moved = jax.device_put((data, actions), jax.devices("cpu")[0])
     there = jax.jit(jax.vmap(env.act), compiler_options=compiler_options("cpu"))(*moved)
     position = np.abs(np.asarray(here.qpos) - np.asarray(there.qpos)).max(axis=1)

@@ -20,6 +20,7 @@ from typing import Any, get_args
 import jax
 import jax.numpy as jnp
 
+import jaxrl_vis_envs
 from jaxrl_vis.bench.timing import compile_timed
 from jaxrl_vis.bench.timing import measure as measure_time
 from jaxrl_vis.config import preset
@@ -29,7 +30,6 @@ from jaxrl_vis.learner.networks import Networks
 from jaxrl_vis.learner.normalizer import Scaling
 from jaxrl_vis.learner.weighting import MAIN, Weighting, make_weighting, weighted_grad
 from jaxrl_vis.learner.weighting.gradients import Way
-from jaxrl_vis_envs.compilation import env_jit
 
 STEPS = 40
 """Gradient steps of a timed call."""
@@ -111,7 +111,7 @@ class Problem:
             (params, state), weights = jax.lax.scan(step, (params, state), jnp.arange(STEPS))
             return params, state, weights
 
-        return env_jit(steps)
+        return jaxrl_vis_envs.jit(steps)
 
 
 def time_step(problem: Problem, weighting: Weighting, way: str) -> tuple[float, float]:

@@ -17,8 +17,8 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 
+import jaxrl_vis_envs
 from benchmarks.tasks import environments
-from jaxrl_vis_envs.compilation import env_jit
 from jaxrl_vis_envs.tasks import stalk_arm
 
 LEAST_SUCCESS = 0.95
@@ -108,7 +108,7 @@ def success_rate(name: str, episodes: int, seed: int = 0, **overrides: Any) -> f
     if name == "FingerTurn":
         return turn_the_finger(env, state, np.random.default_rng(seed))
     policy, memory = POLICIES[name](env)
-    act = env_jit(jax.vmap(policy))
+    act = jaxrl_vis_envs.jit(jax.vmap(policy))
     memory = jax.tree.map(lambda leaf: jnp.tile(leaf, (episodes, 1)), memory)
     for _ in range(env.horizon):
         action, memory = act(state, goals, memory)

@@ -18,7 +18,6 @@ import numpy as np
 import jaxrl_vis_envs
 from jaxrl_vis_envs import registry
 from jaxrl_vis_envs.base import State
-from jaxrl_vis_envs.compilation import env_jit
 from jaxrl_vis_envs.physics import mjx_model
 
 LANES = 16
@@ -54,7 +53,7 @@ def start_at(env: Any, qpos: Any, qvel: Any) -> State:
     still = jax.device_get(mjx_model.still_data(env.mj_model))
     still = jax.tree.map(lambda leaf: np.tile(leaf, (len(qpos), *(1,) * leaf.ndim)), still)
     data = still.replace(qpos=np.asarray(qpos, np.float32), qvel=np.asarray(qvel, np.float32))
-    begin = env_jit(jax.vmap(lambda data: env.state_at(data, jnp.zeros_like(env.achieved(data)))))
+    begin = jaxrl_vis_envs.jit(jax.vmap(lambda data: env.state_at(data, jnp.zeros_like(env.achieved(data)))))
     return jax.device_get(begin(data))  # as `_in_lanes` gives states: for what lies on a device, programs are compiled twice
 
 
@@ -66,12 +65,12 @@ def _reset_program(env: Any) -> Callable:
         knowing.sample_goal = lambda _: goal
         return knowing.reset(key), goal
 
-    return env_jit(jax.vmap(start))
+    return jaxrl_vis_envs.jit(jax.vmap(start))
 
 
 @functools.cache
 def _advance_program(env: Any) -> Callable:
-    return env_jit(jax.vmap(env.advance))
+    return jaxrl_vis_envs.jit(jax.vmap(env.advance))
 
 
 def _in_lanes(program: Callable, *trees: Any) -> Any:

@@ -26,7 +26,6 @@ import numpy as np  # noqa: E402
 from PIL import Image  # noqa: E402
 
 import jaxrl_vis_envs  # noqa: E402
-from jaxrl_vis_envs.compilation import env_jit  # noqa: E402
 from jaxrl_vis_envs.render import Scene, render_planes  # noqa: E402
 
 # What an agent has to see, by the names of its geoms. Parts in one tuple count together.
@@ -64,8 +63,8 @@ def draw_goals(env: Any, count: int, seed: int = 0) -> Goals:
         return image[: len(image) // env.frame_stack], render_planes(scene, data, False, False, segmentation=True).segmentation
 
     keys = jax.random.split(jax.random.key(seed), count)
-    states, data = env_jit(jax.vmap(sample))(keys)
-    images, labels = env_jit(lambda data: jax.lax.map(draw, data, batch_size=_BATCH))(data)
+    states, data = jaxrl_vis_envs.jit(jax.vmap(sample))(keys)
+    images, labels = jaxrl_vis_envs.jit(lambda data: jax.lax.map(draw, data, batch_size=_BATCH))(data)
     return Goals(np.asarray(states), np.asarray(images), np.asarray(labels))
 
 

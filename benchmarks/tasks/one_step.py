@@ -23,8 +23,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+import jaxrl_vis_envs
 from benchmarks.tasks import environments
-from jaxrl_vis_envs.compilation import env_jit
 from jaxrl_vis_envs.physics import constraints, mjx_model
 from jaxrl_vis_envs.physics.mjx_model import mjx
 
@@ -132,7 +132,7 @@ def our_step(env: Any, visited: Visited, iterations: Iterations) -> np.ndarray:
         with jax.default_matmul_precision("highest"):
             return mjx_model.step(model, still.replace(**visited._asdict()), exact).qvel
 
-    return np.asarray(env_jit(jax.vmap(step))(jax.tree.map(jnp.asarray, visited)))
+    return np.asarray(jaxrl_vis_envs.jit(jax.vmap(step))(jax.tree.map(jnp.asarray, visited)))
 
 
 class MujocoStep(NamedTuple):

@@ -14,7 +14,6 @@ import jax
 import jax.numpy as jnp
 
 import jaxrl_vis_envs
-from jaxrl_vis_envs.compilation import env_jit
 from jaxrl_vis_envs.names import TASKS
 
 _BAD_SHARE = 0.01
@@ -44,7 +43,7 @@ def count_bad_episodes(name: str, steps: int, count: int) -> tuple[int, int]:
         state = env.reset(reset_key).replace(obs=None)
         return jnp.all(jax.lax.scan(step, state, jax.random.split(action_key, env.horizon))[1])
 
-    play = env_jit(jax.vmap(episode))
+    play = jaxrl_vis_envs.jit(jax.vmap(episode))
     played, bad = 0, 0
     while played < steps:
         bad += int(jnp.sum(~play(jax.random.split(jax.random.fold_in(jax.random.key(0), played), count))))

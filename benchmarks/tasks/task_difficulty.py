@@ -21,7 +21,6 @@ import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 
 import jaxrl_vis_envs  # noqa: E402
-from jaxrl_vis_envs.compilation import env_jit  # noqa: E402
 from jaxrl_vis_envs.names import TASKS  # noqa: E402
 
 _BATCH = 200  # episodes side by side
@@ -39,7 +38,7 @@ def measure(name: str, episodes: int, seed: int = 0, **overrides: Any) -> tuple[
         end, _ = jax.lax.scan(lambda state, action: (env.advance(state, action), None), start, actions)
         return end.metrics["success"], start.metrics["goal_distance"]
 
-    program, keys = env_jit(jax.vmap(play)), jax.random.split(jax.random.key(seed), episodes)
+    program, keys = jaxrl_vis_envs.jit(jax.vmap(play)), jax.random.split(jax.random.key(seed), episodes)
     outcomes = [jax.device_get(program(keys[first : first + _BATCH])) for first in range(0, episodes, _BATCH)]
     success, distance = (np.concatenate(parts) for parts in zip(*outcomes, strict=True))
     return float(np.mean(success)), float(np.mean(distance)) / env.threshold

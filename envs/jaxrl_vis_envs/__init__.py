@@ -3,17 +3,18 @@
     env = jaxrl_vis_envs.make("VisualFetchReach", image_size=64)
     state = env.reset(jax.random.key(0))
 
+Compile functions of environments with `jit`, which is `jax.jit` with the options that physics needs.
+
 Importing this package loads neither MuJoCo nor JAX, because the learner's leaf modules import only `jaxrl_vis_envs.goals`. The
-names below are resolved on first use. A later import of MJX is faster, and does not print its notice that Warp is missing.
+names below are resolved on first use.
 """
 
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from jaxrl_vis_envs import mjx_imports
-
 if TYPE_CHECKING:
     from jaxrl_vis_envs.base import GoalEnv, State
+    from jaxrl_vis_envs.compiling.compilation import jit
     from jaxrl_vis_envs.registry import UnknownEnvironmentError, UnknownOverrideError, list_envs, make, register
     from jaxrl_vis_envs.task_modules import TaskModuleError
 
@@ -23,6 +24,7 @@ _HOME = {
     "TaskModuleError": "task_modules",
     "UnknownEnvironmentError": "registry",
     "UnknownOverrideError": "registry",
+    "jit": "compiling.compilation",
     "list_envs": "registry",
     "make": "registry",
     "register": "registry",
@@ -34,13 +36,11 @@ __all__ = [
     "TaskModuleError",
     "UnknownEnvironmentError",
     "UnknownOverrideError",
+    "jit",
     "list_envs",
     "make",
     "register",
 ]
-
-
-mjx_imports.install()
 
 
 def __getattr__(name: str) -> Any:

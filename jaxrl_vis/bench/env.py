@@ -4,13 +4,13 @@ from collections.abc import Iterator
 
 import jax
 
+import jaxrl_vis_envs
 from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.settings import Settings
 from jaxrl_vis.bench.timing import Timing, compile_timed
 from jaxrl_vis.bench.timing import measure as measure_time
 from jaxrl_vis.bench.variation import assert_varied
 from jaxrl_vis_envs.base import GoalEnv
-from jaxrl_vis_envs.compilation import env_jit
 
 CPU_COUNTS = (16, 256)
 ACCELERATOR_COUNTS = (256, 1024, 4096, 8192)
@@ -33,7 +33,7 @@ def time_episodes(env: GoalEnv, count: int, repeats: int) -> tuple[Timing, float
         return jax.lax.scan(step, state.replace(obs=None), jax.random.split(action_key, env.horizon))[1], goal
 
     keys = jax.random.split(jax.random.key(3), count)
-    compiled, compile_s = compile_timed(env_jit(jax.vmap(episode, out_axes=(1, 0))), keys)
+    compiled, compile_s = compile_timed(jaxrl_vis_envs.jit(jax.vmap(episode, out_axes=(1, 0))), keys)
     frames, goals = compiled(keys)
     assert_varied(frames[-1], "last frames")
     assert_varied(goals, "goals")

@@ -5,13 +5,13 @@ from collections.abc import Iterator
 import jax
 import jax.numpy as jnp
 
+import jaxrl_vis_envs
 from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.settings import Settings
 from jaxrl_vis.bench.timing import compile_timed
 from jaxrl_vis.bench.timing import measure as measure_time
 from jaxrl_vis.bench.variation import assert_varied
 from jaxrl_vis_envs.base import GoalEnv, State
-from jaxrl_vis_envs.compilation import env_jit
 
 CPU_COUNTS = (16, 256)
 ACCELERATOR_COUNTS = (256, 1024, 4096, 8192)
@@ -20,7 +20,7 @@ ACCELERATOR_COUNTS = (256, 1024, 4096, 8192)
 def start_states(env: GoalEnv, count: int) -> State:
     """Make ``count`` different initial states, without images."""
     keys = jax.random.split(jax.random.key(1), count)
-    return env_jit(jax.vmap(lambda key: env.reset(key).replace(obs=None)))(keys)
+    return jaxrl_vis_envs.jit(jax.vmap(lambda key: env.reset(key).replace(obs=None)))(keys)
 
 
 def measure(settings: Settings) -> Iterator[Measurement]:
@@ -40,7 +40,7 @@ def measure(settings: Settings) -> Iterator[Measurement]:
 
     for count in counts:
         arguments = jax.tree.map(lambda leaf, count=count: leaf[:count], states), jax.random.key(2)
-        compiled, compile_s = compile_timed(env_jit(advance), *arguments)
+        compiled, compile_s = compile_timed(jaxrl_vis_envs.jit(advance), *arguments)
         final = compiled(*arguments)
         assert_varied(final.achieved_state, "end states")
         if not bool(jnp.isfinite(final.achieved_state).all()):

@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 
+import jaxrl_vis_envs
 from jaxrl_vis.bench.physics import start_states
 from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.scenes import images as scene_images
@@ -18,7 +19,6 @@ from jaxrl_vis.bench.timing import measure as measure_time
 from jaxrl_vis.bench.variation import alternate, assert_new_images
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis_envs import registry
-from jaxrl_vis_envs.compilation import env_jit
 
 CPU_COUNTS = (64,)
 ACCELERATOR_COUNTS = (256, 1024, 4096)
@@ -43,7 +43,7 @@ def measure(settings: Settings) -> Iterator[Measurement]:
             env = settings.make_env(image_size=size, pixels=output)
             for count in counts:
                 drawn = [jax.tree.map(lambda leaf, count=count: leaf[:count], states) for states in batches]
-                compiled, compile_s = compile_timed(env_jit(jax.vmap(env.observe)), drawn[0])
+                compiled, compile_s = compile_timed(jaxrl_vis_envs.jit(jax.vmap(env.observe)), drawn[0])
                 assert_new_images(compiled, drawn)
                 timing = measure_time(alternate(compiled, drawn), settings.repeats)
                 yield Measurement(
@@ -74,4 +74,4 @@ def poses(settings: Settings, count: int, seed: int = 4) -> Any:
 
         return jax.lax.scan(step, state, jax.random.split(key, _STEPS))[0]
 
-    return env_jit(jax.vmap(scatter))(start_states(env, count), jax.random.split(jax.random.key(seed), count))
+    return jaxrl_vis_envs.jit(jax.vmap(scatter))(start_states(env, count), jax.random.split(jax.random.key(seed), count))

@@ -8,7 +8,7 @@ from typing import Any
 
 import jax
 
-from jaxrl_vis_envs.compilation import tracing_for_default_device
+from jaxrl_vis_envs.compiling.compilation import tracing_for_default_device
 
 _LEAST_SECONDS = 0.2
 

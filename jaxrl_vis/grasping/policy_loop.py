@@ -13,12 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+import jaxrl_vis_envs
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.grasping import arm
 from jaxrl_vis.grasping.arm import Gains, Timing
 from jaxrl_vis.grasping.reach import Reaching, ReachResult, Scene, arms_among, begin, held_by, period
 from jaxrl_vis.run.policy import Policy
-from jaxrl_vis_envs.compilation import env_jit
 from jaxrl_vis_envs.physics import mjx_model
 from jaxrl_vis_envs.pixels import ImageObserver
 from jaxrl_vis_envs.plants import bending
@@ -134,4 +134,4 @@ def _programs(policy: Policy) -> tuple[Any, Any]:
             (reaching, _), seen = jax.lax.scan(step, start, length=steps)
         return {**seen, "held": held_by(arms, reaching.data), "touched": reaching.touched, "brushed": reaching.brushed}
 
-    return env_jit(jax.vmap(draw)), env_jit(jax.vmap(episode))
+    return jaxrl_vis_envs.jit(jax.vmap(draw)), jaxrl_vis_envs.jit(jax.vmap(episode))

@@ -18,9 +18,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+import jaxrl_vis_envs
 from jaxrl_vis.grasping import arm
 from jaxrl_vis.grasping.arm import Drive, Gains, Timing
-from jaxrl_vis_envs.compilation import env_jit
 from jaxrl_vis_envs.physics import mjx_model
 from jaxrl_vis_envs.physics.mjx_model import mjx
 from jaxrl_vis_envs.plants import bending
@@ -244,7 +244,7 @@ def _programs(stalks: int, timing: Timing, gains: Gains) -> tuple[Any, Any]:
     def advance(scene: Scene, reaching: Reaching, target: jax.Array) -> tuple[Reaching, dict[str, jax.Array]]:
         return _advance(arms, scene, reaching, target, timing, gains)
 
-    return env_jit(jax.vmap(start), runs_once=True), env_jit(jax.vmap(advance))
+    return jaxrl_vis_envs.jit(jax.vmap(start), runs_once=True), jaxrl_vis_envs.jit(jax.vmap(advance))
 
 
 def begin(arms: Arms, scene: Scene, home: tuple[float, float, float] = arm.HOME) -> Reaching:

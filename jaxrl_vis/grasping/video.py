@@ -9,10 +9,10 @@ import jax
 import numpy as np
 from PIL import Image, ImageDraw
 
+import jaxrl_vis_envs
 from jaxrl_vis.grasping.arm import Timing
 from jaxrl_vis.grasping.reach import ReachResult, arms_among
 from jaxrl_vis.report.videos import BACKGROUND, HOLD, MISSED, REACHED, TEXT, check_output, write_images
-from jaxrl_vis_envs.compilation import env_jit
 from jaxrl_vis_envs.physics import mjx_model
 from jaxrl_vis_envs.plants import bending
 from jaxrl_vis_envs.plants.bending import Shape
@@ -74,7 +74,7 @@ def _program(stalks: int, size: int) -> Any:
         assert rgb is not None  # it was asked for
         return rgb.transpose(1, 2, 0)
 
-    return env_jit(draw)
+    return jaxrl_vis_envs.jit(draw)
 
 
 def _deed(time: float, held: set[int], is_alone: bool) -> str:

@@ -38,7 +38,7 @@ from jaxrl_vis.learner.encoder_kernel_passes import (
     whole,
 )
 from jaxrl_vis.learner.encoder_kernel_patches import divisor, padded_channels
-from jaxrl_vis_envs.gpu_kernels import kernel_call
+from jaxrl_vis_envs.compiling.gpu_kernels import kernel_call
 
 _MOST_CHANNELS = 4  # beyond, the weights' gradients no longer fit into registers
 # Cells in a tile, tiles that one program works through at most, and how they are run.

@@ -14,8 +14,8 @@ from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
 
 from jaxrl_vis.learner.encoder_kernel_patches import LEVELS, divisor, prepare_on_gpu
-from jaxrl_vis_envs.compilation import accelerator, by_platform, runs_gpu_kernels, tracing_for
-from jaxrl_vis_envs.gpu_kernels import kernel_call
+from jaxrl_vis_envs.compiling.compilation import accelerator, dispatch_by_platform, tracing_for, use_gpu_kernels
+from jaxrl_vis_envs.compiling.gpu_kernels import kernel_call
 
 LEAST_ROWS = 16
 """Of a product in a kernel."""
@@ -45,11 +45,11 @@ class Weights(NamedTuple):
 
 
 def is_available() -> bool:
-    """Whether this process has a GPU that the kernels run on; `jaxrl_vis_envs.compilation` says how to choose."""
+    """Whether this process has a GPU that the kernels run on; `jaxrl_vis_envs.compiling.compilation` says how to choose."""
     if accelerator() != "cuda":
         return False
     with tracing_for("cuda"):
-        return runs_gpu_kernels(probe)
+        return use_gpu_kernels(probe)
 
 
 def probe() -> None:
@@ -77,7 +77,7 @@ def dispatch(on_gpu: Any, plain: Any, *arguments: Any, interpret: bool) -> Any:
     """The kernel where a program is compiled for a GPU that runs it, and the same in plain JAX for every other platform."""
     if interpret:
         return on_gpu(*arguments)
-    return by_platform(lambda *given: (on_gpu if runs_gpu_kernels(probe) else plain)(*given), *arguments)
+    return dispatch_by_platform(lambda *given: (on_gpu if use_gpu_kernels(probe) else plain)(*given), *arguments)
 
 
 # -- Layers

@@ -13,7 +13,7 @@ from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
 
 from jaxrl_vis.learner.blocks import shifted
-from jaxrl_vis_envs.gpu_kernels import kernel_call
+from jaxrl_vis_envs.compiling.gpu_kernels import kernel_call
 
 LEVELS = 3
 """Layers of which a patch is one row of the result."""

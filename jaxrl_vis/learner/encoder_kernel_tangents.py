@@ -31,7 +31,7 @@ from jaxrl_vis.learner.encoder_kernel_passes import (
     whole,
 )
 from jaxrl_vis.learner.encoder_kernel_patches import divisor
-from jaxrl_vis_envs.gpu_kernels import kernel_call
+from jaxrl_vis_envs.compiling.gpu_kernels import kernel_call
 
 
 def _tangent_kernel(x_ref, *refs):

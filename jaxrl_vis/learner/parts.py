@@ -24,6 +24,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+import jaxrl_vis_envs
 from jaxrl_vis.config import Config
 from jaxrl_vis.learner.networks import Networks
 from jaxrl_vis.learner.rollout import Exploration, play
@@ -31,7 +32,7 @@ from jaxrl_vis.learner.sharding import Layout
 from jaxrl_vis.learner.shards import Slice
 from jaxrl_vis.types import Episodes, LoopState, Metrics, TrainState
 from jaxrl_vis_envs.base import GoalEnv
-from jaxrl_vis_envs.compilation import env_jit, targets_cpu, tracing_for_default_device
+from jaxrl_vis_envs.compiling.compilation import targets_cpu, tracing_for_default_device
 
 PART_SIZE = 8
 """Environments of a part at most, on a CPU: as many float32 numbers as the vector registers of most of them hold."""
@@ -116,7 +117,7 @@ def make_parts(
         return learn(loop, episodes, outcome, keys_of(loop.key, loop.iteration)[1])
 
     seeds, environments, whole = layout.by_seed, layout.by_environment, layout.everywhere
-    spread = functools.partial(layout.spread, jit=env_jit)
+    spread = functools.partial(layout.spread, jit=jaxrl_vis_envs.jit)
     return Parts(
         size=size,
         total=total,

@@ -19,6 +19,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+import jaxrl_vis_envs
 from jaxrl_vis.config import Config
 from jaxrl_vis.learner import normalizer
 from jaxrl_vis.learner.auxiliary import Auxiliary, make_auxiliary
@@ -35,7 +36,6 @@ from jaxrl_vis.resolved import Resolved, resolve
 from jaxrl_vis.types import Episodes, LoopState, Metrics, ReplayState, TrainState
 from jaxrl_vis.validation import validate
 from jaxrl_vis_envs.base import GoalEnv
-from jaxrl_vis_envs.compilation import env_jit
 
 # A leading seed axis on everything but the iteration, which all seeds share (see `replay`).
 _SEED_AXES = LoopState(train=0, replay=0, key=0, iteration=None)  # type: ignore[arg-type]
@@ -215,7 +215,7 @@ def _jitted(
     """The functions of one device's part as programs of all devices, by name."""
     seeds, environments, whole = layout.by_seed, layout.by_environment, layout.everywhere
     loop, replay = layout.loop, layout.replay
-    spread = functools.partial(layout.spread, jit=env_jit)
+    spread = functools.partial(layout.spread, jit=jaxrl_vis_envs.jit)
     return {
         "init": spread(init, (seeds,), loop, runs_once=True),
         "train_iteration": spread(
@@ -230,7 +230,7 @@ def _jitted(
 def _jitted_evaluate(layout: Layout, evaluate: Callable) -> Any:
     in_specs, out_specs = (layout.by_seed, layout.everywhere), (layout.by_seed, layout.by_environment)
     kept_as = (layout.read_by_host, layout.read_by_host) if jax.process_count() > 1 else None
-    return layout.spread(evaluate, in_specs, out_specs, env_jit, kept_as)
+    return layout.spread(evaluate, in_specs, out_specs, jaxrl_vis_envs.jit, kept_as)
 
 
 def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None) -> TrainStep:

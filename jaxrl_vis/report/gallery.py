@@ -22,7 +22,6 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.report.colours import depth_colours, label_colours
 from jaxrl_vis.report.outputs import check_writable
 from jaxrl_vis_envs import registry
-from jaxrl_vis_envs.compilation import env_jit
 from jaxrl_vis_envs.render import Frame, Scene, render
 
 _COLUMNS = ("name", "actions", "observation", "goal state", "horizon", "threshold", "control period", "chance", "difficulty")
@@ -132,8 +131,8 @@ def render_poses(env: Any, key: jax.Array, goals: int, size: int) -> Frame:
 
     scene = Scene.from_mjmodel(env.mj_model, env.camera, size, size)
     # A loop over single images compiles faster than a batch, and a few images render quickly.
-    draw = env_jit(lambda poses: jax.lax.map(lambda one: render(scene, one), poses))
-    return jax.tree.map(np.asarray, draw(env_jit(sample)(keys)))
+    draw = jaxrl_vis_envs.jit(lambda poses: jax.lax.map(lambda one: render(scene, one), poses))
+    return jax.tree.map(np.asarray, draw(jaxrl_vis_envs.jit(sample)(keys)))
 
 
 def check_gallery(path: Path, names: Sequence[str] | None = None) -> Sequence[str]:

@@ -6,12 +6,12 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+import jaxrl_vis_envs
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.networks import Networks
 from jaxrl_vis.learner.rollout import play, split_keys
 from jaxrl_vis.report.outputs import check_writable
 from jaxrl_vis.types import TrainState
-from jaxrl_vis_envs.compilation import env_jit
 
 _HOLD = 0.6  # duration of the last step of an episode, s
 
@@ -75,7 +75,7 @@ def write_page(program: Any, train: TrainState, key: jax.Array, episodes: int, o
     from jaxrl_vis_envs.adapters.brax_viewer import Poses, viewer_page
 
     env = program.env
-    play_all = env_jit(lambda train, key: play_poses(env, program.networks, train, key, episodes))
+    play_all = jaxrl_vis_envs.jit(lambda train, key: play_poses(env, program.networks, train, key, episodes))
     played = jax.tree.map(np.asarray, play_all(train, key))
     # The last step of each episode is repeated, so that its end is visible.
     hold = max(1, round(_HOLD / env.control_period))

@@ -29,11 +29,12 @@ import jax
 from jax import export
 from jax.extend.core import jaxpr_as_fun
 
+import jaxrl_vis_envs
 from jaxrl_vis.config import Config
 from jaxrl_vis.files import make_private, read_private, replacing, stranger_to
 from jaxrl_vis.provenance import device_record, versions
 from jaxrl_vis_envs.base import GoalEnv
-from jaxrl_vis_envs.compilation import env_jit, runs_gpu_kernels, target_platform, tracing_for_default_device
+from jaxrl_vis_envs.compiling.compilation import target_platform, tracing_for_default_device, use_gpu_kernels
 
 VARIABLE = "JAXRL_VIS_KEEP_PROGRAMS"
 MOST_FILES = 300
@@ -57,7 +58,7 @@ def fingerprint(config: Config, env: GoalEnv) -> str | None:
         return None
     settings = {name: value for name, value in jax.config.values.items() if not any(part in name for part in _WITHOUT_EFFECT)}
     with tracing_for_default_device():
-        target = [target_platform(), runs_gpu_kernels()]
+        target = [target_platform(), use_gpu_kernels()]
     # The seed is an argument, in the form of keys.
     compiled_in = {name: value for name, value in dataclasses.asdict(config).items() if name not in (*HOST_FIELDS, "seed")}
     depends_on = [compiled_in, versions(), device_record(), target, settings, _code()]
@@ -118,7 +119,7 @@ class KeptPrograms:
             function: Jitted.
             arguments: Shapes of what it takes.
             simplify: Makes arrays, lists, tuples and dictionaries of what it returns.
-            **jit_options: As of `env_jit`.
+            **jit_options: As of `jaxrl_vis_envs.jit`.
         """
         leaves = tuple(map(jax.tree.leaves, arguments))
         data = self._read(name)
@@ -130,7 +131,7 @@ class KeptPrograms:
             self._fresh[name] = data = bytes(exported.serialize())
         # Also what has just been traced: XLA's cache takes a program that was read for another one than that which was traced.
         program = export.deserialize(bytearray(data))
-        return env_jit(program.call, **jit_options).lower(*leaves)
+        return jaxrl_vis_envs.jit(program.call, **jit_options).lower(*leaves)
 
     def write(self) -> None:
         """Keeps what was traced; call it when it has been compiled. Where that cannot be written, nothing is kept."""

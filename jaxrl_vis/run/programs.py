@@ -30,7 +30,7 @@ from jaxrl_vis.run.pending import Pending, stacked
 from jaxrl_vis.run.side_by_side import SideBySide
 from jaxrl_vis.run.signals import shield_this_thread
 from jaxrl_vis.types import Episodes, LoopState, Metrics, TrainState
-from jaxrl_vis_envs.compilation import distrusted_kernels, tracing_for_default_device, trusting_kernels
+from jaxrl_vis_envs.compiling.compilation import assume_kernels_compile, failed_kernels, tracing_for_default_device
 
 # Evaluation draws from a key of its own, the same at every evaluation and for every seed.
 _EVALUATION_SEED = 2**31 - 1
@@ -123,7 +123,7 @@ class Programs:
     @functools.cached_property
     def shapes(self) -> LoopState:
         """Shapes and types of the loop state, and where it lies; traced, not allocated."""
-        with tracing_for_default_device(), trusting_kernels():  # as it will be compiled, so that it is traced once
+        with tracing_for_default_device(), assume_kernels_compile():  # as it will be compiled, so that it is traced once
             shapes = jax.eval_shape(self.program.init, self.run_keys)
         return self.layout.with_shardings(shapes, self.layout.loop)
 
@@ -182,7 +182,7 @@ class Programs:
         if cache and self._may_keep and (found := fingerprint(self.config, self.env)):
             self._kept = KeptPrograms(Path(cache) / "programs", found)
             try:
-                with trusting_kernels():
+                with assume_kernels_compile():
                     self._compiled |= self._all(names, meanwhile)
                 self._kept.write()
                 return
@@ -190,10 +190,10 @@ class Programs:
                 self._kept.forget()
                 self._kept, self._may_keep = None, False
         try:
-            with trusting_kernels():
+            with assume_kernels_compile():
                 self._compiled |= self._all(names, meanwhile)
         except Exception:
-            if not distrusted_kernels():
+            if not failed_kernels():
                 raise
             self._compiled |= self._all(names, meanwhile)
 

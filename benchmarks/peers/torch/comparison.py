@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+import jaxrl_vis_envs
 from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.timing import measure as measure_time
 from jaxrl_vis.config import Config
@@ -27,7 +28,6 @@ from jaxrl_vis.learner.ddpg import make_ddpg
 from jaxrl_vis.learner.sampling import Choice, Sampler
 from jaxrl_vis.learner.train_step import TrainStep
 from jaxrl_vis.types import ReplayState, TrainState
-from jaxrl_vis_envs.compilation import env_jit
 
 STEPS = 3
 """Number of compared gradient steps."""
@@ -129,9 +129,9 @@ def reference(program: TrainStep, train: TrainState, replay: ReplayState) -> Ref
         taken = gradients if with_actor else gradients._replace(actor=None)
         return algorithm.end(algorithm.apply(working, taken)), losses, gradients
 
-    train, choices, statistics = jax.device_get(env_jit(begin, runs_once=True)(train, replay))
+    train, choices, statistics = jax.device_get(jaxrl_vis_envs.jit(begin, runs_once=True)(train, replay))
     now = train
-    stepped = env_jit(step, static_argnums=0)
+    stepped = jaxrl_vis_envs.jit(step, static_argnums=0)
     losses, gradients = [], []
     with jax.default_matmul_precision("highest"):
         for index in range(STEPS):

@@ -4,3 +4,5 @@ Each needs the library it is named after, and raises an ImportError with instruc
 jaxrl-vis; Gymnasium is an extra: ``pip install 'jaxrl-vis[gymnasium]'``, or in a clone ``pip install '.[gymnasium]'``. Nothing
 else in this package imports them.
 """
+
+from jaxrl_vis_envs import physics as physics  # before brax, which imports MJX

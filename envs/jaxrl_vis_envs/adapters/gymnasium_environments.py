@@ -13,7 +13,7 @@ from jaxrl_vis_envs import render
 from jaxrl_vis_envs.adapters.environments import goal_env
 from jaxrl_vis_envs.adapters.rewards import Reward, reward_function
 from jaxrl_vis_envs.base import GoalEnv, State
-from jaxrl_vis_envs.compilation import env_jit
+from jaxrl_vis_envs.compiling.compilation import jit
 from jaxrl_vis_envs.randomization import varied_scene
 from jaxrl_vis_envs.registry import make
 
@@ -86,7 +86,7 @@ def _programs(env: GoalEnv) -> _Programs:
         return state, jax.vmap(observe)(state)
 
     _, shapes, _ = jax.eval_shape(reset, jax.ShapeDtypeStruct((1,), jnp.uint32))
-    return _Programs(env, _space(shapes), env_jit(reset), env_jit(step, donate_argnums=0))
+    return _Programs(env, _space(shapes), jit(reset), jit(step, donate_argnums=0))
 
 
 def _to_public(image: jax.Array) -> jax.Array:
@@ -111,7 +111,7 @@ def _camera(env: GoalEnv, size: int) -> Any:
     if mj_model is None or camera is None:
         raise ValueError(f"{type(env).__name__} has no MuJoCo model with a camera to render through")
     scene = render.Scene.from_mjmodel(mj_model, camera=camera, height=size, width=size)
-    return env_jit(jax.vmap(lambda data, domain: render.render(varied_scene(scene, domain), data).rgb))
+    return jit(jax.vmap(lambda data, domain: render.render(varied_scene(scene, domain), data).rgb))
 
 
 class Environments:

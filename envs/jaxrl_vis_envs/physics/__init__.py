@@ -10,3 +10,7 @@ steps               physics steps number by number, by folding, quaternions, lin
 kinematics          poses of all bodies at once
 inverse_kinematics  joint angles that bring the last link of a chain to a pose
 """
+
+from jaxrl_vis_envs.compiling import mjx_imports
+
+mjx_imports.install()

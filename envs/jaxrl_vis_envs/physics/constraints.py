@@ -19,7 +19,7 @@ import numpy as np
 from mujoco import mjx
 from mujoco.mjx._src import collision_driver, constraint, smooth, solver, support
 
-from jaxrl_vis_envs.compilation import by_platform, runs_gpu_kernels
+from jaxrl_vis_envs.compiling.compilation import dispatch_by_platform, use_gpu_kernels
 from jaxrl_vis_envs.physics import descent, newton, newton_kernel
 from jaxrl_vis_envs.physics.descent import Motion, Problem, Structure
 
@@ -30,9 +30,9 @@ _MOST_ENTRIES, _MOST_APART = 600, 12
 
 
 def solver_of(model: mjx.Model) -> Literal["numbers", "matrices", "mjx"]:
-    """Which solver a model has on the platform that is being traced for (`jaxrl_vis_envs.compilation`)."""
+    """Which solver a model has on the platform that is being traced for (`jaxrl_vis_envs.compiling.compilation`)."""
     fits_numbers = _fits_numbers(model)
-    if fits_numbers and runs_gpu_kernels(newton_kernel.probe):
+    if fits_numbers and use_gpu_kernels(newton_kernel.probe):
         return "numbers"
     if newton.fits(model):
         return "matrices"
@@ -130,7 +130,7 @@ def solve(model: mjx.Model, data: mjx.Data, exact: bool) -> tuple[mjx.Data, jax.
     """
     applied = data.qfrc_applied + support.xfrc_accumulate(model, data)
     data = data.replace(qfrc_smooth=data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator + applied)
-    motion = by_platform(functools.partial(_motion, exact=exact), model, data)
+    motion = dispatch_by_platform(functools.partial(_motion, exact=exact), model, data)
     return data.replace(qacc_smooth=motion.free, qacc=motion.acceleration, qfrc_constraint=motion.force), motion.damped
 
 
@@ -165,7 +165,7 @@ def _by_numbers(model: mjx.Model, data: mjx.Data, exact: bool) -> Motion:
         most=rows.efc_frictionloss,
         cone=_cone_friction(model, data, structure),
     )
-    if runs_gpu_kernels(newton_kernel.probe):
+    if use_gpu_kernels(newton_kernel.probe):
         return newton_kernel.solve(structure, problem)
     motion = descent.solve(structure, descent.numbers_of(structure, lambda name, *place: getattr(problem, name)[place]))
     return Motion(*(jnp.stack([jnp.asarray(number, jnp.float32) for number in part]) for part in motion))

@@ -18,7 +18,7 @@ from jax.experimental.pallas import triton as plgpu
 from jax.extend.core import jaxpr_as_fun
 from jax.interpreters import mlir
 
-from jaxrl_vis_envs.gpu_kernels import kernel_call
+from jaxrl_vis_envs.compiling.gpu_kernels import kernel_call
 
 LANES = 32
 """Threads of a program: those of a warp."""

@@ -12,7 +12,7 @@ import numpy as np
 from mujoco import mjx
 from mujoco.mjx._src import math, sensor, smooth
 
-from jaxrl_vis_envs.compilation import by_platform, runs_gpu_kernels, targets_cpu
+from jaxrl_vis_envs.compiling.compilation import dispatch_by_platform, targets_cpu, use_gpu_kernels
 from jaxrl_vis_envs.physics import constraints, mechanism, steps, steps_kernel
 from jaxrl_vis_envs.physics.kinematics import kinematics
 from jaxrl_vis_envs.physics.steps import State
@@ -107,13 +107,13 @@ def take_steps(
         return _one_by_one(model, data, count, exact)
 
     def by_numbers_or_not(data: mjx.Data) -> mjx.Data:
-        if runs_gpu_kernels(steps_kernel.probe):
+        if use_gpu_kernels(steps_kernel.probe):
             return _in_one_kernel(model, data, count, exact, beside_exact)
         if targets_cpu() and model.nv <= _FEW_JOINTS:
             return _by_numbers(model, data, count, exact)
         return _one_by_one(model, data, count, exact)
 
-    return by_platform(by_numbers_or_not, data)
+    return dispatch_by_platform(by_numbers_or_not, data)
 
 
 def _one_by_one(model: mjx.Model, data: mjx.Data, count: int, exact: bool) -> mjx.Data:

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis_envs.compilation import compiler_options
+from jaxrl_vis_envs.compiling.compilation import compiler_options
 from jaxrl_vis_envs.cores import num_cores
 from jaxrl_vis_envs.plants.surfaces import GROUND, NOTHING
 from jaxrl_vis_envs.plants.tables import CONE_HIT, FAR, NEAR, TRIANGLE_HIT, View, tile_size

@@ -19,7 +19,7 @@ Modules, in the order in which data passes through them; each imports only from 
     reference    MuJoCo's own OpenGL renderer with the same `Frame`, for tests and videos
 
 Each fast path reproduces the plain path in `pixel`, including its derivatives, for the scenes that it supports. The path is
-selected by the platform that a program is compiled for (`jaxrl_vis_envs.compilation.by_platform`).
+selected by the platform that a program is compiled for (`jaxrl_vis_envs.compiling.compilation.dispatch_by_platform`).
 """
 
 from jaxrl_vis_envs.render.images import quantize, render, render_planes

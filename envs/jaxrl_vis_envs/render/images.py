@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis_envs.compilation import by_platform, target_platform, tracing_for
+from jaxrl_vis_envs.compiling.compilation import dispatch_by_platform, target_platform, tracing_for
 from jaxrl_vis_envs.render import camera
 from jaxrl_vis_envs.render.camera import Rays
 from jaxrl_vis_envs.render.cpu import passes
@@ -88,7 +88,7 @@ def render_planes(
     def draw(scene: Scene, *prepared: Any) -> Planes:
         return _draw_along(_Path(_fast(scene, outputs), target_platform()), outputs, scene, *prepared)
 
-    return by_platform(draw, scene, *prepare(scene, data, rgb))
+    return dispatch_by_platform(draw, scene, *prepare(scene, data, rgb))
 
 
 def _in_32_bits(scene: Scene) -> Scene:

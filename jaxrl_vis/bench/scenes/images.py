@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+import jaxrl_vis_envs
 from jaxrl_vis.bench.peaks import device_peak
 from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.scenes import models, operations, program_memory
@@ -21,7 +22,6 @@ from jaxrl_vis.bench.settings import Settings
 from jaxrl_vis.bench.timing import compile_timed
 from jaxrl_vis.bench.timing import measure as measure_time
 from jaxrl_vis.bench.variation import alternate, assert_new_images
-from jaxrl_vis_envs.compilation import env_jit
 from jaxrl_vis_envs.render import Scene, quantize, render_planes
 
 CPU_COUNTS = (64,)
@@ -110,7 +110,7 @@ def measure_output(case: Case, output: str, repeats: int) -> Measurement:
     count, size = config["images"], config["image_size"]
     scene = Scene.from_mjmodel(mj_model, 0, size, size)
     batches = [{name: jnp.asarray(rows[:count]) for name, rows in batch.items()} for batch in case.batches]
-    draw = env_jit(jax.vmap(lambda poses: _image(scene, poses, output)))
+    draw = jaxrl_vis_envs.jit(jax.vmap(lambda poses: _image(scene, poses, output)))
     compiled, compile_s = compile_timed(draw, batches[0])
     assert_new_images(compiled, batches)
     timing = measure_time(alternate(compiled, batches), repeats)

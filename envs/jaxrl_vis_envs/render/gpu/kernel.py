@@ -16,8 +16,8 @@ import numpy as np
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
 
-from jaxrl_vis_envs.compilation import runs_gpu_kernels
-from jaxrl_vis_envs.gpu_kernels import kernel_call
+from jaxrl_vis_envs.compiling.compilation import use_gpu_kernels
+from jaxrl_vis_envs.compiling.gpu_kernels import kernel_call
 from jaxrl_vis_envs.render import camera
 from jaxrl_vis_envs.render.camera import Rays
 from jaxrl_vis_envs.render.outputs import Outputs, Planes
@@ -53,7 +53,7 @@ def can_render(scene: Scene, outputs: Outputs) -> bool:
 
     The exception is segmentation if a reflecting object may coincide with another one.
     """
-    return supports(scene) and not (outputs.segmentation and scene.reordered) and runs_gpu_kernels(probe)
+    return supports(scene) and not (outputs.segmentation and scene.reordered) and use_gpu_kernels(probe)
 
 
 def supports(scene: Scene) -> bool:

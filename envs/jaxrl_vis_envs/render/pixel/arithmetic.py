@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis_envs.compilation import targets_cpu, tracing_for
+from jaxrl_vis_envs.compiling.compilation import targets_cpu, tracing_for
 
 
 def _fit_polynomial(values: Callable, degree: int) -> tuple[float, ...]:

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis_envs.compilation import targets_cpu
+from jaxrl_vis_envs.compiling.compilation import targets_cpu
 from jaxrl_vis_envs.render.camera import Rays
 from jaxrl_vis_envs.render.pixel import raycast, shapes, triangles
 from jaxrl_vis_envs.render.scene import Scene

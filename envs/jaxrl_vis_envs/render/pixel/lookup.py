@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis_envs.compilation import targets_cpu
+from jaxrl_vis_envs.compiling.compilation import targets_cpu
 from jaxrl_vis_envs.render.model import meshes, reading, textures
 from jaxrl_vis_envs.render.pixel import shapes
 from jaxrl_vis_envs.render.pixel.arithmetic import Vector

@@ -1,8 +1,8 @@
-"""Kernels for NVIDIA GPUs (Pallas, by Triton), also for cards that JAX does not know by their names.
+"""Pallas kernels (Triton) for NVIDIA GPUs, including cards that are missing in JAX's list.
 
-JAX 0.11 lowers a kernel only where it finds the GPU's name in a list of some twenty, for the sake of its compute capability. A
-GeForce RTX 3090 or an L40S is not there. Such a card is called by the name of one that is, of the same capability or the next
-lower one: XLA compiles the kernel for the card itself in any case.
+JAX 0.11 lowers a kernel only if the GPU's name is in a list of some twenty, from which it reads the compute capability. A
+GeForce RTX 3090 or an L40S is missing. Kernels for such a card are lowered under the name of a listed card of the same or the
+next lower capability; XLA compiles them for the actual card in any case.
 """
 
 import concurrent.futures
@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
 
-# Compute capability -> a card that JAX 0.11 knows.
+# Compute capability -> a card in JAX 0.11's list.
 _CARDS = {
     8.0: "NVIDIA A100",
     8.6: "NVIDIA A10",
@@ -25,53 +25,53 @@ _CARDS = {
     10.3: "NVIDIA B300",
     12.0: "NVIDIA RTX PRO 6000",
 }
-# Name of the card that is here -> what it is called; None where nothing need be said, or nothing helps.
-_called: dict[str, str | None] = {}
+# Name of an installed card -> name to lower under; None if that is not needed or does not help.
+_substitutes: dict[str, str | None] = {}
 
 
 def kernel_call(kernel: Callable[..., None], *, interpret: bool = False, **options: Any) -> Callable[..., Any]:
-    """`jax.experimental.pallas.pallas_call`.
+    """Call `jax.experimental.pallas.pallas_call`, also for cards that are missing in JAX's list.
 
     Args:
-        kernel: Reads and writes references.
+        kernel: Function of input and output references.
         interpret: Run the kernel without a GPU, slowly.
-        **options: Of `pallas_call`.
+        **options: Options of `pallas_call`.
 
     Returns:
         The function from arrays to arrays.
     """
     call = pl.pallas_call(kernel, interpret=interpret, **options)
-    name = None if interpret else _stand_in()
+    name = None if interpret else _substitute_name()
     if name is None:
         return call
 
     def described(*arguments: Any) -> Any:
-        with _calling_it(name):
+        with _lowering_as(name):
             return call(*arguments)
 
     return described
 
 
-def _stand_in() -> str | None:
-    """What the first NVIDIA GPU is called, so that JAX knows it; None: what it is."""
+def _substitute_name() -> str | None:
+    """Return the name to lower kernels under for the first NVIDIA GPU; None for its own."""
     if jax.__version_info__ < (0, 11):
         return None
     try:
         gpu = jax.devices("cuda")[0]
         capability = float(gpu.compute_capability)
-    except (RuntimeError, AttributeError, TypeError, ValueError):  # none there, or another maker's
+    except (RuntimeError, AttributeError, TypeError, ValueError):  # no GPU, or another vendor's
         return None
-    if gpu.device_kind not in _called:
-        likest = max((known for known in _CARDS if known <= capability), default=None)
-        name = None if likest is None else _CARDS[likest]
+    if gpu.device_kind not in _substitutes:
+        nearest = max((known for known in _CARDS if known <= capability), default=None)
+        name = None if nearest is None else _CARDS[nearest]
         needs_name = name is not None and not _lowers(gpu, None) and _lowers(gpu, name)
-        _called[gpu.device_kind] = name if needs_name else None
-    return _called[gpu.device_kind]
+        _substitutes[gpu.device_kind] = name if needs_name else None
+    return _substitutes[gpu.device_kind]
 
 
 @contextlib.contextmanager
-def _calling_it(name: str | None) -> Iterator[None]:
-    """What is traced inside is for the card of that name; axes of devices stay what they are."""
+def _lowering_as(name: str | None) -> Iterator[None]:
+    """Trace for a card of that name; the axes of devices stay the same."""
     if name is None:
         yield
         return
@@ -85,7 +85,7 @@ def _calling_it(name: str | None) -> Iterator[None]:
 
 
 def _lowers(gpu: Any, name: str | None) -> bool:
-    """Whether JAX lowers a kernel for a GPU that is called so."""
+    """Return True if JAX lowers a kernel for a GPU under this name."""
 
     def copy(source: Any, target: Any) -> None:
         target[...] = source[...]
@@ -93,13 +93,13 @@ def _lowers(gpu: Any, name: str | None) -> bool:
     def lower() -> None:
         row = jax.ShapeDtypeStruct((32,), jnp.float32)
         call = pl.pallas_call(copy, out_shape=row, compiler_params=plgpu.CompilerParams(num_warps=1))
-        with jax.default_device(gpu), _calling_it(name):
+        with jax.default_device(gpu), _lowering_as(name):
             jax.jit(call).trace(row).lower(lowering_platforms=("cuda",))
 
     try:
-        # Asked while something else is traced, of which this is no part: what is being traced is a thread's own.
+        # This runs during other traces that it is not part of; the current trace is local to a thread.
         with concurrent.futures.ThreadPoolExecutor(1) as pool:
             pool.submit(lower).result()
-    except Exception:  # JAX's own, which are not documented
+    except Exception:  # JAX does not document its types
         return False
     return True
