@@ -24,7 +24,7 @@ from jaxrl_vis_envs.compiling.compilation import (
     tracing_for_default_device,
     use_gpu_kernels,
 )
-from jaxrl_vis_envs.physics import newton_kernel, steps_kernel
+from jaxrl_vis_envs.physics.scalar import steps_kernel
 from jaxrl_vis_envs.render import render_planes
 from jaxrl_vis_envs.render.gpu import kernel
 
@@ -170,7 +170,7 @@ def test_a_run_whose_programs_compile_asks_nothing(gpu):
     assert not probed
 
 
-@pytest.mark.parametrize("module", [kernel, encoder_kernel_passes, newton_kernel, steps_kernel])
+@pytest.mark.parametrize("module", [kernel, encoder_kernel_passes, steps_kernel])
 def test_the_kernels_themselves_are_probed_in_the_midst_of_a_trace(module, gpu):
     """As far as they can be compiled without a GPU: down to Triton's code."""
     gpu()

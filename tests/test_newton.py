@@ -11,7 +11,7 @@ import pytest
 import jaxrl_vis_envs
 from benchmarks.tasks import environments
 from jaxrl_vis_envs.compiling.compilation import kernels, tracing_for
-from jaxrl_vis_envs.physics import constraints, mjx_model, newton
+from jaxrl_vis_envs.physics import mjx_model, newton, scalar
 from jaxrl_vis_envs.physics.mjx_model import mjx
 
 
@@ -74,7 +74,7 @@ def test_the_line_search_finds_the_least_cost():
         there = residual[:, None] + along[:, None] * lengths
         acting = np.where(is_equality[:, None] | (there < 0), stiffness[:, None], 0)
         costs = first * lengths + 0.5 * second * lengths**2 + 0.5 * (acting * there**2).sum(axis=0)
-        assert float(found) == pytest.approx(min(lengths[costs.argmin()], newton._LONGEST), abs=1e-3)
+        assert float(found) == pytest.approx(min(lengths[costs.argmin()], newton._MAX_STEP), abs=1e-3)
 
 
 def test_nothing_moves_where_nothing_pulls():
@@ -90,7 +90,7 @@ def test_a_step_is_that_of_mjx():
     mj_model = copy.copy(env.mj_model)
     mj_model.opt.iterations, mj_model.opt.ls_iterations = 20, 20
     model, start = mjx.put_model(mj_model), env.sample_start(jax.random.key(0))
-    assert newton.fits(model)
+    assert newton.supports(model)
     rng = np.random.default_rng(2)
     count = 16
     arm, fingers = slice(0, 7), slice(7, 9)
@@ -120,45 +120,48 @@ def test_a_step_is_that_of_mjx():
 
 
 @pytest.mark.parametrize(
-    ("joint", "option", "solver"),
+    ("joint", "option", "is_of_newton", "is_of_scalars"),
     [
-        ('<joint type="hinge"/>', "", "matrices"),
-        ('<joint type="hinge" frictionloss="1"/>', "", "numbers"),
-        ('<joint type="hinge"/>', '<option cone="elliptic"/>', "numbers"),
-        ('<joint type="hinge"/>', '<option solver="CG"/>', "mjx"),
-        ("<freejoint/>", "", "mjx"),
-        ('<joint type="hinge"/>', '<option><flag eulerdamp="disable"/></option>', "mjx"),
-        ('<joint type="hinge"/>', '<option><flag warmstart="disable"/></option>', "matrices"),
-        ('<joint type="hinge"/>', '<option integrator="RK4"/>', "matrices"),
-        ('<joint type="hinge"/>', '<option integrator="implicitfast"/>', "mjx"),
+        ('<joint type="hinge"/>', "", True, True),
+        ('<joint type="hinge" frictionloss="1"/>', "", False, True),
+        ('<joint type="hinge"/>', '<option cone="elliptic"/>', False, True),
+        ('<joint type="hinge"/>', '<option solver="CG"/>', False, False),
+        ("<freejoint/>", "", False, False),
+        ('<joint type="hinge"/>', '<option><flag eulerdamp="disable"/></option>', False, False),
+        ('<joint type="hinge"/>', '<option><flag warmstart="disable"/></option>', True, True),
+        ('<joint type="hinge"/>', '<option integrator="RK4"/>', True, True),
+        ('<joint type="hinge"/>', '<option integrator="implicitfast"/>', False, False),
     ],
 )
-def test_what_is_not_small_and_simple_is_left_to_mjx(joint, option, solver):
+def test_what_is_not_small_and_simple_is_left_to_mjx(joint, option, is_of_newton, is_of_scalars):
     body = f'<body>{joint}<geom type="sphere" size=".1"/></body>'
     model = mjx.put_model(mujoco.MjModel.from_xml_string(f"<mujoco>{option}<worldbody>{body}</worldbody></mujoco>"))
-    assert constraints.solver_of(model) == solver
-    assert constraints.takes(model) is (solver != "mjx")
+    assert newton.supports(model) is is_of_newton
+    assert scalar.supports(model) is is_of_scalars
 
 
 # The speed of a task rests on it: VisualReacher makes 1.73 M steps a second on an H100 with ours, 0.78 M with MJX's.
 # The finger has elliptic cones and friction in a joint, the hand 24 joints.
-SOLVERS_ON_A_CPU = {
-    "FetchReach": "matrices",
-    "FingerTurn": "numbers",
+ON_A_CPU = {
+    "FetchReach": "newton",
+    "FingerTurn": "scalar",
     "HandReach": "mjx",
-    "Reacher": "matrices",
-    "SawyerReach": "matrices",
-    "StalkReach": "matrices",
+    "Reacher": "newton",
+    "SawyerReach": "newton",
+    "StalkReach": "newton",
 }
 
 
-@pytest.mark.parametrize("name", SOLVERS_ON_A_CPU)
-def test_the_solver_of_each_task(name):
+@pytest.mark.parametrize("name", ON_A_CPU)
+def test_the_engine_of_each_task(name):
     model = mjx.put_model(environments.make(name).mj_model)
-    assert constraints.takes(model)
-    assert constraints.solver_of(model) == SOLVERS_ON_A_CPU[name]
+    assert scalar.supports(model)
+    assert mjx_model.prefers_scalar_engine(model) is (ON_A_CPU[name] == "scalar")
+    assert newton.supports(model) is (ON_A_CPU[name] == "newton")
     with tracing_for("cuda"), kernels(True):
-        assert constraints.solver_of(model) == "numbers"
+        assert mjx_model.prefers_scalar_engine(model)
+    with tracing_for("cuda"), kernels(False):
+        assert not mjx_model.prefers_scalar_engine(model)
 
 
 def test_without_warm_starts_the_last_accelerations_do_not_matter():

@@ -33,7 +33,8 @@ LAYERS: tuple[tuple[str, ...], ...] = (
 # The same for the environments.
 ENVIRONMENT_LAYERS: tuple[tuple[str, ...], ...] = (
     ("checks", "compiling", "cores", "documents", "goals", "names"),
-    ("physics", "plants", "render", "task_modules"),
+    ("physics",),
+    ("plants", "render", "task_modules"),
     ("randomization",),
     ("base",),
     ("pixels", "registry"),
@@ -119,6 +120,14 @@ def test_packages_do_not_import_the_scripts_outside_the_wheel() -> None:
     for folder, _ in PACKAGES.values():
         for path in folder.rglob("*.py"):
             assert "benchmarks" not in {name.split(".")[0] for name in imported(path, when_running=False)}, path
+
+
+def test_the_scalar_engine_has_one_door() -> None:
+    """Nothing outside of its folder imports more than its two functions and the probe of its kernel."""
+    folder, door = ROOT / "envs" / "jaxrl_vis_envs" / "physics" / "scalar", "jaxrl_vis_envs.physics.scalar"
+    for path in [*(ROOT / "jaxrl_vis").rglob("*.py"), *(ROOT / "envs").rglob("*.py"), *(ROOT / "benchmarks").rglob("*.py")]:
+        inside = {name.removeprefix(f"{door}.") for name in imported(path) if name.startswith(f"{door}.")}
+        assert path.is_relative_to(folder) or inside <= {"simulate", "supports", "probe"}, path
 
 
 def test_nothing_imports_the_folder_of_sources() -> None:

@@ -1,11 +1,13 @@
-"""Physics steps that are written out number by number, and their GPU kernel, which Pallas's interpreter runs here.
+"""Physics steps of the scalar engine, and their GPU kernel, which Pallas's interpreter runs here.
 
 For a whole step of the hand NumPy does the arithmetic, in float32, too: to compile it for a CPU takes minutes.
 """
 
+import contextlib
 import copy
 import functools
 import re
+from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
 
@@ -19,24 +21,24 @@ from nvidia import lowered_for_nvidia
 import jaxrl_vis_envs
 from benchmarks.tasks import environments
 from jaxrl_vis_envs.compiling.compilation import KERNELS_VARIABLE, kernels, tracing_for
-from jaxrl_vis_envs.physics import (
-    algebra,
-    capsules,
-    cones,
-    descent,
+from jaxrl_vis_envs.physics import mjx_model, scalar
+from jaxrl_vis_envs.physics.mjx_model import mjx
+from jaxrl_vis_envs.physics.scalar import (
+    constraint_softness,
+    contacts,
     dynamics,
-    folding,
+    friction_cones,
     line_search,
     links,
-    mechanism,
-    mjx_model,
+    partial_arithmetic,
     quaternions,
-    reference,
+    scalar_model,
+    scalar_newton,
+    sparse_algebra,
     steps,
     steps_kernel,
     welds,
 )
-from jaxrl_vis_envs.physics.mjx_model import mjx
 from jaxrl_vis_envs.tasks.hand_reach import HandReach, HandReachConfig
 
 # Every kind of joint, body, actuator, limit and contact that steps take, at places and along axes that nothing folds away.
@@ -123,28 +125,37 @@ def branch_of_numpy(condition, one, other):
     return one() if condition else other()
 
 
-def taken(model: mjx.Model, data: mjx.Data, count: int, in_kernel: bool, exact: Any = True) -> steps.State:
-    """`steps.take` of a batch, [B, N] each, in NumPy."""
-    constants = mechanism.mechanism_of(model)
+@contextlib.contextmanager
+def arithmetic_of(numpy: Any) -> Iterator[None]:
+    """Lets NumPy, or what behaves like it, do the arithmetic of the scalar engine."""
+    arithmetic = (constraint_softness, contacts, friction_cones, line_search, partial_arithmetic, quaternions)
+    arithmetic += (scalar_newton, sparse_algebra, steps, welds)
+    with pytest.MonkeyPatch.context() as patch, np.errstate(over="ignore"):
+        for module in arithmetic:
+            patch.setattr(module, "jnp", numpy)
+        lax = SimpleNamespace(fori_loop=loop_of_numpy, while_loop=open_loop_of_numpy, cond=branch_of_numpy)
+        for module in (scalar_newton, line_search, steps):
+            patch.setattr(module, "jax", SimpleNamespace(lax=lax))
+        yield
+
+
+def taken(model: mjx.Model, data: mjx.Data, count: int, in_kernel: bool, exact: Any = True) -> steps.JointState:
+    """`steps.simulate` of a batch, [B, N] each, in NumPy."""
+    constants = scalar_model.build_scalar_model(model)
     used = list(constants.mocaps)
     mocap = np.concatenate([data.mocap_pos[:, used], data.mocap_quat[:, used]], axis=2).reshape(data.qpos.shape[0], -1)
-    state = steps.State(*map(columns, (data.qpos, data.qvel, data.qacc_warmstart, data.qvel)))
-    with pytest.MonkeyPatch.context() as patch, np.errstate(over="ignore"):
-        for module in (algebra, capsules, cones, descent, folding, line_search, quaternions, reference, steps, welds):
-            patch.setattr(module, "jnp", Float32Numpy())
-        lax = SimpleNamespace(fori_loop=loop_of_numpy, while_loop=open_loop_of_numpy, cond=branch_of_numpy)
-        for module in (descent, line_search, steps):
-            patch.setattr(module, "jax", SimpleNamespace(lax=lax))
+    state = steps.JointState(*map(columns, (data.qpos, data.qvel, data.qacc_warmstart, data.qvel)))
+    with arithmetic_of(Float32Numpy()):
         control, applied = columns(data.ctrl), columns(data.qfrc_applied)
         timestep = float(model.opt.timestep)
-        state = steps.take(constants, state, control, applied, timestep, count, exact, in_kernel, columns(mocap))
-    return steps.State(*(np.stack(part, axis=1) for part in state))
+        state = steps.simulate(constants, state, control, applied, timestep, count, exact, in_kernel, columns(mocap))
+    return steps.JointState(*(np.stack(part, axis=1) for part in state))
 
 
 @functools.cache
 def by_matrices(name: str, count: int):
     env = environments.make(name)
-    return env, jaxrl_vis_envs.jit(jax.vmap(lambda data: mjx_model._one_by_one(env._model, data, count, True)))
+    return env, jaxrl_vis_envs.jit(jax.vmap(lambda data: mjx_model._take_mjx_steps(env._model, data, count, True)))
 
 
 @functools.cache
@@ -196,24 +207,23 @@ def test_a_control_step_of_each_task_is_that_of_matrices(name):
     assert np.median(error) < 2e-6 and error.max() < 1e-3, np.sort(error)[-5:]
 
 
-def test_on_a_cpu_the_finger_goes_number_by_number():
+def test_on_a_cpu_the_finger_has_the_scalar_engine():
     data = states("FingerTurn")
     env, _ = by_matrices("FingerTurn", 1)
     _, control_step = by_matrices("FingerTurn", env.config.substeps)
     after = control_step(data)
-    found = jaxrl_vis_envs.jit(jax.vmap(lambda data: mjx_model.take_steps(env._model, data, env.config.substeps, True, True)))(
-        data
-    )
+    found = jaxrl_vis_envs.jit(jax.vmap(lambda data: mjx_model.take_steps(env._model, data, env.config.substeps, True)))(data)
     assert not np.array_equal(found.qpos, after.qpos)  # or they would be matrices, too
     for name in ("qpos", "time"):
         np.testing.assert_allclose(getattr(found, name), getattr(after, name), atol=1e-3)
     assert np.median(np.abs(found.qpos - after.qpos).max(axis=1)) < 2e-6
     np.testing.assert_allclose(found.qacc_warmstart, found.qacc)
     pushed = data.replace(xfrc_applied=data.xfrc_applied.at[0, 1, 0].set(1.0))
-    found = jaxrl_vis_envs.jit(jax.vmap(lambda data: mjx_model.take_steps(env._model, data, 1, True, True)))(pushed)
-    assert np.isnan(found.qpos[0]).all() and np.isfinite(found.qpos[1:]).all()
-    # Whoever does not say that nothing is pushed gets what MJX does.
     found = jaxrl_vis_envs.jit(jax.vmap(lambda data: mjx_model.take_steps(env._model, data, 1, True)))(pushed)
+    assert np.isnan(found.qpos[0]).all() and np.isfinite(found.qpos[1:]).all()
+    # Whoever says that bodies are pushed gets what MJX does.
+    disturbed = functools.partial(mjx_model.take_steps, env._model, count=1, exact=True, disturbed=True)
+    found = jaxrl_vis_envs.jit(jax.vmap(disturbed))(pushed)
     _, one_step = by_matrices("FingerTurn", 1)
     np.testing.assert_array_equal(found.qpos, one_step(pushed).qpos)
     assert not np.array_equal(found.qvel[0], one_step(data).qvel[0])
@@ -232,7 +242,7 @@ def test_a_step_of_a_model_with_everything(warmstart):
     """Limits, dry friction, springs, tendons, servos, contacts with friction and without, and joints along any axis."""
     mj_model = odd_model(warmstart)
     model = mjx.put_model(mj_model)
-    assert mechanism.takes(model)
+    assert scalar.supports(model)
     data = odd_states(mj_model, 200)
     after = jaxrl_vis_envs.jit(jax.vmap(lambda data: mjx_model.step(model, data, True)))(data)
     contact = np.asarray(after._impl.contact.dist) - np.asarray(after._impl.contact.includemargin)
@@ -241,6 +251,99 @@ def test_a_step_of_a_model_with_everything(warmstart):
     scale = np.abs(np.asarray(after.qacc)).max(axis=1)
     error = np.abs(state.acceleration - np.asarray(after.qacc)).max(axis=1) / scale
     assert np.median(error) < 2e-6 and error.max() < 1e-3, np.sort(error)[-10:]
+
+
+REACHER_SUBSTEPS = 10
+
+
+def reacher_states(count: int) -> mjx.Data:
+    """The reacher at random velocities and torques, half of the elbows within a step of the limit, on either side of it."""
+    rng = np.random.default_rng(6)
+    elbow = np.concatenate(
+        [rng.uniform(-2.5, 2.5, count // 2), rng.choice([-1, 1], count // 2) * rng.uniform(2.9, 3.05, count // 2)]
+    )
+    numbers = {
+        "qpos": np.stack([rng.uniform(-6, 6, count), elbow], axis=1),
+        "qvel": rng.normal(0, 5, (count, 2)),
+        "qacc_warmstart": rng.normal(0, 100, (count, 2)),
+        "ctrl": rng.uniform(-1, 1, (count, 2)),
+        "qfrc_applied": rng.normal(0, 5, (count, 2)),
+    }
+    still = mjx_model.still_data(environments.make("Reacher").mj_model)
+    return jax.vmap(lambda varied: still.replace(**varied))({name: jnp.float32(value) for name, value in numbers.items()})
+
+
+@pytest.mark.parametrize("integrator", ["mjINT_EULER", "mjINT_RK4"])
+@pytest.mark.parametrize("name", ["Reacher", "FingerTurn", "HandReach"])
+def test_a_step_is_that_of_mujoco(name, integrator, monkeypatch):
+    """In double precision. A step of the Runge-Kutta method has four solutions of the constraints."""
+    mj_model = copy.copy(environments.make(name).mj_model)
+    mj_model.opt.integrator = getattr(mujoco.mjtIntegrator, integrator)
+    mj_model.opt.iterations, mj_model.opt.ls_iterations, mj_model.opt.tolerance = 100, 100, 0
+    rng, count = np.random.default_rng(0), 40
+    low, high = np.where(mj_model.jnt_limited[:, None], mj_model.jnt_range, [-3.0, 3.0]).T
+    drawn = {
+        "qpos": rng.uniform(low - 0.2, high + 0.2, (count, mj_model.nq)),
+        "qvel": rng.normal(0, 2, (count, mj_model.nv)),
+        "qacc_warmstart": rng.normal(0, 10, (count, mj_model.nv)),
+        "ctrl": rng.uniform(-1, 1, (count, mj_model.nu)),
+    }
+    with jax.enable_x64(True):  # or MJX rounds the model
+        constants = scalar_model.build_scalar_model(mjx.put_model(mj_model))
+    monkeypatch.setattr(dynamics, "sine_and_cosine", lambda angle: (np.sin(angle), np.cos(angle)))
+    state = steps.JointState(*(list(drawn[name].T) for name in ("qpos", "qvel", "qacc_warmstart", "qvel")))
+    with arithmetic_of(np):
+        nothing = list(np.zeros((mj_model.nv, count)))
+        control, timestep = list(drawn["ctrl"].T), mj_model.opt.timestep
+        after = steps.simulate(constants, state, control, nothing, timestep, 1, exact=True)
+    theirs, constrained = mujoco.MjData(mj_model), 0
+    for index in range(count):
+        for field, values in drawn.items():
+            getattr(theirs, field)[:] = values[index]
+        mujoco.mj_step(mj_model, theirs)
+        constrained += theirs.nefc - mj_model.dof_frictionloss.astype(bool).sum() > 0
+        for ours, part in ((after.position, theirs.qpos), (after.velocity, theirs.qvel)):
+            np.testing.assert_allclose([number[index] for number in ours], part, rtol=0, atol=1e-11 * np.abs(part).max())
+    assert constrained >= 2
+
+
+def test_the_kernel_of_runge_kutta_takes_the_steps_of_mjx():
+    """Those that the reacher has on a GPU and on a CPU, its own number of iterations included."""
+    env, data = environments.make("Reacher"), reacher_states(48)
+    assert env.mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+    matrices = functools.partial(mjx_model.take_steps, env._model, count=REACHER_SUBSTEPS)
+    take = functools.partial(steps_kernel.simulate, interpret=True)
+    kernel = functools.partial(scalar._simulate_by, take, env._model, count=REACHER_SUBSTEPS, exact=None)
+    after, ours = (jaxrl_vis_envs.jit(jax.vmap(steps))(data) for steps in (matrices, kernel))
+    assert 0.1 < (np.abs(after.qfrc_constraint[:, 1]) > 0).mean() < 0.9
+    for name in ("qpos", "qvel", "time"):
+        np.testing.assert_allclose(getattr(ours, name), getattr(after, name), rtol=1e-5, atol=1e-5)
+    for name in ("qacc", "qacc_warmstart", "qfrc_constraint"):
+        np.testing.assert_allclose(getattr(ours, name), getattr(after, name), rtol=1e-3, atol=1e-2)
+    # One step, also beside MJX's own.
+    theirs = jaxrl_vis_envs.jit(jax.vmap(lambda data: mjx.step(env._model, data)))(data)
+    ours = taken(env._model, data, 1, in_kernel=True, exact=False)
+    np.testing.assert_allclose(ours.position, theirs.qpos, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(ours.velocity, theirs.qvel, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "RK4"])
+def test_joints_without_constraints_beside_others(integrator):
+    xml = f"""
+    <mujoco><option integrator="{integrator}"/><default><geom contype="0" conaffinity="0"/></default><worldbody>
+      <body><joint limited="true" range="-.1 .1" axis="0 1 0"/><geom type="capsule" size=".02 .1"/></body>
+      <body pos="1 0 0"><joint axis="0 1 0"/><geom type="capsule" size=".02 .1" pos=".1 0 0"/></body>
+    </worldbody></mujoco>
+    """
+    mj_model = mujoco.MjModel.from_xml_string(xml)
+    model, still = mjx.put_model(mj_model), mjx_model.still_data(mj_model)
+    assert scalar.supports(model)
+    data = jax.vmap(lambda qpos: still.replace(qpos=qpos))(jnp.array([[0.0, 0.3], [0.2, -0.2]]))
+    after = jaxrl_vis_envs.jit(jax.vmap(functools.partial(mjx_model.take_steps, model, count=3)))(data)
+    for take in (steps.simulate_arrays, functools.partial(steps_kernel.simulate, interpret=True)):
+        ours = jax.jit(jax.vmap(functools.partial(scalar._simulate_by, take, model, count=3, exact=None)))(data)
+        np.testing.assert_allclose(ours.qpos, after.qpos, atol=1e-6)
+        np.testing.assert_allclose(ours.qfrc_constraint, after.qfrc_constraint, atol=1e-3)
 
 
 @pytest.mark.parametrize("is_exact", [False, True])
@@ -252,32 +355,32 @@ def test_whether_steps_are_exact_may_be_a_number(is_exact):
         np.testing.assert_array_equal(one, other)
 
 
-def test_mechanisms_are_the_same_where_their_content_is():
-    def content(**changes):
+def test_scalar_models_are_the_same_where_their_fingerprints_are():
+    def fingerprint(**changes):
         mj_model = odd_model()
         for name, value in changes.items():
             getattr(mj_model, name)[:] = value
-        return mechanism.content(mechanism.mechanism_of(mjx.put_model(mj_model)))
+        return scalar_model.fingerprint(scalar_model.build_scalar_model(mjx.put_model(mj_model)))
 
-    assert hash(content()) == hash(content()) and content() == content()
+    assert hash(fingerprint()) == hash(fingerprint()) and fingerprint() == fingerprint()
     for name in ("dof_damping", "body_mass", "jnt_range", "pair_margin", "geom_pos", "tendon_armature"):
-        assert content(**{name: 0.123}) != content(), name
+        assert fingerprint(**{name: 0.123}) != fingerprint(), name
 
 
 @pytest.mark.parametrize("name", ["HandReach", "FingerTurn", "Reacher", "odd"])
 def test_masses_and_bias_forces_are_those_of_mujoco(name, monkeypatch):
     """In double precision, but for what MJX has rounded of the model."""
-    monkeypatch.setattr(folding, "jnp", np)
+    monkeypatch.setattr(partial_arithmetic, "jnp", np)
     mj_model = copy.copy(odd_model() if name == "odd" else environments.make(name).mj_model)
     mj_model.tendon_armature[:] = 0
     model = mjx.put_model(mj_model)
-    tree, _ = links.links_of(model)
+    tree, _ = links.build_links(model)
     rng = np.random.default_rng(5)
     positions, velocities = rng.uniform(-2, 2, (8, mj_model.nq)), rng.normal(0, 3, (8, mj_model.nv))
-    joints = dynamics.joints_at(tree, list((positions - mj_model.qpos0).T))
+    joints = dynamics.joint_transforms(tree, list((positions - mj_model.qpos0).T))
     has_gravity = not mj_model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY
     mass = dynamics.mass_matrix(tree, joints)
-    bias = dynamics.bias(tree, joints, list(velocities.T), mj_model.opt.gravity * has_gravity)
+    bias = dynamics.bias_forces(tree, joints, list(velocities.T), mj_model.opt.gravity * has_gravity)
     data = mujoco.MjData(mj_model)
     for index, (position, velocity) in enumerate(zip(positions, velocities, strict=True)):
         data.qpos[:], data.qvel[:] = position, velocity
@@ -297,7 +400,7 @@ def test_masses_and_bias_forces_are_those_of_mujoco(name, monkeypatch):
 
 def test_sine_and_cosine():
     angles = np.linspace(-40, 40, 200_001).astype(np.float32)
-    sine, cosine = folding.sine_and_cosine(jnp.asarray(angles))
+    sine, cosine = partial_arithmetic.sine_and_cosine(jnp.asarray(angles))
     np.testing.assert_allclose(sine, np.sin(angles.astype(np.float64)), atol=3e-7)
     np.testing.assert_allclose(cosine, np.cos(angles.astype(np.float64)), atol=3e-7)
 
@@ -308,7 +411,8 @@ def test_the_kernel_takes_the_same_steps():
     data = jax.tree.map(lambda leaf: leaf[:6], states("FingerTurn"))
     after = many_steps(data)
     in_two_axes = jax.tree.map(lambda leaf: leaf.reshape(2, 3, *leaf.shape[1:]), data)
-    kernel = functools.partial(mjx_model._in_one_kernel, env._model, count=3, exact=True, interpret=True)
+    take = functools.partial(steps_kernel.simulate, interpret=True)
+    kernel = functools.partial(scalar._simulate_by, take, env._model, count=3, exact=True)
     run = jax.jit(jax.vmap(jax.vmap(kernel)))
     ours = run(in_two_axes)
     for name in ("qpos", "qvel", "qacc", "qacc_warmstart", "qfrc_constraint", "time"):
@@ -326,18 +430,18 @@ def lowered_for_cuda(model: mjx.Model, data: mjx.Data) -> str:
 
     def control_step(data):
         with tracing_for("cuda"), kernels(True):
-            return mjx_model.take_steps(model, data, 5, True, True)
+            return mjx_model.take_steps(model, data, 5, True)
 
     return lowered_for_nvidia(lambda: jax.jit(jax.vmap(control_step)).trace(data))
 
 
-@pytest.mark.parametrize("name", ["FingerTurn", "HandReach"])
+@pytest.mark.parametrize("name", ["FingerTurn", "HandReach", "Reacher"])
 def test_all_steps_of_a_task_are_one_kernel_for_nvidia(name, monkeypatch):
     monkeypatch.delenv(KERNELS_VARIABLE, raising=False)
     env = environments.make(name)
     data = jax.eval_shape(lambda: jax.vmap(lambda _: mjx.make_data(env.mj_model))(jnp.zeros(8)))
     program = lowered_for_cuda(env._model, data)
-    assert program.count("take_physics_steps") >= 1 and "solve_constraints" not in program
+    assert program.count("take_physics_steps") >= 1
     assert program.count("stablehlo.") < 100
 
 
@@ -356,11 +460,11 @@ def test_goals_and_steps_of_the_hand_are_one_kernel(monkeypatch):
 
 
 def test_steps_are_taken_one_by_one_where_their_kernel_does_not_compile(monkeypatch):
-    monkeypatch.setattr(mjx_model, "use_gpu_kernels", lambda probe: probe is not steps_kernel.probe)
+    monkeypatch.setattr(mjx_model, "use_gpu_kernels", lambda probe: probe is not scalar.probe)
     env = environments.make("FingerTurn")
     data = jax.eval_shape(lambda: jax.vmap(lambda _: mjx.make_data(env.mj_model))(jnp.zeros(8)))
     program = lowered_for_cuda(env._model, data)
-    assert "take_physics_steps" not in program and "solve_constraints" in program
+    assert "take_physics_steps" not in program and program.count("stablehlo.") > 1000
 
 
 def test_the_probe_is_a_kernel_for_nvidia():
@@ -368,16 +472,14 @@ def test_the_probe_is_a_kernel_for_nvidia():
     assert "take_physics_steps" in program
 
 
-def test_which_models_have_steps_by_numbers():
-    takes = {
-        name: mechanism.takes(environments.make(name)._model) for name in ("FingerTurn", "HandReach", "Reacher", "FetchReach")
-    }
-    assert takes == {"FingerTurn": True, "HandReach": True, "Reacher": False, "FetchReach": True}
+def test_which_models_the_scalar_engine_supports():
+    for name in ("FingerTurn", "HandReach", "Reacher", "FetchReach", "SawyerReach", "StalkReach"):
+        assert scalar.supports(environments.make(name)._model), name
     hand = environments.make("HandReach")
-    assert mechanism.takes(hand._goal_model)
+    assert scalar.supports(hand._goal_model)
     without_contacts = HandReach(HandReachConfig(contacts=False))._model
-    assert mechanism.takes(without_contacts)
-    assert mechanism.mechanism_of(without_contacts).contacts == ()
+    assert scalar.supports(without_contacts)
+    assert scalar_model.build_scalar_model(without_contacts).contacts == ()
 
 
 def test_a_model_whose_numbers_vary_has_none():
@@ -386,10 +488,10 @@ def test_a_model_whose_numbers_vary_has_none():
 
     @jax.jit
     def try_it(damping):
-        found.append(mechanism.takes(model.replace(dof_damping=damping)))
+        found.append(scalar.supports(model.replace(dof_damping=damping)))
 
     try_it(model.dof_damping)
-    assert found == [False] and mechanism.takes(model)
+    assert found == [False] and scalar.supports(model)
 
 
 def test_an_order_that_fills_in_little():
@@ -400,9 +502,9 @@ def test_an_order_that_fills_in_little():
     assert order.index(2) > order.index(1) > order.index(0) == 0
 
     env = environments.make("HandReach")
-    constants = mechanism.mechanism_of(env._model)
+    constants = scalar_model.build_scalar_model(env._model)
     tree = constants.links
-    ancestors = [(joint, other) for joint in range(24) for other in links.carriers(tree, joint)]
+    ancestors = [(joint, other) for joint in range(24) for other in links.ancestor_joints(tree, joint)]
     order = steps.elimination_order(24, ancestors, [contact.pair.joints for contact in constants.contacts])
     place = {joint: index for index, joint in enumerate(order)}
     assert all(place[other] <= place[joint] for joint, other in ancestors)

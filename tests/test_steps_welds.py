@@ -1,4 +1,4 @@
-"""Physics steps number by number (`test_steps`) of models with welds, mocap bodies, spheres on planes and pyramidal cones."""
+"""Physics steps of the scalar engine (`test_steps`) with welds, mocap bodies, spheres on planes and pyramidal cones."""
 
 import functools
 
@@ -11,15 +11,9 @@ import pytest
 import jaxrl_vis_envs
 from benchmarks.tasks import environments
 from jaxrl_vis_envs.compiling.compilation import KERNELS_VARIABLE
-from jaxrl_vis_envs.physics import (
-    dynamics,
-    links,
-    mechanism,
-    mjx_model,
-    places,
-    quaternions,
-)
+from jaxrl_vis_envs.physics import mjx_model, scalar
 from jaxrl_vis_envs.physics.mjx_model import mjx
+from jaxrl_vis_envs.physics.scalar import dynamics, link_frames, links, quaternions, scalar_model, steps_kernel
 from jaxrl_vis_envs.tasks.fetch_reach import FetchReach, VisualFetchReachConfig
 from tests.test_steps import columns, lowered_for_cuda, taken
 
@@ -131,9 +125,9 @@ def states(name: str) -> mjx.Data:
 def test_a_step_of_a_model_with_everything(in_kernel):
     mj_model = odd_model()
     model = mjx.put_model(mj_model)
-    assert mechanism.takes(model)
+    assert scalar.supports(model)
     data = odd_states(mj_model, 200)
-    # Contacts of capsules are where steps by numbers have them only if exact.
+    # Contacts of capsules are where the scalar engine has them only if exact.
     after = jaxrl_vis_envs.jit(jax.vmap(lambda data: mjx_model.step(model, data, True)))(data)
     contact = np.asarray(after._impl.contact.dist) - np.asarray(after._impl.contact.includemargin)
     assert ((contact < 0).sum(axis=0) >= 10).all(), (contact < 0).sum(axis=0)
@@ -177,7 +171,8 @@ def test_the_kernel_takes_the_same_steps():
     data = jax.tree.map(lambda leaf: leaf[:6], states("SawyerReach"))
     after = step(data, 3)
     in_two_axes = jax.tree.map(lambda leaf: leaf.reshape(2, 3, *leaf.shape[1:]), data)
-    kernel = functools.partial(mjx_model._in_one_kernel, env._model, count=3, exact=False, interpret=True)
+    take = functools.partial(steps_kernel.simulate, interpret=True)
+    kernel = functools.partial(scalar._simulate_by, take, env._model, count=3, exact=None)
     run = jax.jit(jax.vmap(jax.vmap(kernel)))
     ours = run(in_two_axes)
     for name in ("qpos", "qvel", "qacc", "qacc_warmstart", "qfrc_constraint", "time"):
@@ -197,15 +192,15 @@ def test_all_steps_of_a_task_are_one_kernel_for_nvidia(name, monkeypatch):
     env = environments.make(name)
     data = jax.eval_shape(lambda: jax.vmap(lambda _: mjx.make_data(env.mj_model))(jnp.zeros(8)))
     program = lowered_for_cuda(env._model, data)
-    assert program.count("take_physics_steps") >= 1 and "solve_constraints" not in program
+    assert program.count("take_physics_steps") >= 1
     assert program.count("stablehlo.") < 150
 
 
 def test_what_is_drawn_at_a_mocap_body_changes_nothing():
     env = FetchReach(VisualFetchReachConfig(cross_hair=True))
-    assert mechanism.takes(env._model)
-    plain, drawn = (mechanism.mechanism_of(model) for model in (environments.make("FetchReach")._model, env._model))
-    assert len(drawn.holds) == len(plain.holds) == 1 and len(drawn.contacts) == len(plain.contacts) == 2
+    assert scalar.supports(env._model)
+    plain, drawn = (scalar_model.build_scalar_model(model) for model in (environments.make("FetchReach")._model, env._model))
+    assert len(drawn.welds) == len(plain.welds) == 1 and len(drawn.contacts) == len(plain.contacts) == 2
     assert drawn.mocaps == plain.mocaps == (0,)
 
 
@@ -227,7 +222,7 @@ REFUSED = {
 def test_what_steps_do_not_take(what):
     old, new = REFUSED[what]
     assert ODD.count(old) == 1
-    assert not mechanism.takes(mjx.put_model(mujoco.MjModel.from_xml_string(ODD.replace(old, new))))
+    assert not scalar.supports(mjx.put_model(mujoco.MjModel.from_xml_string(ODD.replace(old, new))))
 
 
 def test_steps_do_not_take_welds_of_sites():
@@ -235,9 +230,9 @@ def test_steps_do_not_take_welds_of_sites():
     for body in ("leaf", "base"):
         spec.body(body).add_site(name=body)
     weld = spec.add_equality(type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_SITE, name1="leaf", name2="base")
-    assert not mechanism.takes(mjx.put_model(spec.compile()))
+    assert not scalar.supports(mjx.put_model(spec.compile()))
     spec.delete(weld)
-    assert mechanism.takes(mjx.put_model(spec.compile()))
+    assert scalar.supports(mjx.put_model(spec.compile()))
 
 
 def test_places_of_welded_bodies():
@@ -246,19 +241,19 @@ def test_places_of_welded_bodies():
     model = mjx.put_model(mj_model)
     data = odd_states(mj_model, 20)
     data = data.replace(qpos=4.0 * data.qpos)
-    constants = mechanism.mechanism_of(model)
+    constants = scalar_model.build_scalar_model(model)
     after = jax.jit(jax.vmap(lambda data: mjx_model.kinematics(model, data)))(data)
     numbers = np.concatenate([data.mocap_pos, data.mocap_quat], axis=2).reshape(20, -1)
-    roots = places.roots_of(tuple(links.link_of_mocap(index) for index in constants.mocaps), columns(numbers))
+    mocap = link_frames.mocap_poses(tuple(links.mocap_link(index) for index in constants.mocaps), columns(numbers))
     moved = columns(np.asarray(data.qpos) - np.asarray(model.qpos0))
-    joints = dynamics.joints_at(constants.links, moved, range(len(moved)))
-    where = places.Places(constants.links, joints, links.WORLD, roots)
-    for hold, (one, other) in zip(constants.holds, zip(model.eq_obj1id, model.eq_obj2id, strict=True), strict=True):
-        _, turn = hold.weld.turns
-        ours = quaternions.multiply(where.turn(hold.weld.frames[1].link), turn)
+    joints = dynamics.joint_transforms(constants.links, moved, range(len(moved)))
+    where = link_frames.LinkFrames(constants.links, joints, links.WORLD, mocap)
+    for constraint, (one, other) in zip(constants.welds, zip(model.eq_obj1id, model.eq_obj2id, strict=True), strict=True):
+        (first, second), (_, rotation) = constraint.weld.frames, constraint.weld.quaternions
+        ours = quaternions.multiply(where.quaternion(second.link), rotation)
         ours, theirs = np.stack([np.broadcast_to(part, 20) for part in ours], axis=1), np.asarray(after.xquat)[:, other]
         ours = ours * np.sign(np.sum(ours * theirs, axis=1, keepdims=True))
         np.testing.assert_allclose(ours, theirs, atol=3e-6)
-        point = where.point(hold.weld.frames[0].link, hold.weld.frames[0].shift)
+        point = where.point(first.link, first.position)
         position = np.stack([np.broadcast_to(part, 20) for part in point], axis=1)
         np.testing.assert_allclose(position, np.asarray(after.xpos)[:, one], atol=3e-6)

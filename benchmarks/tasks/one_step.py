@@ -1,4 +1,4 @@
-"""One physics step of a task's own model by ours (MJX) and by C MuJoCo, from identical states.
+"""One physics step of a task's own model by ours and by C MuJoCo, from identical states.
 
     python -m benchmarks.tasks.one_step [TASK ...]
 
@@ -25,7 +25,7 @@ import numpy as np
 
 import jaxrl_vis_envs
 from benchmarks.tasks import environments
-from jaxrl_vis_envs.physics import constraints, mjx_model
+from jaxrl_vis_envs.physics import mjx_model, newton
 from jaxrl_vis_envs.physics.mjx_model import mjx
 
 MORE_ITERATIONS = (8, 12)
@@ -129,8 +129,7 @@ def our_step(env: Any, visited: Visited, iterations: Iterations) -> np.ndarray:
     exact = iterations == "more" or env.exact_contacts
 
     def step(visited: Visited) -> jax.Array:
-        with jax.default_matmul_precision("highest"):
-            return mjx_model.step(model, still.replace(**visited._asdict()), exact).qvel
+        return mjx_model.take_steps(model, still.replace(**visited._asdict()), 1, exact).qvel
 
     return np.asarray(jaxrl_vis_envs.jit(jax.vmap(step))(jax.tree.map(jnp.asarray, visited)))
 
@@ -190,7 +189,8 @@ def rows(name: str) -> list[str]:
     visited = STATES[name](env)
     steps = {iterations: our_step(env, visited, iterations) for iterations in ("task", "more")}
     own, more = (env.mj_model.opt.iterations, env.mj_model.opt.ls_iterations), MORE_ITERATIONS
-    if constraints.solver_of(mjx.put_model(env.mj_model)) != "mjx":  # a line search of ours has no such number
+    model = mjx.put_model(env.mj_model)
+    if newton.supports(model) or mjx_model.prefers_scalar_engine(model):  # line searches of ours have no such number
         own, more = own[:1], more[:1]
     lines = []
     for weld_term in (True, False) if env.mj_model.neq else (True,):

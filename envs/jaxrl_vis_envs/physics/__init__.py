@@ -1,14 +1,22 @@
-"""Physics in MJX: models, kinematics, constraint solvers and inverse kinematics.
+"""Physics of the tasks: two engines for MuJoCo models, and kinematics.
 
-mjx_model           loading a model, and stepping it: `step`, `take_steps`, `simulate`
-constraints         motion under constraints; `solver_of` names the solver of a model
-descent             the same for small models, number by number (`algebra`, `cones`, `line_search`); newton_kernel makes it a
-                    GPU kernel
-newton              the same for models of few joints in matrices, for CPUs; what neither takes is left to MJX
-steps               physics steps number by number, by folding, quaternions, links, dynamics, places, capsules, welds, reference
-                    and mechanism; steps_kernel makes all steps of a control step one GPU kernel
-kinematics          poses of all bodies at once
-inverse_kinematics  joint angles that bring the last link of a chain to a pose
+    mjx_model           the MJX engine: loading a model and stepping it; `take_steps` and `simulate` choose between the engines
+    constraints         accelerations under constraints for the MJX engine: by `newton` for small trees, else by MJX's own
+    solver
+    newton              a constraint solver for small trees in matrices, the fastest on CPUs
+    kinematics          forward kinematics, all bodies at once
+    inverse_kinematics  joint angles that bring the last link of a chain to a pose
+    scalar/             the scalar engine: a subset of MuJoCo in scalars, one GPU thread per episode
+
+MJX runs every model on every platform and is the reference. The scalar engine computes the same steps for the models that it
+supports (`scalar.supports`), as long as nothing disturbs them (`mjx_model.take_steps`), where it is faster:
+
+    engine    NVIDIA GPUs                                  CPUs
+    scalar    all tasks that are shipped, in one kernel    FingerTurn (up to three joints, if `newton` does not support them)
+    MJX       models that `scalar` does not support,       FetchReach, Reacher, SawyerReach and StalkReach with `newton`,
+              randomized dynamics                          HandReach with MJX's own solver
+
+Other accelerators run MJX. Importing this package makes MJX import faster and without its notice about Warp (`mjx_imports`).
 """
 
 from jaxrl_vis_envs.compiling import mjx_imports

@@ -1,9 +1,9 @@
-"""Poses of all bodies at once.
+"""Forward kinematics of all bodies at once.
 
-MJX walks down a kinematic tree body by body, which makes up half of the program of a step, and of the time to compile it. Here
-every joint is a node with a pose relative to the one before it, and the poses relative to the world come from pointer doubling:
-in each round a node's pose is composed with that of its ancestor, and the ancestor becomes that one's ancestor. A chain of N
-nodes takes log2(N) rounds, each over all nodes side by side.
+MJX walks down a kinematic tree body by body, which is half of a step's program and of its compilation time. Here each joint is
+a node with a pose relative to its parent node, and poses in the world are computed by pointer doubling: in each round a node's
+pose is composed with its ancestor's, and the ancestor is replaced by the ancestor's ancestor. A chain of N nodes takes log2(N)
+rounds, each over all nodes in parallel.
 """
 
 from typing import NamedTuple
@@ -13,30 +13,31 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from mujoco import mjx
-from mujoco.mjx._src import math, smooth, support
+from mujoco.mjx._src import smooth, support
+
+from jaxrl_vis_envs.physics import rotations
 
 _ONE_DEGREE_OF_FREEDOM = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
-_rotate = jax.vmap(math.rotate)
-_multiply = jax.vmap(math.quat_mul)
+_rotate = jax.vmap(rotations.rotate)
+_multiply = jax.vmap(rotations.quat_mul)
 
 
 class _Nodes(NamedTuple):
-    """The tree with one node for each joint and one for each body without joints; node 0 is the world. Integers."""
+    """Tree with one node per joint and one per body without joints; node 0 is the world. Arrays are integers."""
 
-    body: np.ndarray  # [N], the body whose frame a node starts from, or nbody where it goes on from another joint of the body
-    parent: np.ndarray  # [N], the node before
-    depth: int  # the most nodes below the world that follow each other
-    of_joint: np.ndarray  # [njnt]
-    of_body: np.ndarray  # [nbody], the last node of the body
+    body: np.ndarray  # [N], body whose frame the node starts from, or nbody if it follows another joint of its body
+    parent: np.ndarray  # [N], parent node
+    depth: int  # length of the longest chain below the world
+    joint_nodes: np.ndarray  # [njnt], node of each joint
+    body_nodes: np.ndarray  # [nbody], last node of each body
 
 
-@jax.jit  # so that it is traced once, in however many programs it is
+@jax.jit  # traced once for all programs that contain it
 def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """`mjx.kinematics` in a fraction of the operations, and the poses of cameras that ride on bodies.
+    """Compute poses as `mjx.kinematics` does, in a fraction of the operations, and the poses of cameras on bodies.
 
-    Bodies that hang on a mocap body move with it, as in MuJoCo (in MJX they stay). Models with ball or free joints are left to
-    MJX.
+    Descendants of a mocap body move with it, as in MuJoCo (in MJX they stay). Models with ball or free joints are left to MJX.
     """
     if not np.isin(model.jnt_type, _ONE_DEGREE_OF_FREEDOM).all():
         return _place_cameras(model, mjx.kinematics(model, data))
@@ -49,17 +50,23 @@ def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         rotation = _multiply(rotation[ancestor], rotation)
         ancestor = ancestor[ancestor]
 
-    # Turning about its own axis moves neither a hinge's anchor nor its axis. A slide's anchor stays behind.
-    axis = _rotate(model.jnt_axis, rotation[nodes.of_joint])
-    anchor = position[nodes.of_joint] + _rotate(model.jnt_pos, rotation[nodes.of_joint])
+    # A hinge's rotation moves neither its anchor nor its axis. A slide's anchor does not move with the slide.
+    axis = _rotate(model.jnt_axis, rotation[nodes.joint_nodes])
+    anchor = position[nodes.joint_nodes] + _rotate(model.jnt_pos, rotation[nodes.joint_nodes])
     is_slide = np.asarray(model.jnt_type) == mujoco.mjtJoint.mjJNT_SLIDE
     if is_slide.any():
         anchor = anchor - jnp.where(is_slide, displacement, 0.0)[:, None] * axis
-    xpos, xquat = position[nodes.of_body], rotation[nodes.of_body]
+    xpos, xquat = position[nodes.body_nodes], rotation[nodes.body_nodes]
     to_global = jax.vmap(support.local_to_global)
     xipos, ximat = to_global(xpos, xquat, model.body_ipos, model.body_iquat)
     data = data.replace(
-        xanchor=anchor, xaxis=axis, xpos=xpos, xquat=xquat, xmat=jax.vmap(math.quat_to_mat)(xquat), xipos=xipos, ximat=ximat
+        xanchor=anchor,
+        xaxis=axis,
+        xpos=xpos,
+        xquat=xquat,
+        xmat=jax.vmap(rotations.quat_to_mat)(xquat),
+        xipos=xipos,
+        ximat=ximat,
     )
     if model.ngeom:
         bodies = model.geom_bodyid
@@ -73,49 +80,49 @@ def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def _relative_poses(model: mjx.Model, data: mjx.Data, nodes: _Nodes, displacement: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Pose of each node relative to its parent: positions [N, 3] (m) and unit quaternions [N, 4]."""
+    """Return the pose of each node relative to its parent: positions [N, 3] (m) and unit quaternions [N, 4]."""
     body_pos, body_quat = model.body_pos, model.body_quat
     if model.nmocap:
         carried = np.flatnonzero(np.asarray(model.body_mocapid) >= 0)
         order = np.asarray(model.body_mocapid)[carried]
         body_pos = body_pos.at[carried].set(data.mocap_pos[order])
-        body_quat = body_quat.at[carried].set(jax.vmap(math.normalize)(data.mocap_quat[order]))
+        body_quat = body_quat.at[carried].set(jax.vmap(rotations.normalize)(data.mocap_quat[order]))
     position = jnp.concatenate([body_pos, jnp.zeros((1, 3))])[nodes.body]
     rotation = jnp.concatenate([body_quat, jnp.array([[1.0, 0.0, 0.0, 0.0]])])[nodes.body]
     if not model.njnt:
         return position, rotation
     is_slide = np.asarray(model.jnt_type) == mujoco.mjtJoint.mjJNT_SLIDE
-    turn = jax.vmap(math.axis_angle_to_quat)(model.jnt_axis, jnp.where(is_slide, 0.0, displacement))
+    turn = jax.vmap(rotations.axis_angle_to_quat)(model.jnt_axis, jnp.where(is_slide, 0.0, displacement))
     shift = jnp.where(is_slide, displacement, 0.0)[:, None] * model.jnt_axis + model.jnt_pos - _rotate(model.jnt_pos, turn)
-    joints = nodes.of_joint
+    joints = nodes.joint_nodes
     position = position.at[joints].add(_rotate(shift, rotation[joints]))
     return position, rotation.at[joints].set(_multiply(rotation[joints], turn))
 
 
 def _nodes(model: mjx.Model) -> _Nodes:
-    """The tree of a model. Bodies come after their parents in MuJoCo, and joints in the order of their bodies."""
-    body, parent, of_joint, of_body, depth = [0], [0], [], [0], [0]
+    """Return the tree of a model. In MuJoCo, bodies come after their parents, and joints in the order of their bodies."""
+    body, parent, joint_nodes, body_nodes, depth = [0], [0], [], [0], [0]
     for index in range(1, model.nbody):
-        before = of_body[model.body_parentid[index]]
+        before = body_nodes[model.body_parentid[index]]
         for joint in range(max(1, model.body_jntnum[index])):
             body.append(index if joint == 0 else model.nbody)
             parent.append(before)
             depth.append(depth[before] + 1)
             before = len(body) - 1
             if model.body_jntnum[index]:
-                of_joint.append(before)
-        of_body.append(before)
+                joint_nodes.append(before)
+        body_nodes.append(before)
     return _Nodes(
         body=np.array(body, int),
         parent=np.array(parent, int),
         depth=max(depth),
-        of_joint=np.array(of_joint, int),
-        of_body=np.array(of_body, int),
+        joint_nodes=np.array(joint_nodes, int),
+        body_nodes=np.array(body_nodes, int),
     )
 
 
 def _place_cameras(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Poses of cameras, where any can move."""
+    """Compute the poses of cameras if any camera can move."""
     if np.all((model.cam_bodyid == 0) & (model.cam_mode == mujoco.mjtCamLight.mjCAMLIGHT_FIXED)):
         return data
     return smooth.camlight(model, smooth.com_pos(model, data))

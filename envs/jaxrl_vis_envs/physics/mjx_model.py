@@ -1,4 +1,7 @@
-"""What every MJX task needs: loading its model, and states without weak types."""
+"""The MJX engine: loading models, stepping them, and Jacobians.
+
+`take_steps` and `simulate` use the scalar engine where it is faster.
+"""
 
 import functools
 import pathlib
@@ -10,12 +13,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from mujoco import mjx
-from mujoco.mjx._src import math, sensor, smooth
+from mujoco.mjx._src import sensor, smooth
 
 from jaxrl_vis_envs.compiling.compilation import dispatch_by_platform, targets_cpu, use_gpu_kernels
-from jaxrl_vis_envs.physics import constraints, mechanism, steps, steps_kernel
+from jaxrl_vis_envs.physics import constraints, newton, rotations, scalar
 from jaxrl_vis_envs.physics.kinematics import kinematics
-from jaxrl_vis_envs.physics.steps import State
 
 __all__ = [
     "kinematics",
@@ -29,13 +31,13 @@ __all__ = [
     "tip_jacobian",
 ]
 
-# With more joints, steps number by number take longer on a CPU than as matrices, and several times as long to compile.
-_FEW_JOINTS = 3
+# On a CPU, the scalar engine is slower than MJX for more joints, and takes several times as long to compile.
+_MAX_SCALAR_JOINTS_ON_CPU = 3
 _ASSETS = pathlib.Path(__file__).resolve().parents[1] / "tasks" / "assets"
 
 
 def load_model(file_name: str, edit: Callable[[mujoco.MjSpec], None] | None = None) -> mujoco.MjModel:
-    """The MuJoCo model of ``tasks/assets/<file_name>``, after ``edit`` has changed what was read."""
+    """Load ``tasks/assets/<file_name>``, optionally after ``edit`` has modified its `mujoco.MjSpec`."""
     path = str(_ASSETS / file_name)
     if edit is None:
         return mujoco.MjModel.from_xml_path(path)
@@ -45,21 +47,21 @@ def load_model(file_name: str, edit: Callable[[mujoco.MjSpec], None] | None = No
 
 
 def put_model(mj_model: mujoco.MjModel) -> mjx.Model:
-    """`mjx.put_model`, on a device of this process: by itself, MJX takes the first device of all processes."""
+    """Call `mjx.put_model` for a device of this process; by default MJX takes the first device of all processes."""
     return mjx.put_model(mj_model, device=jax.local_devices()[0])
 
 
 def start_data(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> mjx.Data:
-    """`mjx.put_data`, on a device of this process, with a strong type on every array.
+    """Call `mjx.put_data` for a device of this process, and make the types of all arrays strong.
 
-    A weakly typed ``time`` changes its type in the first step, so that everything compiles twice (mujoco issue 2306).
+    A weakly typed ``time`` changes its type in the first step, so that programs compile twice (mujoco issue 2306).
     """
     data = mjx.put_data(mj_model, mj_data, device=jax.local_devices()[0])
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), data)
 
 
 def still_data(mj_model: mujoco.MjModel, keyframe: str | None = None) -> mjx.Data:
-    """`start_data` of a keyframe of the model, or of its own initial configuration, at rest."""
+    """Return `start_data` at a keyframe of the model, or at its initial configuration, at rest."""
     mj_data = mujoco.MjData(mj_model)
     if keyframe is not None:
         mujoco.mj_resetDataKeyframe(mj_model, mj_data, mj_model.key(keyframe).id)
@@ -67,56 +69,53 @@ def still_data(mj_model: mujoco.MjModel, keyframe: str | None = None) -> mjx.Dat
     return start_data(mj_model, mj_data)
 
 
-def simulate(model: mjx.Model, data: mjx.Data, substeps: int, exact: bool = False, undisturbed: bool = False) -> mjx.Data:
-    """``substeps`` physics steps (`take_steps`), after which every pose belongs to the final ``qpos``.
+def simulate(model: mjx.Model, data: mjx.Data, substeps: int, exact: bool | None = None, disturbed: bool = False) -> mjx.Data:
+    """Take ``substeps`` physics steps (`take_steps`) and compute all poses at the final ``qpos``.
 
-    `mjx.step` leaves the poses of the state *before* its last integration, so `kinematics` is needed once more for the
-    image, the true state and ``qpos`` to agree.
+    `mjx.step` leaves the poses at the state *before* its last integration, so `kinematics` is needed once more for the image,
+    the true state and ``qpos`` to agree.
     """
-    return kinematics(model, take_steps(model, data, substeps, exact, undisturbed))
+    return kinematics(model, take_steps(model, data, substeps, exact, disturbed))
 
 
-def take_steps(
-    model: mjx.Model,
-    data: mjx.Data,
-    count: int,
-    exact: bool = False,
-    undisturbed: bool = False,
-    beside_exact: bool = False,
-) -> mjx.Data:
-    """``count`` physics steps; poses and true states are then older than ``qpos``.
+def take_steps(model: mjx.Model, data: mjx.Data, count: int, exact: bool | None = None, disturbed: bool = False) -> mjx.Data:
+    """Take ``count`` physics steps; poses and true states are then older than ``qpos``.
+
+    Models that the scalar engine supports are simulated by it where it is faster: on NVIDIA GPUs, and on CPUs those of up to
+    three joints that `newton` does not support. Contacts between capsules are then always exact, contacts beyond
+    ``max_contact_points`` and ``max_geom_pairs`` count as well, and only positions, velocities, accelerations, constraint
+    forces on the joints and the time are updated.
 
     Args:
-        model: What is simulated.
+        model: The model.
         data: Its state.
-        count: How many steps.
-        exact: See `step`.
-        undisturbed: Nothing pushes bodies (``xfrc_applied`` is 0), and no weld is turned off (``eq_active``). Models that
-            `mechanism` takes are then simulated number by number where that is faster: on a GPU that runs kernels, in one
-            kernel (`steps_kernel`), and on a CPU those of few joints (`steps`). Contacts between capsules are then exact in any
-            case, and if more pairs touch than ``max_contact_points`` or ``max_geom_pairs``, all of them count. If something
-            does disturb them, positions are not a number.
-        beside_exact: For steps that are not exact in a program that also has exact ones, of a model that is the same but for
-            its time step: they share a kernel then, which is compiled once.
-
-    Returns:
-        The state after them. Number by number, nothing but positions, velocities, accelerations, time and the constraints'
-        forces is new.
+        count: Number of steps.
+        exact: Make contacts and forces as exact as float32 allows (see `step`). False and None both mean no: with False, a GPU
+            kernel is shared with exact steps in the same program, of a model that differs in its time step only, and compiled
+            once; with None the kernel cannot take exact steps and is smaller.
+        disturbed: Set True if bodies are pushed (``xfrc_applied`` is not 0) or welds are switched off (``eq_active``), which
+            the scalar engine does not support: MJX then takes the steps on all platforms. Where a state is disturbed all the
+            same, the scalar engine sets its ``qpos`` to NaN.
     """
-    if not (undisturbed and mechanism.takes(model)):
-        return _one_by_one(model, data, count, exact)
+    if disturbed or not scalar.supports(model):
+        return _take_mjx_steps(model, data, count, bool(exact))
 
-    def by_numbers_or_not(data: mjx.Data) -> mjx.Data:
-        if use_gpu_kernels(steps_kernel.probe):
-            return _in_one_kernel(model, data, count, exact, beside_exact)
-        if targets_cpu() and model.nv <= _FEW_JOINTS:
-            return _by_numbers(model, data, count, exact)
-        return _one_by_one(model, data, count, exact)
+    def take(data: mjx.Data) -> mjx.Data:
+        if prefers_scalar_engine(model):
+            return scalar.simulate(model, data, count, exact)
+        return _take_mjx_steps(model, data, count, bool(exact))
 
-    return dispatch_by_platform(by_numbers_or_not, data)
+    return dispatch_by_platform(take, data)
 
 
-def _one_by_one(model: mjx.Model, data: mjx.Data, count: int, exact: bool) -> mjx.Data:
+def prefers_scalar_engine(model: mjx.Model) -> bool:
+    """Return True if the scalar engine is faster than MJX for a model that it supports, on the platform traced for."""
+    if targets_cpu():
+        return model.nv <= _MAX_SCALAR_JOINTS_ON_CPU and not newton.supports(model)
+    return use_gpu_kernels(scalar.probe)
+
+
+def _take_mjx_steps(model: mjx.Model, data: mjx.Data, count: int, exact: bool) -> mjx.Data:
     def substep(data: mjx.Data, _: Any) -> tuple[mjx.Data, None]:
         return step(model, data, exact), None
 
@@ -124,70 +123,32 @@ def _one_by_one(model: mjx.Model, data: mjx.Data, count: int, exact: bool) -> mj
         return jax.lax.scan(substep, data, length=count)[0]
 
 
-def _in_one_kernel(
-    model: mjx.Model, data: mjx.Data, count: int, exact: bool, beside_exact: bool = False, interpret: bool = False
-) -> mjx.Data:
-    return _with_steps(
-        model, data, count, functools.partial(steps_kernel.take, exact=exact, beside_exact=beside_exact, interpret=interpret)
-    )
-
-
-def _by_numbers(model: mjx.Model, data: mjx.Data, count: int, exact: bool) -> mjx.Data:
-    return _with_steps(model, data, count, functools.partial(steps.take_arrays, exact=exact))
-
-
-def _with_steps(model: mjx.Model, data: mjx.Data, count: int, take: Callable[..., State]) -> mjx.Data:
-    """The data after steps by ``take``, which has the arguments of `steps.take_arrays`."""
-    constants, timestep = mechanism.mechanism_of(model), float(model.opt.timestep)
-    state = State(data.qpos, data.qvel, data.qacc_warmstart, data.qfrc_constraint)
-    used = np.array(constants.mocaps, int)
-    mocap = jnp.concatenate([data.mocap_pos[used], data.mocap_quat[used]], axis=1) if len(used) else None
-    state = take(constants, state, data.ctrl, data.qfrc_applied, timestep, count, mocap=mocap)
-    is_unlike = jnp.any(data.xfrc_applied != 0)
-    if constants.holds:
-        is_unlike = is_unlike | ~jnp.all(data.eq_active)
-    return data.replace(
-        qpos=jnp.where(is_unlike, jnp.nan, state.position),
-        qvel=state.velocity,
-        qacc=state.acceleration,
-        qacc_warmstart=state.acceleration,
-        qfrc_constraint=state.force,
-        time=data.time + count * model.opt.timestep,
-    )
-
-
 def _full_precision() -> Any:
-    """Accelerators multiply float32 matrices with ten bits of mantissa unless they are told not to."""
+    """Return a context in which accelerators multiply float32 matrices with all bits of the mantissa, not ten."""
     return jax.default_matmul_precision("highest")
 
 
 @functools.partial(jax.jit, static_argnums=2)
 def step(model: mjx.Model, data: mjx.Data, exact: bool = True) -> mjx.Data:
-    """`mjx.step` in fewer operations; if ``exact``, with contacts and forces as exact as float32 allows.
+    """Take one physics step as `mjx.step` does, in fewer operations; if ``exact``, as exactly as float32 allows.
 
-    Jitted so that it is traced once, in however many programs it is: tracing takes as long as compiling.
+    The function is jitted so that it is traced once for all programs that contain it: tracing takes as long as compiling.
 
-    Exactness costs nearly as much again, so tasks ask for it where contacts decide. Two things are then better than in MJX.
-    Its contacts between capsules lie up to .1 mm off along short capsules (it adds 1e-6 to a squared length). And its solver
-    accepts a step only where it lowers the cost, and in float32 the cost cannot tell forces apart that differ by less than the
-    square root of the rounding error, some 3e-4. Where large forces balance, at a joint's limit say, that is the velocity's
-    first digit. One more Newton step, judged by the gradient, leaves the rounding error.
+    Exact steps cost nearly twice as much and improve on MJX in two respects. MJX's contacts between capsules lie up to .1 mm
+    off along short capsules (it adds 1e-6 to a squared length). And its solver accepts a step only if the cost decreases, but a
+    float32 cost does not resolve forces that differ by less than the square root of the rounding error, some 3e-4: where large
+    forces balance, as at a joint's limit, that is the velocity's first digit. One more Newton step, accepted by the gradient,
+    reduces this to the rounding error.
     """
     if model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER:
-        data, damped = _forward(model, data, exact)
-        if damped is not None:
-            return constraints.euler(model, data, damped)
-        return mjx.euler(model, constraints.one_factorization_at_a_time(data))
+        return constraints.euler(model, _forward(model, data, exact))
     if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 and model.na == 0 and model.nq == model.nv:
         return _runge_kutta_4(model, data, exact)
     return mjx.step(model, data)
 
 
-def _forward(model: mjx.Model, data: mjx.Data, exact: bool) -> tuple[mjx.Data, jax.Array | None]:
-    """`mjx.forward`: accelerations from positions, velocities and controls; for ``exact`` see `step`.
-
-    With them come those with which Euler's method goes on [nv], if `constraints` takes the model.
-    """
+def _forward(model: mjx.Model, data: mjx.Data, exact: bool) -> mjx.Data:
+    """Compute accelerations from positions, velocities and controls, as `mjx.forward` does; for ``exact`` see `step`."""
     data = smooth.com_pos(model, kinematics(model, data))
     data = smooth.crb(model, smooth.tendon(model, data))
     data = mjx.collision(model, smooth.tendon_armature(model, data))
@@ -197,32 +158,28 @@ def _forward(model: mjx.Model, data: mjx.Data, exact: bool) -> tuple[mjx.Data, j
     data = smooth.transmission(model, mjx.make_constraint(model, data))
     data = mjx.fwd_velocity(model, sensor.sensor_pos(model, data))
     data = mjx.fwd_actuation(model, sensor.sensor_vel(model, data))
-    if constraints.takes(model):
-        data, damped = constraints.solve(model, data, exact)
-    else:
-        data, damped = constraints.by_mjx(model, data, exact), None
-    return sensor.sensor_acc(model, data), damped
+    return sensor.sensor_acc(model, constraints.solve(model, data, exact))
 
 
 def _runge_kutta_4(model: mjx.Model, data: mjx.Data, exact: bool) -> mjx.Data:
-    """`mjx.step` with the classical Runge-Kutta method, for joints of one degree of freedom and actuators without a state.
+    """Take one step of the classical Runge-Kutta method, for hinges, slides and actuators without activation.
 
-    MJX's own puts four copies of the forward dynamics into the program; with one it compiles in a third of the time.
+    MJX's own method puts four copies of the forward dynamics into the program; with one it compiles in a third of the time.
     """
     timestep, start = model.opt.timestep, data
 
     def stage(carry: tuple[mjx.Data, jax.Array, jax.Array], row: jax.Array) -> tuple[Any, None]:
         data, mean_velocity, mean_acceleration = carry
-        reach, weight = row  # how far into the step the stage lies, and its share in the mean
-        velocity = start.qvel + reach * timestep * data.qacc
-        position = start.qpos + reach * timestep * data.qvel
-        data = data.replace(qpos=position, qvel=velocity, time=start.time + reach * timestep)
-        data, _ = _forward(model, data, exact)
+        fraction, weight = row  # elapsed share of the step, and weight in the mean
+        velocity = start.qvel + fraction * timestep * data.qacc
+        position = start.qpos + fraction * timestep * data.qvel
+        data = data.replace(qpos=position, qvel=velocity, time=start.time + fraction * timestep)
+        data = _forward(model, data, exact)
         return (data, mean_velocity + weight * velocity, mean_acceleration + weight * data.qacc), None
 
     tableau = jnp.array([[0.0, 1 / 6], [0.5, 1 / 3], [0.5, 1 / 3], [1.0, 1 / 6]], jnp.float32)
-    nothing = jnp.zeros_like(data.qvel)
-    data, velocity, acceleration = jax.lax.scan(stage, (data, nothing, nothing), tableau)[0]
+    zeros = jnp.zeros_like(data.qvel)
+    data, velocity, acceleration = jax.lax.scan(stage, (data, zeros, zeros), tableau)[0]
     return data.replace(
         qpos=start.qpos + timestep * velocity,
         qvel=start.qvel + timestep * acceleration,
@@ -232,7 +189,7 @@ def _runge_kutta_4(model: mjx.Model, data: mjx.Data, exact: bool) -> mjx.Data:
 
 
 def _place_capsule_contacts(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Contacts between two capsules again, at their closest points (Ericson, "Real-Time Collision Detection", 5.1.9)."""
+    """Recompute contacts between capsules at their closest points (Ericson, "Real-Time Collision Detection", 5.1.9)."""
     contact = data._impl.contact
     types = jnp.asarray(model.geom_type)[contact.geom]
     is_of_capsules = jnp.all(types == int(mujoco.mjtGeom.mjGEOM_CAPSULE), axis=-1)
@@ -243,15 +200,15 @@ def _place_capsule_contacts(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         between = middle_1 - middle_2
         cosine, along_1, along_2 = axis_1 @ axis_2, axis_1 @ between, axis_2 @ between
         squared_sine = jnp.sum(jnp.square(jnp.cross(axis_1, axis_2)))
-        # Of lines without end, then with the ends of one, of the other, and of the first again. 0 for parallel ones.
+        # Closest points of infinite lines, clipped to the first segment, to the second, and to the first again; 0 if parallel.
         at_1 = jnp.where(squared_sine > 0, (cosine * along_2 - along_1) / jnp.where(squared_sine > 0, squared_sine, 1.0), 0.0)
         at_1 = jnp.clip(at_1, -half_1, half_1)
         at_2 = jnp.clip(cosine * at_1 + along_2, -half_2, half_2)
         at_1 = jnp.clip(cosine * at_2 - along_1, -half_1, half_1)
         point_1, point_2 = middle_1 + at_1 * axis_1, middle_2 + at_2 * axis_2
-        normal, length = math.normalize_with_norm(point_2 - point_1)
+        normal, length = rotations.normalize_with_norm(point_2 - point_1)
         distance = length - radius_1 - radius_2
-        return distance, point_1 + (radius_1 + 0.5 * distance) * normal, math.make_frame(normal)
+        return distance, point_1 + (radius_1 + 0.5 * distance) * normal, rotations.make_frame(normal)
 
     distance, position, frame = jax.vmap(place)(jnp.asarray(contact.geom))
     contact = contact.replace(
@@ -262,8 +219,8 @@ def _place_capsule_contacts(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     return data.tree_replace({"_impl.contact": contact})  # type: ignore[dict-item] - a Contact is a tree of arrays
 
 
-def carriers(mj_model: mujoco.MjModel, body: int) -> np.ndarray:
-    """Which joints of a tree of joints of one degree of freedom move ``body``: [nv] bool."""
+def ancestor_joints(mj_model: mujoco.MjModel, body: int) -> np.ndarray:
+    """Return a mask of the hinges and slides that move ``body``: [nv] bool."""
     moves = np.zeros(mj_model.nv, bool)
     while body > 0:
         first, count = mj_model.body_jntadr[body], mj_model.body_jntnum[body]
@@ -273,18 +230,18 @@ def carriers(mj_model: mujoco.MjModel, body: int) -> np.ndarray:
 
 
 def tip_jacobian(mj_model: mujoco.MjModel, data: mjx.Data, sites: np.ndarray) -> jax.Array:
-    """Change of the positions of ``sites`` [S] (m, world) per radian of each hinge of a tree: [nv, S, 3] float32, m/rad."""
-    moves = np.stack([carriers(mj_model, mj_model.site_bodyid[site]) for site in sites], axis=1)
+    """Return the derivative of the positions of ``sites`` [S] (world) with respect to each hinge: [nv, S, 3] float32, m/rad."""
+    moves = np.stack([ancestor_joints(mj_model, mj_model.site_bodyid[site]) for site in sites], axis=1)
     arms = data.site_xpos[sites][None] - data.xanchor[:, None]
     return jnp.where(moves[..., None], jnp.cross(data.xaxis[:, None], arms), 0.0)
 
 
 def point_velocity(mj_model: mujoco.MjModel, data: mjx.Data, body: int, point: jax.Array) -> jax.Array:
-    """Velocity of a ``point`` [3] (m, world) that moves with ``body``, which hinges carry: [3] float32, m/s."""
+    """Return the velocity of a ``point`` [3] (m, world) fixed to ``body``, which hinges move: [3] float32, m/s."""
     return data.qvel @ hinge_jacobian(mj_model, data, body, point)[:, :3]
 
 
 def hinge_jacobian(mj_model: mujoco.MjModel, data: mjx.Data, body: int, point: jax.Array) -> jax.Array:
-    """Change of a ``point`` [3] (m, world) of ``body`` (m/rad), and its turn, per radian of each hinge: [nv, 6] float32."""
-    moves = carriers(mj_model, body)[:, None]
+    """Return the derivative of a ``point`` [3] (m, world) and of the rotation of ``body`` per radian of each hinge: [nv, 6]."""
+    moves = ancestor_joints(mj_model, body)[:, None]
     return jnp.where(moves, jnp.concatenate([jnp.cross(data.xaxis, point - data.xanchor), data.xaxis], axis=1), 0.0)

@@ -16,8 +16,8 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mujoco.mjx._src import math
 
+from jaxrl_vis_envs.physics import rotations
 from jaxrl_vis_envs.plants.stand import KNEE, TOP, Stands
 
 MODULUS = 2e9
@@ -142,8 +142,8 @@ def fit(model: Any, layout: Layout, shape: Shape) -> Any:
     """Return an `mjx.Model` with these stalks; `placed` sets their positions."""
     lower_axis, up, upper_axis = _segments(shape)
     lengths = jnp.stack([jnp.linalg.norm(lower_axis, axis=-1), jnp.linalg.norm(upper_axis, axis=-1)], axis=-1)
-    from_lower = jax.vmap(math.quat_inv)(_between(up, lower_axis))
-    rotation = _between(up, jax.vmap(math.rotate)(upper_axis, from_lower))
+    from_lower = jax.vmap(rotations.quat_inv)(_between(up, lower_axis))
+    rotation = _between(up, jax.vmap(rotations.rotate)(upper_axis, from_lower))
     bodies, geoms = (layout.lower, layout.upper), (layout.lower_geom, layout.upper_geom)
     changes = {
         name: getattr(model, name)

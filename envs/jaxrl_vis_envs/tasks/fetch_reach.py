@@ -150,7 +150,7 @@ class FetchReach(PulledArm):
         position = data.xpos[self._hand] + self.config.action_scale * action[:3]
         quaternion = data.xquat[self._hand] + jnp.asarray(_DOWN, jnp.float32)
         data = data.replace(mocap_pos=position[None], mocap_quat=quaternion[None])
-        data = mjx_model.take_steps(self._model, data, self.config.substeps, undisturbed=True)
+        data = mjx_model.take_steps(self._model, data, self.config.substeps)
         return mjx_model.kinematics(self._model, self._with_closed_fingers(data))
 
     def _with_closed_fingers(self, data: mjx.Data) -> mjx.Data:

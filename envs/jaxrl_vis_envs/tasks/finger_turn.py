@@ -102,7 +102,7 @@ class FingerTurn(MjxGoalEnv):
 
     def act(self, data: mjx.Data, action: jax.Array) -> mjx.Data:
         data = data.replace(ctrl=action)
-        return mjx_model.simulate(self._model, data, self.config.substeps, self.exact_contacts, undisturbed=True)
+        return mjx_model.simulate(self._model, data, self.config.substeps, self.exact_contacts)
 
     def achieved(self, data: mjx.Data) -> jax.Array:
         return (data.site_xpos[self._tip] - data.xpos[self._hinge])[jnp.array([0, 2])]

@@ -151,7 +151,7 @@ class HandReach(MjxGoalEnv):
 
     def act(self, data: mjx.Data, action: jax.Array) -> mjx.Data:
         data = data.replace(ctrl=self._targets(action))
-        return mjx_model.simulate(self._model, data, self.config.substeps, self.exact_contacts, undisturbed=True)
+        return mjx_model.simulate(self._model, data, self.config.substeps, self.exact_contacts)
 
     def achieved(self, data: mjx.Data) -> jax.Array:
         return data.site_xpos[self._tips].reshape(-1)
@@ -195,8 +195,8 @@ class HandReach(MjxGoalEnv):
 
         def act(data: mjx.Data, action: jax.Array) -> tuple[mjx.Data, None]:
             data = data.replace(ctrl=self._targets(action))
-            substeps, is_beside = self.config.goal_substeps, self.exact_contacts
-            return mjx_model.take_steps(self._goal_model, data, substeps, undisturbed=True, beside_exact=is_beside), None
+            # Not exact, but in the kernel of the exact steps of `act`.
+            return mjx_model.take_steps(self._goal_model, data, self.config.goal_substeps, exact=False), None
 
         return self.configuration(jax.lax.scan(act, self._start, actions)[0].qpos)
 

@@ -100,7 +100,7 @@ class SawyerReach(PulledArm):
         reach = 0.5 * jnp.asarray(self.config.goal_size, jnp.float32) + self.config.workspace_margin
         target = jnp.clip(data.mocap_pos[0] + self.config.action_scale * action, centre - reach, centre + reach)
         data = data.replace(mocap_pos=target[None])
-        return mjx_model.simulate(self._model, data, self.config.substeps, undisturbed=True)
+        return mjx_model.simulate(self._model, data, self.config.substeps)
 
     def goal_configuration(self, goal: jax.Array) -> mjx.Data:
         """Return the arm at rest with its grip at or near ``goal`` [3] (m, world), the hand pointing down."""

@@ -21,10 +21,9 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mujoco.mjx._src import math as mjx_math
 
 from jaxrl_vis_envs import checks
-from jaxrl_vis_envs.physics import mjx_model
+from jaxrl_vis_envs.physics import mjx_model, rotations
 from jaxrl_vis_envs.physics.mjx_model import mjx
 from jaxrl_vis_envs.pixels import Observer, PixelsConfig
 from jaxrl_vis_envs.plants import bending
@@ -151,7 +150,7 @@ class StalkReach(MjxGoalEnv):
         foot = data.mocap_pos[self._layout.mocap]
         wind = bending.wind_torque(self._model, self._layout, gusts, foot, data.time)
         data = data.replace(ctrl=stalk_arm.joints_at(position, 1.0), qfrc_applied=wind)
-        return mjx_model.simulate(self._model, data, self.config.substeps, undisturbed=True)
+        return mjx_model.simulate(self._model, data, self.config.substeps)
 
     def achieved(self, data: mjx.Data) -> jax.Array:
         return stalk_arm.grip_at(data.qpos[:3]) - self._displacement(data)
@@ -200,7 +199,7 @@ class StalkReach(MjxGoalEnv):
         along = along - 0.5 * along[-1]
         across = config.offset * jax.random.uniform(offset_key, (count,), jnp.float32, -1.0, 1.0)
         lean = math.radians(config.lean) * jax.random.uniform(lean_key, (count, 2), jnp.float32, -1.0, 1.0)
-        turn = jax.vmap(mjx_math.quat_mul)(_turn(0, lean[:, 0]), _turn(1, lean[:, 1]))
+        turn = jax.vmap(rotations.quat_mul)(_turn(0, lean[:, 0]), _turn(1, lean[:, 1]))
         # Stalks are at their sampled positions at `SWAY_HEIGHT`, where the arm works, and not at the ground.
         upright = jnp.stack([along, across, jnp.zeros(count)], axis=-1)
         foot = upright.at[:, :2].add(-_along(jnp.zeros_like(upright), turn, bending.SWAY_HEIGHT)[:, :2])
@@ -218,7 +217,7 @@ def _turn(axis: int, angle: jax.Array) -> jax.Array:
 
 def _along(foot: jax.Array, turn: jax.Array, height: jax.Array | float) -> jax.Array:
     """Return the points [N, 3] (m) of stalks at rest at a height in m."""
-    axis = jax.vmap(lambda quaternion: mjx_math.rotate(jnp.array([0.0, 0.0, 1.0]), quaternion))(turn)
+    axis = jax.vmap(lambda quaternion: rotations.rotate(jnp.array([0.0, 0.0, 1.0]), quaternion))(turn)
     return foot + height / axis[:, 2:] * axis
 
 

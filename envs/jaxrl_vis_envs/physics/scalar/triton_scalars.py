@@ -1,9 +1,8 @@
-"""Reads and writes of one number a thread, for Pallas kernels (Triton) that are programs of thousands of operations.
+"""One scalar per thread in Pallas kernels (Triton) of thousands of operations: loads, stores and the launch.
 
-Before Triton decides how the threads of a block share a read or a write, it searches the whole program for others like it, once
-for each of them: a kernel that reads 500 numbers takes minutes to compile. Here each thread reads and writes its own numbers
-by an instruction of its own (PTX), of which Triton knows nothing. One primitive is missing from Pallas for that, the address of
-an array, and is added here.
+Triton searches the whole program once for each load and store to decide how the threads of a block share it, so a kernel with
+500 loads takes minutes to compile. Here each thread loads and stores its own scalars by inline PTX, which Triton does not
+analyse. This needs a primitive that Pallas lacks, the address of an array, which is added here.
 """
 
 import functools
@@ -20,36 +19,38 @@ from jax.interpreters import mlir
 
 from jaxrl_vis_envs.compiling.gpu_kernels import kernel_call
 
-LANES = 32
-"""Threads of a program: those of a warp."""
+WARP_SIZE = 32
+"""Threads of a kernel's program."""
 _COMPILER = plgpu.CompilerParams(num_warps=1, num_stages=1)
 
 Compute = Callable[[Any, list[jax.Array]], Iterable[Any]]
 
 
-def as_kernel(name: str, compute: Compute, known: Hashable, outputs: int, interpret: bool) -> Callable[[jax.Array], jax.Array]:
-    """A function of episodes as one GPU kernel, in which a thread has an episode and a program 32 of them.
+def episode_kernel(
+    name: str, compute: Compute, known: Hashable, outputs: int, interpret: bool
+) -> Callable[[jax.Array], jax.Array]:
+    """Wrap a function of one episode as a GPU kernel with one thread per episode, 32 threads per program.
 
-    Calls in one program of one function, with the same ``known`` and for as many episodes, are one kernel: it is compiled once.
+    Calls within one program with the same ``compute`` and ``known`` for equally many episodes are one kernel, compiled once.
 
     Args:
-        name: Of the kernel.
-        compute: Makes an episode's outputs of what is known and of the episode's inputs; numbers are [32] float32, one for each
-            thread. It is traced once for all numbers of episodes.
-        known: What is known before the program runs.
-        outputs: How many it makes.
+        name: Name of the kernel.
+        compute: Function from ``known`` and an episode's inputs to its outputs; scalars are [32] float32, one per thread. It is
+            traced once for all numbers of episodes.
+        known: Constants of the kernel.
+        outputs: Number of outputs.
         interpret: Run the kernel without a GPU, slowly.
 
     Returns:
-        Inputs [B, I] float32 -> outputs [B, ``outputs``]. Another axis of `jax.vmap` makes B larger.
+        The function from inputs [B, I] float32 to outputs [B, ``outputs``]; axes of `jax.vmap` are merged into B.
     """
 
     @custom_vmap
     def run(inputs: jax.Array) -> jax.Array:
         batch = inputs.shape[0]
-        programs = pl.cdiv(batch, LANES)
-        # Threads beyond the last episode compute that again: zeros might be nothing to compute with.
-        inputs = jnp.pad(inputs, ((0, programs * LANES - batch), (0, 0)), mode="edge")
+        programs = pl.cdiv(batch, WARP_SIZE)
+        # Threads beyond the last episode repeat it: zeros might be invalid inputs.
+        inputs = jnp.pad(inputs, ((0, programs * WARP_SIZE - batch), (0, 0)), mode="edge")
         launch = _traced(name, compute, known, outputs, interpret, inputs.T.shape, jax.sharding.get_abstract_mesh())
         results, _ = launch(inputs.T)
         return results.T[:batch]
@@ -67,18 +68,17 @@ def as_kernel(name: str, compute: Compute, known: Hashable, outputs: int, interp
 def _traced(
     name: str, compute: Compute, known: Hashable, outputs: int, interpret: bool, shape: tuple[int, int], mesh: Any
 ) -> Callable[[jax.Array], list[jax.Array]]:
-    """The kernel for inputs of a ``shape`` [I, 32 * programs], traced; one that was traced within a ``mesh`` stays there.
+    """Trace the kernel for inputs of a ``shape`` [I, 32 * programs]; a trace is reused only within its ``mesh``.
 
-    XLA takes two kernels for one if they are equal to the last letter. Of one that was traced in another place, the debug
-    information is not.
+    XLA merges kernels whose code is identical, debug information included, and that differs between traces from two places.
     """
     del mesh
-    programs = shape[1] // LANES
+    programs = shape[1] // WARP_SIZE
     launch = kernel_call(
         functools.partial(_kernel, compute=compute, known=known, interpret=interpret),
         grid=(programs,),
         out_shape=[
-            jax.ShapeDtypeStruct((outputs, programs * LANES), jnp.float32),
+            jax.ShapeDtypeStruct((outputs, programs * WARP_SIZE), jnp.float32),
             jax.ShapeDtypeStruct((programs,), jnp.int32),
         ],
         compiler_params=_COMPILER,
@@ -90,29 +90,29 @@ def _traced(
 
 def _kernel(inputs: Any, results: Any, done: Any, *, compute: Compute, known: Hashable, interpret: bool) -> None:
     program = pl.program_id(0)
-    own = pl.ds(program * LANES, LANES)
-    rows = [inputs[row, own] for row in range(inputs.shape[0])] if interpret else read_rows(inputs)
+    own = pl.ds(program * WARP_SIZE, WARP_SIZE)
+    rows = [inputs[row, own] for row in range(inputs.shape[0])] if interpret else load_rows(inputs)
     computed = jax.jit(compute, static_argnums=0)(known, rows)
-    numbers = [jnp.broadcast_to(jnp.asarray(number, jnp.float32), (LANES,)) for number in computed]
+    numbers = [jnp.broadcast_to(jnp.asarray(number, jnp.float32), (WARP_SIZE,)) for number in computed]
     if interpret:
         for row, number in enumerate(numbers):
             results[row, own] = number
     else:
-        done[program] = write_rows(results, numbers)
+        done[program] = store_rows(results, numbers)
 
 
 @functools.cache
 def _address_primitive() -> Any:
-    """A primitive that takes an array of a kernel and has its address, for all threads: [32] int64.
+    """Return a primitive from a kernel's array to its address, for all threads: [32] int64.
 
-    These are insides of JAX. They are imported here so that a JAX that has moved them loses the kernels, and nothing else.
+    It uses private modules of JAX, imported here so that a JAX without them loses the kernels and nothing else.
     """
     from jax._src import core
     from jax._src.lib import triton
     from jax._src.pallas.triton import lowering
 
     primitive = core.Primitive("address")
-    primitive.def_abstract_eval(lambda ref: core.ShapedArray((LANES,), jnp.dtype("int64")))
+    primitive.def_abstract_eval(lambda ref: core.ShapedArray((WARP_SIZE,), jnp.dtype("int64")))
 
     @lowering.register_lowering(primitive)
     def _(context: Any, pointer: Any) -> Any:
@@ -124,10 +124,10 @@ def _address_primitive() -> Any:
 
 
 def _assemble(lines: str, dtype: Any, *arguments: jax.Array) -> jax.Array:
-    """The result, $0, of some instructions with arguments $1, $2, ..., in each thread."""
+    """Run PTX instructions in each thread, with arguments $1, $2, ...; return the result $0."""
     letters = {"int64": "l", "int32": "r", "float32": "f"}
     constraints = ",".join(["=" + letters[dtype], *(letters[str(argument.dtype)] for argument in arguments)])
-    shape = jax.ShapeDtypeStruct((LANES,), dtype)
+    shape = jax.ShapeDtypeStruct((WARP_SIZE,), dtype)
     (result,) = plgpu.elementwise_inline_asm(
         lines, args=arguments, constraints=constraints, pack=1, result_shape_dtypes=[shape]
     )
@@ -135,7 +135,7 @@ def _assemble(lines: str, dtype: Any, *arguments: jax.Array) -> jax.Array:
 
 
 def _own_address(ref: Any) -> jax.Array:
-    """For each thread of all programs, the address of its number in the first row of an array [rows, threads], float32."""
+    """Return each thread's address of its own element in the first row of an array [rows, threads] float32."""
     return _assemble(
         """
         {
@@ -151,21 +151,21 @@ def _own_address(ref: Any) -> jax.Array:
     )
 
 
-def read_rows(ref: Any) -> list[jax.Array]:
-    """[32] float32 of each row of an array [rows, 32 * programs], of which each thread takes its own column."""
+def load_rows(ref: Any) -> list[jax.Array]:
+    """Load each thread's column of an array [rows, 32 * programs]: [32] float32 per row."""
     rows, threads = ref.shape
     address = _own_address(ref)
     return [_assemble(f"ld.global.nc.f32 $0, [$1+{4 * threads * row}];", "float32", address) for row in range(rows)]
 
 
-def write_rows(ref: Any, values: Iterable[jax.Array]) -> jax.Array:
-    """Writes [32] float32 each into the rows of an array [rows, 32 * programs]; the reverse of `read_rows`.
+def store_rows(ref: Any, values: Iterable[jax.Array]) -> jax.Array:
+    """Store one value, [32] float32, per row into each thread's column of an array [rows, 32 * programs].
 
     Returns:
-        [] int32, 0, of which the compiler does not know that: it keeps the writes if this is used.
+        [] int32, always 0; the compiler cannot know that, and keeps the stores if it is used.
     """
     threads = ref.shape[1]
-    address, done = _own_address(ref), jnp.zeros(LANES, jnp.int32)
+    address, done = _own_address(ref), jnp.zeros(WARP_SIZE, jnp.int32)
     for row, value in enumerate(values):
         done = _assemble(f"st.global.f32 [$1+{4 * threads * row}], $2; mov.u32 $0, $3;", "int32", address, value, done)
     return jnp.sum(done)

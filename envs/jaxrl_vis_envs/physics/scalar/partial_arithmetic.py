@@ -1,8 +1,9 @@
-"""Arithmetic on numbers some of which are known before the program runs: those are Python floats, and cost it nothing.
+"""Scalar arithmetic with constant folding: known values are Python floats and generate no operations.
 
-A number is a float, or one array over the episodes of a batch. Nothing is added to 0 or multiplied by 0 or 1, so formulas for
-any joint and any inertia become, for a joint along an axis of its body and a symmetric body, the short ones of that case.
-A vector is a tuple of three numbers, a symmetric matrix a table of its places on the diagonal and above it.
+A scalar is a Python float, or an array with one element per episode of a batch. Additions of 0 and multiplications by 0 or 1
+are skipped, so general formulas for joints and inertias reduce to the short ones that hold for axis-aligned joints and
+symmetric bodies. A vector is a tuple of three scalars; a symmetric matrix is a dictionary of its entries on and above the
+diagonal.
 """
 
 import math
@@ -13,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 
 Vector = tuple[Any, Any, Any]
-Symmetric = dict[tuple[int, int], Any]  # (row, column), row <= column
+Symmetric = dict[tuple[int, int], Any]  # (row, column) -> entry, row <= column
 
-NOTHING: Vector = (0.0, 0.0, 0.0)
+ZERO: Vector = (0.0, 0.0, 0.0)
 
 
 def _is(number: Any, value: float) -> bool:
@@ -23,7 +24,7 @@ def _is(number: Any, value: float) -> bool:
 
 
 def plus(*terms: Any) -> Any:
-    """The sum of numbers; a plain 0 of none."""
+    """Return the sum of scalars; 0.0 for none."""
     known = sum(term for term in terms if isinstance(term, float))
     result = None
     for term in terms:
@@ -34,15 +35,15 @@ def plus(*terms: Any) -> Any:
     return result if known == 0.0 else result + known
 
 
-def minus(one: Any, other: Any) -> Any:
-    """``one - other``."""
-    if isinstance(other, float):
-        return plus(one, -other)
-    return -other if _is(one, 0.0) else one - other
+def minus(left: Any, right: Any) -> Any:
+    """Return ``left - right``."""
+    if isinstance(right, float):
+        return plus(left, -right)
+    return -right if _is(left, 0.0) else left - right
 
 
 def times(*factors: Any) -> Any:
-    """The product of numbers."""
+    """Return the product of scalars."""
     known = math.prod(factor for factor in factors if isinstance(factor, float))
     result = None
     for factor in factors:
@@ -55,42 +56,42 @@ def times(*factors: Any) -> Any:
     return -result if known == -1.0 else result * known
 
 
-def choose(condition: Any, one: Any, other: Any) -> Any:
-    """``one`` where a condition holds, which may be known, and ``other`` elsewhere."""
+def choose(condition: Any, if_true: Any, if_false: Any) -> Any:
+    """Select by a condition, a Python bool or an array."""
     if isinstance(condition, bool):
-        return one if condition else other
-    return jnp.where(condition, one, other)
+        return if_true if condition else if_false
+    return jnp.where(condition, if_true, if_false)
 
 
-def inverse_root(number: Any, least: float) -> Any:
-    """One over the square root of a number, or of ``least`` where that is more."""
-    return 1.0 / math.sqrt(max(number, least)) if isinstance(number, float) else 1.0 / jnp.sqrt(jnp.maximum(number, least))
+def inverse_root(number: Any, minimum: float) -> Any:
+    """Return ``1 / sqrt(max(number, minimum))``."""
+    return 1.0 / math.sqrt(max(number, minimum)) if isinstance(number, float) else 1.0 / jnp.sqrt(jnp.maximum(number, minimum))
 
 
 def add(*vectors: Vector) -> Vector:
-    """The sum of vectors."""
+    """Return the sum of vectors."""
     x, y, z = zip(*vectors, strict=True)
     return plus(*x), plus(*y), plus(*z)
 
 
-def subtract(one: Vector, other: Vector) -> Vector:
-    """The difference of two vectors."""
-    return minus(one[0], other[0]), minus(one[1], other[1]), minus(one[2], other[2])
+def subtract(left: Vector, right: Vector) -> Vector:
+    """Return the difference of two vectors."""
+    return minus(left[0], right[0]), minus(left[1], right[1]), minus(left[2], right[2])
 
 
 def scale(vector: Vector, factor: Any) -> Vector:
-    """A vector times a number."""
+    """Multiply a vector by a scalar."""
     return times(vector[0], factor), times(vector[1], factor), times(vector[2], factor)
 
 
-def dot(one: Vector, other: Vector) -> Any:
-    """The inner product of two vectors."""
-    return plus(*(times(left, right) for left, right in zip(one, other, strict=True)))
+def dot(left: Vector, right: Vector) -> Any:
+    """Return the inner product of two vectors."""
+    return plus(*(times(a, b) for a, b in zip(left, right, strict=True)))
 
 
-def cross(one: Vector, other: Vector) -> Vector:
-    """The vector product."""
-    (a, b, c), (x, y, z) = one, other
+def cross(left: Vector, right: Vector) -> Vector:
+    """Return the cross product of two vectors."""
+    (a, b, c), (x, y, z) = left, right
     return (
         minus(times(b, z), times(c, y)),
         minus(times(c, x), times(a, z)),
@@ -99,27 +100,27 @@ def cross(one: Vector, other: Vector) -> Vector:
 
 
 def floats(array: Any) -> tuple[float, ...]:
-    """The numbers of a NumPy vector, as known ones."""
+    """Convert a NumPy vector to known scalars."""
     return tuple(float(number) for number in array)
 
 
 def combine(columns: Sequence[Vector], weights: Sequence[Any]) -> Vector:
-    """A matrix, of which the columns are given, times a vector."""
+    """Multiply a matrix, given by its columns, by a vector."""
     return add(*(scale(column, weight) for column, weight in zip(columns, weights, strict=True)))
 
 
-def place(row: int, column: int) -> tuple[int, int]:
-    """Where a symmetric matrix keeps a number."""
+def upper(row: int, column: int) -> tuple[int, int]:
+    """Return the key of a symmetric matrix's entry."""
     return (row, column) if row <= column else (column, row)
 
 
 def symmetric_times(matrix: Symmetric, vector: Vector) -> Vector:
-    """A symmetric matrix times a vector."""
-    x, y, z = (plus(*(times(matrix[place(row, column)], vector[column]) for column in range(3))) for row in range(3))
+    """Multiply a symmetric matrix by a vector."""
+    x, y, z = (plus(*(times(matrix[upper(row, column)], vector[column]) for column in range(3))) for row in range(3))
     return x, y, z
 
 
-# On [-pi/2, pi/2], in powers of the squared angle: interpolated at Chebyshev's points, wrong by 4e-9 and 6e-10 there.
+# On [-pi/2, pi/2], in powers of the squared angle: interpolated at Chebyshev points, with errors of 4e-9 and 6e-10 there.
 _QUARTER_SQUARED = (0.5 * np.pi) ** 2
 
 
@@ -130,13 +131,13 @@ def _coefficients(function: Any, degree: int) -> tuple[float, ...]:
 
 _SINE = _coefficients(lambda square: np.sinc(np.sqrt(square) / np.pi), 4)
 _COSINE = _coefficients(lambda square: np.cos(np.sqrt(square)), 5)
-_PI = (3.140625, math.pi - 3.140625)  # the first has few enough digits for its products with whole numbers to be exact
+_PI = (3.140625, math.pi - 3.140625)  # the first part has so few digits that its products with whole numbers are exact
 
 
 def sine_and_cosine(angle: Any) -> tuple[Any, Any]:
-    """Sine and cosine of an array of angles (rad), within 1e-7 for up to some thousand turns.
+    """Return sine and cosine of an array of angles (rad), within 1e-7 for up to some thousand turns.
 
-    A library's functions serve angles of any size, by code that is longer, and it would be there twice for every joint.
+    Library functions handle arguments of any size with longer code, which would appear twice per joint.
     """
     half_turns = jnp.floor(angle * (1.0 / math.pi) + 0.5)
     rest = angle - half_turns * _PI[0] - half_turns * _PI[1]
