@@ -1,6 +1,8 @@
 """Which implementation a program contains follows its platform and what people ask for; no GPU is needed."""
 
 import gc
+import importlib
+import sys
 from types import SimpleNamespace
 
 import jax
@@ -218,6 +220,18 @@ def test_a_program_holds_the_branch_of_its_own_platform(gpu):
     x = jnp.arange(3.0)
     assert "exponential" in lowered(slope, "cuda", x) and "exponential" not in lowered(slope, "cpu", x)
     np.testing.assert_allclose(jax.jit(slope)(x), jnp.cos(x), rtol=1e-6)
+
+
+def test_mlir_finds_the_dialect_of_triton(monkeypatch):
+    """Which jaxlib keeps elsewhere than MLIR expects it; where that has ended, so can the name that it is given here."""
+    name = "jaxlib.mlir.dialects.tt"
+    monkeypatch.delitem(sys.modules, name, raising=False)
+    with pytest.raises(ImportError):
+        importlib.import_module(name)
+    compilation._name_triton_dialect.cache_clear()
+    with tracing_for("cuda"), kernels(True):
+        assert use_gpu_kernels()
+    assert importlib.import_module(name) is importlib.import_module("jaxlib.triton.dialect")
 
 
 def test_a_function_is_traced_for_each_platform_and_choice(gpu):
