@@ -109,9 +109,9 @@ def _line_search(
 
     def slope_at(length: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return slope and curvature of the cost."""
-        there = residual + length * along
-        acting = jnp.where(is_equality | (there < 0), stiffness, 0.0) * along
-        return first + second * length + jnp.sum(acting * there), second + jnp.sum(acting * along)
+        moved = residual + length * along
+        acting = jnp.where(is_equality | (moved < 0), stiffness, 0.0) * along
+        return first + second * length + jnp.sum(acting * moved), second + jnp.sum(acting * along)
 
     # The slope increases along the line and is linear between the corners where a constraint starts or stops acting.
     corners = jnp.where(is_equality | (along == 0), -1.0, -residual / jnp.where(along == 0, 1.0, along))

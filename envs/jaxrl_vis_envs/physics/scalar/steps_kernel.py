@@ -62,7 +62,7 @@ def simulate(
 
 @dataclasses.dataclass(frozen=True)
 class _KernelConstants:
-    """Constants, compared by their fingerprint, and whether the kernel can take exact steps."""
+    """Constants of a model, compared by their fingerprint, and True if the kernel can take exact steps."""
 
     fingerprint: Hashable
     constants: ScalarModel = dataclasses.field(compare=False)
