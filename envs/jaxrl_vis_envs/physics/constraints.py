@@ -12,6 +12,10 @@ from mujoco.mjx._src import smooth, solver, support
 
 from jaxrl_vis_envs.physics import newton
 
+# Rows of contacts and equalities. Beyond, steps are MJX's own: grasping's results, with more contacts, are recorded with these,
+# and the shorter step rounds differently.
+_MAX_COUPLED_ROWS = 12
+
 
 def solve(model: mjx.Model, data: mjx.Data, exact: bool) -> mjx.Data:
     """Compute accelerations with and without constraints (``qacc``, ``qacc_smooth``) and constraint forces
@@ -34,6 +38,8 @@ def solve(model: mjx.Model, data: mjx.Data, exact: bool) -> mjx.Data:
     else:
         solved = newton.solve(model, solved) if newton.supports(model) else mjx.solve(model, solved)
         solved = _polish(model, solved) if exact else solved
+    if not _has_short_step(model, data):
+        return solved
     # MJX's factorized mass matrix, which nothing reads, would be an output of every step.
     names = ("qfrc_smooth", "qacc_smooth", "qacc", "qfrc_constraint")
     return data.replace(**{name: getattr(solved, name) for name in names})
@@ -53,14 +59,21 @@ def _polish(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 def euler(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Take a step of Euler's method, implicit in the joints' damping, with the accelerations and forces of `solve`."""
-    is_damped = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP
-    has_only_hinges_and_slides = model.nq == model.nv and not model.na
-    if not (is_damped and has_only_hinges_and_slides) or support.is_sparse(model):
+    if not _has_short_step(model, data):
         return mjx.euler(model, _after_solving(data))
     timestep = model.opt.timestep
     velocity = data.qvel + timestep * _damped_accelerations(model, data)
     position = data.qpos + timestep * velocity
     return data.replace(qpos=position, qvel=velocity, time=data.time + timestep, qacc_warmstart=data.qacc)
+
+
+def _has_short_step(model: mjx.Model, data: mjx.Data) -> bool:
+    """Return True if `euler` takes its own step: for hinges and slides with damping, a dense mass matrix and few contacts."""
+    is_damped = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+    has_only_hinges_and_slides = model.nq == model.nv and not model.na
+    coupled_rows = data._impl.nefc - data._impl.nf - data._impl.nl
+    is_small = newton.supports(model) or (coupled_rows <= _MAX_COUPLED_ROWS and not support.is_sparse(model))
+    return is_damped and has_only_hinges_and_slides and is_small
 
 
 def _damped_accelerations(model: mjx.Model, data: mjx.Data) -> jax.Array:
