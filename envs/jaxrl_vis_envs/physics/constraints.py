@@ -71,7 +71,7 @@ def _has_short_step(model: mjx.Model, data: mjx.Data) -> bool:
     """Return True if `euler` takes its own step: for hinges and slides with damping, a dense mass matrix and few contacts."""
     is_damped = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP
     has_only_hinges_and_slides = model.nq == model.nv and not model.na
-    coupled_rows = data._impl.nefc - data._impl.nf - data._impl.nl
+    coupled_rows = int(data._impl.nefc - data._impl.nf - data._impl.nl)
     is_small = newton.supports(model) or (coupled_rows <= _MAX_COUPLED_ROWS and not support.is_sparse(model))
     return is_damped and has_only_hinges_and_slides and is_small
 
