@@ -49,7 +49,7 @@ from jaxrl_vis.learner.shards import DATA
 from jaxrl_vis.learner.train_step import make_train_step
 from jaxrl_vis.run.arrays import named_leaves
 from jaxrl_vis.run.checkpoint import FULL, Checkpoints
-from jaxrl_vis.run.programs import Programs
+from jaxrl_vis.run.compiled.programs import Programs
 
 QUICK = {
     "image_size": 16,

@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import probe_environments as probes
 import pytest
-from learners import begin, experienced, iteration_of_one
+from learners import begin, experienced, iteration_of_one, train_iteration
 
 from jaxrl_vis.config import preset
 from jaxrl_vis.learner import rollout
 from jaxrl_vis.learner.train_step import make_train_step
-from jaxrl_vis.run.programs import Programs
+from jaxrl_vis.run.compiled.programs import Programs
 
 DISCOUNT = 0.75  # 1 - 1/horizon of the probes
 # Probes that are learned with the same settings.
@@ -34,7 +34,7 @@ def trained(env, iterations=12, **overrides):
         "relabel_probability": 0.0,
     }
     program = make_train_step(env, preset("debug", **{**settings, **overrides}))
-    iterate = program.train_iteration
+    iterate = functools.partial(train_iteration, program)
     if env in ALIKE and not overrides:
         iterate = functools.partial(iteration_of_one(ALIKE, program.config), ALIKE.index(env))
     loop = begin(program, jax.random.key(7)[None])
@@ -95,11 +95,11 @@ def test_seeds_side_by_side_learn_what_they_learn_alone():
     keys = jax.random.split(jax.random.key(1), 3)
     together = program.init(keys)
     for _ in range(2):
-        together, _ = program.train_iteration(together)
+        together, _ = train_iteration(program, together)
     for seed in range(3):
         alone = program.init(keys[seed][None])
         for _ in range(2):
-            alone, _ = program.train_iteration(alone)
+            alone, _ = train_iteration(program, alone)
         for left, right in zip(jax.tree.leaves(alone.train), jax.tree.leaves(together.train), strict=True):
             np.testing.assert_allclose(left[0], right[seed], rtol=1e-4, atol=1e-5)
 
@@ -117,7 +117,7 @@ def test_one_trace_and_a_new_episode_every_time():
     loop = begin(program, KEYS)
     goals = []
     for _ in range(3):
-        loop, _ = program.train_iteration(loop)
+        loop, _ = train_iteration(program, loop)
         written = (int(loop.iteration) - 1) % program.replay.num_rollouts * program.config.num_envs
         goals.append(np.asarray(loop.replay.episodes.states)[0, written, -1, 0])
     assert traces == 1
@@ -135,7 +135,7 @@ def filtering(positive=None, negative=None):
 def test_a_fresh_filter_drops_nothing(rewards):
     """At initialisation no negative is dropped, under +1/-1 and under 0/-1 (there the critic must start below the band)."""
     program = filtering(*rewards)
-    _, metrics = program.train_iteration(begin(program, KEYS))
+    _, metrics = train_iteration(program, begin(program, KEYS))
     assert metrics["train/filtered_share"][0] == 0.0
     assert metrics["train/positive_share"][0] > 0.3
 
@@ -148,7 +148,7 @@ def test_the_filter_drops_negatives_that_the_critic_values_like_positives():
     last = sorted(head)[-1]
     confident = {**head, last: {**head[last], "bias": head[last]["bias"] + 1e3}}
     loop = loop.replace(train=loop.train.replace(critic={**loop.train.critic, "head": confident}))
-    _, metrics = program.train_iteration(loop)
+    _, metrics = train_iteration(program, loop)
     assert metrics["train/filtered_share"][0] == 1.0
 
 
@@ -161,16 +161,15 @@ def test_share_of_positives_is_the_one_derived(method, expected):
     program = make_train_step(
         probes.PointImage(), preset("debug", method=method, num_envs=256, updates_per_iteration=40, batch_size=512)
     )
-    _, metrics = program.train_iteration(begin(program, jax.random.key(3)[None]))
+    _, metrics = train_iteration(program, begin(program, jax.random.key(3)[None]))
     assert abs(float(metrics["train/positive_share"][0]) - expected) < 0.012
 
 
-@pytest.mark.parametrize("name", ["train_iteration", "learn"])
-def test_replay_is_written_in_place(name):
+def test_replay_is_written_in_place():
     """The compiled iteration holds no second copy of the replay: it is aliased, and temporaries stay far below it."""
     config = preset("debug", replay_transitions=200_000, seeds=2)
     programs = Programs(config, make_train_step(probes.PointImage(), config))
-    memory = programs.lower(name).compile().memory_analysis()
+    memory = programs.lower("learn").compile().memory_analysis()
     replay = 2 * programs.program.replay_bytes
     assert replay > 10e6
     assert memory.alias_size_in_bytes >= replay
@@ -248,7 +247,7 @@ def test_goals_can_have_statistics_of_their_own(source):
 
     def statistics(normalizers):
         program = make_train_step(env, preset("debug", normalizers=normalizers, **settings))
-        loop, metrics = program.train_iteration(begin(program, KEYS))
+        loop, metrics = train_iteration(program, begin(program, KEYS))
         assert metrics["guard/nonfinite"][0] == 0
         outcome, _ = program.evaluate(loop.train, jax.random.key(1))
         assert np.isfinite(outcome["eval/goal_distance"]).all()

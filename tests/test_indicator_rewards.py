@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import probe_environments as probes
 import pytest
-from learners import begin
+from learners import begin, rollout, train_iteration
 from test_ddpg import DISCOUNT, trained
 
 from jaxrl_vis.config import preset
@@ -72,7 +72,7 @@ def test_the_return_of_an_autoencoder_is_in_q(with_autoencoder):
 
 def test_an_autoencoder_learns_to_reconstruct(with_autoencoder):
     program, train, late = with_autoencoder
-    _, early = program.train_iteration(begin(program, jax.random.key(7)[None]))
+    _, early = train_iteration(program, begin(program, jax.random.key(7)[None]))
     assert late["train/autoencoder_loss"][0] < 0.5 * early["train/autoencoder_loss"][0]
     assert set(train.autoencoder.params) == {"encoder", "decoder"}
 
@@ -248,7 +248,7 @@ def test_errors_of_the_estimator_show_in_the_diagnostics():
     options = {"reward_false_positives": 0.1, "reward_false_negatives": 0.2, "reward_clutter": 0.5, "relabel_probability": 0.9}
     config = preset("debug", num_envs=256, updates_per_iteration=20, batch_size=512, **options)
     program = make_train_step(probes.GoWhereTold(), config)
-    _, metrics = program.train_iteration(begin(program, jax.random.key(3)[None]))
+    _, metrics = train_iteration(program, begin(program, jax.random.key(3)[None]))
     assert abs(metrics["train/false_positive_share"][0] - 0.1) < 0.03
     true_share = metrics["train/positive_share"][0]  # of what is there, about a fifth is not paid
     assert 0.0 < metrics["train/false_negative_share"][0] < 0.25 * true_share / (1.0 - true_share)
@@ -273,7 +273,7 @@ def test_noisy_frames_equal_themselves_and_no_others(noise):
     config = preset("debug", method="indicator", num_envs=4, batch_size=4 * env.horizon, observation_noise=noise)
     program = make_train_step(env, config)
     loop = begin(program, jax.random.key(0)[None])
-    episodes, _ = program.rollout(loop.train, jax.random.key(1)[None])
+    episodes, _ = rollout(program, loop.train, jax.random.key(1)[None])
     assert episodes.observations.dtype == jnp.uint8
     frames = np.asarray(episodes.observations[0]).reshape(-1, 64)
     assert len(np.unique(frames, axis=0)) == (1 if noise == 0.0 else len(frames))

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import point_mass
 import pytest
+from learners import train_iteration
 from point_mass import PointMass, PointMassConfig
 
 import jaxrl_vis_envs
@@ -296,7 +297,7 @@ def test_a_learner_trains_in_environments_that_vary() -> None:
     def train() -> tuple[Any, list[Any]]:
         loop, rows = program.init(keys()[:1]), []
         for _ in range(2):
-            loop, metrics = program.train_iteration(loop)
+            loop, metrics = train_iteration(program, loop)
             rows.append(jax.device_get(metrics))
         return loop, rows
 

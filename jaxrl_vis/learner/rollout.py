@@ -11,9 +11,13 @@ import jax
 import jax.numpy as jnp
 
 from jaxrl_vis.learner.networks import Networks
+from jaxrl_vis.learner.rollout_parts import RolloutPart
 from jaxrl_vis.learner.shards import ONE, Shards
 from jaxrl_vis.types import Episodes, Metrics, NormalizerState, TrainState
 from jaxrl_vis_envs.base import GoalEnv, State
+
+Draws = Shards | RolloutPart
+"""Source of the random numbers of the environments that are played: all of a learner's, those of one device, or a few."""
 
 # Folded into keys for noise on observations, so that it changes nothing else.
 _FIRST_NOISE, _GOAL_NOISE, _STEP_NOISE = 0x6E6F30, 0x6E6F31, 0x6E6F32
@@ -53,7 +57,7 @@ def choose_actions(
     exploration: Exploration,
     key: jax.Array,
     observations: jax.Array,
-    shards: Shards = ONE,
+    draws: Draws = ONE,
 ) -> jax.Array:
     """The online actor, with noise where it is asked for.
 
@@ -64,7 +68,7 @@ def choose_actions(
         exploration: The noise.
         key: [] typed; draws the noise.
         observations: [E, ...].
-        shards: Of the learner; observations are those of one part.
+        draws: Random numbers of these environments.
 
     Returns:
         [E, A] float32 in [-1, 1].
@@ -73,33 +77,30 @@ def choose_actions(
     if exploration.is_none:
         return action
     noise_key, random_key = jax.random.split(key)
-    noise = shards.draw(lambda shape: jax.random.normal(noise_key, shape), action.shape)
+    noise = draws.draw(lambda shape: jax.random.normal(noise_key, shape), action.shape)
     action = jnp.clip(action + exploration.action_noise * noise, -1.0, 1.0)
     # One draw says whether an action is random, and which.
-    drawn = shards.draw(lambda shape: jax.random.uniform(random_key, shape), (*action.shape[:-1], 1 + action.shape[-1]))
+    drawn = draws.draw(lambda shape: jax.random.uniform(random_key, shape), (*action.shape[:-1], 1 + action.shape[-1]))
     is_random = drawn[..., :1] < exploration.random_action_probability
     return jnp.where(is_random, 2.0 * drawn[..., 1:] - 1.0, action)
 
 
-def split_keys(keys: jax.Array, num_envs: int, shards: Shards = ONE) -> tuple[jax.Array, jax.Array]:
-    """Keys of a rollout: [S] typed keys -> those of all S x E resets, seed after seed, and those of the policies, [S].
-
-    Of a learner in several parts, only the resets of this part.
-    """
+def split_keys(keys: jax.Array, num_envs: int, draws: Draws = ONE) -> tuple[jax.Array, jax.Array]:
+    """Keys of a rollout: [S] typed keys -> those of all S x E resets, seed after seed, and those of the policies, [S]."""
     reset_keys, policy_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
-    return jax.vmap(lambda key: shards.split(key, num_envs))(reset_keys).reshape(-1), policy_keys
+    return jax.vmap(lambda key: draws.split(key, num_envs))(reset_keys).reshape(-1), policy_keys
 
 
-def add_noise(key: jax.Array, observations: jax.Array, deviation: float, shards: Shards = ONE) -> jax.Array:
+def add_noise(key: jax.Array, observations: jax.Array, deviation: float, draws: Draws = ONE) -> jax.Array:
     """Observations [E, ...] as a noisy camera shows them: same shape and dtype; bytes are rounded and clipped.
 
     Args:
         key: [] a typed key.
         observations: uint8 images or float32 state vectors.
         deviation: Standard deviation of the noise, in the observation's unit.
-        shards: Of the learner; observations are those of one part.
+        draws: Random numbers of these environments.
     """
-    noisy = observations + deviation * shards.noise(key, observations.shape)
+    noisy = observations + deviation * draws.noise(key, observations.shape)
     if observations.dtype == jnp.uint8:
         noisy = jnp.clip(jnp.round(noisy), 0.0, 255.0)
     return noisy.astype(observations.dtype)
@@ -133,7 +134,7 @@ def play(
     exploration: Exploration = NO_EXPLORATION,
     num_kept: int | None = None,
     record: Callable[[State], Any] | None = None,
-    shards: Shards = ONE,
+    draws: Draws = ONE,
 ) -> Rollout:
     """Plays one episode in each of E environments, for each of S learners side by side.
 
@@ -144,14 +145,13 @@ def play(
         networks: What the parameters mean.
         train: The learners, [S, ...].
         keys: [S] typed keys of this rollout.
-        num_envs: E, of whole learners.
+        num_envs: E, environments of each learner that are played here.
         exploration: The noise.
         num_kept: K, how many of the episodes to keep (the first ones); None: all.
         record: What else to keep, a pytree made of the state of one environment after reset and after each step.
-        shards: Of each learner. In one part, E / ``shards.count`` of its environments are played.
+        draws: Random numbers of these environments.
     """
     num_seeds = keys.shape[0]
-    num_envs, num_drawn = num_envs // shards.count, num_envs
 
     def by_seed(leaf: jax.Array) -> jax.Array:
         return leaf.reshape(num_seeds, num_envs, *leaf.shape[1:])
@@ -165,13 +165,13 @@ def play(
         if not deviation:
             return observations
         noise_keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, number)
-        noisy = jax.vmap(lambda key, part: add_noise(key, part, deviation, shards))(noise_keys, by_seed(observations))
+        noisy = jax.vmap(lambda key, part: add_noise(key, part, deviation, draws))(noise_keys, by_seed(observations))
         return noisy.reshape(observations.shape)
 
     def recorded(state: State) -> Any:
         return None if record is None else jax.tree.map(kept, jax.vmap(record)(state))
 
-    reset_keys, policy_keys = split_keys(keys, num_drawn, shards)
+    reset_keys, policy_keys = split_keys(keys, num_envs, draws)
     state = jax.vmap(env.reset)(reset_keys)
     assert state.obs is not None
     first_observation = seen(state.obs["observation"], policy_keys, _FIRST_NOISE)
@@ -180,7 +180,7 @@ def play(
     goal_latents = jax.vmap(lambda train, goals: encode(networks, train, train.goal_statistics, goals))(train, by_seed(goal))
 
     def act(train: TrainState, goal_latents: jax.Array, key: jax.Array, observations: jax.Array) -> jax.Array:
-        return choose_actions(networks, train, goal_latents, exploration, key, observations, shards)
+        return choose_actions(networks, train, goal_latents, exploration, key, observations, draws)
 
     def step(carry, step_keys):
         state, observation = carry

@@ -148,31 +148,25 @@ class Layout:
         return jax.tree.map(placed, self.shardings(specs), tree)
 
     def folded(self, replay: ReplayState, num_envs: int) -> ReplayState:
-        """One device's part of a replay as it is between two iterations; [S, rollouts * E, ...] before.
+        """Return one device's part of a learner's replay as it is between two iterations.
 
         Args:
-            replay: Of learners in this part.
+            replay: Of one learner, [rollouts * E, ...].
             num_envs: E, environments in this part.
         """
         count = self.shards.count
         if count == 1:
             return replay
-
-        def split(leaf: jax.Array) -> jax.Array:
-            return leaf.reshape(leaf.shape[0], -1, num_envs, *leaf.shape[2:])
-
-        return ReplayState(episodes=jax.tree.map(split, replay.episodes), size=replay.size * count)
+        episodes = jax.tree.map(lambda leaf: leaf.reshape(-1, num_envs, *leaf.shape[1:]), replay.episodes)
+        return ReplayState(episodes=episodes, size=replay.size * count)
 
     def unfolded(self, replay: ReplayState) -> ReplayState:
-        """Undoes `folded`."""
+        """Undo `folded`."""
         count = self.shards.count
         if count == 1:
             return replay
-
-        def join(leaf: jax.Array) -> jax.Array:
-            return leaf.reshape(leaf.shape[0], -1, *leaf.shape[3:])
-
-        return ReplayState(episodes=jax.tree.map(join, replay.episodes), size=replay.size // count)
+        episodes = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), replay.episodes)
+        return ReplayState(episodes=episodes, size=replay.size // count)
 
 
 def put_array(array: Any, sharding: Any) -> jax.Array:

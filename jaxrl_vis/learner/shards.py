@@ -9,7 +9,6 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 DATA = "data"
@@ -62,8 +61,8 @@ class Shards:
         return self.draw(lambda whole: jax.random.normal(key, whole), shape)
 
     def split(self, key: jax.Array, count: int) -> jax.Array:
-        """A key for each of this part's share of ``count`` environments."""
-        return self.part(jax.random.split(key, count))
+        """Return a key for each of the ``count`` environments of this part."""
+        return self.part(jax.random.split(key, count * self.count))
 
     def gather(self, array: jax.Array, axis: int = 0) -> jax.Array:
         """All parts of an array, one after the other along ``axis``."""
@@ -76,33 +75,3 @@ class Shards:
 
 ONE = Shards()
 """A learner that is not divided."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Slice(Shards):
-    """A few environments of a learner that is not divided, in a program that plays any few of them.
-
-    Environment ``first + i`` starts as it does where all are played at once, and its actions have the same noise. Noise of
-    images is each slice's own: that of all environments would take longer to draw than the images.
-
-    Attributes:
-        first: [] int32, the number of the first one. Beyond ``total`` there is no noise to draw, as in evaluations.
-        total: How many there are in a rollout.
-    """
-
-    first: jax.Array = dataclasses.field(kw_only=True)
-    total: int = dataclasses.field(kw_only=True)
-
-    def draw(self, draw: Callable[[tuple[int, ...]], jax.Array], shape: tuple[int, ...]) -> jax.Array:
-        """This slice of the numbers that all environments draw; zeros beyond them."""
-        drawn = draw((self.total, *shape[1:]))
-        filled = jnp.concatenate([drawn, jnp.zeros(shape, drawn.dtype)])  # the last slice may be longer than what is left
-        return jax.lax.dynamic_slice_in_dim(filled, self.first, shape[0])
-
-    def noise(self, key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
-        """Standard normal numbers that no other slice draws."""
-        return jax.random.normal(jax.random.fold_in(key, self.first), shape)
-
-    def split(self, key: jax.Array, count: int) -> jax.Array:
-        """Keys number ``first`` to ``first + count - 1`` of those that `jax.random.split` makes, however many these are."""
-        return jax.vmap(jax.random.fold_in, (None, 0))(key, self.first + jnp.arange(count))

@@ -28,16 +28,16 @@ from jaxrl_vis import processes
 from jaxrl_vis.errors import NonFiniteError, RequestError, StorageError
 from jaxrl_vis.run import earlier, metrics, trust
 from jaxrl_vis.run.checkpoint import FULL, LIGHT, RECENT, Checkpoints, Restored
+from jaxrl_vis.run.compiled.memory import check_compiled, check_memory, fit_together
+from jaxrl_vis.run.compiled.pending import Pending
+from jaxrl_vis.run.compiled.programs import Programs
 from jaxrl_vis.run.console import RunConsole, show_seconds, show_shares
 from jaxrl_vis.run.folder import RunFolder, read_record, read_run_id
 from jaxrl_vis.run.goodput import Goodput
 from jaxrl_vis.run.lock import FolderGoneError, Held
 from jaxrl_vis.run.loggers import Loggers
-from jaxrl_vis.run.memory import check_compiled, check_memory, fit_together
 from jaxrl_vis.run.metrics import PerSeed
 from jaxrl_vis.run.pace import Pace
-from jaxrl_vis.run.pending import Pending
-from jaxrl_vis.run.programs import Programs
 from jaxrl_vis.run.progress import Progress
 from jaxrl_vis.run.results import Results, describe
 from jaxrl_vis.run.saving import Saver, import_what_saves

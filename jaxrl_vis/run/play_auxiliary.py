@@ -13,6 +13,7 @@ from jaxrl_vis.learner.auxiliary import Auxiliary
 from jaxrl_vis.learner.auxtasks import View
 from jaxrl_vis.learner.auxtasks.egomotion import MAX_ANGLE
 from jaxrl_vis.learner.networks import Networks
+from jaxrl_vis.learner.rollout_parts import join_parts
 from jaxrl_vis.report import auxiliary_video, videos
 from jaxrl_vis.run.folder import read_config
 from jaxrl_vis.run.trained import load, open_run
@@ -53,7 +54,8 @@ def play_auxiliary(run_dir: Path | str, out: Path | str, episodes: int = 6, trus
     env, config, networks = trainer.env, trainer.config, trainer.program.networks
     train = jax.tree.map(lambda leaf: jnp.asarray(leaf[:1]), load(trainer, run_dir).train)
     enable_compilation_cache()
-    played, outcome = trainer.program.rollout(train, trainer.programs.evaluation_key[None])
+    parts = trainer.programs.play(train, trainer.programs.evaluation_key[None])
+    played, outcome = jax.tree.map(lambda *leaves: join_parts(leaves, episodes, axis=1), *parts)
     auxiliary = trainer.program.auxiliary
 
     def predict(train: TrainState, episodes: Episodes, key: jax.Array) -> dict[str, jax.Array]:

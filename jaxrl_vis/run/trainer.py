@@ -21,9 +21,9 @@ from jaxrl_vis.errors import NonFiniteError, RequestError, Terminated
 from jaxrl_vis.learner.environment import locate_env, make_env
 from jaxrl_vis.learner.train_step import make_train_step
 from jaxrl_vis.run import loggers
+from jaxrl_vis.run.compiled.programs import Programs
 from jaxrl_vis.run.folder import RunFolder, default_folder, read_log
 from jaxrl_vis.run.loop import Report, RunLoop
-from jaxrl_vis.run.programs import Programs
 from jaxrl_vis.run.signals import shielded_children
 from jaxrl_vis.streams import safe_streams
 from jaxrl_vis.types import LoopState, Metrics, TrainState
@@ -42,7 +42,7 @@ class Trainer:
         resume: Go on with the run in ``run_dir``.
         overwrite: Delete the run in ``run_dir`` and start again.
         log: Loggers that are told beside metrics.jsonl: ``tensorboard``, ``wandb``. None: those of the run that goes on.
-        keep_programs: Trace nothing that an earlier process has traced (`jaxrl_vis.run.kept_programs`).
+        keep_programs: Trace nothing that an earlier process has traced (`jaxrl_vis.run.compiled.trace_cache`).
 
     Attributes:
         config: The run.
@@ -179,7 +179,7 @@ def make_trainer(
         overwrite: Delete the run in that folder and start again.
         log: Loggers that are told beside metrics.jsonl: ``tensorboard``, ``wandb``. None: those of the run that goes on.
         keep_programs: Trace nothing that an earlier process has traced. For processes that have replaced nothing in this
-            package's modules, which would not be seen (`jaxrl_vis.run.kept_programs`).
+            package's modules, which would not be seen (`jaxrl_vis.run.compiled.trace_cache`).
 
     Raises:
         RequestError: The configuration asks for something that cannot be, or contradicts the saved run.

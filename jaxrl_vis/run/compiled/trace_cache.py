@@ -1,15 +1,15 @@
-"""Programs as they were traced, kept on disk, so that a run that has been traced once starts without tracing.
+"""Cache of traced programs on disk, so that a run that has been traced once starts without tracing.
 
-XLA's cache spares compiling a program again. Tracing it, which is Python, goes before that, and takes seconds. What is kept is
-StableHLO (`jax.export`), next to XLA's cache: reading it runs no code.
+XLA's cache spares compiling a program again. Tracing it, which is Python, goes before that, and takes seconds. Programs are
+stored as StableHLO (`jax.export`), next to XLA's cache: reading it runs no code.
 
-A kept program is that of one fingerprint: the code of both packages, the versions of the libraries, the configuration, JAX's
-settings and the device. It does not see what a process has replaced in its own modules (a patched loss, say). So only
-commands keep programs, not scripts and notebooks, and none of environments from elsewhere. ``JAXRL_VIS_KEEP_PROGRAMS=0`` turns
+A program belongs to one fingerprint: the code of both packages, the versions of the libraries, the configuration, JAX's
+settings and the device. It does not cover what a process has replaced in its own modules (a patched loss, say). So only
+commands use the cache, not scripts and notebooks, and not with environments from elsewhere. ``JAXRL_VIS_KEEP_PROGRAMS=0`` turns
 it off.
 
-Whoever writes a kept program decides what a run computes. So folder and files are kept for the user alone, nothing is read that
-another user has written or could have written, and a file's digest is of its name, too.
+Whoever writes a stored program decides what a run computes. So folder and files are kept for the user alone, nothing is read
+that another user has written or could have written, and a file's digest covers its name, too.
 """
 
 import contextlib
@@ -17,11 +17,10 @@ import dataclasses
 import functools
 import hashlib
 import importlib.util
-import itertools
 import json
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -31,27 +30,34 @@ from jax.extend.core import jaxpr_as_fun
 
 from jaxrl_vis.config import Config
 from jaxrl_vis.files import make_private, read_private, replacing, stranger_to
+from jaxrl_vis.learner.evaluate import Evaluation
+from jaxrl_vis.learner.iteration import Learned
+from jaxrl_vis.learner.rollout import Exploration
 from jaxrl_vis.provenance import device_record, versions
+from jaxrl_vis.types import Episodes
 from jaxrl_vis_envs.base import GoalEnv
 from jaxrl_vis_envs.compilation import env_jit, runs_gpu_kernels, target_platform, tracing_for_default_device
 
 VARIABLE = "JAXRL_VIS_KEEP_PROGRAMS"
 MOST_FILES = 300
-"""The oldest of more are deleted; one has half a megabyte."""
+"""Largest number of files, of half a megabyte each; the oldest are deleted."""
 
 HOST_FIELDS = ("env_steps", "eval_interval", "checkpoint_interval", "full_checkpoint_interval")
-"""Fields of `Config` that say what the host does with a run: nothing that is compiled knows of them."""
+"""Fields of `Config` that only the host reads: no compiled program depends on them."""
 
 _PACKAGES = ("jaxrl_vis", "jaxrl_vis_envs")
 _DIGEST_BYTES = 32
 # Triton's programs may mean something else to another jaxlib, of which JAX warns; a fingerprint has its version.
 _CHECKS = (export.DisabledSafetyCheck.custom_call("__gpu$xla.gpu.triton"),)
+# Kinds of nodes that `jax.export` knows by name, and one node of each kind that only signatures of programs have.
+_registered: set[type] = set()
+_SIGNATURES = (Episodes(0, 0, 0), Exploration(), Learned(0, {}), Evaluation({}, {}))  # type: ignore[arg-type]
 # These say what JAX writes down and where, and change no program. Folders may differ from run to run.
 _WITHOUT_EFFECT = ("cache", "log", "dump", "dir", "timeout", "traceback")
 
 
 def fingerprint(config: Config, env: GoalEnv) -> str | None:
-    """What the programs of a run depend on, hexadecimal; None if they are not to be kept."""
+    """Return a digest of all that the programs of a run depend on, hexadecimal; None if they are not to be kept."""
     is_ours = type(env).__module__.partition(".")[0] in _PACKAGES
     if not is_ours or os.environ.get(VARIABLE) == "0":
         return None
@@ -78,62 +84,43 @@ def _code() -> str:
     return digest.hexdigest()
 
 
-class CompiledOfLeaves:
-    """A compiled program that takes and returns leaves, called with trees.
+class TraceCache:
+    """Traced programs of one fingerprint.
 
     Args:
-        compiled: From ``jax.jit(...).lower(...).compile()``; takes a list of leaves for each argument. Asked for anything else,
-            this is it.
-        restore: What its results are, given what it returns.
+        folder: Folder of the files; it need not exist.
+        fingerprint: From `fingerprint`.
+        nodes: Tree with all kinds of nodes that arguments and results have, besides those of this package's own signatures.
+        jit_options: Arguments of `env_jit` by name of the program.
     """
 
-    def __init__(self, compiled: Any, restore: Callable[[Any], Any]):
-        self._compiled, self._restore = compiled, restore
-
-    def __call__(self, *arguments: Any) -> Any:
-        """What the program returns for these trees."""
-        return self._restore(self._compiled(*map(jax.tree.leaves, arguments)))
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._compiled, name)
-
-
-class KeptPrograms:
-    """The programs of one fingerprint.
-
-    Args:
-        folder: Where programs are kept; it need not be there.
-        fingerprint: Theirs.
-    """
-
-    def __init__(self, folder: Path, fingerprint: str):
-        self._folder, self._fingerprint = folder, fingerprint
+    def __init__(self, folder: Path, fingerprint: str, nodes: Any = None, jit_options: Mapping[str, Any] | None = None):
+        self._folder, self._fingerprint, self._jit_options = folder, fingerprint, jit_options or {}
         self._fresh: dict[str, bytes] = {}
+        self._nodes = nodes
 
-    def lower(self, name: str, function: Any, arguments: tuple, simplify: Callable[[Any], Any], **jit_options: Any) -> Any:
-        """``function.lower`` of a kept program that takes and returns leaves; traced now, where there is none.
+    def lower(self, name: str, function: Any, arguments: tuple) -> Any:
+        """Return what ``function.lower`` returns, from the stored program; trace it now where there is none.
 
         Args:
-            name: Of the program.
+            name: Name of the program.
             function: Jitted.
-            arguments: Shapes of what it takes.
-            simplify: Makes arrays, lists, tuples and dictionaries of what it returns.
-            **jit_options: As of `env_jit`.
+            arguments: Trees of the shapes of its arguments.
         """
-        leaves = tuple(map(jax.tree.leaves, arguments))
+        _register((self._nodes, arguments, _SIGNATURES))
         data = self._read(name)
         if data is None:
             traced = function.trace(*arguments)
-            call, tree = jaxpr_as_fun(traced.jaxpr), jax.tree.structure(traced.out_info)
-            of_leaves = jax.jit(lambda *leaves: simplify(jax.tree.unflatten(tree, call(*itertools.chain(*leaves)))))
-            exported = export.export(of_leaves, platforms=(target_platform(),), disabled_checks=_CHECKS)(*leaves)
+            call, results = jaxpr_as_fun(traced.jaxpr), jax.tree.structure(traced.out_info)
+            again = jax.jit(lambda *arguments: jax.tree.unflatten(results, call(*jax.tree.leaves(arguments))))
+            exported = export.export(again, platforms=(target_platform(),), disabled_checks=_CHECKS)(*arguments)
             self._fresh[name] = data = bytes(exported.serialize())
         # Also what has just been traced: XLA's cache takes a program that was read for another one than that which was traced.
         program = export.deserialize(bytearray(data))
-        return env_jit(program.call, **jit_options).lower(*leaves)
+        return env_jit(program.call, **self._jit_options.get(name, {})).lower(*arguments)
 
     def write(self) -> None:
-        """Keeps what was traced; call it when it has been compiled. Where that cannot be written, nothing is kept."""
+        """Store what was traced, after it has been compiled; nothing where the folder cannot be written to."""
         with contextlib.suppress(OSError):
             make_private(self._folder)
             for name, data in self._fresh.items() if self._is_private() else ():
@@ -144,7 +131,7 @@ class KeptPrograms:
         self._fresh.clear()
 
     def forget(self) -> None:
-        """Deletes the programs of this fingerprint."""
+        """Delete the programs of this fingerprint."""
         self._fresh.clear()
         with contextlib.suppress(OSError):
             for path in self._folder.glob(f"*-{self._fingerprint}.stablehlo"):
@@ -154,7 +141,7 @@ class KeptPrograms:
         return self._folder / f"{name}-{self._fingerprint}.stablehlo"
 
     def _read(self, name: str) -> bytes | None:
-        """None for a program that is not there, is damaged, or may be another user's."""
+        """Return a stored program; None for one that is missing, damaged, or possibly another user's."""
         contents = read_private(self._path(name)) if self._is_private() else None
         if contents is None:
             return None
@@ -179,6 +166,26 @@ class KeptPrograms:
                 f"programs kept in {self._folder} are not used: it {reason}; JAX_COMPILATION_CACHE_DIR names another folder"
             )
         return reason is None
+
+
+def _register(tree: Any) -> None:
+    """Let `jax.export` store programs that take or return nodes like those of a tree, by the names of their classes."""
+    pending = [jax.tree.structure(tree)]
+    while pending:
+        structure = pending.pop()
+        pending += structure.children()
+        kind, _ = structure.node_data() or (None, None)
+        if kind is None or kind in _registered or kind in (tuple, list, dict, type(None)):
+            continue
+        _registered.add(kind)
+        name = f"{kind.__module__}.{kind.__qualname__}"
+        with contextlib.suppress(ValueError):  # somebody else has registered it
+            if issubclass(kind, tuple):
+                export.register_namedtuple_serialization(kind, serialized_name=name)
+            else:  # a dataclass all of whose fields are children
+                export.register_pytree_node_serialization(
+                    kind, serialized_name=name, serialize_auxdata=lambda data: b"", deserialize_auxdata=lambda data: ()
+                )
 
 
 @functools.cache

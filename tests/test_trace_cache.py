@@ -15,11 +15,13 @@ from jaxrl_vis import cli
 from jaxrl_vis.config import preset
 from jaxrl_vis.devices import enable_compilation_cache
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.learner import train_step
 from jaxrl_vis.learner.environment import make_env
-from jaxrl_vis.run import kept_programs, programs, trainer
+from jaxrl_vis.run import trainer
+from jaxrl_vis.run.compiled import programs, trace_cache
+from jaxrl_vis.run.compiled.programs import Programs
+from jaxrl_vis.run.compiled.trace_cache import VARIABLE, fingerprint
 from jaxrl_vis.run.folder import RunFolder
-from jaxrl_vis.run.kept_programs import VARIABLE, fingerprint
-from jaxrl_vis.run.programs import Programs
 from jaxrl_vis_envs import compilation
 from jaxrl_vis_envs.compilation import env_jit, kernels
 
@@ -47,10 +49,7 @@ def untraceable(program, *names: str):
     def refuse(*arguments):
         raise AssertionError("traced")
 
-    def without(made):
-        return dataclasses.replace(made, **{name: env_jit(refuse) for name in names if hasattr(made, name)})
-
-    return without(program) if program.parts is None else dataclasses.replace(program, parts=without(program.parts))
+    return dataclasses.replace(program, **{name: env_jit(refuse) for name in names})
 
 
 def results(made: Programs) -> list[np.ndarray]:
@@ -70,10 +69,11 @@ def names_in(folder: Path) -> list[str]:
     return sorted(path.name.partition("-")[0] for path in folder.iterdir())
 
 
-@pytest.mark.parametrize("names", [["init", "learn", "play"], ["evaluate", "init", "train_iteration"]], ids=["parts", "whole"])
-def test_what_was_traced_once_is_not_traced_again_and_computes_the_same(folder, program, names):
-    if "train_iteration" in names:  # as on a GPU
-        program = dataclasses.replace(program, parts=None)
+@pytest.mark.parametrize("names", [NAMES, ["evaluate", *NAMES]], ids=["cpu", "gpu"])
+def test_what_was_traced_once_is_not_traced_again_and_computes_the_same(folder, program, monkeypatch, names):
+    if "evaluate" in names:
+        monkeypatch.setattr(train_step, "targets_cpu", lambda: False)
+        program = train_step.make_train_step(program.env, CONFIG)
     straight = results(Programs(CONFIG, program))
     assert not folder.exists()
     first = Programs(CONFIG, program, keep=True)
@@ -121,7 +121,7 @@ def test_the_oldest_programs_make_room(folder, program, monkeypatch):
         path = folder / f"init-{age}.stablehlo"
         path.write_bytes(b"old")
         os.utime(path, (1000 - age, 1000 - age))
-    monkeypatch.setattr(kept_programs, "MOST_FILES", 5)
+    monkeypatch.setattr(trace_cache, "MOST_FILES", 5)
     Programs(CONFIG, program, keep=True).compile()
     assert names_in(folder) == ["init", "init", "init", "learn", "play"]
     assert {"init-0.stablehlo", "init-1.stablehlo"} <= {path.name for path in folder.iterdir()}
@@ -139,18 +139,18 @@ def test_a_fingerprint_is_of_all_that_is_compiled_in(folder, monkeypatch):
         others.append(fingerprint(CONFIG, env))
     finally:
         jax.config.update("jax_default_matmul_precision", before)
-    monkeypatch.setattr(kept_programs, "versions", lambda: {"jax": "0"})
+    monkeypatch.setattr(trace_cache, "versions", lambda: {"jax": "0"})
     others.append(fingerprint(CONFIG, env))
-    monkeypatch.setattr(kept_programs, "_code", lambda: "other")
+    monkeypatch.setattr(trace_cache, "_code", lambda: "other")
     others.append(fingerprint(CONFIG, env))
     assert len({own, *others}) == 1 + len(others)
 
 
 def test_a_fingerprint_sees_whether_kernels_are_used(folder, monkeypatch):
     env = make_env(CONFIG)
-    monkeypatch.setattr(kept_programs, "runs_gpu_kernels", lambda: True)
+    monkeypatch.setattr(trace_cache, "runs_gpu_kernels", lambda: True)
     with_kernels = fingerprint(CONFIG, env)
-    monkeypatch.setattr(kept_programs, "runs_gpu_kernels", lambda: False)
+    monkeypatch.setattr(trace_cache, "runs_gpu_kernels", lambda: False)
     assert with_kernels != fingerprint(CONFIG, env)
     with kernels(False):
         assert fingerprint(CONFIG, env) is not None
@@ -162,8 +162,8 @@ def test_a_change_of_any_file_of_a_package_is_another_program(tmp_path, monkeypa
     (package / "__init__.py").write_text("")
     (package / "assets" / "model.xml").write_text("<mujoco/>")
     monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setattr(kept_programs, "_PACKAGES", ("some_package",))
-    digest = kept_programs._code.__wrapped__
+    monkeypatch.setattr(trace_cache, "_PACKAGES", ("some_package",))
+    digest = trace_cache._code.__wrapped__
     before = digest()
     (package / "__pycache__").mkdir()
     (package / "__pycache__" / "x.pyc").write_bytes(b"1")
@@ -216,12 +216,12 @@ def test_commands_keep_programs_and_scripts_do_not(tmp_path, monkeypatch, capsys
 
 
 @pytest.fixture
-def kept(folder) -> kept_programs.KeptPrograms:
+def kept(folder) -> trace_cache.TraceCache:
     """A program that was kept, without any of JAX."""
-    made = kept_programs.KeptPrograms(folder, "0" * 64)
+    made = trace_cache.TraceCache(folder, "0" * 64)
     made._fresh["play"] = b"a program"
     made.write()
-    kept_programs._say_once.cache_clear()
+    trace_cache._say_once.cache_clear()
     return made
 
 

@@ -1,4 +1,4 @@
-"""Will the run fit? Asked before anything is allocated, because running out of memory an hour later is no answer."""
+"""Memory that a run needs, compared with what a device has before anything is allocated."""
 
 import math
 import os
@@ -142,7 +142,7 @@ def check_compiled(programs: dict[str, Any], already_there: bool, layout: Layout
     """The same question with the compiler's own figures. Still nothing is allocated.
 
     Args:
-        programs: Compiled programs by name; ``train_iteration`` or ``learn`` among them, where a state is to be made.
+        programs: Compiled programs by name; ``learn`` among them, where a state is to be made.
         already_there: The loop state is on the device already.
         layout: Where they run; the compiler's figures are those of one device.
 
@@ -175,7 +175,7 @@ def fit_together(programs: dict[str, Any], already_there: bool, layout: Layout =
 def _sizes(programs: dict[str, Any]) -> tuple[int, dict[str, int]]:
     """Bytes of the state that is trained, and of each program's scratch memory, on one device, as the compiler says."""
     analyses = {name: program.memory_analysis() for name, program in programs.items()}
-    training = analyses.get("train_iteration") or analyses.get("learn")
+    training = analyses.get("learn")
     scratch = {
         name: analysis.temp_size_in_bytes + analysis.output_size_in_bytes - analysis.alias_size_in_bytes
         for name, analysis in analyses.items()
