@@ -1,11 +1,11 @@
 """What it costs to learn the weights of auxiliary losses, and whether that grows with how many there are.
 
-    python benchmarks/weighting_cost.py [--losses 5 10] [--ways jvp latents] [--image-size 64] [--batch-size 512] [--json FILE]
+    python benchmarks/weighting_cost.py [--losses 5 10] [--ways latents] [--image-size 64] [--batch-size 512] [--json FILE]
 
 An encoder of the preset `paper` reads RGB-D images before and after an action. The main loss is a value of three hidden layers;
 each auxiliary loss is a linear head on both latents with its own targets. For each number of auxiliary losses and each way to
 their gradients, gradient steps are timed with fixed weights and with OL-AUX-5. What is in the second and not in the first is
-what the weighting itself takes. By one `jax.jvp` along the main gradient that hardly grows with the number of losses.
+what the weighting itself takes.
 """
 
 import argparse
@@ -134,7 +134,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--losses", type=int, nargs="+", default=[5, 10], help="numbers of auxiliary losses")
     parser.add_argument(
-        "--ways", nargs="+", choices=get_args(Way), default=["jvp", "latents"], help="ways to gradients, of weighted_grad"
+        "--ways", nargs="+", choices=get_args(Way), default=["latents"], help="ways to gradients, of weighted_grad"
     )
     parser.add_argument("--image-size", type=int, default=64)
     parser.add_argument("--batch-size", type=int, default=512)

@@ -145,9 +145,6 @@ class Config:
     """Whether weighting cosine learns logarithms of the losses."""
     aux_form: Literal["thesis", "release"] = "thesis"
     """Whose targets the auxiliary tasks have, where the thesis and the authors' release differ (`auxtasks.Options`)."""
-    aux_gradients: Literal["auto", "per_loss", "one_hot", "jvp", "latents"] = "auto"
-    """How gradients of losses are found and compared, for weightings that compare them; all ways agree
-    (`learner.weighting.gradients`). auto: latents, the fastest, or one_hot for weightings that keep whole gradients."""
 
     # -- Networks
     encoder_filters: tuple[int, ...] = (16, 32, 64, 64)
@@ -325,6 +322,7 @@ def data_devices_of(config: Config) -> int:
 
 
 _OLD_NAMES = {"frames": "frame_stack"}
+_REMOVED = ("aux_gradients",)  # gradients are the same up to rounding, however they were found
 
 
 def config_from_dict(values: Mapping[str, Any]) -> Config:
@@ -341,6 +339,8 @@ def config_from_dict(values: Mapping[str, Any]) -> Config:
     found: dict[str, Any] = {}
     for saved_name, value in values.items():
         name = _OLD_NAMES.get(saved_name, saved_name)
+        if name in _REMOVED:
+            continue
         if name not in hints:
             raise RequestError(f"unknown option {name!r}{nearest(str(name), hints)}")
         if name in found:

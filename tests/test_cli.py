@@ -104,7 +104,6 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
         (["bench", "physics", "--peer", "playground"], ["--env FingerTurn"]),
         (["bench", "train", "--peer", "torch"], ["bench update"]),
         (["bench", "update", "--peer", "torch", "--seeds", "2"], ["--seeds"]),
-        (["bench", "update", "--aux-gradients", "jvp"], ["--weighting and --aux-tasks"]),
         (["bench", "env", "--seeds", "2"], ["bench update", "bench train"]),
         (["bench", "env", "--batch-size", "8"], ["--batch-size", "bench update", "bench train"]),
         (["bench", "--check", "--env", "FetchReach"], ["measure nothing", "leave out --env"]),

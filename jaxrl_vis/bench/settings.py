@@ -25,7 +25,7 @@ class Settings:
         data_devices: How many of them share each learner; see `Config`.
         repeats: Timed repeats at most; see `timing.measure`.
         peer: Another renderer, another physics, or PyTorch, to measure beside ours.
-        aux_tasks, weighting, aux_gradients: Auxiliary losses in gradient steps, their weighting, and how gradients are found.
+        aux_tasks, weighting: Auxiliary losses in gradient steps, and their weighting.
         scene: A scene of `render_scenes`, or the path of an MJCF file, to draw instead of an environment.
         on_accelerator: Whether JAX runs on one; filled in by `for_this_device`.
     """
@@ -43,7 +43,6 @@ class Settings:
     peer: str | None = None
     aux_tasks: tuple[str, ...] = ()
     weighting: str = "none"
-    aux_gradients: str = "auto"
     scene: str | None = None
     on_accelerator: bool = False
 
@@ -102,5 +101,4 @@ class Settings:
         """What a record says about auxiliary losses; nothing where there are none."""
         if self.weighting == "none":
             return {}
-        about = {"weighting": self.weighting, "aux_tasks": " ".join(self.aux_tasks)}
-        return about if self.aux_gradients == "auto" else {**about, "aux_gradients": self.aux_gradients}
+        return {"weighting": self.weighting, "aux_tasks": " ".join(self.aux_tasks)}

@@ -27,7 +27,6 @@ def training_config(settings: Settings, **overrides: Any) -> Config:
         overrides["batch_size"] = settings.batch_size
     overrides |= {"devices": settings.devices, "data_devices": settings.data_devices}
     overrides |= {"seeds": settings.seeds, "weighting": settings.weighting, "aux_tasks": settings.aux_tasks}
-    overrides["aux_gradients"] = settings.aux_gradients
     if settings.peer == "torch":
         overrides |= {"trivial_goals": 1.0, "random_shift": 0}  # the peer does neither
     own = "fast" if settings.on_accelerator else "cpu"

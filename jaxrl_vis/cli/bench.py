@@ -56,8 +56,6 @@ class Bench:
     """Auxiliary tasks in the gradient steps (update, train)."""
     weighting: WeightingName = "none"
     """How their losses are weighted (update, train)."""
-    aux_gradients: Literal["auto", "per_loss", "one_hot", "jvp", "latents"] = "auto"
-    """How gradients of losses are found and compared (update, train)."""
     peer: Peer | None = None
     """Measure another side by side: a renderer on the same poses (render: mujoco, warp), MuJoCo Playground's FingerTurn
     (physics: playground), or the same gradient steps in PyTorch (update: torch)."""
@@ -87,8 +85,6 @@ def run(options: Bench) -> int:
         raise RequestError("--peer torch learns with one seed: leave out --seeds")
     if (options.weighting != "none" or options.aux_tasks) and (options.benchmark not in ("update", "train") or options.peer):
         raise RequestError("--weighting and --aux-tasks go with `bench update` and `bench train` only, without a peer")
-    if options.aux_gradients != "auto" and options.weighting == "none":
-        raise RequestError("--aux-gradients goes with --weighting and --aux-tasks, whose gradients it compares")
     for option in ("preset", "batch_size"):
         if getattr(options, option) is not None and options.benchmark not in ("update", "train"):
             raise RequestError(f"--{option.replace('_', '-')} goes with `bench update` and `bench train` only")

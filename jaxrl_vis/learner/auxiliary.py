@@ -6,7 +6,7 @@ ddpg         latents of all observations that some task reads, losses, and a wei
 """
 
 import dataclasses
-from typing import Any, Literal
+from typing import Any
 
 import jax
 
@@ -30,23 +30,14 @@ class Auxiliary:
         weighting: Of their losses and the main one.
         options: How the tasks were made.
         frame_stack: Images that an observation stacks.
-        gradients: ``Config.aux_gradients``.
+        way: How gradients of losses are found (`weighting.gradients`).
     """
 
     tasks: dict[str, AuxTask]
     weighting: Weighting
     options: auxtasks.Options = auxtasks.Options()
     frame_stack: int = 1
-    gradients: Literal["auto", "per_loss", "one_hot", "jvp", "latents"] = "auto"
-
-    @property
-    def way(self) -> Way:
-        """How gradients of losses are found: by default as fast as the weighting allows."""
-        if self.weighting.needs == "losses":
-            return "latents"  # one backward pass is all
-        if self.gradients == "auto":
-            return "one_hot" if self.weighting.needs == "gradients" else "latents"
-        return self.gradients
+    way: Way = "latents"
 
     @property
     def needs(self) -> frozenset[str]:
@@ -63,17 +54,18 @@ class Auxiliary:
         """Fresh parameters of all heads, by task."""
         return {name: task.init(jax.random.fold_in(key, auxtasks.head_number(name))) for name, task in self.tasks.items()}
 
-    def init_state(self, encoder: Params) -> WeightingState | None:
+    def init_state(self, critic: Params) -> WeightingState | None:
         """The weighting's state; None where there is nothing to weight and nothing to remember.
 
         Args:
-            encoder: Of the critic, in which gradients are compared.
+            critic: All parameters of the critic, in whose encoder gradients are compared.
         """
-        return None if self.weighting.name == "none" else self.start(encoder)
+        return None if self.weighting.name == "none" else self.start(critic)
 
-    def start(self, encoder: Params) -> WeightingState:
+    def start(self, critic: Params) -> WeightingState:
         """The weighting's state before the first update."""
-        return self.weighting.init((MAIN, *self.tasks), encoder)
+        kept = (critic,) if self.weighting.hold is not None else ()
+        return self.weighting.init((MAIN, *self.tasks), critic.get("encoder"), *kept)
 
     @property
     def keeps_flow(self) -> bool:
@@ -158,11 +150,6 @@ def make_auxiliary(
             f"weighting {config.weighting} has no auxiliary tasks to weight: add --aux-tasks with some of "
             f"{' '.join(auxtasks.NAMES)}, or use --weighting none"
         )
-    if config.aux_gradients in ("jvp", "latents") and weighting.needs == "gradients":
-        raise RequestError(
-            f"weighting {config.weighting} keeps whole gradients here, which --aux-gradients {config.aux_gradients} does not "
-            "find: use per_loss or one_hot"
-        )
     if config.updates_per_iteration % weighting.interval:
         raise RequestError(
             f"weighting_interval ({weighting.interval}) must divide updates_per_iteration ({config.updates_per_iteration})"
@@ -171,7 +158,8 @@ def make_auxiliary(
         raise RequestError("n_step and aux_tasks exclude each other: targets are of single steps")
     spec = Spec(observation, action_size, config.latent_size, frame_stack, len(config.encoder_filters), dtype)
     options = auxtasks.RELEASE if config.aux_form == "release" else auxtasks.Options()
-    return Auxiliary(auxtasks.make(config.aux_tasks, spec, options), weighting, options, frame_stack, config.aux_gradients)
+    way: Way = "per_loss" if weighting.needs == "gradients" else "latents"
+    return Auxiliary(auxtasks.make(config.aux_tasks, spec, options), weighting, options, frame_stack, way)
 
 
 def _options(config: Config) -> dict[str, Any]:
@@ -182,9 +170,11 @@ def _options(config: Config) -> dict[str, Any]:
             "interval": config.weighting_interval,
             "learning_rate": config.critic_learning_rate,
             "beta": config.weighting_beta,
-            "main_grad": config.weighting_main_grad,
-            "window": config.weighting_window,
         }
+        if config.weighting_main_grad != "main":
+            options["main_grad"] = config.weighting_main_grad
+        if config.weighting_window != 1:
+            options["window"] = config.weighting_window
     if config.weighting == "fixed":
         options["weights"] = config.weighting_fixed
     if config.weighting == "cosine":

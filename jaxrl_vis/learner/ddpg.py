@@ -44,14 +44,12 @@ class Working(NamedTuple):
         scaling: What observations are normalised with. It stays the same, and is here because it would otherwise be worked out
             in every step, before all else.
         counts: [3] int32, gradient steps: those of the critic, of the actor, and `TrainState.updates`.
-        held: The critic's parameters that the weighting's interval began with, for a weighting that asks for them; else None.
     """
 
     train: TrainState
     copies: ComputeCopies
     scaling: BatchScaling
     counts: jax.Array
-    held: Params = None
 
 
 class Prepared(NamedTuple):
@@ -132,7 +130,7 @@ def _start(networks: Networks, auxiliary: Auxiliary, latent_reward: LatentReward
         normalizer=normalizer.init(networks.observation_spec),
         goal_normalizer=normalizer.init(networks.observation_spec) if separate else None,
         updates=jnp.zeros((), jnp.int32),
-        weighting=auxiliary.init_state(critic.get("encoder")),
+        weighting=auxiliary.init_state(critic),
         autoencoder=None if latent_reward is None else latent_reward.init(jax.random.fold_in(key, _AUTOENCODER)),
     )
 
@@ -156,14 +154,13 @@ def _copies_of(networks: Networks, train: TrainState) -> ComputeCopies:
     return ComputeCopies(*map(networks.compute_copy, _networks_of(train)))
 
 
-def _begin(networks: Networks, train: TrainState, held: bool) -> Working:
+def _begin(networks: Networks, train: TrainState) -> Working:
     """`Algorithm.begin`."""
     return Working(
         train=train,
         copies=_copies_of(networks, train),
         scaling=networks.batch_scaling(train),
         counts=_counts_of(train),
-        held=train.critic if held else None,
     )
 
 
@@ -231,7 +228,7 @@ def make_ddpg(
         auxiliary = make_auxiliary(config, networks.observation_spec, networks.action_size, 1, networks.dtype)
     latent_reward = make_latent_reward(networks, config, resolved, auxiliary.frame_stack)
     learning = Objectives(networks, config, resolved, auxiliary, shards)
-    keeps_state, held = auxiliary.weighting.name != "none", auxiliary.weighting.held
+    keeps_state = auxiliary.weighting.name != "none"
 
     def prepare(working: Working, batch: Batch) -> Prepared:
         image = None
@@ -247,7 +244,7 @@ def make_ddpg(
         if rewarded is not None:
             batch = batch.replace(reward=rewarded.reward)
         assert batch.reward is not None
-        found = learning.of_critic(now, train.weighting, inputs, image, batch, working.held)
+        found = learning.of_critic(now, train.weighting, inputs, image, batch)
         latents, value, keep = found.extra
         counts = diagnostics.count_rewards(
             batch.reward, keep, resolved.reward_positive, resolved.reward_negative, batch.success, rewarded is not None
@@ -279,16 +276,11 @@ def make_ddpg(
         train = _apply(working.train, counts, chosen, config)
         if latent_reward is not None:
             train = train.replace(autoencoder=latent_reward.apply(train.autoencoder, chosen.autoencoder))
-        working = working._replace(train=train, copies=_copies_of(networks, train), counts=counts)
-        if not held:
-            return working
-        is_new = train.weighting.updates % auxiliary.weighting.interval == 0
-        kept = jax.tree.map(lambda now, before: jnp.where(is_new, now, before), train.critic, working.held)
-        return working._replace(held=kept)
+        return working._replace(train=train, copies=_copies_of(networks, train), counts=counts)
 
     return Algorithm(
         init=lambda key: _start(networks, auxiliary, latent_reward, key),
-        begin=lambda train: _begin(networks, train, held),
+        begin=functools.partial(_begin, networks),
         prepare=prepare,
         gradients=gradients,
         apply=apply,

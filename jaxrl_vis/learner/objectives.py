@@ -27,9 +27,6 @@ from jaxrl_vis.learner.weighting import MAIN, Weighted, WeightingState, weighted
 from jaxrl_vis.resolved import Resolved
 from jaxrl_vis.types import Batch, Params
 
-# Ways in which each loss has a pass through the encoder of its own.
-_APART = ("per_loss", "one_hot")
-
 
 class ComputeCopies(NamedTuple):
     """Networks of a `TrainState` in the dtype that they are computed with (`Networks.compute_copy`)."""
@@ -142,13 +139,12 @@ class Objectives:
         inputs: Inputs,
         image: jax.Array | None,
         batch: Batch,
-        held: Params,
     ) -> Weighted:
         """The critic's losses and their gradient; ``extra`` is (latents, values [B], keep [B])."""
         networks, weighting, way = self.networks, self.auxiliary.weighting, self.auxiliary.way
 
         def encode(encoder: Params) -> Latents:
-            return _encode_online(networks, self.auxiliary, {"encoder": encoder}, inputs, apart=way in _APART)
+            return _encode_online(networks, self.auxiliary, {"encoder": encoder}, inputs, apart=way == "per_loss")
 
         def critic_losses(critic: Params, found: Latents | dict[str, jax.Array]):
             assert batch.reward is not None
@@ -166,8 +162,7 @@ class Objectives:
         if self.reduces_early:
             options["reduce"] = self.shards.mean
         find = weighted_grad(critic_losses, weighting, lambda critic: critic.get("encoder"), way, **options)
-        state = self.auxiliary.start(now.critic.get("encoder")) if state is None else state
-        return find(now.critic, state, held=held) if weighting.held else find(now.critic, state)
+        return find(now.critic, self.auxiliary.start(now.critic) if state is None else state)
 
     def _kept(self, keep: jax.Array) -> jax.Array | None:
         """Transitions that count in a part, on average over the parts, by which all divide alike; None: its own."""

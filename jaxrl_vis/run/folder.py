@@ -50,7 +50,7 @@ and save. All others shape what is learned."""
 
 _OF_WEIGHTINGS = (
     *(field.name for field in dataclasses.fields(Config) if field.name.startswith("weighting_")),
-    *("aux_gradients", "aux_form", "actor_log"),
+    *("aux_form", "actor_log"),
 )
 """But for these, where losses are neither weighted nor logarithms: nothing reads them."""
 

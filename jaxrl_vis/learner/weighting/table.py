@@ -7,7 +7,8 @@ from typing import Any
 from jaxrl_vis.errors import RequestError, nearest
 from jaxrl_vis.learner.weighting.base import Weighting
 from jaxrl_vis.learner.weighting.members import balance, cosine, fixed, none, none_log, plain_sum
-from jaxrl_vis.learner.weighting.ol_aux import ol_aux, ol_aux_ablation
+from jaxrl_vis.learner.weighting.ol_aux import ol_aux
+from jaxrl_vis.learner.weighting.ol_aux_variants import ol_aux_ablation, ol_aux_window
 
 WEIGHTINGS: dict[str, Callable[..., Weighting]] = {
     "none": none,
@@ -19,6 +20,8 @@ WEIGHTINGS: dict[str, Callable[..., Weighting]] = {
     "ol_aux": ol_aux,
     "ol_aux_ablation": ol_aux_ablation,
 }
+# Slower functions for options that the first ones lack.
+_VARIANTS: dict[str, Callable[..., Weighting]] = {"ol_aux": ol_aux_window}
 
 
 def make_weighting(name: str, **options: Any) -> Weighting:
@@ -33,17 +36,16 @@ def make_weighting(name: str, **options: Any) -> Weighting:
     """
     if name not in WEIGHTINGS:
         raise RequestError(f"unknown weighting {name!r}{nearest(name, WEIGHTINGS)}")
-    allowed = options_of(name)
+    maker = WEIGHTINGS[name]
+    if not set(options) <= set(_parameters(maker)):
+        maker = _VARIANTS.get(name, maker)
+    allowed = _parameters(maker)
     for option in options:
         if option not in allowed:
             mend = nearest(option, allowed) if allowed else "; it has none"
             raise RequestError(f"weighting {name} has no option {option!r}{mend}")
-    return WEIGHTINGS[name](**options)
+    return maker(**options)
 
 
-def options_of(name: str) -> tuple[str, ...]:
-    """The options that a weighting has."""
-    found = tuple(inspect.signature(WEIGHTINGS[name]).parameters)
-    if name == "ol_aux_ablation":
-        return tuple(option for option in inspect.signature(ol_aux).parameters if option != "held")
-    return found
+def _parameters(maker: Callable[..., Weighting]) -> tuple[str, ...]:
+    return tuple(inspect.signature(maker).parameters)
