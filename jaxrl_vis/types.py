@@ -36,14 +36,13 @@ class Episodes(Replaceable):
         observations: [E, T+2, ...] after 0, 1, ... T steps, then the goal's.
         states: [E, T+2, G] float32, the true goal-space states of the same instants.
         actions: [E, T, A] float32, as executed (with exploration noise).
-        flow: [E, T, H, W] uint8, strength of the optical flow of each step (`auxtasks.optical_flow.to_bytes`); None where no
-            auxiliary task asks for it.
+        stored: [E, T, ...] uint8 or float32, what auxiliary tasks have computed of each step, by task (`AuxTask.episode`).
     """
 
     observations: jax.Array
     states: jax.Array
     actions: jax.Array
-    flow: jax.Array | None = None
+    stored: dict[str, jax.Array] = dataclasses.field(default_factory=dict)
 
 
 @jax.tree_util.register_dataclass
@@ -75,7 +74,8 @@ class Batch(Replaceable):
             may still change, and where the learner itself makes the reward (method autoencoder).
         discount: [B] float32 of what comes after these steps; None: that of one step.
         shift: [B, 2] int32, pixels by which the images are to be moved down and to the right; None: not at all.
-        targets: `auxtasks.Targets` of auxiliary tasks; None where there are no tasks.
+        views: [B, ...] images in the observation's dtype that auxiliary tasks have made, by task (`AuxTask.view`).
+        targets: What auxiliary tasks are to predict, by task.
         reached: [B, ...] what the observation after the action is as a goal, where that is something else (stacked images);
             else None.
         success: [B] float32, 1 where the true state after the action lies at the goal's, else 0: for diagnostics alone. None
@@ -89,7 +89,8 @@ class Batch(Replaceable):
     reward: jax.Array | None = None
     discount: jax.Array | None = None
     shift: jax.Array | None = None
-    targets: Any = None
+    views: dict[str, jax.Array] = dataclasses.field(default_factory=dict)
+    targets: dict[str, Any] = dataclasses.field(default_factory=dict)
     reached: jax.Array | None = None
     success: jax.Array | None = None
 

@@ -56,12 +56,12 @@ def drawn_places():
 
 
 @functools.cache
-def stored(keeps_flow):
+def stored(with_flow):
     """The rollout as a learner stores it that does or does not learn optical flow."""
-    if not keeps_flow:
+    if not with_flow:
         return rollout()
     auxiliary = make_auxiliary(config(aux_tasks=("optical_flow",), weighting="sum"), SPEC, ACTIONS, 1, jnp.float32)
-    return jax.jit(auxiliary.with_flow)(rollout())
+    return jax.jit(auxiliary.with_stored)(rollout())
 
 
 @functools.cache
@@ -98,7 +98,7 @@ def learner(way=None, **overrides):
         gradients, metrics = algorithm.gradients(working, algorithm.prepare(working, batch), with_actor)
         return algorithm.apply(working, gradients), gradients, metrics
 
-    batch = chosen_batch(stored(auxiliary.keeps_flow), drawn_places(), jax.random.key(2))
+    batch = chosen_batch(stored("optical_flow" in auxiliary.tasks), drawn_places(), jax.random.key(2))
     start = fresh(chosen.aux_tasks, chosen.encoders, chosen.target_encoder, chosen.encoder_filters)
     start = start.replace(weighting=auxiliary.init_state(start.critic))
     return algorithm, update, algorithm.begin(start), batch
@@ -205,14 +205,15 @@ def test_an_actor_that_shares_the_encoder_has_no_heads():
 
 def test_kept_flow_is_that_of_the_images():
     episodes = jax.device_get(stored(True))
-    assert episodes.flow is not None and episodes.flow.shape == (EPISODES, HORIZON, 16, 16) and episodes.flow.dtype == jnp.uint8
+    (flow,) = episodes.stored.values()
+    assert flow.shape == (EPISODES, HORIZON, 16, 16) and flow.dtype == jnp.uint8
     images = episodes.observations
     wanted = jax.jit(optical_flow.flow_strength)(images[1, 2][None], images[1, 3][None])[0]
-    np.testing.assert_allclose(optical_flow.from_bytes(episodes.flow[1, 2]), np.clip(wanted, 0.0, 255 / 16), atol=1 / 32 + 1e-4)
+    np.testing.assert_allclose(optical_flow.from_bytes(flow[1, 2]), np.clip(wanted, 0.0, 255 / 16), atol=1 / 32 + 1e-4)
     assert wanted.max() > 0.5
     _, _, _, batch = learner(aux_tasks=("optical_flow",), weighting="sum")
     place = drawn_places()[:, 3]
-    np.testing.assert_array_equal(batch.targets.flow[3], optical_flow.from_bytes(episodes.flow[place[0], place[1]]))
+    np.testing.assert_array_equal(batch.targets["optical_flow"][3], optical_flow.from_bytes(flow[place[0], place[1]]))
 
 
 @pytest.mark.parametrize(

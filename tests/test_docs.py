@@ -215,7 +215,6 @@ from jaxrl_vis.cli.train import Train, training_config
 from jaxrl_vis.config import preset
 from jaxrl_vis.resolved import resolve
 from jaxrl_vis.learner import ddpg
-from jaxrl_vis.learner.auxtasks import Targets
 from jaxrl_vis.learner.networks import Networks
 from jaxrl_vis.learner.sampling import Sampler
 from jaxrl_vis.methods import METHODS
@@ -237,7 +236,7 @@ networks = Networks(config, jax.ShapeDtypeStruct((1, 16, 16), jnp.uint8), 2, 0.0
 algorithm = ddpg.make_ddpg(networks, config, resolved)
 def one_step(key):
     images = jnp.zeros((3, 2, 1, 16, 16), jnp.uint8)
-    batch = Batch(images, jnp.zeros((2, 2)), jnp.zeros((2, 2)), jnp.zeros((2, 2)), jnp.zeros(2), targets=Targets())
+    batch = Batch(images, jnp.zeros((2, 2)), jnp.zeros((2, 2)), jnp.zeros((2, 2)), jnp.zeros(2))
     working = algorithm.begin(algorithm.init(key))
     gradients, metrics = algorithm.gradients(working, algorithm.prepare(working, batch), True)
     assert metrics["train/loss/latent_size"].shape == ()

@@ -98,7 +98,7 @@ def test_stacked_images_are_compared_as_goals():
     env, size = Stacked(), 3
     program = make_train_step(env, preset("debug", method="autoencoder"))
     networks, resolved = program.networks, program.resolved
-    latent_reward = make_latent_reward(networks, program.config, resolved, env.frame_stack)
+    latent_reward = make_latent_reward(networks, program.config, resolved)
     assert latent_reward is not None
     train = jax.tree.map(lambda leaf: leaf[0], begin(program, jax.random.key(0)[None]).train)
     moving = jax.random.bits(jax.random.key(1), (size, 2, 8, 8), jnp.uint8)

@@ -220,7 +220,7 @@ def make_batch(config: Config) -> Batch:
     if not config.aux_tasks:
         return batch
     auxiliary = make_auxiliary(config, SPEC, 2, 1, jnp.float32)
-    return batch.replace(targets=auxiliary.targets(jax.random.key(0), batch, None))
+    return auxiliary.with_targets(jax.random.key(0), batch, {})
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
 """Auxiliary tasks and their weighting as parts of a learner: made from a `Config`, with what each of its steps does for them.
 
-collecting   optical flow, from raw images
-sampling     the other targets, likewise
+collecting   what tasks compute of whole episodes (`AuxTask.episode`)
+sampling     views and targets of a batch (`AuxTask.view`, `AuxTask.target`)
 ddpg         latents of all observations that some task reads, losses, and a weighted gradient for each encoder
 """
 
@@ -13,12 +13,11 @@ import jax
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import auxtasks
-from jaxrl_vis.learner.auxtasks import AuxTask, Spec, Targets, View, optical_flow
-from jaxrl_vis.learner.blocks import shifted
+from jaxrl_vis.learner.auxtasks import AuxTask, Spec, Transitions, View
 from jaxrl_vis.learner.weighting import MAIN, Way, Weighting, WeightingState, make_weighting
 from jaxrl_vis.types import Batch, Episodes, Params
 
-_EPISODES_AT_ONCE = 10  # of which optical flow is computed: some 500 images fill a GPU, and more would fill its memory
+_EPISODES_AT_ONCE = 10  # whose arrays are computed together: some 500 images fill a GPU, and more would fill its memory
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,31 +27,27 @@ class Auxiliary:
     Attributes:
         tasks: By name.
         weighting: Of their losses and the main one.
-        options: How the tasks were made.
-        frame_stack: Images that an observation stacks.
         way: How gradients of losses are found (`weighting.gradients`).
     """
 
     tasks: dict[str, AuxTask]
     weighting: Weighting
-    options: auxtasks.Options = auxtasks.Options()
-    frame_stack: int = 1
     way: Way = "latents"
 
     @property
-    def needs(self) -> frozenset[str]:
-        """The optional fields of `View` that some task reads."""
-        return auxtasks.needs_of(self.tasks)
+    def needs_image(self) -> bool:
+        """Whether some task reads normalised images."""
+        return any("image" in task.needs for task in self.tasks.values())
 
     @property
-    def others(self) -> tuple[str, ...]:
-        """What else than an observation and a goal is encoded with gradient: ``after`` and ``moved`` (`networks.Inputs`)."""
-        read = {"after": "latent_tp1", "moved": "latent_moved"}
-        return tuple(name for name, latent in read.items() if latent in self.needs)
+    def encoded(self) -> tuple[str, ...]:
+        """Observations besides those before and the goals that are encoded with gradient: ``after``, and names of views."""
+        after = ("after",) if any("latent_tp1" in task.needs for task in self.tasks.values()) else ()
+        return (*after, *(name for name, task in self.tasks.items() if task.view is not None))
 
     def init_heads(self, key: jax.Array) -> dict[str, Params]:
         """Fresh parameters of all heads, by task."""
-        return {name: task.init(jax.random.fold_in(key, auxtasks.head_number(name))) for name, task in self.tasks.items()}
+        return {name: task.init(task.fold(key)) for name, task in self.tasks.items()}
 
     def init_state(self, critic: Params) -> WeightingState | None:
         """The weighting's state; None where there is nothing to weight and nothing to remember.
@@ -67,62 +62,69 @@ class Auxiliary:
         kept = (critic,) if self.weighting.hold is not None else ()
         return self.weighting.init((MAIN, *self.tasks), critic.get("encoder"), *kept)
 
-    @property
-    def keeps_flow(self) -> bool:
-        """Whether episodes are to be collected with their optical flow.
+    def with_stored(self, episodes: Episodes) -> Episodes:
+        """Return a rollout's episodes with the arrays that tasks compute once an episode."""
+        images, stored = episodes.observations[:, :-1], {}
+        for name, task in self.tasks.items():
+            if task.episode is not None:
+                stored[name] = jax.lax.map(task.episode, images, batch_size=_EPISODES_AT_ONCE)
+        return episodes.replace(stored=stored)
 
-        It takes longer than all the rest of a gradient step, and a transition is sampled 5 to 20 times.
-        """
-        return "flow" in self.needs
-
-    def with_flow(self, episodes: Episodes) -> Episodes:
-        """A rollout's episodes with their optical flow, where it is kept."""
-        if not self.keeps_flow:
-            return episodes
-
-        def of_episode(images: jax.Array) -> jax.Array:
-            strength = optical_flow.flow_strength_along(images, self.frame_stack, self.options.stretch)
-            return optical_flow.to_bytes(strength, self.options.stretch)
-
-        return episodes.replace(flow=jax.lax.map(of_episode, episodes.observations[:, :-1], batch_size=_EPISODES_AT_ONCE))
-
-    def targets(self, key: jax.Array, batch: Batch, flow: jax.Array | None) -> Targets:
-        """The targets of a batch.
+    def stored_spec(self, observation: jax.ShapeDtypeStruct, horizon: int) -> dict[str, jax.ShapeDtypeStruct]:
+        """Return shapes and dtypes of the arrays that lie beside one episode, by task.
 
         Args:
-            key: [] a typed key, that of its rotations.
-            batch: With raw images.
-            flow: [B, H, W] uint8, as kept; None where it is not.
+            observation: Shape and dtype of one observation.
+            horizon: T.
         """
-        images = batch.observation_t, batch.observation_tp1
-        targets = auxtasks.make_targets(key, *images, self.needs - {"flow"}, self.options, self.frame_stack)
-        return targets if flow is None else targets.replace(flow=optical_flow.from_bytes(flow, self.options.stretch))
+        images = jax.ShapeDtypeStruct((horizon + 1, *observation.shape), observation.dtype)
+        return {name: jax.eval_shape(task.episode, images) for name, task in self.tasks.items() if task.episode is not None}
 
-    def losses(self, heads: dict[str, Params], view: View, batch: Batch) -> dict[str, jax.Array]:
-        """The loss of each task, [] float32 by name.
+    def with_targets(self, key: jax.Array, batch: Batch, stored: dict[str, jax.Array]) -> Batch:
+        """Return a batch with the views and the targets of all tasks.
+
+        Args:
+            key: [] a typed key, from which views are drawn.
+            batch: With raw images.
+            stored: [B, ...] by task, as the replay has it.
+        """
+        views, targets = {}, {}
+        for name, task in self.tasks.items():
+            transitions = Transitions(batch.observation_t, batch.observation_tp1, batch.action, stored.get(name))
+            if task.view is not None:
+                views[name], targets[name] = task.view(key if task.draws_unfolded else task.fold(key), transitions)
+            elif task.target is not None:
+                targets[name] = task.target(transitions)
+        return batch.replace(views=views, targets=targets)
+
+    def losses(self, heads: dict[str, Params], view: View, latents: dict[str, jax.Array], batch: Batch) -> dict[str, jax.Array]:
+        """Return the loss of each task, [] float32 by name.
 
         Args:
             heads: From `init_heads`.
-            view: Of the transitions, without those targets that the batch carries.
+            view: Of the transitions, without what belongs to single tasks.
+            latents: [B, L] of the tasks' own views, by name.
             batch: The transitions, with targets.
         """
-        if not self.tasks:
-            return {}
-        view = _with_targets(view, batch)
-        return {name: task.loss(heads[name], view) for name, task in self.tasks.items()}
+        views = self._views(view, latents, batch)
+        return {name: task.loss(heads[name], views[name]) for name, task in self.tasks.items()}
 
-    def predictions(self, heads: dict[str, Params], view: View, batch: Batch) -> dict[str, jax.Array]:
-        """What each task predicts (`AuxTask.predict`), by name; arguments as of `losses`."""
-        view = _with_targets(view, batch)
-        return {name: task.predict(heads[name], view) for name, task in self.tasks.items()}
+    def predictions(
+        self, heads: dict[str, Params], view: View, latents: dict[str, jax.Array], batch: Batch
+    ) -> dict[str, jax.Array]:
+        """Return the prediction of each task (`AuxTask.predict`), by name; arguments as of `losses`."""
+        views = self._views(view, latents, batch)
+        return {name: task.predict(heads[name], views[name]) for name, task in self.tasks.items()}
 
-
-def _with_targets(view: View, batch: Batch) -> View:
-    """The view with the targets of the batch, moved as its images are."""
-    flow = batch.targets.flow
-    if flow is not None and batch.shift is not None:
-        flow = shifted(flow[:, None], batch.shift)[:, 0]
-    return view.replace(motion=batch.targets.motion, flow=flow)
+    def _views(self, view: View, latents: dict[str, jax.Array], batch: Batch) -> dict[str, View]:
+        """The inputs of each task, with its target shifted as the batch's images are."""
+        views = {}
+        for name, task in self.tasks.items():
+            target = batch.targets.get(name)
+            if task.shift is not None and batch.shift is not None:
+                target = task.shift(target, batch.shift)
+            views[name] = view.replace(latent_view=latents.get(name), target=target)
+        return views
 
 
 def make_auxiliary(
@@ -156,10 +158,10 @@ def make_auxiliary(
         )
     if config.aux_tasks and config.n_step > 1:
         raise RequestError("n_step and aux_tasks exclude each other: targets are of single steps")
-    spec = Spec(observation, action_size, config.latent_size, frame_stack, len(config.encoder_filters), dtype)
     options = auxtasks.RELEASE if config.aux_form == "release" else auxtasks.Options()
+    spec = Spec(observation, action_size, config.latent_size, frame_stack, len(config.encoder_filters), dtype, options)
     way: Way = "per_loss" if weighting.needs == "gradients" else "latents"
-    return Auxiliary(auxtasks.make(config.aux_tasks, spec, options), weighting, options, frame_stack, way)
+    return Auxiliary(auxtasks.make(config.aux_tasks, spec), weighting, way)
 
 
 def _options(config: Config) -> dict[str, Any]:

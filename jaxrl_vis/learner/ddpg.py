@@ -226,15 +226,15 @@ def make_ddpg(
     """
     if auxiliary is None:
         auxiliary = make_auxiliary(config, networks.observation_spec, networks.action_size, 1, networks.dtype)
-    latent_reward = make_latent_reward(networks, config, resolved, auxiliary.frame_stack)
+    latent_reward = make_latent_reward(networks, config, resolved)
     learning = Objectives(networks, config, resolved, auxiliary, shards)
     keeps_state = auxiliary.weighting.name != "none"
 
     def prepare(working: Working, batch: Batch) -> Prepared:
         image = None
-        if "image" in auxiliary.needs:
+        if auxiliary.needs_image:
             image = networks.normalize(working.scaling.observations, batch.observation_t, batch.shift)
-        # Before, goal, after, moved: the online networks read the first two, their targets the second and third.
+        # Before, goal, after, views: the online networks read the first two, their targets the second and third.
         return Prepared(batch, networks.prepare_batch(working.scaling, batch), image)
 
     def gradients(working: Working, prepared: Prepared, with_actor: bool = True) -> tuple[Gradients, Metrics]:

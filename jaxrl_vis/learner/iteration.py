@@ -124,7 +124,7 @@ def make_insert(config: Config, sampler: Sampler, auxiliary: Auxiliary) -> Inser
     def insert(
         train: TrainState, replay_state: ReplayState, episodes: Episodes, key: jax.Array, iteration: jax.Array
     ) -> tuple[TrainState, ReplayState]:
-        episodes = auxiliary.with_flow(episodes)
+        episodes = auxiliary.with_stored(episodes)
         replay_state = sampler.replay.insert(replay_state, episodes, iteration)
         return _update_statistics(train, episodes, jax.random.fold_in(key, _STATISTICS), config, sampler), replay_state
 

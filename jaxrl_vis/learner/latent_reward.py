@@ -115,14 +115,13 @@ class LatentReward:
         return AutoencoderState(params=optax.apply_updates(state.params, change), optimizer=moments)
 
 
-def make_latent_reward(networks: Networks, config: Config, resolved: Resolved, frame_stack: int = 1) -> LatentReward | None:
-    """The autoencoder that a configuration rewards with; None where rewards come from elsewhere.
+def make_latent_reward(networks: Networks, config: Config, resolved: Resolved) -> LatentReward | None:
+    """Make the autoencoder that a configuration rewards with; None where rewards come from elsewhere.
 
     Args:
-        networks: Whose encoder the autoencoder has one of its own of.
+        networks: Architecture of the autoencoder's separate encoder.
         config: The method and the step size, that of the critic.
         resolved: R+ and R-.
-        frame_stack: Images that an observation stacks.
 
     Raises:
         RequestError: Observations are no images.
@@ -136,6 +135,6 @@ def make_latent_reward(networks: Networks, config: Config, resolved: Resolved, f
     if method.reward != "autoencoder":
         return None
     shape = networks.observation_spec, networks.action_size, config.latent_size
-    spec = auxtasks.Spec(*shape, frame_stack, len(config.encoder_filters), networks.dtype)
+    spec = auxtasks.Spec(*shape, levels=len(config.encoder_filters), dtype=networks.dtype)
     task = auxtasks.make(("autoencoder",), spec)["autoencoder"]
     return LatentReward(networks, resolved, task, optax.adam(config.critic_learning_rate))

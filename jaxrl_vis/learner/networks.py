@@ -13,7 +13,7 @@ Observation and goal go through the same encoder; actor and critic have one each
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import flax.linen as nn
@@ -114,11 +114,11 @@ class Inputs(NamedTuple):
 
     Attributes:
         observed: [3 B, ...], those before, the goals, those after.
-        moved: [B, ...], rotated ones; None where no auxiliary task asks for them.
+        views: [B, ...] images that auxiliary tasks have made, by name.
     """
 
     observed: jax.Array
-    moved: jax.Array | None = None
+    views: Mapping[str, jax.Array]
 
     @property
     def size(self) -> int:
@@ -126,12 +126,11 @@ class Inputs(NamedTuple):
         return self.observed.shape[0] // len(_OBSERVED)
 
     def pieces(self, *names: str) -> list[Piece]:
-        """Where observations lie, called ``before``, ``goal``, ``after`` or ``moved``, in the order of ``names``."""
+        """Return where observations lie: ``before``, ``goal``, ``after``, or a view, in the order of ``names``."""
         size, found = self.size, []
         for name in names:
-            if name == "moved":
-                assert self.moved is not None
-                found.append((self.moved, slice(0, size)))
+            if name in self.views:
+                found.append((self.views[name], slice(0, size)))
                 continue
             start = _OBSERVED.index(name) * size
             if found and found[-1][0] is self.observed and found[-1][1].stop == start:  # neighbours are one piece
@@ -300,17 +299,15 @@ class Networks:
     def prepare_batch(self, scaling: BatchScaling, batch: Batch) -> Inputs:
         """`prepare` of all observations of B transitions."""
         of_observations, of_goals = scaling
-        moved = None if batch.targets is None else batch.targets.images_moved
-        if moved is not None:
-            moved = self.prepare(of_observations, moved, batch.shift)
+        views = {name: self.prepare(of_observations, images, batch.shift) for name, images in batch.views.items()}
         if of_goals is None:  # together, and while they are bytes
             count, size, *shape = batch.observations.shape
             shift = None if batch.shift is None else jnp.tile(batch.shift, (count, 1))
             together = self.prepare(of_observations, batch.observations.reshape(count * size, *shape), shift)
-            return Inputs(together, moved)
+            return Inputs(together, views)
         each_scaling = (of_observations, of_goals, of_observations)
         pieces = [self.prepare(each, rows, batch.shift) for each, rows in zip(each_scaling, batch.observations, strict=True)]
-        return Inputs(jnp.concatenate(pieces), moved)
+        return Inputs(jnp.concatenate(pieces), views)
 
     def prepare(self, scaling: Scaling, observations: jax.Array, shift: jax.Array | None = None) -> jax.Array:
         """Normalises and orders [B, ...] observations for the encoders: [B, blocks, block size], or [B, S] for states.

@@ -3,7 +3,7 @@
 Four networks read three observations (before, goal, after). Each is normalised and ordered once, and each network encodes what
 it needs in one pass:
 
-    critic, actor (online, with gradient)   before, goal, and for auxiliary tasks after, moved
+    critic, actor (online, with gradient)   before, goal, and for auxiliary tasks after, views
     their targets                           goal, after
 
 The actor's loss values its actions with the critic's latents from the critic's own forward pass: the actor cannot change them.
@@ -11,7 +11,7 @@ The actor's loss values its actions with the critic's latents from the critic's 
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import jax
@@ -48,13 +48,14 @@ class Latents(NamedTuple):
     Attributes:
         pair: [2, B, latent] before and goal, as heads take them.
         before: The first of them.
-        after, moved: None where no loss reads them.
+        after: None where no loss reads it.
+        views: Of images that auxiliary tasks have made, by name.
     """
 
     pair: jax.Array
     before: jax.Array
-    after: jax.Array | None = None
-    moved: jax.Array | None = None
+    after: jax.Array | None
+    views: dict[str, jax.Array]
 
 
 def _encode_online(networks: Networks, auxiliary: Auxiliary, params: Params, inputs: Inputs, apart: bool) -> Latents:
@@ -62,14 +63,20 @@ def _encode_online(networks: Networks, auxiliary: Auxiliary, params: Params, inp
 
     Most auxiliary losses read two of them or one. Encoded ``apart``, the gradient of each loss passes through these alone.
     """
-    names = ("before", "goal", *auxiliary.others)
+    names = ("before", "goal", *auxiliary.encoded)
     if apart:
         found = [_encode(networks, params, inputs, name)[0] for name in names]
         pair = jnp.stack(found[:2])
     else:
         found = _encode(networks, params, inputs, *names)
         pair = found[:2]
-    return Latents(pair, found[0], **dict(zip(auxiliary.others, found[2:], strict=True)))
+    return _with_others(auxiliary, pair, found[0], found[2:])
+
+
+def _with_others(auxiliary: Auxiliary, pair: jax.Array, before: jax.Array, others: Iterable[jax.Array]) -> Latents:
+    views = dict(zip(auxiliary.encoded, others, strict=True))
+    after = views.pop("after", None)
+    return Latents(pair, before, after, views)
 
 
 _MAIN_READS, _OTHERS_READ = "main", "others"
@@ -84,7 +91,7 @@ def _encoders(networks: Networks, auxiliary: Auxiliary, inputs: Inputs) -> dict[
     def of(*names: str) -> Callable[[Params], jax.Array]:
         return lambda encoder: _encode(networks, {"encoder": encoder}, inputs, *names)
 
-    return {_MAIN_READS: of("before", "goal"), _OTHERS_READ: of("before", *auxiliary.others)}
+    return {_MAIN_READS: of("before", "goal"), _OTHERS_READ: of("before", *auxiliary.encoded)}
 
 
 def _together(auxiliary: Auxiliary, found: Latents | dict[str, jax.Array]) -> Latents:
@@ -92,7 +99,7 @@ def _together(auxiliary: Auxiliary, found: Latents | dict[str, jax.Array]) -> La
     if isinstance(found, Latents):
         return found
     before, *others = found[_OTHERS_READ]
-    return Latents(found[_MAIN_READS], before, **dict(zip(auxiliary.others, others, strict=True)))
+    return _with_others(auxiliary, found[_MAIN_READS], before, others)
 
 
 def _next_latents(networks: Networks, now: ComputeCopies, inputs: Inputs, latents: Latents) -> tuple[jax.Array, jax.Array]:
@@ -206,7 +213,8 @@ class Objectives:
         self, params: Params, latents: Latents, inputs: Inputs, image: jax.Array | None, batch: Batch
     ) -> dict[str, jax.Array]:
         """Losses of the auxiliary tasks on a network's latents, by name."""
-        seen = {"latent_t": latents.before, "latent_tp1": latents.after, "latent_moved": latents.moved}
+        if not self.auxiliary.tasks:
+            return {}
         patches = inputs.observed if self.networks.uses_kernel else None
-        view = View(**seen, image=image, patches=patches, action=batch.action)
-        return self.auxiliary.losses(params.get("heads", {}), view, batch)
+        view = View(latents.before, batch.action, latents.after, image, patches=patches)
+        return self.auxiliary.losses(params["heads"], view, latents.views, batch)

@@ -14,6 +14,7 @@ over seeds it stays a slice and does not become a scatter. Samples are drawn fro
 """
 
 import math
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -43,6 +44,11 @@ def unpack(observations: jax.Array) -> jax.Array:
         return observations
     *shape, words = observations.shape
     return jax.lax.bitcast_convert_type(observations, jnp.uint8).reshape(*shape, words * _WORD)
+
+
+def _pack_steps(array: jax.Array) -> jax.Array:
+    """`pack` of an array [episodes, steps, ...], whose steps stay apart."""
+    return pack(array) if array.ndim > 2 else array
 
 
 class Indices(NamedTuple):
@@ -80,7 +86,11 @@ class Replay(NamedTuple):
         return self.num_rollouts * self.num_envs
 
     def init(
-        self, observation: jax.ShapeDtypeStruct, goal_state_size: int, action_size: int, with_flow: bool = False
+        self,
+        observation: jax.ShapeDtypeStruct,
+        goal_state_size: int,
+        action_size: int,
+        stored: Mapping[str, jax.ShapeDtypeStruct] | None = None,
     ) -> ReplayState:
         """An empty replay.
 
@@ -88,10 +98,12 @@ class Replay(NamedTuple):
             observation: Shape and dtype of one observation (`GoalEnv.observation_spec`).
             goal_state_size: G.
             action_size: A.
-            with_flow: Whether episodes come with their optical flow.
+            stored: Shapes and dtypes of what lies beside one episode, by auxiliary task (`Auxiliary.stored_spec`).
         """
         episodes, horizon = self.num_episodes, self.horizon
-        flow = pack(jnp.zeros((episodes, horizon, *observation.shape[-2:]), jnp.uint8)) if with_flow else None
+        beside = {
+            name: _pack_steps(jnp.zeros((episodes, *spec.shape), spec.dtype)) for name, spec in dict(stored or {}).items()
+        }
         first, *others = observation.shape
         kept = (episodes, horizon + 2, first // self.frame_stack, *others)
         return ReplayState(
@@ -99,21 +111,20 @@ class Replay(NamedTuple):
                 observations=pack(jnp.zeros(kept, observation.dtype)),
                 states=jnp.zeros((episodes, horizon + 2, goal_state_size), jnp.float32),
                 actions=jnp.zeros((episodes, horizon, action_size), jnp.float32),
-                flow=flow,
+                stored=beside,
             ),
             size=jnp.zeros((), jnp.int32),
         )
 
-    def spec(
-        self, observation: jax.ShapeDtypeStruct, goal_state_size: int, action_size: int, with_flow: bool = False
-    ) -> ReplayState:
+    def spec(self, *args: Any) -> ReplayState:
         """Shapes and dtypes of the storage, without allocating it; arguments as of `init`."""
-        return jax.eval_shape(lambda: self.init(observation, goal_state_size, action_size, with_flow))
+        return jax.eval_shape(lambda: self.init(*args))
 
     def _stored(self, rollout: Episodes) -> Episodes:
         """Episodes as they are stored."""
         newest = rollout.observations[:, :, : rollout.observations.shape[2] // self.frame_stack]
-        return rollout.replace(observations=pack(newest), flow=None if rollout.flow is None else pack(rollout.flow))
+        stored = {name: _pack_steps(array) for name, array in rollout.stored.items()}
+        return rollout.replace(observations=pack(newest), stored=stored)
 
     def of_rollout(self, rollout: Episodes) -> ReplayState:
         """A replay of one rollout that holds just these E episodes."""
@@ -213,10 +224,9 @@ class Replay(NamedTuple):
         episodes, slots = jnp.indices(stored.shape[:2])
         return self._read(stored, episodes, slots, slots > self.horizon)
 
-    def flow(self, state: ReplayState, indices: Indices) -> jax.Array:
-        """The optical flow of transitions, as episodes have it: [B, H, W] uint8."""
-        assert state.episodes.flow is not None
-        return unpack(state.episodes.flow[indices.episode, indices.time])
+    def stored(self, state: ReplayState, indices: Indices) -> dict[str, jax.Array]:
+        """What auxiliary tasks have stored of transitions, by task: [B, ...]."""
+        return {name: unpack(array[indices.episode, indices.time]) for name, array in state.episodes.stored.items()}
 
 
 def make_replay(transitions: int, num_envs: int, horizon: int, frame_stack: int = 1, mean_age: int | None = None) -> Replay:

@@ -139,8 +139,7 @@ class Sampler:
         batch = batch.replace(shift=choice.shift)
         if choice.target_key is not None:
             assert self.auxiliary is not None
-            flow = self.replay.flow(state, choice.indices) if self.auxiliary.keeps_flow else None
-            batch = batch.replace(targets=self.auxiliary.targets(choice.target_key, batch, flow))
+            batch = self.auxiliary.with_targets(choice.target_key, batch, self.replay.stored(state, choice.indices))
         reached = batch.observation_tp1
         if self.as_goal is not None:
             # Stacked images also show how things move, and a goal stands still; what is reached is compared in the same terms.

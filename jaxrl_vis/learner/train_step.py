@@ -98,8 +98,9 @@ class TrainStep:
     @property
     def replay_spec(self) -> ReplayState:
         """Shapes of one seed's replay, or of one device's part of it, without allocating it."""
-        sizes = self.env.observation_spec, self.env.goal_state_size, self.env.action_size
-        return self.replay.spec(*sizes, with_flow=self.auxiliary.keeps_flow)
+        observation = self.env.observation_spec
+        stored = self.auxiliary.stored_spec(observation, self.env.horizon)
+        return self.replay.spec(observation, self.env.goal_state_size, self.env.action_size, stored)
 
     @property
     def replay_bytes(self) -> int:
@@ -180,7 +181,8 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None) 
     stacked = env.frame_stack if networks.sees_images else 1
     replay = make_replay(config.replay_transitions, config.num_envs, env.horizon, stacked, config.replay_mean_age)
     replay = replay._replace(num_envs=config.num_envs // shards.count)
-    replay_spec = replay.spec(env.observation_spec, env.goal_state_size, env.action_size, auxiliary.keeps_flow)
+    stored = auxiliary.stored_spec(env.observation_spec, env.horizon)
+    replay_spec = replay.spec(env.observation_spec, env.goal_state_size, env.action_size, stored)
     sampler = Sampler(config, resolved, replay, env.threshold, env.as_goal if stacked > 1 else None, auxiliary, shards)
     insert = iterations.make_insert(config, sampler, auxiliary)
     update = iterations.make_update(config, sampler, algorithm)

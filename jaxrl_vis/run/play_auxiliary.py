@@ -62,7 +62,7 @@ def play_auxiliary(run_dir: Path | str, out: Path | str, episodes: int = 6, trus
         return _predict(networks, auxiliary, train, episodes, key)
 
     first, played = jax.tree.map(lambda leaf: leaf[0], (train, played))
-    played = jax.jit(auxiliary.with_flow)(played)
+    played = jax.jit(auxiliary.with_stored)(played)
     keys = jax.random.split(jax.random.key(config.seed), episodes)
     per_episode = jax.jit(predict)
     found = [
@@ -96,22 +96,22 @@ def _predict(networks: Networks, auxiliary: Auxiliary, train: TrainState, episod
     goals = jnp.broadcast_to(observations[-1], before.shape)
     nothing = jnp.zeros((count, 0))  # nobody asks for true states here
     batch = Batch(jnp.stack([before, goals, after]), actions, nothing, nothing)
-    batch = batch.replace(targets=auxiliary.targets(key, batch, episode.flow))
-    names = ("before", "after", *(name for name in auxiliary.others if name != "after"))
+    batch = auxiliary.with_targets(key, batch, episode.stored)
+    names = ("before", "after", *batch.views)
     inputs = networks.prepare_batch(networks.batch_scaling(train), batch)
     latents = networks.encode_pieces(train.critic, inputs.pieces(*names))
-    latent_t, latent_tp1, *moved = latents.reshape(len(names), count, networks.config.latent_size)
-    image = networks.normalize(networks.scaling(train.normalizer), before) if "image" in auxiliary.needs else None
-    view = View(latent_t, actions, latent_tp1, *moved, image=image)
-    predicted = auxiliary.predictions(train.critic["heads"], view, batch)
+    latent_t, latent_tp1, *of_views = latents.reshape(len(names), count, networks.config.latent_size)
+    image = networks.normalize(networks.scaling(train.normalizer), before) if auxiliary.needs_image else None
+    view = View(latent_t, actions, latent_tp1, image)
+    predicted = auxiliary.predictions(train.critic["heads"], view, dict(zip(batch.views, of_views, strict=True)), batch)
     found: dict[str, Any] = {}
     if "autoencoder" in predicted:
         found["reconstruction"] = _as_image(networks, train, predicted["autoencoder"])
     if "optical_flow" in predicted:
-        found |= {"flow": batch.targets.flow, "flow_predicted": predicted["optical_flow"]}
+        found |= {"flow": batch.targets["optical_flow"], "flow_predicted": predicted["optical_flow"]}
     if "egomotion" in predicted:
         degrees = jnp.degrees(MAX_ANGLE)
-        found |= {"rotated": batch.targets.images_moved, "angle": degrees * batch.targets.motion[:, 0]}
+        found |= {"rotated": batch.views["egomotion"], "angle": degrees * batch.targets["egomotion"][:, 0]}
         found["angle_predicted"] = degrees * predicted["egomotion"][:, 0]
     return found
 
