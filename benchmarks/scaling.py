@@ -245,7 +245,7 @@ def compare(kind: str, config: Config, one: list[float], seconds: list[float], i
 def measure_all_reduce(figure: Figure) -> tuple[str, Measurement]:
     """The time of an update's all-reduce: a line, and the record."""
     train, count = figure.timed.programs.shapes.train, figure.timed.config.devices
-    numbers = sum(math.prod(leaf.shape[1:]) for leaf in jax.tree.leaves((train.actor, train.critic)))
+    numbers = sum(math.prod(leaf.shape[1:]) for leaf in jax.tree.leaves((train.agent.actor, train.agent.critic)))
     seconds = all_reduce_seconds(numbers, count)
     updates = figure.timed.config.updates_per_iteration
     line = (

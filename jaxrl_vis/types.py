@@ -8,7 +8,7 @@ An observation is a planar image [C, H, W] uint8 or a state vector [S] float32; 
 """
 
 import dataclasses
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import jax
 
@@ -126,38 +126,42 @@ class NormalizerState(Replaceable):
     sum_of_squares: jax.Array
 
 
+class Statistics(NamedTuple):
+    """Observation statistics of a learner.
+
+    Attributes:
+        observations: Of observations; of goals, too, unless they have their own.
+        own_goals: Those of goals alone; None where they have not.
+    """
+
+    observations: NormalizerState
+    own_goals: NormalizerState | None
+
+    @property
+    def goals(self) -> NormalizerState:
+        """Statistics that goals are normalised with."""
+        return self.observations if self.own_goals is None else self.own_goals
+
+
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class TrainState(Replaceable):
-    """The learner: networks, their targets, optimisers, observation statistics.
+    """The learner: an agent, and observation statistics.
 
     Attributes:
-        actor, critic: Online parameters. The actor is a head alone where it shares the critic's encoder.
-        target_actor, target_critic: Slowly following copies; heads alone where there is no target encoder.
-        actor_optimizer, critic_optimizer: optax states.
+        agent: State of the algorithm, a pytree of its own (`learner.algorithm`).
         normalizer: Observation statistics.
         goal_normalizer: Those of goals, where they have their own; else None.
-        weighting: `weighting.WeightingState` of the auxiliary losses; None where there is nothing to remember.
-        autoencoder: `latent_reward.AutoencoderState`; None where rewards come from elsewhere.
-        updates: [] int32, gradient steps taken (fewer than 2^31 in any run that ends).
     """
 
-    actor: Params
-    critic: Params
-    target_actor: Params
-    target_critic: Params
-    actor_optimizer: Any
-    critic_optimizer: Any
+    agent: Any
     normalizer: NormalizerState
-    updates: jax.Array
     goal_normalizer: NormalizerState | None = None
-    weighting: Any = None
-    autoencoder: Any = None
 
     @property
-    def goal_statistics(self) -> NormalizerState:
-        """What goals are normalised with."""
-        return self.normalizer if self.goal_normalizer is None else self.goal_normalizer
+    def statistics(self) -> Statistics:
+        """Both statistics."""
+        return Statistics(self.normalizer, self.goal_normalizer)
 
 
 @jax.tree_util.register_dataclass

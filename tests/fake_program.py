@@ -65,16 +65,13 @@ class FakeProgram:
 
         def init_one(key):
             parameters = {"layer": {"kernel": jax.random.uniform(key, (4, 3)) - 0.5, "bias": jnp.zeros(3)}}
-            train = TrainState(
-                actor=parameters,
-                critic=parameters,
-                target_actor=parameters,
-                target_critic=parameters,
-                actor_optimizer=(jnp.zeros((), jnp.int32), parameters),
-                critic_optimizer=(),
-                normalizer=NormalizerState(jnp.zeros(()), jnp.zeros((1, size, size)), jnp.ones((1, size, size))),
-                updates=jnp.zeros((), jnp.int32),
-            )
+            agent = {
+                "actor": parameters,
+                "critic": parameters,
+                "optimizers": ((jnp.zeros((), jnp.int32), parameters), ()),
+                "updates": jnp.zeros((), jnp.int32),
+            }
+            train = TrainState(agent, NormalizerState(jnp.zeros(()), jnp.zeros((1, size, size)), jnp.ones((1, size, size))))
             replay = Episodes(
                 observations=jnp.zeros((episodes, HORIZON + 2, 1, size, size), jnp.uint8),
                 states=jnp.zeros((episodes, HORIZON + 2, 3)),
@@ -107,10 +104,11 @@ class FakeProgram:
                 new = new.replace(states=jnp.where(bad, jnp.nan, new.states))
             replay = jax.tree.map(lambda whole, part: jax.lax.dynamic_update_slice_in_dim(whole, part, start, 0), old, new)
             step = 0.1 * (noise - 0.5) + 1e-3 * replay.states.mean() + 1e-4 * replay.observations.mean()
-            actor = {"layer": {"kernel": loop.train.actor["layer"]["kernel"] + step, "bias": loop.train.actor["layer"]["bias"]}}
+            agent = loop.train.agent
+            actor = {"layer": agent["actor"]["layer"] | {"kernel": agent["actor"]["layer"]["kernel"] + step}}
             loss = jnp.where(bad, jnp.nan, step**2)
-            critic = jax.tree.map(lambda leaf: leaf + 0.0 * loss, loop.train.critic)
-            train = loop.train.replace(actor=actor, critic=critic, updates=loop.train.updates + 3)
+            critic = jax.tree.map(lambda leaf: leaf + 0.0 * loss, agent["critic"])
+            train = loop.train.replace(agent=agent | {"actor": actor, "critic": critic, "updates": agent["updates"] + 3})
             memory = ReplayState(replay, jnp.minimum(loop.replay.size + config.num_envs, episodes))
             metrics = {
                 "train/critic_loss": loss,
@@ -122,7 +120,8 @@ class FakeProgram:
             return Learned(LoopState(train, memory, loop.key, loop.iteration + 1), metrics)
 
         def evaluate_one(train, key):
-            score = jax.nn.sigmoid(train.updates / 9.0 - 1.0 + 0.1 * train.actor["layer"]["kernel"].sum())
+            kernel, updates = train.agent["actor"]["layer"]["kernel"], train.agent["updates"]
+            score = jax.nn.sigmoid(updates / 9.0 - 1.0 + 0.1 * kernel.sum())
             y, x = jnp.mgrid[0:size, 0:size]
             t = jnp.arange(HORIZON + 1)[:, None, None]
             ball = ((y - 3 - t) ** 2 + (x - 4 - t) ** 2 < 9) * 120

@@ -10,7 +10,7 @@ import pytest
 
 from jaxrl_vis.config import preset
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner import auxtasks
+from jaxrl_vis.learner import auxtasks, normalizer
 from jaxrl_vis.learner.auxiliary import Auxiliary, make_auxiliary
 from jaxrl_vis.learner.auxtasks import optical_flow
 from jaxrl_vis.learner.ddpg import make_ddpg
@@ -19,7 +19,7 @@ from jaxrl_vis.learner.replay import Indices, Replay
 from jaxrl_vis.learner.sampling import Choice, Sampler
 from jaxrl_vis.learner.weighting import make_weighting
 from jaxrl_vis.resolved import resolve
-from jaxrl_vis.types import Episodes
+from jaxrl_vis.types import Episodes, Statistics
 from jaxrl_vis.validation import validate
 
 SPEC = jax.ShapeDtypeStruct((2, 16, 16), jnp.uint8)
@@ -101,7 +101,7 @@ def learner(way=None, **overrides):
     batch = chosen_batch(stored("optical_flow" in auxiliary.tasks), drawn_places(), jax.random.key(2))
     start = fresh(chosen.aux_tasks, chosen.encoders, chosen.target_encoder, chosen.encoder_filters)
     start = start.replace(weighting=auxiliary.init_state(start.critic))
-    return algorithm, update, algorithm.begin(start), batch
+    return algorithm, update, algorithm.begin(start, Statistics(normalizer.init(SPEC), None)), batch
 
 
 def sizes(tree):
@@ -121,7 +121,7 @@ def test_every_auxiliary_loss_is_learned_and_reaches_both_encoders():
         working, _, last = update(working, batch)
     for name in ALL:
         assert last[f"train/loss/{name}"] < 0.9 * first[f"train/loss/{name}"], name
-    assert set(working.train.target_critic) == {"encoder", "head"}
+    assert set(working.agent.target_critic) == {"encoder", "head"}
 
 
 def test_a_weighted_gradient_is_the_sum_of_the_losses_own():

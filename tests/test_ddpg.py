@@ -50,7 +50,7 @@ def values(program, train, observations, goals, action=0.0):
     @jax.jit
     def value(train, points, goals):
         latents = jnp.stack([networks.prepare(networks.scaling(train.normalizer), each) for each in (points, goals)])
-        return networks.value(train.critic, latents, jnp.full((points.shape[0], 1), action))
+        return networks.value(train.agent.critic, latents, jnp.full((points.shape[0], 1), action))
 
     return np.asarray(value(train, *(np.array(each, np.float32)[:, None] for each in (observations, goals))))
 
@@ -144,10 +144,12 @@ def test_the_filter_drops_negatives_that_the_critic_values_like_positives():
     """Place 0 is its own goal, seen with noise in one byte, so most of its indicator rewards are false negatives."""
     program = filtering()
     loop = begin(program, KEYS)
-    head = loop.train.critic["head"]
+    agent = loop.train.agent
+    head = agent.critic["head"]
     last = sorted(head)[-1]
     confident = {**head, last: {**head[last], "bias": head[last]["bias"] + 1e3}}
-    loop = loop.replace(train=loop.train.replace(critic={**loop.train.critic, "head": confident}))
+    agent = agent.replace(critic={**agent.critic, "head": confident})
+    loop = loop.replace(train=loop.train.replace(agent=agent))
     _, metrics = train_iteration(program, loop)
     assert metrics["train/filtered_share"][0] == 1.0
 
@@ -181,8 +183,8 @@ def test_targets_follow_once_an_interval(interval, updates):
     """After U updates in one iteration, targets have moved floor(U / interval) times: by each step's own online networks."""
     config = preset("debug", num_envs=4, batch_size=8, target_update_interval=interval, target_decay=0.9)
     program = make_train_step(probes.GoWhereTold(), config.replace(updates_per_iteration=updates))
-    first = jax.device_get(begin(program, KEYS).train)
-    train = jax.device_get(program.update_many(*experienced(program, KEYS[0]))[0])
+    first = jax.device_get(begin(program, KEYS).train.agent)
+    train = jax.device_get(program.update_many(*experienced(program, KEYS[0]))[0]).agent
     moved = jax.tree.map(lambda new, old: bool(np.any(new != old)), train.target_critic, first.target_critic)
     assert any(jax.tree.leaves(moved)) == (updates >= interval)
     if interval == 1:  # and by how much: a tenth of the way to where the online network is
@@ -199,8 +201,10 @@ def test_exploration_has_its_shares_and_spread():
     def actions(exploration):
         @jax.jit
         def act(key, train):
-            latents = rollout.encode(program.networks, train, train.normalizer, observations)
-            return rollout.choose_actions(program.networks, train, latents, exploration, key, observations)
+            algorithm = program.algorithm
+            policy = algorithm.policy_params(train.agent, train.statistics)
+            action = algorithm.act(policy, observations, algorithm.aim(policy, observations))
+            return rollout.explore(action, exploration, key)
 
         return np.asarray(act(jax.random.key(5), train))[:, 0]
 
@@ -274,8 +278,8 @@ def test_policy_learns_from_images_with_fewer_encoders(options):
     settings = {"encoder_filters": (8, 8), "relabel_probability": 0.9, "normalizer_floor": 1.0}
     settings["iterations"] = 20 if "actor_interval" in options else 12  # an actor that steps half as often needs longer
     program, train, _ = trained(probes.SeenGoWhereTold(), **settings, **options)
-    assert ("encoder" in train.actor) == (options.get("encoders") != "shared")
-    assert ("encoder" in train.target_critic) == options.get("target_encoder", True)
+    assert ("encoder" in train.agent.actor) == (options.get("encoders") != "shared")
+    assert ("encoder" in train.agent.target_critic) == options.get("target_encoder", True)
     outcome, _ = program.evaluate(jax.tree.map(lambda leaf: leaf[None], train), jax.random.key(11))
     assert outcome["eval/success"][0] >= 0.9
 
@@ -286,7 +290,7 @@ def test_a_shared_encoder_learns_nothing_from_the_actor():
     def critic_after(learning_rate):
         config = preset("debug", encoders="shared", actor_learning_rate=learning_rate, batch_size=8, updates_per_iteration=1)
         program = make_train_step(probes.SeenGoWhereTold(), config)
-        return jax.device_get(program.update_many(*experienced(program, KEYS[0]))[0])
+        return jax.device_get(program.update_many(*experienced(program, KEYS[0]))[0]).agent
 
     slow, fast = critic_after(1e-5), critic_after(1e-1)
     jax.tree.map(np.testing.assert_array_equal, slow.critic, fast.critic)
@@ -299,7 +303,9 @@ def test_the_actor_steps_once_an_interval():
     for interval in (1, 3):
         program = make_train_step(probes.GoWhereTold(), config.replace(actor_interval=interval))
         train, metrics = program.update_many(*experienced(program, KEYS[0]))
-        counts[interval] = tuple(int(moments[0].count[0]) for moments in (train.actor_optimizer, train.critic_optimizer))
+        counts[interval] = tuple(
+            int(moments[0].count[0]) for moments in (train.agent.actor_optimizer, train.agent.critic_optimizer)
+        )
         assert np.isfinite(metrics["train/actor_loss"]).all()
     assert counts == {1: (6, 6), 3: (2, 6)}
 

@@ -214,11 +214,11 @@ from jaxrl_vis.cli.parsing import parse
 from jaxrl_vis.cli.train import Train, training_config
 from jaxrl_vis.config import preset
 from jaxrl_vis.resolved import resolve
-from jaxrl_vis.learner import ddpg
+from jaxrl_vis.learner import ddpg, normalizer
 from jaxrl_vis.learner.networks import Networks
 from jaxrl_vis.learner.sampling import Sampler
 from jaxrl_vis.methods import METHODS
-from jaxrl_vis.types import Batch
+from jaxrl_vis.types import Batch, Statistics
 from jaxrl_vis.validation import validate
 
 for words in {lines!r}:
@@ -237,7 +237,7 @@ algorithm = ddpg.make_ddpg(networks, config, resolved)
 def one_step(key):
     images = jnp.zeros((3, 2, 1, 16, 16), jnp.uint8)
     batch = Batch(images, jnp.zeros((2, 2)), jnp.zeros((2, 2)), jnp.zeros((2, 2)), jnp.zeros(2))
-    working = algorithm.begin(algorithm.init(key))
+    working = algorithm.begin(algorithm.init(key), Statistics(normalizer.init(networks.observation_spec), None))
     gradients, metrics = algorithm.gradients(working, algorithm.prepare(working, batch), True)
     assert metrics["train/loss/latent_size"].shape == ()
     return gradients

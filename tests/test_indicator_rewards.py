@@ -56,9 +56,9 @@ def test_the_return_of_an_autoencoder_is_in_q(with_autoencoder):
     def values_and_rewards(train, goals):
         images = [jax.vmap(probes.SeenGoWhereTold().see)(each) for each in (points, goals)]
         inputs = [networks.prepare(networks.scaling(train.normalizer), each) for each in images]
-        latents = jnp.stack([networks.encode(train.critic, each) for each in inputs])
-        rewards = cosine_reward(*(networks.encode(train.autoencoder.params, each) for each in inputs))
-        return networks.value(train.critic, latents, jnp.zeros((8, 1))), rewards
+        latents = jnp.stack([networks.encode(train.agent.critic, each) for each in inputs])
+        rewards = cosine_reward(*(networks.encode(train.agent.autoencoder.params, each) for each in inputs))
+        return networks.value(train.agent.critic, latents, jnp.zeros((8, 1))), rewards
 
     values, rewards = values_and_rewards(train, points)
     np.testing.assert_allclose(rewards, 1.0, atol=1e-5)
@@ -74,7 +74,7 @@ def test_an_autoencoder_learns_to_reconstruct(with_autoencoder):
     program, train, late = with_autoencoder
     _, early = train_iteration(program, begin(program, jax.random.key(7)[None]))
     assert late["train/autoencoder_loss"][0] < 0.5 * early["train/autoencoder_loss"][0]
-    assert set(train.autoencoder.params) == {"encoder", "decoder"}
+    assert set(train.agent.autoencoder.params) == {"encoder", "decoder"}
 
 
 def test_likeness_is_a_cosine_that_is_cut_off_at_a_right_angle():
@@ -108,8 +108,10 @@ def test_stacked_images_are_compared_as_goals():
     @jax.jit
     def rewards(train, batch):
         train = train.replace(normalizer=normalizer.update(train.normalizer, batch.observations))
-        inputs = networks.prepare_batch(networks.batch_scaling(train), batch)
-        return [latent_reward.of_batch(train, inputs, each).reward for each in (batch.replace(reached=reached), batch)]
+        scaling = networks.batch_scaling(train.statistics)
+        inputs = networks.prepare_batch(scaling, batch)
+        both = batch.replace(reached=reached), batch
+        return [latent_reward.of_batch(train.agent.autoencoder, scaling.observations, inputs, each).reward for each in both]
 
     of_reached, of_moving = rewards(train, batch)
     np.testing.assert_allclose(of_reached, 1.0, atol=1e-5)
@@ -118,7 +120,7 @@ def test_stacked_images_are_compared_as_goals():
 
 def test_other_methods_carry_no_autoencoder():
     loop = jax.eval_shape(make_train_step(StaysPut(), preset("debug")).init, jax.random.key(0)[None])
-    assert loop.train.autoencoder is None
+    assert loop.train.agent.autoencoder is None
 
 
 @pytest.mark.parametrize(

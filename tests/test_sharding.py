@@ -19,7 +19,7 @@ from jaxrl_vis.config import Config, preset
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import normalizer, reward_errors
 from jaxrl_vis.learner.auxiliary import make_auxiliary
-from jaxrl_vis.learner.ddpg import Algorithm, make_ddpg
+from jaxrl_vis.learner.ddpg import GradientSteps, make_ddpg
 from jaxrl_vis.learner.networks import Networks
 from jaxrl_vis.learner.replay import Replay
 from jaxrl_vis.learner.sampling import Sampler
@@ -186,7 +186,7 @@ SPEC = jax.ShapeDtypeStruct((2, 16, 16), jnp.uint8)
 SIZE = 16
 
 
-def make_algorithm(config: Config, shards: Shards) -> Algorithm:
+def make_steps(config: Config, shards: Shards) -> GradientSteps:
     networks = Networks(config, SPEC, 2, 0.0)
     auxiliary = make_auxiliary(config, SPEC, 2, 1, networks.dtype)
     return make_ddpg(networks, config, resolve(config, 6), auxiliary, shards)
@@ -194,20 +194,20 @@ def make_algorithm(config: Config, shards: Shards) -> Algorithm:
 
 def make_learner(config: Config) -> TrainState:
     """A fresh one that has seen a few images."""
-    train = make_algorithm(config, Shards()).init(jax.random.key(1))
-    train = train.replace(normalizer=normalizer.update(train.normalizer, jnp.arange(1024.0).reshape(2, 1, 2, 16, 16) % 200))
+    agent = make_steps(config, Shards()).init(jax.random.key(1))
+    statistics = normalizer.update(normalizer.init(SPEC), jnp.arange(1024.0).reshape(2, 1, 2, 16, 16) % 200)
     # As high as the filter's threshold, so that it drops some transitions and keeps others.
     threshold = resolve(config, 6).filter_threshold
     is_output = {True: 0.0 if math.isinf(threshold) else threshold, False: 0.0}
-    critic = jax.tree.map_with_path(lambda path, leaf: leaf + is_output["output" in str(path) and leaf.ndim == 1], train.critic)
-    return train.replace(critic=critic)
+    critic = jax.tree.map_with_path(lambda path, leaf: leaf + is_output["output" in str(path) and leaf.ndim == 1], agent.critic)
+    return TrainState(agent.replace(critic=critic), statistics)
 
 
 def gradients(config: Config, shards: Shards, train: TrainState, batch: Batch) -> Any:
     """Gradients and metrics."""
-    algorithm = make_algorithm(config, shards)
-    working = algorithm.begin(train)
-    return algorithm.gradients(working, algorithm.prepare(working, batch), True)
+    steps = make_steps(config, shards)
+    working = steps.begin(train.agent, train.statistics)
+    return steps.gradients(working, steps.prepare(working, batch), True)
 
 
 def make_batch(config: Config) -> Batch:

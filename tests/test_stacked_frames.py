@@ -11,7 +11,7 @@ from probe_environments import Probe
 
 import jaxrl_vis_envs
 from jaxrl_vis.config import preset
-from jaxrl_vis.learner import train_step
+from jaxrl_vis.learner import ddpg, train_step
 from jaxrl_vis.learner.ddpg import make_ddpg
 from jaxrl_vis.learner.environment import make_env
 from jaxrl_vis.learner.replay import Indices, make_replay
@@ -111,11 +111,11 @@ def program(frame_stack: int = 2):
         }  # fmt: skip
 
     def make_looking(*arguments):
-        algorithm = make_ddpg(*arguments)
-        return algorithm._replace(gradients=functools.partial(look, algorithm.gradients))
+        steps = make_ddpg(*arguments)
+        return steps._replace(gradients=functools.partial(look, steps.gradients))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(train_step, "make_ddpg", make_looking)
+        patch.setattr(ddpg, "make_ddpg", make_looking)
         return train_step.make_train_step(env, config)
 
 

@@ -107,8 +107,8 @@ def test_a_non_finite_number_stops_the_run(tmp_path, break_state, capsys):
     (file,) = (path / "nonfinite").iterdir()
     assert str(file) in text
     dumped = np.load(file)
-    assert "critic.layer.kernel" in dumped["nonfinite_leaves"] and np.isnan(dumped["metrics.train/critic_loss"]).all()
-    assert np.isnan(dumped["train.critic.layer.bias"]).all() and dumped["key"].shape[0] == 2
+    assert "agent.critic.layer.kernel" in dumped["nonfinite_leaves"] and np.isnan(dumped["metrics.train/critic_loss"]).all()
+    assert np.isnan(dumped["train.agent.critic.layer.bias"]).all() and dumped["key"].shape[0] == 2
     assert dumped["episodes.states"].shape[0] == (4 if break_state else 0)
     shapes = make_fake_trainer(small_config(), None).shapes
     restored = Checkpoints(path / "checkpoints", read_only=True).restore_for_resume(shapes)

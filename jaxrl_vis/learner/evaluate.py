@@ -7,12 +7,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxrl_vis.config import Config
-from jaxrl_vis.learner.networks import Networks
-from jaxrl_vis.learner.rollout import play
+from jaxrl_vis.learner.rollout import Acting, play
 from jaxrl_vis.learner.shards import ONE, Shards
 from jaxrl_vis.types import Metrics, TrainState
-from jaxrl_vis_envs.base import GoalEnv
 
 # Episodes whose images are returned, for videos.
 _NUM_RECORDED = 8
@@ -59,28 +56,25 @@ def summarize(
     return Evaluation(metrics, {"frames": frames, "goals": goals, "success": success[:, : observations.shape[1]]})
 
 
-def make_evaluate(
-    env: GoalEnv, networks: Networks, config: Config, shards: Shards = ONE
-) -> Callable[[TrainState, jax.Array], Evaluation]:
+def make_evaluate(acting: Acting, num_episodes: int, shards: Shards = ONE) -> Callable[[TrainState, jax.Array], Evaluation]:
     """Make the evaluation without exploration, as a function to be compiled.
 
     Args:
-        env: The environment.
-        networks: What the parameters mean.
-        config: The number of episodes, ``eval_episodes``.
+        acting: The environment and the algorithm.
+        num_episodes: N, of each learner.
         shards: Of each learner. Each part plays its part of the episodes; metrics are of all, and images are of the first few
             of each part.
 
     Returns:
-        (TrainState [S, ...], key []) -> `Evaluation`. All seeds play the same ``config.eval_episodes`` episodes.
+        (TrainState [S, ...], key []) -> `Evaluation`. All seeds play the same episodes.
     """
 
     def evaluate(train: TrainState, key: jax.Array) -> Evaluation:
-        num_kept = num_recorded(config.eval_episodes, shards)
+        num_kept = num_recorded(num_episodes, shards)
         keys = jnp.broadcast_to(key, (jax.tree.leaves(train)[0].shape[0],))
-        num_envs = config.eval_episodes // shards.count
-        episodes, outcome, _ = play(env, networks, train, keys, num_envs, num_kept=num_kept, draws=shards)
+        num_envs = num_episodes // shards.count
+        episodes, outcome, _ = play(acting, train, keys, num_envs, num_kept=num_kept, draws=shards)
         outcome_of_all = {name: shards.gather(values, axis=1) for name, values in outcome.items()}
-        return summarize(outcome_of_all, episodes.observations, outcome["success"], env.frame_stack)
+        return summarize(outcome_of_all, episodes.observations, outcome["success"], acting.env.frame_stack)
 
     return evaluate

@@ -8,7 +8,6 @@ All draw from ``fold_in(seed's key, iteration)``.
 """
 
 import dataclasses
-import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -17,10 +16,10 @@ import jax.numpy as jnp
 
 from jaxrl_vis.config import Config
 from jaxrl_vis.learner import normalizer
+from jaxrl_vis.learner.algorithm import Algorithm, Batches
 from jaxrl_vis.learner.auxiliary import Auxiliary
-from jaxrl_vis.learner.ddpg import Algorithm, Prepared, Working
 from jaxrl_vis.learner.rollout_parts import Played, join_parts
-from jaxrl_vis.learner.sampling import Choice, Sampler
+from jaxrl_vis.learner.sampling import Sampler
 from jaxrl_vis.learner.sharding import Layout
 from jaxrl_vis.types import Episodes, LoopState, Metrics, ReplayState, TrainState
 
@@ -32,6 +31,8 @@ Update = Callable[[TrainState, ReplayState, jax.Array, jax.Array], tuple[TrainSt
 
 # Folded into an iteration's key for what draws statistics. Large, because small numbers give the keys of `jax.random.split`.
 _STATISTICS = 0x73656E
+# The same for what an algorithm draws.
+_UPDATES = 0x757064
 
 
 class Learned(NamedTuple):
@@ -51,48 +52,11 @@ def split_key(key: jax.Array, iteration: jax.Array) -> jax.Array:
     return jax.random.split(jax.random.fold_in(key, iteration))
 
 
-def _mean(values: list[jax.Array]) -> jax.Array:
-    return functools.reduce(jnp.add, values) / len(values)
-
-
-def make_update(config: Config, sampler: Sampler, algorithm: Algorithm) -> Update:
-    """Make the gradient steps of an iteration."""
-    interval = config.actor_interval
-
-    def update(train: TrainState, replay: ReplayState, key: jax.Array, iteration: jax.Array) -> tuple[TrainState, Metrics]:
-        names: list[str] = []
-
-        def steps(state: tuple[Working, Prepared], following: Choice) -> tuple[tuple[Working, Prepared], jax.Array]:
-            """Take gradient steps of which the last is the actor's, too; unrolled, so that the body has no conditional.
-
-            Each has its batch already, and reads and prepares the next one. A GPU does that while it computes; with its own
-            batch it would have to begin with it.
-            """
-            (working, prepared), rows = state, []
-            for number in range(interval):
-                coming = read(working, jax.tree.map(lambda leaf, number=number: leaf[number], following))
-                gradients, metrics = algorithm.gradients(working, prepared, number == interval - 1)
-                working, prepared = algorithm.apply(working, gradients), coming
-                rows.append(metrics)
-            names[:] = rows[-1]
-            # As one vector, because writing each number by itself would be a kernel each.
-            metrics = jnp.stack([_mean([row[name] for row in rows if name in row]) for name in names])
-            return (working, prepared), metrics
-
-        def read(working: Working, choice: Choice) -> Prepared:
-            return algorithm.prepare(working, sampler.batch(replay, choice))
-
-        # All batches are chosen at once: in the loop, drawing numbers would be a dozen tiny kernels an update.
-        keys = jax.random.split(key, config.updates_per_iteration)
-        choices = jax.vmap(lambda update_key: sampler.choose(replay, update_key, iteration))(keys)
-        working = algorithm.begin(train)
-        prepared = read(working, jax.tree.map(lambda leaf: leaf[0], choices))
-        # The last prefetch wraps around to the first batch and is discarded.
-        following = jax.tree.map(lambda leaf: jnp.roll(leaf, -1, axis=0).reshape(-1, interval, *leaf.shape[1:]), choices)
-        (working, _), metrics = jax.lax.scan(steps, (working, prepared), following)
-        return algorithm.end(working), dict(zip(names, jnp.mean(metrics, axis=0), strict=True))
-
-    return update
+def choose_batches(config: Config, sampler: Sampler, replay: ReplayState, key: jax.Array, iteration: jax.Array) -> Batches:
+    """Choose the batches of all gradient steps at once: in a loop, drawing numbers would be a dozen tiny kernels a step."""
+    keys = jax.random.split(key, config.updates_per_iteration)
+    choices = jax.vmap(lambda update_key: sampler.choose(replay, update_key, iteration))(keys)
+    return Batches(choices, lambda choice: sampler.batch(replay, choice))
 
 
 def _update_statistics(train: TrainState, episodes: Episodes, key: jax.Array, config: Config, sampler: Sampler) -> TrainState:
@@ -131,8 +95,19 @@ def make_insert(config: Config, sampler: Sampler, auxiliary: Auxiliary) -> Inser
     return insert
 
 
+def make_update(config: Config, sampler: Sampler, algorithm: Algorithm) -> Update:
+    """Make the gradient steps of an iteration by themselves, to be timed."""
+
+    def update(train: TrainState, replay: ReplayState, key: jax.Array, iteration: jax.Array) -> tuple[TrainState, Metrics]:
+        batches = choose_batches(config, sampler, replay, key, iteration)
+        agent, metrics = algorithm.update(train.agent, train.statistics, batches, jax.random.fold_in(key, _UPDATES))
+        return train.replace(agent=agent), metrics
+
+    return update
+
+
 def make_learn(
-    insert: Insert, update: Update, algorithm: Algorithm, sampler: Sampler, layout: Layout
+    config: Config, insert: Insert, algorithm: Algorithm, sampler: Sampler, layout: Layout
 ) -> Callable[[LoopState, Sequence[Played]], Learned]:
     """Make the second half of an iteration.
 
@@ -146,9 +121,11 @@ def make_learn(
         episodes, outcome = jax.tree.map(lambda *leaves: join_parts(leaves, num_envs), *parts)
         key = split_key(loop.key, loop.iteration)[1]
         train, replay_state = insert(loop.train, layout.unfolded(loop.replay), episodes, key, loop.iteration)
-        train, metrics = update(train, replay_state, key, loop.iteration)
+        batches = choose_batches(config, sampler, replay_state, key, loop.iteration)
+        agent, metrics = algorithm.update(train.agent, train.statistics, batches, jax.random.fold_in(key, _UPDATES))
+        train = train.replace(agent=agent)
         means = {f"train/{name}": jnp.mean(values) for name, values in outcome.items()}
-        means["train/value_at_goals"] = algorithm.value_at_goals(train, episodes.observations[:, -1])
+        means |= algorithm.diagnose(train.agent, train.statistics, episodes.observations[:, -1])
         metrics |= shards.mean(means)
         metrics["guard/nonfinite"] = shards.total(_count_nonfinite((metrics, episodes.states, episodes.actions)))
         replay_state = layout.folded(replay_state, num_envs)

@@ -17,9 +17,10 @@ from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import auxtasks
 from jaxrl_vis.learner.networks import Inputs, Networks
+from jaxrl_vis.learner.normalizer import Scaling
 from jaxrl_vis.methods import METHODS
 from jaxrl_vis.resolved import Resolved
-from jaxrl_vis.types import Batch, Params, Replaceable, TrainState
+from jaxrl_vis.types import Batch, Params, Replaceable
 
 _SMALL = 1e-6  # of a latent's length: the direction of a shorter one means nothing
 
@@ -82,15 +83,16 @@ class LatentReward:
         params = {"encoder": self.networks.init_encoder(encoder_key), "decoder": self.task.init(decoder_key)}
         return AutoencoderState(params=params, optimizer=self.optimizer.init(params))
 
-    def of_batch(self, train: TrainState, inputs: Inputs, batch: Batch) -> Rewarded:
+    def of_batch(self, state: AutoencoderState, scaling: Scaling, inputs: Inputs, batch: Batch) -> Rewarded:
         """Rewards of a batch, and the gradient for the autoencoder.
 
         Args:
-            train: The learner, with the autoencoder and the statistics that observations are normalised with.
+            state: The autoencoder.
+            scaling: Scaling of observations.
             inputs: From `Networks.prepare_batch`.
             batch: The transitions.
         """
-        networks, scaling = self.networks, self.networks.scaling(train.normalizer)
+        networks = self.networks
         if batch.reached is None:
             reached, pieces = batch.observation_tp1, inputs.pieces("after")
         else:
@@ -103,7 +105,7 @@ class LatentReward:
             view = auxtasks.View(latent_t=latent, action=batch.action, image=image)
             return self.task.loss(params["decoder"], view), latent
 
-        params = train.autoencoder.params
+        params = state.params
         (loss, latent), gradient = jax.value_and_grad(reconstruction, has_aux=True)(params)
         goal_latent = networks.encode_pieces(params, inputs.pieces("goal"))
         reward = cosine_reward(latent, goal_latent, self.resolved.reward_positive, self.resolved.reward_negative)

@@ -26,7 +26,7 @@ from jaxrl_vis.learner import encoder_kernel, normalizer
 from jaxrl_vis.learner.blocks import shifted, to_blocks
 from jaxrl_vis.learner.normalizer import Scaling
 from jaxrl_vis.learner.products import product
-from jaxrl_vis.types import Batch, NormalizerState, Params, TrainState
+from jaxrl_vis.types import Batch, NormalizerState, Params, Statistics
 
 _glorot = nn.initializers.glorot_uniform()
 
@@ -89,6 +89,14 @@ class _Dense(nn.Module):
                 total = total + jnp.sum(product(values, rows), axis=0)
             first += parts * part
         return total
+
+
+def compute_dtype(config: Config) -> Any:
+    """Return the dtype that networks of a configuration compute in."""
+    chosen = config.compute_dtype
+    if chosen == "auto":
+        chosen = "float32" if jax.default_backend() == "cpu" else "bfloat16"
+    return jnp.dtype(chosen)
 
 
 class BatchScaling(NamedTuple):
@@ -220,10 +228,7 @@ class Networks:
     @property
     def dtype(self) -> Any:
         """The dtype that the networks compute in."""
-        chosen = self.config.compute_dtype
-        if chosen == "auto":
-            chosen = "float32" if jax.default_backend() == "cpu" else "bfloat16"
-        return jnp.dtype(chosen)
+        return compute_dtype(self.config)
 
     @property
     def _encoder(self) -> Any:
@@ -291,10 +296,10 @@ class Networks:
         """What `prepare` and `normalize` take."""
         return Scaling(statistics.mean, normalizer.scale(statistics, self.config.normalizer_floor))
 
-    def batch_scaling(self, train: TrainState) -> BatchScaling:
-        """What `prepare_batch` takes. It stays the same for all gradient steps of an iteration."""
-        of_goals = None if train.goal_normalizer is None else self.scaling(train.goal_normalizer)
-        return BatchScaling(self.scaling(train.normalizer), of_goals)
+    def batch_scaling(self, statistics: Statistics) -> BatchScaling:
+        """Return the scaling that `prepare_batch` takes. It stays the same for all gradient steps of an iteration."""
+        of_goals = None if statistics.own_goals is None else self.scaling(statistics.own_goals)
+        return BatchScaling(self.scaling(statistics.observations), of_goals)
 
     def prepare_batch(self, scaling: BatchScaling, batch: Batch) -> Inputs:
         """`prepare` of all observations of B transitions."""

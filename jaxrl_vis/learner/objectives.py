@@ -29,7 +29,7 @@ from jaxrl_vis.types import Batch, Params
 
 
 class ComputeCopies(NamedTuple):
-    """Networks of a `TrainState` in the dtype that they are computed with (`Networks.compute_copy`)."""
+    """Networks of an agent in the dtype that they are computed with (`Networks.compute_copy`)."""
 
     actor: Params
     critic: Params
@@ -139,15 +139,10 @@ class Objectives:
         weighting = self.auxiliary.weighting
         return self.shards.count > 1 and (weighting.needs != "losses" or weighting.log)
 
-    def of_critic(
-        self,
-        now: ComputeCopies,
-        state: WeightingState | None,
-        inputs: Inputs,
-        image: jax.Array | None,
-        batch: Batch,
-    ) -> Weighted:
-        """The critic's losses and their gradient; ``extra`` is (latents, values [B], keep [B])."""
+    def critic_gradient(
+        self, now: ComputeCopies, inputs: Inputs, image: jax.Array | None, batch: Batch
+    ) -> Callable[[Params, WeightingState], Weighted]:
+        """Make the function of the critic's losses and their gradient; ``extra`` is (latents, values [B], keep [B])."""
         networks, weighting, way = self.networks, self.auxiliary.weighting, self.auxiliary.way
 
         def encode(encoder: Params) -> Latents:
@@ -168,8 +163,7 @@ class Objectives:
         options: dict[str, Any] = {"forwards": tangents.with_tangents, "encode": encoders, "has_aux": True}
         if self.reduces_early:
             options["reduce"] = self.shards.mean
-        find = weighted_grad(critic_losses, weighting, lambda critic: critic.get("encoder"), way, **options)
-        return find(now.critic, self.auxiliary.start(now.critic) if state is None else state)
+        return weighted_grad(critic_losses, weighting, lambda critic: critic.get("encoder"), way, **options)
 
     def _kept(self, keep: jax.Array) -> jax.Array | None:
         """Transitions that count in a part, on average over the parts, by which all divide alike; None: its own."""

@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxrl_vis.learner.networks import Networks
+from jaxrl_vis.learner.algorithm import Algorithm
 from jaxrl_vis.learner.rollout_parts import RolloutPart
 from jaxrl_vis.learner.shards import ONE, Shards
-from jaxrl_vis.types import Episodes, Metrics, NormalizerState, TrainState
+from jaxrl_vis.types import Episodes, Metrics, TrainState
 from jaxrl_vis_envs.base import GoalEnv, State
 
 Draws = Shards | RolloutPart
@@ -43,37 +43,29 @@ class Exploration(NamedTuple):
 NO_EXPLORATION = Exploration()
 
 
-def encode(networks: Networks, train: TrainState, statistics: NormalizerState, observations: jax.Array) -> jax.Array:
-    """What the online actor makes of images (or states) [E, ...] with these ``statistics``: [E, Z]."""
-    return networks.encode(
-        networks.with_encoder(train.actor, train.critic), networks.prepare(networks.scaling(statistics), observations)
-    )
+class Acting(NamedTuple):
+    """Who acts where.
+
+    Attributes:
+        env: The environment.
+        algorithm: What the agents belong to.
+        observation_noise: Standard deviation of the camera's noise, in the observation's unit.
+    """
+
+    env: GoalEnv
+    algorithm: Algorithm
+    observation_noise: float = 0.0
 
 
-def choose_actions(
-    networks: Networks,
-    train: TrainState,
-    goal_latents: jax.Array,
-    exploration: Exploration,
-    key: jax.Array,
-    observations: jax.Array,
-    draws: Draws = ONE,
-) -> jax.Array:
-    """The online actor, with noise where it is asked for.
+def explore(action: jax.Array, exploration: Exploration, key: jax.Array, draws: Draws = ONE) -> jax.Array:
+    """Return actions [E, A] float32 in [-1, 1] with noise where it is asked for.
 
     Args:
-        networks: What the parameters mean.
-        train: The learner.
-        goal_latents: [E, Z] from `encode`: goals stay, so they are encoded once an episode.
+        action: [E, A] float32 in [-1, 1], the policy's own.
         exploration: The noise.
         key: [] typed; draws the noise.
-        observations: [E, ...].
         draws: Random numbers of these environments.
-
-    Returns:
-        [E, A] float32 in [-1, 1].
     """
-    action = networks.act(train.actor, jnp.stack([encode(networks, train, train.normalizer, observations), goal_latents]))
     if exploration.is_none:
         return action
     noise_key, random_key = jax.random.split(key)
@@ -126,8 +118,7 @@ def _episode_major(*parts: jax.Array) -> jax.Array:
 
 
 def play(
-    env: GoalEnv,
-    networks: Networks,
+    acting: Acting,
     train: TrainState,
     keys: jax.Array,
     num_envs: int,
@@ -141,8 +132,7 @@ def play(
     To the environments learners are nothing but more environments: one `jax.vmap` less means half as much to trace.
 
     Args:
-        env: The environment.
-        networks: What the parameters mean.
+        acting: The environment and the algorithm.
         train: The learners, [S, ...].
         keys: [S] typed keys of this rollout.
         num_envs: E, environments of each learner that are played here.
@@ -151,6 +141,7 @@ def play(
         record: What else to keep, a pytree made of the state of one environment after reset and after each step.
         draws: Random numbers of these environments.
     """
+    env, algorithm, deviation = acting
     num_seeds = keys.shape[0]
 
     def by_seed(leaf: jax.Array) -> jax.Array:
@@ -161,7 +152,6 @@ def play(
 
     def seen(observations: jax.Array, keys: jax.Array, number: int) -> jax.Array:
         # Noise belongs to a frame: it is drawn here, once, and stored with the frame, which therefore equals itself as a goal.
-        deviation = networks.config.observation_noise
         if not deviation:
             return observations
         noise_keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, number)
@@ -177,14 +167,15 @@ def play(
     first_observation = seen(state.obs["observation"], policy_keys, _FIRST_NOISE)
     goal = seen(state.obs["desired_goal"], policy_keys, _GOAL_NOISE)
     first_state, first_record = state.achieved_state, recorded(state)
-    goal_latents = jax.vmap(lambda train, goals: encode(networks, train, train.goal_statistics, goals))(train, by_seed(goal))
+    policies = jax.vmap(algorithm.policy_params)(train.agent, train.statistics)
+    aims = jax.vmap(algorithm.aim)(policies, by_seed(goal))
 
-    def act(train: TrainState, goal_latents: jax.Array, key: jax.Array, observations: jax.Array) -> jax.Array:
-        return choose_actions(networks, train, goal_latents, exploration, key, observations, draws)
+    def act(policy: Any, aim: Any, key: jax.Array, observations: jax.Array) -> jax.Array:
+        return explore(algorithm.act(policy, observations, aim), exploration, key, draws)
 
     def step(carry, step_keys):
         state, observation = carry
-        action = jax.vmap(act)(train, goal_latents, step_keys, by_seed(observation)).reshape(num_seeds * num_envs, -1)
+        action = jax.vmap(act)(policies, aims, step_keys, by_seed(observation)).reshape(num_seeds * num_envs, -1)
         state = jax.vmap(env.advance)(state, action)
         observation = seen(jax.vmap(env.observe)(state), step_keys, _STEP_NOISE)
         step_results = tuple(kept(leaf) for leaf in (observation, state.achieved_state, action))

@@ -19,14 +19,15 @@ import jax
 import jax.numpy as jnp
 
 from jaxrl_vis.config import Config
+from jaxrl_vis.learner import ddpg, normalizer
 from jaxrl_vis.learner import iteration as iterations
+from jaxrl_vis.learner.algorithm import Algorithm, Setup
 from jaxrl_vis.learner.auxiliary import Auxiliary, make_auxiliary
-from jaxrl_vis.learner.ddpg import make_ddpg
 from jaxrl_vis.learner.evaluate import Evaluation, make_evaluate
 from jaxrl_vis.learner.iteration import Insert, Learned, Update
-from jaxrl_vis.learner.networks import Networks
+from jaxrl_vis.learner.networks import Networks, compute_dtype
 from jaxrl_vis.learner.replay import Replay, make_replay, num_bytes
-from jaxrl_vis.learner.rollout import Exploration, play
+from jaxrl_vis.learner.rollout import Acting, Exploration, play
 from jaxrl_vis.learner.rollout_parts import Played, RolloutPart, part_size, played_spec
 from jaxrl_vis.learner.sampling import Sampler
 from jaxrl_vis.learner.sharding import Layout, make_layout
@@ -48,7 +49,7 @@ class TrainStep:
     """The programs of a run, jitted and not compiled yet, and what they were made of; see `make_train_step`.
 
     Attributes:
-        env, config, resolved, networks, auxiliary: Parts that the programs were made of.
+        env, config, resolved, acting, auxiliary: Parts that the programs were made of.
         replay: Sizes of one device's part of a learner's replay.
         layout: Placement of seeds and shards; all programs take and return arrays that lie there.
         exploration: Noise of training; an evaluation has none.
@@ -65,7 +66,7 @@ class TrainStep:
     env: GoalEnv
     config: Config
     resolved: Resolved
-    networks: Networks
+    acting: Acting
     auxiliary: Auxiliary
     replay: Replay
     layout: Layout
@@ -79,6 +80,16 @@ class TrainStep:
     evaluate: Any
     pure_insert: Insert
     pure_update: Update
+
+    @property
+    def algorithm(self) -> Algorithm:
+        """The algorithm."""
+        return self.acting.algorithm
+
+    @property
+    def networks(self) -> Networks:
+        """Networks of the algorithm, for tools that look inside it."""
+        return self.algorithm.networks
 
     @property
     def steps_per_iteration(self) -> int:
@@ -175,26 +186,30 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None) 
     resolved = resolve(validate(config), env.horizon)
     layout = make_layout(config) if layout is None else layout
     shards = layout.shards
-    networks = Networks(config, env.observation_spec, env.action_size, resolved.critic_output_bias)
-    auxiliary = make_auxiliary(config, env.observation_spec, env.action_size, env.frame_stack, networks.dtype)
-    algorithm = make_ddpg(networks, config, resolved, auxiliary, shards)
-    stacked = env.frame_stack if networks.sees_images else 1
+    auxiliary = make_auxiliary(config, env.observation_spec, env.action_size, env.frame_stack, compute_dtype(config))
+    algorithm = ddpg.make(Setup(config, resolved, env.observation_spec, env.action_size, auxiliary, shards))
+    acting = Acting(env, algorithm, config.observation_noise)
+    stacked = env.frame_stack if len(env.observation_spec.shape) == 3 else 1
     replay = make_replay(config.replay_transitions, config.num_envs, env.horizon, stacked, config.replay_mean_age)
     replay = replay._replace(num_envs=config.num_envs // shards.count)
     stored = auxiliary.stored_spec(env.observation_spec, env.horizon)
     replay_spec = replay.spec(env.observation_spec, env.goal_state_size, env.action_size, stored)
     sampler = Sampler(config, resolved, replay, env.threshold, env.as_goal if stacked > 1 else None, auxiliary, shards)
     insert = iterations.make_insert(config, sampler, auxiliary)
-    update = iterations.make_update(config, sampler, algorithm)
     with tracing_for_default_device():
         plays_any = targets_cpu() and layout.mesh is None
     num_played = part_size(config.num_envs) if plays_any else config.num_envs // shards.count
+
+    def init_learner(key: jax.Array) -> TrainState:
+        statistics = normalizer.init(env.observation_spec)
+        of_goals = normalizer.init(env.observation_spec) if config.normalizers == "separate" else None
+        return TrainState(algorithm.init(key), statistics, of_goals)
 
     def init(keys: jax.Array) -> LoopState:
         # Of all seeds at once. Those of one seed, repeated under `vmap`, would lie in memory beside them.
         empty = jax.tree.map(lambda leaf: jnp.zeros((len(keys), *leaf.shape), leaf.dtype), replay_spec)
         return LoopState(
-            train=jax.vmap(algorithm.init)(keys),
+            train=jax.vmap(init_learner)(keys),
             replay=jax.vmap(lambda replay_state: layout.folded(replay_state, replay.num_envs))(empty),
             key=keys,
             iteration=jnp.zeros((), jnp.int32),
@@ -205,10 +220,10 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None) 
 
     def play_part(train: TrainState, keys: jax.Array, first: jax.Array, exploration: Exploration) -> Played:
         draws = RolloutPart(first, config.num_envs) if plays_any else shards
-        episodes, outcome, _ = play(env, networks, train, keys, num_played, exploration, draws=draws)
+        episodes, outcome, _ = play(acting, train, keys, num_played, exploration, draws=draws)
         return episodes, outcome
 
-    learn = iterations.make_learn(insert, update, algorithm, sampler, layout)
+    learn = iterations.make_learn(config, insert, algorithm, sampler, layout)
     seeds, environments, whole = layout.by_seed, layout.by_environment, layout.everywhere
     host = layout.read_by_host
 
@@ -219,7 +234,7 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None) 
         env=env,
         config=config,
         resolved=resolved,
-        networks=networks,
+        acting=acting,
         auxiliary=auxiliary,
         replay=replay,
         layout=layout,
@@ -238,11 +253,11 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None) 
         ),
         evaluate=spread(
             "evaluate",
-            make_evaluate(env, networks, config, shards),
+            make_evaluate(acting, config.eval_episodes, shards),
             (seeds, whole),
             Evaluation(seeds, environments),  # type: ignore[arg-type]
             kept_as=Evaluation(host, host) if jax.process_count() > 1 else None,  # type: ignore[arg-type]
         ),
         pure_insert=insert,
-        pure_update=update,
+        pure_update=iterations.make_update(config, sampler, algorithm),
     )

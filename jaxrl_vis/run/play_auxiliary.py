@@ -98,12 +98,12 @@ def _predict(networks: Networks, auxiliary: Auxiliary, train: TrainState, episod
     batch = Batch(jnp.stack([before, goals, after]), actions, nothing, nothing)
     batch = auxiliary.with_targets(key, batch, episode.stored)
     names = ("before", "after", *batch.views)
-    inputs = networks.prepare_batch(networks.batch_scaling(train), batch)
-    latents = networks.encode_pieces(train.critic, inputs.pieces(*names))
+    inputs = networks.prepare_batch(networks.batch_scaling(train.statistics), batch)
+    latents = networks.encode_pieces(train.agent.critic, inputs.pieces(*names))
     latent_t, latent_tp1, *of_views = latents.reshape(len(names), count, networks.config.latent_size)
     image = networks.normalize(networks.scaling(train.normalizer), before) if auxiliary.needs_image else None
     view = View(latent_t, actions, latent_tp1, image)
-    predicted = auxiliary.predictions(train.critic["heads"], view, dict(zip(batch.views, of_views, strict=True)), batch)
+    predicted = auxiliary.predictions(train.agent.critic["heads"], view, dict(zip(batch.views, of_views, strict=True)), batch)
     found: dict[str, Any] = {}
     if "autoencoder" in predicted:
         found["reconstruction"] = _as_image(networks, train, predicted["autoencoder"])
