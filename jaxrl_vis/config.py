@@ -9,7 +9,7 @@ from typing import Any, Literal, Self
 
 from jaxrl_vis import fields
 from jaxrl_vis.errors import RequestError, nearest
-from jaxrl_vis.methods import METHODS, AuxTaskName, MethodName, WeightingName
+from jaxrl_vis.methods import METHODS, AlgorithmName, AuxTaskName, MethodName, WeightingName
 
 # Values that a field allows, for everything that asks: checks, the command line and its help.
 Pixels = Literal["rgbd", "rgb", "depth"]
@@ -32,7 +32,9 @@ class Config:
     """The preset that this configuration started from; kept for the record."""
     method: MethodName = "oracle"
     """Where rewards come from: the true state (oracle), similarity in the latent space of an autoencoder that is trained along,
-    or equality of observations (indicator), without or with balancing and filtering."""
+    or equality of observations (indicator), without or with balancing and filtering; module:Name is one of your own."""
+    algorithm: AlgorithmName = "ddpg"
+    """What learns; module:Name is one of your own."""
     seed: int = 0
     """First seed."""
     seeds: int = 1
@@ -128,9 +130,9 @@ class Config:
 
     # -- Auxiliary losses (thesis, section 5.2; docs/auxiliary_losses.md)
     aux_tasks: tuple[AuxTaskName, ...] = ()
-    """What the encoders also learn to predict."""
+    """What the encoders also learn to predict; module:Name is one of your own."""
     weighting: WeightingName = "none"
-    """How much each auxiliary loss counts."""
+    """How much each auxiliary loss counts; module:Name is one of your own."""
     weighting_interval: int = 5
     """N of OL-AUX: gradient steps from one change of the weights to the next; divides updates_per_iteration."""
     weighting_beta: float | None = None
@@ -304,9 +306,10 @@ def preset(name: str, **overrides: Any) -> Config:
     config = PRESETS[name]
     env = str(overrides.get("env", config.env))
     of_task = OF_TASK.get((name, env.removeprefix("Visual")), {})
-    method = METHODS.get(overrides.get("method", config.method))
+    method_name = overrides.get("method", config.method)
+    method = METHODS.get(method_name)
     left_out: tuple[str, ...] = ()
-    if method is not None and method.reward != "oracle":
+    if ":" in str(method_name) or (method is not None and method.reward != "oracle"):
         left_out += OF_ORACLE
     if not env.startswith("Visual") or (method is not None and method.reward == "autoencoder"):
         left_out += OF_IMAGES

@@ -260,16 +260,13 @@ def test_an_actor_learns_the_logarithm_of_value_and_penalty_together_where_asked
     np.testing.assert_allclose(metrics["train/actor_loss"], np.log(penalty), atol=0.2)
 
 
-def test_a_head_begins_alike_wherever_its_task_stands_in_the_list(monkeypatch):
+def test_a_head_begins_alike_wherever_its_task_stands_in_the_list():
     """Runs of the thesis's five tasks repeat themselves, and a task from elsewhere needs no place among them."""
     key = jax.random.key(3)
-    before = [*ALL]
-    monkeypatch.setattr(auxtasks, "NAMES", ("new_one", *reversed(before)))
-    tasks = {
-        name: auxtasks.AuxTask(name, frozenset(), lambda key: {"key": jax.random.key_data(key)}, lambda *_: 0.0, lambda *_: 0.0)
-        for name in ("new_one", *before, "another")
-    }
+    made = list(auxtasks.make([*reversed(ALL)], auxtasks.Spec(SPEC, ACTIONS, 8)).values())
+    new = [auxtasks.AuxTask(name, made[0].init, lambda *_: 0.0, lambda *_: 0.0) for name in ("new_one", "another")]
+    tasks = {task.name: task._replace(init=lambda key: {"key": jax.random.key_data(key)}) for task in (new[0], *made, new[1])}
     heads = Auxiliary(tasks, make_weighting("balance")).init_heads(key)
-    for number, name in enumerate(before):
+    for number, name in enumerate(ALL):
         np.testing.assert_array_equal(heads[name]["key"], jax.random.key_data(jax.random.fold_in(key, number)))
     assert len({tuple(head["key"].tolist()) for head in heads.values()}) == 7

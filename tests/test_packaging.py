@@ -17,10 +17,12 @@ ROOT = Path(__file__).resolve().parents[1]
 
 # Folders and single files of jaxrl_vis. A folder imports from earlier rows only; files of one row do not import each other.
 LAYERS: tuple[tuple[str, ...], ...] = (
-    ("errors", "methods", "streams"),
+    ("errors", "streams"),
     ("fields",),
+    ("methods",),
     ("cache_entries", "config", "types", "provenance", "files", "spreadsheets"),
-    ("devices", "parameters", "processes", "resolved", "validation"),
+    ("devices", "parameters", "plugins", "processes", "validation"),
+    ("resolved",),
     ("learner",),
     ("report",),
     ("run",),

@@ -149,4 +149,4 @@ def test_a_single_image_is_left_alone():
             raise AssertionError("a single image is a goal already")
 
     made = train_step.make_train_step(Rigid(1), preset("debug", method="indicator_balance_filter", **SETTINGS))
-    jax.eval_shape(functools.partial(train_iteration, made), jax.eval_shape(made.init, jax.random.key(0)[None]))
+    jax.eval_shape(made.learn, jax.eval_shape(made.init, jax.random.key(0)[None]), made.parts_spec)

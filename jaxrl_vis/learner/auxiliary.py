@@ -14,7 +14,8 @@ from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import auxtasks
 from jaxrl_vis.learner.auxtasks import AuxTask, Spec, Transitions, View
-from jaxrl_vis.learner.weighting import MAIN, Way, Weighting, WeightingState, make_weighting
+from jaxrl_vis.learner.weighting import MAIN, WEIGHTINGS, Way, Weighting, WeightingState, make_weighting
+from jaxrl_vis.plugins import call, find
 from jaxrl_vis.types import Batch, Episodes, Params
 
 _EPISODES_AT_ONCE = 10  # whose arrays are computed together: some 500 images fill a GPU, and more would fill its memory
@@ -142,7 +143,11 @@ def make_auxiliary(
     Raises:
         RequestError: They do not go together, or not with the rest of the configuration.
     """
-    weighting = make_weighting(config.weighting, **_options(config))
+    if config.weighting in WEIGHTINGS:
+        weighting = make_weighting(config.weighting, **_options(config))
+    else:
+        maker = find("weighting", config.weighting, WEIGHTINGS, config.env_folder)
+        weighting = call("weighting", config.weighting, maker, of=Weighting)
     if config.aux_tasks and not weighting.auxiliary:
         raise RequestError(
             f"aux_tasks are given, but weighting {config.weighting} learns none: choose --weighting ol_aux, or leave them out"
@@ -161,7 +166,7 @@ def make_auxiliary(
     options = auxtasks.RELEASE if config.aux_form == "release" else auxtasks.Options()
     spec = Spec(observation, action_size, config.latent_size, frame_stack, len(config.encoder_filters), dtype, options)
     way: Way = "per_loss" if weighting.needs == "gradients" else "latents"
-    return Auxiliary(auxtasks.make(config.aux_tasks, spec), weighting, way)
+    return Auxiliary(auxtasks.make(config.aux_tasks, spec, config.env_folder), weighting, way)
 
 
 def _options(config: Config) -> dict[str, Any]:

@@ -18,7 +18,6 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import auxtasks
 from jaxrl_vis.learner.networks import Inputs, Networks
 from jaxrl_vis.learner.normalizer import Scaling
-from jaxrl_vis.methods import METHODS
 from jaxrl_vis.resolved import Resolved
 from jaxrl_vis.types import Batch, Params, Replaceable
 
@@ -128,7 +127,7 @@ def make_latent_reward(networks: Networks, config: Config, resolved: Resolved) -
     Raises:
         RequestError: Observations are no images.
     """
-    method = METHODS[config.method]
+    method = resolved.method
     if method.needs_images and not networks.sees_images:
         raise RequestError(
             f"method {config.method} encodes images, and {config.env} shows states: train on Visual{config.env}, or use "

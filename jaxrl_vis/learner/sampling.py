@@ -20,7 +20,6 @@ from jaxrl_vis.learner.draws import scaled
 from jaxrl_vis.learner.relabel import choose_goal_slots
 from jaxrl_vis.learner.replay import Indices, Replay
 from jaxrl_vis.learner.shards import ONE, Shards
-from jaxrl_vis.methods import METHODS
 from jaxrl_vis.resolved import Resolved
 from jaxrl_vis.types import Batch, ReplayState
 from jaxrl_vis_envs import goals
@@ -148,7 +147,7 @@ class Sampler:
         if self.config.n_step > 1:
             return self._rewarded_over_steps(state, choice, batch)
         batch = batch.replace(success=goals.success(batch.state_tp1, batch.goal_state, self.threshold))
-        if METHODS[self.config.method].reward == "autoencoder":
+        if self.resolved.method.reward == "autoencoder":
             return batch  # the learner rewards it, with the encoder as it is by then (`latent_reward`)
         return batch.replace(reward=self.reward(batch, reached, choice.clutter_end))
 
@@ -175,8 +174,11 @@ class Sampler:
             clutter_end: As of `Choice`.
         """
         values = {"positive": self.resolved.reward_positive, "negative": self.resolved.reward_negative}
-        if METHODS[self.config.method].reward == "oracle":
+        method = self.resolved.method
+        if method.reward == "oracle":
             return self._estimated_reward(batch, clutter_end)
+        if callable(method.reward):
+            return method.reward(batch, reached, values["positive"], values["negative"])
         return goals.indicator_reward(reached, batch.goal, num_axes=reached.ndim - 1, **values)
 
     def _estimated_reward(self, batch: Batch, clutter_end: jax.Array | None) -> jax.Array:

@@ -13,6 +13,7 @@ or of one learner.
 import dataclasses
 import functools
 import math
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -31,6 +32,7 @@ from jaxrl_vis.learner.rollout import Acting, Exploration, play
 from jaxrl_vis.learner.rollout_parts import Played, RolloutPart, part_size, played_spec
 from jaxrl_vis.learner.sampling import Sampler
 from jaxrl_vis.learner.sharding import Layout, make_layout
+from jaxrl_vis.plugins import call, find
 from jaxrl_vis.resolved import Resolved, resolve
 from jaxrl_vis.types import Episodes, LoopState, Metrics, ReplayState, TrainState
 from jaxrl_vis.validation import validate
@@ -39,6 +41,9 @@ from jaxrl_vis_envs.compilation import env_jit, targets_cpu, tracing_for_default
 
 JIT_OPTIONS: dict[str, dict[str, Any]] = {"init": {"runs_once": True}, "learn": {"donate_argnums": 0}}
 """Arguments of `env_jit` for the programs that have some."""
+
+ALGORITHMS: dict[str, Callable[[Setup], Algorithm]] = {"ddpg": ddpg.make}
+"""Functions that make the built-in algorithms."""
 
 # A leading seed axis on everything but the iteration, which all seeds share (see `replay`).
 _SEED_AXES = LoopState(train=0, replay=0, key=0, iteration=None)  # type: ignore[arg-type]
@@ -187,7 +192,9 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None) 
     layout = make_layout(config) if layout is None else layout
     shards = layout.shards
     auxiliary = make_auxiliary(config, env.observation_spec, env.action_size, env.frame_stack, compute_dtype(config))
-    algorithm = ddpg.make(Setup(config, resolved, env.observation_spec, env.action_size, auxiliary, shards))
+    setup = Setup(config, resolved, env.observation_spec, env.action_size, auxiliary, shards)
+    maker = find("algorithm", config.algorithm, ALGORITHMS, config.env_folder)
+    algorithm = call("algorithm", config.algorithm, maker, setup, of=Algorithm)
     acting = Acting(env, algorithm, config.observation_noise)
     stacked = env.frame_stack if len(env.observation_spec.shape) == 3 else 1
     replay = make_replay(config.replay_transitions, config.num_envs, env.horizon, stacked, config.replay_mean_age)
@@ -197,7 +204,7 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None) 
     sampler = Sampler(config, resolved, replay, env.threshold, env.as_goal if stacked > 1 else None, auxiliary, shards)
     insert = iterations.make_insert(config, sampler, auxiliary)
     with tracing_for_default_device():
-        plays_any = targets_cpu() and layout.mesh is None
+        plays_any = targets_cpu() and layout.mesh is None and shards.count == 1
     num_played = part_size(config.num_envs) if plays_any else config.num_envs // shards.count
 
     def init_learner(key: jax.Array) -> TrainState:

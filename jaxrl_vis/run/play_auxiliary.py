@@ -52,9 +52,11 @@ def play_auxiliary(run_dir: Path | str, out: Path | str, episodes: int = 6, trus
     # A rollout is what it takes; its exploration is switched off.
     trainer = open_run(run_dir, trust=trust, num_envs=episodes, random_action_probability=0.0, action_noise=0.0)
     env, config, networks = trainer.env, trainer.config, trainer.program.networks
-    train = jax.tree.map(lambda leaf: jnp.asarray(leaf[:1]), load(trainer, run_dir).train)
+    if networks is None:
+        raise RequestError(f"--aux shows what networks of ddpg predict, and the run in {run_dir} has {config.algorithm}")
+    train = load(trainer, run_dir).train
     enable_compilation_cache()
-    parts = trainer.programs.play(train, trainer.programs.evaluation_key[None])
+    parts = trainer.programs.play(train, jnp.stack([trainer.programs.evaluation_key] * config.seeds))
     played, outcome = jax.tree.map(lambda *leaves: join_parts(leaves, episodes, axis=1), *parts)
     auxiliary = trainer.program.auxiliary
 

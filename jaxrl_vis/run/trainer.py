@@ -20,6 +20,7 @@ from jaxrl_vis.devices import check_devices, enable_compilation_cache, hush_cach
 from jaxrl_vis.errors import NonFiniteError, RequestError, Terminated
 from jaxrl_vis.learner.environment import locate_env, make_env
 from jaxrl_vis.learner.train_step import make_train_step
+from jaxrl_vis.plugins import own_names
 from jaxrl_vis.run import loggers
 from jaxrl_vis.run.compiled.programs import Programs
 from jaxrl_vis.run.folder import RunFolder, default_folder, read_log
@@ -193,7 +194,7 @@ def make_trainer(
         hush_cache()
         with shielded_children():  # threads that JAX starts with its first use of a device never see signals
             start_devices()
-            if is_built_in(config.env):
+            if is_built_in(config.env) and not own_names(config):
                 locate_env(config)  # imports MuJoCo, meanwhile
             check_devices()
         config = locate_env(config)

@@ -12,9 +12,10 @@ and samples what the tasks of a run declare, and knows none of them by name.
 
 from collections.abc import Callable, Sequence
 
-from jaxrl_vis.errors import RequestError, nearest
+from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.auxtasks import autoencoder, egomotion, forward_dynamics, inverse_dynamics, optical_flow
 from jaxrl_vis.learner.auxtasks.task import RELEASE, AuxTask, Options, Spec, Transitions, View
+from jaxrl_vis.plugins import call, find
 
 __all__ = ["NAMES", "RELEASE", "AuxTask", "Options", "Spec", "Transitions", "View", "make"]
 
@@ -30,19 +31,19 @@ NAMES: tuple[str, ...] = tuple(_MAKERS)
 """The tasks; first those of the thesis, in its order."""
 
 
-def make(names: Sequence[str], spec: Spec) -> dict[str, AuxTask]:
-    """Make the tasks of these names, by name.
+def make(names: Sequence[str], spec: Spec, folder: str | None = None) -> dict[str, AuxTask]:
+    """Make the tasks of these names, by `AuxTask.name`.
 
     Args:
-        names: Some of `NAMES`, or none.
+        names: Some of `NAMES`, and ``module:Name`` of functions of a `Spec` that return an `AuxTask`; or none.
         spec: Sizes of the observation, the action and the latent.
+        folder: Folder from which modules are imported first.
 
     Raises:
         RequestError: A name is unknown or given twice, or there are no images.
     """
+    makers = [find("auxiliary task", name, _MAKERS, folder) for name in names]
     for name in names:
-        if name not in NAMES:
-            raise RequestError(f"unknown auxiliary task {name!r}{nearest(name, NAMES)}")
         if names.count(name) > 1:
             raise RequestError(f"auxiliary task {name} is given twice; give it once")
     shape = spec.observation.shape
@@ -51,4 +52,8 @@ def make(names: Sequence[str], spec: Spec) -> dict[str, AuxTask]:
             f"auxiliary tasks ({', '.join(names)}) train an encoder of images, and here observations are states of "
             f"{shape[0]} numbers: choose a task that shows images (its name begins with Visual), or no auxiliary tasks"
         )
-    return {name: _MAKERS[name](spec) for name in names}
+    made = [call("auxiliary task", name, maker, spec, of=AuxTask) for name, maker in zip(names, makers)]
+    tasks = {task.name: task for task in made}
+    if len(tasks) < len(made):
+        raise RequestError(f"two auxiliary tasks call themselves alike ({', '.join(task.name for task in made)}): rename one")
+    return tasks

@@ -5,7 +5,7 @@ stored as StableHLO (`jax.export`), next to XLA's cache: reading it runs no code
 
 A program belongs to one fingerprint: the code of both packages, the versions of the libraries, the configuration, JAX's
 settings and the device. It does not cover what a process has replaced in its own modules (a patched loss, say). So only
-commands use the cache, not scripts and notebooks, and not with environments from elsewhere. ``JAXRL_VIS_KEEP_PROGRAMS=0`` turns
+commands use the cache, not scripts and notebooks, and not with parts from elsewhere. ``JAXRL_VIS_KEEP_PROGRAMS=0`` turns
 it off.
 
 Whoever writes a stored program decides what a run computes. So folder and files are kept for the user alone, nothing is read
@@ -33,6 +33,7 @@ from jaxrl_vis.files import make_private, read_private, replacing, stranger_to
 from jaxrl_vis.learner.evaluate import Evaluation
 from jaxrl_vis.learner.iteration import Learned
 from jaxrl_vis.learner.rollout import Exploration
+from jaxrl_vis.plugins import own_names
 from jaxrl_vis.provenance import device_record, versions
 from jaxrl_vis.types import Episodes
 from jaxrl_vis_envs.base import GoalEnv
@@ -58,7 +59,7 @@ _WITHOUT_EFFECT = ("cache", "log", "dump", "dir", "timeout", "traceback")
 
 def fingerprint(config: Config, env: GoalEnv) -> str | None:
     """Return a digest of all that the programs of a run depend on, hexadecimal; None if they are not to be kept."""
-    is_ours = type(env).__module__.partition(".")[0] in _PACKAGES
+    is_ours = type(env).__module__.partition(".")[0] in _PACKAGES and not own_names(config)
     if not is_ours or os.environ.get(VARIABLE) == "0":
         return None
     settings = {name: value for name, value in jax.config.values.items() if not any(part in name for part in _WITHOUT_EFFECT)}
