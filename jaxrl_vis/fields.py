@@ -46,6 +46,7 @@ def _plain(hint: Any) -> Any:
 
 
 def _names(hint: Any) -> Names | None:
+    """Return the `Names` of an annotation of one value; None where it is of another kind."""
     return next((extra for extra in getattr(hint, "__metadata__", ()) if isinstance(extra, Names)), None)
 
 
@@ -70,6 +71,11 @@ def unwrap(hint: Any) -> tuple[Any, bool, bool]:
     if typing.get_origin(hint) is tuple:
         hint, several = typing.get_args(hint)[0], True
     return hint, optional, several
+
+
+def names_parts(hint: Any) -> bool:
+    """Return True if a field with this annotation names a part, or several."""
+    return _names(unwrap(hint)[0]) is not None
 
 
 def is_known(hint: Any) -> bool:

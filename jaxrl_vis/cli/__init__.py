@@ -8,6 +8,7 @@ where the reader of what a command prints has left.
 """
 
 import errno
+import functools
 import inspect
 import os
 import sys
@@ -108,7 +109,7 @@ def main(words: Sequence[str] | None = None, give_up: Callable[[int], None] | No
 
 def _status_of(words: Sequence[str], ending: Ending) -> int:
     try:
-        return _run(words)
+        return _command(words)()
     except tuple(_STATUS) as error:
         if ending.signal is not None:  # which went to children as well, most likely
             return _ended_by(ending.signal)
@@ -190,16 +191,21 @@ def command_of(words: Sequence[str]) -> tuple[str, Sequence[str]]:
     return f"{name} {rest[0]}", rest[1:]
 
 
-def _run(words: Sequence[str]) -> int:
+def _command(words: Sequence[str]) -> Callable[[], int]:
+    """Read a command line, and return the command with its options; what is left to do after help is nothing."""
     if not words:
         first = dict.fromkeys(each.split()[0] for each in COMMANDS)
         raise RequestError(f"no command given; choose one of {', '.join(first)} (or see {PROGRAM} --help)")
     if words[0] in ("-h", "--help", "--version"):
         print(jaxrl_vis.__version__ if words[0] == "--version" else overview())
-        return 0
+        return _nothing
     if len(words) > 1 and words[1] in ("-h", "--help") and any(each.startswith(f"{words[0]} ") for each in COMMANDS):
         print(overview(f"{words[0]} "))
-        return 0
+        return _nothing
     name, rest = command_of(words)
     command, run = COMMANDS[name]
-    return run(parse(command, rest, name))
+    return functools.partial(run, parse(command, rest, name))
+
+
+def _nothing() -> int:
+    return 0

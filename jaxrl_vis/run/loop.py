@@ -17,7 +17,7 @@ import dataclasses
 import math
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -74,9 +74,17 @@ class RunLoop:
         programs: What to run.
         folder: Where its files go.
         log: Names of the loggers that are told, see `loggers`.
+        on_begun: Called when the folder is this run's.
     """
 
-    def __init__(self, programs: Programs, folder: RunFolder, log: tuple[str, ...] = ()):
+    def __init__(
+        self,
+        programs: Programs,
+        folder: RunFolder,
+        log: tuple[str, ...] = (),
+        on_begun: Callable[[], None] = lambda: None,
+    ):
+        self._on_begun = on_begun
         self._programs, self._folder = programs, folder
         self._config, self._program = programs.config, programs.program
         self._writes = processes.is_first()
@@ -227,6 +235,7 @@ class RunLoop:
         processes.meet("opened")
         self._checkpoints.run_id = read_run_id(self._folder.path)
         self.has_begun = True
+        self._on_begun()
         with self._saver.writing():
             foreign = self._checkpoints.set_foreign_aside()
             damaged = self._checkpoints.set_aside_after(self._done) if goes_on else []

@@ -150,12 +150,12 @@ class Trainer:
             Terminated: A signal other than Ctrl-C, after saving.
             KeyboardInterrupt: Ctrl-C, after saving.
         """
-        loop = RunLoop(self.programs, self.folder, self._log)
-        try:
-            yield from loop.reports(self._resume, self._overwrite)
-        finally:
-            if loop.has_begun:  # asked again, it goes on; a finished run says that there is nothing left to do
-                self._resume, self._overwrite = True, False
+        loop = RunLoop(self.programs, self.folder, self._log, self._go_on_next_time)
+        return loop.reports(self._resume, self._overwrite)
+
+    def _go_on_next_time(self) -> None:
+        """Resume where `run` is called again; a finished run says that there is nothing left to do."""
+        self._resume, self._overwrite = True, False
 
 
 def _check_key(function: str, key: Any) -> None:
