@@ -24,7 +24,7 @@ BIN := .venv/bin
 STAMPS := .venv/stamps
 ACCELERATOR := $(shell nvidia-smi -L >/dev/null 2>&1 && echo gpu || echo base)
 
-.PHONY: help train test fuzz docs lint format bench-cpu pins clean
+.PHONY: help train test fuzz docs lint format bench-cpu tables stale pins clean
 .DEFAULT_GOAL := help
 
 help: ## Show this list
@@ -57,6 +57,12 @@ format: $(STAMPS)/dev ## Mend style and format
 bench-cpu: $(STAMPS)/base ## Run the five benchmarks at CPU sizes; records land in your cache, or in RESULTS=folder
 	@for benchmark in render physics env update train; do \
 		JAX_PLATFORMS=cpu $(BIN)/jaxrl-vis bench $$benchmark $(if $(RESULTS),--results "$(RESULTS)") $(ARGS); done
+
+tables: $(STAMPS)/dev ## Write the tables of README and docs from the records in benchmarks/results
+	@JAX_PLATFORMS=cpu $(BIN)/python -m benchmarks.ledger tables
+
+stale: $(STAMPS)/dev ## List records that are older than the code they measured, and rows without a record
+	@JAX_PLATFORMS=cpu $(BIN)/python -m benchmarks.ledger stale
 
 pins: .venv/bin/python ## Write requirements/*.txt anew
 	@$(PINS) $(PINS_ARGS) pyproject.toml -c requirements/cpu.in -o requirements/base.txt

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from benchmarks import environments
+from benchmarks.tasks import environments
 from jaxrl_vis_envs import registry
 from jaxrl_vis_envs.base import State
 

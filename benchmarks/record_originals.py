@@ -1,4 +1,4 @@
-"""Records the original environments, for benchmarks/parity.py to compare ours with.
+"""Recorder of the original environments, for the comparison by benchmarks/parity.py.
 
     python benchmarks/record_originals.py ENV FILE.npz [--sequences 24] [--seed 0] [--lower 0]
 
@@ -39,7 +39,7 @@ def sample_actions(rng: np.random.Generator, sequences: int, size: int, lower: f
 
 
 def play(env, actions: np.ndarray, read: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """What ``read`` gives at the T + 1 instants of each sequence: [N, T + 1, ...] float32."""
+    """Play sequences and read the state at their T + 1 instants: [N, T + 1, ...] float32."""
     sequences = []
     for number, sequence in enumerate(actions):
         env.reset(seed=number)

@@ -7,7 +7,7 @@ Every model of tests/render_models.py is drawn in N seeded random poses by both,
 off. What is measured, and the bounds, are in tests/render_comparison.py. The exit status is 1 where a bound does not hold. A
 model that our renderer refuses is a row of the table like any other, with the reason. `--page` writes the table of the rows
 that --out holds into docs/renderer_parity.md. With a FOLDER of anyone's models (MJCF or URDF, at any depth) these are
-compared, each at its start and in a scattered pose: see `render_folder`.
+compared, each at its start and in a scattered pose: see `rendering.model_folder`.
 """
 
 import argparse
@@ -31,11 +31,12 @@ import numpy as np  # noqa: E402
 import render_models  # noqa: E402
 from render_comparison import BOUNDS, Tally, surface_kinds  # noqa: E402
 
-from benchmarks import render_folder  # noqa: E402
+from benchmarks.ledger.markers import fill  # noqa: E402
+from benchmarks.rendering import model_folder  # noqa: E402
 from jaxrl_vis_envs.render.reference import ReferenceRenderer  # noqa: E402
 
 TARGET = ROOT / "benchmarks" / "results" / "render_parity.json"
-PAGE, MARK = ROOT / "docs" / "renderer_parity.md", "<!-- table -->\n"
+PAGE = ROOT / "docs" / "renderer_parity.md"
 BATCH = 10  # poses that we draw at a time
 COLUMNS = {
     "segmentation": ("segm %", 100.0, 3),
@@ -88,7 +89,7 @@ def compare(name: str, poses: int, size: int) -> dict[str, Any]:
 
 
 def named(mj_model: mujoco.MjModel, worst: tuple[float, int, int]) -> dict[str, Any]:
-    """Where the worst of a measure was found."""
+    """Name the model and pose with the worst value of a measure."""
     _, number, pose = worst
     return {"object": number, "name": mj_model.geom(number).name if 0 <= number < mj_model.ngeom else "", "pose": pose}
 
@@ -123,13 +124,18 @@ def table(rows: Iterable[dict[str, Any]]) -> str:
     return "\n".join([table_head(), *map(table_row, rows)]) + "\n"
 
 
+def read_rows(file: pathlib.Path) -> list[dict[str, Any]]:
+    """Read the rows of a record."""
+    return json.loads(file.read_text())["rows"]
+
+
 def main() -> int:
     """Compares the models that were named, or all."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("models", nargs="*", metavar="MODEL", help="all if none is named; or the path of one folder of models")
     parser.add_argument("--poses", type=int, default=200)
     parser.add_argument("--size", type=int, help="height and width in pixels (default: 128, of a folder 96)")
-    parser.add_argument("--out", type=pathlib.Path, default=TARGET, help="rows of other models that this file holds are kept")
+    parser.add_argument("--out", type=pathlib.Path, default=TARGET, help="rows of other models that this file holds are stored")
     parser.add_argument("--print", action="store_true", help="only print the rows that --out holds")
     parser.add_argument("--page", action="store_true", help=f"only write the rows that --out holds into {PAGE.name}")
     parser.add_argument(
@@ -137,16 +143,16 @@ def main() -> int:
     )
     options = parser.parse_args()
     if len(options.models) == 1 and pathlib.Path(options.models[0]).is_dir():
-        return render_folder.report(pathlib.Path(options.models[0]), options.size or 96, options.pictures)
+        return model_folder.report(pathlib.Path(options.models[0]), options.size or 96, options.pictures)
     unknown = set(options.models) - set(render_models.MODELS)
     if unknown:
         parser.error(f"no model {', '.join(sorted(unknown))}; there are {', '.join(render_models.MODELS)}")
-    kept = json.loads(options.out.read_text()) if options.out.exists() else {"rows": []}
-    rows = {row["model"]: row for row in kept["rows"] if row["model"] in render_models.MODELS}
+    stored = json.loads(options.out.read_text()) if options.out.exists() else {"rows": []}
+    rows = {row["model"]: row for row in stored["rows"] if row["model"] in render_models.MODELS}
     versions = render_models.versions()  # first: a package may be missing
     failed = 0
     if options.page:
-        PAGE.write_text(PAGE.read_text().partition(MARK)[0] + MARK + table(rows.values()))
+        PAGE.write_text(fill(PAGE.read_text(), "table", table(rows.values())))
     if options.print or options.page:
         print(table(rows.values()), end="")
         return int(any(row["failures"] for row in rows.values()))

@@ -1,4 +1,4 @@
-"""How training scales over the devices of one machine, in one go: a table, and records.
+"""Scaling of training over the devices of one machine: a table, and records.
 
     python benchmarks/scaling.py [--devices 2 4 8] [--json FILE] [--quick]
 
@@ -203,18 +203,18 @@ class Figure:
     one: Timed
 
 
-def figures_of(base: Config, env: Any, numbers: list[int], batches: tuple[int, ...], seeds: int) -> list[Figure]:
+def make_figures(base: Config, env: Any, numbers: list[int], batches: tuple[int, ...], seeds: int) -> list[Figure]:
     """Everything that is measured."""
     one_of = {batch: Timed(base.replace(batch_size=batch), env, False) for batch in batches}
-    one_seeds, found = Timed(base.replace(seeds=seeds), env, True), []
+    one_seeds, figures = Timed(base.replace(seeds=seeds), env, True), []
     for count in numbers:
-        found.append(Figure("seeds", Timed(base.replace(seeds=seeds * count, devices=count), env, True), one_seeds))
+        figures.append(Figure("seeds", Timed(base.replace(seeds=seeds * count, devices=count), env, True), one_seeds))
         for batch, one in one_of.items():
             sizes = {"batch_size": batch, "num_envs": base.num_envs, "replay_transitions": base.replay_transitions}
             weak = base.replace(devices=count, **{name: size * count for name, size in sizes.items()})
             strong = base.replace(devices=count, batch_size=batch)
-            found += [Figure("weak", Timed(weak, env, False), one), Figure("strong", Timed(strong, env, False), one)]
-    return found
+            figures += [Figure("weak", Timed(weak, env, False), one), Figure("strong", Timed(strong, env, False), one)]
+    return figures
 
 
 def compare(kind: str, config: Config, one: list[float], seconds: list[float], ideal: int) -> tuple[str, Measurement]:
@@ -229,7 +229,7 @@ def compare(kind: str, config: Config, one: list[float], seconds: list[float], i
     """
     before, after = statistics.median(one), statistics.median(seconds)
     speedup = before / after * (1 if kind == "strong" else ideal)
-    spread = max((max(each) - min(each)) / statistics.median(each) for each in (one, seconds))
+    spread = max((max(cycles) - min(cycles)) / statistics.median(cycles) for cycles in (one, seconds))
     line = (
         f"{kind:10}{config.devices:8}{config.seeds:7}{config.batch_size:8}{config.num_envs:6}{1e3 * before:11,.1f} ms"
         f"{1e3 * after:11,.1f} ms{speedup:10.3f}{speedup / ideal:12.1%}{spread:9.1%}"
@@ -257,7 +257,7 @@ def measure_all_reduce(figure: Figure) -> tuple[str, Measurement]:
 
 
 def in_processes(figures: list[Figure], positions: list[int], times: list[list[float]]) -> list[tuple[str, Measurement]]:
-    """What two processes with half of the devices each take for the same: lines of the table, and the records.
+    """Time the same training by two processes with half of the devices each: lines of the table, and the records.
 
     Args:
         figures: To be trained once more, all on equally many devices.
@@ -279,22 +279,22 @@ def in_processes(figures: list[Figure], positions: list[int], times: list[list[f
     printed = [child.communicate()[0] for child in children]
     if any(child.returncode for child in children):
         raise SystemExit(f"two processes ended with {', '.join(str(child.returncode) for child in children)}")
-    found = []
+    results = []
     for figure, one, two in zip(figures, times, json.loads(printed[0].splitlines()[-1]), strict=True):
         line, measurement = compare("processes", figure.timed.config, one, two, 1)
         kind = f"scaling/processes_{figure.kind}"
-        found.append((line, dataclasses.replace(measurement, name=kind, unit="x one process")))
-    return found
+        results.append((line, dataclasses.replace(measurement, name=kind, unit="x one process")))
+    return results
 
 
 def measure_as_process(timed: list[Timed], cycles: int) -> None:
     """One of two processes: compiles and trains each configuration, and prints a list of the seconds of an iteration."""
     seconds = []
-    for each in timed:
-        each.compile()
+    for configuration in timed:
+        configuration.compile()
         processes.meet("compiled")
-        seconds.append(each.run(cycles))
-        each.loop = None
+        seconds.append(configuration.run(cycles))
+        configuration.loop = None
     print(json.dumps(seconds), flush=True)
 
 
@@ -302,7 +302,7 @@ def write_records(file: Path | None, watch: Watch, measurements: list[Measuremen
     """Writes what has been measured so far, if there is a file for it."""
     if file is not None:
         conditions = watch.conditions()
-        write_json(file, [to_record(each, conditions) for each in measurements])
+        write_json(file, [to_record(measurement, conditions) for measurement in measurements])
         print(f"records: {file}", flush=True)
 
 
@@ -339,7 +339,7 @@ def main() -> None:
     base = preset("fast", env=options.env, num_envs=envs, replay_transitions=100_000)
     base = base.replace(**QUICK, replay_transitions=50 * envs) if options.quick else base
     env = make_env(base)
-    figures = figures_of(base, env, numbers, SMALL_BATCHES if options.quick else BATCHES, options.seeds_per_device)
+    figures = make_figures(base, env, numbers, SMALL_BATCHES if options.quick else BATCHES, options.seeds_per_device)
     alone = list({id(figure.one): figure.one for figure in figures}.values())
     everything = [*alone, *(figure.timed for figure in figures)]
     if options.compile_only is not None:
@@ -365,21 +365,23 @@ def main() -> None:
         times[id(figure)] = figure.timed.run(options.cycles)
         ideal = figure.timed.config.devices
         keep(*compare(figure.kind, figure.timed.config, times[id(figure.one)], times[id(figure)], ideal))
-        is_last = figure is [each for each in figures if each.timed.config.devices == figure.timed.config.devices][-1]
+        is_last = figure is [other for other in figures if other.timed.config.devices == figure.timed.config.devices][-1]
         if is_last:  # one learner, of the smallest batch
             keep(*measure_all_reduce(figure))
             counts = (1, *(count for count in numbers if count < figure.timed.config.devices))
             for line in check_resume(
-                figure.timed, [figure.timed.config.replace(devices=each) for each in counts], env, figure.one
+                figure.timed, [figure.timed.config.replace(devices=count) for count in counts], env, figure.one
             ):
                 keep(line)
             figure.one.loop = None
         figure.timed.loop = None
     write_records(options.json, watch, measurements)
     if numbers[-1] % 2 == 0:
-        again = [each for each in figures if each.timed.config.devices == numbers[-1] and each.kind in ("seeds", "weak")][:2]
-        positions = [len(alone) + figures.index(each) for each in again]
-        for line, measurement in in_processes(again, positions, [times[id(each)] for each in again]):
+        again = [
+            figure for figure in figures if figure.timed.config.devices == numbers[-1] and figure.kind in ("seeds", "weak")
+        ][:2]
+        positions = [len(alone) + figures.index(figure) for figure in again]
+        for line, measurement in in_processes(again, positions, [times[id(figure)] for figure in again]):
             keep(line, measurement)
     took = time.perf_counter() - began
     print(

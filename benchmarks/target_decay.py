@@ -1,7 +1,7 @@
-"""Writes docs/lab/target_decay.md's tables from the kept runs, and draws its figure.
+"""Tables of docs/lab/target_decay.md, written from the stored runs.
 
-python benchmarks/target_decay.py            # write both
-python benchmarks/target_decay.py --check    # exit 1 if the page differs from the records
+python benchmarks/target_decay.py            write them (`make tables` does, too)
+python benchmarks/target_decay.py --check    exit 1 if the page differs from the records
 """
 
 import argparse
@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.ledger.markers import fill
+from benchmarks.ledger.records import CHECKOUT, RESULTS
 from jaxrl_vis.report.learning import curve, steps_to
 from jaxrl_vis.report.plots import show_steps
 from jaxrl_vis.run.folder import read_record
@@ -22,10 +24,7 @@ from jaxrl_vis.run.metrics import read_rows
 from jaxrl_vis.studies.authors import mean_difference, released_curves
 from jaxrl_vis.studies.seed_statistics import bootstrap_interval, interquartile_mean, permutation_p_value
 
-STUDIES = Path(__file__).parent / "results/studies"
-RUNS = STUDIES / "target_decay"
-PAGE = Path(__file__).parent.parent / "docs/lab/target_decay.md"
-BEGIN, END = "<!-- tables: begin -->", "<!-- tables: end -->"
+PAGE = CHECKOUT / "docs/lab/target_decay.md"
 SUCCESS = "eval/success"
 RELEASED_DECAY = 0.98
 VARIANTS = {"none": "without", "ol_aux_5": "OL-AUX-5"}
@@ -34,7 +33,7 @@ TASKS = {
     "VisualFingerTurn": ("VisualFingerTurn", (0.3, 0.5, 0.9), 1_000_000),
     "VisualHandReach-view=fingertips": ("VisualHandReach as the authors saw it", (0.1, 0.2, 0.3), 1_000_000),
 }
-"""Task as in a record's name -> heading, levels of success, and the budget over which success is averaged."""
+"""Heading, levels of success, and budget of the mean success, by the task in a record's name."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +42,7 @@ class Group:
 
     Attributes:
         rows: Evaluations of all seeds.
-        revisions: Revisions and devices of the runs.
+        revisions: Revisions and devices of the runs, in words.
     """
 
     rows: list[dict[str, Any]]
@@ -51,12 +50,12 @@ class Group:
 
     @property
     def seeds(self) -> list[int]:
-        """The seeds, ascending."""
+        """Seeds, ascending."""
         return sorted({row["seed"] for row in self.rows})
 
     @property
     def points(self) -> list[tuple[int, float]]:
-        """(environment steps, median success) where every seed was evaluated."""
+        """Curve of (environment steps, median success) at the evaluations that every seed has."""
         return curve(self.rows, SUCCESS)
 
     def means(self, budget: int) -> np.ndarray:
@@ -69,16 +68,16 @@ class Group:
         )
 
 
-def read_groups() -> dict[tuple[str, str, float], Group]:
-    """Kept runs by task, variant and decay; those of figure 5.4, seeds 0 to 4, where a decay was not run with fresh seeds."""
+def read_groups(studies: Path) -> dict[tuple[str, str, float], Group]:
+    """Read the runs by task, variant and decay; without fresh seeds at a decay, those of figure 5.4 (seeds 0 to 4)."""
     folders = collections.defaultdict(list)
-    for folder in sorted(RUNS.iterdir()):
+    for folder in sorted((studies / "target_decay").iterdir()):
         task, variant, decay = re.fullmatch(r"(.+)-(\w+)-paper-decay([\d.]+)-seeds\d+to\d+", folder.name).groups()
         folders[task, variant, float(decay)].append(folder)
     for task, variant in itertools.product(TASKS, VARIANTS):
         env, _, view = task.partition("-")
         name = f"{env}-{variant}-paper-{view and view + '-*-'}seeds*"
-        folders.setdefault((task, variant, RELEASED_DECAY), sorted((STUDIES / "ol_aux").glob(name)))
+        folders.setdefault((task, variant, RELEASED_DECAY), sorted((studies / "ol_aux").glob(name)))
     return {key: _read_group(key[2], parts) for key, parts in folders.items()}
 
 
@@ -91,13 +90,13 @@ def _read_group(decay: float, folders: list[Path]) -> Group:
 
 
 def steps_cell(group: Group, level: float) -> str:
-    """Environment steps to a level, or the budget within which it was not reached."""
+    """Format the environment steps to a level, or the budget that did not suffice."""
     steps = steps_to(group.points, level)
     return f"> {show_steps(group.points[-1][0])}" if steps is None else show_steps(steps)
 
 
 def task_table(task: str, groups: dict[tuple[str, str, float], Group]) -> list[str]:
-    """One row for each variant and decay."""
+    """Write the table of a task, one row per variant and decay."""
     title, levels, budget = TASKS[task]
     theirs = released_curves()
     lines = [
@@ -121,7 +120,7 @@ def task_table(task: str, groups: dict[tuple[str, str, float], Group]) -> list[s
 
 
 def comparison_table(groups: dict[tuple[str, str, float], Group]) -> list[str]:
-    """Table of what OL-AUX-5 adds at each decay: means, and the p-value of an exact permutation test."""
+    """Write the table of OL-AUX-5's gain at every decay: means, and the p-value of an exact permutation test."""
     lines = ["| task | decay | without | OL-AUX-5 | seeds | p |", "|---|---|---|---|---|---|"]
     for task, (title, _, budget) in TASKS.items():
         for decay in sorted({key[2] for key in groups if key[0] == task}, reverse=True):
@@ -137,23 +136,23 @@ def comparison_table(groups: dict[tuple[str, str, float], Group]) -> list[str]:
     return lines
 
 
-def tables() -> str:
-    """Everything between the markers."""
-    groups = read_groups()
+def tables(results: Path = RESULTS) -> str:
+    """Write all tables of the page, as Markdown."""
+    groups = read_groups(results / "studies")
     parts = [line for task in TASKS for line in [*task_table(task, groups), ""]]
-    made = sorted({text for group in groups.values() for text in group.revisions})
-    return "\n".join([*parts, *comparison_table(groups), "", f"Runs: {', '.join(made)}."]) + "\n"
+    revisions = sorted({text for group in groups.values() for text in group.revisions})
+    return "\n".join([*parts, *comparison_table(groups), "", f"Runs: {', '.join(revisions)}."]) + "\n"
 
 
 def main() -> int:
-    """Reads the command line and does what it asks for."""
+    """Run the command line; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true", help="compare, and write nothing")
     options = parser.parse_args()
-    head, _, rest = PAGE.read_text(encoding="utf-8").partition(BEGIN)
-    page = f"{head}{BEGIN}\n{tables()}{END}{rest.partition(END)[2]}"
+    text = PAGE.read_text(encoding="utf-8")
+    page = fill(text, "tables", tables())
     if options.check:
-        return int(page != PAGE.read_text(encoding="utf-8"))
+        return int(page != text)
     PAGE.write_text(page, encoding="utf-8")
     return 0
 

@@ -158,7 +158,8 @@ def _environments(workers: int) -> list[dict[str, str]]:
 
     devices = list_devices()
     threads = dict.fromkeys(_THREADS, str(max(num_cores() // workers, 1)))
-    share = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+    # Workers open no window; importing MuJoCo would start another process that looks for GLFW, and outlives its worker.
+    share = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false", "MUJOCO_GL": os.environ.get("MUJOCO_GL", "disable")}
     if cache := jax.config.jax_compilation_cache_dir:  # one compiles for all
         share["JAX_COMPILATION_CACHE_DIR"] = cache
     return [{**threads, **share, **devices[index % len(devices)].environment} for index in range(workers)]

@@ -3,6 +3,7 @@
 import gc
 import getpass
 import os
+import signal
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -35,6 +36,10 @@ os.environ["XLA_FLAGS"] = " ".join(
 import hypothesis
 import jax
 import pytest
+
+# A script's shell lets what it starts in the background ignore Ctrl-C, which would be passed on to runs that tests interrupt.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # The suite tries the same examples each time, so that a failure is of the change that is tested; `make fuzz` tries others.
 hypothesis.settings.register_profile(

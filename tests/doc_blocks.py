@@ -1,5 +1,6 @@
 """Reads the code of the README and of docs/: which blocks there are, and whether a line of a shell block could be typed."""
 
+import importlib.util
 import re
 import shlex
 import tomllib
@@ -84,6 +85,8 @@ def check_other(words: list[str]) -> None:
             found = re.fullmatch(r"\.(?:\[([\w,]+)\])?", word)
             assert found, f"pip install {word}: there is no such package in an index"
             assert set((found[1] or next(iter(extras))).split(",")) <= set(extras), word
+    elif program == "python" and rest[0] == "-m":
+        assert importlib.util.find_spec(rest[1]) is not None, f"there is no module {rest[1]}"
     elif program == "python" and not rest[0].startswith("-"):
         script = (ROOT / rest[0]).read_text()
         for word in rest:

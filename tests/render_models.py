@@ -20,7 +20,7 @@ import numpy as np
 from render_features import FEATURES, scene_spec, truth_of
 
 import jaxrl_vis_envs
-from jaxrl_vis.bench.render_scenes import forward, scatter_joints
+from jaxrl_vis.bench.scenes.models import forward, scatter_joints
 from jaxrl_vis_envs.compilation import compiler_options
 from jaxrl_vis_envs.render import Frame, Scene, render
 from jaxrl_vis_envs.render.model.cameras import FREE_CAMERA

@@ -210,9 +210,9 @@ def test_encoder_products_count_every_layer() -> None:
 
 
 def test_peaks_take_the_longest_name() -> None:
-    assert peaks.peak_of("NVIDIA H100 80GB HBM3") is peaks.PEAKS["NVIDIA H100 80GB HBM3"]
-    assert peaks.peak_of("NVIDIA H200 NVL") is peaks.PEAKS["NVIDIA H200"]
-    assert peaks.peak_of("cpu") is None
+    assert peaks.device_peak("NVIDIA H100 80GB HBM3") is peaks.PEAKS["NVIDIA H100 80GB HBM3"]
+    assert peaks.device_peak("NVIDIA H200 NVL") is peaks.PEAKS["NVIDIA H200"]
+    assert peaks.device_peak("cpu") is None
     shares = roofline.describe(roofline.Cost(989e9, 3.35e9), 0.01, "bfloat16", "NVIDIA H100 80GB HBM3")
     assert shares["share_of_peak_flops"] == pytest.approx(0.1)
     assert shares["share_of_peak_bandwidth"] == pytest.approx(0.1)
@@ -338,12 +338,12 @@ def test_settings_of_images_go_to_environments_that_have_them() -> None:
 def test_a_missing_opengl_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     import mujoco
 
-    from jaxrl_vis.bench import mujoco_renderer
+    from benchmarks.peers import mujoco as peer
 
     def no_renderer(*_, **__):
         raise RuntimeError("cannot\nconnect")
 
     monkeypatch.setattr(mujoco, "Renderer", no_renderer, raising=False)
     with pytest.raises(RequestError, match="needs OpenGL.*MUJOCO_GL") as caught:
-        mujoco_renderer.check()
+        peer.check()
     assert "\n" not in str(caught.value)

@@ -1,8 +1,8 @@
-"""Goals are attainable: a controller on the true state reaches them (the full figure: benchmarks/controllers.py)."""
+"""Goals are attainable: a controller on the true state reaches them (the full figure: benchmarks/tasks/controllers.py)."""
 
 import pytest
 
-from benchmarks import controllers
+from benchmarks.tasks import controllers
 
 EPISODES = {"FetchReach": 24, "FingerTurn": 6, "HandReach": 16, "Reacher": 64, "SawyerReach": 64, "StalkReach": 64}
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from nvidia import lowered_for_nvidia
 
-from benchmarks import environments
+from benchmarks.tasks import environments
 from jaxrl_vis_envs.compilation import KERNELS_VARIABLE, env_jit
 from jaxrl_vis_envs.physics import algebra, constraints, descent, line_search, newton_kernel
 from jaxrl_vis_envs.physics.descent import Motion, Problem, Structure

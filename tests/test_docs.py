@@ -7,7 +7,6 @@ import html.parser
 import importlib
 import importlib.util
 import inspect
-import json
 import os
 import re
 import shutil
@@ -26,6 +25,7 @@ from doc_blocks import ROOT, Block, blocks, pages_with
 from fake_program import make_fake_trainer, small_config
 
 import jaxrl_vis
+from benchmarks import render_parity
 from jaxrl_vis import cli, config
 from jaxrl_vis.cli.checks import check_env
 from jaxrl_vis.cli.parsing import parse
@@ -285,18 +285,22 @@ def test_the_table_of_tasks_is_that_of_the_environments() -> None:
 
 
 def test_the_table_of_models_is_that_of_the_record(checkout: Path) -> None:
-    spec = importlib.util.spec_from_file_location("render_parity", checkout / "benchmarks" / "render_parity.py")
-    assert spec is not None and spec.loader is not None
-    parity = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(parity)
-    rows = json.loads(parity.TARGET.read_text())["rows"]
+    rows = render_parity.read_rows(render_parity.TARGET)
     assert [row["model"] for row in rows] == list(render_models.MODELS)
     assert not [row["model"] for row in rows if row["failures"]]
-    assert parity.PAGE.read_text().endswith(parity.MARK + parity.table(rows)), "run benchmarks/render_parity.py --page"
     assert f" {len(rows)} models " in (checkout / "docs" / "renderer.md").read_text()
 
 
 # -- Links and the site
+
+
+@pytest.mark.parametrize("page", [*doc_blocks.PAGES, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"], ids=name_of)
+def test_scripts_that_are_named_exist(page: Path) -> None:
+    text = page.read_text()
+    for script in re.findall(r"benchmarks/[\w/]+\.py", text):
+        assert (ROOT / script).exists(), script
+    for module in re.findall(r"-m (benchmarks[.\w]*\w)", text):
+        assert module == "benchmarks.peers.NAME" or importlib.util.find_spec(module) is not None, module
 
 
 @pytest.mark.parametrize("page", doc_blocks.PAGES, ids=name_of)

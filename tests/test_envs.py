@@ -15,7 +15,7 @@ import pytest
 from point_mass import PointMass, PointMassConfig
 
 import jaxrl_vis_envs
-from benchmarks import environments
+from benchmarks.tasks import environments
 from jaxrl_vis_envs import compilation, goals, names, pixels, registry
 from jaxrl_vis_envs.base import GoalEnv, State, sanitize_action
 from jaxrl_vis_envs.compilation import env_jit
@@ -72,7 +72,7 @@ _LATE_START = """
     import time
     import jax
     jax.jit(lambda x: x + 1)(1).block_until_ready()
-    from benchmarks import environments
+    from benchmarks.tasks import environments
     env = environments.make("FetchReach")
     state, _ = environments.reset(env, jax.random.split(jax.random.key(0), 16))
     idle = jax.numpy.zeros((16, env.action_size))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxrl_vis_envs
-from benchmarks import environments, one_step
+from benchmarks.tasks import environments, one_step
 
 COUNT = 512
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks import environments, one_step
+from benchmarks.tasks import environments, one_step
 from jaxrl_vis_envs.compilation import env_jit
 
 COUNT = 128

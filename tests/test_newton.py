@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from benchmarks import environments
+from benchmarks.tasks import environments
 from jaxrl_vis_envs.compilation import env_jit, kernels, tracing_for
 from jaxrl_vis_envs.physics import constraints, mjx_model, newton
 from jaxrl_vis_envs.physics.mjx_model import mjx

@@ -292,7 +292,7 @@ def test_a_task_of_ones_own_in_the_gallery(my_task: str, here: Path, capsys: pyt
 
 
 def test_records_of_tasks_of_ones_own_are_of_no_file_of_ours() -> None:
-    from jaxrl_vis.bench import staleness
+    from benchmarks.ledger import staleness
     from jaxrl_vis.provenance import CHECKOUT
 
     files = [file.name for file in staleness.measured_files("env/steps", "gone:Reach", True, CHECKOUT)]

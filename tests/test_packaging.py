@@ -117,6 +117,12 @@ def test_the_world_knows_nothing_of_the_learner() -> None:
         assert not roots & {"jaxrl_vis", "flax", "optax", "orbax", "envs"}, path
 
 
+def test_packages_do_not_import_the_scripts_outside_the_wheel() -> None:
+    for folder, _ in PACKAGES.values():
+        for path in folder.rglob("*.py"):
+            assert "benchmarks" not in {name.split(".")[0] for name in imported(path, when_running=False)}, path
+
+
 def test_nothing_imports_the_folder_of_sources() -> None:
     for path in [*(ROOT / "jaxrl_vis").rglob("*.py"), *(ROOT / "tests").rglob("*.py"), *(ROOT / "notebooks").rglob("*.py")]:
         assert "envs" not in {name.split(".")[0] for name in imported(path)}, path

@@ -19,7 +19,7 @@ from jaxrl_vis.phenotyping.width import ELLIPSE_FITS, ellipse_width, strip_near,
 from jaxrl_vis_envs.plants import Calibration
 
 ROOT = Path(__file__).resolve().parents[1]
-STRIPS = runpy.run_path(str(ROOT / "benchmarks" / "strip_widths.py"))
+STRIPS = runpy.run_path(str(ROOT / "benchmarks" / "stalks" / "strip_widths.py"))
 CAMERAS = Calibration(640, 480, 500.0, (319.5, 239.5), 0.1)
 
 

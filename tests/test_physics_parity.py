@@ -6,7 +6,8 @@ import pathlib
 import numpy as np
 import pytest
 
-from benchmarks import environments, one_step, parity
+from benchmarks import parity
+from benchmarks.tasks import environments, one_step
 
 DATA = pathlib.Path(__file__).parent / "data"
 RECORDINGS = {

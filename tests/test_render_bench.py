@@ -10,8 +10,10 @@ import mujoco
 import numpy as np
 import pytest
 
+from benchmarks.peers import image_comparison, warp
 from jaxrl_vis import bench
-from jaxrl_vis.bench import comparison, record, render_operations, render_scenes, variation, warp_renderer
+from jaxrl_vis.bench import record, variation
+from jaxrl_vis.bench.scenes import images, models, operations
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis_envs.render import Scene
 
@@ -36,7 +38,7 @@ def ball(tmp_path: Path) -> str:
 
 @pytest.mark.parametrize(("scene", "geoms"), [("finger", 8), ("fetch_reach", 19), ("primitives", 127)])
 def test_scenes_load_ready_for_a_fair_comparison(scene: str, geoms: int) -> None:
-    mj_model = render_scenes.load(scene)
+    mj_model = models.load(scene)
     assert mj_model.ngeom == geoms
     assert mj_model.ncam >= 1
     assert mj_model.vis.quality.offsamples == 0
@@ -44,12 +46,12 @@ def test_scenes_load_ready_for_a_fair_comparison(scene: str, geoms: int) -> None
 
 
 def test_primitives_are_mixed() -> None:
-    types = render_scenes.load("primitives").geom_type
+    types = models.load("primitives").geom_type
     assert sorted(np.unique(types, return_counts=True)[1].tolist()) == [1, 25, 25, 25, 25, 26]
 
 
 def test_textures_can_be_left_out() -> None:
-    with_them, without = render_scenes.load("finger"), render_scenes.load("finger", textures=False)
+    with_them, without = models.load("finger"), models.load("finger", textures=False)
     assert (with_them.mat_texid >= 0).any() and not (without.mat_texid >= 0).any()
     skybox = mujoco.mjtTexture.mjTEXTURE_SKYBOX
     assert (with_them.tex_type == skybox).any() and not (without.tex_type == skybox).any()
@@ -64,19 +66,19 @@ def test_what_is_no_scene_is_refused_in_one_line(content: str | None, complaint:
     if content is not None:
         path.write_text(content)
     with pytest.raises(RequestError, match=complaint) as caught:
-        render_scenes.load(str(path))
+        models.load(str(path))
     assert "\n" not in str(caught.value)
 
 
 def test_a_missing_suite_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(render_scenes.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(models.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(RequestError, match="pip install --no-deps dm_control"):
-        render_scenes.load("finger")
+        models.load("finger")
 
 
 def test_poses_are_random_repeatable_and_within_limits() -> None:
-    mj_model = render_scenes.load("finger")
-    first, again, other = (render_scenes.random_poses(mj_model, 6, seed) for seed in (1, 1, 2))
+    mj_model = models.load("finger")
+    first, again, other = (models.random_poses(mj_model, 6, seed) for seed in (1, 1, 2))
     assert len({row.tobytes() for row in np.concatenate([first["geom_xpos"], other["geom_xpos"]])}) == 12
     for name, rows in first.items():
         np.testing.assert_array_equal(rows, again[name])
@@ -84,17 +86,17 @@ def test_poses_are_random_repeatable_and_within_limits() -> None:
     mj_data, rng = mujoco.MjData(mj_model), np.random.default_rng(0)
     limited = mj_model.jnt_limited.astype(bool)
     for _ in range(20):
-        render_scenes.scatter_joints(mj_model, mj_data, rng)
+        models.scatter_joints(mj_model, mj_data, rng)
         assert np.all(mj_data.qpos[limited] >= mj_model.jnt_range[limited, 0])
         assert np.all(mj_data.qpos[limited] <= mj_model.jnt_range[limited, 1])
 
 
 def test_free_bodies_stay_near_their_start_with_unit_quaternions(ball: str) -> None:
-    mj_model = render_scenes.load(ball)
+    mj_model = models.load(ball)
     mj_data, rng = mujoco.MjData(mj_model), np.random.default_rng(0)
     turns = []
     for _ in range(50):
-        render_scenes.scatter_joints(mj_model, mj_data, rng)
+        models.scatter_joints(mj_model, mj_data, rng)
         assert np.all(np.abs(mj_data.qpos[:3] - [0.0, 2.0, 0.0]) <= 0.1)
         assert np.linalg.norm(mj_data.qpos[3:]) == pytest.approx(1.0)
         turns.append(2.0 * np.arccos(np.clip(mj_data.qpos[3], -1.0, 1.0)))
@@ -102,23 +104,23 @@ def test_free_bodies_stay_near_their_start_with_unit_quaternions(ball: str) -> N
 
 
 def test_needed_tests_count_the_pixels_of_a_ball_and_every_plane(ball: str) -> None:
-    mj_model = render_scenes.load(ball)
+    mj_model = models.load(ball)
     mj_data = mujoco.MjData(mj_model)
-    render_scenes.forward(mj_model, mj_data)
-    poses = {name: np.asarray(getattr(mj_data, name), np.float32)[None] for name in render_scenes.POSES}
+    models.forward(mj_model, mj_data)
+    poses = {name: np.asarray(getattr(mj_data, name), np.float32)[None] for name in models.POSES}
     # The ball's edge lies at tan(asin(.2 / 2)) of an image that reaches to tan(30 degrees).
     disc = np.pi * (np.tan(np.arcsin(0.1)) / np.tan(np.pi / 6)) ** 2 / 4
-    assert render_scenes.needed_tests(mj_model, poses, 128).tolist() == pytest.approx([1.0, disc], abs=2e-3)
+    assert models.needed_tests(mj_model, poses, 128).tolist() == pytest.approx([1.0, disc], abs=2e-3)
     poses["geom_xpos"][:, 1] = [0.0, -2.0, 0.0]  # behind the camera
-    assert render_scenes.needed_tests(mj_model, poses, 128).tolist() == [1.0, 0.0]
+    assert models.needed_tests(mj_model, poses, 128).tolist() == [1.0, 0.0]
 
 
 def test_operations_are_those_of_the_tests_and_of_one_shading(ball: str) -> None:
-    mj_model = render_scenes.load(ball)
+    mj_model = models.load(ball)
     scene = Scene.from_mjmodel(mj_model, 0, 8, 8)
 
     def count(plane: float, ball: float, coloured: bool = True) -> float:
-        found = render_operations.operations_per_pixel(scene, np.array([plane, ball]), coloured)
+        found = operations.operations_per_pixel(scene, np.array([plane, ball]), coloured)
         assert found is not None
         return found
 
@@ -127,7 +129,7 @@ def test_operations_are_those_of_the_tests_and_of_one_shading(ball: str) -> None
     assert 20 < plane < 50 < shading
     assert count(1, 0.5) == pytest.approx(shading + plane + 0.5 * sphere)
     assert count(1, 0.5) - count(1, 0.5, coloured=False) > 50
-    assert render_operations._count(lambda x, y: jnp.sqrt(x * y + 1.0), *[jax.ShapeDtypeStruct((7919,), jnp.float32)] * 2) == 3
+    assert operations._count(lambda x, y: jnp.sqrt(x * y + 1.0), *[jax.ShapeDtypeStruct((7919,), jnp.float32)] * 2) == 3
 
 
 def test_images_that_do_not_change_are_refused() -> None:
@@ -164,19 +166,20 @@ def test_a_scene_that_stands_still_is_not_measured(tmp_path: Path) -> None:
 def test_agreement_counts_sky_and_closeness() -> None:
     ours = np.array([[[np.inf, 2.0, 2.0, np.inf]]])
     theirs = np.array([[[np.inf, 2.01, 2.2, 1.0]]])
-    assert comparison.depth_agreement(ours, theirs) == 0.5
+    assert image_comparison.depth_agreement(ours, theirs) == 0.5
 
 
 @pytest.fixture(scope="module")
-def drawn_ball(tmp_path_factory: pytest.TempPathFactory) -> comparison.Comparison:
+def drawn_ball(tmp_path_factory: pytest.TempPathFactory) -> image_comparison.Comparison:
     path = tmp_path_factory.mktemp("scene") / "ball.xml"
     path.write_text(BALL)
-    mj_model = render_scenes.load(str(path))
-    batches = [render_scenes.random_poses(mj_model, 3, seed) for seed in (1, 2)]
-    return comparison.compare({"image_size": 16, "images": 3}, mj_model, batches, repeats=1, rate=1.0)
+    mj_model = models.load(str(path))
+    batches = [models.random_poses(mj_model, 3, seed) for seed in (1, 2)]
+    case = images.Case({"image_size": 16, "images": 3}, mj_model, batches)
+    return image_comparison.compare(case, repeats=1, rate=1.0)
 
 
-def test_a_peer_must_draw_the_same(drawn_ball: comparison.Comparison) -> None:
+def test_a_peer_must_draw_the_same(drawn_ball: image_comparison.Comparison) -> None:
     ours = drawn_ball
     assert ours.agreement(ours.colours, ours.depth) == {"depth_agreement": 1.0, "colour_difference": 0.0}
     brighter = np.minimum(ours.colours.astype(int) + 10, 255).astype(np.uint8)
@@ -189,33 +192,33 @@ def test_a_peer_must_draw_the_same(drawn_ball: comparison.Comparison) -> None:
     assert ours.agreement(ours.colours[:2], ours.depth[:2])["depth_agreement"] == 1.0
 
 
-def test_textures_have_a_bound_of_their_own(drawn_ball: comparison.Comparison) -> None:
+def test_textures_have_a_bound_of_their_own(drawn_ball: image_comparison.Comparison) -> None:
     lower_half = np.zeros_like(drawn_ball.textured)
     lower_half[:, 8:] = True
     ours = dataclasses.replace(drawn_ball, textured=lower_half)
     theirs = np.where(lower_half[..., None], ours.colours // 2 + 64, ours.colours)
     with pytest.raises(AssertionError, match="textured_difference"):
         ours.agreement(theirs, ours.depth)
-    assert ours.agreement(theirs, ours.depth, 200.0)["textured_difference"] > comparison.MOST_DIFFERENCE
+    assert ours.agreement(theirs, ours.depth, 200.0)["textured_difference"] > image_comparison.MAX_DIFFERENCE
 
 
 def test_textured_geoms_are_those_whose_material_has_a_texture() -> None:
-    assert comparison.textured_geoms(render_scenes.load("primitives")).nonzero()[0].tolist() == [0]
-    assert not comparison.textured_geoms(render_scenes.load("primitives", textures=False)).any()
-    assert not comparison.textured_geoms(render_scenes.load("fetch_reach")).any()
+    assert image_comparison.textured_geoms(models.load("primitives")).nonzero()[0].tolist() == [0]
+    assert not image_comparison.textured_geoms(models.load("primitives", textures=False)).any()
+    assert not image_comparison.textured_geoms(models.load("fetch_reach")).any()
 
 
 def test_start_poses_barely_move_and_still_differ() -> None:
-    mj_model = render_scenes.load("primitives")
+    mj_model = models.load("primitives")
     mj_data = mujoco.MjData(mj_model)
-    render_scenes.forward(mj_model, mj_data)
-    poses = render_scenes.random_poses(mj_model, 4, 1, render_scenes.SPREADS["start"])
+    models.forward(mj_model, mj_data)
+    poses = models.random_poses(mj_model, 4, 1, models.SPREADS["start"])
     assert np.abs(poses["geom_xpos"] - mj_data.geom_xpos).max() < 3e-3
     assert len({row.tobytes() for row in poses["geom_xpos"]}) == 4
-    finger = render_scenes.load("finger")
+    finger = models.load("finger")
     mj_data = mujoco.MjData(finger)
     rng = np.random.default_rng(0)
-    render_scenes.scatter_joints(finger, mj_data, rng, spread=0.0)
+    models.scatter_joints(finger, mj_data, rng, spread=0.0)
     np.testing.assert_array_equal(mj_data.qpos, finger.qpos0)
 
 
@@ -227,9 +230,9 @@ WARP_NEEDS = {
 
 
 def warp_options(scene: str, **variant: bool) -> set[str]:
-    mj_model = render_scenes.load(scene, **variant)
-    batches = [render_scenes.random_poses(mj_model, 2, 1)]
-    options = warp_renderer.render_options(Scene.from_mjmodel(mj_model, 0, 8, 8), mj_model, batches)
+    mj_model = models.load(scene, **variant)
+    batches = [models.random_poses(mj_model, 2, 1)]
+    options = warp.render_options(Scene.from_mjmodel(mj_model, 0, 8, 8), mj_model, batches)
     # Whatever is not said explicitly would be on.
     assert {name for name in options if name.startswith("enable_")} == {
         "enable_specular",
@@ -275,7 +278,7 @@ def test_warp_draws_emission_where_something_emits(tmp_path: Path) -> None:
 
 def test_warp_s_buffers_become_images() -> None:
     packed = np.array([[0xFF030201, 0xFF060504, 0, 0]], np.uint32)
-    colours, depth = warp_renderer.images(packed, np.array([[0.0, 2.0, 3.0, 4.0]], np.float32), 2)
+    colours, depth = warp.images(packed, np.array([[0.0, 2.0, 3.0, 4.0]], np.float32), 2)
     assert colours.shape == (1, 2, 2, 3) and colours[0, 0].tolist() == [[3, 2, 1], [6, 5, 4]]
     assert depth.shape == (1, 2, 2) and np.isinf(depth[0, 0, 0]) and depth[0, 1, 1] == 4.0
 
@@ -284,13 +287,13 @@ def test_a_missing_warp_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(sys, "path", [])
     monkeypatch.setitem(sys.modules, "mujoco_warp", None)
     with pytest.raises(RequestError, match="pip install mujoco-warp==4.0.0") as caught:
-        warp_renderer.check()
+        warp.check()
     assert "\n" not in str(caught.value)
 
 
 def test_another_warp_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(warp_renderer.importlib.metadata, "version", lambda name: "5.0.0")
+    monkeypatch.setattr(warp.importlib.metadata, "version", lambda name: "5.0.0")
     for name in ("mujoco_warp", "warp"):
         monkeypatch.setitem(sys.modules, name, type(sys)(name))
     with pytest.raises(RequestError, match=r"4\.0\.0, not 5\.0\.0"):
-        warp_renderer.check()
+        warp.check()

@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from benchmarks import render_folder
+from benchmarks.rendering import model_folder
 from jaxrl_vis_envs.render import Frame
 
 
@@ -14,7 +14,7 @@ def frame(labels: np.ndarray, colour: int = 100, depth: float = 2.0) -> Frame:
 
 
 def verdict(ours: Frame, theirs: Frame, hidden: np.ndarray | None = None) -> list[str]:
-    return render_folder.measure(ours, theirs, np.zeros((32, 32), bool) if hidden is None else hidden).failures()
+    return model_folder.measure(ours, theirs, np.zeros((32, 32), bool) if hidden is None else hidden).failures()
 
 
 def test_images_pass_where_they_are_the_same_and_fail_by_what_is_not() -> None:
@@ -39,13 +39,13 @@ def test_rows_of_a_model_are_its_cameras_its_sites_and_its_haze() -> None:
         ("eye", ["free", "eye", "free + sites", "free + haze"]),
     ):
         mj_model = mujoco.MjModel.from_xml_string(xml.format(name=name))
-        assert [view.title(mj_model) for view in render_folder.views(mj_model)] == titles
+        assert [view.title(mj_model) for view in model_folder.views(mj_model)] == titles
 
 
 def test_what_is_no_model_has_a_verdict_of_its_own(tmp_path, capsys) -> None:
     (tmp_path / "deep").mkdir()
     (tmp_path / "deep" / "broken.xml").write_text("<mujoco><worldbody>")
     (tmp_path / "notes.txt").write_text("not looked at")
-    assert render_folder.report(tmp_path, 32, None) == 0
+    assert model_folder.report(tmp_path, 32, None) == 0
     shown = capsys.readouterr().out
     assert "| deep/broken.xml |" in shown and "not loaded: " in shown and "1 rows of 1 files, 0 failed" in shown

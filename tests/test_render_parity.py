@@ -11,7 +11,7 @@ import render_models
 import render_references
 from render_comparison import BARE, BOUNDS, PLANE, SKY, TEXTURED, Tally, surface_kinds
 
-from jaxrl_vis.bench.render_scenes import forward
+from jaxrl_vis.bench.scenes.models import forward
 from jaxrl_vis_envs.render import Frame
 
 MANY_TRIANGLES = 100_000  # so many take longer to draw than a fast program takes to compile

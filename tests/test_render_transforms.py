@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from jaxrl_vis.bench.program_memory import largest_temporary
+from jaxrl_vis.bench.scenes.program_memory import largest_temporary
 from jaxrl_vis_envs.compilation import env_jit
 from jaxrl_vis_envs.render import Scene, quantize, render_planes
 

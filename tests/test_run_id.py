@@ -305,3 +305,13 @@ def test_a_config_file_that_cannot_be_used_is_one_line(tmp_path, capsys, words, 
     assert cli.main([*words, str(tmp_path)]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and len(error) < 600
+
+
+@pytest.mark.parametrize("names, goes", [(["_CHECKPOINT_METADATA", "SHA256SUMS"], True), (["manifest"], False)])
+def test_what_a_thread_made_of_a_folder_that_was_moved_goes(tmp_path, names, goes):
+    checkpoint = tmp_path / "run" / "checkpoints" / LIGHT / "4"
+    checkpoint.mkdir(parents=True)
+    for name in names:
+        (checkpoint / name).touch()
+    RunFolder(tmp_path / "run").remove_remains()
+    assert (tmp_path / "run").exists() != goes

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks import environments, one_step
+from benchmarks.tasks import environments, one_step
 
 COUNT = 512
 

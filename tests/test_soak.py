@@ -8,7 +8,9 @@ import os
 
 import pytest
 
-from benchmarks.soak.record import BEGIN, END, PROMISES, Record, added, put_into
+from benchmarks.ledger import pages
+from benchmarks.ledger.markers import fill
+from benchmarks.soak.record import PROMISES, Record, added
 from benchmarks.soak.soak import Soak
 
 FAULTS, WORKERS = 2, 2
@@ -34,17 +36,16 @@ def record(seed: int, **changes) -> Record:
 
 def test_pieces_are_added(tmp_path):
     for seed in (1, 2):
-        record(seed).write(tmp_path / f"{seed}.json")
-    total = added([Record.read(tmp_path / "1.json"), Record.read(tmp_path / "2.json")])
+        record(seed).write(tmp_path / "soak" / f"{seed}.json")
+    total = added([Record.read(piece) for piece in sorted((tmp_path / "soak").iterdir())])
     assert total.faults["SIGKILL"] == 20 and total.total == 2 * (len(PROMISES) - 1 + 10) and len(PROMISES) >= 15
     assert (total.minutes, total.runs, total.exact, total.resumes, total.replays_lost) == (18.0, 12, 10, 96, 2)
     table = total.table()
     assert "| SIGKILL | 20 |" in table and "goodput 0.990 at 96 resumptions, replay lost 2 times" in table
-    page = tmp_path / "page.md"
-    page.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n")
-    put_into(page, table)
-    assert page.read_text() == f"before\n{BEGIN}\n{table}{END}\nafter\n"
-    assert json.loads((tmp_path / "1.json").read_text())["machine"]["commit"] == "abc"
+    begin, end = "<!-- soak: begin -->\n", "<!-- soak: end -->\n"
+    assert fill(f"before\n{begin}old\n{end}after\n", "soak", table) == f"before\n{begin}{table}{end}after\n"
+    assert pages.soak(tmp_path) == table and pages.soak(tmp_path / "soak") is None
+    assert json.loads((tmp_path / "soak" / "1.json").read_text())["machine"]["commit"] == "abc"
 
 
 def test_what_cannot_be_added_is_refused():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxrl_vis_envs
-from benchmarks import environments
+from benchmarks.tasks import environments
 from jaxrl_vis_envs.plants import bending
 from jaxrl_vis_envs.tasks import stalk_arm
 

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from nvidia import lowered_for_nvidia
 
-from benchmarks import environments
+from benchmarks.tasks import environments
 from jaxrl_vis_envs.compilation import KERNELS_VARIABLE, env_jit, kernels, tracing_for
 from jaxrl_vis_envs.physics import (
     algebra,

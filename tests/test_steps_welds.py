@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from benchmarks import environments
+from benchmarks.tasks import environments
 from jaxrl_vis_envs.compilation import KERNELS_VARIABLE, env_jit
 from jaxrl_vis_envs.physics import (
     dynamics,

@@ -30,8 +30,9 @@ import sys
 import tempfile
 from pathlib import Path
 
+from benchmarks.ledger.markers import fill
 from benchmarks.soak.goodput import killed_every, report, undisturbed
-from benchmarks.soak.record import Record, added, put_into
+from benchmarks.soak.record import Record, added
 from benchmarks.soak.soak import Soak
 
 _TO_THE_END = 45.0  # seconds
@@ -56,9 +57,9 @@ def _goodput(options: argparse.Namespace, folder: Path) -> int:
     what = [options.env, "--preset", options.preset, "--seed", str(options.seed)]
     killed = killed_every(folder / "killed", options.sigkill_every, options.minutes, what)
     reference = None if options.no_reference else undisturbed(folder / "undisturbed", killed.env_steps, what)
-    found = report(killed, options.sigkill_every, reference)
+    figures = report(killed, options.sigkill_every, reference)
     if options.json is not None:
-        options.json.write_text(json.dumps(Record(seed=options.seed).machine | found, indent=1) + "\n")
+        options.json.write_text(json.dumps(Record(seed=options.seed).machine | figures, indent=1) + "\n")
     return 0
 
 
@@ -82,7 +83,7 @@ def main() -> int:
         record = added([Record.read(path) for path in options.sum])
         print(record.table())
         if options.table is not None:
-            put_into(options.table, record.table())
+            options.table.write_text(fill(options.table.read_text(), "soak", record.table()))
         return 1 if record.broken else 0
     folder = (options.folder or Path(tempfile.mkdtemp(prefix="soak-"))).resolve()
     folder.mkdir(parents=True, exist_ok=True)

@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.soak.parts import Broken, Part, checkpoints_of, killed_afterwards, rows_of
+from benchmarks.soak.parts import Broken, Part, killed_afterwards, list_checkpoints, read_rows
 
 TASK = """
 import dataclasses
@@ -90,27 +90,27 @@ def nan_on_one_seed(folder: Path, dice: random.Random, _: "References") -> None:
         raise Broken(f"not one seed is named: {line}")
     if not list((run / "nonfinite").glob("*.npz")):
         raise Broken(f"nothing was dumped: {line}")
-    saved = checkpoints_of(run)
+    saved = list_checkpoints(run)
     if not saved:
         return  # in the very first iterations: there is nothing to go on from, and the line says so
-    rows = rows_of(run)
+    rows = read_rows(run)
     again = _finished(Part.start(run, None, ["--env-steps", str((saved[-1][0] + 6) * steps)]), 0)
     if not again.count("resumed at iteration"):
         raise Broken(f"it did not go on from the last good checkpoint: {again.lines}")
-    if [row for row in rows_of(run) if row in rows] != rows:
+    if [row for row in read_rows(run) if row in rows] != rows:
         raise Broken("rows were lost")
 
 
 def _children(process: int) -> list[int]:
     """All processes below one."""
-    found = []
+    processes = []
     for task in Path(f"/proc/{process}/task").glob("*/children"):
         try:
             own = [int(word) for word in task.read_text().split()]
         except OSError:
             continue
-        found += own + [other for child in own for other in _children(child)]
-    return found
+        processes += own + [other for child in own for other in _children(child)]
+    return processes
 
 
 def _is(process: int, words: str) -> bool:
@@ -128,11 +128,11 @@ def _kill_a_worker(part: Part, words: str, dice: random.Random, delay: float, is
 
     part.wait_for(lambda: bool(workers()) and is_ready())
     time.sleep(dice.uniform(0.0, delay))
-    found = workers()
-    if not found or not part.runs():
+    running = workers()
+    if not running or not part.runs():
         return False
     try:
-        os.kill(dice.choice(found), signal.SIGKILL)
+        os.kill(dice.choice(running), signal.SIGKILL)
     except ProcessLookupError:
         return False
     return True
@@ -159,7 +159,7 @@ def worker_of_a_study(folder: Path, dice: random.Random, references: "References
             raise Broken(f"ended with {part.process.returncode}: {part.lines[-5:]}")
         _of_one_line(part, "failed with exit status")
     _finished(_command(words, folder), 0)
-    if _rows_of_cells(folder) != references.study():
+    if _cell_rows(folder) != references.study():
         raise Broken(f"rows differ from those of an undisturbed study: {part.lines}")
     if not struck:
         raise NotStruck
@@ -170,8 +170,8 @@ def _sweep(folder: Path, executor: Sequence[str] = ()) -> list[str]:
     return [*words, "--updates-per-iteration", "20", "--eval-interval", "20", "--runs", str(folder / "runs"), *executor]
 
 
-def _rows_of_cells(folder: Path) -> dict[str, list]:
-    return {path.parent.name: rows_of(path.parent) for path in sorted((folder / "runs").glob("*/metrics.jsonl"))}
+def _cell_rows(folder: Path) -> dict[str, list]:
+    return {path.parent.name: read_rows(path.parent) for path in sorted((folder / "runs").glob("*/metrics.jsonl"))}
 
 
 def job_of_a_study(folder: Path, dice: random.Random, references: "References") -> None:
@@ -202,10 +202,10 @@ def _grasp(folder: Path, spec: Path) -> list[str]:
 
 def _figures(file: Path) -> list[dict[str, Any]]:
     """Results of each run, without durations."""
-    each = json.loads(file.read_text())["each"]
-    for record in each:
+    runs = json.loads(file.read_text())["each"]
+    for record in runs:
         del record["score"]["seconds"]
-    return each
+    return runs
 
 
 def worker_of_grasping(folder: Path, dice: random.Random, references: "References") -> None:
@@ -262,7 +262,7 @@ class References:
 
         def make(folder: Path) -> dict[str, list]:
             _finished(_command(_sweep(folder), folder), 0)
-            return _rows_of_cells(folder)
+            return _cell_rows(folder)
 
         return self._once("study", make)
 

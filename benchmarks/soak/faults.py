@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.soak.disks import freezing_disk, small_disk
-from benchmarks.soak.parts import Broken, Part, checkpoints_of, environment, killed_afterwards, rows_of
+from benchmarks.soak.parts import Broken, Part, environment, killed_afterwards, list_checkpoints, read_rows
 
 SITE = Path(__file__).with_name("site")
 Strike = Callable[[Path, random.Random], int | None]
@@ -89,7 +89,7 @@ def _second_process(folder: Path, dice: random.Random) -> int | None:
     with killed_afterwards(Part.start(folder)) as part:
         # Another process takes seconds to start; the first holds the folder from before it compiles.
         part.wait_for(part.is_compiling)
-        rows = rows_of(folder)
+        rows = read_rows(folder)
         with killed_afterwards(Part.start(folder)) as other:
             status = other.end()
             other.check_words()
@@ -97,7 +97,7 @@ def _second_process(folder: Path, dice: random.Random) -> int | None:
             return part.end() or None
         if status != 2 or other.count("in use by process") != 1:
             raise Broken(f"a second process ended with {status}: {other.lines[-3:]}")
-        if rows_of(folder)[: len(rows)] != rows:
+        if read_rows(folder)[: len(rows)] != rows:
             raise Broken("a second process changed the rows of the first")
         part.wait_for(part.is_training)
         return part.stop() or None
@@ -154,8 +154,8 @@ def _jumping_clock(folder: Path, dice: random.Random) -> int | None:
 def _killed(folder: Path, dice: random.Random) -> bool:
     """SIGKILL in the middle of training; whether the run was still on, and has something saved."""
     with killed_afterwards(_started(folder, dice)) as part:
-        part.wait_for(lambda: len(checkpoints_of(folder)) > 1, 20.0)
-        return part.send(signal.SIGKILL) != 0 and bool(checkpoints_of(folder))
+        part.wait_for(lambda: len(list_checkpoints(folder)) > 1, 20.0)
+        return part.send(signal.SIGKILL) != 0 and bool(list_checkpoints(folder))
 
 
 def _resumed(folder: Path, dice: random.Random, variables: dict[str, str] | None = None) -> tuple[int, Part]:
@@ -177,12 +177,13 @@ def _check_went_back(folder: Path, before: list[dict[str, Any]], all_before: lis
         all_before: Its checkpoints before that.
         good: Those of them that were not damaged.
     """
-    newest, kept, last = (
-        max((iteration for iteration, *_ in found), default=0) for found in (checkpoints_of(folder), good, all_before)
+    newest, newest_good, last = (
+        max((iteration for iteration, *_ in checkpoints), default=0)
+        for checkpoints in (list_checkpoints(folder), good, all_before)
     )
-    if newest < kept:
-        raise Broken(f"a good checkpoint was of iteration {kept}, and the newest is of {newest}")
-    rows = rows_of(folder) + rows_of(folder, "checkpoints/damaged/metrics.jsonl")
+    if newest < newest_good:
+        raise Broken(f"a good checkpoint was of iteration {newest_good}, and the newest is of {newest}")
+    rows = read_rows(folder) + read_rows(folder, "checkpoints/damaged/metrics.jsonl")
     if lost := [row["iteration"] for row in before if row not in rows and row["iteration"] <= last]:
         raise Broken(f"rows {lost} are neither in metrics.jsonl nor kept for inspection")
 
@@ -190,7 +191,7 @@ def _check_went_back(folder: Path, before: list[dict[str, Any]], all_before: lis
 def _damaged(folder: Path, dice: random.Random) -> int | None:
     if not _killed(folder, dice):
         return None
-    rows, there = rows_of(folder), checkpoints_of(folder)
+    rows, there = read_rows(folder), list_checkpoints(folder)
     *good, (_, tier, path) = there
     if path.is_dir():
         files = sorted((file for file in path.rglob("*") if file.is_file()), key=lambda file: file.stat().st_size)
@@ -220,7 +221,7 @@ def flip_a_bit(file: Path, dice: random.Random) -> int:
 def _bit_in_a_checkpoint(folder: Path, dice: random.Random) -> int | None:
     if not _killed(folder, dice):
         return None
-    rows, there = rows_of(folder), checkpoints_of(folder)
+    rows, there = read_rows(folder), list_checkpoints(folder)
     _, tier, path = dice.choice(there[-2:])
     files = [file for file in path.rglob("*") if file.is_file() and file.stat().st_size] if path.is_dir() else [path]
     if tier == "recent":
@@ -228,23 +229,23 @@ def _bit_in_a_checkpoint(folder: Path, dice: random.Random) -> int | None:
     flip_a_bit(dice.choices(files, [file.stat().st_size for file in files])[0], dice)
     # Either it is found, or it says nothing about what the run goes on from: rows are compared at the end.
     status = _resumed(folder, dice)[0]
-    good = [found for found in there if found[2] != path and not tier == found[1] == "recent"]  # recent ones share rollouts
+    good = [entry for entry in there if entry[2] != path and not tier == entry[1] == "recent"]  # recent ones share rollouts
     _check_went_back(folder, rows, there, good)
     return status or None
 
 
 def _bit_in_metrics(folder: Path, dice: random.Random) -> int | None:
-    if not _killed(folder, dice) or not rows_of(folder):
+    if not _killed(folder, dice) or not read_rows(folder):
         return None
-    before, file = rows_of(folder), folder / "metrics.jsonl"
+    before, file = read_rows(folder), folder / "metrics.jsonl"
     place = flip_a_bit(file, dice)
     number = file.read_bytes()[:place].count(b"\n")
     row = file.read_bytes().splitlines()[number] if number < len(file.read_bytes().splitlines()) else b""
-    done = max((iteration for iteration, *_ in checkpoints_of(folder)), default=0)
+    done = max((iteration for iteration, *_ in list_checkpoints(folder)), default=0)
     status, part = _resumed(folder, dice)
     # What was in the same line, and the one after it where the line's end was hit, may be gone; all others stay.
-    others = [each for i, each in enumerate(before) if i not in (number, number + 1) and each["iteration"] <= done]
-    if missing := [each["iteration"] for each in others if each not in rows_of(folder)]:
+    others = [old for i, old in enumerate(before) if i not in (number, number + 1) and old["iteration"] <= done]
+    if missing := [old["iteration"] for old in others if old not in read_rows(folder)]:
         raise Broken(f"rows {missing} were lost with row {number}: {part.lines}")
     try:
         json.loads(row)
@@ -257,7 +258,7 @@ def _bit_in_metrics(folder: Path, dice: random.Random) -> int | None:
 def _moved(folder: Path, dice: random.Random) -> int | None:
     there = folder.with_name(f"{folder.name}-moved")
     with killed_afterwards(_started(folder, dice)) as part:
-        rows = rows_of(folder)
+        rows = read_rows(folder)
         if not part.runs():
             return part.end() or None
         folder.rename(there)
@@ -268,7 +269,7 @@ def _moved(folder: Path, dice: random.Random) -> int | None:
     if folder.exists():
         shutil.rmtree(folder)
     there.rename(folder)
-    if rows_of(folder)[: len(rows)] != rows:
+    if read_rows(folder)[: len(rows)] != rows:
         raise Broken("rows were lost in a folder that was moved")
     return status or None
 

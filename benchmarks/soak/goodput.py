@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.soak.parts import Broken, Part, killed_afterwards, rows_of
+from benchmarks.soak.parts import Broken, Part, killed_afterwards, read_rows
 from jaxrl_vis.run.goodput import account, read_processes
 
 _FOREVER = 10**9  # environment steps
@@ -37,7 +37,7 @@ class Killed:
 
 
 def _success(folder: Path) -> list[float]:
-    rows = rows_of(folder)
+    rows = read_rows(folder)
     return [row["eval/success"] for row in rows if row["iteration"] == rows[-1]["iteration"]]
 
 
@@ -80,7 +80,7 @@ def killed_every(folder: Path, every: float, minutes: float, options: Sequence[s
     with killed_afterwards(Part.start(copy, options=["--env-steps", "1"])) as part:
         if part.end() != 0:
             raise Broken(f"it could not be evaluated: {part.lines[-3:]}")
-    last = rows_of(copy)[-1]
+    last = read_rows(copy)[-1]
     total = account(read_processes(folder / "processes.jsonl"), last["iteration"])
     if total.goodput is None:
         raise Broken("processes.jsonl is damaged")

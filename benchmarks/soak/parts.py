@@ -37,11 +37,11 @@ def environment() -> dict[str, str]:
     """Variables for a run of the checkout, on the CPU; programs that were traced once are kept, as for any user."""
     root = Path(__file__).parents[2]
     paths = os.pathsep.join(filter(None, (str(root), str(root / "envs"), os.environ.get("PYTHONPATH"))))
-    kept = {name: value for name, value in os.environ.items() if name != "JAXRL_VIS_KEEP_PROGRAMS"}
-    return {**kept, "JAX_PLATFORMS": "cpu", "PYTHONPATH": paths}
+    variables = {name: value for name, value in os.environ.items() if name != "JAXRL_VIS_KEEP_PROGRAMS"}
+    return {**variables, "JAX_PLATFORMS": "cpu", "PYTHONPATH": paths}
 
 
-def rows_of(folder: Path, name: str = "metrics.jsonl") -> list[dict[str, Any]]:
+def read_rows(folder: Path, name: str = "metrics.jsonl") -> list[dict[str, Any]]:
     """Rows of a run's metrics without their times and the run's id; a line that is not one is left out."""
     rows = []
     file = folder / name
@@ -55,7 +55,7 @@ def rows_of(folder: Path, name: str = "metrics.jsonl") -> list[dict[str, Any]]:
     return rows
 
 
-def checkpoints_of(folder: Path) -> list[tuple[int, str, Path]]:
+def list_checkpoints(folder: Path) -> list[tuple[int, str, Path]]:
     """Finished checkpoints, iteration, tier, file or folder; the last one is what a run goes on from, if it is good."""
     places = [path for path in folder.glob("checkpoints/*/*") if path.parent.name in PRECEDENCE]
     names = [(path.name.removesuffix(".state"), path) for path in places]

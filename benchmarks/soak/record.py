@@ -13,7 +13,6 @@ from benchmarks.soak.alone import ALONE
 from benchmarks.soak.faults import FAULTS
 from jaxrl_vis import provenance
 
-BEGIN, END = "<!-- soak: begin -->", "<!-- soak: end -->"
 PROMISES = {name: fault.promise for name, fault in (FAULTS | ALONE).items()}
 
 
@@ -61,6 +60,7 @@ class Record:
 
     def write(self, path: Path) -> None:
         """Writes it, so that whoever is killed leaves a record, too."""
+        path.parent.mkdir(parents=True, exist_ok=True)
         temporary = path.with_suffix(".tmp")
         temporary.write_text(json.dumps(dataclasses.asdict(self), indent=1) + "\n")
         temporary.replace(path)
@@ -99,9 +99,3 @@ def added(records: Sequence[Record]) -> Record:
     faults = {name: sum(record.faults.get(name, 0) for record in records) for name in PROMISES}
     broken = [line for record in records for line in record.broken]
     return Record(records[0].machine, records[0].seed, faults=faults, broken=broken, **sums)
-
-
-def put_into(page: Path, table: str) -> None:
-    """Writes a table between the markers of a page."""
-    head, _, rest = page.read_text().partition(BEGIN)
-    page.write_text(head + BEGIN + "\n" + table + END + rest.partition(END)[2])

@@ -12,7 +12,7 @@ from typing import Any
 
 from benchmarks.soak.alone import ALONE, References, strike_alone
 from benchmarks.soak.faults import FAULTS
-from benchmarks.soak.parts import LAST, Broken, Part, checkpoints_of, killed_afterwards, rows_of
+from benchmarks.soak.parts import LAST, Broken, Part, killed_afterwards, list_checkpoints, read_rows
 from benchmarks.soak.record import Record
 from jaxrl_vis.run.goodput import account, read_processes
 
@@ -49,7 +49,7 @@ class Soak:
         with killed_afterwards(Part.start(self._folder / "reference")) as part:
             if part.end() != 0:
                 raise Broken("\n".join(part.lines))
-        self.reference = rows_of(part.folder)
+        self.reference = read_rows(part.folder)
 
     def _next(self, kinds: dict[str, Any]) -> str | None:
         """The next fault of these kinds, each as often as the others; None where it is time to end."""
@@ -119,7 +119,7 @@ class Soak:
             if fault is None:
                 break
             faults.append(fault)
-            before, good = rows_of(folder), checkpoints_of(folder)
+            before, good = read_rows(folder), list_checkpoints(folder)
             status = FAULTS[fault].strike(folder, dice)
             if status is None:  # the run was over before
                 self._again(FAULTS, faults.pop())
@@ -139,23 +139,24 @@ class Soak:
         self._check_end(folder, spoilt)
         return True
 
-    def _check_kept(self, folder: Path, before: list[dict[str, Any]], kept: int) -> None:
+    def _check_kept(self, folder: Path, before: list[dict[str, Any]], checkpointed: int) -> None:
         """Looks whether something is lost.
 
         Args:
             folder: The run.
             before: The rows that there were when its last part began.
-            kept: The iteration of the newest checkpoint at that time.
+            checkpointed: The iteration of the newest checkpoint at that time.
         """
-        old = [row for row in before if row["iteration"] <= kept]
-        if rows_of(folder)[: len(old)] != old:
-            raise Broken(f"rows from before iteration {kept} were lost")
-        newest = max((iteration for iteration, *_ in checkpoints_of(folder)), default=0)
-        if newest < kept - 1:  # a recent state may have been given up for want of room, and one that is damaged is put aside
-            raise Broken(f"the newest checkpoint was of iteration {kept}, and is of {newest}")
+        old = [row for row in before if row["iteration"] <= checkpointed]
+        if read_rows(folder)[: len(old)] != old:
+            raise Broken(f"rows from before iteration {checkpointed} were lost")
+        newest = max((iteration for iteration, *_ in list_checkpoints(folder)), default=0)
+        # A recent state may have been given up for want of room, and a damaged one is put aside.
+        if newest < checkpointed - 1:
+            raise Broken(f"the newest checkpoint was of iteration {checkpointed}, and is of {newest}")
 
     def _check_end(self, folder: Path, spoilt: bool) -> None:
-        rows = rows_of(folder)
+        rows = read_rows(folder)
         total = account(read_processes(folder / "processes.jsonl"), self.reference[-1]["iteration"])
         if not spoilt and [row["iteration"] for row in rows] != [row["iteration"] for row in self.reference]:
             raise Broken(f"rows {[row['iteration'] for row in rows]}")

@@ -76,7 +76,7 @@ class GoalEnv(abc.ABC):
     threshold: float  # an episode succeeds where goal_distance <= threshold, in `distance_unit`
     distance_unit: str = "m"
     control_period: float  # simulated seconds of one control step
-    # How hard the task is before anything is learned, as measured by benchmarks/task_difficulty.py; None: not measured.
+    # How hard the task is before anything is learned, as measured by benchmarks/tasks/task_difficulty.py; None: not measured.
     chance: float | None = None  # share of episodes that uniformly random actions end in success
     difficulty: float | None = None  # mean distance from start to goal, in thresholds
     frame_stack: int = 1  # F, images of the latest control steps that an observation stacks

@@ -1,14 +1,17 @@
-"""Measures one machine and keeps a record, so that a change can be told from noise and from another machine.
+"""Benchmarks of this machine, with records that tell a change of the code from noise and from another machine.
 
-    settings -> render | physics | env | update | train -> Measurement -> record -> staleness, tables
+    settings -> render | physics | env | update | train -> Measurement -> record
 
 Every benchmark varies the state of each environment, asserts that the results differ, warms up, waits for the device, repeats,
-and reports the median; compilation is timed separately. `conditions` says which figures may be compared, `record` keeps them
-and prints each change, `staleness` finds records that are older than the code they measured, and `tables` writes the README's
-tables from those in benchmarks/results.
+and reports the median; compilation is timed separately. `conditions` decides which figures are comparable, and `record` stores
+them and prints each change. `scenes` measures the renderer on scenes that other renderers draw as well.
+
+The other renderers and learners (`benchmarks.peers`) and the tables that are written from records (`benchmarks.ledger`) are
+not part of the package: they run from a checkout.
 """
 
 import importlib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,22 +23,44 @@ BENCHMARKS = ("render", "physics", "env", "update", "train")
 
 
 def run(benchmark: str, results: Path | None = None, json: Path | None = None, **settings: Any) -> list[Measurement]:
-    """Runs one benchmark, prints and keeps its records.
+    """Run one benchmark; print and store its records.
 
     Args:
         benchmark: One of `BENCHMARKS`.
-        results: Folder of kept records; None for the user's cache, see `record.user_folder`.
-        json: Also write this run's records here.
+        results: Folder of stored records; None for the user's cache, see `record.user_folder`.
+        json: Additional file for the records of this run.
         **settings: Fields of `Settings`.
 
     Raises:
-        RequestError: A setting cannot be met, or the file of kept records holds something else.
+        RequestError: A setting cannot be met, or the file of stored records holds something else.
     """
-    load(results_path(benchmark, results))  # first: a figure that cannot be kept is lost
     measure = importlib.import_module(f"jaxrl_vis.bench.{benchmark}").measure
+    return keep_records(benchmark, measure, Settings(**settings), results, json)
+
+
+def keep_records(
+    benchmark: str,
+    measure: Callable[[Settings], Iterator[Measurement]],
+    settings: Settings,
+    results: Path | None = None,
+    json: Path | None = None,
+) -> list[Measurement]:
+    """Take every measurement that ``measure`` yields under the watch of `conditions`; print and store the records.
+
+    Args:
+        benchmark: Name in the file of records.
+        measure: Generator of measurements, called with the settings for this device.
+        settings: Settings as the user gave them.
+        results: See `run`.
+        json: See `run`.
+
+    Raises:
+        RequestError: See `run`.
+    """
+    load(results_path(benchmark, results))  # first: a figure that cannot be stored is lost
     measurements, records = [], []
-    chosen, watch = Settings(**settings).for_this_device(), Watch()
-    for measurement in measure(chosen):
+    device_settings, watch = settings.for_this_device(), Watch()
+    for measurement in measure(device_settings):
         measurements.append(measurement)
         records.append(compare_and_keep(benchmark, measurement, results, watch.conditions()))
     if json is not None:
@@ -45,4 +70,4 @@ def run(benchmark: str, results: Path | None = None, json: Path | None = None, *
     return measurements
 
 
-__all__ = ["BENCHMARKS", "Measurement", "Settings", "run"]
+__all__ = ["BENCHMARKS", "Measurement", "Settings", "keep_records", "run"]

@@ -1,9 +1,9 @@
-"""Under which conditions a figure was measured, and whether two figures may be compared.
+"""Conditions of a measurement: the machine, its load and its speed, which decide if two figures are comparable.
 
-A name such as "AMD EPYC, 2 cores" is that of many machines of many speeds, and one machine is slower while others use it. So a
-record keeps which machine it was, how busy it was with other programs before, and how fast it computed a fixed piece of work
-(a calibration) before and after. Only figures of one machine that was idle, at the same speed, are compared; of all others the
-reason why they are not is told.
+Many machines of different speeds share a name such as "AMD EPYC, 2 cores", and one machine is slower while others use it. A
+record therefore stores an identifier of the machine, its load from other programs before the benchmark, and its speed on a
+fixed workload (a calibration) before and after. Figures are compared only if they come from one idle machine at one speed; for
+any other pair the reason is printed.
 """
 
 import dataclasses
@@ -22,15 +22,15 @@ import jax.numpy as jnp
 from jaxrl_vis_envs.cores import num_cores
 
 SAME_SPEED = 0.1
-"""Calibrations that differ by at most this share are of the same speed."""
+"""Largest relative difference of two calibrations that count as the same speed."""
 BUSY_CORES = 0.3
-"""Other programs may use so much of the machine's cores (of a core, for each core that may be used)."""
+"""Largest share of the available cores that other programs may use."""
 
 _SAMPLE_S, _CALIBRATION_S, _REPEATS = 0.4, 0.04, 5
 
 
 def machine() -> str:
-    """12 hexadecimal digits that stay the same on one machine, and tell it from others of the same name."""
+    """Identifier of this machine: 12 hexadecimal digits, different for machines of the same name."""
     words = [platform.node()]
     for file in ("/etc/machine-id", "/var/lib/dbus/machine-id"):
         if os.path.exists(file):
@@ -39,7 +39,7 @@ def machine() -> str:
 
 
 def busy_cores() -> float | None:
-    """How many of the cores that this process may use others are using now; looks for a moment. None where nobody says."""
+    """Measure the load of other programs on the cores of this process, in cores, over 0.4 s; None if unknown."""
     before = _busy_seconds()
     if before is None:
         return None
@@ -50,7 +50,7 @@ def busy_cores() -> float | None:
 
 
 def _busy_seconds() -> float | None:
-    """Seconds that this process's cores have worked since the machine started, all programs together."""
+    """Seconds of work of this process's cores since boot, over all programs; None if unknown."""
     if not (hasattr(os, "sched_getaffinity") and os.path.exists("/proc/stat")):
         return None
     allowed, total = os.sched_getaffinity(0), 0
@@ -64,19 +64,19 @@ def _busy_seconds() -> float | None:
 
 
 def calibrate() -> dict[str, float]:
-    """How fast the device does two fixed pieces of work: products of matrices (GFLOP/s), and adding long arrays (GB/s)."""
+    """Measure the device on two fixed workloads: matrix products (GFLOP/s) and the addition of long arrays (GB/s)."""
     return {name: round(work.amount / _seconds(work), 2) for name, work in calibrations().items()}
 
 
 @dataclasses.dataclass(frozen=True)
 class Work:
-    """A fixed piece of work.
+    """A fixed workload.
 
     Attributes:
-        program: Compiled.
-        arguments: Its arrays. They are no constants of the program: XLA computes what is constant while it compiles, which
-            takes minutes for a product of large matrices, and leaves nothing to measure.
-        amount: Of work in a call, in 1e9 of its unit.
+        program: Compiled program.
+        arguments: Arrays. They are not constants of the program: XLA folds constants while it compiles, which takes minutes
+            for a product of large matrices and leaves nothing to measure.
+        amount: Work of one call, in 1e9 of its unit.
     """
 
     program: Callable[..., jax.Array]
@@ -84,12 +84,12 @@ class Work:
     amount: float
 
     def __call__(self) -> jax.Array:
-        """Does it, or begins to: wait for the result."""
+        """Dispatch one call; wait for its result."""
         return self.program(*self.arguments)
 
 
 def calibrations() -> dict[str, Work]:
-    """What `calibrate` measures, by the name of the figure."""
+    """Workloads of `calibrate` by the name of the figure."""
     on_cpu = jax.default_backend() == "cpu"
     size, length = (384, 2**22) if on_cpu else (4096, 2**27)
     matrix = jnp.ones((size, size), jnp.float32 if on_cpu else jnp.bfloat16)
@@ -105,9 +105,9 @@ def calibrations() -> dict[str, Work]:
 
 
 def _seconds(call: Callable[[], Any]) -> float:
-    """The median of a few repeats, each of many calls."""
+    """Median seconds of a call over a few repeats of many calls."""
 
-    def of(calls: int) -> float:
+    def seconds_per_call(calls: int) -> float:
         start = time.perf_counter()
         result = None
         for _ in range(calls):
@@ -115,20 +115,20 @@ def _seconds(call: Callable[[], Any]) -> float:
         jax.block_until_ready(result)
         return (time.perf_counter() - start) / calls
 
-    of(1)
-    calls = max(1, min(200, round(_CALIBRATION_S / max(of(1), 1e-6))))
-    return statistics.median(of(calls) for _ in range(_REPEATS))
+    seconds_per_call(1)
+    calls = max(1, min(200, round(_CALIBRATION_S / max(seconds_per_call(1), 1e-6))))
+    return statistics.median(seconds_per_call(calls) for _ in range(_REPEATS))
 
 
 class Watch:
-    """Watches the machine during a benchmark: ask it after each measurement for the conditions of that one."""
+    """Monitor of the machine during a benchmark: ask for the conditions after each measurement."""
 
     def __init__(self) -> None:
         self._busy, self._before = busy_cores(), calibrate()
         self._cores = num_cores()
 
     def conditions(self) -> dict[str, Any]:
-        """What a record keeps: machine, cores, cores busy with other programs before the benchmark, and two calibrations."""
+        """Conditions of a record: machine, cores, load of other programs before the benchmark, and two calibrations."""
         before, self._before = self._before, calibrate()
         return {
             "machine": machine(),
@@ -139,21 +139,21 @@ class Watch:
 
 
 def why_not_comparable(new: dict[str, Any] | None, old: dict[str, Any] | None) -> str | None:
-    """Why a new figure says nothing about an old one; None where it does.
+    """Explain in words why two figures are not comparable; return None if they are.
 
     Args:
-        new, old: Conditions as `Watch` gives them; None of a record that has none.
+        new, old: Conditions from `Watch`; None for a record without conditions.
     """
     if old is None or new is None:
         return "it does not say how fast its machine was"
     if old["machine"] != new["machine"]:
         return "it is of another machine of this name"
-    for which, each in (("now", new), ("then", old)):
-        if each["busy_cores"] is not None and each["busy_cores"] > BUSY_CORES * each["cores"]:
-            return f"other programs used {each['busy_cores']:.1f} of {each['cores']} cores {which}"
-        drift = speed_ratio(each["calibration"]["after"], each["calibration"]["before"])
+    for when, conditions in (("now", new), ("then", old)):
+        if conditions["busy_cores"] is not None and conditions["busy_cores"] > BUSY_CORES * conditions["cores"]:
+            return f"other programs used {conditions['busy_cores']:.1f} of {conditions['cores']} cores {when}"
+        drift = speed_ratio(conditions["calibration"]["after"], conditions["calibration"]["before"])
         if abs(drift - 1) > SAME_SPEED:
-            return f"while it was measured {which}, the machine's speed changed by {drift - 1:+.0%}"
+            return f"while it was measured {when}, the machine's speed changed by {drift - 1:+.0%}"
     ratio = speed_ratio(_mean(new), _mean(old))
     if abs(ratio - 1) > SAME_SPEED:
         return f"the machine itself runs at {ratio:.2f} times the speed that it had then"
@@ -161,7 +161,7 @@ def why_not_comparable(new: dict[str, Any] | None, old: dict[str, Any] | None) -
 
 
 def speed_ratio(new: dict[str, float], old: dict[str, float]) -> float:
-    """The ratio of two calibrations that is farthest from 1."""
+    """Ratio of two calibrations that is farthest from 1."""
     return max((new[name] / old[name] for name in old), key=lambda ratio: abs(ratio - 1))
 
 

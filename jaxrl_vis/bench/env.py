@@ -1,4 +1,4 @@
-"""Whole episodes: reset with its goal image, then physics and an image at every step, under random actions."""
+"""Benchmark of whole episodes: reset with its goal image, then physics and an image at every step, under random actions."""
 
 from collections.abc import Iterator
 
@@ -17,7 +17,7 @@ ACCELERATOR_COUNTS = (256, 1024, 4096, 8192)
 
 
 def time_episodes(env: GoalEnv, count: int, repeats: int) -> tuple[Timing, float]:
-    """The time of one episode in each of ``count`` environments, and the seconds of its compilation."""
+    """Time one episode in each of ``count`` environments; return the timing and the seconds of compilation."""
 
     def episode(key: jax.Array) -> tuple[jax.Array, jax.Array]:
         reset_key, action_key = jax.random.split(key)
@@ -42,7 +42,7 @@ def time_episodes(env: GoalEnv, count: int, repeats: int) -> tuple[Timing, float
 
 
 def measure(settings: Settings) -> Iterator[Measurement]:
-    """Yields environment steps per second; resets and goal images are spread over the horizon."""
+    """Yield environment steps per second; resets and goal images are spread over the horizon."""
     env = settings.make_env()
     for count in settings.counts(CPU_COUNTS, ACCELERATOR_COUNTS):
         timing, compile_s = time_episodes(env, count, settings.repeats)

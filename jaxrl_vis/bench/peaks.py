@@ -5,11 +5,11 @@ import dataclasses
 
 @dataclasses.dataclass(frozen=True)
 class Peak:
-    """A device's limits: dense matrix products without sparsity, everything else, and memory.
+    """Limits of a device: dense matrix products without sparsity, other arithmetic, and memory.
 
     Attributes:
         bfloat16: Floating-point operations per second in matrix products.
-        float32: The same for float32 inputs (TF32, which is what XLA uses by default).
+        float32: The same for float32 inputs (TF32, the default of XLA).
         vector: Single-precision operations per second outside the matrix units.
         memory: Bytes per second.
     """
@@ -20,7 +20,7 @@ class Peak:
     memory: float
 
 
-# The longest name that a device's kind starts with counts.
+# The longest name that is a prefix of the device's kind counts.
 PEAKS = {
     "NVIDIA H100 80GB HBM3": Peak(989e12, 494e12, 67e12, 3.35e12),
     "NVIDIA H100 PCIe": Peak(756e12, 378e12, 51e12, 2.0e12),
@@ -30,7 +30,7 @@ PEAKS = {
 }
 
 
-def peak_of(device_kind: str) -> Peak | None:
-    """The limits of a device, where they are known."""
+def device_peak(device_kind: str) -> Peak | None:
+    """Limits of a device; None if unknown."""
     names = [name for name in PEAKS if device_kind.startswith(name)]
     return PEAKS[max(names, key=len)] if names else None

@@ -1,17 +1,15 @@
-"""Physics alone: `advance` with random actions and no images; on request, MuJoCo Playground's FingerTurn beside ours."""
+"""Benchmark of physics alone: batches of environments under random actions, without images."""
 
 from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
 
-from jaxrl_vis.bench import playground
 from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.settings import Settings
 from jaxrl_vis.bench.timing import compile_timed
 from jaxrl_vis.bench.timing import measure as measure_time
 from jaxrl_vis.bench.variation import assert_varied
-from jaxrl_vis.errors import RequestError
 from jaxrl_vis_envs.base import GoalEnv, State
 from jaxrl_vis_envs.compilation import env_jit
 
@@ -20,21 +18,17 @@ ACCELERATOR_COUNTS = (256, 1024, 4096, 8192)
 
 
 def start_states(env: GoalEnv, count: int) -> State:
-    """``count`` different initial states, without images."""
+    """Make ``count`` different initial states, without images."""
     keys = jax.random.split(jax.random.key(1), count)
     return env_jit(jax.vmap(lambda key: env.reset(key).replace(obs=None)))(keys)
 
 
 def measure(settings: Settings) -> Iterator[Measurement]:
-    """Yields environment steps per second."""
-    if settings.peer is not None:
-        if settings.env != "FingerTurn":
-            raise RequestError("bench physics --peer playground needs --env FingerTurn")
-        playground.load()  # first, because it may be missing
+    """Yield environment steps per second."""
     env = settings.make_env()
     steps = env.horizon if settings.on_accelerator else 10
     counts = settings.counts(CPU_COUNTS, ACCELERATOR_COUNTS)
-    # One program makes all initial states; smaller batches take the first of them.
+    # One program makes all initial states; smaller batches use the first of them.
     states = start_states(env, max(counts))
 
     def advance(states: State, key: jax.Array) -> State:
@@ -52,13 +46,10 @@ def measure(settings: Settings) -> Iterator[Measurement]:
         if not bool(jnp.isfinite(final.achieved_state).all()):
             raise FloatingPointError("physics gave numbers that are not finite")
         timing = measure_time(lambda: compiled(*arguments).achieved_state, settings.repeats)  # noqa: B023 - called at once
-        rate = count * steps / timing.median_s
         yield Measurement(
             name="physics/steps",
-            value=rate,
+            value=count * steps / timing.median_s,
             unit="env-steps/s",
             config={"env": settings.env, "envs": count, "steps": steps},
             details=timing.details(compile_s),
         )
-        if settings.peer is not None:
-            yield from playground.measure(settings, count, steps, env.control_period, rate)

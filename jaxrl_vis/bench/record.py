@@ -1,14 +1,12 @@
-"""Benchmark records: one JSON file per benchmark and device, and the change since the record that was there before.
+"""Benchmark records: one JSON file per benchmark and device, and the change since the previous record.
 
-A file holds the newest record of every configuration. Records lie in the user's cache, unless a folder is named; those that the
-README quotes lie in benchmarks/results, whose git history has the older ones.
+A file holds the newest record of every configuration. Records are stored in the user's cache unless a folder is named.
 """
 
 import dataclasses
 import datetime
 import json
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,11 +24,11 @@ class Measurement:
     """One figure.
 
     Attributes:
-        name: What was measured, as ``benchmark/quantity``.
-        value: The figure.
-        unit: Its unit; larger is better.
-        config: What was asked for. Two figures can be compared only where this and the device agree.
-        details: Whatever else was observed: compilation time, spread, roofline.
+        name: Measured quantity, as ``benchmark/quantity``.
+        value: Figure; larger is better.
+        unit: Unit of the figure.
+        config: Requested configuration. Two figures are comparable only if this and the device agree.
+        details: Further observations: compilation time, spread, roofline.
     """
 
     name: str
@@ -41,7 +39,7 @@ class Measurement:
 
 
 def to_record(measurement: Measurement, conditions: dict[str, Any] | None = None) -> dict[str, Any]:
-    """The measurement with its provenance and the conditions it was made under (see `conditions`), as it is kept."""
+    """Record of a measurement: the figure, its provenance and its conditions (see `conditions`)."""
     return {
         "schema": SCHEMA,
         **dataclasses.asdict(measurement),
@@ -54,24 +52,18 @@ def to_record(measurement: Measurement, conditions: dict[str, Any] | None = None
 
 
 def user_folder() -> Path:
-    """Where a user's records lie."""
+    """Folder of a user's records."""
     return user_cache() / "bench"
 
 
-def results_folder() -> Path:
-    """The records that the README quotes: benchmarks/results of the checkout that holds this code, or of the current folder."""
-    home = provenance.CHECKOUT if (provenance.CHECKOUT / "pyproject.toml").exists() else Path.cwd()
-    return home / "benchmarks" / "results"
-
-
 def results_path(benchmark: str, folder: Path | None = None) -> Path:
-    """The file of one benchmark on this device."""
+    """File of one benchmark on this device."""
     slug = re.sub(r"[^a-z0-9]+", "-", provenance.device_name().lower().replace("(r)", "").replace("(tm)", "")).strip("-")
     return (folder or user_folder()) / f"{benchmark}-{slug}.json"
 
 
 def load(path: Path) -> list[dict[str, Any]]:
-    """The records in a file; none where it is missing.
+    """Read the records of a file; return an empty list if it is missing.
 
     Raises:
         RequestError: The file holds something else.
@@ -79,40 +71,20 @@ def load(path: Path) -> list[dict[str, Any]]:
     if not path.exists():
         return []
     records = read_json(path)
-    if not isinstance(records, list) or not all(isinstance(each, dict) and each.get("schema") == SCHEMA for each in records):
+    if not isinstance(records, list) or not all(
+        isinstance(record, dict) and record.get("schema") == SCHEMA for record in records
+    ):
         raise RequestError(f"{path} holds no records of schema {SCHEMA}; move it away to start a new one")
     return records
 
 
 def read_json(path: Path) -> Any:
-    """What a JSON file holds.
+    """Read a JSON file.
 
     Raises:
-        RequestError: It holds something else, or cannot be read.
+        RequestError: The file holds something else, or cannot be read.
     """
     return files.read_json(path, object, "move it away, or put back what it held")
-
-
-def read_all(folder: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """Every record in ``folder`` and below with its file, sorted by file. JSON files of something else are passed over.
-
-    Raises:
-        RequestError: There is no such folder, or a file is not JSON, or cannot be read.
-    """
-    if not folder.is_dir():
-        raise RequestError(f"there is no folder of records {folder}: name one with --results")
-    for path in sorted(folder.rglob("*.json")):
-        contents = read_json(path)
-        for record in contents if isinstance(contents, list) else [contents]:
-            # The configuration of a run has a schema, too, but neither name nor value.
-            if isinstance(record, dict) and record.get("schema") == SCHEMA and "name" in record:
-                yield path, record
-
-
-def is_of_cpu(record: dict[str, Any]) -> bool:
-    """Whether a record was made on a CPU; its device is a name (`provenance.device_name`) or, of a run, a dictionary."""
-    device = record["device"]
-    return device["platform"] == "cpu" if isinstance(device, dict) else device.endswith(" cores")
 
 
 def _key(record: dict[str, Any]) -> str:
@@ -125,12 +97,12 @@ def _write(path: Path, records: list[dict[str, Any]]) -> None:
 
 
 def write_json(path: Path, records: list[dict[str, Any]]) -> None:
-    """Writes the records of one run."""
+    """Write the records of one run to a file."""
     _write(path, records)
 
 
 def keep(path: Path, record: dict[str, Any]) -> dict[str, Any] | None:
-    """Puts a record into a file. It replaces the one of the same configuration and device, which is returned."""
+    """Store a record in a file; return the record of the same configuration and device that it replaces, if any."""
     record = json.loads(json.dumps(record))  # as it will be read back: tuples are lists
     records = load(path)
     previous = next((old for old in records if _key(old) == _key(record)), None)
@@ -140,35 +112,35 @@ def keep(path: Path, record: dict[str, Any]) -> dict[str, Any] | None:
 
 
 def describe(record: dict[str, Any], previous: dict[str, Any] | None) -> str:
-    """One line: what was measured, the figure, and its change where that says something about the code."""
+    """Describe a record in one line: quantity, configuration, figure, and its change if the two are comparable."""
     config = " ".join(f"{name}={value}" for name, value in record["config"].items())
     line = f"{record['name']:24} {config:72} {format_figure(record['value']):>12} {record['unit']}"
     if previous is None:
         return line + "  (first record)"
     before = f"{format_figure(previous['value'])} of {previous['revision']}, {previous['date'][:10]}"
-    why = why_not_comparable(record["conditions"], previous.get("conditions"))
-    if why is not None:
-        return line + f"  (not compared with {before}: {why})"
+    reason = why_not_comparable(record["conditions"], previous.get("conditions"))
+    if reason is not None:
+        return line + f"  (not compared with {before}: {reason})"
     change = record["value"] / previous["value"] - 1 if previous["value"] else float("nan")
-    spread = max(each["details"].get("spread", 0.0) for each in (record, previous))
+    spread = max(entry["details"].get("spread", 0.0) for entry in (record, previous))
     noise = f", no more than the spread of the repeats, {100 * spread:.1f} %" if abs(change) <= spread else ""
     return line + f"  ({100 * change:+.1f} % against {before}, the same machine at the same speed{noise})"
 
 
 def format_figure(value: float) -> str:
-    """At least three significant figures, with thousands separators."""
+    """Format a figure with at least three significant digits and thousands separators."""
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
 
 
 def compare_and_keep(
     benchmark: str, measurement: Measurement, folder: Path | None = None, conditions: dict[str, Any] | None = None
 ) -> dict[str, Any]:
-    """Keeps a measurement and prints its line, with its details below; returns the record.
+    """Store a measurement and print its line, with its details below; return the record.
 
     Args:
-        benchmark: Its name.
-        measurement: The figure.
-        folder: Where it is kept; None: `user_folder`.
+        benchmark: Name of the benchmark.
+        measurement: Figure to store.
+        folder: Folder of records; None for `user_folder`.
         conditions: See `conditions.Watch`.
     """
     record = to_record(measurement, conditions)

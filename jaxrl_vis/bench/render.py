@@ -1,7 +1,7 @@
-"""Images alone, without physics: an environment's observations, or a scene beside other renderers.
+"""Benchmark of images alone, without physics: the observations of an environment, or the scenes of `scenes`.
 
-All poses in a batch differ, and calls alternate between two batches, so no renderer can reuse an image; that the images differ
-is asserted.
+All poses of a batch differ, and calls alternate between two batches, so that no renderer can reuse an image; that the images
+differ is asserted.
 """
 
 from collections.abc import Iterator
@@ -9,9 +9,9 @@ from typing import Any
 
 import jax
 
-from jaxrl_vis.bench import scene_images
 from jaxrl_vis.bench.physics import start_states
 from jaxrl_vis.bench.record import Measurement
+from jaxrl_vis.bench.scenes import images as scene_images
 from jaxrl_vis.bench.settings import Settings
 from jaxrl_vis.bench.timing import compile_timed
 from jaxrl_vis.bench.timing import measure as measure_time
@@ -28,24 +28,24 @@ _STEPS = 5  # random control steps from the common start, after which no two rob
 
 
 def measure(settings: Settings) -> Iterator[Measurement]:
-    """Yields images per second of each size, output and batch: of the environment, or of scenes if one or a peer is given."""
-    if settings.scene is not None or settings.peer is not None:
+    """Yield images per second of each size, output and batch: of the scene if there is one, else of the environment."""
+    if settings.scene is not None:
         yield from scene_images.measure(settings, image_sizes(settings))
         return
     if not settings.has_images:
         visual = registry.visual_variant(settings.env)
-        mend = f": try --env {visual}" if visual else ""
-        raise RequestError(f"bench render needs an environment with images, and {settings.env} has none{mend}")
+        hint = f": try --env {visual}" if visual else ""
+        raise RequestError(f"bench render needs an environment with images, and {settings.env} has none{hint}")
     counts = settings.counts(CPU_COUNTS, ACCELERATOR_COUNTS)
     batches = [poses(settings, max(counts), seed) for seed in (4, 5)]
     for size in image_sizes(settings):
         for output in ("depth", "rgb", "rgbd") if settings.on_accelerator else ("depth", "rgbd"):
             env = settings.make_env(image_size=size, pixels=output)
             for count in counts:
-                some = [jax.tree.map(lambda leaf, count=count: leaf[:count], states) for states in batches]
-                compiled, compile_s = compile_timed(env_jit(jax.vmap(env.observe)), some[0])
-                assert_new_images(compiled, some)
-                timing = measure_time(alternate(compiled, some), settings.repeats)
+                drawn = [jax.tree.map(lambda leaf, count=count: leaf[:count], states) for states in batches]
+                compiled, compile_s = compile_timed(env_jit(jax.vmap(env.observe)), drawn[0])
+                assert_new_images(compiled, drawn)
+                timing = measure_time(alternate(compiled, drawn), settings.repeats)
                 yield Measurement(
                     name="render/images",
                     value=count / timing.median_s,
@@ -56,7 +56,7 @@ def measure(settings: Settings) -> Iterator[Measurement]:
 
 
 def image_sizes(settings: Settings) -> tuple[int, ...]:
-    """Heights and widths to measure: those of the device, or only the one that was asked for if it is not among them."""
+    """Image sizes to measure: the defaults for this kind of device, or only the requested one if it is not among them."""
     sizes = ACCELERATOR_SIZES if settings.on_accelerator else CPU_SIZES
     if settings.image_size is not None and settings.image_size not in sizes:
         return (settings.image_size,)
@@ -64,7 +64,7 @@ def image_sizes(settings: Settings) -> tuple[int, ...]:
 
 
 def poses(settings: Settings, count: int, seed: int = 4) -> Any:
-    """``count`` environments in different poses."""
+    """Make states of ``count`` environments in different poses."""
     env = settings.make_env()
 
     def scatter(state: Any, key: jax.Array) -> Any:

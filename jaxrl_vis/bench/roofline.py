@@ -1,7 +1,7 @@
-"""The least that a gradient step costs, and what share of the device's peak is achieved.
+"""Minimum cost of a gradient step, and the achieved share of the device's peak.
 
-There are two counts: the compiler's own of the program that it made (`Compiled.cost_analysis`), and one from the shapes of the
-layers, which cannot be beaten without changing the algorithm.
+There are two counts: the compiler's own count of the program (`Compiled.cost_analysis`), and a lower bound from the shapes of
+the layers, which holds for every implementation of the algorithm.
 """
 
 import dataclasses
@@ -10,7 +10,7 @@ from typing import Any
 
 import jax
 
-from jaxrl_vis.bench.peaks import peak_of
+from jaxrl_vis.bench.peaks import device_peak
 from jaxrl_vis.learner.networks import Networks
 
 
@@ -23,7 +23,10 @@ class Cost:
 
 
 def compiler_cost(compiled: Any, steps: int = 1) -> Cost | None:
-    """The compiler's count of one of ``steps`` gradient steps. A loop's body counts once: give it a program with one turn."""
+    """Cost per gradient step from the compiler's count of a program of ``steps`` of them; None if there is no count.
+
+    The body of a loop counts once: pass a program with one turn.
+    """
     analysis = compiled.cost_analysis()
     if isinstance(analysis, list):
         analysis = analysis[0] if analysis else None
@@ -33,7 +36,7 @@ def compiler_cost(compiled: Any, steps: int = 1) -> Cost | None:
 
 
 def encoder_products(networks: Networks) -> tuple[int, int]:
-    """Multiply-adds of one network's encoder for one image: all of them, and the first layer's alone."""
+    """Multiply-adds of one encoder for one image: total, and first layer."""
     if not networks.sees_images:
         return 0, 0
     channels, height, width = networks.observation_spec.shape
@@ -54,18 +57,18 @@ def head_products(sizes: tuple[int, ...]) -> int:
 
 
 def least_cost(networks: Networks, params: Any, batch_size: int) -> Cost:
-    """The count from the layers' shapes, in the mean over the actor's interval.
+    """Lower bound from the shapes of the layers, averaged over the actor's update interval.
 
-    Products: every online encoder takes two images a transition forward and backward (twice a forward pass, less the gradient
-    of the image itself), and every target encoder two forward; without those, every online encoder takes the image after, too.
-    The actor's head runs once forward as target and once both ways; the critic's once as target, once both ways, and once more
-    in the actor's loss, forward and back to the action.
+    Products: every online encoder runs forward and backward on two images per transition (backward costs twice a forward pass,
+    minus the gradient with respect to the image), and every target encoder runs forward on two; without target encoders, every
+    online encoder also encodes the next image. The actor's head runs forward once as the target and once in both directions;
+    the critic's once as the target, once in both directions, and once more in the actor's loss, forward and back to the action.
 
-    Bytes: three images a transition are read once as they lie in the replay; online parameters and two Adam moments are read
-    and written once, target parameters are read and written once. Activations are taken to stay on the chip.
+    Bytes: three images per transition are read once from the replay; online parameters and two Adam moments are read and
+    written once, target parameters are read and written once. Activations are assumed to stay on the chip.
 
     Args:
-        networks: The networks whose parameters these are.
+        networks: Networks of the parameters.
         params: Online actor and critic parameters.
         batch_size: Transitions in a gradient step.
     """
@@ -78,15 +81,15 @@ def least_cost(networks: Networks, params: Any, batch_size: int) -> Cost:
     separate, actor_share = config.encoders == "separate", 1.0 / config.actor_interval
     learned = 2 * (3 * encoder - first_layer)
     followed = (2 if config.target_encoder else 1) * encoder
-    of_critic = learned + followed + (1 + 3) * critic_head
-    of_actor = (followed if separate else 0) + actor_head
-    of_actor_step = (learned if separate else 0) + 3 * actor_head + 2 * critic_head
-    products = of_critic + of_actor + actor_share * of_actor_step
+    critic_products = learned + followed + (1 + 3) * critic_head
+    actor_products = (followed if separate else 0) + actor_head
+    actor_step_products = (learned if separate else 0) + 3 * actor_head + 2 * critic_head
+    products = critic_products + actor_products + actor_share * actor_step_products
 
     images = 3 * batch_size * math.prod(spec.shape) * spec.dtype.itemsize
     actor, critic = params
     online = _bytes(critic) + actor_share * _bytes(actor)
-    targets = sum(_bytes(each if config.target_encoder else each["head"]) for each in (actor, critic))
+    targets = sum(_bytes(network if config.target_encoder else network["head"]) for network in (actor, critic))
     return Cost(flops=2.0 * batch_size * products, bytes=images + (2 + 4) * online + 2 * targets)
 
 
@@ -95,14 +98,14 @@ def _bytes(tree: Any) -> int:
 
 
 def describe(cost: Cost, seconds: float, dtype: str, device_kind: str) -> dict[str, Any]:
-    """What was achieved: TFLOP/s, GB/s, and their shares of the device's peak where that is known."""
+    """Achieved TFLOP/s and GB/s, with their shares of the device's peak if that is known."""
     achieved = {
         "gflop": round(cost.flops / 1e9, 3),
         "mbyte": round(cost.bytes / 1e6, 3),
         "tflop_per_s": round(cost.flops / seconds / 1e12, 4),
         "gbyte_per_s": round(cost.bytes / seconds / 1e9, 2),
     }
-    peak = peak_of(device_kind)
+    peak = device_peak(device_kind)
     if peak is not None:
         flops = peak.bfloat16 if dtype == "bfloat16" else peak.float32
         achieved["share_of_peak_flops"] = round(cost.flops / seconds / flops, 4)

@@ -1,4 +1,4 @@
-"""What a benchmark is asked to measure, with defaults that suit the device."""
+"""Settings of a benchmark, with defaults that suit the device."""
 
 import dataclasses
 from typing import Any, Self
@@ -11,23 +11,22 @@ from jaxrl_vis_envs import registry
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """What to measure. None and the empty tuple stand for a default that suits the device.
+    """Settings of a benchmark. None and the empty tuple stand for a default that suits the device.
 
     Attributes:
-        env: The environment.
-        preset: Whose networks and gradient steps are measured.
-        envs: Environments (or images) side by side; one measurement each.
+        env: Name of the environment.
+        preset: Preset of the networks and gradient steps.
+        envs: Batch sizes in environments (or images), with one measurement for each.
         image_size: Height and width of images.
         pixels: Channels: rgbd, rgb or depth.
-        batch_size: Transitions in a gradient step.
-        seeds: Learners side by side in one program.
-        devices: How many to use.
-        data_devices: How many of them share each learner; see `Config`.
-        repeats: Timed repeats at most; see `timing.measure`.
-        peer: Another renderer, another physics, or PyTorch, to measure beside ours.
-        aux_tasks, weighting: Auxiliary losses in gradient steps, and their weighting.
-        scene: A scene of `render_scenes`, or the path of an MJCF file, to draw instead of an environment.
-        on_accelerator: Whether JAX runs on one; filled in by `for_this_device`.
+        batch_size: Transitions per gradient step.
+        seeds: Learners in one program.
+        devices: Number of devices.
+        data_devices: Number of devices that share each learner; see `Config`.
+        repeats: Maximum number of timed repeats; see `timing.measure`.
+        aux_tasks, weighting: Auxiliary losses of the gradient steps, and their weighting.
+        scene: Scene of `scenes.models`, or path of an MJCF file, to draw instead of an environment.
+        on_accelerator: True if JAX runs on an accelerator; set by `for_this_device`.
     """
 
     env: str = "VisualFetchReach"
@@ -40,14 +39,13 @@ class Settings:
     devices: int = 1
     data_devices: int | None = None
     repeats: int = 5
-    peer: str | None = None
     aux_tasks: tuple[str, ...] = ()
     weighting: str = "none"
     scene: str | None = None
     on_accelerator: bool = False
 
     def for_this_device(self) -> Self:
-        """Fills in what depends on the device alone; each benchmark fills in its own sizes."""
+        """Fill in the defaults that depend on the device alone; each benchmark fills in its own sizes."""
         accelerator = jax.default_backend() != "cpu"
         return dataclasses.replace(
             self,
@@ -57,19 +55,19 @@ class Settings:
         )
 
     def counts(self, cpu: tuple[int, ...], accelerator: tuple[int, ...]) -> tuple[int, ...]:
-        """How many environments to measure: the numbers that were asked for, or the device's defaults."""
+        """Batch sizes to measure: the requested ones, or the defaults for this kind of device."""
         return self.envs or (accelerator if self.on_accelerator else cpu)
 
     @property
     def has_images(self) -> bool:
-        """Whether the environment's observations are images: then its configuration says which channels they have."""
+        """True if the observations of the environment are images: its configuration then has a field for their channels."""
         return "pixels" in {field.name for field in dataclasses.fields(registry.config_class(self.env))}
 
     def make_env(self, **overrides: Any) -> Any:
-        """The environment; where its observations are images, with these settings of them.
+        """Make the environment, with these image settings if its observations are images.
 
         Raises:
-            RequestError: There is no such environment, or it cannot be made like that.
+            RequestError: There is no such environment, or it refuses the settings.
         """
         images = {"image_size": self.image_size, "pixels": self.pixels, **overrides}
         try:
@@ -78,27 +76,27 @@ class Settings:
             raise RequestError(str(error)) from error
 
     def image_config(self) -> dict[str, Any]:
-        """What a record says about the environment that was measured."""
+        """Entries of a record for the measured environment."""
         if not self.has_images:
             return {"env": self.env}
         return {"env": self.env, "image_size": self.image_size, "pixels": self.pixels}
 
     def preset_config(self) -> dict[str, str]:
-        """What a record says about the preset; nothing of the device's own, as in records from before that."""
+        """Entry of a record for the preset; empty for the default of the device."""
         return {} if self.preset is None else {"preset": self.preset}
 
     def seeds_config(self) -> dict[str, int]:
-        """What a record says about the number of learners; nothing of one, as records from before there could be several."""
+        """Entry of a record for the number of learners; empty for one."""
         return {"seeds": self.seeds} if self.seeds > 1 else {}
 
     def devices_config(self) -> dict[str, int]:
-        """What a record says about devices; nothing of one."""
+        """Entries of a record for the devices; empty for one."""
         if self.devices == 1:
             return {}
         return {"devices": self.devices} | ({} if self.data_devices is None else {"data_devices": self.data_devices})
 
     def auxiliary_config(self) -> dict[str, Any]:
-        """What a record says about auxiliary losses; nothing where there are none."""
+        """Entries of a record for auxiliary losses; empty without them."""
         if self.weighting == "none":
             return {}
         return {"weighting": self.weighting, "aux_tasks": " ".join(self.aux_tasks)}

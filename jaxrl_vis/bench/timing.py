@@ -1,4 +1,4 @@
-"""Timing that means something: compiled ahead of time, warmed up, waited for, repeated."""
+"""Timing of compiled programs: warmed up, synchronised and repeated."""
 
 import dataclasses
 import statistics
@@ -18,9 +18,9 @@ class Timing:
     """Seconds of one call.
 
     Attributes:
-        median_s: Of the repeats.
+        median_s: Median of the repeats.
         spread: (slowest - fastest) / median.
-        repeats: How many there were.
+        repeats: Number of repeats.
     """
 
     median_s: float
@@ -28,13 +28,13 @@ class Timing:
     repeats: int
 
     def details(self, compile_s: float, **more: Any) -> dict[str, Any]:
-        """What a record keeps beside the figure."""
+        """Details of a record: repeats, spread and seconds of compilation, with further entries."""
         timing = {"repeats": self.repeats, "spread": round(self.spread, 4), "compile_s": round(compile_s, 2)}
         return {**timing, **more}
 
 
 def compile_timed(jitted: Any, *arguments: Any) -> tuple[Any, float]:
-    """Compiles ahead of time: the program, and the seconds of tracing and compiling (few if a cache had it)."""
+    """Compile ahead of time; return the program and the seconds of tracing and compiling (few on a cache hit)."""
     start = time.perf_counter()
     with tracing_for_default_device():
         lowered = jitted.lower(*arguments)
@@ -48,19 +48,19 @@ def measure(
     budget_s: float = 30.0,
     wait: Callable[[Any], Any] = jax.block_until_ready,
 ) -> Timing:
-    """Times ``call`` until its result is there, after one untimed call.
+    """Time ``call`` until its result is available, after one untimed call.
 
-    Short calls are made one after the other and waited for together, as in a loop that uses the results on the device: waiting
-    after each would measure how fast the host dispatches.
+    Short calls are dispatched back to back and synchronised together, as in a loop that uses the results on the device:
+    synchronising after each would measure the dispatch of the host.
 
     Args:
-        call: The work; returns arrays.
-        repeats: Timed repeats at most. At least three are made, or ``repeats`` if that is less.
-        budget_s: No further repeat starts after this many seconds.
-        wait: Waits for all calls whose last result it is given.
+        call: Workload; returns arrays.
+        repeats: Maximum number of timed repeats. The minimum is three, or ``repeats`` if that is less.
+        budget_s: Seconds after which no further repeat starts.
+        wait: Synchronises all calls up to the one whose result it receives.
     """
 
-    def seconds_of(calls: int) -> float:
+    def seconds_per_call(calls: int) -> float:
         start = time.perf_counter()
         result = None
         for _ in range(calls):
@@ -70,9 +70,9 @@ def measure(
 
     wait(call())
     # A call of a few milliseconds is repeated until a clock and a scheduler can tell it from noise.
-    calls = max(1, min(1000, round(_LEAST_SECONDS / max(seconds_of(1), 1e-6))))
+    calls = max(1, min(1000, round(_LEAST_SECONDS / max(seconds_per_call(1), 1e-6))))
     seconds: list[float] = []
     while len(seconds) < repeats and (len(seconds) < 3 or sum(seconds) * calls < budget_s):
-        seconds.append(seconds_of(calls))
+        seconds.append(seconds_per_call(calls))
     median = statistics.median(seconds)
     return Timing(median, (max(seconds) - min(seconds)) / median, len(seconds))

@@ -1,11 +1,11 @@
-"""Whole training iterations, as `jaxrl-vis train` runs them, and where their time goes.
+"""Benchmark of whole training iterations, as `jaxrl-vis train` runs them, with a breakdown of their time.
 
     iteration    rollout, insert and updates, the host reading the metrics of one iteration during the next
-    parts        each of the three by itself, and what an iteration pays for evaluations and for the host
-    promise      the time that `bench env` and `bench update` give for the same environments and the same gradient steps
+    parts        each of the three alone, and the share of evaluations and of the host in an iteration
+    promise      time that `bench env` and `bench update` give for the same environments and the same gradient steps
 
-    efficiency   on several devices: the time of one device with its share of the seeds, or of the batch and the environments,
-                 divided by that of all of them side by side
+    efficiency   on several devices: time of one device with its share of the seeds, or of the batch and the environments,
+                 divided by the time of all devices together
 
 An iteration that takes longer than the promise loses time between its parts, to the policy in the rollout, or to the replay.
 """
@@ -34,15 +34,15 @@ _BUDGET_S = 40.0
 
 
 def time_iterations(programs: Programs, repeats: int) -> tuple[LoopState, Timing, dict[str, float]]:
-    """Trains for a while.
+    """Train for some iterations and time them.
 
     Args:
-        programs: What trains; without a cache, or the time of compilation means nothing.
-        repeats: Timed repeats at most.
+        programs: Training programs, without a cache: otherwise the time of compilation is meaningless.
+        repeats: Maximum number of timed repeats.
 
     Returns:
-        What was trained, the time of an iteration whose metrics the host reads during the next, and in seconds: ``compile``,
-        and ``host``, what that reading adds.
+        The trained state, the timing of an iteration whose metrics the host reads during the next one, and seconds of
+        ``compile`` and ``host``, the cost of that reading.
 
     Raises:
         FloatingPointError: A metric is not finite.
@@ -73,22 +73,22 @@ def time_iterations(programs: Programs, repeats: int) -> tuple[LoopState, Timing
 
 
 def _settled(program: TrainStep, call: Callable[[], Any]) -> Callable[[], Any]:
-    """The call; where several devices of a CPU share its threads, with its end, for two at a time could wait for each other."""
+    """Return the call, synchronised if several devices of a CPU share its threads: two calls could wait for each other."""
     if program.layout.num_devices == 1 or jax.default_backend() != "cpu":
         return call
     return lambda: jax.block_until_ready(call())
 
 
 def time_parts(programs: Programs, loop: LoopState, repeats: int) -> dict[str, float]:
-    """Seconds of what an iteration consists of, each by itself at the iteration's own sizes.
+    """Time the parts of an iteration, each alone and at the sizes of the iteration.
 
     Args:
-        programs: What the iteration is made of.
-        loop: Donated.
-        repeats: Timed repeats at most.
+        programs: Programs of the parts.
+        loop: Training state, which is donated.
+        repeats: Maximum number of timed repeats.
 
     Returns:
-        ``rollout``, ``insert``, ``updates``, and ``evaluation``, an iteration's part of it.
+        Seconds of ``rollout``, ``insert``, ``updates`` and ``evaluation``, the last per iteration.
     """
     program, iteration = programs.program, loop.iteration
     keys, key = seed_keys(program, 3), jax.random.key(4)
@@ -119,7 +119,7 @@ def time_parts(programs: Programs, loop: LoopState, repeats: int) -> dict[str, f
 
 
 def describe(iteration: float, parts: dict[str, float], promised: float) -> str:
-    """A table of the parts: milliseconds, and percent of an iteration."""
+    """Format a table of the parts: milliseconds, and percent of an iteration."""
     whole = parts["rollout"] + parts["insert"] + parts["updates"] + parts["host"]
     rows = {**parts, "sum without evaluation": whole, "iteration": iteration, "promised": promised}
     lines = [f"    {name:24}{1e3 * seconds:12,.2f} ms {seconds / iteration:8.1%}" for name, seconds in rows.items()]
@@ -127,7 +127,7 @@ def describe(iteration: float, parts: dict[str, float], promised: float) -> str:
 
 
 def share_of_one(config: Config) -> Config:
-    """What one of the devices of a run does, as a run of its own on one device."""
+    """Configuration of one device's share of a run, as a run on one device."""
     parts = data_devices_of(config)
     return config.replace(
         devices=1,
@@ -140,13 +140,13 @@ def share_of_one(config: Config) -> Config:
 
 
 def _time_share(env: GoalEnv, config: Config, settings: Settings) -> float:
-    """Seconds of an iteration of `share_of_one`."""
+    """Time an iteration of `share_of_one`, in seconds."""
     share = share_of_one(config)
     return time_iterations(Programs(share, make_train_step(env, share), cache=False), settings.repeats)[1].median_s
 
 
 def measure(settings: Settings) -> Iterator[Measurement]:
-    """Yields environment steps and gradient steps per second of the device's preset, of all seeds together."""
+    """Yield environment steps and gradient steps per second of all seeds together."""
     env = settings.make_env()
     for count in settings.counts((0,), (0,)):  # 0: the preset's own number of environments
         config = training_config(settings, **({"num_envs": count} if count else {}))

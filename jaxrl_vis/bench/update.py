@@ -1,6 +1,5 @@
-"""Gradient steps alone, including sampling from the replay and relabelling; on request, PyTorch beside ours."""
+"""Benchmark of gradient steps alone, including sampling from the replay and relabelling."""
 
-import dataclasses
 import math
 from collections.abc import Iterator
 from typing import Any
@@ -8,7 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxrl_vis.bench import roofline, torch_peer
+from jaxrl_vis.bench import roofline
 from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.settings import Settings
 from jaxrl_vis.bench.timing import Timing, compile_timed
@@ -20,30 +19,21 @@ from jaxrl_vis.types import LoopState, ReplayState
 
 
 def training_config(settings: Settings, **overrides: Any) -> Config:
-    """The preset that was asked for, or that of this device, with the benchmark's environment, images and sizes."""
+    """Configuration of the requested preset, or of this device's, with the environment, images and sizes of the benchmark."""
     if settings.has_images:
         overrides |= {"image_size": settings.image_size, "pixels": settings.pixels}
     if settings.batch_size is not None:
         overrides["batch_size"] = settings.batch_size
     overrides |= {"devices": settings.devices, "data_devices": settings.data_devices}
     overrides |= {"seeds": settings.seeds, "weighting": settings.weighting, "aux_tasks": settings.aux_tasks}
-    if settings.peer == "torch":
-        overrides |= {"trivial_goals": 1.0, "random_shift": 0}  # the peer does neither
     own = "fast" if settings.on_accelerator else "cpu"
     return preset(settings.preset or own, env=settings.env, **overrides)
 
 
-def _left_out(settings: Settings, config: Config) -> dict[str, str]:
-    """For a record's configuration: what the preset does, and its gradient steps beside a peer do not."""
-    whole = training_config(dataclasses.replace(settings, peer=None))
-    names = [name for name in ("random_shift", "trivial_goals") if getattr(config, name) != getattr(whole, name)]
-    return {"without": " ".join(names)} if names else {}
-
-
 def fill_replay(replay: ReplayState, key: jax.Array) -> ReplayState:
-    """A replay full of noise: no two frames are equal, and every part of the replay is read.
+    """Fill a replay with noise: no two frames are equal, and every part of the replay is read.
 
-    Filled one episode at a time: random words for a whole replay of images would take several times as much memory.
+    Episodes are filled one at a time: random words for a whole replay of images would need several times the memory.
     """
 
     def noise(leaf: jax.Array, leaf_key: jax.Array) -> jax.Array:
@@ -61,20 +51,20 @@ def fill_replay(replay: ReplayState, key: jax.Array) -> ReplayState:
 
 
 def seed_keys(program: TrainStep, seed: int) -> jax.Array:
-    """[S] typed keys, one for each learner, where that is."""
+    """Make typed keys [S], one per learner, on its devices."""
     keys = jax.random.split(jax.random.key(seed), program.config.seeds)
     return program.layout.put(keys, program.layout.by_seed)
 
 
 def start(program: TrainStep) -> LoopState:
-    """Fresh learners with full replays."""
+    """Initialise learners with full replays."""
     loop = program.init(seed_keys(program, 0))
     fill = jax.jit(jax.vmap(fill_replay), donate_argnums=0)
     return loop.replace(replay=fill(loop.replay, seed_keys(program, 1)))
 
 
 def time_updates(program: TrainStep, loop: LoopState, repeats: int) -> tuple[Timing, float]:
-    """The time of one call of ``update_many``, and the seconds of its compilation; the learners of ``loop`` are donated."""
+    """Time one call of ``update_many``, which donates ``loop``; return the timing and the seconds of compilation."""
     keys = seed_keys(program, 2)
     compiled, compile_s = compile_timed(program.update_many, loop.train, loop.replay, keys, loop.iteration)
     train = loop.train
@@ -93,38 +83,31 @@ def time_updates(program: TrainStep, loop: LoopState, repeats: int) -> tuple[Tim
 
 
 def measure(settings: Settings) -> Iterator[Measurement]:
-    """Yields gradient steps per second, of all seeds together, and how far they are from the roofline."""
-    updates = 200 if settings.on_accelerator else 20
-    config = training_config(settings, updates_per_iteration=updates)
-    if settings.peer is not None:
-        torch_peer.load()  # first, because it may be missing
-    env = settings.make_env()
-    program = make_train_step(env, config)
-    if settings.peer is not None:
-        torch_peer.check_config(program)
+    """Yield gradient steps per second of all seeds together, and their distance from the roofline."""
+    config = training_config(settings, updates_per_iteration=updates_per_call(settings))
+    yield measure_program(make_train_step(settings.make_env(), config), settings)
+
+
+def updates_per_call(settings: Settings) -> int:
+    """Gradient steps of one timed call."""
+    return 200 if settings.on_accelerator else 20
+
+
+def measure_program(program: TrainStep, settings: Settings) -> Measurement:
+    """Measure gradient steps per second of all seeds together, and their distance from the roofline.
+
+    Args:
+        program: Learner, one call of which takes ``updates_per_iteration`` gradient steps.
+        settings: Settings of the record, and the maximum number of timed repeats.
+    """
+    config = program.config
     loop = start(program)
     assert_varied(loop.replay.episodes.observations[:1, :64, :1][0, :, 0], "observations of the replay")
     timing, compile_s = time_updates(program, loop, settings.repeats)
     del loop
-    seconds = timing.median_s / (updates * config.seeds)
-
-    # As few gradient steps of one learner as there can be, compiled for their cost alone: that of a turn of their loop.
-    few = math.lcm(config.actor_interval, program.auxiliary.weighting.interval)
-    single = make_train_step(env, config.replace(updates_per_iteration=few, seeds=1))
-    shapes = jax.eval_shape(single.init, seed_keys(single, 0))
-    arguments = shapes.train, shapes.replay, seed_keys(single, 2), shapes.iteration
-    counted = roofline.compiler_cost(single.update_many.lower(*arguments).compile(), config.actor_interval)
-    params = jax.tree.map(
-        lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), (shapes.train.agent.actor, shapes.train.agent.critic)
-    )
-    dtype, device = str(program.networks.dtype), jax.devices()[0].device_kind
-    costs = {}
-    if not config.aux_tasks:
-        least = roofline.least_cost(program.networks, params, config.batch_size)
-        costs["roofline"] = roofline.describe(least, seconds, dtype, device)
-    if counted is not None:
-        costs["compiler"] = roofline.describe(counted, seconds, dtype, device)
-    ours = Measurement(
+    seconds = timing.median_s / (program.updates_per_iteration * config.seeds)
+    dtype = str(program.networks.dtype)
+    return Measurement(
         name="update/gradient_steps",
         value=1.0 / seconds,
         unit="updates/s",
@@ -134,13 +117,30 @@ def measure(settings: Settings) -> Iterator[Measurement]:
             "method": config.method,
             "batch_size": config.batch_size,
             "dtype": dtype,
-            **_left_out(settings, config),
             **settings.seeds_config(),
             **settings.auxiliary_config(),
         },
-        details=timing.details(compile_s, replay_mb=round(program.replay_bytes / 1e6, 1), **costs),
+        details=timing.details(compile_s, replay_mb=round(program.replay_bytes / 1e6, 1), **_costs(program, seconds)),
     )
-    yield ours
-    if settings.peer is not None:
-        fresh = jax.tree.map(lambda leaf: leaf[0], start(program).replace(iteration=jnp.zeros(1, jnp.int32)))
-        yield torch_peer.measure(program, fresh.train, fresh.replay, settings, ours)
+
+
+def _costs(program: TrainStep, seconds: float) -> dict[str, Any]:
+    """Cost of a gradient step of ``seconds``, by the lower bound (``roofline``) and by the compiler's count (``compiler``)."""
+    config = program.config
+    # The fewest possible gradient steps of one learner, compiled for their cost alone: the count covers one turn of the loop.
+    steps = math.lcm(config.actor_interval, program.auxiliary.weighting.interval)
+    single = make_train_step(program.env, config.replace(updates_per_iteration=steps, seeds=1))
+    shapes = jax.eval_shape(single.init, seed_keys(single, 0))
+    arguments = shapes.train, shapes.replay, seed_keys(single, 2), shapes.iteration
+    counted = roofline.compiler_cost(single.update_many.lower(*arguments).compile(), config.actor_interval)
+    params = jax.tree.map(
+        lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), (shapes.train.agent.actor, shapes.train.agent.critic)
+    )
+    dtype, device = str(program.networks.dtype), jax.devices()[0].device_kind
+    costs = {}
+    if not config.aux_tasks:
+        bound = roofline.least_cost(program.networks, params, config.batch_size)
+        costs["roofline"] = roofline.describe(bound, seconds, dtype, device)
+    if counted is not None:
+        costs["compiler"] = roofline.describe(counted, seconds, dtype, device)
+    return costs

@@ -1,4 +1,4 @@
-"""No benchmark measures copies: results differ within a batch, and the next call computes another batch."""
+"""Checks that no benchmark measures copies: results differ within a batch and between calls."""
 
 import itertools
 from collections.abc import Callable
@@ -9,7 +9,7 @@ import numpy as np
 
 
 def assert_varied(rows: Any, what: str) -> None:
-    """Asserts that [N, ...] ``rows`` are not copies of each other: more than half are unlike all others.
+    """Assert that [N, ...] ``rows`` are not copies: more than half of them are distinct.
 
     A benchmark whose environments all do the same measures one environment and a broadcast.
     """
@@ -21,19 +21,19 @@ def assert_varied(rows: Any, what: str) -> None:
 
 
 def alternate(draw: Callable[[Any], Any], batches: list[Any]) -> Callable[[], Any]:
-    """A call without arguments that draws the next of the batches, round and round."""
+    """Return a call without arguments that draws the batches in turn."""
     turns = itertools.cycle(batches)
     return lambda: draw(next(turns))
 
 
 def assert_new_images(draw: Callable[[Any], Any], batches: list[Any]) -> None:
-    """Asserts that images differ within a batch and between batches.
+    """Assert that images differ within a batch and between batches.
 
     Args:
-        draw: Gives arrays [N, ...], or a tree of them.
+        draw: Function from a batch to arrays [N, ...] or a tree of them.
         batches: Two or more.
     """
-    drawn = [rows_of(draw(batch)) for batch in batches]
+    drawn = [image_bytes(draw(batch)) for batch in batches]
     for rows in drawn:
         assert_varied(rows, "images")
     for first, second in itertools.pairwise(drawn):
@@ -44,7 +44,7 @@ def assert_new_images(draw: Callable[[Any], Any], batches: list[Any]) -> None:
             )
 
 
-def rows_of(images: Any) -> np.ndarray:
-    """[N, bytes] of a tree of arrays [N, ...]."""
+def image_bytes(images: Any) -> np.ndarray:
+    """Bytes of a tree of arrays [N, ...] as one array [N, bytes] uint8."""
     planes = [np.ascontiguousarray(plane) for plane in jax.tree.leaves(jax.device_get(images))]
     return np.concatenate([plane.reshape(len(plane), -1).view(np.uint8) for plane in planes], axis=1)

@@ -221,7 +221,7 @@ def _apply(state: Agent, counts: jax.Array, gradients: Gradients, config: Config
 
 def _value_at_goals(networks: Networks, agent: Agent, statistics: Statistics, goals: jax.Array) -> Metrics:
     """`Algorithm.diagnose`: the mean value of the policy's actions where the goal itself is observed."""
-    own = (statistics.observations,) if statistics.own_goals is None else statistics
+    own = (statistics.observations,) if statistics.own_goals is None else (statistics.observations, statistics.goals)
     inputs = [networks.prepare(networks.scaling(each), goals) for each in own]
 
     def latents(params: Params) -> jax.Array:

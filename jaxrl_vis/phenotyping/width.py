@@ -4,8 +4,8 @@
          -> one straight line through each, deaf to outliers                `strip_width`, near one line `strip_near`
          -> their distance across the axis, at any line                     `Strip.width`
 
-An ellipse is no strip: its minor axis misses the width of one by -19 to +16 %, depending on how it is fitted
-(benchmarks/strip_widths.py prints by how much). Columns and lines are pixels, with (0, 0) in the middle of the first one.
+An ellipse is no strip: its minor axis misses the width of one by -19 to +16 %, depending on how it is fitted, see
+benchmarks/stalks/strip_widths.py. Columns and lines are pixels, with (0, 0) in the middle of the first one.
 """
 
 import dataclasses

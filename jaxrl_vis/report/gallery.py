@@ -28,7 +28,7 @@ from jaxrl_vis_envs.render import Frame, Scene, render
 _COLUMNS = ("name", "actions", "observation", "goal state", "horizon", "threshold", "control period", "chance", "difficulty")
 _LEGEND = (
     "chance: share of episodes that random actions end in success. difficulty: mean distance of start and goal in thresholds.\n"
-    "Both are measured by benchmarks/task_difficulty.py."
+    "Both are measured by benchmarks/tasks/task_difficulty.py."
 )
 _GAP, _TITLE, _GROUP_GAP = 3, 17, 12  # px
 _SKY = (255, 255, 255)

@@ -244,10 +244,14 @@ class Checkpoints:
     def retire_full(self, has_ended: bool = False) -> None:
         """Deletes full checkpoints that are older than a light one which is safely on the disk: nothing goes on from them.
 
+        Recent states that are not kept up to date any more go likewise.
+
         Args:
             has_ended: Delete those that are as new, too: the run has come to its end.
         """
         newest = max(self.iterations(LIGHT), default=-1)
+        if processes.is_first():
+            self.recent.retire(newest)
         for iteration in self.iterations(FULL):
             if iteration < newest + has_ended:
                 self._forget(FULL)

@@ -186,7 +186,11 @@ class RunFolder:
         A folder with anything else in it is somebody's, and stays.
         """
         with contextlib.suppress(OSError):
-            unfinished = [_UNFINISHED in path.name for path in self.checkpoints.glob("*/*")]
+            # A folder that went between two steps of a writing thread may even get its final name, but never a manifest.
+            unfinished = [
+                _UNFINISHED in path.name or (path.name.isdigit() and not (path / "manifest").exists())
+                for path in self.checkpoints.glob("*/*")
+            ]
             if all(unfinished) and [entry.name for entry in self.path.iterdir()] == [self.checkpoints.name]:
                 shutil.rmtree(self.path)
 

@@ -108,7 +108,7 @@ class Recent:
             self._write(iteration, loop, num_envs, progress)
         except OSError as error:
             self._is_off = True
-            self.clear()
+            self._drop_unfinished()
             self._say(
                 f"the replay is not kept up to date any more ({error.strerror or type(error).__name__}): "
                 "if this process is killed, the run goes on without it"
@@ -226,6 +226,19 @@ class Recent:
         for number in _numbers(self._folder, "rollout"):
             if number > iteration:
                 self._path(number, "rollout").unlink(missing_ok=True)
+
+    def _drop_unfinished(self) -> None:
+        """Deletes what belongs to no state. The states stay: nothing newer may ever find room."""
+        newest = max(self.iterations(), default=0)
+        with contextlib.suppress(OSError):
+            for file in self._folder.iterdir():
+                if file.suffix == ".tmp" or (file.suffix == ".rollout" and file.stem.isdigit() and int(file.stem) > newest):
+                    file.unlink(missing_ok=True)
+
+    def retire(self, newest: int) -> None:
+        """Deletes everything if no more states are saved and a checkpoint of iteration ``newest`` has overtaken them."""
+        if self._is_off and newest >= max(self.iterations(), default=0):
+            self.clear()
 
     def clear(self) -> None:
         """Deletes everything: a full checkpoint takes its place, or the run has ended."""

@@ -89,7 +89,7 @@ class FetchReach(PulledArm):
     config: FetchReachConfig
     action_size = 4
     camera = "front"
-    chance, difficulty = 0.008, 2.8  # benchmarks/task_difficulty.py FetchReach --episodes 1000
+    chance, difficulty = 0.008, 2.8  # benchmarks/tasks/task_difficulty.py FetchReach --episodes 1000
 
     def __init__(self, config: FetchReachConfig, observer: Callable[[mujoco.MjModel], Observer] | None = None):
         """Builds the model and finds the start.

@@ -65,7 +65,7 @@ class FingerTurn(MjxGoalEnv):
     camera = "side"
     distance_unit = "m"
     exact_contacts = True  # they decide what happens
-    chance, difficulty = 0.16, 2.4  # benchmarks/task_difficulty.py FingerTurn --episodes 1000
+    chance, difficulty = 0.16, 2.4  # benchmarks/tasks/task_difficulty.py FingerTurn --episodes 1000
 
     def __init__(self, config: FingerTurnConfig, observer: Callable[[mujoco.MjModel], Observer] | None = None):
         """Builds the model.

@@ -105,7 +105,7 @@ class HandReach(MjxGoalEnv):
     camera = "front"
     distance_unit = "m"
     exact_contacts = True  # they decide what happens
-    chance, difficulty = 0.0, 4.3  # benchmarks/task_difficulty.py HandReach --episodes 1000
+    chance, difficulty = 0.0, 4.3  # benchmarks/tasks/task_difficulty.py HandReach --episodes 1000
 
     def __init__(self, config: HandReachConfig, observer: Callable[[mujoco.MjModel], Observer] | None = None):
         """Builds the model.

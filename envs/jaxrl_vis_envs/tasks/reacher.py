@@ -67,7 +67,7 @@ class Reacher(MjxGoalEnv):
     action_size = 2
     camera = "above"
     distance_unit = "m"
-    chance, difficulty = 0.004, 23.7  # benchmarks/task_difficulty.py Reacher --episodes 20000
+    chance, difficulty = 0.004, 23.7  # benchmarks/tasks/task_difficulty.py Reacher --episodes 20000
 
     def __init__(self, config: ReacherConfig, observer: Callable[[mujoco.MjModel], Observer] | None = None):
         """Builds the model.

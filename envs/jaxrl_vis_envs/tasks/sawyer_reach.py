@@ -69,7 +69,7 @@ class SawyerReach(PulledArm):
     config: SawyerReachConfig
     action_size = 3
     camera = "above"
-    chance, difficulty = 0.010, 3.5  # benchmarks/task_difficulty.py SawyerReach --episodes 1000
+    chance, difficulty = 0.010, 3.5  # benchmarks/tasks/task_difficulty.py SawyerReach --episodes 1000
 
     def __init__(self, config: SawyerReachConfig, observer: Callable[[mujoco.MjModel], Observer] | None = None):
         """Builds the model and finds the start.

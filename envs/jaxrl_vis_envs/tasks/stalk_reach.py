@@ -108,7 +108,7 @@ class StalkReach(MjxGoalEnv):
     camera = "shoulder"
     distance_unit = "m"
     control_period = _CONTROL_PERIOD
-    chance, difficulty = 0.003, 11.1  # benchmarks/task_difficulty.py StalkReach --episodes 1000
+    chance, difficulty = 0.003, 11.1  # benchmarks/tasks/task_difficulty.py StalkReach --episodes 1000
 
     def __init__(self, config: StalkReachConfig, observer: Callable[[mujoco.MjModel], Observer] | None = None):
         """Builds the model.

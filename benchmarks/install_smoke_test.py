@@ -1,0 +1,281 @@
+"""Smoke test of the installation: the commands of a new user on an unprepared machine, with the result of each.
+
+    python benchmarks/install_smoke_test.py [--python python3.12 python3.13] [--ways wheel clone notebooks] [--whole]
+
+wheel      builds a wheel, installs it with pip, runs every command, trains a task of one's own, and makes mistakes
+clone      clones the repository, `make train`, then the commands of the README; nothing may be left untracked
+notebooks  a Jupyter without this project, and the notebooks in a folder of their own: without an address they stop, with one
+           that cannot be cloned too, and with that of a clone they run
+
+Each of them has a home folder, a virtual environment and caches of its own, all new and empty; packages come from the registry
+that pip is configured for. Settings are tiny (the robots learn nothing), except for notebooks with ``--whole``. Each command is
+printed with its exit status and its time. Exits with 1 where a status is not the one expected, where a mistake is answered with
+more than one line, or where a text that a command should show is missing. Takes about ten minutes a Python on two idle cores.
+"""
+
+import argparse
+import dataclasses
+import json
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+CHECKOUT = Path(__file__).resolve().parents[1]
+NOTEBOOKS = ("01_quickstart", "02_new_environment")
+TINY = "--preset debug --env-steps 400"
+# What of the caller's environment says how to reach a registry; everything else starts afresh.
+_KEPT = ("PIP_", "UV_", "SSL", "CA_BUNDLE", "PROXY")
+_SHOWN_LINES = 4  # of a command's output
+
+
+@dataclasses.dataclass
+class Shell:
+    """Terminal of a new user.
+
+    Attributes:
+        folder: The current folder.
+        environment: Environment variables.
+        failures: What was not as expected.
+    """
+
+    folder: Path
+    environment: dict[str, str]
+    failures: list[str] = dataclasses.field(default_factory=list)
+
+    def type(self, words: str, status: int = 0, shows: str = "", **variables: str) -> str:
+        """Runs a command line, prints what came of it, and returns its output.
+
+        Args:
+            words: The command line.
+            status: The exit status that it should have.
+            shows: A text that its output should hold.
+            **variables: More environment variables.
+        """
+        prefix = "".join(f"{name}={shlex.quote(value)} " for name, value in variables.items())
+        print(f"$ {prefix}{words}", flush=True)
+        start = time.perf_counter()
+        done = subprocess.run(
+            ["bash", "-c", words],
+            cwd=self.folder,
+            env=self.environment | variables,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+        )
+        output = done.stdout + done.stderr
+        problems = [] if done.returncode == status else [f"exit status {done.returncode}, not {status}"]
+        if status == 2 and len(output.splitlines()) != 1:
+            problems.append(f"{len(output.splitlines())} lines, not one")
+        if shows not in output:
+            problems.append(f"{shows!r} is missing")
+        lines = output.splitlines()
+        for line in lines if problems else lines[-_SHOWN_LINES:]:
+            print(f"    {line[:200]}")
+        verdict = "; ".join(["NOT AS EXPECTED", *problems]) if problems else "as expected"
+        print(f"  exit status {done.returncode}, {time.perf_counter() - start:.1f} s: {verdict}", flush=True)
+        if problems:
+            self.failures.append(f"{prefix}{words}: {'; '.join(problems)}")
+        return output
+
+    def activate(self, environment: Path) -> None:
+        """Activate the virtual environment, as ``source .venv/bin/activate`` does."""
+        self.environment["PATH"] = f"{environment / 'bin'}{os.pathsep}{self.environment['PATH']}"
+        self.environment["VIRTUAL_ENV"] = str(environment)
+
+
+def new_shell(folder: Path, python: Path) -> Shell:
+    """A terminal in a new folder, with ``python`` as python3, and a home in which there is nothing yet."""
+    (folder / "home").mkdir(parents=True)
+    (folder / "work").mkdir()
+    (folder / "bin").mkdir()
+    for name in ("python3", python.name):
+        if not (folder / "bin" / name).exists():
+            (folder / "bin" / name).symlink_to(python)
+    inherited = {name: value for name, value in os.environ.items() if any(part in name.upper() for part in _KEPT)}
+    return Shell(
+        folder / "work",
+        {
+            **inherited,
+            "HOME": str(folder / "home"),
+            "PATH": os.pathsep.join([str(folder / "bin"), "/usr/local/bin", "/usr/bin", "/bin"]),
+            "LANG": "C.UTF-8",
+            "PIP_NO_CACHE_DIR": "1",
+            "PIP_DISABLE_PIP_VERSION_CHECK": "1",
+        },
+    )
+
+
+def puck_push() -> str:
+    """The file of a task that notebook 02 writes."""
+    cells = json.loads((CHECKOUT / "notebooks/02_new_environment.ipynb").read_text())["cells"]
+    (source,) = (text for cell in cells if (text := "".join(cell["source"])).startswith("%%writefile puck_push.py\n"))
+    return source.partition("\n")[2]
+
+
+def mistakes() -> list[tuple[str, Mapping[str, str]]]:
+    """Command lines that are wrong, and environment variables: each is answered with one line and exit status 2."""
+    train = "jaxrl-vis train"
+    lines = [
+        "jaxrl-vis",
+        "jaxrl-vis trian",
+        f"{train} VisualReachr",
+        f"{train} VisualReacher --presett debug",
+        f"{train} VisualReacher --preset tiny",
+        f"{train} VisualReacher --num-envs 0",
+        f"{train} VisualReacher --env-steps many",
+        f"{train} VisualReacher --seed -1",
+        f"{train} no_such_file:Task",
+        f"{train} puck_push:PuckPull",
+        f"{train} puck_push.py",
+        f"{train} VisualReacher {TINY} --run-dir runs/tiny",
+        f"{train} VisualReacher {TINY} --run-dir runs/missing --resume",
+        f"{train} VisualReacher {TINY} --run-dir runs/tiny --resume --overwrite",
+        "jaxrl-vis eval runs/missing",
+        "jaxrl-vis eval runs/tiny --episodes 0",
+        "jaxrl-vis play runs/tiny --out tiny.avi",
+        "jaxrl-vis envs --gallery",
+        "jaxrl-vis bench nothing",
+    ]
+    without_gpu = [(f"{train} VisualReacher {TINY}", {"JAX_PLATFORMS": "cuda"})] if shutil.which("nvidia-smi") is None else []
+    return [*((line, {}) for line in lines), *without_gpu]
+
+
+def wheel(shell: Shell, python: Path) -> None:
+    """From a wheel, with pip."""
+    shell.type(f"git clone --quiet {CHECKOUT} source")
+    shell.type(f"{python.name} -m venv .venv")
+    shell.activate(shell.folder / ".venv")
+    shell.type("pip wheel --quiet --no-deps --wheel-dir dist ./source")
+    shell.type('pip install --quiet "$(ls dist/*.whl)[video]"')
+    shutil.rmtree(shell.folder / "source")  # nothing but the wheel is there
+    shell.type("pip check")
+    shell.type("jaxrl-vis --version", shows="0.")
+    shell.type("python -m jaxrl_vis --version", shows="0.")
+    shell.type("jaxrl-vis --help", shows="train")
+    shell.type("jaxrl-vis train --help", shows="--env-steps")
+    shell.type("jaxrl-vis doctor", shows="all is well")
+    shell.type("jaxrl-vis envs", shows="VisualFetchReach")
+    shell.type("jaxrl-vis envs --gallery tasks.png && test -s tasks.png")
+    shell.type(f"jaxrl-vis train VisualReacher {TINY} --run-dir runs/tiny && ls runs/tiny", shows="video.gif")
+    shell.type("jaxrl-vis eval runs/tiny", shows="eval/success")
+    for suffix in ("gif", "mp4"):
+        shell.type(f"jaxrl-vis play runs/tiny --out tiny.{suffix} && test -s tiny.{suffix}")
+    shell.type("jaxrl-vis play runs/tiny --html && test -s runs/tiny/play.html")
+    shell.type("jaxrl-vis train --run-dir runs/tiny --resume")
+    load = "import jaxrl_vis; print(jaxrl_vis.load_policy('runs/tiny'))"
+    shell.type(f"python -c {shlex.quote(load)}")
+    (shell.folder / "puck_push.py").write_text(puck_push())
+    shell.type(f"jaxrl-vis train puck_push:PuckPush {TINY} --run-dir runs/puck", shows="puck_push:PuckPush")
+    (shell.folder / "elsewhere").mkdir()
+    shell.type("cd elsewhere && jaxrl-vis eval ../runs/puck", shows="eval/success")
+    shell.type("cd elsewhere && jaxrl-vis play ../runs/puck --out puck.gif && test -s puck.gif")
+    for line, variables in mistakes():
+        shell.type(line, status=2, **variables)
+
+
+def readme_commands() -> list[str]:
+    """The commands of the program that the README shows, without their comments."""
+    lines = [line.partition(" # ")[0].strip() for line in (CHECKOUT / "README.md").read_text().splitlines()]
+    return [line for line in lines if line.startswith("jaxrl-vis ")]
+
+
+def tiny(line: str) -> str:
+    """A command of the README at tiny settings, and without the preset that would make it large."""
+    words = shlex.split(line)
+    if words[1] == "train" and "--resume" not in words:
+        if "--preset" in words:
+            at = words.index("--preset")
+            del words[at : at + 2]
+        if "--env-steps" in words:
+            at = words.index("--env-steps")
+            del words[at : at + 2]
+        words += shlex.split(TINY)
+    if words[1] == "bench":
+        words += shlex.split("--envs 8 --image-size 16 --repeats 1")
+    return shlex.join(words)
+
+
+def clone(shell: Shell, python: Path) -> None:
+    """From a clone, with make, and then what the README shows."""
+    shell.type(f"git clone --quiet {CHECKOUT} jaxrl-vis")
+    shell.folder /= "jaxrl-vis"
+    shell.type("make help", shows="make train")
+    tiny_run = f"PRESET=debug RUN_DIR=runs/first PYTHON={python}"
+    shell.type(f"make train {tiny_run} ARGS='--env-steps 400' && ls runs/first", shows="video.gif")
+    shell.type(".venv/bin/python --version", shows=f"Python {python.name.removeprefix('python')}")
+    shell.activate(shell.folder / ".venv")
+    # What the README says next to the commands that need it.
+    shell.type(".uv/bin/uv pip install --quiet '.[tensorboard,wandb]'")
+    for line in readme_commands():
+        shell.type(tiny(line))
+    untracked = shell.type("git status --porcelain")
+    if untracked.strip():
+        shell.failures.append(f"left in the checkout: {' '.join(untracked.split())}")
+
+
+def notebooks(shell: Shell, python: Path, whole: bool) -> None:
+    """In a Jupyter that has nothing of this project, with the notebooks in a folder of their own."""
+    shell.type(f"{python.name} -m venv .venv")
+    shell.activate(shell.folder / ".venv")
+    shell.type("pip install --quiet nbconvert nbclient ipykernel")
+    shell.type(f"git clone --quiet {CHECKOUT} ../address")
+    for name in NOTEBOOKS:
+        shutil.copy(CHECKOUT / f"notebooks/{name}.ipynb", shell.folder)
+    variables = {} if whole else {"JAXRL_VIS_NOTEBOOK_FAST": "1"}
+    execute = "jupyter nbconvert --execute --to html --ExecutePreprocessor.timeout=7200"
+    shell.type(f"{execute} {NOTEBOOKS[0]}.ipynb", status=1, shows="set REPOSITORY in this cell")
+    missing = str(shell.folder.parent / "missing")
+    shell.type(f"{execute} {NOTEBOOKS[0]}.ipynb", status=1, shows="could not clone", JAXRL_VIS_REPOSITORY=missing)
+    for name in NOTEBOOKS:
+        shell.type(f"{execute} {name}.ipynb", JAXRL_VIS_REPOSITORY=f"file://{shell.folder.parent / 'address'}", **variables)
+        text = (shell.folder / f"{name}.html").read_text()
+        for line in text.splitlines():
+            if "goals reached" in line and "%" in line and "print" not in line:
+                print(f"    {name}: {line.strip()}")
+    shell.type("ls")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Prints the transcript; 1 where anything was not as expected."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--python", nargs="+", default=["python3.12", "python3.13"], help="names or paths of interpreters")
+    parser.add_argument("--ways", nargs="+", choices=("wheel", "clone", "notebooks"), default=["wheel", "clone", "notebooks"])
+    parser.add_argument("--whole", action="store_true", help="notebooks train to the end")
+    parser.add_argument(
+        "--folder", type=Path, help="where to work, and keep what comes of it; default: a folder that is removed"
+    )
+    options = parser.parse_args(arguments)
+    interpreters = {name: shutil.which(name) for name in options.python}
+    for name, path in interpreters.items():
+        if path is None:
+            parser.error(f"there is no {name} on this machine")
+    top = Path(tempfile.mkdtemp(prefix="stranger-")) if options.folder is None else options.folder.resolve()
+    failures = []
+    for path in interpreters.values():
+        for method in options.ways:
+            python = Path(str(path)).resolve()
+            print(f"\n== {method}, {python.name} ==", flush=True)
+            shell = new_shell(top / f"{method}-{python.name}", python)
+            if method == "wheel":
+                wheel(shell, python)
+            elif method == "clone":
+                clone(shell, python)
+            else:
+                notebooks(shell, python, options.whole)
+            failures += [f"{method}, {python.name}: {failure}" for failure in shell.failures]
+    print(f"\n{len(failures)} commands were not as expected" if failures else "\nall as expected")
+    for failure in failures:
+        print(f"  {failure}")
+    if options.folder is None:
+        shutil.rmtree(top)
+    return 1 if failures else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,17 @@
+"""Ledger: the stored records in benchmarks/results, the tables that are written from them, and their age.
+
+    records          reading of records                      evidence     training runs behind learning figures
+    readme_rows      rows of the README's tables             staleness    records that are older than the measured code
+    readme_tables    tables of the README                    ablations    learning curves of the ablations, one table
+    scaling_table    tables of docs/scaling.md               render_table tables of docs/renderer_speed.md
+    pages            every page with tables from records     markers      position of a table in its page
+
+    python -m benchmarks.ledger tables     write the tables of README and docs (`make tables`)
+    python -m benchmarks.ledger stale      list stale records, rows without a record, and outdated tables (`make stale`)
+
+Neither pyperf nor asv replaces it. pyperf repeats every figure in fresh worker processes, each of which would compile its JAX
+programs again (tens of seconds for a figure of milliseconds), and its metadata know no GPU. asv measures a range of commits in
+environments of their own; here a GPU is available once, and the question is which records the code has left behind, without
+measuring again. Both store seconds, while the tables here show rates, ratios and learning curves. The parts that they could
+replace (`jaxrl_vis.bench.timing` and `conditions`, 250 lines) are no longer than the glue to them.
+"""

@@ -1,0 +1,89 @@
+"""Pages with tables that are written from records: one writer per table and its markers."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from benchmarks import target_decay
+from benchmarks.ledger import ablations, readme_tables, render_table, scaling_table
+from benchmarks.ledger.markers import fill
+from benchmarks.ledger.records import CHECKOUT, RESULTS
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.files import write_atomically
+
+Writer = Callable[[Path], str | None]
+"""Function from the folder of records to a table in Markdown; None leaves the page's table as it is."""
+
+
+def renderer_parity(results: Path) -> str:
+    """Write the table of docs/renderer_parity.md."""
+    from benchmarks import render_parity  # imports the models of the tests
+
+    return render_parity.table(render_parity.read_rows(results / render_parity.TARGET.name))
+
+
+def soak(results: Path) -> str | None:
+    """Write the table of docs/reliability.md from the pieces of a soak in ``soak``; None without pieces."""
+    from benchmarks.soak.record import Record, added
+
+    pieces = sorted((results / "soak").glob("*.json"))
+    return added([Record.read(piece) for piece in pieces]).table() if pieces else None
+
+
+PAGES: dict[str, dict[str, Writer]] = {
+    "README.md": {"results table": readme_tables.results_table, "speed table": readme_tables.speed_table},
+    "docs/scaling.md": {"devices": scaling_table.devices_table, "processes": scaling_table.processes_table},
+    "docs/renderer_speed.md": {"warp": render_table.warp_table, "mujoco": render_table.mujoco_table},
+    "docs/reliability.md": {"soak": soak},
+    "docs/renderer_parity.md": {"table": renderer_parity},
+    "docs/lab/ablations.md": {"curves": ablations.index_table},
+    "docs/lab/target_decay.md": {"tables": target_decay.tables},
+}
+"""Writers of a page's tables by the name in their markers."""
+
+
+def filled(text: str, writers: dict[str, Writer], results: Path = RESULTS) -> str:
+    """Return the text of a page with its tables written from the records.
+
+    Raises:
+        RequestError: A marker is missing, evidence contradicts its row, or records cannot be read.
+    """
+    for name, write in writers.items():
+        table = write(results)
+        if table is not None:
+            text = fill(text, name, table)
+    return text
+
+
+def write_pages(results: Path = RESULTS, checkout: Path = CHECKOUT) -> Iterator[tuple[Path, bool]]:
+    """Write the tables of every page; yield the page, and True if that changed it.
+
+    Raises:
+        RequestError: See `filled`; or a page is missing.
+    """
+    for name, writers in PAGES.items():
+        page = checkout / name
+        if not page.exists():
+            raise RequestError(f"there is no {page}: tables are written in a checkout")
+        before = page.read_text(encoding="utf-8")
+        after = filled(before, writers, results)
+        if after != before:
+            write_atomically(page, after)
+        yield page, after != before
+
+
+def outdated(results: Path = RESULTS, checkout: Path = CHECKOUT) -> Iterator[str]:
+    """Yield a complaint for every page whose tables differ from the records.
+
+    Raises:
+        RequestError: There is no folder of records, or a file in it cannot be read.
+    """
+    for name, writers in PAGES.items():
+        page = checkout / name
+        if not page.exists():
+            continue
+        text = page.read_text(encoding="utf-8")
+        try:
+            if filled(text, writers, results) != text:
+                yield f"{name}: its tables differ from the records: make tables"
+        except RequestError as error:
+            yield f"{name}: {error}"

@@ -1,0 +1,168 @@
+"""Tables of the README, written from the records: the rows are declared in `readme_rows`, the figures are not.
+
+A figure without a record reads `MISSING`, and `make stale` lists it.
+"""
+
+import dataclasses
+import statistics
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from benchmarks.ledger import evidence
+from benchmarks.ledger.evidence import Evidence
+from benchmarks.ledger.readme_rows import DEVICES, LEARNING, SPEED, Figure, Learning
+from benchmarks.ledger.records import read_all
+from jaxrl_vis.config import config_from_dict
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.report.learning import curve, steps_to
+from jaxrl_vis.run.command import command_of
+
+MISSING = "not measured yet"
+
+
+def short(value: float) -> str:
+    """Format a figure with three significant digits: 176 k, 1.73 M, 901, 12.3."""
+    rounded = float(f"{value:.3g}")
+    for factor, letter in ((1e6, " M"), (1e3, " k")):
+        if rounded >= factor:
+            return _three_digits(rounded / factor) + letter
+    return _three_digits(rounded)
+
+
+def _three_digits(value: float) -> str:
+    return f"{value:.{max(0, 2 - len(str(int(value))) + 1)}f}"
+
+
+def find(figure: Figure, device: str, records: list[dict[str, Any]]) -> dict[str, Any] | None:
+    """Select the record of a figure; return None if there is none."""
+    matches = [
+        record
+        for record in records
+        if record["name"] == figure.name
+        and record["device"] == device
+        and all(record["config"].get(name) == value for name, value in figure.config.items())
+    ]
+    if figure.least is not None:
+        return min(matches, key=lambda record: record["details"][figure.least], default=None)
+    return max(matches, key=lambda record: record["value"], default=None)
+
+
+def _words(record: dict[str, Any]) -> dict[str, Any]:
+    """Fields for the format string of a figure."""
+    config = record["config"]
+    words = {**record["details"], **config, "value": short(record["value"])}
+    if "mbyte" in words.get("roofline", {}):
+        words["moved_gib"] = words["roofline"]["mbyte"] * 1e6 / 2**30
+    if "pixels" in config:
+        words["pixels"] = {"rgbd": "RGB-D", "rgb": "RGB", "depth": "depth"}.get(config["pixels"], config["pixels"])
+    if "poses" in config:
+        without = [word for word in ("textures", "highlights") if not config[word]]
+        words["variant"] = f"{config['poses']} poses" + (f" without {' and '.join(without)}" if without else "")
+    return words
+
+
+def speed_cell(figures: tuple[Figure, ...], device: str, records: list[dict[str, Any]]) -> str:
+    """Format the figures of one device."""
+    shown = [(figure, find(figure, device, records)) for figure in figures]
+    return "; ".join(MISSING if record is None else figure.text.format(**_words(record)) for figure, record in shown)
+
+
+def speed_table(results: Path) -> str:
+    """Write the speed table, as Markdown."""
+    records = [record for _, record in read_all(results) if record["name"] != evidence.NAME]
+    lines = [f"| what | {' | '.join(DEVICES)} |", "|---" * (1 + len(DEVICES)) + "|"]
+    for row in SPEED:
+        cells = (speed_cell(row.figures.get(column, ()), device, records) for column, device in DEVICES.items())
+        lines.append(f"| {row.label} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+# Fields without an effect on learning: files on the disk, and the method of the same gradients.
+_NEUTRAL = ("checkpoint_interval", "full_checkpoint_interval", "aux_gradients")
+_LOGARITHMIC = ("actor_log",)
+
+
+def load_runs(row: Learning, results: Path) -> list[Evidence]:
+    """Load the runs of a row; return an empty list if one is missing.
+
+    Raises:
+        RequestError: A run has a different configuration than the row.
+    """
+    runs = []
+    for name, config in row.runs.items():
+        run = evidence.load(name, results)
+        if run is None:
+            return []
+        made_with = config_from_dict(run.record["config"])
+        no_matter = (*_NEUTRAL, *_LOGARITHMIC) if config.weighting in ("none", "sum") else _NEUTRAL
+        made_with = made_with.replace(**{field: getattr(config, field) for field in no_matter})
+        if made_with != config:
+            names = [field.name for field in dataclasses.fields(config)]
+            differing = [field for field in names if getattr(made_with, field) != getattr(config, field)]
+            raise RequestError(
+                f"evidence {name} was made by `{run.record['command']}`, and the README says `{command_of(config)}`, "
+                f"which has other {', '.join(differing)}: train again, then python -m benchmarks.ledger keep"
+            )
+        runs.append(run)
+    return runs
+
+
+def learning_text(row: Learning, runs: list[Evidence]) -> str:
+    """Describe the learning of the runs of a row."""
+    rows = [line for run in runs for line in run.rows]
+    points = curve(rows, row.metric)
+    parts = []
+    for target in row.targets:
+        steps = steps_to(points, target, row.least)
+        reached = "not reached" if steps is None else f"by {short(steps)} steps"
+        parts.append(row.word.format(target) + f" {reached}")
+    for budget in row.steps:
+        steps, value = max(point for point in points if point[0] <= budget)
+        parts.append(row.word.format(value) + f" at {short(steps)} steps")
+    end, median = points[-1]
+    finals = sorted(line[row.metric] for line in rows if line["env_steps"] == end)
+    spread = f" ({finals[0]:.3g} to {finals[-1]:.3g})" if finals[0] != finals[-1] else ""
+    parts.append(row.word.format(median) + f"{spread} at the end, {short(end)} steps")
+    wall, compiling = (statistics.median(times) for times in zip(*(evidence.seconds(run.rows) for run in runs), strict=True))
+    return (
+        f"{'; '.join(parts)} (median of {len(finals)} seeds); {minutes(wall)}{' each' if len(runs) > 1 else ''}, "
+        f"of which {minutes(compiling)} compiling"
+    )
+
+
+def minutes(seconds: float) -> str:
+    """Format seconds: 43 s, or 1 min 37 s."""
+    whole = round(seconds)
+    return f"{whole} s" if whole < 60 else f"{whole // 60} min {whole % 60} s"
+
+
+def _machine(device: dict[str, Any]) -> str:
+    if device["platform"] == "cpu":
+        return f"{device['cpu_count']} CPU cores"
+    return device["kind"] if device["count"] == 1 else f"{device['count']} x {device['kind']}"
+
+
+def results_table(results: Path) -> str:
+    """Write the results table, as Markdown."""
+    lines = ["| what | machine | figure | command |", "|---|---|---|---|"]
+    for row in LEARNING:
+        runs = load_runs(row, results)
+        command = row.command or command_of(next(iter(row.runs.values())))
+        machine = _machine(runs[0].record["device"]) if runs else ""
+        lines.append(f"| {row.label} | {machine} | {learning_text(row, runs) if runs else MISSING} | `{command}` |")
+    return "\n".join(lines)
+
+
+def missing_rows(results: Path) -> Iterator[str]:
+    """Yield the rows and figures without a record."""
+    for row in LEARNING:
+        missing = [name for name in row.runs if evidence.load(name, results) is None]
+        if missing:
+            yield f"row {row.label!r} has no evidence {', '.join(missing)}"
+    records = [record for _, record in read_all(results)]
+    for row in SPEED:
+        for column, figures in row.figures.items():
+            for figure in figures:
+                if find(figure, DEVICES[column], records) is None:
+                    yield f"row {row.label!r} has no record {figure.name} {figure.config} of {DEVICES[column]}"

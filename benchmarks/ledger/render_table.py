@@ -1,0 +1,58 @@
+"""Tables of docs/renderer_speed.md, written from the records of other renderers beside ours on the same poses."""
+
+from pathlib import Path
+from typing import Any
+
+from benchmarks.ledger.readme_tables import short
+from jaxrl_vis.bench.record import load
+
+_WARP_RECORDS, _MUJOCO_RECORDS = "render-nvidia-h200-x1.json", "render-amd-epyc-2-cores.json"
+_OURS = "render/scene"
+_ORDER = ("finger", "fetch_reach", "primitives")
+_TEXTURED = ("finger", "primitives")  # fetch_reach has no texture to leave out
+_OUTPUTS = {"rgbd": "RGB-D", "depth": "depth"}
+
+
+def _label(config: dict[str, Any]) -> str:
+    """Describe scene, poses and the parts left out."""
+    names = ("textures", "highlights") if config["scene"] in _TEXTURED else ()
+    without = " and ".join(name for name in names if not config[name])
+    poses = f"{config['poses']} poses" if config["scene"] == "primitives" else ""
+    return ", ".join(part for part in (config["scene"], poses, without and f"without {without}") if part)
+
+
+def _rank(record: dict[str, Any]) -> tuple[Any, ...]:
+    config = record["config"]
+    return _ORDER.index(config["scene"]), config["poses"], config["highlights"], config["textures"], config["image_size"]
+
+
+def _rows(file: Path, peer: str) -> list[tuple[dict[str, Any], dict[str, Any] | None]]:
+    """Our records with the peer's on the same poses, or None for an output that the peer does not have."""
+    records = load(file)
+    peers = {str({**record["config"], "images": 0}): record for record in records if record["name"] == peer}
+    ours = [record for record in records if record["name"] == _OURS and record["config"]["pixels"] in _OUTPUTS]
+    drawn = [record for record in ours if record["config"]["scene"] in _TEXTURED or not record["config"]["textures"]]
+    drawn = sorted(drawn, key=_rank)
+    return [(record, peers.get(str({**record["config"], "images": 0}))) for record in drawn]
+
+
+def _table(file: Path, peer: str, title: str, with_depth: bool) -> str:
+    lines = [f"| scene | images | ours | {title} | ratio |", "|---|---|---|---|---|"]
+    for ours, other in _rows(file, peer):
+        if other is None and not with_depth:
+            continue
+        config = ours["config"]
+        images = f"{config['image_size']}x{config['image_size']} {_OUTPUTS[config['pixels']]}, {config['images']:,}"
+        rate, ratio = ("", "") if other is None else (short(other["value"]), f"{other['details']['ours_over_peer']:.3g}")
+        lines.append(f"| {_label(config)} | {images} | {short(ours['value'])} | {rate} | {ratio} |")
+    return "\n".join(lines)
+
+
+def warp_table(results: Path) -> str:
+    """Write the table of MuJoCo Warp's renderer beside ours, as Markdown; images per second."""
+    return _table(results / _WARP_RECORDS, "render/peer_warp", "MuJoCo Warp 4.0.0", with_depth=False)
+
+
+def mujoco_table(results: Path) -> str:
+    """Write the table of MuJoCo's own renderer beside ours, as Markdown; images per second."""
+    return _table(results / _MUJOCO_RECORDS, "render/peer_mujoco", "`mujoco.Renderer`", with_depth=True)

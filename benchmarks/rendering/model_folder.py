@@ -1,0 +1,337 @@
+"""Compares our renderer with MuJoCo's own on every model of a folder that nobody here has seen before; see `render_parity`.
+
+Each MJCF or URDF file is drawn at its start and in a scattered pose: by its camera `cam`, or else by the free camera and all of
+its own. Sites are drawn in a row of their own where there are any, and so is haze. Where a camera or a light moves, the poses
+come from `mjx.kinematics`, as in a task. Shadows, reflections, tendons, skins, flexes and multisampling are off.
+
+What counts as a pass is in `Measures.failures`. A model that does not load, one of which next to nothing is seen, and one where
+MuJoCo's own image is not to be trusted have a verdict of their own, and fail nothing.
+"""
+
+import dataclasses
+import pathlib
+import time
+import warnings
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import render_models
+from mujoco import mjx
+from PIL import Image
+from render_comparison import dilated, matched_shares, near_edges
+
+from jaxrl_vis.bench.scenes.models import forward, scatter_joints
+from jaxrl_vis_envs.render import Frame, Scene
+from jaxrl_vis_envs.render.camera import camera_pose, pixel_rays, ray_parts
+from jaxrl_vis_envs.render.reference import ReferenceRenderer
+
+SUFFIXES = (".xml", ".mjcf", ".urdf")
+VOID = 0.002  # share of a picture; where less of it shows an object, there is nothing to compare
+SEEN_PIXELS = 12  # an object with so many pixels away from edges must not be missing
+LOUD = 16  # grey levels
+SHIFT = 2e-6  # of the model's extent: a camera that is moved by so little should see the same
+SKY = 0.69  # of zfar: the sky hides the colours of what is further, see docs/renderer.md
+FINE = 1e-3  # m, cells of a plane's grid; MuJoCo makes at most some 200 in a row
+DEFORMABLES = ("skin", "flex")
+
+
+@dataclasses.dataclass(frozen=True)
+class Measures:
+    """Differences of two images, away from edges; the worst over the poses of a row.
+
+    Attributes:
+        segmentation: Share of pixels that show the same object.
+        depth: Share of pixels that show an object, with the same depth: within 1 mm or a thousandth.
+        rgb: Mean difference of 255.
+        most: Largest difference of 255.
+        loud: Share of pixels with a channel that differs by more than 16.
+        matched: `render_comparison.matched_shares`, the least.
+        missing: Labels that are seen in MuJoCo's image and not at all in ours.
+    """
+
+    segmentation: float = 1.0
+    depth: float = 1.0
+    rgb: float = 0.0
+    most: int = 0
+    loud: float = 0.0
+    matched: float = 1.0
+    missing: tuple[int, ...] = ()
+
+    def failures(self) -> list[str]:
+        """Parts of the pass criterion that do not hold."""
+        held = {
+            "seg": self.segmentation >= 0.99,
+            "depth": self.depth >= 0.995,
+            "rgb": self.rgb <= 4.0,
+            ">16": self.loud <= 0.02,
+            "match": self.matched >= 0.9,
+            f"missing {self.missing}": not self.missing,
+        }
+        return [name for name, holds in held.items() if not holds]
+
+    def worse(self, other: "Measures") -> "Measures":
+        """The worse of each."""
+        least, most = ("segmentation", "depth", "matched"), ("rgb", "most", "loud")
+        values: dict[str, Any] = {name: min(getattr(self, name), getattr(other, name)) for name in least}
+        values |= {name: max(getattr(self, name), getattr(other, name)) for name in most}
+        return Measures(**values, missing=tuple(sorted({*self.missing, *other.missing})))
+
+
+def measure(ours: Frame, theirs: Frame, hidden: np.ndarray) -> Measures:
+    """Compares two images of NumPy arrays; where ``hidden`` [H, W] is true, colours do not count."""
+    inside = ~(near_edges(ours.segmentation) | near_edges(theirs.segmentation))
+    solid = inside & ((ours.segmentation >= 0) | (theirs.segmentation >= 0))
+    difference = np.max(np.abs(ours.rgb.astype(np.int16) - theirs.rgb), axis=-1)
+    coloured = inside & ~hidden
+    # Of two surfaces that coincide MuJoCo labels one by chance, and so do we: where depth and colour agree, either will do.
+    either = (np.abs(ours.depth - theirs.depth) <= 1e-4 * np.maximum(1.0, theirs.depth)) & (difference <= 4)
+    near = np.abs(ours.depth - theirs.depth) <= np.maximum(1e-3, 1e-3 * theirs.depth)
+    labels, counts = np.unique(theirs.segmentation[inside & ~either], return_counts=True)
+    missing = [
+        int(label)
+        for label in labels[(labels >= 0) & (counts >= SEEN_PIXELS)]
+        if not np.any(dilated(ours.segmentation == label) & (theirs.segmentation == label))
+    ]
+    mean = np.abs(ours.rgb.astype(np.int16) - theirs.rgb)[coloured].mean() if coloured.any() else 0.0
+    return Measures(
+        segmentation=_share(inside & ((ours.segmentation == theirs.segmentation) | either), inside),
+        depth=_share(solid & near, solid),
+        rgb=float(mean),
+        most=int(difference[coloured].max(initial=0)),
+        loud=1.0 - _share(coloured & (difference <= LOUD), coloured),
+        matched=min(matched_shares(ours, theirs).values(), default=1.0),
+        missing=tuple(missing),
+    )
+
+
+def _share(part: np.ndarray, whole: np.ndarray) -> float:
+    return float(part.sum() / whole.sum()) if whole.any() else 1.0
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """One row: a camera (None: the free one) and what is drawn beside geoms."""
+
+    camera: int | None
+    sites: bool = False
+    haze: bool = False
+
+    def title(self, mj_model: mujoco.MjModel) -> str:
+        """Short, for the table."""
+        name = "free" if self.camera is None else mj_model.camera(self.camera).name or str(self.camera)
+        return name + " + sites" * self.sites + " + haze" * self.haze
+
+
+def views(mj_model: mujoco.MjModel) -> list[View]:
+    """The rows of a model."""
+    named = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_CAMERA, "cam")
+    cameras = [named] if named >= 0 else [None, *range(mj_model.ncam)]
+    rows = [View(camera) for camera in cameras]
+    if mj_model.nsite:
+        rows.append(View(cameras[0], sites=True))
+    endless = (mj_model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) & np.all(mj_model.geom_size[:, :2] == 0, axis=1)
+    if np.any(endless) and np.any(mj_model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX):
+        rows.append(View(cameras[0], haze=True))
+    return rows
+
+
+class Comparison:
+    """A model that was read from a file, its poses, and the comparison of its views."""
+
+    def __init__(self, path: pathlib.Path, size: int) -> None:
+        """Reads the model; raises a ValueError where MuJoCo cannot."""
+        self.mj_model = mujoco.MjModel.from_xml_path(str(path))
+        quality = self.mj_model.vis.quality
+        quality.offsamples = 0
+        quality.numslices, quality.numstacks, quality.numquads = (
+            render_models.SLICES, render_models.STACKS, render_models.QUADS,
+        )  # fmt: skip
+        # MuJoCo lights the corners of a grid, and a spot light's edge is lost between two of them: as fine a grid as there is.
+        self.mj_model.geom_size[self.mj_model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, 2] = FINE
+        buffer = self.mj_model.vis.global_
+        buffer.offwidth, buffer.offheight = max(buffer.offwidth, size), max(buffer.offheight, size)
+        self.size = size
+        self.data = list(self._poses())
+
+    def _poses(self) -> Iterator[mujoco.MjData]:
+        """The start, and a scattered pose if there are joints."""
+        start = mujoco.MjData(self.mj_model)
+        forward(self.mj_model, start)
+        yield start
+        if self.mj_model.nq:
+            scattered = mujoco.MjData(self.mj_model)
+            scatter_joints(self.mj_model, scattered, np.random.default_rng(0), 0.3)
+            forward(self.mj_model, scattered)
+            yield scattered
+
+    def our_poses(self) -> list[dict[str, np.ndarray]]:
+        """Poses that we draw from: where something that sees or lights moves, from MJX's kinematics alone."""
+        moving = np.any(self.mj_model.cam_bodyid > 0) or np.any(self.mj_model.light_bodyid > 0)
+        moving |= np.any(self.mj_model.cam_targetbodyid >= 0) or np.any(self.mj_model.light_targetbodyid >= 0)
+        if moving and not self.mj_model.nmocap:  # MJX leaves what hangs on a mocap body behind
+            try:
+                model = mjx.put_model(self.mj_model)
+                empty = mjx.make_data(self.mj_model)
+                move = jax.jit(lambda qpos: mjx.kinematics(model, empty.replace(qpos=qpos)))
+                return [render_models.poses_of(move(jnp.asarray(data.qpos))) for data in self.data]
+            except (NotImplementedError, ValueError):  # MJX has no such joint, geom or solver
+                pass
+        return [render_models.poses_of(data) for data in self.data]
+
+    def lens(self, view: View) -> tuple[int, int]:
+        """Height and width, of the proportions that the camera's resolution has."""
+        wide, high = (1, 1) if view.camera is None else self.mj_model.cam_resolution[view.camera]
+        scale = self.size / max(wide, high)
+        return max(1, round(high * scale)), max(1, round(wide * scale))
+
+    def compare(self, view: View, pictures: pathlib.Path | None = None) -> tuple[Measures | None, str]:
+        """Measures and verdict of a view."""
+        height, width = self.lens(view)
+        groups = (0, 1, 2) if view.sites else ()
+        options: dict[str, Any] = dict(site_groups=groups, haze=view.haze, lights="mujoco")
+        remark = ""
+        try:
+            try:
+                scene = Scene.from_mjmodel(self.mj_model, view.camera, height, width, **options)
+            except ValueError as refusal:
+                said = [kind for kind in DEFORMABLES if f"{kind} " in str(refusal)]
+                if not said:
+                    raise
+                scene = Scene.from_mjmodel(self.mj_model, view.camera, height, width, leave_out=DEFORMABLES, **options)
+                remark = f" without {' and '.join(said)} (limit)"
+        except ValueError as refusal:
+            return None, f"**FAIL**: refused: {' '.join(str(refusal).split())}"
+        theirs = self.reference(view)
+        shown = max(float(np.mean(frame.segmentation >= 0)) for frame in theirs)
+        ours = render_models.draw(scene, self.our_poses(), quick=True)
+        total = Measures()
+        for our, their, data in zip(ours, theirs, self.data, strict=True):
+            measures = measure(our, their, np.zeros(their.depth.shape, bool))
+            for limit, hidden in self.limits(scene, their, data).items():
+                if measures.failures() and np.any(hidden):
+                    measures = measure(our, their, hidden)
+                    remark += f", without {limit} (limit)" if limit not in remark else ""
+            total = total.worse(measures)
+        if pictures is not None:
+            for number, (our, their) in enumerate(zip(ours, theirs, strict=True)):
+                difference = np.minimum(8 * np.abs(our.rgb.astype(np.int16) - their.rgb), 255).astype(np.uint8)
+                Image.fromarray(np.concatenate([our.rgb, their.rgb, difference], axis=1)).save(f"{pictures}_{number}.png")
+        if shown < VOID:
+            return total, f"void: {shown:.1%} of the picture shows an object"
+        failures = total.failures()
+        if not failures:
+            return total, "pass" + remark
+        doubt = self.doubt(view, scene, ours, theirs)
+        return total, f"no verdict: {doubt}" if doubt else "**FAIL**: " + ", ".join(failures) + remark
+
+    def reference(self, view: View, shift: np.ndarray | float = 0.0) -> list[Frame]:
+        """MuJoCo's images of all poses, the camera moved by ``shift`` [3] (m)."""
+        height, width = self.lens(view)
+        frames = []
+        groups = (0, 1, 2) if view.sites else ()
+        with ReferenceRenderer(self.mj_model, height, width, site_groups=groups, haze=view.haze) as renderer:
+            for data in self.data:
+                camera: Any = view.camera
+                if camera is None:
+                    camera = mujoco.MjvCamera()
+                    mujoco.mjv_defaultFreeCamera(self.mj_model, camera)
+                    camera.lookat[:] += shift
+                    frames.append(renderer(data, camera))
+                    continue
+                data.cam_xpos[camera] += shift
+                frames.append(renderer(data, camera))
+                data.cam_xpos[camera] -= shift
+        return frames
+
+    def doubt(self, view: View, scene: Scene, ours: list[Frame], theirs: list[Frame]) -> str:
+        """Why MuJoCo's images are no reference, "" where they are."""
+        nowhere = np.zeros(theirs[0].segmentation.shape, bool)
+        for direction in ([0.3, 0.5, 0.8], [-0.7, 0.2, 0.1]):
+            moved = self.reference(view, SHIFT * self.mj_model.stat.extent * np.array(direction))
+            if any(measure(one, other, nowhere).failures() for one, other in zip(moved, theirs, strict=True)):
+                return "MuJoCo's image changes when its camera moves by a hair"
+        endless = (self.mj_model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) & np.all(self.mj_model.geom_size[:, :2] == 0, 1)
+        for our, their, data in zip(ours, theirs, self.data, strict=True):
+            for floor in np.flatnonzero(endless):
+                position, away = seen_points(scene, our, data)
+                beyond = np.linalg.norm((position[:, None, None] + away) - data.geom_xpos[floor][:, None, None], axis=0)
+                lost = (our.segmentation == floor) & (their.segmentation != floor) & (beyond > float(scene.zfar))
+                if np.mean(lost) > 0.01:
+                    return "MuJoCo's endless floor ends at zfar from its middle, and the camera is beyond"
+        return ""
+
+    def limits(self, scene: Scene, frame: Frame, data: mujoco.MjData) -> dict[str, np.ndarray]:
+        """[H, W] bool: where colours differ as docs/renderer.md says, each with what was there before it.
+
+        MuJoCo draws its sky on a cylinder around the camera, which hides what is beyond; and it lights the corners of a grid,
+        between which the edge of a spot light lies somewhere.
+        """
+        position, away = seen_points(scene, frame, data)
+        hidden = np.zeros(frame.depth.shape, bool)
+        if np.any(self.mj_model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX):
+            reach = SKY * float(scene.zfar)
+            hidden = (np.hypot(away[0], away[1]) > reach) | (np.abs(away[2]) > reach)
+        lit = np.zeros(frame.depth.shape, np.int64)
+        spots = self.mj_model.light_active.astype(bool) & (self.mj_model.light_type == mujoco.mjtLightType.mjLIGHT_SPOT)
+        for number, light in enumerate(np.flatnonzero(spots)):
+            ray = position[:, None, None] + away - data.light_xpos[light][:, None, None]
+            cosine = np.tensordot(data.light_xdir[light], ray, axes=1) / np.maximum(np.linalg.norm(ray, axis=0), 1e-9)
+            lit += (cosine > np.cos(np.deg2rad(self.mj_model.light_cutoff[light]))).astype(np.int64) << number
+        edges = near_edges(np.where(frame.segmentation >= 0, lit, 0))
+        return {"what is behind the sky": hidden, "edges of spot lights": hidden | dilated(edges)}
+
+
+def seen_points(scene: Scene, frame: Frame, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
+    """Position of the camera [3] (m), and points seen by each pixel from there, [3, H, W] (m); in the world's frame."""
+    position, rotation, _ = camera_pose(scene, data)
+    start, direction, _ = ray_parts(scene, pixel_rays(scene, *np.indices(frame.depth.shape)))
+    points = [np.asarray(s + frame.depth * d) * np.ones(frame.depth.shape) for s, d in zip(start, direction, strict=True)]
+    return np.asarray(position), np.tensordot(np.asarray(rotation), np.stack(points), axes=1)
+
+
+def report(folder: pathlib.Path, size: int, pictures: pathlib.Path | None) -> int:
+    """Prints the table of a folder; the exit status is 1 where a row fails."""
+    paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
+    print("| model | view | seg | depth | rgb | max | > 16 | match | s | verdict |\n" + "| --- " * 10 + "|", flush=True)
+    rows = failed = 0
+    for path in paths:
+        name = str(path.relative_to(folder))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what MuJoCo says about other people's models
+            for title, measures, verdict, seconds in folder_rows(path, name, size, pictures):
+                rows, failed = rows + 1, failed + ("FAIL" in verdict)
+                figures = (
+                    " | | | | |"
+                    if measures is None
+                    else (
+                        f"{measures.segmentation:.4f} | {measures.depth:.4f} | {measures.rgb:.2f} | {measures.most} |"
+                        f" {measures.loud:.2%} | {measures.matched:.3f}"
+                    )
+                )
+                print(f"| {name} | {title} | {figures} | {seconds:.0f} | {verdict} |", flush=True)
+    print(f"\n{rows} rows of {len(paths)} files, {failed} failed")
+    return int(failed > 0)
+
+
+def folder_rows(
+    path: pathlib.Path, name: str, size: int, pictures: pathlib.Path | None
+) -> Iterator[tuple[str, Measures | None, str, float]]:
+    """View, measures, verdict and seconds of each row of a file."""
+    start = time.perf_counter()
+    try:
+        comparison = Comparison(path, size)
+    except (ValueError, mujoco.FatalError) as error:
+        yield "", None, f"not loaded: {' '.join(str(error).split())[:120]}", time.perf_counter() - start
+        return
+    for view in views(comparison.mj_model):
+        start, title = time.perf_counter(), view.title(comparison.mj_model)
+        target = None
+        if pictures is not None:
+            pictures.mkdir(parents=True, exist_ok=True)
+            target = pictures / f"{name}_{title}".replace("/", "_").replace(" ", "")
+        measures, verdict = comparison.compare(view, target)
+        yield title, measures, verdict, time.perf_counter() - start

@@ -1,0 +1,65 @@
+"""Error of widths with perfect detection and masks: `python -m benchmarks.stalks.perfect_masks`.
+
+Synthetic pairs; true masks of the band around 12 inches; our own disparity and our own widths against the diameter that faces
+the cameras at the height that was measured, sheaths included. What detection and segmentation add comes on top.
+"""
+
+import argparse
+
+import numpy as np
+
+from jaxrl_vis.phenotyping.measure import measure
+from jaxrl_vis.phenotyping.stereo import grey
+from jaxrl_vis_envs.plants import FAMILIES, Family, draw
+from jaxrl_vis_envs.plants.pairs import Sequence
+from jaxrl_vis_envs.plants.truth import outline, stalks_in_view
+
+
+def width_errors(family: Family, seed: int, frame: int) -> list[dict[str, float]]:
+    """Measurements of one pair beside the truth, mm; stalks of which less than 0.3 is seen are left out."""
+    sequence = Sequence.of(draw(family, seed))
+    pair, drive = sequence[frame], sequence.drive
+    instance, left, right = np.asarray(pair.instance), grey(np.asarray(pair.left)), grey(np.asarray(pair.right))
+    rows = []
+    for view in stalks_in_view(sequence.plot, pair.pose, drive.true, instance, np.asarray(pair.depth)):
+        if view.band_box is None or view.band_visible < 0.3:
+            continue
+        begin, top, end, bottom = (round(edge) for edge in view.band_box)
+        begin, top = max(begin - 3, 0), max(top, 0)
+        mask = instance[top : bottom + 1, begin : end + 4] == view.stalk
+        stalk = sequence.plot.stalks[view.stalk]
+        row = {"seen": view.band_visible}
+        for method in ("strip", "ellipse"):
+            got = measure(mask, (top, begin), left, right, drive.stated, method=method)
+            if got.diameter_mm is None:
+                break
+            heights = np.linspace(0.0, 0.6, 1201)
+            lines = outline(stalk, pair.pose, drive.true, heights)[:, :, 1].mean(axis=1)
+            height = float(heights[np.argmin(np.abs(lines - got.line))])
+            # At a node, the stalk above and below it is meant.
+            beside = (0.02, -0.02) if stalk.node_distance(height) < 0.01 else (0.0,)
+            true = 1e3 * float(np.mean([stalk.diameter(height + offset) for offset in beside]))
+            row |= {method: got.diameter_mm - true, "confidence": got.confidence}
+        else:
+            rows.append(row)
+    return rows
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description="Error of widths with perfect masks, on synthetic pairs.")
+    parser.add_argument("--family", choices=FAMILIES, default="training")
+    parser.add_argument("--pairs", type=int, default=3, help="one of each plot")
+    parser.add_argument("--width", type=int, default=3376, help="of an image, pixels")
+    options = parser.parse_args()
+    family = FAMILIES[options.family].at_width(options.width)
+    rows = [row for seed in range(options.pairs) for row in width_errors(family, 5000 + seed, family.rig.frames // 2)]
+    print("synthetic, family", family.name)
+    for least in (0.0, 0.5, 0.8):
+        confident = [row for row in rows if row["confidence"] >= least]
+        if not confident:
+            break
+        for method in ("strip", "ellipse"):
+            errors = np.array([row[method] for row in confident])
+            size = np.abs(errors)
+            text = f"mean absolute {size.mean():.2f}, median absolute {np.median(size):.2f}, bias {errors.mean():+.2f} mm"
+            print(f"{method:8} confidence >= {least:.1f}: {len(confident)} of {len(rows)} stalks, {text}")

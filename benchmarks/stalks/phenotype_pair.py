@@ -1,0 +1,96 @@
+"""Time and memory for one pair of 9 megapixels, from arrays in memory: `python -m benchmarks.stalks.phenotype_pair`.
+
+Finding, outlining, disparity, ground and widths; a synthetic pair of the shifted family; decoding of files is not in it. Parts
+are timed one after the other in repeats of their own; in the whole, the ground is found while the networks compute.
+``--workers 1 8 14`` says how long a pair takes where so many processes look at pairs, as with `phenotype run --workers`.
+"""
+
+import functools
+import resource
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks.stalks.worker_rate import Once, options, print_rate, timed
+from jaxrl_vis.phenotyping.detector.detect import detect, pad
+from jaxrl_vis.phenotyping.detector.finder import Finder, reduce
+from jaxrl_vis.phenotyping.detector.weights import SHIPPED, read_weights
+from jaxrl_vis.phenotyping.ground import find_ground
+from jaxrl_vis.phenotyping.sightings import find_with_ground, grey_of, look
+from jaxrl_vis.provenance import device_name
+from jaxrl_vis_envs.plants import SHIFTED, Calibration, draw
+from jaxrl_vis_envs.plants.pairs import Sequence
+from jaxrl_vis_envs.plants.truth import stalks_in_view
+
+
+def make(path: Path, stated: Calibration) -> tuple[Once, int]:
+    """Make the work of a process on the pairs in a file."""
+    images = list(np.load(path).values())
+    pairs = list(zip(images[::2], images[1::2]))
+    params, settings, _ = read_weights(SHIPPED)
+    finder = Finder(params, settings)
+
+    def once(number: int) -> list[float]:
+        left, right = pairs[number]
+        detections, ground = find_with_ground(finder, left, right, stated)
+        return [sighting.diameter_mm or 0.0 for sighting in look(detections, left, right, stated, ground=ground)]
+
+    return once, len(pairs)
+
+
+if __name__ == "__main__":
+    asked = options()
+    family = SHIFTED if asked.width is None else SHIFTED.at_width(asked.width)
+    sequence = Sequence.of(draw(family, 3))
+    pair = sequence[15]
+    left, right, stated = np.asarray(pair.left), np.asarray(pair.right), sequence.drive.stated
+    params, settings, _ = read_weights(SHIPPED)
+    finder = Finder(params, settings)
+
+    def once() -> tuple[Any, Any, list[Any]]:
+        """Process one pair: finds, ground and sightings."""
+        detections, ground = find_with_ground(finder, left, right, stated)
+        return detections, ground, look(detections, left, right, stated, ground=ground)
+
+    started = time.perf_counter()
+    detections, ground, sightings = once()
+    first = time.perf_counter() - started
+    measured = sum(sighting.diameter_mm is not None for sighting in sightings)
+    whole = timed(once, asked.repeats)
+    print(f"{left.shape[1]} x {left.shape[0]}, {len(detections)} finds, {measured} measured, on {device_name()}")
+    print(f"{np.median(whole):.3f} s a pair (least {min(whole):.3f}); the first one, which compiles, {first:.1f} s")
+    small = pad(reduce(left, settings.width)[0])
+    dtype = finder.dtype
+    parts = {
+        "image to the device": lambda: jax.block_until_ready(jax.device_put(left)),
+        "reduced image": lambda: reduce(left, settings.width),
+        "detector": lambda: jax.block_until_ready(detect(params["detector"], small, settings, dtype)),
+        "all of finding, with masks and edges": lambda: finder(left),
+        "ground, beside that": lambda: find_ground(grey_of(left), grey_of(right), stated),
+        "disparities and widths": lambda: look(detections, left, right, stated, ground=ground),
+    }
+    for name, part in parts.items():
+        print(f"  {np.median(timed(part, asked.repeats)):.4f} s  {name}")
+    print("what an evaluated pair costs besides:")
+    on_device = (pair.left, pair.right, pair.instance, pair.depth)
+    truth = np.asarray(pair.instance), np.asarray(pair.depth)
+    others = {
+        "drawing both images, with their truth": lambda: jax.block_until_ready((sequence[15].left, sequence[15].right)),
+        "images and truth to the host": lambda: jax.device_get([jnp.copy(array) for array in on_device]),
+        "truth of the stalks": lambda: stalks_in_view(sequence.plot, pair.pose, sequence.drive.true, *truth),
+    }
+    for name, part in others.items():
+        print(f"  {np.median(timed(part, min(asked.repeats, 3))):.4f} s  {name}")
+    print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6:.2f} GB, drawing the pair included")
+    if asked.workers:
+        some = [sequence[frame] for frame in (5, 12, 19, 26)]
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "pairs.npz"
+            np.savez(path, *[np.asarray(image) for pair in some for image in (pair.left, pair.right)])
+            for workers in asked.workers:
+                print_rate(functools.partial(make, path, stated), workers, asked.seconds)

@@ -1,0 +1,76 @@
+"""Error of every estimator of width on ideal strips: `python -m benchmarks.stalks.strip_widths`.
+
+A strip is a rectangle of known width, drawn leaning at many sub-pixel places, as pixels whose middle it covers (hard) and as
+the share of each pixel that it covers (soft). The figure is the largest mean error over widths, the mean being over places.
+"""
+
+import argparse
+
+import numpy as np
+
+from jaxrl_vis.phenotyping.width import ELLIPSE_FITS, ellipse_width, strip_width
+
+RATIOS = (1.5, 3.0, 6.0, 12.0)
+LEANS = (0.0, 2.0, 8.0, 14.0, 20.0)
+
+
+def ideal_strip(width: float, ratio: float, lean: float, place: tuple[float, float], soft: bool) -> np.ndarray:
+    """A strip's mask [H, W]: float32 shares of pixels, or bool.
+
+    Args:
+        width: Across the axis, pixels.
+        ratio: Length over width.
+        lean: Degrees.
+        place: Of its middle, from the middle of a pixel, in pixels.
+        soft: Whether a pixel has the share of it that is covered.
+    """
+    fine = 8 if soft else 1
+    half = int(0.5 * width * np.hypot(ratio, 1.0)) + 4
+    ticks = (np.arange((2 * half + 1) * fine) + 0.5) / fine - half - 0.5
+    x, y = ticks[None, :] - place[0], ticks[:, None] - place[1]
+    angle = np.radians(lean)
+    across, along = x * np.cos(angle) + y * np.sin(angle), -x * np.sin(angle) + y * np.cos(angle)
+    inside = (np.abs(across) < width / 2) & (np.abs(along) < width * ratio / 2)
+    if not soft:
+        return inside
+    size = 2 * half + 1
+    return inside.reshape(size, fine, size, fine).mean(axis=(1, 3)).astype(np.float32)
+
+
+def mean_errors(estimate, ratio: float, lean: float, soft: bool, places: int, widths: tuple[float, ...]) -> np.ndarray:
+    """Mean error of an estimator for each width, of 1."""
+    rng = np.random.default_rng(0)
+    errors = []
+    for width in widths:
+        estimates = [estimate(ideal_strip(width, ratio, lean, tuple(rng.uniform(-0.5, 0.5, 2)), soft)) for _ in range(places)]
+        errors.append(np.mean([np.nan if estimated is None else estimated / width - 1.0 for estimated in estimates]))
+    return np.array(errors)
+
+
+def strip(mask: np.ndarray) -> float | None:
+    """Width by `strip_width`, in the middle."""
+    strip = strip_width(mask)
+    return None if strip is None else strip.width()
+
+
+def table(places: int = 12, widths: tuple[float, ...] = (20.0, 27.5, 38.9)) -> list[str]:
+    """Lines of a Markdown table."""
+    estimators = {"strip": strip} | {f"ellipse, {fit}": lambda mask, fit=fit: ellipse_width(mask, fit) for fit in ELLIPSE_FITS}
+    lines = [
+        "| estimator | mask | lean | " + " | ".join(f"L/W {ratio:g}" for ratio in RATIOS) + " |",
+        "|---|---|---" + "|---" * len(RATIOS) + "|",
+    ]
+    for name, estimate in estimators.items():
+        for soft in (True, False) if name == "strip" else (False,):
+            for lean in LEANS if name == "strip" else (0.0, 20.0):
+                errors = [mean_errors(estimate, ratio, lean, soft, places, widths) for ratio in RATIOS]
+                worst = [row[np.nanargmax(np.abs(row))] if np.isfinite(row).any() else np.nan for row in errors]
+                cells = " | ".join(f"{100 * error:+.2f} %" for error in worst)
+                lines.append(f"| {name} | {'soft' if soft else 'hard'} | {lean:g} | {cells} |")
+    return lines
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description="Error of every estimator of width on ideal strips.")
+    parser.add_argument("--places", type=int, default=12, help="sub-pixel places of each strip")
+    print("\n".join(table(parser.parse_args().places)))

@@ -1,0 +1,70 @@
+"""Rate of a job that several processes do at the same time; for the other scripts of this folder."""
+
+import argparse
+import functools
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from jaxrl_vis.evaluation_pool import processes, share_accelerator
+
+Once = Callable[[int], list[float]]
+"""Does it once, with the input of that number, and says something of what came out."""
+
+
+def timed(run: Callable[[], object], repeats: int) -> list[float]:
+    """Seconds of each repeat, after one that compiles."""
+    run()
+    times = []
+    for _ in range(repeats):
+        started = time.perf_counter()
+        run()
+        times.append(time.perf_counter() - started)
+    return times
+
+
+def options() -> argparse.Namespace:
+    """Parse the options of the scripts; several processes share the GPU."""
+    parser = argparse.ArgumentParser(description="Time and memory for one synthetic pair.")
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument(
+        "--workers", type=int, nargs="*", default=[], help="processes side by side; several numbers, one by one"
+    )
+    parser.add_argument("--seconds", type=float, default=10.0, help="how long each number of them is timed")
+    parser.add_argument("--width", type=int, help="of an image, pixels, in place of the family's")
+    parsed = parser.parse_args()
+    if parsed.workers:
+        share_accelerator()
+    return parsed
+
+
+def print_rate(make: Callable[[], tuple[Once, int]], workers: int, seconds: float, each_is: float = 1.0) -> None:
+    """Prints how long a pair takes where so many processes look at pairs, each at one of its own.
+
+    Args:
+        make: Called in each process: what it does, and for how many inputs; these are done once before time is taken.
+        workers: How many processes.
+        seconds: How long they go on, once all are ready.
+        each_is: How many pairs are looked at each time.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        with processes(workers) as pool:
+            counts = list(pool(functools.partial(_work, make, Path(folder), workers, seconds), range(workers)))
+    pairs = sum(counts) * each_is
+    print(f"{workers} processes: {seconds / pairs:.4f} s a pair ({pairs:.0f} pairs in {seconds:.0f} s)")
+
+
+def _work(make: Callable[[], tuple[Once, int]], folder: Path, workers: int, seconds: float, index: int) -> int:
+    """Do the work of one process, and count how often it finished."""
+    once, inputs = make()
+    results = {tuple(once(number)) for number in range(inputs)}
+    assert len(results) > 1 or inputs < 2, "all pairs gave the same"
+    (folder / f"ready_{index}").touch()
+    while len(list(folder.glob("ready_*"))) < workers:
+        time.sleep(0.01)
+    count, started = 0, time.perf_counter()
+    while time.perf_counter() - started < seconds:
+        once((index + count) % inputs)
+        count += 1
+    return count

@@ -1,0 +1,138 @@
+"""Content of goal images: visibility of the relevant parts, and different goals with the same image.
+
+    python -m benchmarks.tasks.goal_images [ENV ...] [--goals 1000] [--image-size 100] [--save FOLDER]
+
+For each visual task, over its goals, as the agent sees them (RGB-D bytes):
+
+    visible      the fewest pixels of each part that must be seen, over all goals, and the share of goals that show none of it
+    identical    pairs of goals further apart than a threshold with the same image; must be 0
+    nearest      the fewest bytes in which two images differ, among pairs 1 to 1.5 thresholds apart
+
+Exit status: 1 where two different goals look the same, or where a goal shows none of the parts that must be seen; else 0.
+"""
+
+import argparse
+import os
+import pathlib
+import sys
+from typing import Any, NamedTuple
+
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+sys.path[:0] = [str(ROOT), str(ROOT / "envs")]
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+import jax  # noqa: E402
+import numpy as np  # noqa: E402
+from PIL import Image  # noqa: E402
+
+import jaxrl_vis_envs  # noqa: E402
+from jaxrl_vis_envs.compilation import env_jit  # noqa: E402
+from jaxrl_vis_envs.render import Scene, render_planes  # noqa: E402
+
+# What an agent has to see, by the names of its geoms. Parts in one tuple count together.
+PARTS: dict[str, dict[str, tuple[str, ...]]] = {
+    "VisualFetchReach": {"gripper": ("palm", "left_finger", "right_finger"), "fingers": ("left_finger", "right_finger")},
+    "VisualFingerTurn": {"spinner tip": ("tip_marker",), "fingertip": ("fingertip",)},
+    "VisualHandReach": {f"{tip} tip": (f"{tip}tip",) for tip in ("ff", "mf", "rf", "lf", "th")},
+    "VisualReacher": {"fingertip": ("fingertip",)},
+    "VisualSawyerReach": {"gripper": ("palm", "left_finger", "right_finger"), "fingers": ("left_finger", "right_finger")},
+    "VisualStalkReach": {"gripper": ("palm", "left_jaw", "right_jaw"), "stalks": tuple(f"upper_{index}" for index in range(4))},
+}
+_NEAR = 1.5  # thresholds
+_BATCH = 25  # goals drawn at once
+
+
+class Goals(NamedTuple):
+    """Goals of a task: states [N, G] float32, images [N, C, H, W] uint8, visible geom of each pixel [N, H, W] int32."""
+
+    states: np.ndarray
+    images: np.ndarray
+    labels: np.ndarray
+
+
+def draw_goals(env: Any, count: int, seed: int = 0) -> Goals:
+    """The goals of ``count`` episodes."""
+    size = env.observation_spec.shape[-1]
+    scene = Scene.from_mjmodel(env.mj_model, env.camera, size, size)
+
+    def sample(key: jax.Array) -> Any:
+        data = env.sample_goal(key)
+        return env.achieved(data), data
+
+    def draw(data: Any) -> tuple[jax.Array, jax.Array]:
+        image = env.observe(env.state_at(data, env.achieved(data)).replace(history=None))
+        return image[: len(image) // env.frame_stack], render_planes(scene, data, False, False, segmentation=True).segmentation
+
+    keys = jax.random.split(jax.random.key(seed), count)
+    states, data = env_jit(jax.vmap(sample))(keys)
+    images, labels = env_jit(lambda data: jax.lax.map(draw, data, batch_size=_BATCH))(data)
+    return Goals(np.asarray(states), np.asarray(images), np.asarray(labels))
+
+
+def visible_pixels(env: Any, labels: np.ndarray, geoms: tuple[str, ...]) -> np.ndarray:
+    """[N] pixels that show any of these geoms."""
+    return np.isin(labels, [env.mj_model.geom(name).id for name in geoms]).sum(axis=(1, 2))
+
+
+def compare(goals: Goals, threshold: float) -> tuple[int, int, int, tuple[int, int]]:
+    """Compare pairs of goals that are more than a threshold apart.
+
+    Returns:
+        Pairs with identical images, pairs up to `_NEAR` thresholds apart, the fewest bytes in which these images differ,
+        and the indices of that pair; -1 without such pairs.
+    """
+    distance = np.linalg.norm(goals.states[:, None] - goals.states[None], axis=-1)
+    flat = goals.images.reshape(len(goals.images), -1)
+    kinds = np.unique(flat, axis=0, return_inverse=True)[1].reshape(-1)
+    apart = np.triu(distance > threshold, 1)
+    identical = int(np.sum(apart & (kinds[:, None] == kinds[None])))
+    first, second = np.nonzero(apart & (distance <= _NEAR * threshold))
+    differences = np.array([np.count_nonzero(flat[i] != flat[j]) for i, j in zip(first, second, strict=True)])
+    if not len(differences):
+        return identical, 0, -1, (-1, -1)
+    least = int(np.argmin(differences))
+    return identical, len(differences), int(differences[least]), (int(first[least]), int(second[least]))
+
+
+def report(name: str, count: int, size: int, folder: pathlib.Path | None) -> bool:
+    """Prints a task's figures; whether all is well."""
+    env: Any = jaxrl_vis_envs.make(name, image_size=size, pixels="rgbd")
+    goals = draw_goals(env, count)
+    identical, near, least, pair = compare(goals, env.threshold)
+    print(f"{name}: {count} goals at {size}x{size}, {len(goals.images[0])} channels")
+    print(f"  identical images of goals more than {env.threshold:g} {env.distance_unit} apart: {identical} pairs")
+    span = f"{env.threshold:g} to {_NEAR * env.threshold:g} {env.distance_unit}"
+    nearest = f"{least} bytes differ (goals {pair[0]} and {pair[1]})" if near else "none"
+    print(f"  nearest images of {near} pairs {span} apart: {nearest}")
+    good, worst = identical == 0, {}
+    for part, geoms in PARTS.get(name, {}).items():
+        pixels = visible_pixels(env, goals.labels, geoms)
+        hidden = int(np.sum(pixels == 0))
+        good &= hidden == 0
+        worst[part] = int(np.argmin(pixels))
+        figures = f"at least {pixels.min():4d} pixels, median {int(np.median(pixels)):4d}"
+        print(f"  {part:<12} {figures}, hidden in {hidden} goals")
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+        for title, index in [*worst.items(), ("pair_1", pair[0]), ("pair_2", pair[1])]:
+            image = np.moveaxis(goals.images[index, :3], 0, -1)
+            scaled = Image.fromarray(image).resize((4 * size, 4 * size), Image.Resampling.NEAREST)
+            scaled.save(folder / f"{name}_{title.replace(' ', '_')}.png")
+    sys.stdout.flush()
+    return good
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Prints the figures of each task; 1 where one fails."""
+    parser = argparse.ArgumentParser(description="Whether goal images show and tell apart what matters.")
+    parser.add_argument("env", nargs="*", default=sorted(PARTS), help=f"any of {', '.join(sorted(PARTS))}; default: all")
+    parser.add_argument("--goals", type=int, default=1000)
+    parser.add_argument("--image-size", type=int, default=100)
+    parser.add_argument("--save", type=pathlib.Path, help="write the worst goal of each part, and the nearest pair, here")
+    options = parser.parse_args(arguments)
+    passed = [report(name, options.goals, options.image_size, options.save) for name in options.env]
+    return 0 if all(passed) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
