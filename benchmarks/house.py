@@ -25,10 +25,7 @@ STALKS = ("phenotyping", "grasping", "plants", "stalks")
 
 _RAISE = """
 import sys, traceback
-try:
-    from jaxrl_vis.learner.ddpg import losses
-except ImportError:
-    from jaxrl_vis.learner import losses
+from jaxrl_vis.learner.ddpg import losses
 from jaxrl_vis import cli
 
 source = "def critic_loss(*arguments, **options):\\n    raise LookupError('critic_loss was called')"

@@ -44,8 +44,8 @@ from jaxrl_vis.bench.record import Measurement, to_record, write_json
 from jaxrl_vis.config import Config
 from jaxrl_vis.devices import enable_compilation_cache
 from jaxrl_vis.learner.environment import make_env
-from jaxrl_vis.learner.sharding import make_layout
-from jaxrl_vis.learner.shards import DATA
+from jaxrl_vis.learner.parallel.sharding import make_layout
+from jaxrl_vis.learner.parallel.shards import DATA
 from jaxrl_vis.learner.train_step import make_train_step
 from jaxrl_vis.run.arrays import named_leaves
 from jaxrl_vis.run.checkpoint import FULL, Checkpoints

@@ -75,7 +75,7 @@ def imported(clock: Clock, options: argparse.Namespace) -> Any:
 
 def parts(clock: Clock, options: argparse.Namespace) -> None:
     """Every program by itself."""
-    from jaxrl_vis.learner.rollout_parts import played_spec
+    from jaxrl_vis.learner.acting.rollout_parts import played_spec
 
     programs = imported(clock, options)
     program, shapes, keys = programs.program, programs.shapes, programs.run_keys

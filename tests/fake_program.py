@@ -16,12 +16,12 @@ import numpy as np
 
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import Terminated
-from jaxrl_vis.learner.evaluate import Evaluation
+from jaxrl_vis.learner.acting.evaluate import Evaluation
+from jaxrl_vis.learner.acting.rollout import Exploration
+from jaxrl_vis.learner.acting.rollout_parts import played_spec
 from jaxrl_vis.learner.iteration import Learned
-from jaxrl_vis.learner.replay import make_replay
-from jaxrl_vis.learner.rollout import Exploration
-from jaxrl_vis.learner.rollout_parts import played_spec
-from jaxrl_vis.learner.sharding import ONE_DEVICE
+from jaxrl_vis.learner.memory.replay import make_replay
+from jaxrl_vis.learner.parallel.sharding import ONE_DEVICE
 from jaxrl_vis.run import metrics
 from jaxrl_vis.run.checkpoint import Checkpoints
 from jaxrl_vis.run.folder import read_run_id

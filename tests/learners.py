@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import probe_environments as probes
 
 from jaxrl_vis.config import preset
-from jaxrl_vis.learner.rollout_parts import join_parts
+from jaxrl_vis.learner.acting.rollout_parts import join_parts
 from jaxrl_vis.learner.train_step import make_train_step
 from jaxrl_vis_envs.compilation import env_jit
 

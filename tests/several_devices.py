@@ -15,7 +15,7 @@ import probe_environments as probes
 from learners import train_iteration
 
 from jaxrl_vis.config import preset
-from jaxrl_vis.learner.sharding import DATA, Layout, Shards, Spec
+from jaxrl_vis.learner.parallel.sharding import DATA, Layout, Shards, Spec
 from jaxrl_vis.learner.train_step import make_train_step
 from jaxrl_vis.run.arrays import named_leaves
 from jaxrl_vis.run.checkpoint import Checkpoints

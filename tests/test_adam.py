@@ -8,7 +8,7 @@ import probe_environments as probes
 from learners import experienced
 
 from jaxrl_vis.config import preset
-from jaxrl_vis.learner import adam
+from jaxrl_vis.learner.ddpg import adam
 from jaxrl_vis.learner.train_step import make_train_step
 
 RATES = (1e-3, 3e-2)

@@ -10,13 +10,14 @@ import pytest
 
 from jaxrl_vis.config import preset
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner import auxtasks, normalizer
-from jaxrl_vis.learner.auxiliary import Auxiliary, make_auxiliary
+from jaxrl_vis.learner import auxtasks
 from jaxrl_vis.learner.auxtasks import optical_flow
-from jaxrl_vis.learner.ddpg import make_ddpg
-from jaxrl_vis.learner.networks import Networks
-from jaxrl_vis.learner.replay import Indices, Replay
-from jaxrl_vis.learner.sampling import Choice, Sampler
+from jaxrl_vis.learner.auxtasks.auxiliary import Auxiliary, make_auxiliary
+from jaxrl_vis.learner.ddpg.ddpg import make_ddpg
+from jaxrl_vis.learner.memory.replay import Indices, Replay
+from jaxrl_vis.learner.memory.sampling import Choice, Sampler
+from jaxrl_vis.learner.networks import normalizer
+from jaxrl_vis.learner.networks.networks import Networks
 from jaxrl_vis.learner.weighting import make_weighting
 from jaxrl_vis.resolved import resolve
 from jaxrl_vis.types import Episodes, Statistics

@@ -9,11 +9,12 @@ import optax
 import pytest
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner import auxtasks, decoder_kernel
-from jaxrl_vis.learner.auxiliary import Auxiliary
+from jaxrl_vis.learner import auxtasks
 from jaxrl_vis.learner.auxtasks import autoencoder, heads, optical_flow
-from jaxrl_vis.learner.blocks import from_blocks
-from jaxrl_vis.learner.encoder_kernel_patches import to_patches
+from jaxrl_vis.learner.auxtasks.auxiliary import Auxiliary
+from jaxrl_vis.learner.networks.blocks import from_blocks
+from jaxrl_vis.learner.networks.kernels import decoder as decoder_kernel
+from jaxrl_vis.learner.networks.kernels.patches import to_patches
 from jaxrl_vis.learner.weighting import make_weighting
 from jaxrl_vis.types import Batch
 

@@ -12,8 +12,8 @@ from nvidia import lowered_for_nvidia
 from small_scene import small_scene
 
 from jaxrl_vis.config import preset
-from jaxrl_vis.learner import encoder_kernel_passes
-from jaxrl_vis.learner.sharding import ONE_DEVICE
+from jaxrl_vis.learner.networks.kernels import passes as encoder_kernel_passes
+from jaxrl_vis.learner.parallel.sharding import ONE_DEVICE
 from jaxrl_vis.run.compiled.programs import Programs, rarely_collecting_garbage
 from jaxrl_vis_envs import compilation, gpu_kernels
 from jaxrl_vis_envs.compilation import (

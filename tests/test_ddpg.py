@@ -10,7 +10,7 @@ import pytest
 from learners import begin, experienced, iteration_of_one, train_iteration
 
 from jaxrl_vis.config import preset
-from jaxrl_vis.learner import rollout
+from jaxrl_vis.learner.acting import rollout
 from jaxrl_vis.learner.train_step import make_train_step
 from jaxrl_vis.run.compiled.programs import Programs
 

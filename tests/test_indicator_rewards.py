@@ -10,11 +10,13 @@ from test_ddpg import DISCOUNT, trained
 
 from jaxrl_vis.config import preset
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner import diagnostics, normalizer, reward_errors
-from jaxrl_vis.learner.latent_reward import cosine_reward, make_latent_reward
-from jaxrl_vis.learner.replay import Replay
-from jaxrl_vis.learner.rollout import add_noise
-from jaxrl_vis.learner.sampling import Choice, Sampler
+from jaxrl_vis.learner.acting.rollout import add_noise
+from jaxrl_vis.learner.ddpg import diagnostics
+from jaxrl_vis.learner.ddpg.latent_reward import cosine_reward, make_latent_reward
+from jaxrl_vis.learner.memory import reward_errors
+from jaxrl_vis.learner.memory.replay import Replay
+from jaxrl_vis.learner.memory.sampling import Choice, Sampler
+from jaxrl_vis.learner.networks import normalizer
 from jaxrl_vis.learner.train_step import make_train_step
 from jaxrl_vis.resolved import resolve
 from jaxrl_vis.run.metrics import with_precision

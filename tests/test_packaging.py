@@ -131,7 +131,13 @@ def test_nothing_imports_the_folder_of_sources() -> None:
 def test_leaves_load_no_mujoco(clean_environment: dict[str, str]) -> None:
     code = """
 import sys
-from jaxrl_vis.learner import auxtasks, losses, networks, normalizer, relabel, replay, weighting
+from jaxrl_vis.learner import auxtasks
+from jaxrl_vis.learner.ddpg import losses
+from jaxrl_vis.learner.networks import networks
+from jaxrl_vis.learner.networks import normalizer
+from jaxrl_vis.learner.memory import relabel
+from jaxrl_vis.learner.memory import replay
+from jaxrl_vis.learner import weighting
 from jaxrl_vis_envs import goals
 assert not {"mujoco", "matplotlib", "orbax"} & set(sys.modules)
 """

@@ -14,7 +14,7 @@ import pytest
 
 import jaxrl_vis
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner.rollout import play
+from jaxrl_vis.learner.acting.rollout import play
 from jaxrl_vis.run.checkpoint import LIGHT
 from jaxrl_vis.run.trained import load, open_run
 from jaxrl_vis_envs import registry

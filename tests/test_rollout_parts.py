@@ -10,10 +10,10 @@ import pytest
 
 from jaxrl_vis.config import preset
 from jaxrl_vis.learner import train_step
+from jaxrl_vis.learner.acting.rollout import Exploration
+from jaxrl_vis.learner.acting.rollout_parts import PART_SIZE, RolloutPart, join_parts, part_size, played_spec
 from jaxrl_vis.learner.environment import make_env
-from jaxrl_vis.learner.rollout import Exploration
-from jaxrl_vis.learner.rollout_parts import PART_SIZE, RolloutPart, join_parts, part_size, played_spec
-from jaxrl_vis.learner.shards import ONE
+from jaxrl_vis.learner.parallel.shards import ONE
 from jaxrl_vis.learner.train_step import TrainStep, make_train_step
 from jaxrl_vis.run.compiled.programs import Programs
 from jaxrl_vis.run.compiled.threaded_rollout import ThreadedRollout

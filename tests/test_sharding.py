@@ -17,14 +17,15 @@ import pytest
 from jaxrl_vis import cli
 from jaxrl_vis.config import Config, preset
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner import normalizer, reward_errors
-from jaxrl_vis.learner.auxiliary import make_auxiliary
-from jaxrl_vis.learner.ddpg import GradientSteps, make_ddpg
-from jaxrl_vis.learner.networks import Networks
-from jaxrl_vis.learner.replay import Replay
-from jaxrl_vis.learner.sampling import Sampler
-from jaxrl_vis.learner.sharding import make_layout
-from jaxrl_vis.learner.shards import DATA, Shards
+from jaxrl_vis.learner.auxtasks.auxiliary import make_auxiliary
+from jaxrl_vis.learner.ddpg.ddpg import GradientSteps, make_ddpg
+from jaxrl_vis.learner.memory import reward_errors
+from jaxrl_vis.learner.memory.replay import Replay
+from jaxrl_vis.learner.memory.sampling import Sampler
+from jaxrl_vis.learner.networks import normalizer
+from jaxrl_vis.learner.networks.networks import Networks
+from jaxrl_vis.learner.parallel.sharding import make_layout
+from jaxrl_vis.learner.parallel.shards import DATA, Shards
 from jaxrl_vis.resolved import resolve
 from jaxrl_vis.run.compiled import memory
 from jaxrl_vis.types import Batch, Episodes, ReplayState, TrainState

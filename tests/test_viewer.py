@@ -15,7 +15,7 @@ import probe_environments as probes
 
 from jaxrl_vis import cli
 from jaxrl_vis.config import preset
-from jaxrl_vis.learner.rollout import play
+from jaxrl_vis.learner.acting.rollout import play
 from jaxrl_vis.learner.train_step import make_train_step
 from jaxrl_vis.report import viewer
 from jaxrl_vis_envs.adapters.brax_viewer import Poses, viewer_page

@@ -24,9 +24,9 @@ from jaxrl_vis.bench.timing import compile_timed
 from jaxrl_vis.bench.timing import measure as measure_time
 from jaxrl_vis.config import preset
 from jaxrl_vis.devices import check_devices
-from jaxrl_vis.learner import tangents
-from jaxrl_vis.learner.networks import Networks
-from jaxrl_vis.learner.normalizer import Scaling
+from jaxrl_vis.learner.networks import forward_mode
+from jaxrl_vis.learner.networks.networks import Networks
+from jaxrl_vis.learner.networks.normalizer import Scaling
 from jaxrl_vis.learner.weighting import MAIN, Weighting, make_weighting, weighted_grad
 from jaxrl_vis.learner.weighting.gradients import Way
 from jaxrl_vis_envs.compilation import env_jit
@@ -97,7 +97,7 @@ class Problem:
             weighting,
             lambda params: params["critic"]["encoder"],
             way,
-            forwards=tangents.with_tangents,
+            forwards=forward_mode.with_tangents,
             encode=self.encode,
         )
 

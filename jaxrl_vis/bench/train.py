@@ -24,7 +24,7 @@ from jaxrl_vis.bench.timing import Timing, compile_timed
 from jaxrl_vis.bench.timing import measure as measure_time
 from jaxrl_vis.bench.update import seed_keys, time_updates, training_config
 from jaxrl_vis.config import Config, data_devices_of
-from jaxrl_vis.learner.rollout_parts import join_parts
+from jaxrl_vis.learner.acting.rollout_parts import join_parts
 from jaxrl_vis.learner.train_step import TrainStep, make_train_step
 from jaxrl_vis.run.compiled.programs import Programs
 from jaxrl_vis.types import Episodes, LoopState, Metrics

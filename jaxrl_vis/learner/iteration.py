@@ -15,12 +15,12 @@ import jax
 import jax.numpy as jnp
 
 from jaxrl_vis.config import Config
-from jaxrl_vis.learner import normalizer
+from jaxrl_vis.learner.acting.rollout_parts import Played, join_parts
 from jaxrl_vis.learner.algorithm import Algorithm, Batches
-from jaxrl_vis.learner.auxiliary import Auxiliary
-from jaxrl_vis.learner.rollout_parts import Played, join_parts
-from jaxrl_vis.learner.sampling import Sampler
-from jaxrl_vis.learner.sharding import Layout
+from jaxrl_vis.learner.auxtasks.auxiliary import Auxiliary
+from jaxrl_vis.learner.memory.sampling import Sampler
+from jaxrl_vis.learner.networks import normalizer
+from jaxrl_vis.learner.parallel.sharding import Layout
 from jaxrl_vis.types import Episodes, LoopState, Metrics, ReplayState, TrainState
 
 Insert = Callable[[TrainState, ReplayState, Episodes, jax.Array, jax.Array], tuple[TrainState, ReplayState]]

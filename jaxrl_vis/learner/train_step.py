@@ -20,18 +20,19 @@ import jax
 import jax.numpy as jnp
 
 from jaxrl_vis.config import Config
-from jaxrl_vis.learner import ddpg, normalizer
 from jaxrl_vis.learner import iteration as iterations
+from jaxrl_vis.learner.acting.evaluate import Evaluation, make_evaluate
+from jaxrl_vis.learner.acting.rollout import Acting, Exploration, play
+from jaxrl_vis.learner.acting.rollout_parts import Played, RolloutPart, part_size, played_spec
 from jaxrl_vis.learner.algorithm import Algorithm, Setup
-from jaxrl_vis.learner.auxiliary import Auxiliary, make_auxiliary
-from jaxrl_vis.learner.evaluate import Evaluation, make_evaluate
+from jaxrl_vis.learner.auxtasks.auxiliary import Auxiliary, make_auxiliary
+from jaxrl_vis.learner.ddpg import ddpg
 from jaxrl_vis.learner.iteration import Insert, Learned, Update
-from jaxrl_vis.learner.networks import Networks, compute_dtype
-from jaxrl_vis.learner.replay import Replay, make_replay, num_bytes
-from jaxrl_vis.learner.rollout import Acting, Exploration, play
-from jaxrl_vis.learner.rollout_parts import Played, RolloutPart, part_size, played_spec
-from jaxrl_vis.learner.sampling import Sampler
-from jaxrl_vis.learner.sharding import Layout, make_layout
+from jaxrl_vis.learner.memory.replay import Replay, make_replay, num_bytes
+from jaxrl_vis.learner.memory.sampling import Sampler
+from jaxrl_vis.learner.networks import normalizer
+from jaxrl_vis.learner.networks.networks import Networks, compute_dtype
+from jaxrl_vis.learner.parallel.sharding import Layout, make_layout
 from jaxrl_vis.plugins import call, find
 from jaxrl_vis.resolved import Resolved, resolve
 from jaxrl_vis.types import Episodes, LoopState, Metrics, ReplayState, TrainState

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner.rollout import Acting, play, split_keys
+from jaxrl_vis.learner.acting.rollout import Acting, play, split_keys
 from jaxrl_vis.report.outputs import check_writable
 from jaxrl_vis.types import TrainState
 from jaxrl_vis_envs.compilation import env_jit

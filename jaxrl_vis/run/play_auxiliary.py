@@ -9,11 +9,11 @@ import numpy as np
 
 from jaxrl_vis.devices import enable_compilation_cache
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner.auxiliary import Auxiliary
+from jaxrl_vis.learner.acting.rollout_parts import join_parts
 from jaxrl_vis.learner.auxtasks import View
+from jaxrl_vis.learner.auxtasks.auxiliary import Auxiliary
 from jaxrl_vis.learner.auxtasks.egomotion import MAX_ANGLE
-from jaxrl_vis.learner.networks import Networks
-from jaxrl_vis.learner.rollout_parts import join_parts
+from jaxrl_vis.learner.networks.networks import Networks
 from jaxrl_vis.report import auxiliary_video, videos
 from jaxrl_vis.run.folder import read_config
 from jaxrl_vis.run.trained import load, open_run

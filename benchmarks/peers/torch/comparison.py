@@ -22,9 +22,9 @@ from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.timing import measure as measure_time
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner import normalizer
-from jaxrl_vis.learner.ddpg import make_ddpg
-from jaxrl_vis.learner.sampling import Choice, Sampler
+from jaxrl_vis.learner.ddpg.ddpg import make_ddpg
+from jaxrl_vis.learner.memory.sampling import Choice, Sampler
+from jaxrl_vis.learner.networks import normalizer
 from jaxrl_vis.learner.train_step import TrainStep
 from jaxrl_vis.types import ReplayState, TrainState
 from jaxrl_vis_envs.compilation import env_jit

@@ -5,7 +5,7 @@ import jax
 from jaxrl_vis.learner.auxtasks import heads
 from jaxrl_vis.learner.auxtasks.images import grey
 from jaxrl_vis.learner.auxtasks.task import AuxTask, Spec, View, mean_squared_error, read
-from jaxrl_vis.learner.blocks import from_blocks, to_blocks
+from jaxrl_vis.learner.networks.blocks import from_blocks, to_blocks
 from jaxrl_vis.types import Params
 
 

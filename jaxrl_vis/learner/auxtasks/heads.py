@@ -10,9 +10,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxrl_vis.learner import decoder_kernel, encoder_kernel_patches
-from jaxrl_vis.learner.encoder_kernel_passes import LEAST_ROWS
-from jaxrl_vis.learner.products import product
+from jaxrl_vis.learner.networks.kernels import decoder as decoder_kernel
+from jaxrl_vis.learner.networks.kernels import patches as encoder_kernel_patches
+from jaxrl_vis.learner.networks.kernels.passes import LEAST_ROWS
+from jaxrl_vis.learner.networks.matmul import product
 from jaxrl_vis.types import Params
 
 _glorot = jax.nn.initializers.glorot_uniform()
@@ -73,7 +74,7 @@ def decoding_error(params: Params, values: jax.Array, patches: jax.Array, dtype:
     Args:
         params: From `init_decoder`; see `has_kernel`.
         values: [B, inputs].
-        patches: [at least B, patches, 64 C'], what is to be decoded, as `encoder_kernel_patches.to_patches` orders it.
+        patches: [at least B, patches, 64 C'], what is to be decoded, as `kernels.patches.to_patches` orders it.
         dtype: What is computed in.
     """
     *coarser, before, finer, finest = _layers(params)

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 from jaxrl_vis.learner.auxtasks import farneback, heads
 from jaxrl_vis.learner.auxtasks.images import grey
 from jaxrl_vis.learner.auxtasks.task import AuxTask, Spec, View, mean_squared_error, read
-from jaxrl_vis.learner.blocks import from_blocks, shifted, to_blocks
-from jaxrl_vis.learner.encoder_kernel_patches import to_patches
+from jaxrl_vis.learner.networks.blocks import from_blocks, shifted, to_blocks
+from jaxrl_vis.learner.networks.kernels.patches import to_patches
 from jaxrl_vis.types import Params
 
 

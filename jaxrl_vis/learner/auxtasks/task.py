@@ -98,8 +98,8 @@ class View(Replaceable):
         image: [B, C, H, W] any float dtype, the observations before, normalised as for the encoder.
         latent_view: [B, L] of the images that the task's own ``view`` has made.
         target: Result of the task's own ``view`` or ``target``.
-        patches: [at least B, patches, 64 C'], ``image`` and others as `encoder_kernel.prepare` orders them, where the encoder
-            reads them so: decoders, too, are kernels then (`decoder_kernel`).
+        patches: [at least B, patches, 64 C'], ``image`` and others as `kernels.encoder.prepare` orders them, where the encoder
+            reads them so: decoders, too, are kernels then (`kernels.decoder`).
     """
 
     latent_t: jax.Array

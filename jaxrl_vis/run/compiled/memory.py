@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner.sharding import ONE_DEVICE, Layout
+from jaxrl_vis.learner.parallel.sharding import ONE_DEVICE, Layout
 
 # What stays unclaimed: XLA's workspaces and the allocator's gaps on an accelerator, the program and its libraries on a host.
 _SLACK_BYTES = 256 * 2**20

@@ -20,9 +20,9 @@ import jax.numpy as jnp
 from jaxrl_vis import processes
 from jaxrl_vis.config import Config
 from jaxrl_vis.devices import cache_fault, default_cache, enable_compilation_cache
-from jaxrl_vis.learner.evaluate import Evaluation
+from jaxrl_vis.learner.acting.evaluate import Evaluation
+from jaxrl_vis.learner.acting.rollout import Exploration
 from jaxrl_vis.learner.iteration import Learned
-from jaxrl_vis.learner.rollout import Exploration
 from jaxrl_vis.learner.train_step import JIT_OPTIONS
 from jaxrl_vis.report import videos
 from jaxrl_vis.run.arrays import to_host

@@ -10,9 +10,9 @@ from collections.abc import Callable
 import jax
 import numpy as np
 
-from jaxrl_vis.learner.evaluate import Evaluation, num_recorded, summarize
-from jaxrl_vis.learner.rollout import NO_EXPLORATION, Exploration
-from jaxrl_vis.learner.rollout_parts import Played, join_parts
+from jaxrl_vis.learner.acting.evaluate import Evaluation, num_recorded, summarize
+from jaxrl_vis.learner.acting.rollout import NO_EXPLORATION, Exploration
+from jaxrl_vis.learner.acting.rollout_parts import Played, join_parts
 from jaxrl_vis.run.signals import shield_this_thread
 from jaxrl_vis.types import Episodes, Metrics, TrainState
 from jaxrl_vis_envs.cores import num_cores

@@ -30,9 +30,9 @@ from jax.extend.core import jaxpr_as_fun
 
 from jaxrl_vis.config import Config
 from jaxrl_vis.files import make_private, read_private, replacing, stranger_to
-from jaxrl_vis.learner.evaluate import Evaluation
+from jaxrl_vis.learner.acting.evaluate import Evaluation
+from jaxrl_vis.learner.acting.rollout import Exploration
 from jaxrl_vis.learner.iteration import Learned
-from jaxrl_vis.learner.rollout import Exploration
 from jaxrl_vis.plugins import own_names
 from jaxrl_vis.provenance import device_record, versions
 from jaxrl_vis.types import Episodes

@@ -22,10 +22,11 @@ import jax.numpy as jnp
 
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner import encoder_kernel, normalizer
-from jaxrl_vis.learner.blocks import shifted, to_blocks
-from jaxrl_vis.learner.normalizer import Scaling
-from jaxrl_vis.learner.products import product
+from jaxrl_vis.learner.networks import normalizer
+from jaxrl_vis.learner.networks.blocks import shifted, to_blocks
+from jaxrl_vis.learner.networks.kernels import encoder as encoder_kernel
+from jaxrl_vis.learner.networks.matmul import product
+from jaxrl_vis.learner.networks.normalizer import Scaling
 from jaxrl_vis.types import Batch, NormalizerState, Params, Statistics
 
 _glorot = nn.initializers.glorot_uniform()
@@ -213,7 +214,7 @@ class Networks:
 
     @property
     def uses_kernel(self) -> bool:
-        """Whether the first layers are those of `encoder_kernel`, one kernel on a GPU, instead of one product each."""
+        """Whether the first layers are those of `kernels.encoder`, one kernel on a GPU, instead of one product each."""
         return (
             self.sees_images
             and self.dtype == jnp.bfloat16

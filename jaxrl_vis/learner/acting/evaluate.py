@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxrl_vis.learner.rollout import Acting, play
-from jaxrl_vis.learner.shards import ONE, Shards
+from jaxrl_vis.learner.acting.rollout import Acting, play
+from jaxrl_vis.learner.parallel.shards import ONE, Shards
 from jaxrl_vis.types import Metrics, TrainState
 
 # Episodes whose images are returned, for videos.

@@ -1,6 +1,6 @@
-"""Images in the order that `encoder_kernel` reads: normalised, in patches of 8x8 pixels, four quarters each.
+"""Images in the order that `kernels.encoder` reads: normalised, in patches of 8x8 pixels, four quarters each.
 
-As one GPU kernel (Pallas, by Triton), and the same in plain JAX; `encoder_kernel.prepare` chooses.
+As one GPU kernel (Pallas, by Triton), and the same in plain JAX; `kernels.encoder.prepare` chooses.
 """
 
 import functools
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
 
-from jaxrl_vis.learner.blocks import shifted
+from jaxrl_vis.learner.networks.blocks import shifted
 from jaxrl_vis_envs.gpu_kernels import kernel_call
 
 LEVELS = 3
@@ -85,7 +85,7 @@ def prepare_on_gpu(
     dtype: Any,
     interpret: bool = False,
 ) -> jax.Array:
-    """`encoder_kernel.prepare` as a kernel; ``interpret`` runs it without a GPU."""
+    """`kernels.encoder.prepare` as a kernel; ``interpret`` runs it without a GPU."""
     batch, *shape = images.shape
     channels, height, width = shape
     rows, columns, of_block = height >> levels, width >> levels, 4 ** (levels - LEVELS)
@@ -113,7 +113,7 @@ def prepare_on_gpu(
 def prepare_plainly(
     images: jax.Array, mean: jax.Array, scale: jax.Array, shift: jax.Array | None, levels: int, limit: float, dtype: Any
 ) -> jax.Array:
-    """`encoder_kernel.prepare` in plain JAX."""
+    """`kernels.encoder.prepare` in plain JAX."""
     if shift is not None:
         values = jnp.clip((images.astype(jnp.float32) - mean) * scale, -limit, limit).astype(dtype)
         return to_patches(shifted(values, shift), levels)

@@ -1,7 +1,7 @@
 """The encoder's first three layers as one GPU kernel each way (Pallas, by Triton).
 
 Windows of 2x2 pixels with stride 2 never overlap, so three layers see a *patch* of 8x8 pixels at a time and nothing else. A
-tile of R patches (`encoder_kernel_patches` makes them, in an order that has windows side by side) passes through all three
+tile of R patches (`kernels.patches` makes them, in an order that has windows side by side) passes through all three
 without leaving the chip:
 
     4 R quarters of 4x4 pixels     [4 R, 16 C']  @ [16 C', 4 F1]   layer 1, its four windows at once: block-diagonal
@@ -27,10 +27,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxrl_vis.learner import tangents
-from jaxrl_vis.learner.encoder_kernel_passes import TILE, Weights, apply, dispatch, is_available
-from jaxrl_vis.learner.encoder_kernel_patches import LEVELS, padded_channels, prepare_on_gpu, prepare_plainly
-from jaxrl_vis.learner.encoder_kernel_tangents import apply_forwards
+from jaxrl_vis.learner.networks import forward_mode
+from jaxrl_vis.learner.networks.kernels.jvp import apply_forwards
+from jaxrl_vis.learner.networks.kernels.passes import TILE, Weights, apply, dispatch, is_available
+from jaxrl_vis.learner.networks.kernels.patches import LEVELS, padded_channels, prepare_on_gpu, prepare_plainly
 
 __all__ = ["LEVELS", "encode", "is_available", "make_weights", "prepare", "supports"]
 
@@ -103,6 +103,6 @@ def encode(patches: jax.Array, weights: Weights, which: slice = slice(None), int
     if math.gcd(first, count) % TILE:  # a few small images
         patches = jnp.pad(patches[which], ((0, -len(images) % TILE), (0, 0), (0, 0)))
         first, rows = 0, patches.shape[0] * of_image
-    chosen = apply_forwards if tangents.are_wanted() else apply
+    chosen = apply_forwards if forward_mode.are_wanted() else apply
     out: jax.Array = chosen(patches.reshape(-1, size), weights, first, rows, interpret)  # type: ignore[assignment]
     return out[:count].reshape(-1, of_image, out.shape[-1])

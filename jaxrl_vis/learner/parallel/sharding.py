@@ -23,7 +23,7 @@ from jax.sharding import PartitionSpec as Spec
 
 from jaxrl_vis.config import Config, data_devices_of
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner.shards import DATA, ONE, Shards
+from jaxrl_vis.learner.parallel.shards import DATA, ONE, Shards
 from jaxrl_vis.types import LoopState, ReplayState
 
 SEED = "seed"

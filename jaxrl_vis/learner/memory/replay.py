@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxrl_vis.learner.draws import scaled
+from jaxrl_vis.learner.memory.random_integers import scaled
 from jaxrl_vis.types import Batch, Episodes, ReplayState
 
 _WORD = 4  # bytes

@@ -18,11 +18,12 @@ import jax
 import jax.numpy as jnp
 
 from jaxrl_vis.config import Config
-from jaxrl_vis.learner import losses, tangents
-from jaxrl_vis.learner.auxiliary import Auxiliary
 from jaxrl_vis.learner.auxtasks import View
-from jaxrl_vis.learner.networks import Inputs, Networks
-from jaxrl_vis.learner.shards import Shards
+from jaxrl_vis.learner.auxtasks.auxiliary import Auxiliary
+from jaxrl_vis.learner.ddpg import losses
+from jaxrl_vis.learner.networks import forward_mode
+from jaxrl_vis.learner.networks.networks import Inputs, Networks
+from jaxrl_vis.learner.parallel.shards import Shards
 from jaxrl_vis.learner.weighting import MAIN, Weighted, WeightingState, weighted_grad
 from jaxrl_vis.resolved import Resolved
 from jaxrl_vis.types import Batch, Params
@@ -160,7 +161,7 @@ class Objectives:
         # Where the main gradient is passed on by itself, the others' need not pass through all that it does.
         passes_apart = way == "latents" and weighting.needs == "dots"
         encoders = _encoders(networks, self.auxiliary, inputs) if passes_apart else encode
-        options: dict[str, Any] = {"forwards": tangents.with_tangents, "encode": encoders, "has_aux": True}
+        options: dict[str, Any] = {"forwards": forward_mode.with_tangents, "encode": encoders, "has_aux": True}
         if self.reduces_early:
             options["reduce"] = self.shards.mean
         return weighted_grad(critic_losses, weighting, lambda critic: critic.get("encoder"), way, **options)

@@ -13,7 +13,7 @@ What is observed in that slot becomes the goal in `sampling`.
 import jax
 import jax.numpy as jnp
 
-from jaxrl_vis.learner.draws import scaled
+from jaxrl_vis.learner.memory.random_integers import scaled
 
 
 def choose_goal_slots(

@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxrl_vis.learner.acting.rollout_parts import RolloutPart
 from jaxrl_vis.learner.algorithm import Algorithm
-from jaxrl_vis.learner.rollout_parts import RolloutPart
-from jaxrl_vis.learner.shards import ONE, Shards
+from jaxrl_vis.learner.parallel.shards import ONE, Shards
 from jaxrl_vis.types import Episodes, Metrics, TrainState
 from jaxrl_vis_envs.base import GoalEnv, State
 

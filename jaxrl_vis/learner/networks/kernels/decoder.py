@@ -9,11 +9,11 @@ be written and read a dozen times on the way there and back. Here a tile of *cel
     layer    [R, 16 C']    16 pixels of it, C' channels      @ [64, 16 C'], block-diagonal
     error    of these pixels, and the way back at once: the gradient of a squared error is known as soon as the error is
 
-Pixels have the order of the encoder's patches (`encoder_kernel_patches`): channel, row, column within a cell, and cells in
+Pixels have the order of the encoder's patches (`kernels.patches`): channel, row, column within a cell, and cells in
 nested blocks. So what an autoencoder is to reconstruct is what the encoder read, byte for byte.
 
 The gradient of the cells is written in the networks' dtype, those of the weights are added up in float32 as in
-`encoder_kernel_passes`; both are multiplied by the gradient that comes in.
+`kernels.passes`; both are multiplied by the gradient that comes in.
 """
 
 import functools
@@ -25,8 +25,8 @@ import jax.numpy as jnp
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
 
-from jaxrl_vis.learner import tangents
-from jaxrl_vis.learner.encoder_kernel_passes import (
+from jaxrl_vis.learner.networks import forward_mode
+from jaxrl_vis.learner.networks.kernels.passes import (
     LEAST_ROWS,
     before,
     dispatch,
@@ -37,7 +37,7 @@ from jaxrl_vis.learner.encoder_kernel_passes import (
     tiles_of_program,
     whole,
 )
-from jaxrl_vis.learner.encoder_kernel_patches import divisor, padded_channels
+from jaxrl_vis.learner.networks.kernels.patches import divisor, padded_channels
 from jaxrl_vis_envs.gpu_kernels import kernel_call
 
 _MOST_CHANNELS = 4  # beyond, the weights' gradients no longer fit into registers
@@ -112,7 +112,7 @@ def _kernel(cells_ref, target_ref, *refs, tile, scale):
     weights, (gradient_ref, sums_ref) = Weights(*(ref[...] for ref in refs[:-2])), refs[-2:]
 
     def add_rows(values):
-        """As in `encoder_kernel_passes`."""
+        """As in `kernels.passes`."""
         return dot(jnp.ones((LEAST_ROWS, values.shape[0]), values.dtype), values)
 
     def one_tile(number, carry):
@@ -222,6 +222,6 @@ def squared_error(cells: jax.Array, target: jax.Array, weights: Weights, scale: 
     """
     if cells.shape[0] % LEAST_ROWS:
         raise ValueError(f"{cells.shape[0]} cells are not a multiple of {LEAST_ROWS}")
-    if tangents.are_wanted():
+    if forward_mode.are_wanted():
         return _plainly(cells, target, weights, scale)
     return _squared_error(cells, target, weights, scale, interpret)

@@ -1,6 +1,6 @@
 """The kernel of the encoder's first layers that also makes their tangents: forward along a direction of the weights.
 
-And the same in plain JAX, as in `encoder_kernel_passes`. Weightings that need dot products of gradients ask for it
+And the same in plain JAX, as in `kernels.passes`. Weightings that need dot products of gradients ask for it
 (`learner.tangents`).
 """
 
@@ -10,7 +10,7 @@ from typing import Any
 
 import jax
 
-from jaxrl_vis.learner.encoder_kernel_passes import (
+from jaxrl_vis.learner.networks.kernels.passes import (
     FORWARD,
     FORWARD_TILES,
     TILE,
@@ -30,7 +30,7 @@ from jaxrl_vis.learner.encoder_kernel_passes import (
     rows_of,
     whole,
 )
-from jaxrl_vis.learner.encoder_kernel_patches import divisor
+from jaxrl_vis.learner.networks.kernels.patches import divisor
 from jaxrl_vis_envs.gpu_kernels import kernel_call
 
 

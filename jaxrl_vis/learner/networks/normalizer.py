@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxrl_vis.learner.shards import ONE, Shards
+from jaxrl_vis.learner.parallel.shards import ONE, Shards
 from jaxrl_vis.types import NormalizerState
 
 

@@ -2,12 +2,12 @@
 
 import jax
 
-from jaxrl_vis.learner import tangents
+from jaxrl_vis.learner.networks import forward_mode
 
 
 def product(values: jax.Array, kernel: jax.Array) -> jax.Array:
     """``values @ kernel``, [..., M, K] and [..., K, N]."""
-    return values @ kernel if tangents.are_wanted() else _with_rule(values, kernel)
+    return values @ kernel if forward_mode.are_wanted() else _with_rule(values, kernel)
 
 
 @jax.custom_vjp

@@ -16,8 +16,8 @@ import optax
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import auxtasks
-from jaxrl_vis.learner.networks import Inputs, Networks
-from jaxrl_vis.learner.normalizer import Scaling
+from jaxrl_vis.learner.networks.networks import Inputs, Networks
+from jaxrl_vis.learner.networks.normalizer import Scaling
 from jaxrl_vis.resolved import Resolved
 from jaxrl_vis.types import Batch, Params, Replaceable
 

@@ -1,4 +1,4 @@
-"""The kernels of the encoder's first layers: forward and backward (`encoder_kernel`; `encoder_kernel_tangents` has a third).
+"""The kernels of the encoder's first layers: forward and backward (`kernels.encoder`; `kernels.jvp` has a third).
 
 Each with the same in plain JAX, for processes without such a GPU and as the kernels' reference.
 """
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
 
-from jaxrl_vis.learner.encoder_kernel_patches import LEVELS, divisor, prepare_on_gpu
+from jaxrl_vis.learner.networks.kernels.patches import LEVELS, divisor, prepare_on_gpu
 from jaxrl_vis_envs.compilation import accelerator, by_platform, runs_gpu_kernels, tracing_for
 from jaxrl_vis_envs.gpu_kernels import kernel_call
 
