@@ -51,7 +51,7 @@ def _names(hint: Any) -> Names | None:
 
 
 def _is_own(name: Any) -> bool:
-    """Whether a name is written ``module:Name``."""
+    """Return True if a name is written ``module:Name``."""
     if not isinstance(name, str):
         return False
     module, colon, part = name.partition(":")
@@ -59,7 +59,7 @@ def _is_own(name: Any) -> bool:
 
 
 def unwrap(hint: Any) -> tuple[Any, bool, bool]:
-    """What one value of a field is.
+    """Split an annotation.
 
     Returns:
         The annotation of one value, whether None is allowed, and whether there are several.
@@ -79,7 +79,7 @@ def names_parts(hint: Any) -> bool:
 
 
 def is_known(hint: Any) -> bool:
-    """Whether values of a field with this annotation can be checked and read."""
+    """Return True if values of a field with this annotation can be checked and read."""
     try:
         one, _, _ = unwrap(hint)
     except (ValueError, IndexError):  # a union of several kinds, an empty tuple
@@ -179,7 +179,7 @@ def _said(value: Any) -> str:
 
 
 def _mend(one: Any, value: Any) -> str:
-    """How to write a whole number that is written as another kind: 1e6."""
+    """Say how to write a whole number that is written as another kind: 1e6."""
     try:
         number = float(value) if one is int and not isinstance(value, bool) else math.nan
     except (TypeError, ValueError, OverflowError):

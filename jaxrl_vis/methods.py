@@ -36,12 +36,12 @@ class Method:
 
     @property
     def balance(self) -> bool:
-        """Whether samples are balanced: some take the very next observation as their goal, which is a sure positive."""
+        """True if samples are balanced: some take the very next observation as their goal, which is a sure positive."""
         return self.balance_probability > 0.0
 
     @property
     def needs_images(self) -> bool:
-        """Whether rewards are made from images, so that the environment must show some."""
+        """True if rewards are made from images, so that the environment must show some."""
         return self.reward == "autoencoder"
 
 

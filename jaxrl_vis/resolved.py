@@ -1,4 +1,4 @@
-"""What follows from a configuration and an environment's horizon: discount, rewards, filter, bounds of targets."""
+"""Values that follow from a configuration and an environment's horizon: discount, rewards, filter, bounds of targets."""
 
 import dataclasses
 import math
@@ -11,10 +11,10 @@ from jaxrl_vis.plugins import call, find
 
 @dataclasses.dataclass(frozen=True)
 class Resolved:
-    """What follows from a `Config` and the environment's horizon: no None left.
+    """Values that follow from a `Config` and the environment's horizon: no None left.
 
     Attributes:
-        method: Where rewards come from.
+        method: Source of rewards.
         horizon: T, control steps in an episode.
         discount: gamma.
         reward_positive, reward_negative: R+ and R-.

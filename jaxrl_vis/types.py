@@ -75,7 +75,7 @@ class Batch(Replaceable):
         discount: [B] float32 of what comes after these steps; None: that of one step.
         shift: [B, 2] int32, pixels by which the images are to be moved down and to the right; None: not at all.
         views: [B, ...] images in the observation's dtype that auxiliary tasks have made, by task (`AuxTask.view`).
-        targets: What auxiliary tasks are to predict, by task.
+        targets: Targets of auxiliary tasks, by task.
         reached: [B, ...] what the observation after the action is as a goal, where that is something else (stacked images);
             else None.
         success: [B] float32, 1 where the true state after the action lies at the goal's, else 0: for diagnostics alone. None
@@ -130,7 +130,7 @@ class Statistics(NamedTuple):
     """Observation statistics of a learner.
 
     Attributes:
-        observations: Of observations; of goals, too, unless they have their own.
+        observations: Statistics of observations; of goals, too, unless they have their own.
         own_goals: Those of goals alone; None where they have not.
     """
 

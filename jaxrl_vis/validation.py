@@ -1,4 +1,4 @@
-"""Whether a configuration makes sense in itself: checks that say in one line what is wrong, and how to mend it.
+"""Checks of a configuration in itself, which say in one line what is wrong, and how to mend it.
 
 Imports no JAX, so that the command line can refuse a request at once.
 """
@@ -80,7 +80,7 @@ def validate(config: Config) -> Config:
 
 
 def _is_set(config: Config, name: str) -> bool:
-    """Whether a field is not as it is where nobody asks for anything."""
+    """Return True if a field differs from its default."""
     return getattr(config, name) != next(field.default for field in dataclasses.fields(Config) if field.name == name)
 
 

@@ -1,8 +1,8 @@
-"""The interface of an algorithm: what rollouts, evaluations, checkpoints and policies know of a learner.
+"""The interface of an algorithm. Rollouts, evaluations, checkpoints and policies know nothing else of a learner.
 
     init            a fresh agent: a pytree of the algorithm's own
     update          all gradient steps of an iteration, from batches that were chosen by the replay
-    policy_params   what acting reads of an agent: small, and all that a policy is made of
+    policy_params   the part of an agent that acting reads: small, and all that a policy is made of
     act             actions without exploration
 
 An algorithm is made by a function of a `Setup`, which has the configuration and the sizes of the task. DDPG is the one that is
@@ -36,7 +36,7 @@ class Setup:
         observation_spec: Shape and dtype of an observation: [C, H, W] uint8 or [S] float32.
         action_size: A; actions lie in [-1, 1].
         auxiliary: Auxiliary tasks of the run and their weighting; an algorithm may leave them alone.
-        shards: Of the learner: batches are those of one part, gradients and metrics must be those of the whole.
+        shards: Shards of the learner: batches are those of one shard, gradients and metrics must be those of the whole.
     """
 
     config: Config

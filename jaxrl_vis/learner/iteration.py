@@ -1,4 +1,4 @@
-"""What follows a rollout in a training iteration, for one learner, as pure functions that are not compiled yet.
+"""Second half of a training iteration, after its rollout, for one learner, as pure functions that are not compiled yet.
 
     insert      one contiguous slice of the replay; observation statistics
     update      scan over U: sample, relabel, reward, gradient step, target networks

@@ -59,7 +59,7 @@ class TrainStep:
         replay: Sizes of one device's part of a learner's replay.
         layout: Placement of seeds and shards; all programs take and return arrays that lie there.
         exploration: Noise of training; an evaluation has none.
-        plays_any: Whether ``play`` can begin with any environment, and so evaluate, too; else it plays a whole rollout.
+        plays_any: True if ``play`` can begin with any environment, and so evaluate, too; else it plays a whole rollout.
         part_size: P, environments that one call of ``play`` plays, on all devices together.
         init: keys [S] -> LoopState.
         keys: (keys [S], iteration []) -> keys [S] of this iteration's rollout.
@@ -179,12 +179,12 @@ class TrainStep:
 
 
 def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None) -> TrainStep:
-    """Builds the programs of a run. Nothing is compiled or allocated yet.
+    """Build the programs of a run. Nothing is compiled or allocated yet.
 
     Args:
         env: The environment.
         config: The run; what belongs to the environment is taken from ``env``.
-        layout: Where it runs; None: as ``config`` says.
+        layout: Placement on devices; None: as ``config`` says.
 
     Raises:
         RequestError: The configuration asks for something that cannot be.

@@ -52,7 +52,7 @@ GUARD = "guard/"
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """What the host knows about one iteration.
+    """Record of one iteration on the host.
 
     Attributes:
         iteration: Iterations done since the run began, this one included.
@@ -71,8 +71,8 @@ class RunLoop:
     """One call of `Trainer.run`.
 
     Args:
-        programs: What to run.
-        folder: Where its files go.
+        programs: Programs of the run.
+        folder: Folder of its files.
         log: Names of the loggers that are told, see `loggers`.
         on_begun: Called when the folder is this run's.
     """
@@ -164,7 +164,7 @@ class RunLoop:
                 self._rescue()
                 raise
             finally:
-                # What is being written becomes whole, unless somebody is in a hurry; and no error on the way hides the first.
+                # Finish pending writes unless interrupted twice; never mask the original error.
                 if not interruption.is_urgent and not self._is_left_alone:
                     with contextlib.suppress(StorageError):
                         self._checkpoints.close()
@@ -267,7 +267,7 @@ class RunLoop:
         """Cuts the metrics back to the iteration that the run goes on from, and opens the loggers.
 
         Args:
-            goes_on: Whether it does.
+            goes_on: True if it does.
             damaged: Checkpoints that were set aside.
             foreign: Those of other runs.
         """

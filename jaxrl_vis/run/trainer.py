@@ -38,8 +38,8 @@ class Trainer:
 
     Args:
         config: The run.
-        program: What `jaxrl_vis.learner.train_step.make_train_step` returns, or anything with the same attributes.
-        run_dir: Where `run` puts its files; None: `jaxrl_vis.run.folder.default_folder`.
+        program: From `jaxrl_vis.learner.train_step.make_train_step`, or anything with the same attributes.
+        run_dir: Folder of the files of `run`; None: `jaxrl_vis.run.folder.default_folder`.
         resume: Go on with the run in ``run_dir``.
         overwrite: Delete the run in ``run_dir`` and start again.
         log: Loggers that are told beside metrics.jsonl: ``tensorboard``, ``wandb``. None: those of the run that goes on.
@@ -122,7 +122,7 @@ class Trainer:
         """``eval/success``, ``eval/goal_distance`` and its median, [S] float32, of the policy without noise.
 
         Args:
-            loop: What was trained.
+            loop: The learner.
             key: A typed key that draws the episodes; None: always the same ones.
 
         Raises:
@@ -175,7 +175,7 @@ def make_trainer(
 
     Args:
         config: The run.
-        run_dir: Where `Trainer.run` puts its files; None: below ``runs/``, named after the configuration.
+        run_dir: Folder of the files of `Trainer.run`; None: below ``runs/``, named after the configuration.
         resume: Go on with the run in that folder; in an empty one it starts at the beginning, and says so.
         overwrite: Delete the run in that folder and start again.
         log: Loggers that are told beside metrics.jsonl: ``tensorboard``, ``wandb``. None: those of the run that goes on.

@@ -20,8 +20,8 @@ class Evaluation(NamedTuple):
 
     Attributes:
         metrics: [S] float32 by name.
-        recording: Of the first K episodes of each seed, ``frames`` [S, K, T+1, ...], ``goals`` [S, K, ...] and ``success``
-            [S, K].
+        recording: ``frames`` [S, K, T+1, ...], ``goals`` [S, K, ...] and ``success`` [S, K] of the first K episodes of each
+            seed.
     """
 
     metrics: Metrics
@@ -62,8 +62,8 @@ def make_evaluate(acting: Acting, num_episodes: int, shards: Shards = ONE) -> Ca
     Args:
         acting: The environment and the algorithm.
         num_episodes: N, of each learner.
-        shards: Of each learner. Each part plays its part of the episodes; metrics are of all, and images are of the first few
-            of each part.
+        shards: Shards of each learner. Each plays its part of the episodes; metrics are of all, and images are of the first few
+            of each shard.
 
     Returns:
         (TrainState [S, ...], key []) -> `Evaluation`. All seeds play the same episodes.

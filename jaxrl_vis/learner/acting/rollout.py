@@ -24,7 +24,7 @@ _FIRST_NOISE, _GOAL_NOISE, _STEP_NOISE = 0x6E6F30, 0x6E6F31, 0x6E6F32
 
 
 class Exploration(NamedTuple):
-    """How far actions stray from the policy; the default not at all.
+    """Noise of actions; none by default.
 
     Attributes:
         random_action_probability: Share of actions replaced by uniformly random ones, whole vectors at a time.
@@ -36,7 +36,7 @@ class Exploration(NamedTuple):
 
     @property
     def is_none(self) -> bool:
-        """Whether actions are known to be the policy's own; not so of numbers that a compiled program is given."""
+        """True if actions are known to be the policy's own; not so of numbers that a compiled program is given."""
         return all(isinstance(value, float | int) and value == 0 for value in self)
 
 
@@ -44,11 +44,11 @@ NO_EXPLORATION = Exploration()
 
 
 class Acting(NamedTuple):
-    """Who acts where.
+    """An environment, and the algorithm whose agents act in it.
 
     Attributes:
         env: The environment.
-        algorithm: What the agents belong to.
+        algorithm: Algorithm of the agents.
         observation_noise: Standard deviation of the camera's noise, in the observation's unit.
     """
 
@@ -99,12 +99,12 @@ def add_noise(key: jax.Array, observations: jax.Array, deviation: float, draws: 
 
 
 class Rollout(NamedTuple):
-    """What `play` has seen.
+    """Result of `play`.
 
     Attributes:
         episodes: The kept episodes, [S, K, ...].
-        outcome: Of all episodes at their last step: ``success`` and ``goal_distance``, [S, E].
-        record: What ``record`` made of the kept episodes' states after 0, 1, ... T steps, [S, K, T+1, ...]; or None.
+        outcome: ``success`` and ``goal_distance`` of all episodes at their last step, [S, E].
+        record: Result of ``record`` for the kept episodes' states after 0, 1, ... T steps, [S, K, T+1, ...]; or None.
     """
 
     episodes: Episodes
@@ -138,7 +138,7 @@ def play(
         num_envs: E, environments of each learner that are played here.
         exploration: The noise.
         num_kept: K, how many of the episodes to keep (the first ones); None: all.
-        record: What else to keep, a pytree made of the state of one environment after reset and after each step.
+        record: Makes a pytree, to be kept, of the state of one environment after reset and after each step.
         draws: Random numbers of these environments.
     """
     env, algorithm, deviation = acting

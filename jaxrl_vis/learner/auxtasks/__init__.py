@@ -1,4 +1,4 @@
-"""Auxiliary tasks: what an encoder's latents should also tell (thesis, section 5.2.3.1).
+"""Auxiliary tasks, which an encoder's latents should also serve (thesis, section 5.2.3.1).
 
     forward_dynamics   latent, action       -> next latent
     inverse_dynamics   latent, next latent  -> action

@@ -27,8 +27,8 @@ class Auxiliary:
 
     Attributes:
         tasks: By name.
-        weighting: Of their losses and the main one.
-        way: How gradients of losses are found (`weighting.gradients`).
+        weighting: Weighting of their losses and the main one.
+        way: Method of the gradients of losses (`weighting.gradients`).
     """
 
     tasks: dict[str, AuxTask]
@@ -37,7 +37,7 @@ class Auxiliary:
 
     @property
     def needs_image(self) -> bool:
-        """Whether some task reads normalised images."""
+        """True if some task reads normalised images."""
         return any("image" in task.needs for task in self.tasks.values())
 
     @property
@@ -103,7 +103,7 @@ class Auxiliary:
 
         Args:
             heads: From `init_heads`.
-            view: Of the transitions, without what belongs to single tasks.
+            view: Inputs that all tasks share.
             latents: [B, L] of the tasks' own views, by name.
             batch: The transitions, with targets.
         """
@@ -138,7 +138,7 @@ def make_auxiliary(
         observation: Shape and dtype of one observation.
         action_size: A.
         frame_stack: Images that an observation stacks.
-        dtype: What the networks compute in.
+        dtype: Dtype that the networks compute in.
 
     Raises:
         RequestError: They do not go together, or not with the rest of the configuration.

@@ -60,7 +60,7 @@ def decode(params: Params, values: jax.Array, dtype: Any) -> jax.Array:
     Args:
         params: From `init_decoder`.
         values: [B, inputs].
-        dtype: What is computed in.
+        dtype: Dtype of the computation.
     """
     layers = _layers(params)
     pixels = _through(layers, values, dtype) + layers[-1]["bias"].astype(dtype)
@@ -75,7 +75,7 @@ def decoding_error(params: Params, values: jax.Array, patches: jax.Array, dtype:
         params: From `init_decoder`; see `has_kernel`.
         values: [B, inputs].
         patches: [at least B, patches, 64 C'], what is to be decoded, as `kernels.patches.to_patches` orders it.
-        dtype: What is computed in.
+        dtype: Dtype of the computation.
     """
     *coarser, before, finer, finest = _layers(params)
     cells = _through([*coarser, before], values, dtype)
@@ -85,7 +85,7 @@ def decoding_error(params: Params, values: jax.Array, patches: jax.Array, dtype:
 
 
 def has_kernel(batch: int, shape: tuple[int, int, int], levels: int) -> bool:
-    """Whether `decoding_error` can decode ``batch`` images of shape C, H, W by a decoder of so many levels."""
+    """Return True if `decoding_error` supports ``batch`` images of shape C, H, W and a decoder of so many levels."""
     channels, height, width = shape
     cells = batch * (height >> levels) * (width >> levels) * 4 ** (levels - 2)
     is_whole = levels >= encoder_kernel_patches.LEVELS and cells % LEAST_ROWS == 0
@@ -98,7 +98,7 @@ def _layers(params: Params) -> list[Params]:
 
 
 def _through(layers: list[Params], values: jax.Array, dtype: Any) -> jax.Array:
-    """What the last layer makes before its bias is added: [.., outputs of a pixel], in ``dtype``."""
+    """Return the output of the last layer before its bias is added: [.., outputs of a pixel], in ``dtype``."""
     for number, layer in enumerate(layers):
         if number > 0:
             biased = values + layers[number - 1]["bias"].astype(dtype)

@@ -34,7 +34,7 @@ def with_count(state: Any, steps: jax.Array) -> Any:
 
 
 def corrections(counts: jax.Array) -> jax.Array:
-    """What moments are divided by because they began at 0: [N, 2] float32, for the first and the second moment.
+    """Return divisors of moments, which began at 0: [N, 2] float32, for the first and the second moment.
 
     Args:
         counts: [N] int32, steps of N networks, from 1.

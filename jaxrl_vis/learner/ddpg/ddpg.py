@@ -108,11 +108,11 @@ class Prepared(NamedTuple):
 
 
 class Gradients(NamedTuple):
-    """What a batch changes.
+    """Gradients of a batch.
 
     Attributes:
         critic, actor: For the optimisers, float32; None for an actor that stays as it is.
-        weighting: Of the auxiliary losses, after this batch; None where there is nothing to remember.
+        weighting: State of the weighting after this batch; None where there is nothing to remember.
         autoencoder: For the optimiser of the autoencoder that makes rewards; None where there is none.
     """
 
@@ -233,7 +233,7 @@ def _value_at_goals(networks: Networks, agent: Agent, statistics: Statistics, go
 
 
 def _metrics_of(found: Weighted, value: jax.Array) -> Metrics:
-    """What the critic's losses and their weighting say, and the mean of its values [B]."""
+    """Return metrics of the critic's losses and their weighting, and the mean of its values [B]."""
     return {
         "train/critic_loss": found.losses[MAIN],
         "train/value": jnp.mean(value),
@@ -251,8 +251,8 @@ def make_ddpg(
         networks: Architecture of the parameters.
         config: Learning rates, target decay, action penalty.
         resolved: Discount, bounds of the targets, filter threshold.
-        auxiliary: What is learned beside; None for what ``config`` asks for, without stacked images.
-        shards: Of the learner: batches are those of one part, gradients and metrics those of the whole.
+        auxiliary: Auxiliary tasks; None for those that ``config`` asks for, without stacked images.
+        shards: Shards of the learner: batches are those of one shard, gradients and metrics those of the whole.
     """
     if auxiliary is None:
         auxiliary = make_auxiliary(config, networks.observation_spec, networks.action_size, 1, networks.dtype)

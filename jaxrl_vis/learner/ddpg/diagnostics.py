@@ -1,4 +1,4 @@
-"""What a batch says about its rewards, measured against the truth that only a simulation knows.
+"""Rewards of a batch, measured against the truth that only a simulation knows.
 
 Shares of one batch are means of products, so that a quotient of two of them, averaged over many batches, is the share over all
 of these batches: precision of the filter = ``filtered_false_share`` / ``filtered_share`` (see `run.metrics`).
@@ -20,7 +20,7 @@ def count_rewards(
     success: jax.Array | None = None,
     graded: bool = False,
 ) -> Metrics:
-    """What a batch of B transitions has of what, [] float32 by name; `shares` makes shares of it.
+    """Count positives, negatives and errors among B transitions, [] float32 by name; `shares` makes shares of them.
 
     Where a batch is spread over devices, the mean of these over the devices comes in between.
 
@@ -29,7 +29,7 @@ def count_rewards(
         keep: [B] float32, 0 for what the filter drops (`losses.keep_mask`).
         reward_positive, reward_negative: R+ and R-.
         success: [B] float32, 1 where the goal was truly reached; None: nothing is said about the truth.
-        graded: Whether rewards lie anywhere between R- and R+: one in the middle counts as half a positive.
+        graded: True if rewards lie anywhere between R- and R+: one in the middle counts as half a positive.
     """
     if graded:
         positive = (reward - reward_negative) / (reward_positive - reward_negative)
@@ -57,7 +57,7 @@ def shares(counts: Metrics, parts: int = 1) -> Metrics:
 
     Args:
         counts: From `count_rewards`; of a batch in several parts, the mean over these.
-        parts: How many there are.
+        parts: Number of parts.
     """
 
     def share(part: str, whole: str) -> jax.Array:

@@ -39,12 +39,12 @@ class AutoencoderState(Replaceable):
 
 
 class Rewarded(NamedTuple):
-    """What `LatentReward.of_batch` finds.
+    """Result of `LatentReward.of_batch`.
 
     Attributes:
         reward: [B] float32, without gradient.
         loss: [] float32, mean squared error of the reconstruction, of normalised observations.
-        gradient: Of that loss, for the parameters, float32.
+        gradient: Gradient of that loss, for the parameters, float32.
     """
 
     reward: jax.Array

@@ -1,4 +1,4 @@
-"""What the critic and the actor learn from a batch: their losses, auxiliary ones included, and one weighted gradient for each.
+"""Losses of the critic and the actor for a batch, auxiliary ones included, and one weighted gradient for each.
 
 Four networks read three observations (before, goal, after). Each is normalised and ordered once, and each network encodes what
 it needs in one pass:
@@ -50,7 +50,7 @@ class Latents(NamedTuple):
         pair: [2, B, latent] before and goal, as heads take them.
         before: The first of them.
         after: None where no loss reads it.
-        views: Of images that auxiliary tasks have made, by name.
+        views: Latents of images that auxiliary tasks have made, by name.
     """
 
     pair: jax.Array
@@ -84,7 +84,7 @@ _MAIN_READS, _OTHERS_READ = "main", "others"
 
 
 def _encoders(networks: Networks, auxiliary: Auxiliary, inputs: Inputs) -> dict[str, Callable[[Params], jax.Array]]:
-    """What the critic's main loss reads of the observations, and what auxiliary losses read, as functions of the encoder.
+    """Latents that the critic's main loss reads, and those that auxiliary losses read, as functions of the encoder.
 
     The main loss looks at goals and auxiliary losses never do, so gradients have less to pass through.
     """
@@ -132,7 +132,7 @@ class Objectives:
 
     @property
     def reduces_early(self) -> bool:
-        """Whether the critic's gradients are averaged over the parts of a learner before they are weighted.
+        """True if the critic's gradients are averaged over the shards of a learner before they are weighted.
 
         A weighting that takes logarithms of losses, or compares gradients, must see those of the whole learner. What others
         make of them is a sum, which may be averaged afterwards, together with all else.

@@ -52,7 +52,7 @@ def _pack_steps(array: jax.Array) -> jax.Array:
 
 
 class Indices(NamedTuple):
-    """Where B transitions lie: [B] int32 each.
+    """Places of B transitions: [B] int32 each.
 
     Attributes:
         episode: In [0, N).
@@ -71,7 +71,7 @@ class Replay(NamedTuple):
         num_envs: E, episodes in a rollout.
         horizon: T.
         frame_stack: F, images that an observation stacks along C, the newest first; 1 for state vectors.
-        mean_age: Of what is sampled, in rollouts, if probabilities are to fall exponentially with age; None: they are even.
+        mean_age: Mean age of samples, in rollouts, if probabilities are to fall exponentially with age; None: they are even.
     """
 
     num_rollouts: int
@@ -147,11 +147,11 @@ class Replay(NamedTuple):
         return ReplayState(episodes=episodes, size=jnp.minimum(state.size + self.num_envs, self.num_episodes))
 
     def _latest(self, iteration: jax.Array) -> jax.Array:
-        """Where the last episode of the rollout of ``iteration`` lies."""
+        """Return the place of the last episode of the rollout of ``iteration``."""
         return (iteration % self.num_rollouts + 1) * self.num_envs - 1
 
     def is_stored(self, state: ReplayState, iteration: jax.Array) -> jax.Array:
-        """Which places hold an episode: [N] bool. Not always the first ones: a resumed run may begin anywhere in the ring.
+        """Return which places hold an episode: [N] bool. Not always the first: a resumed run may begin anywhere in the ring.
 
         Args:
             state: The replay, with the rollout of ``iteration`` inserted.
@@ -190,9 +190,9 @@ class Replay(NamedTuple):
 
         Args:
             state: The replay.
-            indices: Where the transitions lie, [B] each.
+            indices: Places of the transitions, [B] each.
             goal_slot: [B] int32 in [1, T+1].
-            steps: Of a transition; it has fewer where the episode ends.
+            steps: Steps of a transition; it has fewer where the episode ends.
             goal_episode: [B] int32, whose slots those are; None: of the transitions' own episodes.
 
         Returns:
@@ -225,7 +225,7 @@ class Replay(NamedTuple):
         return self._read(stored, episodes, slots, slots > self.horizon)
 
     def stored(self, state: ReplayState, indices: Indices) -> dict[str, jax.Array]:
-        """What auxiliary tasks have stored of transitions, by task: [B, ...]."""
+        """Return the arrays that auxiliary tasks have stored of transitions, by task: [B, ...]."""
         return {name: unpack(array[indices.episode, indices.time]) for name, array in state.episodes.stored.items()}
 
 
@@ -237,7 +237,7 @@ def make_replay(transitions: int, num_envs: int, horizon: int, frame_stack: int 
         num_envs: E, episodes in a rollout.
         horizon: T, control steps in an episode.
         frame_stack: F, images that an observation stacks.
-        mean_age: Of what is sampled, transitions; None: samples are even.
+        mean_age: Mean age of samples, transitions; None: samples are even.
     """
     of_rollout = num_envs * horizon
     in_rollouts = None if mean_age is None else mean_age / of_rollout

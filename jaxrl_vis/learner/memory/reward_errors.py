@@ -24,7 +24,7 @@ def _keys(states: jax.Array, purpose: int) -> jax.Array:
 
 
 def estimate(states: jax.Array, noise: float) -> jax.Array:
-    """What an estimator makes of true states: [B, G] float32, in their unit.
+    """Return an estimator's estimates of true states: [B, G] float32, in their unit.
 
     Args:
         states: [B, G] float32.
@@ -43,7 +43,7 @@ def flip(
     clutter: float = 1.0,
     clutter_end: jax.Array | None = None,
 ) -> jax.Array:
-    """Which rewards are positive after some of them were misjudged: [B] bool.
+    """Return which rewards are positive after some of them were misjudged: [B] bool.
 
     Args:
         is_positive: [B] bool, before.

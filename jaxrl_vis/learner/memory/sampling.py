@@ -29,10 +29,10 @@ _TRIVIAL, _SHIFT, _TARGETS = 0x747276, 0x736866, 0x617578
 
 
 class Choice(NamedTuple):
-    """Which transitions to read, and with which goals; made ahead, for many batches at once.
+    """Choice of transitions and of their goals; made ahead, for many batches at once.
 
     Attributes:
-        indices: Where the transitions lie, [B] each.
+        indices: Places of the transitions, [B] each.
         goal_slot: [B] int32 in [t + 1, T + 1]; of another episode, in [1, T].
         goal_episode: [B] int32, whose slots those are; None: of the transitions' own episodes.
         shift: [B, 2] int32, see `Batch`; or None.
@@ -55,11 +55,11 @@ class Sampler:
     Attributes:
         config: Batch size, method, and p1.
         resolved: p2, R+ and R-.
-        replay: What to read from.
-        threshold: Of the oracle's reward, in the unit of the true states.
+        replay: Sizes of the replay to read from.
+        threshold: Threshold of the oracle's reward, in the unit of the true states.
         as_goal: [...] -> [...], makes a goal of what was reached (`GoalEnv.as_goal`); None where an observation is one already.
-        auxiliary: Whose targets batches carry.
-        shards: Of the learner. ``replay`` is one part, and so are batches; the configuration's batch size is that of all.
+        auxiliary: Auxiliary tasks, whose targets batches carry.
+        shards: Shards of the learner. ``replay`` is one, and so are batches; the configuration's batch size is that of all.
     """
 
     config: Config
@@ -83,9 +83,9 @@ class Sampler:
         goal_slot = self.goal_slots(goal_key, indices.time)
         choice = Choice(indices, goal_slot)
         if self.config.trivial_goals < 1.0:
-            gives_way = self._gives_way(state, jax.random.fold_in(key, _TRIVIAL), indices, goal_slot)
+            is_replaced = self._replaced(state, jax.random.fold_in(key, _TRIVIAL), indices, goal_slot)
             # Transitions are drawn at random, so those of the next one's episode are, too.
-            choice = choice._replace(goal_episode=jnp.where(gives_way, jnp.roll(indices.episode, 1), indices.episode))
+            choice = choice._replace(goal_episode=jnp.where(is_replaced, jnp.roll(indices.episode, 1), indices.episode))
         if self.config.random_shift:
             most, shape = self.config.random_shift, (self.config.batch_size, 2)
             fraction = jax.random.uniform(jax.random.fold_in(key, _SHIFT), shape)
@@ -112,8 +112,8 @@ class Sampler:
         shares = self.config.relabel_probability, self.resolved.balance_probability
         return choose_goal_slots(key, time, self.replay.horizon, *shares)
 
-    def _gives_way(self, state: ReplayState, key: jax.Array, indices: Indices, goal_slot: jax.Array) -> jax.Array:
-        """Which relabelled goals [B] bool give way to one of another episode: most of those that are reached already.
+    def _replaced(self, state: ReplayState, key: jax.Array, indices: Indices, goal_slot: jax.Array) -> jax.Array:
+        """Return which relabelled goals [B] bool another episode's replace: most of those that are reached already.
 
         Not to the original goals. Where these look different from what episodes show (VisualFingerTurn's finger always hangs
         down in them), all that is seldom reached would look like that, and a critic would tell rewards by it.

@@ -15,11 +15,11 @@ _wanted = jax.make_user_context(default_value=False)
 
 @contextlib.contextmanager
 def with_tangents() -> Iterator[None]:
-    """What is traced inside can be differentiated by `jax.jvp`."""
+    """Trace what is inside so that `jax.jvp` can differentiate it."""
     with _wanted(True):
         yield
 
 
 def are_wanted() -> bool:
-    """Whether what is being traced must have tangents."""
+    """Return True if what is being traced must have tangents."""
     return bool(_wanted.value)

@@ -101,7 +101,7 @@ def compute_dtype(config: Config) -> Any:
 
 
 class BatchScaling(NamedTuple):
-    """What the observations of transitions are normalised with.
+    """Scaling of the observations of transitions.
 
     Attributes:
         observations: Before and after the action; goals, too, unless they have their own.
@@ -209,12 +209,12 @@ class Networks:
 
     @property
     def sees_images(self) -> bool:
-        """Whether observations are planar images rather than state vectors."""
+        """True if observations are planar images rather than state vectors."""
         return len(self.observation_spec.shape) == 3
 
     @property
     def uses_kernel(self) -> bool:
-        """Whether the first layers are those of `kernels.encoder`, one kernel on a GPU, instead of one product each."""
+        """True if the first layers are those of `kernels.encoder`, one kernel on a GPU, instead of one product each."""
         return (
             self.sees_images
             and self.dtype == jnp.bfloat16
@@ -294,7 +294,7 @@ class Networks:
         )
 
     def scaling(self, statistics: NormalizerState) -> Scaling:
-        """What `prepare` and `normalize` take."""
+        """Return the scaling that `prepare` and `normalize` take."""
         return Scaling(statistics.mean, normalizer.scale(statistics, self.config.normalizer_floor))
 
     def batch_scaling(self, statistics: Statistics) -> BatchScaling:

@@ -13,7 +13,7 @@ from jaxrl_vis.types import NormalizerState
 
 
 class Scaling(NamedTuple):
-    """What observations are normalised with, as statistics say it.
+    """Mean and scale that observations are normalised with.
 
     Attributes:
         mean: [...] float32, in the observation's unit.
@@ -39,7 +39,7 @@ def update(
         state: Statistics so far.
         observations: In their own dtype, with leading axes to reduce.
         axes: The leading axes.
-        shards: Of the learner; ``observations`` are those of one part.
+        shards: Shards of the learner; ``observations`` are those of one shard.
     """
     count = jnp.float32(shards.count)
     for axis in axes:

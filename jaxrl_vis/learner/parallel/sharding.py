@@ -32,7 +32,7 @@ SEED = "seed"
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """How the seeds of a run, and the parts of each learner, lie on devices; make it with `make_layout`.
+    """Placement of the seeds of a run, and of the shards of each learner, on devices; make it with `make_layout`.
 
     Between two iterations, the replay of a learner that is divided is an array [S, rollouts, E, ...] in place of
     [S, rollouts * E, ...]: the same bytes, so that a run may go on with another number of devices.
@@ -86,13 +86,13 @@ class Layout:
 
     @property
     def replay(self) -> Any:
-        """Of a `ReplayState`."""
+        """Specs of a `ReplayState`."""
         episodes = Spec(SEED) if self.shards.count == 1 else Spec(SEED, None, DATA)
         return ReplayState(episodes=episodes, size=Spec(SEED))  # type: ignore[arg-type]
 
     @property
     def loop(self) -> Any:
-        """Of a `LoopState`."""
+        """Specs of a `LoopState`."""
         return LoopState(train=Spec(SEED), replay=self.replay, key=Spec(SEED), iteration=Spec())  # type: ignore[arg-type]
 
     def shardings(self, specs: Any) -> Any:
@@ -108,7 +108,7 @@ class Layout:
         """Compiles a function of one device's part so that it runs on all devices.
 
         Args:
-            function: Of one device's parts of its arguments.
+            function: Function of one device's parts of its arguments.
             in_specs: A partition spec, or a tree of them, for each argument.
             out_specs: The same for what it returns.
             jit: Such as `jax.jit`.
@@ -151,7 +151,7 @@ class Layout:
         """Return one device's part of a learner's replay as it is between two iterations.
 
         Args:
-            replay: Of one learner, [rollouts * E, ...].
+            replay: Replay of one learner, [rollouts * E, ...].
             num_envs: E, environments in this part.
         """
         count = self.shards.count
@@ -195,7 +195,7 @@ def _avoid_shardy() -> None:
 
 
 def make_layout(config: Config) -> Layout:
-    """Where the seeds of a run go, and the parts of each learner.
+    """Place the seeds of a run, and the shards of each learner, on devices.
 
     Args:
         config: The run; its ``devices`` and ``data_devices``.

@@ -20,7 +20,7 @@ class Shards:
     """The parts of one learner.
 
     Attributes:
-        count: How many there are.
+        count: Number of shards.
     """
 
     count: int = 1
@@ -52,7 +52,7 @@ class Shards:
 
         Args:
             draw: shape -> random numbers, with a key that all parts share.
-            shape: Of this part; the first axis is the one that is divided.
+            shape: Shape of this part; the first axis is the one that is divided.
         """
         return self.part(draw((shape[0] * self.count, *shape[1:])))
 

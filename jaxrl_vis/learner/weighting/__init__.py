@@ -1,9 +1,9 @@
-"""How much auxiliary losses count beside the main one. A leaf: knows neither DDPG nor environments.
+"""Weightings of auxiliary losses beside the main one. A leaf: knows neither DDPG nor environments.
 
 base        the interface, `Weighting`, and the logarithm of a loss
-members     weights that are given, or follow from one step
+constant    weights that are given, or follow from one step
 ol_aux      weights that learn; `ol_aux_variants`: as in the authors' release, and the ablation of figure 5.7
-table       all of them by name
+registry    all of them by name
 gradients   `weighted_grad`: anybody's losses and parameters, differentiated, weighted and added up
 """
 

@@ -66,8 +66,8 @@ class Weighting(NamedTuple):
 
             Gradients are those of the losses as they are, with respect to the shared parameters alone.
         needs: Kind of ``statistics``.
-        auxiliary: Whether auxiliary losses are learned at all; if not, they weigh 0 and need not be computed.
-        log: Whether logarithms of the losses are learned.
+        auxiliary: True if auxiliary losses are learned at all; if not, they weigh 0 and need not be computed.
+        log: True if logarithms of the losses are learned.
         eps: Added to auxiliary losses before their logarithm is taken.
         main_eps: Added to the main loss likewise.
         interval: N, calls of ``update`` from one change of the weights to the next.
@@ -95,7 +95,7 @@ class Weighting(NamedTuple):
         return {name: weights[name] * slope for name, slope in self.slopes(losses).items()}
 
     def objective(self, weights: Weights, losses: Losses) -> jax.Array:
-        """What is learned: the weighted sum of the losses or of their logarithms, [] float32.
+        """Return the objective: the weighted sum of the losses or of their logarithms, [] float32.
 
         Its gradient, weights being constant, is the sum of c_i grad L_i.
         """
@@ -193,8 +193,8 @@ def auxiliary_names(weighting: str, names: Iterable[str], needed: bool = True) -
 
     Args:
         weighting: Its name, for the message.
-        names: Of all losses.
-        needed: Whether there must be some.
+        names: Names of all losses.
+        needed: True if there must be some.
 
     Raises:
         RequestError: `MAIN` is missing, a name is there twice, or there are no others.
@@ -227,8 +227,8 @@ def start(names: Iterable[str], weights: Mapping[str, float], **more: Any) -> We
     """A state at its beginning.
 
     Args:
-        names: Of the auxiliary losses.
-        weights: Of these.
+        names: Names of the auxiliary losses.
+        weights: Their weights.
         more: Other fields.
     """
     filled = {MAIN: jnp.ones(())} | {name: jnp.asarray(weights[name], jnp.ones(()).dtype) for name in names}

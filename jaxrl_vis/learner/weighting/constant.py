@@ -46,7 +46,7 @@ def fixed(weights: float | Mapping[str, float] = 1.0, log: bool = True, eps: flo
 
     Args:
         weights: One number for all auxiliary losses, or a number for each by its name.
-        log: Whether logarithms of the losses are learned.
+        log: True if logarithms of the losses are learned.
         eps, main_eps: See `Weighting`.
 
     Raises:
@@ -65,7 +65,7 @@ def cosine(log: bool = False, eps: float = 0.02, main_eps: float = 1e-8) -> Weig
     the sign matters, so no norm is needed, and logarithms do not change the weights.
 
     Args:
-        log: Whether logarithms of the losses are learned.
+        log: True if logarithms of the losses are learned.
         eps, main_eps: See `Weighting`.
     """
 

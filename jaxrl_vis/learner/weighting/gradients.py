@@ -48,11 +48,11 @@ class Weighted(NamedTuple):
 
     Attributes:
         gradient: For the optimiser: the weighted sum of all gradients, shaped like the parameters, float32.
-        state: Of the weighting, after this step.
+        state: State of the weighting after this step.
         losses: [] float32 by name.
         metrics: [] float32 by name.
         weights: Weight of each loss in ``gradient``, [] float32 by name.
-        extra: What the losses' function returned beside them; None without ``has_aux``.
+        extra: Further result of the losses' function; None without ``has_aux``.
     """
 
     gradient: Params
@@ -101,7 +101,7 @@ def measure(weighting: Weighting, losses: Losses, gradients: Mapping[str, Params
     Args:
         weighting: Reads them.
         losses: [] float32 by name.
-        gradients: Of these, with respect to the shared parameters alone.
+        gradients: Their gradients with respect to the shared parameters alone.
     """
     if weighting.needs == "losses":
         return None
@@ -129,7 +129,7 @@ def weighted_grad(
         weighting: From `make_weighting`.
         shared: Selects the parameters in which gradients are compared, for instance ``lambda params: params["encoder"]``. It
             may only pick: what it returns must be parts of its argument.
-        way: How gradients are found, see above.
+        way: Method of the gradients, see above.
         has_aux: See ``losses_fn``.
         reduce: Applied to losses, gradients and dots before the weighting reads them, where each device has its own part of
             the data and the losses are means: ``lambda tree: jax.lax.pmean(tree, axis)``.

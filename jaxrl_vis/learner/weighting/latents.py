@@ -38,7 +38,7 @@ class Through:
         pullbacks: By group: of a gradient there, the gradient in the shared parameters.
         functions: By group: the shared parameters -> its latents.
         picked: The shared parameters.
-        has_names: Whether losses take a dictionary of groups rather than the one that there is.
+        has_names: True if losses take a dictionary of groups rather than a single one.
     """
 
     latents: dict[str, Any]
@@ -93,7 +93,7 @@ class Differentiated:
         losses: [] float32 by name.
         of_params: Loss -> place among the parameters' leaves -> gradient.
         at_latents: See `AtLatents`.
-        extra: What the main loss's function returned beside the losses.
+        extra: Further result of the main loss's function.
     """
 
     losses: dict[str, jax.Array]

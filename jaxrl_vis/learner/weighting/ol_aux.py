@@ -47,7 +47,7 @@ def ol_aux(
         interval: N, updates from one change of the weights to the next.
         learning_rate: alpha, the nominal one of the optimiser of the shared parameters, whichever kind it is.
         beta: Step size of the weights; 5 N if None (thesis: 25 for N = 5, 5 for N = 1).
-        log: Whether logarithms of the losses are learned and compared.
+        log: True if logarithms of the losses are learned and compared.
         eps, main_eps: See `Weighting`. The release adds nothing to the main loss.
         minimum: Least weight; None for none (thesis). Without one, weights turn negative and losses grow.
 

@@ -58,7 +58,7 @@ def available_bytes(device: Any = None) -> int | None:
 
 
 def _container_bytes() -> int:
-    """What a container's limit (cgroup version 2) leaves; a very large number where there is none."""
+    """Return the bytes that a container's limit (cgroup version 2) leaves; a very large number where there is none."""
     group = Path("/sys/fs/cgroup")
     try:
         limit = (group / "memory.max").read_text(encoding="ascii").strip()
@@ -100,9 +100,9 @@ def check_memory(
     Args:
         config: The run.
         loop_shapes: The loop state's shapes, all seeds.
-        replay_bytes: Of one seed's replay.
+        replay_bytes: Bytes of one seed's replay.
         steps_per_iteration: Environment steps of one seed in an iteration; the replay's capacity is a multiple of it.
-        layout: Where it runs.
+        layout: Placement of the run.
         frame_stack: Images that an observation stacks, of which the replay keeps one; rollouts and batches have all.
 
     Returns:
@@ -144,7 +144,7 @@ def check_compiled(programs: dict[str, Any], already_there: bool, layout: Layout
     Args:
         programs: Compiled programs by name; ``learn`` among them, where a state is to be made.
         already_there: The loop state is on the device already.
-        layout: Where they run; the compiler's figures are those of one device.
+        layout: Placement of the run; the compiler's figures are those of one device.
 
     Raises:
         RequestError: A program's scratch memory does not fit beside the state.
@@ -162,7 +162,7 @@ def check_compiled(programs: dict[str, Any], already_there: bool, layout: Layout
 
 
 def fit_together(programs: dict[str, Any], already_there: bool, layout: Layout = ONE_DEVICE) -> bool:
-    """Whether all programs have room at once, so that one may be called while another still runs.
+    """Return True if all programs have room at once, so that one may be called while another still runs.
 
     Args:
         programs, already_there, layout: As of `check_compiled`.

@@ -19,7 +19,7 @@ def _checked(tree: Any) -> dict[str, Any]:
 
 
 def broken_leaves(loop: LoopState) -> dict[str, jax.Array]:
-    """Which floating-point leaves hold a NaN or an infinity: name -> [] bool. Traceable; compiled before training starts."""
+    """Return which floating-point leaves hold a NaN or an infinity: name -> [] bool. Traceable; compiled before training."""
     return {name: ~jnp.isfinite(leaf).all() for name, leaf in _checked(loop).items()}
 
 
@@ -72,7 +72,7 @@ def dump(file: Path, loop: LoopState, values: PerSeed, leaves: list[str]) -> Non
     iteration would draw from. ``nonfinite_leaves``: the names in ``leaves``.
 
     Args:
-        file: Where to; its folder is made.
+        file: Path of the file; its folder is made.
         loop: The state: of the iteration that went wrong, or of the one that was dispatched before the host knew.
         values: Metrics of the iteration that went wrong.
         leaves: Names of the learner's leaves that are not finite.

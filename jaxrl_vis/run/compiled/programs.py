@@ -101,7 +101,7 @@ class Programs:
 
     @functools.cached_property
     def shows_images(self) -> bool:
-        """Whether what the robot sees can be shown in a video."""
+        """True if what the robot sees can be shown in a video."""
         replay = jax.eval_shape(jax.vmap(self.layout.unfolded), self.shapes.replay)
         _, episodes, slots, *image = replay.episodes.observations.shape
         return videos.shows_images((episodes, slots, *image))
@@ -113,7 +113,7 @@ class Programs:
 
     @property
     def evaluates_ahead(self) -> bool:
-        """Whether `evaluate` returns before the device has done its work."""
+        """True if `evaluate` returns before the device has done its work."""
         return not self.program.plays_any
 
     @property

@@ -64,13 +64,13 @@ class Weights(NamedTuple):
 
 
 def supports(channels: int, cell_features: int, quarter_features: int) -> bool:
-    """Whether the kernel can take decoders of images with these channels, and layers of these sizes."""
+    """Return True if the kernel supports decoders of images with these channels, and layers of these sizes."""
     powers = all(16 <= size <= 64 and size & (size - 1) == 0 for size in (cell_features, 4 * quarter_features))
     return channels <= _MOST_CHANNELS and powers
 
 
 def make_weights(bias_in: jax.Array, finer: dict[str, jax.Array], finest: dict[str, jax.Array]) -> Weights:
-    """Of a decoder's last two layers.
+    """Make the kernel's weights from a decoder's last two layers.
 
     Args:
         bias_in: [F], of the layer before.

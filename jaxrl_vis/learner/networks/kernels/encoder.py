@@ -38,7 +38,7 @@ _MOST_CHANNELS = 16
 
 
 def supports(filters: tuple[int, ...], shape: tuple[int, ...]) -> bool:
-    """Whether the kernel can take encoders with these output channels, and images [C, H, W] of this shape."""
+    """Return True if the kernel supports encoders with these output channels, and images [C, H, W] of this shape."""
     powers = all(16 <= size <= 64 and size & (size - 1) == 0 for size in filters[:LEVELS])
     return len(filters) >= LEVELS and powers and shape[0] <= _MOST_CHANNELS
 

@@ -82,7 +82,7 @@ def _apply_along(first: int, count: int, interpret: bool, primals: Any, tangents
 def _along_on_gpu(
     patches: jax.Array, weights: Weights, along: Weights, first: int, count: int, interpret: bool = False
 ) -> tuple[jax.Array, jax.Array]:
-    """What `apply` makes of patches, and its tangent along a direction of the weights, [count, F] each."""
+    """Return the result of `apply` for patches, and its tangent along a direction of the weights, [count, F] each."""
     outputs = weights.biases[-1].shape[0]
     block = TILE * divisor(math.gcd(first, count) // TILE, FORWARD_TILES)
     data, data_spec = as_quarters(patches, first, block)

@@ -18,7 +18,7 @@ from jaxrl_vis_envs.compilation import accelerator, by_platform, runs_gpu_kernel
 from jaxrl_vis_envs.gpu_kernels import kernel_call
 
 LEAST_ROWS = 16
-"""Of a product in a kernel."""
+"""Least number of rows of a product in a kernel."""
 TILE = 16
 """Patches in a tile."""
 # Measured on an H200: tiles that one program works through (at most, on the way back), and how they are run.
@@ -45,7 +45,7 @@ class Weights(NamedTuple):
 
 
 def is_available() -> bool:
-    """Whether this process has a GPU that the kernels run on; `jaxrl_vis_envs.compilation` says how to choose."""
+    """Return True if this process has a GPU that the kernels run on; `jaxrl_vis_envs.compilation` says how to choose."""
     if accelerator() != "cuda":
         return False
     with tracing_for("cuda"):
@@ -105,7 +105,7 @@ def before(after: jax.Array, gradient: jax.Array) -> jax.Array:
 
 
 def _layers(quarters: jax.Array, weights: Weights) -> list[jax.Array]:
-    """What each layer makes of [4 R, 16 C'] quarters of patches; `joined` says in which rows."""
+    """Return the output of each layer for [4 R, 16 C'] quarters of patches; `joined` says in which rows."""
     found, values = [], quarters
     for level, (kernel, bias) in enumerate(zip(*weights, strict=True)):
         values = layer(joined(values, level), kernel, bias)
@@ -114,12 +114,12 @@ def _layers(quarters: jax.Array, weights: Weights) -> list[jax.Array]:
 
 
 def joined(values: jax.Array, level: int) -> jax.Array:
-    """What a layer multiplies: the third one four quarters side by side, the others rows of the layer before."""
+    """Return the rows that a layer multiplies: the third one four quarters side by side, others those of the layer before."""
     return values.reshape(values.shape[0] // 4, -1) if level == LEVELS - 1 else values
 
 
 def read(refs: Any) -> Weights:
-    """What a kernel is given for weights: kernels, then biases."""
+    """Return the weights as arguments of a kernel: kernels, then biases."""
     values = tuple(ref[...] for ref in refs)
     return Weights(values[: len(values) // 2], values[len(values) // 2 :])
 
@@ -185,7 +185,7 @@ def rows(count: int, columns: int, skipped: int = 0) -> pl.BlockSpec:
 
 
 def tiles_of_program(tiles: int, total: int, limit: int) -> int:
-    """How many tiles one program works through where it leaves a sum: many, for few sums, as long as all processors are busy.
+    """Return the number of tiles per program where it leaves a sum: many, for few sums, as long as all processors are busy.
 
     Args:
         tiles: What the number must divide.

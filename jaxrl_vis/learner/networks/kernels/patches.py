@@ -18,7 +18,7 @@ from jaxrl_vis_envs.gpu_kernels import kernel_call
 LEVELS = 3
 """Layers of which a patch is one row of the result."""
 _SIDE = 4
-"""Of a quarter of a patch, in pixels."""
+"""Side of a quarter of a patch, in pixels."""
 # Measured on an H100: numbers, of one image, and images of one program, and how it is run.
 _PREPARE_NUMBERS, _PREPARE_IMAGES, _PREPARE = 4096, 16, plgpu.CompilerParams(num_warps=8, num_stages=2)
 
